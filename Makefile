@@ -1,0 +1,48 @@
+# Every target does its whole set-up: a virtual environment of its own in .venv, with the versions of constraints.txt.
+# `make map` and `make test` are what a new user needs; `make test-full` adds the slow Monte-Carlo sizes.
+
+PYTHON ?= python3
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+MAKE_VENV = $(PYTHON) -m venv --clear
+
+.PHONY: map test test-full test-oldest bench lint clean
+
+map: .venv/installed
+	$(BIN)/magloc map
+
+test: lint
+	$(BIN)/python -m pytest -q -n 2 -m "not slow"
+
+test-full: lint
+	$(BIN)/python -m pytest -q -n 2
+
+lint: .venv/installed
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache --no-logo
+
+bench: .venv/installed
+	$(BIN)/python -m tests.bench
+
+# The lower bounds of pyproject.toml, installed exactly.
+test-oldest: .venv-oldest/installed
+	.venv-oldest/bin/python -m pytest -q -n 2 -m "not slow"
+
+.venv/installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit("magloc needs Python 3.11 or newer, found " + sys.version.split()[0]) if sys.version_info < (3, 11) else None'
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(MAKE_VENV) .venv >/dev/null 2>&1 || \
+		{ $(MAKE_VENV) --without-pip .venv && $(PYTHON) -m pip --python $(BIN)/python install --quiet pip; } >/dev/null 2>&1 || \
+		{ echo "magloc needs Python's venv and pip: on Debian and Ubuntu, apt-get install python3-venv" >&2; exit 1; }
+	$(PIP) install --constraint constraints.txt --editable '.[test]'
+	@touch $@
+
+.venv-oldest/installed: pyproject.toml constraints-oldest.txt
+	$(MAKE_VENV) .venv-oldest
+	.venv-oldest/bin/python -m pip --disable-pip-version-check --quiet install --constraint constraints-oldest.txt --editable '.[test]'
+	@touch $@
+
+clean:
+	rm -rf .venv .venv-oldest build dist *.egg-info
+	find . -name __pycache__ -prune -exec rm -rf {} +
