@@ -1,0 +1,526 @@
+"""The TOML file of an array.
+
+Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, or the sensors one by one::
+
+    name = "tetrahedron-1.5"        # optional
+    geometry = "tetrahedron"
+    edge_m = 1.5
+    kind = "vector"                 # or "scalar"
+    noise_nT = 1.0
+
+    [[sensor]]                      # in place of geometry, its size, kind and noise_nT
+    id = "s1"
+    kind = "vector"
+    position_m = [0.0, 0.0, 0.918]  # array frame
+    rotation_xyzw = [0, 0, 0, 1]    # optional, sensor axes -> array frame
+    noise_nT = 1.0
+    [sensor.calibration]            # optional, reading = scale · (field in sensor axes) + offset
+    scale = 1.0                     # a number, 3 numbers or a 3×3 matrix
+    offset_nT = [0.0, 0.0, 0.0]     # one number for a scalar sensor
+
+Both may have ``noise_fraction``, ``common_field_nT``, ``ambient_nT = [x, y, z]`` and ``format_version = 1``; see
+:class:`arrays.sensor.SensorArray` for what they mean.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import os
+import re
+import secrets
+import tomllib
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from decimal import Context, Decimal
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from arrays.errors import InputError
+from arrays.geometries import GEOMETRIES
+from arrays.sensor import Calibration, Sensor, SensorArray
+
+FORMAT_VERSION = 1
+
+# Fields are converted between nT and T by shifting the decimal point of what is written, never by a multiplication:
+# 1.0 nT is the number 1e-9 to the last digit, and every float survives the way to a file and back.
+_SHIFT = Context(prec=1000, traps=[])
+_Number = int | Decimal
+_Vector = tuple[float, float, float]
+_Any = TypeVar("_Any")
+
+
+class _Header(msgspec.Struct, kw_only=True):
+    format_version: int = FORMAT_VERSION
+    name: str | None = None
+    noise_fraction: float = 0.0
+    common_field_nT: _Number | None = None
+    ambient_nT: tuple[_Number, _Number, _Number] | None = None
+
+
+class _GeometryFile(_Header, kw_only=True):
+    geometry: str
+    kind: str
+    noise_nT: _Number
+
+
+class _CalibrationTable(msgspec.Struct, kw_only=True):
+    scale: float | list[float | list[float]] = 1.0
+    offset_nT: _Number | list[_Number] | None = None
+
+
+class _SensorTable(msgspec.Struct, kw_only=True):
+    id: str
+    kind: str
+    position_m: _Vector
+    noise_nT: _Number
+    rotation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    calibration: _CalibrationTable = msgspec.field(default_factory=_CalibrationTable)
+
+
+class _SensorsFile(_Header, kw_only=True):
+    sensor: list[_SensorTable]
+
+
+def read_array(path: str | PathLike[str]) -> SensorArray:
+    """Array from its TOML file.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    SensorArray
+        A geometry without a name in the file is called after its shape.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or does not describe an array; the text says where and why.
+    """
+    return array_of_table(str(path), read_toml(path, "a TOML file of an array"))
+
+
+def array_of_table(place: str, table: dict[str, Any]) -> SensorArray:
+    """Array from the keys of an array file, which another file may hold as a table of its own.
+
+    Parameters
+    ----------
+    place : str
+        Name of the file, and of the table within it, for errors.
+    table : dict
+        As :func:`read_toml` returns it, with decimal numbers.
+
+    Returns
+    -------
+    SensorArray
+
+    Raises
+    ------
+    InputError
+        The table does not describe an array; the text says where and why.
+    """
+    if not table:
+        raise InputError(f"{place} is empty, expected an array: a geometry with its size, or [[sensor]] tables.")
+    if "geometry" in table and "sensor" in table:
+        raise InputError(f"{place}, keys geometry and sensor: found both, expected one of them.")
+    if "geometry" in table:
+        return _array_of_geometry(place, table)
+    if "sensor" in table:
+        return _array_of_sensors(place, table)
+    check_keys(place, table, {*_keys(_GeometryFile), *_keys(_SensorsFile), *_size_keys()})
+    raise InputError(f"{place}: found neither the key geometry nor [[sensor]] tables, expected one of them.")
+
+
+def write_array(array: SensorArray, path: str | PathLike[str]) -> None:
+    """Write an array's TOML file, from which :func:`read_array` makes an equal array.
+
+    Parameters
+    ----------
+    array : SensorArray
+    path : path-like
+        Replaced if it exists, in one step: nobody sees half a file.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    write_text(array_toml(array), path)
+
+
+def array_toml(array: SensorArray) -> str:
+    """Text of an array's TOML file, sensor by sensor.
+
+    Parameters
+    ----------
+    array : SensorArray
+
+    Returns
+    -------
+    str
+    """
+    lines = [f"format_version = {FORMAT_VERSION}"]
+    if array.name:
+        lines.append(f"name = {_quoted(array.name)}")
+    if array.noise_fraction:
+        lines.append(f"noise_fraction = {array.noise_fraction!r}")
+    if array.common_field_T is not None:
+        lines.append(f"common_field_nT = {_nanotesla(array.common_field_T)}")
+    if array.ambient_T is not None:
+        lines.append(f"ambient_nT = [{', '.join(map(_nanotesla, array.ambient_T))}]")
+    for sensor in array.sensors:
+        lines += ["", "[[sensor]]", f"id = {_quoted(sensor.id)}", f'kind = "{sensor.kind}"']
+        lines.append(f"position_m = {list(sensor.position_m)}")
+        if sensor.rotation_xyzw != (0.0, 0.0, 0.0, 1.0):
+            lines.append(f"rotation_xyzw = {list(sensor.rotation_xyzw)}")
+        lines.append(f"noise_nT = {_nanotesla(sensor.noise_T)}")
+        if sensor.calibration != Calibration.of(sensor.kind):
+            offsets = ", ".join(map(_nanotesla, sensor.calibration.offset_T))
+            offset = f"[{offsets}]" if sensor.kind == "vector" else offsets
+            lines += ["[sensor.calibration]", f"scale = {_shortest_scale(sensor.calibration)}"]
+            lines.append(f"offset_nT = {offset}")
+    return "\n".join(lines) + "\n"
+
+
+def read_text(path: str | PathLike[str], expected: str) -> str:
+    """Text of a UTF-8 file, with or without a byte order mark.
+
+    Parameters
+    ----------
+    path : path-like
+    expected : str
+        What the file should be, in words, for errors.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    InputError
+        The file does not exist, cannot be read, or is not UTF-8.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist, expected {expected}.") from None
+    except IsADirectoryError:
+        raise InputError(f"{path} is a directory, expected {expected}.") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path} cannot be read ({reason}), expected {expected}.") from None
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise InputError(
+            f"{path}, line {line}: found the byte 0x{data[error.start]:02x}, which is not UTF-8, expected UTF-8 text."
+        ) from None
+
+
+def write_text(text: str, path: str | PathLike[str]) -> None:
+    """Write a UTF-8 file in one step: a reader finds the old text or the new one, also after an interruption.
+
+    Parameters
+    ----------
+    text : str
+    path : path-like
+        Replaced if it exists; the target of a link, if it is one.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    target = Path(path)
+    in_place = target.exists() and not target.is_file()  # a pipe or a terminal cannot be replaced
+    if not in_place:
+        target = Path(os.path.realpath(path))
+    written = target if in_place else target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        try:
+            written.write_text(text, encoding="utf-8", newline="\n")
+            if not in_place:
+                os.replace(written, target)
+        finally:
+            if not in_place:
+                written.unlink(missing_ok=True)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None
+
+
+def read_toml(path: str | PathLike[str], expected: str) -> dict[str, Any]:
+    """Table of a TOML file, fractional numbers as Decimal.
+
+    Parameters
+    ----------
+    path : path-like
+    expected : str
+        What the file should be, in words, for errors.
+
+    Returns
+    -------
+    dict
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or is not TOML; the text names the line.
+    """
+    text = read_text(path, expected)
+    try:
+        return tomllib.loads(text, parse_float=Decimal)
+    except tomllib.TOMLDecodeError as error:
+        fault, _, where = str(error).rpartition(" (at ")
+        place = re.match(r"line (\d+)", where)
+        line = int(place[1]) if place else len(text.splitlines())  # else it is the end of the document
+        raise InputError(f"{path}, line {line}: found what is not TOML ({_lower_first(fault)}).") from None
+    except (ValueError, ArithmeticError):
+        raise InputError(f"{path}: found a number out of range, expected one with fewer digits.") from None
+    except RecursionError:
+        raise InputError(f"{path}: found lists nested too deeply, expected a list of lists at most.") from None
+
+
+def _array_of_geometry(path: str, table: dict[str, Any]) -> SensorArray:
+    name = table["geometry"]
+    if not isinstance(name, str) or name not in GEOMETRIES:
+        raise InputError(f"{path}, key geometry: found {name!r}, expected one of {', '.join(GEOMETRIES)}.")
+    make, size_key = GEOMETRIES[name]
+    foreign = next((key for key in table if key in _size_keys() and key != size_key), None)
+    if foreign is not None:
+        raise InputError(f"{path}, key {foreign}: found the size of another geometry, expected {size_key} of a {name}.")
+    check_keys(path, table, {*_keys(_GeometryFile), size_key})
+    if size_key not in table:
+        raise InputError(f"{path}: found no key {size_key}, expected the size of the {name}.")
+    file = converted(path, table, _GeometryFile)
+    size = getattr(converted(path, table, msgspec.defstruct("_Size", [(size_key, float)])), size_key)
+    noise_T = _noise(path, file.noise_nT)
+    with _naming(path):
+        array = make(size, file.kind, noise_T)  # type: ignore[arg-type]  # the kind is checked there
+    return _with_header(path, array, file)
+
+
+def _array_of_sensors(path: str, table: dict[str, Any]) -> SensorArray:
+    misplaced = next((key for key in ("kind", "noise_nT") if key in table), None)
+    if misplaced is not None:
+        raise InputError(f"{path}, key {misplaced}: found at the top, expected in each [[sensor]] table.")
+    check_keys(path, table, _keys(_SensorsFile))
+    for i, sensor in _tables(table["sensor"]):
+        place = _place(path, table, f"sensor[{i}]")
+        check_keys(place, sensor, _keys(_SensorTable))
+        if isinstance(sensor.get("calibration"), dict):
+            check_keys(place, sensor["calibration"], _keys(_CalibrationTable), within="calibration.")
+    file = converted(path, table, _SensorsFile)
+    sensors = tuple(_sensor(_place(path, table, f"sensor[{i}]"), sensor) for i, sensor in enumerate(file.sensor))
+    with _naming(path):
+        array = SensorArray(sensors)
+    return _with_header(path, array, file)
+
+
+def _sensor(place: str, table: _SensorTable) -> Sensor:
+    noise_T = _noise(place, table.noise_nT)
+    with _naming(place):
+        sensor = Sensor(table.id, table.kind, table.position_m, noise_T, table.rotation_xyzw)  # type: ignore[arg-type]
+    offset_nT: list[_Number] = [0] * sensor.n_channels
+    if table.calibration.offset_nT is not None:
+        given = table.calibration.offset_nT
+        offset_nT = given if isinstance(given, list) else [given]
+    key = f"{place}, key calibration.offset_nT"
+    if len(offset_nT) != sensor.n_channels:
+        raise InputError(
+            f"{key}: found {_count(len(offset_nT))}, expected {_count(sensor.n_channels)} for a {sensor.kind} sensor."
+        )
+    with _naming(place):
+        calibration = Calibration.of(sensor.kind, table.calibration.scale, [_tesla(key, x) for x in offset_nT])
+    return replace(sensor, calibration=calibration)
+
+
+def _with_header(path: str, array: SensorArray, header: _Header) -> SensorArray:
+    if header.format_version != FORMAT_VERSION:
+        raise InputError(f"{path}, key format_version: found {header.format_version}, expected {FORMAT_VERSION}.")
+    common_T = ambient_T = None
+    if header.common_field_nT is not None:
+        common_T = _tesla(f"{path}, key common_field_nT", header.common_field_nT)
+        if common_T < 0.0:
+            raise InputError(
+                f"{path}, key common_field_nT: found {header.common_field_nT}, expected a number that is not negative."
+            )
+    if header.ambient_nT is not None:
+        x, y, z = (_tesla(f"{path}, key ambient_nT", component) for component in header.ambient_nT)
+        ambient_T = (x, y, z)
+    name = array.name if header.name is None else header.name
+    with _naming(path):
+        return SensorArray(array.sensors, name, header.noise_fraction, common_T, ambient_T)
+
+
+def _noise(place: str, noise_nT: _Number) -> float:
+    noise_T = _tesla(f"{place}, key noise_nT", noise_nT)
+    if noise_T <= 0.0:
+        raise InputError(f"{place}, key noise_nT: found {noise_nT}, expected a positive number.")
+    return noise_T
+
+
+def _tesla(place: str, nanotesla: _Number) -> float:
+    """Field in T from a number in nT as it is written."""
+    tesla = Decimal(nanotesla).scaleb(-9, _SHIFT)
+    if not abs(float(tesla)) < float("inf"):
+        raise InputError(f"{place}: found {nanotesla}, expected a finite number.")
+    return float(tesla)
+
+
+def _nanotesla(tesla: float) -> str:
+    """A field in T as a TOML float in nT."""
+    shifted = Decimal(repr(tesla)).scaleb(9, _SHIFT)
+    text = f"{shifted:f}" if not shifted or -7 < shifted.adjusted() < 16 else str(shifted)
+    return text if set(text) & set(".E") else f"{text}.0"
+
+
+def _shortest_scale(calibration: Calibration) -> float | list[float] | list[list[float]]:
+    """A number, 3 numbers or the matrix."""
+    rows = [list(row) for row in calibration.scale]
+    diagonal = [row[i] for i, row in enumerate(rows)]
+    if any(x for i, row in enumerate(rows) for j, x in enumerate(row) if i != j):
+        return rows
+    return diagonal[0] if len(set(diagonal)) == 1 else diagonal
+
+
+def _quoted(text: str) -> str:
+    """A TOML string; what JSON escapes TOML escapes alike, and printable text needs nothing else."""
+    return json.dumps(text, ensure_ascii=False)
+
+
+def _keys(struct: type[msgspec.Struct]) -> tuple[str, ...]:
+    return struct.__struct_fields__
+
+
+def _size_keys() -> set[str]:
+    return {geometry.size_key for geometry in GEOMETRIES.values()}
+
+
+def check_keys(place: str, table: Mapping[str, Any], known: Collection[str], within: str = "") -> None:
+    """Refuse a table with a key that is not known, naming the nearest one that is.
+
+    Parameters
+    ----------
+    place : str
+        Name of the file, and of the table within it, for errors.
+    table : mapping
+    known : collection of str
+        Keys that the table may have.
+    within : str
+        What the keys are shown with in front, such as ``"calibration."``.
+
+    Raises
+    ------
+    InputError
+        For the first unknown key.
+    """
+    for key in table:
+        if key not in known:
+            nearest = difflib.get_close_matches(key, sorted(known), n=1, cutoff=0.0)[0]
+            shown = key if key and key.isprintable() else repr(key)
+            raise InputError(
+                f"{place}, key {within}{shown}: found an unknown key, expected a known one "
+                f"(the nearest is {within}{nearest})."
+            )
+
+
+def _tables(value: object) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Those members of a list that are tables; anything else is the type check's to refuse."""
+    if isinstance(value, list):
+        yield from ((i, item) for i, item in enumerate(value) if isinstance(item, dict))
+
+
+@contextmanager
+def _naming(place: str) -> Iterator[None]:
+    """Turn what the sensors and arrays say of their inputs into errors of a place in the file."""
+    try:
+        yield
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{place}: {str(error).removeprefix('Input ')}") from None
+
+
+_TYPE_ERROR = re.compile(r"Expected `(?P<expected>[^`]+)`(?P<length> of length \d+)?, got `?(?P<found>[^`]+)`?")
+_MISSING_ERROR = re.compile(r"Object missing required field `(?P<key>[^`]+)`")
+_TYPES = {
+    "array": "a list",
+    "bool": "a truth value",
+    "decimal": "a number",
+    "float": "a number",
+    "int": "a whole number",
+    "null": "nothing",
+    "object": "a table",
+    "str": "text",
+}
+
+
+def converted(path: str, table: dict[str, Any], type_: type[_Any]) -> _Any:
+    """A table as a struct of the right types.
+
+    Parameters
+    ----------
+    path : str
+        Name of the file, for errors.
+    table : dict
+        As :func:`read_toml` returns it, with decimal numbers.
+    type_ : type
+        The struct. Fields of type float take any number.
+
+    Returns
+    -------
+    object
+        Of that type.
+
+    Raises
+    ------
+    InputError
+        A key is missing, or its value has another type; the text names the key.
+    """
+    try:
+        return msgspec.convert(table, type_, builtin_types=(Decimal,))
+    except msgspec.ValidationError as error:
+        text, _, where = str(error).partition(" - at `$.")
+        place = _place(path, table, where.rstrip("`"))
+    missing = _MISSING_ERROR.fullmatch(text)
+    if missing:
+        raise InputError(f"{place}: found no key {missing['key']}, expected one.")
+    wrong = _TYPE_ERROR.fullmatch(text)
+    if not wrong:
+        raise InputError(f"{place}: {_lower_first(text)}.")
+    found = f"a list of length {wrong['found']}" if wrong["length"] else _type_in_words(wrong["found"])
+    raise InputError(f"{place}: found {found}, expected {_type_in_words(wrong['expected'])}{wrong['length'] or ''}.")
+
+
+def _type_in_words(types: str) -> str:
+    names = set(types.split(" | ")) - {"null"} or {"null"}
+    if names & {"decimal", "float"}:
+        names.discard("int")
+    return " or ".join(_TYPES.get(name, name) for name in sorted(names, reverse=True))
+
+
+def _place(path: str, table: Mapping[str, Any], where: str) -> str:
+    """Where ``sensor[1].noise_nT`` is, in words: the sensor by its id, or by its number if that cannot be shown."""
+    sensor = re.fullmatch(r"sensor\[(\d+)\]\.?(.*)", where)
+    if sensor:
+        index, where = int(sensor[1]), sensor[2]
+        item = table["sensor"][index]
+        name = item.get("id") if isinstance(item, dict) else None
+        usable = isinstance(name, str) and name.isprintable() and name.strip()
+        path = f"{path}, sensor {name}" if usable else f"{path}, sensor number {index + 1}"
+    return f"{path}, key {where}" if where else path
+
+
+def _count(n: int) -> str:
+    return "1 number" if n == 1 else f"{n} numbers"
+
+
+def _lower_first(text: str) -> str:
+    return text[:1].lower() + text[1:]

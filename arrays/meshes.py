@@ -1,0 +1,139 @@
+"""Arrays as meshes, to be looked at.
+
+A vector sensor is a cube with three rods along its own axes, red x, green y, blue z; a scalar sensor is a sphere.
+Glyphs are sized by the spacing of the sensors, so that an array of 3 cm and one of 30 m look alike.
+"""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
+from scipy.spatial.transform import Rotation
+
+from arrays.sensor import Sensor, SensorArray
+
+FloatArray = NDArray[np.float64]
+
+BODY_COLOUR = (90, 96, 105, 255)
+AXIS_COLOURS = ((214, 66, 62, 255), (68, 160, 71, 255), (52, 101, 204, 255))
+
+# In units of the glyph's size, the reach of the rods from the sensor's position.
+_CUBE_SIDE = 0.6
+_ROD_RADIUS = 0.08
+_SPHERE_RADIUS = 0.4
+
+_SIZE_OF_SPACING = 0.4  # rods of neighbours that point at each other leave a fifth of the way free
+_SAME_PLACE_RTOL = 1e-9
+
+
+def glyph_size(array: SensorArray) -> float:
+    """Size at which the glyphs of an array do not touch: 0.4 of the least distance between two sensors.
+
+    Parameters
+    ----------
+    array : SensorArray
+
+    Returns
+    -------
+    float
+        Size [m]. Sensors in the same place do not count.
+    """
+    distances = pdist(array.positions)
+    return _SIZE_OF_SPACING * float(distances[distances > _SAME_PLACE_RTOL * array.circumradius].min())
+
+
+def sensor_mesh(sensor: Sensor, size_m: float) -> trimesh.Trimesh:
+    """Glyph of a sensor at its place, turned as the sensor is.
+
+    Parameters
+    ----------
+    sensor : Sensor
+    size_m : float
+        Reach of the rods from the sensor's position [m].
+
+    Returns
+    -------
+    trimesh.Trimesh
+        In the array's frame [m], watertight.
+    """
+    glyph = _glyph(sensor, size_m)
+    glyph.apply_transform(_pose(sensor))
+    return glyph
+
+
+def array_mesh(array: SensorArray, size_m: float | None = None) -> trimesh.Trimesh:
+    """All sensors of an array as one mesh.
+
+    Parameters
+    ----------
+    array : SensorArray
+    size_m : float, optional
+        Size of the glyphs [m], :func:`glyph_size` by default.
+
+    Returns
+    -------
+    trimesh.Trimesh
+        In the array's frame [m], watertight.
+    """
+    size = glyph_size(array) if size_m is None else size_m
+    return _joined([sensor_mesh(sensor, size) for sensor in array.sensors])
+
+
+def array_scene(array: SensorArray, size_m: float | None = None) -> trimesh.Scene:
+    """An array as a scene with one node for each sensor, called after its id.
+
+    Parameters
+    ----------
+    array : SensorArray
+    size_m : float, optional
+        Size of the glyphs [m], :func:`glyph_size` by default.
+
+    Returns
+    -------
+    trimesh.Scene
+        In the array's frame [m]. A node's transform is the pose of its sensor.
+    """
+    size = glyph_size(array) if size_m is None else size_m
+    scene = trimesh.Scene()
+    for sensor in array.sensors:
+        glyph = _glyph(sensor, size)
+        scene.add_geometry(glyph, node_name=sensor.id, geom_name=sensor.id, transform=_pose(sensor))
+    return scene
+
+
+def _glyph(sensor: Sensor, size_m: float) -> trimesh.Trimesh:
+    """Mesh of a sensor in its own axes."""
+    if not 0.0 < size_m < np.inf:
+        raise ValueError(f"Input size_m must be a positive finite number; instead received {size_m}.")
+    if sensor.kind == "scalar":
+        radius = _SPHERE_RADIUS * size_m
+        sphere: trimesh.Trimesh = trimesh.creation.icosphere(subdivisions=3, radius=radius, face_colors=BODY_COLOUR)
+        return sphere
+    body = trimesh.creation.box(extents=[_CUBE_SIDE * size_m] * 3, face_colors=BODY_COLOUR)
+    return _joined([body, *(_rod(axis, size_m) for axis in range(3))])
+
+
+def _rod(axis: int, size_m: float) -> trimesh.Trimesh:
+    """Rod from the origin along an axis."""
+    segment = np.array([np.zeros(3), size_m * np.eye(3)[axis]])
+    radius = _ROD_RADIUS * size_m
+    rod: trimesh.Trimesh = trimesh.creation.cylinder(
+        radius, sections=16, segment=segment, face_colors=AXIS_COLOURS[axis]
+    )
+    return rod
+
+
+def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    return cast(trimesh.Trimesh, trimesh.util.concatenate(meshes))
+
+
+def _pose(sensor: Sensor) -> FloatArray:
+    """Homogeneous transform from a sensor's axes to the array's frame, shape (4, 4)."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat(sensor.rotation_xyzw).as_matrix()
+    pose[:3, 3] = sensor.position_m
+    return pose
