@@ -1,0 +1,360 @@
+r"""Square-root Kalman filtering, one scalar measurement at a time, iterated.
+
+Generic: no magnetics in here. The covariance is carried as a square root S with :math:`P = S S^T`, so that it stays
+symmetric and positive semidefinite however small a measurement's noise is against the prior.
+
+The names of the source paper (Pavlov, Karshakov, Goldin) and ours:
+
+==============  =================================================================
+PrognosisFK     :func:`predict_square_root`
+ProcessingFK    :func:`scalar_update`
+MeasureS        :func:`estimability`
+(19), (30)      stop rule of :func:`iterated_update`
+==============  =================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+MeasurementFunction = Callable[[FloatArray], FloatArray]
+
+
+def predict_square_root(S: FloatArray, F: FloatArray, S_q: FloatArray) -> FloatArray:
+    """Square root of ``F S Sᵀ Fᵀ + S_q S_qᵀ`` (the paper's PrognosisFK).
+
+    Parameters
+    ----------
+    S : ndarray, shape (n, n)
+        Square root of the covariance.
+    F : ndarray, shape (n, n)
+        State transition matrix.
+    S_q : ndarray, shape (n, m)
+        Square root of the process noise covariance.
+
+    Returns
+    -------
+    ndarray, shape (n, n)
+        Lower triangular, by an orthogonal factorisation: the covariance itself is never formed.
+    """
+    upper = np.asarray(np.linalg.qr(np.concatenate([F @ S, S_q], axis=1).T, mode="r"))
+    return upper.T.copy()
+
+
+def scalar_update(
+    x: FloatArray, S: FloatArray, h: FloatArray, innovation: float, variance: float
+) -> tuple[FloatArray, FloatArray]:
+    r"""Update of the estimate and of its square root by one scalar measurement (ProcessingFK, in Potter's form).
+
+    With :math:`\varphi = S^T h`: :math:`\alpha = 1/(\varphi^T\varphi + r)`, :math:`K = \alpha S \varphi`,
+    :math:`x^+ = x + K\,\nu`, :math:`S^+ = S - K \varphi^T / (1 + \sqrt{\alpha r})`.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n,)
+    S : ndarray, shape (n, n)
+        Square root of the covariance, :math:`P = S S^T`.
+    h : ndarray, shape (n,)
+        Row of the measurement matrix.
+    innovation : float
+        Measured minus predicted value.
+    variance : float
+        Variance r of the measurement's noise, positive.
+
+    Returns
+    -------
+    x, S : ndarray
+        Updated copies.
+
+    Notes
+    -----
+    J. E. Potter's update, in Bierman, "Factorization Methods for Discrete Sequential Estimation", II.4.
+    """
+    phi = S.T @ h
+    alpha = 1.0 / (phi @ phi + variance)
+    gain = alpha * (S @ phi)
+    return x + gain * innovation, S - np.outer(gain, phi) / (1.0 + np.sqrt(alpha * variance))
+
+
+def sequential_update(
+    x: FloatArray, S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Update by independent scalars of one linearisation, in turn.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n,)
+        Estimate to correct.
+    S : ndarray, shape (n, n)
+        Square root of its covariance.
+    H : ndarray, shape (k, n)
+        Measurement matrix at one linearisation point.
+    innovation : ndarray, shape (k,)
+        Innovations at x, before any of these scalars is used.
+    variance : ndarray, shape (k,)
+
+    Returns
+    -------
+    x, S : ndarray
+        Updated copies.
+    """
+    x0 = x
+    for h, nu, r in zip(H, innovation, variance, strict=True):
+        x, S = scalar_update(x, S, h, float(nu - h @ (x - x0)), float(r))
+    return x, S
+
+
+@dataclass(frozen=True, eq=False)
+class IteratedUpdate:
+    """Result of :func:`iterated_update`.
+
+    Attributes
+    ----------
+    x : ndarray, shape (n,)
+        Updated estimate.
+    S : ndarray, shape (n, n)
+        Square root of its covariance, linearised where the last iteration was.
+    iterations : int
+        Number of linearisations.
+    converged : bool
+        Whether the stop rule was met. If not, x is not an optimum and must not be used as one.
+    innovation : ndarray, shape (k,)
+        Measured minus predicted at the predicted state.
+    nis : float
+        Normalised innovation squared of the first linearisation.
+    """
+
+    x: FloatArray
+    S: FloatArray
+    iterations: int
+    converged: bool
+    innovation: FloatArray
+    nis: float
+
+
+def iterated_update(
+    x: FloatArray,
+    S: FloatArray,
+    z: FloatArray,
+    variance: FloatArray,
+    Hx: MeasurementFunction,
+    HJacobian: MeasurementFunction,
+    *,
+    tolerance: float,
+    max_iterations: int = 50,
+) -> IteratedUpdate:
+    r"""Iterated extended Kalman update, scalar by scalar, with the paper's stop rule.
+
+    Every iteration linearises at :math:`x_k` and processes all scalars from the *predicted* mean and covariance again,
+    with innovations :math:`z - h(x_k) - H(x_k)(x - x_k)`: Gauss-Newton on the maximum-a-posteriori cost, so a
+    measurement is counted once however often it is linearised. It stops when
+    :math:`\|h(x_{k+1}) - h(x_k)\| <` `tolerance`, equations (19) and (30).
+
+    Parameters
+    ----------
+    x : ndarray, shape (n,)
+        Predicted mean.
+    S : ndarray, shape (n, n)
+        Square root of the predicted covariance.
+    z : ndarray, shape (k,)
+        Independent scalar measurements.
+    variance : ndarray, shape (k,)
+        Their variances.
+    Hx : callable
+        Predicted measurements of a state, (n,) -> (k,).
+    HJacobian : callable
+        Their Jacobian, (n,) -> (k, n).
+    tolerance : float
+        In the unit of z; a fraction of the sensors' noise.
+    max_iterations : int
+        Linearisations at most.
+
+    Returns
+    -------
+    IteratedUpdate
+    """
+    x_k, predicted = x, Hx(x)
+    innovation = z - predicted
+    nis = np.nan
+    S_k = S
+    for iteration in range(1, max_iterations + 1):
+        H = HJacobian(x_k)
+        if iteration == 1:
+            nis = _normalised_innovation_squared(S, H, innovation, variance)
+        x_next, S_k = sequential_update(x, S, H, z - predicted - H @ (x - x_k), variance)
+        predicted_next = Hx(x_next)
+        change = float(np.linalg.norm(predicted_next - predicted))
+        x_k, predicted = x_next, predicted_next
+        if not np.isfinite(change):
+            return IteratedUpdate(x_k, S_k, iteration, False, innovation, nis)
+        if change < tolerance:
+            return IteratedUpdate(x_k, S_k, iteration, True, innovation, nis)
+    return IteratedUpdate(x_k, S_k, max_iterations, False, innovation, nis)
+
+
+def _normalised_innovation_squared(S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray) -> float:
+    HS = H @ S
+    return float(innovation @ np.linalg.solve(HS @ HS.T + np.diag(variance), innovation))
+
+
+def estimability(S: FloatArray, S_predicted: FloatArray) -> FloatArray:
+    r"""Stochastic measure of estimability of every component (the paper's MeasureS).
+
+    :math:`\mu_i = 1 - \sigma_i / \sigma_i^-`: 0 where the measurements taught nothing, 1 where they fixed it.
+
+    Parameters
+    ----------
+    S : ndarray, shape (..., n, n)
+        Square root of the covariance after the measurements.
+    S_predicted : ndarray, shape (..., n, n)
+        Square root of the covariance predicted without any measurement.
+
+    Returns
+    -------
+    ndarray, shape (..., n)
+    """
+    measure: FloatArray = 1.0 - np.linalg.norm(S, axis=-1) / np.linalg.norm(S_predicted, axis=-1)
+    return measure
+
+
+class IteratedExtendedKalmanFilter:
+    r"""Iterated extended Kalman filter with a square-root covariance and filterpy's names.
+
+    ``predict()`` then ``update(z, HJacobian, Hx)`` as in :class:`filterpy.kalman.ExtendedKalmanFilter`. The measurement
+    is iterated (:func:`iterated_update`), a correlated `R` is decorrelated by its eigenvectors first.
+
+    Parameters
+    ----------
+    dim_x, dim_z : int
+        Sizes of the state and of the measurement.
+    tolerance : float
+        Stop rule: norm of the change of the predicted measurements between iterations, in the unit of z.
+    max_iterations : int
+        Linearisations at most.
+
+    Attributes
+    ----------
+    x : ndarray, shape (n,)
+        State estimate.
+    P : ndarray, shape (n, n)
+        Its covariance; assigning it factorises it. `S` is the square root itself.
+    F, Q : ndarray, shape (n, n)
+        Transition matrix and process noise covariance (positive semidefinite).
+    R : ndarray, shape (k, k)
+        Measurement noise covariance.
+    y, nis : ndarray, float
+        Innovation of the last update at the predicted state, and its normalised square.
+    iterations, converged : int, bool
+        Of the last update.
+    x_prior, P_prior, x_post, P_post : ndarray
+        Copies after the last `predict` and the last `update`.
+    """
+
+    def __init__(self, dim_x: int, dim_z: int, *, tolerance: float, max_iterations: int = 50) -> None:
+        self.dim_x = dim_x
+        self.dim_z = dim_z
+        self.tolerance = tolerance
+        self.max_iterations = max_iterations
+        self.x: FloatArray = np.zeros(dim_x)
+        self.S: FloatArray = np.eye(dim_x)
+        self.F: FloatArray = np.eye(dim_x)
+        self.Q: FloatArray = np.zeros((dim_x, dim_x))
+        self.R: FloatArray = np.eye(dim_z)
+        self.y: FloatArray = np.zeros(dim_z)
+        self.nis = np.nan
+        self.iterations = 0
+        self.converged = False
+        self.x_prior, self.P_prior = self.x.copy(), self.P
+        self.x_post, self.P_post = self.x.copy(), self.P
+
+    @property
+    def P(self) -> FloatArray:
+        """Covariance ``S Sᵀ``, shape (n, n)."""
+        return self.S @ self.S.T
+
+    @P.setter
+    def P(self, covariance: ArrayLike) -> None:
+        self.S = symmetric_square_root(np.broadcast_to(np.asarray(covariance, dtype=np.float64), (self.dim_x,) * 2))
+
+    def predict(self) -> None:
+        """Time update: ``x = F x``, ``P = F P Fᵀ + Q``."""
+        self.x = self.F @ self.x
+        self.S = predict_square_root(self.S, self.F, symmetric_square_root(self.Q))
+        self.x_prior, self.P_prior = self.x.copy(), self.P
+
+    def update(
+        self,
+        z: ArrayLike,
+        HJacobian: MeasurementFunction,
+        Hx: MeasurementFunction,
+        R: ArrayLike | None = None,
+    ) -> None:
+        """Iterated measurement update.
+
+        Parameters
+        ----------
+        z : array_like, shape (k,)
+        HJacobian, Hx : callable
+            Jacobian (k, n) and prediction (k,) of a state (n,).
+        R : array_like, optional
+            Noise covariance (k, k), variances (k,) or one variance, for this update only.
+        """
+        z = np.atleast_1d(np.asarray(z, dtype=np.float64))
+        noise = np.asarray(self.R if R is None else R, dtype=np.float64)
+        covariance = noise if noise.ndim == 2 else np.diag(np.broadcast_to(noise, z.shape))
+        variance = np.diagonal(covariance)
+        T = np.eye(z.size)
+        if np.count_nonzero(covariance - np.diag(variance)):
+            variance, vectors = np.linalg.eigh(covariance)
+            T = vectors.T
+        result = iterated_update(
+            self.x,
+            self.S,
+            T @ z,
+            variance,
+            lambda x: T @ Hx(x),
+            lambda x: T @ HJacobian(x),
+            tolerance=self.tolerance,
+            max_iterations=self.max_iterations,
+        )
+        self.x, self.S = result.x, result.S
+        self.y, self.nis = T.T @ result.innovation, result.nis
+        self.iterations, self.converged = result.iterations, result.converged
+        self.x_post, self.P_post = self.x.copy(), self.P
+
+
+def symmetric_square_root(covariance: FloatArray) -> FloatArray:
+    """S with ``S Sᵀ = covariance``, for a positive semidefinite matrix (Cholesky does not take singular ones).
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (n, n)
+
+    Returns
+    -------
+    ndarray, shape (n, n)
+
+    Raises
+    ------
+    ValueError
+        The matrix is not symmetric positive semidefinite.
+    """
+    covariance = np.asarray(covariance, dtype=np.float64)
+    # States of mixed units (m, A·m²) differ by many orders: factor the correlations, whose entries are of order one.
+    deviation = np.sqrt(np.clip(np.diagonal(covariance), 0.0, None))
+    scale = np.where(deviation > 0.0, deviation, 1.0)
+    correlation = covariance / np.outer(scale, scale)
+    if not np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-9):
+        raise ValueError("Input covariance must be symmetric; instead received a matrix that is not.")
+    eigenvalue, eigenvector = np.linalg.eigh(correlation)
+    if eigenvalue[0] < -1e-9 * max(1.0, eigenvalue[-1]):
+        raise ValueError(
+            "Input covariance must be positive semidefinite; "
+            f"instead received a matrix whose correlations have the eigenvalue {eigenvalue[0]:g}."
+        )
+    return scale[:, None] * eigenvector * np.sqrt(np.clip(eigenvalue, 0.0, None))

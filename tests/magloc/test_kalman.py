@@ -1,0 +1,266 @@
+"""Square-root Kalman filtering against forms that others wrote.
+
+| what | who checks it |
+|---|---|
+| scalar_update, sequential_update | exact rational arithmetic, filterpy's batch update, information form |
+| predict_square_root | F P Fᵀ + Q |
+| iterated_update | scipy's minimiser of the MAP cost, Stone Soup's IteratedKalmanUpdater, the affine closed form |
+| IteratedExtendedKalmanFilter | filterpy's ExtendedKalmanFilter where one linearisation is exact |
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import filterpy.kalman
+import numpy as np
+import pytest
+import scipy.optimize
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import chi2 as chi2_distribution
+
+from arrays.geometries import tetrahedron
+from magloc.kalman import (
+    IteratedExtendedKalmanFilter,
+    estimability,
+    iterated_update,
+    predict_square_root,
+    scalar_update,
+    sequential_update,
+    symmetric_square_root,
+)
+from magloc.measurement import DifferenceMeasurement
+from tests import oracles
+
+
+def random_problem(seed, n=6, k=9):
+    rng = np.random.default_rng(seed)
+    return (
+        rng.normal(size=n),
+        rng.normal(size=(n, n)),
+        rng.normal(size=(k, n)),
+        rng.normal(size=k),
+        rng.uniform(0.1, 2, k),
+    )
+
+
+def dipole_problem(start, seed=0, prior=(3.0, 300.0), scale=1.0):
+    """Readings of a dipole before a tetrahedron, as an update problem in nT (the sizes scipy's stop rules expect)."""
+    rng = np.random.default_rng(seed)
+    measurement = DifferenceMeasurement.of(tetrahedron(1.5, noise_T=1e-9))
+    z = 1e9 * measurement.predicted([5.0, 0.0, 0.306], [60.0, 50.0, 60.0])
+    variance = 1e18 * measurement.variance * scale
+    z = z + rng.normal(size=z.size) * np.sqrt(variance)
+    return (
+        np.asarray(start, dtype=float),
+        np.diag(np.repeat(prior, 3)),
+        z,
+        variance,
+        lambda x: 1e9 * measurement.predicted(x[:3], x[3:]),
+        lambda x: 1e9 * measurement.jacobian(x[:3], x[3:]),
+    )
+
+
+START = [7.0, 1.0, 2.0, 0.0, 0.0, 0.0]
+
+
+class TestScalarUpdateIsBayes:
+    """One scalar measurement of a Gaussian state is conditioned exactly."""
+
+    @given(st.integers(0, 2**32 - 1))
+    @settings(max_examples=30, deadline=None)
+    def test_information_form(self, seed):
+        x, S, H, nu, r = random_problem(seed)
+        x_new, S_new = sequential_update(x, S, H, nu, r)
+        information = np.linalg.inv(S @ S.T) + (H.T / r) @ H
+        P = np.linalg.inv(information)
+        np.testing.assert_allclose(S_new @ S_new.T, P, rtol=1e-6, atol=1e-8 * np.abs(P).max())
+        np.testing.assert_allclose(x_new - x, P @ (H.T / r) @ nu, rtol=1e-6, atol=1e-8)
+
+    def test_filterpy_batch_update(self):
+        x, S, H, nu, r = random_problem(3)
+        peer = filterpy.kalman.KalmanFilter(dim_x=6, dim_z=9)
+        peer.x, peer.P, peer.H, peer.R = x[:, None], S @ S.T, H, np.diag(r)
+        peer.update((H @ x + nu)[:, None])
+        x_new, S_new = sequential_update(x, S, H, nu, r)
+        np.testing.assert_allclose(x_new, peer.x.ravel(), rtol=1e-10)
+        np.testing.assert_allclose(S_new @ S_new.T, peer.P, rtol=1e-9, atol=1e-12)
+
+    def test_order_of_scalars_is_free(self):
+        x, S, H, nu, r = random_problem(4)
+        order = np.random.default_rng(0).permutation(9)
+        first, second = sequential_update(x, S, H, nu, r), sequential_update(x, S, H[order], nu[order], r[order])
+        np.testing.assert_allclose(first[0], second[0], rtol=1e-12)
+        np.testing.assert_allclose(first[1] @ first[1].T, second[1] @ second[1].T, rtol=1e-11, atol=1e-14)
+
+    def test_exact_rational_arithmetic_where_the_prior_dwarfs_the_noise(self):
+        """P = 1e8·I against r = 1e-8: P - K H P loses every digit in float64, the square root none."""
+        h = [3, 4]
+        P, r = Fraction(10) ** 8, Fraction(1, 10**8)
+        s = P * 25 + r
+        exact = [[(P if i == j else 0) - P * h[i] * h[j] * P / s for j in range(2)] for i in range(2)]
+        _, S = scalar_update(np.zeros(2), 1e4 * np.eye(2), np.array([3.0, 4.0]), 0.0, 1e-8)
+        along = np.array([0.6, 0.8])
+        exact_along = sum(Fraction(h[i], 5) * exact[i][j] * Fraction(h[j], 5) for i in range(2) for j in range(2))
+        assert np.linalg.norm(S.T @ along) ** 2 == pytest.approx(float(exact_along), rel=1e-6)
+        naive = 1e8 * np.eye(2) - np.outer([3e8, 4e8], [3e8, 4e8]) / (25e8 + 1e-8)
+        assert abs(along @ naive @ along - float(exact_along)) > 0.5 * float(exact_along)
+
+
+class TestPrediction:
+    @given(st.integers(0, 2**32 - 1))
+    @settings(max_examples=30, deadline=None)
+    def test_covariance(self, seed):
+        rng = np.random.default_rng(seed)
+        S, F, S_q = rng.normal(size=(4, 4)), rng.normal(size=(4, 4)), rng.normal(size=(4, 2))
+        L = predict_square_root(S, F, S_q)
+        np.testing.assert_allclose(L @ L.T, F @ S @ S.T @ F.T + S_q @ S_q.T, rtol=1e-10, atol=1e-12)
+        np.testing.assert_array_equal(L, np.tril(L))
+
+
+class TestIteratedUpdateIsMaximumAPosteriori:
+    def test_scipy_minimises_the_same_cost(self):
+        x, S, z, r, h, H = dipole_problem(START)
+        ours = iterated_update(x, S, z, r, h, H, tolerance=1e-9, max_iterations=100)
+
+        def residual(y):
+            return np.concatenate([np.linalg.solve(S, y - x), (z - h(y)) / np.sqrt(r)])
+
+        theirs = scipy.optimize.least_squares(residual, x, x_scale=np.diag(S), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+        assert ours.converged
+        np.testing.assert_allclose(ours.x, theirs.x, rtol=1e-5, atol=1e-5)
+
+    def test_stone_soup_iterates_the_same_steps(self):
+        x, S, z, r, h, H = dipole_problem(START)
+        ours = iterated_update(x, S, z, r, h, H, tolerance=1e-9, max_iterations=100)
+        mean, covariance = oracles.stonesoup_iterated_update(x, S @ S.T, z, np.diag(r), h, H)
+        np.testing.assert_allclose(ours.x, mean, rtol=1e-6, atol=1e-6)
+        scale = np.sqrt(np.diag(covariance))
+        np.testing.assert_allclose(
+            ours.S @ ours.S.T / np.outer(scale, scale), covariance / np.outer(scale, scale), atol=1e-5
+        )
+
+    def test_affine_measurement_needs_one_linearisation(self):
+        x, S, H, nu, r = random_problem(5)
+        z = H @ x + nu
+        result = iterated_update(x, S, z, r, lambda y: H @ y, lambda _: H, tolerance=1e-8)
+        expected, _ = sequential_update(x, S, H, nu, r)
+        assert result.iterations == 2  # the second finds that nothing changes
+        np.testing.assert_allclose(result.x, expected, rtol=1e-10)
+
+    def test_square_root_form_equals_information_form_on_ill_conditioned_starts(self):
+        """A prior of 300 m and 1e6 A·m² against 1 pT: the correlation of the posterior comes close to one."""
+        x, S, z, r, h, H = dipole_problem([5.5, 0.5, 0.5, 50.0, 50.0, 50.0], prior=(300.0, 1e6), scale=1e-6)
+        linear, S_new = sequential_update(x, S, H(x), z - h(x), r)
+        # The information form in extended precision stands in for the exact one.
+        unit = np.diag(S).astype(np.longdouble)
+        W = (H(x) / np.sqrt(r)[:, None]).astype(np.longdouble) * unit
+        information = np.eye(6, dtype=np.longdouble) + W.T @ W
+        rhs = W.T @ ((z - h(x)) / np.sqrt(r)).astype(np.longdouble)
+        assert np.linalg.cond(information.astype(float)) > 1e6
+        step = _solve_extended(information, rhs)
+        np.testing.assert_allclose((linear - x) / np.diag(S), step.astype(float), rtol=1e-6, atol=1e-12)
+        P = np.stack([_solve_extended(information, e) for e in np.eye(6, dtype=np.longdouble)]).astype(float)
+        ours = (S_new @ S_new.T) / np.outer(np.diag(S), np.diag(S))
+        sigma = np.sqrt(np.diag(P))
+        np.testing.assert_allclose(ours / np.outer(sigma, sigma), P / np.outer(sigma, sigma), atol=1e-6)
+
+    def test_a_measurement_counts_once_however_often_it_is_linearised(self):
+        x, S, z, r, h, H = dipole_problem(START)
+        result = iterated_update(x, S, z, r, h, H, tolerance=1e-9, max_iterations=100)
+        J = H(result.x)
+        P = np.linalg.inv(np.linalg.inv(S @ S.T) + (J.T / r) @ J)
+        np.testing.assert_allclose(np.linalg.norm(result.S, axis=1), np.sqrt(np.diag(P)), rtol=1e-5)
+
+
+def _solve_extended(a, b):
+    """Gaussian elimination in the precision of its input (LAPACK has no long double)."""
+    a, b = a.copy(), b.copy()
+    n = len(b)
+    for i in range(n):
+        pivot = i + int(np.argmax(np.abs(a[i:, i])))
+        a[[i, pivot]], b[[i, pivot]] = a[[pivot, i]], b[[pivot, i]]
+        for j in range(i + 1, n):
+            f = a[j, i] / a[i, i]
+            a[j] -= f * a[i]
+            b[j] -= f * b[i]
+    for i in range(n - 1, -1, -1):
+        b[i] = (b[i] - a[i, i + 1 :] @ b[i + 1 :]) / a[i, i]
+    return b
+
+
+class TestStopRule:
+    def test_too_few_iterations_are_not_convergence(self):
+        x, S, z, r, h, H = dipole_problem(START)
+        result = iterated_update(x, S, z, r, h, H, tolerance=1e-9, max_iterations=2)
+        assert not result.converged
+        assert result.iterations == 2
+
+    def test_a_start_on_a_sensor_does_not_converge(self):
+        sensor = tetrahedron(1.5).positions[0]
+        x, S, z, r, h, H = dipole_problem([*sensor, 0.0, 0.0, 0.0])
+        result = iterated_update(x, S, z, r, h, H, tolerance=1e-9)
+        assert not result.converged
+
+
+class TestNormalisedInnovationSquared:
+    def test_chi_square_when_the_model_holds(self):
+        """Mean of 400 NIS of an affine model; two-sided false-alarm rate 1e-4."""
+        rng = np.random.default_rng(1)
+        H, r = rng.normal(size=(4, 3)), np.array([0.5, 1.0, 2.0, 1.0])
+        S = np.diag([1.0, 2.0, 0.5])
+        nis = []
+        for _ in range(400):
+            x = np.zeros(3)
+            z = H @ (S @ rng.normal(size=3)) + rng.normal(size=4) * np.sqrt(r)
+            nis.append(iterated_update(x, S, z, r, lambda y: H @ y, lambda _: H, tolerance=1e-6).nis)
+        low, high = chi2_distribution.ppf([0.5e-4, 1 - 0.5e-4], 4 * 400)
+        assert low < np.sum(nis) < high
+
+
+class TestEstimability:
+    def test_nothing_learned_and_fully_determined(self):
+        S = np.diag([2.0, 3.0])
+        _, S_new = scalar_update(np.zeros(2), S, np.array([1.0, 0.0]), 0.0, 1e-12)
+        np.testing.assert_allclose(estimability(S_new, S), [1.0, 0.0], atol=1e-6)
+
+
+class TestFilterpyNames:
+    def test_same_numbers_as_filterpy_where_one_linearisation_is_exact(self):
+        x, S, H, nu, r = random_problem(6, n=4, k=3)
+        F = np.eye(4) + np.diag([0.1, 0.1, 0.1], k=1)
+        ours = IteratedExtendedKalmanFilter(4, 3, tolerance=1e-9)
+        peer = filterpy.kalman.ExtendedKalmanFilter(dim_x=4, dim_z=3)
+        for kf, column in ((ours, x), (peer, x[:, None])):
+            kf.x, kf.P, kf.F, kf.Q, kf.R = column, S @ S.T, F, 0.3 * np.eye(4), np.diag(r)
+        z = H @ x + nu
+        ours.predict()
+        peer.predict()
+        ours.update(z, lambda _: H, lambda y: H @ y)
+        peer.update(z[:, None], lambda _: H, lambda y: H @ y)
+        np.testing.assert_allclose(ours.x, peer.x.ravel(), rtol=1e-10)
+        np.testing.assert_allclose(ours.P, peer.P, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(ours.y, peer.y.ravel(), rtol=1e-9)
+        np.testing.assert_allclose(ours.P_prior, peer.P_prior, rtol=1e-9, atol=1e-12)
+
+    def test_correlated_noise_is_decorrelated_first(self):
+        x, S, H, nu, _ = random_problem(7, n=4, k=3)
+        root = np.random.default_rng(8).normal(size=(3, 3))
+        R = root @ root.T + 0.1 * np.eye(3)
+        ours = IteratedExtendedKalmanFilter(4, 3, tolerance=1e-9)
+        ours.x, ours.P = x, S @ S.T
+        ours.update(H @ x + nu, lambda _: H, lambda y: H @ y, R=R)
+        P = np.linalg.inv(np.linalg.inv(S @ S.T) + H.T @ np.linalg.inv(R) @ H)
+        np.testing.assert_allclose(ours.P, P, rtol=1e-8, atol=1e-10)
+
+    def test_covariance_that_is_none(self):
+        with pytest.raises(ValueError, match="positive semidefinite"):
+            symmetric_square_root(np.diag([1.0, -1.0]))
+        with pytest.raises(ValueError, match="symmetric"):
+            symmetric_square_root(np.array([[1.0, 0.5], [0.0, 1.0]]))
+
+    def test_singular_covariance_has_a_root(self):
+        P = np.outer([1e-3, 2.0, 300.0], [1e-3, 2.0, 300.0])
+        S = symmetric_square_root(P)
+        np.testing.assert_allclose(S @ S.T, P, rtol=1e-12)
