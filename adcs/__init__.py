@@ -1,0 +1,1 @@
+"""Satellite attitude determination on the magnetic models of :mod:`magloc`."""

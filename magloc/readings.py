@@ -1,0 +1,344 @@
+"""Readings of an array row by row, and the files that hold them.
+
+A readings file is CSV with one row per instant: ``time_s``, then ``<id>_x_nT, <id>_y_nT, <id>_z_nT`` for every vector
+sensor and ``<id>_nT`` for every scalar sensor, in any order. An empty cell, or ``nan``, is a missing reading. Optional
+groups of columns, each complete or absent: the pose of a moving array in the world frame (``array_x_m, array_y_m,
+array_z_m, array_qx, array_qy, array_qz, array_qw``) and the ambient field in the array's frame (``ambient_x_nT,
+ambient_y_nT, ambient_z_nT``). A truth file has ``time_s, x_m, y_m[, z_m][, mx_Am2, my_Am2, mz_Am2]``.
+
+Whatever is wrong with a file is an :class:`arrays.errors.InputError` of one sentence: the file, the line as an editor
+counts it, the column, what was found and what was expected.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.errors import InputError
+from arrays.files import write_text
+from arrays.sensor import AMBIENT_CHANNELS, Sensor, SensorArray
+from magloc.tables import Table, read_table
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+POSITION_COLUMNS = ("array_x_m", "array_y_m", "array_z_m")
+ROTATION_COLUMNS = ("array_qx", "array_qy", "array_qz", "array_qw")
+AMBIENT_COLUMNS = tuple(f"{name}_nT" for name in AMBIENT_CHANNELS)
+TRUE_POSITION_COLUMNS = ("x_m", "y_m", "z_m")
+TRUE_MOMENT_COLUMNS = ("mx_Am2", "my_Am2", "mz_Am2")
+
+_T_IN_nT = 1e9
+_LARGEST_nT = 1e15  # a million tesla: a column of something else, or a broken line
+_UNIT_QUATERNION_ATOL = 1e-3  # a log that keeps four decimals passes; the quaternion is normalised afterwards
+_SENSOR_COLUMN = re.compile(r"(?P<id>.+?)(_[xyz])?_nT")
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Raw readings of an array at n instants.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n,)
+        Instants [s].
+    values_T : ndarray, shape (n, C)
+        Raw readings [T] in the array's channel order; NaN where a reading is missing.
+    line_numbers : ndarray of int, shape (n,)
+        Line of the file that each row came from, counted from 1.
+    array_position_m : ndarray, shape (n, 3), optional
+        Origin of the array's frame in the world frame [m].
+    array_rotation_xyzw : ndarray, shape (n, 4), optional
+        Unit quaternions, array frame to world frame.
+    ambient_T : ndarray, shape (n, 3), optional
+        Ambient field in the array's frame [T].
+    """
+
+    time_s: FloatArray
+    values_T: FloatArray
+    line_numbers: IntArray
+    array_position_m: FloatArray | None = None
+    array_rotation_xyzw: FloatArray | None = None
+    ambient_T: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.time_s)
+        if np.ndim(self.values_T) != 2:
+            raise ValueError(f"Input values_T must have shape (n, C); instead received {np.shape(self.values_T)}.")
+        expected = {
+            "values_T": (n, self.values_T.shape[1]),
+            "line_numbers": (n,),
+            "array_position_m": (n, 3),
+            "array_rotation_xyzw": (n, 4),
+            "ambient_T": (n, 3),
+        }
+        for name, shape in expected.items():
+            value = getattr(self, name)
+            if value is not None and np.shape(value) != shape:
+                raise ValueError(f"Input {name} must have shape {shape}; instead received {np.shape(value)}.")
+        if (self.array_position_m is None) != (self.array_rotation_xyzw is None):
+            raise ValueError(
+                "Inputs array_position_m and array_rotation_xyzw must come together; instead received one of them."
+            )
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Where the source truly was at n instants.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n,)
+        Instants [s].
+    position_m : ndarray, shape (n, 3)
+        Position of the source [m]; z is NaN where the file does not give it.
+    moment_Am2 : ndarray, shape (n, 3), optional
+        Moment of the source [A·m²].
+    """
+
+    time_s: FloatArray
+    position_m: FloatArray
+    moment_Am2: FloatArray | None = None
+
+
+def read_readings(path: str | PathLike[str], array: SensorArray, *, sensors: Sequence[str] | None = None) -> Readings:
+    """Readings of an array from a CSV file.
+
+    Parameters
+    ----------
+    path : path-like
+    array : SensorArray
+        Whose sensors the file must have, with a column for each channel.
+    sensors : sequence of str, optional
+        Ids of a subset of the array. Only their columns are read, and the columns of any other sensor are ignored;
+        without it such columns are an error.
+
+    Returns
+    -------
+    Readings
+        With the channels of ``array``, or of ``array.subset(sensors)``.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or is not a readings file of this array.
+    """
+    table = read_table(path, "a header with time_s and the sensors' columns")
+    if sensors is not None:
+        array = array.subset(sensors)
+    channels = [f"{name}_nT" for name in array.channel_names]
+    _check_sensor_columns(table, array, channels, ignore_others=sensors is not None)
+    time_s = table.complete_and_distinct("time_s")
+    position_m = rotation_xyzw = ambient_T = None
+    if table.has_group(POSITION_COLUMNS + ROTATION_COLUMNS):
+        position_m = table.complete(POSITION_COLUMNS)
+        rotation_xyzw = _unit_quaternions(table)
+    if table.has_group(AMBIENT_COLUMNS):
+        ambient_T = table.complete(AMBIENT_COLUMNS) / _T_IN_nT
+    values_nT = table.finite_or_missing(channels)
+    table.refuse(np.abs(values_nT) > _LARGEST_nT, channels, f"found a field above {_LARGEST_nT:g} nT, expected less")
+    return Readings(time_s, values_nT / _T_IN_nT, table.line_numbers, position_m, rotation_xyzw, ambient_T)
+
+
+def read_truth(path: str | PathLike[str]) -> Truth:
+    """True positions, and moments where they are known, from a CSV file.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    Truth
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or is not a truth file.
+    """
+    table = read_table(path, "a header with time_s, x_m and y_m")
+    known = ("time_s", *TRUE_POSITION_COLUMNS, *TRUE_MOMENT_COLUMNS)
+    for name in ("time_s", "x_m", "y_m"):
+        table.require(name, known)
+    for name in table.header:
+        if name not in known:
+            raise InputError(
+                f"{table.header_place(name)}: found an unknown column, expected one of {', '.join(known)}."
+            )
+    time_s = table.complete_and_distinct("time_s")
+    position_m = np.full((len(time_s), 3), np.nan)
+    columns = TRUE_POSITION_COLUMNS if "z_m" in table.header else TRUE_POSITION_COLUMNS[:2]
+    position_m[:, : len(columns)] = table.complete(columns)
+    moment_Am2 = table.complete(TRUE_MOMENT_COLUMNS) if table.has_group(TRUE_MOMENT_COLUMNS) else None
+    return Truth(time_s, position_m, moment_Am2)
+
+
+def write_readings(path: str | PathLike[str], readings: Readings, array: SensorArray) -> None:
+    """Write a readings file.
+
+    Fields are written in nT with 15 significant digits, which are those of the file that they were read from, if it had
+    no more; the other numbers are written exactly.
+
+    Parameters
+    ----------
+    path : path-like
+        Replaced if it exists.
+    readings : Readings
+    array : SensorArray
+        Names the columns.
+
+    Raises
+    ------
+    ValueError
+        The readings do not have the array's channels.
+    """
+    if readings.values_T.shape[1] != array.n_channels:
+        raise ValueError(
+            f"Input readings must have the {array.n_channels} channels of the array; "
+            f"instead received {readings.values_T.shape[1]}."
+        )
+    header = ["time_s", *(f"{name}_nT" for name in array.channel_names)]
+    plain: list[FloatArray] = []
+    fields = [readings.values_T]
+    if readings.ambient_T is not None:
+        header += AMBIENT_COLUMNS
+        fields.append(readings.ambient_T)
+    if readings.array_position_m is not None and readings.array_rotation_xyzw is not None:
+        header += POSITION_COLUMNS + ROTATION_COLUMNS
+        plain += [readings.array_position_m, readings.array_rotation_xyzw]
+    fields_nT = (np.hstack(fields) * _T_IN_nT).tolist()
+    numbers = np.hstack(plain).tolist() if plain else [[]] * len(readings)
+    lines = [",".join(header)]
+    for time, nanotesla, row in zip(readings.time_s.tolist(), fields_nT, numbers, strict=True):
+        cells = ["" if math.isnan(value) else f"{value:.15g}" for value in nanotesla]
+        lines.append(",".join([repr(time), *cells, *map(repr, row)]))
+    write_text("\n".join([*lines, ""]), path)
+
+
+def average(readings: Readings) -> Readings:
+    """All rows averaged to one, channel by channel, missing readings left out.
+
+    Parameters
+    ----------
+    readings : Readings
+        Of an array that does not move.
+
+    Returns
+    -------
+    Readings
+        One row, at the mean time and with the first row's line number. A channel that no row has stays missing.
+
+    Raises
+    ------
+    InputError
+        The array moves between the rows.
+    """
+    position_m, rotation_xyzw, ambient_T = readings.array_position_m, readings.array_rotation_xyzw, readings.ambient_T
+    if position_m is not None and rotation_xyzw is not None:
+        moved = np.any(position_m != position_m[0], axis=1) | np.any(rotation_xyzw != rotation_xyzw[0], axis=1)
+        if moved.any():
+            raise InputError(
+                f"found the array moved between lines {readings.line_numbers[0]} and "
+                f"{readings.line_numbers[moved.argmax()]}, "
+                "expected one pose for all rows that are averaged."
+            )
+        position_m, rotation_xyzw = position_m[:1], rotation_xyzw[:1]
+    present = np.isfinite(readings.values_T)
+    count = present.sum(axis=0)
+    total = np.where(present, readings.values_T, 0.0).sum(axis=0)
+    mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return Readings(
+        time_s=readings.time_s.mean(keepdims=True),
+        values_T=mean[None],
+        line_numbers=readings.line_numbers[:1],
+        array_position_m=position_m,
+        array_rotation_xyzw=rotation_xyzw,
+        ambient_T=None if ambient_T is None else ambient_T.mean(axis=0, keepdims=True),
+    )
+
+
+def averaging_array(array: SensorArray, readings: Readings) -> SensorArray:
+    r"""The array with the noise of :func:`average`'s row in place of that of a single row.
+
+    White noise of n rows falls by :math:`\sqrt n`. A sensor's n is that of its channel with the fewest readings; the
+    proportional noise, which the sensors share, falls with the sensor of the fewest readings.
+
+    Parameters
+    ----------
+    array : SensorArray
+    readings : Readings
+        The rows that are averaged.
+
+    Returns
+    -------
+    SensorArray
+    """
+    n_rows = np.isfinite(readings.values_T).sum(axis=0)
+    n_rows[n_rows == 0] = len(readings)  # such channels have no mean: what is set for them does not matter
+    fewest = [int(n_rows[array.channel_sensor == i].min()) for i in range(array.n_sensors)]
+    sensors = tuple(
+        replace(sensor, noise_T=sensor.noise_T / math.sqrt(n)) for sensor, n in zip(array.sensors, fewest, strict=True)
+    )
+    return replace(array, sensors=sensors, noise_fraction=array.noise_fraction / math.sqrt(min(fewest)))
+
+
+def _check_sensor_columns(table: Table, array: SensorArray, channels: Sequence[str], *, ignore_others: bool) -> None:
+    known = ("time_s", *channels, *POSITION_COLUMNS, *ROTATION_COLUMNS, *AMBIENT_COLUMNS)
+    called = f"array {array.name!r}" if array.name else "the array"
+    table.require("time_s", known)
+    for sensor in array.sensors:
+        for name in _columns_of_other_kind(sensor):
+            if name in table.header and name not in known:
+                own = ", ".join(f"{channel}_nT" for channel in sensor.channel_names)
+                raise InputError(
+                    f"{table.header_place(name)}: found a column of another kind of sensor, expected {own} "
+                    f"because sensor {sensor.id} of {called} is a {sensor.kind} sensor."
+                )
+    for name in channels:
+        table.require(name, known)
+    for name in table.header:
+        sensor_column = _SENSOR_COLUMN.fullmatch(name)
+        if name in known or (sensor_column and ignore_others):
+            continue
+        if sensor_column:
+            raise InputError(
+                f"{table.header_place(name)}: found a column of sensor {sensor_column['id']}, "
+                f"which {called} does not have, expected columns of {_listed(array.ids)}."
+            )
+        raise InputError(
+            f"{table.header_place(name)}: found an unknown column, expected time_s, "
+            "<sensor>_x_nT and so on, and optionally array_x_m and so on (pose) or ambient_x_nT and so on."
+        )
+
+
+def _columns_of_other_kind(sensor: Sensor) -> list[str]:
+    """Columns that a sensor would have if it were of the other kind."""
+    return [f"{sensor.id}_nT"] if sensor.kind == "vector" else [f"{sensor.id}_{axis}_nT" for axis in "xyz"]
+
+
+def _listed(ids: Sequence[str], most: int = 6) -> str:
+    return ", ".join(ids) if len(ids) <= most else f"{', '.join(ids[: most - 1])} … {ids[-1]}"
+
+
+def _unit_quaternions(table: Table) -> FloatArray:
+    quaternion = table.complete(ROTATION_COLUMNS)
+    norm = np.linalg.norm(quaternion, axis=1)
+    wrong = np.abs(norm - 1.0) > _UNIT_QUATERNION_ATOL
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise InputError(
+            f"{table.path}, line {table.line_numbers[row]}, columns array_qx to array_qw: "
+            f"found a quaternion of norm {norm[row]:.6g}, expected norm 1."
+        )
+    unit: FloatArray = quaternion / norm[:, None]
+    return unit

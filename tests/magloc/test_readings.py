@@ -1,0 +1,353 @@
+"""Readings files: what is read, what is refused and how the refusal reads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from arrays.errors import InputError
+from arrays.files import read_array
+from arrays.sensor import Sensor, SensorArray
+from magloc.readings import Readings, average, averaging_array, read_readings, read_truth, write_readings
+
+HEADER = "time_s,s1_x_nT,s1_y_nT,s1_z_nT,s2_x_nT,s2_y_nT,s2_z_nT,s3_nT"
+ROW = "0,1,2,3,4,5,6,7"
+POSE = "array_x_m,array_y_m,array_z_m,array_qx,array_qy,array_qz,array_qw"
+
+HALF_OF_DIGIT_15 = 5e-15 + 4.0 * np.finfo(np.float64).eps  # and the rounding of nT to T and back
+
+WriteFile = Callable[[str | bytes], Path]
+
+
+@pytest.fixture
+def array() -> SensorArray:
+    return SensorArray(
+        (
+            Sensor("s1", "vector", (0.0, 0.0, 0.0), 1e-9),
+            Sensor("s2", "vector", (1.0, 0.0, 0.0), 2e-9),
+            Sensor("s3", "scalar", (0.0, 1.0, 0.0), 4e-9),
+        ),
+        name="mixed",
+    )
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> WriteFile:
+    def write_file(content: str | bytes) -> Path:
+        path = tmp_path / "readings.csv"
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return write_file
+
+
+class TestValues:
+    """Columns go to their channels by name, from nT to T."""
+
+    def test_channels(self, array: SensorArray, write: WriteFile) -> None:
+        readings = read_readings(write(f"{HEADER}\n{ROW}\n0.5,-1,-2e3,.5,+4,5,6,7\n"), array)
+        np.testing.assert_array_equal(readings.time_s, [0.0, 0.5])
+        expected_nT = [[1, 2, 3, 4, 5, 6, 7], [-1, -2000, 0.5, 4, 5, 6, 7]]
+        np.testing.assert_allclose(readings.values_T, np.array(expected_nT) * 1e-9, rtol=1e-15)
+        assert readings.array_position_m is None
+        assert readings.ambient_T is None
+
+    def test_columns_in_any_order(self, array: SensorArray, write: WriteFile) -> None:
+        header, row = HEADER.split(","), ROW.split(",")
+        straight = read_readings(write(f"{HEADER}\n{ROW}\n"), array)
+        turned = read_readings(write(f"{','.join(header[::-1])}\n{','.join(row[::-1])}\n"), array)
+        np.testing.assert_array_equal(turned.values_T, straight.values_T)
+        np.testing.assert_array_equal(turned.time_s, straight.time_s)
+
+    @pytest.mark.parametrize("cell", ["", "  ", "nan", "NaN"])
+    def test_missing_cell(self, array: SensorArray, write: WriteFile, cell: str) -> None:
+        readings = read_readings(write(f"{HEADER}\n0,1,2,{cell},4,5,6,7\n1,1,2,3,4,5,6,{cell}\n"), array)
+        np.testing.assert_array_equal(np.argwhere(np.isnan(readings.values_T)), [[0, 2], [1, 6]])
+
+    def test_pose_and_ambient(self, array: SensorArray, write: WriteFile) -> None:
+        header = f"{HEADER},{POSE},ambient_x_nT,ambient_y_nT,ambient_z_nT"
+        half = math.sqrt(0.5)
+        readings = read_readings(write(f"{header}\n{ROW},10,20,30,0,0,0.7071,0.7071,100,200,300\n"), array)
+        assert readings.array_position_m is not None
+        assert readings.array_rotation_xyzw is not None
+        assert readings.ambient_T is not None
+        np.testing.assert_array_equal(readings.array_position_m, [[10.0, 20.0, 30.0]])
+        np.testing.assert_allclose(readings.array_rotation_xyzw, [[0.0, 0.0, half, half]], rtol=1e-15)
+        np.testing.assert_allclose(readings.ambient_T, [[100e-9, 200e-9, 300e-9]], rtol=1e-15)
+
+    def test_subset_ignores_columns_of_other_sensors(self, array: SensorArray, write: WriteFile) -> None:
+        path = write("time_s,s9_nT,s3_nT,s2_x_nT,s2_y_nT,s2_z_nT,s8_x_nT\n0,9,7,4,5,6,text is no number\n")
+        with pytest.raises(InputError, match="line 2, column s8_x_nT"):
+            read_readings(path, array, sensors=["s2", "s3"])
+        path = write("time_s,s9_nT,s3_nT,s2_x_nT,s2_y_nT,s2_z_nT,s8_x_nT\n0,inf,7,4,5,6,8\n")
+        readings = read_readings(path, array, sensors=["s2", "s3"])
+        np.testing.assert_allclose(readings.values_T, np.array([[4e-9, 5e-9, 6e-9, 7e-9]]), rtol=1e-15)
+
+    @given(
+        values=st.lists(
+            st.lists(st.one_of(st.none(), st.floats(-1e15, 1e15)), min_size=7, max_size=7),
+            min_size=1,
+            max_size=5,
+        )
+    )
+    def test_any_number_as_pandas_reads_it(
+        self, tmp_path_factory: pytest.TempPathFactory, values: list[list[float | None]]
+    ) -> None:
+        sensors = [Sensor(f"s{i}", "scalar", (float(i), 0.0, 0.0), 1e-9) for i in range(7)]
+        path = tmp_path_factory.mktemp("any") / "readings.csv"
+        lines = ["time_s," + ",".join(f"s{i}_nT" for i in range(7))]
+        lines += [",".join([str(i), *("" if v is None else repr(v) for v in row)]) for i, row in enumerate(values)]
+        path.write_text("\n".join(lines), encoding="utf-8")
+        expected_nT = pd.read_csv(path).to_numpy(dtype=np.float64)[:, 1:]
+        readings = read_readings(path, SensorArray(tuple(sensors)))
+        np.testing.assert_allclose(readings.values_T, expected_nT / 1e9, rtol=1e-15, atol=0.0)
+
+    def test_recording_as_pandas_reads_it(self, data_folder: Path) -> None:
+        folder = data_folder / "magnet-array"
+        if not folder.is_dir():
+            pytest.skip("needs the recording magnet-array")
+        readings = read_readings(folder / "readings.csv", read_array(folder / "array.toml"))
+        expected = pd.read_csv(folder / "readings.csv").to_numpy(dtype=np.float64)
+        np.testing.assert_array_equal(readings.time_s, expected[:, 0])
+        np.testing.assert_allclose(readings.values_T, expected[:, 1:] * 1e-9, rtol=1e-15)
+
+
+class TestTolerance:
+    """What editors and spreadsheets add changes nothing."""
+
+    @pytest.mark.parametrize(
+        "content",
+        [
+            f"\ufeff{HEADER}\n{ROW}\n",
+            f"{HEADER}\r\n{ROW}\r\n",
+            f"{HEADER}\r{ROW}\r",
+            f"{HEADER}\n{ROW}",
+            f"{HEADER}\n{ROW}\n\n  \n\r\n",
+            f"{HEADER.replace(',', ' , ')} \n {ROW.replace(',', ' ,  ')}\t\n",
+            ",".join(f'"{name}"' for name in HEADER.split(",")) + f"\n{ROW}\n",
+            f"{HEADER}\n" + ",".join(f'"{cell}"' for cell in ROW.split(",")) + "\n",
+        ],
+        ids=["bom", "crlf", "cr", "no last line end", "blank lines", "spaces", "quoted names", "quoted numbers"],
+    )
+    def test_same_values(self, array: SensorArray, write: WriteFile, content: str) -> None:
+        readings = read_readings(write(content), array)
+        np.testing.assert_allclose(readings.values_T, np.arange(1.0, 8.0)[None] * 1e-9, rtol=1e-15)
+
+    def test_line_numbers_are_those_of_an_editor(self, array: SensorArray, write: WriteFile) -> None:
+        readings = read_readings(write(f"\r\n{HEADER}\r\n{ROW}\r\n\r\n1{ROW[1:]}\r\n"), array)
+        np.testing.assert_array_equal(readings.line_numbers, [3, 5])
+
+
+BAD_FILES = {
+    "empty": ("", ["is empty", "header"]),
+    "only blank lines": ("\n \n", ["is empty", "header"]),
+    "header without rows": (f"{HEADER}\n\n", ["line 1", "without rows"]),
+    "no header": (f"{ROW}\n{ROW}\n", ["line 1", "column 1", "'0'", "header"]),
+    "semicolons": (f"{HEADER.replace(',', ';')}\n", ["line 1", "semicolons", "commas"]),
+    "tabs": (HEADER.replace(",", "\t") + "\n", ["line 1", "tabs", "commas"]),
+    "column without a name": (f"{HEADER},\n{ROW},\n", ["line 1", "column 9", "no name"]),
+    "column twice": (f"{HEADER},s1_x_nT\n{ROW},1\n", ["line 1", "column s1_x_nT", "second time"]),
+    "text": (f"{HEADER}\n{ROW}\n1,2,abc,4,5,6,7,8\n", ["line 3", "column s1_y_nT", "'abc'", "expected a number"]),
+    "decimal comma": (f"{HEADER}\n0,1,2,3,4,5,6,7,5\n", ["line 2", "found 9 cells", "expected 8"]),
+    "short row": (f"{HEADER}\n{ROW}\n1,2,3\n", ["line 3", "found 3 cells", "expected 8"]),
+    "number with underscore": (f"{HEADER}\n0,1_000,2,3,4,5,6,7\n", ["line 2", "column s1_x_nT", "'1_000'"]),
+    "digits of another script": (f"{HEADER}\n0,١٢,2,3,4,5,6,7\n", ["line 2", "column s1_x_nT", "'١٢'"]),
+    "infinity": (f"{HEADER}\n{ROW}\n1,2,3,-inf,5,6,7,8\n", ["line 3", "column s1_z_nT", "infinite"]),
+    "too large": (f"{HEADER}\n0,1,2,3,4,5,6,1e999\n", ["line 2", "column s3_nT", "infinite"]),
+    "no field": (f"{HEADER}\n0,1,2,3,4,5,6,-2e15\n", ["line 2", "column s3_nT", "1e+15 nT"]),
+    "missing time": (f"{HEADER}\n{ROW}\n,2,3,4,5,6,7,8\n", ["line 3", "column time_s", "no value"]),
+    "infinite time": (f"{HEADER}\ninf{ROW[1:]}\n", ["line 2", "column time_s", "infinite"]),
+    "time twice": (f"{HEADER}\n{ROW}\n1{ROW[1:]}\n\n0.0{ROW[1:]}\n", ["line 5", "column time_s", "as on line 2"]),
+    "no time column": (f"t{HEADER[4:]}\n{ROW}\n", ["line 1", "column time_s", "t_s"]),
+    "missing sensor column": (
+        f"{HEADER.replace('s2_y_nT', 's2_y_T')}\n{ROW}\n",
+        ["column s2_y_nT", "nearest is s2_y_T"],
+    ),
+    "vector columns of a scalar sensor": (
+        f"{HEADER[:-5]}s3_x_nT,s3_y_nT,s3_z_nT\n{ROW},8,9\n",
+        ["column s3_x_nT", "another kind", "expected s3_nT", "scalar"],
+    ),
+    "scalar column of a vector sensor": (
+        "time_s,s1_nT,s2_x_nT,s2_y_nT,s2_z_nT,s3_nT\n0,1,2,3,4,5\n",
+        ["column s1_nT", "another kind", "expected s1_x_nT, s1_y_nT, s1_z_nT", "vector"],
+    ),
+    "sensor that the array lacks": (f"{HEADER},s9_x_nT\n{ROW},1\n", ["column s9_x_nT", "sensor s9", "'mixed'"]),
+    "unknown column": (f"{HEADER},comment\n{ROW},1\n", ["line 1", "column comment", "unknown"]),
+    "incomplete pose": (f"{HEADER},array_x_m,array_y_m\n{ROW},1,2\n", ["column array_z_m", "array_x_m, array_y_m"]),
+    "missing pose": (f"{HEADER},{POSE}\n{ROW},1,2,3,0,0,0,\n", ["line 2", "column array_qw", "no value"]),
+    "quaternion not unit": (f"{HEADER},{POSE}\n{ROW},1,2,3,0,0,1,1\n", ["line 2", "array_qx", "norm 1.41421"]),
+    "quaternion zero": (f"{HEADER},{POSE}\n{ROW},1,2,3,0,0,0,0\n", ["line 2", "array_qx", "norm 0"]),
+    "incomplete ambient field": (f"{HEADER},ambient_x_nT\n{ROW},1\n", ["column ambient_y_nT", "ambient_x_nT"]),
+    "missing ambient field": (
+        f"{HEADER},ambient_x_nT,ambient_y_nT,ambient_z_nT\n{ROW},1,,3\n",
+        ["line 2", "column ambient_y_nT", "no value"],
+    ),
+    "not UTF-8": (f"{HEADER}\n{ROW}\n".encode() + b"1,\xb5,3,4,5,6,7,8\n", ["line 3", "0xb5", "UTF-8"]),
+    "UTF-16": (f"{HEADER}\n{ROW}\n".encode("utf-16"), ["line 1", "UTF-8"]),
+    "binary": (f"{HEADER}\n".encode() + bytes(range(128)), ["line 2", "NUL", "UTF-8"]),
+    "cell without end": (f"{HEADER}\n0,{'x' * 200_000},2,3,4,5,6,7\n", ["line 2", "not CSV"]),
+    "unclosed quote": (f'{HEADER}\n{ROW}\n"1{ROW[1:]}\n{ROW}\n', ["line 3", "found 1 cells"]),
+}
+
+
+class TestBadFiles:
+    """Every fault is one sentence that names the file, the place, what was found and what was expected."""
+
+    @pytest.mark.parametrize(("content", "fragments"), BAD_FILES.values(), ids=BAD_FILES.keys())
+    def test_content(self, array: SensorArray, write: WriteFile, content: str | bytes, fragments: list[str]) -> None:
+        path = write(content)
+        with pytest.raises(InputError) as raised:
+            read_readings(path, array)
+        message = str(raised.value)
+        assert message.startswith(str(path))
+        assert "\n" not in message
+        assert "expected" in message
+        for fragment in fragments:
+            assert fragment in message
+
+    def test_missing_file(self, array: SensorArray, tmp_path: Path) -> None:
+        with pytest.raises(InputError, match=r"none\.csv does not exist"):
+            read_readings(tmp_path / "none.csv", array)
+
+    def test_directory(self, array: SensorArray, tmp_path: Path) -> None:
+        with pytest.raises(InputError, match="is a directory"):
+            read_readings(tmp_path, array)
+
+    def test_unknown_column_beside_a_subset(self, array: SensorArray, write: WriteFile) -> None:
+        with pytest.raises(InputError, match="column comment: found an unknown column"):
+            read_readings(write(f"{HEADER},comment\n{ROW},1\n"), array, sensors=["s1", "s2"])
+
+
+class TestWriting:
+    """A written file reads back as what was written."""
+
+    @given(
+        readings_nT=st.lists(
+            st.lists(st.one_of(st.just(math.nan), st.floats(-1e9, 1e9)), min_size=7, max_size=7), min_size=1, max_size=4
+        ),
+        scale=st.floats(1e-3, 1e6),
+    )
+    def test_round_trip(
+        self, tmp_path_factory: pytest.TempPathFactory, readings_nT: list[list[float]], scale: float
+    ) -> None:
+        array = SensorArray(
+            (
+                Sensor("a", "vector", (0.0, 0.0, 0.0), 1e-9),
+                Sensor("b", "scalar", (1.0, 0.0, 0.0), 1e-9),
+                Sensor("c", "vector", (0.0, 1.0, 0.0), 1e-9),
+            )
+        )
+        n = len(readings_nT)
+        written = Readings(
+            time_s=np.linspace(0.0, scale, n),
+            values_T=np.array(readings_nT) * 1e-9,
+            line_numbers=np.arange(n) + 2,
+            array_position_m=np.full((n, 3), scale / 3.0),
+            array_rotation_xyzw=np.full((n, 4), 0.5),
+            ambient_T=np.full((n, 3), scale * 1e-9),
+        )
+        path = tmp_path_factory.mktemp("round") / "readings.csv"
+        write_readings(path, written, array)
+        read = read_readings(path, array)
+        np.testing.assert_array_equal(read.time_s, written.time_s)
+        np.testing.assert_array_equal(read.line_numbers, written.line_numbers)
+        np.testing.assert_allclose(read.values_T, written.values_T, rtol=HALF_OF_DIGIT_15, atol=0.0)
+        assert read.array_position_m is not None
+        assert read.ambient_T is not None
+        assert written.ambient_T is not None
+        np.testing.assert_array_equal(read.array_position_m, written.array_position_m)
+        np.testing.assert_allclose(read.ambient_T, written.ambient_T, rtol=HALF_OF_DIGIT_15)
+
+    def test_text_of_a_file_survives(self, array: SensorArray, write: WriteFile) -> None:
+        content = f"{HEADER}\n0.1,533163,-108961.25,0.001,,5,6,49999.987\n"
+        path = write(content)
+        write_readings(path, read_readings(path, array), array)
+        assert path.read_text(encoding="utf-8") == content
+
+    def test_other_array(self, array: SensorArray, write: WriteFile, tmp_path: Path) -> None:
+        readings = read_readings(write(f"{HEADER}\n{ROW}\n"), array)
+        with pytest.raises(ValueError, match="6 channels"):
+            write_readings(tmp_path / "other.csv", readings, array.subset(["s1", "s2"]))
+
+
+class TestReadingsShapes:
+    """Arrays that do not belong together are refused."""
+
+    def test_shapes(self) -> None:
+        with pytest.raises(ValueError, match=r"ambient_T must have shape \(2, 3\)"):
+            Readings(np.arange(2.0), np.zeros((2, 6)), np.arange(2), ambient_T=np.zeros(3))
+        with pytest.raises(ValueError, match=r"values_T must have shape \(n, C\)"):
+            Readings(np.arange(2.0), np.zeros(2), np.arange(2))
+        with pytest.raises(ValueError, match="must come together"):
+            Readings(np.arange(2.0), np.zeros((2, 6)), np.arange(2), array_position_m=np.zeros((2, 3)))
+
+
+class TestAverage:
+    """The mean of all rows, and its noise."""
+
+    @staticmethod
+    def readings(values_T: list[list[float]], **columns: object) -> Readings:
+        n = len(values_T)
+        return Readings(np.arange(float(n)), np.array(values_T), np.arange(n) + 2, **columns)  # type: ignore[arg-type]
+
+    def test_missing_readings_do_not_count(self) -> None:
+        rows = self.readings([[1.0, math.nan, 3.0], [3.0, math.nan, math.nan], [5.0, math.nan, 4.0]])
+        mean = average(rows)
+        np.testing.assert_array_equal(mean.values_T, [[3.0, math.nan, 3.5]])
+        np.testing.assert_array_equal(mean.time_s, [1.0])
+        np.testing.assert_array_equal(mean.line_numbers, [2])
+
+    def test_noise_falls_with_the_root_of_the_rows(self, array: SensorArray) -> None:
+        values = np.ones((4, 7))
+        values[1:, 2] = math.nan  # one reading of s1's z axis is left, all four of the others
+        averaged = averaging_array(array, self.readings(values.tolist()))
+        np.testing.assert_allclose([sensor.noise_T for sensor in averaged.sensors], [1e-9, 1e-9, 2e-9], rtol=1e-15)
+
+    def test_channels_without_any_reading_do_not_count(self, array: SensorArray) -> None:
+        values = np.ones((4, 7))
+        values[:, 2] = math.nan
+        averaged = averaging_array(array, self.readings(values.tolist()))
+        np.testing.assert_allclose([sensor.noise_T for sensor in averaged.sensors], [0.5e-9, 1e-9, 2e-9], rtol=1e-15)
+
+    def test_array_that_moves(self) -> None:
+        position = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.1, 0.0]])
+        rotation = np.array([[0.0, 0.0, 0.0, 1.0]] * 3)
+        rows = self.readings([[1.0]] * 3, array_position_m=position, array_rotation_xyzw=rotation)
+        with pytest.raises(InputError, match="between lines 2 and 4"):
+            average(rows)
+
+
+class TestTruth:
+    """Truth files have positions, and moments where they are known."""
+
+    def test_plane(self, write: WriteFile) -> None:
+        truth = read_truth(write("time_s,x_m,y_m\n0,1,2\n1,3,4\n"))
+        np.testing.assert_array_equal(truth.position_m, [[1.0, 2.0, math.nan], [3.0, 4.0, math.nan]])
+        assert truth.moment_Am2 is None
+
+    def test_space_and_moment(self, write: WriteFile) -> None:
+        truth = read_truth(write("time_s,x_m,y_m,z_m,mx_Am2,my_Am2,mz_Am2\n0,1,2,3,4,5,6\n"))
+        np.testing.assert_array_equal(truth.position_m, [[1.0, 2.0, 3.0]])
+        assert truth.moment_Am2 is not None
+        np.testing.assert_array_equal(truth.moment_Am2, [[4.0, 5.0, 6.0]])
+
+    @pytest.mark.parametrize(
+        ("content", "fragment"),
+        [
+            ("time_s,x_m\n0,1\n", "column y_m"),
+            ("time_s,x_m,y_m,mx_Am2\n0,1,2,3\n", "column my_Am2"),
+            ("time_s,x_m,y_m,speed\n0,1,2,3\n", "column speed"),
+            ("time_s,x_m,y_m\n0,1,\n", "line 2, column y_m"),
+            ("time_s,x_m,y_m\n0,1,2\n0,3,4\n", "line 3, column time_s"),
+        ],
+    )
+    def test_bad_file(self, write: WriteFile, content: str, fragment: str) -> None:
+        with pytest.raises(InputError, match=fragment):
+            read_truth(write(content))
