@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from magloc.kernels import compiled, compiled_parallel
 from magloc.kernels.separable import orthonormalise
 
 FloatArray = NDArray[np.float64]
@@ -19,7 +20,7 @@ FloatArray = NDArray[np.float64]
 MU0_OVER_4PI = 1e-7
 
 
-@njit(cache=True)
+@compiled
 def _row(x: FloatArray, sensors: FloatArray, weights: FloatArray, j: int, h: FloatArray) -> float:
     """Difference j at the state x (p, m), and its gradient into h (6,)."""
     value = 0.0
@@ -47,13 +48,13 @@ def _row(x: FloatArray, sensors: FloatArray, weights: FloatArray, j: int, h: Flo
     return value
 
 
-@njit(cache=True)
+@compiled
 def _linearise(x: FloatArray, sensors: FloatArray, weights: FloatArray, g: FloatArray, H: FloatArray) -> None:
     for j in range(g.size):
         g[j] = _row(x, sensors, weights, j, H[j])
 
 
-@njit(cache=True)
+@compiled
 def _scalar_update(
     x: FloatArray, S: FloatArray, h: FloatArray, innovation: float, variance: float, phi: FloatArray, gain: FloatArray
 ) -> None:
@@ -77,7 +78,7 @@ def _scalar_update(
             S[r, c] -= gain[r] * phi[c] * shrink
 
 
-@njit(cache=True)
+@compiled
 def _add_process_noise(S: FloatArray, s_q: FloatArray, wide: FloatArray, triangle: FloatArray) -> None:
     """S becomes a lower triangular square root of ``S Sᵀ + diag(s_q²)``."""
     wide[:] = 0.0
@@ -91,7 +92,7 @@ def _add_process_noise(S: FloatArray, s_q: FloatArray, wide: FloatArray, triangl
             S[r, c] = triangle[c, r] if c <= r else 0.0
 
 
-@njit(cache=True)
+@compiled
 def _finish(
     x: FloatArray, z: FloatArray, chi2_variance: FloatArray, sensors: FloatArray, weights: FloatArray, h: FloatArray
 ) -> float:
@@ -102,7 +103,7 @@ def _finish(
     return chi2
 
 
-@njit(cache=True, parallel=True)
+@compiled_parallel
 def repeated_map(
     starts: FloatArray,
     z: FloatArray,
@@ -157,7 +158,7 @@ def repeated_map(
     return states, chi2, passes, stopped
 
 
-@njit(cache=True, parallel=True)
+@compiled_parallel
 def iekf_map(
     starts: FloatArray,
     z: FloatArray,

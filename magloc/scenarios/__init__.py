@@ -118,7 +118,7 @@ def _repeated(table: _Repeated) -> RepeatedFilter:
         moment_step_Am2=table.moment_step_Am2,
         noise_inflation=table.noise_inflation,
         relinearise_every_scalar=table.relinearise_every_scalar,
-        tolerance_T=table.tolerance_nT * 1e-9,
+        tolerance_T=table.tolerance_nT / 1e9,
         max_iterations=table.max_iterations,
     )
 
@@ -127,7 +127,7 @@ def _iekf(table: _Iekf) -> IekfFilter:
     return IekfFilter(
         position_sigma_m=table.position_sigma_m,
         moment_sigma_Am2=table.moment_sigma_Am2,
-        tolerance_T=table.tolerance_nT * 1e-9,
+        tolerance_T=table.tolerance_nT / 1e9,
         max_iterations=table.max_iterations,
     )
 
