@@ -24,25 +24,20 @@ Both may have ``noise_fraction``, ``common_field_nT``, ``ambient_nT = [x, y, z]`
 
 from __future__ import annotations
 
-import difflib
 import json
-import os
-import re
-import secrets
-import tomllib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from decimal import Context, Decimal
 from os import PathLike
-from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import msgspec
 
 from arrays.errors import InputError
 from arrays.geometries import GEOMETRIES
 from arrays.sensor import Calibration, Sensor, SensorArray
+from arrays.toml import check_keys, converted, place_of, read_toml, write_text
 
 FORMAT_VERSION = 1
 
@@ -51,7 +46,6 @@ FORMAT_VERSION = 1
 _SHIFT = Context(prec=1000, traps=[])
 _Number = int | Decimal
 _Vector = tuple[float, float, float]
-_Any = TypeVar("_Any")
 
 
 class _Header(msgspec.Struct, kw_only=True):
@@ -188,105 +182,6 @@ def array_toml(array: SensorArray) -> str:
     return "\n".join(lines) + "\n"
 
 
-def read_text(path: str | PathLike[str], expected: str) -> str:
-    """Text of a UTF-8 file, with or without a byte order mark.
-
-    Parameters
-    ----------
-    path : path-like
-    expected : str
-        What the file should be, in words, for errors.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    InputError
-        The file does not exist, cannot be read, or is not UTF-8.
-    """
-    try:
-        data = Path(path).read_bytes()
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist, expected {expected}.") from None
-    except IsADirectoryError:
-        raise InputError(f"{path} is a directory, expected {expected}.") from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{path} cannot be read ({reason}), expected {expected}.") from None
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise InputError(
-            f"{path}, line {line}: found the byte 0x{data[error.start]:02x}, which is not UTF-8, expected UTF-8 text."
-        ) from None
-
-
-def write_text(text: str, path: str | PathLike[str]) -> None:
-    """Write a UTF-8 file in one step: a reader finds the old text or the new one, also after an interruption.
-
-    Parameters
-    ----------
-    text : str
-    path : path-like
-        Replaced if it exists; the target of a link, if it is one.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
-    """
-    target = Path(path)
-    in_place = target.exists() and not target.is_file()  # a pipe or a terminal cannot be replaced
-    if not in_place:
-        target = Path(os.path.realpath(path))
-    written = target if in_place else target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        try:
-            written.write_text(text, encoding="utf-8", newline="\n")
-            if not in_place:
-                os.replace(written, target)
-        finally:
-            if not in_place:
-                written.unlink(missing_ok=True)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from None
-
-
-def read_toml(path: str | PathLike[str], expected: str) -> dict[str, Any]:
-    """Table of a TOML file, fractional numbers as Decimal.
-
-    Parameters
-    ----------
-    path : path-like
-    expected : str
-        What the file should be, in words, for errors.
-
-    Returns
-    -------
-    dict
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, or is not TOML; the text names the line.
-    """
-    text = read_text(path, expected)
-    try:
-        return tomllib.loads(text, parse_float=Decimal)
-    except tomllib.TOMLDecodeError as error:
-        fault, _, where = str(error).rpartition(" (at ")
-        place = re.match(r"line (\d+)", where)
-        line = int(place[1]) if place else len(text.splitlines())  # else it is the end of the document
-        raise InputError(f"{path}, line {line}: found what is not TOML ({_lower_first(fault)}).") from None
-    except (ValueError, ArithmeticError):
-        raise InputError(f"{path}: found a number out of range, expected one with fewer digits.") from None
-    except RecursionError:
-        raise InputError(f"{path}: found lists nested too deeply, expected a list of lists at most.") from None
-
-
 def _array_of_geometry(path: str, table: dict[str, Any]) -> SensorArray:
     name = table["geometry"]
     if not isinstance(name, str) or name not in GEOMETRIES:
@@ -312,12 +207,12 @@ def _array_of_sensors(path: str, table: dict[str, Any]) -> SensorArray:
         raise InputError(f"{path}, key {misplaced}: found at the top, expected in each [[sensor]] table.")
     check_keys(path, table, _keys(_SensorsFile))
     for i, sensor in _tables(table["sensor"]):
-        place = _place(path, table, f"sensor[{i}]")
+        place = place_of(path, table, f"sensor[{i}]")
         check_keys(place, sensor, _keys(_SensorTable))
         if isinstance(sensor.get("calibration"), dict):
             check_keys(place, sensor["calibration"], _keys(_CalibrationTable), within="calibration.")
     file = converted(path, table, _SensorsFile)
-    sensors = tuple(_sensor(_place(path, table, f"sensor[{i}]"), sensor) for i, sensor in enumerate(file.sensor))
+    sensors = tuple(_sensor(place_of(path, table, f"sensor[{i}]"), sensor) for i, sensor in enumerate(file.sensor))
     with _naming(path):
         array = SensorArray(sensors)
     return _with_header(path, array, file)
@@ -403,34 +298,6 @@ def _size_keys() -> set[str]:
     return {geometry.size_key for geometry in GEOMETRIES.values()}
 
 
-def check_keys(place: str, table: Mapping[str, Any], known: Collection[str], within: str = "") -> None:
-    """Refuse a table with a key that is not known, naming the nearest one that is.
-
-    Parameters
-    ----------
-    place : str
-        Name of the file, and of the table within it, for errors.
-    table : mapping
-    known : collection of str
-        Keys that the table may have.
-    within : str
-        What the keys are shown with in front, such as ``"calibration."``.
-
-    Raises
-    ------
-    InputError
-        For the first unknown key.
-    """
-    for key in table:
-        if key not in known:
-            nearest = difflib.get_close_matches(key, sorted(known), n=1, cutoff=0.0)[0]
-            shown = key if key and key.isprintable() else repr(key)
-            raise InputError(
-                f"{place}, key {within}{shown}: found an unknown key, expected a known one "
-                f"(the nearest is {within}{nearest})."
-            )
-
-
 def _tables(value: object) -> Iterator[tuple[int, dict[str, Any]]]:
     """Those members of a list that are tables; anything else is the type check's to refuse."""
     if isinstance(value, list):
@@ -448,79 +315,5 @@ def _naming(place: str) -> Iterator[None]:
         raise InputError(f"{place}: {str(error).removeprefix('Input ')}") from None
 
 
-_TYPE_ERROR = re.compile(r"Expected `(?P<expected>[^`]+)`(?P<length> of length \d+)?, got `?(?P<found>[^`]+)`?")
-_MISSING_ERROR = re.compile(r"Object missing required field `(?P<key>[^`]+)`")
-_TYPES = {
-    "array": "a list",
-    "bool": "a truth value",
-    "decimal": "a number",
-    "float": "a number",
-    "int": "a whole number",
-    "null": "nothing",
-    "object": "a table",
-    "str": "text",
-}
-
-
-def converted(path: str, table: dict[str, Any], type_: type[_Any]) -> _Any:
-    """A table as a struct of the right types.
-
-    Parameters
-    ----------
-    path : str
-        Name of the file, for errors.
-    table : dict
-        As :func:`read_toml` returns it, with decimal numbers.
-    type_ : type
-        The struct. Fields of type float take any number.
-
-    Returns
-    -------
-    object
-        Of that type.
-
-    Raises
-    ------
-    InputError
-        A key is missing, or its value has another type; the text names the key.
-    """
-    try:
-        return msgspec.convert(table, type_, builtin_types=(Decimal,))
-    except msgspec.ValidationError as error:
-        text, _, where = str(error).partition(" - at `$.")
-        place = _place(path, table, where.rstrip("`"))
-    missing = _MISSING_ERROR.fullmatch(text)
-    if missing:
-        raise InputError(f"{place}: found no key {missing['key']}, expected one.")
-    wrong = _TYPE_ERROR.fullmatch(text)
-    if not wrong:
-        raise InputError(f"{place}: {_lower_first(text)}.")
-    found = f"a list of length {wrong['found']}" if wrong["length"] else _type_in_words(wrong["found"])
-    raise InputError(f"{place}: found {found}, expected {_type_in_words(wrong['expected'])}{wrong['length'] or ''}.")
-
-
-def _type_in_words(types: str) -> str:
-    names = set(types.split(" | ")) - {"null"} or {"null"}
-    if names & {"decimal", "float"}:
-        names.discard("int")
-    return " or ".join(_TYPES.get(name, name) for name in sorted(names, reverse=True))
-
-
-def _place(path: str, table: Mapping[str, Any], where: str) -> str:
-    """Where ``sensor[1].noise_nT`` is, in words: the sensor by its id, or by its number if that cannot be shown."""
-    sensor = re.fullmatch(r"sensor\[(\d+)\]\.?(.*)", where)
-    if sensor:
-        index, where = int(sensor[1]), sensor[2]
-        item = table["sensor"][index]
-        name = item.get("id") if isinstance(item, dict) else None
-        usable = isinstance(name, str) and name.isprintable() and name.strip()
-        path = f"{path}, sensor {name}" if usable else f"{path}, sensor number {index + 1}"
-    return f"{path}, key {where}" if where else path
-
-
 def _count(n: int) -> str:
     return "1 number" if n == 1 else f"{n} numbers"
-
-
-def _lower_first(text: str) -> str:
-    return text[:1].lower() + text[1:]

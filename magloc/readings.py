@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.errors import InputError
-from arrays.files import write_text
 from arrays.sensor import AMBIENT_CHANNELS, Sensor, SensorArray
+from arrays.toml import write_text
 from magloc.tables import Table, read_table
 
 FloatArray = NDArray[np.float64]

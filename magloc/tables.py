@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.errors import InputError
-from arrays.files import read_text
+from arrays.toml import read_text
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

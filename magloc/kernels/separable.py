@@ -10,6 +10,7 @@ Arrays are transposed against the twin, (component, channel), so that the inner 
 from __future__ import annotations
 
 import math
+
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray

@@ -9,8 +9,9 @@ from typing import Any
 import msgspec
 
 from arrays.errors import InputError
-from arrays.files import array_of_table, check_keys, converted, read_array, read_toml
+from arrays.files import array_of_table, read_array
 from arrays.sensor import SensorArray
+from arrays.toml import check_keys, converted, read_toml
 from magloc.convergence import Filter, IekfFilter, RepeatedFilter, StartsScenario
 
 FORMAT_VERSION = 1
