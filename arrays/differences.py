@@ -256,7 +256,8 @@ def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray
     """Noise of every channel when a part of it is proportional to the field.
 
     ``σ² = noise² + (noise_fraction · |B|)²`` with |B| the modulus of the calibrated reading minus the array's mean
-    (vector sensors), or the deviation of the modulus from the mean modulus (scalar sensors).
+    (vector sensors), or the deviation of the modulus from the mean modulus (scalar sensors). The noise is in the
+    readings' units, so |B| is multiplied by the channel's gain.
 
     Parameters
     ----------
@@ -283,7 +284,8 @@ def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray
         scalar = ~vector
         moduli = (readings_T[..., scalar] - array.channel_offset_T[scalar]) / array.channel_gain[scalar, 0]
         modulus[..., scalar] = np.abs(moduli - _mean_of_finite(moduli, axis=-1))
-    result: FloatArray = np.hypot(noise, array.noise_fraction * np.nan_to_num(modulus))
+    gain = np.linalg.norm(array.channel_gain, axis=1)
+    result: FloatArray = np.hypot(noise, array.noise_fraction * gain * np.nan_to_num(modulus))
     return result
 
 

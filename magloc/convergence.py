@@ -1,11 +1,12 @@
 r"""Convergence maps: from which starts does a dipole filter find the source?
 
 One source, one set of readings, a cube of starts (the moment always starts at zero). Two filters of the source paper's
-kind, and a map of how they end:
+kind and one that takes no step uphill, and a map of how they end:
 
 * :class:`RepeatedFilter`: the same readings are processed again and again by an extended Kalman filter whose covariance
   grows by :math:`S_q S_q^T` before every pass. It forgets its start, so where it stops is a maximum of the likelihood.
 * :class:`IekfFilter`: the iterated extended Kalman filter with the start as the mean of a prior.
+* :class:`DampedFilter`: the same cost as the latter's, by Levenberg-Marquardt steps.
 
 Source: Pavlov, Karshakov, Goldin, "Determination of the magnetic field parameters of an object from remote
 magnetogradient measurements", the function table, equations (19), (30), and the figure of the convergence region.
@@ -13,8 +14,8 @@ magnetogradient measurements", the function table, equations (19), (30), and the
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from importlib.metadata import version
@@ -25,8 +26,10 @@ from numpy.typing import NDArray
 
 from arrays.geometries import tetrahedron
 from arrays.sensor import SensorArray
+from magloc.cubes import Box, MapSummary, Tally, Values, Variable, histogram, in_memory
 from magloc.kalman import IteratedUpdate, iterated_update, predict_square_root, scalar_update, sequential_update
-from magloc.kernels import starts as kernels
+from magloc.kernels import lanes
+from magloc.kernels.starts import relinearised_map
 from magloc.locate import Locator, Solution
 from magloc.measurement import DifferenceMeasurement, predicted_channels
 
@@ -39,7 +42,6 @@ FloatArray = NDArray[np.float64]
 CHI2_REACHED = 0.05
 # Distance from the maximum-likelihood position that a filter with a prior may keep.
 PRIOR_REACHED_M = 0.5
-_STARTS_AT_ONCE = 4096
 
 
 class Status(IntEnum):
@@ -123,18 +125,19 @@ class RepeatedFilter:
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
+        run_all = relinearised_map if self.relinearise_every_scalar else lanes.repeated_map
         return Ends(
-            *kernels.repeated_map(
+            *run_all(
                 starts,
                 z,
                 measurement.variance,
-                self.noise_inflation,
-                self.s_q,
-                self.relinearise_every_scalar,
-                self.tolerance_T,
-                self.max_iterations,
                 measurement.array.positions,
                 field_weights(measurement),
+                self.noise_inflation,
+                self.position_step_m,
+                self.moment_step_Am2,
+                self.tolerance_T,
+                self.max_iterations,
             )
         )
 
@@ -195,15 +198,16 @@ class IekfFilter:
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
         return Ends(
-            *kernels.iekf_map(
+            *lanes.iekf_map(
                 starts,
                 z,
                 measurement.variance,
-                self.s_0,
-                self.tolerance_T,
-                self.max_iterations,
                 measurement.array.positions,
                 field_weights(measurement),
+                self.position_sigma_m,
+                self.moment_sigma_Am2,
+                self.tolerance_T,
+                self.max_iterations,
             )
         )
 
@@ -224,6 +228,110 @@ class IekfFilter:
         """Stopped at the prior's own optimum, near the maximum-likelihood position (the prior pulls, so χ² differs)."""
         distance = np.linalg.norm(ends.states[:, :3] - position_optimum, axis=1)
         return ends.stopped & (distance < PRIOR_REACHED_M)
+
+
+@dataclass(frozen=True)
+class DampedFilter:
+    r"""Levenberg-Marquardt iteration on the cost of :class:`IekfFilter`: no accepted step raises it.
+
+    A step solves :math:`(M + \lambda\,\mathrm{diag} M)\,\delta = -\nabla` with :math:`M = H^T R^{-1} H + P_0^{-1}` and
+    the gradient of half the cost. One that lowers the cost is taken and divides the damping λ by 5; any other is not,
+    and multiplies it by 4. Where Gauss-Newton steps wander without end, this one stops at an optimum; a wide prior
+    makes it one of the likelihood.
+
+    Attributes
+    ----------
+    position_sigma_m, moment_sigma_Am2 : float
+        Standard deviations of the prior around the start, per axis.
+    first_damping : float
+        λ of the first step, positive.
+    tolerance_T : float
+        A step that changes the predicted differences by less than this [T] is followed by one without damping; if that
+        changes them by less as well, stop.
+    max_iterations : int
+        Linearisations at most, at states that are not taken as well.
+
+    Notes
+    -----
+    D. W. Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", J. SIAM 11 (1963).
+    """
+
+    position_sigma_m: float = 3.0
+    moment_sigma_Am2: float = 300.0
+    first_damping: float = 1.0
+    tolerance_T: float = 1e-12
+    max_iterations: int = 200
+
+    @property
+    def name(self) -> str:
+        """Name on the command line."""
+        return "damped"
+
+    @property
+    def s_0(self) -> FloatArray:
+        """Diagonal of the square root of the prior covariance, shape (6,)."""
+        return np.repeat([self.position_sigma_m, self.moment_sigma_Am2], 3)
+
+    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
+        """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
+        return Ends(
+            *lanes.damped_map(
+                starts,
+                z,
+                measurement.variance,
+                measurement.array.positions,
+                field_weights(measurement),
+                self.position_sigma_m,
+                self.moment_sigma_Am2,
+                self.first_damping,
+                self.tolerance_T,
+                self.max_iterations,
+            )
+        )
+
+    def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
+        """End of one start (6,), in units of the standard deviations of readings and prior."""
+        sigma = np.sqrt(measurement.variance)
+
+        def linearised(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+            """Predicted differences; residuals of readings and prior, and minus their Jacobian."""
+            predicted = measurement.predicted(x[:3], x[3:])
+            residual = np.concatenate([(z - predicted) / sigma, (start - x) / self.s_0])
+            jacobian = measurement.jacobian(x[:3], x[3:]) * self.s_0 / sigma[:, None]
+            return predicted, residual, np.concatenate([jacobian, np.eye(6)])
+
+        x, damping, kept = start, self.first_damping, self.first_damping
+        predicted, residual, J = linearised(x)
+        innovation = z - predicted
+        iteration, ended = 0, False
+        while not ended:
+            iteration += 1
+            # The normal equations of M + λ diag M, without M: its diagonal is the columns' square norm.
+            Q, R = np.linalg.qr(np.concatenate([J, np.diag(np.sqrt(damping) * np.linalg.norm(J, axis=0))]))
+            trial = x + self.s_0 * np.linalg.solve(R, Q[: residual.size].T @ residual)
+            at_trial = linearised(trial)
+            change = float(np.linalg.norm(at_trial[0] - predicted))
+            small = change < self.tolerance_T
+            stopped = small and damping == 0.0
+            if at_trial[1] @ at_trial[1] < residual @ residual:
+                x, kept = trial, kept / lanes.DAMPING_DECREASE
+                predicted, residual, J = at_trial
+            else:
+                kept *= lanes.DAMPING_INCREASE
+            # Damping alone can make a step small: the stop rule is left to the step without it.
+            damping = 0.0 if small else kept
+            ended = stopped or iteration >= self.max_iterations or not np.all(np.isfinite(residual))
+        S: FloatArray = self.s_0[:, None] * np.linalg.inv(np.linalg.qr(J, mode="r"))
+        return IteratedUpdate(x, S, iteration, stopped, innovation, np.nan)
+
+    def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
+        """As :meth:`IekfFilter.reached`."""
+        distance = np.linalg.norm(ends.states[:, :3] - position_optimum, axis=1)
+        return ends.stopped & (distance < PRIOR_REACHED_M)
+
+
+# Every method of a map by its name, with its default settings; scenario files and the command line take them from here.
+FILTERS: dict[str, Filter] = {method.name: method for method in (RepeatedFilter(), IekfFilter(), DampedFilter())}
 
 
 def field_weights(measurement: DifferenceMeasurement) -> FloatArray:
@@ -273,6 +381,153 @@ def simulated_differences(
     return readings, measurement.measured(readings)
 
 
+@dataclass(frozen=True, eq=False)
+class StartsMap:
+    """Map of a filter's ends over a cube of starts, as :class:`magloc.cubes.CubeMap`.
+
+    Attributes
+    ----------
+    scenario : StartsScenario
+    grid : int
+        Starts along every axis.
+    measurement : DifferenceMeasurement
+    z : ndarray, shape (k,)
+        Decorrelated differences that every start is given [T].
+    optimum : Solution
+        The best one for them.
+    """
+
+    scenario: StartsScenario
+    grid: int
+    measurement: DifferenceMeasurement
+    z: FloatArray
+    optimum: Solution
+
+    @classmethod
+    def of(cls, scenario: StartsScenario, grid: int) -> StartsMap:
+        """Map of a scenario; the arguments and errors of :func:`convergence_map`."""
+        if grid < 2:
+            raise ValueError(f"Input grid must be at least 2; instead received {grid}.")
+        measurement = DifferenceMeasurement.of(scenario.array)
+        readings, z = simulated_differences(scenario, measurement)
+        fix = Locator(scenario.array).fit(readings)
+        if not fix.solutions:
+            raise ValueError(f"The scenario's readings have no maximum-likelihood solution: {fix.reason}.")
+        return cls(scenario, grid, measurement, z, fix.solutions[0])
+
+    @property
+    def edge(self) -> int:
+        """Starts along the edges of a box."""
+        return 32 if self.grid <= 128 else 64
+
+    @property
+    def axis(self) -> FloatArray:
+        """Coordinates of the starts [m], shape (grid,)."""
+        return np.linspace(-self.scenario.half_width_m, self.scenario.half_width_m, self.grid)
+
+    @property
+    def point(self) -> str:
+        """What a point is."""
+        return "start"
+
+    @property
+    def variables(self) -> Mapping[str, Variable]:
+        """Variables over the cube."""
+        return _VARIABLES
+
+    @property
+    def attributes(self) -> Mapping[str, Any]:
+        """All that determines the map."""
+        from arrays.files import array_toml
+
+        scenario = self.scenario
+        return {
+            "Conventions": "CF-1.10",
+            "title": "Convergence of a dipole filter over its starts",
+            "source": f"magloc {version('magloc')}",
+            "grid": self.grid,
+            "method": scenario.method.name,
+            **{f"method_{key}": _attribute(value) for key, value in vars(scenario.method).items()},
+            "array": array_toml(scenario.array),
+            "position_m": np.asarray(scenario.position_m),
+            "moment_Am2": np.asarray(scenario.moment_Am2),
+            "centroid_m": scenario.array.centroid,
+            "half_width_m": scenario.half_width_m,
+            "noise_seed": -1 if scenario.noise_seed is None else scenario.noise_seed,
+        }
+
+    @property
+    def findings(self) -> Mapping[str, Any]:
+        """The maximum-likelihood solution that the ends are compared with."""
+        return {
+            "optimum_position_m": self.optimum.position_m,
+            "optimum_moment_Am2": self.optimum.moment_Am2,
+            "optimum_chi2": self.optimum.chi2,
+        }
+
+    def warm_up(self) -> None:
+        """Compile, or load what was compiled."""
+        self.scenario.method.run(self.measurement, self.z, np.full((1, 6), self.scenario.half_width_m))
+
+    def values(self, box: Box) -> Values:
+        """Ends of the starts of a box."""
+        scenario, centroid = self.scenario, self.scenario.array.centroid
+        positions = box.points(self.axis)
+        starts = np.concatenate([positions, np.zeros_like(positions)], axis=1)
+        ends = scenario.method.run(self.measurement, self.z, starts)
+        # On a grid the plane itself is hit to rounding only.
+        depth = (positions - centroid) @ (np.asarray(scenario.position_m) - centroid)
+        half = np.sign(np.where(np.abs(depth) < 1e-9 * scenario.half_width_m**2, 0.0, depth))
+        values = {
+            "iterations": ends.iterations,
+            "chi2": ends.chi2,
+            "distance": np.linalg.norm(ends.states[:, :3] - self.optimum.position_m, axis=1),
+            "status": _status(ends, scenario.method.reached(ends, self.optimum.chi2, self.optimum.position_m)),
+            "half": half,
+        }
+        return {name: values[name].reshape(box.shape).astype(_VARIABLES[name].dtype) for name in _VARIABLES}
+
+    def tally(self, values: Values) -> Tally:
+        """Counts of a part's values."""
+        return starts_tally(values)
+
+    def summary(self, tally: Tally, seconds: float) -> MapSummary:
+        """Summary of the whole cube."""
+        return starts_summary(tally, seconds)
+
+
+def starts_tally(values: Values) -> Tally:
+    """Counts of ``status``, ``half`` and ``iterations`` of a part of a map over starts."""
+    converged = values["status"] == Status.CONVERGED
+    front, back = values["half"] == 1, values["half"] == -1
+    counts = {
+        "starts": converged.size,
+        "converged": converged.sum(),
+        "front": front.sum(),
+        "converged front": (converged & front).sum(),
+        "back": back.sum(),
+        "converged back": (converged & back).sum(),
+        "iterations": values["iterations"].sum(dtype=np.int64),
+    }
+    return Tally(
+        Counter({name: int(count) for name, count in counts.items()}), histogram(values["iterations"][converged])
+    )
+
+
+def starts_summary(tally: Tally, seconds: float) -> MapSummary:
+    """Summary of a map over starts from its tally."""
+    return MapSummary(
+        starts=tally.counts["starts"],
+        converged=tally.counts["converged"],
+        fraction=tally.fraction("converged", "starts"),
+        front_fraction=tally.fraction("converged front", "front"),
+        back_fraction=tally.fraction("converged back", "back"),
+        median_iterations=tally.median_iterations(),
+        iterations_total=tally.counts["iterations"],
+        seconds=seconds,
+    )
+
+
 def convergence_map(
     scenario: StartsScenario, grid: int = 41, progress: Callable[[int], None] | None = None
 ) -> xr.Dataset:
@@ -282,7 +537,7 @@ def convergence_map(
     ----------
     scenario : StartsScenario
     grid : int
-        Starts along every axis, at least 2.
+        Starts along every axis, at least 2. For maps that do not fit into memory see :mod:`magloc.sweep`.
     progress : callable, optional
         Called with the number of starts finished since the last call.
 
@@ -298,32 +553,7 @@ def convergence_map(
     ValueError
         The array has scalar sensors or too few of them, or its readings have no unique best fit.
     """
-    if grid < 2:
-        raise ValueError(f"Input grid must be at least 2; instead received {grid}.")
-    measurement = DifferenceMeasurement.of(scenario.array)
-    readings, z = simulated_differences(scenario, measurement)
-    fix = Locator(scenario.array).fit(readings)
-    if not fix.solutions:
-        raise ValueError(f"The scenario's readings have no maximum-likelihood solution: {fix.reason}.")
-    optimum = fix.solutions[0]
-    axis = np.linspace(-scenario.half_width_m, scenario.half_width_m, grid)
-    starts = np.zeros((grid**3, 6))
-    starts[:, :3] = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    scenario.method.run(measurement, z, starts[:1])  # compiles, or loads what was compiled
-    parts = []
-    began = time.perf_counter()
-    for begin in range(0, len(starts), _STARTS_AT_ONCE):
-        parts.append(scenario.method.run(measurement, z, starts[begin : begin + _STARTS_AT_ONCE]))
-        if progress is not None:
-            progress(len(parts[-1].chi2))
-    seconds = time.perf_counter() - began
-    ends = Ends(
-        states=np.concatenate([part.states for part in parts]),
-        chi2=np.concatenate([part.chi2 for part in parts]),
-        iterations=np.concatenate([part.iterations for part in parts]),
-        stopped=np.concatenate([part.stopped for part in parts]),
-    )
-    return _dataset(scenario, axis, starts[:, :3], ends, optimum, seconds)
+    return in_memory(StartsMap.of(scenario, grid), progress)
 
 
 def _status(ends: Ends, reached: NDArray[np.bool_]) -> NDArray[np.int8]:
@@ -332,109 +562,34 @@ def _status(ends: Ends, reached: NDArray[np.bool_]) -> NDArray[np.int8]:
     return np.where(reached, Status.CONVERGED, status).astype(np.int8)
 
 
-def _dataset(
-    scenario: StartsScenario, axis: FloatArray, starts: FloatArray, ends: Ends, optimum: Solution, seconds: float
-) -> xr.Dataset:
-    import xarray as xr
-
-    from arrays.files import array_toml
-
-    shape = (axis.size,) * 3
-    status = _status(ends, scenario.method.reached(ends, optimum.chi2, optimum.position_m))
-    centroid = scenario.array.centroid
-    # On a grid the plane itself is hit to rounding only.
-    depth = (starts - centroid) @ (np.asarray(scenario.position_m) - centroid)
-    half = np.sign(np.where(np.abs(depth) < 1e-9 * scenario.half_width_m**2, 0.0, depth)).astype(np.int8)
-    distance = np.linalg.norm(ends.states[:, :3] - optimum.position_m, axis=1)
-
-    def variable(values: NDArray[Any], **attributes: Any) -> tuple[tuple[str, ...], NDArray[Any], dict[str, Any]]:
-        return ("x", "y", "z"), values.reshape(shape), attributes
-
-    return xr.Dataset(
+_VARIABLES = {
+    "iterations": Variable(np.int32, {"long_name": "passes over the readings", "units": "1"}),
+    "chi2": Variable(np.float64, {"long_name": "chi-square at the end", "units": "1"}),
+    "distance": Variable(np.float64, {"long_name": "distance from the maximum-likelihood position", "units": "m"}),
+    "status": Variable(
+        np.int8,
         {
-            "iterations": variable(ends.iterations.astype(np.int32), long_name="passes over the readings", units="1"),
-            "chi2": variable(ends.chi2, long_name="chi-square at the end", units="1"),
-            "distance": variable(distance, long_name="distance from the maximum-likelihood position", units="m"),
-            "status": variable(
-                status,
-                long_name="how the start ended",
-                flag_values=np.array([s.value for s in Status], dtype=np.int8),
-                flag_meanings=" ".join(s.name.lower() for s in Status),
-            ),
-            "half": variable(
-                half,
-                long_name="side of the plane through the centroid, orthogonal to the source's direction",
-                flag_values=np.array([-1, 0, 1], dtype=np.int8),
-                flag_meanings="back plane front",
-            ),
+            "long_name": "how the start ended",
+            "flag_values": np.array([s.value for s in Status], dtype=np.int8),
+            "flag_meanings": " ".join(s.name.lower() for s in Status),
         },
-        coords={
-            name: (name, axis, {"long_name": f"start {name}, array frame", "units": "m", "axis": name.upper()})
-            for name in ("x", "y", "z")
+    ),
+    "half": Variable(
+        np.int8,
+        {
+            "long_name": "side of the plane through the centroid, orthogonal to the source's direction",
+            "flag_values": np.array([-1, 0, 1], dtype=np.int8),
+            "flag_meanings": "back plane front",
         },
-        attrs={
-            "Conventions": "CF-1.10",
-            "title": "Convergence of a dipole filter over its starts",
-            "source": f"magloc {version('magloc')}",
-            "method": scenario.method.name,
-            **{f"method_{key}": _attribute(value) for key, value in vars(scenario.method).items()},
-            "array": array_toml(scenario.array),
-            "position_m": np.asarray(scenario.position_m),
-            "moment_Am2": np.asarray(scenario.moment_Am2),
-            "centroid_m": scenario.array.centroid,
-            "half_width_m": scenario.half_width_m,
-            "noise_seed": -1 if scenario.noise_seed is None else scenario.noise_seed,
-            "optimum_position_m": optimum.position_m,
-            "optimum_moment_Am2": optimum.moment_Am2,
-            "optimum_chi2": optimum.chi2,
-            "seconds": seconds,
-        },
-    )
+    ),
+}
 
 
 def _attribute(value: Any) -> Any:
     return int(value) if isinstance(value, bool) else value  # netCDF has no booleans
 
 
-@dataclass(frozen=True)
-class MapSummary:
-    """Counts of a convergence map.
-
-    Attributes
-    ----------
-    starts, converged : int
-    fraction, front_fraction, back_fraction : float
-        Converged starts over all starts, over those in front of the plane and over those behind it.
-    median_iterations : float
-        Over the converged starts; NaN if there are none.
-    iterations_total : int
-        Passes of all starts.
-    seconds : float
-        Duration of the sweep alone.
-    """
-
-    starts: int
-    converged: int
-    fraction: float
-    front_fraction: float
-    back_fraction: float
-    median_iterations: float
-    iterations_total: int
-    seconds: float
-
-
 def summary(dataset: xr.Dataset) -> MapSummary:
     """Counts of a map made by :func:`convergence_map`."""
-    converged = (dataset["status"] == Status.CONVERGED).to_numpy()
-    half = dataset["half"].to_numpy()
-    iterations = dataset["iterations"].to_numpy()
-    return MapSummary(
-        starts=converged.size,
-        converged=int(converged.sum()),
-        fraction=float(converged.mean()),
-        front_fraction=float(converged[half == 1].mean()),
-        back_fraction=float(converged[half == -1].mean()),
-        median_iterations=float(np.median(iterations[converged])) if converged.any() else float("nan"),
-        iterations_total=int(iterations.sum()),
-        seconds=float(dataset.attrs["seconds"]),
-    )
+    values = {name: dataset[name].to_numpy() for name in ("status", "half", "iterations")}
+    return starts_summary(starts_tally(values), float(dataset.attrs["seconds"]))

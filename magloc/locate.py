@@ -7,8 +7,10 @@ steps which decrease χ², and every distinct optimum near the best one is retur
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from arrays.differences import Whitening, proportional_noise, whitening
 from arrays.sensor import SensorArray
 from magloc.dipole import MU0_OVER_4PI
+from magloc.kernels import over_rows
 from magloc.kernels import separable as kernels
 from magloc.separable import SeparableProblem, candidate_positions
 
@@ -88,13 +91,82 @@ class Fix:
     failed_starts: int = 0
 
 
+@dataclass(frozen=True)
+class Knowledge:
+    """What is known of the source beforehand; solutions that contradict it are left out.
+
+    Attributes
+    ----------
+    low_m, high_m : tuple of 3 floats
+        Bounds of the position in the array's frame [m], infinite where there is none: a box, a slab or a half-space.
+    largest_moment_Am2 : float
+        Bound of the moment's modulus [A·m²].
+
+    Raises
+    ------
+    ValueError
+        The bounds leave nothing.
+    """
+
+    low_m: tuple[float, float, float] = (-math.inf, -math.inf, -math.inf)
+    high_m: tuple[float, float, float] = (math.inf, math.inf, math.inf)
+    largest_moment_Am2: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not all(low < high for low, high in zip(self.low_m, self.high_m, strict=True)):
+            raise ValueError(
+                f"Input low_m must be below high_m along every axis; instead received {self.low_m}, {self.high_m}."
+            )
+        if not self.largest_moment_Am2 > 0.0:
+            raise ValueError(f"Input largest_moment_Am2 must be positive; instead received {self.largest_moment_Am2}.")
+
+    def allows_position(self, position_m: FloatArray) -> Any:
+        """Whether positions (..., 3) lie within the bounds."""
+        return np.all((position_m >= np.asarray(self.low_m)) & (position_m <= np.asarray(self.high_m)), axis=-1)
+
+    def allows_moment(self, moment_Am2: FloatArray) -> Any:
+        """Whether moments (..., 3) are small enough."""
+        return np.linalg.norm(moment_Am2, axis=-1) <= self.largest_moment_Am2
+
+
+@dataclass(frozen=True, eq=False)
+class BestFits:
+    """The best optima found from many starts, without their uncertainty.
+
+    Attributes
+    ----------
+    position_m, moment_Am2 : ndarray, shape (n, 3)
+        NaN where no start converged.
+    chi2 : ndarray, shape (n,)
+    linearisations : ndarray of int, shape (n,)
+        Of all refinements together.
+    """
+
+    position_m: FloatArray
+    moment_Am2: FloatArray
+    chi2: FloatArray
+    linearisations: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Optima:
+    """Outputs of the compiled search, (rows, starts, ...), and the arguments of its model."""
+
+    model: tuple[NDArray[Any], ...]
+    q: FloatArray
+    mu: FloatArray
+    chi2: FloatArray
+    iterations: NDArray[np.int64]
+    counts: NDArray[np.int64]
+
+
 @dataclass(frozen=True, eq=False)
 class _Kernel:
     """A whitening in the layout of the compiled search, with the bases of all candidates."""
 
     whitening: Whitening
     problem: SeparableProblem
-    bases: FloatArray
+    bases: NDArray[np.float32]
 
 
 class Locator:
@@ -110,15 +182,23 @@ class Locator:
         Least distance of two candidates, as an angle of their homogeneous coordinates.
     max_iterations : int
         Linearisations of one refinement at most; a refinement that needs more did not converge.
+    knowledge : Knowledge
+        Bounds of the source's position and moment.
 
     Raises
     ------
     ValueError
-        The array has scalar sensors.
+        The array has scalar sensors, or the known region is out of its reach.
     """
 
     def __init__(
-        self, array: SensorArray, *, n_starts: int = 6, apart_rad: float = 0.3, max_iterations: int = 100
+        self,
+        array: SensorArray,
+        *,
+        n_starts: int = 8,
+        apart_rad: float = 0.25,
+        max_iterations: int = 100,
+        knowledge: Knowledge = Knowledge(),
     ) -> None:
         if array.channel_is_scalar.any():
             raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
@@ -126,7 +206,13 @@ class Locator:
         self.n_starts = n_starts
         self.apart_rad = apart_rad
         self.max_iterations = max_iterations
-        self._candidates = candidate_positions(array)
+        self.knowledge = knowledge
+        candidates = candidate_positions(array)
+        self._candidates = candidates[knowledge.allows_position(candidates)]
+        if not len(self._candidates):
+            raise ValueError(
+                "Input knowledge must leave some of the space around the array; instead it leaves nothing."
+            )
         self._of_mask: dict[bytes, _Kernel] = {}
 
     def fit(self, readings_T: ArrayLike) -> Fix:
@@ -186,89 +272,196 @@ class Locator:
             self._of_mask.clear()  # bases are large, and rows come sorted by their mask
             white = whitening(self.array, mask)
             problem = SeparableProblem.of(self.array, white)
-            bases = kernels.candidate_bases(
-                problem.homogeneous(self._candidates),
+            candidates = problem.homogeneous(self._candidates)
+            bases = np.empty((len(candidates), 3, self.array.n_channels))
+            over_rows(
+                kernels.candidate_bases,
+                len(candidates),
+                candidates,
                 problem.sensors,
                 problem.channel_sensor,
                 problem.gain,
                 np.ascontiguousarray(white.basis.T),
                 white.shrinkage,
+                bases,
             )
-            self._of_mask[key] = _Kernel(white, problem, bases)
+            # (component, candidate, channel): the search adds up three contiguous rows of a matrix product. Single
+            # precision ranks candidates as well, in half the time.
+            single = bases.transpose(1, 0, 2).astype(np.float32, order="C")
+            self._of_mask[key] = _Kernel(white, problem, single.reshape(-1, self.array.n_channels))
         return self._of_mask[key]
 
-    def _fit_block(self, kernel: _Kernel, mask: NDArray[np.bool_], readings: FloatArray) -> list[Fix]:
-        problem = kernel.problem
+    def fit_from(self, readings_T: ArrayLike, starts_m: ArrayLike) -> BestFits:
+        """Best optimum that the search finds when a start is refined before the best candidates, for many starts.
+
+        Parameters
+        ----------
+        readings_T : array_like, shape (C,)
+            Raw readings in channel order [T]; NaN where missing.
+        starts_m : array_like, shape (n, 3)
+            Positions in the array's frame [m].
+
+        Returns
+        -------
+        BestFits
+            Of every start; `knowledge` is not used.
+        """
+        readings = np.asarray(readings_T, dtype=np.float64)[None]
+        starts = np.asarray(starts_m, dtype=np.float64)
+        mask = np.isfinite(readings[0])
+        kernel = self._kernel(mask)
+        y, components, whitenings = self._whitened(kernel, mask, readings)
+        n = len(starts)
+        found = self._search(
+            kernel,
+            y,
+            components,
+            np.zeros(n, dtype=np.intp),
+            whitenings,
+            np.zeros(n, dtype=np.intp),
+            kernel.problem.homogeneous(starts)[:, None],
+            DISTINCT_WITHIN,
+        )
+        return BestFits(
+            position_m=kernel.problem.position(found.q[:, 0]),
+            moment_Am2=kernel.problem.moment(found.q[:, 0], found.mu[:, 0]),
+            chi2=found.chi2[:, 0],
+            linearisations=found.counts[:, 2],
+        )
+
+    def _whitened(
+        self, kernel: _Kernel, mask: NDArray[np.bool_], readings: FloatArray
+    ) -> tuple[FloatArray, NDArray[np.float32], list[Whitening]]:
+        """Whitened readings, their parts in the bases of all candidates, and the whitenings: one, or one a row."""
         channels = np.where(mask, readings - self.array.channel_offset_T, 0.0)
         y = kernel.whitening.apply(channels)
-        scores = self._scores(kernel.bases, y)
-        whitenings = [kernel.whitening]
-        set_of_row = np.zeros(len(readings), dtype=np.intp)
-        if self.array.noise_fraction > 0.0:
-            noise = proportional_noise(self.array, readings)
-            whitenings = [whitening(self.array, mask, channel_noise_T=row) for row in noise]
-            set_of_row = np.arange(len(readings), dtype=np.intp)
-            y = np.stack([w.apply(row) for w, row in zip(whitenings, channels, strict=True)])
-        shape = (len(readings), self.n_starts)
-        q, mu, chi2 = np.full((*shape, 4), np.nan), np.full((*shape, 3), np.nan), np.full(shape, np.nan)
-        iterations = np.zeros(shape, dtype=np.int64)
-        covariance, ends = np.full((*shape, 6, 6), np.nan), np.full((*shape, 2), np.nan)
-        counts = np.zeros((len(readings), 2), dtype=np.int64)
-        kernels.fix_rows(
+        components = y.astype(np.float32) @ kernel.bases.T
+        if self.array.noise_fraction == 0.0:
+            return y, components, [kernel.whitening]
+        noise = proportional_noise(self.array, readings)
+        whitenings = [whitening(self.array, mask, channel_noise_T=row) for row in noise]
+        return np.stack([w.apply(row) for w, row in zip(whitenings, channels, strict=True)]), components, whitenings
+
+    def _search(
+        self,
+        kernel: _Kernel,
+        y: FloatArray,
+        components: NDArray[np.float32],
+        reading_of_row: NDArray[np.intp],
+        whitenings: list[Whitening],
+        set_of_row: NDArray[np.intp],
+        first: FloatArray,
+        keep_within: float,
+    ) -> _Optima:
+        problem = kernel.problem
+        shape = (len(reading_of_row), self.n_starts + first.shape[1])
+        found = _Optima(
+            model=(
+                problem.sensors,
+                problem.channel_sensor,
+                np.stack([self.array.channel_gain * w.inverse_noise[:, None] for w in whitenings]),
+                np.ascontiguousarray(np.stack([w.basis.T for w in whitenings])),
+                np.stack([w.shrinkage for w in whitenings]),
+                set_of_row,
+            ),
+            q=np.full((*shape, 4), np.nan),
+            mu=np.full((*shape, 3), np.nan),
+            chi2=np.full(shape, np.nan),
+            iterations=np.zeros(shape, dtype=np.int64),
+            counts=np.zeros((shape[0], 3), dtype=np.int64),
+        )
+        over_rows(
+            kernels.search_rows,
+            shape[0],
             y,
-            scores,
+            components,
+            reading_of_row,
             problem.homogeneous(self._candidates),
+            first,
             np.cos(self.apart_rad),
-            DISTINCT_WITHIN,
-            RISE_95,
+            keep_within,
             self.max_iterations,
-            problem.sensors,
-            problem.channel_sensor,
-            np.stack([self.array.channel_gain * w.inverse_noise[:, None] for w in whitenings]),
-            np.ascontiguousarray(np.stack([w.basis.T for w in whitenings])),
-            np.stack([w.shrinkage for w in whitenings]),
-            set_of_row,
-            q,
-            mu,
+            *found.model,
+            found.q,
+            found.mu,
+            found.chi2,
+            found.iterations,
+            found.counts,
+        )
+        return found
+
+    def _known(self, kernel: _Kernel, found: _Optima) -> _Optima:
+        """Optima that agree with what is known, again those within Δχ² of the best of them."""
+        position, moment = kernel.problem.position(found.q), kernel.problem.moment(found.q, found.mu)
+        with np.errstate(invalid="ignore"):
+            allowed = self.knowledge.allows_position(position) & self.knowledge.allows_moment(moment)
+        chi2 = np.where(allowed, found.chi2, np.inf)
+        order = np.argsort(chi2, axis=1, kind="stable")
+        chi2 = np.take_along_axis(chi2, order, axis=1)
+        counts = found.counts.copy()
+        counts[:, 0] = (np.isfinite(chi2) & (chi2 <= chi2[:, :1] + DISTINCT_WITHIN)).sum(axis=1)
+        return _Optima(
+            found.model,
+            np.take_along_axis(found.q, order[..., None], axis=1),
+            np.take_along_axis(found.mu, order[..., None], axis=1),
             chi2,
-            iterations,
-            covariance,
-            ends,
+            np.take_along_axis(found.iterations, order, axis=1),
             counts,
         )
-        kept, failed = counts.T
+
+    def _fit_block(self, kernel: _Kernel, mask: NDArray[np.bool_], readings: FloatArray) -> list[Fix]:
+        problem, n_rows = kernel.problem, len(readings)
+        y, components, whitenings = self._whitened(kernel, mask, readings)
+        every = np.arange(n_rows, dtype=np.intp)
+        found = self._search(
+            kernel,
+            y,
+            components,
+            every,
+            whitenings,
+            every if len(whitenings) > 1 else np.zeros(n_rows, dtype=np.intp),
+            np.empty((n_rows, 0, 4)),
+            DISTINCT_WITHIN if self.knowledge == Knowledge() else math.inf,
+        )
+        unknown = found.counts[:, 0]
+        if self.knowledge != Knowledge():
+            found = self._known(kernel, found)
+        q, mu, chi2, counts = found.q, found.mu, found.chi2, found.counts
+        covariance, ends = np.full((*chi2.shape, 6, 6), np.nan), np.full((*chi2.shape, 2), np.nan)
+        over_rows(kernels.uncertainty_rows, n_rows, y, RISE_95, *found.model, q, mu, chi2, counts, covariance, ends)
+        kept, failed, _ = counts.T
         position, moment = problem.position(q), problem.moment(q, mu)
         unit = np.repeat([problem.radius, problem.radius**3 / MU0_OVER_4PI], 3)
         covariance = covariance * np.outer(unit, unit)
         ends = ends * problem.radius
         dof = kernel.whitening.n_differences - N_UNKNOWNS
+        determined = np.isfinite(covariance).all(axis=(-2, -1))
         silent = np.einsum("ic,ic->i", y, y) < SILENT * kernel.whitening.n_differences
+        observable = (ends[..., 0] > 0.0) & (ends[..., 1] <= 2.0 * ends[..., 0])
+        chi2_, iterations_, observable_ = chi2.tolist(), found.iterations.tolist(), observable.tolist()
+        ends_ = ends.tolist()
         fixes = []
-        for i in range(len(readings)):
+        for i, n in enumerate(kept.tolist()):
             if silent[i]:
                 fixes.append(Fix((), "the sensors' readings do not differ: no signal"))
                 continue
             solutions = tuple(
-                _solution(
-                    position[i, j],
-                    moment[i, j],
-                    covariance[i, j],
-                    float(chi2[i, j]),
-                    dof,
-                    int(iterations[i, j]),
-                    ends[i, j],
+                Solution(
+                    position_m=position[i, j],
+                    moment_Am2=moment[i, j],
+                    covariance=covariance[i, j],
+                    chi2=chi2_[i][j],
+                    dof=dof,
+                    iterations=iterations_[i][j],
+                    converged=True,
+                    range_observable=observable_[i][j],
+                    range_interval95_m=(_open_ended(*ends_[i][j]),),
                 )
-                for j in range(kept[i])
-                if np.isfinite(covariance[i, j]).all()
+                for j in range(n)
+                if determined[i, j]
             )
-            fixes.append(Fix(solutions, "" if solutions else _why_unsolved(int(kept[i])), int(failed[i])))
+            fixes.append(Fix(solutions, "" if solutions else _why_unsolved(int(unknown[i]), n), int(failed[i])))
         return fixes
-
-    @staticmethod
-    def _scores(bases: FloatArray, y: FloatArray) -> FloatArray:
-        """Energy of whitened readings (n, C) that every candidate explains: (n, candidates)."""
-        components = y @ bases.reshape(-1, y.shape[1]).T
-        return np.square(components, out=components).reshape(len(y), -1, 3).sum(axis=-1)
 
 
 def _rows_of_equal_mask(available: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.intp]]]:
@@ -277,30 +470,13 @@ def _rows_of_equal_mask(available: NDArray[np.bool_]) -> Iterator[tuple[NDArray[
         yield mask, np.flatnonzero(of_row.ravel() == i)
 
 
-def _solution(
-    position: FloatArray,
-    moment: FloatArray,
-    covariance: FloatArray,
-    chi2: float,
-    dof: int,
-    iterations: int,
-    ends: FloatArray,
-) -> Solution:
-    low, high = float(ends[0]), float(ends[1])
-    return Solution(
-        position_m=position,
-        moment_Am2=moment,
-        covariance=covariance,
-        chi2=chi2,
-        dof=dof,
-        iterations=iterations,
-        converged=True,
-        range_observable=bool(low > 0.0 and high <= 2.0 * low),
-        range_interval95_m=((low, high if np.isfinite(high) else None),),
-    )
+def _open_ended(low: float, high: float) -> tuple[float, float | None]:
+    return low, high if math.isfinite(high) else None
 
 
-def _why_unsolved(n_optima: int) -> str:
-    if n_optima:
+def _why_unsolved(n_optima: int, n_allowed: int) -> str:
+    if n_allowed:
         return "the differences between the sensors do not determine the source: no signal, or a degenerate array"
+    if n_optima:
+        return "no solution lies within the known region and largest moment"
     return "the search did not converge from any of its starts"

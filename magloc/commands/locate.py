@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
 
 from arrays.errors import InputError
 from magloc.commands.common import CommonOptions, Flag, print_json, print_note, progress
 
 if TYPE_CHECKING:
     from arrays.sensor import SensorArray
-    from magloc.locate import Fix
+    from magloc.locate import Fix, Knowledge
     from magloc.readings import Readings
+
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_BOUNDS = re.compile(rf"(?:(?P<below>{_NUMBER})<(?=[xyz]<))?(?P<axis>[xyz])(?P<sign>[<>])(?P<bound>{_NUMBER})")
 
 _JSON_KEYS = (
     "position_m",
@@ -36,6 +43,8 @@ def locate(
     array: Path,
     sensors: str | None = None,
     average: Flag = False,
+    region: str | None = None,
+    max_moment_Am2: Annotated[float | None, Parameter(name="--max-moment-Am2")] = None,
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
@@ -56,6 +65,11 @@ def locate(
         Ids of the sensors to use, separated by commas; columns of others are ignored. All by default.
     average : bool
         Average all rows to one fix. The array and the source must stand still.
+    region : str
+        Where the source is known to be, in m in the array's frame, as "z>0" or "-1<x<1,z>0"; solutions elsewhere are
+        left out.
+    max_moment_Am2 : float
+        Largest moment that the source can have [A·m²]; solutions with a larger one are left out.
     json : bool
         Print one JSON object with every solution in place of the table.
     common : CommonOptions
@@ -71,8 +85,13 @@ def locate(
     rows = read_readings(readings, used, sensors=ids)
     if average:
         rows, used = _averaged(rows, used, readings)
+    knowledge = _knowledge(region, max_moment_Am2)
+    try:
+        locator = Locator(used, knowledge=knowledge)
+    except ValueError as error:
+        raise InputError(f"--region {region}: {str(error).removeprefix('Input ')}") from None
     with progress(len(rows), "rows", quiet=common.quiet) as advance:
-        fixes = Locator(used).fit_rows(rows.values_T, advance)
+        fixes = locator.fit_rows(rows.values_T, advance)
     fixes = _in_world(fixes, rows)
 
     if json:
@@ -103,6 +122,33 @@ def _vector_sensors(array: SensorArray, ids: Sequence[str] | None, path: Path) -
     if scalar:
         raise InputError(f"{path}: found scalar sensors ({', '.join(scalar)}), expected vector sensors only.")
     return array
+
+
+def _knowledge(region: str | None, largest_moment: float | None) -> Knowledge:
+    """What the options say of the source."""
+    from magloc.locate import Knowledge
+
+    low, high = [-math.inf] * 3, [math.inf] * 3
+    for part in [] if region is None else region.split(","):
+        bounds = _BOUNDS.fullmatch(part.replace(" ", ""))
+        if not bounds:
+            raise InputError(f"--region: found {part.strip()!r}, expected bounds such as z>0 or -1<x<1, in m.")
+        i = "xyz".index(bounds["axis"])
+        lower = bounds["below"] or (bounds["bound"] if bounds["sign"] == ">" else None)
+        upper = bounds["bound"] if bounds["sign"] == "<" else None
+        low[i] = max(low[i], float(lower)) if lower else low[i]
+        high[i] = min(high[i], float(upper)) if upper else high[i]
+        if not low[i] < high[i]:
+            raise InputError(
+                f"--region: found {region!r}, expected bounds that leave some room along {bounds['axis']}."
+            )
+    if largest_moment is not None and not largest_moment > 0.0:
+        raise InputError(f"--max-moment-Am2: found {largest_moment:g}, expected a positive number.")
+    return Knowledge(
+        (low[0], low[1], low[2]),
+        (high[0], high[1], high[2]),
+        math.inf if largest_moment is None else largest_moment,
+    )
 
 
 def _averaged(readings: Readings, array: SensorArray, path: Path) -> tuple[Readings, SensorArray]:

@@ -10,17 +10,29 @@ Arrays are transposed against the twin, (component, channel), so that the inner 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import cast
 
 import numpy as np
-from numba import prange
 from numpy.typing import NDArray
 
-from magloc.kernels import compiled, compiled_parallel
+from magloc.kernels import compiled
 
 FloatArray = NDArray[np.float64]
 
+# Numba compiles a function once more for every literal integer that it is called with; a converted one is no literal.
+runtime_int = cast(Callable[[int], int], np.int64)
+
 # |s| stays above this: below it the differences lose their digits, and no array resolves a range of 10⁵ radii.
 SMALLEST_S = 1e-5
+
+# How a refinement ends.
+CONVERGED, KNOWN, FAILED = 0, 1, 2
+
+# Gauss-Newton gain in χ² at which an optimum is one: the position is then within 1e-4 σ of it.
+OPTIMUM_TOLERANCE = 1e-9
+# The same for the profile over the range, which is read at a rise of 3.84 to 0.01.
+PROFILE_TOLERANCE = 1e-3
 
 
 @compiled
@@ -223,6 +235,13 @@ def _solve_damped(a: FloatArray, b: FloatArray, n: int, damping: float, step: Fl
 
 
 @compiled
+def same_optimum(q: FloatArray, chi2: float, other_q: FloatArray, other_chi2: float) -> bool:
+    """Whether two ends are one optimum: 0.01 rad apart on the sphere of homogeneous coordinates, at the same χ²."""
+    t = q[0] * other_q[0] + q[1] * other_q[1] + q[2] * other_q[2] + q[3] * other_q[3]
+    return abs(t) > 0.99995 and abs(chi2 - other_chi2) < 0.01
+
+
+@compiled
 def refine(
     q: FloatArray,
     y: FloatArray,
@@ -231,17 +250,21 @@ def refine(
     gain: FloatArray,
     common: FloatArray,
     shrinkage: FloatArray,
-    fixed_range: bool,
+    n_free: int,
+    tolerance: float,
     max_iterations: int,
+    known_q: FloatArray,
+    known_chi2: FloatArray,
+    n_known: int,
     mu: FloatArray,
-) -> tuple[float, int, bool]:
+) -> tuple[float, int, int]:
     """Damped Gauss-Newton on the projected cost, from q (4,), which becomes the optimum as mu its scaled moment.
 
-    With fixed_range only the direction moves. Every accepted step decreases χ². Returns χ², the number of
-    linearisations, and whether a further Gauss-Newton step could gain nothing.
+    With n_free = 3 it moves on the sphere of homogeneous coordinates, with 2 at one range. Every accepted step
+    decreases χ². It ends where a further Gauss-Newton step would gain less than the tolerance, or as soon as it has
+    come to one of the known optima. Returns χ², the number of linearisations, and CONVERGED, KNOWN or FAILED.
     """
     n = y.size
-    n_free = 2 if fixed_range else 3
     basis, triangle, residual = np.empty((3, n)), np.zeros((3, 3)), np.empty(n)
     new_basis, new_triangle, new_residual = np.empty((3, n)), np.zeros((3, 3)), np.empty(n)
     jacobian, rows = np.empty((4, n)), np.empty((n_free, n))
@@ -249,11 +272,14 @@ def refine(
     a, b, step = np.empty((3, 3)), np.empty(3), np.empty(3)
     chi2 = _residual(q, y, sensors, channel_sensor, gain, common, shrinkage, basis, triangle, mu, residual)
     if not math.isfinite(chi2):
-        return math.inf, 0, False
+        return math.inf, 0, FAILED
     damping = 1e-3
     for iteration in range(1, max_iterations + 1):
+        for j in range(n_known):
+            if same_optimum(q, chi2, known_q[j], known_chi2[j]):
+                return chi2, iteration - 1, KNOWN
         homogeneous_jacobian(q, mu, sensors, channel_sensor, gain, jacobian)
-        if fixed_range:
+        if n_free == 2:
             _directional_tangent(q, tangent)
         else:
             _tangent(q, tangent)
@@ -290,9 +316,9 @@ def refine(
         for i in range(n_free):
             decrement += b[i] * step[i]
         if not math.isfinite(decrement):
-            return chi2, iteration, False
-        if decrement < 1e-9 + 1e-14 * chi2:
-            return chi2, iteration, True
+            return chi2, iteration, FAILED
+        if decrement < tolerance + 1e-14 * chi2:
+            return chi2, iteration, CONVERGED
         accepted = False
         while damping < 1e12:
             _solve_damped(a, b, n_free, damping, step)
@@ -308,7 +334,7 @@ def refine(
                     t += shorten * step[i] * tangent[i, d]
                 new_q[d] = t
                 norm += t * t
-            if fixed_range:
+            if n_free == 2:
                 u2 = norm - new_q[3] * new_q[3]
                 stretch = math.sqrt((1.0 - new_q[3] * new_q[3]) / u2)
                 for d in range(3):
@@ -329,7 +355,7 @@ def refine(
             damping = max(damping, 1e-4) * 5.0
         if not accepted:
             # No representable step decreases χ²: an optimum to rounding if the model promised next to nothing.
-            return chi2, iteration, decrement < 1e-6 * (1.0 + chi2)
+            return chi2, iteration, CONVERGED if decrement < 1e-6 * (1.0 + chi2) else FAILED
         gained = chi2 - new_chi2
         if gained > 0.5 * decrement * shorten:
             damping *= 0.1
@@ -340,7 +366,7 @@ def refine(
         chi2 = new_chi2
         basis, new_basis = new_basis, basis
         residual, new_residual = new_residual, residual
-    return chi2, max_iterations, False
+    return chi2, max_iterations, FAILED
 
 
 @compiled
@@ -485,44 +511,53 @@ def _profile(
     for d in range(3):
         q[d] = direction[d] * math.cos(alpha)
     q[3] = math.sin(alpha)
-    chi2, _, _ = refine(q, y, sensors, channel_sensor, gain, common, shrinkage, True, 30, mu)
+    chi2, _, _ = refine(
+        q, y, sensors, channel_sensor, gain, common, shrinkage, runtime_int(2), PROFILE_TOLERANCE, runtime_int(30),
+        q.reshape(1, 4), mu, runtime_int(0), mu,
+    )  # fmt: skip
     for d in range(3):
         trial[d] = q[d] / math.cos(alpha)
     return chi2
 
 
-@compiled_parallel
+@compiled
 def candidate_bases(
+    begin: int,
+    end: int,
     candidates: FloatArray,
     sensors: FloatArray,
     channel_sensor: NDArray[np.intp],
     gain: FloatArray,
     common: FloatArray,
     shrinkage: FloatArray,
-) -> FloatArray:
-    """Orthonormal whitened bases (n, 3, c) of all candidate positions q (n, 4)."""
-    n = channel_sensor.size
-    bases = np.empty((candidates.shape[0], 3, n))
-    for i in prange(candidates.shape[0]):
-        triangle = np.zeros((3, 3))
+    bases: FloatArray,
+) -> None:
+    """Orthonormal whitened bases (n, 3, c) of candidate positions q (n, 4), rows begin to end."""
+    triangle = np.zeros((3, 3))
+    for i in range(begin, end):
         unit_basis(candidates[i], sensors, channel_sensor, gain, common, shrinkage, bases[i])
         orthonormalise(bases[i], triangle)
-    return bases
 
 
 @compiled
-def _pick_starts(score: FloatArray, candidates: FloatArray, cos_apart: float, starts: FloatArray) -> int:
-    """Best candidates that are some angle apart on the sphere of homogeneous coordinates; score is consumed."""
+def _pick_starts(components: NDArray[np.float32], candidates: FloatArray, cos_apart: float, starts: FloatArray) -> int:
+    """Candidates that explain most energy, some angle apart on the sphere of homogeneous coordinates."""
+    n = candidates.shape[0]
+    score = np.empty(n, np.float32)
+    for i in range(n):
+        score[i] = components[i] ** 2 + components[n + i] ** 2 + components[2 * n + i] ** 2
     for k in range(starts.shape[0]):
-        best = int(np.argmax(score))
+        best = 0
+        for i in range(n):
+            if score[i] > score[best]:
+                best = i
         if score[best] < 0.0:
             return k
         for d in range(4):
             starts[k, d] = candidates[best, d]
-        for i in range(score.size):
-            t = 0.0
-            for d in range(4):
-                t += candidates[i, d] * starts[k, d]
+        q0, q1, q2, q3 = starts[k]
+        for i in range(n):
+            t = candidates[i, 0] * q0 + candidates[i, 1] * q1 + candidates[i, 2] * q2 + candidates[i, 3] * q3
             if abs(t) > cos_apart:
                 score[i] = -1.0
     return int(starts.shape[0])
@@ -545,13 +580,13 @@ def _gaussian_step(q: FloatArray, covariance: FloatArray, rise: float) -> float:
 
 
 @compiled
-def _fix_row(
+def _search_row(
     y: FloatArray,
-    score: FloatArray,
+    components: NDArray[np.float32],
     candidates: FloatArray,
+    first: FloatArray,
     cos_apart: float,
     keep_within: float,
-    rise: float,
     max_iterations: int,
     sensors: FloatArray,
     channel_sensor: NDArray[np.intp],
@@ -562,72 +597,69 @@ def _fix_row(
     out_mu: FloatArray,
     out_chi2: FloatArray,
     out_iterations: NDArray[np.int64],
-    out_covariance: FloatArray,
-    out_range: FloatArray,
     counts: NDArray[np.int64],
 ) -> None:
-    """Distinct optima of one row into the outputs, best first; counts: how many, and how many starts failed."""
-    n_starts = out_chi2.size
+    """Distinct optima of one row into the outputs, best first; counts as in :func:`search_rows`."""
+    n_starts, n_first = out_chi2.size, first.shape[0]
     starts = np.empty((n_starts, 4))
     moments = np.empty((n_starts, 3))
     chi2 = np.empty(n_starts)
     iterations = np.empty(n_starts, np.int64)
-    n = _pick_starts(score, candidates, cos_apart, starts)
-    best = math.inf
-    counts[0] = counts[1] = 0
+    for k in range(n_first):
+        for d in range(4):
+            starts[k, d] = first[k, d]
+    n = n_first + _pick_starts(components, candidates, cos_apart, starts[n_first:])
+    found = runtime_int(0)
+    counts[1] = counts[2] = 0
     for k in range(n):
-        chi2[k], iterations[k], converged = refine(
-            starts[k], y, sensors, channel_sensor, gain, common, shrinkage, False, max_iterations, moments[k]
-        )
-        if converged:
-            best = min(best, chi2[k])
-        else:
-            chi2[k] = math.inf
+        # The optima found so far fill the places of the starts that led to them.
+        for d in range(4):
+            starts[found, d] = starts[k, d]
+        chi2[found], iterations[found], end = refine(
+            starts[found], y, sensors, channel_sensor, gain, common, shrinkage, runtime_int(3),
+            OPTIMUM_TOLERANCE, max_iterations, starts, chi2, found, moments[found],
+        )  # fmt: skip
+        counts[2] += iterations[found]
+        if end == FAILED:
             counts[1] += 1
+        elif end == CONVERGED:
+            known = False
+            for j in range(found):
+                known = known or same_optimum(starts[found], chi2[found], starts[j], chi2[j])
+            if not known:
+                found += 1
     kept = 0
-    while True:
+    best = math.inf
+    while kept < found:
         k = 0
-        for i in range(1, n):
+        for i in range(1, found):
             if chi2[i] < chi2[k]:
                 k = i
-        if n == 0 or not chi2[k] <= min(best + keep_within, 1e300):
+        best = min(best, chi2[k])
+        if chi2[k] > best + keep_within or chi2[k] == math.inf:
             break
-        duplicate = False
-        for j in range(kept):
-            t = 0.0
-            for d in range(4):
-                t += out_q[j, d] * starts[k, d]
-            if abs(t) > 0.99995 and abs(out_chi2[j] - chi2[k]) < 0.01:
-                duplicate = True
-        if not duplicate:
-            for d in range(4):
-                out_q[kept, d] = starts[k, d]
-            for d in range(3):
-                out_mu[kept, d] = moments[k, d]
-            out_chi2[kept] = chi2[k]
-            out_iterations[kept] = iterations[k]
-            kept += 1
+        for d in range(4):
+            out_q[kept, d] = starts[k, d]
+        for d in range(3):
+            out_mu[kept, d] = moments[k, d]
+        out_chi2[kept] = chi2[k]
+        out_iterations[kept] = iterations[k]
         chi2[k] = math.inf
+        kept += 1
     counts[0] = kept
-    for j in range(kept):
-        first_step = 0.05
-        if _scaled_covariance(out_q[j], out_mu[j], sensors, channel_sensor, gain, common, shrinkage, out_covariance[j]):
-            first_step = _gaussian_step(out_q[j], out_covariance[j], rise)
-        for end in range(2):
-            out_range[j, end] = _range_end(
-                out_q[j], out_chi2[j], rise, end == 1, first_step, y,
-                sensors, channel_sensor, gain, common, shrinkage,
-            )  # fmt: skip
 
 
-@compiled_parallel
-def fix_rows(
+@compiled
+def search_rows(
+    begin: int,
+    end: int,
     y: FloatArray,
-    scores: FloatArray,
+    components: NDArray[np.float32],
+    reading_of_row: NDArray[np.intp],
     candidates: FloatArray,
+    first: FloatArray,
     cos_apart: float,
     keep_within: float,
-    rise: float,
     max_iterations: int,
     sensors: FloatArray,
     channel_sensor: NDArray[np.intp],
@@ -639,22 +671,58 @@ def fix_rows(
     out_mu: FloatArray,
     out_chi2: FloatArray,
     out_iterations: NDArray[np.int64],
-    out_covariance: FloatArray,
-    out_range: FloatArray,
     counts: NDArray[np.int64],
 ) -> None:
-    """Distinct optima of every row, best first.
+    """Distinct optima of rows begin to end, best first; for :func:`magloc.kernels.over_rows`.
 
-    y (rows, c) are whitened readings, scores (rows, candidates) the energy that every candidate explains (consumed);
-    gain (sets, c, 3), common (sets, q, c), shrinkage (sets, q) the whitening that each row uses. Into the outputs
-    (rows, starts, …): q, mu, χ², linearisations, scaled covariance (left as it is where singular), ends of the range
-    interval in radii; counts (rows, 2) are the optima kept and the starts that did not converge.
+    y (readings, c) are whitened readings, components (readings, 3 · candidates) their parts in the orthonormal basis of
+    every candidate, reading_of_row which of them a row has; first (rows, f, 4) are starts of a row's own, refined
+    before the best candidates; gain (sets, c, 3), common (sets, q, c), shrinkage (sets, q) the whitening, set_of_row
+    which of them a row has. Into the outputs (rows, starts, …): q, mu, χ², linearisations; counts (rows, 3) are the
+    optima kept, the starts that did not converge, and all linearisations.
     """
-    for row in prange(y.shape[0]):
-        w = set_of_row[row]
-        _fix_row(
-            y[row], scores[row], candidates, cos_apart, keep_within, rise, max_iterations,
+    for row in range(begin, end):
+        w, r = set_of_row[row], reading_of_row[row]
+        _search_row(
+            y[r], components[r], candidates, first[row], cos_apart, keep_within, max_iterations,
             sensors, channel_sensor, gain[w], common[w], shrinkage[w],
-            out_q[row], out_mu[row], out_chi2[row], out_iterations[row], out_covariance[row], out_range[row],
-            counts[row],
+            out_q[row], out_mu[row], out_chi2[row], out_iterations[row], counts[row],
         )  # fmt: skip
+
+
+@compiled
+def uncertainty_rows(
+    begin: int,
+    end: int,
+    y: FloatArray,
+    rise: float,
+    sensors: FloatArray,
+    channel_sensor: NDArray[np.intp],
+    gain: FloatArray,
+    common: FloatArray,
+    shrinkage: FloatArray,
+    set_of_row: NDArray[np.intp],
+    q: FloatArray,
+    mu: FloatArray,
+    chi2: FloatArray,
+    counts: NDArray[np.int64],
+    out_covariance: FloatArray,
+    out_range: FloatArray,
+) -> None:
+    """Scaled covariance and range interval [radii] of the optima of :func:`search_rows`, rows begin to end.
+
+    Into the outputs (rows, starts, …), which are left as they are where the information is singular.
+    """
+    for row in range(begin, end):
+        w = set_of_row[row]
+        for j in range(counts[row, 0]):
+            first_step = 0.05
+            if _scaled_covariance(
+                q[row, j], mu[row, j], sensors, channel_sensor, gain[w], common[w], shrinkage[w], out_covariance[row, j]
+            ):
+                first_step = _gaussian_step(q[row, j], out_covariance[row, j], rise)
+            for side in range(2):
+                out_range[row, j, side] = _range_end(
+                    q[row, j], chi2[row, j], rise, side == 1, first_step, y[row],
+                    sensors, channel_sensor, gain[w], common[w], shrinkage[w],
+                )  # fmt: skip

@@ -1,4 +1,6 @@
-"""Compiled filters of the convergence map, one start after the other; readable twins: :mod:`magloc.convergence`.
+"""Compiled filter of the convergence map that linearises before every scalar; its twin: :mod:`magloc.convergence`.
+
+It has to go through the scalars in turn; the filters that do not are in :mod:`magloc.kernels.lanes`.
 
 A model of the differences is passed as ``weights`` (k, N, 3): difference j is ``Σ_i weights[j, i] · B_i``, as in
 :func:`magloc.convergence.field_weights`.
@@ -46,12 +48,6 @@ def _row(x: FloatArray, sensors: FloatArray, weights: FloatArray, j: int, h: Flo
         h[4] += k3 * (3.0 * nw * n1 - w1)
         h[5] += k3 * (3.0 * nw * n2 - w2)
     return value
-
-
-@compiled
-def _linearise(x: FloatArray, sensors: FloatArray, weights: FloatArray, g: FloatArray, H: FloatArray) -> None:
-    for j in range(g.size):
-        g[j] = _row(x, sensors, weights, j, H[j])
 
 
 @compiled
@@ -104,50 +100,45 @@ def _finish(
 
 
 @compiled_parallel
-def repeated_map(
+def relinearised_map(
     starts: FloatArray,
     z: FloatArray,
     variance: FloatArray,
-    inflation: float,
-    s_q: FloatArray,
-    every_scalar: bool,
-    tolerance: float,
-    max_iterations: int,
     sensors: FloatArray,
     weights: FloatArray,
+    inflation: float,
+    position_step_m: float,
+    moment_step_Am2: float,
+    tolerance: float,
+    max_iterations: int,
 ) -> tuple[FloatArray, FloatArray, NDArray[np.int64], NDArray[np.bool_]]:
-    """Repeated-measurement filter from every start (n, 6): states, χ², passes, whether the stop rule was met."""
+    """Repeated-measurement filter, linearised anew before every scalar, from every start (n, 6).
+
+    Returns states, χ², passes, and whether the stop rule was met.
+    """
     n, k = starts.shape[0], z.size
     states = starts.copy()
     chi2 = np.empty(n)
     passes = np.zeros(n, np.int64)
     stopped = np.zeros(n, np.bool_)
+    s_q = np.repeat(np.array([position_step_m, moment_step_Am2]), 3)
     for i in prange(n):
         x = states[i]
-        S = np.zeros((6, 6))
-        for r in range(6):
-            S[r, r] = s_q[r]
+        S = np.diag(s_q)
         wide, triangle = np.empty((6, 12)), np.zeros((6, 6))
-        phi, gain, x0, h = np.empty(6), np.empty(6), np.empty(6), np.empty(6)
-        g, g_new, H = np.empty(k), np.empty(k), np.empty((k, 6))
-        _linearise(x, sensors, weights, g, H)
+        phi, gain, h, g = np.empty(6), np.empty(6), np.empty(6), np.empty(k)
+        for j in range(k):
+            g[j] = _row(x, sensors, weights, j, h)
         for iteration in range(1, max_iterations + 1):
             _add_process_noise(S, s_q, wide, triangle)
-            x0[:] = x
             for j in range(k):
-                if every_scalar:
-                    nu = z[j] - _row(x, sensors, weights, j, h)
-                    _scalar_update(x, S, h, nu, inflation * variance[j], phi, gain)
-                else:
-                    nu = z[j] - g[j]
-                    for r in range(6):
-                        nu -= H[j, r] * (x[r] - x0[r])
-                    _scalar_update(x, S, H[j], nu, inflation * variance[j], phi, gain)
-            _linearise(x, sensors, weights, g_new, H)
+                nu = z[j] - _row(x, sensors, weights, j, h)
+                _scalar_update(x, S, h, nu, inflation * variance[j], phi, gain)
             change = 0.0
             for j in range(k):
-                change += (g_new[j] - g[j]) ** 2
-                g[j] = g_new[j]
+                predicted = _row(x, sensors, weights, j, h)
+                change += (predicted - g[j]) ** 2
+                g[j] = predicted
             passes[i] = iteration
             if not math.isfinite(change):
                 break
@@ -156,53 +147,3 @@ def repeated_map(
                 break
         chi2[i] = _finish(x, z, variance, sensors, weights, h)
     return states, chi2, passes, stopped
-
-
-@compiled_parallel
-def iekf_map(
-    starts: FloatArray,
-    z: FloatArray,
-    variance: FloatArray,
-    s_0: FloatArray,
-    tolerance: float,
-    max_iterations: int,
-    sensors: FloatArray,
-    weights: FloatArray,
-) -> tuple[FloatArray, FloatArray, NDArray[np.int64], NDArray[np.bool_]]:
-    """Iterated update from every start (n, 6) as prior mean: states, χ², iterations, whether the stop rule was met."""
-    n, k = starts.shape[0], z.size
-    states = starts.copy()
-    chi2 = np.empty(n)
-    iterations = np.zeros(n, np.int64)
-    stopped = np.zeros(n, np.bool_)
-    for i in prange(n):
-        S = np.empty((6, 6))
-        phi, gain, h = np.empty(6), np.empty(6), np.empty(6)
-        g, g_new, H = np.empty(k), np.empty(k), np.empty((k, 6))
-        x_k = states[i]
-        x = np.empty(6)
-        _linearise(x_k, sensors, weights, g, H)
-        for iteration in range(1, max_iterations + 1):
-            S[:] = 0.0
-            for r in range(6):
-                S[r, r] = s_0[r]
-                x[r] = starts[i, r]
-            for j in range(k):
-                nu = z[j] - g[j]
-                for r in range(6):
-                    nu -= H[j, r] * (x[r] - x_k[r])
-                _scalar_update(x, S, H[j], nu, variance[j], phi, gain)
-            x_k[:] = x
-            _linearise(x_k, sensors, weights, g_new, H)
-            change = 0.0
-            for j in range(k):
-                change += (g_new[j] - g[j]) ** 2
-                g[j] = g_new[j]
-            iterations[i] = iteration
-            if not math.isfinite(change):
-                break
-            if math.sqrt(change) < tolerance:
-                stopped[i] = True
-                break
-        chi2[i] = _finish(x_k, z, variance, sensors, weights, h)
-    return states, chi2, iterations, stopped

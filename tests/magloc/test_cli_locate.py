@@ -435,3 +435,27 @@ class TestRecording:
         error_m = np.linalg.norm(best[:, :2] - truth.position_m[:, :2], axis=1)
         assert np.median(error_m) <= 0.6e-3
         assert np.mean(error_m > 5e-3) <= 0.005
+
+
+class TestKnowledge:
+    def test_region_and_largest_moment_rule_solutions_out(self, run: Run, array: Path, readings: Path) -> None:
+        inside = results_of(run("locate", readings, "--array", array, "--region", "x>0, -3<y<3", "--json"))
+        assert np.allclose(inside[0]["solutions"][0]["position_m"], SOURCE, atol=1e-3)
+        for option, value in (("--region", "x<-1"), ("--max-moment-Am2", "1e-6")):
+            outcome = run("locate", readings, "--array", array, option, value)
+            assert outcome.status == 2
+            assert "no solution lies within the known region and largest moment" in outcome.err
+
+    @pytest.mark.parametrize(
+        ("option", "value", "fragment"),
+        [
+            ("--region", "q>1", "found 'q>1'"),
+            ("--region", "z>1,z<0", "room along z"),
+            ("--region", "x>1e9", "leaves nothing"),
+            ("--region", "z>a", "found 'z>a'"),
+            ("--max-moment-Am2", "-1", "expected a positive number"),
+            ("--max-moment-Am2", "nan", "expected a positive number"),
+        ],
+    )
+    def test_refused(self, run: Run, array: Path, readings: Path, option: str, value: str, fragment: str) -> None:
+        assert_refused(run("locate", readings, "--array", array, option, value), option, fragment)

@@ -22,7 +22,7 @@ from arrays.differences import decorrelated_differences, proportional_noise, whi
 from arrays.geometries import axial, cross, square, tetrahedron
 from arrays.sensor import Sensor, SensorArray
 from magloc.kernels import separable as kernels
-from magloc.locate import RISE_95, Locator
+from magloc.locate import RISE_95, Knowledge, Locator
 from magloc.measurement import DifferenceMeasurement, predicted_channels
 from magloc.separable import SeparableProblem, candidate_positions
 from tests import oracles
@@ -58,6 +58,27 @@ def scipy_chi2(array, readings, position, moment):
         residual, np.concatenate([position, moment / size]), x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12
     )
     return 2.0 * found.cost
+
+
+def refined(problem, q, y, mu, max_iterations=100):
+    """The compiled refinement of q (in place) without known optima: χ², linearisations, how it ended."""
+    common = np.ascontiguousarray(problem.whitening.basis.T)
+    return kernels.refine(
+        q,
+        y,
+        problem.sensors,
+        problem.channel_sensor,
+        problem.gain,
+        common,
+        problem.whitening.shrinkage,
+        3,
+        kernels.OPTIMUM_TOLERANCE,
+        max_iterations,
+        np.empty((1, 4)),
+        np.empty(1),
+        0,
+        mu,
+    )
 
 
 class TestNoiseFreeReadings:
@@ -281,6 +302,54 @@ class TestWhatCannotBeSolved:
             Locator(TETRAHEDRON).fit(np.zeros(9))
 
 
+class TestKnowledge:
+    """What is known beforehand removes solutions, and only those that contradict it."""
+
+    rng = np.random.default_rng(14)
+    p, m = random_sources(rng, 60, 6.0, 12.0)
+    readings = noisy_readings(TETRAHEDRON, p, m, rng)
+
+    def test_half_space(self):
+        everything = Locator(TETRAHEDRON).fit_rows(self.readings)
+        above = Locator(TETRAHEDRON, knowledge=Knowledge(low_m=(-np.inf, -np.inf, 0.0))).fit_rows(self.readings)
+        assert any(s.position_m[2] < 0 for fix in everything for s in fix.solutions)
+        assert all(s.position_m[2] >= 0 for fix in above for s in fix.solutions)
+        for free, bound in zip(everything, above, strict=True):
+            for s in (s for s in free.solutions if s.position_m[2] >= 0):
+                assert any(np.allclose(s.position_m, other.position_m, rtol=1e-3) for other in bound.solutions)
+
+    def test_a_worse_solution_comes_up_when_better_ones_are_ruled_out(self):
+        for free, low in zip(self.readings, np.sign(self.p[:, 0]), strict=True):
+            known = Knowledge((0.0, -np.inf, -np.inf)) if low > 0 else Knowledge(high_m=(0.0, np.inf, np.inf))
+            for s in Locator(TETRAHEDRON, knowledge=known).fit(free).solutions:
+                assert s.position_m[0] * low >= 0
+
+    def test_largest_moment(self):
+        fixes = Locator(TETRAHEDRON, knowledge=Knowledge(largest_moment_Am2=400.0)).fit_rows(self.readings)
+        solved = [s for fix in fixes for s in fix.solutions]
+        assert solved
+        assert all(np.linalg.norm(s.moment_Am2) <= 400.0 for s in solved)
+        assert all("known region" in fix.reason for fix in fixes if not fix.solutions)
+
+    def test_bounds_that_leave_nothing(self):
+        with pytest.raises(ValueError, match="low_m must be below high_m"):
+            Knowledge((1.0, 0.0, 0.0), (0.0, 1.0, 1.0))
+        with pytest.raises(ValueError, match="must be positive"):
+            Knowledge(largest_moment_Am2=0.0)
+        with pytest.raises(ValueError, match="leaves nothing"):
+            Locator(TETRAHEDRON, knowledge=Knowledge(low_m=(1e6, 1e6, 1e6)))
+
+
+class TestFitFrom:
+    def test_every_start_leads_to_the_best_fit(self):
+        p, m = np.array([5.0, 0.0, 0.306]), np.array([0.0, 0.0, 100.0])
+        readings = predicted_channels(TETRAHEDRON, p, m)
+        starts = np.random.default_rng(0).uniform(-20, 20, (50, 3))
+        ends = Locator(TETRAHEDRON).fit_from(readings, starts)
+        assert_allclose(ends.position_m, np.tile(p, (50, 1)), atol=1e-4)
+        assert (ends.linearisations > 0).all()
+
+
 class TestIndependence:
     """Rows, blocks and threads do not see each other."""
 
@@ -342,8 +411,9 @@ class TestReadableTwin:
         )
         expected = self.problem.unit_basis(q).T
         assert_allclose(basis, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
-        bases = kernels.candidate_bases(
-            q[None], self.problem.sensors, self.problem.channel_sensor, self.problem.gain, *self.common()
+        bases = np.empty((1, 3, 18))
+        kernels.candidate_bases(
+            0, 1, q[None], self.problem.sensors, self.problem.channel_sensor, self.problem.gain, *self.common(), bases
         )
         assert y @ y - np.sum((bases[0] @ y) ** 2) == pytest.approx(
             float(self.problem.projected_chi2(q, y)), rel=1e-7, abs=1e-9
@@ -373,10 +443,8 @@ class TestReadableTwin:
         q = self.problem.homogeneous(p[0] + 0.1 * rng.normal(size=3))
         before = float(self.problem.projected_chi2(q, y))
         mu = np.empty(3)
-        chi2, _, converged = kernels.refine(
-            q, y, self.problem.sensors, self.problem.channel_sensor, self.problem.gain, *self.common(), False, 100, mu
-        )
-        assert converged
+        chi2, _, end = refined(self.problem, q, y, mu)
+        assert end == kernels.CONVERGED
         assert chi2 <= before
         assert chi2 == pytest.approx(float(self.problem.projected_chi2(q, y)), rel=1e-9)
         assert_allclose(mu, self.problem.best_moment(q, y), rtol=1e-6, atol=1e-9 * np.linalg.norm(mu))
