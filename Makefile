@@ -23,7 +23,7 @@ lint: .venv/installed
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache --no-logo
 
-bench: .venv/installed
+bench: .venv/installed-bench
 	$(BIN)/python -m tests.bench
 
 # The lower bounds of pyproject.toml, installed exactly.
@@ -36,6 +36,10 @@ test-oldest: .venv-oldest/installed
 		{ $(MAKE_VENV) --without-pip .venv && $(PYTHON) -m pip --python $(BIN)/python install --quiet pip; } >/dev/null 2>&1 || \
 		{ echo "magloc needs Python's venv and pip: on Debian and Ubuntu, apt-get install python3-venv" >&2; exit 1; }
 	$(PIP) install --constraint constraints.txt --editable '.[test]'
+	@touch $@
+
+.venv/installed-bench: .venv/installed
+	$(PIP) install --constraint constraints.txt --editable '.[test,bench]'
 	@touch $@
 
 .venv-oldest/installed: pyproject.toml constraints-oldest.txt

@@ -1,52 +1,43 @@
-"""``make bench``: how fast, as ratios measured in one run wherever there is a peer."""
+"""``make bench``: how fast, as ratios to peers that run in turn with ours, in one process on the same problems."""
 
 from __future__ import annotations
 
-import os
-import platform
+import argparse
 import sys
-import time
-from collections.abc import Callable
-from pathlib import Path
 
-import numba
-import numpy as np
+from tests.bench import fields, filters, fixes, machine, maps, recording
+from tests.bench.table import header, table
+from tests.bench.timing import FULL, QUICK, Size
 
-from arrays.files import read_array
-from magloc.locate import Locator
-from magloc.readings import read_readings
-
-
-def best_of(repeats: int, function: Callable[[], object]) -> float:
-    """Shortest duration [s] of some calls, after one that is not counted."""
-    function()
-    durations = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        function()
-        durations.append(time.perf_counter() - begin)
-    return min(durations)
+GROUPS = {
+    "fields": fields,
+    "fixes": fixes,
+    "filters": filters,
+    "maps": maps,
+    "machine": machine,
+    "recording": recording,
+}
 
 
-def recording() -> None:
-    """All rows of the recording of a magnet over thirty magnetometers."""
-    folder = Path(os.environ.get("MAGLOC_DATA", "../shared/data")) / "magnet-array"
-    if not folder.is_dir():
-        print("magnet-array: skipped, the recording is not there (set MAGLOC_DATA)")
-        return
-    array = read_array(folder / "array.toml")
-    readings = read_readings(folder / "readings.csv", array).values_T
-    locator = Locator(array)
-    seconds = best_of(3, lambda: locator.fit_rows(readings))
-    print(
-        f"magnet-array: {len(readings)} rows of 30 sensors in {seconds:.2f} s ({1e6 * seconds / len(readings):.0f} µs)"
-    )
+def report(names: list[str], size: Size) -> str:
+    """Header and table of some groups."""
+    head = header()  # before our own work loads the machine
+    groups = []
+    for name in names:
+        print(f"{name} ...", file=sys.stderr, flush=True)
+        groups.append((GROUPS[name].TITLE, list(GROUPS[name].rows(size))))
+    return f"{head}\n\n{table(groups)}"
 
 
 def main() -> int:
     """Print the table."""
-    print(f"{platform.processor() or platform.machine()}, {numba.get_num_threads()} threads, numpy {np.__version__}")
-    recording()
+    parser = argparse.ArgumentParser(prog="python -m tests.bench", description=__doc__)
+    parser.add_argument("group", nargs="*", help=f"any of {', '.join(GROUPS)} (default: all)")
+    parser.add_argument("--quick", action="store_true", help="fewer repeats and smaller samples")
+    arguments = parser.parse_args()
+    if unknown := set(arguments.group) - set(GROUPS):
+        parser.error(f"group must be any of {', '.join(GROUPS)}; instead received {', '.join(sorted(unknown))}")
+    print(report(arguments.group or list(GROUPS), QUICK if arguments.quick else FULL))
     return 0
 
 

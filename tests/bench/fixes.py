@@ -1,0 +1,111 @@
+"""One fix without a start, against scipy.optimize.least_squares from several starts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numba
+import numpy as np
+from scipy.optimize import OptimizeResult, least_squares
+
+from arrays.geometries import tetrahedron
+from magloc.locate import Locator
+from magloc.measurement import DifferenceMeasurement, predicted_channels
+from tests.bench.table import Row
+from tests.bench.timing import Contestant, Size, interleaved
+
+TITLE = "fix: tetrahedron of 1.5 m, 1 nT, source of 300 A·m² at 2-8 m, no start given"
+MOMENT_AM2 = 300.0
+# χ² above the one found from the truth within which a fix has succeeded.
+REACHED = 0.05
+
+
+def rows(size: Size) -> Iterator[Row]:
+    """Ours from its own search, the peer from random positions with the best moment at each, both with one thread.
+
+    The peer has our measurement model and its analytic Jacobian, in NumPy, and MINPACK's Levenberg-Marquardt iteration.
+    """
+    measurement = DifferenceMeasurement.of(tetrahedron(1.5, noise_T=1e-9))
+    locator = Locator(measurement.array)
+    truths, readings = simulated(measurement, size.rows, np.random.default_rng(2))
+    few = range(min(size.problems, size.rows))
+    z = measurement.measured(readings)
+    best = np.array([2.0 * best_fit(measurement, z[i], truths[i]).cost for i in few])
+    starts = random_directions(np.random.default_rng(3), 20) * np.geomspace(1.0, 20.0, 20)[:, None]
+    starts = np.random.default_rng(4).permutation(starts)
+
+    chi2_found = {}
+
+    def multi_starts(n_starts: int) -> None:
+        chi2_found[n_starts] = [2.0 * multi_start(measurement, z[i], starts[:n_starts]).cost for i in few]
+
+    def success(chi2: Sequence[float]) -> str:
+        return f"{int(np.sum(np.asarray(chi2) < best + REACHED))}/{len(best)}"
+
+    fixes = locator.fit_rows(readings[: len(best)])
+    ours = success([fix.solutions[0].chi2 if fix.solutions else np.inf for fix in fixes])
+    threads = numba.get_num_threads()
+    timings = interleaved(
+        {
+            "many": Contestant(lambda: locator.fit_rows(readings), 1, size.rows),
+            "all threads": Contestant(lambda: locator.fit_rows(readings), threads, size.rows),
+            "one": Contestant(lambda: [locator.fit(readings[i]) for i in few], 1, len(best)),
+            6: Contestant(lambda: multi_starts(6), 1, len(best)),
+            20: Contestant(lambda: multi_starts(20), 1, len(best)),
+        },
+        size.rounds,
+    )
+    for name, what in ((f"{size.rows:,} at once", "many"), ("one alone", "one")):
+        for n_starts in (6, 20):
+            yield Row(
+                f"a fix, {name}, 1 thr.",
+                timings[what],
+                f"scipy, {n_starts} starts",
+                timings[n_starts],
+                f"optimum found: ours {ours}, peer {success(chi2_found[n_starts])}" if what == "many" else "",
+            )
+    yield Row(f"a fix, {size.rows:,} at once, {threads} thr.", timings["all threads"])
+
+
+def simulated(measurement: DifferenceMeasurement, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """States (n, 6) of sources all around the array, and noisy readings (n, C) [T]."""
+    array = measurement.array
+    positions = random_directions(rng, n) * rng.uniform(2.0, 8.0, (n, 1))
+    moments = random_directions(rng, n) * MOMENT_AM2
+    noise = rng.normal(scale=array.channel_noise_T, size=(n, array.n_channels))
+    readings = predicted_channels(array, positions, moments) + array.channel_offset_T + noise
+    return np.concatenate([positions, moments], axis=1), readings
+
+
+def random_directions(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Unit vectors, shape (n, 3)."""
+    vectors = rng.normal(size=(n, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def best_fit(
+    measurement: DifferenceMeasurement, z: np.ndarray, start: np.ndarray, prior_sigma: np.ndarray | None = None
+) -> OptimizeResult:
+    """scipy's optimum of the likelihood of z (k,), or with the start as the mean of a prior, of the posterior."""
+    sigma = np.sqrt(measurement.variance)
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        whitened = (measurement.predicted(x[:3], x[3:]) - z) / sigma
+        return whitened if prior_sigma is None else np.concatenate([whitened, (x - start) / prior_sigma])
+
+    def jacobian(x: np.ndarray) -> np.ndarray:
+        whitened = measurement.jacobian(x[:3], x[3:]) / sigma[:, None]
+        return whitened if prior_sigma is None else np.concatenate([whitened, np.diag(1.0 / prior_sigma)])
+
+    return least_squares(residual, start, jacobian, method="lm", x_scale="jac")
+
+
+def multi_start(measurement: DifferenceMeasurement, z: np.ndarray, positions: np.ndarray) -> OptimizeResult:
+    """Best of scipy's optima from several positions, each with the moment that fits it best."""
+    fits = []
+    for position in positions:
+        by_moment = measurement.jacobian(position, np.zeros(3))[:, 3:]
+        sigma = np.sqrt(measurement.variance)
+        moment = np.linalg.lstsq(by_moment / sigma[:, None], z / sigma)[0]
+        fits.append(best_fit(measurement, z, np.concatenate([position, moment])))
+    return min(fits, key=lambda fit: fit.cost)

@@ -1,0 +1,121 @@
+"""The bench itself: its table says what was measured, and every group still runs."""
+
+from __future__ import annotations
+
+import time
+
+import numba
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from arrays.geometries import tetrahedron
+from magloc.dipole import total_field
+from magloc.measurement import DifferenceMeasurement
+from tests.bench import fields, filters
+from tests.bench.__main__ import GROUPS, report
+from tests.bench.fixes import simulated
+from tests.bench.table import Row, ratio_text, table, time_text
+from tests.bench.timing import Contestant, Size, Timing, installed, interleaved
+
+TINY = Size(points=30, rows=2, problems=1, grid=2, sample=1, rounds=1)
+
+
+class TestTable:
+    @pytest.mark.parametrize(
+        ("seconds", "text"),
+        [
+            ((2.0, 2.0, 2.0), "2.00 s +0%"),
+            ((1.1e-2, 1.0e-2, 1.2e-2), "10.0 ms +10%"),
+            ((1.234e-4,), "123 µs +0%"),
+            ((9.99e-7,), "999 ns +0%"),
+        ],
+    )
+    def test_a_time_has_the_best_and_the_medians_distance_from_it(self, seconds, text):
+        assert time_text(Timing(seconds)) == text
+
+    def test_a_ratio_pairs_the_rounds(self):
+        # A machine that gets three times slower for one round slows both: the ratio stays.
+        assert ratio_text(Timing((1.0, 3.0, 1.0)), Timing((4.0, 12.0, 4.0))) == "4.00 (4.00-4.00)"
+
+    def test_a_ratio_has_the_median_and_the_range(self):
+        assert ratio_text(Timing((1.0, 1.0, 2.0)), Timing((2.0, 1234.0, 1.0))) == "2.00 (0.500-1234)"
+
+    def test_columns_line_up(self):
+        text = table([("a group", [Row("one", Timing((1.0,)), "peer", Timing((2.0,))), Row("another row", note="n")])])
+        first, title, *rest = text.splitlines()
+        assert title.startswith("-- a group ---")
+        bars = [[i for i, c in enumerate(line) if c == "|"] for line in (first, *rest)]
+        assert bars[0] == bars[1] == bars[2]
+
+    def test_a_peer_that_is_not_here_is_said_so(self):
+        assert Row("one", Timing((1.0,)), "peer").cells == ("one", "1.00 s +0%", "peer not installed", "", "")
+
+
+class TestInterleaved:
+    def test_takes_turns_after_one_uncounted_call_each(self, monkeypatch):
+        monkeypatch.setattr("tests.bench.timing.SAMPLE_S", 1e-9)
+        order = []
+        contestants = {name: Contestant(lambda name=name: order.append(name)) for name in "AB"}
+        interleaved(contestants, 3)
+        assert "".join(order) == "AB" + "ABABAB"
+
+    def test_sets_the_threads_and_restores_them(self):
+        before = numba.get_num_threads()
+        seen = []
+        interleaved({"A": Contestant(lambda: seen.append(numba.get_num_threads()))}, 1)
+        assert set(seen) == {1}
+        assert numba.get_num_threads() == before
+
+    def test_divides_by_the_units_of_work(self):
+        timing = interleaved({"A": Contestant(lambda: time.sleep(0.06), count=1000)}, 1)["A"]
+        # A sleep is never shorter than asked for; how much longer it takes is the machine's own affair.
+        assert 6e-5 <= timing.best < 6e-2
+
+
+class TestPeersHaveTheSameProblem:
+    @pytest.mark.parametrize("peer", fields.PEERS)
+    def test_field(self, peer):
+        if not installed(peer):
+            pytest.skip(f"{peer} is not installed (extra bench)")
+        rng = np.random.default_rng(0)
+        points, sources, moments = rng.normal(size=(5, 3)), rng.normal(size=(2, 3)), rng.normal(size=(2, 3))
+        field = total_field(points, sources, moments)
+        # The peers' magnetic constants differ from ours by up to 6e-10.
+        found = fields.in_tesla(fields.PEERS[peer](points, sources, moments)())
+        assert_allclose(found, field, rtol=1e-9, atol=1e-9 * np.abs(field).max())
+
+    def test_filter_step(self):
+        measurement = DifferenceMeasurement.of(tetrahedron(1.5, noise_T=1e-9))
+        truths, readings = simulated(measurement, 1, np.random.default_rng(0))
+        z, x = measurement.measured(readings)[0], truths[0] + np.repeat([0.1, 5.0], 3)
+        once, iterated = (filters.our_step(measurement, z, x, n)() for n in (1, filters.ITERATIONS))
+        assert_allclose(filters.filterpy_step(measurement, z, x)(), once, rtol=1e-6)
+        assert_allclose(filters.stonesoup_step(measurement, z, x)(), iterated, rtol=1e-6)
+
+    def test_stone_soup_linearises_as_often(self, monkeypatch):
+        count = []
+        jacobian = DifferenceMeasurement.jacobian
+        monkeypatch.setattr(
+            DifferenceMeasurement, "jacobian", lambda *arguments: count.append(1) or jacobian(*arguments)
+        )
+        measurement = DifferenceMeasurement.of(tetrahedron(1.5, noise_T=1e-9))
+        truths, readings = simulated(measurement, 1, np.random.default_rng(0))
+        z, x = measurement.measured(readings)[0], truths[0] + np.repeat([0.1, 5.0], 3)
+        filters.stonesoup_step(measurement, z, x)()
+        assert len(count) == filters.ITERATIONS
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_group_runs(group, monkeypatch):
+    monkeypatch.setattr("tests.bench.timing.SAMPLE_S", 1e-9)
+    lines = report([group], TINY).splitlines()
+    assert any(line.startswith(f"-- {GROUPS[group].TITLE}") for line in lines)
+    assert "|" in lines[-1]
+
+
+@pytest.mark.parametrize("group", ["fields", "filters", "maps"])
+def test_group_runs_without_its_peers(group, monkeypatch):
+    monkeypatch.setattr("tests.bench.timing.SAMPLE_S", 1e-9)
+    monkeypatch.setattr(f"tests.bench.{group}.installed", lambda package: package in {"magloc", "scipy"})
+    assert "not installed" in report([group], TINY).split("\n\n")[1]
