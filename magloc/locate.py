@@ -195,8 +195,8 @@ class Locator:
         self,
         array: SensorArray,
         *,
-        n_starts: int = 8,
-        apart_rad: float = 0.25,
+        n_starts: int = 6,
+        apart_rad: float = 0.3,
         max_iterations: int = 100,
         knowledge: Knowledge = Knowledge(),
     ) -> None:

@@ -356,9 +356,19 @@ def refine(
         if not accepted:
             # No representable step decreases χ²: an optimum to rounding if the model promised next to nothing.
             return chi2, iteration, CONVERGED if decrement < 1e-6 * (1.0 + chi2) else FAILED
+        # χ² falls by twice the step's product with the gradient, less its curvature: a ratio of gains of one is a model
+        # that holds, a low one a step that went too far.
+        promised = 0.0
+        for i in range(n_free):
+            t = 0.0
+            for j in range(n_free):
+                t += a[i, j] * shorten * step[j]
+            promised += shorten * step[i] * (2.0 * b[i] - t)
         gained = chi2 - new_chi2
-        if gained > 0.5 * decrement * shorten:
+        if gained > 0.75 * promised:
             damping *= 0.1
+        elif gained < 0.5 * promised:
+            damping = max(damping, 0.1) * 3.0
         for d in range(4):
             q[d] = new_q[d]
         for d in range(3):
