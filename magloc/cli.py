@@ -65,8 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (InputError, CycloptsError) as error:
         print_note(str(error))
         return BAD_INPUT
-    except KeyboardInterrupt:
-        print_note("interrupted")
+    except KeyboardInterrupt as interruption:
+        print_note(str(interruption) or "interrupted")
         return INTERRUPTED
     except BrokenPipeError:
         # The interpreter flushes stdout once more when it exits, which must not fail again.

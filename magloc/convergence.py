@@ -1,12 +1,13 @@
 r"""Convergence maps: from which starts does a dipole filter find the source?
 
 One source, one set of readings, a cube of starts (the moment always starts at zero). Two filters of the source paper's
-kind and one that takes no step uphill, and a map of how they end:
+kind, one that takes no step uphill and one that needs no start, and a map of how they end:
 
 * :class:`RepeatedFilter`: the same readings are processed again and again by an extended Kalman filter whose covariance
   grows by :math:`S_q S_q^T` before every pass. It forgets its start, so where it stops is a maximum of the likelihood.
 * :class:`IekfFilter`: the iterated extended Kalman filter with the start as the mean of a prior.
 * :class:`DampedFilter`: the same cost as the latter's, by Levenberg-Marquardt steps.
+* :class:`GlobalFilter`: the start-free search.
 
 Source: Pavlov, Karshakov, Goldin, "Determination of the magnetic field parameters of an object from remote
 magnetogradient measurements", the function table, equations (19), (30), and the figure of the convergence region.
@@ -331,7 +332,44 @@ class DampedFilter:
 
 
 # Every method of a map by its name, with its default settings; scenario files and the command line take them from here.
-FILTERS: dict[str, Filter] = {method.name: method for method in (RepeatedFilter(), IekfFilter(), DampedFilter())}
+@dataclass(frozen=True)
+class GlobalFilter:
+    """The start-free search of :class:`magloc.locate.Locator`, with the map's start refined before its candidates.
+
+    Attributes
+    ----------
+    max_iterations : int
+        Linearisations of one refinement at most. The map counts those of all refinements of a start together.
+    """
+
+    max_iterations: int = 100
+
+    @property
+    def name(self) -> str:
+        """Name on the command line."""
+        return "global"
+
+    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
+        """Best end of every start (n, 6), compiled; the readable twin of its cost is :mod:`magloc.separable`."""
+        array = measurement.array
+        # Any readings with these differences will do: the common field does not enter.
+        readings = np.linalg.lstsq(measurement.differences.transform, z, rcond=None)[0] + array.channel_offset_T
+        ends = Locator(array, max_iterations=self.max_iterations).fit_from(readings, starts[:, :3])
+        return Ends(
+            states=np.concatenate([ends.position_m, ends.moment_Am2], axis=1),
+            chi2=ends.chi2,
+            iterations=ends.linearisations,
+            stopped=np.isfinite(ends.chi2),
+        )
+
+    def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
+        """Stopped with the χ² of the maximum-likelihood optimum."""
+        return ends.stopped & (ends.chi2 < chi2_optimum + CHI2_REACHED)
+
+
+FILTERS: dict[str, Filter] = {
+    method.name: method for method in (RepeatedFilter(), IekfFilter(), DampedFilter(), GlobalFilter())
+}
 
 
 def field_weights(measurement: DifferenceMeasurement) -> FloatArray:

@@ -7,9 +7,12 @@ store on disk: :mod:`magloc.sweep`).
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -205,7 +208,25 @@ def computed(cube: CubeMap, box: Box) -> Chunk:
 def computed_here(cube: CubeMap, wanted: Iterable[Box]) -> Iterator[Chunk]:
     """Values of some boxes, one after the other, in this process."""
     for box in wanted:
-        yield computed(cube, box)
+        with uninterrupted():
+            chunk = computed(cube, box)
+        yield chunk
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Let Ctrl-C wait for the end of the block: compiled code and writing would fail with errors of their own."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # which no signal interrupts
+        return
+    signals: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: signals.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if signals:
+        raise KeyboardInterrupt
 
 
 def coordinates(cube: CubeMap) -> dict[str, tuple[FloatArray, dict[str, str]]]:

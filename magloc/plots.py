@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,6 +10,9 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from magloc.convergence import Status, summary
+from magloc.cubes import MapSummary
+from magloc.source_map import SourceMapSummary, SourceStatus
+from magloc.source_map import summary as source_summary
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -20,15 +24,26 @@ _NOT_CONVERGED = {
     Status.NOT_STOPPED: ("#8f8f8f", "did not stop"),
     Status.DIVERGED: ("#4a4a4a", "diverged"),
 }
+_STARTS_COLOURS = ListedColormap(["#ffffff", *(colour for colour, _ in _NOT_CONVERGED.values())])
+_SOURCE_ENDS = {
+    SourceStatus.FOUND: ("#0072b2", "found"),
+    SourceStatus.MISSED: ("#d55e00", "missed"),
+    SourceStatus.UNSOLVED: ("#000000", "no solution"),
+    SourceStatus.LEFT_OUT: ("#ffffff", "left out"),
+}
+_SOURCES_COLOURS = ListedColormap([colour for colour, _ in _SOURCE_ENDS.values()])
 
 
-def convergence_figure(dataset: xr.Dataset) -> Figure:
+def convergence_figure(dataset: xr.Dataset, counts: MapSummary | None = None) -> Figure:
     """Iterations to convergence on three slices through the source, as in the source paper.
 
     Parameters
     ----------
     dataset : xarray.Dataset
-        A map made by :func:`magloc.convergence.convergence_map`.
+        A map made by :func:`magloc.convergence.convergence_map`, or one opened by :func:`magloc.sweep.open_map`, of
+        which only the slices are loaded.
+    counts : MapSummary, optional
+        Its summary, where that is known; without it the whole map is loaded to count.
 
     Returns
     -------
@@ -36,27 +51,22 @@ def convergence_figure(dataset: xr.Dataset) -> Figure:
         Starts that did not converge are grey; the dashed line is the plane through the array, orthogonal to the
         direction of the source.
     """
-    counts = summary(dataset)
+    counts = summary(dataset) if counts is None else counts
     source = np.atleast_1d(dataset.attrs["position_m"])
     centroid = np.atleast_1d(dataset.attrs["centroid_m"])
     moment = np.atleast_1d(dataset.attrs["moment_Am2"])
     figure = Figure(figsize=(13.0, 5.0), layout="constrained")
     axes = figure.subplots(1, 3)
-    converged = dataset["status"] == Status.CONVERGED
-    shown = dataset["iterations"].where(converged)
-    top = float(np.nanpercentile(shown, 99)) if converged.any() else 1.0
-    for ax, (across, up, through) in zip(axes, _SLICES, strict=True):
-        plane = {through: float(source["xyz".index(through)])}
-        part = dataset.sel(plane, method="nearest")
-        _slice(ax, part, shown.sel(plane, method="nearest"), across, up, top)
+    parts = _slices(dataset[["status", "iterations"]], source)
+    shown = [part["iterations"].where(part["status"] == Status.CONVERGED) for part in parts]
+    converged = np.concatenate([values.to_numpy()[np.isfinite(values)] for values in shown])
+    top = float(np.percentile(converged, 99)) if converged.size else 1.0
+    for ax, part, values, (across, up, through) in zip(axes, parts, shown, _SLICES, strict=True):
+        _slice(ax, part["status"], _STARTS_COLOURS, values, across, up, "start", (0.0, top))
         _scene(ax, dataset, source, centroid, moment, "xyz".index(across), "xyz".index(up))
         ax.set_title(f"starts with {through} = {float(part[through]):g} m", fontsize=10)
     figure.colorbar(axes[-1].images[-1], ax=axes, label="passes over the readings until convergence", shrink=0.9)
-    present = [s for s in _NOT_CONVERGED if bool((dataset["status"] == s).any())]
-    handles = [
-        figure.axes[0].scatter([], [], marker="s", color=_NOT_CONVERGED[s][0], label=_NOT_CONVERGED[s][1])
-        for s in present
-    ]
+    handles = _handles(axes[0], parts, _NOT_CONVERGED)
     handles += [h for h in axes[0].get_legend_handles_labels()[0] if h not in handles]
     figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False, fontsize=9)
     figure.suptitle(
@@ -67,20 +77,83 @@ def convergence_figure(dataset: xr.Dataset) -> Figure:
     return figure
 
 
+def source_figure(dataset: xr.Dataset, counts: SourceMapSummary | None = None) -> Figure:
+    """How fixes ended, over the Cramér-Rao bound of the range, on three slices through the array.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        A map made by :func:`magloc.source_map.source_map`, or one opened by :func:`magloc.sweep.open_map`, of which
+        only the slices are loaded.
+    counts : SourceMapSummary, optional
+        Its summary, where that is known; without it the whole map is loaded to count.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    counts = source_summary(dataset) if counts is None else counts
+    figure = Figure(figsize=(13.0, 8.6), layout="constrained")
+    axes = figure.subplots(2, 3)
+    parts = _slices(dataset[["status", "sigma_range"]], np.zeros(3))
+    bounds = [part["sigma_range"].copy(data=np.log10(part["sigma_range"].to_numpy())) for part in parts]
+    finite = np.concatenate([bound.to_numpy()[np.isfinite(bound)] for bound in bounds])
+    low, high = np.percentile(finite, [1, 99]) if finite.size else (0.0, 1.0)
+    white = ListedColormap(["#ffffff"])
+    for column, part, bound, (across, up, through) in zip(axes.T, parts, bounds, _SLICES, strict=True):
+        _slice(column[0], part["status"], _SOURCES_COLOURS, bound.where(False), across, up, "source")
+        _slice(column[1], part["status"], white, bound, across, up, "source", (low, high))
+        column[0].set_title(f"sources with {through} = {float(part[through]):g} m", fontsize=10)
+        for ax in column:
+            ax.plot(0.0, 0.0, "^", color="white", mec="black", ms=9)
+    figure.colorbar(axes[1, 2].images[-1], ax=axes[1], label="log10 of the range's Cramér-Rao bound / m", shrink=0.9)
+    handles = _handles(axes[0, 0], parts, _SOURCE_ENDS)
+    figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False, fontsize=9)
+    figure.suptitle(
+        f"One start-free fix each of {counts.starts} sources of {dataset.attrs['moment_magnitude_Am2']:g} A·m²: "
+        f"{counts.fraction:.2%} found, truth listed {counts.truth_listed:.2%}"
+    )
+    return figure
+
+
+def _slices(dataset: xr.Dataset, through: np.ndarray) -> list[xr.Dataset]:
+    """The three planes through a point, loaded."""
+    planes = ({name: float(through["xyz".index(name)])} for _, _, name in _SLICES)
+    return [dataset.sel(plane, method="nearest").load() for plane in planes]
+
+
+def _handles(ax: Axes, parts: Sequence[xr.Dataset], colours: Mapping[Any, tuple[str, str]]) -> list[Any]:
+    """Legend of the colours that occur."""
+    present = [status for status in colours if any(bool((part["status"] == status).any()) for part in parts)]
+    return [
+        ax.scatter([], [], marker="s", color=colours[status][0], edgecolor="grey", label=colours[status][1])
+        for status in present
+    ]
+
+
 def _percent(fraction: float) -> str:
     return f"{100.0 * fraction:.1f} %"
 
 
-def _slice(ax: Axes, part: xr.Dataset, shown: xr.DataArray, across: str, up: str, top: float) -> None:
-    axis = part[across].to_numpy()
+def _slice(
+    ax: Axes,
+    status: xr.DataArray,
+    colours: ListedColormap,
+    shown: xr.DataArray,
+    across: str,
+    up: str,
+    point: str,
+    limits: tuple[float, float] = (0.0, 1.0),
+) -> None:
+    """Colours of the status, and over them the values that are finite."""
+    axis = status[across].to_numpy()
     half_cell = 0.5 * float(axis[1] - axis[0])
     low, high = float(axis[0]) - half_cell, float(axis[-1]) + half_cell
     options: dict[str, Any] = {"origin": "lower", "extent": (low, high, low, high), "interpolation": "nearest"}
-    colours = ListedColormap(["#ffffff", *(colour for colour, _ in _NOT_CONVERGED.values())])
-    ax.imshow(part["status"].transpose(up, across), cmap=colours, vmin=-0.5, vmax=3.5, **options)
-    ax.imshow(shown.transpose(up, across), cmap="viridis", vmin=0.0, vmax=top, **options)
-    ax.set_xlabel(f"start {across} [m]")
-    ax.set_ylabel(f"start {up} [m]")
+    ax.imshow(status.transpose(up, across), cmap=colours, vmin=-0.5, vmax=colours.N - 0.5, **options)
+    ax.imshow(shown.transpose(up, across), cmap="viridis", vmin=limits[0], vmax=limits[1], **options)
+    ax.set_xlabel(f"{point} {across} [m]")
+    ax.set_ylabel(f"{point} {up} [m]")
 
 
 def _scene(

@@ -65,7 +65,7 @@ def print_note(text: str) -> None:
 
 
 @contextmanager
-def progress(total: int, unit: str, *, quiet: bool) -> Iterator[Callable[[int], None]]:
+def progress(total: int, unit: str, *, quiet: bool, initial: int = 0) -> Iterator[Callable[[int], None]]:
     """Count up to a total on a terminal's stderr.
 
     Parameters
@@ -74,6 +74,8 @@ def progress(total: int, unit: str, *, quiet: bool) -> Iterator[Callable[[int], 
     unit : str
         What is counted.
     quiet : bool
+    initial : int
+        Finished before; does not count in the estimate of the time left.
 
     Yields
     ------
@@ -82,7 +84,8 @@ def progress(total: int, unit: str, *, quiet: bool) -> Iterator[Callable[[int], 
     """
     from tqdm import tqdm
 
-    with tqdm(total=total, unit=f" {unit}", disable=quiet or not sys.stderr.isatty(), leave=False) as bar:
+    hidden = quiet or not sys.stderr.isatty()
+    with tqdm(total=total, initial=initial, unit=f" {unit}", disable=hidden, leave=False) as bar:
 
         def advance(finished: int) -> None:
             bar.update(finished)

@@ -1,11 +1,11 @@
-"""``magloc map``: from which starts does a filter find the source?"""
+"""``magloc map``: from which starts does a filter find the source, and which sources does a fix find?"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -13,36 +13,50 @@ from cyclopts.validators import Number
 from arrays.errors import InputError
 from magloc.commands.common import CommonOptions, Flag, print_json, print_note, progress, whole_number
 
-Method = Literal["repeated", "iekf"]
+if TYPE_CHECKING:
+    from magloc.cubes import CubeMap, MapSummary
+    from magloc.sweep import Sweep
+
+Over = Literal["starts", "sources"]
 Grid = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=2))]
+
+# Larger maps stay in map.zarr alone.
+LARGEST_NETCDF = 101
 
 
 def map_(
     scenario: str = "paper",
     /,
     *,
-    method: Method | None = None,
-    grid: Grid = 41,
+    over: Over = "starts",
+    method: str | None = None,
+    grid: Grid | None = None,
     noise: Flag = False,
+    scheduler: str | None = None,
     out: Path | None = None,
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Draw the convergence map of a filter over a cube of starts.
+    """Draw the convergence map of a filter over a cube of starts, or that of start-free fixes over a cube of sources.
 
-    Writes convergence.nc (iterations, chi-square, distance from the maximum-likelihood position, status, half) and
-    convergence.png (three slices through the source).
+    Writes map.zarr chunk by chunk, convergence.png (three slices), and up to a grid of 101 convergence.nc. The same
+    command continues a map that was interrupted.
 
     Parameters
     ----------
     scenario : str
         Built-in scenario or scenario file (TOML). "paper" is the figure of the source paper.
+    over : str
+        starts: one source, a filter from every start. sources: every source with a random moment and noise, drawn with
+        --seed, fixed once without a start.
     method : str
-        Filter, in place of the scenario's.
+        Filter over starts, in place of the scenario's: repeated, iekf, damped.
     grid : int
-        Starts along every axis.
+        Points along every axis; by default 41 starts, 21 sources.
     noise : bool
-        Add one realisation of the sensors' noise, drawn with --seed, to the noise-free readings.
+        Over starts: add one realisation of the sensors' noise, drawn with --seed, to the noise-free readings.
+    scheduler : str
+        Address of a dask scheduler (tcp://HOST:PORT) whose workers compute the map.
     out : Path
         Folder to write; by default map-SCENARIO-METHOD.
     json : bool
@@ -52,35 +66,120 @@ def map_(
     """
     from dataclasses import asdict
 
-    from magloc.convergence import convergence_map, summary
-    from magloc.plots import convergence_figure
-    from magloc.scenarios import read_starts_scenario
+    from magloc.sweep import Sweep
 
-    problem = read_starts_scenario(scenario, method=method, noise_seed=common.seed if noise else None)
-    folder = Path(f"map-{Path(scenario).stem}-{problem.method.name}") if out is None else out
+    if over == "starts":
+        cube = _starts_map(scenario, method, 41 if grid is None else grid, common.seed if noise else None)
+    else:
+        cube = _sources_map(scenario, method, 21 if grid is None else grid, common.seed)
+    name = cube.attributes["method"] if over == "starts" else over
+    folder = Path(f"map-{Path(scenario).stem}-{name}") if out is None else out
     _make_folder(folder)
-    try:
-        with progress(grid**3, "starts", quiet=common.quiet) as advance:
-            dataset = convergence_map(problem, grid, advance)
-    except ValueError as error:
-        raise InputError(f"{scenario}: {error}") from None
-    figure = convergence_figure(dataset)
-    _replace(folder / "convergence.nc", lambda path: dataset.to_netcdf(path))
-    _replace(folder / "convergence.png", lambda path: figure.savefig(path, format="png", dpi=150))
-    counts = summary(dataset)
+    with Sweep(cube, folder / "map.zarr") as sweep:
+        for sentence in sweep.unreadable:
+            print_note(sentence)
+        before = sweep.chunks_done
+        if before < sweep.n_chunks:
+            _run(sweep, scheduler, quiet=common.quiet)
+        counts = sweep.summary
+    _export(folder, cube, counts)
     if json:
         print_json({**asdict(counts), "out": str(folder)})
-        return
-    print(
+    else:
+        print(_in_words(counts))
+    if not (json or common.quiet):
+        print_note(_how_done(before, counts, sweep, folder))
+
+
+def _starts_map(scenario: str, method: str | None, grid: int, noise_seed: int | None) -> CubeMap:
+    from magloc.convergence import FILTERS, StartsMap
+    from magloc.scenarios import read_starts_scenario
+
+    if method is not None and method not in FILTERS:
+        raise InputError(f"--method: found {method!r}, expected one of {', '.join(FILTERS)}.")
+    problem = read_starts_scenario(scenario, method=method, noise_seed=noise_seed)
+    try:
+        return StartsMap.of(problem, grid)
+    except ValueError as error:
+        raise InputError(f"{scenario}: {error}") from None
+
+
+def _sources_map(scenario: str, method: str | None, grid: int, seed: int) -> CubeMap:
+    from magloc.scenarios import read_sources_scenario
+    from magloc.source_map import SourcesMap
+
+    if method not in (None, "global"):
+        raise InputError(f"--method: found {method!r}, expected global or none: sources are fixed without a start.")
+    problem = read_sources_scenario(scenario, seed=seed)
+    try:
+        return SourcesMap(problem, grid)
+    except ValueError as error:
+        raise InputError(f"{scenario}: {error}") from None
+
+
+def _run(sweep: Sweep, scheduler: str | None, *, quiet: bool) -> None:
+    """Compute what is not done yet; however that ends, say how to go on."""
+    from magloc.cubes import computed_here
+
+    cube = sweep.cube
+    if scheduler is None:
+        chunks = computed_here(cube, sweep.unfinished())
+    else:
+        from magloc.cluster import computed_by
+
+        chunks = computed_by(scheduler, cube, sweep.unfinished())
+
+    def kept() -> str:
+        return f"{sweep.chunks_done} of {sweep.n_chunks} chunks are done, the same command goes on with the others"
+
+    with progress(cube.grid**3, f"{cube.point}s", quiet=quiet, initial=sweep.points_done) as advance:
+        try:
+            sweep.write(chunks, advance)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"interrupted: {kept()}") from None
+        except InputError as error:
+            raise InputError(f"{str(error).rstrip('.')}; {kept()}.") from None
+        except OSError as error:
+            raise InputError(f"{sweep.path} cannot be written ({error.strerror or error}); {kept()}.") from None
+
+
+def _export(folder: Path, cube: CubeMap, counts: MapSummary) -> None:
+    """Figure of a finished map, and all of it as netCDF if it is small."""
+    from magloc.plots import convergence_figure, source_figure
+    from magloc.source_map import SourceMapSummary
+    from magloc.sweep import open_map
+
+    with open_map(folder / "map.zarr") as dataset:
+        if isinstance(counts, SourceMapSummary):
+            figure = source_figure(dataset, counts)
+        else:
+            figure = convergence_figure(dataset, counts)
+        if cube.grid <= LARGEST_NETCDF:
+            _replace(folder / "convergence.nc", lambda path: dataset.to_netcdf(path))
+    _replace(folder / "convergence.png", lambda path: figure.savefig(path, format="png", dpi=150))
+
+
+def _how_done(before: int, counts: MapSummary, sweep: Sweep, folder: Path) -> str:
+    per_iteration_us = 1e6 * counts.seconds / max(1, counts.iterations_total)
+    text = f"{counts.iterations_total} iterations in {counts.seconds:.2f} s ({per_iteration_us:.3g} µs each)"
+    if before == sweep.n_chunks:
+        return f"{folder}/ was complete, nothing was computed again; {text}"
+    return f"{text}; wrote {folder}/" + (f", {before} of {sweep.n_chunks} chunks were there before" if before else "")
+
+
+def _in_words(counts: MapSummary) -> str:
+    from magloc.source_map import SourceMapSummary
+
+    if isinstance(counts, SourceMapSummary):
+        return (
+            f"{counts.converged} of {counts.starts} sources found ({counts.fraction:.2%}), "
+            f"truth listed {counts.truth_listed:.2%}, median {counts.median_iterations:.0f} iterations"
+        )
+    return (
         f"{counts.converged} of {counts.starts} starts converged ({counts.fraction:.1%}): "
         f"front half {counts.front_fraction:.1%}, back half {counts.back_fraction:.1%}, "
         f"median {counts.median_iterations:.0f} passes"
     )
-    if not common.quiet:
-        rate = counts.iterations_total / counts.seconds
-        print_note(
-            f"{counts.iterations_total} passes in {counts.seconds:.2f} s ({rate / 1e6:.1f} M/s); wrote {folder}/"
-        )
 
 
 def _make_folder(folder: Path) -> None:
@@ -88,6 +187,8 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
         raise InputError(f"--out {folder}: found a file, expected a folder.") from None
+    except OSError as error:
+        raise InputError(f"--out {folder} cannot be written ({error.strerror}).") from None
 
 
 def _replace(path: Path, write: Callable[[Path], object]) -> None:
@@ -96,5 +197,7 @@ def _replace(path: Path, write: Callable[[Path], object]) -> None:
     try:
         write(unfinished)
         os.replace(unfinished, path)
+    except (OSError, RuntimeError) as error:  # netCDF's own errors are RuntimeErrors
+        raise InputError(f"{path} cannot be written ({getattr(error, 'strerror', None) or error}).") from None
     finally:
         unfinished.unlink(missing_ok=True)

@@ -1,7 +1,8 @@
-"""Scenario files of convergence maps, and the built-in ones beside this file."""
+"""Scenario files of maps, and the built-in ones beside this file."""
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,10 @@ from arrays.errors import InputError
 from arrays.files import array_of_table, read_array
 from arrays.sensor import SensorArray
 from arrays.toml import check_keys, converted, read_toml
-from magloc.convergence import Filter, IekfFilter, RepeatedFilter, StartsScenario
+from magloc.convergence import FILTERS, Filter, StartsScenario
+from magloc.source_map import SourcesScenario
 
 FORMAT_VERSION = 1
-METHODS = ("repeated", "iekf")
 
 _Vector = tuple[float, float, float]
 
@@ -25,30 +26,42 @@ class _Source(msgspec.Struct, kw_only=True):
     moment_Am2: _Vector
 
 
-class _Repeated(msgspec.Struct, kw_only=True):
-    position_step_m: float = RepeatedFilter.position_step_m
-    moment_step_Am2: float = RepeatedFilter.moment_step_Am2
-    noise_inflation: float = RepeatedFilter.noise_inflation
-    relinearise_every_scalar: bool = RepeatedFilter.relinearise_every_scalar
-    tolerance_nT: float = RepeatedFilter.tolerance_T * 1e9
-    max_iterations: int = RepeatedFilter.max_iterations
-
-
-class _Iekf(msgspec.Struct, kw_only=True):
-    position_sigma_m: float = IekfFilter.position_sigma_m
-    moment_sigma_Am2: float = IekfFilter.moment_sigma_Am2
-    tolerance_nT: float = IekfFilter.tolerance_T * 1e9
-    max_iterations: int = IekfFilter.max_iterations
+class _Sources(msgspec.Struct, kw_only=True):
+    half_width_m: float = SourcesScenario.half_width_m
+    nearest_m: float = SourcesScenario.nearest_m
+    farthest_m: float = SourcesScenario.farthest_m
+    moment_Am2: float = SourcesScenario.moment_Am2
 
 
 class _File(msgspec.Struct, kw_only=True):
     array: dict[str, Any] | str
-    source: _Source
+    source: _Source | None = None
+    sources: _Sources = msgspec.field(default_factory=_Sources)
     format_version: int = FORMAT_VERSION
     method: str = "repeated"
     half_width_m: float = StartsScenario.half_width_m
-    repeated: _Repeated = msgspec.field(default_factory=_Repeated)
-    iekf: _Iekf = msgspec.field(default_factory=_Iekf)
+
+
+def _table_of(method: Filter) -> type[msgspec.Struct]:
+    """The table of a filter: its fields, tolerances in nT."""
+    return msgspec.defstruct(
+        f"_{type(method).__name__}",
+        [(_key(name), type(value), value) for name, value in vars(method).items()],
+        kw_only=True,
+    )
+
+
+def _key(name: str) -> str:
+    return f"{name.removesuffix('_T')}_nT" if name.endswith("_T") else name
+
+
+_FILTER_TABLES = {name: _table_of(method) for name, method in FILTERS.items()}
+_FileWithFilters: Any = msgspec.defstruct(
+    "_FileWithFilters",
+    [(name, table, msgspec.field(default_factory=table)) for name, table in _FILTER_TABLES.items()],
+    bases=(_File,),
+    kw_only=True,
+)
 
 
 def built_in_scenarios() -> tuple[str, ...]:
@@ -60,14 +73,14 @@ def built_in_scenarios() -> tuple[str, ...]:
 def read_starts_scenario(
     name_or_path: str, *, method: str | None = None, noise_seed: int | None = None
 ) -> StartsScenario:
-    """Scenario of a convergence map over starts.
+    """Scenario of a map over starts.
 
     Parameters
     ----------
     name_or_path : str
         A built-in scenario's name, or a TOML file; ``paper.toml`` beside this module documents every key.
     method : str, optional
-        In place of the file's method: "repeated" or "iekf".
+        In place of the file's method: a key of :data:`magloc.convergence.FILTERS`.
     noise_seed : int, optional
         See :class:`magloc.convergence.StartsScenario`.
 
@@ -80,27 +93,13 @@ def read_starts_scenario(
     InputError
         The file cannot be read or does not describe a scenario; the text says where and why.
     """
-    path = name_or_path
-    if name_or_path in built_in_scenarios():
-        path = str(resources.files(__name__) / f"{name_or_path}.toml")
-    expected = f"a scenario file, or one of the built-in scenarios {', '.join(built_in_scenarios())}"
-    table = read_toml(path, expected)
-    check_keys(path, table, _File.__struct_fields__)
-    for key, struct in (("source", _Source), ("repeated", _Repeated), ("iekf", _Iekf)):
-        if isinstance(table.get(key), dict):
-            check_keys(path, table[key], struct.__struct_fields__, within=f"{key}.")
-    file = converted(path, table, _File)
-    if file.format_version != FORMAT_VERSION:
-        raise InputError(f"{path}, key format_version: found {file.format_version}, expected {FORMAT_VERSION}.")
-    filters: dict[str, Filter] = {"repeated": _repeated(file.repeated), "iekf": _iekf(file.iekf)}
+    path, table, file = _read(name_or_path)
     chosen = file.method if method is None else method
-    if chosen not in filters:
-        raise InputError(f"{path}, key method: found {chosen!r}, expected one of {', '.join(filters)}.")
+    if chosen not in FILTERS:
+        raise InputError(f"{path}, key method: found {chosen!r}, expected one of {', '.join(FILTERS)}.")
     _check_positive(path, "half_width_m", file.half_width_m)
-    for section in (file.repeated, file.iekf):
-        for key in section.__struct_fields__:
-            if key != "relinearise_every_scalar":
-                _check_positive(path, f"{type(section).__name__.strip('_').lower()}.{key}", getattr(section, key))
+    if file.source is None:
+        raise InputError(f"{path}: found no key source, expected one.")
     if not any(file.source.moment_Am2):
         raise InputError(f"{path}, key source.moment_Am2: found zero, expected a moment.")
     return StartsScenario(
@@ -108,29 +107,80 @@ def read_starts_scenario(
         position_m=file.source.position_m,
         moment_Am2=file.source.moment_Am2,
         half_width_m=file.half_width_m,
-        method=filters[chosen],
+        method=_filter(FILTERS[chosen], getattr(file, chosen), table.get(chosen, {})),
         noise_seed=noise_seed,
     )
 
 
-def _repeated(table: _Repeated) -> RepeatedFilter:
-    return RepeatedFilter(
-        position_step_m=table.position_step_m,
-        moment_step_Am2=table.moment_step_Am2,
-        noise_inflation=table.noise_inflation,
-        relinearise_every_scalar=table.relinearise_every_scalar,
-        tolerance_T=table.tolerance_nT / 1e9,
-        max_iterations=table.max_iterations,
+def read_sources_scenario(name_or_path: str, *, seed: int = 0) -> SourcesScenario:
+    """Scenario of a map over sources: a scenario file's array, and its table ``sources`` if it has one.
+
+    Parameters
+    ----------
+    name_or_path : str
+        As for :func:`read_starts_scenario`.
+    seed : int
+        See :class:`magloc.source_map.SourcesScenario`.
+
+    Returns
+    -------
+    SourcesScenario
+
+    Raises
+    ------
+    InputError
+        As for :func:`read_starts_scenario`.
+    """
+    path, _, file = _read(name_or_path)
+    sources = file.sources
+    for key in ("half_width_m", "farthest_m", "moment_Am2"):
+        _check_positive(path, f"sources.{key}", getattr(sources, key))
+    if not 0.0 <= sources.nearest_m < sources.farthest_m:
+        raise InputError(
+            f"{path}, key sources.nearest_m: found {sources.nearest_m:g}, "
+            f"expected zero or more, and less than farthest_m = {sources.farthest_m:g}."
+        )
+    return SourcesScenario(
+        array=_array(path, file.array),
+        half_width_m=sources.half_width_m,
+        nearest_m=sources.nearest_m,
+        farthest_m=sources.farthest_m,
+        moment_Am2=sources.moment_Am2,
+        seed=seed,
     )
 
 
-def _iekf(table: _Iekf) -> IekfFilter:
-    return IekfFilter(
-        position_sigma_m=table.position_sigma_m,
-        moment_sigma_Am2=table.moment_sigma_Am2,
-        tolerance_T=table.tolerance_nT / 1e9,
-        max_iterations=table.max_iterations,
-    )
+def _read(name_or_path: str) -> tuple[str, dict[str, Any], Any]:
+    """Path, table and checked types of a scenario file."""
+    path = name_or_path
+    if name_or_path in built_in_scenarios():
+        path = str(resources.files(__name__) / f"{name_or_path}.toml")
+    expected = f"a scenario file, or one of the built-in scenarios {', '.join(built_in_scenarios())}"
+    table = read_toml(path, expected)
+    check_keys(path, table, _FileWithFilters.__struct_fields__)
+    tables: dict[str, type[msgspec.Struct]] = {"source": _Source, "sources": _Sources, **_FILTER_TABLES}
+    for key, struct in tables.items():
+        if isinstance(table.get(key), dict):
+            check_keys(path, table[key], struct.__struct_fields__, within=f"{key}.")
+    file = converted(path, table, _FileWithFilters)
+    if file.format_version != FORMAT_VERSION:
+        raise InputError(f"{path}, key format_version: found {file.format_version}, expected {FORMAT_VERSION}.")
+    for name, struct in _FILTER_TABLES.items():
+        for key in struct.__struct_fields__:
+            value = getattr(getattr(file, name), key)
+            if not isinstance(value, bool):
+                _check_positive(path, f"{name}.{key}", value)
+    return path, table, file
+
+
+def _filter(default: Filter, table: Any, given: dict[str, Any]) -> Filter:
+    """A filter with the settings that its table gives."""
+    values = {}
+    for name in (field.name for field in fields(default)):  # type: ignore[arg-type]
+        if _key(name) in given:
+            value = getattr(table, _key(name))
+            values[name] = value / 1e9 if name.endswith("_T") else value
+    return replace(default, **values)  # type: ignore[type-var]
 
 
 def _array(path: str, array: dict[str, Any] | str) -> SensorArray:

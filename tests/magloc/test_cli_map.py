@@ -4,15 +4,35 @@ from __future__ import annotations
 
 import json
 import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import xarray as xr
 
 from magloc.cli import main
 from magloc.convergence import IekfFilter, StartsScenario
-from magloc.scenarios import built_in_scenarios, read_starts_scenario
+from magloc.scenarios import built_in_scenarios, read_sources_scenario, read_starts_scenario
+from magloc.source_map import SourcesScenario
 
 SOURCE = "[source]\nposition_m = [5, 0, 0.3]\nmoment_Am2 = [100, 0, 0]\n"
+STARTS_KEYS = [
+    "starts",
+    "converged",
+    "fraction",
+    "front_fraction",
+    "back_fraction",
+    "median_iterations",
+    "iterations_total",
+    "seconds",
+    "out",
+]
+REPOSITORY = Path(__file__).parents[2]
 ARRAY = '[array]\ngeometry = "tetrahedron"\nedge_m = 1.5\nkind = "vector"\nnoise_nT = 1.0\n'
 
 
@@ -20,24 +40,14 @@ class TestResult:
     def test_json_is_the_only_thing_on_stdout(self, tmp_path, capsys):
         assert main(["map", "--grid", "5", "--out", str(tmp_path / "out"), "--json"]) == 0
         result = json.loads(capsys.readouterr().out)
-        assert set(result) == {
-            "starts",
-            "converged",
-            "fraction",
-            "front_fraction",
-            "back_fraction",
-            "median_iterations",
-            "seconds",
-            "iterations_total",
-            "out",
-        }
+        assert set(result) == set(STARTS_KEYS)
         assert result["starts"] == 125
         assert result["fraction"] == result["converged"] / 125
         assert result["out"] == str(tmp_path / "out")
 
     def test_files(self, tmp_path, capsys):
         assert main(["map", "paper", "--method", "iekf", "--grid", "5", "--out", str(tmp_path), "--quiet"]) == 0
-        assert sorted(path.name for path in tmp_path.iterdir()) == ["convergence.nc", "convergence.png"]
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["convergence.nc", "convergence.png", "map.zarr"]
         assert (tmp_path / "convergence.png").read_bytes().startswith(b"\x89PNG")
         with xr.open_dataset(tmp_path / "convergence.nc") as dataset:
             assert dataset.attrs["method"] == "iekf"
@@ -62,6 +72,147 @@ class TestResult:
                 optima.append(tuple(dataset.attrs["optimum_position_m"]))
         assert len(set(optima)) == 3
         assert optima[2] == optima[3]
+
+
+class TestOverSources:
+    def test_json(self, tmp_path, capsys):
+        assert main(["map", "--over", "sources", "--grid", "5", "--out", str(tmp_path / "out"), "--json"]) == 0
+        result = json.loads(capsys.readouterr().out)
+        assert list(result) == [*STARTS_KEYS[:-1], "truth_listed", "out"]
+        with xr.open_dataset(tmp_path / "out/convergence.nc") as dataset:
+            assert result["starts"] == (dataset.status != 3).sum()
+            assert result["converged"] == (dataset.status == 0).sum()
+        assert result["fraction"] == result["converged"] / result["starts"]
+        assert result["front_fraction"] is None
+        assert result["back_fraction"] is None
+        assert 0.9 < result["truth_listed"] <= 1.0
+        assert (tmp_path / "out/convergence.png").read_bytes().startswith(b"\x89PNG")
+
+    def test_seed_counts_and_threads_do_not(self, tmp_path, capsys):
+        chi2 = []
+        for i, options in enumerate((["--threads", "1"], ["--threads", "2"], ["--seed", "1"])):
+            out = tmp_path / str(i)
+            assert main(["map", "--over", "sources", "--grid", "7", "--out", str(out), "--quiet", *options]) == 0
+            with xr.open_dataset(out / "convergence.nc") as dataset:
+                chi2.append(dataset.chi2.to_numpy())
+        np.testing.assert_array_equal(chi2[0], chi2[1])
+        assert np.nanmin(abs(chi2[0] - chi2[2])) > 0.0
+
+    def test_sources_of_a_file(self, tmp_path, capsys):
+        path = tmp_path / "mine.toml"
+        path.write_text(ARRAY + "[sources]\nhalf_width_m = 3\nnearest_m = 2\nfarthest_m = 3\nmoment_Am2 = 10\n")
+        scenario = read_sources_scenario(str(path), seed=4)
+        assert (scenario.half_width_m, scenario.nearest_m, scenario.farthest_m) == (3.0, 2.0, 3.0)
+        assert (scenario.moment_Am2, scenario.seed) == (10.0, 4)
+        assert main(["map", str(path), "--over", "sources", "--grid", "3", "--out", str(tmp_path / "out")]) == 0
+        assert "of 6 sources found" in capsys.readouterr().out
+
+    def test_the_paper_file_has_the_defaults(self):
+        default = SourcesScenario()
+        paper = read_sources_scenario("paper")
+        assert replace(paper, array=default.array) == default
+
+    @pytest.mark.parametrize(
+        ("text", "options", "expected"),
+        [
+            (ARRAY + "[sources]\nnearest_m = 13\n", [], "key sources.nearest_m: found 13"),
+            (ARRAY + "[sources]\nmoment_Am2 = 0\n", [], "key sources.moment_Am2: found 0, expected a positive number"),
+            (ARRAY + "[sources]\nradius = 1\n", [], "key sources.radius: found an unknown key"),
+            (ARRAY.replace("vector", "scalar"), [], "vector sensors only"),
+            (ARRAY, ["--method", "iekf"], "--method: found 'iekf', expected global"),
+            (ARRAY, ["--over", "moments"], "--over"),
+        ],
+    )
+    def test_bad_input(self, text, options, expected, tmp_path, capsys):
+        path = tmp_path / "bad.toml"
+        path.write_text(text)
+        out = tmp_path / "out"
+        assert main(["map", str(path), "--over", "sources", "--grid", "3", "--out", str(out), *options]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert expected in line
+        assert not out.exists()
+
+
+class TestInterrupted:
+    """The command as a process of its own, with signals."""
+
+    arguments = ("map", "--grid", "70", "--method", "iekf")  # 27 chunks
+
+    def started(self, out):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "magloc.cli", *self.arguments, "--threads", "1", "--out", str(out)],
+            cwd=REPOSITORY, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        marks = out / "map.zarr/seconds_of_chunk/c"
+        while len([path for path in marks.rglob("*") if path.is_file()]) < 3:
+            assert process.poll() is None
+            time.sleep(0.002)
+        return process
+
+    def resumed(self, out, whole, capsys):
+        """Result of the same command, compared with that of an uninterrupted one, to the last bit."""
+        assert main([*self.arguments, "--out", str(out)]) == 0
+        err = capsys.readouterr().err
+        assert re.search(r"\d+ of 27 chunks were there before", err)
+        assert main([*self.arguments, "--out", str(whole), "--quiet"]) == 0
+        with (
+            xr.open_dataset(out / "convergence.nc") as found,
+            xr.open_dataset(whole / "convergence.nc") as expected,
+        ):
+            xr.testing.assert_equal(found, expected)
+
+    def test_kill_9(self, tmp_path, capsys):
+        process = self.started(tmp_path / "out")
+        process.kill()
+        process.communicate()
+        assert not (tmp_path / "out/convergence.nc").exists()
+        self.resumed(tmp_path / "out", tmp_path / "whole", capsys)
+
+    def test_control_c(self, tmp_path, capsys):
+        process = self.started(tmp_path / "out")
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=20)
+        assert process.returncode == 130
+        (line,) = err.splitlines()
+        assert re.fullmatch(
+            r"magloc: interrupted: \d+ of 27 chunks are done, the same command goes on with the others", line
+        )
+        self.resumed(tmp_path / "out", tmp_path / "whole", capsys)
+
+    def test_finished(self, tmp_path, capsys):
+        arguments = ["map", "--grid", "5", "--out", str(tmp_path)]
+        results = []
+        for _ in range(2):
+            assert main([*arguments, "--json"]) == 0
+            results.append(json.loads(capsys.readouterr().out))
+        assert results[0] == results[1]  # the seconds as well
+        assert main(arguments) == 0
+        assert "was complete, nothing was computed again" in capsys.readouterr().err
+
+    def test_another_map_in_the_folder(self, tmp_path, capsys):
+        assert main(["map", "--grid", "5", "--out", str(tmp_path), "--quiet"]) == 0
+        before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+        capsys.readouterr()
+        for options in (["--grid", "6"], ["--grid", "5", "--method", "iekf"], ["--grid", "5", "--over", "sources"]):
+            assert main(["map", *options, "--out", str(tmp_path)]) == 2
+            out, err = capsys.readouterr()
+            assert out == ""
+            assert len(err.splitlines()) == 1
+            assert "found another map, with" in err
+        assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+    def test_what_cannot_be_written(self, tmp_path, capsys):
+        """A limit on the size of files stands for a full disk."""
+        script = (
+            "import resource, sys; from magloc.cli import main;"
+            "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000));"
+            f"sys.exit(main(['map', '--grid', '40', '--out', {str(tmp_path)!r}]))"
+        )
+        result = subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, capture_output=True, text=True)
+        assert result.returncode == 2
+        (line,) = result.stderr.splitlines()
+        assert "map.zarr cannot be written (File too large); 0 of 8 chunks are done, the same command goes on" in line
+        assert main(["map", "--grid", "40", "--out", str(tmp_path), "--quiet"]) == 0
 
 
 class TestScenarios:
