@@ -15,7 +15,6 @@ from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -249,6 +248,8 @@ class SensorArray:
     @cached_property
     def rotation_matrices(self) -> FloatArray:
         """Rotations from the sensors' axes to the array's frame, shape (N, 3, 3)."""
+        from scipy.spatial.transform import Rotation  # a third of a second to import
+
         return _read_only(Rotation.from_quat([sensor.rotation_xyzw for sensor in self.sensors]).as_matrix())
 
     @cached_property

@@ -456,6 +456,8 @@ class StartsMap:
     @property
     def edge(self) -> int:
         """Starts along the edges of a box."""
+        if self.grid <= 48:  # a second's work at most: a chunk would cost more to write than to compute
+            return self.grid
         return 32 if self.grid <= 128 else 64
 
     @property

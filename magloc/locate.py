@@ -285,10 +285,8 @@ class Locator:
                 white.shrinkage,
                 bases,
             )
-            # (component, candidate, channel): the search adds up three contiguous rows of a matrix product. Single
-            # precision ranks candidates as well, in half the time.
-            single = bases.transpose(1, 0, 2).astype(np.float32, order="C")
-            self._of_mask[key] = _Kernel(white, problem, single.reshape(-1, self.array.n_channels))
+            single = bases.transpose(2, 1, 0).astype(np.float32, order="C").reshape(self.array.n_channels, -1)
+            self._of_mask[key] = _Kernel(white, problem, single)
         return self._of_mask[key]
 
     def fit_from(self, readings_T: ArrayLike, starts_m: ArrayLike) -> BestFits:
@@ -310,12 +308,12 @@ class Locator:
         starts = np.asarray(starts_m, dtype=np.float64)
         mask = np.isfinite(readings[0])
         kernel = self._kernel(mask)
-        y, components, whitenings = self._whitened(kernel, mask, readings)
+        y, ranked, whitenings = self._whitened(kernel, mask, readings)
         n = len(starts)
         found = self._search(
             kernel,
             y,
-            components,
+            ranked,
             np.zeros(n, dtype=np.intp),
             whitenings,
             np.zeros(n, dtype=np.intp),
@@ -331,22 +329,22 @@ class Locator:
 
     def _whitened(
         self, kernel: _Kernel, mask: NDArray[np.bool_], readings: FloatArray
-    ) -> tuple[FloatArray, NDArray[np.float32], list[Whitening]]:
-        """Whitened readings, their parts in the bases of all candidates, and the whitenings: one, or one a row."""
+    ) -> tuple[FloatArray, FloatArray, list[Whitening]]:
+        """Whitened readings, the same as the candidates are ranked by, and the whitenings: one, or one a row."""
         channels = np.where(mask, readings - self.array.channel_offset_T, 0.0)
-        y = kernel.whitening.apply(channels)
-        components = y.astype(np.float32) @ kernel.bases.T
+        ranked = kernel.whitening.apply(channels)
         if self.array.noise_fraction == 0.0:
-            return y, components, [kernel.whitening]
+            return ranked, ranked, [kernel.whitening]
         noise = proportional_noise(self.array, readings)
         whitenings = [whitening(self.array, mask, channel_noise_T=row) for row in noise]
-        return np.stack([w.apply(row) for w, row in zip(whitenings, channels, strict=True)]), components, whitenings
+        y = np.stack([w.apply(row) for w, row in zip(whitenings, channels, strict=True)])
+        return y, ranked, whitenings
 
     def _search(
         self,
         kernel: _Kernel,
         y: FloatArray,
-        components: NDArray[np.float32],
+        ranked: FloatArray,
         reading_of_row: NDArray[np.intp],
         whitenings: list[Whitening],
         set_of_row: NDArray[np.intp],
@@ -374,8 +372,9 @@ class Locator:
             kernels.search_rows,
             shape[0],
             y,
-            components,
+            ranked,
             reading_of_row,
+            kernel.bases,
             problem.homogeneous(self._candidates),
             first,
             np.cos(self.apart_rad),
@@ -411,12 +410,12 @@ class Locator:
 
     def _fit_block(self, kernel: _Kernel, mask: NDArray[np.bool_], readings: FloatArray) -> list[Fix]:
         problem, n_rows = kernel.problem, len(readings)
-        y, components, whitenings = self._whitened(kernel, mask, readings)
+        y, ranked, whitenings = self._whitened(kernel, mask, readings)
         every = np.arange(n_rows, dtype=np.intp)
         found = self._search(
             kernel,
             y,
-            components,
+            ranked,
             every,
             whitenings,
             every if len(whitenings) > 1 else np.zeros(n_rows, dtype=np.intp),

@@ -55,8 +55,9 @@ def convergence_figure(dataset: xr.Dataset, counts: MapSummary | None = None) ->
     source = np.atleast_1d(dataset.attrs["position_m"])
     centroid = np.atleast_1d(dataset.attrs["centroid_m"])
     moment = np.atleast_1d(dataset.attrs["moment_Am2"])
-    figure = Figure(figsize=(13.0, 5.0), layout="constrained")
-    axes = figure.subplots(1, 3)
+    # Places by hand: a layout engine draws everything twice.
+    figure = Figure(figsize=(13.0, 5.0))
+    axes = figure.subplots(1, 3, gridspec_kw={"left": 0.05, "right": 0.9, "bottom": 0.18, "top": 0.86, "wspace": 0.24})
     parts = _slices(dataset[["status", "iterations"]], source)
     shown = [part["iterations"].where(part["status"] == Status.CONVERGED) for part in parts]
     converged = np.concatenate([values.to_numpy()[np.isfinite(values)] for values in shown])
@@ -65,10 +66,11 @@ def convergence_figure(dataset: xr.Dataset, counts: MapSummary | None = None) ->
         _slice(ax, part["status"], _STARTS_COLOURS, values, across, up, "start", (0.0, top))
         _scene(ax, dataset, source, centroid, moment, "xyz".index(across), "xyz".index(up))
         ax.set_title(f"starts with {through} = {float(part[through]):g} m", fontsize=10)
-    figure.colorbar(axes[-1].images[-1], ax=axes, label="passes over the readings until convergence", shrink=0.9)
+    bar = figure.add_axes((0.925, 0.18, 0.012, 0.68))
+    figure.colorbar(axes[-1].images[-1], cax=bar, label="passes over the readings until convergence")
     handles = _handles(axes[0], parts, _NOT_CONVERGED)
     handles += [h for h in axes[0].get_legend_handles_labels()[0] if h not in handles]
-    figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False, fontsize=9)
+    figure.legend(handles=handles, loc="lower center", ncols=6, frameon=False, fontsize=9)
     figure.suptitle(
         f"Convergence of '{dataset.attrs['method']}', moment ({', '.join(f'{m:g}' for m in moment)}) A·m²: "
         f"front half {_percent(counts.front_fraction)}, back half {_percent(counts.back_fraction)}"

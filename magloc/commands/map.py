@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 Over = Literal["starts", "sources"]
 Grid = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=2))]
 
-# Larger maps stay in map.zarr alone.
-LARGEST_NETCDF = 101
-
 
 def map_(
     scenario: str = "paper",
@@ -34,13 +31,14 @@ def map_(
     noise: Flag = False,
     scheduler: str | None = None,
     out: Path | None = None,
+    netcdf: Flag = False,
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Draw the convergence map of a filter over a cube of starts, or that of start-free fixes over a cube of sources.
 
-    Writes map.zarr chunk by chunk, convergence.png (three slices), and up to a grid of 101 convergence.nc. The same
-    command continues a map that was interrupted.
+    Writes map.zarr chunk by chunk, and convergence.png (three slices). The same command continues a map that was
+    interrupted.
 
     Parameters
     ----------
@@ -50,7 +48,7 @@ def map_(
         starts: one source, a filter from every start. sources: every source with a random moment and noise, drawn with
         --seed, fixed once without a start.
     method : str
-        Filter over starts, in place of the scenario's: repeated, iekf, damped.
+        Filter over starts, in place of the scenario's: repeated, iekf, damped, global.
     grid : int
         Points along every axis; by default 41 starts, 21 sources.
     noise : bool
@@ -59,6 +57,8 @@ def map_(
         Address of a dask scheduler (tcp://HOST:PORT) whose workers compute the map.
     out : Path
         Folder to write; by default map-SCENARIO-METHOD.
+    netcdf : bool
+        Write convergence.nc as well: the whole map, which has to fit into memory.
     json : bool
         Print one JSON object with the counts.
     common : CommonOptions
@@ -82,7 +82,7 @@ def map_(
         if before < sweep.n_chunks:
             _run(sweep, scheduler, quiet=common.quiet)
         counts = sweep.summary
-    _export(folder, cube, counts)
+    _export(folder, counts, netcdf=netcdf)
     if json:
         print_json({**asdict(counts), "out": str(folder)})
     else:
@@ -143,8 +143,8 @@ def _run(sweep: Sweep, scheduler: str | None, *, quiet: bool) -> None:
             raise InputError(f"{sweep.path} cannot be written ({error.strerror or error}); {kept()}.") from None
 
 
-def _export(folder: Path, cube: CubeMap, counts: MapSummary) -> None:
-    """Figure of a finished map, and all of it as netCDF if it is small."""
+def _export(folder: Path, counts: MapSummary, *, netcdf: bool) -> None:
+    """Figure of a finished map, and all of it as netCDF if wanted."""
     from magloc.plots import convergence_figure, source_figure
     from magloc.source_map import SourceMapSummary
     from magloc.sweep import open_map
@@ -154,7 +154,7 @@ def _export(folder: Path, cube: CubeMap, counts: MapSummary) -> None:
             figure = source_figure(dataset, counts)
         else:
             figure = convergence_figure(dataset, counts)
-        if cube.grid <= LARGEST_NETCDF:
+        if netcdf:
             _replace(folder / "convergence.nc", lambda path: dataset.to_netcdf(path))
     _replace(folder / "convergence.png", lambda path: figure.savefig(path, format="png", dpi=150))
 

@@ -550,9 +550,16 @@ def candidate_bases(
 
 
 @compiled
-def _pick_starts(components: NDArray[np.float32], candidates: FloatArray, cos_apart: float, starts: FloatArray) -> int:
-    """Candidates that explain most energy, some angle apart on the sphere of homogeneous coordinates."""
+def _pick_starts(
+    y: FloatArray, bases: NDArray[np.float32], candidates: FloatArray, cos_apart: float, starts: FloatArray
+) -> int:
+    """Candidates that explain most of the energy of y, some angle apart on the sphere of homogeneous coordinates."""
     n = candidates.shape[0]
+    components = np.zeros(3 * n, np.float32)
+    for c in range(y.size):
+        t = np.float32(y[c])
+        for i in range(3 * n):
+            components[i] += t * bases[c, i]
     score = np.empty(n, np.float32)
     for i in range(n):
         score[i] = components[i] ** 2 + components[n + i] ** 2 + components[2 * n + i] ** 2
@@ -592,7 +599,8 @@ def _gaussian_step(q: FloatArray, covariance: FloatArray, rise: float) -> float:
 @compiled
 def _search_row(
     y: FloatArray,
-    components: NDArray[np.float32],
+    ranked: FloatArray,
+    bases: NDArray[np.float32],
     candidates: FloatArray,
     first: FloatArray,
     cos_apart: float,
@@ -618,7 +626,7 @@ def _search_row(
     for k in range(n_first):
         for d in range(4):
             starts[k, d] = first[k, d]
-    n = n_first + _pick_starts(components, candidates, cos_apart, starts[n_first:])
+    n = n_first + _pick_starts(ranked, bases, candidates, cos_apart, starts[n_first:])
     found = runtime_int(0)
     counts[1] = counts[2] = 0
     for k in range(n):
@@ -664,8 +672,9 @@ def search_rows(
     begin: int,
     end: int,
     y: FloatArray,
-    components: NDArray[np.float32],
+    ranked: FloatArray,
     reading_of_row: NDArray[np.intp],
+    bases: NDArray[np.float32],
     candidates: FloatArray,
     first: FloatArray,
     cos_apart: float,
@@ -685,16 +694,17 @@ def search_rows(
 ) -> None:
     """Distinct optima of rows begin to end, best first; for :func:`magloc.kernels.over_rows`.
 
-    y (readings, c) are whitened readings, components (readings, 3 · candidates) their parts in the orthonormal basis of
-    every candidate, reading_of_row which of them a row has; first (rows, f, 4) are starts of a row's own, refined
-    before the best candidates; gain (sets, c, 3), common (sets, q, c), shrinkage (sets, q) the whitening, set_of_row
-    which of them a row has. Into the outputs (rows, starts, …): q, mu, χ², linearisations; counts (rows, 3) are the
-    optima kept, the starts that did not converge, and all linearisations.
+    y (readings, c) are whitened readings, reading_of_row which of them a row has; ranked (readings, c) the same ones
+    under the whitening of bases (c, 3 · candidates), the candidates' orthonormal bases in single precision, which ranks
+    them as well; first (rows, f, 4) are starts of a row's own, refined before the best candidates; gain (sets, c, 3),
+    common (sets, q, c), shrinkage (sets, q) the whitening, set_of_row which of them a row has. Into the outputs
+    (rows, starts, …): q, mu, χ², linearisations; counts (rows, 3) are the optima kept, the starts that did not
+    converge, and all linearisations.
     """
     for row in range(begin, end):
         w, r = set_of_row[row], reading_of_row[row]
         _search_row(
-            y[r], components[r], candidates, first[row], cos_apart, keep_within, max_iterations,
+            y[r], ranked[r], bases, candidates, first[row], cos_apart, keep_within, max_iterations,
             sensors, channel_sensor, gain[w], common[w], shrinkage[w],
             out_q[row], out_mu[row], out_chi2[row], out_iterations[row], counts[row],
         )  # fmt: skip

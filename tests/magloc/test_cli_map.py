@@ -19,6 +19,7 @@ from magloc.cli import main
 from magloc.convergence import IekfFilter, StartsScenario
 from magloc.scenarios import built_in_scenarios, read_sources_scenario, read_starts_scenario
 from magloc.source_map import SourcesScenario
+from magloc.sweep import open_map
 
 SOURCE = "[source]\nposition_m = [5, 0, 0.3]\nmoment_Am2 = [100, 0, 0]\n"
 STARTS_KEYS = [
@@ -46,7 +47,10 @@ class TestResult:
         assert result["out"] == str(tmp_path / "out")
 
     def test_files(self, tmp_path, capsys):
-        assert main(["map", "paper", "--method", "iekf", "--grid", "5", "--out", str(tmp_path), "--quiet"]) == 0
+        assert (
+            main(["map", "paper", "--method", "iekf", "--grid", "5", "--out", str(tmp_path), "--quiet", "--netcdf"])
+            == 0
+        )
         assert sorted(path.name for path in tmp_path.iterdir()) == ["convergence.nc", "convergence.png", "map.zarr"]
         assert (tmp_path / "convergence.png").read_bytes().startswith(b"\x89PNG")
         with xr.open_dataset(tmp_path / "convergence.nc") as dataset:
@@ -68,7 +72,7 @@ class TestResult:
         optima = []
         for i, options in enumerate(([], ["--noise"], ["--noise", "--seed", "1"], ["--noise", "--seed", "1"])):
             assert main(["map", "--grid", "3", "--out", str(tmp_path / str(i)), "--quiet", *options]) == 0
-            with xr.open_dataset(tmp_path / str(i) / "convergence.nc") as dataset:
+            with open_map(tmp_path / str(i) / "map.zarr") as dataset:
                 optima.append(tuple(dataset.attrs["optimum_position_m"]))
         assert len(set(optima)) == 3
         assert optima[2] == optima[3]
@@ -79,7 +83,7 @@ class TestOverSources:
         assert main(["map", "--over", "sources", "--grid", "5", "--out", str(tmp_path / "out"), "--json"]) == 0
         result = json.loads(capsys.readouterr().out)
         assert list(result) == [*STARTS_KEYS[:-1], "truth_listed", "out"]
-        with xr.open_dataset(tmp_path / "out/convergence.nc") as dataset:
+        with open_map(tmp_path / "out/map.zarr") as dataset:
             assert result["starts"] == (dataset.status != 3).sum()
             assert result["converged"] == (dataset.status == 0).sum()
         assert result["fraction"] == result["converged"] / result["starts"]
@@ -93,7 +97,7 @@ class TestOverSources:
         for i, options in enumerate((["--threads", "1"], ["--threads", "2"], ["--seed", "1"])):
             out = tmp_path / str(i)
             assert main(["map", "--over", "sources", "--grid", "7", "--out", str(out), "--quiet", *options]) == 0
-            with xr.open_dataset(out / "convergence.nc") as dataset:
+            with open_map(out / "map.zarr") as dataset:
                 chi2.append(dataset.chi2.to_numpy())
         np.testing.assert_array_equal(chi2[0], chi2[1])
         assert np.nanmin(abs(chi2[0] - chi2[2])) > 0.0
@@ -156,8 +160,8 @@ class TestInterrupted:
         assert re.search(r"\d+ of 27 chunks were there before", err)
         assert main([*self.arguments, "--out", str(whole), "--quiet"]) == 0
         with (
-            xr.open_dataset(out / "convergence.nc") as found,
-            xr.open_dataset(whole / "convergence.nc") as expected,
+            open_map(out / "map.zarr") as found,
+            open_map(whole / "map.zarr") as expected,
         ):
             xr.testing.assert_equal(found, expected)
 
@@ -165,7 +169,7 @@ class TestInterrupted:
         process = self.started(tmp_path / "out")
         process.kill()
         process.communicate()
-        assert not (tmp_path / "out/convergence.nc").exists()
+        assert not (tmp_path / "out/convergence.png").exists()
         self.resumed(tmp_path / "out", tmp_path / "whole", capsys)
 
     def test_control_c(self, tmp_path, capsys):

@@ -89,8 +89,8 @@ class TestCluster:
         assert main([*arguments, "--out", str(tmp_path / "here")]) == 0
         assert capsys.readouterr().err == ""
         with (
-            xr.open_dataset(tmp_path / "far/convergence.nc") as far,
-            xr.open_dataset(tmp_path / "here/convergence.nc") as here,
+            open_map(tmp_path / "far/map.zarr") as far,
+            open_map(tmp_path / "here/map.zarr") as here,
         ):
             xr.testing.assert_equal(far, here)
 
