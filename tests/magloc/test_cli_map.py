@@ -210,13 +210,13 @@ class TestInterrupted:
         script = (
             "import resource, sys; from magloc.cli import main;"
             "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000));"
-            f"sys.exit(main(['map', '--grid', '40', '--out', {str(tmp_path)!r}]))"
+            f"sys.exit(main(['map', '--grid', '49', '--out', {str(tmp_path)!r}]))"
         )
         result = subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, capture_output=True, text=True)
         assert result.returncode == 2
         (line,) = result.stderr.splitlines()
         assert "map.zarr cannot be written (File too large); 0 of 8 chunks are done, the same command goes on" in line
-        assert main(["map", "--grid", "40", "--out", str(tmp_path), "--quiet"]) == 0
+        assert main(["map", "--grid", "49", "--out", str(tmp_path), "--quiet"]) == 0
 
 
 class TestScenarios:
