@@ -268,7 +268,8 @@ def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray
     Returns
     -------
     ndarray, shape (..., C)
-        Standard deviations [T], in the units of the readings. A sensor whose reading is incomplete keeps its own noise.
+        Standard deviations [T], in the units of the readings. Of a sensor whose reading is incomplete the known axes
+        stand for the missing ones, and the largest |B| of a complete sensor is the least it is given.
     """
     readings_T = np.asarray(readings_T, dtype=np.float64)
     noise = np.broadcast_to(array.channel_noise_T, readings_T.shape)
@@ -277,9 +278,7 @@ def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray
     vector = ~array.channel_is_scalar
     modulus = np.zeros_like(readings_T)
     if vector.any():
-        fields = array.calibrated_field(readings_T)
-        deviation = np.linalg.norm(fields - _mean_of_finite(fields, axis=-2), axis=-1)
-        modulus[..., vector] = deviation[..., array.channel_sensor[vector]]
+        modulus[..., vector] = _deviations(array, readings_T)[..., array.channel_sensor[vector]]
     if not vector.all():
         scalar = ~vector
         moduli = (readings_T[..., scalar] - array.channel_offset_T[scalar]) / array.channel_gain[scalar, 0]
@@ -287,6 +286,29 @@ def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray
     gain = np.linalg.norm(array.channel_gain, axis=1)
     result: FloatArray = np.hypot(noise, array.noise_fraction * gain * np.nan_to_num(modulus))
     return result
+
+
+def _deviations(array: SensorArray, readings_T: FloatArray) -> FloatArray:
+    """Modulus of every sensor's field minus the array's mean: (..., N) [T]."""
+    fields = array.calibrated_field(readings_T)
+    mean = _mean_of_finite(fields, axis=-2)
+    deviation: FloatArray = np.linalg.norm(fields - mean, axis=-1)
+    missing = np.isnan(deviation)
+    if missing.any():
+        vector = np.flatnonzero(~array.channel_is_scalar)
+        gain = array.channel_gain[vector]
+        axes = (readings_T - array.channel_offset_T)[..., vector] - mean[..., 0, :] @ gain.T
+        axes = np.where(np.isfinite(axes), axes / np.linalg.norm(gain, axis=1), np.nan)
+        of_sensor = np.stack(
+            [
+                _mean_of_finite(axes[..., array.channel_sensor[vector] == i] ** 2, axis=-1)
+                for i in range(array.n_sensors)
+            ],
+            axis=-2,
+        )[..., 0]
+        largest = np.max(np.where(missing, 0.0, deviation), axis=-1, keepdims=True)
+        deviation = np.where(missing, np.maximum(np.sqrt(3.0 * of_sensor), largest), deviation)
+    return deviation
 
 
 def _mean_of_finite(values: FloatArray, axis: int) -> FloatArray:

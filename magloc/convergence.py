@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from arrays.differences import decorrelated_differences, proportional_noise
 from arrays.geometries import tetrahedron
 from arrays.sensor import SensorArray
 from magloc.cubes import Box, MapSummary, Tally, Values, Variable, histogram, in_memory
@@ -331,7 +332,6 @@ class DampedFilter:
         return ends.stopped & (distance < PRIOR_REACHED_M)
 
 
-# Every method of a map by its name, with its default settings; scenario files and the command line take them from here.
 @dataclass(frozen=True)
 class GlobalFilter:
     """The start-free search of :class:`magloc.locate.Locator`, with the map's start refined before its candidates.
@@ -352,7 +352,7 @@ class GlobalFilter:
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """Best end of every start (n, 6), compiled; the readable twin of its cost is :mod:`magloc.separable`."""
         array = measurement.array
-        # Any readings with these differences will do: the common field does not enter.
+        # Any readings with these differences have the same likelihood.
         readings = np.linalg.lstsq(measurement.differences.transform, z, rcond=None)[0] + array.channel_offset_T
         ends = Locator(array, max_iterations=self.max_iterations).fit_from(readings, starts[:, :3])
         return Ends(
@@ -367,6 +367,7 @@ class GlobalFilter:
         return ends.stopped & (ends.chi2 < chi2_optimum + CHI2_REACHED)
 
 
+# Every method of a map by its name, with its default settings; scenario files and the command line take them from here.
 FILTERS: dict[str, Filter] = {
     method.name: method for method in (RepeatedFilter(), IekfFilter(), DampedFilter(), GlobalFilter())
 }
@@ -408,15 +409,30 @@ class StartsScenario:
     noise_seed: int | None = None
 
 
-def simulated_differences(
-    scenario: StartsScenario, measurement: DifferenceMeasurement
-) -> tuple[FloatArray, FloatArray]:
-    """Readings (C,) [T] of the scenario, and their decorrelated differences (k,) [T]."""
+def simulated_measurement(scenario: StartsScenario) -> tuple[FloatArray, DifferenceMeasurement, FloatArray]:
+    """Readings of a scenario, and what the filters make of them.
+
+    Parameters
+    ----------
+    scenario : StartsScenario
+
+    Returns
+    -------
+    readings : ndarray, shape (C,)
+        [T]
+    measurement : DifferenceMeasurement
+        With the noise that goes with these readings.
+    z : ndarray, shape (k,)
+        Their decorrelated differences [T].
+    """
     array = scenario.array
     readings = predicted_channels(array, scenario.position_m, scenario.moment_Am2) + array.channel_offset_T
     if scenario.noise_seed is not None:
-        readings = readings + np.random.default_rng(scenario.noise_seed).normal(scale=array.channel_noise_T)
-    return readings, measurement.measured(readings)
+        sigma = proportional_noise(array, readings)
+        readings = readings + np.random.default_rng(scenario.noise_seed).normal(scale=sigma)
+    differences = decorrelated_differences(array, channel_noise_T=proportional_noise(array, readings))
+    measurement = DifferenceMeasurement(array, differences)
+    return readings, measurement, measurement.measured(readings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -446,9 +462,9 @@ class StartsMap:
         """Map of a scenario; the arguments and errors of :func:`convergence_map`."""
         if grid < 2:
             raise ValueError(f"Input grid must be at least 2; instead received {grid}.")
-        measurement = DifferenceMeasurement.of(scenario.array)
-        readings, z = simulated_differences(scenario, measurement)
-        fix = Locator(scenario.array).fit(readings)
+        locator = Locator(scenario.array)
+        readings, measurement, z = simulated_measurement(scenario)
+        fix = locator.fit(readings)
         if not fix.solutions:
             raise ValueError(f"The scenario's readings have no maximum-likelihood solution: {fix.reason}.")
         return cls(scenario, grid, measurement, z, fix.solutions[0])

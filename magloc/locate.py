@@ -202,6 +202,7 @@ class Locator:
     ) -> None:
         if array.channel_is_scalar.any():
             raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
+        _check_magnitudes(array)
         self.array = array
         self.n_starts = n_starts
         self.apart_rad = apart_rad
@@ -461,6 +462,25 @@ class Locator:
             )
             fixes.append(Fix(solutions, "" if solutions else _why_unsolved(int(unknown[i]), n), int(failed[i])))
         return fixes
+
+
+def _check_magnitudes(array: SensorArray) -> None:
+    """Refuse what double precision cannot square."""
+    noise = array.channel_noise_T
+    if noise.min() < 1e-20 or noise.max() > 1e3:
+        raise ValueError(
+            f"Input array must have a noise between 1e-11 and 1e12 nT; instead received {1e9 * noise.min():g} nT"
+            f" to {1e9 * noise.max():g} nT."
+        )
+    if np.abs(array.positions).max() > 1e9 or array.circumradius < 1e-9:
+        raise ValueError(
+            "Input array must span 1e-9 m at least and lie within 1e9 m of its origin; instead it does not."
+        )
+    if array.common_field_T is not None and array.common_field_T > 1e3:
+        common_nT = 1e9 * array.common_field_T
+        raise ValueError(f"Input array must have a common field of 1e12 nT at most; instead received {common_nT:g} nT.")
+    if array.noise_fraction > 10.0:
+        raise ValueError(f"Input array must have a noise_fraction of 10 at most; instead: {array.noise_fraction:g}.")
 
 
 def _rows_of_equal_mask(available: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.intp]]]:

@@ -226,7 +226,10 @@ def write_readings(path: str | PathLike[str], readings: Readings, array: SensorA
 
 
 def average(readings: Readings) -> Readings:
-    """All rows averaged to one, channel by channel, missing readings left out.
+    """All complete rows averaged to one.
+
+    Complete are the rows with every channel that any row has. Rows with less are left out: the field common to all
+    sensors changes from row to row, and cancels only between channels that are averaged over the same rows.
 
     Parameters
     ----------
@@ -236,12 +239,13 @@ def average(readings: Readings) -> Readings:
     Returns
     -------
     Readings
-        One row, at the mean time and with the first row's line number. A channel that no row has stays missing.
+        One row, at the mean time and with the line number of the first complete one. A channel that no row has stays
+        missing.
 
     Raises
     ------
     InputError
-        The array moves between the rows.
+        The array moves between the rows, or no row is complete.
     """
     position_m, rotation_xyzw, ambient_T = readings.array_position_m, readings.array_rotation_xyzw, readings.ambient_T
     if position_m is not None and rotation_xyzw is not None:
@@ -253,25 +257,29 @@ def average(readings: Readings) -> Readings:
                 "expected one pose for all rows that are averaged."
             )
         position_m, rotation_xyzw = position_m[:1], rotation_xyzw[:1]
-    present = np.isfinite(readings.values_T)
-    count = present.sum(axis=0)
-    total = np.where(present, readings.values_T, 0.0).sum(axis=0)
-    mean = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    complete = _complete(readings)
+    if not complete.any():
+        raise InputError("found no row with all channels, expected at least one for an average.")
     return Readings(
-        time_s=readings.time_s.mean(keepdims=True),
-        values_T=mean[None],
-        line_numbers=readings.line_numbers[:1],
+        time_s=readings.time_s[complete].mean(keepdims=True),
+        values_T=readings.values_T[complete].mean(axis=0, keepdims=True),
+        line_numbers=readings.line_numbers[complete][:1],
         array_position_m=position_m,
         array_rotation_xyzw=rotation_xyzw,
-        ambient_T=None if ambient_T is None else ambient_T.mean(axis=0, keepdims=True),
+        ambient_T=None if ambient_T is None else ambient_T[complete].mean(axis=0, keepdims=True),
     )
+
+
+def _complete(readings: Readings) -> NDArray[np.bool_]:
+    """Rows with every channel that any row has."""
+    present = np.isfinite(readings.values_T)
+    return np.asarray((present == present.any(axis=0)).all(axis=1))
 
 
 def averaging_array(array: SensorArray, readings: Readings) -> SensorArray:
     r"""The array with the noise of :func:`average`'s row in place of that of a single row.
 
-    White noise of n rows falls by :math:`\sqrt n`. A sensor's n is that of its channel with the fewest readings; the
-    proportional noise, which the sensors share, falls with the sensor of the fewest readings.
+    White noise, and the proportional noise with it, falls by :math:`\sqrt n` with n complete rows.
 
     Parameters
     ----------
@@ -283,13 +291,9 @@ def averaging_array(array: SensorArray, readings: Readings) -> SensorArray:
     -------
     SensorArray
     """
-    n_rows = np.isfinite(readings.values_T).sum(axis=0)
-    n_rows[n_rows == 0] = len(readings)  # such channels have no mean: what is set for them does not matter
-    fewest = [int(n_rows[array.channel_sensor == i].min()) for i in range(array.n_sensors)]
-    sensors = tuple(
-        replace(sensor, noise_T=sensor.noise_T / math.sqrt(n)) for sensor, n in zip(array.sensors, fewest, strict=True)
-    )
-    return replace(array, sensors=sensors, noise_fraction=array.noise_fraction / math.sqrt(min(fewest)))
+    root = math.sqrt(max(1, int(_complete(readings).sum())))
+    sensors = tuple(replace(sensor, noise_T=sensor.noise_T / root) for sensor in array.sensors)
+    return replace(array, sensors=sensors, noise_fraction=array.noise_fraction / root)
 
 
 def _check_sensor_columns(table: Table, array: SensorArray, channels: Sequence[str], *, ignore_others: bool) -> None:

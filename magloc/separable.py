@@ -123,8 +123,8 @@ def fibonacci_directions(n: int) -> FloatArray:
 def candidate_positions(
     array: SensorArray,
     *,
-    n_directions: int = 300,
-    n_ranges: int = 14,
+    n_directions: int = 200,
+    n_ranges: int = 10,
     n_near_directions: int = 12,
 ) -> FloatArray:
     """Positions that a search scores before it refines the best of them.

@@ -89,7 +89,8 @@ def locate(
     try:
         locator = Locator(used, knowledge=knowledge)
     except ValueError as error:
-        raise InputError(f"--region {region}: {str(error).removeprefix('Input ')}") from None
+        place = array if region is None else f"--region {region}"
+        raise InputError(f"{place}: {str(error).removeprefix('Input ')}") from None
     with progress(len(rows), "rows", quiet=common.quiet) as advance:
         fixes = locator.fit_rows(rows.values_T, advance)
     fixes = _in_world(fixes, rows)

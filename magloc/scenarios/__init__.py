@@ -100,8 +100,10 @@ def read_starts_scenario(
     _check_positive(path, "half_width_m", file.half_width_m)
     if file.source is None:
         raise InputError(f"{path}: found no key source, expected one.")
+    _check_positive(path, "source.position_m", 1.0 + max(map(abs, file.source.position_m)))
     if not any(file.source.moment_Am2):
         raise InputError(f"{path}, key source.moment_Am2: found zero, expected a moment.")
+    _check_positive(path, "source.moment_Am2", max(map(abs, file.source.moment_Am2)))
     return StartsScenario(
         array=_array(path, file.array),
         position_m=file.source.position_m,
@@ -192,3 +194,5 @@ def _array(path: str, array: dict[str, Any] | str) -> SensorArray:
 def _check_positive(path: str, key: str, value: float) -> None:
     if not 0.0 < value < float("inf"):
         raise InputError(f"{path}, key {key}: found {value:g}, expected a positive number.")
+    if not 1e-12 <= value <= 1e12:
+        raise InputError(f"{path}, key {key}: found {value:g}, expected a number between 1e-12 and 1e12.")

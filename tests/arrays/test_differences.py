@@ -247,8 +247,23 @@ class TestProportionalNoise:
         assert_allclose(noise.reshape(4, 3)[:2], np.hypot(2e-9, 0.03 * 4e-6), rtol=1e-12)
         assert_allclose(noise.reshape(4, 3)[2:], 2e-9, rtol=1e-9)
 
-    def test_a_uniform_field_adds_none_and_a_missing_reading_keeps_its_own(self):
+    def test_a_uniform_field_adds_none(self):
         array = SensorArray(tetrahedron(1.0, noise_T=2e-9).sensors, noise_fraction=0.03)
         readings = np.tile([1e-5, 2e-5, 3e-5], 4)
         readings[4] = np.nan
         assert_allclose(proportional_noise(array, readings), 2e-9, rtol=1e-6)
+
+    def test_an_incomplete_sensor_is_no_better_than_a_complete_one(self):
+        array = SensorArray(tetrahedron(1.0, noise_T=2e-9).sensors, noise_fraction=0.03)
+        rng = np.random.default_rng(0)
+        for _ in range(20):
+            readings = 1e-6 * rng.normal(size=12)
+            readings[4] = np.nan
+            noise = proportional_noise(array, readings).reshape(4, 3)[:, 0]
+            assert noise[1] >= noise[[0, 2, 3]].max() * (1 - 1e-12)
+
+    def test_the_known_axes_of_an_incomplete_sensor_count(self):
+        array = SensorArray(tetrahedron(1.0, noise_T=2e-9).sensors, noise_fraction=0.03)
+        readings = np.zeros(12)
+        readings[3], readings[4] = 9e-6, np.nan
+        assert_allclose(proportional_noise(array, readings)[3:6], np.hypot(2e-9, 0.03 * np.sqrt(1.5) * 9e-6))

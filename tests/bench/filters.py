@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from arrays.geometries import tetrahedron
-from magloc.convergence import IekfFilter, StartsScenario, simulated_differences
+from magloc.convergence import IekfFilter, StartsScenario, simulated_measurement
 from magloc.kalman import IteratedExtendedKalmanFilter
 from magloc.measurement import DifferenceMeasurement
 from tests.bench.table import Row
@@ -27,8 +27,7 @@ def rows(size: Size) -> Iterator[Row]:
     The last rows compare an iteration of the compiled filter of the convergence map, over a map of starts.
     """
     scenario = StartsScenario(array=tetrahedron(1.5, noise_T=1e-9), noise_seed=5)
-    measurement = DifferenceMeasurement.of(scenario.array)
-    _, z = simulated_differences(scenario, measurement)
+    _, measurement, z = simulated_measurement(scenario)
     x = np.array([*scenario.position_m, *scenario.moment_Am2]) + np.repeat([0.3, -20.0], 3)
     method = IekfFilter(tolerance_T=0.0, max_iterations=ITERATIONS)
     starts = np.tile(x, (size.grid**3, 1))

@@ -8,9 +8,8 @@ import numba
 import numpy as np
 from numba import prange
 
-from magloc.convergence import DampedFilter, IekfFilter, RepeatedFilter, StartsScenario, simulated_differences
+from magloc.convergence import DampedFilter, IekfFilter, RepeatedFilter, StartsScenario, simulated_measurement
 from magloc.kernels import compiled, compiled_parallel
-from magloc.measurement import DifferenceMeasurement
 from tests.bench.maps import starts_of
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
@@ -26,8 +25,7 @@ FLOPS_PER_THREAD = 2 * 8 * LANES * REPEATS
 def rows(size: Size) -> Iterator[Row]:
     """The peer is the time that the operations would take as fused multiply-adds alone: a ratio of 1 is ideal."""
     scenario = StartsScenario()
-    measurement = DifferenceMeasurement.of(scenario.array)
-    _, z = simulated_differences(scenario, measurement)
+    _, measurement, z = simulated_measurement(scenario)
     starts = starts_of(scenario, size.grid)
     methods = {method.name: method for method in (IekfFilter(), RepeatedFilter(), DampedFilter())}
     all_threads = numba.get_num_threads()

@@ -8,7 +8,7 @@ from functools import partial
 import numba
 import numpy as np
 
-from magloc.convergence import Ends, IekfFilter, RepeatedFilter, StartsScenario, simulated_differences
+from magloc.convergence import Ends, IekfFilter, RepeatedFilter, StartsScenario, simulated_measurement
 from magloc.locate import Locator
 from magloc.measurement import DifferenceMeasurement
 from tests.bench.filters import TIME, functions, stonesoup_update
@@ -39,8 +39,7 @@ def rows_of(
 ) -> Iterator[Row]:
     """One filter, against its twin, its peers (package and loop by name) and scipy."""
     scenario = StartsScenario()
-    measurement = DifferenceMeasurement.of(scenario.array)
-    readings, z = simulated_differences(scenario, measurement)
+    readings, measurement, z = simulated_measurement(scenario)
     optimum = Locator(scenario.array).fit(readings).solutions[0]
     starts = starts_of(scenario, size.grid)
     sampled = np.random.default_rng(6).permutation(len(starts))[: size.sample]

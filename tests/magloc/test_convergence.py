@@ -17,14 +17,16 @@ import xarray as xr
 from numpy.testing import assert_allclose
 
 from arrays.geometries import axial, tetrahedron
+from arrays.sensor import SensorArray
 from magloc.convergence import (
+    GlobalFilter,
     IekfFilter,
     RepeatedFilter,
     StartsScenario,
     Status,
     convergence_map,
     field_weights,
-    simulated_differences,
+    simulated_measurement,
     summary,
 )
 from magloc.measurement import DifferenceMeasurement
@@ -77,6 +79,22 @@ class TestThePapersFigure:
         assert counts.back_fraction <= 0.12
 
 
+class TestProportionalNoise:
+    def test_filters_and_optimum_use_the_same_noise(self):
+        array = SensorArray(PAPER.array.sensors, noise_fraction=0.02)
+        counts = summary(convergence_map(replace(PAPER, array=array, noise_seed=3), 7))
+        assert counts.front_fraction > 0.5
+
+
+class TestStartFree:
+    """The method `global` does not care where it starts: both halves, noise or none."""
+
+    @pytest.mark.parametrize("noise_seed", [None, 0])
+    def test_every_start_reaches_the_optimum(self, noise_seed):
+        dataset = convergence_map(replace(PAPER, method=GlobalFilter(), noise_seed=noise_seed), 11)
+        assert summary(dataset).converged == 11**3
+
+
 class TestOtherRowsOfTheTable:
     """Those rows that the specification's recipe reproduces within its ±0.08; the README has all of them."""
 
@@ -115,8 +133,7 @@ class TestReadableTwins:
     )
     def test_few_passes(self, array, method):
         scenario = replace(PAPER, array=array, noise_seed=1)
-        measurement = DifferenceMeasurement.of(array)
-        _, z = simulated_differences(scenario, measurement)
+        _, measurement, z = simulated_measurement(scenario)
         ends = method.run(measurement, z, self.starts)
         for start, state in zip(self.starts, ends.states, strict=True):
             twin = method.run_one(measurement, z, start)
@@ -125,8 +142,7 @@ class TestReadableTwins:
 
     @pytest.mark.parametrize("method", [RepeatedFilter(), IekfFilter()], ids=["repeated", "iekf"])
     def test_whole_runs_that_converge(self, method):
-        measurement = DifferenceMeasurement.of(PAPER.array)
-        _, z = simulated_differences(PAPER, measurement)
+        _, measurement, z = simulated_measurement(PAPER)
         starts = np.array([[6.0, 1.0, 1.0, 0, 0, 0], [4.0, -1.0, 0.5, 0, 0, 0]])
         ends = method.run(measurement, z, starts)
         assert ends.stopped.all()
@@ -144,8 +160,7 @@ class TestReadableTwins:
         assert_allclose(np.einsum("kni,ni->k", field_weights(measurement), fields), expected, rtol=1e-10)
 
     def test_a_start_on_a_sensor_diverges_and_says_so(self):
-        measurement = DifferenceMeasurement.of(PAPER.array)
-        _, z = simulated_differences(PAPER, measurement)
+        _, measurement, z = simulated_measurement(PAPER)
         start = np.concatenate([PAPER.array.positions[0], np.zeros(3)])[None]
         for method in (RepeatedFilter(), IekfFilter()):
             ends = method.run(measurement, z, start)

@@ -297,24 +297,30 @@ class TestAverage:
         n = len(values_T)
         return Readings(np.arange(float(n)), np.array(values_T), np.arange(n) + 2, **columns)  # type: ignore[arg-type]
 
-    def test_missing_readings_do_not_count(self) -> None:
+    def test_rows_with_less_than_the_others_are_left_out(self) -> None:
         rows = self.readings([[1.0, math.nan, 3.0], [3.0, math.nan, math.nan], [5.0, math.nan, 4.0]])
         mean = average(rows)
         np.testing.assert_array_equal(mean.values_T, [[3.0, math.nan, 3.5]])
         np.testing.assert_array_equal(mean.time_s, [1.0])
         np.testing.assert_array_equal(mean.line_numbers, [2])
 
-    def test_noise_falls_with_the_root_of_the_rows(self, array: SensorArray) -> None:
-        values = np.ones((4, 7))
-        values[1:, 2] = math.nan  # one reading of s1's z axis is left, all four of the others
-        averaged = averaging_array(array, self.readings(values.tolist()))
-        np.testing.assert_allclose([sensor.noise_T for sensor in averaged.sensors], [1e-9, 1e-9, 2e-9], rtol=1e-15)
+    def test_a_common_field_that_drifts_still_cancels(self) -> None:
+        drift = np.linspace(0.0, 1.0, 6)[:, None] * np.ones(4)
+        values = drift + np.arange(4.0)
+        values[3:, 0] = math.nan
+        np.testing.assert_allclose(np.diff(average(self.readings(values.tolist())).values_T[0]), 1.0, rtol=1e-12)
 
-    def test_channels_without_any_reading_do_not_count(self, array: SensorArray) -> None:
-        values = np.ones((4, 7))
-        values[:, 2] = math.nan
+    def test_no_complete_row(self) -> None:
+        with pytest.raises(InputError, match="no row with all channels"):
+            average(self.readings([[1.0, math.nan], [math.nan, 2.0]]))
+
+    def test_noise_falls_with_the_root_of_the_rows(self, array: SensorArray) -> None:
+        values = np.ones((5, 7))
+        values[4, 2] = math.nan  # this row is left out
+        values[:, 6] = math.nan  # a channel that no row has
         averaged = averaging_array(array, self.readings(values.tolist()))
-        np.testing.assert_allclose([sensor.noise_T for sensor in averaged.sensors], [0.5e-9, 1e-9, 2e-9], rtol=1e-15)
+        before = [sensor.noise_T for sensor in array.sensors]
+        np.testing.assert_allclose([sensor.noise_T for sensor in averaged.sensors], np.divide(before, 2.0), rtol=1e-15)
 
     def test_array_that_moves(self) -> None:
         position = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.1, 0.0]])
