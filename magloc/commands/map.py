@@ -156,7 +156,10 @@ def _export(folder: Path, counts: MapSummary, *, netcdf: bool) -> None:
             figure = convergence_figure(dataset, counts)
         if netcdf:
             _replace(folder / "convergence.nc", lambda path: dataset.to_netcdf(path))
-    _replace(folder / "convergence.png", lambda path: figure.savefig(path, format="png", dpi=150))
+    _replace(
+        folder / "convergence.png",
+        lambda path: figure.savefig(path, format="png", dpi=120, pil_kwargs={"compress_level": 3}),
+    )
 
 
 def _how_done(before: int, counts: MapSummary, sweep: Sweep, folder: Path) -> str:
