@@ -56,7 +56,7 @@ def map_(
     scheduler : str
         Address of a dask scheduler (tcp://HOST:PORT) whose workers compute the map.
     out : Path
-        Folder to write; by default map-SCENARIO-METHOD.
+        Folder to write; by default map-SCENARIO-METHOD-GRID.
     netcdf : bool
         Write convergence.nc as well: the whole map, which has to fit into memory.
     json : bool
@@ -73,7 +73,8 @@ def map_(
     else:
         cube = _sources_map(scenario, method, 21 if grid is None else grid, common.seed)
     name = cube.attributes["method"] if over == "starts" else over
-    folder = Path(f"map-{Path(scenario).stem}-{name}") if out is None else out
+    drawn = f"-seed{common.seed}" if noise or (over == "sources" and common.seed) else ""
+    folder = Path(f"map-{Path(scenario).stem}-{name}-{cube.grid}{drawn}") if out is None else out
     _make_folder(folder)
     with Sweep(cube, folder / "map.zarr") as sweep:
         for sentence in sweep.unreadable:

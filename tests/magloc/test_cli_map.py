@@ -78,6 +78,23 @@ class TestResult:
         assert optima[2] == optima[3]
 
 
+class TestDefaultFolder:
+    def test_other_settings_go_to_other_folders(self, tmp_path, capsys, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        sources = ["--over", "sources"]
+        for options in (
+            [],
+            ["--noise"],
+            ["--noise", "--seed", "1"],
+            ["--method", "iekf"],
+            sources,
+            [*sources, "--seed", "1"],
+        ):
+            for grid in ("3", "5"):
+                assert main(["map", "--grid", grid, "--quiet", *options]) == 0
+        assert len(list(tmp_path.iterdir())) == 12
+
+
 class TestOverSources:
     def test_json(self, tmp_path, capsys):
         assert main(["map", "--over", "sources", "--grid", "5", "--out", str(tmp_path / "out"), "--json"]) == 0
