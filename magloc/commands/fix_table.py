@@ -52,7 +52,6 @@ def _cells(solution: Solution, per_m: float, decimals: int, *, others: int) -> l
     deviations = np.sqrt(np.diagonal(solution.covariance)[:3])
     flags = [
         *([] if solution.range_observable else ["range?"]),
-        *([] if solution.converged else ["unconverged"]),
         *([f"+{others}"] if others else []),
     ]
     return [

@@ -14,12 +14,11 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from magloc.dipole import MU0_OVER_4PI
 from magloc.kernels import compiled, compiled_parallel
 from magloc.kernels.separable import orthonormalise
 
 FloatArray = NDArray[np.float64]
-
-MU0_OVER_4PI = 1e-7
 
 
 @compiled
