@@ -6,12 +6,13 @@ Differences that share a base sensor have correlated noise. Two forms remove the
 
 * :class:`Differences`, the form of the source paper: independent scalars
   :math:`z' = W y` with variances, which a filter may process one at a time.
-* :class:`Whitening`, the same likelihood written as a projection: every reading divided by its own
-  noise, the common field projected out. It costs O(channels) instead of O(channels²), which is what
-  compiled fits want.
+* :class:`Whitening`, the same likelihood written as a projection: the readings of every sensor freed
+  of their own noise, the common field projected out. A model costs O(channels) instead of O(channels²),
+  which is what compiled fits want.
 
-Both hold for any number of vector and scalar sensors, any noise, calibration and missing readings;
-that they give the same :math:`\chi^2` is a tested identity.
+Both hold for any number of vector and scalar sensors, any calibration and missing readings, and any
+noise that is independent between sensors (:func:`reading_covariance`); that they give the same
+:math:`\chi^2` is a tested identity.
 
 Source: Pavlov, Karshakov, Goldin, "Determination of the magnetic field parameters of an object from
 remote magnetogradient measurements", equations (5), (9), (13)-(16), (20), (24), (28).
@@ -31,6 +32,8 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _EQUAL_NOISE_RTOL = 1e-12
+# Relative addition to the variances of an uncertain calibration, which are singular: above rounding, below any effect.
+_REGULAR_RTOL = 1e-13
 
 
 def contrasts(n_sensors: int, base: int = -1) -> FloatArray:
@@ -142,23 +145,24 @@ class Differences:
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
-    """The differences' likelihood as a projection: ``w = e - Q (g ∘ Qᵀ e)``, ``e = y / noise``.
+    """The differences' likelihood as a projection: ``w = e - Q (g ∘ Qᵀ e)``, ``e = L⁻¹ y``, noise covariance ``L Lᵀ``.
 
     ``wᵀ w`` equals the χ² of :class:`Differences`, for the same readings.
 
     Attributes
     ----------
-    inverse_noise : ndarray, shape (C,)
-        1/σ of every channel [1/T]; zero where the reading is missing.
+    root : ndarray, shape (C, C)
+        ``L⁻¹`` [1/T], block-diagonal by sensor: 1/σ of every channel where the channels' noise is independent. Rows and
+        columns of missing channels are zero; a sensor's other channels keep the covariance that they have without them.
     basis : ndarray, shape (C, q)
-        Orthonormal basis of the common field in channels divided by their noise.
+        Orthonormal basis of the common field in channels of unit noise.
     shrinkage : ndarray, shape (q,)
         1 where the common field is unknown, less where a prior bounds it.
     n_differences : int
         Number of independent scalars in w.
     """
 
-    inverse_noise: FloatArray
+    root: FloatArray
     basis: FloatArray
     shrinkage: FloatArray
     n_differences: int
@@ -177,7 +181,7 @@ class Whitening:
         ndarray, shape (..., C)
             Residuals of unit variance once the common field is projected out.
         """
-        e = channels * self.inverse_noise
+        e = channels @ self.root.T
         w: FloatArray = e - ((e @ self.basis) * self.shrinkage) @ self.basis.T
         return w
 
@@ -187,7 +191,7 @@ def decorrelated_differences(
     available: BoolArray | None = None,
     *,
     base: int = -1,
-    channel_noise_T: FloatArray | None = None,
+    covariance_T2: FloatArray | None = None,
 ) -> Differences:
     """Decorrelated differences of an array, equations (16) and (28) for any sensors.
 
@@ -202,20 +206,21 @@ def decorrelated_differences(
         Channels that have a reading; all by default.
     base : int
         Base sensor among the complete sensors of a kind. It changes the differences, never their likelihood.
-    channel_noise_T : ndarray, shape (C,), optional
-        Noise per channel in place of the array's own [T], for noise that depends on the reading.
+    covariance_T2 : ndarray, shape (C, C), optional
+        Covariance of the channels' noise in place of the array's own [T²], as one of :func:`reading_covariance`:
+        block-diagonal by sensor. What it holds of channels without a reading does not count.
 
     Returns
     -------
     Differences
         With k = channels - rank of the common field; k = channels under a prior.
     """
-    mask, noise = _channels(array, available, channel_noise_T)
+    mask, covariance = _channels(array, available, covariance_T2)
     transforms: list[FloatArray] = []
     variances: list[FloatArray] = []
     for group in _groups(array, mask):
-        closed = None if array.common_field_T is not None else _closed_form(array, group, mask, noise, base)
-        w, variance = closed if closed is not None else _numerical_form(array, group, noise)
+        closed = None if array.common_field_T is not None else _closed_form(array, group, mask, covariance, base)
+        w, variance = closed if closed is not None else _numerical_form(array, group, covariance)
         full = np.zeros((variance.size, array.n_channels))
         full[:, group] = w
         transforms.append(full)
@@ -226,30 +231,49 @@ def decorrelated_differences(
 
 
 def whitening(
-    array: SensorArray, available: BoolArray | None = None, *, channel_noise_T: FloatArray | None = None
+    array: SensorArray, available: BoolArray | None = None, *, covariance_T2: FloatArray | None = None
 ) -> Whitening:
     """The projection form of :func:`decorrelated_differences`, with the same parameters.
 
-    With channels ``y = U c + n``, n of covariance N (diagonal) and c the common field of prior variance λ:
-    ``N^(-1/2) U = Q diag(s) Vᵀ`` gives the shrinkage ``1 - 1/√(1 + s² λ)``, which is 1 for an unknown field.
+    With channels ``y = U c + n``, n of covariance ``L Lᵀ`` and c the common field of prior variance λ:
+    ``L⁻¹ U = Q diag(s) Vᵀ`` gives the shrinkage ``1 - 1/√(1 + s² λ)``, which is 1 for an unknown field.
     """
-    mask, noise = _channels(array, available, channel_noise_T)
-    inverse_noise = np.where(mask, 1.0 / noise, 0.0)
-    bases: list[FloatArray] = []
-    shrinkages: list[FloatArray] = []
-    for group in _groups(array, mask):
-        q, s, _ = np.linalg.svd(_common_field(array, group) * inverse_noise[group, None], full_matrices=False)
-        keep = s > s.max(initial=0.0) * 1e-10
-        basis = np.zeros((array.n_channels, int(keep.sum())))
-        basis[group] = q[:, keep]
-        bases.append(basis)
-        if array.common_field_T is None:
-            shrinkages.append(np.ones(basis.shape[1]))
-        else:
-            shrinkages.append(1.0 - 1.0 / np.sqrt(1.0 + (s[keep] * array.common_field_T) ** 2))
-    basis = np.concatenate(bases, axis=1) if bases else np.zeros((array.n_channels, 0))
-    n = int(mask.sum()) - (basis.shape[1] if array.common_field_T is None else 0)
-    return Whitening(inverse_noise, basis, np.concatenate(shrinkages) if shrinkages else np.zeros(0), n)
+    mask, covariance = _channels(array, available, covariance_T2)
+    return whitenings(array, mask, covariance[None])[0]
+
+
+def whitenings(array: SensorArray, available: BoolArray, covariances_T2: FloatArray) -> list[Whitening]:
+    """Whitening of each of n covariances at once, for rows that have the same readings.
+
+    Parameters
+    ----------
+    array : SensorArray
+    available : ndarray of bool, shape (C,)
+        Channels that have a reading.
+    covariances_T2 : ndarray, shape (n, C, C)
+        As one of :func:`reading_covariance` [T²].
+
+    Returns
+    -------
+    list of Whitening
+        As :func:`whitening` makes them one by one.
+    """
+    n_rows, n = len(covariances_T2), array.n_channels
+    root = _inverse_root(array, available, covariances_T2)
+    gain = root @ array.channel_gain
+    basis, shrinkage, keep = np.zeros((n_rows, n, 0)), np.zeros((n_rows, 0)), np.zeros((n_rows, 0), dtype=np.bool_)
+    for group in _groups(array, available):
+        q, s, _ = np.linalg.svd(_common_field(array, group, gain), full_matrices=False)
+        of_group = np.zeros((n_rows, n, s.shape[1]))
+        of_group[:, group] = q
+        basis = np.concatenate([basis, of_group], axis=2)
+        keep = np.concatenate([keep, s > s.max(axis=1, keepdims=True, initial=0.0) * 1e-10], axis=1)
+        prior = np.inf if array.common_field_T is None else array.common_field_T
+        with np.errstate(invalid="ignore"):  # zero times infinity, for what is not kept
+            shrinkage = np.concatenate([shrinkage, 1.0 - 1.0 / np.sqrt(1.0 + (s * prior) ** 2)], axis=1)
+    lost = keep.sum(axis=1) if array.common_field_T is None else np.zeros(n_rows, dtype=np.intp)
+    n_differences = (int(available.sum()) - lost).tolist()
+    return [Whitening(root[i], basis[i][:, keep[i]], shrinkage[i, keep[i]], n_differences[i]) for i in range(n_rows)]
 
 
 def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray:
@@ -288,6 +312,102 @@ def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray
     return result
 
 
+def reading_covariance(array: SensorArray, readings_T: FloatArray) -> FloatArray:
+    r"""Covariance of the readings' errors: noise, proportional noise, and what the calibration does not know.
+
+    A vector sensor of scale S in the field b, in its own axes, that is turned by a small unknown rotation θ and has
+    relative errors g of its gains reads :math:`S (b + θ × b + g ∘ b)`. Its block is
+
+    .. math:: diag(σ²) + S (σ_θ² (|b|² I - b b^T) + σ_g² diag(b²)) S^T
+
+    with σ of :func:`proportional_noise`; the error of an angle stands at right angles to the field. That of a scalar
+    sensor is :math:`σ² + σ_g² (reading - offset)²`. The rotations and gains are constant, so that the errors of one
+    sensor's rows are not independent of each other: this is their covariance within one row.
+
+    Parameters
+    ----------
+    array : SensorArray
+    readings_T : ndarray, shape (..., C)
+        Raw readings of the whole field [T], NaN where missing. For a missing axis of b stands the known ambient field,
+        else the mean of the other sensors' fields, else zero.
+
+    Returns
+    -------
+    ndarray, shape (..., C, C)
+        Block-diagonal by sensor, in the units of the readings [T²]. Entries of missing channels are finite.
+    """
+    return _block_diagonal(array, _covariance_blocks(array, readings_T), array.sensor_channels >= 0)
+
+
+def reading_errors(array: SensorArray, readings_T: FloatArray, normal: FloatArray) -> FloatArray:
+    """Errors of the covariance of :func:`reading_covariance`, from independent standard normal numbers.
+
+    Parameters
+    ----------
+    array : SensorArray
+    readings_T : ndarray, shape (..., C)
+        Readings without errors [T].
+    normal : ndarray, shape (..., C)
+        The numbers.
+
+    Returns
+    -------
+    ndarray, shape (..., C)
+        To be added to the readings [T].
+    """
+    if not array.noise_depends_on_reading:
+        return array.channel_noise_T * normal
+    channel, used = array.sensor_channels, array.sensor_channels >= 0
+    root = np.linalg.cholesky(_covariance_blocks(array, readings_T))
+    slots = np.where(used, np.asarray(normal, dtype=np.float64)[..., channel], 0.0)
+    errors: FloatArray = np.einsum("...nij,...nj->...ni", root, slots)
+    return errors[..., used]
+
+
+def _covariance_blocks(array: SensorArray, readings_T: FloatArray) -> FloatArray:
+    """Blocks of :func:`reading_covariance`, (..., N, 3, 3) [T²], with unit variances in the slots that are not used."""
+    readings_T = np.asarray(readings_T, dtype=np.float64)
+    channel, used = array.sensor_channels, array.sensor_channels >= 0
+    variance = np.where(used, proportional_noise(array, readings_T)[..., channel] ** 2, 1.0)
+    blocks: FloatArray = variance[..., None] * np.eye(3)
+    misalignment = np.array([sensor.misalignment_rad for sensor in array.sensors])
+    gain_error = np.array([sensor.gain_uncertainty for sensor in array.sensors])
+    if not (misalignment.any() or gain_error.any()):
+        return blocks
+    scale = np.tile(np.eye(3), (array.n_sensors, 1, 1))
+    for i, sensor in enumerate(array.sensors):
+        scale[i, : sensor.n_channels, : sensor.n_channels] = sensor.calibration.scale
+    b = _fields_in_sensor_axes(array, readings_T, scale)
+    turned = np.cross(b[..., None, :], np.eye(3))  # row k is b × e_k, minus the error of a turn about axis k
+    factor = np.concatenate(
+        [
+            misalignment[:, None, None] * np.swapaxes(turned, -1, -2),
+            gain_error[:, None, None] * b[..., None] * np.eye(3),
+        ],
+        axis=-1,
+    )
+    factor = scale @ factor
+    # Formed from its factor, the product is singular to the rounding of its diagonal, also for a field along an axis.
+    calibration = factor @ np.swapaxes(factor, -1, -2)
+    return blocks + calibration * (1.0 + _REGULAR_RTOL * np.eye(3))
+
+
+def _fields_in_sensor_axes(array: SensorArray, readings_T: FloatArray, scale: FloatArray) -> FloatArray:
+    """Field that each sensor saw, in its own axes, complete: (..., N, 3) [T]; (modulus, 0, 0) of a scalar sensor."""
+    channel, used = array.sensor_channels, array.sensor_channels >= 0
+    response = np.where(used, (readings_T - array.channel_offset_T)[..., channel], 0.0)
+    missing = np.isnan(response)
+    if missing.any():
+        if array.ambient_T is not None:
+            elsewhere = array.ambient_fields
+        else:
+            elsewhere = _mean_of_finite(array.calibrated_field(readings_T), axis=-2)
+        in_axes = np.einsum("nji,...nj->...ni", array.rotation_matrices, elsewhere + np.zeros((array.n_sensors, 1)))
+        response = np.where(missing, np.einsum("nij,...nj->...ni", scale, in_axes), response)
+    field: FloatArray = np.einsum("nij,...nj->...ni", np.linalg.inv(scale), response)
+    return field
+
+
 def _deviations(array: SensorArray, readings_T: FloatArray) -> FloatArray:
     """Modulus of every sensor's field minus the array's mean: (..., N) [T]."""
     fields = array.calibrated_field(readings_T)
@@ -319,16 +439,44 @@ def _mean_of_finite(values: FloatArray, axis: int) -> FloatArray:
 
 
 def _channels(
-    array: SensorArray, available: BoolArray | None, channel_noise_T: FloatArray | None
+    array: SensorArray, available: BoolArray | None, covariance_T2: FloatArray | None
 ) -> tuple[BoolArray, FloatArray]:
     n = array.n_channels
     mask = np.ones(n, dtype=np.bool_) if available is None else np.asarray(available, dtype=np.bool_)
-    noise = array.channel_noise_T if channel_noise_T is None else np.asarray(channel_noise_T, dtype=np.float64)
     if mask.shape != (n,):
         raise ValueError(f"Input available must have shape ({n},); instead received {mask.shape}.")
-    if noise.shape != (n,):
-        raise ValueError(f"Input channel_noise_T must have shape ({n},); instead received {noise.shape}.")
-    return mask, noise
+    if covariance_T2 is None:
+        return mask, np.diag(array.channel_noise_T**2)
+    covariance = np.asarray(covariance_T2, dtype=np.float64)
+    if covariance.shape != (n, n):
+        raise ValueError(f"Input covariance_T2 must have shape ({n}, {n}); instead received {covariance.shape}.")
+    if covariance[array.channel_sensor[:, None] != array.channel_sensor].any():
+        raise ValueError(
+            "Input covariance_T2 must be block-diagonal by sensor; instead received one that correlates two sensors."
+        )
+    return mask, covariance
+
+
+def _inverse_root(array: SensorArray, mask: BoolArray, covariance: FloatArray) -> FloatArray:
+    """``L⁻¹`` of ``covariance = L Lᵀ`` among the channels that have a reading, zero elsewhere: (..., C, C)."""
+    channel = array.sensor_channels
+    present = (channel >= 0) & mask[channel]
+    blocks = covariance[..., channel[:, :, None], channel[:, None, :]]
+    blocks = np.where(present[:, :, None] & present[:, None, :], blocks, np.eye(3))
+    try:
+        inverse = np.linalg.inv(np.linalg.cholesky(blocks))
+    except np.linalg.LinAlgError:
+        raise ValueError("Input covariance_T2 must be positive definite; instead received one that is not.") from None
+    return _block_diagonal(array, inverse, present)
+
+
+def _block_diagonal(array: SensorArray, blocks: FloatArray, present: BoolArray) -> FloatArray:
+    """Matrices (..., C, C) of the sensors' blocks (..., N, 3, 3), zero for channels that are not present (N, 3)."""
+    n = array.n_channels
+    slot = np.where(present, array.sensor_channels, n)  # the others end in a row and a column that are cut off
+    matrix = np.zeros((*blocks.shape[:-3], n + 1, n + 1))
+    matrix[..., slot[:, :, None], slot[:, None, :]] = blocks
+    return matrix[..., :n, :n]
 
 
 def _groups(array: SensorArray, mask: BoolArray) -> list[NDArray[np.intp]]:
@@ -337,14 +485,13 @@ def _groups(array: SensorArray, mask: BoolArray) -> list[NDArray[np.intp]]:
     return [np.flatnonzero(kind) for kind in kinds if kind.any()]
 
 
-def _common_field(array: SensorArray, group: NDArray[np.intp]) -> FloatArray:
-    """How the common field enters the channels of one kind: (channels, 3), or (channels, 1) for moduli."""
-    gain = array.channel_gain[group]
-    return gain[:, :1] if array.channel_is_scalar[group[0]] else gain
+def _common_field(array: SensorArray, group: NDArray[np.intp], gain: FloatArray) -> FloatArray:
+    """How the common field enters the channels of one kind: (..., channels, 3), or (..., channels, 1) for moduli."""
+    return gain[..., group, :1] if array.channel_is_scalar[group[0]] else gain[..., group, :]
 
 
 def _closed_form(
-    array: SensorArray, group: NDArray[np.intp], mask: BoolArray, noise: FloatArray, base: int
+    array: SensorArray, group: NDArray[np.intp], mask: BoolArray, covariance_T2: FloatArray, base: int
 ) -> tuple[FloatArray, FloatArray] | None:
     """The paper's form where it holds: complete sensors whose calibrated noise is the same along every axis."""
     width = 1 if array.channel_is_scalar[group[0]] else 3
@@ -355,7 +502,7 @@ def _closed_form(
     for i, sensor in enumerate(sensors):
         channels = np.flatnonzero((array.channel_sensor == sensor) & mask)
         inverse = np.linalg.inv(array.channel_gain[channels, :width])
-        covariance = (inverse * noise[channels] ** 2) @ inverse.T
+        covariance = inverse @ covariance_T2[np.ix_(channels, channels)] @ inverse.T
         sigma[i] = np.sqrt(covariance[0, 0])
         if not np.allclose(covariance, sigma[i] ** 2 * np.eye(width), rtol=0.0, atol=1e-12 * sigma[i] ** 2):
             return None
@@ -370,15 +517,17 @@ def _closed_form(
     return w, np.repeat(variance, width)
 
 
-def _numerical_form(array: SensorArray, group: NDArray[np.intp], noise: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _numerical_form(
+    array: SensorArray, group: NDArray[np.intp], covariance_T2: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Combinations of channels that are free of the common field, decorrelated by their eigenvectors."""
-    common = _common_field(array, group)
-    sigma2 = noise[group] ** 2
+    common = _common_field(array, group, array.channel_gain)
+    covariance = covariance_T2[np.ix_(group, group)]
     if array.common_field_T is not None:
-        t, variance = eigen_decorrelation(np.diag(sigma2) + array.common_field_T**2 * common @ common.T)
+        t, variance = eigen_decorrelation(covariance + array.common_field_T**2 * common @ common.T)
         return t, variance
     d: FloatArray = null_space(common.T).T
     if d.shape[0] == 0:
         return np.zeros((0, group.size)), np.zeros(0)
-    t, variance = eigen_decorrelation((d * sigma2) @ d.T)
+    t, variance = eigen_decorrelation(d @ covariance @ d.T)
     return t @ d, variance

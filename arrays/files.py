@@ -7,25 +7,32 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
     edge_m = 1.5
     kind = "vector"                 # or "scalar"
     noise_nT = 1.0
+    saturation_nT = 100_000.0       # optional, readings that reach it are no measurements
+    misalignment_mrad = 1.0         # optional, unknown small rotation of a vector sensor's axes, 1 sigma per axis
+    gain_uncertainty = 0.001        # optional, relative, 1 sigma per axis
 
-    [[sensor]]                      # in place of geometry, its size, kind and noise_nT
+    [[sensor]]                      # in place of geometry, its size, and the keys from kind to gain_uncertainty
     id = "s1"
     kind = "vector"
     position_m = [0.0, 0.0, 0.918]  # array frame
     rotation_xyzw = [0, 0, 0, 1]    # optional, sensor axes -> array frame
     noise_nT = 1.0
+    saturation_nT = 100_000.0       # these three optional, as above
+    misalignment_mrad = 1.0
+    gain_uncertainty = 0.001
     [sensor.calibration]            # optional, reading = scale · (field in sensor axes) + offset
     scale = 1.0                     # a number, 3 numbers or a 3×3 matrix
     offset_nT = [0.0, 0.0, 0.0]     # one number for a scalar sensor
 
-Both may have ``noise_fraction``, ``common_field_nT``, ``ambient_nT = [x, y, z]`` and ``format_version = 1``; see
+Both may have ``noise_fraction``, ``common_field_nT``, ``ambient_nT = [x, y, z]``, the gradient of that field
+``ambient_gradient_nT_m = [[…], […], […]]`` (symmetric and traceless) and ``format_version = 1``; see
 :class:`arrays.sensor.SensorArray` for what they mean.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from decimal import Context, Decimal
@@ -41,11 +48,12 @@ from arrays.toml import check_keys, converted, place_of, read_toml, write_text
 
 FORMAT_VERSION = 1
 
-# Fields are converted between nT and T by shifting the decimal point of what is written, never by a multiplication:
-# 1.0 nT is the number 1e-9 to the last digit, and every float survives the way to a file and back.
+# Units are converted, nT to T and mrad to rad, by shifting the decimal point of what is written, never by a
+# multiplication: 1.0 nT is the number 1e-9 to the last digit, and every float survives the way to a file and back.
 _SHIFT = Context(prec=1000, traps=[])
 _Number = int | Decimal
 _Vector = tuple[float, float, float]
+_NumberVector = tuple[_Number, _Number, _Number]
 
 
 class _Header(msgspec.Struct, kw_only=True):
@@ -53,13 +61,20 @@ class _Header(msgspec.Struct, kw_only=True):
     name: str | None = None
     noise_fraction: float = 0.0
     common_field_nT: _Number | None = None
-    ambient_nT: tuple[_Number, _Number, _Number] | None = None
+    ambient_nT: _NumberVector | None = None
+    ambient_gradient_nT_m: tuple[_NumberVector, _NumberVector, _NumberVector] | None = None
+
+
+class _Quality(msgspec.Struct, kw_only=True):
+    noise_nT: _Number
+    saturation_nT: _Number | None = None
+    misalignment_mrad: _Number = 0
+    gain_uncertainty: float = 0.0
 
 
 class _GeometryFile(_Header, kw_only=True):
     geometry: str
     kind: str
-    noise_nT: _Number
 
 
 class _CalibrationTable(msgspec.Struct, kw_only=True):
@@ -67,11 +82,10 @@ class _CalibrationTable(msgspec.Struct, kw_only=True):
     offset_nT: _Number | list[_Number] | None = None
 
 
-class _SensorTable(msgspec.Struct, kw_only=True):
+class _SensorTable(_Quality, kw_only=True):
     id: str
     kind: str
     position_m: _Vector
-    noise_nT: _Number
     rotation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     calibration: _CalibrationTable = msgspec.field(default_factory=_CalibrationTable)
 
@@ -127,7 +141,7 @@ def array_of_table(place: str, table: dict[str, Any]) -> SensorArray:
         return _array_of_geometry(place, table)
     if "sensor" in table:
         return _array_of_sensors(place, table)
-    check_keys(place, table, {*_keys(_GeometryFile), *_keys(_SensorsFile), *_size_keys()})
+    check_keys(place, table, {*_keys(_GeometryFile), *_keys(_Quality), *_keys(_SensorsFile), *_size_keys()})
     raise InputError(f"{place}: found neither the key geometry nor [[sensor]] tables, expected one of them.")
 
 
@@ -167,16 +181,25 @@ def array_toml(array: SensorArray) -> str:
     if array.common_field_T is not None:
         lines.append(f"common_field_nT = {_nanotesla(array.common_field_T)}")
     if array.ambient_T is not None:
-        lines.append(f"ambient_nT = [{', '.join(map(_nanotesla, array.ambient_T))}]")
+        lines.append(f"ambient_nT = {_nanotesla_list(array.ambient_T)}")
+    if array.ambient_gradient_T_m is not None:
+        rows = ", ".join(map(_nanotesla_list, array.ambient_gradient_T_m))
+        lines.append(f"ambient_gradient_nT_m = [{rows}]")
     for sensor in array.sensors:
         lines += ["", "[[sensor]]", f"id = {_quoted(sensor.id)}", f'kind = "{sensor.kind}"']
         lines.append(f"position_m = {list(sensor.position_m)}")
         if sensor.rotation_xyzw != (0.0, 0.0, 0.0, 1.0):
             lines.append(f"rotation_xyzw = {list(sensor.rotation_xyzw)}")
         lines.append(f"noise_nT = {_nanotesla(sensor.noise_T)}")
+        if sensor.saturation_T is not None:
+            lines.append(f"saturation_nT = {_nanotesla(sensor.saturation_T)}")
+        if sensor.misalignment_rad:
+            lines.append(f"misalignment_mrad = {_shifted(sensor.misalignment_rad, 3)}")
+        if sensor.gain_uncertainty:
+            lines.append(f"gain_uncertainty = {sensor.gain_uncertainty!r}")
         if sensor.calibration != Calibration.of(sensor.kind):
-            offsets = ", ".join(map(_nanotesla, sensor.calibration.offset_T))
-            offset = f"[{offsets}]" if sensor.kind == "vector" else offsets
+            offsets = sensor.calibration.offset_T
+            offset = _nanotesla_list(offsets) if sensor.kind == "vector" else _nanotesla(offsets[0])
             lines += ["[sensor.calibration]", f"scale = {_shortest_scale(sensor.calibration)}"]
             lines.append(f"offset_nT = {offset}")
     return "\n".join(lines) + "\n"
@@ -190,19 +213,20 @@ def _array_of_geometry(path: str, table: dict[str, Any]) -> SensorArray:
     foreign = next((key for key in table if key in _size_keys() and key != size_key), None)
     if foreign is not None:
         raise InputError(f"{path}, key {foreign}: found the size of another geometry, expected {size_key} of a {name}.")
-    check_keys(path, table, {*_keys(_GeometryFile), size_key})
+    check_keys(path, table, {*_keys(_GeometryFile), *_keys(_Quality), size_key})
     if size_key not in table:
         raise InputError(f"{path}: found no key {size_key}, expected the size of the {name}.")
     file = converted(path, table, _GeometryFile)
     size = getattr(converted(path, table, msgspec.defstruct("_Size", [(size_key, float)])), size_key)
-    noise_T = _noise(path, file.noise_nT)
+    quality = _quality(path, converted(path, table, _Quality))
     with _naming(path):
-        array = make(size, file.kind, noise_T)  # type: ignore[arg-type]  # the kind is checked there
+        array = make(size, file.kind, quality["noise_T"])  # type: ignore[arg-type]  # the kind is checked there
+        array = replace(array, sensors=tuple(replace(sensor, **quality) for sensor in array.sensors))
     return _with_header(path, array, file)
 
 
 def _array_of_sensors(path: str, table: dict[str, Any]) -> SensorArray:
-    misplaced = next((key for key in ("kind", "noise_nT") if key in table), None)
+    misplaced = next((key for key in ("kind", *_keys(_Quality)) if key in table), None)
     if misplaced is not None:
         raise InputError(f"{path}, key {misplaced}: found at the top, expected in each [[sensor]] table.")
     check_keys(path, table, _keys(_SensorsFile))
@@ -219,9 +243,15 @@ def _array_of_sensors(path: str, table: dict[str, Any]) -> SensorArray:
 
 
 def _sensor(place: str, table: _SensorTable) -> Sensor:
-    noise_T = _noise(place, table.noise_nT)
+    quality = _quality(place, table)
     with _naming(place):
-        sensor = Sensor(table.id, table.kind, table.position_m, noise_T, table.rotation_xyzw)  # type: ignore[arg-type]
+        sensor = Sensor(
+            id=table.id,
+            kind=table.kind,  # type: ignore[arg-type]  # checked there
+            position_m=table.position_m,
+            rotation_xyzw=table.rotation_xyzw,
+            **quality,
+        )
     offset_nT: list[_Number] = [0] * sensor.n_channels
     if table.calibration.offset_nT is not None:
         given = table.calibration.offset_nT
@@ -239,7 +269,7 @@ def _sensor(place: str, table: _SensorTable) -> Sensor:
 def _with_header(path: str, array: SensorArray, header: _Header) -> SensorArray:
     if header.format_version != FORMAT_VERSION:
         raise InputError(f"{path}, key format_version: found {header.format_version}, expected {FORMAT_VERSION}.")
-    common_T = ambient_T = None
+    common_T = ambient_T = gradient_T_m = None
     if header.common_field_nT is not None:
         common_T = _tesla(f"{path}, key common_field_nT", header.common_field_nT)
         if common_T < 0.0:
@@ -247,31 +277,63 @@ def _with_header(path: str, array: SensorArray, header: _Header) -> SensorArray:
                 f"{path}, key common_field_nT: found {header.common_field_nT}, expected a number that is not negative."
             )
     if header.ambient_nT is not None:
-        x, y, z = (_tesla(f"{path}, key ambient_nT", component) for component in header.ambient_nT)
-        ambient_T = (x, y, z)
+        ambient_T = _tesla_vector(f"{path}, key ambient_nT", header.ambient_nT)
+    if header.ambient_gradient_nT_m is not None:
+        place = f"{path}, key ambient_gradient_nT_m"
+        gradient_T_m = tuple(_tesla_vector(place, row) for row in header.ambient_gradient_nT_m)
     name = array.name if header.name is None else header.name
     with _naming(path):
-        return SensorArray(array.sensors, name, header.noise_fraction, common_T, ambient_T)
+        return SensorArray(array.sensors, name, header.noise_fraction, common_T, ambient_T, gradient_T_m)
 
 
-def _noise(place: str, noise_nT: _Number) -> float:
-    noise_T = _tesla(f"{place}, key noise_nT", noise_nT)
-    if noise_T <= 0.0:
-        raise InputError(f"{place}, key noise_nT: found {noise_nT}, expected a positive number.")
-    return noise_T
+def _quality(place: str, table: _Quality) -> dict[str, Any]:
+    """How good a sensor is, as arguments of Sensor."""
+    for key in ("noise_nT", "saturation_nT"):
+        value = getattr(table, key)
+        if value is not None and _tesla(f"{place}, key {key}", value) <= 0.0:
+            raise InputError(f"{place}, key {key}: found {value}, expected a positive number.")
+    key = f"{place}, key misalignment_mrad"
+    misalignment_rad = _scaled(key, table.misalignment_mrad, -3)
+    if not 0.0 <= misalignment_rad < 1.0:
+        raise InputError(f"{key}: found {table.misalignment_mrad}, expected a number from 0 to below 1000.")
+    return {
+        "noise_T": _tesla(place, table.noise_nT),
+        "saturation_T": None if table.saturation_nT is None else _tesla(place, table.saturation_nT),
+        "misalignment_rad": misalignment_rad,
+        "gain_uncertainty": table.gain_uncertainty,
+    }
 
 
 def _tesla(place: str, nanotesla: _Number) -> float:
     """Field in T from a number in nT as it is written."""
-    tesla = Decimal(nanotesla).scaleb(-9, _SHIFT)
-    if not abs(float(tesla)) < float("inf"):
-        raise InputError(f"{place}: found {nanotesla}, expected a finite number.")
-    return float(tesla)
+    return _scaled(place, nanotesla, -9)
+
+
+def _tesla_vector(place: str, nanotesla: _NumberVector) -> _Vector:
+    x, y, z = (_tesla(place, component) for component in nanotesla)
+    return (x, y, z)
+
+
+def _scaled(place: str, number: _Number, exponent: int) -> float:
+    """A number as it is written, times a power of ten."""
+    result = float(Decimal(number).scaleb(exponent, _SHIFT))
+    if not abs(result) < float("inf"):
+        raise InputError(f"{place}: found {number}, expected a finite number.")
+    return result
 
 
 def _nanotesla(tesla: float) -> str:
     """A field in T as a TOML float in nT."""
-    shifted = Decimal(repr(tesla)).scaleb(9, _SHIFT)
+    return _shifted(tesla, 9)
+
+
+def _nanotesla_list(tesla: Iterable[float]) -> str:
+    return f"[{', '.join(map(_nanotesla, tesla))}]"
+
+
+def _shifted(value: float, exponent: int) -> str:
+    """A number times a power of ten as a TOML float."""
+    shifted = Decimal(repr(value)).scaleb(exponent, _SHIFT)
     text = f"{shifted:f}" if not shifted or -7 < shifted.adjusted() < 16 else str(shifted)
     return text if set(text) & set(".E") else f"{text}.0"
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any, Literal, TypeVar, get_args
 
@@ -29,6 +29,7 @@ AMBIENT_CHANNELS = ("ambient_x", "ambient_y", "ambient_z")
 _SINGULAR_RTOL = 1e-12
 _UNIT_QUATERNION_ATOL = 1e-6
 _SAME_PLACE_RTOL = 1e-9
+_GRADIENT_RTOL = 1e-6
 
 
 @dataclass(frozen=True)
@@ -115,12 +116,21 @@ class Sensor:
         Unit quaternion from the sensor's axes to the array's frame.
     calibration : Calibration
         None stands for the identity.
+    saturation_T : float, optional
+        A reading whose modulus reaches it is no measurement, in the reading's units [T]. None: the sensor never
+        saturates.
+    misalignment_rad : float
+        Standard deviation, per axis, of a small constant rotation of the sensor's axes that the calibration does not
+        know [rad]; 0 for a scalar sensor, which has no axes.
+    gain_uncertainty : float
+        Standard deviation of the relative error of the gain, independent per axis.
 
     Raises
     ------
     ValueError
-        A number is not finite, a shape is wrong, the noise is not positive, the quaternion's norm differs from 1 by
-        more than 1e-6, or the id cannot name a column.
+        A number is not finite, a shape is wrong, the noise or the saturation is not positive, the misalignment or the
+        gain's uncertainty is negative or not below 1, a scalar sensor has a misalignment, the quaternion's norm differs
+        from 1 by more than 1e-6, or the id cannot name a column.
     """
 
     id: str
@@ -129,14 +139,28 @@ class Sensor:
     noise_T: float
     rotation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     calibration: Calibration = None  # type: ignore[assignment]  # replaced in __post_init__
+    saturation_T: float | None = None
+    misalignment_rad: float = 0.0
+    gain_uncertainty: float = 0.0
 
     def __post_init__(self) -> None:
         _check_id(self.id)
         n = _n_channels(self.kind)
         object.__setattr__(self, "position_m", tuple(_finite("position_m", self.position_m, (3,)).tolist()))
-        object.__setattr__(self, "noise_T", _finite_number("noise_T", self.noise_T))
-        if self.noise_T <= 0.0:
-            raise ValueError(f"Input noise_T must be positive; instead received {self.noise_T}.")
+        for name in ("noise_T", "saturation_T"):
+            value = getattr(self, name)
+            if value is not None or name == "noise_T":
+                object.__setattr__(self, name, _finite_number(name, value))
+                if value <= 0.0:
+                    raise ValueError(f"Input {name} must be positive; instead received {value}.")
+        for name in ("misalignment_rad", "gain_uncertainty"):
+            object.__setattr__(self, name, _finite_number(name, getattr(self, name)))
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise ValueError(f"Input {name} must be from 0 to below 1; instead received {getattr(self, name)}.")
+        if self.kind == "scalar" and self.misalignment_rad:
+            raise ValueError(
+                f"Input misalignment_rad must be 0 for a scalar sensor; instead received {self.misalignment_rad}."
+            )
         object.__setattr__(self, "rotation_xyzw", _unit_quaternion(self.rotation_xyzw))
         if self.calibration is None:
             object.__setattr__(self, "calibration", Calibration.of(self.kind))
@@ -176,7 +200,10 @@ class SensorArray:
         Standard deviation, per axis, of the field that is common to all sensors [T]. None: nothing is known of it, and
         only differences between sensors carry information.
     ambient_T : tuple, shape (3,), optional
-        Known ambient field in the array's frame, for scalar sensors [T].
+        Known ambient field in the array's frame, at its origin [T].
+    ambient_gradient_T_m : tuple of tuples, shape (3, 3), optional
+        Known gradient tensor dB_i/dx_j of the ambient field in the array's frame [T/m]: symmetric and traceless, as
+        that of any field whose sources are elsewhere. None stands for a uniform field.
 
     Raises
     ------
@@ -189,6 +216,7 @@ class SensorArray:
     noise_fraction: float = 0.0
     common_field_T: float | None = None
     ambient_T: tuple[float, float, float] | None = None
+    ambient_gradient_T_m: tuple[tuple[float, float, float], ...] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sensors", tuple(self.sensors))
@@ -202,6 +230,8 @@ class SensorArray:
                     raise ValueError(f"Input {name} must not be negative; instead received {value}.")
         if self.ambient_T is not None:
             object.__setattr__(self, "ambient_T", tuple(_finite("ambient_T", self.ambient_T, (3,)).tolist()))
+        if self.ambient_gradient_T_m is not None:
+            object.__setattr__(self, "ambient_gradient_T_m", _gradient_tensor(self.ambient_gradient_T_m))
         if len(self.sensors) < 2:
             raise ValueError(f"Input sensors must be at least 2; instead received {len(self.sensors)}.")
         _check_distinct_names(self)
@@ -263,6 +293,14 @@ class SensorArray:
         return _read_only(np.repeat(np.arange(self.n_sensors), [sensor.n_channels for sensor in self.sensors]))
 
     @cached_property
+    def sensor_channels(self) -> IntArray:
+        """Channels of each sensor, shape (N, 3); -1 where a scalar sensor has none."""
+        counts = [sensor.n_channels for sensor in self.sensors]
+        first = np.cumsum([0, *counts[:-1]])
+        axis = np.arange(3)
+        return _read_only(np.where(axis < np.array(counts)[:, None], first[:, None] + axis, -1))
+
+    @cached_property
     def channel_is_scalar(self) -> BoolArray:
         """Whether each channel reads the modulus of the field, shape (C,)."""
         return _read_only(np.array([sensor.kind == "scalar" for sensor in self.sensors])[self.channel_sensor])
@@ -271,6 +309,31 @@ class SensorArray:
     def channel_noise_T(self) -> FloatArray:
         """Standard deviation of each channel, shape (C,) [T]."""
         return _read_only(np.array([sensor.noise_T for sensor in self.sensors])[self.channel_sensor])
+
+    @cached_property
+    def channel_saturation_T(self) -> FloatArray:
+        """Modulus at which each channel saturates, infinite where it never does, shape (C,) [T]."""
+        limits = [np.inf if sensor.saturation_T is None else sensor.saturation_T for sensor in self.sensors]
+        return _read_only(np.array(limits)[self.channel_sensor])
+
+    @property
+    def noise_depends_on_reading(self) -> bool:
+        """Whether the covariance of the readings changes with them; else it is diagonal, with the channels' noise."""
+        uncertain = any(sensor.misalignment_rad or sensor.gain_uncertainty for sensor in self.sensors)
+        return bool(self.noise_fraction) or uncertain
+
+    @cached_property
+    def ambient_fields(self) -> FloatArray:
+        """Known ambient field at every sensor, ``ambient_T + ambient_gradient_T_m @ position``: (N, 3) [T].
+
+        What is not known counts as zero.
+        """
+        fields = np.zeros((self.n_sensors, 3))
+        if self.ambient_T is not None:
+            fields += self.ambient_T
+        if self.ambient_gradient_T_m is not None:
+            fields += self.positions @ np.array(self.ambient_gradient_T_m).T
+        return _read_only(fields)
 
     @cached_property
     def channel_offset_T(self) -> FloatArray:
@@ -318,9 +381,7 @@ class SensorArray:
                 nearest = difflib.get_close_matches(name, self.ids, n=1)
                 hint = f" (the nearest is {nearest[0]})" if nearest else ""
                 raise ValueError(f"Input ids must be ids of sensors of the array; instead received {name!r}{hint}.")
-        return SensorArray(
-            tuple(by_id[name] for name in ids), self.name, self.noise_fraction, self.common_field_T, self.ambient_T
-        )
+        return replace(self, sensors=tuple(by_id[name] for name in ids))
 
     def readings_of(self, fields: ArrayLike) -> FloatArray:
         """Readings without noise.
@@ -418,6 +479,19 @@ def _unit_quaternion(value: ArrayLike) -> tuple[float, ...]:
     # One that is normalised already keeps its last digits, or it would change whenever it is copied.
     unit = quaternion if abs(norm - 1.0) <= 4 * np.finfo(np.float64).eps else quaternion / norm
     return tuple(unit.tolist())
+
+
+def _gradient_tensor(value: ArrayLike) -> tuple[tuple[float, ...], ...]:
+    """Gradient of a field without sources or currents: its divergence and its curl vanish, to a part in a million."""
+    tensor = _finite("ambient_gradient_T_m", value, (3, 3))
+    largest = float(np.abs(tensor).max())
+    for fault, what in ((np.abs(tensor - tensor.T).max(), "symmetric"), (abs(np.trace(tensor)), "traceless")):
+        if fault > _GRADIENT_RTOL * largest:
+            raise ValueError(
+                f"Input ambient_gradient_T_m must be {what} to {_GRADIENT_RTOL:g} of its largest entry; "
+                f"instead received {_plain(value)}."
+            )
+    return tuple(map(tuple, tensor.tolist()))
 
 
 def _numbers(name: str, value: ArrayLike) -> FloatArray:

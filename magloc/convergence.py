@@ -25,14 +25,15 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from arrays.differences import decorrelated_differences, proportional_noise
+from arrays.differences import decorrelated_differences, reading_covariance, reading_errors
 from arrays.geometries import tetrahedron
 from arrays.sensor import SensorArray
 from magloc.cubes import Box, MapSummary, Tally, Values, Variable, histogram, in_memory
+from magloc.fix import Solution
 from magloc.kalman import IteratedUpdate, iterated_update, predict_square_root, scalar_update, sequential_update
 from magloc.kernels import lanes
 from magloc.kernels.starts import relinearised_map
-from magloc.locate import Locator, Solution
+from magloc.locate import Locator
 from magloc.measurement import DifferenceMeasurement, predicted_channels
 
 if TYPE_CHECKING:
@@ -131,7 +132,7 @@ class RepeatedFilter:
         return Ends(
             *run_all(
                 starts,
-                z,
+                _of_source(measurement, z),
                 measurement.variance,
                 measurement.array.positions,
                 field_weights(measurement),
@@ -202,7 +203,7 @@ class IekfFilter:
         return Ends(
             *lanes.iekf_map(
                 starts,
-                z,
+                _of_source(measurement, z),
                 measurement.variance,
                 measurement.array.positions,
                 field_weights(measurement),
@@ -279,7 +280,7 @@ class DampedFilter:
         return Ends(
             *lanes.damped_map(
                 starts,
-                z,
+                _of_source(measurement, z),
                 measurement.variance,
                 measurement.array.positions,
                 field_weights(measurement),
@@ -373,6 +374,12 @@ FILTERS: dict[str, Filter] = {
 }
 
 
+def _of_source(measurement: DifferenceMeasurement, z: FloatArray) -> FloatArray:
+    """Differences (k,) without those of the known ambient field, which the compiled filters do not model."""
+    array = measurement.array
+    return z - measurement.measured(array.readings_of(array.ambient_fields))
+
+
 def field_weights(measurement: DifferenceMeasurement) -> FloatArray:
     """Weight of the field at every sensor in every decorrelated difference, shape (k, N, 3), for vector sensors."""
     array = measurement.array
@@ -428,9 +435,9 @@ def simulated_measurement(scenario: StartsScenario) -> tuple[FloatArray, Differe
     array = scenario.array
     readings = predicted_channels(array, scenario.position_m, scenario.moment_Am2) + array.channel_offset_T
     if scenario.noise_seed is not None:
-        sigma = proportional_noise(array, readings)
-        readings = readings + np.random.default_rng(scenario.noise_seed).normal(scale=sigma)
-    differences = decorrelated_differences(array, channel_noise_T=proportional_noise(array, readings))
+        normal = np.random.default_rng(scenario.noise_seed).standard_normal(array.n_channels)
+        readings = readings + reading_errors(array, readings, normal)
+    differences = decorrelated_differences(array, covariance_T2=reading_covariance(array, readings))
     measurement = DifferenceMeasurement(array, differences)
     return readings, measurement, measurement.measured(readings)
 

@@ -8,125 +8,26 @@ steps which decrease χ², and every distinct optimum near the best one is retur
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from arrays.differences import Whitening, proportional_noise, whitening
+from arrays.differences import Whitening, reading_covariance, whitening, whitenings
 from arrays.sensor import SensorArray
 from magloc.dipole import MU0_OVER_4PI
+from magloc.fix import DISTINCT_WITHIN, NOTHING_KNOWN, RISE_95, SILENT, Fix, Knowledge, Solution, open_ended
 from magloc.kernels import over_rows
 from magloc.kernels import separable as kernels
+from magloc.rows import NO_SIGNAL, rows_of_equal_mask
 from magloc.separable import SeparableProblem, candidate_positions
 
 FloatArray = NDArray[np.float64]
 
 N_UNKNOWNS = 6
-# Δχ² of a 95 % interval of one parameter, and within which another optimum is a solution too.
-RISE_95 = 3.841458820694124
-DISTINCT_WITHIN = 20.0
-# Mean square of whitened differences below which they are rounding errors rather than noise.
-SILENT = 1e-9
 _ROWS_AT_ONCE = 256
-
-
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """One optimum of the likelihood.
-
-    Attributes
-    ----------
-    position_m : ndarray, shape (3,)
-        Source in the array's frame [m].
-    moment_Am2 : ndarray, shape (3,)
-        Its moment [A·m²].
-    covariance : ndarray, shape (6, 6)
-        Of (position, moment), the inverse information at the solution. Where the range is not observable it is no
-        description of the uncertainty: use `range_interval95_m`.
-    chi2 : float
-        Sum of squared residuals of the decorrelated differences over their variances.
-    dof : int
-        Differences minus unknowns.
-    iterations : int
-        Linearisations that led here.
-    converged : bool
-        Whether the iteration ended at an optimum; no other solutions are listed.
-    range_observable : bool
-        Whether the 95 % interval of the range is closed and its ends differ by a factor of two at most.
-    range_interval95_m : tuple of (low, high)
-        Where the profile χ² over the distance from the sensors' centroid stays within 3.84 of this optimum [m];
-        high is None where it never leaves it.
-    """
-
-    position_m: FloatArray
-    moment_Am2: FloatArray
-    covariance: FloatArray
-    chi2: float
-    dof: int
-    iterations: int
-    converged: bool
-    range_observable: bool
-    range_interval95_m: tuple[tuple[float, float | None], ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Fix:
-    """Every distinct solution of one set of readings, best χ² first.
-
-    Attributes
-    ----------
-    solutions : tuple of Solution
-        Empty if the readings cannot be solved.
-    reason : str
-        Why there is no solution; empty if there is one.
-    failed_starts : int
-        Starts of the search that ended without an optimum.
-    """
-
-    solutions: tuple[Solution, ...]
-    reason: str = ""
-    failed_starts: int = 0
-
-
-@dataclass(frozen=True)
-class Knowledge:
-    """What is known of the source beforehand; solutions that contradict it are left out.
-
-    Attributes
-    ----------
-    low_m, high_m : tuple of 3 floats
-        Bounds of the position in the array's frame [m], infinite where there is none: a box, a slab or a half-space.
-    largest_moment_Am2 : float
-        Bound of the moment's modulus [A·m²].
-
-    Raises
-    ------
-    ValueError
-        The bounds leave nothing.
-    """
-
-    low_m: tuple[float, float, float] = (-math.inf, -math.inf, -math.inf)
-    high_m: tuple[float, float, float] = (math.inf, math.inf, math.inf)
-    largest_moment_Am2: float = math.inf
-
-    def __post_init__(self) -> None:
-        if not all(low < high for low, high in zip(self.low_m, self.high_m, strict=True)):
-            raise ValueError(
-                f"Input low_m must be below high_m along every axis; instead received {self.low_m}, {self.high_m}."
-            )
-        if not self.largest_moment_Am2 > 0.0:
-            raise ValueError(f"Input largest_moment_Am2 must be positive; instead received {self.largest_moment_Am2}.")
-
-    def allows_position(self, position_m: FloatArray) -> Any:
-        """Whether positions (..., 3) lie within the bounds."""
-        return np.all((position_m >= np.asarray(self.low_m)) & (position_m <= np.asarray(self.high_m)), axis=-1)
-
-    def allows_moment(self, moment_Am2: FloatArray) -> Any:
-        """Whether moments (..., 3) are small enough."""
-        return np.linalg.norm(moment_Am2, axis=-1) <= self.largest_moment_Am2
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +99,7 @@ class Locator:
         n_starts: int = 6,
         apart_rad: float = 0.3,
         max_iterations: int = 100,
-        knowledge: Knowledge = Knowledge(),
+        knowledge: Knowledge = NOTHING_KNOWN,
     ) -> None:
         if array.channel_is_scalar.any():
             raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
@@ -215,6 +116,7 @@ class Locator:
                 "Input knowledge must leave some of the space around the array; instead it leaves nothing."
             )
         self._of_mask: dict[bytes, _Kernel] = {}
+        self._without_source = array.readings_of(array.ambient_fields)
 
     def fit(self, readings_T: ArrayLike) -> Fix:
         """Fix from one set of readings.
@@ -251,7 +153,7 @@ class Locator:
                 f"Input readings_T must have shape (n, {self.array.n_channels}); instead received {readings.shape}."
             )
         fixes: list[Fix] = [Fix(())] * len(readings)
-        for mask, rows in _rows_of_equal_mask(np.isfinite(readings)):
+        for mask, rows in rows_of_equal_mask(np.isfinite(readings)):
             kernel = self._kernel(mask)
             k = kernel.whitening.n_differences
             for start in range(0, rows.size, _ROWS_AT_ONCE):
@@ -309,14 +211,14 @@ class Locator:
         starts = np.asarray(starts_m, dtype=np.float64)
         mask = np.isfinite(readings[0])
         kernel = self._kernel(mask)
-        y, ranked, whitenings = self._whitened(kernel, mask, readings)
+        y, ranked, of_rows = self._whitened(kernel, mask, readings)
         n = len(starts)
         found = self._search(
             kernel,
             y,
             ranked,
             np.zeros(n, dtype=np.intp),
-            whitenings,
+            of_rows,
             np.zeros(n, dtype=np.intp),
             kernel.problem.homogeneous(starts)[:, None],
             DISTINCT_WITHIN,
@@ -332,14 +234,13 @@ class Locator:
         self, kernel: _Kernel, mask: NDArray[np.bool_], readings: FloatArray
     ) -> tuple[FloatArray, FloatArray, list[Whitening]]:
         """Whitened readings, the same as the candidates are ranked by, and the whitenings: one, or one a row."""
-        channels = np.where(mask, readings - self.array.channel_offset_T, 0.0)
+        channels = np.where(mask, readings - self._without_source, 0.0)
         ranked = kernel.whitening.apply(channels)
-        if self.array.noise_fraction == 0.0:
+        if not self.array.noise_depends_on_reading:
             return ranked, ranked, [kernel.whitening]
-        noise = proportional_noise(self.array, readings)
-        whitenings = [whitening(self.array, mask, channel_noise_T=row) for row in noise]
-        y = np.stack([w.apply(row) for w, row in zip(whitenings, channels, strict=True)])
-        return y, ranked, whitenings
+        of_rows = whitenings(self.array, mask, reading_covariance(self.array, readings))
+        y = np.stack([w.apply(row) for w, row in zip(of_rows, channels, strict=True)])
+        return y, ranked, of_rows
 
     def _search(
         self,
@@ -347,7 +248,7 @@ class Locator:
         y: FloatArray,
         ranked: FloatArray,
         reading_of_row: NDArray[np.intp],
-        whitenings: list[Whitening],
+        of_rows: list[Whitening],
         set_of_row: NDArray[np.intp],
         first: FloatArray,
         keep_within: float,
@@ -358,9 +259,9 @@ class Locator:
             model=(
                 problem.sensors,
                 problem.channel_sensor,
-                np.stack([self.array.channel_gain * w.inverse_noise[:, None] for w in whitenings]),
-                np.ascontiguousarray(np.stack([w.basis.T for w in whitenings])),
-                np.stack([w.shrinkage for w in whitenings]),
+                np.stack([w.root @ self.array.channel_gain for w in of_rows]),
+                np.ascontiguousarray(np.stack([w.basis.T for w in of_rows])),
+                np.stack([w.shrinkage for w in of_rows]),
                 set_of_row,
             ),
             q=np.full((*shape, 4), np.nan),
@@ -411,20 +312,20 @@ class Locator:
 
     def _fit_block(self, kernel: _Kernel, mask: NDArray[np.bool_], readings: FloatArray) -> list[Fix]:
         problem, n_rows = kernel.problem, len(readings)
-        y, ranked, whitenings = self._whitened(kernel, mask, readings)
+        y, ranked, of_rows = self._whitened(kernel, mask, readings)
         every = np.arange(n_rows, dtype=np.intp)
         found = self._search(
             kernel,
             y,
             ranked,
             every,
-            whitenings,
-            every if len(whitenings) > 1 else np.zeros(n_rows, dtype=np.intp),
+            of_rows,
+            every if len(of_rows) > 1 else np.zeros(n_rows, dtype=np.intp),
             np.empty((n_rows, 0, 4)),
-            DISTINCT_WITHIN if self.knowledge == Knowledge() else math.inf,
+            DISTINCT_WITHIN if self.knowledge == NOTHING_KNOWN else math.inf,
         )
         unknown = found.counts[:, 0]
-        if self.knowledge != Knowledge():
+        if self.knowledge != NOTHING_KNOWN:
             found = self._known(kernel, found)
         q, mu, chi2, counts = found.q, found.mu, found.chi2, found.counts
         covariance, ends = np.full((*chi2.shape, 6, 6), np.nan), np.full((*chi2.shape, 2), np.nan)
@@ -443,7 +344,7 @@ class Locator:
         fixes = []
         for i, n in enumerate(kept.tolist()):
             if silent[i]:
-                fixes.append(Fix((), "the sensors' readings do not differ: no signal"))
+                fixes.append(Fix((), NO_SIGNAL))
                 continue
             solutions = tuple(
                 Solution(
@@ -455,7 +356,7 @@ class Locator:
                     iterations=iterations_[i][j],
                     converged=True,
                     range_observable=observable_[i][j],
-                    range_interval95_m=(_open_ended(*ends_[i][j]),),
+                    range_interval95_m=(open_ended(*ends_[i][j]),),
                 )
                 for j in range(n)
                 if determined[i, j]
@@ -479,18 +380,10 @@ def _check_magnitudes(array: SensorArray) -> None:
     if array.common_field_T is not None and array.common_field_T > 1e3:
         common_nT = 1e9 * array.common_field_T
         raise ValueError(f"Input array must have a common field of 1e12 nT at most; instead received {common_nT:g} nT.")
+    if not np.abs(array.ambient_fields).max() <= 1e3:
+        raise ValueError("Input array must have an ambient field of 1e12 nT at most; instead received a larger one.")
     if array.noise_fraction > 10.0:
         raise ValueError(f"Input array must have a noise_fraction of 10 at most; instead: {array.noise_fraction:g}.")
-
-
-def _rows_of_equal_mask(available: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.intp]]]:
-    masks, of_row = np.unique(available, axis=0, return_inverse=True)
-    for i, mask in enumerate(masks):
-        yield mask, np.flatnonzero(of_row.ravel() == i)
-
-
-def _open_ended(low: float, high: float) -> tuple[float, float | None]:
-    return low, high if math.isfinite(high) else None
 
 
 def _why_unsolved(n_optima: int, n_allowed: int) -> str:

@@ -28,14 +28,16 @@ def predicted_channels(array: SensorArray, position_m: ArrayLike, moment_Am2: Ar
     Parameters
     ----------
     array : SensorArray
-        With ``ambient_T`` where scalar sensors stand in an ambient field.
+        With ``ambient_T`` where scalar sensors stand in an ambient field, and with ``ambient_gradient_T_m`` where it is
+        not uniform, which differences between sensors of either kind see.
     position_m, moment_Am2 : array_like, shape (..., 3)
         Source in the array's frame [m], its moment [A·m²].
 
     Returns
     -------
     ndarray, shape (..., C)
-        Readings minus offsets [T]: ``a_c · (B_a + B)`` for a component, ``g |B_a + B|`` for a modulus.
+        Readings minus offsets [T]: ``a_c · (B_a + B)`` for a component, ``g |B_a + B|`` for a modulus, with the ambient
+        field B_a at each sensor.
     """
     fields = _fields(array, position_m, moment_Am2)
     return array.readings_of(fields) - array.channel_offset_T
@@ -77,7 +79,7 @@ def _fields(array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike) ->
     p = np.asarray(position_m, dtype=np.float64)[..., None, :]
     m = np.asarray(moment_Am2, dtype=np.float64)[..., None, :]
     fields = dipole.field(array.positions, p, m)
-    return fields if array.ambient_T is None else fields + np.asarray(array.ambient_T)
+    return fields + array.ambient_fields
 
 
 @dataclass(frozen=True, eq=False)

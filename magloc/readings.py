@@ -36,6 +36,7 @@ TRUE_POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 TRUE_MOMENT_COLUMNS = ("mx_Am2", "my_Am2", "mz_Am2")
 
 _T_IN_nT = 1e9
+_SATURATION_RTOL = 1e-12
 _LARGEST_nT = 1e15  # a million tesla: a column of something else, or a broken line
 _UNIT_QUATERNION_ATOL = 1e-3  # a log that keeps four decimals passes; the quaternion is normalised afterwards
 _SENSOR_COLUMN = re.compile(r"(?P<id>.+?)(_[xyz])?_nT")
@@ -202,11 +203,7 @@ def write_readings(path: str | PathLike[str], readings: Readings, array: SensorA
     ValueError
         The readings do not have the array's channels.
     """
-    if readings.values_T.shape[1] != array.n_channels:
-        raise ValueError(
-            f"Input readings must have the {array.n_channels} channels of the array; "
-            f"instead received {readings.values_T.shape[1]}."
-        )
+    _check_channels(readings, array)
     header = ["time_s", *(f"{name}_nT" for name in array.channel_names)]
     plain: list[FloatArray] = []
     fields = [readings.values_T]
@@ -279,7 +276,8 @@ def _complete(readings: Readings) -> NDArray[np.bool_]:
 def averaging_array(array: SensorArray, readings: Readings) -> SensorArray:
     r"""The array with the noise of :func:`average`'s row in place of that of a single row.
 
-    White noise, and the proportional noise with it, falls by :math:`\sqrt n` with n complete rows.
+    White noise, and the proportional noise with it, falls by :math:`\sqrt n` with n complete rows. Misalignments and
+    errors of the gains stay as they are: they are the same in every row, and no average removes them.
 
     Parameters
     ----------
@@ -294,6 +292,39 @@ def averaging_array(array: SensorArray, readings: Readings) -> SensorArray:
     root = math.sqrt(max(1, int(_complete(readings).sum())))
     sensors = tuple(replace(sensor, noise_T=sensor.noise_T / root) for sensor in array.sensors)
     return replace(array, sensors=sensors, noise_fraction=array.noise_fraction / root)
+
+
+def without_saturated(readings: Readings, array: SensorArray) -> Readings:
+    """The readings without those that are no measurements because their channel saturates.
+
+    Parameters
+    ----------
+    readings : Readings
+    array : SensorArray
+        With ``saturation_T`` of the sensors that have a limit.
+
+    Returns
+    -------
+    Readings
+        NaN where the modulus of a reading reaches the limit of its sensor: of a vector sensor only the axis that does.
+
+    Raises
+    ------
+    ValueError
+        The readings do not have the array's channels.
+    """
+    _check_channels(readings, array)
+    # A limit and a reading that are written alike in two files may differ by their rounding.
+    saturated = np.abs(readings.values_T) >= array.channel_saturation_T * (1.0 - _SATURATION_RTOL)
+    return replace(readings, values_T=np.where(saturated, np.nan, readings.values_T))
+
+
+def _check_channels(readings: Readings, array: SensorArray) -> None:
+    if readings.values_T.shape[1] != array.n_channels:
+        raise ValueError(
+            f"Input readings must have the {array.n_channels} channels of the array; "
+            f"instead received {readings.values_T.shape[1]}."
+        )
 
 
 def _check_sensor_columns(table: Table, array: SensorArray, channels: Sequence[str], *, ignore_others: bool) -> None:

@@ -45,7 +45,7 @@ class SeparableProblem:
         Sensor of every channel.
     whitening : Whitening
     gain : ndarray, shape (C, 3)
-        Channel gains divided by the channels' noise; zero rows where readings are missing.
+        Channel gains in channels of unit noise; zero rows where readings are missing.
     """
 
     centroid: FloatArray
@@ -64,7 +64,7 @@ class SeparableProblem:
             sensors=(array.positions - array.centroid) / array.circumradius,
             channel_sensor=array.channel_sensor.astype(np.intp),
             whitening=whitening,
-            gain=array.channel_gain * whitening.inverse_noise[:, None],
+            gain=whitening.root @ array.channel_gain,
         )
 
     def homogeneous(self, position_m: ArrayLike) -> FloatArray:

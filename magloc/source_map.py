@@ -17,12 +17,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from arrays.differences import proportional_noise, whitening
+from arrays.differences import reading_covariance, reading_errors, whitening
 from arrays.geometries import tetrahedron
 from arrays.sensor import SensorArray
 from magloc.cubes import Box, FloatArray, MapSummary, Tally, Values, Variable, histogram, in_memory
+from magloc.fix import Fix
 from magloc.kernels import separable as kernels
-from magloc.locate import N_UNKNOWNS, Fix, Locator
+from magloc.locate import N_UNKNOWNS, Locator
 from magloc.measurement import channel_jacobian, predicted_channels
 from magloc.separable import SeparableProblem
 
@@ -214,18 +215,18 @@ class SourcesMap:
         return self.scenario.moment_Am2 * direction, normal[:, 3:]
 
     def _readings(self, position: FloatArray, moment: FloatArray, noise: FloatArray) -> FloatArray:
-        """Raw readings (n, C) [T]; noise in standard deviations."""
+        """Raw readings (n, C) [T]; noise as standard normal numbers."""
         array = self.scenario.array
         exact = predicted_channels(array, position, moment) + array.channel_offset_T
-        return exact + proportional_noise(array, exact) * noise
+        return exact + reading_errors(array, exact, noise)
 
     def _problems(self, readings: FloatArray) -> list[SeparableProblem]:
         """Problem of every row, with the whitening of its fix."""
         array = self.scenario.array
-        if array.noise_fraction == 0.0:
+        if not array.noise_depends_on_reading:
             return [self._problem] * len(readings)
-        noise = proportional_noise(array, readings)
-        return [SeparableProblem.of(array, whitening(array, channel_noise_T=row)) for row in noise]
+        covariances = (reading_covariance(array, row) for row in readings)
+        return [SeparableProblem.of(array, whitening(array, covariance_T2=covariance)) for covariance in covariances]
 
     def _searched_from(self, truth: FloatArray, readings: FloatArray) -> list[tuple[FloatArray, float]]:
         """Ends q (4,) and χ² of the refinements that start at the truth (n, 3).
@@ -234,13 +235,14 @@ class SourcesMap:
         against it where it is lower.
         """
         array = self.scenario.array
+        without_source = array.readings_of(array.ambient_fields)
         ends = []
         for position, row, problem in zip(truth, readings, self._problems(readings), strict=True):
             white = problem.whitening
             q = problem.homogeneous(position)
             chi2, _, _ = kernels.refine(
                 q,
-                white.apply(row - array.channel_offset_T),
+                white.apply(row - without_source),
                 problem.sensors,
                 problem.channel_sensor,
                 problem.gain,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from magloc.locate import Fix, Solution
+from magloc.fix import Fix, Solution
 
 _WIDTH = 100
 _MILLIMETRES_BELOW_M = 1.0

@@ -17,7 +17,7 @@ from magloc.commands.common import CommonOptions, Flag, print_json, print_note, 
 
 if TYPE_CHECKING:
     from arrays.sensor import SensorArray
-    from magloc.locate import Fix, Knowledge
+    from magloc.fix import Fix, Knowledge
     from magloc.readings import Readings
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
@@ -127,7 +127,7 @@ def _vector_sensors(array: SensorArray, ids: Sequence[str] | None, path: Path) -
 
 def _knowledge(region: str | None, largest_moment: float | None) -> Knowledge:
     """What the options say of the source."""
-    from magloc.locate import Knowledge
+    from magloc.fix import Knowledge
 
     low, high = [-math.inf] * 3, [math.inf] * 3
     for part in [] if region is None else region.split(","):

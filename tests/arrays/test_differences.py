@@ -5,15 +5,20 @@
 | the paper's T, eigenvalues | the printed matrices (13)-(15) |
 | decorrelated noise | Monte Carlo of the differences themselves |
 | χ² of Differences and of Whitening | generalised least squares with the full covariance, in extended form |
+| reading_covariance | closed forms, and Monte Carlo of sensors with other calibrations |
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
 
 from arrays.differences import (
     contrasts,
@@ -22,7 +27,10 @@ from arrays.differences import (
     eigen_decorrelation,
     helmert_decorrelation,
     proportional_noise,
+    reading_covariance,
+    reading_errors,
     whitening,
+    whitenings,
 )
 from arrays.geometries import tetrahedron
 from arrays.sensor import Calibration, Sensor, SensorArray
@@ -30,8 +38,8 @@ from arrays.sensor import Calibration, Sensor, SensorArray
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-def random_array(seed, n=5, *, kinds=("vector",), equal=False, common_field_T=None):
-    """Sensors anywhere, turned anyhow, of unequal noise and gain."""
+def random_array(seed, n=5, *, kinds=("vector",), equal=False, common_field_T=None, uncertain=False):
+    """Sensors anywhere, turned anyhow, of unequal noise and gain, and of a calibration that is uncertain or not."""
     rng = np.random.default_rng(seed)
     sensors = []
     for i in range(n):
@@ -47,6 +55,8 @@ def random_array(seed, n=5, *, kinds=("vector",), equal=False, common_field_T=No
                 noise_T=1e-9 if equal else 1e-9 * rng.uniform(0.3, 3.0),
                 rotation_xyzw=rotation / np.linalg.norm(rotation),
                 calibration=Calibration.of(kind, scale, 1e-7 * rng.normal(size=channels)),
+                misalignment_rad=rng.uniform(1e-4, 1e-3) if uncertain and kind == "vector" else 0.0,
+                gain_uncertainty=rng.uniform(1e-4, 1e-3) if uncertain else 0.0,
             )
         )
     return SensorArray(tuple(sensors), common_field_T=common_field_T)
@@ -56,24 +66,32 @@ def chi2_of_differences(differences, channels):
     return float(np.sum((differences.transform @ channels) ** 2 / differences.variance))
 
 
-def chi2_by_generalised_least_squares(array, available, channels):
+def chi2_by_generalised_least_squares(array, available, channels, covariance_T2=None):
     """χ² with the common field of each kind as an unknown (or with its prior), by the full normal equations."""
     total = 0.0
+    everything = np.diag(array.channel_noise_T**2) if covariance_T2 is None else covariance_T2
     for is_scalar in (False, True):
         group = available & (array.channel_is_scalar == is_scalar)
         if not group.any():
             continue
         common = array.channel_gain[group, :1] if is_scalar else array.channel_gain[group]
         # nT keep the numbers of order one.
-        y, noise = 1e9 * channels[group], 1e9 * array.channel_noise_T[group]
+        y, noise = 1e9 * channels[group], 1e18 * everything[np.ix_(group, group)]
         if array.common_field_T is None:
-            W = np.diag(1 / noise)
+            eigenvalues, vectors = np.linalg.eigh(noise)
+            W = (vectors / np.sqrt(eigenvalues)).T
             residual = W @ y - W @ common @ np.linalg.lstsq(W @ common, W @ y, rcond=None)[0]
             total += residual @ residual
         else:
-            covariance = np.diag(noise**2) + (1e9 * array.common_field_T) ** 2 * common @ common.T
+            covariance = noise + (1e9 * array.common_field_T) ** 2 * common @ common.T
             total += y @ np.linalg.solve(covariance, y)
     return total
+
+
+def earth_field(rng):
+    """50 µT in any direction."""
+    direction = rng.normal(size=3)
+    return 5e-5 * direction / np.linalg.norm(direction)
 
 
 class TestThePapersMatrices:
@@ -184,6 +202,56 @@ class TestLikelihoodDoesNotDependOnItsForm:
 
     @given(SEEDS, st.sampled_from([("vector",), ("scalar",), ("vector", "scalar")]), st.booleans(), st.booleans())
     @settings(max_examples=60, deadline=None)
+    def test_correlated_readings(self, seed, kinds, missing, prior):
+        """In a field of 50 µT: the errors of a calibration are up to 50 times the noise, and correlated."""
+        array = random_array(seed, 6, kinds=kinds, common_field_T=3e-9 if prior else None, uncertain=True)
+        rng = np.random.default_rng(seed)
+        readings = array.readings_of(earth_field(rng) + 1e-7 * rng.normal(size=(6, 3)))
+        available = rng.random(array.n_channels) > 0.3 if missing else np.ones(array.n_channels, dtype=bool)
+        covariance = reading_covariance(array, np.where(available, readings, np.nan))
+        channels = 1e-8 * rng.normal(size=array.n_channels)
+        d = decorrelated_differences(array, available, covariance_T2=covariance)
+        w = whitening(array, available, covariance_T2=covariance)
+        expected = chi2_by_generalised_least_squares(array, available, channels, covariance)
+        assert chi2_of_differences(d, channels) == pytest.approx(expected, rel=1e-7, abs=1e-9)
+        assert float(np.sum(w.apply(channels) ** 2)) == pytest.approx(expected, rel=1e-7, abs=1e-9)
+        assert d.n_differences == w.n_differences
+
+    @given(SEEDS, st.integers(0, 4))
+    @settings(max_examples=40, deadline=None)
+    def test_base_sensor_of_correlated_readings(self, seed, base):
+        """Equal covariances along all axes take the closed form, others the numerical one: one χ² for any base."""
+        array = random_array(seed, 5, equal=True)
+        if seed % 2:  # errors of the gains in a field along the diagonal are alike for all axes
+            array = replace(array, sensors=tuple(replace(s, gain_uncertainty=1e-3) for s in array.sensors))
+            readings = np.tile(2e-5 * np.ones(3), 5) + array.channel_offset_T
+        else:
+            array = random_array(seed, 5, uncertain=True)
+            readings = array.readings_of(np.tile(earth_field(np.random.default_rng(seed)), (5, 1)))
+        covariance = reading_covariance(array, readings)
+        channels = 1e-8 * np.random.default_rng(seed).normal(size=15)
+        last = chi2_of_differences(decorrelated_differences(array, covariance_T2=covariance), channels)
+        other = chi2_of_differences(decorrelated_differences(array, base=base, covariance_T2=covariance), channels)
+        assert other == pytest.approx(last, rel=1e-7)
+
+    @given(SEEDS, st.booleans())
+    @settings(max_examples=20, deadline=None)
+    def test_rows_at_once(self, seed, prior):
+        array = random_array(
+            seed, 6, kinds=("vector", "scalar"), common_field_T=3e-9 if prior else None, uncertain=True
+        )
+        rng = np.random.default_rng(seed)
+        available = rng.random(array.n_channels) > 0.3
+        covariances = reading_covariance(array, array.readings_of(5e-5 * rng.normal(size=(4, 6, 3))))
+        for together, covariance in zip(whitenings(array, available, covariances), covariances, strict=True):
+            alone = whitening(array, available, covariance_T2=covariance)
+            channels = 1e-8 * rng.normal(size=array.n_channels)
+            assert_allclose(together.apply(channels), alone.apply(channels), atol=1e-9)
+            assert_array_equal(together.root, alone.root)
+            assert together.n_differences == alone.n_differences
+
+    @given(SEEDS, st.sampled_from([("vector",), ("scalar",), ("vector", "scalar")]), st.booleans(), st.booleans())
+    @settings(max_examples=60, deadline=None)
     def test_differences_whitening_and_generalised_least_squares(self, seed, kinds, missing, prior):
         array = random_array(seed, 6, kinds=kinds, common_field_T=3e-9 if prior else None)
         rng = np.random.default_rng(seed)
@@ -224,7 +292,8 @@ class TestMissingReadings:
         d, w = decorrelated_differences(array, available), whitening(array, available)
         assert d.n_differences == 10
         assert not d.transform[:, ~available].any()
-        assert not w.inverse_noise[~available].any()
+        assert not w.root[~available].any()
+        assert not w.root[:, ~available].any()
 
     def test_nothing_left(self):
         array = random_array(5)
@@ -234,8 +303,33 @@ class TestMissingReadings:
     def test_wrong_shapes_are_named(self):
         with pytest.raises(ValueError, match=r"Input available must have shape \(12,\)"):
             decorrelated_differences(tetrahedron(1.0), np.ones(4, dtype=bool))
-        with pytest.raises(ValueError, match=r"Input channel_noise_T must have shape \(12,\)"):
-            whitening(tetrahedron(1.0), channel_noise_T=np.ones(4))
+        with pytest.raises(ValueError, match=r"Input covariance_T2 must have shape \(12, 12\)"):
+            whitening(tetrahedron(1.0), covariance_T2=np.ones(12))
+
+    def test_covariances_that_are_none_are_refused(self):
+        array, correlated = tetrahedron(1.0), np.eye(12)
+        correlated[0, 3] = correlated[3, 0] = 0.1
+        for make in (whitening, decorrelated_differences):
+            with pytest.raises(ValueError, match="Input covariance_T2 must be block-diagonal by sensor; instead"):
+                make(array, covariance_T2=correlated)
+        with pytest.raises(ValueError, match="Input covariance_T2 must be positive definite; instead"):
+            whitening(array, covariance_T2=-np.eye(12))
+
+    def test_axes_that_no_sensor_has_cost_no_difference(self):
+        """Of parallel axes alone one component of the common field is seen, not three."""
+        array = tetrahedron(1.0)
+        available = np.tile([True, False, False], 4)
+        assert decorrelated_differences(array, available).n_differences == 3
+        assert whitening(array, available).n_differences == 3
+        assert whitening(array, available).basis.shape == (12, 1)
+
+    def test_the_other_axes_of_a_sensor_keep_their_covariance(self):
+        array = random_array(5, uncertain=True)
+        covariance = reading_covariance(array, array.readings_of(np.full((5, 3), 3e-5)))
+        available = np.ones(15, dtype=bool)
+        available[4] = False
+        root = whitening(array, available, covariance_T2=covariance).root[np.ix_([3, 5], [3, 5])]
+        assert_allclose(root @ covariance[np.ix_([3, 5], [3, 5])] @ root.T, np.eye(2), atol=1e-12)
 
 
 class TestProportionalNoise:
@@ -267,3 +361,159 @@ class TestProportionalNoise:
         readings = np.zeros(12)
         readings[3], readings[4] = 9e-6, np.nan
         assert_allclose(proportional_noise(array, readings)[3:6], np.hypot(2e-9, 0.03 * np.sqrt(1.5) * 9e-6))
+
+
+def with_errors(array, **errors):
+    """The array with the same errors of calibration at every sensor."""
+    return replace(array, sensors=tuple(replace(sensor, **errors) for sensor in array.sensors))
+
+
+def uncalibrated_readings(array, fields, rng):
+    """Readings of sensors whose axes are turned and whose gains are wrong, by as much as the array says."""
+    sensors = []
+    for sensor in array.sensors:
+        scale = np.array(sensor.calibration.scale)
+        gains = np.diag(1.0 + sensor.gain_uncertainty * rng.normal(size=sensor.n_channels))
+        if sensor.kind == "vector":
+            gains = gains @ Rotation.from_rotvec(sensor.misalignment_rad * rng.normal(size=3)).as_matrix()
+        sensors.append(
+            replace(sensor, calibration=Calibration.of(sensor.kind, scale @ gains, sensor.calibration.offset_T))
+        )
+    return SensorArray(tuple(sensors)).readings_of(fields) + array.channel_noise_T * rng.normal(size=array.n_channels)
+
+
+def assert_is_covariance_of(samples, covariance):
+    """Within 5 standard errors of every entry, once the samples are decorrelated.
+
+    The false-alarm rate is C(C+1)/2 · 6e-7: 1e-4 for 17 channels.
+    """
+    n, c = samples.shape
+    scale = np.sqrt(np.diagonal(covariance))
+    root = np.linalg.inv(np.linalg.cholesky(covariance / np.outer(scale, scale)))
+    z = (samples - samples.mean(axis=0)) / scale @ root.T
+    standard_error = np.where(np.eye(c, dtype=bool), np.sqrt(2.0 / n), np.sqrt(1.0 / n))
+    assert np.max(np.abs(z.T @ z / n - np.eye(c)) / standard_error) < 5.0
+
+
+class TestReadingCovariance:
+    """Noise, and what the calibration does not know."""
+
+    def test_a_tenth_of_a_milliradian_in_50_microtesla_is_5_nanotesla(self):
+        array = with_errors(tetrahedron(1.0, noise_T=1e-9), misalignment_rad=1e-4)
+        field = np.array([0.0, 0.0, 5e-5])
+        covariance = reading_covariance(array, np.tile(field, 4))
+        block = np.diag([5e-9**2, 5e-9**2, 0.0]) + 1e-9**2 * np.eye(3)
+        assert_allclose(covariance, block_diag(*[block] * 4), rtol=1e-12, atol=1e-30)
+
+    def test_errors_of_the_gain_are_relative(self):
+        array = with_errors(tetrahedron(1.0, noise_T=1e-12), gain_uncertainty=1e-3)
+        field = np.array([1e-5, -2e-5, 3e-5])
+        covariance = reading_covariance(array, np.tile(field, 4))
+        assert_allclose(covariance, np.diag(np.tile((1e-3 * field) ** 2 + 1e-24, 4)), rtol=1e-12, atol=1e-30)
+
+    def test_scalar_sensors(self):
+        sensors = [
+            Sensor(f"s{i}", "scalar", (i, 0, 0), 1e-9, calibration=Calibration.of("scalar", 2.0, 1e-6))
+            for i in range(2)
+        ]
+        array = with_errors(SensorArray(tuple(sensors)), gain_uncertainty=1e-3)
+        readings = array.readings_of(np.tile([3e-5, 0.0, 4e-5], (2, 1)))
+        assert_allclose(reading_covariance(array, readings), np.eye(2) * (1e-9**2 + 1e-7**2), rtol=1e-12)
+
+    @given(SEEDS)
+    @settings(max_examples=20, deadline=None)
+    def test_without_errors_of_calibration_it_is_the_noise(self, seed):
+        array = replace(random_array(seed, 6, kinds=("vector", "scalar")), noise_fraction=0.02)
+        readings = 1e-6 * np.random.default_rng(seed).normal(size=(3, array.n_channels))
+        readings[0, 1] = np.nan
+        expected = np.eye(array.n_channels) * proportional_noise(array, readings)[:, :, None] ** 2
+        assert_array_equal(reading_covariance(array, readings), expected)
+
+    @pytest.mark.parametrize("error", ["rotations", "gains", "both"])
+    def test_of_sensors_with_other_calibrations(self, error):
+        """4,000 arrays drawn; terms of second order in the errors are 1e-3 of the noise."""
+        rng = np.random.default_rng(8)
+        array = random_array(8, 3, kinds=("vector", "vector", "scalar"), uncertain=True)
+        array = with_errors(array, gain_uncertainty=0.0 if error == "rotations" else 2e-4, misalignment_rad=0.0)
+        if error != "gains":
+            sensors = (replace(s, misalignment_rad=2e-4 if s.kind == "vector" else 0.0) for s in array.sensors)
+            array = replace(array, sensors=tuple(sensors))
+        fields = 5e-5 * rng.normal(size=(3, 3))
+        samples = np.array([uncalibrated_readings(array, fields, rng) for _ in range(4_000)])
+        assert_is_covariance_of(samples, reading_covariance(array, array.readings_of(fields)))
+
+    def test_turns_with_the_sensor(self):
+        """A sensor that is turned has the covariance of one that is not, in turned axes."""
+        array = with_errors(random_array(3, 4, equal=True), misalignment_rad=1e-3)
+        array = replace(array, sensors=tuple(replace(s, calibration=None) for s in array.sensors))
+        field = np.array([1e-5, -2e-5, 4e-5])
+        blocks = reading_covariance(array, array.readings_of(np.tile(field, (4, 1))))
+        to_frame = block_diag(*array.rotation_matrices)
+        expected = 1e-6 * (field @ field * np.eye(3) - np.outer(field, field)) + 1e-18 * np.eye(3)
+        assert_allclose(to_frame @ blocks @ to_frame.T, block_diag(*[expected] * 4), rtol=0.0, atol=1e-27)
+
+    def test_batches(self):
+        array = replace(random_array(4, 5, kinds=("vector", "scalar"), uncertain=True), noise_fraction=0.01)
+        readings = array.readings_of(5e-5 * np.random.default_rng(4).normal(size=(2, 3, 5, 3)))
+        readings[0, 1, 4] = np.nan
+        covariance = reading_covariance(array, readings)
+        assert covariance.shape == (2, 3, array.n_channels, array.n_channels)
+        for index in np.ndindex(2, 3):
+            assert_allclose(covariance[index], reading_covariance(array, readings[index]), rtol=1e-12, atol=1e-30)
+
+    @pytest.mark.parametrize(
+        "field", [(5e-5, 0, 0), (5e-5, 1e-12, 0), (1e-3, 1e-3, 1e-3), (3e-2, 4e-2, 1e-9), (0, 0, 0)]
+    )
+    def test_is_never_singular(self, field):
+        """The error of a turn along the field is nil, and the noise may be far below the others."""
+        array = with_errors(random_array(5, 4), misalignment_rad=1e-2)
+        array = replace(array, sensors=tuple(replace(s, noise_T=1e-15) for s in array.sensors))
+        covariance = reading_covariance(array, array.readings_of(np.tile(field, (4, 1))))
+        w = whitening(array, covariance_T2=covariance)
+        assert np.isfinite(w.root).all()
+        assert w.n_differences == 9
+
+
+class TestCovarianceOfIncompleteReadings:
+    """The field along a missing axis is taken from what else is known."""
+
+    field = np.array([1e-5, -2e-5, 4e-5])
+
+    @pytest.fixture
+    def array(self):
+        return with_errors(random_array(6, 4, equal=True), misalignment_rad=1e-3, gain_uncertainty=2e-3)
+
+    def test_the_other_sensors(self, array):
+        readings = array.readings_of(np.tile(self.field, (4, 1)))
+        whole = reading_covariance(array, readings)
+        readings[[4, 7]] = np.nan
+        assert_allclose(reading_covariance(array, readings), whole, rtol=1e-9, atol=1e-26)
+
+    def test_the_known_ambient_field_before_them(self, array):
+        readings = array.readings_of(np.tile(self.field, (4, 1)))
+        whole = reading_covariance(array, readings)
+        other = array.readings_of(np.array([self.field, self.field, 2 * self.field, 2 * self.field]))
+        other[[4, 6, 7, 8]] = np.nan
+        known = replace(array, ambient_T=self.field)
+        assert_allclose(reading_covariance(known, other)[:9, :9], whole[:9, :9], rtol=1e-9, atol=1e-26)
+
+    def test_nothing(self):
+        array = with_errors(tetrahedron(1.0), misalignment_rad=1e-3)
+        readings = np.full(12, np.nan)
+        readings[[0, 3, 6, 9]] = 5e-5
+        expected = np.diag(np.tile([0.0, 5e-8**2, 5e-8**2], 4)) + 1e-18 * np.eye(12)
+        assert_allclose(reading_covariance(array, readings), expected, rtol=1e-12, atol=1e-30)
+
+
+class TestReadingErrors:
+    def test_their_covariance(self):
+        array = replace(random_array(9, 7, kinds=("vector", "scalar"), uncertain=True), noise_fraction=0.001)
+        rng = np.random.default_rng(9)
+        readings = array.readings_of(5e-5 * rng.normal(size=(7, 3)))
+        errors = reading_errors(array, readings, rng.normal(size=(100_000, array.n_channels)))
+        assert_is_covariance_of(errors, reading_covariance(array, readings))
+
+    def test_of_constant_noise(self):
+        array = random_array(10, 5, kinds=("vector", "scalar"))
+        normal = np.random.default_rng(10).normal(size=(3, array.n_channels))
+        assert_array_equal(reading_errors(array, np.zeros(array.n_channels), normal), array.channel_noise_T * normal)

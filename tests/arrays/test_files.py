@@ -39,6 +39,12 @@ position_m = [1, 0, 0]
 noise_nT = 2
 """
 
+QUALITY = """\
+saturation_nT = 100_000
+misalignment_mrad = 0.1
+gain_uncertainty = 0.003
+"""
+
 WriteFile = Callable[[str | bytes], Path]
 
 
@@ -60,6 +66,7 @@ def changed(text: str, old: str, new: str) -> str:
 
 finite = st.floats(-1e6, 1e6)
 positive = st.floats(min_value=0.0, exclude_min=True, allow_infinity=False)
+below_one = st.floats(0.0, 1.0, exclude_max=True)
 names = st.text(st.characters(codec="utf-8", categories=("L", "N", "P", "S"), exclude_characters=',"'), min_size=1)
 
 
@@ -84,7 +91,16 @@ def sensors(draw: st.DrawFn, name: str) -> Sensor:
         draw(positive),
         q / np.linalg.norm(q),
         draw(st.none() | calibrations(kind)),
+        draw(st.none() | positive),
+        draw(below_one) if kind == "vector" else 0.0,
+        draw(below_one),
     )
+
+
+@st.composite
+def gradients(draw: st.DrawFn) -> list[list[float]]:
+    a, b, d, e, f = draw(st.tuples(finite, finite, finite, finite, finite))
+    return [[a, d, e], [d, b, f], [e, f, -a - b]]
 
 
 @st.composite
@@ -98,6 +114,7 @@ def any_arrays(draw: st.DrawFn) -> SensorArray:
         draw(st.floats(0.0, 1.0)),
         draw(st.none() | st.floats(0.0, 1e-3)),
         draw(st.none() | st.tuples(finite, finite, finite)),
+        draw(st.none() | gradients()),
     )
 
 
@@ -115,12 +132,20 @@ class TestGeometryForm:
 
     def test_header(self, write: WriteFile) -> None:
         header = 'name = "Turm №1"\nnoise_fraction = 0.01\ncommon_field_nT = 50\nambient_nT = [1, 2.5, -3]\n'
+        header += "ambient_gradient_nT_m = [[1, 2, 0], [2, -1.5, 0.3], [0, 0.3, 0.5]]\n"
         assert read_array(write(f"format_version = 1\n{header}{GEOMETRY}")) == replace(
             tetrahedron(1.5),
             name="Turm №1",
             noise_fraction=0.01,
             common_field_T=5e-8,
             ambient_T=(1e-9, 2.5e-9, -3e-9),
+            ambient_gradient_T_m=((1e-9, 2e-9, 0.0), (2e-9, -1.5e-9, 0.3e-9), (0.0, 0.3e-9, 0.5e-9)),
+        )
+
+    def test_quality_of_all_sensors(self, write: WriteFile) -> None:
+        assert read_array(write(GEOMETRY + QUALITY)).sensors == tuple(
+            replace(sensor, saturation_T=1e-4, misalignment_rad=1e-4, gain_uncertainty=0.003)
+            for sensor in tetrahedron(1.5).sensors
         )
 
     def test_empty_name(self, write: WriteFile) -> None:
@@ -138,6 +163,11 @@ class TestSensorsForm:
         first = Sensor("s1", "vector", (0.0, 0.0, 0.918), 1e-9)
         second = Sensor("s2", "scalar", (1.0, 0.0, 0.0), 2e-9)
         assert read_array(write(SENSORS)) == SensorArray((first, second))
+
+    def test_quality_of_one_sensor(self, write: WriteFile) -> None:
+        first, second = read_array(write(changed(SENSORS, "noise_nT = 1.0\n", f"noise_nT = 1.0\n{QUALITY}"))).sensors
+        assert (first.saturation_T, first.misalignment_rad, first.gain_uncertainty) == (1e-4, 1e-4, 0.003)
+        assert (second.saturation_T, second.misalignment_rad, second.gain_uncertainty) == (None, 0.0, 0.0)
 
     def test_rotation(self, write: WriteFile) -> None:
         array = read_array(write(f"{SENSORS}rotation_xyzw = [0.5, 0.5, 0.5, 0.5]\n"))
@@ -360,6 +390,40 @@ class TestRefused:
             ),
             ("noise_nT = 1.0", "noise_nT = 1.0\nambient_nT = [1, 2]", ("key ambient_nT", "length 2", "length 3")),
             ("noise_nT = 1.0", "noise_nT = 1.0\nambient_nT = [1, 2, nan]", ("key ambient_nT", "finite")),
+            (
+                "noise_nT = 1.0",
+                "noise_nT = 1.0\nambient_gradient_nT_m = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]",
+                ("ambient_gradient_T_m must be traceless",),
+            ),
+            (
+                "noise_nT = 1.0",
+                "noise_nT = 1.0\nambient_gradient_nT_m = [[0, 1, 0], [2, 0, 0], [0, 0, 0]]",
+                ("ambient_gradient_T_m must be symmetric",),
+            ),
+            (
+                "noise_nT = 1.0",
+                "noise_nT = 1.0\nambient_gradient_nT_m = [[0, 1], [1, 0]]",
+                ("key ambient_gradient_nT_m", "length 2", "length 3"),
+            ),
+            (
+                "noise_nT = 1.0",
+                "noise_nT = 1.0\nambient_gradient_nT_m = [[0, inf, 0], [0, 0, 0], [0, 0, 0]]",
+                ("key ambient_gradient_nT_m", "finite"),
+            ),
+            (
+                "noise_nT = 1.0",
+                "noise_nT = 1.0\nsaturation_nT = 0",
+                ("key saturation_nT", "expected a positive number"),
+            ),
+            ("noise_nT = 1.0", "noise_nT = 1.0\nsaturation_nT = 'x'", ("key saturation_nT", "found text")),
+            (
+                "noise_nT = 1.0",
+                "noise_nT = 1.0\nmisalignment_mrad = 1000",
+                ("key misalignment_mrad", "found 1000, expected a number from 0 to below 1000"),
+            ),
+            ("noise_nT = 1.0", "noise_nT = 1.0\nmisalignment_mrad = -1", ("key misalignment_mrad", "found -1")),
+            ("noise_nT = 1.0", "noise_nT = 1.0\ngain_uncertainty = 2", ("gain_uncertainty must be from 0 to below 1",)),
+            ("noise_nT = 1.0", "noise_nT = 1.0\ngain_uncertainity = 2", ("nearest is gain_uncertainty",)),
             ("noise_nT = 1.0", "noise_nT = 1.0\n[[sensor]]", ("keys geometry and sensor", "found both")),
         ],
     )
@@ -388,6 +452,7 @@ class TestRefused:
             ("noise_nT = 1.0", "noise_nT = nan", ("sensor s1, key noise_nT", "expected a finite number")),
             ("noise_nT = 1.0", "nose_nT = 1.0", ("sensor s1, key nose_nT", "nearest is noise_nT")),
             ("[[sensor]]", "kind = 'vector'\n[[sensor]]", ("key kind", "found at the top", "each [[sensor]]")),
+            ("[[sensor]]", "saturation_nT = 5\n[[sensor]]", ("key saturation_nT", "found at the top")),
             ("[[sensor]]", "nmae = 'x'\n[[sensor]]", ("key nmae", "unknown key", "nearest is name")),
             (SENSORS, "name = 'x'", ("found neither the key geometry nor [[sensor]] tables",)),
             (SENSORS, "sensor = []", ("sensors must be at least 2; instead received 0",)),
@@ -406,6 +471,9 @@ class TestRefused:
             ("vector", "rotation_xyzw = [0, 0, 0, 2]", ("rotation_xyzw must be a quaternion of norm 1", "norm 2")),
             ("vector", "rotation_xyzw = [0, 0, 0, 0.99999]", ("rotation_xyzw must be a quaternion of norm 1",)),
             ("vector", "rotation_xyzw = [0, 0, 1]", ("key rotation_xyzw", "length 3", "length 4")),
+            ("scalar", "misalignment_mrad = 1.0", ("misalignment_rad must be 0 for a scalar sensor",)),
+            ("vector", "misalignment_mrad = inf", ("key misalignment_mrad", "finite")),
+            ("vector", "saturation_nT = -5", ("key saturation_nT", "found -5, expected a positive number")),
             ("vector", "calibration = 2.0", ("key calibration", "found a number, expected a table")),
             ("vector", "calibration.scal = 1", ("key calibration.scal", "nearest is calibration.scale")),
             ("vector", "calibration.scale = 'x'", ("key calibration.scale", "expected a number or a list")),

@@ -27,6 +27,7 @@ from arrays.sensor import Calibration, Sensor, SensorArray
 
 SEEDS = st.integers(0, 2**32 - 1)
 QUARTER_TURN_Z = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))
+GRADIENT = ((1e-9, 2e-9, 3e-9), (2e-9, -5e-9, 6e-9), (3e-9, 6e-9, 4e-9))
 ARRAY_PROPERTIES = (
     "positions",
     "centroid",
@@ -36,6 +37,9 @@ ARRAY_PROPERTIES = (
     "channel_noise_T",
     "channel_offset_T",
     "channel_gain",
+    "channel_saturation_T",
+    "sensor_channels",
+    "ambient_fields",
 )
 
 
@@ -55,7 +59,7 @@ def random_array(seed: int, kinds: tuple[str, ...] = ("vector", "scalar", "vecto
 def mixed() -> SensorArray:
     return SensorArray(
         (
-            Sensor("a", "vector", (0.0, 0.0, 1.0), 1e-9, QUARTER_TURN_Z),
+            Sensor("a", "vector", (0.0, 0.0, 1.0), 1e-9, QUARTER_TURN_Z, saturation_T=1e-4, misalignment_rad=1e-3),
             Sensor("b", "scalar", (0.0, 3.0, 0.0), 2e-9, calibration=Calibration.of("scalar", 2.0, 5e-9)),
             Sensor(
                 "c", "vector", (0.0, 0.0, -1.0), 3e-9, calibration=Calibration.of("vector", (1, 2, 3), (0, 0, 7e-9))
@@ -65,6 +69,7 @@ def mixed() -> SensorArray:
         noise_fraction=0.01,
         common_field_T=5e-8,
         ambient_T=(1e-5, 0.0, 4e-5),
+        ambient_gradient_T_m=GRADIENT,
     )
 
 
@@ -251,6 +256,17 @@ class TestSensor:
             ({"rotation_xyzw": (0, 0, 0, 0)}, "Input rotation_xyzw must be a quaternion of norm 1; instead"),
             ({"rotation_xyzw": (0, 0, 1)}, r"Input rotation_xyzw must have shape \(4,\); instead"),
             ({"calibration": Calibration.of("scalar")}, "Input calibration must have 3 channels for a vector sensor"),
+            ({"saturation_T": 0.0}, r"Input saturation_T must be positive; instead received 0\.0"),
+            ({"saturation_T": np.nan}, "Input saturation_T must be finite; instead received nan"),
+            (
+                {"misalignment_rad": -1e-3},
+                r"Input misalignment_rad must be from 0 to below 1; instead received -0\.001",
+            ),
+            ({"misalignment_rad": 1.0}, r"Input misalignment_rad must be from 0 to below 1; instead received 1\.0"),
+            ({"misalignment_rad": np.inf}, "Input misalignment_rad must be finite; instead received inf"),
+            ({"gain_uncertainty": -0.1}, r"Input gain_uncertainty must be from 0 to below 1; instead received -0\.1"),
+            ({"gain_uncertainty": [0.1]}, r"Input gain_uncertainty must be one number; instead received \[0\.1\]"),
+            ({"kind": "scalar", "misalignment_rad": 1e-3}, "Input misalignment_rad must be 0 for a scalar sensor"),
         ],
     )
     def test_refused(self, change: dict[str, object], text: str) -> None:
@@ -272,6 +288,31 @@ class TestSensorArray:
         assert_array_equal(mixed.channel_is_scalar, [0, 0, 0, 1, 0, 0, 0])
         assert_array_equal(mixed.channel_noise_T, [1e-9] * 3 + [2e-9] + [3e-9] * 3)
         assert_array_equal(mixed.channel_offset_T, [0, 0, 0, 5e-9, 0, 0, 7e-9])
+        assert_array_equal(mixed.channel_saturation_T, [1e-4] * 3 + [np.inf] * 4)
+        assert_array_equal(mixed.sensor_channels, [[0, 1, 2], [3, -1, -1], [4, 5, 6]])
+
+    def test_ambient_field_of_every_sensor(self, mixed: SensorArray) -> None:
+        expected = np.array([[3e-9, 6e-9, 4e-9], [6e-9, -15e-9, 18e-9], [-3e-9, -6e-9, -4e-9]])
+        assert_allclose(mixed.ambient_fields - mixed.ambient_T, expected, rtol=0.0, atol=1e-20)
+        assert_allclose(replace(mixed, ambient_T=None).ambient_fields, expected, rtol=1e-15)
+        assert_array_equal(replace(mixed, ambient_gradient_T_m=None).ambient_fields, [mixed.ambient_T] * 3)
+        assert_array_equal(replace(mixed, ambient_T=None, ambient_gradient_T_m=None).ambient_fields, np.zeros((3, 3)))
+
+    @pytest.mark.parametrize(
+        ("fraction", "change", "depends"),
+        [
+            (0.0, {}, False),
+            (0.01, {}, True),
+            (0.0, {"misalignment_rad": 1e-4}, True),
+            (0.0, {"gain_uncertainty": 1e-4}, True),
+            (0.0, {"saturation_T": 1e-4}, False),
+        ],
+    )
+    def test_noise_that_depends_on_the_reading(
+        self, mixed: SensorArray, fraction: float, change: dict[str, float], depends: bool
+    ) -> None:
+        sensors = (replace(mixed.sensors[2], **change), Sensor("d", "scalar", (0, 0, 0), 1e-9))
+        assert SensorArray(sensors, noise_fraction=fraction).noise_depends_on_reading is depends
 
     def test_size(self, mixed: SensorArray) -> None:
         assert_array_equal(mixed.positions, [[0, 0, 1], [0, 3, 0], [0, 0, -1]])
@@ -340,6 +381,16 @@ class TestSensorArray:
             ({"common_field_T": np.inf}, "Input common_field_T must be finite"),
             ({"ambient_T": (1e-5, 0.0)}, r"Input ambient_T must have shape \(3,\)"),
             ({"ambient_T": (1e-5, 0.0, np.nan)}, "Input ambient_T must be finite"),
+            ({"ambient_gradient_T_m": (1e-9, 0.0, 0.0)}, r"Input ambient_gradient_T_m must have shape \(3, 3\)"),
+            ({"ambient_gradient_T_m": np.full((3, 3), np.nan)}, "Input ambient_gradient_T_m must be finite"),
+            (
+                {"ambient_gradient_T_m": ((0, 1e-9, 0), (1.00001e-9, 0, 0), (0, 0, 0))},
+                "Input ambient_gradient_T_m must be symmetric to 1e-06 of its largest entry; instead received",
+            ),
+            (
+                {"ambient_gradient_T_m": 1e-9 * np.diag([1.0, 1.0, -2.00001])},
+                "Input ambient_gradient_T_m must be traceless to 1e-06 of its largest entry; instead received",
+            ),
         ],
     )
     def test_refused(self, mixed: SensorArray, change: dict[str, object], text: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,15 @@ from hypothesis import strategies as st
 from arrays.errors import InputError
 from arrays.files import read_array
 from arrays.sensor import Sensor, SensorArray
-from magloc.readings import Readings, average, averaging_array, read_readings, read_truth, write_readings
+from magloc.readings import (
+    Readings,
+    average,
+    averaging_array,
+    read_readings,
+    read_truth,
+    without_saturated,
+    write_readings,
+)
 
 HEADER = "time_s,s1_x_nT,s1_y_nT,s1_z_nT,s2_x_nT,s2_y_nT,s2_z_nT,s3_nT"
 ROW = "0,1,2,3,4,5,6,7"
@@ -322,12 +331,60 @@ class TestAverage:
         before = [sensor.noise_T for sensor in array.sensors]
         np.testing.assert_allclose([sensor.noise_T for sensor in averaged.sensors], np.divide(before, 2.0), rtol=1e-15)
 
+    def test_errors_of_the_calibration_do_not_average_out(self, array: SensorArray) -> None:
+        uncertain = replace(
+            array,
+            sensors=tuple(
+                replace(sensor, misalignment_rad=1e-3 * (sensor.kind == "vector"), gain_uncertainty=2e-3)
+                for sensor in array.sensors
+            ),
+            noise_fraction=0.01,
+        )
+        averaged = averaging_array(uncertain, self.readings([[1.0] * 7] * 4))
+        assert averaged.noise_fraction == 0.005
+        for before, after in zip(uncertain.sensors, averaged.sensors, strict=True):
+            assert after == replace(before, noise_T=before.noise_T / 2.0)
+
     def test_array_that_moves(self) -> None:
         position = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.1, 0.0]])
         rotation = np.array([[0.0, 0.0, 0.0, 1.0]] * 3)
         rows = self.readings([[1.0]] * 3, array_position_m=position, array_rotation_xyzw=rotation)
         with pytest.raises(InputError, match="between lines 2 and 4"):
             average(rows)
+
+
+class TestSaturation:
+    """A reading at its sensor's limit, or beyond it, is no measurement."""
+
+    @pytest.fixture
+    def limited(self, array: SensorArray) -> SensorArray:
+        first, second, third = array.sensors
+        return replace(array, sensors=(replace(first, saturation_T=5e-9), second, replace(third, saturation_T=3.3e-9)))
+
+    def test_only_the_saturated_channels(self, limited: SensorArray, write: WriteFile) -> None:
+        # 3.3/1e9 is one rounding below 3.3e-9.
+        rows = ["0,4.9,-5,7,1e6,1e6,1e6,3.2999", "1,-4.9,4.9,,0,-1e6,,3.3"]
+        readings = read_readings(write("\n".join([HEADER, *rows])), limited)
+        expected = readings.values_T.copy()
+        expected[[0, 0, 1], [1, 2, 6]] = math.nan
+        before = readings.values_T.copy()
+        np.testing.assert_array_equal(without_saturated(readings, limited).values_T, expected)
+        np.testing.assert_array_equal(readings.values_T, before)
+
+    def test_everything_else_stays(self, limited: SensorArray, write: WriteFile) -> None:
+        readings = read_readings(write(f"{HEADER},{POSE}\n{ROW},1,2,3,0,0,0,1\n"), limited)
+        after = without_saturated(readings, limited)
+        for name in ("time_s", "line_numbers", "array_position_m", "array_rotation_xyzw", "ambient_T"):
+            assert getattr(after, name) is getattr(readings, name)
+
+    def test_no_limit(self, array: SensorArray, write: WriteFile) -> None:
+        readings = read_readings(write(f"{HEADER}\n0,1e15,2,,4,5,6,-1e15\n"), array)
+        np.testing.assert_array_equal(without_saturated(readings, array).values_T, readings.values_T)
+
+    def test_other_array(self, array: SensorArray, write: WriteFile) -> None:
+        readings = read_readings(write(f"{HEADER}\n{ROW}\n"), array)
+        with pytest.raises(ValueError, match="6 channels"):
+            without_saturated(readings, array.subset(["s1", "s2"]))
 
 
 class TestTruth:

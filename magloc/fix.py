@@ -1,0 +1,195 @@
+"""What a fix is: the solutions of one set of readings, and what is known of the source beforehand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+# Δχ² of a 95 % interval of one parameter, and within which another optimum is a solution too.
+RISE_95 = 3.841458820694124
+DISTINCT_WITHIN = 20.0
+# Mean square of whitened differences below which they are rounding errors rather than noise.
+SILENT = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """One optimum of the likelihood.
+
+    Attributes
+    ----------
+    position_m : ndarray, shape (3,)
+        Source in the array's frame [m].
+    moment_Am2 : ndarray, shape (3,)
+        Its moment [A·m²].
+    covariance : ndarray, shape (6, 6)
+        Of (position, moment), the inverse information at the solution. Where the range is not observable it is no
+        description of the uncertainty: use `range_interval95_m`.
+    chi2 : float
+        Sum of squared residuals of the decorrelated differences over their variances.
+    dof : int
+        Differences minus unknowns.
+    iterations : int
+        Linearisations that led here.
+    converged : bool
+        Whether the iteration ended at an optimum; no other solutions are listed.
+    range_observable : bool
+        Whether the 95 % interval of the range is closed and its ends differ by a factor of two at most.
+    range_interval95_m : tuple of (low, high)
+        Where the profile χ² over the distance from the sensors' centroid stays within 3.84 of this optimum [m];
+        high is None where it never leaves it.
+    """
+
+    position_m: FloatArray
+    moment_Am2: FloatArray
+    covariance: FloatArray
+    chi2: float
+    dof: int
+    iterations: int
+    converged: bool
+    range_observable: bool
+    range_interval95_m: tuple[tuple[float, float | None], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Fix:
+    """Every distinct solution of one set of readings, best χ² first.
+
+    Attributes
+    ----------
+    solutions : tuple of Solution
+        Empty if the readings cannot be solved.
+    reason : str
+        Why there is no solution; empty if there is one.
+    failed_starts : int
+        Starts of the search that ended without an optimum.
+    dropped : tuple of str
+        Ids of sensors that contradict all others, and were left out.
+    """
+
+    solutions: tuple[Solution, ...]
+    reason: str = ""
+    failed_starts: int = 0
+    dropped: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """What is known of the source beforehand; solutions that contradict it are left out.
+
+    Attributes
+    ----------
+    low_m, high_m : tuple of 3 floats
+        Bounds of the position in the array's frame [m], infinite where there is none: a box, a slab or a half-space.
+    largest_moment_Am2 : float
+        Bound of the moment's modulus [A·m²].
+
+    Raises
+    ------
+    ValueError
+        The bounds leave nothing.
+    """
+
+    low_m: tuple[float, float, float] = (-math.inf, -math.inf, -math.inf)
+    high_m: tuple[float, float, float] = (math.inf, math.inf, math.inf)
+    largest_moment_Am2: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not all(low < high for low, high in zip(self.low_m, self.high_m, strict=True)):
+            raise ValueError(
+                f"Input low_m must be below high_m along every axis; instead received {self.low_m}, {self.high_m}."
+            )
+        if not self.largest_moment_Am2 > 0.0:
+            raise ValueError(f"Input largest_moment_Am2 must be positive; instead received {self.largest_moment_Am2}.")
+
+    def allows_position(self, position_m: FloatArray) -> Any:
+        """Whether positions (..., 3) lie within the bounds."""
+        return np.all((position_m >= np.asarray(self.low_m)) & (position_m <= np.asarray(self.high_m)), axis=-1)
+
+    def allows_moment(self, moment_Am2: FloatArray) -> Any:
+        """Whether moments (..., 3) are small enough."""
+        return np.linalg.norm(moment_Am2, axis=-1) <= self.largest_moment_Am2
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """One of several sources of a :class:`JointSolution`.
+
+    Attributes
+    ----------
+    position_m, moment_Am2 : ndarray, shape (3,)
+        [m], array's frame; [A·m²].
+    covariance : ndarray, shape (6, 6)
+        Of its position and moment, all other sources being unknown too.
+    range_observable : bool
+    range_interval95_m : tuple of (low, high)
+        As in :class:`Solution`.
+    merged : bool
+        Whether it stands for two sources that the array does not tell apart.
+    """
+
+    position_m: FloatArray
+    moment_Am2: FloatArray
+    covariance: FloatArray
+    range_observable: bool
+    range_interval95_m: tuple[tuple[float, float | None], ...]
+    merged: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class JointSolution:
+    """Several sources that together explain the readings.
+
+    Attributes
+    ----------
+    sources : tuple of Source
+    covariance : ndarray, shape (6 K, 6 K)
+        Of (position, moment) of the first source, then of the second, and so on.
+    chi2, dof, iterations, converged
+        As in :class:`Solution`.
+    """
+
+    sources: tuple[Source, ...]
+    covariance: FloatArray
+    chi2: float
+    dof: int
+    iterations: int
+    converged: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class JointFix:
+    """Every distinct solution with the chosen number of sources, best χ² first.
+
+    Attributes
+    ----------
+    solutions : tuple of JointSolution
+        Empty if the readings cannot be solved.
+    reason : str
+        Why there is no solution, or why it has fewer sources than were asked for; empty otherwise.
+    dropped : tuple of str
+        Ids of sensors that contradict all others, and were left out.
+    """
+
+    solutions: tuple[JointSolution, ...]
+    reason: str = ""
+    dropped: tuple[str, ...] = ()
+
+
+NOTHING_KNOWN = Knowledge()
+
+
+def open_ended(low: float, high: float) -> tuple[float, float | None]:
+    """An interval whose upper end may be open."""
+    return low, high if math.isfinite(high) else None
+
+
+def is_observable(low: float, high: float) -> bool:
+    """Whether an interval of the range is closed and its ends differ by a factor of two at most."""
+    return low > 0.0 and high <= 2.0 * low

@@ -1,0 +1,463 @@
+r"""Any number of dipoles seen by any sensors: the exact model and its damped Gauss-Newton fit, many at once.
+
+Vector sensors read components, scalar sensors the exact modulus :math:`|B_a + B|` of the sum with the ambient field, so
+that the readings are not linear in the moments. Every source has the homogeneous coordinates q = (u, s) and the scaled
+moment μ of :mod:`magloc.separable`: infinity (s = 0) is an ordinary point.
+
+Positions are damped, moments are not: after every step of the positions the moments are fitted anew, which for vector
+sensors makes the iteration that of variable projection.
+
+Shapes: b fits, K sources, N sensors, C channels, c columns of the whitening's common field.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from arrays.differences import Whitening
+from arrays.sensor import SensorArray
+from magloc.dipole import MU0_OVER_4PI
+
+FloatArray = NDArray[np.float64]
+
+# A refinement has converged where the linearised model promises to lower χ² by less than this, absolute and relative.
+PROMISE_ABSOLUTE = 1e-8
+PROMISE_RELATIVE = 1e-11
+_LARGEST_STEP_RAD = 0.5
+_LARGEST_DAMPING = 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class JointProblem:
+    """Geometry and whitening of b sets of readings of one array, scaled by the array's size.
+
+    Attributes
+    ----------
+    centroid : ndarray, shape (3,)
+        Sensors' centroid [m], array frame.
+    radius : float
+        Largest distance of a sensor from it [m].
+    sensors : ndarray, shape (N, 3)
+        Sensors relative to the centroid, in radii.
+    channel_sensor : ndarray of int, shape (C,)
+    channel_is_scalar : ndarray of bool, shape (C,)
+    gain : ndarray, shape (b, C, 3)
+        Channel gains divided by the noise; of a scalar channel the first number counts.
+    ambient : ndarray, shape (b, N, 3)
+        Ambient field at the sensors [T]; only scalar channels see it.
+    basis : ndarray, shape (b, C, c)
+        Orthonormal common field of the whitening.
+    shrinkage : ndarray, shape (b, c)
+    """
+
+    centroid: FloatArray
+    radius: float
+    sensors: FloatArray
+    channel_sensor: NDArray[np.intp]
+    channel_is_scalar: NDArray[np.bool_]
+    gain: FloatArray
+    ambient: FloatArray
+    basis: FloatArray
+    shrinkage: FloatArray
+
+    @classmethod
+    def of(cls, array: SensorArray, whitenings: list[Whitening], ambient_T: FloatArray) -> JointProblem:
+        """Problem of b sets of readings, each with its whitening and its ambient field (b, N, 3)."""
+        return cls(
+            centroid=array.centroid,
+            radius=array.circumradius,
+            sensors=(array.positions - array.centroid) / array.circumradius,
+            channel_sensor=array.channel_sensor.astype(np.intp),
+            channel_is_scalar=array.channel_is_scalar,
+            gain=np.stack([w.root @ array.channel_gain for w in whitenings]),
+            ambient=np.asarray(ambient_T, dtype=np.float64),
+            basis=np.stack([w.basis for w in whitenings]),
+            shrinkage=np.stack([w.shrinkage for w in whitenings]),
+        )
+
+    def __len__(self) -> int:
+        return len(self.gain)
+
+    def rows(self, index: NDArray[np.intp]) -> JointProblem:
+        """Problem of some of the readings, repeated at will."""
+        return replace(
+            self,
+            gain=self.gain[index],
+            ambient=self.ambient[index],
+            basis=self.basis[index],
+            shrinkage=self.shrinkage[index],
+        )
+
+    def without_ambient(self) -> JointProblem:
+        """The same without an ambient field."""
+        return replace(self, ambient=np.zeros_like(self.ambient))
+
+    def homogeneous(self, position_m: ArrayLike) -> FloatArray:
+        """Homogeneous coordinates (..., 4), of unit norm and s > 0, of positions (..., 3) [m]."""
+        rho = (np.asarray(position_m, dtype=np.float64) - self.centroid) / self.radius
+        q = np.concatenate([rho, np.ones_like(rho[..., :1])], axis=-1)
+        unit: FloatArray = q / np.linalg.norm(q, axis=-1, keepdims=True)
+        return unit
+
+    def position(self, q: FloatArray) -> FloatArray:
+        """Positions (..., 3) [m] of homogeneous coordinates (..., 4); not finite at s = 0."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            position: FloatArray = self.centroid + self.radius * q[..., :3] / q[..., 3:]
+        return position
+
+    def moment(self, q: FloatArray, mu: FloatArray) -> FloatArray:
+        """Moments (..., 3) [A·m²] of scaled moments μ (..., 3) [T] at q (..., 4)."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            moment: FloatArray = mu * (self.radius**3 / MU0_OVER_4PI) / np.abs(q[..., 3:]) ** 3
+        return moment
+
+    def scaled_moment(self, q: FloatArray, moment_Am2: ArrayLike) -> FloatArray:
+        """The inverse of :meth:`moment`."""
+        mu: FloatArray = np.asarray(moment_Am2) * (MU0_OVER_4PI / self.radius**3) * np.abs(q[..., 3:]) ** 3
+        return mu
+
+    def whitened(self, channels: FloatArray) -> FloatArray:
+        """Channels (b, C) or columns of them (b, C, n), divided by the noise, without their common field."""
+        columns = channels if channels.ndim == 3 else channels[..., None]
+        common = self.shrinkage[..., None] * (self.basis.transpose(0, 2, 1) @ columns)
+        free: FloatArray = columns - self.basis @ common
+        return free if channels.ndim == 3 else free[..., 0]
+
+    def source_fields(self, q: FloatArray, mu: FloatArray) -> FloatArray:
+        """Field of all sources (b, K, ...) at the sensors: (b, N, 3) [T]."""
+        n, inverse3 = self._directions(q)
+        along = np.sum(n * mu[:, :, None], axis=-1, keepdims=True)
+        fields: FloatArray = np.sum((3.0 * along * n - mu[:, :, None]) * inverse3, axis=1)
+        return fields
+
+    def _directions(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Unit vectors from the sources to the sensors (b, K, N, 3) and the inverse cubes of the distances."""
+        v = q[:, :, None, 3:] * self.sensors - q[:, :, None, :3]
+        r = np.sqrt(np.sum(v * v, axis=-1, keepdims=True))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return v / r, 1.0 / r**3
+
+    def predicted(self, source_fields: FloatArray) -> FloatArray:
+        """Whitened predictions (b, C) of the fields of the sources at the sensors (b, N, 3)."""
+        channels = np.sum(source_fields[:, self.channel_sensor] * self.gain, axis=-1)
+        scalar = self.channel_is_scalar
+        if scalar.any():
+            owner = self.channel_sensor[scalar]
+            total = source_fields[:, owner] + self.ambient[:, owner]
+            channels[:, scalar] = self.gain[:, scalar, 0] * np.sqrt(np.sum(total * total, axis=-1))
+        return self.whitened(channels)
+
+    def linear_gain(self, source_fields: FloatArray) -> FloatArray:
+        """What every channel reads of a small change of the field: (b, C, 3), the direction of the sum for moduli."""
+        scalar = self.channel_is_scalar
+        if not scalar.any():
+            return self.gain
+        owner = self.channel_sensor[scalar]
+        total = source_fields[:, owner] + self.ambient[:, owner]
+        modulus = np.sqrt(np.sum(total * total, axis=-1, keepdims=True))
+        gain = self.gain.copy()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            gain[:, scalar] = self.gain[:, scalar, :1] * np.where(modulus > 0.0, total / modulus, 0.0)
+        return gain
+
+    def moment_jacobian(self, q: FloatArray, gain: FloatArray) -> FloatArray:
+        """Derivative of the predictions with respect to μ: (b, C, 3 K)."""
+        n, inverse3 = (x[:, :, self.channel_sensor] for x in self._directions(q))
+        along = np.sum(n * gain[:, None], axis=-1, keepdims=True)
+        columns = (3.0 * along * n - gain[:, None]) * inverse3
+        return self.whitened(columns.transpose(0, 2, 1, 3).reshape(len(q), gain.shape[1], -1))
+
+    def position_jacobian(self, q: FloatArray, mu: FloatArray, gain: FloatArray, tangent: FloatArray) -> FloatArray:
+        """Derivative of the predictions along tangents (b, K, 4, 3) of q: (b, C, 3 K)."""
+        n, inverse3 = (x[:, :, self.channel_sensor] for x in self._directions(q))
+        g, m = gain[:, None], mu[:, :, None]
+        n_m, n_g = np.sum(n * m, axis=-1, keepdims=True), np.sum(n * g, axis=-1, keepdims=True)
+        g_m = np.sum(g * m, axis=-1, keepdims=True)
+        # g · dB/dv, and v = s x - u.
+        with np.errstate(invalid="ignore"):
+            slope = (3.0 * np.cbrt(inverse3) * inverse3) * (n_m * g + n_g * m + (g_m - 5.0 * n_m * n_g) * n)
+        along_s = np.sum(slope * self.sensors[self.channel_sensor], axis=-1, keepdims=True)
+        columns = np.concatenate([-slope, along_s], axis=-1) @ tangent
+        return self.whitened(columns.transpose(0, 2, 1, 3).reshape(len(q), gain.shape[1], -1))
+
+
+@dataclass(frozen=True, eq=False)
+class JointFits:
+    """Results of :func:`refine` and :func:`refine_moments`.
+
+    Attributes
+    ----------
+    q : ndarray, shape (b, K, 4)
+    mu : ndarray, shape (b, K, 3)
+    chi2 : ndarray, shape (b,)
+        Infinite where the fit did not converge.
+    iterations : ndarray of int, shape (b,)
+        Linearisations.
+    """
+
+    q: FloatArray
+    mu: FloatArray
+    chi2: FloatArray
+    iterations: NDArray[np.int64]
+
+    @property
+    def converged(self) -> NDArray[np.bool_]:
+        """Whether the iteration ended at an optimum, shape (b,)."""
+        return np.isfinite(self.chi2)
+
+    def rows(self, index: NDArray[np.intp]) -> JointFits:
+        """Some of the fits."""
+        return JointFits(self.q[index], self.mu[index], self.chi2[index], self.iterations[index])
+
+
+def tangents(q: FloatArray) -> FloatArray:
+    """Orthonormal tangents of the unit sphere at q (..., 4): (..., 4, 3).
+
+    The first two turn the direction u at one range, the third changes the range alone.
+    """
+    u, s = q[..., :3], q[..., 3:]
+    length = np.linalg.norm(u, axis=-1, keepdims=True)
+    direction = np.where(length > 1e-12, u / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
+    # Any vector that is not along u: the axis of its smallest component.
+    axis = np.eye(3)[np.argmin(np.abs(direction), axis=-1)]
+    first = np.cross(direction, axis)
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    second = np.cross(direction, first)
+    zero = np.zeros_like(s)
+    columns = (
+        np.concatenate([first, zero], axis=-1),
+        np.concatenate([second, zero], axis=-1),
+        np.concatenate([direction * s, -length], axis=-1),
+    )
+    return np.stack(columns, axis=-1)
+
+
+def fit_moments(problem: JointProblem, y: FloatArray, q: FloatArray) -> FloatArray:
+    """Scaled moments (b, K, 3) that fit y (b, C) best at q, the channels linearised about the ambient field alone."""
+    gain = problem.linear_gain(np.zeros_like(problem.ambient))
+    return _moment_step(problem.moment_jacobian(q, gain), y - problem.predicted(np.zeros_like(problem.ambient)))
+
+
+def _moment_step(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
+    step = _solve_scaled(jacobian, residual, np.zeros(jacobian.shape[-1]), np.zeros(len(residual)))[0]
+    return step.reshape(len(residual), -1, 3)
+
+
+def _solve_scaled(
+    jacobian: FloatArray, residual: FloatArray, damped: FloatArray, damping: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Damped normal equations in columns of unit norm: the step, and by how much it promises to lower χ²."""
+    norm = np.linalg.norm(jacobian, axis=1)
+    norm = np.where(norm > 0.0, norm, 1.0)
+    unit = jacobian / norm[:, None]
+    transposed = unit.transpose(0, 2, 1)
+    gradient = (transposed @ residual[..., None])[..., 0]
+    information = transposed @ unit
+    diagonal = np.arange(norm.shape[-1])
+    system = information.copy()
+    system[:, diagonal, diagonal] += 1e-13 + damping[:, None] * damped
+    with np.errstate(all="ignore"):
+        step = np.linalg.solve(system, gradient[..., None])[..., 0]
+        promised = 2.0 * np.sum(step * gradient, axis=-1) - np.sum(step * (information @ step[..., None])[..., 0], -1)
+    return step / norm, promised
+
+
+def refine_moments(
+    problem: JointProblem, y: FloatArray, q: FloatArray, mu: FloatArray, *, max_iterations: int = 60
+) -> JointFits:
+    """Moments of sources at known places, from starts: a damped Gauss-Newton iteration.
+
+    Parameters
+    ----------
+    problem : JointProblem
+    y : ndarray, shape (b, C)
+        Whitened readings.
+    q, mu : ndarray, shapes (b, K, 4) and (b, K, 3)
+        The places, which stay, and the moments to start from.
+    max_iterations : int
+        Linearisations at most.
+
+    Returns
+    -------
+    JointFits
+    """
+    return _descend(problem, y, q, mu, np.zeros((q.shape[1], 3), dtype=bool), max_iterations)
+
+
+def refine(
+    problem: JointProblem,
+    y: FloatArray,
+    q: FloatArray,
+    mu: FloatArray,
+    *,
+    free: NDArray[np.bool_] | None = None,
+    max_iterations: int = 60,
+) -> JointFits:
+    """Positions and moments from starts: a damped Gauss-Newton iteration that never raises χ².
+
+    Parameters
+    ----------
+    problem : JointProblem
+    y : ndarray, shape (b, C)
+        Whitened readings.
+    q, mu : ndarray, shapes (b, K, 4) and (b, K, 3)
+        Starts.
+    free : ndarray of bool, shape (K, 3), optional
+        Which of the :func:`tangents` of a source may change; all by default. Without the third one its range stays.
+    max_iterations : int
+        Linearisations at most.
+
+    Returns
+    -------
+    JointFits
+    """
+    free = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
+    return _descend(problem, y, q, mu, free, max_iterations)
+
+
+def _descend(
+    problem: JointProblem,
+    y: FloatArray,
+    q: FloatArray,
+    mu: FloatArray,
+    free: NDArray[np.bool_],
+    max_iterations: int,
+) -> JointFits:
+    n_fits, n_sources = q.shape[:2]
+    columns = np.flatnonzero(free.ravel())
+    # Without free positions the moments themselves are what has to be damped.
+    damped = np.repeat([1.0, 0.0 if columns.size else 1.0], [columns.size, 3 * n_sources])
+    q, mu = q.copy(), mu.copy()
+    chi2, iterations = np.full(n_fits, np.inf), np.zeros(n_fits, dtype=np.int64)
+    live = np.arange(n_fits)
+    damping = np.full(n_fits, 1e-3)
+    fields = problem.source_fields(q, mu)
+    residual = y - problem.predicted(fields)
+    current = _squares(residual)
+    fresh = np.ones(n_fits, dtype=bool)
+    jacobian = np.empty((n_fits, y.shape[1], damped.size))
+    tangent = np.empty((n_fits, n_sources, 4, 3))
+    sub = problem
+    for _ in range(max_iterations):
+        if not live.size:
+            break
+        new = np.flatnonzero(fresh)
+        if new.size:
+            at = sub if new.size == live.size else sub.rows(new)
+            gain = at.linear_gain(fields[new])
+            tangent[new] = tangents(q[live[new]])
+            along = at.position_jacobian(q[live[new]], mu[live[new]], gain, tangent[new])[..., columns]
+            jacobian[new] = np.concatenate([along, at.moment_jacobian(q[live[new]], gain)], axis=-1)
+            iterations[live[new]] += 1
+        step, promised = _solve_scaled(jacobian, residual, damped, damping)
+        _, reachable = _solve_scaled(jacobian, residual, damped, np.zeros(live.size))
+        new_q, new_mu, step_share = _moved(q[live], mu[live], step, tangent, columns)
+        new_fields = sub.source_fields(new_q, new_mu)
+        new_residual = y[live] - sub.predicted(new_fields)
+        new_chi2 = _squares(new_residual)
+        if columns.size:
+            gain = sub.linear_gain(new_fields)
+            better_mu = new_mu + _moment_step(sub.moment_jacobian(new_q, gain), new_residual)
+            better_fields = sub.source_fields(new_q, better_mu)
+            better_residual = y[live] - sub.predicted(better_fields)
+            better_chi2 = _squares(better_residual)
+            better = better_chi2 < new_chi2
+            new_mu = np.where(better[:, None, None], better_mu, new_mu)
+            new_fields = np.where(better[:, None, None], better_fields, new_fields)
+            new_residual = np.where(better[:, None], better_residual, new_residual)
+            new_chi2 = np.where(better, better_chi2, new_chi2)
+        with np.errstate(invalid="ignore"):
+            accepted = new_chi2 < current
+            gained = current - new_chi2
+            small = np.abs(reachable) < PROMISE_ABSOLUTE + PROMISE_RELATIVE * current
+            # A step that rounding refuses is the end too, if next to nothing was promised.
+            ended = small | (~accepted & (damping > _LARGEST_DAMPING))
+            at_optimum = small | (np.abs(reachable) < 1e-6 * (1.0 + current))
+            well = gained > 0.75 * promised
+            badly = gained < 0.5 * promised
+        q[live[accepted]], mu[live[accepted]] = new_q[accepted], new_mu[accepted]
+        fields, residual = (
+            np.where(accepted[:, None, None], new_fields, fields),
+            np.where(accepted[:, None], new_residual, residual),
+        )
+        current = np.where(accepted, new_chi2, current)
+        damping = np.where(
+            accepted,
+            np.where(
+                well & (step_share == 1.0), 0.1 * damping, np.where(badly, np.maximum(damping, 0.1) * 3.0, damping)
+            ),
+            np.maximum(damping, 1e-4) * 5.0,
+        )
+        finished = ended | ~np.isfinite(current)
+        chi2[live[finished]] = np.where(at_optimum, current, np.inf)[finished]
+        fresh = accepted
+        if finished.any():
+            stay = np.flatnonzero(~finished)
+            live, fresh, damping, current = live[stay], fresh[stay], damping[stay], current[stay]
+            fields, residual, jacobian, tangent = fields[stay], residual[stay], jacobian[stay], tangent[stay]
+            sub = sub.rows(stay)
+    return JointFits(q, mu, np.where(np.isnan(chi2), np.inf, chi2), iterations)
+
+
+def _squares(residual: FloatArray) -> FloatArray:
+    squares: FloatArray = np.sum(residual * residual, axis=-1)
+    return squares
+
+
+def _moved(
+    q: FloatArray, mu: FloatArray, step: FloatArray, tangent: FloatArray, columns: NDArray[np.intp]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Coordinates and moments after a step, shortened where it would turn q too far, and the share that was taken."""
+    n_fits, n_sources = q.shape[:2]
+    along = np.zeros((n_fits, 3 * n_sources))
+    along[:, columns] = step[:, : columns.size]
+    along = along.reshape(n_fits, n_sources, 3)
+    longest = np.max(np.linalg.norm(along, axis=-1), axis=-1)
+    share = np.minimum(1.0, _LARGEST_STEP_RAD / np.maximum(longest, 1e-300))
+    moved = q + (tangent @ (share[:, None, None] * along)[..., None])[..., 0]
+    turned = step[:, columns.size :].reshape(n_fits, n_sources, 3)
+    new_mu = mu + share[:, None, None] * turned
+    norm = np.linalg.norm(moved, axis=-1, keepdims=True)
+    return moved / norm, new_mu / norm**3, share
+
+
+def covariances(problem: JointProblem, fits: JointFits) -> FloatArray:
+    """Inverse information of (p₁, m₁, p₂, m₂, …) of every fit: (b, 6 K, 6 K) [m, A·m²], NaN where it is singular."""
+    n_fits, n_sources = fits.q.shape[:2]
+    s = fits.q[..., 3:]
+    rho = np.concatenate([fits.q[..., :3] / s, np.ones_like(s)], axis=-1)
+    mu = fits.mu / np.abs(s) ** 3
+    gain = problem.linear_gain(problem.source_fields(rho, mu))
+    along = np.broadcast_to(np.eye(4)[:, :3], (n_fits, n_sources, 4, 3))
+    by_position = problem.position_jacobian(rho, mu, gain, along).reshape(n_fits, -1, n_sources, 3)
+    by_moment = problem.moment_jacobian(rho, gain).reshape(n_fits, -1, n_sources, 3)
+    jacobian = np.concatenate([by_position, by_moment], axis=-1).reshape(n_fits, -1, 6 * n_sources)
+    unit = np.tile(np.repeat([problem.radius, problem.radius**3 / MU0_OVER_4PI], 3), n_sources)
+    return _inverse_information(jacobian) * np.outer(unit, unit)
+
+
+def moment_covariances(problem: JointProblem, fits: JointFits) -> FloatArray:
+    """Inverse information of the moments at known places: (b, 3 K, 3 K) [A·m²], NaN where it is singular."""
+    jacobian = problem.moment_jacobian(fits.q, problem.linear_gain(problem.source_fields(fits.q, fits.mu)))
+    unit = np.repeat(problem.radius**3 / MU0_OVER_4PI / np.abs(fits.q[..., 3]) ** 3, 3, axis=-1)
+    return _inverse_information(jacobian) * unit[:, :, None] * unit[:, None]
+
+
+def _inverse_information(jacobian: FloatArray) -> FloatArray:
+    """``(JᵀJ)⁻¹`` of every fit by singular values of the Jacobian in columns of unit norm."""
+    norm = np.linalg.norm(jacobian, axis=1)
+    good = np.isfinite(norm).all(axis=-1) & (norm > 0.0).all(axis=-1)
+    safe = np.where(good[:, None], norm, 1.0)
+    unit = np.where(good[:, None, None], jacobian, 0.0) / safe[:, None]
+    singular, vt = np.linalg.svd(unit, full_matrices=False)[1:]
+    good &= (singular.shape[-1] == norm.shape[-1]) & (singular[:, -1] > 1e-13 * singular[:, 0])
+    if not good.any():
+        return np.full((len(norm), norm.shape[-1], norm.shape[-1]), np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rooted = vt / singular[..., None] / safe[:, None]
+        inverse: FloatArray = rooted.transpose(0, 2, 1) @ rooted
+    inverse[~good] = np.nan
+    return inverse

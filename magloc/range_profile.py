@@ -1,0 +1,98 @@
+r"""How far the range of a source may be off: the profile of χ² over the range, all else fitted anew.
+
+The range is followed as :math:`\alpha = \mathrm{atan2}(s, |u|)`: 0 at infinity, π/2 at the sensors' centroid.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magloc.fix import RISE_95
+from magloc.joint import JointFits, JointProblem, refine
+
+FloatArray = NDArray[np.float64]
+
+_SMALLEST_ALPHA = 1e-6
+# Steps outwards in standard deviations of a Gaussian profile, about the one where it would have risen enough.
+_STEPS = np.array([0.6, 0.85, 1.0, 1.15, 1.5, 2.2, 4.0, 9.0, 25.0, 80.0])
+_ROUNDS = 3
+
+
+def range_intervals(
+    problem: JointProblem, y: FloatArray, fits: JointFits, source: int, sigma_over_range: FloatArray
+) -> FloatArray:
+    """Ends of the 95 % interval of the range of one source, for b fits.
+
+    Parameters
+    ----------
+    problem : JointProblem
+    y : ndarray, shape (b, C)
+        Whitened readings.
+    fits : JointFits
+        Optima.
+    source : int
+        Which source's range.
+    sigma_over_range : ndarray, shape (b,)
+        Relative standard deviation of the range as the covariance has it, for the first steps; NaN if unknown.
+
+    Returns
+    -------
+    ndarray, shape (b, 2)
+        Where χ² has risen by 3.84 [radii]: 0 and infinity where it does not.
+    """
+    n = len(y)
+    q = fits.q[:, source]
+    length = np.linalg.norm(q[:, :3], axis=-1)
+    alpha = np.arctan2(np.abs(q[:, 3]), length)
+    sigma = np.abs(np.nan_to_num(sigma_over_range, nan=1.0)) * np.sin(alpha) * np.cos(alpha)
+    step = np.clip(np.sqrt(RISE_95) * sigma, 1e-7, 0.05)
+    bounds = np.array([0.5 * np.pi - _SMALLEST_ALPHA, _SMALLEST_ALPHA])
+    ends = np.empty((n, 2))
+    for side, sign in enumerate((1.0, -1.0)):
+        # The last point of the grid is the bound itself.
+        grid = alpha[:, None] + sign * step[:, None] * np.append(_STEPS, np.inf)
+        grid = np.clip(grid, _SMALLEST_ALPHA, bounds[0])
+        rise = _rises(problem, y, fits, source, grid)
+        above = rise > RISE_95
+        first = np.argmax(above, axis=1)
+        found = above.any(axis=1)
+        rows = np.arange(n)
+        outside, f_outside = grid[rows, first], rise[rows, first]
+        inside = np.where(first > 0, grid[rows, np.maximum(first - 1, 0)], alpha)
+        f_inside = np.where(first > 0, rise[rows, np.maximum(first - 1, 0)], 0.0)
+        for _ in range(_ROUNDS):
+            # The profile is nearly a parabola: interpolate its square root.
+            a, b = np.sqrt(np.clip(f_inside, 0.0, None)), np.sqrt(np.clip(f_outside, 0.0, 1e6))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                share = np.clip((np.sqrt(RISE_95) - a) / (b - a), 0.05, 0.95)
+            middle = inside + np.nan_to_num(share, nan=0.5) * (outside - inside)
+            f = _rises(problem, y, fits, source, middle[:, None])[:, 0]
+            higher = f > RISE_95
+            outside, f_outside = np.where(higher, middle, outside), np.where(higher, f, f_outside)
+            inside, f_inside = np.where(higher, inside, middle), np.where(higher, f_inside, f)
+        at_end = np.where(f_outside - RISE_95 < RISE_95 - f_inside, outside, inside)
+        ends[:, side] = np.where(found, 1.0 / np.tan(at_end), (0.0, np.inf)[side])
+    return ends
+
+
+def _rises(problem: JointProblem, y: FloatArray, fits: JointFits, source: int, alpha: FloatArray) -> FloatArray:
+    """Rise of χ² above the optimum at ranges (b, g), everything else fitted anew from the optimum."""
+    n, n_grid = alpha.shape
+    row = np.repeat(np.arange(n), n_grid)
+    q, mu = fits.q[row].copy(), fits.mu[row].copy()
+    u = q[:, source, :3]
+    length = np.linalg.norm(u, axis=-1, keepdims=True)
+    at = alpha.ravel()[:, None]
+    sign = np.where(q[:, source, 3:] < 0.0, -1.0, 1.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        direction = np.where(length > 1e-12, u / length, [0.0, 0.0, 1.0])
+        mu[:, source] *= np.clip(np.cos(at) / length, 1e-3, 1e3) ** 3
+    q[:, source] = np.concatenate([direction * np.cos(at), sign * np.sin(at)], axis=-1)
+    free = np.ones((q.shape[1], 3), dtype=bool)
+    free[source, 2] = False
+    profile = refine(problem.rows(row), y[row], q, mu, free=free, max_iterations=40)
+    # A refinement that did not end says nothing of the profile: the points beyond it decide.
+    chi2 = np.where(profile.converged, profile.chi2, -np.inf)
+    rise: FloatArray = chi2.reshape(n, n_grid) - fits.chi2[:, None]
+    return rise

@@ -1,0 +1,431 @@
+"""Several dipoles at once, by any sensors: how many there are, where, and how well all of it is known.
+
+One source is searched for, then another in what the first leaves, and so on; all sources are refined together and the
+best three distinct fits go on. A source is only added where it lowers χ² by more than a threshold: the larger one of
+the penalty of the Bayesian information criterion and of what noise alone reaches in one of a thousand sets of readings,
+drawn for the array at hand. A plain χ² test would not do, because without a source its position has no meaning, and the
+best of many positions is what is compared. While the best fit of the largest number of sources is not credible, random
+sources are replaced by others; in the end every source is left out in turn, and stays out where it is not missed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.stats import chi2 as chi2_distribution
+
+from arrays.sensor import SensorArray
+from magloc.fix import (
+    DISTINCT_WITHIN,
+    NOTHING_KNOWN,
+    SILENT,
+    JointFix,
+    JointSolution,
+    Knowledge,
+    Source,
+    is_observable,
+    open_ended,
+)
+from magloc.joint import JointFits, JointProblem, covariances, refine
+from magloc.range_profile import range_intervals
+from magloc.rows import NO_SIGNAL, joint_problem, rows_of_equal_mask, whitenings_of
+from magloc.search import Beam, Search, best_distinct, merged
+from magloc.separable import candidate_positions
+from magloc.starts import linear_bases, linear_scores
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+N_UNKNOWNS = 6
+# A fit whose χ² is above this quantile is no optimum worth the name yet; above the lower one another source is tried.
+_CREDIBLE = 0.9999
+_SUSPICIOUS = 0.99
+FALSE_ALARM = 1e-3
+_N_DRAWS = 5_000
+_MOST_RESTARTS = 20
+_ROWS_AT_ONCE = 64
+_MOST_BY_ITSELF = 5
+
+
+def most_sources(n_differences: int) -> int:
+    """Largest number of sources that leaves a degree of freedom."""
+    return (n_differences - 1) // N_UNKNOWNS
+
+
+class SeveralLocator:
+    """Start-free fixes of several dipoles with any sensors.
+
+    Parameters
+    ----------
+    array : SensorArray
+    n_sources : int, optional
+        Number of sources; by default it is chosen, up to five.
+    knowledge : Knowledge
+        Bounds that hold for every source.
+    seed : int
+        Of random restarts and of the draws for the threshold.
+
+    Raises
+    ------
+    ValueError
+        The array has too few channels for that many sources.
+    """
+
+    def __init__(
+        self,
+        array: SensorArray,
+        *,
+        n_sources: int | None = None,
+        knowledge: Knowledge = NOTHING_KNOWN,
+        seed: int = 0,
+    ) -> None:
+        whitening = whitenings_of(array, np.ones(array.n_channels, dtype=bool), np.zeros((1, array.n_channels)))[0]
+        most = most_sources(whitening.n_differences)
+        if n_sources == 1 and whitening.n_differences == N_UNKNOWNS:
+            most = 1  # exactly determined: no χ² to judge it by, but a solution
+        needed = N_UNKNOWNS * (n_sources or 1)
+        if whitening.n_differences < needed or (n_sources or 1) > max(most, 1):
+            raise ValueError(
+                f"Input n_sources must be at most {most} for an array of {whitening.n_differences} independent"
+                f" differences, {N_UNKNOWNS} unknowns a source; instead received {n_sources or 1}."
+            )
+        self.array = array
+        self.n_sources = n_sources
+        self.most = n_sources or max(1, min(most, _MOST_BY_ITSELF))
+        self.knowledge = knowledge
+        self.seed = seed
+        candidates = candidate_positions(array)
+        self._thresholds: dict[int, float] = {}
+        self._candidates = candidates[knowledge.allows_position(candidates)]
+        if not len(self._candidates):
+            raise ValueError(
+                "Input knowledge must leave some of the space around the array; instead it leaves nothing."
+            )
+
+    def fit_rows(
+        self,
+        readings_T: ArrayLike,
+        ambient_T: ArrayLike | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> list[JointFix]:
+        """Fixes of many sets of readings, each on its own.
+
+        Parameters
+        ----------
+        readings_T : array_like, shape (n, C)
+            Raw readings in channel order [T]; NaN where missing.
+        ambient_T : array_like, shape (n, 3), optional
+            Ambient field of every row in the array's frame [T], in place of the array's own.
+        progress : callable, optional
+            Called with the number of rows finished since the last call.
+
+        Returns
+        -------
+        list of JointFix
+            In the order of the rows. Sources keep their place from row to row where they can be followed.
+        """
+        readings = np.asarray(readings_T, dtype=np.float64)
+        if readings.ndim != 2 or readings.shape[1] != self.array.n_channels:
+            raise ValueError(
+                f"Input readings_T must have shape (n, {self.array.n_channels}); instead received {readings.shape}."
+            )
+        ambient = None if ambient_T is None else np.asarray(ambient_T, dtype=np.float64)
+        fixes: list[JointFix] = [JointFix(())] * len(readings)
+        for mask, rows in rows_of_equal_mask(np.isfinite(readings)):
+            for start in range(0, rows.size, _ROWS_AT_ONCE):
+                block = rows[start : start + _ROWS_AT_ONCE]
+                found = self._fit_block(mask, readings[block], None if ambient is None else ambient[block])
+                for row, fix in zip(block, found, strict=True):
+                    fixes[row] = fix
+                if progress is not None:
+                    progress(block.size)
+        return _in_stable_order(fixes)
+
+    def threshold_of(self, levels: _Levels, first: Beam) -> float:
+        """The threshold for another source, drawn once for every number of differences."""
+        if levels.n_differences not in self._thresholds:
+            self._thresholds[levels.n_differences] = levels.threshold(first)
+        return self._thresholds[levels.n_differences]
+
+    def _fit_block(self, mask: NDArray[np.bool_], readings: FloatArray, ambient: FloatArray | None) -> list[JointFix]:
+        whitenings = whitenings_of(self.array, mask, readings)
+        n_differences = whitenings[0].n_differences
+        fewest = N_UNKNOWNS * (self.n_sources or 1)
+        if n_differences < fewest:
+            reason = f"{int(mask.sum())} readings give {n_differences} independent differences, {fewest} are needed"
+            return [JointFix((), reason)] * len(readings)
+        problem, raw = joint_problem(self.array, mask, readings, whitenings, ambient)
+        y = problem.whitened(raw)
+        loud = np.flatnonzero(np.sum(y * y, axis=1) >= SILENT * n_differences)
+        fixes = [JointFix((), NO_SIGNAL)] * len(readings)
+        if not loud.size:
+            return fixes
+        found = _Levels(self, problem.rows(loud), y[loud], n_differences).fixes()
+        for row, fix in zip(loud, found, strict=True):
+            fixes[row] = fix
+        return fixes
+
+
+class _Levels:
+    """The search over numbers of sources for one block of rows."""
+
+    def __init__(self, locator: SeveralLocator, problem: JointProblem, y: FloatArray, n_differences: int) -> None:
+        self.locator, self.problem, self.y, self.n_differences = locator, problem, y, n_differences
+        self.asked = locator.n_sources
+        self.most = min(locator.most, max(1, most_sources(n_differences)))
+        self.rng = np.random.default_rng(locator.seed)
+        knowledge = locator.knowledge
+
+        def allowed(q: FloatArray, mu: FloatArray) -> NDArray[np.bool_]:
+            with np.errstate(invalid="ignore"):
+                kept: NDArray[np.bool_] = knowledge.allows_position(problem.position(q)) & knowledge.allows_moment(
+                    problem.moment(q, mu)
+                )
+            return kept
+
+        # A single source is listed with all its solutions, several ones with those of the beam.
+        self.search = Search(problem.homogeneous(locator._candidates), allowed, width=8 if self.most == 1 else 3)
+
+    def fixes(self) -> list[JointFix]:
+        """The chosen number of sources of every row, and its solutions."""
+        everything = np.arange(len(self.y))
+        beams: list[Beam] = [self._first(everything)]
+        level = np.zeros(len(self.y), dtype=np.intp)
+        threshold = self.locator.threshold_of(self, beams[0]) if self.most > 1 else math.inf
+        rows = everything
+        while len(beams) < self.most:
+            if self.asked is None:
+                rows = rows[self._worth_another(rows, beams[-1].rows(rows), threshold)]
+            if not rows.size:
+                break
+            before = beams[-1].rows(rows)
+            wider = self.search.one_more(self.problem.rows(rows), self.y[rows], before)
+            last = len(beams) + 1 == self.most
+            gained = before.chi2[:, 0] - wider.chi2[:, 0] > threshold
+            # Where no number of sources is credible so far, the search failed, at this number or at an earlier one.
+            credible = self._quantile(wider.n_sources, _CREDIBLE)
+            failed = np.flatnonzero(~(wider.chi2[:, 0] <= credible) & (last | ~gained))
+            if failed.size:
+                wider = wider.replaced(failed, self._restarted(rows[failed], wider.rows(failed)))
+                gained = before.chi2[:, 0] - wider.chi2[:, 0] > threshold
+            beams.append(_scattered(wider, rows, len(self.y)))
+            rows = rows if self.asked is not None else rows[gained]
+            level[rows] = len(beams) - 1
+        wanted = level.copy()
+        for n in range(len(beams) - 1, 0, -1):
+            at = np.flatnonzero(level == n)
+            if not at.size:
+                continue
+            fewer = merged(
+                beams[n - 1].rows(at), self.search.one_less(self.problem.rows(at), self.y[at], beams[n].rows(at))
+            )
+            if n > 1:
+                fewer = self._restarted(at, fewer, rounds=2)
+            beams[n - 1] = beams[n - 1].replaced(at, fewer)
+            superfluous = fewer.chi2[:, 0] - beams[n].chi2[at, 0] <= threshold
+            level[at[superfluous]] = n - 1
+        return self._assembled(beams, level, wanted)
+
+    def _first(self, rows: IntArray) -> Beam:
+        beam = self.search.first(self.problem, self.y)
+        doubtful = rows[beam.chi2[:, 0] > self._quantile(1, _CREDIBLE)]
+        if doubtful.size and self.most == 1:
+            wide = replace(self.search, n_starts=5 * self.search.n_starts, apart_rad=0.4 * self.search.apart_rad)
+            again = wide.first(self.problem.rows(doubtful), self.y[doubtful])
+            beam = beam.replaced(doubtful, merged(beam.rows(doubtful), again))
+        return beam
+
+    def _worth_another(self, rows: IntArray, beam: Beam, threshold: float) -> NDArray[np.bool_]:
+        """Whether another source might pay: a suspicious χ², or a candidate that explains much of what is left."""
+        suspicious = ~(beam.chi2[:, 0] <= self._quantile(beam.n_sources, _SUSPICIOUS))
+        clean = np.flatnonzero(~suspicious)
+        if clean.size:
+            scores = self.search.left_scores(
+                self.problem.rows(rows[clean]), self.y[rows[clean]], beam.q[clean, 0], beam.mu[clean, 0]
+            )
+            suspicious[clean] = scores.max(axis=1) > 0.5 * threshold
+        return suspicious
+
+    def _restarted(self, rows: IntArray, beam: Beam, rounds: int = _MOST_RESTARTS) -> Beam:
+        """Beams of rows, with random sources replaced until the best fit is credible."""
+        credible = self._quantile(beam.n_sources, _CREDIBLE)
+        for _ in range(rounds):
+            bad = np.flatnonzero(~(beam.chi2[:, 0] <= credible))
+            if not bad.size:
+                break
+            again = self.search.restarted(self.problem.rows(rows[bad]), self.y[rows[bad]], beam.rows(bad), self.rng)
+            beam = beam.replaced(bad, again)
+        return beam
+
+    def _quantile(self, n_sources: int, level: float) -> float:
+        dof = self.n_differences - N_UNKNOWNS * n_sources
+        return float(chi2_distribution.ppf(level, dof)) if dof > 0 else 1e-6
+
+    def threshold(self, beam: Beam) -> float:
+        """By how much χ² must fall for another source: what noise reaches in one of a thousand rows, or BIC's penalty.
+
+        Noise is drawn around the best fit of all rows; only the loudest draws, where a candidate explains most, are
+        searched for a second source.
+        """
+        penalty = N_UNKNOWNS * math.log(self.n_differences)
+        best = int(np.argmin(beam.chi2[:, 0]))
+        if not np.isfinite(beam.chi2[best, 0]):
+            return penalty
+        rng = np.random.default_rng(0)
+        row = np.full(_N_DRAWS, best)
+        problem = self.problem.rows(row)
+        at = self.problem.rows(row[:1])
+        q, mu = beam.q[row[:1], 0], beam.mu[row[:1], 0]
+        fields = at.source_fields(q, mu)
+        noise = rng.normal(size=(_N_DRAWS, self.y.shape[1])) * np.any(at.gain[0] != 0.0, axis=-1)
+        draws = at.predicted(fields) + problem.whitened(noise)
+        bases = linear_bases(at, at.linear_gain(fields)[0], 0, self.search.candidates)
+        loudness = np.concatenate([linear_scores(bases, part).max(axis=1) for part in np.array_split(noise, 20)])
+        loud = np.argsort(-loudness)[: int(10 * FALSE_ALARM * _N_DRAWS)]
+        search = replace(self.search, width=1)
+        problem, draws = self.problem.rows(row[loud]), draws[loud]
+        one = refine(problem, draws, q[np.zeros(loud.size, dtype=np.intp)], mu[np.zeros(loud.size, dtype=np.intp)])
+        first = best_distinct(one, loud.size, 1)
+        fall = first.chi2[:, 0] - search.one_more(problem, draws, first).chi2[:, 0]
+        fall = np.sort(fall[np.isfinite(fall)])
+        n_above = int(FALSE_ALARM * _N_DRAWS)
+        return max(penalty, float(fall[-n_above - 1])) if fall.size > n_above else penalty
+
+    def _assembled(self, beams: list[Beam], level: IntArray, wanted: IntArray) -> list[JointFix]:
+        fixes: list[JointFix] = [JointFix(())] * len(level)
+        for n, beam in enumerate(beams):
+            rows = np.flatnonzero(level == n)
+            if not rows.size:
+                continue
+            for row, fix in zip(rows, self._solutions(rows, beam.rows(rows)), strict=True):
+                if wanted[row] > n and self.asked is not None and fix.solutions:
+                    fix = _marked_as_merged(fix, self.problem, beams[n + 1], int(row), self.asked)
+                fixes[row] = fix
+        return fixes
+
+    def _solutions(self, rows: IntArray, beam: Beam) -> list[JointFix]:
+        listed = beam.chi2 <= beam.chi2[:, :1] + DISTINCT_WITHIN
+        listed &= np.isfinite(beam.chi2)
+        of_row, of_fit = np.nonzero(listed)
+        fits = JointFits(
+            beam.q[of_row, of_fit], beam.mu[of_row, of_fit], beam.chi2[of_row, of_fit], beam.iterations[of_row, of_fit]
+        )
+        problem, y = self.problem.rows(rows[of_row]), self.y[rows[of_row]]
+        position, moment = problem.position(fits.q), problem.moment(fits.q, fits.mu)
+        covariance = covariances(problem, fits)
+        determined = np.isfinite(covariance).all(axis=(1, 2))
+        ends = [self._ranges(problem, y, fits, k, position, covariance) for k in range(beam.n_sources)]
+        dof = self.n_differences - N_UNKNOWNS * beam.n_sources
+        solutions: list[list[JointSolution]] = [[] for _ in rows]
+        for i in np.flatnonzero(determined):
+            sources = tuple(
+                Source(
+                    position_m=position[i, k],
+                    moment_Am2=moment[i, k],
+                    covariance=covariance[i, 6 * k : 6 * k + 6, 6 * k : 6 * k + 6],
+                    range_observable=is_observable(*ends[k][i]),
+                    range_interval95_m=(open_ended(float(ends[k][i, 0]), float(ends[k][i, 1])),),
+                )
+                for k in range(beam.n_sources)
+            )
+            solutions[of_row[i]].append(
+                JointSolution(sources, covariance[i], float(fits.chi2[i]), dof, int(fits.iterations[i]))
+            )
+        any_fit = np.isfinite(beam.chi2[:, 0])
+        return [
+            JointFix(tuple(found), "" if found else _why_unsolved(bool(any_fit[i])))
+            for i, found in enumerate(solutions)
+        ]
+
+    @staticmethod
+    def _ranges(
+        problem: JointProblem, y: FloatArray, fits: JointFits, k: int, position: FloatArray, covariance: FloatArray
+    ) -> FloatArray:
+        offset = position[:, k] - problem.centroid
+        block = covariance[:, 6 * k : 6 * k + 3, 6 * k : 6 * k + 3]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            variance = np.einsum("bi,bij,bj->b", offset, block, offset)
+            relative = np.sqrt(variance) / np.sum(offset * offset, axis=-1)
+        return problem.radius * range_intervals(problem, y, fits, k, relative)
+
+
+def _scattered(beam: Beam, rows: IntArray, n_rows: int) -> Beam:
+    """A beam of some rows among all; the others have no fit."""
+    width, n_sources = beam.chi2.shape[1], beam.n_sources
+    empty = Beam(
+        np.full((n_rows, width, n_sources, 4), np.nan),
+        np.full((n_rows, width, n_sources, 3), np.nan),
+        np.full((n_rows, width), np.inf),
+        np.zeros((n_rows, width), dtype=np.int64),
+    )
+    return empty.replaced(rows, beam)
+
+
+def _why_unsolved(found: bool) -> str:
+    if found:
+        return "the differences between the sensors do not determine the source: no signal, or a degenerate array"
+    return "the search did not converge to a solution within the known region and largest moment"
+
+
+def _marked_as_merged(fix: JointFix, problem: JointProblem, more: Beam, row: int, asked: int) -> JointFix:
+    """A fix with fewer sources than asked for: the source that stands for the closest pair of the larger fit."""
+    best = fix.solutions[0]
+    n = len(best.sources)
+    reason = f"the readings support {n} source{'s' if n > 1 else ''}, {asked} were asked for"
+    if not np.isfinite(more.chi2[row, 0]):
+        return replace(fix, reason=reason)
+    position = problem.position(more.q[row, 0])
+    moment = problem.moment(more.q[row, 0], more.mu[row, 0])
+    distance = np.linalg.norm(position[:, None] - position, axis=-1)
+    np.fill_diagonal(distance, np.inf)
+    i, j = np.unravel_index(int(np.argmin(distance)), distance.shape)
+    together = moment[i] + moment[j]
+    offsets = [np.linalg.norm(source.position_m - 0.5 * (position[i] + position[j])) for source in best.sources]
+    nearest = int(np.argmin(offsets))
+    stands_for_both = np.linalg.norm(together - best.sources[nearest].moment_Am2) < 0.5 * np.linalg.norm(together)
+    if not (stands_for_both and offsets[nearest] < 2.0 * distance[i, j]):
+        return replace(fix, reason=reason)
+    sources = tuple(replace(source, merged=k == nearest) for k, source in enumerate(best.sources))
+    solutions = (replace(best, sources=sources), *fix.solutions[1:])
+    return JointFix(solutions, f"{reason}: two are closer than the array resolves")
+
+
+def _in_stable_order(fixes: list[JointFix]) -> list[JointFix]:
+    """Fixes whose sources are numbered as in the row before; the strongest comes first where there is none."""
+    ordered: list[JointFix] = []
+    before: FloatArray | None = None
+    for fix in fixes:
+        if not fix.solutions:
+            ordered.append(fix)
+            continue
+        solutions = []
+        for solution in fix.solutions:
+            order = _order(solution, before)
+            solutions.append(_reordered(solution, order))
+        ordered.append(replace(fix, solutions=tuple(solutions)))
+        before = np.stack([source.position_m for source in solutions[0].sources])
+    return ordered
+
+
+def _order(solution: JointSolution, before: FloatArray | None) -> list[int]:
+    strengths = np.array([np.linalg.norm(source.moment_Am2) for source in solution.sources])
+    if before is None:
+        return [int(k) for k in np.argsort(-strengths, kind="stable")]
+    position = np.stack([source.position_m for source in solution.sources])
+    known, found = linear_sum_assignment(np.linalg.norm(before[:, None] - position, axis=-1))
+    followed = [int(k) for _, k in sorted(zip(known.tolist(), found.tolist(), strict=True))]
+    return followed + [int(k) for k in np.argsort(-strengths, kind="stable") if k not in followed]
+
+
+def _reordered(solution: JointSolution, order: list[int]) -> JointSolution:
+    index = np.concatenate([np.arange(6 * k, 6 * k + 6) for k in order])
+    return replace(
+        solution,
+        sources=tuple(solution.sources[k] for k in order),
+        covariance=solution.covariance[np.ix_(index, index)],
+    )
