@@ -91,6 +91,11 @@ class JointProblem:
             shrinkage=self.shrinkage[index],
         )
 
+    @property
+    def is_even(self) -> bool:
+        """Whether moments m and -m give the same readings: moduli without an ambient field, and nothing else."""
+        return bool(self.channel_is_scalar.all()) and not np.any(self.ambient)
+
     def without_ambient(self) -> JointProblem:
         """The same without an ambient field."""
         return replace(self, ambient=np.zeros_like(self.ambient))
@@ -207,6 +212,13 @@ class JointFits:
     def converged(self) -> NDArray[np.bool_]:
         """Whether the iteration ended at an optimum, shape (b,)."""
         return np.isfinite(self.chi2)
+
+    def with_opposite_moments(self, n_rows: int) -> JointFits:
+        """The fits of n rows, equally many each, and beside every fit that of the opposite moment."""
+        both = np.repeat(np.arange(len(self.q)).reshape(n_rows, -1), 2, axis=1).ravel()
+        fits = self.rows(both)
+        fits.mu[1::2] *= -1.0
+        return fits
 
     def rows(self, index: NDArray[np.intp]) -> JointFits:
         """Some of the fits."""

@@ -21,7 +21,7 @@ from magloc.dipole import MU0_OVER_4PI
 from magloc.fix import DISTINCT_WITHIN, NOTHING_KNOWN, RISE_95, SILENT, Fix, Knowledge, Solution, open_ended
 from magloc.kernels import over_rows
 from magloc.kernels import separable as kernels
-from magloc.rows import NO_SIGNAL, rows_of_equal_mask
+from magloc.rows import NO_SIGNAL, ambient_fields, rows_of_equal_mask
 from magloc.separable import SeparableProblem, candidate_positions
 
 FloatArray = NDArray[np.float64]
@@ -132,13 +132,21 @@ class Locator:
         """
         return self.fit_rows(np.asarray(readings_T, dtype=np.float64)[None])[0]
 
-    def fit_rows(self, readings_T: ArrayLike, progress: Callable[[int], None] | None = None) -> list[Fix]:
+    def fit_rows(
+        self,
+        readings_T: ArrayLike,
+        ambient_T: ArrayLike | None = None,
+        progress: Callable[[int], None] | None = None,
+    ) -> list[Fix]:
         """Fixes of many sets of readings, each on its own.
 
         Parameters
         ----------
         readings_T : array_like, shape (n, C)
             Raw readings in channel order [T]; NaN where missing.
+        ambient_T : array_like, shape (n, 3), optional
+            Ambient field of every row in the array's frame [T], in place of the array's own. It only matters with a
+            prior of the common field.
         progress : callable, optional
             Called with the number of rows finished since the last call.
 
@@ -152,6 +160,10 @@ class Locator:
             raise ValueError(
                 f"Input readings_T must have shape (n, {self.array.n_channels}); instead received {readings.shape}."
             )
+        without_source = np.broadcast_to(self._without_source, readings.shape)
+        if ambient_T is not None:
+            ambient = np.asarray(ambient_T, dtype=np.float64)
+            without_source = self.array.readings_of(ambient_fields(self.array, len(readings), ambient))
         fixes: list[Fix] = [Fix(())] * len(readings)
         for mask, rows in rows_of_equal_mask(np.isfinite(readings)):
             kernel = self._kernel(mask)
@@ -162,7 +174,7 @@ class Locator:
                     reason = f"{int(mask.sum())} readings give {k} independent differences, {N_UNKNOWNS} are needed"
                     found = [Fix((), reason)] * block.size
                 else:
-                    found = self._fit_block(kernel, mask, readings[block])
+                    found = self._fit_block(kernel, mask, readings[block], without_source[block])
                 for row, fix in zip(block, found, strict=True):
                     fixes[row] = fix
                 if progress is not None:
@@ -211,7 +223,7 @@ class Locator:
         starts = np.asarray(starts_m, dtype=np.float64)
         mask = np.isfinite(readings[0])
         kernel = self._kernel(mask)
-        y, ranked, of_rows = self._whitened(kernel, mask, readings)
+        y, ranked, of_rows = self._whitened(kernel, mask, readings, self._without_source)
         n = len(starts)
         found = self._search(
             kernel,
@@ -231,10 +243,10 @@ class Locator:
         )
 
     def _whitened(
-        self, kernel: _Kernel, mask: NDArray[np.bool_], readings: FloatArray
+        self, kernel: _Kernel, mask: NDArray[np.bool_], readings: FloatArray, without_source: FloatArray
     ) -> tuple[FloatArray, FloatArray, list[Whitening]]:
         """Whitened readings, the same as the candidates are ranked by, and the whitenings: one, or one a row."""
-        channels = np.where(mask, readings - self._without_source, 0.0)
+        channels = np.where(mask, readings - without_source, 0.0)
         ranked = kernel.whitening.apply(channels)
         if not self.array.noise_depends_on_reading:
             return ranked, ranked, [kernel.whitening]
@@ -310,9 +322,11 @@ class Locator:
             counts,
         )
 
-    def _fit_block(self, kernel: _Kernel, mask: NDArray[np.bool_], readings: FloatArray) -> list[Fix]:
+    def _fit_block(
+        self, kernel: _Kernel, mask: NDArray[np.bool_], readings: FloatArray, without_source: FloatArray
+    ) -> list[Fix]:
         problem, n_rows = kernel.problem, len(readings)
-        y, ranked, of_rows = self._whitened(kernel, mask, readings)
+        y, ranked, of_rows = self._whitened(kernel, mask, readings, without_source)
         every = np.arange(n_rows, dtype=np.intp)
         found = self._search(
             kernel,

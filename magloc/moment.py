@@ -14,16 +14,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from arrays.sensor import SensorArray
 from magloc.fix import DISTINCT_WITHIN, NOTHING_KNOWN, SILENT, Fix, Knowledge, Solution
-from magloc.joint import JointFits, JointProblem, fit_moments, moment_covariances, refine_moments
+from magloc.joint import JointFits, JointProblem, fit_moments, refine_moments
 from magloc.rows import NO_SIGNAL, joint_problem, rows_of_equal_mask, whitenings_of
-from magloc.search import Beam, best_distinct
+from magloc.search import Beam
 from magloc.separable import fibonacci_directions
 
 FloatArray = NDArray[np.float64]
 
 N_UNKNOWNS = 3
 _N_DIRECTIONS = 60
-_MOST_SOLUTIONS = 16
+# Up to the sign.
+_MOST_SOLUTIONS = 8
+# By how much χ² must rise halfway between two optima for them to count as two.
+_BARRIER = 0.01
+_LEAST_EIGENVALUE = 1e-13
 _ROWS_AT_ONCE = 64
 
 
@@ -122,7 +126,7 @@ class MomentLocator:
         fits = JointFits(
             beam.q[of_row, of_fit], beam.mu[of_row, of_fit], chi2[of_row, of_fit], beam.iterations[of_row, of_fit]
         )
-        covariance = moment_covariances(problem.rows(of_row), fits)
+        covariance = _covariances(problem.rows(of_row), y[of_row], fits)
         distance = np.linalg.norm(positions - self.array.centroid, axis=-1)
         solutions: list[list[Solution]] = [[] for _ in readings]
         for i in np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2))):
@@ -163,7 +167,84 @@ def _all_moments(problem: JointProblem, y: FloatArray, q: FloatArray) -> Beam:
     mu = np.concatenate(starts, axis=1)
     row = np.repeat(np.arange(n), mu.shape[1])
     fits = refine_moments(problem.rows(row), y[row], q[row], mu.reshape(-1, 1, 3))
-    return best_distinct(fits, n, _MOST_SOLUTIONS)
+    return _distinct(problem, y, q, fits)
+
+
+def _distinct(problem: JointProblem, y: FloatArray, q: FloatArray, fits: JointFits) -> Beam:
+    """The best optima of every row that χ² rises between, and their opposites where χ² is even in the moment."""
+    n = len(y)
+    mu, chi2 = fits.mu.reshape(n, -1, 3), fits.chi2.reshape(n, -1).copy()
+    iterations = fits.iterations.reshape(n, -1)
+    row, rows = np.repeat(np.arange(n), mu.shape[1]), np.arange(n)
+    each = problem.rows(row)
+    even = _is_even(problem)
+    kept_mu = np.full((n, _MOST_SOLUTIONS, 3), np.nan)
+    kept_chi2 = np.full((n, _MOST_SOLUTIONS), np.inf)
+    kept_iterations = np.zeros((n, _MOST_SOLUTIONS), dtype=np.int64)
+    for k in range(_MOST_SOLUTIONS):
+        best = np.argmin(chi2, axis=1)
+        value = chi2[rows, best]
+        if not np.isfinite(value).any():
+            break
+        kept_mu[:, k], kept_chi2[:, k] = mu[rows, best], value
+        kept_iterations[:, k] = iterations[rows, best]
+        opposite = even[:, None] & (np.sum(mu * kept_mu[:, k, None], axis=-1) < 0.0)
+        halfway = 0.5 * (np.where(opposite[..., None], -mu, mu) + kept_mu[:, k, None])
+        residual = y[row] - each.predicted(each.source_fields(q[row], halfway.reshape(-1, 1, 3)))
+        between = np.sum(residual**2, axis=-1).reshape(n, -1)
+        chi2[between < np.where(np.isfinite(chi2), chi2, 0.0) + _BARRIER] = np.inf
+        chi2[rows, best] = np.inf
+    both_mu = np.stack([kept_mu, -kept_mu], axis=2).reshape(n, -1, 1, 3)
+    both_chi2 = np.stack([kept_chi2, np.where(even[:, None], kept_chi2, np.inf)], axis=2).reshape(n, -1)
+    return Beam(
+        np.repeat(q[:, None], both_chi2.shape[1], axis=1), both_mu, both_chi2, np.repeat(kept_iterations, 2, axis=1)
+    )
+
+
+def _is_even(problem: JointProblem) -> NDArray[np.bool_]:
+    """Whether the readings (b,) stay as they are if the moment is reversed: moduli alone, without an ambient field."""
+    silent = ~np.any(problem.gain, axis=-1)
+    lone = problem.channel_is_scalar & ~np.any(problem.ambient, axis=-1)[:, problem.channel_sensor]
+    even: NDArray[np.bool_] = np.all(silent | lone, axis=-1)
+    return even
+
+
+def _covariances(problem: JointProblem, y: FloatArray, fits: JointFits) -> FloatArray:
+    """Inverse of half the second derivative of χ² (b, 3, 3) [A·m²], NaN where it is not positive.
+
+    Where two exact solutions are about to meet, the first derivative of the readings alone would say nothing.
+    """
+    fields = problem.source_fields(fits.q, fits.mu)
+    jacobian = problem.moment_jacobian(fits.q, problem.linear_gain(fields))
+    information = jacobian.transpose(0, 2, 1) @ jacobian
+    scalar = problem.channel_is_scalar
+    if scalar.any():
+        owner = problem.channel_sensor[scalar]
+        residual = problem.whitened(y - problem.predicted(fields))[:, scalar]
+        total = (fields + problem.ambient)[:, owner]
+        modulus = np.linalg.norm(total, axis=-1, keepdims=True)
+        matrix = np.stack(
+            [problem.source_fields(fits.q, np.broadcast_to(axis, fits.mu.shape)) for axis in np.eye(3)], axis=-1
+        )[:, owner]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            direction = total / modulus
+            across = matrix - direction[..., None] * (direction[..., None, :] @ matrix)
+            weight = residual * problem.gain[:, scalar, 0] / modulus[..., 0]
+            information = information - np.einsum("bc,bcji,bcjk->bik", weight, across, across)
+    length = np.sqrt(np.abs(np.diagonal(information, axis1=1, axis2=2)))
+    scale = length[:, :, None] * length[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        unit = information / scale
+    positive = np.isfinite(unit).all(axis=(1, 2))
+    values, vectors = np.linalg.eigh(np.where(positive[:, None, None], unit, np.eye(3)))
+    positive &= values[:, 0] > _LEAST_EIGENVALUE
+    safe = np.where(positive[:, None], values, 1.0)
+    inverse = (vectors / safe[:, None]) @ vectors.transpose(0, 2, 1)
+    size = problem.moment(fits.q[:, 0], np.ones((len(y), 3)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        covariance: FloatArray = inverse / scale * size[:, :, None] * size[:, None]
+    covariance[~positive] = np.nan
+    return covariance
 
 
 def _why_unsolved(beam: Beam, row: int) -> str:

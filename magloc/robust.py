@@ -14,12 +14,12 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from arrays.sensor import SensorArray
-from magloc.fix import Fix, JointFix, Solution
+from magloc.fix import Fix, JointFix, JointSolution, Solution
 from magloc.joint import JointProblem, refine
-from magloc.rows import joint_problem, rows_of_equal_mask, whitenings_of
+from magloc.rows import NO_SIGNAL, joint_problem, rows_of_equal_mask, whitenings_of
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -34,6 +34,8 @@ _SPOILT = 4.0
 _N_REWEIGHTINGS = 30
 _MOST_LEFT_OUT = 8
 _LEAST_WEIGHT = 1e-16
+# Share of a source's energy in one sensor above which no other sensor sees it.
+_LONELY = 0.9
 # Median of χ²/n of three degrees of freedom.
 _MEDIAN_RATIO = 0.789
 _ROWS_AT_ONCE = 64
@@ -86,16 +88,24 @@ def robust_fixes(
             block = doubtful[start : start + _ROWS_AT_ONCE]
             ambient = None if ambient_T is None else ambient_T[block]
             examined = _Examination(array, fit, mask, readings_T[block], ambient, free_position)
-            for row, fix in zip(block, examined.fixes([fixes[row] for row in block]), strict=True):
+            plain = examined.without_lonely_sources([fixes[row] for row in block])
+            for row, fix in zip(block, examined.fixes(plain), strict=True):
                 fixes[row] = fix
     return fixes
 
 
 def _is_doubtful(fix: Fix | JointFix) -> bool:
     if not fix.solutions:
-        return False
+        return fix.reason != NO_SIGNAL
     best = fix.solutions[0]
-    return best.dof > 0 and best.chi2 > chi2_distribution.ppf(_CREDIBLE, best.dof)
+    if isinstance(best, JointSolution) and len(best.sources) > 1:
+        return True
+    return not _is_credible(fix)
+
+
+def _is_credible(fix: Fix | JointFix) -> bool:
+    best = fix.solutions[0]
+    return best.dof <= 0 or bool(best.chi2 <= chdtri(best.dof, 1.0 - _CREDIBLE))
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +134,30 @@ class _Examination(Generic[AnyFix]):
         self.problem, self.raw = joint_problem(array, mask, readings, whitenings_of(array, mask, readings), ambient)
         self.count = np.bincount(array.channel_sensor[mask], minlength=array.n_sensors)
         level = 1.0 - _SENSOR_FALSE_ALARM / array.n_sensors
-        self.limits = chi2_distribution.ppf(level, np.maximum(self.count, 1))
+        self.limits = chdtri(np.maximum(self.count, 1), 1.0 - level)
+
+    def without_lonely_sources(self, plain: Sequence[AnyFix]) -> list[AnyFix]:
+        """Fixes without sources that a single sensor sees: nothing tells such a source from a fault of the sensor."""
+        found = list(plain)
+        for row, fix in enumerate(plain):
+            if not fix.solutions or len(self._scaled(fix)[0]) < 2:
+                continue
+            sensors = self._seers_of_lonely_sources(row, fix)
+            if not sensors:
+                continue
+            (other,) = self._without(sensors, np.array([row]))
+            if other.solutions and _is_credible(other) and len(self._scaled(other)[0]) < len(self._scaled(fix)[0]):
+                found[row] = replace(other, dropped=tuple(self.array.ids[sensor] for sensor in sorted(sensors)))
+        return found
+
+    def _seers_of_lonely_sources(self, row: int, fix: AnyFix) -> frozenset[int]:
+        q, mu = self._scaled(fix)
+        problem = self.problem.rows(np.full(len(q), row))
+        seen = problem.predicted(problem.source_fields(q[:, None], mu[:, None]))
+        seen -= problem.predicted(np.zeros_like(problem.ambient))
+        energy = np.stack([np.bincount(self.array.channel_sensor, of**2, self.array.n_sensors) for of in seen])
+        lonely = energy.max(axis=1) > _LONELY * energy.sum(axis=1)
+        return frozenset(np.argmax(energy[lonely], axis=1).tolist())
 
     def fixes(self, plain: Sequence[AnyFix]) -> list[AnyFix]:
         """The plain fix, or that without the sensors that stand out."""
@@ -147,16 +180,20 @@ class _Examination(Generic[AnyFix]):
 
     def _suspected(self, plain: Sequence[AnyFix]) -> IntArray:
         """Rows where a sensor may stand out: it does so from the plain fix, or nothing fits and the fit is spoilt."""
+        solved = np.array([bool(fix.solutions) for fix in plain])
+        credible = np.array([bool(fix.solutions) and _is_credible(fix) for fix in plain])
         # What a fit of so many unknowns leaves of a sensor's residual on average.
-        unknowns = np.array([3.0 + 6.0 * len(self._scaled(fix)[0]) for fix in plain])
+        unknowns = np.array([3.0 + 6.0 * (len(self._scaled(fix)[0]) if fix.solutions else 1) for fix in plain])
         unseen = np.clip(1.0 - unknowns / self.count.sum(), 0.2, 1.0)
-        spoilt = np.array([fix.solutions[0].chi2 > _SPOILT * fix.solutions[0].dof for fix in plain])
-        for of_count, q, mu in self._by_count([(row, plain[row]) for row in np.flatnonzero(~spoilt).tolist()]):
+        spoilt = ~solved
+        spoilt[solved] = [fix.solutions[0].chi2 > _SPOILT * fix.solutions[0].dof for fix in plain if fix.solutions]
+        judged = np.flatnonzero(~spoilt & ~credible).tolist()
+        for of_count, q, mu in self._by_count([(row, plain[row]) for row in judged]):
             misfit = self._misfit(of_count, q, mu, np.ones((len(of_count), self.array.n_sensors)))
             spoilt[of_count] = np.any(
                 misfit > unseen[of_count, None] * self.limits * self._scale2(misfit)[:, None], axis=1
             )
-        return np.flatnonzero(spoilt)
+        return np.flatnonzero(spoilt & ~credible)
 
     def _by_count(self, fixes: Sequence[tuple[int, AnyFix]]) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
         """Rows, and best solutions (f, K, …), of fixes of equally many sources."""
@@ -173,12 +210,17 @@ class _Examination(Generic[AnyFix]):
             return [(int(sensor), rows) for sensor in standing]
         chosen: dict[int, list[int]] = {}
         for row in rows.tolist():
-            q, mu = self._scaled(plain[row])
+            near: list[int] = []
+            if plain[row].solutions:
+                q, mu = self._scaled(plain[row])
+                position = self.problem.position(q)
+                nearest = np.argmin(np.linalg.norm(self.array.positions[standing] - position[:, None], axis=-1), axis=1)
+                near = standing[nearest].tolist()
+            else:
+                q, mu = np.array([[0.0, 0.0, 1.0, 1e-3]]), np.zeros((1, 3))
             misfit = self._misfit(np.array([row]), q[None], mu[None], np.ones((1, self.array.n_sensors)))[0]
-            position = self.problem.position(q)
-            near = np.argmin(np.linalg.norm(self.array.positions[standing] - position[:, None], axis=-1), axis=1)
             worst = np.argsort(-misfit)[: _MOST_LEFT_OUT - 1]
-            for sensor in {*worst.tolist(), *standing[near].tolist()}:
+            for sensor in {*worst.tolist(), *near}:
                 chosen.setdefault(int(sensor), []).append(row)
         return [(sensor, np.array(of_sensor, dtype=np.intp)) for sensor, of_sensor in sorted(chosen.items())]
 

@@ -171,6 +171,8 @@ class Search:
         q, mu = (np.concatenate(parts, axis=1) for parts in zip(*starts, strict=True))
         row = np.repeat(np.arange(len(y)), q.shape[1])
         fits = refine(problem.rows(row), y[row], q.reshape(-1, 1, 4), mu.reshape(-1, 1, 3))
+        if problem.is_even:
+            fits = fits.with_opposite_moments(len(y))
         return best_distinct(self._known(fits), len(y), self.width)
 
     def _needs_templates(self, problem: JointProblem, y: FloatArray) -> bool:

@@ -11,13 +11,13 @@ sources are replaced by others; in the end every source is left out in turn, and
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from arrays.sensor import SensorArray
 from magloc.fix import (
@@ -85,18 +85,21 @@ class SeveralLocator:
         seed: int = 0,
     ) -> None:
         whitening = whitenings_of(array, np.ones(array.n_channels, dtype=bool), np.zeros((1, array.n_channels)))[0]
-        most = most_sources(whitening.n_differences)
-        if n_sources == 1 and whitening.n_differences == N_UNKNOWNS:
-            most = 1  # exactly determined: no χ² to judge it by, but a solution
-        needed = N_UNKNOWNS * (n_sources or 1)
-        if whitening.n_differences < needed or (n_sources or 1) > max(most, 1):
+        if whitening.n_differences < N_UNKNOWNS:
             raise ValueError(
-                f"Input n_sources must be at most {most} for an array of {whitening.n_differences} independent"
-                f" differences, {N_UNKNOWNS} unknowns a source; instead received {n_sources or 1}."
+                f"Input array must give {N_UNKNOWNS} independent differences at least for a position and a moment;"
+                f" instead it gives {whitening.n_differences}."
+            )
+        # A single source may be exactly determined: no χ² to judge it by, but a solution.
+        most = max(1, most_sources(whitening.n_differences))
+        if n_sources is not None and not 1 <= n_sources <= most:
+            raise ValueError(
+                f"Input n_sources must be between 1 and {most} for an array of {whitening.n_differences} independent"
+                f" differences and {N_UNKNOWNS} unknowns a source; instead received {n_sources}."
             )
         self.array = array
         self.n_sources = n_sources
-        self.most = n_sources or max(1, min(most, _MOST_BY_ITSELF))
+        self.most = n_sources or min(most, _MOST_BY_ITSELF)
         self.knowledge = knowledge
         self.seed = seed
         candidates = candidate_positions(array)
@@ -144,7 +147,7 @@ class SeveralLocator:
                     fixes[row] = fix
                 if progress is not None:
                     progress(block.size)
-        return _in_stable_order(fixes)
+        return in_stable_order(fixes)
 
     def threshold_of(self, levels: _Levels, first: Beam) -> float:
         """The threshold for another source, drawn once for every number of differences."""
@@ -229,7 +232,12 @@ class _Levels:
             beams[n - 1] = beams[n - 1].replaced(at, fewer)
             superfluous = fewer.chi2[:, 0] - beams[n].chi2[at, 0] <= threshold
             level[at[superfluous]] = n - 1
-        return self._assembled(beams, level, wanted)
+        fixes = self._assembled(beams, level, wanted)
+        if self.asked is None and self.most > 1:
+            nothing = np.sum((self.y - self.problem.predicted(np.zeros_like(self.problem.ambient))) ** 2, axis=1)
+            for row in np.flatnonzero(nothing - beams[0].chi2[:, 0] <= threshold):
+                fixes[row] = JointFix((), "noise alone explains the readings: no source stands out of it")
+        return fixes
 
     def _first(self, rows: IntArray) -> Beam:
         beam = self.search.first(self.problem, self.y)
@@ -264,7 +272,7 @@ class _Levels:
 
     def _quantile(self, n_sources: int, level: float) -> float:
         dof = self.n_differences - N_UNKNOWNS * n_sources
-        return float(chi2_distribution.ppf(level, dof)) if dof > 0 else 1e-6
+        return float(chdtri(dof, 1.0 - level)) if dof > 0 else 1e-6
 
     def threshold(self, beam: Beam) -> float:
         """By how much χ² must fall for another source: what noise reaches in one of a thousand rows, or BIC's penalty.
@@ -395,8 +403,8 @@ def _marked_as_merged(fix: JointFix, problem: JointProblem, more: Beam, row: int
     return JointFix(solutions, f"{reason}: two are closer than the array resolves")
 
 
-def _in_stable_order(fixes: list[JointFix]) -> list[JointFix]:
-    """Fixes whose sources are numbered as in the row before; the strongest comes first where there is none."""
+def in_stable_order(fixes: Sequence[JointFix]) -> list[JointFix]:
+    """Fixes of successive rows, their sources numbered as in the row before; at first the strongest comes first."""
     ordered: list[JointFix] = []
     before: FloatArray | None = None
     for fix in fixes:

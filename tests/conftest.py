@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from magloc.cli import main
+from tests.command_line import Outcome, Run
+
 REPOSITORY = Path(__file__).parents[1]
 
 
@@ -19,3 +22,14 @@ def data_folder() -> Path:
         if folder.is_dir():
             return folder
     pytest.skip("needs recordings, but neither MAGLOC_DATA nor ../shared/data is a folder")
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run ``magloc`` with arguments in this process."""
+
+    def run_in_process(*arguments: str | Path) -> Outcome:
+        status = main([str(argument) for argument in arguments])
+        return Outcome(status, *capsys.readouterr())
+
+    return run_in_process

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
@@ -17,23 +15,13 @@ from magloc.commands.common import CommonOptions, Flag, print_json, print_note, 
 
 if TYPE_CHECKING:
     from arrays.sensor import SensorArray
-    from magloc.fix import Fix, Knowledge
+    from magloc.fix import Knowledge
     from magloc.readings import Readings
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _BOUNDS = re.compile(rf"(?:(?P<below>{_NUMBER})<(?=[xyz]<))?(?P<axis>[xyz])(?P<sign>[<>])(?P<bound>{_NUMBER})")
 
-_JSON_KEYS = (
-    "position_m",
-    "moment_Am2",
-    "covariance",
-    "chi2",
-    "dof",
-    "iterations",
-    "converged",
-    "range_observable",
-    "range_interval95_m",
-)
+Vector = tuple[float, float, float]
 
 
 def locate(
@@ -42,18 +30,27 @@ def locate(
     *,
     array: Path,
     sensors: str | None = None,
+    sources: str | None = None,
+    position: Vector | None = None,
     average: Flag = False,
     region: str | None = None,
     max_moment_Am2: Annotated[float | None, Parameter(name="--max-moment-Am2")] = None,
+    place: Vector | None = None,
+    date: str | None = None,
+    geomagnetic_model: str | None = None,
+    ambient_gradient: Flag = False,
+    body_length_m: float | None = None,
+    keep_sensors: Flag = False,
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Find the source in every row of a readings file, each row on its own.
+    """Find the sources in every row of a readings file, each row on its own.
 
     Positions are in the array's frame, or in the world frame if the readings have the array's pose. The table has the
     best solution of every row: s is the standard deviation, range95 the 95 % interval of the distance from the
     sensors' centroid. Flags: "range?" = the range is not observable, trust range95 and not s; "+2" = two other
-    solutions fit almost as well, see --json.
+    solutions fit almost as well, see --json; "-s3" = sensor s3 contradicts all others and is not used; "merged" = two
+    sources that the array does not tell apart; "near" = too near for a dipole.
 
     Parameters
     ----------
@@ -63,6 +60,10 @@ def locate(
         Array file (TOML).
     sensors : str
         Ids of the sensors to use, separated by commas; columns of others are ignored. All by default.
+    sources : str
+        Number of sources in every row, or "auto": as many as the readings support, five at most. One by default.
+    position : tuple of 3 floats
+        Where the source is [m], in the frame of the results: only its moment is looked for.
     average : bool
         Average all rows to one fix. The array and the source must stand still.
     region : str
@@ -70,59 +71,110 @@ def locate(
         left out.
     max_moment_Am2 : float
         Largest moment that the source can have [A·m²]; solutions with a larger one are left out.
+    place : tuple of 3 floats
+        Latitude, longitude [deg] and height [m] of the array, for the ambient field of scalar sensors. The world frame,
+        or that of the array if the readings have no pose, is then east, north, up.
+    date : str
+        When, such as 2026-11-21; goes with --place.
+    geomagnetic_model : str
+        IGRF-14 (1900 to 2030) or WMM2025 (2025 to 2030). IGRF-14 by default.
+    ambient_gradient : bool
+        Take the gradient of the geomagnetic field into account too (tens of pT/m).
+    body_length_m : float
+        Length of the object; flags fixes that are nearer than three lengths, where it is no dipole.
+    keep_sensors : bool
+        Use all sensors, also those that contradict the others.
     json : bool
         Print one JSON object with every solution in place of the table.
     common : CommonOptions
         Common options.
     """
     from arrays.files import read_array
+    from magloc.commands.ambient import place_of_options, with_ambient_field
+    from magloc.commands.fix_output import counted_reasons, in_world, json_entry, saturated_channels, warn_of
     from magloc.commands.fix_table import fix_table
-    from magloc.locate import Locator
-    from magloc.readings import read_readings
+    from magloc.commands.row_fixes import RowFixes
+    from magloc.readings import read_readings, without_saturated
 
     ids = None if sensors is None else [name.strip() for name in sensors.split(",")]
-    used = _vector_sensors(read_array(array), ids, array)
-    rows = read_readings(readings, used, sensors=ids)
+    where = place_of_options(place, date, geomagnetic_model)
+    knowledge, n_sources = _knowledge(region, max_moment_Am2), _n_sources(sources)
+    if body_length_m is not None and not body_length_m > 0.0:
+        raise InputError(f"--body-length-m: found {body_length_m:g}, expected a positive length.")
+    if position is not None and (sources is not None or region is not None):
+        other = "--sources" if sources is not None else "--region"
+        raise InputError(f"--position: found it together with {other}, expected one of them.")
+    used = _subset(read_array(array), ids, array)
+    measured = read_readings(readings, used, sensors=ids)
+    rows = without_saturated(measured, used)
     if average:
         rows, used = _averaged(rows, used, readings)
-    knowledge = _knowledge(region, max_moment_Am2)
+    used, ambient_T = with_ambient_field(used, rows, where, gradient=ambient_gradient)
     try:
-        locator = Locator(used, knowledge=knowledge)
+        task = RowFixes(used, rows, ambient_T, knowledge, n_sources, position, keep_sensors, common.seed)
     except ValueError as error:
-        place = array if region is None else f"--region {region}"
-        raise InputError(f"{place}: {str(error).removeprefix('Input ')}") from None
+        sentence = str(error).removeprefix("Input ")
+        option = "" if sentence.startswith("array") else _option_of(sentence, region, sources)
+        raise InputError(f"{option or array}: {sentence}{_advice(sentence, used)}") from None
     with progress(len(rows), "rows", quiet=common.quiet) as advance:
-        fixes = locator.fit_rows(rows.values_T, advance)
-    fixes = _in_world(fixes, rows)
+        fixes = task.fixes(advance)
+    near = task.too_near(fixes, body_length_m)
+    fixes = [in_world(fix, rows, i) for i, fix in enumerate(fixes)]
 
+    times = rows.time_s.tolist()
+    saturated = saturated_channels(measured, rows, used) if not average else [()] * len(rows)
     if json:
-        print_json({"results": [_entry(time, fix) for time, fix in zip(rows.time_s.tolist(), fixes, strict=True)]})
+        entries = (json_entry(*of_row) for of_row in zip(times, fixes, saturated, near, strict=True))
+        print_json({"results": list(entries)})
     else:
-        print("\n".join(fix_table(rows.time_s.tolist(), fixes)))
-    reasons = _counted(fix.reason for fix in fixes if not fix.solutions)
+        print("\n".join(fix_table(times, fixes, near)))
+    reasons = counted_reasons(fix.reason for fix in fixes if not fix.solutions)
     solved = sum(bool(fix.solutions) for fix in fixes)
     if not solved:
         raise InputError(f"{readings}: found no row that can be solved ({reasons}).")
     if not (json or common.quiet):
         print_note(f"{solved} of {len(fixes)} rows solved" + (f"; not solved: {reasons}" if reasons else ""))
+    warn_of(fixes, saturated, near, quiet=common.quiet)
 
 
-def _vector_sensors(array: SensorArray, ids: Sequence[str] | None, path: Path) -> SensorArray:
+def _subset(array: SensorArray, ids: Sequence[str] | None, path: Path) -> SensorArray:
     """The sensors of an array that the fixes use."""
-    if ids is not None:
-        for name in ids:
-            if name not in array.ids:
-                raise InputError(
-                    f"--sensors: found {name!r}, expected ids of sensors in {path}: {', '.join(array.ids)}."
-                )
-        try:
-            array = array.subset(ids)
-        except ValueError as error:
-            raise InputError(f"--sensors {','.join(ids)}: {error}") from None
-    scalar = [sensor.id for sensor in array.sensors if sensor.kind == "scalar"]
-    if scalar:
-        raise InputError(f"{path}: found scalar sensors ({', '.join(scalar)}), expected vector sensors only.")
-    return array
+    if ids is None:
+        return array
+    for name in ids:
+        if name not in array.ids:
+            raise InputError(f"--sensors: found {name!r}, expected ids of sensors in {path}: {', '.join(array.ids)}.")
+    try:
+        return array.subset(ids)
+    except ValueError as error:
+        raise InputError(f"--sensors {','.join(ids)}: {error}") from None
+
+
+def _n_sources(option: str | None) -> int | Literal["auto"] | None:
+    """The number of sources that is asked for; None for the plain fix of one."""
+    if option is None:
+        return None
+    if option == "auto":
+        return "auto"
+    try:
+        return int(option)
+    except ValueError:
+        raise InputError(f"--sources: found {option!r}, expected a whole number or auto.") from None
+
+
+def _option_of(sentence: str, region: str | None, sources: str | None) -> str:
+    """The option that an error of the library is about."""
+    if sentence.startswith("n_sources"):
+        return f"--sources {sources}"
+    if sentence.startswith("position_m"):
+        return "--position"
+    return f"--region {region}" if sentence.startswith("knowledge") and region is not None else ""
+
+
+def _advice(sentence: str, array: SensorArray) -> str:
+    if sentence.startswith("array must give") and array.channel_is_scalar.any():
+        return " Add sensors, or name the place of the source with --position."
+    return ""
 
 
 def _knowledge(region: str | None, largest_moment: float | None) -> Knowledge:
@@ -159,42 +211,3 @@ def _averaged(readings: Readings, array: SensorArray, path: Path) -> tuple[Readi
         return average(readings), averaging_array(array, readings)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-
-
-def _in_world(fixes: Sequence[Fix], readings: Readings) -> list[Fix]:
-    """Fixes in the world frame if the array's pose is known."""
-    import numpy as np
-    from scipy.spatial.transform import Rotation
-
-    if readings.array_position_m is None or readings.array_rotation_xyzw is None:
-        return list(fixes)
-    world_from_array = Rotation.from_quat(readings.array_rotation_xyzw).as_matrix()
-    moved = []
-    for fix, origin, R in zip(fixes, readings.array_position_m, world_from_array, strict=True):
-        R6 = np.kron(np.eye(2), R)
-        solutions = (
-            replace(
-                solution,
-                position_m=origin + R @ solution.position_m,
-                moment_Am2=R @ solution.moment_Am2,
-                covariance=R6 @ solution.covariance @ R6.T,
-            )
-            for solution in fix.solutions
-        )
-        moved.append(replace(fix, solutions=tuple(solutions)))
-    return moved
-
-
-def _entry(time_s: float, fix: Fix) -> dict[str, object]:
-    """What ``--json`` prints of one row."""
-    solutions = [{key: getattr(solution, key) for key in _JSON_KEYS} for solution in fix.solutions]
-    entry: dict[str, object] = {"time_s": time_s, "solutions": solutions}
-    return entry if solutions else {**entry, "reason": fix.reason}
-
-
-def _counted(reasons: Iterable[str], most: int = 3) -> str:
-    """Reasons with the number of rows that each applies to, the commonest first."""
-    counts = Counter(reasons).most_common()
-    others = sum(n for _, n in counts[most:])
-    parts = counts[:most] + [("other reasons", others)] * (others > 0)
-    return "; ".join(f"{n} row{'s' if n > 1 else ''}: {reason}" for reason, n in parts)

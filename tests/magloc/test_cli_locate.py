@@ -6,17 +6,17 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from magloc.cli import main
 from magloc.readings import read_truth
+from tests.command_line import Outcome, Run, assert_refused, refuse_constant, results_of
 from tests.oracles import magpylib_field
 
 FloatArray = NDArray[np.float64]
@@ -28,26 +28,6 @@ MOMENT = np.array([60.0, 50.0, 60.0])
 
 COLUMNS = [f"s{i}_{axis}_nT" for i in range(1, len(SENSORS) + 1) for axis in "xyz"]
 HEADER = ",".join(["time_s", *COLUMNS])
-
-
-class Outcome(NamedTuple):
-    """What a run of the command line left behind."""
-
-    status: int
-    out: str
-    err: str
-
-
-Run = Callable[..., Outcome]
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    def run_in_process(*arguments: str | Path) -> Outcome:
-        status = main([str(argument) for argument in arguments])
-        return Outcome(status, *capsys.readouterr())
-
-    return run_in_process
 
 
 def run_process(*arguments: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
@@ -93,29 +73,6 @@ def readings(tmp_path: Path) -> Path:
     rows[2, 5:] = np.nan
     path.write_text(table(list(rows)), encoding="utf-8")
     return path
-
-
-def refuse_constant(name: str) -> None:
-    raise AssertionError(f"{name} is not JSON")
-
-
-def results_of(outcome: Outcome) -> list[dict[str, Any]]:
-    assert outcome.status == 0, outcome.err
-    parsed = json.loads(outcome.out, parse_constant=refuse_constant)
-    assert list(parsed) == ["results"]
-    results: list[dict[str, Any]] = parsed["results"]
-    return results
-
-
-def assert_refused(outcome: Outcome, *fragments: str) -> None:
-    """Exit status 2 and one line on stderr that says what and where."""
-    assert outcome.status == 2
-    lines = outcome.err.splitlines()
-    assert len(lines) == 1, outcome.err
-    assert lines[0].startswith("magloc: ")
-    assert "Traceback" not in outcome.err
-    for fragment in fragments:
-        assert fragment in lines[0]
 
 
 class TestJson:
@@ -312,7 +269,7 @@ class TestBadInput:
 
     def test_scalar_sensors(self, run: Run, array: Path, readings: Path) -> None:
         array.write_text(array_text("scalar"), encoding="utf-8")
-        assert_refused(run("locate", readings, "--array", array), "array.toml", "scalar", "s1")
+        assert_refused(run("locate", readings, "--array", array), "readings.csv", "scalar", "s1")
 
     @pytest.mark.parametrize(
         ("ids", "fragment"), [("s1,s7,s2", "'s7'"), ("", "''"), ("s1,,s2", "''"), ("s1", "s1"), ("s1,s1,s2", "s1")]

@@ -1,0 +1,114 @@
+"""Which fixes are made of the rows of a readings file, and whether their source is near enough to matter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.special import chdtrc
+
+from arrays.sensor import SensorArray
+from magloc.exact import ExactLocator
+from magloc.fix import Fix, JointFix, Knowledge
+from magloc.locate import Locator
+from magloc.moment import MomentLocator
+from magloc.readings import Readings
+from magloc.robust import robust_fixes
+from magloc.several import SeveralLocator, in_stable_order
+
+FloatArray = NDArray[np.float64]
+AnyFix = Fix | JointFix
+Vector = tuple[float, float, float]
+
+_ROWS_AT_ONCE = 256
+# Probability of a χ² under noise below which what is left is looked at.
+_MISFIT = 1e-3
+
+
+class RowFixes:
+    """The fixes of all rows, whatever is asked for."""
+
+    def __init__(
+        self,
+        array: SensorArray,
+        rows: Readings,
+        ambient_T: FloatArray | None,
+        knowledge: Knowledge,
+        n_sources: int | Literal["auto"] | None,
+        position: Vector | None,
+        keep_sensors: bool,
+        seed: int,
+    ) -> None:
+        self.array, self.rows, self.ambient_T, self.keep_sensors = array, rows, ambient_T, keep_sensors
+        self.position_known = position is not None
+        self.at_once = _ROWS_AT_ONCE
+        self.fit_rows: list[Callable[..., list[Any]]]
+        if position is not None:
+            places = _in_array_frame(position, rows)
+            if len(places) > 1:
+                # The known place moves in the frame of an array that moves.
+                self.at_once = 1
+            self.fit_rows = [MomentLocator(array, place, knowledge=knowledge).fit_rows for place in places]
+            return
+        if n_sources is not None:
+            number = None if n_sources == "auto" else n_sources
+            self.fit_rows = [SeveralLocator(array, n_sources=number, knowledge=knowledge, seed=seed).fit_rows]
+        elif array.channel_is_scalar.any():
+            self.fit_rows = [ExactLocator(array, knowledge=knowledge).fit_rows]
+        else:
+            self.fit_rows = [Locator(array, knowledge=knowledge).fit_rows]
+
+    def fixes(self, advance: Callable[[int], None]) -> list[AnyFix]:
+        """Fixes of all rows, without the sensors that contradict all others."""
+        fixes: list[Any] = []
+        for begin in range(0, len(self.rows), self.at_once):
+            fit = self.fit_rows[min(begin, len(self.fit_rows) - 1)]
+            readings = self.rows.values_T[begin : begin + self.at_once]
+            ambient = None if self.ambient_T is None else self.ambient_T[begin : begin + self.at_once]
+            if self.keep_sensors:
+                fixes += fit(readings, ambient)
+            else:
+                fixes += robust_fixes(self.array, fit, readings, ambient, free_position=not self.position_known)
+            advance(len(readings))
+        if any(isinstance(fix, JointFix) for fix in fixes):
+            fixes = list(in_stable_order(fixes))
+        return fixes
+
+    def too_near(self, fixes: Sequence[AnyFix], body_length_m: float | None) -> list[bool]:
+        """Whether the source of each row is too near for a dipole: by its length, or by the pattern of what is left."""
+        from magloc.extended import dipole_validity, nearness_test  # trimesh takes a while to import
+
+        near = []
+        for i, fix in enumerate(fixes):
+            if not isinstance(fix, Fix) or not fix.solutions:
+                near.append(False)
+                continue
+            best = fix.solutions[0]
+            found = False
+            if body_length_m is not None:
+                nearest = np.linalg.norm(self.array.positions - best.position_m, axis=1).min()
+                found = not dipole_validity(nearest, body_length_m)
+            if not found and best.dof > 0 and chdtrc(best.dof, best.chi2) < _MISFIT:
+                readings = self.rows.values_T[i].copy()
+                left_out = [self.array.ids[sensor] in fix.dropped for sensor in self.array.channel_sensor]
+                readings[left_out] = np.nan
+                array = self.array
+                if self.ambient_T is not None:
+                    array = replace(array, ambient_T=tuple(self.ambient_T[i].tolist()))
+                test = nearness_test(array, best.position_m, best.moment_Am2, readings)
+                found = test.extended and test.distinguishable
+            near.append(found)
+        return near
+
+
+def _in_array_frame(position: Vector, readings: Readings) -> FloatArray:
+    """A place in the frame of the results in that of the array: one for all rows (1, 3), or one for each (n, 3)."""
+    if readings.array_position_m is None or readings.array_rotation_xyzw is None:
+        return np.array([position])
+    array_from_world = Rotation.from_quat(readings.array_rotation_xyzw).inv()
+    place: FloatArray = array_from_world.apply(np.array(position) - readings.array_position_m)
+    return place

@@ -1,0 +1,41 @@
+"""Running the command lines in the tests' own process, and what every command has in common."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+
+class Outcome(NamedTuple):
+    """What a run of the command line left behind."""
+
+    status: int
+    out: str
+    err: str
+
+
+Run = Callable[..., Outcome]
+
+
+def refuse_constant(name: str) -> None:
+    raise AssertionError(f"{name} is not JSON")
+
+
+def results_of(outcome: Outcome) -> list[dict[str, Any]]:
+    assert outcome.status == 0, outcome.err
+    parsed = json.loads(outcome.out, parse_constant=refuse_constant)
+    assert list(parsed) == ["results"]
+    results: list[dict[str, Any]] = parsed["results"]
+    return results
+
+
+def assert_refused(outcome: Outcome, *fragments: str) -> None:
+    """Exit status 2 and one line on stderr that says what and where."""
+    assert outcome.status == 2
+    lines = outcome.err.splitlines()
+    assert len(lines) == 1, outcome.err
+    assert lines[0].startswith("magloc: ")
+    assert "Traceback" not in outcome.err
+    for fragment in fragments:
+        assert fragment in lines[0]
