@@ -43,43 +43,44 @@ def range_intervals(
     """
     n = len(y)
     q = fits.q[:, source]
-    length = np.linalg.norm(q[:, :3], axis=-1)
-    alpha = np.arctan2(np.abs(q[:, 3]), length)
+    alpha = np.arctan2(np.abs(q[:, 3]), np.linalg.norm(q[:, :3], axis=-1))
     sigma = np.abs(np.nan_to_num(sigma_over_range, nan=1.0)) * np.sin(alpha) * np.cos(alpha)
     step = np.clip(np.sqrt(RISE_95) * sigma, 1e-7, 0.05)
-    bounds = np.array([0.5 * np.pi - _SMALLEST_ALPHA, _SMALLEST_ALPHA])
-    ends = np.empty((n, 2))
-    for side, sign in enumerate((1.0, -1.0)):
-        # The last point of the grid is the bound itself.
-        grid = alpha[:, None] + sign * step[:, None] * np.append(_STEPS, np.inf)
-        grid = np.clip(grid, _SMALLEST_ALPHA, bounds[0])
-        rise = _rises(problem, y, fits, source, grid)
-        above = rise > RISE_95
-        first = np.argmax(above, axis=1)
-        found = above.any(axis=1)
-        rows = np.arange(n)
-        outside, f_outside = grid[rows, first], rise[rows, first]
-        inside = np.where(first > 0, grid[rows, np.maximum(first - 1, 0)], alpha)
-        f_inside = np.where(first > 0, rise[rows, np.maximum(first - 1, 0)], 0.0)
-        for _ in range(_ROUNDS):
-            # The profile is nearly a parabola: interpolate its square root.
-            a, b = np.sqrt(np.clip(f_inside, 0.0, None)), np.sqrt(np.clip(f_outside, 0.0, 1e6))
-            with np.errstate(divide="ignore", invalid="ignore"):
-                share = np.clip((np.sqrt(RISE_95) - a) / (b - a), 0.05, 0.95)
-            middle = inside + np.nan_to_num(share, nan=0.5) * (outside - inside)
-            f = _rises(problem, y, fits, source, middle[:, None])[:, 0]
-            higher = f > RISE_95
-            outside, f_outside = np.where(higher, middle, outside), np.where(higher, f, f_outside)
-            inside, f_inside = np.where(higher, inside, middle), np.where(higher, f_inside, f)
-        at_end = np.where(f_outside - RISE_95 < RISE_95 - f_inside, outside, inside)
-        ends[:, side] = np.where(found, 1.0 / np.tan(at_end), (0.0, np.inf)[side])
+    # Both sides at once: inwards, where α grows, for all fits, then outwards.
+    rows = np.tile(np.arange(n), 2)
+    sign = np.repeat([1.0, -1.0], n)
+    at_optimum = alpha[rows]
+    # The last point of the grid is the bound itself.
+    grid = at_optimum[:, None] + (sign * step[rows])[:, None] * np.append(_STEPS, np.inf)
+    grid = np.clip(grid, _SMALLEST_ALPHA, 0.5 * np.pi - _SMALLEST_ALPHA)
+    rise = _rises(problem, y, fits, source, rows, grid)
+    above = rise > RISE_95
+    first, found, each = np.argmax(above, axis=1), above.any(axis=1), np.arange(2 * n)
+    before = np.maximum(first - 1, 0)
+    outside, f_outside = grid[each, first], rise[each, first]
+    inside = np.where(first > 0, grid[each, before], at_optimum)
+    f_inside = np.where(first > 0, rise[each, before], 0.0)
+    for _ in range(_ROUNDS):
+        # The profile is nearly a parabola: interpolate its square root.
+        a, b = np.sqrt(np.clip(f_inside, 0.0, None)), np.sqrt(np.clip(f_outside, 0.0, 1e6))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.clip((np.sqrt(RISE_95) - a) / (b - a), 0.05, 0.95)
+        middle = inside + np.nan_to_num(share, nan=0.5) * (outside - inside)
+        f = _rises(problem, y, fits, source, rows, middle[:, None])[:, 0]
+        higher = f > RISE_95
+        outside, f_outside = np.where(higher, middle, outside), np.where(higher, f, f_outside)
+        inside, f_inside = np.where(higher, inside, middle), np.where(higher, f_inside, f)
+    end = np.where(f_outside - RISE_95 < RISE_95 - f_inside, outside, inside)
+    ends: FloatArray = np.where(found, 1.0 / np.tan(end), np.repeat([0.0, np.inf], n)).reshape(2, n).T
     return ends
 
 
-def _rises(problem: JointProblem, y: FloatArray, fits: JointFits, source: int, alpha: FloatArray) -> FloatArray:
-    """Rise of χ² above the optimum at ranges (b, g), everything else fitted anew from the optimum."""
+def _rises(
+    problem: JointProblem, y: FloatArray, fits: JointFits, source: int, rows: NDArray[np.intp], alpha: FloatArray
+) -> FloatArray:
+    """Rise of χ² above the optima of rows (r,) at ranges (r, g), everything else fitted anew from the optimum."""
     n, n_grid = alpha.shape
-    row = np.repeat(np.arange(n), n_grid)
+    row = np.repeat(rows, n_grid)
     q, mu = fits.q[row].copy(), fits.mu[row].copy()
     u = q[:, source, :3]
     length = np.linalg.norm(u, axis=-1, keepdims=True)
@@ -94,5 +95,5 @@ def _rises(problem: JointProblem, y: FloatArray, fits: JointFits, source: int, a
     profile = refine(problem.rows(row), y[row], q, mu, free=free, max_iterations=40)
     # A refinement that did not end says nothing of the profile: the points beyond it decide.
     chi2 = np.where(profile.converged, profile.chi2, -np.inf)
-    rise: FloatArray = chi2.reshape(n, n_grid) - fits.chi2[:, None]
+    rise: FloatArray = chi2.reshape(n, n_grid) - fits.chi2[rows, None]
     return rise

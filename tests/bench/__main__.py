@@ -5,13 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 
-from tests.bench import fields, filters, fixes, machine, maps, recording
+from tests.bench import fields, filters, fixes, machine, maps, recording, sources
 from tests.bench.table import header, table
 from tests.bench.timing import FULL, QUICK, Size
 
 GROUPS = {
     "fields": fields,
     "fixes": fixes,
+    "sources": sources,
     "filters": filters,
     "maps": maps,
     "machine": machine,
