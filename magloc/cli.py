@@ -17,6 +17,7 @@ from importlib import metadata
 from cyclopts import App, CycloptsError, Parameter
 
 from arrays.errors import InputError
+from magloc.commands.calibrate import calibrate
 from magloc.commands.common import CommonOptions, print_note
 from magloc.commands.locate import locate
 from magloc.commands.map import map_
@@ -40,6 +41,7 @@ app = App(
     version=_version,
     default_parameter=Parameter(negative=()),
 )
+app.command(calibrate)
 app.command(locate)
 app.command(map_, name="map")
 
