@@ -111,6 +111,14 @@ def read_array(path: str | PathLike[str]) -> SensorArray:
     InputError
         The file cannot be read, or does not describe an array; the text says where and why.
     """
+    array = read_sensors(path)
+    if array.n_sensors < 2:
+        raise InputError(f"{path}: sensors must be at least 2; instead received {array.n_sensors}.")
+    return array
+
+
+def read_sensors(path: str | PathLike[str]) -> SensorArray:
+    """Array from its TOML file as :func:`read_array`, which may also be a single sensor, to be calibrated."""
     return array_of_table(str(path), read_toml(path, "a TOML file of an array"))
 
 

@@ -191,7 +191,7 @@ class SensorArray:
     Attributes
     ----------
     sensors : tuple of Sensor
-        Two at least, with different ids and not all in one place.
+        With different ids and not all in one place. One alone can be calibrated; differences need two.
     name : str
         One line of text, or empty.
     noise_fraction : float
@@ -232,10 +232,10 @@ class SensorArray:
             object.__setattr__(self, "ambient_T", tuple(_finite("ambient_T", self.ambient_T, (3,)).tolist()))
         if self.ambient_gradient_T_m is not None:
             object.__setattr__(self, "ambient_gradient_T_m", _gradient_tensor(self.ambient_gradient_T_m))
-        if len(self.sensors) < 2:
-            raise ValueError(f"Input sensors must be at least 2; instead received {len(self.sensors)}.")
+        if not self.sensors:  # one alone is for calibration only
+            raise ValueError("Input sensors must be at least 2; instead received 0.")
         _check_distinct_names(self)
-        if self.circumradius <= _SAME_PLACE_RTOL * np.abs(self.positions).max():
+        if self.n_sensors > 1 and self.circumradius <= _SAME_PLACE_RTOL * np.abs(self.positions).max():
             raise ValueError(
                 f"Input sensors must stand in two places at least; instead received {self.n_sensors} sensors "
                 f"at {_plain(self.positions[0])} m."
@@ -381,6 +381,8 @@ class SensorArray:
                 nearest = difflib.get_close_matches(name, self.ids, n=1)
                 hint = f" (the nearest is {nearest[0]})" if nearest else ""
                 raise ValueError(f"Input ids must be ids of sensors of the array; instead received {name!r}{hint}.")
+        if len(ids) < 2:
+            raise ValueError(f"Input sensors must be at least 2; instead received {len(ids)}.")
         return replace(self, sensors=tuple(by_id[name] for name in ids))
 
     def readings_of(self, fields: ArrayLike) -> FloatArray:

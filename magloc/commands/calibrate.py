@@ -65,17 +65,21 @@ def calibrate(
     array: Path,
     out: Path,
     truth: Path | None = None,
+    modulus_nT: Annotated[float | None, Parameter(name="--modulus-nT")] = None,
     height_m: float | None = None,
     moment: Literal["constant", "free"] | None = None,
     known: PriorOptions = PriorOptions(),
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Calibrate an array of vector sensors by a source that moves past it.
+    """Calibrate vector sensors by a source that moves past them, or by turning them in a field of known modulus.
 
     With --truth the path of the source is known; without it, the path is found as well, and the array as a whole can be
     moved, turned and scaled unseen: there the array file decides, or the sensors that are trusted. What the readings do
     not tell is said. The table has what the calibration adds to the array file, with standard deviations.
+
+    With --modulus-nT there is no source: every sensor, or a single one, was turned in a uniform field of that modulus.
+    That tells the gains, the angles between the axes and the offsets of each sensor, not how it is mounted.
 
     Parameters
     ----------
@@ -89,6 +93,8 @@ def calibrate(
     truth : Path
         Truth file (CSV); rows belong to the readings of the same time. A missing z_m is one unknown height for all
         rows. Moments, where it has them, are taken as known.
+    modulus_nT : float
+        Modulus of the uniform field that the sensors were turned in.
     height_m : float
         The z of a truth file without z_m.
     moment : {"constant", "free"}
@@ -103,13 +109,18 @@ def calibrate(
     """
     from arrays.files import read_array, write_array
     from magloc.calibration import calibrate_on_path, self_calibrate
+    from magloc.commands.calibrate_by_turning import calibrate_by_turning, check_folder
     from magloc.readings import read_readings, read_truth
 
+    if modulus_nT is not None:
+        if truth is not None:
+            raise InputError("--modulus-nT: found it together with --truth, expected one of them.")
+        calibrate_by_turning(readings, array, modulus_nT, out, json=json, quiet=common.quiet)
+        return
     nominal = read_array(array)
     prior = _prior(known, nominal, array)
     rows = read_readings(readings, nominal)
-    if not out.absolute().parent.is_dir():
-        raise InputError(f"--out {out}: found no folder {out.absolute().parent}, expected one.")
+    check_folder(out)
     if truth is None and height_m is not None:
         raise InputError("--height-m: found no --truth, expected it because the height is that of its path.")
     attitude = _world_from_array(rows)

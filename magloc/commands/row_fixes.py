@@ -100,7 +100,7 @@ class RowFixes:
                 if self.ambient_T is not None:
                     array = replace(array, ambient_T=tuple(self.ambient_T[i].tolist()))
                 test = nearness_test(array, best.position_m, best.moment_Am2, readings)
-                found = test.extended and test.distinguishable
+                found = test.extended
             near.append(found)
         return near
 

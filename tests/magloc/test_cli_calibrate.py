@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from arrays.files import read_array, write_array
+from arrays.files import read_array, read_sensors, write_array
 from arrays.sensor import Calibration, Sensor, SensorArray
 from magloc import calibration
-from magloc.cli import main
 from magloc.readings import Readings, write_readings
+from tests.command_line import Outcome, Run, assert_refused
 from tests.oracles import magpylib_field
 
 FloatArray = NDArray[np.float64]
@@ -26,26 +25,6 @@ FloatArray = NDArray[np.float64]
 NOISE_T = 1e-9
 MOMENT = np.array([0.5, -0.3, 0.8])
 PLACES = 0.1 * np.array([[1, 0, 0], [-1, 0, 0.2], [0, 1, -0.1], [0.1, -1, 0], [0, 0.2, 1], [0.2, 0.1, -1]])
-
-
-class Outcome(NamedTuple):
-    """What a run of the command line left behind."""
-
-    status: int
-    out: str
-    err: str
-
-
-Run = Callable[..., Outcome]
-
-
-@pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Run:
-    def run_in_process(*arguments: str | Path) -> Outcome:
-        status = main([str(argument) for argument in arguments])
-        return Outcome(status, *capsys.readouterr())
-
-    return run_in_process
 
 
 @dataclass(frozen=True)
@@ -135,15 +114,9 @@ def assert_recovered(files: Files, *, but_gain: bool = False, within_m: float = 
     np.testing.assert_allclose(found.channel_gain / factor, true.channel_gain, rtol=0, atol=2e-3)
 
 
-def assert_refused(outcome: Outcome, files: Files, *fragments: str) -> None:
-    """Exit status 2, one line on stderr that says what and where, and no array file nor a part of one."""
-    assert outcome.status == 2
-    lines = outcome.err.splitlines()
-    assert len(lines) == 1, outcome.err
-    assert lines[0].startswith("magloc: ")
-    assert "Traceback" not in outcome.err
-    for fragment in fragments:
-        assert fragment in lines[0]
+def assert_nothing_written(outcome: Outcome, files: Files, *fragments: str) -> None:
+    """Refused, and no array file nor a part of one."""
+    assert_refused(outcome, *fragments)
     assert {path.name for path in files.folder.iterdir()} <= {"array.toml", "readings.csv", "truth.csv"}
 
 
@@ -293,27 +266,29 @@ class TestRefusals:
         ],
     )
     def test_options(self, run: Run, files: Files, option: str, value: str, message: str) -> None:
-        assert_refused(run(*self.arguments(files, **{option: value})), files, message)
+        assert_nothing_written(run(*self.arguments(files, **{option: value})), files, message)
 
     def test_height_twice(self, run: Run, files: Files) -> None:
         truth = files.truth()
         outcome = run(*self.arguments(files, truth=truth, **{"height-m": "0.1"}))
-        assert_refused(outcome, files, "--height-m: found z_m in", "expected a truth file without it")
+        assert_nothing_written(outcome, files, "--height-m: found z_m in", "expected a truth file without it")
 
     def test_times_that_do_not_match(self, run: Run, files: Files) -> None:
         truth = files.truth(shift_s=0.5)
         outcome = run(*self.arguments(files, truth=truth))
-        assert_refused(outcome, files, "truth.csv: found none of the times of", "0 s to 39 s")
+        assert_nothing_written(outcome, files, "truth.csv: found none of the times of", "0 s to 39 s")
 
     @pytest.mark.parametrize("with_truth", [False, True])
     def test_too_few_rows(self, run: Run, tmp_path: Path, with_truth: bool) -> None:
         files = made(tmp_path, n=4)
         extra = {"truth": files.truth()} if with_truth else {}
-        assert_refused(run(*self.arguments(files, **extra)), files, "readings.csv", "more readings than unknowns")
+        assert_nothing_written(
+            run(*self.arguments(files, **extra)), files, "readings.csv", "more readings than unknowns"
+        )
 
     def test_no_folder(self, run: Run, files: Files) -> None:
         outcome = run(*self.arguments(files, out=files.folder / "nowhere" / "out.toml"))
-        assert_refused(outcome, files, "nowhere", "found no folder")
+        assert_nothing_written(outcome, files, "nowhere", "found no folder")
 
     @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
     def test_folder_that_cannot_be_written(self, run: Run, files: Files) -> None:
@@ -322,11 +297,11 @@ class TestRefusals:
             outcome = run(*self.arguments(files))
         finally:
             files.folder.chmod(0o700)
-        assert_refused(outcome, files, "out.toml: Permission denied")
+        assert_nothing_written(outcome, files, "out.toml: Permission denied")
 
     def test_out_is_a_folder(self, run: Run, files: Files, tmp_path_factory: pytest.TempPathFactory) -> None:
         folder = tmp_path_factory.mktemp("taken")
-        assert_refused(run(*self.arguments(files, truth=files.truth(), out=folder)), files, f"{folder}: ")
+        assert_nothing_written(run(*self.arguments(files, truth=files.truth(), out=folder)), files, f"{folder}: ")
         assert list(folder.iterdir()) == []
 
     def test_scalar_sensors(self, run: Run, files: Files) -> None:
@@ -334,7 +309,7 @@ class TestRefusals:
         array = SensorArray(tuple(sensors))
         write_array(array, files.array)
         write_readings(files.readings, Readings(np.arange(4.0), np.ones((4, 3)), np.arange(2, 6)), array)
-        assert_refused(run(*self.arguments(files)), files, "must have vector sensors only")
+        assert_nothing_written(run(*self.arguments(files)), files, "must have vector sensors only")
 
     def test_what_does_not_converge_is_not_written(
         self, run: Run, files: Files, monkeypatch: pytest.MonkeyPatch
@@ -343,4 +318,56 @@ class TestRefusals:
         monkeypatch.setattr(
             calibration, "self_calibrate", lambda *args, **options: replace(honest(*args, **options), converged=False)
         )
-        assert_refused(run(*self.arguments(files)), files, "the calibration did not converge within", "is not written")
+        assert_nothing_written(
+            run(*self.arguments(files)), files, "the calibration did not converge within", "is not written"
+        )
+
+
+class TestTurnedInAKnownModulus:
+    """--modulus-nT: no source, a sensor turned by hand in a uniform field."""
+
+    SCALE = np.array([[1.05, 0.02, -0.01], [0.0, 0.97, 0.03], [0.0, 0.0, 1.01]])
+    OFFSET_T = np.array([300e-9, -150e-9, 80e-9])
+
+    def write(self, folder: Path, directions: np.ndarray) -> tuple[str, ...]:
+        (folder / "one.toml").write_text(
+            '[[sensor]]\nid = "m"\nkind = "vector"\nposition_m = [0.0, 0.0, 0.0]\nnoise_nT = 5.0\n', encoding="utf-8"
+        )
+        noise = 5e-9 * np.random.default_rng(3).normal(size=(len(directions), 3))
+        values_nT = 1e9 * (48e-6 * directions @ self.SCALE.T + self.OFFSET_T + noise)
+        rows = [",".join(map(repr, [float(i), *row])) for i, row in enumerate(values_nT.tolist())]
+        (folder / "turned.csv").write_text("\n".join(["time_s,m_x_nT,m_y_nT,m_z_nT", *rows, ""]), encoding="utf-8")
+        return (
+            "calibrate", str(folder / "turned.csv"), "--array", str(folder / "one.toml"), "--out",
+            str(folder / "out.toml"), "--modulus-nT", "48000",
+        )  # fmt: skip
+
+    def test_single_sensor(self, run: Run, tmp_path: Path) -> None:
+        directions = np.random.default_rng(1).normal(size=(400, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        outcome = run(*self.write(tmp_path, directions), "--json")
+        assert outcome.status == 0, outcome.err
+        (sensor,) = read_sensors(tmp_path / "out.toml").sensors
+        np.testing.assert_allclose(sensor.calibration.offset_T, self.OFFSET_T, atol=3e-9)
+        scale = np.array(sensor.calibration.scale)
+        # The modulus tells S Sᵀ, not the rotation between S and the field.
+        np.testing.assert_allclose(scale @ scale.T, self.SCALE @ self.SCALE.T, atol=2e-4)
+        (entry,) = json.loads(outcome.out)["sensors"]
+        assert entry["converged"]
+        assert entry["dof"] == 400 - 9
+
+    def test_turned_about_one_axis_only(self, run: Run, tmp_path: Path) -> None:
+        angle = np.linspace(0.0, 6.0, 100)
+        directions = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+        assert_refused(run(*self.write(tmp_path, directions)), "turned.csv", "sensor m", "not written")
+        assert not (tmp_path / "out.toml").exists()
+
+    def test_bad_modulus(self, run: Run, tmp_path: Path) -> None:
+        command = self.write(tmp_path, np.eye(3))
+        assert_refused(run(*command[:-1], "-5"), "--modulus-nT")
+        assert_refused(run(*command, "--truth", tmp_path / "truth.csv"), "--modulus-nT", "--truth")
+
+    def test_other_commands_need_two_sensors(self, run: Run, tmp_path: Path) -> None:
+        self.write(tmp_path, np.eye(3))
+        outcome = run("locate", tmp_path / "turned.csv", "--array", tmp_path / "one.toml")
+        assert_refused(outcome, "one.toml", "at least 2")

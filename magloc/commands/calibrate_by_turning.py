@@ -1,0 +1,79 @@
+"""``magloc calibrate --modulus-nT``: gains, angles and offsets of sensors that were turned in a uniform field."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from arrays.errors import InputError
+from arrays.files import read_sensors, write_array
+from magloc.commands.common import print_json, print_note
+from magloc.ellipsoid_calibration import EllipsoidCalibration, calibrated_in_modulus
+from magloc.readings import read_readings
+
+
+def check_folder(out: Path) -> None:
+    """Refuse a file to write whose folder is not there, before long work."""
+    if not out.absolute().parent.is_dir():
+        raise InputError(f"--out {out}: found no folder {out.absolute().parent}, expected one.")
+
+
+def calibrate_by_turning(readings: Path, array: Path, modulus_nT: float, out: Path, *, json: bool, quiet: bool) -> None:
+    """Calibrate every vector sensor of an array file, or its only one, and write the array file.
+
+    Raises
+    ------
+    InputError
+        The readings do not determine a sensor; nothing is written.
+    """
+    if not 0.0 < modulus_nT < np.inf:
+        raise InputError(f"--modulus-nT: found {modulus_nT:g}, expected a positive number.")
+    nominal = read_sensors(array)
+    rows = read_readings(readings, nominal)
+    check_folder(out)
+    try:
+        calibrated, results = calibrated_in_modulus(nominal, rows.values_T, 1e-9 * modulus_nT)
+    except ValueError as error:
+        raise InputError(f"{array}: {str(error).removeprefix('Input ')}") from None
+    for name, result in results.items():
+        if not result.converged:
+            raise InputError(f"{readings}: sensor {name} cannot be calibrated: {result.reason}; {out} is not written.")
+    write_array(calibrated, out)
+    if json:
+        print_json({"out": str(out), "rows": len(rows), "sensors": [_entry(*item) for item in results.items()]})
+    else:
+        print("\n".join(_line(*item) for item in results.items()))
+    if not (json or quiet):
+        print_note("the modulus does not tell how a sensor is mounted: its rotation stays as in the array file")
+
+
+def _deviations(result: EllipsoidCalibration) -> tuple[Any, Any]:
+    sigma = np.sqrt(np.diagonal(result.covariance))
+    return sigma[:3], sigma[3:]
+
+
+def _entry(name: str, result: EllipsoidCalibration) -> dict[str, Any]:
+    offset_sd, scale_sd = _deviations(result)
+    return {
+        "id": name,
+        "scale": result.scale,
+        "scale_sd": scale_sd,
+        "offset_nT": 1e9 * result.offset_T,
+        "offset_sd_nT": 1e9 * offset_sd,
+        "chi2": result.chi2,
+        "dof": result.dof,
+        "iterations": result.iterations,
+        "converged": result.converged,
+    }
+
+
+def _line(name: str, result: EllipsoidCalibration) -> str:
+    offset_sd, scale_sd = _deviations(result)
+    gains = " ".join(f"{value:.6f}" for value in np.diagonal(result.scale))
+    offsets = " ".join(f"{1e9 * value:.1f}" for value in result.offset_T)
+    return (
+        f"{name}: gains {gains} (s {scale_sd.max():.1g}), offset {offsets} nT (s {1e9 * offset_sd.max():.2g}),"
+        f" chi2 {result.chi2:.1f}/{result.dof}"
+    )
