@@ -232,8 +232,8 @@ class SensorArray:
             object.__setattr__(self, "ambient_T", tuple(_finite("ambient_T", self.ambient_T, (3,)).tolist()))
         if self.ambient_gradient_T_m is not None:
             object.__setattr__(self, "ambient_gradient_T_m", _gradient_tensor(self.ambient_gradient_T_m))
-        if not self.sensors:  # one alone is for calibration only
-            raise ValueError("Input sensors must be at least 2; instead received 0.")
+        if not self.sensors:
+            raise ValueError("Input sensors must be at least 1; instead received 0.")
         _check_distinct_names(self)
         if self.n_sensors > 1 and self.circumradius <= _SAME_PLACE_RTOL * np.abs(self.positions).max():
             raise ValueError(

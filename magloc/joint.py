@@ -430,6 +430,10 @@ def _moved(
     longest = np.max(np.linalg.norm(along, axis=-1), axis=-1)
     share = np.minimum(1.0, _LARGEST_STEP_RAD / np.maximum(longest, 1e-300))
     moved = q + (tangent @ (share[:, None, None] * along)[..., None])[..., 0]
+    # A step along the tangents lengthens u a little: where the range is held, u keeps its length.
+    held = ~np.isin(3 * np.arange(n_sources) + 2, columns)
+    before, after = (np.linalg.norm(x[:, held, :3], axis=-1, keepdims=True) for x in (q, moved))
+    moved[:, held, :3] *= before / np.maximum(after, 1e-300)
     turned = step[:, columns.size :].reshape(n_fits, n_sources, 3)
     new_mu = mu + share[:, None, None] * turned
     norm = np.linalg.norm(moved, axis=-1, keepdims=True)

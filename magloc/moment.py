@@ -214,6 +214,8 @@ def _covariances(problem: JointProblem, y: FloatArray, fits: JointFits) -> Float
 
     Where two exact solutions are about to meet, the first derivative of the readings alone would say nothing.
     """
+    if not len(problem):
+        return np.empty((0, N_UNKNOWNS, N_UNKNOWNS))
     fields = problem.source_fields(fits.q, fits.mu)
     jacobian = problem.moment_jacobian(fits.q, problem.linear_gain(fields))
     information = jacobian.transpose(0, 2, 1) @ jacobian

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
+from scipy.special import chdtri, fdtri
 
 from arrays.sensor import SensorArray
 from magloc.fix import Fix, JointFix, JointSolution, Solution
@@ -31,6 +32,8 @@ _CREDIBLE = 0.999
 _SENSOR_FALSE_ALARM = 1e-3
 # Above this χ² per degree of freedom a bad sensor may have bent the fit so much that it does not stand out.
 _SPOILT = 4.0
+# Above this variance, in units of what is stated, the noise is taken to be larger than stated.
+_UNDERSTATED = 2.0
 _N_REWEIGHTINGS = 30
 _MOST_LEFT_OUT = 8
 _LEAST_WEIGHT = 1e-16
@@ -103,6 +106,11 @@ def _is_doubtful(fix: Fix | JointFix) -> bool:
     return not _is_credible(fix)
 
 
+def _explains(fix: Fix | JointFix) -> bool:
+    """Whether a fix is credible and might have been incredible."""
+    return bool(fix.solutions) and fix.solutions[0].dof > 0 and _is_credible(fix)
+
+
 def _is_credible(fix: Fix | JointFix) -> bool:
     best = fix.solutions[0]
     return best.dof <= 0 or bool(best.chi2 <= chdtri(best.dof, 1.0 - _CREDIBLE))
@@ -110,10 +118,10 @@ def _is_credible(fix: Fix | JointFix) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Start(Generic[AnyFix]):
-    """A fix to reweight from, and the sensor that it was made without."""
+    """A fix to reweight from, and the sensors that it was made without."""
 
     fix: AnyFix
-    without: int | None
+    without: frozenset[int]
 
 
 class _Examination(Generic[AnyFix]):
@@ -165,10 +173,14 @@ class _Examination(Generic[AnyFix]):
         suspected = self._suspected(plain)
         if not suspected.size:
             return found
-        starts = {int(row): [_Start(plain[row], None)] for row in suspected}
+        starts = {int(row): [_Start(plain[row], frozenset[int]())] for row in suspected}
         for sensor, rows in self._left_out(plain, suspected):
-            for row, fix in zip(rows.tolist(), self._without({sensor}, rows), strict=True):
-                starts[row].append(_Start(fix, sensor))
+            self._start_without(starts, frozenset({sensor}), rows)
+        unexplained = [row for row, tried in starts.items() if not any(_explains(start.fix) for start in tried)]
+        for sensors in self._all_left_out():
+            rows = np.array([r for r in unexplained if all(start.without != sensors for start in starts[r])], np.intp)
+            if rows.size:
+                self._start_without(starts, sensors, rows)
         standing_out = self._standing_out(starts)
         for dropped in set(standing_out.values()) - {frozenset()}:
             rows = np.array([row for row, sensors in standing_out.items() if sensors == dropped], dtype=np.intp)
@@ -224,6 +236,18 @@ class _Examination(Generic[AnyFix]):
                 chosen.setdefault(int(sensor), []).append(row)
         return [(sensor, np.array(of_sensor, dtype=np.intp)) for sensor, of_sensor in sorted(chosen.items())]
 
+    def _all_left_out(self) -> list[frozenset[int]]:
+        """What to leave out where nothing has helped: every sensor, and of a small array every two."""
+        standing = np.flatnonzero(self.count).tolist()
+        singles = [frozenset({sensor}) for sensor in standing]
+        if len(standing) > _MOST_LEFT_OUT:
+            return singles
+        return singles + [frozenset(pair) for pair in combinations(standing, 2)]
+
+    def _start_without(self, starts: dict[int, list[_Start[AnyFix]]], sensors: frozenset[int], rows: IntArray) -> None:
+        for row, fix in zip(rows.tolist(), self._without(sensors, rows), strict=True):
+            starts[row].append(_Start(fix, sensors))
+
     def _without(self, sensors: set[int] | frozenset[int], rows: IntArray) -> list[AnyFix]:
         readings = self.readings[rows].copy()
         readings[:, np.isin(self.array.channel_sensor, list(sensors))] = np.nan
@@ -261,9 +285,7 @@ class _Examination(Generic[AnyFix]):
             row = np.array([every[i][0] for i in index], dtype=np.intp)
             weight = np.ones((len(row), self.array.n_sensors))
             for f, i in enumerate(index):
-                without = every[i][1].without
-                if without is not None:
-                    weight[f, without] = _LEAST_WEIGHT
+                weight[f, list(every[i][1].without)] = _LEAST_WEIGHT
             misfit, scale2 = self._reweighted(row, q, mu, weight)
             score = 0.5 * np.sum(
                 (DEGREES_OF_FREEDOM + self.count) * np.log1p(misfit / scale2[:, None] / DEGREES_OF_FREEDOM), axis=1
@@ -271,10 +293,20 @@ class _Examination(Generic[AnyFix]):
             for f, r in enumerate(row.tolist()):
                 if score[f] < best[r]:
                     best[r] = score[f]
-                    out = np.flatnonzero(misfit[f] > self.limits * scale2[f])
+                    out = np.flatnonzero(misfit[f] > self._limits_of(float(scale2[f]), q.shape[1]) * scale2[f])
                     few = 2 * out.size < np.count_nonzero(self.count)
                     found[r] = frozenset(out.tolist()) if few else frozenset()
         return found
+
+    def _limits_of(self, scale2: float, n_sources: int) -> FloatArray:
+        """Limits (N,) of the squared residuals over the variance of the noise; wider where that is a guess."""
+        if scale2 < _UNDERSTATED:
+            return self.limits
+        count = np.maximum(self.count, 1)
+        # A median is about as good as the mean of half as many.
+        spare = 0.5 * max(2.0, self.count.sum() - 6.0 * n_sources - 6.0)
+        limits: FloatArray = count * fdtri(count, spare, 1.0 - _SENSOR_FALSE_ALARM / self.array.n_sensors)
+        return limits
 
     def _reweighted(
         self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray

@@ -109,10 +109,11 @@ def best_distinct(fits: JointFits, n_rows: int, width: int) -> Beam:
     for k in range(width):
         best = np.argmin(chi2, axis=1)
         value = chi2[rows, best]
-        if not np.isfinite(value).any():
+        fit = np.isfinite(value)
+        if not fit.any():
             break
-        kept.q[:, k], kept.mu[:, k], kept.chi2[:, k] = q[rows, best], mu[rows, best], value
-        kept.iterations[:, k] = iterations[rows, best]
+        kept.q[fit, k], kept.mu[fit, k], kept.chi2[fit, k] = q[rows, best][fit], mu[rows, best][fit], value[fit]
+        kept.iterations[fit, k] = iterations[rows, best][fit]
         with np.errstate(invalid="ignore"):
             same = np.abs(chi2 - value[:, None]) < _SAME_CHI2 * (1.0 + 1e-6 * value[:, None])
             same &= _same_sources(q, mu, kept.q[:, None, k], kept.mu[:, None, k])

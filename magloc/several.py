@@ -235,7 +235,9 @@ class _Levels:
         fixes = self._assembled(beams, level, wanted)
         if self.asked is None and self.most > 1:
             nothing = np.sum((self.y - self.problem.predicted(np.zeros_like(self.problem.ambient))) ** 2, axis=1)
-            for row in np.flatnonzero(nothing - beams[0].chi2[:, 0] <= threshold):
+            # Against the chosen number: a single source may have no fit where several ones stand out.
+            chosen = np.array([beams[n].chi2[row, 0] for row, n in enumerate(level)])
+            for row in np.flatnonzero(np.isfinite(chosen) & (nothing - chosen <= threshold)):
                 fixes[row] = JointFix((), "noise alone explains the readings: no source stands out of it")
         return fixes
 

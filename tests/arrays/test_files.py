@@ -455,7 +455,7 @@ class TestRefused:
             ("[[sensor]]", "saturation_nT = 5\n[[sensor]]", ("key saturation_nT", "found at the top")),
             ("[[sensor]]", "nmae = 'x'\n[[sensor]]", ("key nmae", "unknown key", "nearest is name")),
             (SENSORS, "name = 'x'", ("found neither the key geometry nor [[sensor]] tables",)),
-            (SENSORS, "sensor = []", ("sensors must be at least 2; instead received 0",)),
+            (SENSORS, "sensor = []", ("sensors must be at least 1; instead received 0",)),
             (SENSORS, "sensor = 5", ("key sensor", "found a whole number, expected a list")),
             (SENSORS, "sensor = [5, 6]", ("sensor number 1", "found a whole number, expected a table")),
             (SENSORS, "[sensor]\nid = 's1'", ("key sensor", "found a table, expected a list")),
