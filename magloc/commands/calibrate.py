@@ -110,7 +110,7 @@ def calibrate(
     from arrays.files import read_array, write_array
     from magloc.calibration import calibrate_on_path, self_calibrate
     from magloc.commands.calibrate_by_turning import calibrate_by_turning, check_folder
-    from magloc.readings import read_readings, read_truth
+    from magloc.readings import read_readings, read_truth, without_saturated
 
     if modulus_nT is not None:
         if truth is not None:
@@ -119,7 +119,7 @@ def calibrate(
         return
     nominal = read_array(array)
     prior = _prior(known, nominal, array)
-    rows = read_readings(readings, nominal)
+    rows = without_saturated(read_readings(readings, nominal), nominal)
     check_folder(out)
     if truth is None and height_m is not None:
         raise InputError("--height-m: found no --truth, expected it because the height is that of its path.")

@@ -11,7 +11,7 @@ from arrays.errors import InputError
 from arrays.files import read_sensors, write_array
 from magloc.commands.common import print_json, print_note
 from magloc.ellipsoid_calibration import EllipsoidCalibration, calibrated_in_modulus
-from magloc.readings import read_readings
+from magloc.readings import read_readings, without_saturated
 
 
 def check_folder(out: Path) -> None:
@@ -31,7 +31,7 @@ def calibrate_by_turning(readings: Path, array: Path, modulus_nT: float, out: Pa
     if not 0.0 < modulus_nT < np.inf:
         raise InputError(f"--modulus-nT: found {modulus_nT:g}, expected a positive number.")
     nominal = read_sensors(array)
-    rows = read_readings(readings, nominal)
+    rows = without_saturated(read_readings(readings, nominal), nominal)
     check_folder(out)
     try:
         calibrated, results = calibrated_in_modulus(nominal, rows.values_T, 1e-9 * modulus_nT)
