@@ -443,6 +443,8 @@ def _moved(
 def covariances(problem: JointProblem, fits: JointFits) -> FloatArray:
     """Inverse information of (p₁, m₁, p₂, m₂, …) of every fit: (b, 6 K, 6 K) [m, A·m²], NaN where it is singular."""
     n_fits, n_sources = fits.q.shape[:2]
+    if not n_fits:
+        return np.empty((0, 6 * n_sources, 6 * n_sources))
     s = fits.q[..., 3:]
     rho = np.concatenate([fits.q[..., :3] / s, np.ones_like(s)], axis=-1)
     mu = fits.mu / np.abs(s) ** 3

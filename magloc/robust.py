@@ -34,6 +34,8 @@ _SENSOR_FALSE_ALARM = 1e-3
 _SPOILT = 4.0
 # Above this variance, in units of what is stated, the noise is taken to be larger than stated.
 _UNDERSTATED = 2.0
+# Squared residuals, in limits, above which a larger one says nothing more.
+_BEYOND_DOUBT = 10.0
 _N_REWEIGHTINGS = 30
 _MOST_LEFT_OUT = 8
 _LEAST_WEIGHT = 1e-16
@@ -142,7 +144,7 @@ class _Examination(Generic[AnyFix]):
         self.problem, self.raw = joint_problem(array, mask, readings, whitenings_of(array, mask, readings), ambient)
         self.count = np.bincount(array.channel_sensor[mask], minlength=array.n_sensors)
         level = 1.0 - _SENSOR_FALSE_ALARM / array.n_sensors
-        self.limits = chdtri(np.maximum(self.count, 1), 1.0 - level)
+        self.limits = np.array(chdtri(np.maximum(self.count, 1), 1.0 - level), dtype=np.float64)
 
     def without_lonely_sources(self, plain: Sequence[AnyFix]) -> list[AnyFix]:
         """Fixes without sources that a single sensor sees: nothing tells such a source from a fault of the sensor."""
@@ -287,8 +289,10 @@ class _Examination(Generic[AnyFix]):
             for f, i in enumerate(index):
                 weight[f, list(every[i][1].without)] = _LEAST_WEIGHT
             misfit, scale2 = self._reweighted(row, q, mu, weight)
+            # Beyond doubt is beyond doubt: two sensors that are far off must not cost less than one that is farther.
+            bounded = np.minimum(misfit / scale2[:, None], _BEYOND_DOUBT * self.limits)
             score = 0.5 * np.sum(
-                (DEGREES_OF_FREEDOM + self.count) * np.log1p(misfit / scale2[:, None] / DEGREES_OF_FREEDOM), axis=1
+                (DEGREES_OF_FREEDOM + self.count) * np.log1p(bounded / DEGREES_OF_FREEDOM), axis=1
             ) + 0.5 * self.count.sum() * np.log(scale2)
             for f, r in enumerate(row.tolist()):
                 if score[f] < best[r]:
@@ -305,8 +309,8 @@ class _Examination(Generic[AnyFix]):
         count = np.maximum(self.count, 1)
         # A median is about as good as the mean of half as many.
         spare = 0.5 * max(2.0, self.count.sum() - 6.0 * n_sources - 6.0)
-        limits: FloatArray = count * fdtri(count, spare, 1.0 - _SENSOR_FALSE_ALARM / self.array.n_sensors)
-        return limits
+        quantile: FloatArray = fdtri(count, spare, 1.0 - _SENSOR_FALSE_ALARM / self.array.n_sensors)
+        return np.array(count * quantile, dtype=np.float64)
 
     def _reweighted(
         self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray
