@@ -21,6 +21,8 @@ from magloc.commands.calibrate import calibrate
 from magloc.commands.common import CommonOptions, print_note
 from magloc.commands.locate import locate
 from magloc.commands.map import map_
+from magloc.commands.simulate import simulate
+from magloc.commands.track import track
 
 DONE = 0
 BAD_INPUT = 2
@@ -44,6 +46,8 @@ app = App(
 app.command(calibrate)
 app.command(locate)
 app.command(map_, name="map")
+app.command(track)
+app.command(simulate)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

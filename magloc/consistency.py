@@ -3,7 +3,7 @@ r"""How true a track is: its errors against what it claims, and against what is 
 The normalised estimation error squared, NEES, of an estimate of n numbers with covariance P is
 :math:`e^T P^{-1} e`; over independent rows its mean times their number is a χ² of n numbers each. The posterior
 Cramér-Rao bound is the least covariance that any filter can reach with a motion model, by the recursion of Tichavský,
-Muravchik and Nehorai (1998), for linear motion :math:`J_{j+1} = (Q + F J_j^{-1} F^T)^{-1} + H^T R^{-1} H` at the true state.
+Muravchik and Nehorai (1998), for linear motion :math:`J_{j+1} = (Q + F J_j^{-1} F^T)^{-1} + H^T R^{-1} H` at the truth.
 """
 
 from __future__ import annotations

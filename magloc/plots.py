@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 
 from magloc.convergence import Status, summary
 from magloc.cubes import MapSummary
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
+    from magloc.track import TrackPoint
+
+_TRACK_COLOURS = ("#0072b2", "#d55e00", "#009e73")
 _SLICES = (("x", "y", "z"), ("x", "z", "y"), ("y", "z", "x"))
 _NOT_CONVERGED = {
     Status.OTHER_OPTIMUM: ("#c8c8c8", "stopped elsewhere"),
@@ -116,6 +120,78 @@ def source_figure(dataset: xr.Dataset, counts: SourceMapSummary | None = None) -
         f"{counts.fraction:.2%} found, truth listed {counts.truth_listed:.2%}"
     )
     return figure
+
+
+def track_figure(points: Sequence[TrackPoint], truth_m: np.ndarray | None = None) -> Figure:
+    """A track from above with 95 % ellipses, its coordinates and its strength through time, and the innovations.
+
+    Parameters
+    ----------
+    points : sequence of TrackPoint
+    truth_m : ndarray, shape (n, 3), optional
+        True positions, NaN where they are not known.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    from magloc.consistency import mean_bounds
+
+    figure = Figure(figsize=(13.0, 7.4), layout="constrained")
+    grid = figure.add_gridspec(3, 2, width_ratios=[1.25, 1.0])
+    plan, coordinates = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])
+    strength = figure.add_subplot(grid[1, 1], sharex=coordinates)
+    innovations = figure.add_subplot(grid[2, 1], sharex=coordinates)
+    time = np.array([point.time_s for point in points])
+    position = np.array([np.full(3, np.nan) if p.position_m is None else p.position_m for p in points])
+    moment = np.array([np.full(3, np.nan) if p.moment_Am2 is None else p.moment_Am2 for p in points])
+    covariance = np.array([np.full((6, 6), np.nan) if p.covariance is None else p.covariance for p in points])
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    if truth_m is not None:
+        plan.plot(truth_m[:, 0], truth_m[:, 1], color="black", lw=1.0, label="truth")
+    plan.plot(position[:, 0], position[:, 1], color=_TRACK_COLOURS[0], lw=1.4, label="track")
+    tracked = np.flatnonzero(np.isfinite(position[:, 0]))
+    for i in tracked[:: max(1, len(tracked) // 40)]:
+        plan.add_patch(_ellipse(position[i, :2], covariance[i, :2, :2]))
+    plan.plot(0.0, 0.0, "^", color="white", mec="black", ms=9, label="origin of the frame")
+    plan.set_aspect("equal", adjustable="datalim")
+    plan.set_xlabel("x [m]")
+    plan.set_ylabel("y [m]")
+    plan.set_title("from above, 95 % ellipses", fontsize=10)
+    plan.legend(frameon=False, fontsize=9)
+    for i, (name, colour) in enumerate(zip("xyz", _TRACK_COLOURS, strict=True)):
+        coordinates.plot(time, position[:, i], color=colour, lw=1.2, label=name)
+        low, high = position[:, i] - 1.96 * sigma[:, i], position[:, i] + 1.96 * sigma[:, i]
+        coordinates.fill_between(time, low, high, color=colour, alpha=0.25, lw=0.0)
+        if truth_m is not None:
+            coordinates.plot(time, truth_m[:, i], color="black", lw=0.7)
+    coordinates.set_ylabel("position [m]")
+    coordinates.legend(frameon=False, fontsize=9, ncols=3)
+    strength.plot(time, np.linalg.norm(moment, axis=1), color=_TRACK_COLOURS[0], lw=1.2)
+    strength.set_ylabel("moment [A·m²]")
+    strength.set_ylim(bottom=0.0)
+    dof = np.array([max(point.nis_dof, 1) for point in points])
+    nis = np.array([point.nis for point in points]) / dof
+    innovations.plot(time, nis, ".", color=_TRACK_COLOURS[0], ms=4)
+    if np.isfinite(nis).any():
+        low, high = mean_bounds(int(np.median(dof)), 0.99)
+        innovations.axhspan(low, high, color="grey", alpha=0.2, label="99 % of a right filter's")
+        innovations.legend(frameon=False, fontsize=9)
+        innovations.set_ylim(0.0, max(1.5 * high, float(np.nanpercentile(nis, 99.0)) * 1.1))
+    innovations.set_ylabel("NIS / degrees of freedom")
+    innovations.set_xlabel("time [s]")
+    return figure
+
+
+def _ellipse(centre: np.ndarray, covariance: np.ndarray) -> Ellipse:
+    """95 % ellipse of two coordinates."""
+    values, vectors = np.linalg.eigh(covariance)
+    width, height = 2.0 * np.sqrt(np.clip(values, 0.0, None) * 5.991464547107979)
+    angle = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
+    return Ellipse(
+        (float(centre[0]), float(centre[1])), float(width), float(height), angle=angle, fill=False,
+        edgecolor=_TRACK_COLOURS[1], lw=0.7,
+    )  # fmt: skip
 
 
 def _slices(dataset: xr.Dataset, through: np.ndarray) -> list[xr.Dataset]:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from arrays.errors import InputError
 from arrays.sensor import AMBIENT_CHANNELS, Sensor, SensorArray
 from arrays.toml import write_text
-from magloc.tables import Table, read_table
+from magloc.tables import Table, read_table, table_of_text
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -134,7 +134,39 @@ def read_readings(path: str | PathLike[str], array: SensorArray, *, sensors: Seq
     InputError
         The file cannot be read, or is not a readings file of this array.
     """
-    table = read_table(path, "a header with time_s and the sensors' columns")
+    return _readings_of_table(read_table(path, "a header with time_s and the sensors' columns"), array, sensors)
+
+
+def readings_of_text(
+    text: str, name: str, array: SensorArray, *, sensors: Sequence[str] | None = None, first_line: int = 2
+) -> Readings:
+    """Readings as :func:`read_readings`, from CSV text.
+
+    Parameters
+    ----------
+    text : str
+        Header and rows.
+    name : str
+        What the text is called in errors.
+    array, sensors
+        As in :func:`read_readings`.
+    first_line : int
+        Line number of the first row, for errors.
+
+    Returns
+    -------
+    Readings
+
+    Raises
+    ------
+    InputError
+        The text is not that of a readings file of this array.
+    """
+    table = table_of_text(text, name, "a header with time_s and the sensors' columns", first_line=first_line)
+    return _readings_of_table(table, array, sensors)
+
+
+def _readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] | None) -> Readings:
     if sensors is not None:
         array = array.subset(sensors)
     channels = [f"{name}_nT" for name in array.channel_names]

@@ -43,7 +43,7 @@ class Beam:
     q : ndarray, shape (b, w, K, 4)
     mu : ndarray, shape (b, w, K, 3)
     chi2 : ndarray, shape (b, w)
-        Infinite where there is no such fit.
+        Infinite where there is no such fit; the first is then one that did not converge or is not allowed.
     iterations : ndarray of int, shape (b, w)
     """
 
@@ -109,7 +109,8 @@ def best_distinct(fits: JointFits, n_rows: int, width: int) -> Beam:
     for k in range(width):
         best = np.argmin(chi2, axis=1)
         value = chi2[rows, best]
-        fit = np.isfinite(value)
+        # A row without any fit keeps its first one, infinite χ² and all: the next source starts better beside it.
+        fit = np.isfinite(value) | (k == 0)
         if not fit.any():
             break
         kept.q[fit, k], kept.mu[fit, k], kept.chi2[fit, k] = q[rows, best][fit], mu[rows, best][fit], value[fit]

@@ -49,6 +49,9 @@ FALSE_ALARM = 1e-3
 _N_DRAWS = 5_000
 _MOST_RESTARTS = 20
 _ROWS_AT_ONCE = 64
+# Squares, in units of their covariance, of a moment that is hardly known and of an offset that hardly is one.
+_FAINT = 40.0
+_NEAR = 150.0
 _MOST_BY_ITSELF = 5
 
 
@@ -220,6 +223,7 @@ class _Levels:
             rows = rows if self.asked is not None else rows[gained]
             level[rows] = len(beams) - 1
         wanted = level.copy()
+        certain = np.zeros(len(self.y), dtype=bool)
         for n in range(len(beams) - 1, 0, -1):
             at = np.flatnonzero(level == n)
             if not at.size:
@@ -231,8 +235,10 @@ class _Levels:
                 fewer = self._restarted(at, fewer, rounds=2)
             beams[n - 1] = beams[n - 1].replaced(at, fewer)
             superfluous = fewer.chi2[:, 0] - beams[n].chi2[at, 0] <= threshold
-            level[at[superfluous]] = n - 1
-        fixes = self._assembled(beams, level, wanted)
+            unresolved = self._has_unresolved_pair(at, beams[n].rows(at))
+            level[at[superfluous | unresolved]] = n - 1
+            certain[at[unresolved & ~superfluous]] = True
+        fixes = self._assembled(beams, level, wanted, certain)
         if self.asked is None and self.most > 1:
             nothing = np.sum((self.y - self.problem.predicted(np.zeros_like(self.problem.ambient))) ** 2, axis=1)
             # Against the chosen number: a single source may have no fit where several ones stand out.
@@ -306,15 +312,40 @@ class _Levels:
         n_above = int(FALSE_ALARM * _N_DRAWS)
         return max(penalty, float(fall[-n_above - 1])) if fall.size > n_above else penalty
 
-    def _assembled(self, beams: list[Beam], level: IntArray, wanted: IntArray) -> list[JointFix]:
+    def _has_unresolved_pair(self, rows: IntArray, beam: Beam) -> NDArray[np.bool_]:
+        """Whether a source of the best fit is hardly known beside another one, so that other pairs would do as well.
+
+        Its moment is not far from nothing, and its place not far from the other's, both by their own covariance. In
+        such a fit χ² has curved valleys and several optima, and the covariance of one of them says far too little.
+        """
+        fits = JointFits(beam.q[:, 0], beam.mu[:, 0], beam.chi2[:, 0], beam.iterations[:, 0])
+        problem = self.problem.rows(rows)
+        covariance = covariances(problem, fits).reshape(len(rows), beam.n_sources, 6, beam.n_sources, 6)
+        position, moment = problem.position(fits.q), problem.moment(fits.q, fits.mu)
+        unresolved = np.asarray(~np.isfinite(covariance).all(axis=(1, 2, 3, 4)))
+        for i in range(beam.n_sources):
+            for j in range(beam.n_sources):
+                if i == j:
+                    continue
+                of_moment = covariance[:, i, 3:, i, 3:]
+                pair = [[covariance[:, a, :3, b, :3] for b in (i, j)] for a in (i, j)]
+                of_offset = pair[0][0] - pair[0][1] - pair[1][0] + pair[1][1]
+                faint = _squared_ratio(moment[:, i], of_moment) < _FAINT
+                near = _squared_ratio(position[:, i] - position[:, j], of_offset) < _NEAR
+                unresolved |= faint & near
+        return unresolved
+
+    def _assembled(
+        self, beams: list[Beam], level: IntArray, wanted: IntArray, certain: NDArray[np.bool_]
+    ) -> list[JointFix]:
         fixes: list[JointFix] = [JointFix(())] * len(level)
         for n, beam in enumerate(beams):
             rows = np.flatnonzero(level == n)
             if not rows.size:
                 continue
             for row, fix in zip(rows, self._solutions(rows, beam.rows(rows)), strict=True):
-                if wanted[row] > n and self.asked is not None and fix.solutions:
-                    fix = _marked_as_merged(fix, self.problem, beams[n + 1], int(row), self.asked)
+                if wanted[row] > n and fix.solutions and (self.asked is not None or certain[row]):
+                    fix = _marked_as_merged(fix, self.problem, beams[n + 1], int(row), self.asked, certain=certain[row])
                 fixes[row] = fix
         return fixes
 
@@ -382,11 +413,25 @@ def _why_unsolved(found: bool) -> str:
     return "the search did not converge to a solution within the known region and largest moment"
 
 
-def _marked_as_merged(fix: JointFix, problem: JointProblem, more: Beam, row: int, asked: int) -> JointFix:
+def _squared_ratio(values: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Squares of vectors (b, 3) in units of their covariance (b, 3, 3); 0 where that is not known."""
+    known = np.asarray(np.isfinite(covariance).all(axis=(1, 2)) & np.isfinite(values).all(axis=1))
+    scale = np.sqrt(np.abs(np.diagonal(covariance, axis1=1, axis2=2)))
+    safe = np.where(known[:, None], scale, 1.0)
+    correlation = np.where(known[:, None, None], covariance / (safe[:, :, None] * safe[:, None]), np.eye(3))
+    unit = np.where(known[:, None], values / safe, 0.0)
+    ratio: FloatArray = np.sum(unit * (np.linalg.pinv(correlation) @ unit[..., None])[..., 0], axis=-1)
+    return ratio
+
+
+def _marked_as_merged(
+    fix: JointFix, problem: JointProblem, more: Beam, row: int, asked: int | None, *, certain: bool
+) -> JointFix:
     """A fix with fewer sources than asked for: the source that stands for the closest pair of the larger fit."""
     best = fix.solutions[0]
     n = len(best.sources)
-    reason = f"the readings support {n} source{'s' if n > 1 else ''}, {asked} were asked for"
+    reason = f"the readings support {n} source{'s' if n > 1 else ''}"
+    reason += "" if asked is None else f", {asked} were asked for"
     if not np.isfinite(more.chi2[row, 0]):
         return replace(fix, reason=reason)
     position = problem.position(more.q[row, 0])
@@ -398,7 +443,7 @@ def _marked_as_merged(fix: JointFix, problem: JointProblem, more: Beam, row: int
     offsets = [np.linalg.norm(source.position_m - 0.5 * (position[i] + position[j])) for source in best.sources]
     nearest = int(np.argmin(offsets))
     stands_for_both = np.linalg.norm(together - best.sources[nearest].moment_Am2) < 0.5 * np.linalg.norm(together)
-    if not (stands_for_both and offsets[nearest] < 2.0 * distance[i, j]):
+    if not certain and not (stands_for_both and offsets[nearest] < 2.0 * distance[i, j]):
         return replace(fix, reason=reason)
     sources = tuple(replace(source, merged=k == nearest) for k, source in enumerate(best.sources))
     solutions = (replace(best, sources=sources), *fix.solutions[1:])

@@ -129,8 +129,32 @@ def read_table(path: str | PathLike[str], expected_header: str) -> Table:
     InputError
         The file cannot be read or is not such a table.
     """
-    name = str(path)
-    text = read_text(path, "a CSV file").replace("\r\n", "\n").replace("\r", "\n")
+    return table_of_text(read_text(path, "a CSV file"), str(path), expected_header)
+
+
+def table_of_text(text: str, name: str, expected_header: str, *, first_line: int | None = None) -> Table:
+    """Table as of :func:`read_table`, from text.
+
+    Parameters
+    ----------
+    text : str
+    name : str
+        What the text is called in errors.
+    expected_header : str
+        What the header should be, in words, for errors.
+    first_line : int, optional
+        Line number of the first row, where the text is a part of a longer one.
+
+    Returns
+    -------
+    Table
+
+    Raises
+    ------
+    InputError
+        The text is not such a table.
+    """
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
         raise InputError(f"{name}, line {line}: found a NUL byte, expected UTF-8 text.")
@@ -142,7 +166,9 @@ def read_table(path: str | PathLike[str], expected_header: str) -> Table:
     # float() would also take 1_000 and digits of other scripts: only text without them may go through it directly.
     read = float if text.isascii() and "_" not in text[text.find("\n") :] else _number
     values, line_numbers = packed("d"), packed("q")
-    for line, cells in rows:
+    shift = 0 if first_line is None else first_line - header_line - 1
+    for row_line, cells in rows:
+        line = row_line + shift
         if len(cells) != len(header):
             raise InputError(f"{name}, line {line}: found {len(cells)} cells, expected {len(header)} as in the header.")
         try:

@@ -98,13 +98,13 @@ def locate(
 
     ids = None if sensors is None else [name.strip() for name in sensors.split(",")]
     where = place_of_options(place, date, geomagnetic_model)
-    knowledge, n_sources = _knowledge(region, max_moment_Am2), _n_sources(sources)
+    knowledge, n_sources = knowledge_of(region, max_moment_Am2), _n_sources(sources)
     if body_length_m is not None and not body_length_m > 0.0:
         raise InputError(f"--body-length-m: found {body_length_m:g}, expected a positive length.")
     if position is not None and (sources is not None or region is not None):
         other = "--sources" if sources is not None else "--region"
         raise InputError(f"--position: found it together with {other}, expected one of them.")
-    used = _subset(read_array(array), ids, array)
+    used = subset_of(read_array(array), ids, array)
     measured = read_readings(readings, used, sensors=ids)
     rows = without_saturated(measured, used)
     if average:
@@ -137,7 +137,7 @@ def locate(
     warn_of(fixes, saturated, near, quiet=common.quiet)
 
 
-def _subset(array: SensorArray, ids: Sequence[str] | None, path: Path) -> SensorArray:
+def subset_of(array: SensorArray, ids: Sequence[str] | None, path: Path) -> SensorArray:
     """The sensors of an array that the fixes use."""
     if ids is None:
         return array
@@ -177,7 +177,7 @@ def _advice(sentence: str, array: SensorArray) -> str:
     return ""
 
 
-def _knowledge(region: str | None, largest_moment: float | None) -> Knowledge:
+def knowledge_of(region: str | None, largest_moment: float | None) -> Knowledge:
     """What the options say of the source."""
     from magloc.fix import Knowledge
 

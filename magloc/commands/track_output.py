@@ -1,0 +1,150 @@
+"""What a track looks like: JSON, table, GeoJSON, picture, and the report of its consistency."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.errors import InputError
+from magloc.consistency import Consistency
+from magloc.readings import Readings, Truth
+from magloc.track import TrackPoint
+
+if TYPE_CHECKING:
+    from magloc.commands.track import Vector
+
+FloatArray = NDArray[np.float64]
+
+_SAME_TIME_S = 1e-6
+
+
+def json_entry(point: TrackPoint) -> dict[str, object]:
+    """What ``--json`` and ``--jsonl`` print of one row; null where the source is not tracked."""
+    tracked = point.position_m is not None
+    return {
+        "time_s": point.time_s,
+        "position_m": point.position_m,
+        "moment_Am2": point.moment_Am2,
+        "covariance": point.covariance,
+        "estimability": point.estimability,
+        "iterations": point.iterations if tracked else None,
+        "nis": point.nis,
+        "nis_dof": point.nis_dof,
+        "status": point.status,
+    }
+
+
+def track_table(points: Sequence[TrackPoint]) -> list[str]:
+    """Aligned lines: a header, then one for every row."""
+    header = ["time_s", "x_m", "y_m", "z_m", "s_x_m", "s_y_m", "s_z_m", "m_Am2", "nis", "status"]
+    rows = [header]
+    for point in points:
+        if point.position_m is None or point.moment_Am2 is None or point.covariance is None:
+            rows.append([f"{point.time_s:.10g}", *["-"] * 8, point.status])
+            continue
+        deviations = np.sqrt(np.diagonal(point.covariance)[:3])
+        rows.append(
+            [
+                f"{point.time_s:.10g}",
+                *(f"{value:.3f}" for value in point.position_m),
+                *(f"{value:.2g}" for value in deviations),
+                f"{np.linalg.norm(point.moment_Am2):.4g}",
+                f"{point.nis:.1f}/{point.nis_dof}" if np.isfinite(point.nis) else "-",
+                point.status,
+            ]
+        )
+    widths = [max(len(row[i]) for row in rows) for i in range(len(header) - 1)]
+    return [
+        "  ".join([*(cell.rjust(width) for cell, width in zip(row, widths, strict=False)), row[-1]]) for row in rows
+    ]
+
+
+def report(result: Consistency) -> list[str]:
+    """Errors against the truth, and what they should be."""
+    lines = [
+        f"against the truth, {result.tracked_rows} of {result.rows} rows tracked:",
+        f"  position rms {result.position_rms_m:.4g} m",
+    ]
+    if np.isfinite(result.position_bound_m):
+        ratio = result.position_rms_m / result.position_bound_m
+        lines[-1] += f", least possible {result.position_bound_m:.4g} m (posterior Cramér-Rao bound), ratio {ratio:.2f}"
+    for name, value, (low, high) in (
+        ("NEES", result.nees_per_dimension, result.nees_bounds),
+        ("NIS", result.nis_per_dimension, result.nis_bounds),
+    ):
+        lines.append(f"  {name} per dimension {value:.3f}, 99 % bounds for independent rows {low:.3f} to {high:.3f}")
+    return lines
+
+
+def truth_of_rows(readings: Readings, truth: Truth, path: Path) -> tuple[FloatArray, FloatArray | None]:
+    """True position, and moment if it is known, of every row (n, 3); NaN where the truth has no row of that time."""
+    order = np.argsort(truth.time_s, kind="stable")
+    times = truth.time_s[order]
+    after = np.clip(np.searchsorted(times, readings.time_s), 1, max(1, len(times) - 1))
+    candidates = np.stack([after - 1, np.minimum(after, len(times) - 1)])
+    off = np.abs(times[candidates] - readings.time_s)
+    nearest = np.take_along_axis(candidates, np.argmin(off, axis=0)[None], axis=0)[0]
+    same = off.min(axis=0) <= _SAME_TIME_S
+    if not same.any():
+        raise InputError(f"{path}: found none of the times of the readings, expected rows with the same time_s.")
+    position = np.where(same[:, None], truth.position_m[order][nearest], np.nan)
+    if truth.moment_Am2 is None:
+        return position, None
+    return position, np.where(same[:, None], truth.moment_Am2[order][nearest], np.nan)
+
+
+def geojson_text(points: Sequence[TrackPoint], origin: Vector) -> str:
+    """A GeoJSON feature collection: the track as a line for every unbroken part, and every row as a point.
+
+    Parameters
+    ----------
+    points : sequence of TrackPoint
+        In east, north, up from the origin [m].
+    origin : tuple of 3 floats
+        Latitude, longitude [deg] and height [m] of the origin.
+
+    Returns
+    -------
+    str
+        Coordinates are longitude, latitude [deg] and height above the ellipsoid [m], as RFC 7946 has them.
+    """
+    from pymap3d import enu2geodetic
+
+    features: list[dict[str, object]] = []
+    line: list[list[float]] = []
+    lines: list[list[list[float]]] = []
+    for point in points:
+        if point.position_m is None or point.covariance is None:
+            line = []
+            continue
+        latitude, longitude, height = enu2geodetic(*point.position_m.tolist(), *origin)
+        place = [float(longitude), float(latitude), float(height)]
+        if not line:
+            line = []
+            lines.append(line)
+        line.append(place)
+        deviations = np.sqrt(np.diagonal(point.covariance)[:3])
+        features.append(
+            {
+                "type": "Feature",
+                "geometry": {"type": "Point", "coordinates": place},
+                "properties": {
+                    "time_s": point.time_s,
+                    "sigma_east_m": float(deviations[0]),
+                    "sigma_north_m": float(deviations[1]),
+                    "sigma_up_m": float(deviations[2]),
+                    "moment_Am2": None if point.moment_Am2 is None else point.moment_Am2.tolist(),
+                    "status": point.status,
+                },
+            }
+        )
+    for part in lines:
+        if len(part) > 1:
+            geometry = {"type": "LineString", "coordinates": part}
+            features.insert(0, {"type": "Feature", "geometry": geometry, "properties": {"name": "track"}})
+    return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"

@@ -1,0 +1,154 @@
+r"""Random processes of a simulation, each from a stream of its own.
+
+Noise of a sensor has the one-sided spectral density
+
+.. math:: S(f) = N² (1 + f_c/f) / (1 + (f/f_b)²)
+
+white above the corner frequency f_c, 1/f below it, and limited by the sensor's first-order low-pass of bandwidth f_b.
+It is made by shaping the discrete Fourier transform of white normal numbers, of a record twice as long as needed, so
+that its end does not know its beginning. There is nothing at zero frequency, nor below 1/(2·duration): a constant is no
+noise.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.signal import lfilter
+
+FloatArray = NDArray[np.float64]
+
+HOUR_S = 3600.0
+
+
+def stream(seed: int, feature: str, owner: str = "") -> np.random.Generator:
+    """Random numbers of one feature of one sensor, source or carrier.
+
+    Parameters
+    ----------
+    seed : int
+        Of the simulation.
+    feature : str
+        What they are for, such as ``"noise"``.
+    owner : str
+        Whose they are, such as a sensor's id.
+
+    Returns
+    -------
+    numpy.random.Generator
+        Independent of that of any other name: leaving out a feature or a sensor changes no other one.
+    """
+    key = (zlib.crc32(feature.encode()), zlib.crc32(owner.encode()))
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
+
+
+def coloured_noise(
+    n: int,
+    channels: int,
+    rate_Hz: float,
+    density: float,
+    corner_Hz: float,
+    bandwidth_Hz: float,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Noise with a white and a 1/f part behind a first-order low-pass.
+
+    Parameters
+    ----------
+    n, channels : int
+        Samples, and independent channels.
+    rate_Hz : float
+        Sampling rate.
+    density : float
+        N, square root of the one-sided spectral density of the white part [unit/√Hz].
+    corner_Hz : float
+        f_c, where both parts are equal; 0 = none.
+    bandwidth_Hz : float
+        f_b, infinite = none.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    ndarray, shape (n, channels)
+        [unit]
+    """
+    white = rng.standard_normal((2 * n, channels)) * (density * math.sqrt(rate_Hz / 2.0))
+    if corner_Hz == 0.0 and math.isinf(bandwidth_Hz):
+        return white[:n]
+    f = fft.rfftfreq(2 * n, 1.0 / rate_Hz)
+    shape = np.zeros_like(f)
+    shape[1:] = np.sqrt((1.0 + corner_Hz / f[1:]) / (1.0 + (f[1:] / bandwidth_Hz) ** 2))
+    result: FloatArray = fft.irfft(fft.rfft(white, axis=0) * shape[:, None], 2 * n, axis=0)[:n]
+    return result
+
+
+def white_sigma(rate_Hz: float, density: float, bandwidth_Hz: float) -> float:
+    r"""Standard deviation of the white part of :func:`coloured_noise` in one sample.
+
+    :math:`σ² = N² ∫_0^{f_s/2} df/(1 + (f/f_b)²) = N² f_b \arctan(f_s/(2 f_b))`.
+
+    Parameters
+    ----------
+    rate_Hz, density, bandwidth_Hz : float
+        As there.
+
+    Returns
+    -------
+    float
+        [unit]
+    """
+    nyquist = rate_Hz / 2.0
+    band = nyquist if math.isinf(bandwidth_Hz) else bandwidth_Hz * math.atan(nyquist / bandwidth_Hz)
+    return density * math.sqrt(band)
+
+
+def random_walk(n: int, channels: int, rate_Hz: float, per_root_hour: float, rng: np.random.Generator) -> FloatArray:
+    """Drift that starts at zero and whose variance grows by ``per_root_hour²`` in an hour.
+
+    Parameters
+    ----------
+    n, channels : int
+        Samples, and independent channels.
+    rate_Hz : float
+        Sampling rate.
+    per_root_hour : float
+        [unit/√h]
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    ndarray, shape (n, channels)
+        [unit]
+    """
+    steps = rng.standard_normal((n, channels)) * (per_root_hour / math.sqrt(HOUR_S * rate_Hz))
+    steps[0] = 0.0
+    return np.cumsum(steps, axis=0)
+
+
+def low_passed(values: FloatArray, rate_Hz: float, bandwidth_Hz: float) -> FloatArray:
+    """What a first-order low-pass makes of a signal that is linear between its samples and constant before them.
+
+    Parameters
+    ----------
+    values : ndarray, shape (n, channels)
+    rate_Hz : float
+        Sampling rate.
+    bandwidth_Hz : float
+        Where the amplitude has fallen by 3 dB; infinite = no filter.
+
+    Returns
+    -------
+    ndarray, shape (n, channels)
+    """
+    if math.isinf(bandwidth_Hz):
+        return values
+    step = 2.0 * math.pi * bandwidth_Hz / rate_Hz  # in time constants
+    decay = math.exp(-step)
+    mean = -math.expm1(-step) / step
+    rest = mean * values[:1]  # the filter's state after a long time at the first value
+    result: FloatArray = lfilter([1.0 - mean, mean - decay], [1.0, -decay], values, axis=0, zi=rest)[0]
+    return result
