@@ -126,7 +126,8 @@ class IteratedUpdate:
     innovation : ndarray, shape (k,)
         Measured minus predicted at the predicted state.
     nis : float
-        Normalised innovation squared of the first linearisation.
+        Normalised innovation squared, of the last linearisation: where the iteration converged it is the smallest sum
+        of squares of residual and correction in units of their noise, a χ² of k numbers for curved measurements too.
     """
 
     x: FloatArray
@@ -180,21 +181,17 @@ def iterated_update(
     """
     x_k, predicted = x, Hx(x)
     innovation = z - predicted
-    nis = np.nan
-    S_k = S
-    for iteration in range(1, max_iterations + 1):
+    S_k, H, linearised = S, np.zeros((len(z), len(x))), innovation
+    iteration, change = 0, np.inf
+    while iteration < max_iterations and np.isfinite(predicted).all() and not change < tolerance:
+        iteration += 1
         H = HJacobian(x_k)
-        if iteration == 1:
-            nis = _normalised_innovation_squared(S, H, innovation, variance)
-        x_next, S_k = sequential_update(x, S, H, z - predicted - H @ (x - x_k), variance)
-        predicted_next = Hx(x_next)
-        change = float(np.linalg.norm(predicted_next - predicted))
-        x_k, predicted = x_next, predicted_next
-        if not np.isfinite(change):
-            return IteratedUpdate(x_k, S_k, iteration, False, innovation, nis)
-        if change < tolerance:
-            return IteratedUpdate(x_k, S_k, iteration, True, innovation, nis)
-    return IteratedUpdate(x_k, S_k, max_iterations, False, innovation, nis)
+        linearised = z - predicted - H @ (x - x_k)
+        x_k, S_k = sequential_update(x, S, H, linearised, variance)
+        before, predicted = predicted, Hx(x_k)
+        change = float(np.linalg.norm(predicted - before))
+    nis = _normalised_innovation_squared(S, H, linearised, variance)
+    return IteratedUpdate(x_k, S_k, iteration, change < tolerance, innovation, nis)
 
 
 def _normalised_innovation_squared(S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray) -> float:

@@ -147,45 +147,68 @@ class UnknownMotion:
 
 
 @dataclass(frozen=True)
-class WanderingVelocity:
-    r"""Position, moment, velocity and moment rate: both rates wander about zero, and are forgotten in time.
+class WanderingMotion:
+    r"""Position, and a moment that turns: speed and turn rate wander about zero, and are forgotten in time.
 
-    Each rate is :math:`\dot v = -v/τ + w`, with the white noise w that keeps its standard deviation at the
-    characteristic speed V, for the moment at |m| W; with τ towards infinity a constant velocity. State (p, m, v, ṁ),
-    discretised after van Loan.
+    State (p, m, v, ω), with
+
+    .. math:: \dot p = v, \quad \dot m = ω × m, \quad \dot v = -v/τ + w_v, \quad \dot ω = -ω/τ + w_ω
+
+    and white noises that keep the standard deviations of v and ω at the characteristic speed V and rate W; with τ
+    towards
+    infinity a constant velocity and turn. Discretised after van Loan.
 
     Attributes
     ----------
     speed_m_s, turn_rad_s : float
         Characteristic speed V and rate W, along and about each axis.
-    correlation_s : float
-        Correlation time τ.
+    correlation_s : float, optional
+        Correlation time τ; by default 1/W, the time in which a course changes that turns at the rate W.
+    moment_change : float
+        How much the moment changes otherwise, relative to its modulus, in the root of a second [1/√s].
     """
 
     speed_m_s: float
     turn_rad_s: float
-    correlation_s: float = 20.0
+    correlation_s: float | None = None
+    moment_change: float = 3e-3
     n_states: int = 12
 
     def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As :class:`MotionModel`."""
-        strength = float(np.linalg.norm(source[3:]))
-        return _without_rest(source, S, np.repeat([self.speed_m_s, strength * self.turn_rad_s], 3))
-
-    def linear_step(self, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """As :class:`LinearMotion`."""
-        a, b, root = _wandering_step(self.correlation_s, dt_s)
-        F = np.eye(12)
-        first, rest = np.arange(6), np.arange(6, 12)
-        F[first, rest], F[rest, rest] = a, b
-        of_unit_rate = np.kron(root, np.eye(6))
-        of_position = of_unit_rate * np.tile(np.repeat([self.speed_m_s, 0.0], 3), 2)
-        of_moment = of_unit_rate * np.tile(np.repeat([0.0, self.turn_rad_s], 3), 2)
-        return F, of_position, of_moment
+        return _without_rest(source, S, np.repeat([self.speed_m_s, self.turn_rad_s], 3))
 
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """As :class:`MotionModel`."""
-        return _stepped(self, x, dt_s)
+        correlation_s = 1.0 / self.turn_rad_s if self.correlation_s is None else self.correlation_s
+        moved, kept, root = _wandering_step(correlation_s, dt_s)
+        p, m, v, rate = x[:3], x[3:6], x[6:9], x[9:]
+        turn = rotation_matrix(moved * rate)
+        turned = turn @ m
+        by_rate = -cross_matrix(turned)
+        F = np.eye(12)
+        F[:3, 6:9] = moved * np.eye(3)
+        F[3:6, 3:6], F[3:6, 9:] = turn, moved * by_rate
+        F[6:, 6:] = kept * np.eye(6)
+        S_q = np.zeros((12, 15))
+        of_speed, of_rate = self.speed_m_s * np.eye(3), self.turn_rad_s * np.eye(3)
+        S_q[:3, :3], S_q[6:9, :3], S_q[6:9, 6:9] = root[0, 0] * of_speed, root[1, 0] * of_speed, root[1, 1] * of_speed
+        S_q[3:6, 3:6] = root[0, 0] * self.turn_rad_s * by_rate
+        S_q[9:, 3:6], S_q[9:, 9:12] = root[1, 0] * of_rate, root[1, 1] * of_rate
+        S_q[3:6, 12:] = self.moment_change * math.sqrt(dt_s * float(m @ m)) * np.eye(3)
+        return np.concatenate([p + moved * v, turned, kept * v, kept * rate]), F, S_q
+
+
+def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
+    """Rotation (3, 3) by a vector (3,), by Rodrigues' formula [rad]."""
+    angle = math.sqrt(float(rotation_vector @ rotation_vector))
+    K = cross_matrix(rotation_vector)
+    # sin(a)/a and (1 - cos(a))/a², without cancelling.
+    first = math.sin(angle) / angle if angle > 1e-8 else 1.0
+    half = 0.5 * angle
+    second = 0.5 * (math.sin(half) / half) ** 2 if angle > 1e-8 else 0.5
+    matrix: FloatArray = np.eye(3) + first * K + second * (K @ K)
+    return matrix
 
 
 @lru_cache(maxsize=64)

@@ -10,6 +10,7 @@ This module is the readable form; :mod:`magloc.kernels.tracks` steps long record
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -28,17 +29,26 @@ from magloc.locate import Locator
 from magloc.measurement import DifferenceMeasurement
 from magloc.motion import N_SOURCE, LinearMotion, MotionModel
 from magloc.rows import ambient_fields
+from magloc.stacked import stacked_fix
 
 FloatArray = NDArray[np.float64]
 
 # Probability under noise below which a row contradicts the track, and how many such rows in a row end it.
 _CONTRADICTION = 1e-6
 _ROWS_TO_LOSE = 3
-# A track whose range is less certain than this is no track.
-_LARGEST_RANGE_ERROR = 0.5
-# A start needs a fix whose range is known this well, and after a gap a prediction worse than this is not refined.
-_START_RANGE_ERROR = 0.25
+# Standard deviation of the range over the range: a fix must be as certain as the first to start a track, because beyond
+# it the posterior is no Gaussian in Cartesian coordinates; a prediction that is less certain than the second is
+# replaced by a fix, if there is one; a track that is less certain than the third is lost.
+_START_RANGE_ERROR = 0.05
+_REFIX_RANGE_ERROR = 0.15
+_LARGEST_RANGE_ERROR = 0.4
 _MOST_ITERATIONS = 50
+# Another solution within this Δχ² forbids a start.
+_RIVAL_WITHIN = 9.0
+# Rows of a moving array that together may determine a source at rest: how far back, how many, how often it is tried.
+_WINDOW_ROWS = 64
+_STACKED_ROWS = 16
+_TRY_EVERY = 4
 # Stop of the iteration, in standard deviations of the differences: equation (19).
 _TOLERANCE = 1e-4
 _STATUS = {kernels.TRACKED: "tracked", kernels.PREDICTED: "predicted", kernels.OUTLIER: "outlier"}
@@ -155,9 +165,12 @@ class Tracker:
         self.motion = motion
         known = Knowledge() if knowledge is None else knowledge
         scalar = bool(array.channel_is_scalar.any())
-        self._locator: Locator | ExactLocator = (
-            ExactLocator(array, knowledge=known) if scalar else Locator(array, knowledge=known)
-        )
+        self._locator: Locator | ExactLocator | None = None
+        if decorrelated_differences(array).n_differences >= N_SOURCE:
+            self._locator = ExactLocator(array, knowledge=known) if scalar else Locator(array, knowledge=known)
+        self._knowledge = known
+        self._recent: deque[Row] = deque(maxlen=_WINDOW_ROWS)
+        self._rows_untracked = 0
         self._differences: dict[bytes, Differences] = {}
         self._x: FloatArray | None = None
         self._S: FloatArray = np.zeros((0, 0))
@@ -196,7 +209,7 @@ class Tracker:
         differences = self.differences_of(row)
         if not differences.n_differences:
             return self._kept(row, index, x, S, prediction, status="predicted")
-        if self._range_error(x, S, row) > _START_RANGE_ERROR:
+        if self._range_error(x, S, row) > _REFIX_RANGE_ERROR:
             # The prediction says too little for an iteration to start from it.
             self._x = None
             point = self._acquired(row, index, near=(x, S))
@@ -292,15 +305,20 @@ class Tracker:
 
     def _acquired(self, row: Row, index: int, near: tuple[FloatArray, FloatArray] | None = None) -> TrackPoint:
         """A new track from the fix of one row, if its range is known."""
-        ambient = None if row.ambient_T is None else row.ambient_T[None]
-        (fix,) = self._locator.fit_rows(row.readings_T[None], ambient)
-        solution, reason = _start(fix, row, near)
+        solution, reason = None, "not acquired: one row does not determine the source"
+        if self._locator is not None:
+            ambient = None if row.ambient_T is None else row.ambient_T[None]
+            (fix,) = self._locator.fit_rows(row.readings_T[None], ambient)
+            centroid = row.origin_m + row.R_world_from_array @ self.array.centroid
+            solution, reason = _start(_in_world(fix, row), centroid, near)
+        if solution is None:
+            solution = self._start_from_recent(row)
         if solution is None:
             return TrackPoint(row.time_s, status=reason)
-        R6 = np.kron(np.eye(2), row.R_world_from_array)
-        source = R6 @ np.concatenate([solution.position_m, solution.moment_Am2])
-        source[:3] += row.origin_m
-        covariance = R6 @ solution.covariance @ R6.T
+        source = np.concatenate([solution.position_m, solution.moment_Am2])
+        covariance = solution.covariance
+        self._recent.clear()
+        self._rows_untracked = 0
         self._x, self._S = self.motion.start(source, symmetric_square_root(covariance))
         self._contradictions = 0
         if self.keep_steps:
@@ -314,6 +332,26 @@ class Tracker:
             solution.iterations,
             status="acquired",
         )
+
+    def _start_from_recent(self, row: Row) -> Solution | None:
+        """A source at rest that the latest rows of a moving array determine together."""
+        self._recent.append(row)
+        self._rows_untracked += 1
+        origins = np.stack([recent.origin_m for recent in self._recent])
+        moved = np.ptp(origins, axis=0).max() > self.array.circumradius
+        if self._rows_untracked % _TRY_EVERY or not moved:
+            return None
+        chosen = list(self._recent)[:: -max(1, len(self._recent) // _STACKED_ROWS)]
+        known = [recent.ambient_T for recent in chosen if recent.ambient_T is not None]
+        fix = stacked_fix(
+            self.array,
+            np.stack([recent.readings_T for recent in chosen]),
+            np.stack([recent.origin_m for recent in chosen]),
+            np.stack([recent.R_world_from_array for recent in chosen]),
+            np.stack(known) if len(known) == len(chosen) else None,
+        )
+        centroid = row.origin_m + row.R_world_from_array @ self.array.centroid
+        return _start(fix, centroid, None)[0]
 
     def _range_error(self, x: FloatArray, S: FloatArray, row: Row) -> float:
         """Standard deviation of the range over the range."""
@@ -341,15 +379,30 @@ class Tracker:
         return self._differences[key]
 
 
-def _start(fix: Fix, row: Row, near: tuple[FloatArray, FloatArray] | None) -> tuple[Solution | None, str]:
-    """The solution that a track starts from, or why there is none."""
+def _in_world(fix: Fix, row: Row) -> Fix:
+    """A fix of one row in the world frame."""
+    R, R6 = row.R_world_from_array, np.kron(np.eye(2), row.R_world_from_array)
+    solutions = (
+        replace(
+            solution,
+            position_m=row.origin_m + R @ solution.position_m,
+            moment_Am2=R @ solution.moment_Am2,
+            covariance=R6 @ solution.covariance @ R6.T,
+        )
+        for solution in fix.solutions
+    )
+    return replace(fix, solutions=tuple(solutions))
+
+
+def _start(fix: Fix, centroid: FloatArray, near: tuple[FloatArray, FloatArray] | None) -> tuple[Solution | None, str]:
+    """The solution that a track starts from, the nearest one to a prediction, or why there is none."""
     if not fix.solutions:
-        return None, fix.reason
+        return None, f"not acquired: {fix.reason}"
     solutions = fix.solutions
     if near is not None:
         x, S = near
         inverse = np.linalg.pinv(S[:3] @ S[:3].T)
-        offsets = [row.R_world_from_array @ s.position_m + row.origin_m - x[:3] for s in solutions]
+        offsets = [solution.position_m - x[:3] for solution in solutions]
         cost = [s.chi2 + float(o @ inverse @ o) for s, o in zip(solutions, offsets, strict=True)]
         solutions = tuple(solutions[i] for i in np.argsort(cost, kind="stable"))
     best = solutions[0]
@@ -357,8 +410,11 @@ def _start(fix: Fix, row: Row, near: tuple[FloatArray, FloatArray] | None) -> tu
         return None, "not acquired: no dipole fits the readings"
     if not best.range_observable:
         return None, "not acquired: the range is not observable"
-    rivals = [s for s in solutions[1:] if s.chi2 < best.chi2 + 9.0]
-    if rivals and near is None:
+    offset = best.position_m - centroid
+    variance = float(offset @ best.covariance[:3, :3] @ offset)
+    if math.sqrt(variance) > _START_RANGE_ERROR * float(offset @ offset):
+        return None, "not acquired: the range is not certain enough"
+    if near is None and any(solution.chi2 < best.chi2 + _RIVAL_WITHIN for solution in solutions[1:]):
         return None, "not acquired: several solutions fit alike"
     return best, ""
 
@@ -483,7 +539,7 @@ class _CompiledSteps:
             _TOLERANCE,
             _MOST_ITERATIONS,
             _ROWS_TO_LOSE,
-            _START_RANGE_ERROR,
+            _REFIX_RANGE_ERROR,
             _LARGEST_RANGE_ERROR,
             self.x,
             self.S,

@@ -41,16 +41,16 @@ class MotionOptions:
         Characteristic rate at which its moment turns.
     motion : {"unknown", "wandering", "turn"}
         unknown: position and moment are random walks, by the speed and the rate times the interval in every row.
-        wandering: speed and rate are estimated too, and forgotten in --correlation-s. turn: a steady turn about the
-        vertical. By default unknown, and with --smooth wandering.
+        wandering: speed and turn rate are estimated too, and forgotten in --correlation-s. turn: a steady turn about
+        the vertical. By default unknown, and with --smooth wandering.
     correlation_s : float
-        How long a speed lasts, for wandering.
+        How long a speed lasts, for wandering; by default as long as a turn at the characteristic rate.
     """
 
     speed_m_s: float = 0.5
     turn_deg_s: float = 5.0
     motion: Literal["unknown", "wandering", "turn"] | None = None
-    correlation_s: float = 20.0
+    correlation_s: float | None = None
 
 
 @Parameter(name="*", group="Conditioning of the readings")
@@ -214,18 +214,18 @@ def track(
 
 
 def _motion(options: MotionOptions, *, smooth: bool) -> MotionModel:
-    from magloc.motion import ConstantTurn, UnknownMotion, WanderingVelocity
+    from magloc.motion import ConstantTurn, UnknownMotion, WanderingMotion
 
     for name in ("speed_m_s", "turn_deg_s", "correlation_s"):
         value = getattr(options, name)
-        if not 0.0 < value < math.inf:
+        if value is not None and not 0.0 < value < math.inf:
             raise InputError(f"--{name.replace('_', '-')}: found {value:g}, expected a positive number.")
     turn = math.radians(options.turn_deg_s)
     name = options.motion or ("wandering" if smooth else "unknown")
     if name == "unknown":
         return UnknownMotion(options.speed_m_s, turn)
     if name == "wandering":
-        return WanderingVelocity(options.speed_m_s, turn, options.correlation_s)
+        return WanderingMotion(options.speed_m_s, turn, options.correlation_s)
     return ConstantTurn(options.speed_m_s, turn)
 
 

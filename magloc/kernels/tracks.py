@@ -248,9 +248,7 @@ def follow(
                     x_next[i] = predicted_x[i]
                     for c in range(n):
                         S_k[i, c] = predicted_S[i, c]
-                squares = _updated(x_next, S_k, H, innovation, phi)
-                if iterations == 1:
-                    nis = squares
+                nis = _updated(x_next, S_k, H, innovation, phi)
                 _predicted(
                     x_next, origins[row], rotations[row], ambients[a], positions, channel_sensor, channel_is_scalar,
                     gain, transforms[w], channels, slopes, predicted_next, H,
