@@ -12,6 +12,10 @@ from arrays.geometries import tetrahedron
 from magloc.convergence import IekfFilter, StartsScenario, simulated_measurement
 from magloc.kalman import IteratedExtendedKalmanFilter
 from magloc.measurement import DifferenceMeasurement
+from magloc.motion import UnknownMotion
+from magloc.track import Row as TrackRow
+from magloc.track import Tracker, rows_of, track_record
+from sims import read_scenario, simulate
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, installed, interleaved
 
@@ -36,6 +40,9 @@ def rows(size: Size) -> Iterator[Row]:
         "once": Contestant(our_step(measurement, z, x, 1)),
         "compiled": Contestant(lambda: method.run(measurement, z, starts), 1, len(starts) * ITERATIONS),
     }
+    record, tracker = track_of_weaving(size)
+    contestants["record"] = Contestant(lambda: track_record(tracker(), record), 1, len(record))
+    contestants["readable"] = Contestant(lambda: list(tracker().run(record)), 1, len(record))
     if installed("filterpy"):
         contestants["filterpy"] = Contestant(filterpy_step(measurement, z, x))
     if installed("stonesoup"):
@@ -48,6 +55,20 @@ def rows(size: Size) -> Iterator[Row]:
     compiled = "an iteration, compiled map kernel"
     yield Row(compiled, timings["compiled"], "Stone Soup iterated", timings.get("stonesoup iteration"))
     yield Row(compiled, timings["compiled"], "filterpy EKF", timings.get("filterpy"), "peer: one step")
+    note = "ours: iterated to convergence, gates, estimability, start"
+    for what, name in (("a row of a track, compiled", "record"), ("a row of a track, readable class", "readable")):
+        yield Row(what, timings[name], "Stone Soup iterated", timings.get("stonesoup"), note)
+        yield Row(what, timings[name], "filterpy EKF", timings.get("filterpy"), "peer: one linearisation")
+
+
+def track_of_weaving(size: Size) -> tuple[list[TrackRow], Callable[[], Tracker]]:
+    """Rows of the built-in scenario, repeated in time there and back, and what makes a fresh tracker for them."""
+    simulation = simulate(read_scenario("weaving"), seed=0)
+    readings = simulation.readings.values_T[60:260]  # where the range is certain
+    there_and_back = np.concatenate([readings, readings[::-1]])
+    values = np.tile(there_and_back, (max(1, size.rows // len(there_and_back)), 1))
+    record = list(rows_of(0.5 * np.arange(len(values)), values))
+    return record, lambda: Tracker(simulation.array, UnknownMotion(0.1, np.radians(1.2)))
 
 
 def functions(
