@@ -81,6 +81,10 @@ class MotionModel(Protocol):
     """What a tracker needs to know of the motion."""
 
     @property
+    def speed_m_s(self) -> float:
+        """Characteristic speed along each axis."""
+
+    @property
     def n_states(self) -> int:
         """Length of the state, of which the first six are position [m] and moment [A·m²]."""
 

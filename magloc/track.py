@@ -39,16 +39,20 @@ _ROWS_TO_LOSE = 3
 # Standard deviation of the range over the range: a fix must be as certain as the first to start a track, because beyond
 # it the posterior is no Gaussian in Cartesian coordinates; a prediction that is less certain than the second is
 # replaced by a fix, if there is one; a track that is less certain than the third is lost.
-_START_RANGE_ERROR = 0.05
+_START_RANGE_ERROR = 0.03
 _REFIX_RANGE_ERROR = 0.15
 _LARGEST_RANGE_ERROR = 0.4
 _MOST_ITERATIONS = 50
 # Another solution within this Δχ² forbids a start.
 _RIVAL_WITHIN = 9.0
-# Rows of a moving array that together may determine a source at rest: how far back, how many, how often it is tried.
+# Rows that together may determine a source at rest: how far back, how many, how often it is tried.
 _WINDOW_ROWS = 64
+# A source is as good as at rest while it moves by less than this share of its range.
+_AT_REST = 0.01
 _STACKED_ROWS = 16
 _TRY_EVERY = 4
+# Probability under noise below which two successive proposals for a start disagree.
+_DISAGREEMENT = 1e-3
 # Stop of the iteration, in standard deviations of the differences: equation (19).
 _TOLERANCE = 1e-4
 _STATUS = {kernels.TRACKED: "tracked", kernels.PREDICTED: "predicted", kernels.OUTLIER: "outlier"}
@@ -171,6 +175,7 @@ class Tracker:
         self._knowledge = known
         self._recent: deque[Row] = deque(maxlen=_WINDOW_ROWS)
         self._rows_untracked = 0
+        self._proposed: Solution | None = None
         self._differences: dict[bytes, Differences] = {}
         self._x: FloatArray | None = None
         self._S: FloatArray = np.zeros((0, 0))
@@ -305,20 +310,21 @@ class Tracker:
 
     def _acquired(self, row: Row, index: int, near: tuple[FloatArray, FloatArray] | None = None) -> TrackPoint:
         """A new track from the fix of one row, if its range is known."""
-        solution, reason = None, "not acquired: one row does not determine the source"
+        solution, reason, fix = None, "not acquired: one row does not determine the source", Fix(())
         if self._locator is not None:
             ambient = None if row.ambient_T is None else row.ambient_T[None]
             (fix,) = self._locator.fit_rows(row.readings_T[None], ambient)
             centroid = row.origin_m + row.R_world_from_array @ self.array.centroid
             solution, reason = _start(_in_world(fix, row), centroid, near)
         if solution is None:
-            solution = self._start_from_recent(row)
+            solution = self._start_from_recent(row, fix)
         if solution is None:
             return TrackPoint(row.time_s, status=reason)
         source = np.concatenate([solution.position_m, solution.moment_Am2])
         covariance = solution.covariance
         self._recent.clear()
         self._rows_untracked = 0
+        self._proposed = None
         self._x, self._S = self.motion.start(source, symmetric_square_root(covariance))
         self._contradictions = 0
         if self.keep_steps:
@@ -333,25 +339,38 @@ class Tracker:
             status="acquired",
         )
 
-    def _start_from_recent(self, row: Row) -> Solution | None:
-        """A source at rest that the latest rows of a moving array determine together."""
+    def _start_from_recent(self, row: Row, alone: Fix) -> Solution | None:
+        """A start from the latest rows together, while the source is as good as at rest in them.
+
+        That is a matter of its characteristic speed, and of how far away it is; where the array itself moves and one
+        row says nothing of that (`alone` is its fix), it is tried.
+        """
         self._recent.append(row)
         self._rows_untracked += 1
-        origins = np.stack([recent.origin_m for recent in self._recent])
-        moved = np.ptp(origins, axis=0).max() > self.array.circumradius
-        if self._rows_untracked % _TRY_EVERY or not moved:
+        if self._rows_untracked % _TRY_EVERY:
             return None
-        chosen = list(self._recent)[:: -max(1, len(self._recent) // _STACKED_ROWS)]
-        known = [recent.ambient_T for recent in chosen if recent.ambient_T is not None]
+        recent = list(self._recent)
+        if alone.solutions:
+            centroid = row.R_world_from_array @ self.array.centroid
+            range_m = float(np.linalg.norm(row.R_world_from_array @ alone.solutions[0].position_m - centroid))
+            time_s = _AT_REST * range_m / self.motion.speed_m_s
+            recent = [earlier for earlier in recent if row.time_s - earlier.time_s <= time_s]
+        elif np.ptp([earlier.origin_m for earlier in recent], axis=0).max() <= self.array.circumradius:
+            return None
+        if len(recent) < 2:
+            return None
+        chosen = recent[:: -max(1, len(recent) // _STACKED_ROWS)]
+        known = [earlier.ambient_T for earlier in chosen if earlier.ambient_T is not None]
         fix = stacked_fix(
             self.array,
-            np.stack([recent.readings_T for recent in chosen]),
-            np.stack([recent.origin_m for recent in chosen]),
-            np.stack([recent.R_world_from_array for recent in chosen]),
+            np.stack([earlier.readings_T for earlier in chosen]),
+            np.stack([earlier.origin_m for earlier in chosen]),
+            np.stack([earlier.R_world_from_array for earlier in chosen]),
             np.stack(known) if len(known) == len(chosen) else None,
         )
         centroid = row.origin_m + row.R_world_from_array @ self.array.centroid
-        return _start(fix, centroid, None)[0]
+        before, self._proposed = self._proposed, _start(fix, centroid, None)[0]
+        return self._proposed if _agree(before, self._proposed) else None
 
     def _range_error(self, x: FloatArray, S: FloatArray, row: Row) -> float:
         """Standard deviation of the range over the range."""
@@ -417,6 +436,15 @@ def _start(fix: Fix, centroid: FloatArray, near: tuple[FloatArray, FloatArray] |
     if near is None and any(solution.chi2 < best.chi2 + _RIVAL_WITHIN for solution in solutions[1:]):
         return None, "not acquired: several solutions fit alike"
     return best, ""
+
+
+def _agree(before: Solution | None, after: Solution | None) -> bool:
+    """Whether two successive proposals for a start are one: a wrong basin seldom stays where it is as rows come in."""
+    if before is None or after is None:
+        return False
+    offset = after.position_m - before.position_m
+    both = before.covariance[:3, :3] + after.covariance[:3, :3]
+    return bool(offset @ np.linalg.solve(both, offset) < chdtri(3, _DISAGREEMENT))
 
 
 class _WorldMeasurement:
