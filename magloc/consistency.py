@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from arrays.differences import decorrelated_differences
 from magloc.measurement import DifferenceMeasurement
 from magloc.motion import N_SOURCE, MotionModel
 from magloc.track import Row, Tracker, TrackPoint
@@ -150,7 +149,7 @@ def posterior_bound(
     P: FloatArray | None = None
     for i, row in enumerate(rows):
         truth = np.concatenate([position_m[i], moment_Am2[i]])
-        differences = decorrelated_differences(tracker.array, np.isfinite(row.readings_T))
+        differences = tracker.differences_of(row)
         R = row.R_world_from_array
         model = DifferenceMeasurement(tracker.array_of(row), differences)
         H = model.jacobian(R.T @ (truth[:3] - row.origin_m), R.T @ truth[3:]) / np.sqrt(model.variance)[:, None]

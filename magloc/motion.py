@@ -189,7 +189,7 @@ class WanderingMotion:
         p, m, v, rate = x[:3], x[3:6], x[6:9], x[9:]
         turn = rotation_matrix(moved * rate)
         turned = turn @ m
-        by_rate = -cross_matrix(turned)
+        by_rate = -cross_matrix(turned) @ _turn_of_change(moved * rate)
         F = np.eye(12)
         F[:3, 6:9] = moved * np.eye(3)
         F[3:6, 3:6], F[3:6, 9:] = turn, moved * by_rate
@@ -215,11 +215,32 @@ def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
     return matrix
 
 
+def _turn_of_change(rotation_vector: FloatArray) -> FloatArray:
+    """The small turn J δ (3, 3) that follows a rotation by a vector (3,) when δ is added to the vector."""
+    square = float(rotation_vector @ rotation_vector)
+    angle = math.sqrt(square)
+    K = cross_matrix(rotation_vector)
+    # (1 - cos(a))/a² and (a - sin(a))/a³, by series where they cancel.
+    if angle < 1e-2:
+        first, second = 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
+    else:
+        first, second = (1.0 - math.cos(angle)) / square, (angle - math.sin(angle)) / (square * angle)
+    matrix: FloatArray = np.eye(3) + first * K + second * (K @ K)
+    return matrix
+
+
 @lru_cache(maxsize=64)
 def _wandering_step(correlation_s: float, dt_s: float) -> tuple[float, float, FloatArray]:
     """Entries of F of (value, rate), and the square root of its noise for a rate of unit standard deviation."""
     if dt_s == 0.0:
         return 0.0, 1.0, np.zeros((2, 2))
+    if dt_s > correlation_s:
+        # Van Loan's exponential grows with exp(Δt/τ) and loses Q over long gaps; the closed form cancels in short ones.
+        kept = math.exp(-dt_s / correlation_s)
+        Q_vv, Q_pv = 1.0 - kept**2, correlation_s * (1.0 - kept) ** 2
+        Q_pp = correlation_s**2 * (2.0 * dt_s / correlation_s - 3.0 + 4.0 * kept - kept**2)
+        root = np.linalg.cholesky(np.array([[Q_pp, Q_pv], [Q_pv, Q_vv]]))
+        return correlation_s * (1.0 - kept), kept, root
     drift = np.array([[0.0, 1.0], [0.0, -1.0 / correlation_s]])
     noise = np.array([[0.0], [math.sqrt(2.0 / correlation_s)]])
     F, Q = van_loan_discretization(drift, noise, dt_s)

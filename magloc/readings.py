@@ -38,6 +38,8 @@ TRUE_MOMENT_COLUMNS = ("mx_Am2", "my_Am2", "mz_Am2")
 _T_IN_nT = 1e9
 _SATURATION_RTOL = 1e-12
 _LARGEST_nT = 1e15  # a million tesla: a column of something else, or a broken line
+# Change of the ambient field, relative, within which moduli may be averaged: 50 nT in 50 µT.
+_SAME_AMBIENT_RTOL = 1e-3
 _UNIT_QUATERNION_ATOL = 1e-3  # a log that keeps four decimals passes; the quaternion is normalised afterwards
 _SENSOR_COLUMN = re.compile(r"(?P<id>.+?)(_[xyz])?_nT")
 
@@ -274,7 +276,7 @@ def average(readings: Readings) -> Readings:
     Raises
     ------
     InputError
-        The array moves between the rows, or no row is complete.
+        The array moves, or the ambient field changes, between the rows, or no row is complete.
     """
     position_m, rotation_xyzw, ambient_T = readings.array_position_m, readings.array_rotation_xyzw, readings.ambient_T
     if position_m is not None and rotation_xyzw is not None:
@@ -286,7 +288,14 @@ def average(readings: Readings) -> Readings:
                 "expected one pose for all rows that are averaged."
             )
         position_m, rotation_xyzw = position_m[:1], rotation_xyzw[:1]
-    complete = _complete(readings)
+    if ambient_T is not None:
+        changed = np.linalg.norm(ambient_T - ambient_T[0], axis=1) > _SAME_AMBIENT_RTOL * np.linalg.norm(ambient_T[0])
+        if changed.any():
+            raise InputError(
+                f"found the ambient field changed between lines {readings.line_numbers[0]} and "
+                f"{readings.line_numbers[changed.argmax()]}, expected one ambient field for all rows that are averaged."
+            )
+    complete = complete_rows(readings)
     if not complete.any():
         raise InputError("found no row with all channels, expected at least one for an average.")
     return Readings(
@@ -299,7 +308,7 @@ def average(readings: Readings) -> Readings:
     )
 
 
-def _complete(readings: Readings) -> NDArray[np.bool_]:
+def complete_rows(readings: Readings) -> NDArray[np.bool_]:
     """Rows with every channel that any row has."""
     present = np.isfinite(readings.values_T)
     return np.asarray((present == present.any(axis=0)).all(axis=1))
@@ -321,7 +330,7 @@ def averaging_array(array: SensorArray, readings: Readings) -> SensorArray:
     -------
     SensorArray
     """
-    root = math.sqrt(max(1, int(_complete(readings).sum())))
+    root = math.sqrt(max(1, int(complete_rows(readings).sum())))
     sensors = tuple(replace(sensor, noise_T=sensor.noise_T / root) for sensor in array.sensors)
     return replace(array, sensors=sensors, noise_fraction=array.noise_fraction / root)
 

@@ -36,6 +36,8 @@ _SPOILT = 4.0
 _UNDERSTATED = 2.0
 # Squared residuals, in limits, above which a larger one says nothing more.
 _BEYOND_DOUBT = 10.0
+# A fix that explains the other sensors badly must be better by this factor in χ² per degree of freedom.
+_INCOMPARABLE = 1000.0
 _N_REWEIGHTINGS = 30
 _MOST_LEFT_OUT = 8
 _LEAST_WEIGHT = 1e-16
@@ -118,6 +120,20 @@ def _is_credible(fix: Fix | JointFix) -> bool:
     return best.dof <= 0 or bool(best.chi2 <= chdtri(best.dof, 1.0 - _CREDIBLE))
 
 
+def _is_worth_dropping_for(fix: Fix | JointFix, plain: Fix | JointFix) -> bool:
+    """Whether a fix without some sensors explains all others, or all but incomparably better than with them.
+
+    Where it does not, it is the model, or what is known of the source, that is wrong.
+    """
+    if not fix.solutions or fix.solutions[0].dof <= 0:
+        return False
+    per_degree = fix.solutions[0].chi2 / fix.solutions[0].dof
+    if not plain.solutions:
+        return _is_credible(fix)
+    before = plain.solutions[0].chi2 / max(1, plain.solutions[0].dof)
+    return per_degree <= _SPOILT or per_degree * _INCOMPARABLE < before
+
+
 @dataclass(frozen=True, eq=False)
 class _Start(Generic[AnyFix]):
     """A fix to reweight from, and the sensors that it was made without."""
@@ -188,7 +204,7 @@ class _Examination(Generic[AnyFix]):
             rows = np.array([row for row, sensors in standing_out.items() if sensors == dropped], dtype=np.intp)
             names = tuple(self.array.ids[sensor] for sensor in sorted(dropped))
             for row, fix in zip(rows, self._without(dropped, rows), strict=True):
-                if fix.solutions and fix.solutions[0].dof > 0:
+                if _is_worth_dropping_for(fix, plain[row]):
                     found[row] = replace(fix, dropped=names)
         return found
 
@@ -198,7 +214,7 @@ class _Examination(Generic[AnyFix]):
         credible = np.array([bool(fix.solutions) and _is_credible(fix) for fix in plain])
         # What a fit of so many unknowns leaves of a sensor's residual on average.
         unknowns = np.array([3.0 + 6.0 * (len(self._scaled(fix)[0]) if fix.solutions else 1) for fix in plain])
-        unseen = np.clip(1.0 - unknowns / self.count.sum(), 0.2, 1.0)
+        unseen = np.clip(1.0 - unknowns / max(1, self.count.sum()), 0.2, 1.0)
         spoilt = ~solved
         spoilt[solved] = [fix.solutions[0].chi2 > _SPOILT * fix.solutions[0].dof for fix in plain if fix.solutions]
         judged = np.flatnonzero(~spoilt & ~credible).tolist()

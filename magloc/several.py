@@ -212,13 +212,13 @@ class _Levels:
             before = beams[-1].rows(rows)
             wider = self.search.one_more(self.problem.rows(rows), self.y[rows], before)
             last = len(beams) + 1 == self.most
-            gained = before.chi2[:, 0] - wider.chi2[:, 0] > threshold
+            gained = wider.chi2[:, 0] < before.chi2[:, 0] - threshold
             # Where no number of sources is credible so far, the search failed, at this number or at an earlier one.
             credible = self._quantile(wider.n_sources, _CREDIBLE)
             failed = np.flatnonzero(~(wider.chi2[:, 0] <= credible) & (last | ~gained))
             if failed.size:
                 wider = wider.replaced(failed, self._restarted(rows[failed], wider.rows(failed)))
-                gained = before.chi2[:, 0] - wider.chi2[:, 0] > threshold
+                gained = wider.chi2[:, 0] < before.chi2[:, 0] - threshold
             beams.append(_scattered(wider, rows, len(self.y)))
             rows = rows if self.asked is not None else rows[gained]
             level[rows] = len(beams) - 1
@@ -234,7 +234,7 @@ class _Levels:
             if n > 1:
                 fewer = self._restarted(at, fewer, rounds=2)
             beams[n - 1] = beams[n - 1].replaced(at, fewer)
-            superfluous = fewer.chi2[:, 0] - beams[n].chi2[at, 0] <= threshold
+            superfluous = fewer.chi2[:, 0] <= beams[n].chi2[at, 0] + threshold
             unresolved = self._has_unresolved_pair(at, beams[n].rows(at))
             level[at[superfluous | unresolved]] = n - 1
             certain[at[unresolved & ~superfluous]] = True

@@ -71,23 +71,42 @@ def with_ambient_field(
             raise InputError("--ambient-gradient: found an array with a pose, expected one that stands east-north-up.")
         rows = [(float(x), float(y), float(z)) for x, y, z in gradient_T_m]
         array = replace(array, ambient_gradient_T_m=tuple(rows))
+    scalar = bool(array.channel_is_scalar.any())
+    if scalar and readings.ambient_T is None and array.ambient_T is not None and _turns(readings):
+        raise InputError(
+            "key ambient_nT of the array file: found an array that turns, for which it is not constant; expected"
+            " columns ambient_x_nT and so on in the readings, or --place and --date without that key."
+        )
+    if scalar and array.common_field_T is not None:
+        print_note(
+            "warning: common_field_nT stands for one offset of all moduli; how a change of the ambient field differs"
+            " between scalar sensors is not modelled"
+        )
     if readings.ambient_T is not None or array.ambient_T is not None:
         if place is not None and not gradient:
             where = "readings have" if readings.ambient_T is not None else "array file has"
             print_note(f"--place is not used: the {where} the ambient field")
         return array, readings.ambient_T
     if model_T is None:
-        if array.channel_is_scalar.any():
+        if scalar:
             print_note(
                 "warning: no ambient field is known (ambient_x_nT and so on in the readings, ambient_nT in the array"
                 " file, or --place and --date): moduli are taken as those of the source alone"
             )
         return array, None
+    if scalar:
+        print_note("note: the geomagnetic model is taken as exact; crust and storms make it wrong by some 100 nT")
     if readings.array_rotation_xyzw is None:
         return replace(array, ambient_T=tuple(model_T.tolist())), None
     from scipy.spatial.transform import Rotation
 
     return array, Rotation.from_quat(readings.array_rotation_xyzw).inv().apply(model_T)
+
+
+def _turns(readings: Readings) -> bool:
+    """Whether the array turns between the rows, by more than a milliradian."""
+    rotations = readings.array_rotation_xyzw
+    return rotations is not None and bool((abs(rotations @ rotations[0]) < 1.0 - 1e-7).any())
 
 
 def _of_model(place: Place) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

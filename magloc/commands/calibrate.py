@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     FloatArray = NDArray[np.float64]
 
 _SAME_TIME_S = 1e-6
+# Gains beyond this many standard deviations of the prior are named.
+_STRANGE = 4.0
 
 
 @Parameter(name="*", group="What is known of the array")
@@ -107,6 +109,8 @@ def calibrate(
     common : CommonOptions
         Common options.
     """
+    import numpy as np
+
     from arrays.files import read_array, write_array
     from magloc.calibration import calibrate_on_path, self_calibrate
     from magloc.commands.calibrate_by_turning import calibrate_by_turning, check_folder
@@ -115,6 +119,8 @@ def calibrate(
     if modulus_nT is not None:
         if truth is not None:
             raise InputError("--modulus-nT: found it together with --truth, expected one of them.")
+        if known != PriorOptions() or height_m is not None or moment is not None:
+            raise InputError("--modulus-nT: found it together with an option for a moving source, expected none.")
         calibrate_by_turning(readings, array, modulus_nT, out, json=json, quiet=common.quiet)
         return
     nominal = read_array(array)
@@ -145,6 +151,11 @@ def calibrate(
             )
     except InputError:
         raise
+    except np.linalg.LinAlgError:
+        raise InputError(
+            f"{readings}: found a source that the model cannot place (on a sensor, or at infinity), expected one that"
+            " passes the sensors at a distance."
+        ) from None
     except ValueError as error:
         raise InputError(f"{readings}: {str(error).removeprefix('Input ')}") from None
     if not result.converged:
@@ -160,6 +171,7 @@ def calibrate(
         print("\n".join(_table(result)))
     if not (json or common.quiet):
         _print_summary(result, len(rows))
+        _warn_of_strangers(result, prior)
 
 
 def _prior(options: PriorOptions, array: SensorArray, path: Path) -> Prior:
@@ -310,6 +322,18 @@ def _table(result: CalibrationResult) -> list[str]:
             f"  {offset:>26} {1e6 * sd[OFFSET].max():7.3f}  {1e9 * rms:10.1f}"
         )
     return lines
+
+
+def _warn_of_strangers(result: CalibrationResult, prior: Prior) -> None:
+    """Name the sensors whose gain is far from what the array file could be wrong by: dead, or of another kind."""
+    import numpy as np
+
+    from magloc.moving_source import GAINS
+
+    far = np.max(np.abs(result.change[:, GAINS]), axis=1) > _STRANGE * prior.gain
+    names = [sensor for sensor, strange in zip(result.array.ids, far.tolist(), strict=True) if strange]
+    if names:
+        print_note(f"warning: gains far beyond --gain-prior, a dead or wrong sensor: {', '.join(names)}")
 
 
 def _print_summary(result: CalibrationResult, n_rows: int) -> None:

@@ -13,6 +13,9 @@ from magloc.commands.common import print_json, print_note
 from magloc.ellipsoid_calibration import EllipsoidCalibration, calibrated_in_modulus
 from magloc.readings import read_readings, without_saturated
 
+# Of a gain from the array file: beyond it the modulus is in another unit.
+_LARGEST_CHANGE = 3.0
+
 
 def check_folder(out: Path) -> None:
     """Refuse a file to write whose folder is not there, before long work."""
@@ -40,6 +43,14 @@ def calibrate_by_turning(readings: Path, array: Path, modulus_nT: float, out: Pa
     for name, result in results.items():
         if not result.converged:
             raise InputError(f"{readings}: sensor {name} cannot be calibrated: {result.reason}; {out} is not written.")
+    for before, sensor in zip(nominal.sensors, calibrated.sensors, strict=True):
+        volumes = np.linalg.det([sensor.calibration.scale, before.calibration.scale])
+        ratio = float(np.cbrt(volumes[0] / volumes[1]))
+        if not 1.0 / _LARGEST_CHANGE < ratio < _LARGEST_CHANGE:
+            raise InputError(
+                f"--modulus-nT: found {modulus_nT:g}, which makes the gains of sensor {sensor.id} {ratio:.3g} times"
+                f" those of {array}, expected the modulus in nT, or an array file with its gains; {out} is not written."
+            )
     write_array(calibrated, out)
     if json:
         print_json({"out": str(out), "rows": len(rows), "sensors": [_entry(*item) for item in results.items()]})

@@ -10,6 +10,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.special import chdtrc
 
 from arrays.sensor import SensorArray
 from magloc.commands.common import print_note
@@ -31,6 +32,8 @@ _JSON_KEYS = (
     "range_observable",
     "range_interval95_m",
 )
+# Probability of χ² under noise.
+_MISFIT = 1e-6
 _SOURCE_KEYS = ("position_m", "moment_Am2", "covariance", "range_observable", "range_interval95_m", "merged")
 _JOINT_KEYS = ("covariance", "chi2", "dof", "iterations", "converged")
 
@@ -72,6 +75,13 @@ def saturated_channels(measured: Readings, rows: Readings, array: SensorArray) -
     return [tuple(array.channel_names[channel] for channel in np.flatnonzero(row)) for row in lost]
 
 
+def is_misfit(fix: AnyFix) -> bool:
+    """Whether χ² is far beyond noise: then neither the position nor its standard deviations are to be trusted."""
+    if not fix.solutions or fix.solutions[0].dof <= 0:
+        return False
+    return bool(chdtrc(fix.solutions[0].dof, fix.solutions[0].chi2) < _MISFIT)
+
+
 def json_entry(time_s: float, fix: AnyFix, saturated: tuple[str, ...], near: bool) -> dict[str, object]:
     """What ``--json`` prints of one row."""
     solutions: list[dict[str, object]]
@@ -94,6 +104,8 @@ def json_entry(time_s: float, fix: AnyFix, saturated: tuple[str, ...], near: boo
         entry["saturated_channels"] = saturated
     if near:
         entry["too_near"] = True
+    if is_misfit(fix):
+        entry["misfit"] = True
     return entry
 
 
@@ -109,6 +121,12 @@ def warn_of(
     fewer = Counter(fix.reason for fix in fixes if fix.solutions and fix.reason)
     for reason, n in fewer.most_common():
         print_note(f"note: in {n} of {len(fixes)} rows {reason}")
+    misfits = sum(is_misfit(fix) for fix in fixes)
+    if misfits:
+        print_note(
+            f"warning: in {misfits} of {len(fixes)} rows χ² is far beyond noise: the noise is understated, or the model"
+            " does not hold, and the standard deviations say too little"
+        )
     lost = Counter(name for names in saturated for name in names)
     if lost:
         print_note(f"warning: saturated readings are not used: {_rows_of(lost)}")

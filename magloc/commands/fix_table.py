@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from magloc.commands.fix_output import is_misfit
 from magloc.fix import Fix, JointFix, Solution, Source
 
 _WIDTH = 100
@@ -80,6 +81,7 @@ def _cells(fix: Fix | JointFix, source: Solution | Source, per_m: float, decimal
     flags = [
         *([] if source.range_observable else ["range?"]),
         *([f"+{others}"] if others else []),
+        *(["misfit"] if is_misfit(fix) else []),
         *(["merged"] if isinstance(source, Source) and source.merged else []),
         *(["near"] if too_near else []),
         *(f"-{name}" for name in fix.dropped),

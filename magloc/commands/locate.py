@@ -50,7 +50,7 @@ def locate(
     best solution of every row: s is the standard deviation, range95 the 95 % interval of the distance from the
     sensors' centroid. Flags: "range?" = the range is not observable, trust range95 and not s; "+2" = two other
     solutions fit almost as well, see --json; "-s3" = sensor s3 contradicts all others and is not used; "merged" = two
-    sources that the array does not tell apart; "near" = too near for a dipole.
+    sources that the array does not tell apart; "near" = too near for a dipole; "misfit" = χ² is far beyond noise.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def locate(
     measured = read_readings(readings, used, sensors=ids)
     rows = without_saturated(measured, used)
     if average:
-        rows, used = _averaged(rows, used, readings)
+        rows, used = _averaged(rows, used, readings, quiet=common.quiet)
     used, ambient_T = with_ambient_field(used, rows, where, gradient=ambient_gradient)
     try:
         task = RowFixes(used, rows, ambient_T, knowledge, n_sources, position, keep_sensors, common.seed)
@@ -204,8 +204,12 @@ def knowledge_of(region: str | None, largest_moment: float | None) -> Knowledge:
     )
 
 
-def _averaged(readings: Readings, array: SensorArray, path: Path) -> tuple[Readings, SensorArray]:
-    from magloc.readings import average, averaging_array
+def _averaged(readings: Readings, array: SensorArray, path: Path, *, quiet: bool) -> tuple[Readings, SensorArray]:
+    from magloc.readings import average, averaging_array, complete_rows
+
+    n_complete = int(complete_rows(readings).sum())
+    if 0 < n_complete < len(readings) and not quiet:
+        print_note(f"note: {n_complete} of {len(readings)} rows are averaged, the others miss some readings")
 
     try:
         return average(readings), averaging_array(array, readings)

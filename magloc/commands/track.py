@@ -77,7 +77,7 @@ class ConditioningOptions:
 
 
 def track(
-    readings: Path,
+    readings: Annotated[Path, Parameter(allow_leading_hyphen=True)],
     /,
     *,
     array: Path,
@@ -158,7 +158,8 @@ def track(
     model = _motion(motion, smooth=smooth)
     knowledge = knowledge_of(region, max_moment_Am2)
     if str(readings) == STREAM:
-        if smooth or truth is not None or out is not None or geojson is not None or json:
+        whole = smooth or json or any(option is not None for option in (truth, out, geojson))
+        if whole or conditioning != ConditioningOptions():
             raise InputError("READINGS -: found an option that needs the whole record, expected a stream of --jsonl.")
         _stream(used, ids, model, knowledge, where)
         return

@@ -362,6 +362,17 @@ class TestTurnedInAKnownModulus:
         assert_refused(run(*self.write(tmp_path, directions)), "turned.csv", "sensor m", "not written")
         assert not (tmp_path / "out.toml").exists()
 
+    def test_modulus_in_another_unit(self, run: Run, tmp_path: Path) -> None:
+        directions = np.random.default_rng(1).normal(size=(100, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        command = self.write(tmp_path, directions)
+        assert_refused(run(*command[:-1], "48"), "--modulus-nT", "in nT", "not written")
+        assert not (tmp_path / "out.toml").exists()
+
+    def test_options_of_the_other_calibration(self, run: Run, tmp_path: Path) -> None:
+        assert_refused(run(*self.write(tmp_path, np.eye(3)), "--height-m", "3"), "--modulus-nT")
+        assert_refused(run(*self.write(tmp_path, np.eye(3)), "--estimate", "gains"), "--modulus-nT")
+
     def test_bad_modulus(self, run: Run, tmp_path: Path) -> None:
         command = self.write(tmp_path, np.eye(3))
         assert_refused(run(*command[:-1], "-5"), "--modulus-nT")

@@ -276,6 +276,53 @@ class TestBadSensors:
         assert row["dropped_sensors"] == ["v0"]
 
 
+class TestMisfit:
+    """Where the model is wrong no sensor is blamed, and the row says that its uncertainty is not to be trusted."""
+
+    def test_wrong_place(self, run: Run, files: Files) -> None:
+        command = files.write(vector_plate(), readings_of(vector_plate(), [TestBadSensors.SOURCE]))
+        outcome = run(*command, "--position", "0.6", "0.3", "-1.2", "--json")
+        for row in results_of(outcome):
+            assert row["misfit"]
+            assert "dropped_sensors" not in row
+        assert "χ² is far beyond noise" in outcome.err
+
+    def test_moment_that_is_too_small(self, run: Run, files: Files) -> None:
+        command = files.write(vector_plate(), readings_of(vector_plate(), [TestBadSensors.SOURCE]))
+        outcome = run(*command, "--max-moment-Am2", "2", "--json")
+        assert "dropped_sensors" not in outcome.out
+
+    def test_right_model(self, run: Run, files: Files) -> None:
+        command = files.write(vector_plate(), readings_of(vector_plate(), [TestBadSensors.SOURCE]))
+        assert not any("misfit" in row for row in results_of(run(*command, "--json")))
+
+
+class TestAverage:
+    def test_changing_ambient_field(self, run: Run, files: Files) -> None:
+        """The mean of moduli is not the modulus of the mean."""
+        array = scalar_cloud()
+        ambient = np.stack([AMBIENT, AMBIENT[[2, 1, 0]]])
+        values = np.concatenate([readings_of(array, [(PLACE * 0.7, MOMENT)], 1, field) for field in ambient])
+        outcome = run(*files.write(array, values, ambient=ambient), "--average")
+        assert_refused(outcome, "readings.csv", "ambient field changed between lines 2 and 3")
+
+    def test_rows_that_are_left_out_are_counted(self, run: Run, files: Files) -> None:
+        values = readings_of(vector_plate(), [TestBadSensors.SOURCE], 5)
+        values[1:3, 0] = np.nan
+        outcome = run(*files.write(vector_plate(), values), "--average")
+        assert outcome.status == 0
+        assert "3 of 5 rows are averaged" in outcome.err
+
+
+class TestTurningArray:
+    def test_constant_ambient_field_in_its_axes(self, run: Run, files: Files) -> None:
+        array = replace(scalar_cloud(), ambient_T=tuple(AMBIENT))
+        turns = Rotation.from_rotvec(np.radians([[0.0, 0.0, angle] for angle in (0.0, 40.0, 80.0)])).as_quat()
+        values = readings_of(array, [(PLACE * 0.7, MOMENT)], ambient=AMBIENT)
+        command = files.write(array, values, pose=(np.zeros((3, 3)), turns))
+        assert_refused(run(*command), "ambient_nT", "turns")
+
+
 class TestTooNear:
     def test_body_length(self, run: Run, files: Files) -> None:
         command = files.write(vector_plate(), readings_of(vector_plate(), [TestBadSensors.SOURCE]))

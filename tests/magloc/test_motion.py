@@ -41,6 +41,15 @@ MODELS: list[MotionModel] = [
 ]
 
 
+def step_derivative(motion: MotionModel, x: FloatArray, dt_s: float, step: float = 1e-2) -> FloatArray:
+    """Numerical derivative of the predicted state."""
+
+    def moved(states: FloatArray) -> FloatArray:
+        return np.apply_along_axis(lambda state: motion.step(state, dt_s)[0], -1, states)
+
+    return derivative(moved, x, step, atol=1e-9)
+
+
 def state_of(motion: MotionModel, seed: int) -> FloatArray:
     """A state with a moment of about 100 A·m², and speeds and rates of the size that the model expects."""
     rng = np.random.default_rng(seed)
@@ -137,29 +146,18 @@ class TestJacobian:
     def test_is_the_derivative(self, motion: MotionModel, dt_s: float) -> None:
         x = state_of(motion, 7)
         _, F, _ = motion.step(x, dt_s)
-
-        def moved(state: FloatArray) -> FloatArray:
-            return motion.step(state, dt_s)[0]
-
-        numerical = derivative(moved, x, step=1e-2)
+        numerical = step_derivative(motion, x, dt_s)
         assert F.shape == (x.size, x.size)
-        if isinstance(motion, WanderingMotion):
-            # The turn's left Jacobian is taken at rate zero: right to first order in the angle of one step.
-            exact = np.ones(F.shape, dtype=np.bool_)
-            exact[3:6, 9:] = False
-            np.testing.assert_allclose(F[exact], numerical[exact], atol=1e-7)
-            angle = dt_s * float(np.linalg.norm(x[9:]))
-            off = np.linalg.norm(F[3:6, 9:] - numerical[3:6, 9:]) / np.linalg.norm(numerical[3:6, 9:])
-            assert off <= 0.75 * angle
-        else:
-            np.testing.assert_allclose(F, numerical, atol=1e-7)
+        np.testing.assert_allclose(F, numerical, atol=1e-7)
 
-    def test_of_a_wandering_turn_at_rest_is_exact(self) -> None:
-        motion = WanderingMotion(0.5, 0.3, correlation_s=4.0)
+    @pytest.mark.parametrize("angle", [0.0, 1e-6, 0.0199, 0.0201])
+    def test_of_a_slowly_wandering_turn(self, angle: float) -> None:
+        """At rest, and on both sides of the angle below which the series stands for the quotient."""
+        motion = WanderingMotion(0.5, 0.3, correlation_s=1e9)
         x = state_of(motion, 3)
-        x[9:] = 0.0
+        x[9:] = np.array([2.0, -1.0, 2.0]) / 3.0 * angle
         _, F, _ = motion.step(x, 0.5)
-        np.testing.assert_allclose(F, derivative(lambda s: motion.step(s, 0.5)[0], x, step=1e-3), atol=1e-6)
+        np.testing.assert_allclose(F, step_derivative(motion, x, 0.5, step=1e-3), atol=1e-6)
 
     @pytest.mark.parametrize("angle", [0.9e-4, 1.1e-4])
     def test_of_a_slow_turn(self, angle: float) -> None:
@@ -167,7 +165,7 @@ class TestJacobian:
         motion = ConstantTurn(0.5, 0.1)
         x = np.array([1.0, 2.0, 3.0, 60.0, -50.0, 40.0, 0.5, -0.3, 0.2, angle])
         _, F, _ = motion.step(x, 1.0)
-        np.testing.assert_allclose(F, derivative(lambda s: motion.step(s, 1.0)[0], x, step=1e-2), atol=1e-7)
+        np.testing.assert_allclose(F, step_derivative(motion, x, 1.0), atol=1e-7)
 
 
 def noise_of(motion: MotionModel, x: FloatArray, dt_s: float) -> FloatArray:
@@ -316,6 +314,17 @@ class TestWanderingMotion:
         np.testing.assert_array_equal(moved, x)
         np.testing.assert_array_equal(F, np.eye(12))
         np.testing.assert_array_equal(S_q, 0.0)
+
+    @pytest.mark.parametrize("tau", [0.5, 7.0])
+    @pytest.mark.parametrize("dt_s", [0.05, 0.4999, 0.5001, 6.999, 7.001, 60.0, 3600.0, 1e5])
+    def test_position_spreads_as_ornstein_and_uhlenbeck_say(self, tau: float, dt_s: float) -> None:
+        """Variance 2 V² τ (Δt - τ (1 - exp(-Δt/τ))) of the position of a source whose speed is stationary."""
+        motion = WanderingMotion(0.4, 0.1, correlation_s=tau)
+        _, F, S_q = motion.step(state_of(motion, 1), dt_s)
+        P = F[[0, 6]][:, [0, 6]] @ np.diag([0.0, 0.16]) @ F[[0, 6]][:, [0, 6]].T + (S_q @ S_q.T)[[0, 6]][:, [0, 6]]
+        assert P[0, 0] == pytest.approx(2.0 * 0.16 * tau * (dt_s + tau * math.expm1(-dt_s / tau)), rel=1e-9)
+        assert P[0, 1] == pytest.approx(-0.16 * tau * math.expm1(-dt_s / tau), rel=1e-9)
+        assert P[1, 1] == pytest.approx(0.16, rel=1e-9)
 
     @pytest.mark.parametrize("dt_s", [1e-6, 1e-3, 1e4])
     def test_noise_is_regular_at_any_step(self, dt_s: float) -> None:

@@ -1,0 +1,190 @@
+"""The consistency of a track: χ² bounds by scipy, NEES by hand, and the posterior bound by its information form."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from arrays import geometries
+from arrays.differences import contrasts, difference_covariance
+from magloc.consistency import consistency, mean_bounds, posterior_bound
+from magloc.motion import UnknownMotion, WanderingMotion
+from magloc.track import Row, Tracker, TrackPoint, rows_of
+from tests.oracles import derivative, magpylib_field
+
+FloatArray = NDArray[np.float64]
+
+ARRAY = geometries.tetrahedron(1.5, "vector", 2e-10)
+
+
+def point_of(
+    position_m: FloatArray, moment_Am2: FloatArray, covariance: FloatArray, nis: float = 9.0, status: str = "tracked"
+) -> TrackPoint:
+    return TrackPoint(0.0, position_m, moment_Am2, covariance, np.ones(6), 2, nis, 9, status)
+
+
+class TestMeanBounds:
+    @pytest.mark.parametrize("dof", [1, 9, 600, 36_000])
+    @pytest.mark.parametrize("level", [0.95, 0.99])
+    def test_are_the_quantiles_of_chi_square(self, dof: int, level: float) -> None:
+        expected = chi2.ppf([0.5 - 0.5 * level, 0.5 + 0.5 * level], dof) / dof
+        np.testing.assert_allclose(mean_bounds(dof, level), expected, rtol=1e-9)
+
+    def test_of_nothing(self) -> None:
+        assert np.isnan(mean_bounds(0)).all()
+
+
+class TestNees:
+    @pytest.fixture
+    def covariance(self) -> FloatArray:
+        """Correlated, and of mixed units."""
+        root = np.random.default_rng(0).normal(size=(6, 6)) * np.repeat([0.05, 20.0], 3)[:, None]
+        return np.asarray(root @ root.T)
+
+    def test_of_position_and_moment(self, covariance: FloatArray) -> None:
+        error = np.random.default_rng(1).multivariate_normal(np.zeros(6), covariance)
+        points = [point_of(error[:3], error[3:], covariance)]
+        result = consistency(points, np.zeros((1, 3)), np.zeros((1, 3)))
+        assert result.nees_per_dimension == pytest.approx(error @ np.linalg.inv(covariance) @ error / 6.0, rel=1e-6)
+        assert result.nees_bounds == pytest.approx(mean_bounds(6))
+        assert result.position_rms_m == pytest.approx(float(np.linalg.norm(error[:3])))
+
+    @pytest.mark.parametrize("moment", [True, False])
+    def test_of_a_truth_without_a_height(self, covariance: FloatArray, moment: bool) -> None:
+        """z missing: the marginal of the other coordinates, and of the moment where it is known."""
+        error = np.array([0.04, -0.05, 7.0, 10.0, -8.0, 3.0])
+        truth = np.array([[0.0, 0.0, np.nan]])
+        points = [point_of(error[:3], error[3:], covariance)]
+        result = consistency(points, truth, np.zeros((1, 3)) if moment else None)
+        kept = [0, 1, 3, 4, 5] if moment else [0, 1]
+        expected = error[kept] @ np.linalg.inv(covariance[np.ix_(kept, kept)]) @ error[kept] / len(kept)
+        assert result.nees_per_dimension == pytest.approx(expected, rel=1e-6)
+        assert result.position_rms_m == pytest.approx(math.hypot(0.04, 0.05))
+
+    def test_of_truth_is_chi_square(self) -> None:
+        """5,000 draws from the covariance lie inside the 99 % bounds: false-alarm rate 1 %, seed not tuned."""
+        rng = np.random.default_rng(7)
+        root = rng.normal(size=(6, 6)) * np.repeat([0.05, 20.0], 3)[:, None]
+        draws = rng.normal(size=(5000, 6)) @ root.T
+        nis = rng.chisquare(9.0, 5000)
+        covariance = root @ root.T
+        points = [point_of(x[:3], x[3:], covariance, float(n)) for x, n in zip(draws, nis, strict=True)]
+        result = consistency(points, np.zeros((5000, 3)), np.zeros((5000, 3)))
+        assert result.nees_bounds[0] < result.nees_per_dimension < result.nees_bounds[1]
+        assert result.nis_bounds[0] < result.nis_per_dimension < result.nis_bounds[1]
+
+
+class TestCounting:
+    def test_rows_without_track_or_truth(self) -> None:
+        zero, P = np.zeros(3), np.eye(6)
+        points = [
+            TrackPoint(0.0, status="not acquired: no signal"),
+            point_of(zero, zero, P, math.nan, "acquired"),
+            point_of(zero + 1.0, zero, P, 4.5),
+            point_of(zero + 5.0, zero, P, 18.0),
+            point_of(zero, zero, P, 500.0, "outlier"),
+        ]
+        truth = np.zeros((5, 3))
+        truth[3] = np.nan
+        result = consistency(points, truth, None, np.array([np.inf, 1.0, 2.0, 7.0, 2.0]))
+        assert (result.rows, result.tracked_rows) == (4, 3)
+        assert result.position_rms_m == pytest.approx(math.sqrt(3.0 / 3.0))
+        assert result.position_bound_m == pytest.approx(math.sqrt(9.0 / 3.0))
+        assert result.nees_per_dimension == pytest.approx(3.0 / 9.0)
+        # The innovations of an outlier are not those of the filter.
+        assert result.nis_per_dimension == pytest.approx(22.5 / 18.0)
+        assert result.nis_bounds == mean_bounds(18)
+
+    def test_nothing_tracked(self) -> None:
+        result = consistency([TrackPoint(0.0, status="not acquired: no signal")], np.zeros((1, 3)), None)
+        assert (result.rows, result.tracked_rows) == (1, 0)
+        assert math.isnan(result.position_rms_m)
+        assert math.isnan(result.nees_per_dimension)
+        assert math.isnan(result.nis_per_dimension)
+        assert np.isnan([*result.nees_bounds, *result.nis_bounds]).all()
+
+
+def information_of(state: FloatArray, rotation: FloatArray, origin: FloatArray) -> FloatArray:
+    """Information of one row of the tetrahedron, from magpylib's field by numerical derivatives: (6, 6)."""
+    D = np.kron(contrasts(4), np.eye(3))
+    R = np.kron(difference_covariance(np.full(4, 2e-10)), np.eye(3))
+    scale = np.repeat([1.0, 100.0], 3)
+
+    def differences(states: FloatArray) -> FloatArray:
+        def one(x: FloatArray) -> FloatArray:
+            p, m = rotation.T @ (x[:3] - origin), rotation.T @ (x * scale)[3:]
+            return np.asarray(D @ magpylib_field(ARRAY.positions, p, m).ravel()) * 1e9
+
+        return np.apply_along_axis(one, -1, states)
+
+    H = derivative(differences, state / scale, step=1e-2, atol=1e-9) * 1e-9 / scale
+    return np.asarray(H.T @ np.linalg.solve(R, H))
+
+
+class TestPosteriorBound:
+    N_ROWS = 6
+
+    def truth(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        t = np.array([0.0, 0.5, 1.0, 2.5, 3.0, 3.2])
+        p = np.array([3.0, 1.5, 0.8]) + np.outer(t, [-0.2, 0.1, 0.0])
+        return t, p, np.tile([120.0, -150.0, 160.0], (self.N_ROWS, 1))
+
+    def rows(self, t: FloatArray) -> tuple[list[Row], FloatArray, FloatArray]:
+        """Of an array that moves and turns; their readings play no part, only that they are there."""
+        from scipy.spatial.transform import Rotation
+
+        origin = np.outer(t, [0.1, -0.1, 0.0])
+        rotation = Rotation.from_rotvec(np.outer(t, [0.1, 0.0, -0.2]))
+        rows = list(rows_of(t, np.zeros((self.N_ROWS, 12)), origin, rotation.as_quat()))
+        return rows, rotation.as_matrix(), origin
+
+    def test_is_tichavskys_recursion_in_information_form(self) -> None:
+        """J' = D22 - D21 (J + D11)⁻¹ D12 with D11 = F⊤Q⁻¹F, D12 = -F⊤Q⁻¹, D22 = Q⁻¹ + H⊤R⁻¹H."""
+        t, p, m = self.truth()
+        rows, rotations, origin = self.rows(t)
+        motion = UnknownMotion(0.2, 0.05)
+        bounds = posterior_bound(Tracker(ARRAY, motion), rows, p, m)
+        expected = []
+        J = np.zeros((6, 6))
+        for i in range(self.N_ROWS):
+            seen = information_of(np.concatenate([p[i], m[i]]), rotations[i], origin[i])
+            if i == 0:
+                J = seen
+            else:
+                dt_s = t[i] - t[i - 1]
+                strength = float(np.linalg.norm(m[i]))
+                Q = np.diag(np.repeat([0.2 * dt_s, 0.05 * strength * dt_s], 3) ** 2)
+                Q_inverse = np.linalg.inv(Q)
+                J = Q_inverse + seen - Q_inverse @ np.linalg.inv(J + Q_inverse) @ Q_inverse
+            expected.append(math.sqrt(float(np.trace(np.linalg.inv(J)[:3, :3]))))
+        np.testing.assert_allclose(bounds, expected, rtol=1e-5)
+
+    def test_first_row_is_the_cramer_rao_bound(self) -> None:
+        """Spec 1, section 4: edge 1.5 m, 1 nT, source (5, 0, 0.306) m, moment along z: (0.289, 0.082, 0.076) m."""
+        array = geometries.tetrahedron(1.5, "vector", 1e-9)
+        row = Row(0.0, np.zeros(12))
+        p, m = np.array([[5.0, 0.0, 0.306]]), np.array([[0.0, 0.0, 100.0]])
+        (bound,) = posterior_bound(Tracker(array, UnknownMotion(0.1, 0.1)), [row], p, m)
+        assert bound == pytest.approx(math.sqrt(0.289**2 + 0.082**2 + 0.076**2), rel=0.01)
+
+    def test_of_rest_falls_with_the_root_of_the_rows(self) -> None:
+        t, p, m = self.truth()
+        rows = list(rows_of(t, np.zeros((self.N_ROWS, 12))))
+        still_p, still_m = np.tile(p[0], (self.N_ROWS, 1)), m
+        bounds = posterior_bound(Tracker(ARRAY, UnknownMotion(1e-9, 1e-9)), rows, still_p, still_m)
+        np.testing.assert_allclose(bounds, bounds[0] / np.sqrt(np.arange(1.0, self.N_ROWS + 1.0)), rtol=1e-6)
+
+    def test_is_infinite_until_the_readings_determine_the_source(self) -> None:
+        t, p, m = self.truth()
+        readings = np.zeros((self.N_ROWS, 12))
+        readings[0] = np.nan
+        readings[1, 6:] = np.nan  # three differences
+        readings[4] = np.nan
+        bounds = posterior_bound(Tracker(ARRAY, WanderingMotion(0.2, 0.05)), list(rows_of(t, readings)), p, m)
+        assert np.isinf(bounds[:2]).all()
+        assert np.isfinite(bounds[2:]).all()
+        assert bounds[4] > bounds[3]
