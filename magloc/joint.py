@@ -457,13 +457,6 @@ def covariances(problem: JointProblem, fits: JointFits) -> FloatArray:
     return _inverse_information(jacobian) * np.outer(unit, unit)
 
 
-def moment_covariances(problem: JointProblem, fits: JointFits) -> FloatArray:
-    """Inverse information of the moments at known places: (b, 3 K, 3 K) [A·m²], NaN where it is singular."""
-    jacobian = problem.moment_jacobian(fits.q, problem.linear_gain(problem.source_fields(fits.q, fits.mu)))
-    unit = np.repeat(problem.radius**3 / MU0_OVER_4PI / np.abs(fits.q[..., 3]) ** 3, 3, axis=-1)
-    return _inverse_information(jacobian) * unit[:, :, None] * unit[:, None]
-
-
 def _inverse_information(jacobian: FloatArray) -> FloatArray:
     """``(JᵀJ)⁻¹`` of every fit by singular values of the Jacobian in columns of unit norm."""
     norm = np.linalg.norm(jacobian, axis=1)
