@@ -15,11 +15,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from arrays.differences import Whitening
 from arrays.sensor import SensorArray
 from magloc.dipole import MU0_OVER_4PI
+from magloc.separable import ScaledSensors
 
 FloatArray = NDArray[np.float64]
 
@@ -31,18 +32,11 @@ _LARGEST_DAMPING = 1e9
 
 
 @dataclass(frozen=True, eq=False)
-class JointProblem:
+class JointProblem(ScaledSensors):
     """Geometry and whitening of b sets of readings of one array, scaled by the array's size.
 
     Attributes
     ----------
-    centroid : ndarray, shape (3,)
-        Sensors' centroid [m], array frame.
-    radius : float
-        Largest distance of a sensor from it [m].
-    sensors : ndarray, shape (N, 3)
-        Sensors relative to the centroid, in radii.
-    channel_sensor : ndarray of int, shape (C,)
     channel_is_scalar : ndarray of bool, shape (C,)
     gain : ndarray, shape (b, C, 3)
         Channel gains divided by the noise; of a scalar channel the first number counts.
@@ -53,10 +47,6 @@ class JointProblem:
     shrinkage : ndarray, shape (b, c)
     """
 
-    centroid: FloatArray
-    radius: float
-    sensors: FloatArray
-    channel_sensor: NDArray[np.intp]
     channel_is_scalar: NDArray[np.bool_]
     gain: FloatArray
     ambient: FloatArray
@@ -99,30 +89,6 @@ class JointProblem:
     def without_ambient(self) -> JointProblem:
         """The same without an ambient field."""
         return replace(self, ambient=np.zeros_like(self.ambient))
-
-    def homogeneous(self, position_m: ArrayLike) -> FloatArray:
-        """Homogeneous coordinates (..., 4), of unit norm and s > 0, of positions (..., 3) [m]."""
-        rho = (np.asarray(position_m, dtype=np.float64) - self.centroid) / self.radius
-        q = np.concatenate([rho, np.ones_like(rho[..., :1])], axis=-1)
-        unit: FloatArray = q / np.linalg.norm(q, axis=-1, keepdims=True)
-        return unit
-
-    def position(self, q: FloatArray) -> FloatArray:
-        """Positions (..., 3) [m] of homogeneous coordinates (..., 4); not finite at s = 0."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            position: FloatArray = self.centroid + self.radius * q[..., :3] / q[..., 3:]
-        return position
-
-    def moment(self, q: FloatArray, mu: FloatArray) -> FloatArray:
-        """Moments (..., 3) [A·m²] of scaled moments μ (..., 3) [T] at q (..., 4)."""
-        with np.errstate(divide="ignore", invalid="ignore"):
-            moment: FloatArray = mu * (self.radius**3 / MU0_OVER_4PI) / np.abs(q[..., 3:]) ** 3
-        return moment
-
-    def scaled_moment(self, q: FloatArray, moment_Am2: ArrayLike) -> FloatArray:
-        """The inverse of :meth:`moment`."""
-        mu: FloatArray = np.asarray(moment_Am2) * (MU0_OVER_4PI / self.radius**3) * np.abs(q[..., 3:]) ** 3
-        return mu
 
     def whitened(self, channels: FloatArray) -> FloatArray:
         """Channels (b, C) or columns of them (b, C, n), divided by the noise, without their common field."""
@@ -254,27 +220,37 @@ def fit_moments(problem: JointProblem, y: FloatArray, q: FloatArray) -> FloatArr
 
 
 def _moment_step(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
-    step = _solve_scaled(jacobian, residual, np.zeros(jacobian.shape[-1]), np.zeros(len(residual)))[0]
+    step, _ = _NormalEquations.of(jacobian, residual).step()
     return step.reshape(len(residual), -1, 3)
 
 
-def _solve_scaled(
-    jacobian: FloatArray, residual: FloatArray, damped: FloatArray, damping: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Damped normal equations in columns of unit norm: the step, and by how much it promises to lower χ²."""
-    norm = np.linalg.norm(jacobian, axis=1)
-    norm = np.where(norm > 0.0, norm, 1.0)
-    unit = jacobian / norm[:, None]
-    transposed = unit.transpose(0, 2, 1)
-    gradient = (transposed @ residual[..., None])[..., 0]
-    information = transposed @ unit
-    diagonal = np.arange(norm.shape[-1])
-    system = information.copy()
-    system[:, diagonal, diagonal] += 1e-13 + damping[:, None] * damped
-    with np.errstate(all="ignore"):
-        step = np.linalg.solve(system, gradient[..., None])[..., 0]
-        promised = 2.0 * np.sum(step * gradient, axis=-1) - np.sum(step * (information @ step[..., None])[..., 0], -1)
-    return step / norm, promised
+@dataclass(frozen=True, eq=False)
+class _NormalEquations:
+    """Normal equations of many fits, in columns of unit norm."""
+
+    norm: FloatArray
+    gradient: FloatArray
+    information: FloatArray
+
+    @classmethod
+    def of(cls, jacobian: FloatArray, residual: FloatArray) -> _NormalEquations:
+        """From Jacobians (b, C, n) and residuals (b, C)."""
+        norm = np.linalg.norm(jacobian, axis=1)
+        norm = np.where(norm > 0.0, norm, 1.0)
+        unit = jacobian / norm[:, None]
+        transposed = unit.transpose(0, 2, 1)
+        return cls(norm, (transposed @ residual[..., None])[..., 0], transposed @ unit)
+
+    def step(self, damping: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """The step (b, n) with a damping of every column, and by how much it promises to lower χ² (b,)."""
+        diagonal = np.arange(self.norm.shape[-1])
+        system = self.information.copy()
+        system[:, diagonal, diagonal] += 1e-13 + damping
+        with np.errstate(all="ignore"):
+            step = np.linalg.solve(system, self.gradient[..., None])[..., 0]
+            curvature = np.sum(step * (self.information @ step[..., None])[..., 0], axis=-1)
+            promised = 2.0 * np.sum(step * self.gradient, axis=-1) - curvature
+        return step / self.norm, promised
 
 
 def refine_moments(
@@ -364,8 +340,9 @@ def _descend(
             along = at.position_jacobian(q[live[new]], mu[live[new]], gain, tangent[new])[..., columns]
             jacobian[new] = np.concatenate([along, at.moment_jacobian(q[live[new]], gain)], axis=-1)
             iterations[live[new]] += 1
-        step, promised = _solve_scaled(jacobian, residual, damped, damping)
-        _, reachable = _solve_scaled(jacobian, residual, damped, np.zeros(live.size))
+        normal = _NormalEquations.of(jacobian, residual)
+        step, promised = normal.step(damping[:, None] * damped)
+        _, reachable = normal.step()
         new_q, new_mu, step_share = _moved(q[live], mu[live], step, tangent, columns)
         new_fields = sub.source_fields(new_q, new_mu)
         new_residual = y[live] - sub.predicted(new_fields)

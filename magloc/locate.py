@@ -21,7 +21,7 @@ from magloc.dipole import MU0_OVER_4PI
 from magloc.fix import DISTINCT_WITHIN, NOTHING_KNOWN, RISE_95, SILENT, Fix, Knowledge, Solution, open_ended
 from magloc.kernels import over_rows
 from magloc.kernels import separable as kernels
-from magloc.rows import NO_SIGNAL, ambient_fields, rows_of_equal_mask
+from magloc.rows import NO_SIGNAL, ambient_fields, checked_rows, rows_of_equal_mask
 from magloc.separable import SeparableProblem, candidate_positions
 
 FloatArray = NDArray[np.float64]
@@ -155,11 +155,7 @@ class Locator:
         list of Fix
             In the order of the rows.
         """
-        readings = np.asarray(readings_T, dtype=np.float64)
-        if readings.ndim != 2 or readings.shape[1] != self.array.n_channels:
-            raise ValueError(
-                f"Input readings_T must have shape (n, {self.array.n_channels}); instead received {readings.shape}."
-            )
+        readings = checked_rows(self.array, readings_T)
         without_source = np.broadcast_to(self._without_source, readings.shape)
         if ambient_T is not None:
             ambient = np.asarray(ambient_T, dtype=np.float64)

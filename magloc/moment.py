@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from arrays.sensor import SensorArray
 from magloc.fix import DISTINCT_WITHIN, NOTHING_KNOWN, SILENT, Fix, Knowledge, Solution
 from magloc.joint import JointFits, JointProblem, fit_moments, refine_moments
-from magloc.rows import NO_SIGNAL, joint_problem, rows_of_equal_mask, whitenings_of
+from magloc.rows import NO_SIGNAL, checked_rows, joint_problem, rows_of_equal_mask, whitenings_of
 from magloc.search import Beam
 from magloc.separable import fibonacci_directions
 
@@ -84,11 +84,7 @@ class MomentLocator:
         list of Fix
             Every distinct solution, with the covariance (3, 3) of the moment. The range is that of the known place.
         """
-        readings = np.asarray(readings_T, dtype=np.float64)
-        if readings.ndim != 2 or readings.shape[1] != self.array.n_channels:
-            raise ValueError(
-                f"Input readings_T must have shape (n, {self.array.n_channels}); instead received {readings.shape}."
-            )
+        readings = checked_rows(self.array, readings_T)
         positions = np.broadcast_to(
             self.position_m if position_m is None else np.asarray(position_m, dtype=np.float64), (len(readings), 3)
         )

@@ -75,6 +75,18 @@ def range_intervals(
     return ends
 
 
+def range_intervals_m(
+    problem: JointProblem, y: FloatArray, fits: JointFits, source: int, covariance: FloatArray
+) -> FloatArray:
+    """:func:`range_intervals` in metres, (b, 2), with first steps from the covariances of the fits (b, 6 K, 6 K)."""
+    offset = problem.position(fits.q)[:, source] - problem.centroid
+    of_position = slice(6 * source, 6 * source + 3)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        variance = np.einsum("bi,bij,bj->b", offset, covariance[:, of_position, of_position], offset)
+        relative = np.sqrt(variance) / np.sum(offset * offset, axis=-1)
+    return problem.radius * range_intervals(problem, y, fits, source, relative)
+
+
 def _rises(
     problem: JointProblem, y: FloatArray, fits: JointFits, source: int, rows: NDArray[np.intp], alpha: FloatArray
 ) -> FloatArray:

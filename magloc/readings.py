@@ -36,6 +36,7 @@ TRUE_POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 TRUE_MOMENT_COLUMNS = ("mx_Am2", "my_Am2", "mz_Am2")
 
 _T_IN_nT = 1e9
+_SAME_TIME_S = 1e-6
 _SATURATION_RTOL = 1e-12
 _LARGEST_nT = 1e15  # a million tesla: a column of something else, or a broken line
 # Change of the ambient field, relative, within which moduli may be averaged: 50 nT in 50 µT.
@@ -216,6 +217,28 @@ def read_truth(path: str | PathLike[str]) -> Truth:
     position_m[:, : len(columns)] = table.complete(columns)
     moment_Am2 = table.complete(TRUE_MOMENT_COLUMNS) if table.has_group(TRUE_MOMENT_COLUMNS) else None
     return Truth(time_s, position_m, moment_Am2)
+
+
+def rows_of_same_time(readings: Readings, truth: Truth) -> tuple[IntArray, IntArray]:
+    """Rows of readings and of a truth that have the same time, to a microsecond.
+
+    Parameters
+    ----------
+    readings : Readings
+    truth : Truth
+
+    Returns
+    -------
+    in_readings, in_truth : ndarray of int, shape (k,)
+        In the order of the readings; empty where no time agrees.
+    """
+    order = np.argsort(truth.time_s, kind="stable")
+    times = truth.time_s[order]
+    after = np.clip(np.searchsorted(times, readings.time_s), 1, max(1, len(times) - 1))
+    before, after = after - 1, np.minimum(after, len(times) - 1)
+    nearest = np.where(np.abs(times[before] - readings.time_s) <= np.abs(times[after] - readings.time_s), before, after)
+    same = np.abs(times[nearest] - readings.time_s) <= _SAME_TIME_S
+    return np.flatnonzero(same), order[nearest[same]]
 
 
 def write_readings(path: str | PathLike[str], readings: Readings, array: SensorArray) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from arrays.differences import Whitening, reading_covariance, whitening, whitenings
 from arrays.sensor import SensorArray
@@ -14,6 +14,22 @@ from magloc.joint import JointProblem
 FloatArray = NDArray[np.float64]
 
 NO_SIGNAL = "the sensors' readings do not differ: no signal"
+
+
+def checked_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
+    """Raw readings (n, C) of an array [T] as numbers.
+
+    Raises
+    ------
+    ValueError
+        They have another shape.
+    """
+    readings = np.asarray(readings_T, dtype=np.float64)
+    if readings.ndim != 2 or readings.shape[1] != array.n_channels:
+        raise ValueError(
+            f"Input readings_T must have shape (n, {array.n_channels}); instead received {readings.shape}."
+        )
+    return readings
 
 
 def rows_of_equal_mask(available: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.intp]]]:

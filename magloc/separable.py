@@ -30,8 +30,8 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class SeparableProblem:
-    """Geometry and noise of one set of channels, scaled for the search.
+class ScaledSensors:
+    """Sensors in units of their array's size, and what homogeneous coordinates mean there.
 
     Attributes
     ----------
@@ -43,15 +43,49 @@ class SeparableProblem:
         Sensors relative to the centroid, in radii.
     channel_sensor : ndarray of int, shape (C,)
         Sensor of every channel.
-    whitening : Whitening
-    gain : ndarray, shape (C, 3)
-        Channel gains in channels of unit noise; zero rows where readings are missing.
     """
 
     centroid: FloatArray
     radius: float
     sensors: FloatArray
     channel_sensor: NDArray[np.intp]
+
+    def homogeneous(self, position_m: ArrayLike) -> FloatArray:
+        """Homogeneous coordinates (..., 4), of unit norm and s > 0, of positions (..., 3) [m]."""
+        rho = (np.asarray(position_m, dtype=np.float64) - self.centroid) / self.radius
+        q = np.concatenate([rho, np.ones_like(rho[..., :1])], axis=-1)
+        unit: FloatArray = q / np.linalg.norm(q, axis=-1, keepdims=True)
+        return unit
+
+    def position(self, q: FloatArray) -> FloatArray:
+        """Positions (..., 3) [m] of homogeneous coordinates (..., 4); not finite at s = 0."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            position: FloatArray = self.centroid + self.radius * q[..., :3] / q[..., 3:]
+        return position
+
+    def moment(self, q: FloatArray, mu: FloatArray) -> FloatArray:
+        """Moments (..., 3) [A·m²] of scaled moments μ (..., 3) [T] at q (..., 4); not finite at s = 0."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            moment: FloatArray = mu * (self.radius**3 / MU0_OVER_4PI) / np.abs(q[..., 3:]) ** 3
+        return moment
+
+    def scaled_moment(self, q: FloatArray, moment_Am2: ArrayLike) -> FloatArray:
+        """The inverse of :meth:`moment`."""
+        mu: FloatArray = np.asarray(moment_Am2) * (MU0_OVER_4PI / self.radius**3) * np.abs(q[..., 3:]) ** 3
+        return mu
+
+
+@dataclass(frozen=True, eq=False)
+class SeparableProblem(ScaledSensors):
+    """Geometry and noise of one set of channels, scaled for the search.
+
+    Attributes
+    ----------
+    whitening : Whitening
+    gain : ndarray, shape (C, 3)
+        Channel gains in channels of unit noise; zero rows where readings are missing.
+    """
+
     whitening: Whitening
     gain: FloatArray
 
@@ -66,23 +100,6 @@ class SeparableProblem:
             whitening=whitening,
             gain=whitening.root @ array.channel_gain,
         )
-
-    def homogeneous(self, position_m: ArrayLike) -> FloatArray:
-        """Homogeneous coordinates (..., 4), of unit norm and s > 0, of positions (..., 3) [m]."""
-        rho = (np.asarray(position_m, dtype=np.float64) - self.centroid) / self.radius
-        q = np.concatenate([rho, np.ones_like(rho[..., :1])], axis=-1)
-        unit: FloatArray = q / np.linalg.norm(q, axis=-1, keepdims=True)
-        return unit
-
-    def position(self, q: FloatArray) -> FloatArray:
-        """Positions (..., 3) [m] of homogeneous coordinates (..., 4); not finite at s = 0."""
-        position: FloatArray = self.centroid + self.radius * q[..., :3] / q[..., 3:]
-        return position
-
-    def moment(self, q: FloatArray, mu: FloatArray) -> FloatArray:
-        """Moments (..., 3) [A·m²] of scaled moments mu (..., 3) at q (..., 4)."""
-        moment: FloatArray = mu * (self.radius**3 / MU0_OVER_4PI) / np.abs(q[..., 3:]) ** 3
-        return moment
 
     def unit_basis(self, q: FloatArray) -> FloatArray:
         """Whitened readings of the three unit scaled moments at q (..., 4): shape (..., C, 3)."""

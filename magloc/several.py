@@ -32,8 +32,8 @@ from magloc.fix import (
     open_ended,
 )
 from magloc.joint import JointFits, JointProblem, covariances, refine
-from magloc.range_profile import range_intervals
-from magloc.rows import NO_SIGNAL, joint_problem, rows_of_equal_mask, whitenings_of
+from magloc.range_profile import range_intervals_m
+from magloc.rows import NO_SIGNAL, checked_rows, joint_problem, rows_of_equal_mask, whitenings_of
 from magloc.search import Beam, Search, best_distinct, merged
 from magloc.separable import candidate_positions
 from magloc.starts import linear_bases, linear_scores
@@ -135,11 +135,7 @@ class SeveralLocator:
         list of JointFix
             In the order of the rows. Sources keep their place from row to row where they can be followed.
         """
-        readings = np.asarray(readings_T, dtype=np.float64)
-        if readings.ndim != 2 or readings.shape[1] != self.array.n_channels:
-            raise ValueError(
-                f"Input readings_T must have shape (n, {self.array.n_channels}); instead received {readings.shape}."
-            )
+        readings = checked_rows(self.array, readings_T)
         ambient = None if ambient_T is None else np.asarray(ambient_T, dtype=np.float64)
         fixes: list[JointFix] = [JointFix(())] * len(readings)
         for mask, rows in rows_of_equal_mask(np.isfinite(readings)):
@@ -360,7 +356,7 @@ class _Levels:
         position, moment = problem.position(fits.q), problem.moment(fits.q, fits.mu)
         covariance = covariances(problem, fits)
         determined = np.isfinite(covariance).all(axis=(1, 2))
-        ends = [self._ranges(problem, y, fits, k, position, covariance) for k in range(beam.n_sources)]
+        ends = [range_intervals_m(problem, y, fits, k, covariance) for k in range(beam.n_sources)]
         dof = self.n_differences - N_UNKNOWNS * beam.n_sources
         solutions: list[list[JointSolution]] = [[] for _ in rows]
         for i in np.flatnonzero(determined):
@@ -382,17 +378,6 @@ class _Levels:
             JointFix(tuple(found), "" if found else _why_unsolved(bool(any_fit[i])))
             for i, found in enumerate(solutions)
         ]
-
-    @staticmethod
-    def _ranges(
-        problem: JointProblem, y: FloatArray, fits: JointFits, k: int, position: FloatArray, covariance: FloatArray
-    ) -> FloatArray:
-        offset = position[:, k] - problem.centroid
-        block = covariance[:, 6 * k : 6 * k + 3, 6 * k : 6 * k + 3]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            variance = np.einsum("bi,bij,bj->b", offset, block, offset)
-            relative = np.sqrt(variance) / np.sum(offset * offset, axis=-1)
-        return problem.radius * range_intervals(problem, y, fits, k, relative)
 
 
 def _scattered(beam: Beam, rows: IntArray, n_rows: int) -> Beam:

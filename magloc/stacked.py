@@ -13,7 +13,7 @@ from scipy.linalg import block_diag
 from arrays.sensor import SensorArray
 from magloc.fix import DISTINCT_WITHIN, NOTHING_KNOWN, Fix, Knowledge, Solution, is_observable, open_ended
 from magloc.joint import JointProblem, covariances
-from magloc.range_profile import range_intervals
+from magloc.range_profile import range_intervals_m
 from magloc.rows import NO_SIGNAL, ambient_fields, whitenings_of
 from magloc.search import Search
 from magloc.separable import fibonacci_directions
@@ -74,11 +74,7 @@ def stacked_fix(
     same = problem.rows(np.zeros(len(listed), dtype=np.intp))
     covariance = covariances(same, fits)
     position, moment = problem.position(fits.q)[:, 0], problem.moment(fits.q, fits.mu)[:, 0]
-    offset = position - problem.centroid
-    with np.errstate(invalid="ignore", divide="ignore"):
-        variance = np.einsum("bi,bij,bj->b", offset, covariance[:, :3, :3], offset)
-        relative = np.sqrt(variance) / np.sum(offset * offset, axis=-1)
-    ends = problem.radius * range_intervals(same, np.repeat(y, len(listed), axis=0), fits, 0, relative)
+    ends = range_intervals_m(same, np.repeat(y, len(listed), axis=0), fits, 0, covariance)
     solutions = tuple(
         Solution(
             position_m=position[i],

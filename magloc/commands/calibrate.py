@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     FloatArray = NDArray[np.float64]
 
-_SAME_TIME_S = 1e-6
 # Gains beyond this many standard deviations of the prior are named.
 _STRANGE = 4.0
 
@@ -220,21 +219,15 @@ def _matched(
     readings: Readings, truth: Truth, readings_path: Path, truth_path: Path
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of the readings and of the truth that have the same time."""
-    import numpy as np
+    from magloc.readings import rows_of_same_time
 
-    order = np.argsort(truth.time_s, kind="stable")
-    times = truth.time_s[order]
-    after = np.clip(np.searchsorted(times, readings.time_s), 1, max(1, len(times) - 1))
-    before = after - 1
-    after = np.minimum(after, len(times) - 1)
-    nearest = np.where(np.abs(times[before] - readings.time_s) <= np.abs(times[after] - readings.time_s), before, after)
-    same = np.abs(times[nearest] - readings.time_s) <= _SAME_TIME_S
-    if not same.any():
+    in_readings, in_truth = rows_of_same_time(readings, truth)
+    if not in_readings.size:
         raise InputError(
             f"{truth_path}: found none of the times of {readings_path} ({readings.time_s.min():.15g} s to "
             f"{readings.time_s.max():.15g} s), expected rows with the same time_s."
         )
-    return np.flatnonzero(same), order[nearest[same]]
+    return in_readings, in_truth
 
 
 def _has_height(truth: Truth) -> bool:

@@ -12,15 +12,13 @@ from numpy.typing import NDArray
 
 from arrays.errors import InputError
 from magloc.consistency import Consistency
-from magloc.readings import Readings, Truth
+from magloc.readings import Readings, Truth, rows_of_same_time
 from magloc.track import TrackPoint
 
 if TYPE_CHECKING:
     from magloc.commands.track import Vector
 
 FloatArray = NDArray[np.float64]
-
-_SAME_TIME_S = 1e-6
 
 
 def json_entry(point: TrackPoint) -> dict[str, object]:
@@ -83,19 +81,16 @@ def report(result: Consistency) -> list[str]:
 
 def truth_of_rows(readings: Readings, truth: Truth, path: Path) -> tuple[FloatArray, FloatArray | None]:
     """True position, and moment if it is known, of every row (n, 3); NaN where the truth has no row of that time."""
-    order = np.argsort(truth.time_s, kind="stable")
-    times = truth.time_s[order]
-    after = np.clip(np.searchsorted(times, readings.time_s), 1, max(1, len(times) - 1))
-    candidates = np.stack([after - 1, np.minimum(after, len(times) - 1)])
-    off = np.abs(times[candidates] - readings.time_s)
-    nearest = np.take_along_axis(candidates, np.argmin(off, axis=0)[None], axis=0)[0]
-    same = off.min(axis=0) <= _SAME_TIME_S
-    if not same.any():
+    in_readings, in_truth = rows_of_same_time(readings, truth)
+    if not in_readings.size:
         raise InputError(f"{path}: found none of the times of the readings, expected rows with the same time_s.")
-    position = np.where(same[:, None], truth.position_m[order][nearest], np.nan)
+    position = np.full((len(readings), 3), np.nan)
+    position[in_readings] = truth.position_m[in_truth]
     if truth.moment_Am2 is None:
         return position, None
-    return position, np.where(same[:, None], truth.moment_Am2[order][nearest], np.nan)
+    moment = np.full((len(readings), 3), np.nan)
+    moment[in_readings] = truth.moment_Am2[in_truth]
+    return position, moment
 
 
 def geojson_text(points: Sequence[TrackPoint], origin: Vector) -> str:
