@@ -374,22 +374,35 @@ def _covariance_blocks(array: SensorArray, readings_T: FloatArray) -> FloatArray
     gain_error = np.array([sensor.gain_uncertainty for sensor in array.sensors])
     if not (misalignment.any() or gain_error.any()):
         return blocks
+    turns, gains = np.split(calibration_errors(array, readings_T), 2, axis=-1)
+    factor = np.concatenate([misalignment[:, None, None] * turns, gain_error[:, None, None] * gains], axis=-1)
+    # Formed from its factor, the product is singular to the rounding of its diagonal, also for a field along an axis.
+    calibration = factor @ np.swapaxes(factor, -1, -2)
+    return blocks + calibration * (1.0 + _REGULAR_RTOL * np.eye(3))
+
+
+def calibration_errors(array: SensorArray, readings_T: FloatArray) -> FloatArray:
+    """What small errors of a calibration do to the readings: derivatives with respect to turns θ and gains g.
+
+    Parameters
+    ----------
+    array : SensorArray
+    readings_T : ndarray, shape (..., C)
+        Raw readings [T], NaN where missing; see :func:`reading_covariance` for what stands for those.
+
+    Returns
+    -------
+    ndarray, shape (..., N, 3, 6)
+        By sensor, its three axes, and (θ, g): ``S (θ × b + g ∘ b)`` [T]. A scalar sensor has its first axis only.
+    """
+    readings_T = np.asarray(readings_T, dtype=np.float64)
     scale = np.tile(np.eye(3), (array.n_sensors, 1, 1))
     for i, sensor in enumerate(array.sensors):
         scale[i, : sensor.n_channels, : sensor.n_channels] = sensor.calibration.scale
     b = _fields_in_sensor_axes(array, readings_T, scale)
-    turned = np.cross(b[..., None, :], np.eye(3))  # row k is b × e_k, minus the error of a turn about axis k
-    factor = np.concatenate(
-        [
-            misalignment[:, None, None] * np.swapaxes(turned, -1, -2),
-            gain_error[:, None, None] * b[..., None] * np.eye(3),
-        ],
-        axis=-1,
-    )
-    factor = scale @ factor
-    # Formed from its factor, the product is singular to the rounding of its diagonal, also for a field along an axis.
-    calibration = factor @ np.swapaxes(factor, -1, -2)
-    return blocks + calibration * (1.0 + _REGULAR_RTOL * np.eye(3))
+    turned = np.swapaxes(np.cross(np.eye(3), b[..., None, :]), -1, -2)  # column k is e_k × b
+    derivative: FloatArray = scale @ np.concatenate([turned, b[..., None] * np.eye(3)], axis=-1)
+    return derivative
 
 
 def _fields_in_sensor_axes(array: SensorArray, readings_T: FloatArray, scale: FloatArray) -> FloatArray:

@@ -10,16 +10,22 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
     saturation_nT = 100_000.0       # optional, readings that reach it are no measurements
     misalignment_mrad = 1.0         # optional, unknown small rotation of a vector sensor's axes, 1 sigma per axis
     gain_uncertainty = 0.001        # optional, relative, 1 sigma per axis
+    offset_uncertainty_nT = 0.5     # optional, unknown field fixed to the array, 1 sigma per axis
+    flicker_nT = 0.01               # optional, 1/f noise: 1 sigma in every decade of frequency
+    drift_nT_rth = 0.1              # optional, random walk of the offset: 1 sigma after an hour
 
-    [[sensor]]                      # in place of geometry, its size, and the keys from kind to gain_uncertainty
+    [[sensor]]                      # in place of geometry, its size, and the keys from kind to drift_nT_rth
     id = "s1"
     kind = "vector"
     position_m = [0.0, 0.0, 0.918]  # array frame
     rotation_xyzw = [0, 0, 0, 1]    # optional, sensor axes -> array frame
     noise_nT = 1.0
-    saturation_nT = 100_000.0       # these three optional, as above
+    saturation_nT = 100_000.0       # this and the following optional, as above
     misalignment_mrad = 1.0
     gain_uncertainty = 0.001
+    offset_uncertainty_nT = 0.5
+    flicker_nT = 0.01
+    drift_nT_rth = 0.1
     [sensor.calibration]            # optional, reading = scale · (field in sensor axes) + offset
     scale = 1.0                     # a number, 3 numbers or a 3×3 matrix
     offset_nT = [0.0, 0.0, 0.0]     # one number for a scalar sensor
@@ -70,6 +76,9 @@ class _Quality(msgspec.Struct, kw_only=True):
     saturation_nT: _Number | None = None
     misalignment_mrad: _Number = 0
     gain_uncertainty: float = 0.0
+    offset_uncertainty_nT: _Number = 0
+    flicker_nT: _Number = 0
+    drift_nT_rth: _Number = 0
 
 
 class _GeometryFile(_Header, kw_only=True):
@@ -205,6 +214,13 @@ def array_toml(array: SensorArray) -> str:
             lines.append(f"misalignment_mrad = {_shifted(sensor.misalignment_rad, 3)}")
         if sensor.gain_uncertainty:
             lines.append(f"gain_uncertainty = {sensor.gain_uncertainty!r}")
+        for key, value in (
+            ("offset_uncertainty_nT", sensor.offset_uncertainty_T),
+            ("flicker_nT", sensor.flicker_T),
+            ("drift_nT_rth", sensor.drift_T_rth),
+        ):
+            if value:
+                lines.append(f"{key} = {_nanotesla(value)}")
         if sensor.calibration != Calibration.of(sensor.kind):
             offsets = sensor.calibration.offset_T
             offset = _nanotesla_list(offsets) if sensor.kind == "vector" else _nanotesla(offsets[0])
@@ -304,11 +320,18 @@ def _quality(place: str, table: _Quality) -> dict[str, Any]:
     misalignment_rad = _scaled(key, table.misalignment_mrad, -3)
     if not 0.0 <= misalignment_rad < 1.0:
         raise InputError(f"{key}: found {table.misalignment_mrad}, expected a number from 0 to below 1000.")
+    lasting = {}
+    for name in ("offset_uncertainty_nT", "flicker_nT", "drift_nT_rth"):
+        value = getattr(table, name)
+        lasting[name.replace("nT", "T")] = _tesla(f"{place}, key {name}", value)
+        if value < 0:
+            raise InputError(f"{place}, key {name}: found {value}, expected a number that is not negative.")
     return {
         "noise_T": _tesla(place, table.noise_nT),
         "saturation_T": None if table.saturation_nT is None else _tesla(place, table.saturation_nT),
         "misalignment_rad": misalignment_rad,
         "gain_uncertainty": table.gain_uncertainty,
+        **lasting,
     }
 
 

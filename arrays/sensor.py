@@ -7,6 +7,7 @@ and fields refer to the array's own frame; all quantities are SI.
 from __future__ import annotations
 
 import difflib
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -22,6 +23,9 @@ BoolArray = NDArray[np.bool_]
 AnyArray = TypeVar("AnyArray", bound=NDArray[Any])
 
 SensorKind = Literal["vector", "scalar"]
+
+FLICKER_DECADES = 3
+"""Decades of frequency that 1/f noise is counted in: above them white noise is stronger, below them drift."""
 
 AMBIENT_CHANNELS = ("ambient_x", "ambient_y", "ambient_z")
 """Names of a readings file's columns that no channel may take."""
@@ -124,13 +128,20 @@ class Sensor:
         know [rad]; 0 for a scalar sensor, which has no axes.
     gain_uncertainty : float
         Standard deviation of the relative error of the gain, independent per axis.
+    offset_uncertainty_T : float
+        Standard deviation, per axis, of an unknown field at the sensor that is fixed to the array, such as that of what
+        carries it; for a vector sensor the same as an error of its offsets [T].
+    flicker_T : float
+        Standard deviation of what 1/f noise adds in every decade of frequency, per channel [T].
+    drift_T_rth : float
+        Random walk of the offset, per channel: its standard deviation after an hour [T/√h].
 
     Raises
     ------
     ValueError
         A number is not finite, a shape is wrong, the noise or the saturation is not positive, the misalignment or the
-        gain's uncertainty is negative or not below 1, a scalar sensor has a misalignment, the quaternion's norm differs
-        from 1 by more than 1e-6, or the id cannot name a column.
+        gain's uncertainty is negative or not below 1, one of the last three is negative, a scalar sensor has a
+        misalignment, the quaternion's norm differs from 1 by more than 1e-6, or the id cannot name a column.
     """
 
     id: str
@@ -142,6 +153,9 @@ class Sensor:
     saturation_T: float | None = None
     misalignment_rad: float = 0.0
     gain_uncertainty: float = 0.0
+    offset_uncertainty_T: float = 0.0
+    flicker_T: float = 0.0
+    drift_T_rth: float = 0.0
 
     def __post_init__(self) -> None:
         _check_id(self.id)
@@ -157,6 +171,10 @@ class Sensor:
             object.__setattr__(self, name, _finite_number(name, getattr(self, name)))
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise ValueError(f"Input {name} must be from 0 to below 1; instead received {getattr(self, name)}.")
+        for name in ("offset_uncertainty_T", "flicker_T", "drift_T_rth"):
+            object.__setattr__(self, name, _finite_number(name, getattr(self, name)))
+            if getattr(self, name) < 0.0:
+                raise ValueError(f"Input {name} must not be negative; instead received {getattr(self, name)}.")
         if self.kind == "scalar" and self.misalignment_rad:
             raise ValueError(
                 f"Input misalignment_rad must be 0 for a scalar sensor; instead received {self.misalignment_rad}."
@@ -169,6 +187,11 @@ class Sensor:
                 f"Input calibration must have {n} channel{'s' if n > 1 else ''} for a {self.kind} sensor; "
                 f"instead received {len(self.calibration.offset_T)}."
             )
+
+    @property
+    def row_noise_T(self) -> float:
+        """Standard deviation of a channel in one row by itself: noise, 1/f noise and error of the offset [T]."""
+        return math.hypot(self.noise_T, self.offset_uncertainty_T, math.sqrt(FLICKER_DECADES) * self.flicker_T)
 
     @property
     def n_channels(self) -> int:
@@ -307,8 +330,8 @@ class SensorArray:
 
     @cached_property
     def channel_noise_T(self) -> FloatArray:
-        """Standard deviation of each channel, shape (C,) [T]."""
-        return _read_only(np.array([sensor.noise_T for sensor in self.sensors])[self.channel_sensor])
+        """Standard deviation of each channel in one row by itself, shape (C,) [T]."""
+        return _read_only(np.array([sensor.row_noise_T for sensor in self.sensors])[self.channel_sensor])
 
     @cached_property
     def channel_saturation_T(self) -> FloatArray:

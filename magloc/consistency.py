@@ -16,13 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from magloc.measurement import DifferenceMeasurement
-from magloc.motion import N_SOURCE, MotionModel
-from magloc.track import Row, Tracker, TrackPoint
+from magloc.kalman import sequential_update
+from magloc.motion import N_SOURCE
+from magloc.row_measurement import RowMeasurement
+from magloc.track import Tracker
+from magloc.track_rows import Row, TrackPoint
 
 FloatArray = NDArray[np.float64]
 
 _LEVEL = 0.99
+# Rows determine a source if their Jacobian, columns scaled, is not nearer to singular.
+_SINGULAR_RTOL = 1e-6
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,8 @@ class Consistency:
     position_bound_m : float
         The same of the posterior Cramér-Rao bound, over the same rows; NaN where the true moment is not known.
     nees_per_dimension : float
-        Mean NEES over the number of its dimensions: 1 if the covariance is right.
+        Mean NEES over the number of its dimensions: 1 if the covariance is right. It is counted in coordinates in
+        which an uncertain one is Gaussian, see :func:`nees_of`.
     nees_bounds : tuple of 2 floats
         Two-sided 99 % bounds of it for independent rows. A track's rows are not independent: over one record it may
         well lie outside.
@@ -69,6 +74,8 @@ def mean_bounds(degrees_of_freedom: int, level: float = _LEVEL) -> tuple[float, 
 
 def consistency(
     points: Sequence[TrackPoint],
+    tracker: Tracker,
+    rows: Sequence[Row],
     position_m: FloatArray,
     moment_Am2: FloatArray | None,
     bound_m: FloatArray | None = None,
@@ -78,6 +85,9 @@ def consistency(
     Parameters
     ----------
     points : sequence of TrackPoint
+    tracker : Tracker
+        That made them.
+    rows : sequence of Row
     position_m, moment_Am2 : ndarray, shape (n, 3)
         Truth of every row in the track's frame; NaN where a coordinate is not known.
         With the moment NEES is that of all six numbers, else that of the position.
@@ -88,32 +98,22 @@ def consistency(
     -------
     Consistency
     """
-    squares, nees, nees_dof, nis, nis_dof, bounds = [], 0.0, 0, 0.0, 0, []
-    n_rows = 0
+    squares, bounds, nis, nis_dof = [], [], 0.0, 0
     for i, point in enumerate(points):
-        known = np.isfinite(position_m[i])
-        n_rows += bool(known.any())
-        if point.position_m is None or point.moment_Am2 is None or point.covariance is None:
+        if point.position_m is None:
             continue
         if math.isfinite(point.nis) and point.nis_dof and point.status == "tracked":
             nis, nis_dof = nis + point.nis, nis_dof + point.nis_dof
-        if not known.any():
-            continue
-        error = point.position_m[known] - position_m[i][known]
-        squares.append(float(error @ error))
-        if bound_m is not None:
-            bounds.append(float(bound_m[i]))
-        index = np.flatnonzero(known)
-        if moment_Am2 is not None and np.isfinite(moment_Am2[i]).all():
-            error = np.concatenate([error, point.moment_Am2 - moment_Am2[i]])
-            index = np.concatenate([index, [3, 4, 5]])
-        covariance = point.covariance[np.ix_(index, index)]
-        scale = np.sqrt(np.diagonal(covariance))
-        normalised = error / scale
-        nees += float(normalised @ np.linalg.solve(covariance / np.outer(scale, scale), normalised))
-        nees_dof += error.size
+        known = np.isfinite(position_m[i])
+        if known.any():
+            error = point.position_m[known] - position_m[i][known]
+            squares.append(float(error @ error))
+            if bound_m is not None:
+                bounds.append(float(bound_m[i]))
+    of_rows, dof_of_rows = nees_of_rows(points, tracker, rows, position_m, moment_Am2)
+    nees, nees_dof = float(np.nansum(of_rows)), int(dof_of_rows.sum())
     return Consistency(
-        rows=n_rows,
+        rows=int(np.isfinite(position_m).any(axis=1).sum()),
         tracked_rows=len(squares),
         position_rms_m=math.sqrt(float(np.mean(squares))) if squares else math.nan,
         position_bound_m=math.sqrt(float(np.mean(np.square(bounds)))) if bounds else math.nan,
@@ -124,12 +124,76 @@ def consistency(
     )
 
 
+def nees_of_rows(
+    points: Sequence[TrackPoint],
+    tracker: Tracker,
+    rows: Sequence[Row],
+    position_m: FloatArray,
+    moment_Am2: FloatArray | None,
+) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Normalised estimation error squared of every row, see :func:`nees_of`.
+
+    Parameters
+    ----------
+    points, tracker, rows, position_m, moment_Am2
+        As of :func:`consistency`.
+
+    Returns
+    -------
+    nees : ndarray, shape (n,)
+        NaN where the source is not tracked, or nothing is known of the truth.
+    dof : ndarray of int, shape (n,)
+    """
+    moments = np.full_like(position_m, np.nan) if moment_Am2 is None else moment_Am2
+    truth = np.concatenate([position_m, moments], axis=1)
+    nees, dof = np.full(len(points), np.nan), np.zeros(len(points), dtype=np.int64)
+    for i, point in enumerate(points):
+        if point.position_m is None or point.moment_Am2 is None or point.covariance is None:
+            continue
+        if np.isfinite(truth[i]).any():
+            estimate = np.concatenate([point.position_m, point.moment_Am2])
+            nees[i], dof[i] = nees_of(tracker.measurement(rows[i]), estimate, point.covariance, truth[i])
+    return nees, dof
+
+
+def nees_of(
+    measurement: RowMeasurement, estimate: FloatArray, covariance: FloatArray, truth: FloatArray
+) -> tuple[float, int]:
+    """Normalised estimation error squared of one estimate, and how many numbers it is of.
+
+    Parameters
+    ----------
+    measurement : RowMeasurement
+        Of the row.
+    estimate, covariance : ndarray, shapes (6,) and (6, 6)
+        Of position and moment.
+    truth : ndarray, shape (6,)
+        NaN where a number is not known: NEES is then that of what is known. If all six are, the error is counted in the
+        coordinates of :mod:`magloc.row_measurement`, in which it is Gaussian.
+
+    Returns
+    -------
+    float, int
+    """
+    known = np.isfinite(truth)
+    known[3:] &= known[3:].all()
+    error = truth - estimate
+    if known.all():
+        error, _ = measurement.coordinates(estimate, np.sqrt(np.diagonal(covariance))).at(truth)
+    error, covariance = error[known], covariance[np.ix_(known, known)]
+    scale = np.sqrt(np.diagonal(covariance))
+    normalised = error / scale
+    return float(normalised @ np.linalg.solve(covariance / np.outer(scale, scale), normalised)), int(known.sum())
+
+
 def posterior_bound(
     tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
 ) -> FloatArray:
     """Posterior Cramér-Rao bound of the distance from the truth, for every row.
 
-    Nothing is known before the first row.
+    Nothing is known before the first row but the standard deviations of the sensors' lasting errors, which count as
+    unknowns of their own, and until the readings determine it the source counts as at rest. Speed and turn rate are
+    those of the truth.
 
     Parameters
     ----------
@@ -144,32 +208,49 @@ def posterior_bound(
     ndarray, shape (n,)
         Root of the trace of the position's bound [m]; infinite as long as the readings do not determine it.
     """
-    motion: MotionModel = tracker.motion
+    motion, n_errors = tracker.motion, tracker.errors.n_states
+    truth = np.concatenate([position_m, moment_Am2], axis=1)
+    velocity, rate = _velocities(np.array([row.time_s for row in rows]), truth)
     bounds = np.full(len(rows), np.inf)
-    P: FloatArray | None = None
+    S: FloatArray | None = None
+    seen: list[FloatArray] = []
     for i, row in enumerate(rows):
-        truth = np.concatenate([position_m[i], moment_Am2[i]])
-        differences = tracker.differences_of(row)
-        R = row.R_world_from_array
-        model = DifferenceMeasurement(tracker.array_of(row), differences)
-        H = model.jacobian(R.T @ (truth[:3] - row.origin_m), R.T @ truth[3:]) / np.sqrt(model.variance)[:, None]
-        H = np.concatenate([H[:, :3] @ R.T, H[:, 3:] @ R.T], axis=1)
-        if P is None:
-            norm = np.linalg.norm(H, axis=0)
-            scaled = H / np.where(norm > 0.0, norm, 1.0)
-            singular = np.linalg.svd(scaled, compute_uv=False)
-            if len(H) < N_SOURCE or singular[-1] < 1e-9 * singular[0]:
-                continue
-            source = np.linalg.inv(scaled.T @ scaled) / np.outer(norm, norm)
-            _, root = motion.start(truth, np.asarray(np.linalg.cholesky(source), dtype=np.float64))
-            P = root @ root.T
+        measurement = tracker.measurement(row)
+        before = max(i - 1, 0)
+        if S is not None:
+            state = np.concatenate([motion.state_of(truth[before], velocity[before], rate[before]), np.zeros(n_errors)])
+            S = tracker.predicted(state, S, row.time_s - rows[before].time_s).S
+        state = np.concatenate([motion.state_of(truth[i], velocity[i], rate[i]), np.zeros(n_errors)])
+        H = measurement.jacobian(state)
+        if S is not None:
+            _, S = sequential_update(state, S, H, np.zeros(len(H)), np.ones(len(H)))
         else:
-            state = np.concatenate([truth, np.zeros(motion.n_states - N_SOURCE)])
-            _, F, S_q = motion.step(state, row.time_s - rows[i - 1].time_s)
-            P = F @ P @ F.T + S_q @ S_q.T
-            full = np.concatenate([H, np.zeros((len(H), motion.n_states - N_SOURCE))], axis=1)
-            gain = P @ full.T @ np.linalg.inv(full @ P @ full.T + np.eye(len(H)))
-            keep = np.eye(motion.n_states) - gain @ full
-            P = keep @ P @ keep.T + gain @ gain.T
-        bounds[i] = math.sqrt(float(np.trace(P[:3, :3])))
+            seen.append(H[:, :N_SOURCE])
+            covariance = _bound_at_rest(np.concatenate(seen))
+            if covariance is None:
+                continue
+            _, S = tracker.start(truth[i], covariance, rows[: i + 1], n_steps=0)
+        bounds[i] = float(np.linalg.norm(S[:3]))
     return bounds
+
+
+def _bound_at_rest(H: FloatArray) -> FloatArray | None:
+    """Covariance (6, 6) of a source at rest from a whitened Jacobian (k, 6), or None where it is not determined."""
+    norm = np.linalg.norm(H, axis=0)
+    scaled = H / np.where(norm > 0.0, norm, 1.0)
+    singular = np.linalg.svd(scaled, compute_uv=False)
+    if len(H) < N_SOURCE or singular[-1] < _SINGULAR_RTOL * singular[0]:
+        return None
+    covariance: FloatArray = np.linalg.inv(scaled.T @ scaled) / np.outer(norm, norm)
+    return covariance
+
+
+def _velocities(time_s: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Velocities and turn rates (n, 3) of true positions and moments (n, 6), by differences of the rows."""
+    if len(time_s) < 2:
+        return np.zeros((len(time_s), 3)), np.zeros((len(time_s), 3))
+    derivative = np.gradient(truth, time_s, axis=0)
+    moment, change = truth[:, 3:], derivative[:, 3:]
+    square = np.sum(moment * moment, axis=1, keepdims=True)
+    rate = np.divide(np.cross(moment, change), square, out=np.zeros_like(moment), where=square > 0.0)
+    return derivative[:, :3], rate

@@ -148,6 +148,8 @@ def iterated_update(
     *,
     tolerance: float,
     max_iterations: int = 50,
+    shrink: float = 1.0,
+    prior: Callable[[FloatArray], tuple[FloatArray, FloatArray]] | None = None,
 ) -> IteratedUpdate:
     r"""Iterated extended Kalman update, scalar by scalar, with the paper's stop rule.
 
@@ -174,6 +176,10 @@ def iterated_update(
         In the unit of z; a fraction of the sensors' noise.
     max_iterations : int
         Linearisations at most.
+    shrink : float
+        What the length of the steps is multiplied by whenever one changes the prediction no less than the one before:
+        Gauss-Newton steps may swing to and fro about an optimum in a strongly curved direction. 1: they are whole, as
+        in the paper.
 
     Returns
     -------
@@ -181,16 +187,20 @@ def iterated_update(
     """
     x_k, predicted = x, Hx(x)
     innovation = z - predicted
-    S_k, H, linearised = S, np.zeros((len(z), len(x))), innovation
-    iteration, change = 0, np.inf
+    S_k, root, H, linearised = S, S, np.zeros((len(z), len(x))), innovation
+    iteration, change, length = 0, np.inf, 1.0
     while iteration < max_iterations and np.isfinite(predicted).all() and not change < tolerance:
         iteration += 1
         H = HJacobian(x_k)
-        linearised = z - predicted - H @ (x - x_k)
-        x_k, S_k = sequential_update(x, S, H, linearised, variance)
+        mean, root = (x, S) if prior is None else prior(x_k)
+        linearised = z - predicted - H @ (mean - x_k)
+        optimum, S_k = sequential_update(mean, root, H, linearised, variance)
+        x_k = optimum if length == 1.0 else x_k + length * (optimum - x_k)
         before, predicted = predicted, Hx(x_k)
-        change = float(np.linalg.norm(predicted - before))
-    nis = _normalised_innovation_squared(S, H, linearised, variance)
+        change_before, change = change, float(np.linalg.norm(predicted - before)) / length
+        if change >= change_before:
+            length *= shrink
+    nis = _normalised_innovation_squared(root, H, linearised, variance)
     return IteratedUpdate(x_k, S_k, iteration, change < tolerance, innovation, nis)
 
 

@@ -94,6 +94,9 @@ class MotionModel(Protocol):
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Predicted state (n,), its Jacobian F (n, n), and a square root S_q (n, m) of the noise of the step."""
 
+    def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
+        """State (n,) of a source (6,) that moves and turns so, (3,) each."""
+
 
 @runtime_checkable
 class LinearMotion(MotionModel, Protocol):
@@ -139,6 +142,10 @@ class UnknownMotion:
         """As :class:`MotionModel`."""
         return source.copy(), S.copy()
 
+    def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
+        """As :class:`MotionModel`."""
+        return source.copy()
+
     def linear_step(self, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """As :class:`LinearMotion`."""
         of_position = np.diag(np.repeat([self.speed_m_s * dt_s, 0.0], 3))
@@ -181,6 +188,10 @@ class WanderingMotion:
     def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As :class:`MotionModel`."""
         return _without_rest(source, S, np.repeat([self.speed_m_s, self.turn_rad_s], 3))
+
+    def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
+        """As :class:`MotionModel`."""
+        return np.concatenate([source, velocity_m_s, rate_rad_s])
 
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """As :class:`MotionModel`."""
@@ -278,6 +289,10 @@ class ConstantTurn:
     def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As :class:`MotionModel`."""
         return _without_rest(source, S, np.array([self.speed_m_s] * 3 + [self.turn_rad_s]))
+
+    def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
+        """As :class:`MotionModel`."""
+        return np.concatenate([source, velocity_m_s, rate_rad_s[2:]])
 
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """As :class:`MotionModel`."""

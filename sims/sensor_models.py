@@ -42,6 +42,8 @@ class SensorModel:
         Standard deviation of the relative error of the gain, per channel.
     drift_T_rth : float
         Random walk of a channel's offset, from zero [T/√h].
+    offset_error_T : float
+        Standard deviation, per axis, of a constant field at the sensor that is fixed to the array.
     """
 
     reads: SensorKind
@@ -53,6 +55,12 @@ class SensorModel:
     misalignment_rad: float = 0.0
     gain_error: float = 0.0
     drift_T_rth: float = 0.0
+    offset_error_T: float = 0.0
+
+    @property
+    def flicker_T(self) -> float:
+        """Standard deviation of 1/f noise in a decade of frequency: ``N √(f_c ln 10)`` [T]."""
+        return self.noise_T_rtHz * math.sqrt(self.corner_Hz * math.log(10.0))
 
     def sigma_T(self, rate_Hz: float) -> float:
         """Standard deviation of white noise and rounding in one sample [T]; that of 1/f noise depends on the record."""
@@ -123,7 +131,7 @@ SENSOR_KINDS: dict[str, SensorModel] = {
 
 
 def model_of(sensor: Sensor, rate_Hz: float) -> SensorModel:
-    """The model that an array file's sensor describes: white noise, and nothing that the array does not state.
+    """The model that an array file's sensor describes, with nothing that the array does not state.
 
     Parameters
     ----------
@@ -141,12 +149,14 @@ def model_of(sensor: Sensor, rate_Hz: float) -> SensorModel:
         range_T=math.inf if sensor.saturation_T is None else sensor.saturation_T,
         misalignment_rad=sensor.misalignment_rad,
         gain_error=sensor.gain_uncertainty,
-    )
-    return model.with_sigma(sensor.noise_T, rate_Hz)
+        drift_T_rth=sensor.drift_T_rth,
+        offset_error_T=sensor.offset_uncertainty_T,
+    ).with_sigma(sensor.noise_T, rate_Hz)
+    return replace(model, corner_Hz=(sensor.flicker_T / model.noise_T_rtHz) ** 2 / math.log(10.0))
 
 
 def nominal_array(array: SensorArray, models: tuple[SensorModel, ...], rate_Hz: float) -> SensorArray:
-    """The array as its user knows it: the noise of one sample, limits and uncertainties of its sensors' models.
+    """The array as its user knows it: noise, limits and uncertainties of its sensors' models.
 
     Parameters
     ----------
@@ -174,6 +184,9 @@ def nominal_array(array: SensorArray, models: tuple[SensorModel, ...], rate_Hz: 
                 saturation_T=None if math.isinf(model.range_T) else model.range_T,
                 misalignment_rad=model.misalignment_rad,
                 gain_uncertainty=model.gain_error,
+                offset_uncertainty_T=model.offset_error_T,
+                flicker_T=model.flicker_T,
+                drift_T_rth=model.drift_T_rth,
             )
             for sensor, model in zip(array.sensors, models, strict=True)
         ),

@@ -109,6 +109,7 @@ def simulate(scenario: Scenario, seed: int) -> Simulation:
         fields_T += field(sensors_m, pose.position_m[:, None, :], moment_Am2[:, None, :])
         truths.append(Truth(time_s, pose.position_m, moment_Am2))
     fields_T = _applied_each(array_pose.rotation.inv(), fields_T) + _platform_fields(scenario, time_s, seed)
+    fields_T += _stray_fields(scenario, seed)
     true_array = _true_array(scenario, seed)
     values_T = _sensed(scenario, true_array.readings_of(fields_T), seed)
     present = np.ones(len(time_s), dtype=bool)
@@ -187,6 +188,16 @@ def _platform_fields(scenario: Scenario, time_s: FloatArray, seed: int) -> Float
         common = stream(seed, "platform noise").standard_normal((len(time_s), 1, 3))
         total += platform.noise_T * common
     return total
+
+
+def _stray_fields(scenario: Scenario, seed: int) -> FloatArray:
+    """Constant fields at the sensors (N, 3) that are fixed to the array."""
+    return np.stack(
+        [
+            model.offset_error_T * stream(seed, "offset", name).standard_normal(3)
+            for name, model in zip(scenario.array.ids, scenario.models, strict=True)
+        ]
+    )
 
 
 def _true_array(scenario: Scenario, seed: int) -> SensorArray:

@@ -70,6 +70,7 @@ def calibrate(
     height_m: float | None = None,
     moment: Literal["constant", "free"] | None = None,
     known: PriorOptions = PriorOptions(),
+    figures: Path | None = None,
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
@@ -103,6 +104,8 @@ def calibrate(
         Constant by default.
     known : PriorOptions
         What is known of the array.
+    figures : Path
+        Folder for figures and the data behind them: residuals before and after, and what the calibration changes.
     json : bool
         Print one JSON object in place of the table.
     common : CommonOptions
@@ -110,17 +113,26 @@ def calibrate(
     """
     import numpy as np
 
-    from arrays.files import read_array, write_array
+    from arrays.files import read_array, read_sensors, write_array
     from magloc.calibration import calibrate_on_path, self_calibrate
     from magloc.commands.calibrate_by_turning import calibrate_by_turning, check_folder
+    from magloc.commands.figure_files import refuse_file
     from magloc.readings import read_readings, read_truth, without_saturated
 
+    if figures is not None:
+        refuse_file(figures, "--figures")
     if modulus_nT is not None:
         if truth is not None:
             raise InputError("--modulus-nT: found it together with --truth, expected one of them.")
         if known != PriorOptions() or height_m is not None or moment is not None:
             raise InputError("--modulus-nT: found it together with an option for a moving source, expected none.")
         calibrate_by_turning(readings, array, modulus_nT, out, json=json, quiet=common.quiet)
+        if figures is not None:
+            from magloc.commands.calibration_picture import write_turning_pictures
+
+            nominal = read_sensors(array)
+            rows = without_saturated(read_readings(readings, nominal), nominal)
+            write_turning_pictures(nominal, read_sensors(out), rows, 1e-9 * modulus_nT, figures, quiet=common.quiet)
         return
     nominal = read_array(array)
     prior = _prior(known, nominal, array)
@@ -128,25 +140,26 @@ def calibrate(
     check_folder(out)
     if truth is None and height_m is not None:
         raise InputError("--height-m: found no --truth, expected it because the height is that of its path.")
-    attitude = _world_from_array(rows)
+    attitude, readings_T = _world_from_array(rows), rows.values_T
     try:
         if truth is None:
             result = self_calibrate(
-                nominal, rows.values_T, moment=moment or "constant", prior=prior, world_from_array=attitude
+                nominal, readings_T, moment=moment or "constant", prior=prior, world_from_array=attitude
             )
         else:
             path = read_truth(truth)
             in_readings, in_truth = _matched(rows, path, readings, truth)
             unknown_height = not _has_height(path) and height_m is None
+            attitude, readings_T = attitude[in_readings], readings_T[in_readings]
             result = calibrate_on_path(
                 nominal,
-                rows.values_T[in_readings],
+                readings_T,
                 _in_array_frame(rows, in_readings, path.position_m[in_truth], height_m, truth),
                 moment_Am2=None if path.moment_Am2 is None or moment is not None else path.moment_Am2[in_truth],
                 moment=moment or "constant",
                 unknown_height=unknown_height,
                 prior=prior,
-                world_from_array=attitude[in_readings],
+                world_from_array=attitude,
             )
     except InputError:
         raise
@@ -168,6 +181,10 @@ def calibrate(
         print_json(_report(result, len(rows), out))
     else:
         print("\n".join(_table(result)))
+    if figures is not None:
+        from magloc.commands.calibration_picture import write_calibration_pictures
+
+        write_calibration_pictures(nominal, readings_T, attitude, result, figures, quiet=common.quiet)
     if not (json or common.quiet):
         _print_summary(result, len(rows))
         _warn_of_strangers(result, prior)

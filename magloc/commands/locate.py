@@ -14,6 +14,9 @@ from arrays.errors import InputError
 from magloc.commands.common import CommonOptions, Flag, print_json, print_note, progress
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from arrays.sensor import SensorArray
     from magloc.fix import Knowledge
     from magloc.readings import Readings
@@ -41,6 +44,8 @@ def locate(
     ambient_gradient: Flag = False,
     body_length_m: float | None = None,
     keep_sensors: Flag = False,
+    truth: Path | None = None,
+    out: Path | None = None,
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
@@ -84,6 +89,11 @@ def locate(
         Length of the object; flags fixes that are nearer than three lengths, where it is no dipole.
     keep_sensors : bool
         Use all sensors, also those that contradict the others.
+    truth : Path
+        Truth file (CSV) to draw in the figures, with the errors; goes with --out.
+    out : Path
+        Folder for figures and the data behind them: the fixes with 95 % ellipses, standard deviations and χ² with its
+        bounds, and what is left of every sensor's readings.
     json : bool
         Print one JSON object with every solution in place of the table.
     common : CommonOptions
@@ -91,6 +101,7 @@ def locate(
     """
     from arrays.files import read_array
     from magloc.commands.ambient import place_of_options, with_ambient_field
+    from magloc.commands.figure_files import refuse_file
     from magloc.commands.fix_output import counted_reasons, in_world, json_entry, saturated_channels, warn_of
     from magloc.commands.fix_table import fix_table
     from magloc.commands.row_fixes import RowFixes
@@ -104,12 +115,17 @@ def locate(
     if position is not None and (sources is not None or region is not None):
         other = "--sources" if sources is not None else "--region"
         raise InputError(f"--position: found it together with {other}, expected one of them.")
+    if truth is not None and out is None:
+        raise InputError("--truth: found no --out, expected a folder for the figures with it.")
+    if out is not None:
+        refuse_file(out, "--out")
     used = subset_of(read_array(array), ids, array)
     measured = read_readings(readings, used, sensors=ids)
     rows = without_saturated(measured, used)
     if average:
         rows, used = _averaged(rows, used, readings, quiet=common.quiet)
     used, ambient_T = with_ambient_field(used, rows, where, gradient=ambient_gradient)
+    true_position_m = None if truth is None else _true_position(rows, truth)
     try:
         task = RowFixes(used, rows, ambient_T, knowledge, n_sources, position, keep_sensors, common.seed)
     except ValueError as error:
@@ -119,6 +135,7 @@ def locate(
     with progress(len(rows), "rows", quiet=common.quiet) as advance:
         fixes = task.fixes(advance)
     near = task.too_near(fixes, body_length_m)
+    in_array = fixes
     fixes = [in_world(fix, rows, i) for i, fix in enumerate(fixes)]
 
     times = rows.time_s.tolist()
@@ -132,6 +149,12 @@ def locate(
     solved = sum(bool(fix.solutions) for fix in fixes)
     if not solved:
         raise InputError(f"{readings}: found no row that can be solved ({reasons}).")
+    if out is not None:
+        from magloc.commands.fix_picture import write_pictures
+        from magloc.fix_residuals import fix_residuals
+
+        residuals = fix_residuals(used, rows.values_T, in_array, ambient_T)
+        write_pictures(rows, used, fixes, residuals, true_position_m, out, quiet=common.quiet)
     if not (json or common.quiet):
         print_note(f"{solved} of {len(fixes)} rows solved" + (f"; not solved: {reasons}" if reasons else ""))
     warn_of(fixes, saturated, near, quiet=common.quiet)
@@ -148,6 +171,14 @@ def subset_of(array: SensorArray, ids: Sequence[str] | None, path: Path) -> Sens
         return array.subset(ids)
     except ValueError as error:
         raise InputError(f"--sensors {','.join(ids)}: {error}") from None
+
+
+def _true_position(rows: Readings, path: Path) -> NDArray[np.float64]:
+    from magloc.commands.track_output import truth_of_rows
+    from magloc.readings import read_truth
+
+    position_m, _ = truth_of_rows(rows, read_truth(path), path)
+    return position_m
 
 
 def _n_sources(option: str | None) -> int | Literal["auto"] | None:

@@ -146,7 +146,7 @@ def _run(sweep: Sweep, scheduler: str | None, *, quiet: bool) -> None:
 
 def _export(folder: Path, counts: MapSummary, *, netcdf: bool) -> None:
     """Figure of a finished map, and all of it as netCDF if wanted."""
-    from magloc.plots import convergence_figure, source_figure
+    from magloc.plots import convergence_figure, save, source_figure
     from magloc.source_map import SourceMapSummary
     from magloc.sweep import open_map
 
@@ -157,10 +157,7 @@ def _export(folder: Path, counts: MapSummary, *, netcdf: bool) -> None:
             figure = convergence_figure(dataset, counts)
         if netcdf:
             _replace(folder / "convergence.nc", lambda path: dataset.to_netcdf(path))
-    _replace(
-        folder / "convergence.png",
-        lambda path: figure.savefig(path, format="png", dpi=120, pil_kwargs={"compress_level": 3}),
-    )
+    _replace(folder / "convergence.png", lambda path: save(figure, path))
 
 
 def _how_done(before: int, counts: MapSummary, sweep: Sweep, folder: Path) -> str:

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from magloc.commands.ambient import Place
     from magloc.motion import MotionModel
     from magloc.readings import Readings
-    from magloc.track import Tracker, TrackPoint
+    from magloc.track import Tracker
+    from magloc.track_rows import TrackPoint
 
 Vector = tuple[float, float, float]
 STREAM = "-"
@@ -142,14 +143,20 @@ def track(
 
     from arrays.files import read_array
     from magloc.commands.ambient import place_of_options
+    from magloc.commands.figure_files import refuse_file
     from magloc.commands.locate import knowledge_of, subset_of
     from magloc.commands.track_output import geojson_text, json_entry, report, track_table, truth_of_rows
-    from magloc.consistency import consistency, posterior_bound
+    from magloc.consistency import consistency, nees_of_rows, posterior_bound
+    from magloc.long_record import track_record
     from magloc.readings import read_readings, read_truth, without_saturated
-    from magloc.track import Tracker, rows_of, smoothed, track_record
+    from magloc.smoother import smoothed
+    from magloc.track import Tracker
+    from magloc.track_rows import rows_of
 
     if json and jsonl:
         raise InputError("--json: found it together with --jsonl, expected one of them.")
+    if out is not None:
+        refuse_file(out, "--out")
     if geojson is not None and place is None:
         raise InputError("--geojson: found no --place, expected the origin of the world frame with it.")
     where = None if place is not None and date is None else place_of_options(place, date, geomagnetic_model)
@@ -185,12 +192,13 @@ def track(
     if not any(point.position_m is not None for point in points):
         reasons = sorted({point.status for point in points})
         raise InputError(f"{readings}: found no row where a source can be tracked ({'; '.join(reasons[:3])}).")
-    result = truth_position = None
+    result = truth_position = bound = nees = None
     if truth is not None:
         truth_position, moment = truth_of_rows(rows, read_truth(truth), truth)
         complete = moment is not None and bool(np.isfinite(truth_position).all() and np.isfinite(moment).all())
         bound = posterior_bound(tracker, records, truth_position, moment) if complete and moment is not None else None
-        result = consistency(points, truth_position, moment, bound)
+        result = consistency(points, tracker, records, truth_position, moment, bound)
+        nees = nees_of_rows(points, tracker, records, truth_position, moment)
     if geojson is not None and place is not None:
         from arrays.toml import write_text
 
@@ -198,7 +206,15 @@ def track(
     if out is not None:
         from magloc.commands.track_picture import write_picture
 
-        write_picture(points, truth_position, out)
+        write_picture(
+            points,
+            truth_position,
+            out,
+            nees=nees,
+            bound_m=bound,
+            array_m=rows.array_position_m,
+            quiet=common.quiet,
+        )
     if json:
         entries = {"results": [json_entry(point) for point in points]}
         print_json(entries if result is None else {**entries, "consistency": result})
@@ -282,7 +298,8 @@ def _stream(
 ) -> None:
     """Answer every row of standard input by one line."""
     from magloc.readings import readings_of_text, without_saturated
-    from magloc.track import Tracker, rows_of
+    from magloc.track import Tracker
+    from magloc.track_rows import rows_of
 
     lines = _lines_of_stdin()
     header = next(lines, None)

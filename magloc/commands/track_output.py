@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from arrays.errors import InputError
 from magloc.consistency import Consistency
 from magloc.readings import Readings, Truth, rows_of_same_time
-from magloc.track import TrackPoint
+from magloc.track_rows import TrackPoint
 
 if TYPE_CHECKING:
     from magloc.commands.track import Vector

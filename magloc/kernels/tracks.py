@@ -154,6 +154,123 @@ def _updated(
 
 
 @compiled
+def _chart(H: FloatArray, predicted_S: FloatArray, least_singular: float, M: FloatArray) -> bool:
+    """M (6, k) with M H = I, by Gram and Schmidt on H's columns in units of what is known; whether there is one."""
+    k = H.shape[0]
+    n = predicted_S.shape[1]
+    Q, R, unit = np.empty((6, k)), np.zeros((6, 6)), np.empty(6)
+    for i in range(6):
+        t = 0.0
+        for c in range(n):
+            t += predicted_S[i, c] * predicted_S[i, c]
+        unit[i] = math.sqrt(t)
+        for j in range(k):
+            Q[i, j] = H[j, i] * unit[i]
+    smallest, largest = math.inf, 0.0
+    for i in range(6):
+        # Twice, or the columns lose their right angles to rounding.
+        for _ in range(2):
+            for before in range(i):
+                t = 0.0
+                for j in range(k):
+                    t += Q[before, j] * Q[i, j]
+                R[before, i] += t
+                for j in range(k):
+                    Q[i, j] -= t * Q[before, j]
+        t = 0.0
+        for j in range(k):
+            t += Q[i, j] * Q[i, j]
+        t = math.sqrt(t)
+        R[i, i] = t
+        smallest, largest = min(smallest, t), max(largest, t)
+        if t == 0.0:
+            return False
+        for j in range(k):
+            Q[i, j] /= t
+    if not smallest > least_singular * largest:
+        return False
+    for i in range(5, -1, -1):
+        for j in range(k):
+            t = Q[i, j]
+            for c in range(i + 1, 6):
+                t -= R[i, c] * M[c, j]
+            M[i, j] = t / R[i, i]
+    for i in range(6):
+        for j in range(k):
+            M[i, j] *= unit[i]
+    return True
+
+
+@compiled
+def _solved(A: FloatArray, B: FloatArray) -> bool:
+    """B becomes the solution X (6, m) of A X = B, by elimination with pivots that destroys A; whether there is one."""
+    m = B.shape[1]
+    for i in range(6):
+        pivot = i
+        for r in range(i + 1, 6):
+            if abs(A[r, i]) > abs(A[pivot, i]):
+                pivot = r
+        if not abs(A[pivot, i]) > 0.0:
+            return False
+        if pivot != i:
+            for c in range(6):
+                A[i, c], A[pivot, c] = A[pivot, c], A[i, c]
+            for c in range(m):
+                B[i, c], B[pivot, c] = B[pivot, c], B[i, c]
+        inverse = 1.0 / A[i, i]
+        for r in range(i + 1, 6):
+            factor = A[r, i] * inverse
+            if factor != 0.0:
+                for c in range(i + 1, 6):
+                    A[r, c] -= factor * A[i, c]
+                for c in range(m):
+                    B[r, c] -= factor * B[i, c]
+    for i in range(5, -1, -1):
+        inverse = 1.0 / A[i, i]
+        for c in range(m):
+            t = B[i, c]
+            for r in range(i + 1, 6):
+                t -= A[i, r] * B[r, c]
+            B[i, c] = t * inverse
+    return True
+
+
+@compiled
+def _curved_prior(
+    M: FloatArray,
+    H: FloatArray,
+    predicted: FloatArray,
+    predicted_first: FloatArray,
+    x: FloatArray,
+    S: FloatArray,
+    x_k: FloatArray,
+    A: FloatArray,
+    B: FloatArray,
+    mean: FloatArray,
+    root: FloatArray,
+) -> None:
+    """Mean (6,) and root (6, n) that the prediction (x, S) has to first order at the state x_k."""
+    k, n = predicted.size, S.shape[1]
+    for i in range(6):
+        for c in range(6):
+            t = 0.0
+            for j in range(k):
+                t += M[i, j] * H[j, c]
+            A[i, c] = t
+        t = 0.0
+        for j in range(k):
+            t += M[i, j] * (predicted[j] - predicted_first[j])
+        B[i, 0] = t
+        for c in range(n):
+            B[i, 1 + c] = S[i, c]
+    solved = _solved(A, B)
+    for i in range(6):
+        mean[i] = x_k[i] - B[i, 0] if solved else x[i]
+        for c in range(n):
+            root[i, c] = B[i, 1 + c] if solved else S[i, c]
+
+
+@compiled
 def follow(
     begin: int,
     end: int,
@@ -180,6 +297,8 @@ def follow(
     nis_limits: FloatArray,
     tolerance: float,
     max_iterations: int,
+    step_shrink: float,
+    least_singular: float,
     rows_to_lose: int,
     start_range_error: float,
     largest_range_error: float,
@@ -205,6 +324,8 @@ def follow(
     H, predicted, predicted_next = np.empty((k, 6)), np.empty(k), np.empty(k)
     channels, slopes = np.empty(n_channels), np.empty((n_channels, 6))
     innovation, phi = np.empty(k), np.empty(n)
+    predicted_first, M = np.empty(k), np.empty((6, k))
+    A, B, mean, root = np.empty((6, 6)), np.empty((6, 1 + n)), np.empty(n), np.empty((n, n))
     for row in range(begin, end):
         step = step_of_row[row]
         strength = math.sqrt(x[3] * x[3] + x[4] * x[4] + x[5] * x[5])
@@ -236,19 +357,32 @@ def follow(
                 x_k, origins[row], rotations[row], ambients[a], positions, channel_sensor, channel_is_scalar, gain,
                 transforms[w], channels, slopes, predicted, H,
             )  # fmt: skip
-            converged = False
+            curved = _chart(H, predicted_S, least_singular, M)
+            for j in range(k):
+                predicted_first[j] = predicted[j]
+            for i in range(n):
+                mean[i] = predicted_x[i]
+                for c in range(n):
+                    root[i, c] = predicted_S[i, c]
+            converged, change_before, length = False, math.inf, 1.0
             for _ in range(max_iterations):
                 iterations += 1
+                if curved and iterations > 1:
+                    _curved_prior(
+                        M, H, predicted, predicted_first, predicted_x, predicted_S, x_k, A, B, mean, root
+                    )  # fmt: skip
                 for j in range(k):
                     t = z[row, j] - predicted[j]
                     for i in range(6):
-                        t -= H[j, i] * (predicted_x[i] - x_k[i])
+                        t -= H[j, i] * (mean[i] - x_k[i])
                     innovation[j] = t
                 for i in range(n):
-                    x_next[i] = predicted_x[i]
+                    x_next[i] = mean[i]
                     for c in range(n):
-                        S_k[i, c] = predicted_S[i, c]
+                        S_k[i, c] = root[i, c]
                 nis = _updated(x_next, S_k, H, innovation, phi)
+                for i in range(n):
+                    x_next[i] = x_k[i] + length * (x_next[i] - x_k[i])
                 _predicted(
                     x_next, origins[row], rotations[row], ambients[a], positions, channel_sensor, channel_is_scalar,
                     gain, transforms[w], channels, slopes, predicted_next, H,
@@ -259,11 +393,15 @@ def follow(
                     predicted[j] = predicted_next[j]
                 for i in range(n):
                     x_k[i] = x_next[i]
+                change = math.sqrt(change) / length
                 if not math.isfinite(change):
                     break
-                if change < tolerance * tolerance:
+                if change < tolerance:
                     converged = True
                     break
+                if change >= change_before:
+                    length *= step_shrink
+                change_before = change
             if not converged or nis > nis_limits[n_differences[row]]:
                 if contradictions + 1 >= rows_to_lose:
                     return row, contradictions

@@ -181,6 +181,7 @@ _OVERRIDES: dict[str, tuple[str, float]] = {
     "misalignment_mrad": ("misalignment_rad", 1e3),
     "gain_error": ("gain_error", 1.0),
     "drift_nT_rth": ("drift_T_rth", 1e9),
+    "offset_error_nT": ("offset_error_T", 1e9),
 }
 
 

@@ -52,7 +52,9 @@ class SensorsTable(Table, kw_only=True):
     """What is known of all sensors, or of one."""
 
     positive = frozenset({"noise_nT", "noise_nT_rtHz", "bandwidth_Hz", "range_nT"})
-    not_negative = frozenset({"corner_Hz", "resolution_nT", "misalignment_mrad", "gain_error", "drift_nT_rth"})
+    not_negative = frozenset(
+        {"corner_Hz", "resolution_nT", "misalignment_mrad", "gain_error", "drift_nT_rth", "offset_error_nT"}
+    )
     may_be_infinite = frozenset({"bandwidth_Hz", "range_nT"})
 
     kind: str | None = None
@@ -65,6 +67,7 @@ class SensorsTable(Table, kw_only=True):
     misalignment_mrad: float | None = None
     gain_error: float | None = None
     drift_nT_rth: float | None = None
+    offset_error_nT: float | None = None
     of: dict[str, dict[str, Any]] = {}
 
 

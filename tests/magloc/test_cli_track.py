@@ -20,7 +20,10 @@ from arrays import geometries
 from arrays.files import read_array
 from magloc.motion import UnknownMotion, WanderingMotion
 from magloc.readings import read_readings
-from magloc.track import Tracker, rows_of, smoothed, track_record
+from magloc.long_record import track_record
+from magloc.smoother import smoothed
+from magloc.track import Tracker
+from magloc.track_rows import rows_of
 from tests.command_line import Outcome, Run, assert_refused, refuse_constant, results_of
 from tests.oracles import magpylib_field
 

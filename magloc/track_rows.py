@@ -1,0 +1,112 @@
+"""What goes into a track row by row, and what comes out of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """Readings at one instant.
+
+    Attributes
+    ----------
+    time_s : float
+    readings_T : ndarray, shape (C,)
+        Raw readings, NaN where missing.
+    origin_m, R_world_from_array : ndarray, shapes (3,) and (3, 3)
+        Pose of the array.
+    ambient_T : ndarray, shape (3,), optional
+        Ambient field in the array's frame, in place of the array's own.
+    """
+
+    time_s: float
+    readings_T: FloatArray
+    origin_m: FloatArray = field(default_factory=lambda: np.zeros(3))
+    R_world_from_array: FloatArray = field(default_factory=lambda: np.eye(3))
+    ambient_T: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class TrackPoint:
+    """What is known of the source at one instant; None where it is not tracked.
+
+    Attributes
+    ----------
+    time_s : float
+    position_m, moment_Am2 : ndarray, shape (3,)
+    covariance : ndarray, shape (6, 6)
+        Of (position, moment).
+    estimability : ndarray, shape (6,)
+        What the row's readings taught of every component: 1 - σ after / σ predicted without them.
+    iterations : int
+        Linearisations.
+    nis : float
+        Normalised innovation squared, and `nis_dof` its degrees of freedom. NaN for rows that the track started from.
+    status : str
+        "tracked", "acquired" (a new track started here), "predicted" (no readings), "outlier" (readings that contradict
+        the track, not used), or why there is no track.
+    """
+
+    time_s: float
+    position_m: FloatArray | None = None
+    moment_Am2: FloatArray | None = None
+    covariance: FloatArray | None = None
+    estimability: FloatArray | None = None
+    iterations: int = 0
+    nis: float = math.nan
+    nis_dof: int = 0
+    status: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """State and square root of its covariance before a row's readings, and the transition that led there."""
+
+    x: FloatArray
+    S: FloatArray
+    F: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One step of a track, for smoothing.
+
+    Attributes
+    ----------
+    row : int
+        Which row it belongs to.
+    prediction : Prediction, optional
+        From the step before; None at the first step of a track.
+    x, S : ndarray
+        State and square root of its covariance after the row's readings.
+    """
+
+    row: int
+    prediction: Prediction | None
+    x: FloatArray
+    S: FloatArray
+
+
+def rows_of(
+    time_s: FloatArray,
+    readings_T: FloatArray,
+    array_position_m: FloatArray | None = None,
+    array_rotation_xyzw: FloatArray | None = None,
+    ambient_T: FloatArray | None = None,
+) -> Iterator[Row]:
+    """Rows of readings for a tracker, from columns as :class:`magloc.readings.Readings` has them."""
+    rotations = None if array_rotation_xyzw is None else Rotation.from_quat(array_rotation_xyzw).as_matrix()
+    for i, time in enumerate(time_s.tolist()):
+        row = Row(time, readings_T[i], ambient_T=None if ambient_T is None else ambient_T[i])
+        if array_position_m is not None and rotations is not None:
+            row = replace(row, origin_m=array_position_m[i], R_world_from_array=rotations[i])
+        yield row
