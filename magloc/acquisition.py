@@ -25,6 +25,13 @@ FloatArray = NDArray[np.float64]
 START_RANGE_ERROR = 0.03
 """Standard deviation of the range over the range that a start may have: beyond it the posterior is no Gaussian in
 Cartesian coordinates."""
+CONFIRMED_RANGE_ERROR = 2.0 * START_RANGE_ERROR
+"""The same for the row after one that could start a track, where that is not beyond doubt. The first row that falls
+below a limit is one whose noise makes it look certain; the next one has noise of its own, and starts the track."""
+STACKED_RANGE_ERROR = 0.5 * START_RANGE_ERROR
+"""The same for several rows, of which one alone does not determine the source: the track's prediction is then Gaussian
+in Cartesian coordinates, which it must be nearly."""
+_BEYOND_DOUBT = 0.5 * START_RANGE_ERROR
 # Probability under noise below which a row contradicts a dipole.
 _CONTRADICTION = 1e-6
 # Another solution within this Δχ² forbids a start.
@@ -48,7 +55,7 @@ class Start:
     solution : Solution
         In the world frame.
     rows : sequence of Row
-        The readings that it was found from.
+        The readings that it was found from, in the order of time.
     """
 
     solution: Solution
@@ -81,6 +88,7 @@ class Acquisition:
         self._recent: deque[Row] = deque(maxlen=_WINDOW_ROWS)
         self._n_rows = 0
         self._proposed: Solution | None = None
+        self._of_last_row: Solution | None = None
 
     def start(self, row: Row, near: tuple[FloatArray, FloatArray] | None = None) -> tuple[Start | None, str]:
         """A start with one more row, or why there is none.
@@ -102,9 +110,15 @@ class Acquisition:
             ambient = None if row.ambient_T is None else row.ambient_T[None]
             (fix,) = self._locator.fit_rows(row.readings_T[None], ambient)
             centroid = row.origin_m + row.R_world_from_array @ self.array.centroid
-            solution, reason = _certain_solution(_in_world(fix, row), centroid, near)
+            last, self._of_last_row = self._of_last_row, None
+            limit = START_RANGE_ERROR if last is None else CONFIRMED_RANGE_ERROR
+            solution, reason = _certain_solution(_in_world(fix, row), centroid, near, limit)
             if solution is not None:
-                return Start(solution, [row]), ""
+                if _agree(last, solution) or _range_error(solution, centroid) < _BEYOND_DOUBT or near is not None:
+                    return Start(solution, [row]), ""
+                if _range_error(solution, centroid) < START_RANGE_ERROR:
+                    self._of_last_row = solution
+                reason = "not acquired: the next row is to confirm the source"
         return self._start_from_recent(row, fix), reason
 
     def _start_from_recent(self, row: Row, alone: Fix) -> Start | None:
@@ -137,10 +151,10 @@ class Acquisition:
             np.stack(known) if len(known) == len(chosen) else None,
         )
         centroid = row.origin_m + row.R_world_from_array @ self.array.centroid
-        before, self._proposed = self._proposed, _certain_solution(fix, centroid, None)[0]
+        before, self._proposed = self._proposed, _certain_solution(fix, centroid, None, START_RANGE_ERROR)[0]
         if self._proposed is None or not _agree(before, self._proposed):
             return None
-        return Start(self._proposed, chosen)
+        return Start(self._proposed, chosen[::-1])
 
 
 def _in_world(fix: Fix, row: Row) -> Fix:
@@ -159,7 +173,7 @@ def _in_world(fix: Fix, row: Row) -> Fix:
 
 
 def _certain_solution(
-    fix: Fix, centroid: FloatArray, near: tuple[FloatArray, FloatArray] | None
+    fix: Fix, centroid: FloatArray, near: tuple[FloatArray, FloatArray] | None, largest_range_error: float
 ) -> tuple[Solution | None, str]:
     """The solution that a track starts from, the nearest one to a prediction, or why there is none."""
     if not fix.solutions:
@@ -176,13 +190,17 @@ def _certain_solution(
         return None, "not acquired: no dipole fits the readings"
     if not best.range_observable:
         return None, "not acquired: the range is not observable"
-    offset = best.position_m - centroid
-    variance = float(offset @ best.covariance[:3, :3] @ offset)
-    if math.sqrt(variance) > START_RANGE_ERROR * float(offset @ offset):
+    if _range_error(best, centroid) > largest_range_error:
         return None, "not acquired: the range is not certain enough"
     if near is None and any(solution.chi2 < best.chi2 + _RIVAL_WITHIN for solution in solutions[1:]):
         return None, "not acquired: several solutions fit alike"
     return best, ""
+
+
+def _range_error(solution: Solution, centroid: FloatArray) -> float:
+    """Standard deviation of the range over the range."""
+    offset = solution.position_m - centroid
+    return math.sqrt(float(offset @ solution.covariance[:3, :3] @ offset)) / float(offset @ offset)
 
 
 def _agree(before: Solution | None, after: Solution) -> bool:

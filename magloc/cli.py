@@ -23,6 +23,7 @@ from magloc.commands.locate import locate
 from magloc.commands.map import map_
 from magloc.commands.simulate import simulate
 from magloc.commands.track import track
+from magloc.commands.view import view
 
 DONE = 0
 BAD_INPUT = 2
@@ -48,6 +49,7 @@ app.command(locate)
 app.command(map_, name="map")
 app.command(track)
 app.command(simulate)
+app.command(view)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

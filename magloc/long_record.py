@@ -15,6 +15,7 @@ from magloc.row_measurement import LEAST_SINGULAR
 from magloc.rows import ambient_fields
 from magloc.track import (
     CONTRADICTION,
+    LARGEST_GROWTH,
     LARGEST_RANGE_ERROR,
     MOST_ITERATIONS,
     REFIX_RANGE_ERROR,
@@ -131,6 +132,7 @@ class _CompiledSteps:
             MOST_ITERATIONS,
             SHRINK,
             LEAST_SINGULAR,
+            LARGEST_GROWTH,
             ROWS_TO_LOSE,
             REFIX_RANGE_ERROR,
             LARGEST_RANGE_ERROR,

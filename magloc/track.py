@@ -21,9 +21,9 @@ from scipy.special import chdtri
 
 from arrays.differences import Differences, decorrelated_differences, reading_covariance
 from arrays.sensor import SensorArray
-from magloc.acquisition import START_RANGE_ERROR, Acquisition
+from magloc.acquisition import CONFIRMED_RANGE_ERROR, STACKED_RANGE_ERROR, Acquisition
 from magloc.fix import NOTHING_KNOWN, Knowledge
-from magloc.kalman import estimability, iterated_update, predict_square_root, symmetric_square_root
+from magloc.kalman import estimability, iterated_update, predict_square_root, sequential_update, symmetric_square_root
 from magloc.measurement import DifferenceMeasurement
 from magloc.motion import N_SOURCE, MotionModel
 from magloc.row_measurement import RowMeasurement
@@ -45,8 +45,13 @@ TOLERANCE = 1e-4
 MOST_ITERATIONS = 50
 SHRINK = 0.5
 """Of steps that swing: see :func:`magloc.kalman.iterated_update`."""
-# Gauss-Newton steps of source and sensor errors together, from a start that is the optimum of the source alone.
-_START_STEPS = 3
+LARGEST_GROWTH = 1.5
+"""A prediction bends as the readings do while no standard deviation grows by more in the step: beyond that it is the
+motion that it is uncertain of, which is Gaussian in Cartesian coordinates."""
+# How often the rows that a track starts from are linearised anew.
+_START_STEPS = 2
+# How much less is known of a source before them than after, in standard deviations.
+_UNKNOWN = 100.0
 
 
 class Tracker:
@@ -135,7 +140,7 @@ class Tracker:
             tolerance=TOLERANCE,
             max_iterations=MOST_ITERATIONS,
             shrink=SHRINK,
-            prior=measurement.curved_prior(x, S),
+            prior=measurement.curved_prior(x, S) if _is_of_readings(self._S, S) else None,
         )
         if not update.converged or update.nis > chdtri(k, CONTRADICTION):
             self._contradictions += 1
@@ -218,52 +223,46 @@ class Tracker:
     def start(
         self, source: FloatArray, covariance: FloatArray, rows: Sequence[Row], *, n_steps: int = _START_STEPS
     ) -> tuple[FloatArray, FloatArray]:
-        """State and square root of its covariance from a source at rest and the readings that it was found from.
+        """State and square root of its covariance from a source and the readings that it was found from.
 
         Parameters
         ----------
         source : ndarray, shape (6,)
-            Position and moment that fit best.
+            Position and moment that fit all rows best, were it at rest.
         covariance : ndarray, shape (6, 6)
-            Of the fix, without regard to which part of the errors lasts.
+            Of that fit, without regard to what moves and which part of the errors lasts.
         rows : sequence of Row
+            In the order of time.
         n_steps : int
-            Gauss-Newton steps towards the optimum of source and lasting errors together; none leave the source as it
-            is, for its covariance there.
+            How often the readings are linearised anew at what was found; 0 for the covariance at the source as given.
 
         Returns
         -------
         x, S : ndarray
-            Where sensors have lasting errors, those are found from the same readings, together with the source:
-            from there on the errors of both are known to be correlated.
+            At the last row. The rows are filtered once more, from a source that is hardly known: what moves between
+            them, and the errors of sensors that they have in common, are counted as in the rows to come.
         """
         n, n_errors = self.motion.n_states, self.errors.n_states
-        if not n_errors:
+        if len(rows) == 1 and not n_errors:
             return self.motion.start(source, symmetric_square_root(covariance))
         measurements = [self.measurement(row) for row in rows]
-        # In units of what is known before, in which the information of the errors is the identity.
-        scale = np.concatenate([np.sqrt(np.diagonal(covariance)), self.errors.sigma])
-        state = np.zeros(n + n_errors)
-        chosen = np.concatenate([np.arange(N_SOURCE), n + np.arange(n_errors)])
-        state[:N_SOURCE] = source
-        prior = np.diag(np.repeat([0.0, 1.0], [N_SOURCE, n_errors]))
-        errors = np.zeros(chosen.size)
-        for step in range(n_steps + 1):
-            H = np.concatenate([measurement.jacobian(state)[:, chosen] for measurement in measurements]) * scale
-            P = np.linalg.inv(H.T @ H + prior)
-            if step == n_steps:
-                break
-            residual = np.concatenate([measurement.z - measurement.predicted(state) for measurement in measurements])
-            change = P @ (H.T @ residual - errors)
-            state[chosen] += scale * change
-            errors[N_SOURCE:] += change[N_SOURCE:]
-        P = scale[:, None] * P * scale
-        P = 0.5 * (P + P.T)
-        x, root = self.motion.start(state[:N_SOURCE], symmetric_square_root(P[:N_SOURCE, :N_SOURCE]))
-        full = np.zeros((n + n_errors,) * 2)
-        full[:n, :n] = root @ root.T
-        full[np.ix_(chosen, chosen)] = P
-        return np.concatenate([x, state[n:]]), symmetric_square_root(full)
+        first, root = self.motion.start(source, np.diag(_UNKNOWN * np.sqrt(np.diagonal(covariance))))
+        x_first, S_first = np.concatenate([first, np.zeros(n_errors)]), np.zeros((n + n_errors,) * 2)
+        S_first[:n, :n] = root
+        S_first[n + np.arange(n_errors), n + np.arange(n_errors)] = self.errors.sigma
+        centre = x_first
+        x, S = x_first, S_first
+        for _ in range(n_steps + 1):
+            x, S = x_first, S_first
+            for before, row, measurement in zip([rows[0], *rows], rows, measurements, strict=False):
+                if row is not before:
+                    prediction = self.predicted(x, S, row.time_s - before.time_s)
+                    x, S = prediction.x, prediction.S
+                H = measurement.jacobian(centre)
+                innovation = measurement.z - measurement.predicted(centre) - H @ (x - centre)
+                x, S = sequential_update(x, S, H, innovation, np.ones(len(H)))
+            centre = np.concatenate([x[:N_SOURCE], centre[N_SOURCE:]])
+        return x, S
 
     def _kept(
         self,
@@ -303,7 +302,7 @@ class Tracker:
             return TrackPoint(row.time_s, status=reason)
         solution = start.solution
         x, S = self.start(np.concatenate([solution.position_m, solution.moment_Am2]), solution.covariance, start.rows)
-        if self._range_error(x, S, row) > START_RANGE_ERROR:
+        if self._range_error(x, S, row) > (CONFIRMED_RANGE_ERROR if len(start.rows) == 1 else STACKED_RANGE_ERROR):
             return TrackPoint(row.time_s, status="not acquired: the range is not certain enough")
         self._acquisition.forget()
         self._x, self._S = x, S
@@ -326,3 +325,9 @@ class Tracker:
         square = float(offset @ offset)
         along = offset @ S[:3]
         return math.sqrt(float(along @ along)) / square if square > 0.0 else math.inf
+
+
+def _is_of_readings(S: FloatArray, S_predicted: FloatArray) -> bool:
+    """Whether what a prediction knows of a source is mostly what readings told, not what the motion leaves of it."""
+    before, after = (np.linalg.norm(root[:N_SOURCE], axis=1) for root in (S, S_predicted))
+    return bool(np.all(after <= LARGEST_GROWTH * before))

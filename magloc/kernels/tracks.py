@@ -202,6 +202,20 @@ def _chart(H: FloatArray, predicted_S: FloatArray, least_singular: float, M: Flo
 
 
 @compiled
+def _is_of_readings(S: FloatArray, predicted_S: FloatArray, largest_growth: float) -> bool:
+    """Whether no standard deviation of position and moment has grown by more than a factor."""
+    n = S.shape[1]
+    for i in range(6):
+        before, after = 0.0, 0.0
+        for c in range(n):
+            before += S[i, c] * S[i, c]
+            after += predicted_S[i, c] * predicted_S[i, c]
+        if after > largest_growth * largest_growth * before:
+            return False
+    return True
+
+
+@compiled
 def _solved(A: FloatArray, B: FloatArray) -> bool:
     """B becomes the solution X (6, m) of A X = B, by elimination with pivots that destroys A; whether there is one."""
     m = B.shape[1]
@@ -299,6 +313,7 @@ def follow(
     max_iterations: int,
     step_shrink: float,
     least_singular: float,
+    largest_growth: float,
     rows_to_lose: int,
     start_range_error: float,
     largest_range_error: float,
@@ -357,7 +372,7 @@ def follow(
                 x_k, origins[row], rotations[row], ambients[a], positions, channel_sensor, channel_is_scalar, gain,
                 transforms[w], channels, slopes, predicted, H,
             )  # fmt: skip
-            curved = _chart(H, predicted_S, least_singular, M)
+            curved = _is_of_readings(S, predicted_S, largest_growth) and _chart(H, predicted_S, least_singular, M)
             for j in range(k):
                 predicted_first[j] = predicted[j]
             for i in range(n):

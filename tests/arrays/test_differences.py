@@ -6,6 +6,7 @@
 | decorrelated noise | Monte Carlo of the differences themselves |
 | χ² of Differences and of Whitening | generalised least squares with the full covariance, in extended form |
 | reading_covariance | closed forms, and Monte Carlo of sensors with other calibrations |
+| calibration_errors | differences of readings of sensors with other calibrations |
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from arrays.differences import (
+    calibration_errors,
     contrasts,
     decorrelated_differences,
     difference_covariance,
@@ -472,6 +474,58 @@ class TestReadingCovariance:
         w = whitening(array, covariance_T2=covariance)
         assert np.isfinite(w.root).all()
         assert w.n_differences == 9
+
+
+class TestCalibrationErrors:
+    """What turns and gains do to the readings of sensors with any calibration, in any attitude."""
+
+    @given(SEEDS)
+    @settings(max_examples=15, deadline=None)
+    def test_are_the_differences_of_readings(self, seed):
+        """Central differences of readings of sensors whose axes are turned, and whose gains are off, by a millionth."""
+        array = random_array(seed, 4, kinds=("vector", "scalar"))
+        fields = np.random.default_rng(seed + 1).normal(0.0, 3e-5, (4, 3))
+        found = calibration_errors(array, array.readings_of(fields))
+        assert found.shape == (4, 3, 6)
+        step = 1e-6
+        for i, sensor in enumerate(array.sensors):
+            channels = array.channel_sensor == i
+            for column in range(6) if sensor.kind == "vector" else [3]:
+                readings = []
+                for sign in (1.0, -1.0):
+                    error = np.zeros(6)
+                    error[column] = sign * step
+                    matrix = np.diag(1.0 + error[3 : 3 + sensor.n_channels])
+                    if sensor.kind == "vector":
+                        matrix = matrix @ Rotation.from_rotvec(error[:3]).as_matrix()
+                    scale = np.array(sensor.calibration.scale) @ matrix
+                    calibration = Calibration.of(sensor.kind, scale, sensor.calibration.offset_T)
+                    sensors = list(array.sensors)
+                    sensors[i] = replace(sensor, calibration=calibration)
+                    readings.append(replace(array, sensors=tuple(sensors)).readings_of(fields)[channels])
+                expected = (readings[0] - readings[1]) / (2.0 * step)
+                assert_allclose(found[i, : sensor.n_channels, column], expected, rtol=1e-7, atol=1e-13)
+
+    @given(SEEDS)
+    @settings(max_examples=15, deadline=None)
+    def test_with_their_variances_are_the_covariance_of_readings(self, seed):
+        array = random_array(seed, 4, kinds=("vector", "scalar"), uncertain=True)
+        readings = array.readings_of(np.random.default_rng(seed + 1).normal(0.0, 3e-5, (4, 3)))
+        blocks = []
+        for sensor, derivative in zip(array.sensors, calibration_errors(array, readings), strict=True):
+            used = derivative[: sensor.n_channels]
+            variance = np.repeat([sensor.misalignment_rad, sensor.gain_uncertainty], 3) ** 2
+            if sensor.kind == "scalar":
+                variance = variance * (np.arange(6) == 3)
+            blocks.append(used * variance @ used.T + sensor.noise_T**2 * np.eye(sensor.n_channels))
+        assert_allclose(reading_covariance(array, readings), block_diag(*blocks), rtol=1e-9, atol=1e-28)
+
+    def test_batches(self):
+        array = random_array(3, 4)
+        readings = array.readings_of(np.random.default_rng(4).normal(0.0, 3e-5, (2, 5, 4, 3)))
+        found = calibration_errors(array, readings)
+        assert found.shape == (2, 5, 4, 3, 6)
+        assert_allclose(found[1, 3], calibration_errors(array, readings[1, 3]), rtol=1e-12)
 
 
 class TestCovarianceOfIncompleteReadings:

@@ -43,7 +43,11 @@ QUALITY = """\
 saturation_nT = 100_000
 misalignment_mrad = 0.1
 gain_uncertainty = 0.003
+offset_uncertainty_nT = 0.5
+flicker_nT = 0.01
+drift_nT_rth = 20
 """
+LASTING = {"offset_uncertainty_T": 5e-10, "flicker_T": 1e-11, "drift_T_rth": 2e-8}
 
 WriteFile = Callable[[str | bytes], Path]
 
@@ -94,6 +98,7 @@ def sensors(draw: st.DrawFn, name: str) -> Sensor:
         draw(st.none() | positive),
         draw(below_one) if kind == "vector" else 0.0,
         draw(below_one),
+        *draw(st.tuples(*[st.just(0.0) | positive] * 3)),
     )
 
 
@@ -144,7 +149,7 @@ class TestGeometryForm:
 
     def test_quality_of_all_sensors(self, write: WriteFile) -> None:
         assert read_array(write(GEOMETRY + QUALITY)).sensors == tuple(
-            replace(sensor, saturation_T=1e-4, misalignment_rad=1e-4, gain_uncertainty=0.003)
+            replace(sensor, saturation_T=1e-4, misalignment_rad=1e-4, gain_uncertainty=0.003, **LASTING)
             for sensor in tetrahedron(1.5).sensors
         )
 
@@ -168,6 +173,8 @@ class TestSensorsForm:
         first, second = read_array(write(changed(SENSORS, "noise_nT = 1.0\n", f"noise_nT = 1.0\n{QUALITY}"))).sensors
         assert (first.saturation_T, first.misalignment_rad, first.gain_uncertainty) == (1e-4, 1e-4, 0.003)
         assert (second.saturation_T, second.misalignment_rad, second.gain_uncertainty) == (None, 0.0, 0.0)
+        assert {name: getattr(first, name) for name in LASTING} == LASTING
+        assert {name: getattr(second, name) for name in LASTING} == dict.fromkeys(LASTING, 0.0)
 
     def test_rotation(self, write: WriteFile) -> None:
         array = read_array(write(f"{SENSORS}rotation_xyzw = [0.5, 0.5, 0.5, 0.5]\n"))
@@ -422,6 +429,14 @@ class TestRefused:
                 ("key misalignment_mrad", "found 1000, expected a number from 0 to below 1000"),
             ),
             ("noise_nT = 1.0", "noise_nT = 1.0\nmisalignment_mrad = -1", ("key misalignment_mrad", "found -1")),
+            (
+                "noise_nT = 1.0",
+                "noise_nT = 1.0\noffset_uncertainty_nT = -0.5",
+                ("key offset_uncertainty_nT", "found -0.5, expected a number that is not negative"),
+            ),
+            ("noise_nT = 1.0", "noise_nT = 1.0\nflicker_nT = -1", ("key flicker_nT", "found -1")),
+            ("noise_nT = 1.0", "noise_nT = 1.0\ndrift_nT_rth = inf", ("key drift_nT_rth", "finite")),
+            ("noise_nT = 1.0", "noise_nT = 1.0\nflicker_nt = 1", ("nearest is flicker_nT",)),
             ("noise_nT = 1.0", "noise_nT = 1.0\ngain_uncertainty = 2", ("gain_uncertainty must be from 0 to below 1",)),
             ("noise_nT = 1.0", "noise_nT = 1.0\ngain_uncertainity = 2", ("nearest is gain_uncertainty",)),
             ("noise_nT = 1.0", "noise_nT = 1.0\n[[sensor]]", ("keys geometry and sensor", "found both")),

@@ -266,6 +266,14 @@ class TestSensor:
             ({"misalignment_rad": np.inf}, "Input misalignment_rad must be finite; instead received inf"),
             ({"gain_uncertainty": -0.1}, r"Input gain_uncertainty must be from 0 to below 1; instead received -0\.1"),
             ({"gain_uncertainty": [0.1]}, r"Input gain_uncertainty must be one number; instead received \[0\.1\]"),
+            (
+                {"offset_uncertainty_T": -1e-9},
+                r"Input offset_uncertainty_T must not be negative; instead received -1e-09",
+            ),
+            ({"flicker_T": -1e-12}, r"Input flicker_T must not be negative; instead received -1e-12"),
+            ({"drift_T_rth": -1e-9}, r"Input drift_T_rth must not be negative; instead received -1e-09"),
+            ({"drift_T_rth": np.nan}, "Input drift_T_rth must be finite; instead received nan"),
+            ({"flicker_T": [1.0, 2.0]}, r"Input flicker_T must be one number; instead received \[1.0, 2.0\]"),
             ({"kind": "scalar", "misalignment_rad": 1e-3}, "Input misalignment_rad must be 0 for a scalar sensor"),
         ],
     )
@@ -275,6 +283,15 @@ class TestSensor:
             Sensor(**(good | change))
         assert not isinstance(error.value, InputError)
         assert str(error.value).endswith(".")
+
+    def test_noise_of_one_row_counts_what_lasts(self) -> None:
+        """1/f noise in three decades; drift has not begun, and errors of axes and gains depend on the reading."""
+        quiet = Sensor("s1", "scalar", (0, 0, 0), 3e-9)
+        assert quiet.row_noise_T == 3e-9
+        lasting = replace(quiet, offset_uncertainty_T=4e-9, flicker_T=2e-9, drift_T_rth=1e-6, gain_uncertainty=0.1)
+        assert lasting.row_noise_T == pytest.approx((9e-18 + 16e-18 + 3 * 4e-18) ** 0.5)
+        array = SensorArray((lasting, Sensor("s2", "vector", (1, 0, 0), 1e-9)))
+        np.testing.assert_allclose(array.channel_noise_T, [lasting.row_noise_T, 1e-9, 1e-9, 1e-9])
 
 
 class TestSensorArray:
@@ -306,6 +323,7 @@ class TestSensorArray:
             (0.0, {"misalignment_rad": 1e-4}, True),
             (0.0, {"gain_uncertainty": 1e-4}, True),
             (0.0, {"saturation_T": 1e-4}, False),
+            (0.0, {"offset_uncertainty_T": 1e-9, "flicker_T": 1e-9, "drift_T_rth": 1e-9}, False),
         ],
     )
     def test_noise_that_depends_on_the_reading(

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from arrays import geometries
 from arrays.differences import contrasts, difference_covariance
-from magloc.consistency import consistency, mean_bounds, posterior_bound
+from magloc.consistency import consistency, mean_bounds, nees_of, posterior_bound
 from magloc.motion import UnknownMotion, WanderingMotion
-from magloc.track import Row, Tracker, TrackPoint, rows_of
+from magloc.row_measurement import RowMeasurement
+from magloc.track import Tracker
+from magloc.track_rows import Row, TrackPoint, rows_of
 from tests.oracles import derivative, magpylib_field
 
 FloatArray = NDArray[np.float64]
@@ -25,6 +29,14 @@ def point_of(
     position_m: FloatArray, moment_Am2: FloatArray, covariance: FloatArray, nis: float = 9.0, status: str = "tracked"
 ) -> TrackPoint:
     return TrackPoint(0.0, position_m, moment_Am2, covariance, np.ones(6), 2, nis, 9, status)
+
+
+def blank_rows(n: int) -> list[Row]:
+    """Rows without readings: they give no coordinates, and NEES is that of position and moment."""
+    return list(rows_of(np.arange(float(n)), np.full((n, 12), np.nan)))
+
+
+TRACKER = Tracker(ARRAY, UnknownMotion(0.1, 0.1))
 
 
 class TestMeanBounds:
@@ -48,7 +60,7 @@ class TestNees:
     def test_of_position_and_moment(self, covariance: FloatArray) -> None:
         error = np.random.default_rng(1).multivariate_normal(np.zeros(6), covariance)
         points = [point_of(error[:3], error[3:], covariance)]
-        result = consistency(points, np.zeros((1, 3)), np.zeros((1, 3)))
+        result = consistency(points, TRACKER, blank_rows(1), np.zeros((1, 3)), np.zeros((1, 3)))
         assert result.nees_per_dimension == pytest.approx(error @ np.linalg.inv(covariance) @ error / 6.0, rel=1e-6)
         assert result.nees_bounds == pytest.approx(mean_bounds(6))
         assert result.position_rms_m == pytest.approx(float(np.linalg.norm(error[:3])))
@@ -59,7 +71,7 @@ class TestNees:
         error = np.array([0.04, -0.05, 7.0, 10.0, -8.0, 3.0])
         truth = np.array([[0.0, 0.0, np.nan]])
         points = [point_of(error[:3], error[3:], covariance)]
-        result = consistency(points, truth, np.zeros((1, 3)) if moment else None)
+        result = consistency(points, TRACKER, blank_rows(1), truth, np.zeros((1, 3)) if moment else None)
         kept = [0, 1, 3, 4, 5] if moment else [0, 1]
         expected = error[kept] @ np.linalg.inv(covariance[np.ix_(kept, kept)]) @ error[kept] / len(kept)
         assert result.nees_per_dimension == pytest.approx(expected, rel=1e-6)
@@ -73,9 +85,60 @@ class TestNees:
         nis = rng.chisquare(9.0, 5000)
         covariance = root @ root.T
         points = [point_of(x[:3], x[3:], covariance, float(n)) for x, n in zip(draws, nis, strict=True)]
-        result = consistency(points, np.zeros((5000, 3)), np.zeros((5000, 3)))
+        result = consistency(points, TRACKER, blank_rows(5000), np.zeros((5000, 3)), np.zeros((5000, 3)))
         assert result.nees_bounds[0] < result.nees_per_dimension < result.nees_bounds[1]
         assert result.nis_bounds[0] < result.nis_per_dimension < result.nis_bounds[1]
+
+
+class TestNeesOfACurvedEstimate:
+    """Six differences of a weak source: their noise is χ² of six numbers, and so is NEES in their coordinates."""
+
+    THREE = ARRAY.subset(["s1", "s2", "s3"])
+    TRUTH = np.array([3.0, 1.5, 0.8, 120.0, -150.0, 160.0])
+    UNIT = np.repeat([1.0, 100.0], 3)
+
+    def test_is_the_square_of_the_noise(self) -> None:
+        """To rounding, for 200 draws of a noise that leaves the range known to 5 %; the Cartesian one is far off."""
+        rng = np.random.default_rng(3)
+        array = replace(self.THREE, sensors=tuple(replace(s, noise_T=6e-9) for s in self.THREE.sensors))
+        tracker = Tracker(array, UnknownMotion(0.1, 0.1))
+        measurement = tracker.measurement(Row(0.0, np.zeros(9)))
+        expected, found, cartesian = [], [], []
+        for _ in range(200):
+            noise = rng.normal(size=6)
+            estimate = self.solved(measurement, measurement.of_source(self.TRUTH) + noise)
+            if estimate is None:
+                continue
+            H = measurement.source_jacobian(estimate)
+            covariance = np.linalg.inv(H.T @ H)
+            expected.append(noise @ noise)
+            found.append(nees_of(measurement, estimate, covariance, self.TRUTH)[0])
+            cartesian.append((H @ (self.TRUTH - estimate)) @ (H @ (self.TRUTH - estimate)))
+        assert len(found) > 190
+        np.testing.assert_allclose(found, expected, rtol=1e-5)
+        assert np.max(np.abs(np.array(cartesian) / expected - 1.0)) > 0.1
+
+    def solved(self, measurement: RowMeasurement, z: FloatArray) -> FloatArray | None:
+        """The source whose six differences are z, if scipy finds it."""
+        fit = least_squares(
+            lambda y: measurement.of_source(y * self.UNIT) - z,
+            self.TRUTH / self.UNIT,
+            lambda y: measurement.source_jacobian(y * self.UNIT) * self.UNIT,
+            xtol=1e-15,
+            ftol=1e-15,
+            gtol=1e-15,
+        )
+        return np.asarray(fit.x * self.UNIT) if np.abs(fit.fun).max() < 1e-7 else None
+
+    def test_what_is_known_in_part_is_counted_in_cartesian_coordinates(self) -> None:
+        measurement = Tracker(ARRAY, UnknownMotion(0.1, 0.1)).measurement(Row(0.0, np.zeros(12)))
+        truth = self.TRUTH.copy()
+        truth[2] = np.nan
+        square, dof = nees_of(measurement, self.TRUTH + 0.1 * self.UNIT, np.diag(self.UNIT**2), truth)
+        assert (square, dof) == (pytest.approx(5 * 0.01), 5)
+        # A moment that is known in part is not known.
+        truth[3] = np.nan
+        assert nees_of(measurement, self.TRUTH, np.diag(self.UNIT**2), truth)[1] == 2
 
 
 class TestCounting:
@@ -90,7 +153,7 @@ class TestCounting:
         ]
         truth = np.zeros((5, 3))
         truth[3] = np.nan
-        result = consistency(points, truth, None, np.array([np.inf, 1.0, 2.0, 7.0, 2.0]))
+        result = consistency(points, TRACKER, blank_rows(5), truth, None, np.array([np.inf, 1.0, 2.0, 7.0, 2.0]))
         assert (result.rows, result.tracked_rows) == (4, 3)
         assert result.position_rms_m == pytest.approx(math.sqrt(3.0 / 3.0))
         assert result.position_bound_m == pytest.approx(math.sqrt(9.0 / 3.0))
@@ -100,7 +163,8 @@ class TestCounting:
         assert result.nis_bounds == mean_bounds(18)
 
     def test_nothing_tracked(self) -> None:
-        result = consistency([TrackPoint(0.0, status="not acquired: no signal")], np.zeros((1, 3)), None)
+        points = [TrackPoint(0.0, status="not acquired: no signal")]
+        result = consistency(points, TRACKER, blank_rows(1), np.zeros((1, 3)), None)
         assert (result.rows, result.tracked_rows) == (1, 0)
         assert math.isnan(result.position_rms_m)
         assert math.isnan(result.nees_per_dimension)
@@ -109,9 +173,15 @@ class TestCounting:
 
 
 def information_of(state: FloatArray, rotation: FloatArray, origin: FloatArray) -> FloatArray:
-    """Information of one row of the tetrahedron, from magpylib's field by numerical derivatives: (6, 6)."""
-    D = np.kron(contrasts(4), np.eye(3))
+    """Information of one row of the tetrahedron: (6, 6)."""
+    H = jacobian_of(state, rotation, origin)
     R = np.kron(difference_covariance(np.full(4, 2e-10)), np.eye(3))
+    return np.asarray(H.T @ np.linalg.solve(R, H))
+
+
+def jacobian_of(state: FloatArray, rotation: FloatArray, origin: FloatArray) -> FloatArray:
+    """Jacobian of the differences of one row, from magpylib's field by numerical derivatives: (9, 6)."""
+    D = np.kron(contrasts(4), np.eye(3))
     scale = np.repeat([1.0, 100.0], 3)
 
     def differences(states: FloatArray) -> FloatArray:
@@ -121,8 +191,7 @@ def information_of(state: FloatArray, rotation: FloatArray, origin: FloatArray) 
 
         return np.apply_along_axis(one, -1, states)
 
-    H = derivative(differences, state / scale, step=1e-2, atol=1e-9) * 1e-9 / scale
-    return np.asarray(H.T @ np.linalg.solve(R, H))
+    return derivative(differences, state / scale, step=1e-2, atol=1e-9) * 1e-9 / scale
 
 
 class TestPosteriorBound:
@@ -177,6 +246,22 @@ class TestPosteriorBound:
         still_p, still_m = np.tile(p[0], (self.N_ROWS, 1)), m
         bounds = posterior_bound(Tracker(ARRAY, UnknownMotion(1e-9, 1e-9)), rows, still_p, still_m)
         np.testing.assert_allclose(bounds, bounds[0] / np.sqrt(np.arange(1.0, self.N_ROWS + 1.0)), rtol=1e-6)
+
+    def test_counts_lasting_errors_as_unknowns_of_their_own(self) -> None:
+        """Rest, and fields fixed to the array: the inverse of the information of source and fields from all rows."""
+        t, p, m = self.truth()
+        fields = replace(ARRAY, sensors=tuple(replace(s, offset_uncertainty_T=5e-10) for s in ARRAY.sensors))
+        rows, rotations, origin = self.rows(t)
+        still_p = np.tile(p[0], (self.N_ROWS, 1))
+        bounds = posterior_bound(Tracker(fields, UnknownMotion(1e-9, 1e-9)), rows, still_p, m)
+        D, R = np.kron(contrasts(4), np.eye(3)), np.kron(difference_covariance(np.full(4, 2e-10)), np.eye(3))
+        J = np.diag(np.repeat([0.0, 1.0 / 5e-10**2], [6, 12]))
+        expected = []
+        for rotation, place in zip(rotations, origin, strict=True):
+            H = np.concatenate([jacobian_of(np.concatenate([p[0], m[0]]), rotation, place), D], axis=1)
+            J = J + H.T @ np.linalg.solve(R, H)
+            expected.append(math.sqrt(float(np.trace(np.linalg.inv(J)[:3, :3]))))
+        np.testing.assert_allclose(bounds, expected, rtol=1e-3)
 
     def test_is_infinite_until_the_readings_determine_the_source(self) -> None:
         t, p, m = self.truth()

@@ -5,6 +5,7 @@
 | scalar_update, sequential_update | exact rational arithmetic, filterpy's batch update, information form |
 | predict_square_root | F P Fᵀ + Q |
 | iterated_update | scipy's minimiser of the MAP cost, Stone Soup's IteratedKalmanUpdater, the affine closed form |
+| its curved prior | the linear update in coordinates where everything is linear |
 | IteratedExtendedKalmanFilter | filterpy's ExtendedKalmanFilter where one linearisation is exact |
 """
 
@@ -188,6 +189,100 @@ def _solve_extended(a, b):
     for i in range(n - 1, -1, -1):
         b[i] = (b[i] - a[i, i + 1 :] @ b[i + 1 :]) / a[i, i]
     return b
+
+
+class TestPlainFormIsUnchanged:
+    """Without a prior that bends and without shrinking it is Gauss-Newton as the paper has it, to the last bit."""
+
+    def reference(self, x, S, z, r, h, H, tolerance):
+        x_k, predicted, change, iterations = x, h(x), np.inf, 0
+        while change >= tolerance and iterations < 100:
+            J = H(x_k)
+            x_k, S_k = sequential_update(x, S, J, z - predicted - J @ (x - x_k), r)
+            before, predicted = predicted, h(x_k)
+            change, iterations = np.linalg.norm(predicted - before), iterations + 1
+        return x_k, S_k, iterations
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_is_the_loop_of_equation_19(self, seed):
+        x, S, z, r, h, H = dipole_problem(START, seed)
+        expected_x, expected_S, iterations = self.reference(x, S, z, r, h, H, 1e-6)
+        result = iterated_update(x, S, z, r, h, H, tolerance=1e-6, max_iterations=100)
+        np.testing.assert_array_equal(result.x, expected_x)
+        np.testing.assert_array_equal(result.S, expected_S)
+        assert (result.converged, result.iterations) == (True, iterations)
+
+    def test_a_prior_that_is_the_prediction_everywhere_changes_nothing(self):
+        x, S, z, r, h, H = dipole_problem(START)
+        plain = iterated_update(x, S, z, r, h, H, tolerance=1e-6)
+        same = iterated_update(x, S, z, r, h, H, tolerance=1e-6, prior=lambda _: (x, S))
+        np.testing.assert_array_equal(same.x, plain.x)
+        np.testing.assert_array_equal(same.S, plain.S)
+        assert (same.nis, same.iterations) == (plain.nis, plain.iterations)
+
+
+class TestCurvedPrior:
+    def test_a_gaussian_in_other_coordinates_is_the_plain_update_in_them(self):
+        """c = sinh(x) of every number: prior and readings are linear in c, and one linear update there is exact."""
+        x, S, H, nu, r = random_problem(8)
+        c = np.sinh(x)
+        z = H @ c + nu
+        c_new, S_new = sequential_update(c, S, H, nu, r)
+
+        def prior(y):
+            J = np.cosh(y)
+            return y - (np.sinh(y) - c) / J, S / J[:, None]
+
+        result = iterated_update(
+            x, S, z, r, lambda y: H @ np.sinh(y), lambda y: H * np.cosh(y), tolerance=1e-10, prior=prior
+        )
+        assert result.converged
+        np.testing.assert_allclose(np.sinh(result.x), c_new, rtol=1e-9, atol=1e-9)
+        J = np.cosh(result.x)[:, None]
+        P = S_new @ S_new.T
+        np.testing.assert_allclose((J * result.S) @ (J * result.S).T, P, rtol=1e-7, atol=1e-9 * np.abs(P).max())
+        expected_nis = nu @ np.linalg.solve(H @ S @ S.T @ H.T + np.diag(r), nu)
+        assert result.nis == pytest.approx(expected_nis, rel=1e-7)
+
+
+class TestShrink:
+    """Fletcher's example: residuals (x + 1, λx² + x - 1), where Gauss-Newton multiplies the distance from 0 by λ."""
+
+    SLOPE = -1.3
+
+    def update(self, shrink, max_iterations=50):
+        return iterated_update(
+            np.array([0.1]),
+            np.array([[1e6]]),
+            np.zeros(2),
+            np.ones(2),
+            lambda x: np.array([x[0] + 1.0, self.SLOPE * x[0] ** 2 + x[0] - 1.0]),
+            lambda x: np.array([[1.0], [2.0 * self.SLOPE * x[0] + 1.0]]),
+            tolerance=1e-10,
+            max_iterations=max_iterations,
+            shrink=shrink,
+        )
+
+    def test_whole_steps_swing_for_ever(self):
+        assert not self.update(1.0).converged
+
+    def test_shorter_ones_reach_the_optimum(self):
+        """Which is at 0, by scipy too."""
+        result = self.update(0.5)
+        assert result.converged
+        cost = scipy.optimize.minimize_scalar(
+            lambda x: (x + 1.0) ** 2 + (self.SLOPE * x**2 + x - 1.0) ** 2, bracket=(-0.2, 0.1, 0.3)
+        )
+        assert abs(result.x[0]) < 1e-9
+        assert cost.x == pytest.approx(result.x[0], abs=1e-6)
+
+    def test_steps_that_do_not_swing_stay_whole(self):
+        """Where every change of the prediction is smaller than the one before, nothing is shrunk: to the last bit."""
+        x, S, z, r, h, H = dipole_problem([5.2, 0.1, 0.4, 55.0, 50.0, 60.0], prior=(0.3, 30.0))
+        whole, shrunk = (iterated_update(x, S, z, r, h, H, tolerance=1e-6, shrink=s) for s in (1.0, 0.5))
+        assert whole.converged
+        np.testing.assert_array_equal(shrunk.x, whole.x)
+        np.testing.assert_array_equal(shrunk.S, whole.S)
 
 
 class TestStopRule:

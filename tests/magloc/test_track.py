@@ -1,87 +1,41 @@
-"""The tracker: matched models, the weaving target, gaps, outliers, loss, and compiled steps against readable ones."""
+"""The tracker: matched models, the weaving target, gaps, outliers, loss, time, and estimability."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import sims
-from arrays import geometries
 from arrays.sensor import Sensor, SensorArray
 from magloc.consistency import consistency
+from magloc.long_record import track_record
 from magloc.measurement import predicted_channels
 from magloc.motion import ConstantTurn, MotionModel, UnknownMotion, WanderingMotion
-from magloc.track import Prediction, Row, Step, Tracker, TrackPoint, rows_of, smoothed, track_record
+from magloc.smoother import smoothed
+from magloc.track import Tracker
+from magloc.track_rows import Row, TrackPoint, rows_of
 from tests.oracles import magpylib_field
+from tests.passing_source import (
+    ARRAY,
+    MOMENT,
+    POSITION,
+    SLOW,
+    followed,
+    moving_source,
+    positions,
+    readings_of,
+    rows_from,
+    statuses,
+)
 
 FloatArray = NDArray[np.float64]
-
-EDGE_M, NOISE_T = 1.5, 2e-10
-POSITION = np.array([3.0, 1.5, 0.8])
-MOMENT = np.array([120.0, -150.0, 160.0])
-ARRAY = geometries.tetrahedron(EDGE_M, "vector", NOISE_T)
-SLOW = UnknownMotion(0.1, math.radians(1.2))
-
-
-def moving_source(n: int, dt_s: float = 0.5) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Times, and positions and moments (n, 3) of a source that passes at 0.08 m/s and turns by 1 degree a second."""
-    t = dt_s * np.arange(n, dtype=np.float64)
-    p = POSITION + np.outer(t, [-0.08, 0.02, 0.0])
-    return t, p, Rotation.from_rotvec(np.outer(np.deg2rad(t), [0.0, 0.0, 1.0])).apply(MOMENT)
-
-
-def readings_of(array: SensorArray, p: FloatArray, m: FloatArray, seed: int = 0) -> FloatArray:
-    noise = np.random.default_rng(seed).normal(size=(len(p), array.n_channels))
-    return predicted_channels(array, p, m) + array.channel_noise_T * noise
-
-
-def rows_from(time_s: FloatArray, readings_T: FloatArray) -> list[Row]:
-    return list(rows_of(time_s, readings_T))
-
-
-def statuses(points: list[TrackPoint]) -> list[str]:
-    return [point.status for point in points]
-
-
-def followed(tracker: Tracker, rows: list[Row]) -> list[TrackPoint]:
-    return list(tracker.run(rows))
-
-
-def positions(points: list[TrackPoint]) -> FloatArray:
-    return np.array([np.full(3, np.nan) if point.position_m is None else point.position_m for point in points])
-
-
-def assert_same_points(some: list[TrackPoint], others: list[TrackPoint]) -> None:
-    """To 1e-9 m and 1e-9 of the moment; and what is not a number is the same."""
-    assert statuses(some) == statuses(others)
-    for a, b in zip(some, others, strict=True):
-        assert (a.time_s, a.nis_dof) == (b.time_s, b.nis_dof)
-        np.testing.assert_allclose(a.nis, b.nis, rtol=1e-5, atol=1e-6)
-        assert (a.position_m is None) == (b.position_m is None)
-        if a.position_m is None or b.position_m is None or a.moment_Am2 is None or b.moment_Am2 is None:
-            continue
-        np.testing.assert_allclose(a.position_m, b.position_m, rtol=0.0, atol=1e-9)
-        np.testing.assert_allclose(
-            a.moment_Am2, b.moment_Am2, rtol=0.0, atol=1e-9 * float(np.linalg.norm(b.moment_Am2))
-        )
-        assert a.covariance is not None
-        assert b.covariance is not None
-        assert a.estimability is not None
-        assert b.estimability is not None
-        scale = np.sqrt(np.diagonal(b.covariance))
-        np.testing.assert_allclose(
-            a.covariance / np.outer(scale, scale), b.covariance / np.outer(scale, scale), atol=1e-7
-        )
-        np.testing.assert_allclose(a.estimability, b.estimability, atol=1e-7)
 
 
 class TestStationarySource:
@@ -191,14 +145,16 @@ def weaving_errors(
     """Distances of filter and smoother from the truth after 20 s, the filter's NEES per dimension, and its points."""
     simulation = sims.simulate(WEAVING, seed)
     tracker = Tracker(simulation.array, motion(), keep_steps=True)
-    points = track_record(tracker, rows_from(simulation.readings.time_s, simulation.readings.values_T))
+    rows = rows_from(simulation.readings.time_s, simulation.readings.values_T)
+    points = track_record(tracker, rows)
     truth = simulation.truth
     assert truth.moment_Am2 is not None
     late = np.flatnonzero(truth.time_s >= 20.0)
     finished = smoothed(points, tracker.steps)
     filtered_m = np.linalg.norm((positions(points) - truth.position_m)[late], axis=1)
     smoothed_m = np.linalg.norm((positions(finished) - truth.position_m)[late], axis=1)
-    of_late = consistency([points[i] for i in late], truth.position_m[late], truth.moment_Am2[late])
+    late_points, late_rows = [points[i] for i in late], [rows[i] for i in late]
+    of_late = consistency(late_points, tracker, late_rows, truth.position_m[late], truth.moment_Am2[late])
     return filtered_m, smoothed_m, of_late.nees_per_dimension, points
 
 
@@ -430,80 +386,6 @@ class TestEstimability:
         assert (point.estimability[3:] > 0.9999).all()
 
 
-class TestCompiledRecord:
-    """The compiled steps and the readable ones: the same points to 1e-9, and the same steps."""
-
-    def both(self, array: SensorArray, motion: MotionModel, rows: list[Row]) -> list[TrackPoint]:
-        readable, compiled = Tracker(array, motion, keep_steps=True), Tracker(array, motion, keep_steps=True)
-        expected, points = followed(readable, rows), track_record(compiled, rows)
-        assert_same_points(points, expected)
-        assert [step.row for step in compiled.steps] == [step.row for step in readable.steps]
-        for a, b in zip(smoothed(points, compiled.steps), smoothed(expected, readable.steps), strict=True):
-            if a.position_m is not None and b.position_m is not None:
-                np.testing.assert_allclose(a.position_m, b.position_m, rtol=0.0, atol=1e-8)
-        return points
-
-    def test_gaps_missing_channels_and_spikes(self) -> None:
-        n = 120
-        rng = np.random.default_rng(8)
-        time_s, p, m = moving_source(n)
-        time_s = time_s + rng.uniform(0.0, 0.4, n)
-        p[90:] += [-5.0, 0.0, 0.0]
-        readings = readings_of(ARRAY, p, m)
-        readings[rng.random(readings.shape) < 0.05] = np.nan
-        readings[30:36] = np.nan
-        readings[[20, 50, 51], [3, 7, 1]] += 1e-6
-        points = self.both(ARRAY, SLOW, rows_from(time_s, readings))
-        assert {"acquired", "tracked", "predicted", "outlier"} <= set(statuses(points))
-        assert statuses(points).count("acquired") >= 2
-
-    def test_scalar_sensors_in_an_ambient_field_of_every_row(self) -> None:
-        n = 60
-        array = geometries.cube(1.5, "scalar", NOISE_T)
-        time_s, p, m = moving_source(n)
-        ambient = np.array([1e-5, -2e-5, 4.5e-5]) + 1e-6 * np.random.default_rng(2).normal(size=(n, 3))
-        noise = NOISE_T * np.random.default_rng(0).normal(size=(n, 8))
-        fields = np.stack([magpylib_field(array.positions, *source) for source in zip(p, m, strict=True)])
-        readings = np.linalg.norm(fields + ambient[:, None], axis=-1) + noise
-        rows = list(rows_of(time_s, readings, ambient_T=ambient))
-        points = self.both(array, SLOW, rows)
-        assert statuses(points).count("tracked") > 50
-        assert np.nanmax(np.linalg.norm(positions(points) - p, axis=1)) < 0.3
-
-    def test_a_moving_array(self) -> None:
-        n = 60
-        time_s, p, m = moving_source(n)
-        origin = np.outer(time_s, [-0.05, 0.05, 0.0]) + np.array([10.0, -4.0, 2.0])
-        rotation = Rotation.from_rotvec(np.outer(time_s, [0.02, 0.01, -0.05]))
-        world_p = p + np.array([10.0, -4.0, 2.0])
-        in_array = rotation.inv().apply(world_p - origin)
-        readings = readings_of(ARRAY, in_array, rotation.inv().apply(m))
-        rows = list(rows_of(time_s, readings, origin, rotation.as_quat()))
-        points = self.both(ARRAY, SLOW, rows)
-        assert statuses(points) == ["acquired"] + ["tracked"] * (n - 1)
-        assert np.linalg.norm(positions(points) - world_p, axis=1).max() < 0.2
-
-    def test_noise_that_depends_on_the_reading(self) -> None:
-        time_s, p, m = moving_source(40)
-        array = replace(ARRAY, noise_fraction=1e-3)
-        points = self.both(array, SLOW, rows_from(time_s, readings_of(array, p, m)))
-        assert statuses(points).count("tracked") > 30
-
-    def test_other_motions_take_the_readable_path(self) -> None:
-        time_s, p, m = moving_source(20)
-        points = self.both(ARRAY, WanderingMotion(0.1, 0.02), rows_from(time_s, readings_of(ARRAY, p, m)))
-        assert statuses(points).count("tracked") == 19
-
-    def test_no_rows(self) -> None:
-        assert track_record(Tracker(ARRAY, SLOW), []) == []
-
-    def test_progress_counts_every_row_once(self) -> None:
-        time_s, p, m = moving_source(25)
-        finished: list[int] = []
-        track_record(Tracker(ARRAY, SLOW), rows_from(time_s, readings_of(ARRAY, p, m)), finished.append)
-        assert sum(finished) == 25
-
-
 class TestFrames:
     def test_the_track_turns_and_moves_with_the_world(self) -> None:
         """A fixed array in another place and attitude of the world: the same track there."""
@@ -519,63 +401,3 @@ class TestFrames:
             assert a.covariance is not None
             assert b.covariance is not None
             np.testing.assert_allclose(b.covariance, R6 @ a.covariance @ R6.T, rtol=1e-6, atol=1e-9)
-
-
-class TestSmoother:
-    def test_is_filterpys(self) -> None:
-        """Of a linear system with random transitions, by filterpy's Rauch-Tung-Striebel smoother."""
-        rng = np.random.default_rng(4)
-        n = 12
-        reference = KalmanFilter(dim_x=6, dim_z=4)
-        reference.F = np.eye(6) + 0.1 * rng.normal(size=(6, 6))
-        reference.H = rng.normal(size=(4, 6))
-        reference.Q, reference.R, reference.P = 0.1 * np.eye(6), 0.5 * np.eye(4), 4.0 * np.eye(6)
-        points, steps, xs, Ps = [], [], [], []
-        for i in range(n):
-            prediction = None
-            if i:
-                reference.predict()
-                x_predicted = reference.x.ravel().copy()
-                prediction = Prediction(x_predicted, np.linalg.cholesky(reference.P), reference.F)
-            reference.update(rng.normal(size=4))
-            x, P = reference.x.ravel().copy(), 0.5 * (reference.P + reference.P.T)
-            xs.append(x)
-            Ps.append(P)
-            steps.append(Step(i, prediction, x, np.linalg.cholesky(P)))
-            points.append(TrackPoint(float(i), x[:3], x[3:], P, status="tracked"))
-        expected_x, expected_P, _, _ = reference.rts_smoother(np.array(xs)[..., None], np.array(Ps))
-        for i, point in enumerate(smoothed(points, steps)):
-            assert point.position_m is not None
-            assert point.moment_Am2 is not None
-            np.testing.assert_allclose(
-                np.concatenate([point.position_m, point.moment_Am2]), expected_x[i].ravel(), rtol=1e-8, atol=1e-9
-            )
-            assert point.covariance is not None
-            np.testing.assert_allclose(point.covariance, expected_P[i], rtol=1e-8, atol=1e-9)
-
-    def test_goes_no_farther_than_a_track(self) -> None:
-        """Every track is smoothed by itself: the last row of one stays as the filter had it."""
-        time_s, p, m = moving_source(30)
-        p[15:] += [-6.0, 0.0, 0.0]
-        tracker = Tracker(ARRAY, SLOW, keep_steps=True)
-        points = track_record(tracker, rows_from(time_s, readings_of(ARRAY, p, m)))
-        again = points.index(next(point for point in points[1:] if point.status == "acquired"))
-        finished = smoothed(points, tracker.steps)
-        np.testing.assert_array_equal(finished[again - 1].position_m, points[again - 1].position_m)
-        np.testing.assert_array_equal(finished[-1].position_m, points[-1].position_m)
-        assert np.abs(positions(finished)[5] - positions(points)[5]).max() > 0.0
-
-    def test_never_claims_to_know_less(self) -> None:
-        time_s, p, m = moving_source(40)
-        tracker = Tracker(ARRAY, WanderingMotion(0.1, 0.02), keep_steps=True)
-        points = track_record(tracker, rows_from(time_s, readings_of(ARRAY, p, m)))
-        for before, after in zip(points, smoothed(points, tracker.steps), strict=True):
-            assert before.covariance is not None
-            assert after.covariance is not None
-            assert (np.diagonal(after.covariance) <= np.diagonal(before.covariance) * (1.0 + 1e-9)).all()
-
-    def test_keeps_no_steps_unless_asked(self) -> None:
-        time_s, p, m = moving_source(5)
-        tracker = Tracker(ARRAY, SLOW)
-        track_record(tracker, rows_from(time_s, readings_of(ARRAY, p, m)))
-        assert tracker.steps == []

@@ -174,13 +174,18 @@ class TestReading:
 
     def test_what_the_array_states_is_simulated(self, write) -> None:
         text = PLAIN.replace(
-            "noise_nT", "misalignment_mrad = 2\ngain_uncertainty = 0.01\nsaturation_nT = 500\nnoise_nT"
+            "noise_nT",
+            "misalignment_mrad = 2\ngain_uncertainty = 0.01\nsaturation_nT = 500\n"
+            "offset_uncertainty_nT = 3\nflicker_nT = 0.04\ndrift_nT_rth = 5\nnoise_nT",
         )
         scenario = read_scenario(write(text))
         assert scenario.models[0].misalignment_rad == 2e-3
         assert scenario.models[0].gain_error == 0.01
         assert scenario.models[0].range_T == pytest.approx(5e-7)
-        assert scenario.nominal_array.sensors[0].misalignment_rad == 2e-3
+        (nominal, *_) = scenario.nominal_array.sensors
+        assert nominal.misalignment_rad == 2e-3
+        assert (nominal.offset_uncertainty_T, nominal.drift_T_rth) == (3e-9, 5e-9)
+        assert nominal.flicker_T == pytest.approx(4e-11, rel=1e-9)
 
     @pytest.mark.parametrize("kind", SENSOR_KINDS)
     def test_every_kind_of_sensor(self, write, kind: str) -> None:
@@ -191,12 +196,12 @@ class TestReading:
     def test_every_figure_of_a_kind_can_be_overridden(self, write) -> None:
         figures = (
             "noise_nT_rtHz = 1\ncorner_Hz = 2\nbandwidth_Hz = 3\nrange_nT = inf\nresolution_nT = 5\n"
-            "misalignment_mrad = 6\ngain_error = 0.7\ndrift_nT_rth = 8\n"
+            "misalignment_mrad = 6\ngain_error = 0.7\ndrift_nT_rth = 8\noffset_error_nT = 9\n"
         )
         model = read_scenario(write(f'{OF_KIND}[sensors]\nkind = "fluxgate"\n{figures}')).models[0]
         found = [model.noise_T_rtHz, model.corner_Hz, model.bandwidth_Hz, model.range_T, model.resolution_T]
-        found += [model.misalignment_rad, model.gain_error, model.drift_T_rth]
-        np.testing.assert_allclose(found, [1e-9, 2.0, 3.0, math.inf, 5e-9, 6e-3, 0.7, 8e-9], rtol=1e-15)
+        found += [model.misalignment_rad, model.gain_error, model.drift_T_rth, model.offset_error_T]
+        np.testing.assert_allclose(found, [1e-9, 2.0, 3.0, math.inf, 5e-9, 6e-3, 0.7, 8e-9, 9e-9], rtol=1e-15)
 
     def test_the_noise_of_a_sample_may_be_given(self, write) -> None:
         text = f'{OF_KIND}[sensors]\nkind = "overhauser"\nresolution_nT = 0\nnoise_nT = 0.3\n'

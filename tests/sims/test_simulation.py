@@ -239,6 +239,34 @@ class TestSensorErrors:
         assert result.array.sensors[0].gain_uncertainty == 3e-4
         assert result.array.sensors[0].calibration == Calibration.of("vector")
 
+    def test_a_field_fixed_to_the_array_stays_the_same_in_its_axes(self) -> None:
+        model = replace(SILENT, offset_error_T=5e-9)
+        stray = simulate(scenario(model, carrier=MOVING), 1).readings.values_T
+        stray = stray - simulate(scenario(carrier=MOVING), 1).readings.values_T
+        np.testing.assert_allclose(stray, np.broadcast_to(stray[0], stray.shape), atol=1e-19)
+        assert len(np.unique(stray[0].round(12))) == 12
+
+    def test_it_has_its_rms(self) -> None:
+        sensors = tuple(Sensor(f"s{i}", "vector", (float(i), 0.0, 0.0), 1e-9) for i in range(1000))
+        model = replace(SILENT, offset_error_T=5e-9)
+        values = simulate(scenario(model, SensorArray(sensors), duration_s=0.1, sources=()), 1).readings.values_T
+        low, high = bounds(3000)
+        assert low < (values[0] ** 2).sum() / 25e-18 < high
+
+    def test_a_scalar_sensor_reads_the_modulus_with_it(self) -> None:
+        vector = SILENT
+        scalar = replace(SILENT, reads="scalar", offset_error_T=5e-9)
+        fields = simulate(scenario(replace(vector, offset_error_T=5e-9), ambient_T=AMBIENT_T), 1).readings.values_T
+        moduli = simulate(scenario(scalar, tetrahedron(1.5, "scalar"), ambient_T=AMBIENT_T), 1).readings.values_T
+        np.testing.assert_allclose(moduli, np.linalg.norm(fields.reshape(-1, 4, 3), axis=-1), rtol=1e-13)
+
+    def test_the_array_states_all_that_lasts(self) -> None:
+        """1/f noise of density N²·f_c/f has the variance N² f_c ln 10 in a decade."""
+        model = SensorModel("vector", 2e-11, corner_Hz=0.5, drift_T_rth=3e-10, offset_error_T=1e-9)
+        for sensor in scenario(model).nominal_array.sensors:
+            assert (sensor.drift_T_rth, sensor.offset_uncertainty_T) == (3e-10, 1e-9)
+            assert sensor.flicker_T**2 == pytest.approx(4e-22 * 0.5 * math.log(10.0))
+
     def test_drift_starts_at_zero_and_grows(self) -> None:
         sensors = tuple(Sensor(f"s{i}", "vector", (float(i), 0.0, 0.0), 1e-9) for i in range(500))
         model = replace(SILENT, drift_T_rth=6e-9)
@@ -305,7 +333,7 @@ class TestRandomNumbers:
         monkeypatch.setattr(simulation_module, "stream", recorded)
         platform = Platform((0.0, 0.0, 3.0), (0.0, 0.0, 1.0), 0.5, 1e-9)
         simulate(replace(self.FULL, sources=(TARGET, TARGET), platform=platform), 1)
-        assert len(set(used)) == len(used) == 3 + 1 + 2 + 5 * 4
+        assert len(set(used)) == len(used) == 3 + 1 + 2 + 6 * 4
 
     def test_leaving_out_a_sensor_changes_no_other(self) -> None:
         part = replace(self.FULL, array=self.FULL.array.subset(["s1", "s3", "s4"]), models=(self.NOISY,) * 3)

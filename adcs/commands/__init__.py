@@ -1,0 +1,1 @@
+"""The commands of ``adcs``, one module each."""

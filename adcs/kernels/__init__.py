@@ -1,0 +1,1 @@
+"""Compiled hot loops of :mod:`adcs`, with the compiler options of :mod:`magloc.kernels`."""

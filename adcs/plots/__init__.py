@@ -1,0 +1,1 @@
+"""Figures of :mod:`adcs`. Only the command line draws."""

@@ -1,0 +1,196 @@
+r"""Unit quaternions of attitude: Hamilton's product, scalar part first.
+
+A quaternion q = (q0, p) of frame "to" from frame "from" turns components of a vector,
+
+.. math:: v_{to} = q \circ v_{from} \circ q^*, \qquad v_{from} = A(q)\, v_{to}
+
+so that ``q_orbital_from_body`` gives orbital components of a body vector, and A(q) is the matrix that the literature of
+attitude writes for the opposite direction. q and -q are the same rotation. The error of an estimate is in its right
+factor, :math:`q = \hat q \circ (\sqrt{1-|\delta|^2}, \delta)`, and turns in body axes by the angle 2δ for small δ.
+
+All functions take leading batch axes. :mod:`scipy.spatial.transform` has the scalar part last: :func:`to_rotation` and
+:func:`from_rotation` are the only place that converts.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+FloatArray = NDArray[np.float64]
+
+IDENTITY: FloatArray = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def multiply(p: ArrayLike, q: ArrayLike) -> FloatArray:
+    """Hamilton product p∘q: the rotation q, then p.
+
+    Parameters
+    ----------
+    p, q : array_like, shape (..., 4)
+        Scalar first; they broadcast.
+
+    Returns
+    -------
+    ndarray, shape (..., 4)
+    """
+    p0, p1, p2, p3 = np.moveaxis(np.asarray(p, dtype=np.float64), -1, 0)
+    q0, q1, q2, q3 = np.moveaxis(np.asarray(q, dtype=np.float64), -1, 0)
+    return np.stack(
+        [
+            p0 * q0 - p1 * q1 - p2 * q2 - p3 * q3,
+            p0 * q1 + p1 * q0 + p2 * q3 - p3 * q2,
+            p0 * q2 - p1 * q3 + p2 * q0 + p3 * q1,
+            p0 * q3 + p1 * q2 - p2 * q1 + p3 * q0,
+        ],
+        axis=-1,
+    )
+
+
+def conjugate(q: ArrayLike) -> FloatArray:
+    """Conjugate q*: the rotation back. Shape (..., 4) -> (..., 4)."""
+    return np.asarray(q, dtype=np.float64) * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def normalised(q: ArrayLike) -> FloatArray:
+    """Quaternion of length 1, shape (..., 4); NaN where the length is zero or not finite."""
+    values = np.asarray(q, dtype=np.float64)
+    norm = np.linalg.norm(values, axis=-1, keepdims=True)
+    return values / np.where(norm > 0.0, norm, np.nan)
+
+
+def rotate(q: ArrayLike, v: ArrayLike) -> FloatArray:
+    """Vector q∘v∘q*: for ``q_orbital_from_body``, orbital components of a body vector.
+
+    Parameters
+    ----------
+    q : array_like, shape (..., 4)
+        Unit quaternion.
+    v : array_like, shape (..., 3)
+        Broadcasts against q.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+    """
+    q = np.asarray(q, dtype=np.float64)
+    v = np.asarray(v, dtype=np.float64)
+    vector = q[..., 1:]
+    twice = 2.0 * np.cross(vector, v)
+    return v + q[..., :1] * twice + np.cross(vector, twice)
+
+
+def rotate_back(q: ArrayLike, v: ArrayLike) -> FloatArray:
+    """Vector q*∘v∘q = A(q) v: for ``q_orbital_from_body``, body components of an orbital vector; see :func:`rotate`."""
+    return rotate(conjugate(q), v)
+
+
+def matrix(q: ArrayLike) -> FloatArray:
+    """Matrix R with ``R @ v`` = :func:`rotate` (q, v). Shape (..., 4) -> (..., 3, 3); A(q) is its transpose."""
+    q = np.asarray(q, dtype=np.float64)
+    # Row i of this is the turned unit vector i, which is column i of R.
+    return rotate(q[..., None, :], np.eye(3)).mT
+
+
+def exp(rotation_vector: ArrayLike) -> FloatArray:
+    """Quaternion (cos θ/2, n sin θ/2) of a rotation vector θn.
+
+    Parameters
+    ----------
+    rotation_vector : array_like, shape (..., 3)
+        [rad]
+
+    Returns
+    -------
+    ndarray, shape (..., 4)
+    """
+    half = 0.5 * np.asarray(rotation_vector, dtype=np.float64)
+    angle = np.linalg.norm(half, axis=-1, keepdims=True)
+    # np.sinc(x) is sin(πx)/(πx), which is 1 at zero.
+    return np.concatenate([np.cos(angle), half * np.sinc(angle / np.pi)], axis=-1)
+
+
+def log(q: ArrayLike) -> FloatArray:
+    """Rotation vector of a unit quaternion, of length π at most [rad]; inverse of :func:`exp`. (..., 4) -> (..., 3)."""
+    q = np.asarray(q, dtype=np.float64)
+    q = np.where(q[..., :1] < 0.0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    half = np.arctan2(sine, q[..., :1])
+    # np.sinc(x) is sin(πx)/(πx), which is 1 at zero.
+    return 2.0 * q[..., 1:] / np.sinc(half / np.pi)
+
+
+def error_vector(q_estimated: ArrayLike, q_true: ArrayLike) -> FloatArray:
+    r"""Vector part δ of :math:`\hat q^* \circ q` with the sign that makes its scalar part positive.
+
+    Parameters
+    ----------
+    q_estimated, q_true : array_like, shape (..., 4)
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Body axes; 2δ is the angle of error for small errors [rad].
+    """
+    error = multiply(conjugate(q_estimated), q_true)
+    return np.where(error[..., :1] < 0.0, -error[..., 1:], error[..., 1:])
+
+
+def from_error_vector(delta: ArrayLike) -> FloatArray:
+    """Quaternion (√(1-|δ|²), δ), normalised where |δ| > 1. Shape (..., 3) -> (..., 4)."""
+    delta = np.asarray(delta, dtype=np.float64)
+    squared = np.sum(delta * delta, axis=-1, keepdims=True)
+    scalar = np.sqrt(np.clip(1.0 - squared, 0.0, None))
+    return np.concatenate([scalar, delta / np.sqrt(np.maximum(squared, 1.0))], axis=-1)
+
+
+def angle_between(p: ArrayLike, q: ArrayLike) -> FloatArray:
+    """Angle of the rotation between two attitudes, 0 to π [rad]. Shapes (..., 4) -> (...)."""
+    error = multiply(conjugate(p), q)
+    return 2.0 * np.arctan2(np.linalg.norm(error[..., 1:], axis=-1), np.abs(error[..., 0]))
+
+
+def derivative(q: ArrayLike, w: ArrayLike) -> FloatArray:
+    """Rate of change ½ q∘(0, w) for the rate w of the "from" frame against the "to" frame, in "from" axes [rad/s].
+
+    Parameters
+    ----------
+    q : array_like, shape (..., 4)
+    w : array_like, shape (..., 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 4)
+        [1/s]
+    """
+    w = np.asarray(w, dtype=np.float64)
+    return 0.5 * multiply(q, np.concatenate([np.zeros_like(w[..., :1]), w], axis=-1))
+
+
+def cross_matrix(a: ArrayLike) -> FloatArray:
+    """W(a) with ``W(a) @ b`` = a×b. Shape (..., 3) -> (..., 3, 3)."""
+    a = np.asarray(a, dtype=np.float64)
+    # Row i of this is a×e_i, which is column i of W.
+    return np.cross(a[..., None, :], np.eye(3)).mT
+
+
+def random_attitudes(n: int, rng: np.random.Generator) -> FloatArray:
+    """Attitudes (n, 4), uniform over all rotations."""
+    return normalised(rng.standard_normal((n, 4)))
+
+
+def to_rotation(q: ArrayLike) -> Rotation:
+    """Rotation of scipy of quaternions (..., 4), with ``Rotation.apply(v)`` = :func:`rotate` (q, v)."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(np.asarray(q, dtype=np.float64), scalar_first=True)
+
+
+def from_rotation(rotation: Rotation) -> FloatArray:
+    """Quaternions (..., 4), scalar part not negative, of scipy's Rotation."""
+    return np.asarray(rotation.as_quat(canonical=True, scalar_first=True), dtype=np.float64)

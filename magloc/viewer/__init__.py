@@ -1,0 +1,1 @@
+"""Results seen in three dimensions, in a browser (viser)."""

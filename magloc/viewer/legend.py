@@ -1,0 +1,126 @@
+"""The legend: what the colours mean, with units. The same HTML in the panel of the live page and in a static file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import viser
+
+Colour = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class Swatch:
+    """A colour and what it stands for.
+
+    Attributes
+    ----------
+    colour : tuple of 3 ints
+    text : str
+        With its unit.
+    """
+
+    colour: Colour
+    text: str
+
+
+@dataclass(frozen=True)
+class ColourScale:
+    """A scale of colours.
+
+    Attributes
+    ----------
+    text : str
+        What is coloured, with its unit.
+    low, high : str
+        What the first and the last colour stand for.
+    colours : tuple of tuples of 3 ints
+        Evenly along the scale.
+    """
+
+    text: str
+    low: str
+    high: str
+    colours: tuple[Colour, ...]
+
+
+Entry = Swatch | ColourScale
+
+
+def legend_html(entries: Sequence[Entry], notes: Sequence[str] = ()) -> str:
+    """Legend as HTML.
+
+    Parameters
+    ----------
+    entries : sequence of Swatch or ColourScale
+    notes : sequence of str
+        Sentences below.
+
+    Returns
+    -------
+    str
+        One ``div``; all texts are escaped.
+    """
+    rows = [_row(entry) for entry in entries]
+    rows += [f'<div style="margin-top:.35em;opacity:.8">{escape(note)}</div>' for note in notes]
+    return f'<div style="font-size:.8rem;line-height:1.35;padding:.2em .6em .5em">{"".join(rows)}</div>'
+
+
+def add_legend(gui: viser.GuiApi, entries: Sequence[Entry], notes: Sequence[str] = ()) -> viser.GuiHtmlHandle:
+    """Put the legend into the panel, where its GUI is at present.
+
+    Parameters
+    ----------
+    gui : viser.GuiApi
+    entries, notes
+        As in :func:`legend_html`.
+
+    Returns
+    -------
+    viser.GuiHtmlHandle
+    """
+    return gui.add_html(legend_html(entries, notes))
+
+
+def with_legend(page: str, title: str, entries: Sequence[Entry], notes: Sequence[str] = ()) -> str:
+    """A static page with the title and the legend in its corner.
+
+    Parameters
+    ----------
+    page : str
+        HTML as viser makes it, which has no panel.
+    title : str
+    entries, notes
+        As in :func:`legend_html`.
+
+    Returns
+    -------
+    str
+    """
+    box = (
+        '<div style="position:fixed;bottom:.8em;left:.8em;z-index:1000;max-width:19rem;background:rgba(255,255,255,.9);'
+        "color:#222;border-radius:.4em;box-shadow:0 1px 4px rgba(0,0,0,.25);font-family:sans-serif;"
+        f'pointer-events:none"><div style="font-weight:600;padding:.5em .6em .2em">{escape(title)}</div>'
+        f"{legend_html(entries, notes)}</div>"
+    )
+    before, end, after = page.rpartition("</body>")
+    return f"{before}{box}{end}{after}"
+
+
+def _row(entry: Entry) -> str:
+    if isinstance(entry, Swatch):
+        swatch = f"background:{_css(entry.colour)};width:.9em;height:.9em;border-radius:.15em;flex:none;margin-top:.2em"
+        return f'<div style="display:flex;gap:.55em"><span style="{swatch}"></span>{escape(entry.text)}</div>'
+    gradient = ",".join(_css(colour) for colour in entry.colours)
+    bar = f"background:linear-gradient(to right,{gradient});height:.7em;border-radius:.15em"
+    ends = f"<span>{escape(entry.low)}</span><span>{escape(entry.high)}</span>"
+    return (
+        f'<div style="margin:.2em 0 .3em">{escape(entry.text)}<div style="{bar}"></div>'
+        f'<div style="display:flex;justify-content:space-between">{ends}</div></div>'
+    )
+
+
+def _css(colour: Colour) -> str:
+    return f"rgb({colour[0]},{colour[1]},{colour[2]})"

@@ -1,0 +1,170 @@
+"""A viser server: opened on a free port of this machine, filled with a result, written as a page or a picture."""
+
+from __future__ import annotations
+
+import io
+import os
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+
+import viser
+
+from arrays.errors import InputError
+from arrays.toml import write_text
+from magloc.viewer.browser import BrowserError, Chromium
+from magloc.viewer.legend import with_legend
+from magloc.viewer.pages import Page
+
+HOST = "127.0.0.1"  # a viewer for whoever sits at this machine, not for the network
+FIRST_PORT = 8080
+_PORTS = 20
+_PICTURE_PX = (1280, 800)
+_PANEL_PX = 330
+_CONNECTION_S = 60.0
+_CLOSE_NOTICES = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(button => button.click())"
+
+
+def free_port(wanted: int) -> int:
+    """A port of this machine on which nobody listens.
+
+    Parameters
+    ----------
+    wanted : int
+        The first that is tried, and 19 after it; 0 takes any.
+
+    Returns
+    -------
+    int
+
+    Raises
+    ------
+    InputError
+        All of them are in use.
+    """
+    last = wanted if wanted == 0 else min(wanted + _PORTS - 1, 65535)
+    for port in range(wanted, last + 1):
+        with socket.socket() as probe:
+            # Else a port of a server that ended a moment ago counts as in use.
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((HOST, port))
+            except OSError:
+                continue
+            found: int = probe.getsockname()[1]
+            return found
+    raise InputError(f"--port: found the ports {wanted} to {last} in use, expected a free one.")
+
+
+@contextmanager
+def opened(port: int, title: str) -> Iterator[viser.ViserServer]:
+    """A server that is stopped afterwards, whatever happens.
+
+    Parameters
+    ----------
+    port : int
+        Free.
+    title : str
+        Above the panel.
+
+    Yields
+    ------
+    viser.ViserServer
+    """
+    # viser writes its own greetings to stdout.
+    with redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host=HOST, port=port, label=title, verbose=False)
+    try:
+        server.gui.configure_theme(show_logo=False, show_share_button=False)
+        server.gui.main_panel.dock_right()
+        server.gui.main_panel.set_width(_PANEL_PX)
+        yield server
+    finally:
+        with redirect_stdout(io.StringIO()):
+            server.stop()
+
+
+def address(server: viser.ViserServer) -> str:
+    """Where a browser finds the server."""
+    return f"http://{HOST}:{server.get_port()}"
+
+
+def wait_for_interruption() -> None:
+    """Return after Ctrl-C. A browser that is closed, or opened anew, changes nothing."""
+    forever = threading.Event()
+    try:
+        # Waiting without a limit could not be interrupted on every system.
+        while not forever.wait(1.0):
+            pass
+    except KeyboardInterrupt:
+        return
+
+
+def write_page(server: viser.ViserServer, page: Page, path: Path) -> None:
+    """Write the scene as one HTML file that needs nothing else.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    page : Page
+    path : Path
+        Replaced if it exists.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    html = with_legend(server.scene.as_html(), page.title, page.entries, page.notes)
+    try:
+        write_text(html, path)
+    except OSError as error:
+        raise InputError(f"--html {path} cannot be written ({error.strerror}).") from None
+
+
+def write_picture(server: viser.ViserServer, path: Path) -> None:
+    """Write the page as a headless Chromium shows it, a PNG file.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    path : Path
+        Replaced if it exists.
+
+    Raises
+    ------
+    InputError
+        There is no Chromium, or the file cannot be written.
+    BrowserError
+        The browser fails.
+    """
+    with Chromium(address(server), _PICTURE_PX) as browser:
+        browser.wait_for("document.querySelector('canvas') !== null")
+        # The scene is sent when the page has reported its camera; before that a blank page is at rest too.
+        _wait_for_client(server)
+        picture = browser.settled_screenshot(before=_CLOSE_NOTICES)
+    _write_bytes(picture, path)
+
+
+def _wait_for_client(server: viser.ViserServer) -> None:
+    deadline = time.monotonic() + _CONNECTION_S
+    while not server.get_clients():
+        if time.monotonic() > deadline:
+            raise BrowserError(f"The page did not connect to the server within {_CONNECTION_S:g} s.")
+        time.sleep(0.05)
+
+
+def _write_bytes(data: bytes, path: Path) -> None:
+    """Write a file in one step: a reader finds the old one or the new one."""
+    unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        unfinished.write_bytes(data)
+        os.replace(unfinished, path)
+    except OSError as error:
+        raise InputError(f"--png {path} cannot be written ({error.strerror}).") from None
+    finally:
+        unfinished.unlink(missing_ok=True)

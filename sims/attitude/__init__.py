@@ -1,0 +1,1 @@
+"""Truth and readings of satellites' attitude, for the filters of :mod:`adcs`."""

@@ -1,0 +1,147 @@
+"""What is simulated: a satellite with its wheels and sensors, its orbit, disturbances, and when a run may start."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from adcs.dynamics import RigidBody, WheelControl, wheel_control
+from adcs.orbit import CircularOrbit, Orbit, node_of_local_time
+from adcs.sensors import Gyro, Magnetometer, StarTracker, SunSensor
+from magloc.geomagnetic import Model
+
+
+@dataclass(frozen=True)
+class StartConditions:
+    r"""What must hold from the start of a run to its end.
+
+    Attributes
+    ----------
+    sunlit : bool
+        The Sun is seen throughout.
+    least_separation_rad, most_separation_rad : float
+        Bounds of the angle between the lines of Sun and field: the first throughout, the second at least once.
+    least_field_T : float
+        \|B\| throughout.
+    eclipse_after_s : float or None
+        The Sun is seen until then, and not at that time.
+    """
+
+    sunlit: bool = True
+    least_separation_rad: float = math.radians(45.0)
+    most_separation_rad: float = math.radians(90.0)
+    least_field_T: float = 25e-6
+    eclipse_after_s: float | None = None
+
+
+ANY_START = StartConditions(sunlit=False, least_separation_rad=0.0, least_field_T=0.0)
+"""No condition at all."""
+
+
+@dataclass(frozen=True, eq=False)
+class AttitudeScenario:
+    """A satellite under wheel control that holds the orbital frame.
+
+    Directions of torque, biases and errors are random, one for every run.
+
+    Attributes
+    ----------
+    body : RigidBody
+    control : WheelControl
+    orbit : Orbit
+    day : datetime64
+        Runs start within the 24 hours from here, UTC.
+    conditions : StartConditions
+    duration_s, dt_s : float
+        Of a run, and between its instants. Readings are taken and torques set at every instant.
+    star_tracker : StarTracker
+    gyro : Gyro
+    magnetometer : Magnetometer
+    sun_sensor : SunSensor
+    torque_Nm : float
+        Size of a disturbing torque that is constant in the body.
+    torque_period_s : float
+        Period with which that torque goes to its opposite and back; infinite = constant.
+    gyro_bias_rad_s, field_bias_T : float
+        Sizes of the biases at the start.
+    field_error_T : float
+        Size of the difference between the true field and its model, constant in the orbital frame.
+    start_attitude_rad, start_rate_rad_s : float
+        Standard deviations, per axis, of attitude and rate from those of the orbital frame.
+    field_model : str or Coefficients
+
+    Raises
+    ------
+    ValueError
+        A duration or step is not positive, or a size is negative.
+    """
+
+    body: RigidBody
+    control: WheelControl
+    orbit: Orbit
+    day: np.datetime64
+    conditions: StartConditions = StartConditions()
+    duration_s: float = 200.0
+    dt_s: float = 1.0
+    star_tracker: StarTracker = field(default_factory=StarTracker)
+    gyro: Gyro = field(default_factory=Gyro)
+    magnetometer: Magnetometer = field(default_factory=Magnetometer)
+    sun_sensor: SunSensor = field(default_factory=SunSensor)
+    torque_Nm: float = 0.0
+    torque_period_s: float = math.inf
+    gyro_bias_rad_s: float = 0.0
+    field_bias_T: float = 0.0
+    field_error_T: float = 0.0
+    start_attitude_rad: float = math.radians(1.0)
+    start_rate_rad_s: float = math.radians(0.01)
+    field_model: Model = "IGRF-14"
+
+    def __post_init__(self) -> None:
+        for name in ("dt_s", "torque_period_s"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"Input {name} must be positive; instead received {getattr(self, name)}.")
+        if not self.dt_s <= self.duration_s < math.inf:
+            raise ValueError(f"Input duration_s must be dt_s or more and finite; instead received {self.duration_s}.")
+        for name in (
+            "torque_Nm",
+            "gyro_bias_rad_s",
+            "field_bias_T",
+            "field_error_T",
+            "start_attitude_rad",
+            "start_rate_rad_s",
+        ):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"Input {name} must be 0 or more and finite; instead received {getattr(self, name)}.")
+
+    @property
+    def n_instants(self) -> int:
+        """Instants of a run, the start included."""
+        return 1 + round(self.duration_s / self.dt_s)
+
+
+TABLETSAT_INERTIA_KGM2 = ((0.519, 0.002, 0.005), (0.002, 0.579, 0.009), (0.005, 0.009, 0.71))
+
+
+def tabletsat(duration_s: float = 200.0, local_time_h: float = 15.0) -> AttitudeScenario:
+    """TabletSat-Aurora as in Ivanov et al., Keldysh Institute preprint 64, 2014, with what it leaves open filled in.
+
+    A circular orbit of 600 km and 97.8° on 2014-09-01; a constant torque of 8e-7 N·m; sensors of Table 1. Orbit, date,
+    gains and the conditions of the start are ours.
+
+    Parameters
+    ----------
+    duration_s : float
+    local_time_h : float
+        Mean solar time of the ascending node. With 15 h Sun and field never come nearer to each other than 31° in
+        sunlight; with 13 h they come as near as 1.2°.
+
+    Returns
+    -------
+    AttitudeScenario
+    """
+    body = RigidBody(np.array(TABLETSAT_INERTIA_KGM2))
+    day = np.datetime64("2014-09-01", "us")
+    orbit = CircularOrbit(600e3, math.radians(97.8), node_of_local_time(local_time_h, day), day)
+    return AttitudeScenario(body, wheel_control(body), orbit, day, duration_s=duration_s, torque_Nm=8e-7)

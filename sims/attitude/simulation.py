@@ -1,0 +1,338 @@
+"""Truth and readings of many runs of an attitude scenario at once: the leading axis of all arrays is the run.
+
+:func:`simulate` lets the control see the true state. That makes no difference to a filter which is told the torque that
+was set. Where the loop shall be closed by an estimate, :func:`prepare` gives everything that does not depend on it, and
+:func:`sense` and :func:`advance` go on from instant to instant.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adcs import dynamics, quaternion, sensors
+from adcs.environment import Environment, environment
+from adcs.orbit import EARTH_RADIUS_M
+from sims.attitude.scenario import AttitudeScenario
+from sims.attitude.starts import starts
+from sims.noise import stream
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+State = tuple[FloatArray, FloatArray, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """What the sensors report at the instants of some runs, in body axes; NaN where there is no reading.
+
+    Attributes
+    ----------
+    star : ndarray, shape (runs, n, 4)
+        Attitude, orbital from body, scalar first; sign as it comes.
+    gyro_rad_s : ndarray, shape (runs, n, 3)
+    field_T : ndarray, shape (runs, n, 3)
+    sun : ndarray, shape (runs, n, 3)
+        Unit vector.
+    """
+
+    star: FloatArray
+    gyro_rad_s: FloatArray
+    field_T: FloatArray
+    sun: FloatArray
+
+    @property
+    def has_star(self) -> BoolArray:
+        """Whether there is an attitude, shape (runs, n)."""
+        return ~np.isnan(self.star[..., 0])
+
+    @property
+    def has_gyro(self) -> BoolArray:
+        """Whether there is a rate, shape (runs, n)."""
+        return ~np.isnan(self.gyro_rad_s[..., 0])
+
+    @property
+    def has_field(self) -> BoolArray:
+        """Whether there is a field, shape (runs, n)."""
+        return ~np.isnan(self.field_T[..., 0])
+
+    @property
+    def has_sun(self) -> BoolArray:
+        """Whether there is a direction to the Sun, shape (runs, n)."""
+        return ~np.isnan(self.sun[..., 0])
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Everything of some runs that does not depend on their motion.
+
+    Attributes
+    ----------
+    scenario : AttitudeScenario
+    seeds : tuple of int
+    environment : Environment
+        As the filters know it; leading axis runs.
+    true_field_orbital_T : ndarray, shape (runs, n, 3)
+        With the error of the model.
+    q, w, momentum_Nms : ndarray, shape (runs, 4), (runs, 3), (runs, 3)
+        True state at the start.
+    torque_Nm : ndarray, shape (runs, n, 3)
+        Disturbing torque in body axes, held from each instant to the next.
+    gyro_bias_rad_s, field_bias_T : ndarray, shape (runs, n, 3)
+    noise : dict of str to ndarray, shape (runs, n, 3)
+        Standard normal numbers for ``star``, ``gyro``, ``field`` and ``sun``.
+    """
+
+    scenario: AttitudeScenario
+    seeds: tuple[int, ...]
+    environment: Environment
+    true_field_orbital_T: FloatArray
+    q: FloatArray
+    w: FloatArray
+    momentum_Nms: FloatArray
+    torque_Nm: FloatArray
+    gyro_bias_rad_s: FloatArray
+    field_bias_T: FloatArray
+    noise: dict[str, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class AttitudeRuns:
+    """Truth and readings.
+
+    Attributes
+    ----------
+    prepared : Prepared
+    q : ndarray, shape (runs, n, 4)
+        Attitude, orbital from body.
+    w : ndarray, shape (runs, n, 3)
+        Rate against inertial space, body axes [rad/s].
+    momentum_Nms : ndarray, shape (runs, n, 3)
+        Of the wheels.
+    wheel_torque_Nm : ndarray, shape (runs, n, 3)
+        Rate of change of the wheels' momentum from each instant to the next.
+    readings : Readings
+    """
+
+    prepared: Prepared
+    q: FloatArray
+    w: FloatArray
+    momentum_Nms: FloatArray
+    wheel_torque_Nm: FloatArray
+    readings: Readings
+
+    @property
+    def scenario(self) -> AttitudeScenario:
+        """What was simulated."""
+        return self.prepared.scenario
+
+    @property
+    def environment(self) -> Environment:
+        """Surroundings as the filters know them."""
+        return self.prepared.environment
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Since the start of every run, shape (n,)."""
+        return self.prepared.environment.time_s
+
+    @property
+    def acceleration_s2(self) -> FloatArray:
+        """The disturbance d = J⁻¹·torque that filters estimate, shape (runs, n, 3) [rad/s²]."""
+        return self.prepared.torque_Nm @ self.scenario.body.inverse
+
+
+def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
+    """Starts, surroundings, disturbances, biases and noise of one run for every seed.
+
+    Parameters
+    ----------
+    scenario : AttitudeScenario
+    seeds : sequence of int
+        The numbers of a run depend on its seed alone, and every sensor has its own stream.
+
+    Returns
+    -------
+    Prepared
+
+    Raises
+    ------
+    ValueError
+        There are no seeds, no start fulfils the conditions, or a date is outside of the field model.
+    """
+    numbers = [int(seed) for seed in seeds]
+    if not numbers:
+        raise ValueError("Input seeds must hold one seed at least; instead received none.")
+    n = scenario.n_instants
+    time_s = scenario.dt_s * np.arange(n)
+    around = environment(scenario.orbit, starts(scenario, numbers), time_s, model=scenario.field_model)
+    error_T = scenario.field_error_T * _directions(numbers, "field error")
+    q = quaternion.exp(scenario.start_attitude_rad * _normal(numbers, "start attitude", 1)[:, 0])
+    w_relative = scenario.start_rate_rad_s * _normal(numbers, "start rate", 1)[:, 0]
+    wave = np.cos(2.0 * math.pi * time_s / scenario.torque_period_s)
+    gyro, magnetometer = scenario.gyro, scenario.magnetometer
+    return Prepared(
+        scenario=scenario,
+        seeds=tuple(numbers),
+        environment=around,
+        true_field_orbital_T=around.b_orbital_T + error_T[:, None],
+        q=q,
+        w=dynamics.absolute_rate(q, w_relative, around.orbital_rate_rad_s[:, 0]),
+        momentum_Nms=np.zeros((len(numbers), 3)),
+        torque_Nm=scenario.torque_Nm * _directions(numbers, "torque")[:, None] * wave[:, None],
+        gyro_bias_rad_s=sensors.bias_walk(
+            scenario.gyro_bias_rad_s * _directions(numbers, "gyro bias"),
+            gyro.bias_walk_rad_s,
+            scenario.dt_s,
+            _normal(numbers, "gyro walk", n),
+        ),
+        field_bias_T=sensors.bias_walk(
+            scenario.field_bias_T * _directions(numbers, "field bias"),
+            magnetometer.bias_walk_T,
+            scenario.dt_s,
+            _normal(numbers, "field walk", n),
+        ),
+        noise={name: _normal(numbers, f"{name} noise", n) for name in ("star", "gyro", "field", "sun")},
+    )
+
+
+def simulate(scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
+    """Truth and readings of one run for every seed, with a control that sees the true state.
+
+    Parameters
+    ----------
+    scenario : AttitudeScenario
+    seeds : sequence of int
+
+    Returns
+    -------
+    AttitudeRuns
+
+    Raises
+    ------
+    ValueError
+        As :func:`prepare`.
+    """
+    from adcs.kernels import rigid_body
+    from magloc.kernels import over_rows
+
+    prepared = prepare(scenario, seeds)
+    runs, n = prepared.torque_Nm.shape[:2]
+    q, w, momentum, wheel_torque = np.empty((runs, n, 4)), *np.empty((3, runs, n, 3))
+    q[:, 0], w[:, 0], momentum[:, 0] = prepared.q, prepared.w, prepared.momentum_Nms
+    body, control, around = scenario.body, scenario.control, prepared.environment
+    over_rows(
+        rigid_body.run,
+        runs,
+        q,
+        w,
+        momentum,
+        wheel_torque,
+        body.inertia_kgm2,
+        body.inverse,
+        body.residual_dipole_Am2,
+        control.attitude_gain_Nm,
+        control.rate_gain_Nms,
+        control.torque_limit_Nm,
+        control.momentum_limit_Nms,
+        quaternion.IDENTITY,
+        prepared.torque_Nm,
+        around.orbital_rate_rad_s,
+        around.gravity_s2,
+        prepared.true_field_orbital_T,
+        scenario.dt_s,
+    )
+    return AttitudeRuns(prepared, q, w, momentum, wheel_torque, sense(prepared, q, w))
+
+
+def sense(prepared: Prepared, q: FloatArray, w: FloatArray, rows: slice = slice(None)) -> Readings:
+    """Readings of the instants ``rows`` of all runs, from their true attitudes and rates.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    q, w : ndarray, shape (runs, len(rows), 4), (runs, len(rows), 3)
+    rows : slice
+        All instants, unless given.
+
+    Returns
+    -------
+    Readings
+    """
+    scenario, around = prepared.scenario, prepared.environment
+    sun_orbital, lit = around.sun_orbital[:, rows], around.illuminated[:, rows]
+    earth_radius = np.arcsin(EARTH_RADIUS_M / np.linalg.norm(around.position_eci_m[:, rows], axis=-1))
+    b_body = quaternion.rotate_back(q, prepared.true_field_orbital_T[:, rows])
+    noise = {name: numbers[:, rows] for name, numbers in prepared.noise.items()}
+    return Readings(
+        star=sensors.star_tracker_readings(scenario.star_tracker, q, w, sun_orbital, earth_radius, lit, noise["star"]),
+        gyro_rad_s=sensors.gyro_readings(scenario.gyro, w, prepared.gyro_bias_rad_s[:, rows], noise["gyro"]),
+        field_T=sensors.magnetometer_readings(
+            scenario.magnetometer, b_body, prepared.field_bias_T[:, rows], noise["field"]
+        ),
+        sun=sensors.sun_readings(scenario.sun_sensor, quaternion.rotate_back(q, sun_orbital), lit, noise["sun"]),
+    )
+
+
+def advance(prepared: Prepared, state: State, wheel_torque_Nm: FloatArray, row: int) -> State:
+    """True state (q, w, momentum) of all runs at instant ``row`` + 1 from that at ``row``.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    state : tuple of ndarray, shapes (runs, 4), (runs, 3), (runs, 3)
+    wheel_torque_Nm : ndarray, shape (runs, 3)
+        As set, by :func:`adcs.dynamics.commanded_torque` of an estimate.
+    row : int
+
+    Returns
+    -------
+    tuple of ndarray
+    """
+    around = prepared.environment
+    return dynamics.step(
+        prepared.scenario.body,
+        *state,
+        wheel_torque_Nm,
+        prepared.torque_Nm[:, row],
+        around.orbital_rate_rad_s[:, row],
+        around.gravity_s2[:, row],
+        prepared.true_field_orbital_T[:, row],
+        prepared.scenario.dt_s,
+    )
+
+
+def start_estimates(
+    prepared: Prepared, attitude_error_rad: float, rate_error_rad_s: float
+) -> tuple[FloatArray, FloatArray]:
+    """Attitudes and rates that a filter may start from: the truth with normal errors in body axes.
+
+    Parameters
+    ----------
+    prepared : Prepared
+    attitude_error_rad, rate_error_rad_s : float
+        Standard deviations per axis.
+
+    Returns
+    -------
+    q, w : ndarray, shape (runs, 4), (runs, 3)
+    """
+    seeds = list(prepared.seeds)
+    error = quaternion.exp(attitude_error_rad * _normal(seeds, "estimate attitude", 1)[:, 0])
+    rate_error = rate_error_rad_s * _normal(seeds, "estimate rate", 1)[:, 0]
+    return quaternion.multiply(prepared.q, quaternion.conjugate(error)), prepared.w - rate_error
+
+
+def _normal(seeds: list[int], feature: str, n: int) -> FloatArray:
+    """Standard normal numbers (runs, n, 3)."""
+    return np.stack([stream(seed, feature).standard_normal((n, 3)) for seed in seeds])
+
+
+def _directions(seeds: list[int], feature: str) -> FloatArray:
+    """Unit vectors (runs, 3), uniform on the sphere."""
+    vectors = _normal(seeds, feature, 1)[:, 0]
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

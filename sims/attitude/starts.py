@@ -1,0 +1,77 @@
+"""When runs may start: instants of a day from which the conditions of a scenario hold to the end of a run."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adcs.environment import Environment, environment
+from adcs.frames import DAY_S, Instants
+from adcs.orbit import Orbit
+from magloc.geomagnetic import Model
+from sims.attitude.scenario import AttitudeScenario, StartConditions
+from sims.noise import stream
+
+BoolArray = NDArray[np.bool_]
+
+GRID_S = 10.0
+"""Conditions are checked at instants this far apart, so that they may be missed by what changes in 10 s."""
+
+
+def starts(scenario: AttitudeScenario, seeds: list[int]) -> Instants:
+    """Start of the run of every seed, drawn from the instants of the day that the conditions allow.
+
+    Parameters
+    ----------
+    scenario : AttitudeScenario
+    seeds : list of int
+
+    Returns
+    -------
+    ndarray of datetime64, shape (runs,)
+
+    Raises
+    ------
+    ValueError
+        The conditions hold at no instant of the day.
+    """
+    day = _day(scenario.orbit, scenario.day, scenario.duration_s, scenario.field_model)
+    n = 1 + math.ceil(scenario.duration_s / GRID_S)
+    allowed = np.flatnonzero(_allowed(scenario.conditions, day, n))
+    if not allowed.size:
+        raise ValueError(
+            f"Input conditions must hold for {scenario.duration_s:g} s somewhere in the 24 hours from {scenario.day}; "
+            f"instead received {scenario.conditions}, which never do."
+        )
+    return np.array([day.utc[stream(seed, "start").choice(allowed)] for seed in seeds])
+
+
+@lru_cache(maxsize=4)
+def _day(orbit: Orbit, day: np.datetime64, duration_s: float, model: Model) -> Environment:
+    return environment(orbit, day, np.arange(0.0, DAY_S + duration_s + 2.0 * GRID_S, GRID_S), model=model)
+
+
+def _allowed(conditions: StartConditions, day: Environment, n: int) -> BoolArray:
+    """For every instant of the day, whether a run of n instants may start there."""
+    lit = day.sunlit
+    field_T = np.linalg.norm(day.b_orbital_T, axis=-1)
+    throughout = (day.separation_rad >= conditions.least_separation_rad) & (field_T >= conditions.least_field_T)
+    if conditions.sunlit:
+        throughout &= lit
+    once = day.separation_rad <= conditions.most_separation_rad
+    allowed: BoolArray = np.logical_and(_windows(throughout, n).all(axis=-1), _windows(once, n).any(axis=-1))
+    if conditions.eclipse_after_s is not None:
+        before = max(1, round(conditions.eclipse_after_s / GRID_S))
+        in_time = _windows(lit, before + 1)
+        entering = in_time[:, :-1].all(axis=-1) & ~in_time[:, -1]
+        m = min(len(allowed), len(entering))
+        allowed = allowed[:m] & entering[:m]
+    return allowed[: round(DAY_S / GRID_S)]
+
+
+def _windows(values: BoolArray, n: int) -> BoolArray:
+    """All runs of n values in turn, shape (..., n)."""
+    return np.lib.stride_tricks.sliding_window_view(values, n)

@@ -1,0 +1,96 @@
+"""The notebooks of ``notebooks/``: how they are executed, and what is kept of it.
+
+They are kept with their outputs, so that the pictures show wherever they are read; ``python -m tests.notebooks``
+executes them and writes them back. Cells are executed with this Python, whatever kernels are installed elsewhere.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+from pathlib import Path
+
+import nbformat
+from nbclient import NotebookClient
+from nbformat import NotebookNode
+from PIL import Image
+
+FOLDER = Path(__file__).parents[2] / "notebooks"
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+DOCS = FOLDER.parent / "docs"
+
+# Which picture of a notebook stands in the README, as docs/notebook-NAME.png.
+SHOWN = {
+    "01-first-fix": 2,
+    "02-convergence-map": 1,
+    "03-real-magnet": 1,
+    "04-scalar-sign": 0,
+    "05-tracking": 1,
+    "06-which-array": 2,
+}
+LONGEST_CELL_S = 300
+"""A cell that compiles what it uses, on slow cores."""
+
+# Otherwise jupyter_core warns that its folders will move.
+os.environ.setdefault("JUPYTER_PLATFORM_DIRS", "1")
+
+
+def executed(path: Path, folder: Path) -> NotebookNode:
+    """The notebook with the outputs of an execution in a folder.
+
+    Raises
+    ------
+    nbclient.exceptions.CellExecutionError
+        A cell raises.
+    """
+    notebook = nbformat.read(path, as_version=4)
+    NotebookClient(
+        notebook,
+        kernel_name="python3",
+        resources={"metadata": {"path": str(folder)}},
+        timeout=LONGEST_CELL_S,
+        record_timing=False,
+    ).execute()
+    return notebook
+
+
+def kept(notebook: NotebookNode) -> NotebookNode:
+    """The notebook with small pictures, and with nothing that differs from machine to machine but the numbers."""
+    notebook.metadata = NotebookNode(
+        kernelspec={"name": "python3", "display_name": "Python 3", "language": "python"},
+        language_info={"name": "python"},
+    )
+    for number, cell in enumerate(notebook.cells):
+        cell.id = f"cell-{number:02d}"
+        cell.metadata = NotebookNode()
+        for output in cell.get("outputs", []):
+            if output.output_type in ("display_data", "execute_result"):
+                output.metadata = NotebookNode()
+                if "image/png" in output.data:
+                    picture = base64.b64encode(_small(base64.b64decode(output.data["image/png"]))).decode()
+                    output.data = NotebookNode({"image/png": picture, "text/plain": "<Figure>"})
+    return notebook
+
+
+def _small(png: bytes) -> bytes:
+    """A picture with a palette of its own: less than half the size, and the same to the eye."""
+    result = io.BytesIO()
+    picture = Image.open(io.BytesIO(png)).convert("RGB")
+    # Maximum coverage keeps small spots of a colour that is rare, such as a star on a map.
+    picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+        result, "png", optimize=True
+    )
+    return result.getvalue()
+
+
+def pictures(notebook: NotebookNode) -> list[bytes]:
+    """Its pictures as PNG files."""
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    return [base64.b64decode(o.data["image/png"]) for o in outputs if "image/png" in o.get("data", {})]
+
+
+def texts(notebook: NotebookNode) -> str:
+    """All that the notebook's cells print or display as text."""
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    return "\n".join(o.get("text", "") + o.get("data", {}).get("text/markdown", "") for o in outputs)

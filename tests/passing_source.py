@@ -1,0 +1,53 @@
+"""A source that passes a tetrahedron, its readings, and what tests ask of a track."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from arrays import geometries
+from arrays.sensor import SensorArray
+from magloc.measurement import predicted_channels
+from magloc.motion import UnknownMotion
+from magloc.track import Tracker
+from magloc.track_rows import Row, TrackPoint, rows_of
+
+FloatArray = NDArray[np.float64]
+
+EDGE_M, NOISE_T = 1.5, 2e-10
+POSITION = np.array([3.0, 1.5, 0.8])
+MOMENT = np.array([120.0, -150.0, 160.0])
+ARRAY = geometries.tetrahedron(EDGE_M, "vector", NOISE_T)
+SLOW = UnknownMotion(0.1, math.radians(1.2))
+
+
+def moving_source(n: int, dt_s: float = 0.5) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Times, and positions and moments (n, 3) of a source that passes at 0.08 m/s and turns by 1 degree a second."""
+    t = dt_s * np.arange(n, dtype=np.float64)
+    p = POSITION + np.outer(t, [-0.08, 0.02, 0.0])
+    return t, p, Rotation.from_rotvec(np.outer(np.deg2rad(t), [0.0, 0.0, 1.0])).apply(MOMENT)
+
+
+def readings_of(array: SensorArray, p: FloatArray, m: FloatArray, seed: int = 0) -> FloatArray:
+    """Readings (n, C) of a source (n, 3) with white noise."""
+    noise = np.random.default_rng(seed).normal(size=(len(p), array.n_channels))
+    return predicted_channels(array, p, m) + array.channel_noise_T * noise
+
+
+def rows_from(time_s: FloatArray, readings_T: FloatArray) -> list[Row]:
+    return list(rows_of(time_s, readings_T))
+
+
+def statuses(points: list[TrackPoint]) -> list[str]:
+    return [point.status for point in points]
+
+
+def followed(tracker: Tracker, rows: list[Row]) -> list[TrackPoint]:
+    return list(tracker.run(rows))
+
+
+def positions(points: list[TrackPoint]) -> FloatArray:
+    return np.array([np.full(3, np.nan) if point.position_m is None else point.position_m for point in points])
