@@ -3,10 +3,11 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+export OPENBLAS_NUM_THREADS ?= 1
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 MAKE_VENV = $(PYTHON) -m venv --clear
 
-.PHONY: map test test-full test-oldest bench lint clean
+.PHONY: map test test-full test-oldest bench notebooks lint clean
 
 map: .venv/installed
 	$(BIN)/magloc map
@@ -25,6 +26,10 @@ lint: .venv/installed
 
 bench: .venv/installed-bench
 	$(BIN)/python -m tests.bench
+
+# The notebooks executed anew, and the README's pictures of them.
+notebooks: .venv/installed
+	$(BIN)/python -m tests.notebooks
 
 # The lower bounds of pyproject.toml, installed exactly.
 test-oldest: .venv-oldest/installed

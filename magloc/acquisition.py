@@ -28,9 +28,9 @@ Cartesian coordinates."""
 CONFIRMED_RANGE_ERROR = 2.0 * START_RANGE_ERROR
 """The same for the row after one that could start a track, where that is not beyond doubt. The first row that falls
 below a limit is one whose noise makes it look certain; the next one has noise of its own, and starts the track."""
-STACKED_RANGE_ERROR = 0.5 * START_RANGE_ERROR
-"""The same for several rows, of which one alone does not determine the source: the track's prediction is then Gaussian
-in Cartesian coordinates, which it must be nearly."""
+STACKED_POSITION_ERROR = 0.01
+"""Standard deviation of the whole position over the range, for a start from several rows of which one alone does not
+determine the source: the prediction is then Gaussian in Cartesian coordinates, so that it must be as good as linear."""
 _BEYOND_DOUBT = 0.5 * START_RANGE_ERROR
 # Probability under noise below which a row contradicts a dipole.
 _CONTRADICTION = 1e-6
@@ -119,7 +119,8 @@ class Acquisition:
                 if _range_error(solution, centroid) < START_RANGE_ERROR:
                     self._of_last_row = solution
                 reason = "not acquired: the next row is to confirm the source"
-        return self._start_from_recent(row, fix), reason
+        start = self._start_from_recent(row, fix)
+        return start, reason if start is None else ""
 
     def _start_from_recent(self, row: Row, alone: Fix) -> Start | None:
         """A start from the latest rows together, while the source is as good as at rest in them.

@@ -66,6 +66,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit status: 0 done, 2 bad input, 130 interrupted, 141 the reader of the output is gone.
     """
     tokens = sys.argv[1:] if arguments is None else list(arguments)
+    # Before numpy is loaded: threads of linear algebra only wait for each other over matrices as small as ours.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         with _one_line_warnings():
             _run(tokens)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from magloc.kalman import sequential_update
+from magloc.kalman import block_update
 from magloc.motion import N_SOURCE
 from magloc.row_measurement import RowMeasurement
 from magloc.track import Tracker
@@ -214,6 +214,7 @@ def posterior_bound(
     bounds = np.full(len(rows), np.inf)
     S: FloatArray | None = None
     seen: list[FloatArray] = []
+    measurements: list[RowMeasurement] = []
     for i, row in enumerate(rows):
         measurement = tracker.measurement(row)
         before = max(i - 1, 0)
@@ -223,13 +224,17 @@ def posterior_bound(
         state = np.concatenate([motion.state_of(truth[i], velocity[i], rate[i]), np.zeros(n_errors)])
         H = measurement.jacobian(state)
         if S is not None:
-            _, S = sequential_update(state, S, H, np.zeros(len(H)), np.ones(len(H)))
+            _, S = block_update(state, S, H, np.zeros(len(H)), np.ones(len(H)))
         else:
-            seen.append(H[:, :N_SOURCE])
+            # Lasting errors of sensors as noise of the row: only to see whether the source is determined, and how well.
+            lasting = H[:, motion.n_states :] * tracker.errors.sigma
+            root = np.linalg.cholesky(np.eye(len(H)) + lasting @ lasting.T)
+            seen.append(np.linalg.solve(root, H[:, :N_SOURCE]))
+            measurements.append(measurement)
             covariance = _bound_at_rest(np.concatenate(seen))
             if covariance is None:
                 continue
-            _, S = tracker.start(truth[i], covariance, rows[: i + 1], n_steps=0)
+            S = tracker.filtered_start(truth[i], covariance, measurements).S
         bounds[i] = float(np.linalg.norm(S[:3]))
     return bounds
 

@@ -15,6 +15,7 @@ MeasureS        :func:`estimability`
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -75,10 +76,10 @@ def scalar_update(
     -----
     J. E. Potter's update, in Bierman, "Factorization Methods for Discrete Sequential Estimation", II.4.
     """
-    phi = S.T @ h
-    alpha = 1.0 / (phi @ phi + variance)
-    gain = alpha * (S @ phi)
-    return x + gain * innovation, S - np.outer(gain, phi) / (1.0 + np.sqrt(alpha * variance))
+    phi = h @ S
+    alpha = 1.0 / (float(phi @ phi) + variance)
+    gain = S @ (alpha * phi)
+    return x + gain * innovation, S - gain[:, None] * (phi / (1.0 + math.sqrt(alpha * variance)))
 
 
 def sequential_update(
@@ -107,6 +108,37 @@ def sequential_update(
     for h, nu, r in zip(H, innovation, variance, strict=True):
         x, S = scalar_update(x, S, h, float(nu - h @ (x - x0)), float(r))
     return x, S
+
+
+def block_update(
+    x: FloatArray, S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    r"""Update by independent scalars of one linearisation at once: :func:`sequential_update` but for rounding.
+
+    Parameters
+    ----------
+    x, S, H, innovation, variance : ndarray
+        As there.
+
+    Returns
+    -------
+    x, S : ndarray
+        Updated copies.
+
+    Notes
+    -----
+    With :math:`Φ = R^{-1/2} H S` and :math:`L L^T = I + Φ Φ^T` lower triangular,
+    :math:`S^+ = S (I - Φ^T L^{-T} (L + I)^{-1} Φ)`: A. Andrews, "A square root formulation of the Kalman covariance
+    equations", AIAA Journal 6 (1968) 1165. For one scalar it is Potter's.
+    """
+    sigma = np.sqrt(variance)
+    phi = (H / sigma[:, None]) @ S
+    # By an orthogonal factorisation: I + Φ Φᵀ itself would lose the digits of a prediction that is hardly known.
+    upper = np.asarray(np.linalg.qr(np.concatenate([np.eye(sigma.size), phi.T]), mode="r"))
+    L = upper.T * np.sign(np.diagonal(upper))
+    solved = np.linalg.solve(L, np.column_stack([phi, innovation / sigma]))
+    spread = S @ solved[:, :-1].T
+    return x + spread @ solved[:, -1], S - spread @ np.linalg.solve(L + np.eye(sigma.size), phi)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +183,7 @@ def iterated_update(
     shrink: float = 1.0,
     prior: Callable[[FloatArray], tuple[FloatArray, FloatArray]] | None = None,
 ) -> IteratedUpdate:
-    r"""Iterated extended Kalman update, scalar by scalar, with the paper's stop rule.
+    r"""Iterated extended Kalman update with the paper's stop rule.
 
     Every iteration linearises at :math:`x_k` and processes all scalars from the *predicted* mean and covariance again,
     with innovations :math:`z - h(x_k) - H(x_k)(x - x_k)`: Gauss-Newton on the maximum-a-posteriori cost, so a
@@ -194,17 +226,18 @@ def iterated_update(
         H = HJacobian(x_k)
         mean, root = (x, S) if prior is None else prior(x_k)
         linearised = z - predicted - H @ (mean - x_k)
-        optimum, S_k = sequential_update(mean, root, H, linearised, variance)
+        optimum, S_k = block_update(mean, root, H, linearised, variance)
         x_k = optimum if length == 1.0 else x_k + length * (optimum - x_k)
         before, predicted = predicted, Hx(x_k)
         change_before, change = change, float(np.linalg.norm(predicted - before)) / length
         if change >= change_before:
             length *= shrink
-    nis = _normalised_innovation_squared(root, H, linearised, variance)
+    nis = normalised_innovation_squared(root, H, linearised, variance)
     return IteratedUpdate(x_k, S_k, iteration, change < tolerance, innovation, nis)
 
 
-def _normalised_innovation_squared(S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray) -> float:
+def normalised_innovation_squared(S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray) -> float:
+    """Innovation squared in units of its covariance ``H S Sᵀ Hᵀ + R``: a χ² of k numbers for a right prediction."""
     HS = H @ S
     return float(innovation @ np.linalg.solve(HS @ HS.T + np.diag(variance), innovation))
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,7 @@ class RowMeasurement:
     n_motion: int
     effect: FloatArray
 
-    @property
+    @cached_property
     def z(self) -> FloatArray:
         """Measured differences, shape (k,)."""
         return self.model.measured(self.row.readings_T) / self.sigma

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,16 @@ from scipy.special import chdtri
 
 from arrays.differences import Differences, decorrelated_differences, reading_covariance
 from arrays.sensor import SensorArray
-from magloc.acquisition import CONFIRMED_RANGE_ERROR, STACKED_RANGE_ERROR, Acquisition
+from magloc.acquisition import CONFIRMED_RANGE_ERROR, STACKED_POSITION_ERROR, Acquisition
 from magloc.fix import NOTHING_KNOWN, Knowledge
-from magloc.kalman import estimability, iterated_update, predict_square_root, sequential_update, symmetric_square_root
+from magloc.kalman import (
+    block_update,
+    estimability,
+    iterated_update,
+    normalised_innovation_squared,
+    predict_square_root,
+    symmetric_square_root,
+)
 from magloc.measurement import DifferenceMeasurement
 from magloc.motion import N_SOURCE, MotionModel
 from magloc.row_measurement import RowMeasurement
@@ -48,10 +55,20 @@ SHRINK = 0.5
 LARGEST_GROWTH = 1.5
 """A prediction bends as the readings do while no standard deviation grows by more in the step: beyond that it is the
 motion that it is uncertain of, which is Gaussian in Cartesian coordinates."""
-# How often the rows that a track starts from are linearised anew.
-_START_STEPS = 2
+# How often the rows that a track starts from are linearised anew, until they move it by less than a share of its σ.
+_MOST_START_STEPS = 30
+_START_TOLERANCE = 1e-3
 # How much less is known of a source before them than after, in standard deviations.
-_UNKNOWN = 100.0
+_UNKNOWN = 1e4
+
+
+@dataclass(frozen=True, eq=False)
+class FilteredStart:
+    """State at the start of a track, square root of its covariance, and χ² of the readings that it was found from."""
+
+    x: FloatArray
+    S: FloatArray
+    chi2: float
 
 
 class Tracker:
@@ -220,49 +237,57 @@ class Tracker:
             self._differences[key] = decorrelated_differences(array, available)
         return self._differences[key]
 
-    def start(
-        self, source: FloatArray, covariance: FloatArray, rows: Sequence[Row], *, n_steps: int = _START_STEPS
-    ) -> tuple[FloatArray, FloatArray]:
+    def start(self, source: FloatArray, covariance: FloatArray, rows: Sequence[Row]) -> FilteredStart | None:
         """State and square root of its covariance from a source and the readings that it was found from.
 
         Parameters
         ----------
         source : ndarray, shape (6,)
-            Position and moment that fit all rows best, were it at rest.
+            Position and moment that fit all rows best, were it at rest and were errors of sensors new in every row.
         covariance : ndarray, shape (6, 6)
-            Of that fit, without regard to what moves and which part of the errors lasts.
+            Of that fit.
         rows : sequence of Row
             In the order of time.
-        n_steps : int
-            How often the readings are linearised anew at what was found; 0 for the covariance at the source as given.
 
         Returns
         -------
-        x, S : ndarray
-            At the last row. The rows are filtered once more, from a source that is hardly known: what moves between
-            them, and the errors of sensors that they have in common, are counted as in the rows to come.
+        FilteredStart or None
+            At the last row. The rows are filtered once more, from a source that is hardly known, until they are
+            linearised where they lead: what moves between them, and the errors of sensors that they have in common,
+            are counted as in the rows to come. None where that does not converge, or they contradict each other then.
         """
-        n, n_errors = self.motion.n_states, self.errors.n_states
-        if len(rows) == 1 and not n_errors:
-            return self.motion.start(source, symmetric_square_root(covariance))
+        if len(rows) == 1 and not self.errors.n_states:
+            return FilteredStart(*self.motion.start(source, symmetric_square_root(covariance)), 0.0)
         measurements = [self.measurement(row) for row in rows]
-        first, root = self.motion.start(source, np.diag(_UNKNOWN * np.sqrt(np.diagonal(covariance))))
-        x_first, S_first = np.concatenate([first, np.zeros(n_errors)]), np.zeros((n + n_errors,) * 2)
-        S_first[:n, :n] = root
-        S_first[n + np.arange(n_errors), n + np.arange(n_errors)] = self.errors.sigma
-        centre = x_first
-        x, S = x_first, S_first
-        for _ in range(n_steps + 1):
-            x, S = x_first, S_first
-            for before, row, measurement in zip([rows[0], *rows], rows, measurements, strict=False):
-                if row is not before:
-                    prediction = self.predicted(x, S, row.time_s - before.time_s)
-                    x, S = prediction.x, prediction.S
-                H = measurement.jacobian(centre)
-                innovation = measurement.z - measurement.predicted(centre) - H @ (x - centre)
-                x, S = sequential_update(x, S, H, innovation, np.ones(len(H)))
-            centre = np.concatenate([x[:N_SOURCE], centre[N_SOURCE:]])
-        return x, S
+        dof = sum(measurement.z.size for measurement in measurements) - N_SOURCE
+        centre = source
+        for _ in range(_MOST_START_STEPS):
+            found = self.filtered_start(centre, covariance, measurements)
+            step = found.x[:N_SOURCE] - centre
+            centre = found.x[:N_SOURCE]
+            if np.all(np.abs(step) < _START_TOLERANCE * np.linalg.norm(found.S[:N_SOURCE], axis=1)):
+                return found if dof <= 0 or found.chi2 < chdtri(dof, CONTRADICTION) else None
+        return None
+
+    def filtered_start(
+        self, source: FloatArray, covariance: FloatArray, measurements: Sequence[RowMeasurement]
+    ) -> FilteredStart:
+        """One pass of :meth:`start`, with the readings linearised at a source."""
+        n, n_errors = self.motion.n_states, self.errors.n_states
+        x, S = np.zeros(n + n_errors), np.zeros((n + n_errors,) * 2)
+        x[:n], S[:n, :n] = self.motion.start(source, np.diag(_UNKNOWN * np.sqrt(np.diagonal(covariance))))
+        S[n + np.arange(n_errors), n + np.arange(n_errors)] = self.errors.sigma
+        centre = x
+        chi2 = 0.0
+        for before, measurement in zip([measurements[0], *measurements], measurements, strict=False):
+            if measurement is not before:
+                prediction = self.predicted(x, S, measurement.row.time_s - before.row.time_s)
+                x, S = prediction.x, prediction.S
+            H, ones = measurement.jacobian(centre), np.ones(measurement.z.size)
+            innovation = measurement.z - measurement.predicted(centre) - H @ (x - centre)
+            chi2 += normalised_innovation_squared(S, H, innovation, ones)
+            x, S = block_update(x, S, H, innovation, ones)
+        return FilteredStart(x, S, chi2)
 
     def _kept(
         self,
@@ -301,8 +326,16 @@ class Tracker:
         if start is None:
             return TrackPoint(row.time_s, status=reason)
         solution = start.solution
-        x, S = self.start(np.concatenate([solution.position_m, solution.moment_Am2]), solution.covariance, start.rows)
-        if self._range_error(x, S, row) > (CONFIRMED_RANGE_ERROR if len(start.rows) == 1 else STACKED_RANGE_ERROR):
+        source = np.concatenate([solution.position_m, solution.moment_Am2])
+        found = self.start(source, solution.covariance, start.rows)
+        if found is None:
+            return TrackPoint(row.time_s, status="not acquired: no dipole fits the latest rows together")
+        x, S = found.x, found.S
+        certain = self._range_error(x, S, row) <= CONFIRMED_RANGE_ERROR
+        if len(start.rows) > 1:
+            offset = x[:3] - row.origin_m - row.R_world_from_array @ self.array.centroid
+            certain = float(np.linalg.norm(S[:3])) <= STACKED_POSITION_ERROR * float(np.linalg.norm(offset))
+        if not certain:
             return TrackPoint(row.time_s, status="not acquired: the range is not certain enough")
         self._acquisition.forget()
         self._x, self._S = x, S

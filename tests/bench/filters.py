@@ -11,11 +11,11 @@ import numpy as np
 from arrays.geometries import tetrahedron
 from magloc.convergence import IekfFilter, StartsScenario, simulated_measurement
 from magloc.kalman import IteratedExtendedKalmanFilter
+from magloc.long_record import track_record
 from magloc.measurement import DifferenceMeasurement
 from magloc.motion import UnknownMotion
-from magloc.track_rows import Row as TrackRow
-from magloc.long_record import track_record
 from magloc.track import Tracker
+from magloc.track_rows import Row as TrackRow
 from magloc.track_rows import rows_of
 from sims import read_scenario, simulate
 from tests.bench.table import Row

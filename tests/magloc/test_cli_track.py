@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from arrays import geometries
 from arrays.files import read_array
+from magloc.long_record import track_record
 from magloc.motion import UnknownMotion, WanderingMotion
 from magloc.readings import read_readings
-from magloc.long_record import track_record
 from magloc.smoother import smoothed
 from magloc.track import Tracker
 from magloc.track_rows import rows_of

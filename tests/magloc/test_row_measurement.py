@@ -197,9 +197,9 @@ def _solved(row: RowMeasurement, z: FloatArray) -> FloatArray:
 class TestSourceAtRest:
     """The paper's scenario: a filter row by row against scipy's fit of the same rows, with magpylib's field.
 
-    Measured with these five seeds, which were not chosen: the curved prior ends 0.11 to 0.46 σ from the fit, and the
-    same updates with a prior that is Gaussian in position and moment 1.3 to 5 σ, while they claim 0.8 to 0.98 of its
-    standard deviations.
+    Measured with these eight seeds, which were not chosen: the curved prior ends 0.09 to 0.24 σ from the fit; the same
+    updates with a prior that is Gaussian in position and moment 0.3 to 6.9 σ, rms 2.7, while they claim 0.75 to 0.97 of
+    its standard deviations.
     """
 
     def distances(self, seed: int) -> tuple[float, float, FloatArray, FloatArray]:
@@ -239,11 +239,11 @@ class TestSourceAtRest:
 
     def test_is_the_batch_fit(self) -> None:
         curved, plain, claimed, claimed_plain = map(
-            np.array, zip(*(self.distances(seed) for seed in range(5)), strict=True)
+            np.array, zip(*(self.distances(seed) for seed in range(8)), strict=True)
         )
-        assert curved.max() < 0.6
+        assert curved.max() < 0.3
         np.testing.assert_allclose(claimed, 1.0, atol=0.02)
-        assert math.sqrt(float(np.mean(plain**2))) > 2.0
+        assert math.sqrt(float(np.mean(plain**2))) > 1.5
         assert claimed_plain.max() < 0.99
         assert claimed_plain.mean() < 0.93
 

@@ -1,0 +1,182 @@
+"""What the command lines have in common: one main loop, the options of every command, JSON, notes and progress.
+
+Commands are functions that :mod:`cyclopts` calls. They raise :class:`arrays.errors.InputError` for bad input; whatever
+is wrong with the input becomes one line on stderr and exit status 2, an interruption becomes 130.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Annotated
+
+from cyclopts import App, CycloptsError, Parameter, Token
+from cyclopts.validators import Number
+
+from arrays.errors import InputError
+
+DONE = 0
+BAD_INPUT = 2
+INTERRUPTED = 130
+BROKEN_PIPE = 141
+
+
+def whole_number(_: type, tokens: Sequence[Token]) -> int:
+    """Convert one argument; cyclopts alone would round 1.5."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError(f"found {tokens[0].value!r}, expected a whole number.") from None
+
+
+Flag = Annotated[bool, Parameter(show_default=False)]
+Count = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1))]
+Seed = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0))]
+
+
+@Parameter(name="*", group="Common options")
+@dataclass(frozen=True)
+class QuietOptions:
+    """Options of every command.
+
+    Parameters
+    ----------
+    threads : int
+        Threads at most; by default all cores. Results do not depend on it.
+    quiet : bool
+        No progress and no summary on stderr, only errors.
+    """
+
+    threads: Count | None = None
+    quiet: Flag = False
+
+    def apply(self) -> None:
+        """Limit the threads of compiled code."""
+        if self.threads is not None:
+            import numba
+
+            numba.set_num_threads(min(self.threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+
+
+@Parameter(name="*", group="Common options")
+@dataclass(frozen=True)
+class CommonOptions(QuietOptions):
+    """Options of every command that draws random numbers once.
+
+    Parameters
+    ----------
+    threads : int
+        Threads at most; by default all cores. Results do not depend on it.
+    quiet : bool
+        No progress and no summary on stderr, only errors.
+    seed : int
+        Seed of whatever is random; the same seed gives the same result.
+    """
+
+    seed: Seed = 0
+
+
+def installed_version() -> str:
+    """Version of the package that holds the command lines."""
+    try:
+        return metadata.version("magloc")
+    except metadata.PackageNotFoundError:
+        return "unknown (not installed)"
+
+
+def run(app: App, arguments: Sequence[str] | None = None) -> int:
+    """Run one command of a command line.
+
+    Parameters
+    ----------
+    app : App
+    arguments : sequence of str, optional
+        The command and its arguments; by default those of the process.
+
+    Returns
+    -------
+    int
+        Exit status: 0 done, 2 bad input, 130 interrupted, 141 the reader of the output is gone.
+    """
+    program = app.name[0]
+    tokens = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        with _one_line_warnings(program):
+            _run(app, tokens)
+            sys.stdout.flush()
+    except (InputError, CycloptsError) as error:
+        print_note(str(error), program)
+        return BAD_INPUT
+    except KeyboardInterrupt as interruption:
+        print_note(str(interruption) or "interrupted", program)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # The interpreter flushes stdout once more when it exits, which must not fail again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BROKEN_PIPE
+    except OSError as error:
+        print_note(f"{error.filename}: {error.strerror}" if error.filename else str(error), program)
+        return BAD_INPUT
+    return DONE
+
+
+def _run(app: App, tokens: Sequence[str]) -> None:
+    command, bound, _ = app.parse_args(tokens, print_error=False, exit_on_error=False)
+    for value in bound.arguments.values():
+        if isinstance(value, QuietOptions):
+            value.apply()
+    command(*bound.args, **bound.kwargs)
+
+
+@contextmanager
+def _one_line_warnings(program: str) -> Iterator[None]:
+    """Show warnings without the source line that raised them."""
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_, **__: print_note(f"warning: {message}", program)
+        yield
+
+
+def print_json(value: object) -> None:
+    """Print one JSON value on stdout; numbers that are not finite become null, numpy arrays lists."""
+    import msgspec
+
+    print(msgspec.json.encode(value, enc_hook=lambda array: array.tolist()).decode())
+
+
+def print_note(text: str, program: str) -> None:
+    """Print one line of a program on stderr, whatever the text."""
+    print(f"{program}: {' '.join(text.split())}", file=sys.stderr)
+
+
+@contextmanager
+def progress(total: int, unit: str, *, quiet: bool, initial: int = 0) -> Iterator[Callable[[int], None]]:
+    """Count up to a total on a terminal's stderr.
+
+    Parameters
+    ----------
+    total : int
+    unit : str
+        What is counted.
+    quiet : bool
+    initial : int
+        Finished before; does not count in the estimate of the time left.
+
+    Yields
+    ------
+    callable
+        To be called with the number finished since the last call.
+    """
+    from tqdm import tqdm
+
+    hidden = quiet or not sys.stderr.isatty()
+    with tqdm(total=total, initial=initial, unit=f" {unit}", disable=hidden, leave=False) as bar:
+
+        def advance(finished: int) -> None:
+            bar.update(finished)
+
+        yield advance
