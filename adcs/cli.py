@@ -1,38 +1,58 @@
-"""The command line ``adcs``. It has no command yet: it answers --help and --version, and refuses the rest."""
+"""The command line ``adcs``.
+
+Every command is a function in a module of :mod:`adcs.commands`; its NumPy docstring is its help text. What the command
+lines have in common is in :mod:`magloc.command_line`.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 
-_HELP = """Usage: adcs [--help] [--version]
+from cyclopts import App, Parameter
 
-Satellite attitude determination. This version has no commands yet."""
+from adcs.commands.compare import compare
+from adcs.commands.estimate import estimate
+from adcs.commands.run_complementary import complementary
+from adcs.commands.run_ellipsoid import ellipsoid
+from adcs.commands.run_tabletsat import run_attitude
+from adcs.commands.tables import tables
+from magloc import command_line
+
+app = App(
+    name="adcs",
+    help="Determine the attitude of satellites.",
+    version=command_line.installed_version,
+    default_parameter=Parameter(negative=()),
+)
+run = App(
+    name="run",
+    help="Simulate a scenario, estimate its attitude, and say how good that is.",
+    version_flags=[],
+)
+run.default(run_attitude)
+run.command(complementary)
+run.command(ellipsoid)
+app.command(run)
+app.command(compare)
+app.command(tables)
+app.command(estimate)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line.
+    """Run one command.
 
     Parameters
     ----------
     arguments : sequence of str, optional
-        Those of the process by default.
+        The command and its arguments; by default those of the process.
 
     Returns
     -------
     int
-        Exit status: 0 done, 2 bad input.
+        Exit status: 0 done, 2 bad input, 130 interrupted, 141 the reader of the output is gone.
     """
-    tokens = sys.argv[1:] if arguments is None else list(arguments)
-    if tokens in ([], ["--help"], ["-h"]):
-        print(_HELP)
-        return 0
-    if tokens == ["--version"]:
-        print(version("magloc"))
-        return 0
-    print(f"adcs: found {' '.join(tokens)!r}, expected --help or --version: no commands yet.", file=sys.stderr)
-    return 2
+    return command_line.run(app, arguments)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 from cyclopts import Parameter
 from numpy.typing import NDArray
 
+from adcs.commands.common import Flag, QuietOptions, print_json, print_note, progress
 from adcs.roll_yaw import STEP_S, YAW, SetTrack
 from adcs.strip_steps import StepRule
 from arrays.errors import InputError
@@ -52,8 +52,8 @@ class EllipsoidOptions:
     noise_deg: float = 1.0
     drift_deg_s: float = 0.02
     step: StepRule = "tightened"
-    jump: Annotated[bool, Parameter(negative=())] = False
-    closed_loop: Annotated[bool, Parameter(negative=())] = False
+    jump: Annotated[bool, Parameter(negative=(), show_default=False)] = False
+    closed_loop: Annotated[bool, Parameter(negative=(), show_default=False)] = False
     seeds: Annotated[int, Parameter(name=["--seeds", "--runs"])] = 300
     seed: int = 0
     duration: float = 5678.0
@@ -270,8 +270,8 @@ def ellipsoid(
     *,
     options: EllipsoidOptions = EllipsoidOptions(),
     out: Path | None = None,
-    json: Annotated[bool, Parameter(negative=())] = False,
-    quiet: Annotated[bool, Parameter(negative=())] = False,
+    json: Flag = False,
+    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Yaw of a satellite from a horizon sensor and gyros, in guaranteed ellipsoids.
 
@@ -286,15 +286,14 @@ def ellipsoid(
         Folder for the figure and the data behind it.
     json : bool
         Print one JSON object.
-    quiet : bool
-        Nothing on stderr but errors.
+    common : QuietOptions
+        Common options.
     """
-    result = run_ellipsoid(options, out)
+    with progress(options.seeds, "runs", quiet=common.quiet) as advance:
+        result = run_ellipsoid(options, out, advance)
     if json:
-        import msgspec
-
-        print(msgspec.json.encode(result).decode())
+        print_json(result)
     else:
         print("\n".join(summary_lines(options, result)))
-    if out is not None and not quiet:
-        print(f"adcs: wrote ellipsoid.png, ellipsoid.csv and ellipsoid-runs.csv into {out}", file=sys.stderr)
+    if out is not None and not common.quiet:
+        print_note(f"wrote ellipsoid.png, ellipsoid.csv and ellipsoid-runs.csv into {out}")

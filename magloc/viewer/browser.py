@@ -97,9 +97,7 @@ class Chromium:
             # The window's size counts its frame too; this one is the page's own.
             metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
             self.call("Emulation.setDeviceMetricsOverride", **metrics)
-            fault = self.call("Page.navigate", url=url).get("errorText")
-            if fault:
-                raise BrowserError(f"Chromium cannot open {url}: {fault}.")
+            self.open(url)
         except BaseException:
             self.close()
             raise
@@ -126,6 +124,24 @@ class Chromium:
                 self._process.wait()
             self._process = None
         shutil.rmtree(self._profile, ignore_errors=True)
+
+    def open(self, url: str) -> None:
+        """Open another page. What the one before asked for and complained of is forgotten.
+
+        Parameters
+        ----------
+        url : str
+
+        Raises
+        ------
+        BrowserError
+            It cannot be reached.
+        """
+        self.requests.clear()
+        self.errors.clear()
+        fault = self.call("Page.navigate", url=url).get("errorText")
+        if fault:
+            raise BrowserError(f"Chromium cannot open {url}: {fault}.")
 
     def call(self, method: str, **parameters: object) -> dict[str, Any]:
         """Result of a DevTools method, such as ``Page.reload``.

@@ -34,7 +34,10 @@ _SOLUTIONS_SHOWN = 3
 _DECADES = 4.0
 # In circumradii of the array: the arrow and the control, and how far an open region is drawn.
 _ARROW = 0.6
-_CONTROL = 0.9
+_CONTROL = 1.15
+# In arrows of the dipole.
+_FIT_LENGTH = 1.4
+_FIT_THICKNESS = 0.19
 _FARTHEST = 10.0
 _FARTHEST_OF_RANGE = 3.0
 
@@ -145,8 +148,10 @@ class DipoleEditor:
         name, radius = f"{parent}/dipole", array.circumradius
         self._region = SurfaceGlyph(server.scene, f"{name}/region")
         self._glyph = DipoleGlyph(server.scene, f"{name}/true", _ARROW * radius, DIPOLE_COLOUR, reach_m=1.5 * radius)
+        # A good fit stands where the dipole is: it is thinner and longer, so that its tip is seen beyond the other's.
+        length, thickness = _FIT_LENGTH * _ARROW * radius, _FIT_THICKNESS * _ARROW * radius
         self._found = [
-            DipoleGlyph(server.scene, f"{name}/fit {i + 1}", _ARROW * radius, FIT_COLOUR, label=label)
+            DipoleGlyph(server.scene, f"{name}/fit {i + 1}", length, FIT_COLOUR, label=label, thickness_m=thickness)
             for i, label in enumerate(["fit", *["also fits"] * (_SOLUTIONS_SHOWN - 1)])
         ]
         self.control = server.scene.add_transform_controls(

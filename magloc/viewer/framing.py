@@ -20,6 +20,9 @@ _ASPECT = 1.15  # of the scene beside the panel, about
 _MARGIN = 1.2
 _CELLS_PER_RADIUS = 4.0
 _FLOOR_RADII = 3.0
+# Strengths of the lights beside the one from above, which has 3.
+_AMBIENT = 1.8
+_FRONT = 2.0
 
 
 class Extent(NamedTuple):
@@ -87,8 +90,7 @@ def prepare(server: viser.ViserServer, extent: Extent) -> float:
     scene, centre, radius = server.scene, extent.centre_m, extent.radius_m
     scene.set_up_direction("+z")
     scene.world_axes.visible = False
-    # Shadows fall on whatever is near, and say nothing.
-    scene.configure_default_lights(enabled=True, cast_shadow=False)
+    _light(scene)
     cell = round_length(radius / _CELLS_PER_RADIUS * 1.5)
     side = 2.0 * np.ceil(_FLOOR_RADII * radius / cell) * cell
     middle = np.round(centre[:2] / cell) * cell
@@ -106,6 +108,16 @@ def prepare(server: viser.ViserServer, extent: Extent) -> float:
     )
     aim(server, extent)
     return cell
+
+
+def _light(scene: viser.SceneApi) -> None:
+    """From above, from where the first camera stands, and a little from everywhere."""
+    # Shadows fall on whatever is near, and say nothing.
+    scene.configure_default_lights(enabled=True, cast_shadow=False)
+    # The picture of surroundings that viser lights with costs a machine without a graphics card several seconds.
+    scene.configure_environment_map(hdri=None)
+    scene.add_light_ambient("/lights/everywhere", intensity=_AMBIENT)
+    scene.add_light_directional("/lights/front", intensity=_FRONT, position=tuple(_TOWARDS_CAMERA.tolist()))
 
 
 def aim(server: viser.ViserServer, extent: Extent) -> None:

@@ -100,10 +100,8 @@ def array_page(server: viser.ViserServer, result: ArrayResult, *, live: bool) ->
         entries += [
             Swatch(DIPOLE_COLOUR, "dipole to be dragged: the arrow is its moment"),
             Swatch(FIELD_LINE_COLOUR, "its field lines"),
-            Swatch(FIT_COLOUR, "what a fix of its readings finds"),
-            Swatch(
-                REGION_COLOUR, "95 % ellipsoid of the best fix that is possible; long where the range is not observable"
-            ),
+            Swatch(FIT_COLOUR, "what a fix of its readings finds: thinner and longer"),
+            Swatch(REGION_COLOUR, "95 % region by the Cramér-Rao bound; long where the range is not observable"),
         ]
     return _finished(server, legend, ball, array.name or "array", entries)
 
@@ -193,7 +191,7 @@ def track_page(
     if array is not None:
         entries += _array_entries(server, glyphs, rows, ball)
     followers: list[Callable[[int], None]] = []
-    player = TrackPlayer(server, points, 0.12 * ball.radius_m, array_poses=poses, on_pose=on_pose, on_row=followers)
+    player = TrackPlayer(server, points, 0.2 * ball.radius_m, array_poses=poses, on_pose=on_pose, on_row=followers)
     if array is not None and rows is not None:
         plot = ReadingsPlot(server, rows, array)
         of_point = _nearest_rows(rows, points)
@@ -201,8 +199,8 @@ def track_page(
         followers.append(lambda index: plot.show_row(int(of_point[index])))
     tracked = np.flatnonzero(np.isfinite(positions).all(axis=1))
     for i in dict.fromkeys((tracked[0], tracked[-1])):
-        above = positions[i] + np.array([0.0, 0.0, 0.06 * ball.radius_m])
-        screen_label(server.scene, f"/times/{i}", f"{points[i].time_s:.6g} s", above)
+        below = positions[i] - np.array([0.0, 0.0, 0.14 * ball.radius_m])  # above, the arrow of the moment may be
+        screen_label(server.scene, f"/times/{i}", f"{points[i].time_s:.6g} s", below)
     return _finished(server, legend, ball, name, entries, close=player.close)
 
 

@@ -178,7 +178,9 @@ class DipoleGlyph:
     reach_m : float, optional
         Of the field lines; by default there are none.
     label : str
-        Text at the tip.
+        Text beside the tip.
+    thickness_m : float, optional
+        As in :func:`~magloc.viewer.shapes.dipole_body`.
 
     Attributes
     ----------
@@ -194,10 +196,11 @@ class DipoleGlyph:
         colour: Colour = DIPOLE_COLOUR,
         reach_m: float | None = None,
         label: str = "",
+        thickness_m: float | None = None,
     ) -> None:
         # The moment is the frame's z axis: a turn of the frame turns all that belongs to it.
         self.frame = scene.add_frame(name, show_axes=False, visible=False)
-        body = dipole_body(size_m)
+        body = dipole_body(size_m, thickness_m)
         scene.add_mesh_simple(
             f"{name}/body", body.vertices, body.faces, color=colour, cast_shadow=False, receive_shadow=False
         )
@@ -209,7 +212,8 @@ class DipoleGlyph:
             )
         self.label: viser.LabelHandle | None = None
         if label:
-            self.label = screen_label(scene, f"{name}/text", label, np.array([0.0, 0.0, 1.1 * size_m]))
+            # Beside the tip, beyond which there may be the arrow of a control.
+            self.label = screen_label(scene, f"{name}/text", label, np.array([0.0, 0.0, 0.9 * size_m]), "center-right")
         self._wanted = True
         self._defined = False
 

@@ -65,24 +65,28 @@ def joined(surfaces: Iterable[Surface]) -> Surface:
     return Surface(np.concatenate(vertices), np.concatenate(faces))
 
 
-def dipole_body(size_m: float) -> Surface:
+def dipole_body(size_m: float, thickness_m: float | None = None) -> Surface:
     """A ball at the origin and an arrow from it along z, which stand for a dipole.
 
     Parameters
     ----------
     size_m : float
         Length of the arrow [m].
+    thickness_m : float, optional
+        Diameter of the ball, by which the arrow's shaft and head are sized too; by default a quarter of the length,
+        about [m].
 
     Returns
     -------
     Surface
     """
-    shaft = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.7 * size_m]])
-    head = trimesh.creation.cone(0.12 * size_m, 0.32 * size_m, sections=24)
-    head.apply_translation([0.0, 0.0, 0.68 * size_m])
+    thickness = 0.26 * size_m if thickness_m is None else thickness_m
+    neck = size_m - 1.23 * thickness
+    head = trimesh.creation.cone(0.46 * thickness, size_m - neck, sections=24)
+    head.apply_translation([0.0, 0.0, neck])
     parts = (
-        trimesh.creation.icosphere(subdivisions=3, radius=0.13 * size_m),
-        trimesh.creation.cylinder(0.045 * size_m, sections=16, segment=shaft),
+        trimesh.creation.icosphere(subdivisions=3, radius=0.5 * thickness),
+        trimesh.creation.cylinder(0.17 * thickness, sections=16, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, neck]]),
         head,
     )
     return joined(Surface(np.array(part.vertices), np.array(part.faces, dtype=np.int64)) for part in parts)

@@ -91,7 +91,7 @@ class TrackPlayer:
         self.whole = server.scene.add_line_segments(
             f"{name}/whole", line_segments(positions), _WHOLE_COLOUR, thickness=1.5, thickness_units="screen"
         )
-        self.glyph = TrackGlyph(server.scene, f"{name}/tail", positions, _covariances(points), size_m=0.25 * size_m)
+        self.glyph = TrackGlyph(server.scene, f"{name}/tail", positions, _covariances(points), size_m=0.15 * size_m)
         self.dipole = DipoleGlyph(server.scene, f"{name}/moment", size_m, DIPOLE_COLOUR)
         self.index = int(np.flatnonzero(self._tracked)[-1]) if self._tracked.any() else 0
         self._follow = Latest(self._show)

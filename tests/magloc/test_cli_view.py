@@ -375,15 +375,3 @@ class TestServer:
         assert out == ""
         assert f"port {port} is in use" in err
         assert "Traceback" not in err
-
-    @needs_chromium
-    def test_a_browser_that_is_closed_changes_nothing(self, array_file: Path) -> None:
-        with self.started(array_file, "--port", "0", "--quiet") as (process, address):
-            for _ in range(2):
-                with Chromium(address, (640, 400)) as browser:
-                    browser.wait_for("document.querySelector('canvas') !== null")
-                assert process.poll() is None
-            process.send_signal(signal.SIGINT)
-            _, err = process.communicate(timeout=30.0)
-        assert process.returncode == 0
-        assert err == ""
