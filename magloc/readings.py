@@ -36,7 +36,7 @@ TRUE_POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 TRUE_MOMENT_COLUMNS = ("mx_Am2", "my_Am2", "mz_Am2")
 
 _T_IN_nT = 1e9
-_SAME_TIME_S = 1e-6
+SAME_TIME_S = 1e-6
 _SATURATION_RTOL = 1e-12
 _LARGEST_nT = 1e15  # a million tesla: a column of something else, or a broken line
 # Change of the ambient field, relative, within which moduli may be averaged: 50 nT in 50 µT.
@@ -237,7 +237,7 @@ def rows_of_same_time(readings: Readings, truth: Truth) -> tuple[IntArray, IntAr
     after = np.clip(np.searchsorted(times, readings.time_s), 1, max(1, len(times) - 1))
     before, after = after - 1, np.minimum(after, len(times) - 1)
     nearest = np.where(np.abs(times[before] - readings.time_s) <= np.abs(times[after] - readings.time_s), before, after)
-    same = np.abs(times[nearest] - readings.time_s) <= _SAME_TIME_S
+    same = np.abs(times[nearest] - readings.time_s) <= SAME_TIME_S
     return np.flatnonzero(same), order[nearest[same]]
 
 

@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 
 from arrays.errors import InputError
 from magloc.consistency import Consistency
-from magloc.readings import Readings, Truth, rows_of_same_time
+from magloc.readings import SAME_TIME_S, Readings, Truth
 from magloc.track_rows import TrackPoint
 
 if TYPE_CHECKING:
     from magloc.commands.track import Vector
 
 FloatArray = NDArray[np.float64]
+
+# Of the truth's usual interval: over a longer one it is not interpolated.
+_LONGEST_STEP = 2.0
 
 
 def json_entry(point: TrackPoint) -> dict[str, object]:
@@ -80,17 +83,28 @@ def report(result: Consistency) -> list[str]:
 
 
 def truth_of_rows(readings: Readings, truth: Truth, path: Path) -> tuple[FloatArray, FloatArray | None]:
-    """True position, and moment if it is known, of every row (n, 3); NaN where the truth has no row of that time."""
-    in_readings, in_truth = rows_of_same_time(readings, truth)
-    if not in_readings.size:
+    """True position, and moment if it is known, of every row (n, 3); NaN where the truth says nothing of that time.
+
+    Between two rows of the truth, as the mean time of a window may be, it is interpolated, but not over a gap.
+    """
+    order = np.argsort(truth.time_s, kind="stable")
+    times, wanted = truth.time_s[order], readings.time_s
+    after = np.clip(np.searchsorted(times, wanted - SAME_TIME_S), 0, len(times) - 1)
+    exact = np.abs(times[after] - wanted) <= SAME_TIME_S
+    before = np.where(exact, after, np.maximum(after - 1, 0))
+    length = times[after] - times[before]
+    longest = _LONGEST_STEP * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    known = exact | ((times[before] <= wanted) & (wanted <= times[after]) & (length <= longest))
+    if not known.any():
         raise InputError(f"{path}: found none of the times of the readings, expected rows with the same time_s.")
-    position = np.full((len(readings), 3), np.nan)
-    position[in_readings] = truth.position_m[in_truth]
-    if truth.moment_Am2 is None:
-        return position, None
-    moment = np.full((len(readings), 3), np.nan)
-    moment[in_readings] = truth.moment_Am2[in_truth]
-    return position, moment
+    share = np.divide(wanted - times[before], length, out=np.zeros_like(wanted), where=length > 0.0)[:, None]
+
+    def of_rows(values: FloatArray) -> FloatArray:
+        values = values[order]
+        between = values[before] + share * (values[after] - values[before])
+        return np.asarray(np.where(known[:, None], between, np.nan))
+
+    return of_rows(truth.position_m), None if truth.moment_Am2 is None else of_rows(truth.moment_Am2)
 
 
 def geojson_text(points: Sequence[TrackPoint], origin: Vector) -> str:

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from arrays import geometries
 from arrays.files import read_array
+from magloc.commands.track_output import truth_of_rows
 from magloc.long_record import track_record
 from magloc.motion import UnknownMotion, WanderingMotion
-from magloc.readings import read_readings
+from magloc.readings import Readings, Truth, read_readings
 from magloc.smoother import smoothed
 from magloc.track import Tracker
 from magloc.track_rows import rows_of
@@ -242,6 +243,15 @@ class TestTruth:
     def test_of_other_times(self, run: Run, array: Path, readings: Path, tmp_path: Path) -> None:
         late = write(tmp_path / "late.csv", ["time_s,x_m,y_m,z_m", "1000,1,2,3", "1001,1,2,3"])
         assert_refused(run("track", readings, "--array", array, "--truth", late), str(late), "same time_s")
+
+
+class TestTruthBetweenItsRows:
+    def test_is_interpolated_but_not_over_a_gap(self) -> None:
+        truth = Truth(np.array([0.0, 1.0, 2.0, 10.0, 11.0]), np.arange(15.0).reshape(5, 3), None)
+        time = np.array([0.0, 0.5, 2.0, 5.0, 10.25, 12.0])
+        position, moment = truth_of_rows(Readings(time, np.zeros((6, 1)), np.arange(6)), truth, Path("truth.csv"))
+        assert moment is None
+        np.testing.assert_allclose(position[:, 0], [0.0, 1.5, 6.0, np.nan, 9.75, np.nan])
 
 
 class TestGeojson:
