@@ -7,16 +7,16 @@ export OPENBLAS_NUM_THREADS ?= 1
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 MAKE_VENV = $(PYTHON) -m venv --clear
 
-.PHONY: map test test-full test-oldest bench notebooks lint clean
+.PHONY: map test test-full test-oldest bench notebooks chromium lint clean
 
 map: .venv/installed
 	$(BIN)/magloc map
 
-test: lint
-	$(BIN)/python -m pytest -q -n 2 -m "not slow"
+test: lint chromium
+	$(BIN)/python -m pytest -q -n 2 --dist loadgroup -m "not slow"
 
-test-full: lint
-	$(BIN)/python -m pytest -q -n 2
+test-full: lint chromium
+	$(BIN)/python -m pytest -q -n 2 --dist loadgroup
 
 lint: .venv/installed
 	$(BIN)/ruff check
@@ -27,13 +27,26 @@ lint: .venv/installed
 bench: .venv/installed-bench
 	$(BIN)/python -m tests.bench
 
+# Headless Chromium, for the tests in a browser, which are skipped without it.
+chromium:
+	@for name in chromium chromium-browser google-chrome google-chrome-stable; do \
+		command -v $$name >/dev/null && exit 0; \
+	done; \
+	if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+		echo "installing Chromium for the tests in a browser"; \
+		export DEBIAN_FRONTEND=noninteractive; \
+		apt-get install -y --no-install-recommends chromium fonts-liberation >/dev/null 2>&1 && exit 0; \
+		{ apt-get update && apt-get install -y --no-install-recommends chromium fonts-liberation; } >/dev/null 2>&1 && exit 0; \
+	fi; \
+	echo "no Chromium: the tests in a browser are skipped (on Debian and Ubuntu: apt-get install chromium)"
+
 # The notebooks executed anew, and the README's pictures of them.
 notebooks: .venv/installed
 	$(BIN)/python -m tests.notebooks
 
 # The lower bounds of pyproject.toml, installed exactly.
-test-oldest: .venv-oldest/installed
-	.venv-oldest/bin/python -m pytest -q -n 2 -m "not slow"
+test-oldest: .venv-oldest/installed chromium
+	.venv-oldest/bin/python -m pytest -q -n 2 --dist loadgroup -m "not slow"
 
 .venv/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("magloc needs Python 3.11 or newer, found " + sys.version.split()[0]) if sys.version_info < (3, 11) else None'

@@ -9,6 +9,7 @@ Use, inside a tab or folder of the GUI::
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from html import escape
@@ -164,7 +165,7 @@ class ArrayEditor:
     def _move_to_control(self) -> None:
         try:
             # Rounded to what a hand can do: the file should not have ten digits of it.
-            place = np.round(self.control.position / (0.01 * self._step_m)) * 0.01 * self._step_m
+            place = np.round(self.control.position, 2 - round(math.log10(self._step_m)))
             array = moved(self.array, self._sensor, place)
         except ValueError as error:
             self.move_panel.content = words.panel([escape(f"Not moved: {error}")], warning=True)

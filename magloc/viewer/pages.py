@@ -14,8 +14,6 @@ from arrays.sensor import SensorArray
 from magloc.fix import Fix
 from magloc.readings import Readings
 from magloc.track_rows import TrackPoint
-from magloc.viewer.array_editor import ArrayEditor
-from magloc.viewer.dipole_editor import DipoleEditor
 from magloc.viewer.files import ArrayResult, MapResult, ReadingsResult, TrackResult
 from magloc.viewer.fix_view import FixView, best_positions
 from magloc.viewer.framing import Extent, corners_of, extent_of, prepare
@@ -90,6 +88,10 @@ def array_page(server: viser.ViserServer, result: ArrayResult, *, live: bool) ->
     entries: list[Entry] = [_sensors_entry(array)]
     legend = server.gui.add_folder("Legend")
     if live and array.n_sensors > 1:
+        # What fits readings takes a second to load, and the other pages do without.
+        from magloc.viewer.array_editor import ArrayEditor
+        from magloc.viewer.dipole_editor import DipoleEditor
+
         tabs = server.gui.add_tab_group()
         with tabs.add_tab("Dipole"):
             dipole = DipoleEditor(server, array)
@@ -128,7 +130,7 @@ def readings_page(server: viser.ViserServer, result: ReadingsResult, fixes: Sequ
     centroids = _centroids(array, rows)
     near = _not_far(best_positions(fixes), centroids)
     ball = extent_of(array.positions + (centroids - array.centroid)[:, None], near)
-    size, dot = max(0.4 * array.circumradius, 0.11 * ball.radius_m), 0.006 * ball.radius_m
+    size, dot = max(0.4 * array.circumradius, 0.11 * ball.radius_m), 0.012 * ball.radius_m
     view = FixView(server, rows.time_s, fixes, centroids, size_m=size, reach_m=1.4 * size, dot_m=dot)
 
     def move_array(row: int) -> None:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from html import escape
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from arrays.sensor import SensorArray
-from magloc.fix import Fix, Solution
-from magloc.viewer.live_fit import Forecast
 from magloc.viewer.scene import length_text
+
+if TYPE_CHECKING:
+    from magloc.fix import Fix, Solution
+    from magloc.viewer.live_fit import Forecast
 
 FloatArray = NDArray[np.float64]
 

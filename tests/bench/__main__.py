@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from tests.bench import fields, filters, fixes, machine, maps, recording, sources
+from tests.bench import complementary, fields, filters, fixes, machine, maps, recording, sources
 from tests.bench.table import header, table
 from tests.bench.timing import FULL, QUICK, Size
 
@@ -14,6 +14,7 @@ GROUPS = {
     "fixes": fixes,
     "sources": sources,
     "filters": filters,
+    "complementary": complementary,
     "maps": maps,
     "machine": machine,
     "recording": recording,

@@ -1,0 +1,24 @@
+"""One browser for all tests of this folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from arrays.errors import InputError
+from magloc.viewer.browser import Chromium, find_chromium
+from tests.browser.screen import Screen
+from tests.conftest import REPOSITORY
+
+ARTEFACTS = REPOSITORY / ".artefacts" / "browser"
+
+
+@pytest.fixture(scope="session")
+def screen() -> Iterator[Screen]:
+    try:
+        find_chromium()
+    except InputError:
+        pytest.skip("needs Chromium or Chrome on the PATH: on Debian and Ubuntu, apt-get install chromium")
+    with Chromium("about:blank") as browser:
+        yield Screen(browser, ARTEFACTS)

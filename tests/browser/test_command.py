@@ -1,0 +1,76 @@
+"""``magloc view`` as a process of its own: its server outlives the page, and ends at Ctrl-C."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from arrays.files import write_array
+from arrays.geometries import tetrahedron
+from tests.browser.screen import Screen
+
+# All in one process of a parallel run: one browser is enough.
+pytestmark = pytest.mark.xdist_group("browser")
+
+ARRAY = tetrahedron(1.5)
+
+
+@pytest.fixture
+def array_file(tmp_path: Path) -> Path:
+    write_array(ARRAY, tmp_path / "tetra.toml")
+    return tmp_path / "tetra.toml"
+
+
+@contextmanager
+def started(*arguments: str | Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The command in a process of its own, and the address that it prints."""
+    command = [sys.executable, "-m", "magloc.cli", "view", *map(str, arguments)]
+    environment = {**os.environ, "NUMBA_NUM_THREADS": "1"}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        try:
+            assert process.stdout is not None
+            yield process, process.stdout.readline().strip()
+        finally:
+            process.kill()
+
+
+def interrupted(process: subprocess.Popen[str]) -> str:
+    """What it writes to stderr until it has ended after Ctrl-C."""
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=30.0)
+    assert process.returncode == 0
+    assert out == ""
+    assert "Traceback" not in err
+    return err
+
+
+class TestProcess:
+    def test_a_closed_page_leaves_the_server_as_it_was(self, screen: Screen, array_file: Path) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as taken:
+            port = taken.getsockname()[1]
+            with started(array_file, "--port", str(port)) as (process, address):
+                screen.open(address)
+                screen.until(lambda: "Predicted readings" in screen.text(), "the panel")
+                screen.browser.click(*screen.button("Another draw of the noise"))
+                screen.until(lambda: screen.numbers("Seed of the noise") == [1.0], "another draw")
+                screen.leave()
+                assert process.poll() is None
+                screen.open(address)
+                screen.until(lambda: "found at" in screen.text(), "the panel")
+                assert screen.numbers("Seed of the noise") == [1.0]
+                # Nothing is fetched from anywhere else.
+                asked = {url.replace("ws:", "http:").split("/?")[0].rstrip("/") for url in screen.browser.requests}
+                assert asked == {address}
+                screen.leave()
+                err = interrupted(process)
+        assert f"port {port} is in use" in err

@@ -1,0 +1,62 @@
+"""The live page of readings: the fix of the row that is chosen is seen where its numbers say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import viser
+
+from arrays.geometries import tetrahedron
+from magloc.measurement import predicted_channels
+from magloc.readings import Readings
+from magloc.viewer.files import ReadingsResult
+from magloc.viewer.live_fit import LiveFit
+from magloc.viewer.pages import readings_page
+from magloc.viewer.scene import DIPOLE_COLOUR, FIT_COLOUR
+from magloc.viewer.server import opened
+from tests.browser.screen import Screen, Sight, dark_grey, hue_of
+
+# All in one process of a parallel run: one browser is enough.
+pytestmark = pytest.mark.xdist_group("browser")
+
+ARRAY = tetrahedron(1.5)
+POSITIONS = np.stack([np.linspace(-2.0, 2.0, 9), np.full(9, 2.0), np.full(9, 0.5)], axis=-1)
+MOMENT = np.array([0.0, 0.0, 80.0])
+ORANGE = hue_of(DIPOLE_COLOUR)
+
+
+@pytest.fixture(scope="module")
+def server(screen: Screen, tmp_path_factory: pytest.TempPathFactory) -> Iterator[viser.ViserServer]:
+    values = np.array([predicted_channels(ARRAY, position, MOMENT) for position in POSITIONS])
+    rows = Readings(0.5 * np.arange(9.0), values, np.arange(2, 11))
+    fit = LiveFit(ARRAY)
+    fixes = [fit.fix(reading) for reading in values]
+    with opened(0, "readings") as server:
+        page = readings_page(server, ReadingsResult(rows, ARRAY, tmp_path_factory.getbasetemp()), fixes, rows)
+        screen.open_server(server)
+        yield server
+        screen.leave()
+        page.close()
+
+
+class TestReadings:
+    @pytest.mark.parametrize(("share", "row"), [(0.0, 0), (1.0, 8)])
+    def test_the_row_slider_moves_the_source(
+        self, screen: Screen, server: viser.ViserServer, share: float, row: int
+    ) -> None:
+        camera = screen.live_camera(server)
+        screen.slide("row", share)
+        x, y, z = POSITIONS[row].tolist()
+        # The readings have no errors: neither has the fix.
+        words = f"time {0.5 * row:g} s, ({x:.3f}, {y:.3f}, {z:.3f}) m"
+        screen.until(lambda: words in screen.text().replace("\N{MINUS SIGN}", "-"), words)
+        others = np.delete(POSITIONS, [0, row, 8], axis=0)
+        screen.until_seen(
+            Sight("source", camera.pixels([POSITIONS[row]]), ORANGE),
+            Sight("source of the other row", camera.pixels([POSITIONS[8 - row]]), ORANGE, absent=True),
+            Sight("fixes of other rows", camera.pixels(others), hue_of(FIT_COLOUR), share=0.7),
+            Sight("sensor", camera.pixels(ARRAY.positions), dark_grey, share=0.75),
+        )
+        screen.keep("readings")

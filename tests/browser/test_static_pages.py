@@ -1,0 +1,66 @@
+"""The files of ``--html``: they need no server, and show the same scene from the same camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from arrays.files import write_array
+from arrays.geometries import tetrahedron
+from magloc.viewer.files import ArrayResult, MapResult
+from magloc.viewer.pages import array_page, map_page
+from magloc.viewer.scene import DIPOLE_COLOUR
+from magloc.viewer.server import opened, write_page
+from tests.browser.screen import Screen, Sight, dark_grey, hue_of
+from tests.browser.test_map_page import DIPOLE, RESULT, sights
+from tests.command_line import Run
+
+# All in one process of a parallel run: one browser is enough.
+pytestmark = pytest.mark.xdist_group("browser")
+
+LARGEST = 15_000_000
+
+
+class TestStaticPages:
+    def test_array_of_3_cm(self, screen: Screen, run: Run, tmp_path: Path) -> None:
+        array = tetrahedron(0.03)
+        write_array(array, tmp_path / "array.toml")
+        page = tmp_path / "array.html"
+        assert run("view", tmp_path / "array.toml", "--html", page, "--quiet").status == 0
+        with opened(0, "array") as server:
+            array_page(server, ArrayResult(array), live=False)
+            screen.open(page.as_uri())
+            camera = screen.camera(server.initial_camera)
+        screen.until_seen(
+            Sight("body of a sensor", camera.pixels(array.positions), dark_grey),
+            Sight("sensor", camera.pixels(-0.5 * array.positions), dark_grey, absent=True),
+        )
+        assert screen.browser.requests == [page.as_uri()]
+        assert screen.browser.errors == []
+        screen.keep("static-array")
+
+    def test_map(self, screen: Screen, tmp_path: Path) -> None:
+        page = tmp_path / "map.html"
+        with opened(0, "map") as server:
+            write_page(server, map_page(server, RESULT), page)
+            screen.open(page.as_uri())
+            camera = screen.camera(server.initial_camera)
+        on_slice = np.array([[x, 0.0, z] for x in (0.5, 3.5) for z in (-3.5, -2.0, 3.5)])
+        arrow = camera.pixels(DIPOLE)
+        screen.until_seen(
+            *sights("slice", camera, on_slice, within=45.0), Sight("the source", arrow, hue_of(DIPOLE_COLOUR), radius=6)
+        )
+        screen.keep("static-map")
+        assert "passes until convergence" in screen.text()
+
+    def test_a_map_of_41_points_along_an_axis_is_small(self, tmp_path: Path) -> None:
+        axis = np.linspace(-20.0, 20.0, 41)
+        values = np.random.default_rng(0).uniform(1.0, 60.0, (41, 41, 41))
+        known = np.zeros(values.shape, dtype=bool)
+        array = tetrahedron(1.0)
+        result = MapResult(axis, values, known, "starts", "passes", False, array, None, None, "random", 1)
+        with opened(0, "map") as server:
+            write_page(server, map_page(server, result), tmp_path / "map.html")
+        assert (tmp_path / "map.html").stat().st_size < LARGEST

@@ -1,0 +1,144 @@
+"""The live page of a track: time moves the scene, and the plot beside it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import viser
+from numpy.typing import NDArray
+
+from arrays.geometries import tetrahedron
+from magloc.measurement import predicted_channels
+from magloc.readings import Readings
+from magloc.track_rows import TrackPoint
+from magloc.viewer.files import TrackResult
+from magloc.viewer.pages import track_page
+from magloc.viewer.scene import DIPOLE_COLOUR, TRACK_COLOUR
+from magloc.viewer.server import opened
+from tests.browser.screen import Screen, Sight, dark_grey, hue_of
+
+# All in one process of a parallel run: one browser is enough.
+pytestmark = pytest.mark.xdist_group("browser")
+
+FloatArray = NDArray[np.float64]
+
+ARRAY = tetrahedron(1.5)
+TIMES = 0.5 * np.arange(41)
+POSITIONS = np.stack([np.linspace(-4.0, 4.0, 41), np.full(41, 3.0), np.linspace(0.0, 1.0, 41)], axis=-1)
+MOMENT = np.array([0.0, 0.0, 80.0])
+SIGMA_M = 0.1
+Z = np.array([0.0, 0.0, 1.0])
+BLUE, ORANGE = hue_of(TRACK_COLOUR), hue_of(DIPOLE_COLOUR)
+
+
+@pytest.fixture(scope="module")
+def server(screen: Screen) -> Iterator[viser.ViserServer]:
+    covariance = np.diag([SIGMA_M**2] * 3 + [1.0] * 3)
+    points = tuple(
+        TrackPoint(float(time), position, MOMENT, covariance, nis=9.0, nis_dof=9, status="tracked")
+        for time, position in zip(TIMES, POSITIONS, strict=True)
+    )
+    values = np.array([predicted_channels(ARRAY, position, MOMENT) for position in POSITIONS])
+    with opened(0, "track") as server:
+        page = track_page(server, TrackResult(points, is_truth=False), ARRAY, Readings(TIMES, values, np.arange(2, 43)))
+        screen.open_server(server)
+        yield server
+        screen.leave()
+        page.close()
+
+
+def row_of(screen: Screen) -> int:
+    """Which row the panel says is shown, from 0."""
+    words = re.search(r"row (\d+) of 41", screen.text())
+    assert words, screen.text()
+    return int(words[1]) - 1
+
+
+def arrow_in(row: int, arrow_m: float) -> FloatArray:
+    """The head of the moment's arrow, beyond the ellipsoid."""
+    return POSITIONS[row : row + 1] + 0.85 * arrow_m * Z
+
+
+class TestTrack:
+    """In the order of a user's session."""
+
+    @pytest.fixture
+    def arrow_m(self) -> float:
+        # The scene holds the track and the array: a fifth of its radius.
+        seen = np.vstack([POSITIONS, ARRAY.positions])
+        centre = 0.5 * (seen.min(axis=0) + seen.max(axis=0))
+        return 0.2 * float(np.linalg.norm(seen - centre, axis=1).max())
+
+    def test_line_arrow_and_array_are_where_the_camera_has_them(
+        self, screen: Screen, server: viser.ViserServer, arrow_m: float
+    ) -> None:
+        camera = screen.live_camera(server)
+        between = 0.5 * (POSITIONS[1:] + POSITIONS[:-1])
+        screen.until_seen(
+            Sight("track", camera.pixels(between), BLUE),
+            Sight("moment at the end", camera.pixels(arrow_in(40, arrow_m)), ORANGE, radius=4),
+            Sight("sensor", camera.pixels(ARRAY.positions), dark_grey),
+            Sight("track", camera.pixels(between[::8] + 1.5 * Z), BLUE, absent=True),
+        )
+        screen.keep("track")
+        assert row_of(screen) == 40
+        assert screen.browser.errors == []
+
+    def test_the_time_slider_moves_the_scene(self, screen: Screen, server: viser.ViserServer, arrow_m: float) -> None:
+        camera = screen.live_camera(server)
+        screen.slide("Time [s]", 0.3)
+        screen.until(lambda: abs(row_of(screen) - 12) <= 2, "the row follows the slider")
+        row = row_of(screen)
+        later = 0.5 * (POSITIONS[row + 2 :] + POSITIONS[row + 1 : -1])
+        screen.until_seen(
+            Sight("moment", camera.pixels(arrow_in(row, arrow_m)), ORANGE, radius=4),
+            Sight("track so far", camera.pixels(POSITIONS[1:row]), BLUE),
+            Sight("moment where it was", camera.pixels(arrow_in(40, arrow_m)), ORANGE, radius=4, absent=True),
+            Sight("track of later times", camera.pixels(later[2:]), BLUE, absent=True),
+        )
+        screen.keep("track-earlier")
+
+    def test_the_tail_is_cut(self, screen: Screen, server: viser.ViserServer) -> None:
+        camera = screen.live_camera(server)
+        screen.slide("Time [s]", 1.0)
+        screen.until(lambda: row_of(screen) == 40, "the row follows the slider")
+        screen.slide("Tail [s]", 0.25)
+        screen.until(lambda: abs(screen.numbers("Tail [s]")[0] - 5.0) < 1.0, "the slider moves")
+        screen.until_seen(
+            Sight("tail", camera.pixels(POSITIONS[33:40]), BLUE),
+            Sight("track before the tail", camera.pixels(POSITIONS[:27]), BLUE, absent=True),
+        )
+
+    def test_play_and_pause(self, screen: Screen, server: viser.ViserServer, arrow_m: float) -> None:
+        camera = screen.live_camera(server)
+        screen.browser.click(*screen.button("Play"))
+        screen.until(lambda: 4 <= row_of(screen) < 30, "time runs from the beginning")
+        screen.browser.click(*screen.button("Pause"))
+        screen.browser.wait_for("[...document.querySelectorAll('button')].some(b => b.innerText.trim() === 'Play')")
+        row = row_of(screen)
+        screen.until_seen(Sight("moment", camera.pixels(arrow_in(row, arrow_m)), ORANGE, radius=4))
+        assert row_of(screen) == row < 40
+
+    def test_the_plot_marks_the_time(self, screen: Screen, server: viser.ViserServer) -> None:
+        screen.slide("Time [s]", 0.5)
+        screen.until(lambda: abs(row_of(screen) - 20) <= 2, "the row follows the slider")
+        share = row_of(screen) / 40.0
+        box = screen.browser.wait_for(
+            "(() => { const plot = document.querySelector('.u-over'); if (!plot) return null;"
+            " plot.scrollIntoView({block: 'nearest'}); return plot.getBoundingClientRect().toJSON() })()"
+        )
+        rows = box["y"] + box["height"] * np.linspace(0.15, 0.85, 8)
+        mark = np.column_stack([np.full(8, box["x"] + share * box["width"]), rows])
+        elsewhere = mark + np.array([0.2 * box["width"], 0.0])
+
+        def black(picture: FloatArray) -> NDArray[np.bool_]:
+            return picture.max(axis=-1) < 0.25
+
+        screen.until_seen(
+            Sight("mark of the time", mark, black, radius=2),
+            Sight("mark of the time", elsewhere, black, radius=2, absent=True),
+        )
+        screen.keep("track-plot")
