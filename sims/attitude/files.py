@@ -1,0 +1,56 @@
+"""What is simulated of a scenario file of ``adcs``."""
+
+from __future__ import annotations
+
+import math
+
+from adcs.scenario_files import AttitudeFile, naming
+from sims.attitude.scenario import AttitudeScenario, StartConditions
+
+
+def simulation_of(file: AttitudeFile) -> AttitudeScenario:
+    """Scenario of a simulation.
+
+    Parameters
+    ----------
+    file : AttitudeFile
+        Of :func:`adcs.scenario_files.read_scenario`.
+
+    Returns
+    -------
+    AttitudeScenario
+
+    Raises
+    ------
+    InputError
+        The file describes what cannot be simulated.
+    """
+    start, disturbance = file.start, file.disturbance
+    with naming(file.path):
+        return AttitudeScenario(
+            body=file.body,
+            control=file.control,
+            orbit=file.orbit,
+            day=file.start_utc,
+            conditions=StartConditions(
+                sunlit=start.sunlit,
+                least_separation_rad=math.radians(start.least_separation_deg),
+                most_separation_rad=math.radians(start.most_separation_deg),
+                least_field_T=1e-9 * start.least_field_nT,
+                eclipse_after_s=start.eclipse_after_s,
+            ),
+            duration_s=file.duration_s,
+            dt_s=file.step_s,
+            star_tracker=file.star_tracker,
+            gyro=file.gyro,
+            magnetometer=file.magnetometer,
+            sun_sensor=file.sun_sensor,
+            torque_Nm=disturbance.torque_Nm,
+            torque_period_s=disturbance.torque_period_s,
+            gyro_bias_rad_s=math.radians(disturbance.gyro_bias_deg_s),
+            field_bias_T=1e-9 * disturbance.field_bias_nT,
+            field_error_T=1e-9 * disturbance.field_error_nT,
+            start_attitude_rad=math.radians(start.attitude_deg),
+            start_rate_rad_s=math.radians(start.rate_deg_s),
+            field_model=file.field_model,
+        )

@@ -1,0 +1,108 @@
+"""Runs for the tests of the filters: the source's set-up, and a truth that does exactly what a filter believes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adcs import dynamics, quaternion
+from adcs.multiplicative import FilterSettings, Start, start_near
+from adcs.sensor_sets import SensorSet, sensor_set, tuned_noise
+from sims.attitude.scenario import AttitudeScenario, StartConditions, tabletsat
+from sims.attitude.simulation import AttitudeRuns, Prepared, prepare, sense, simulate, start_estimates
+
+Array = NDArray[np.float64]
+
+START_RAD, START_RAD_S = math.radians(5.0), math.radians(0.1)
+GYRO_BIAS_RAD_S, FIELD_BIAS_T = math.radians(0.027), 500e-9
+SEEDS = range(10)
+
+
+def settings(sensors: str, states: Iterable[str] = ()) -> FilterSettings:
+    used = sensor_set(sensors, states)
+    return FilterSettings(used, tuned_noise(used))
+
+
+def scenario_for(used: SensorSet, duration_s: float) -> AttitudeScenario:
+    """A bias is there where the filter estimates it."""
+    return replace(
+        tabletsat(duration_s),
+        gyro_bias_rad_s=GYRO_BIAS_RAD_S if used.gyro_bias else 0.0,
+        field_bias_T=FIELD_BIAS_T if used.field_bias else 0.0,
+    )
+
+
+def start_of(runs: AttitudeRuns, attitude_rad: float = START_RAD, rate_rad_s: float = START_RAD_S) -> Start:
+    q, w = start_estimates(runs.prepared, attitude_rad, rate_rad_s)
+    return start_near(q, w, attitude_rad, rate_rad_s)
+
+
+def runs_for(used: SensorSet, duration_s: float, seeds: Iterable[int] = SEEDS) -> tuple[AttitudeRuns, Start]:
+    runs = simulate(scenario_for(used, duration_s), list(seeds))
+    return runs, start_of(runs)
+
+
+def followed(prepared: Prepared) -> AttitudeRuns:
+    """Truth and readings from the start and the torques of ``prepared``, which may have been changed."""
+    scenario, around = prepared.scenario, prepared.environment
+    states, torques = [(prepared.q, prepared.w, prepared.momentum_Nms)], []
+    n = prepared.torque_Nm.shape[1]
+    for row in range(n):
+        rate = around.orbital_rate_rad_s[:, row]
+        torques.append(
+            dynamics.commanded_torque(
+                scenario.body, scenario.control, *states[row], quaternion.IDENTITY, rate, scenario.dt_s
+            )
+        )
+        if row < n - 1:
+            states.append(
+                dynamics.step(
+                    scenario.body,
+                    *states[row],
+                    torques[row],
+                    prepared.torque_Nm[:, row],
+                    rate,
+                    around.gravity_s2[:, row],
+                    prepared.true_field_orbital_T[:, row],
+                    scenario.dt_s,
+                )
+            )
+    q, w, momentum = (np.stack(part, axis=1) for part in zip(*states, strict=True))
+    return AttitudeRuns(prepared, q, w, momentum, np.stack(torques, axis=1), sense(prepared, q, w))
+
+
+def believed_runs(filter_settings: FilterSettings, duration_s: float, seeds: range) -> AttitudeRuns:
+    """Runs whose disturbances and biases are random walks with the filter's own process noise and start deviations."""
+    noise = filter_settings.noise
+    used = filter_settings.sensors
+    prepared = prepare(replace(tabletsat(duration_s), torque_Nm=0.0), seeds)
+    shape = prepared.torque_Nm.shape
+    rng = np.random.default_rng(seeds[0])
+
+    def walk(start: float, step: float) -> Array:
+        steps = step * rng.standard_normal(shape)
+        steps[:, 0] = start * rng.standard_normal((shape[0], 3))
+        return np.cumsum(steps, axis=1)
+
+    body, dt_s = prepared.scenario.body, prepared.scenario.dt_s
+    acceleration = noise.rate_rad_s / dt_s * rng.standard_normal(shape)
+    if used.disturbance:
+        acceleration = acceleration + walk(filter_settings.disturbance_sigma_s2, noise.disturbance_s2)
+    changed = replace(prepared, torque_Nm=acceleration @ body.inertia_kgm2)
+    if used.gyro_bias:
+        changed = replace(changed, gyro_bias_rad_s=walk(filter_settings.gyro_bias_sigma_rad_s, noise.gyro_bias_rad_s))
+    if used.field_bias:
+        changed = replace(changed, field_bias_T=walk(filter_settings.field_bias_sigma_T, noise.field_bias_T))
+    return followed(changed)
+
+
+def tumbled(duration_s: float, seeds: range, conditions: StartConditions | None = None) -> AttitudeRuns:
+    """Runs whose true attitude is uniform over all rotations at the start."""
+    prepared = prepare(replace(tabletsat(duration_s), conditions=conditions or StartConditions()), seeds)
+    q = quaternion.random_attitudes(len(seeds), np.random.default_rng(seeds[0]))
+    rest = dynamics.absolute_rate(q, np.zeros((len(seeds), 3)), prepared.environment.orbital_rate_rad_s[:, 0])
+    return followed(replace(prepared, q=q, w=rest))
