@@ -105,6 +105,8 @@ def run(app: App, arguments: Sequence[str] | None = None) -> int:
     """
     program = app.name[0]
     tokens = sys.argv[1:] if arguments is None else list(arguments)
+    # Before numpy is loaded: threads of linear algebra only wait for each other over matrices as small as ours.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         with _one_line_warnings(program):
             _run(app, tokens)

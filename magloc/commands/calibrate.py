@@ -116,7 +116,7 @@ def calibrate(
     from arrays.files import read_array, read_sensors, write_array
     from magloc.calibration import calibrate_on_path, self_calibrate
     from magloc.commands.calibrate_by_turning import calibrate_by_turning, check_folder
-    from magloc.commands.figure_files import refuse_file
+    from magloc.output_files import refuse_file
     from magloc.readings import read_readings, read_truth, without_saturated
 
     if figures is not None:

@@ -11,8 +11,8 @@ from arrays.sensor import SensorArray
 from magloc import dipole
 from magloc.calibration import CalibrationResult
 from magloc.commands.common import print_note
-from magloc.commands.figure_files import Column, make_folder, write_columns
 from magloc.moving_source import AXES, AXIS_PAIRS, GAINS, OFFSET, POSITION
+from magloc.output_files import Column, make_folder, write_columns
 from magloc.plots import calibration_figure, save, turning_figure
 from magloc.readings import Readings
 

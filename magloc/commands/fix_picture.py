@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from arrays.sensor import SensorArray
 from magloc.commands.common import print_note
-from magloc.commands.figure_files import Column, make_folder, write_columns
 from magloc.fix import Fix, JointFix
+from magloc.output_files import Column, make_folder, write_columns
 from magloc.plots import fix_figure, residual_figure, save
 from magloc.plots.fix_figures import distances_from_truth, fix_columns
 from magloc.plots.style import bounds99

@@ -101,10 +101,10 @@ def locate(
     """
     from arrays.files import read_array
     from magloc.commands.ambient import place_of_options, with_ambient_field
-    from magloc.commands.figure_files import refuse_file
     from magloc.commands.fix_output import counted_reasons, in_world, json_entry, saturated_channels, warn_of
     from magloc.commands.fix_table import fix_table
     from magloc.commands.row_fixes import RowFixes
+    from magloc.output_files import refuse_file
     from magloc.readings import read_readings, without_saturated
 
     ids = None if sensors is None else [name.strip() for name in sensors.split(",")]

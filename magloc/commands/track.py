@@ -143,11 +143,11 @@ def track(
 
     from arrays.files import read_array
     from magloc.commands.ambient import place_of_options
-    from magloc.commands.figure_files import refuse_file
     from magloc.commands.locate import knowledge_of, subset_of
     from magloc.commands.track_output import geojson_text, json_entry, report, track_table, truth_of_rows
     from magloc.consistency import consistency, nees_of_rows, posterior_bound
     from magloc.long_record import track_record
+    from magloc.output_files import refuse_file
     from magloc.readings import read_readings, read_truth, without_saturated
     from magloc.smoother import smoothed
     from magloc.track import Tracker

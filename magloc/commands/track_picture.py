@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magloc.commands.common import print_note
-from magloc.commands.figure_files import Column, make_folder, write_columns
+from magloc.output_files import Column, make_folder, write_columns
 from magloc.plots import consistency_figure, save, track_figure
 from magloc.plots.style import bounds99
 from magloc.plots.track_figures import columns_of

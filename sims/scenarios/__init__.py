@@ -21,6 +21,7 @@ from arrays.errors import InputError
 from arrays.files import array_of_table, read_array
 from arrays.sensor import SensorArray
 from arrays.toml import read_toml
+from arrays.toml_tables import section_of
 from sims.paths import Attitude, Path, Steered, Vector
 from sims.scenario import Carrier, Matrix, Missing, Platform, Pulsation, Scenario, Source
 from sims.scenarios.tables import (
@@ -34,7 +35,6 @@ from sims.scenarios.tables import (
     PulsationTable,
     SensorsTable,
     SourceTable,
-    section_of,
 )
 from sims.sensor_models import SENSOR_KINDS, SensorModel, model_of
 

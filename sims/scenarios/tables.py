@@ -3,30 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, ClassVar, TypeVar
+from typing import Any
 
 import msgspec
 
-from arrays.errors import InputError
-from arrays.toml import check_keys, converted
+from arrays.toml_tables import Table
 from sims.paths import Lawnmower, Path, Steered, Vector, Waypoints, circle
 
 FORMAT_VERSION = 1
 
 Quaternion = tuple[float, float, float, float]
-
-
-class Table(msgspec.Struct, kw_only=True):
-    """A table of the file; numbers are finite unless they are named here."""
-
-    positive: ClassVar[frozenset[str]] = frozenset()
-    not_negative: ClassVar[frozenset[str]] = frozenset()
-    may_be_infinite: ClassVar[frozenset[str]] = frozenset()
-
-
-AnyTable = TypeVar("AnyTable", bound=Table)
 
 
 class FileTable(Table, kw_only=True):
@@ -39,13 +26,13 @@ class FileTable(Table, kw_only=True):
     array: dict[str, Any] | str
     format_version: int = FORMAT_VERSION
     name: str | None = None
-    sensors: dict[str, Any] = {}
-    carrier: dict[str, Any] = {}
-    source: list[dict[str, Any]] = []
+    sensors: dict[str, Any] = msgspec.field(default_factory=dict)
+    carrier: dict[str, Any] = msgspec.field(default_factory=dict)
+    source: list[dict[str, Any]] = msgspec.field(default_factory=list)
     ambient: dict[str, Any] | None = None
-    pulsation: list[dict[str, Any]] = []
-    platform: dict[str, Any] = {}
-    missing: dict[str, Any] = {}
+    pulsation: list[dict[str, Any]] = msgspec.field(default_factory=list)
+    platform: dict[str, Any] = msgspec.field(default_factory=dict)
+    missing: dict[str, Any] = msgspec.field(default_factory=dict)
 
 
 class SensorsTable(Table, kw_only=True):
@@ -68,7 +55,7 @@ class SensorsTable(Table, kw_only=True):
     gain_error: float | None = None
     drift_nT_rth: float | None = None
     offset_error_nT: float | None = None
-    of: dict[str, dict[str, Any]] = {}
+    of: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
 
 
 class CarrierTable(Table, kw_only=True):
@@ -77,7 +64,7 @@ class CarrierTable(Table, kw_only=True):
     positive = frozenset({"wobble_period_s"})
     not_negative = frozenset({"wobble_deg"})
 
-    path: dict[str, Any] = {}
+    path: dict[str, Any] = msgspec.field(default_factory=dict)
     attitude: str = "fixed"
     rotation_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
     rate_deg_s: Vector = (0.0, 0.0, 0.0)
@@ -132,7 +119,7 @@ class MissingTable(Table, kw_only=True):
     not_negative = frozenset({"dropout"})
 
     dropout: float = 0.0
-    gaps_s: list[tuple[float, float]] = []
+    gaps_s: list[tuple[float, float]] = msgspec.field(default_factory=list)
 
 
 class PathTable(Table, kw_only=True):
@@ -244,49 +231,6 @@ class LawnmowerPath(PathTable, kw_only=True):
         return Lawnmower(
             self.start_m, math.radians(self.course_deg), self.length_m, self.spacing_m, self.lines, self.speed_m_s
         )
-
-
-def section_of(place: str, table: dict[str, Any], struct: type[AnyTable]) -> AnyTable:
-    """A table of the file with known keys of the right types and numbers within their bounds.
-
-    Parameters
-    ----------
-    place : str
-        Name of the file, and of the table within it, for errors.
-    table : dict
-        As :func:`arrays.toml.read_toml` returns it.
-    struct : type
-        What it should be.
-
-    Returns
-    -------
-    Table
-        Of that type.
-
-    Raises
-    ------
-    InputError
-        It is not; the text says where and why.
-    """
-    check_keys(place, table, struct.__struct_fields__)
-    result = converted(place, table, struct)
-    for key in struct.__struct_fields__:
-        for number in _numbers(getattr(result, key)):
-            if not (math.isfinite(number) or (number == math.inf and key in struct.may_be_infinite)):
-                raise InputError(f"{place}, key {key}: found {number}, expected a finite number.")
-            if key in struct.positive and not number > 0.0:
-                raise InputError(f"{place}, key {key}: found {number:g}, expected a positive number.")
-            if key in struct.not_negative and not number >= 0.0:
-                raise InputError(f"{place}, key {key}: found {number:g}, expected a number that is not negative.")
-    return result
-
-
-def _numbers(value: Any) -> Iterator[float]:
-    if isinstance(value, int | float):
-        yield value
-    elif isinstance(value, list | tuple):
-        for item in value:
-            yield from _numbers(item)
 
 
 PATH_TABLES: dict[str, Any] = {

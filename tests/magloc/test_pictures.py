@@ -11,8 +11,8 @@ import pytest
 from scipy.stats import chi2
 
 from magloc.commands.calibration_picture import residual_rms
-from magloc.commands.figure_files import write_columns
 from magloc.commands.track_picture import write_picture
+from magloc.output_files import write_columns
 from magloc.track_rows import TrackPoint
 from tests.command_line import Run, assert_refused, results_of
 from tests.magloc.test_cli_calibrate import MOMENT, Files, made
