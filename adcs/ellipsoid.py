@@ -183,7 +183,8 @@ def minimum_trace_sum(H: FloatArray, Q: FloatArray) -> FloatArray:
         return H
     if trace_H == 0.0:
         return Q
-    k = math.sqrt(trace_Q / trace_H)
+    # Of the roots, not of the traces: these may differ by more than a number can hold.
+    k = math.sqrt(trace_Q) / math.sqrt(trace_H)
     return (1.0 + 1.0 / k) * Q + (1.0 + k) * H
 
 

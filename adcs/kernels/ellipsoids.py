@@ -116,7 +116,7 @@ def _add(H: FloatArray, Q: FloatArray) -> None:
     if trace_H == 0.0:
         H[:] = Q
         return
-    k = np.sqrt(trace_Q / trace_H)
+    k = np.sqrt(trace_Q) / np.sqrt(trace_H)
     for i in range(n):
         for j in range(n):
             H[i, j] = (1.0 + 1.0 / k) * Q[i, j] + (1.0 + k) * H[i, j]
@@ -132,7 +132,7 @@ def _cover(H: FloatArray, size: FloatArray) -> None:
         trace_Q += n * (4.0 * EPS * size[i]) ** 2
     if trace_Q == 0.0:
         return
-    k = np.sqrt(trace_Q / trace_H) if trace_H > 0.0 else 0.0
+    k = np.sqrt(trace_Q) / np.sqrt(trace_H) if trace_H > 0.0 else 0.0
     for i in range(n):
         for j in range(n):
             H[i, j] *= 1.0 + k

@@ -64,8 +64,10 @@ class MapControls:
                 )
                 for i, name in enumerate(_AXES)
             ]
-        self.points.on_update(self._switch)
-        self.failed.on_update(self._switch)
+        # Two switches that are thrown at once must not undo each other.
+        self._show_switched = Latest(self._switch)
+        self.points.on_update(self._show_switched)
+        self.failed.on_update(self._show_switched)
         self.cut.on_update(Latest(lambda: view.show_cut(self.cut.value)))
         self.size.on_update(lambda _: view.show_size(self.size.value))
         show_level = Latest(self._show_level)
@@ -77,11 +79,11 @@ class MapControls:
             self._connect_slice(i)
 
     def _connect_slice(self, i: int) -> None:
-        self.slices[i].on_update(self._switch)
+        self.slices[i].on_update(self._show_switched)
         self.places[i].on_update(lambda _: set_value(self.slices[i], True))
         self.places[i].on_update(Latest(lambda: self._view.show_slice(i, self.places[i].value)))
 
-    def _switch(self, _: object) -> None:
+    def _switch(self) -> None:
         view = self._view
         view.cloud.visible, view.failed.visible = self.points.value, self.failed.value
         for handle, switch in zip(view.slices, self.slices, strict=True):
