@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, NamedTuple
 
 
@@ -39,3 +44,18 @@ def assert_refused(outcome: Outcome, *fragments: str) -> None:
     assert "Traceback" not in outcome.err
     for fragment in fragments:
         assert fragment in lines[0]
+
+
+@contextmanager
+def viewer_started(*arguments: str | Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """``magloc view`` in a process of its own, and the address that it prints."""
+    command = [sys.executable, "-m", "magloc.cli", "view", *map(str, arguments)]
+    environment = {**os.environ, "NUMBA_NUM_THREADS": "1"}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        try:
+            assert process.stdout is not None
+            yield process, process.stdout.readline().strip()
+        finally:
+            process.kill()

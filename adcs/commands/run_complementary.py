@@ -12,7 +12,7 @@ import numpy as np
 from cyclopts import Parameter
 from numpy.typing import NDArray
 
-from adcs.commands.common import Flag, QuietOptions, print_json, print_note, progress
+from adcs.commands.common import Flag, QuietOptions, print_json, print_note, progress, write_table
 from adcs.complementary import Gains, VectorRecord
 from adcs.outage import Rule, Substitution
 from arrays.errors import InputError
@@ -195,7 +195,7 @@ def run_complementary(
     table = np.concatenate(rows)
     if out is not None:
         numbers = np.arange(options.seed, last)
-        _write_csv(out / "complementary-runs.csv", ("seed", *_RUN_COLUMNS), np.column_stack([numbers, table]))
+        write_table(out / "complementary-runs.csv", ("seed", *_RUN_COLUMNS), np.column_stack([numbers, table]))
     means = [float(value) for value in table[:, :3].mean(axis=0)]
     return {
         "rms_deg": means[0],
@@ -276,18 +276,11 @@ def _write_picture(options: ComplementaryOptions, runs: SatelliteRuns, out: Path
     )
     complementary_figure(picture).savefig(out / "complementary.png", dpi=130)
     columns = [f"{name.replace('-', '_')}_{axis}_deg" for name in names for axis in ("roll", "pitch", "yaw")]
-    _write_csv(
+    write_table(
         out / "complementary.csv",
         ("time_s", "orbits", *columns),
         np.column_stack([runs.scenario.time_s, orbits, *(errors[name] for name in names)]),
     )
-
-
-def _write_csv(path: Path, columns: tuple[str, ...], table: FloatArray) -> None:
-    from arrays.toml import write_text
-
-    lines = [",".join(columns), *(",".join(f"{value:.9g}" for value in row) for row in table.tolist()), ""]
-    write_text("\n".join(lines), path)
 
 
 def summary_lines(options: ComplementaryOptions, result: dict[str, Any]) -> list[str]:

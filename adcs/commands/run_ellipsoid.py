@@ -12,7 +12,7 @@ import numpy as np
 from cyclopts import Parameter
 from numpy.typing import NDArray
 
-from adcs.commands.common import Flag, QuietOptions, print_json, print_note, progress
+from adcs.commands.common import Flag, QuietOptions, print_json, print_note, progress, write_table
 from adcs.roll_yaw import STEP_S, YAW, SetTrack
 from adcs.strip_steps import StepRule
 from arrays.errors import InputError
@@ -132,7 +132,7 @@ def run_ellipsoid(
             progress(len(runs.seeds))
     table = np.concatenate(rows)
     if out is not None:
-        _write_csv(out / "ellipsoid-runs.csv", _RUN_COLUMNS, table)
+        write_table(out / "ellipsoid-runs.csv", _RUN_COLUMNS, table)
     error, half_width, resets, outside = table[:, 1], table[:, 2], table[:, 4], table[:, 5]
     return {
         "final_error_mean_deg": float(error.mean()),
@@ -213,7 +213,7 @@ def _write_picture(options: EllipsoidOptions, runs: _Runs, out: Path) -> None:
         *np.degrees(kalman.means).T,
         *(np.degrees(np.degrees(P[:, i, j])) for i, j in ((0, 0), (0, 1), (1, 1))),
     ]
-    _write_csv(out / "ellipsoid.csv", _TIME_COLUMNS, np.stack(columns, axis=1))
+    write_table(out / "ellipsoid.csv", _TIME_COLUMNS, np.stack(columns, axis=1))
 
 
 _TIME_COLUMNS = (
@@ -233,13 +233,6 @@ _TIME_COLUMNS = (
     "kalman_roll_yaw_deg2",
     "kalman_yaw_yaw_deg2",
 )
-
-
-def _write_csv(path: Path, columns: tuple[str, ...], table: FloatArray) -> None:
-    from arrays.toml import write_text
-
-    lines = [",".join(columns), *(",".join(f"{value:.9g}" for value in row) for row in table.tolist()), ""]
-    write_text("\n".join(lines), path)
 
 
 def summary_lines(options: EllipsoidOptions, result: dict[str, Any]) -> list[str]:

@@ -198,7 +198,8 @@ def track(
         complete = moment is not None and bool(np.isfinite(truth_position).all() and np.isfinite(moment).all())
         bound = posterior_bound(tracker, records, truth_position, moment) if complete and moment is not None else None
         result = consistency(points, tracker, records, truth_position, moment, bound)
-        nees = nees_of_rows(points, tracker, records, truth_position, moment)
+        if out is not None:
+            nees = nees_of_rows(points, tracker, records, truth_position, moment)
     if geojson is not None and place is not None:
         from arrays.toml import write_text
 

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import socket
 import subprocess
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -16,6 +12,7 @@ import pytest
 from arrays.files import write_array
 from arrays.geometries import tetrahedron
 from tests.browser.screen import Screen
+from tests.command_line import viewer_started
 
 # All in one process of a parallel run: one browser is enough.
 pytestmark = pytest.mark.xdist_group("browser")
@@ -27,21 +24,6 @@ ARRAY = tetrahedron(1.5)
 def array_file(tmp_path: Path) -> Path:
     write_array(ARRAY, tmp_path / "tetra.toml")
     return tmp_path / "tetra.toml"
-
-
-@contextmanager
-def started(*arguments: str | Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """The command in a process of its own, and the address that it prints."""
-    command = [sys.executable, "-m", "magloc.cli", "view", *map(str, arguments)]
-    environment = {**os.environ, "NUMBA_NUM_THREADS": "1"}
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-    ) as process:
-        try:
-            assert process.stdout is not None
-            yield process, process.stdout.readline().strip()
-        finally:
-            process.kill()
 
 
 def interrupted(process: subprocess.Popen[str]) -> str:
@@ -58,7 +40,7 @@ class TestProcess:
     def test_a_closed_page_leaves_the_server_as_it_was(self, screen: Screen, array_file: Path) -> None:
         with socket.create_server(("127.0.0.1", 0)) as taken:
             port = taken.getsockname()[1]
-            with started(array_file, "--port", str(port)) as (process, address):
+            with viewer_started(array_file, "--port", str(port)) as (process, address):
                 screen.open(address)
                 screen.until(lambda: "Predicted readings" in screen.text(), "the panel")
                 screen.browser.click(*screen.button("Another draw of the noise"))

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import socket
 import struct
-import subprocess
-import sys
 import urllib.request
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +25,7 @@ from magloc.viewer.files import ArrayResult, MapResult, ReadingsResult, TrackRes
 from magloc.viewer.pages import array_page
 from magloc.viewer.scene import ArrayGlyphs
 from magloc.viewer.server import free_port, opened
-from tests.command_line import Run, assert_refused
+from tests.command_line import Run, assert_refused, viewer_started
 
 LARGEST_PAGE = 15_000_000
 PICTURE_PX = (1280, 800)
@@ -345,25 +341,10 @@ class TestPicture:
 class TestServer:
     """The command serves until Ctrl-C, and then ends quietly."""
 
-    @staticmethod
-    @contextmanager
-    def started(*arguments: str | Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
-        """The command in a process of its own, and the address that it prints."""
-        command = [sys.executable, "-m", "magloc.cli", "view", *map(str, arguments)]
-        environment = {**os.environ, "NUMBA_NUM_THREADS": "1"}
-        with subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
-        ) as process:
-            try:
-                assert process.stdout is not None
-                yield process, process.stdout.readline().strip()
-            finally:
-                process.kill()
-
     def test_it_answers_and_ends_at_an_interruption(self, array_file: Path) -> None:
         with socket.create_server(("127.0.0.1", 0)) as taken:
             port = taken.getsockname()[1]
-            with self.started(array_file, "--port", str(port)) as (process, address):
+            with viewer_started(array_file, "--port", str(port)) as (process, address):
                 assert address.startswith("http://127.0.0.1:")
                 assert address != f"http://127.0.0.1:{port}"
                 direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
