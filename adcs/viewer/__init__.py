@@ -1,0 +1,1 @@
+"""Attitude results seen in three dimensions, in a browser."""

@@ -1,0 +1,1 @@
+"""Truth and readings of the table-top satellite, for :mod:`adcs.mockup`."""

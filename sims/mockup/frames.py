@@ -1,0 +1,179 @@
+"""Frames of the camera under the sky of lights: point spread, motion, noise, lost and spurious lights, hot pixels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adcs.mockup.camera import Camera, Pose, image_from_table, in_frame, table_from_image
+from adcs.mockup.sky import LedSky
+
+FloatArray = NDArray[np.float64]
+ByteArray = NDArray[np.uint8]
+
+_PSF_REACH = 4.0  # a Gaussian is cut off where it is below 0.04 % of its peak
+_STEP_PSF = 0.25  # along a smear: the sum of Gaussians this far apart is its integral to 0.05 DN
+_MOST_STEPS = 2000
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How the satellite moves during the exposure.
+
+    Attributes
+    ----------
+    velocity_m_s : tuple, shape (2,)
+        In the table's frame.
+    turn_rate_rad_s : float
+        Counter-clockwise seen from above.
+    """
+
+    velocity_m_s: tuple[float, float] = (0.0, 0.0)
+    turn_rate_rad_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class FrameQuality:
+    """What a frame of the camera is like.
+
+    Attributes
+    ----------
+    psf_px : float
+        Standard deviation of the Gaussian image of a light.
+    peak_DN : float
+        Of a light at rest, above the background; motion spreads the same light over more pixels.
+    background_DN : float
+    noise_DN : float
+        Standard deviation in a pixel.
+    lost : float
+        Probability that a light is dark.
+    spurious : int
+        Lights in view that are in no catalogue, at random places of the ceiling.
+    hot_pixels : int
+        Pixels at 255, at random places.
+
+    Raises
+    ------
+    ValueError
+        A number is out of range.
+    """
+
+    psf_px: float = 1.5
+    peak_DN: float = 180.0
+    background_DN: float = 20.0
+    noise_DN: float = 4.0
+    lost: float = 0.0
+    spurious: int = 0
+    hot_pixels: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.psf_px < math.inf:
+            raise ValueError(f"Input psf_px must be a positive number; instead received {self.psf_px}.")
+        for name in ("peak_DN", "background_DN", "noise_DN", "spurious", "hot_pixels"):
+            value = getattr(self, name)
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"Input {name} must not be negative; instead received {value}.")
+        if not 0.0 <= self.lost <= 1.0:
+            raise ValueError(f"Input lost must be between 0 and 1; instead received {self.lost}.")
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A rendered frame.
+
+    Attributes
+    ----------
+    image : ndarray of uint8, shape (height_px, width_px)
+    lights : ndarray of int, shape (k,)
+        Lights of the sky that shine and are in the frame in the middle of the exposure.
+    lights_px : ndarray, shape (k, 2)
+        Column and row of them.
+    spurious_px : ndarray, shape (spurious, 2)
+    """
+
+    image: ByteArray
+    lights: NDArray[np.intp]
+    lights_px: FloatArray
+    spurious_px: FloatArray
+
+
+def rendered_frame(
+    sky: LedSky,
+    camera: Camera,
+    pose: Pose,
+    rng: np.random.Generator,
+    motion: Motion = Motion(),
+    quality: FrameQuality = FrameQuality(),
+) -> Frame:
+    """Frame that the camera takes.
+
+    A light's image is a Gaussian, drawn out along the path that it takes during the exposure; the total light does not
+    depend on the motion. Gaussian noise, then rounding to whole numbers from 0 to 255.
+
+    Parameters
+    ----------
+    sky : LedSky
+    camera : Camera
+    pose : Pose
+        In the middle of the exposure.
+    rng : numpy.random.Generator
+    motion : Motion
+    quality : FrameQuality
+
+    Returns
+    -------
+    Frame
+    """
+    shining = np.flatnonzero(rng.random(len(sky)) >= quality.lost)
+    size = np.array([camera.width_px, camera.height_px])
+    spurious_px = rng.uniform(0.0, 1.0, (quality.spurious, 2)) * (size - 1.0)
+    spurious_m = table_from_image(camera, pose, spurious_px)
+    middle_px = image_from_table(camera, pose, sky.positions_m[shining])
+    seen = in_frame(camera, middle_px)
+    paths = _paths(camera, pose, motion, np.concatenate([sky.positions_m[shining], spurious_m]), quality.psf_px)
+    image = rng.standard_normal((camera.height_px, camera.width_px), dtype=np.float32)
+    image *= np.float32(quality.noise_DN)
+    image += np.float32(quality.background_DN + 0.5)  # then cutting off decimals rounds
+    for path in paths:
+        _add_light(image, path, quality)
+    np.clip(image, 0.0, 255.0, out=image)
+    pixels = image.astype(np.uint8)
+    if quality.hot_pixels:
+        pixels.reshape(-1)[rng.choice(pixels.size, quality.hot_pixels, replace=False)] = 255
+    return Frame(pixels, shining[seen], middle_px[seen], spurious_px)
+
+
+def _paths(camera: Camera, pose: Pose, motion: Motion, points_m: FloatArray, psf_px: float) -> FloatArray:
+    """Where the lights that come near the frame are during the exposure, shape (lights, steps, 2)."""
+    path_px = camera.exposure_s / camera.m_per_px * math.hypot(*motion.velocity_m_s)
+    path_px += camera.exposure_s * abs(motion.turn_rate_rad_s) * math.hypot(camera.width_px, camera.height_px)
+    n_steps = min(max(math.ceil(path_px / (_STEP_PSF * psf_px)), 1), _MOST_STEPS)
+    t = camera.exposure_s * ((np.arange(n_steps) + 0.5) / n_steps - 0.5)
+    poses = Pose(
+        pose.x_m + motion.velocity_m_s[0] * t,
+        pose.y_m + motion.velocity_m_s[1] * t,
+        pose.heading_rad + motion.turn_rate_rad_s * t,
+    )
+    reach = camera.m_per_px * (2.0 * math.hypot(camera.width_px, camera.height_px) + path_px)
+    near = np.sum((points_m - pose.position_m) ** 2, axis=1) < reach**2
+    paths = np.swapaxes(image_from_table(camera, poses, points_m[near]), 0, 1)
+    in_reach = in_frame(camera, paths, -_PSF_REACH * psf_px).any(axis=1)
+    return paths[in_reach]
+
+
+def _add_light(image: NDArray[np.float32], path: FloatArray, quality: FrameQuality) -> None:
+    """Add what a light leaves along a path, shape (steps, 2); steps that the lens does not show are NaN."""
+    shown = path[np.isfinite(path[:, 0])]
+    reach = _PSF_REACH * quality.psf_px
+    size = np.array(image.shape[::-1])
+    begin = np.clip(np.floor(shown.min(axis=0) - reach), 0, size).astype(int)
+    end = np.clip(np.ceil(shown.max(axis=0) + reach) + 1, 0, size).astype(int)
+    across, down = (
+        np.exp(-0.5 * ((np.arange(begin[axis], end[axis]) - shown[:, axis, None]) / quality.psf_px) ** 2)
+        for axis in range(2)
+    )
+    patch = (quality.peak_DN / len(path)) * (down.T @ across)
+    image[begin[1] : end[1], begin[0] : end[0]] += patch.astype(np.float32)

@@ -1,0 +1,379 @@
+r"""Runs of the table-top satellite: how it drives, what its inertial unit reads, and which fixes its camera sends.
+
+The truth is integrated over the polls of the microcontroller, a thousand in a second; a sample is the mean of ten. Two
+drives:
+
+- "perimeter": around the table at about constant speed, for figures 8, 9 and 21 to 24 of the source. Valves of ±0.04
+  m/s² along each body axis, opened and closed by a controller ten times in a second, follow a rounded rectangle, while
+  a flywheel turns the satellite at rates between -10 and 40 °/s, or the other way round.
+- "two-firings": figures 13 to 18, two firings that turn it by about 400° in 15 s, with thrust in between.
+
+Errors are those of our summary of the source, section 8. Zeros drift because the sensor warms.
+
+Random numbers of each feature come from a stream of their own, so that leaving out one changes no other.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adcs.mockup.fixes import FixRecord
+from adcs.mockup.inertial import ImuRecord, PlanarState, PlanarTrack, strapdown
+from adcs.mockup.inertial_sensors import Inclinometer, RateGyro
+from sims.noise import stream
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+DriveName = Literal["perimeter", "two-firings"]
+
+POLL_S = 1e-3
+THRUST_M_S2 = 0.04
+SPEED_M_S = 0.085
+"""Of the point that the perimeter drive follows."""
+
+_CONTROL_S = 0.1
+_STRAIGHT_M = (1.4, 0.9)
+_CORNER_M = 0.2
+_SPRING_S2, _DAMPER_S, _DEADBAND_M_S2 = 0.15, 0.8, 0.02
+
+
+@dataclass(frozen=True)
+class ImuErrors:
+    """Errors of the inertial unit after its calibration.
+
+    Attributes
+    ----------
+    acceleration_m_s2, rate_rad_s : float
+        Noise of a sample, each axis.
+    spikes_Hz, spike_m_s2 : float
+        One sample in about a second gets a parasitic spike on each axis, uniform within ± its size.
+    calibration_m_s2 : float
+        Standard deviation of what the calibration leaves of each zero.
+    zero_m_s2 : tuple
+        Constant zeros beside it.
+    drift_m_s2 : tuple
+        What the zeros drift by, linearly, over the run.
+    warming_K : float
+        How much warmer the sensor becomes meanwhile: the drift over it is its slope.
+    zero_rad_s : float
+        Of the gyro.
+    """
+
+    acceleration_m_s2: float = 0.002
+    rate_rad_s: float = math.radians(0.1)
+    spikes_Hz: float = 1.0
+    spike_m_s2: float = 0.07
+    calibration_m_s2: float = 0.001
+    zero_m_s2: tuple[float, float] = (0.0, 0.0)
+    drift_m_s2: tuple[float, float] = (0.002, -0.0015)
+    warming_K: float = 20.0 / 3.0
+    zero_rad_s: float = math.radians(0.02)
+
+
+@dataclass(frozen=True)
+class CameraErrors:
+    """Errors and delays of the camera's fixes.
+
+    Attributes
+    ----------
+    period_s, delay_s : float
+        Between exposures, and from exposure to arrival.
+    position_m, heading_rad : float
+        Noise of a fix, each axis.
+    failed : float
+        Fraction of the frames that give no fix.
+    false : float
+        Fraction of the fixes that are anywhere under the sky, at any heading.
+    overtaken : float
+        Fraction of the fixes that arrive up to three periods later than the others.
+    repeated : float
+        Fraction of the fixes that arrive twice.
+    outages_s : tuple of (float, float)
+        From when to when there are no exposures.
+    latency_s : float
+        By how much later than the exposure the time stamps are.
+    """
+
+    period_s: float = 0.6
+    delay_s: float = 0.6
+    position_m: float = 1e-3
+    heading_rad: float = math.radians(0.05)
+    failed: float = 0.12
+    false: float = 0.0
+    overtaken: float = 0.0
+    repeated: float = 0.0
+    outages_s: tuple[tuple[float, float], ...] = ()
+    latency_s: float = 0.0
+
+
+NO_IMU_ERRORS = ImuErrors(0.0, 0.0, 0.0, 0.0, 0.0, drift_m_s2=(0.0, 0.0), warming_K=1.0, zero_rad_s=0.0)
+NO_CAMERA_ERRORS = CameraErrors(position_m=0.0, heading_rad=0.0, failed=0.0)
+
+
+@dataclass(frozen=True)
+class TableScenario:
+    """Settings of :func:`table_run`.
+
+    Attributes
+    ----------
+    drive : {'perimeter', 'two-firings'}
+    duration_s : float
+    sample_s : float
+        Between samples of the inertial unit, a multiple of :data:`POLL_S`.
+    imu : ImuErrors
+    camera : CameraErrors
+
+    Raises
+    ------
+    ValueError
+        The drive is unknown, or a time is not positive.
+    """
+
+    drive: DriveName = "perimeter"
+    duration_s: float = 180.0
+    sample_s: float = 0.01
+    imu: ImuErrors = field(default_factory=ImuErrors)
+    camera: CameraErrors = field(default_factory=CameraErrors)
+
+    def __post_init__(self) -> None:
+        if self.drive not in get_args(DriveName):
+            raise ValueError(f"Input drive must be one of {get_args(DriveName)}; instead received {self.drive!r}.")
+        if not self.duration_s >= self.sample_s > 0.0 or not math.isfinite(self.duration_s):
+            raise ValueError(
+                "Input duration_s must be finite and sample_s at least, which must be positive; "
+                f"instead received {self.duration_s} and {self.sample_s}."
+            )
+        if abs(self.polls * POLL_S - self.sample_s) > 1e-9:
+            raise ValueError(f"Input sample_s must be a multiple of {POLL_S}; instead received {self.sample_s}.")
+
+    @property
+    def polls(self) -> int:
+        """Polls of a sample."""
+        return max(1, round(self.sample_s / POLL_S))
+
+    @property
+    def n_samples(self) -> int:
+        """Samples of the run."""
+        return int(self.duration_s / self.sample_s + 1e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class TableRun:
+    """Truth and readings.
+
+    Attributes
+    ----------
+    truth : PlanarTrack
+        At the end of each sample.
+    true_start, start : PlanarState
+        At 0 s, and what is known of it: as well as from a fix, and the true velocity.
+    imu : ImuRecord
+    temperature_C : ndarray, shape (n,)
+    zero_m_s2 : ndarray, shape (n, 2)
+        True zeros of the accelerometer in each sample.
+    zero_rad_s : float
+        True zero of the gyro.
+    fixes : FixRecord
+        As they arrive.
+    exposure_s : ndarray, shape (k,)
+        When the images were taken: their time stamps less the latency.
+    false : ndarray of bool, shape (k,)
+        Which of them are false.
+    """
+
+    truth: PlanarTrack
+    true_start: PlanarState
+    start: PlanarState
+    imu: ImuRecord
+    temperature_C: FloatArray
+    zero_m_s2: FloatArray
+    zero_rad_s: float
+    fixes: FixRecord
+    exposure_s: FloatArray
+    false: BoolArray
+
+
+def table_run(scenario: TableScenario, seed: int) -> TableRun:
+    """Simulate one run.
+
+    Parameters
+    ----------
+    scenario : TableScenario
+    seed : int
+
+    Returns
+    -------
+    TableRun
+    """
+    camera, n, polls = scenario.camera, scenario.n_samples, scenario.polls
+    drive = perimeter_drive if scenario.drive == "perimeter" else two_firings_drive
+    polled, true_start = drive(n * polls, stream(seed, "drive"))
+    flown = strapdown(polled, true_start)
+    rows = slice(polls - 1, None, polls)
+    truth = flown.rows(rows)
+    ideal = ImuRecord(
+        0.0,
+        flown.time_s[rows],
+        polled.acceleration_m_s2.reshape(n, polls, 2).mean(axis=1),
+        polled.rate_rad_s.reshape(n, polls).mean(axis=1),
+    )
+    imu, temperature_C, zero = _readings(ideal, scenario, seed)
+    known = stream(seed, "start").standard_normal(3)
+    start = PlanarState(
+        true_start.position_m + camera.position_m * known[:2],
+        true_start.velocity_m_s,
+        float(true_start.heading_rad) + camera.heading_rad * float(known[2]),
+    )
+    fixes, exposure_s, false = _fixes(flown, camera, seed)
+    zero_rate = scenario.imu.zero_rad_s
+    return TableRun(truth, true_start, start, imu, temperature_C, zero, zero_rate, fixes, exposure_s, false)
+
+
+def _readings(ideal: ImuRecord, scenario: TableScenario, seed: int) -> tuple[ImuRecord, FloatArray, FloatArray]:
+    """Readings, temperatures and true zeros of the accelerometer."""
+    errors, n = scenario.imu, len(ideal)
+    left = errors.calibration_m_s2 * stream(seed, "calibration").standard_normal(2)
+    slope = np.array(errors.drift_m_s2) / errors.warming_K
+    gyro = RateGyro(errors.rate_rad_s, zero_rad_s=errors.zero_rad_s)
+    accelerometer = Inclinometer(
+        errors.acceleration_m_s2, zero_m_s2=np.array(errors.zero_m_s2) + left, zero_slope_m_s2_K=slope
+    )
+    temperature_C = accelerometer.reference_C + errors.warming_K * ideal.time_s / scenario.duration_s
+    acceleration = accelerometer.readings(
+        ideal.acceleration_m_s2, stream(seed, "accelerometer").standard_normal((n, 2)), temperature_C
+    )
+    rate = gyro.readings(ideal.rate_rad_s, stream(seed, "gyro").standard_normal(n))
+    spikes = stream(seed, "spikes")
+    struck = spikes.random((n, 2)) < errors.spikes_Hz * scenario.sample_s
+    acceleration = acceleration + np.where(struck, spikes.uniform(-errors.spike_m_s2, errors.spike_m_s2, (n, 2)), 0.0)
+    zero = accelerometer.zero_m_s2 + slope * (temperature_C - accelerometer.reference_C)[:, None]
+    return ImuRecord(0.0, ideal.time_s, acceleration, rate), temperature_C, zero
+
+
+def _fixes(flown: PlanarTrack, camera: CameraErrors, seed: int) -> tuple[FixRecord, FloatArray, BoolArray]:
+    """Fixes as they arrive, when their images were taken, and which of them are false."""
+    phase = stream(seed, "camera").uniform(0.0, camera.period_s)
+    time_s = np.arange(phase, flown.time_s[-1], camera.period_s)
+    k = len(time_s)
+    true = np.stack([np.interp(time_s, flown.time_s, y) for y in (*flown.position_m.T, flown.heading_rad)], axis=1)
+    noise = stream(seed, "fixes").standard_normal((k, 3))
+    measured = true + noise * [camera.position_m, camera.position_m, camera.heading_rad]
+    false = stream(seed, "false fixes").random(k) < camera.false
+    anywhere = stream(seed, "false fixes", "where").uniform([-1.5, -1.2, -math.pi], [1.5, 1.2, math.pi], (k, 3))
+    measured = np.where(false[:, None], anywhere, measured)
+    lateness = stream(seed, "overtaken")
+    late = np.where(lateness.random(k) < camera.overtaken, 3.0 * camera.period_s * lateness.random(k), 0.0)
+    stamp_s = time_s + camera.latency_s
+    arrival_s = np.maximum(time_s + camera.delay_s + late, stamp_s)
+    kept = stream(seed, "failed frames").random(k) >= camera.failed
+    for begin_s, end_s in camera.outages_s:
+        kept &= (time_s < begin_s) | (time_s >= end_s)
+    row = np.flatnonzero(kept)
+    again = row[stream(seed, "repeated").random(k)[row] < camera.repeated]
+    row, arrival_s = np.concatenate([row, again]), np.concatenate([arrival_s[row], arrival_s[again] + 0.1])
+    order = np.argsort(arrival_s, kind="stable")
+    row = row[order]
+    heading = np.asarray(math.pi - np.mod(math.pi - measured[row, 2], 2.0 * math.pi))
+    return FixRecord(stamp_s[row], arrival_s[order], measured[row, :2], heading), time_s[row], false[row]
+
+
+def perimeter_drive(n_polls: int, rng: np.random.Generator) -> tuple[ImuRecord, PlanarState]:
+    """True readings of every poll around the table, and the start, at rest.
+
+    Parameters
+    ----------
+    n_polls : int
+    rng : numpy.random.Generator
+        For where and which way round it starts, its heading, and how it turns.
+
+    Returns
+    -------
+    ImuRecord, PlanarState
+    """
+    time_s = POLL_S * np.arange(1.0, n_polls + 1.0)
+    middle_s = time_s - 0.5 * POLL_S
+    way, turn = rng.choice([-1.0, 1.0], 2).tolist()
+    along_m, heading, phase = rng.uniform(0.0, 6.0), rng.uniform(-math.pi, math.pi), rng.uniform(-math.pi, math.pi)
+    turning = turn * (15.0 + 25.0 * np.sin(2.0 * math.pi / 17.0 * middle_s + phase))
+    rate = np.radians(turning) * np.minimum(1.0, middle_s / 3.0)
+    per_control = round(_CONTROL_S / POLL_S)
+    firings = _firings(way, along_m, heading, POLL_S * np.add.reduceat(rate, np.arange(0, n_polls, per_control)))
+    acceleration = np.repeat(firings, per_control, axis=0)[:n_polls]
+    point = _on_perimeter(along_m)[0]
+    start = PlanarState(np.array([point.real, point.imag]), np.zeros(2), heading)
+    return ImuRecord(0.0, time_s, acceleration, rate), start
+
+
+def _firings(way: float, along_m: float, heading: float, turns: FloatArray) -> FloatArray:
+    """Accelerations along body x and y in every step of the controller, in which the satellite turns by ``turns``.
+
+    Table axes are complex numbers. The controller knows where it is, but for rates that change within its step.
+    """
+    position, velocity = _on_perimeter(along_m)[0], 0j
+    firings = np.zeros((len(turns), 2))
+    for step, turn in enumerate(turns.tolist()):
+        target, direction = _on_perimeter(along_m + way * SPEED_M_S * _CONTROL_S * step)
+        wanted = _SPRING_S2 * (target - position) + _DAMPER_S * (way * SPEED_M_S * direction - velocity)
+        in_body = wanted * cmath.rect(1.0, -heading)
+        fired = [
+            math.copysign(THRUST_M_S2, part) if abs(part) > _DEADBAND_M_S2 else 0.0
+            for part in (in_body.real, in_body.imag)
+        ]
+        firings[step] = fired
+        shrunk = math.sin(0.5 * turn) / (0.5 * turn) if turn else 1.0  # the mean of a vector that turns
+        gained = complex(*fired) * cmath.rect(shrunk * _CONTROL_S, heading + 0.5 * turn)
+        position += (velocity + 0.5 * gained) * _CONTROL_S
+        velocity += gained
+        heading += turn
+    return firings
+
+
+def _on_perimeter(along_m: float) -> tuple[complex, complex]:
+    """Point of the rounded rectangle after a length, and the direction of the path there, as complex numbers."""
+    arc = 0.5 * math.pi * _CORNER_M
+    rest = along_m % (2.0 * sum(_STRAIGHT_M) + 4.0 * arc)
+    position = complex(-0.5 * _STRAIGHT_M[0], -0.5 * _STRAIGHT_M[1] - _CORNER_M)
+    direction = 1.0 + 0j
+    for straight in (*_STRAIGHT_M, *_STRAIGHT_M):
+        if rest <= straight:
+            return position + rest * direction, direction
+        rest -= straight
+        position += straight * direction
+        if rest <= arc:
+            turned_to = direction * cmath.rect(1.0, rest / _CORNER_M)
+            return position + _CORNER_M * 1j * (direction - turned_to), turned_to
+        rest -= arc
+        position += _CORNER_M * (1.0 + 1j) * direction
+        direction *= 1j
+    return position, direction
+
+
+def two_firings_drive(n_polls: int, rng: np.random.Generator) -> tuple[ImuRecord, PlanarState]:
+    """True readings of every poll of the run with two firings, and its start; nothing of it is random.
+
+    Parameters
+    ----------
+    n_polls : int
+    rng : numpy.random.Generator
+        Not used.
+
+    Returns
+    -------
+    ImuRecord, PlanarState
+    """
+    time_s = POLL_S * np.arange(1.0, n_polls + 1.0)
+    middle_s = time_s - 0.5 * POLL_S
+    knots_s = [2.0, 2.6, 4.5, 5.2, 9.0, 9.5, 11.8, 12.2]
+    rate = np.radians(np.interp(middle_s, knots_s, [0.0, 105.0, 105.0, -12.0, -12.0, 60.0, 60.0, 5.0]))
+    acceleration = np.zeros((n_polls, 2))
+    for begin_s, end_s, x, y in ((2.0, 4.5, -1, 1), (5.2, 9.0, 0, -1), (9.5, 11.5, -1, 1), (12.2, 14.5, 1, 1)):
+        acceleration[(middle_s > begin_s) & (middle_s < end_s)] = THRUST_M_S2 * np.array([x, y])
+    start = PlanarState(np.array([-0.1, 0.0]), np.array([0.1, 0.0]), 0.3)
+    return ImuRecord(0.0, time_s, acceleration, rate), start
