@@ -17,6 +17,7 @@ from magloc.exact import ExactLocator
 from magloc.fix import Fix, Knowledge, Solution
 from magloc.locate import Locator
 from magloc.motion import N_SOURCE
+from magloc.rivals import weights
 from magloc.stacked import stacked_fix
 from magloc.track_rows import Row
 
@@ -53,13 +54,16 @@ class Start:
     Attributes
     ----------
     solution : Solution
-        In the world frame.
+        In the world frame; its weight is that among all solutions and, where there is one, after the prediction.
     rows : sequence of Row
         The readings that it was found from, in the order of time.
+    rivals : tuple of Solution
+        The other solutions that explain these readings.
     """
 
     solution: Solution
     rows: Sequence[Row]
+    rivals: tuple[Solution, ...] = ()
 
 
 class Acquisition:
@@ -72,11 +76,17 @@ class Acquisition:
         Bounds for the fix of one row, in the array's frame.
     speed_m_s : float
         Characteristic speed of the source.
+
+    Attributes
+    ----------
+    of_last_row : Fix
+        What the last row says on its own, in the world frame.
     """
 
     def __init__(self, array: SensorArray, knowledge: Knowledge, speed_m_s: float) -> None:
         self.array = array
         self.speed_m_s = speed_m_s
+        self.of_last_row = Fix(())
         self._locator: Locator | ExactLocator | None = None
         if decorrelated_differences(array).n_differences >= N_SOURCE:
             scalar = bool(array.channel_is_scalar.any())
@@ -88,7 +98,7 @@ class Acquisition:
         self._recent: deque[Row] = deque(maxlen=_WINDOW_ROWS)
         self._n_rows = 0
         self._proposed: Solution | None = None
-        self._of_last_row: Solution | None = None
+        self._confirmable: Solution | None = None
 
     def start(self, row: Row, near: tuple[FloatArray, FloatArray] | None = None) -> tuple[Start | None, str]:
         """A start with one more row, or why there is none.
@@ -106,18 +116,21 @@ class Acquisition:
             Why there is none.
         """
         reason, fix = "not acquired: one row does not determine the source", Fix(())
+        self.of_last_row = fix
         if self._locator is not None:
             ambient = None if row.ambient_T is None else row.ambient_T[None]
             (fix,) = self._locator.fit_rows(row.readings_T[None], ambient)
             centroid = row.origin_m + row.R_world_from_array @ self.array.centroid
-            last, self._of_last_row = self._of_last_row, None
+            last, self._confirmable = self._confirmable, None
             limit = START_RANGE_ERROR if last is None else CONFIRMED_RANGE_ERROR
-            solution, reason = _certain_solution(_in_world(fix, row), centroid, near, limit)
+            self.of_last_row = _in_world(fix, row)
+            found = self.of_last_row if near is None else _after(self.of_last_row, *near)
+            solution, reason = _certain_solution(found, centroid, limit, alone=near is None)
             if solution is not None:
                 if _agree(last, solution) or _range_error(solution, centroid) < _BEYOND_DOUBT or near is not None:
-                    return Start(solution, [row]), ""
+                    return Start(solution, [row], found.solutions[1:]), ""
                 if _range_error(solution, centroid) < START_RANGE_ERROR:
-                    self._of_last_row = solution
+                    self._confirmable = solution
                 reason = "not acquired: the next row is to confirm the source"
         start = self._start_from_recent(row, fix)
         return start, reason if start is None else ""
@@ -152,10 +165,10 @@ class Acquisition:
             np.stack(known) if len(known) == len(chosen) else None,
         )
         centroid = row.origin_m + row.R_world_from_array @ self.array.centroid
-        before, self._proposed = self._proposed, _certain_solution(fix, centroid, None, START_RANGE_ERROR)[0]
+        before, self._proposed = self._proposed, _certain_solution(fix, centroid, START_RANGE_ERROR)[0]
         if self._proposed is None or not _agree(before, self._proposed):
             return None
-        return Start(self._proposed, chosen[::-1])
+        return Start(self._proposed, chosen[::-1], fix.solutions[1:])
 
 
 def _in_world(fix: Fix, row: Row) -> Fix:
@@ -173,27 +186,33 @@ def _in_world(fix: Fix, row: Row) -> Fix:
     return replace(fix, solutions=tuple(solutions))
 
 
+def _after(fix: Fix, x: FloatArray, S: FloatArray) -> Fix:
+    """A fix after a prediction, state and square root of its covariance: ranked and weighted by both."""
+    if not fix.solutions:
+        return fix
+    inverse = np.linalg.pinv(S[:3] @ S[:3].T)
+    offsets = [solution.position_m - x[:3] for solution in fix.solutions]
+    cost = np.array([s.chi2 + float(o @ inverse @ o) for s, o in zip(fix.solutions, offsets, strict=True)])
+    # What is known beforehand is the prediction here, not that nothing is known of the scale.
+    weight = weights(cost, np.zeros(len(cost))).tolist()
+    order = np.argsort(cost, kind="stable").tolist()
+    return replace(fix, solutions=tuple(replace(fix.solutions[i], weight=weight[i]) for i in order))
+
+
 def _certain_solution(
-    fix: Fix, centroid: FloatArray, near: tuple[FloatArray, FloatArray] | None, largest_range_error: float
+    fix: Fix, centroid: FloatArray, largest_range_error: float, *, alone: bool = True
 ) -> tuple[Solution | None, str]:
-    """The solution that a track starts from, the nearest one to a prediction, or why there is none."""
+    """The first solution, that a track starts from, or why it does not; `alone`: no other one may fit alike."""
     if not fix.solutions:
         return None, f"not acquired: {fix.reason}"
-    solutions = fix.solutions
-    if near is not None:
-        x, S = near
-        inverse = np.linalg.pinv(S[:3] @ S[:3].T)
-        offsets = [solution.position_m - x[:3] for solution in solutions]
-        cost = [s.chi2 + float(o @ inverse @ o) for s, o in zip(solutions, offsets, strict=True)]
-        solutions = tuple(solutions[i] for i in np.argsort(cost, kind="stable"))
-    best = solutions[0]
+    best = fix.solutions[0]
     if best.dof > 0 and best.chi2 > chdtri(best.dof, _CONTRADICTION):
         return None, "not acquired: no dipole fits the readings"
     if not best.range_observable:
         return None, "not acquired: the range is not observable"
     if _range_error(best, centroid) > largest_range_error:
         return None, "not acquired: the range is not certain enough"
-    if near is None and any(solution.chi2 < best.chi2 + _RIVAL_WITHIN for solution in solutions[1:]):
+    if alone and any(solution.chi2 < best.chi2 + _RIVAL_WITHIN for solution in fix.solutions[1:]):
         return None, "not acquired: several solutions fit alike"
     return best, ""
 

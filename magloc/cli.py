@@ -12,7 +12,9 @@ from collections.abc import Sequence
 from cyclopts import App, Parameter
 
 from magloc import command_line
+from magloc.commands.bounds import bounds
 from magloc.commands.calibrate import calibrate
+from magloc.commands.design import design
 from magloc.commands.locate import locate
 from magloc.commands.map import map_
 from magloc.commands.simulate import simulate
@@ -29,6 +31,8 @@ app.command(calibrate)
 app.command(locate)
 app.command(map_, name="map")
 app.command(track)
+app.command(bounds)
+app.command(design)
 app.command(simulate)
 app.command(view)
 

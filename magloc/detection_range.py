@@ -1,4 +1,4 @@
-"""How far an array detects a source of a given moment, in every direction and for every direction of the moment."""
+"""How far an array detects a source, in every direction and for every moment that it may have."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from arrays.sensor import SensorArray
 from magloc.detection import Detector, DipoleFilter
-from magloc.separable import fibonacci_directions
 
 FloatArray = NDArray[np.float64]
 
@@ -22,11 +21,10 @@ _FARTHEST_M = 1e6
 def detection_range(
     array: SensorArray,
     directions: ArrayLike,
-    moment_Am2: float,
+    moments_Am2: ArrayLike,
     detector: Detector,
     *,
     probability: float = 0.9,
-    n_moments: int = 200,
 ) -> FloatArray:
     """Largest distance at which a source is detected with a probability, along given directions.
 
@@ -35,22 +33,20 @@ def detection_range(
     array : SensorArray
     directions : array_like, shape (d, 3)
         From the sensors' centroid, array frame, of any length.
-    moment_Am2 : float
-        Modulus of the moment [A·m²].
+    moments_Am2 : array_like, shape (n, 3)
+        Moments that the source may have [A·m²]: a size times :func:`magloc.bounds.moment_directions`, say.
     detector : Detector
         With its false-alarm rate: :class:`magloc.detection.ChiSquareDetector` or
         :class:`magloc.matched_filter.MatchedFilterDetector`.
     probability : float
         Of detection.
-    n_moments : int
-        Directions of the moment, evenly spread.
 
     Returns
     -------
-    ndarray, shape (d, n_moments)
-        Distance from the sensors' centroid [m], for every direction of the moment; its quantiles over the last axis are
-        what to expect of a moment of unknown direction. Zero where the source is not even detected beside the array, at
-        1.1 circumradii from the centroid.
+    ndarray, shape (d, n)
+        Distance from the sensors' centroid [m], for every moment; its quantiles over the last axis are what to expect
+        of a moment of unknown direction. Zero where the source is not even detected beside the array, at 1.1
+        circumradii from the centroid.
 
     Raises
     ------
@@ -61,17 +57,17 @@ def detection_range(
     lengths = np.linalg.norm(towards, axis=-1, keepdims=True)
     if towards.ndim != 2 or towards.shape[1] != 3 or not np.all(lengths > 0.0):
         raise ValueError(f"Input directions must be vectors of shape (d, 3) with a length; instead: {towards.shape}.")
-    if not 0.0 < moment_Am2 < np.inf:
-        raise ValueError(f"Input moment_Am2 must be a positive finite number; instead received {moment_Am2}.")
-    required = detector.required_energy(probability) / moment_Am2**2
+    moments = np.asarray(moments_Am2, dtype=np.float64)
+    if moments.ndim != 2 or moments.shape[1] != 3 or not np.isfinite(moments).all():
+        raise ValueError(f"Input moments_Am2 must be finite vectors of shape (n, 3); instead received {moments.shape}.")
+    required = detector.required_energy(probability)
     matched = DipoleFilter(array)
-    moments = fibonacci_directions(n_moments)
     parts = np.array_split(towards / lengths, -(-len(towards) // _DIRECTIONS_AT_ONCE))
     return np.concatenate([_ranges(matched, part, moments, required) for part in parts])
 
 
 def _ranges(matched: DipoleFilter, directions: FloatArray, moments: FloatArray, required: float) -> FloatArray:
-    """Largest distances (d, n) at which moments (n, 3) of 1 A·m² have the required energy."""
+    """Largest distances (d, n) at which moments (n, 3) have the required energy."""
     nearest = _NEAREST * matched.array.circumradius
     farthest = 2.0 * nearest
     while farthest < _FARTHEST_M and _log_energies(matched, directions, moments, farthest).max() > np.log(required):
@@ -90,7 +86,7 @@ def _ranges(matched: DipoleFilter, directions: FloatArray, moments: FloatArray, 
 
 
 def _log_energies(matched: DipoleFilter, directions: FloatArray, moments: FloatArray, distance: float) -> FloatArray:
-    """Logarithm of the energy of unit moments (n, 3) at one distance along directions (d, 3): (d, n)."""
+    """Logarithm of the energy of moments (n, 3) at one distance along directions (d, 3): (d, n)."""
     signals = matched.unit_signals(matched.array.centroid + distance * directions)
     normal = np.swapaxes(signals, -1, -2) @ signals
     energies = np.einsum("nj,djk,nk->dn", moments, normal, moments, optimize=True)

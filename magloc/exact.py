@@ -67,7 +67,9 @@ def _of_one(fix: JointFix) -> Fix:
             converged=solution.converged,
             range_observable=solution.sources[0].range_observable,
             range_interval95_m=solution.sources[0].range_interval95_m,
+            weight=solution.weight,
+            gaussian=solution.sources[0].gaussian,
         )
         for solution in fix.solutions
     )
-    return Fix(solutions, "" if solutions else fix.reason)
+    return Fix(solutions, "" if solutions else fix.reason, detected=fix.detected)

@@ -29,8 +29,8 @@ class Solution:
     moment_Am2 : ndarray, shape (3,)
         Its moment [A·m²].
     covariance : ndarray, shape (6, 6)
-        Of (position, moment), the inverse information at the solution. Where the range is not observable it is no
-        description of the uncertainty: use `range_interval95_m`.
+        Of (position, moment): the inverse information at the solution. Where the range is not observable it is widened
+        along the range until it is as long as `range_interval95_m` (:func:`magloc.rivals.widened`).
     chi2 : float
         Sum of squared residuals of the decorrelated differences over their variances.
     dof : int
@@ -40,10 +40,17 @@ class Solution:
     converged : bool
         Whether the iteration ended at an optimum; no other solutions are listed.
     range_observable : bool
-        Whether the 95 % interval of the range is closed and its ends differ by a factor of two at most.
+        Whether a source is detected, the 95 % set of ranges is closed, and its ends differ by a factor of two at most.
     range_interval95_m : tuple of (low, high)
-        Where the profile χ² over the distance from the sensors' centroid stays within 3.84 of this optimum [m];
-        high is None where it never leaves it.
+        The 95 % set of the distance from the sensors' centroid [m], all solutions together: it is a property of the
+        readings, and the same for all their solutions (:mod:`magloc.range_set`). In ascending order; high is None where
+        it is open.
+    weight : float
+        How likely the solution is among those of the fix; they add up to one (:func:`magloc.rivals.weights`).
+    gaussian : bool
+        Whether the covariance describes the uncertainty: the range is observable in one interval, no other solution has
+        a weight to speak of, and the standard deviations of position and moment are so small against the range and the
+        moment that errors are Gaussian (:data:`magloc.rivals.LARGEST_GAUSSIAN_SIGMA`).
     """
 
     position_m: FloatArray
@@ -55,6 +62,8 @@ class Solution:
     converged: bool
     range_observable: bool
     range_interval95_m: tuple[tuple[float, float | None], ...]
+    weight: float = 1.0
+    gaussian: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,12 +80,16 @@ class Fix:
         Starts of the search that ended without an optimum.
     dropped : tuple of str
         Ids of sensors that contradict all others, and were left out.
+    detected : bool
+        Whether the readings stand out of noise, which alone makes them do so in one of a thousand rows. Where they do
+        not, or cannot be tested, the solutions are fits of noise and nothing is known of the range.
     """
 
     solutions: tuple[Solution, ...]
     reason: str = ""
     failed_starts: int = 0
     dropped: tuple[str, ...] = ()
+    detected: bool = True
 
 
 @dataclass(frozen=True)
@@ -129,6 +142,9 @@ class Source:
         Of its position and moment, all other sources being unknown too.
     range_observable : bool
     range_interval95_m : tuple of (low, high)
+        As in :class:`Solution` for a single source. Of several sources each has its own: where the profile χ² over its
+        range, all else fitted anew, stays within 3.84 of this solution.
+    gaussian : bool
         As in :class:`Solution`.
     merged : bool
         Whether it stands for two sources that the array does not tell apart.
@@ -140,6 +156,7 @@ class Source:
     range_observable: bool
     range_interval95_m: tuple[tuple[float, float | None], ...]
     merged: bool = False
+    gaussian: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +168,7 @@ class JointSolution:
     sources : tuple of Source
     covariance : ndarray, shape (6 K, 6 K)
         Of (position, moment) of the first source, then of the second, and so on.
-    chi2, dof, iterations, converged
+    chi2, dof, iterations, converged, weight
         As in :class:`Solution`.
     """
 
@@ -161,6 +178,7 @@ class JointSolution:
     dof: int
     iterations: int
     converged: bool = True
+    weight: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,11 +193,14 @@ class JointFix:
         Why there is no solution, or why it has fewer sources than were asked for; empty otherwise.
     dropped : tuple of str
         Ids of sensors that contradict all others, and were left out.
+    detected : bool
+        As in :class:`Fix`.
     """
 
     solutions: tuple[JointSolution, ...]
     reason: str = ""
     dropped: tuple[str, ...] = ()
+    detected: bool = True
 
 
 NOTHING_KNOWN = Knowledge()

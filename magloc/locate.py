@@ -18,9 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from arrays.differences import Whitening, reading_covariance, whitening, whitenings
 from arrays.sensor import SensorArray
 from magloc.dipole import MU0_OVER_4PI
-from magloc.fix import DISTINCT_WITHIN, NOTHING_KNOWN, RISE_95, SILENT, Fix, Knowledge, Solution, open_ended
+from magloc.fix import DISTINCT_WITHIN, NOTHING_KNOWN, SILENT, Fix, Knowledge, Solution
 from magloc.kernels import over_rows
 from magloc.kernels import separable as kernels
+from magloc.range_set import is_detected
+from magloc.rivals import Rivals
 from magloc.rows import NO_SIGNAL, ambient_fields, checked_rows, rows_of_equal_mask
 from magloc.separable import SeparableProblem, candidate_positions
 
@@ -168,7 +170,7 @@ class Locator:
                 block = rows[start : start + _ROWS_AT_ONCE]
                 if k < N_UNKNOWNS:
                     reason = f"{int(mask.sum())} readings give {k} independent differences, {N_UNKNOWNS} are needed"
-                    found = [Fix((), reason)] * block.size
+                    found = [Fix((), reason, detected=False)] * block.size
                 else:
                     found = self._fit_block(kernel, mask, readings[block], without_source[block])
                 for row, fix in zip(block, found, strict=True):
@@ -338,40 +340,45 @@ class Locator:
         if self.knowledge != NOTHING_KNOWN:
             found = self._known(kernel, found)
         q, mu, chi2, counts = found.q, found.mu, found.chi2, found.counts
-        covariance, ends = np.full((*chi2.shape, 6, 6), np.nan), np.full((*chi2.shape, 2), np.nan)
-        over_rows(kernels.uncertainty_rows, n_rows, y, RISE_95, *found.model, q, mu, chi2, counts, covariance, ends)
         kept, failed, _ = counts.T
+        n_differences = kernel.whitening.n_differences
+        energy = np.einsum("ic,ic->i", y, y)
+        scaled, alpha = np.full((*chi2.shape, 6, 6), np.nan), np.full((*chi2.shape, 2), np.nan)
+        over_rows(kernels.covariance_rows, n_rows, *found.model, q, mu, counts, scaled)
         position, moment = problem.position(q), problem.moment(q, mu)
         unit = np.repeat([problem.radius, problem.radius**3 / MU0_OVER_4PI], 3)
-        covariance = covariance * np.outer(unit, unit)
-        ends = ends * problem.radius
-        dof = kernel.whitening.n_differences - N_UNKNOWNS
-        determined = np.isfinite(covariance).all(axis=(-2, -1))
-        silent = np.einsum("ic,ic->i", y, y) < SILENT * kernel.whitening.n_differences
-        observable = (ends[..., 0] > 0.0) & (ends[..., 1] <= 2.0 * ends[..., 0])
-        chi2_, iterations_, observable_ = chi2.tolist(), found.iterations.tolist(), observable.tolist()
-        ends_ = ends.tolist()
+        covariance = scaled * np.outer(unit, unit)
+        rivals = Rivals.of(chi2, covariance, position - problem.centroid, moment, energy, n_differences)
+        over_rows(kernels.profile_rows, n_rows, y, rivals.rise, *found.model, q, chi2, counts, scaled, alpha)
+        ranges = rivals.ranges(alpha, problem.radius)
+        determined, silent = np.isfinite(rivals.chi2), energy < SILENT * n_differences
+        chi2_, iterations_, dof = chi2.tolist(), found.iterations.tolist(), n_differences - N_UNKNOWNS
+        weight_, gaussian_, observable_ = rivals.weight.tolist(), ranges.gaussian.tolist(), ranges.observable.tolist()
+        detected_ = is_detected(energy, n_differences).tolist()
         fixes = []
         for i, n in enumerate(kept.tolist()):
             if silent[i]:
-                fixes.append(Fix((), NO_SIGNAL))
+                fixes.append(Fix((), NO_SIGNAL, detected=False))
                 continue
             solutions = tuple(
                 Solution(
                     position_m=position[i, j],
                     moment_Am2=moment[i, j],
-                    covariance=covariance[i, j],
+                    covariance=ranges.covariance[i, j],
                     chi2=chi2_[i][j],
                     dof=dof,
                     iterations=iterations_[i][j],
                     converged=True,
-                    range_observable=observable_[i][j],
-                    range_interval95_m=(open_ended(*ends_[i][j]),),
+                    range_observable=observable_[i],
+                    range_interval95_m=ranges.sets[i],
+                    weight=weight_[i][j],
+                    gaussian=gaussian_[i][j],
                 )
                 for j in range(n)
                 if determined[i, j]
             )
-            fixes.append(Fix(solutions, "" if solutions else _why_unsolved(int(unknown[i]), n), int(failed[i])))
+            reason = "" if solutions else _why_unsolved(int(unknown[i]), n)
+            fixes.append(Fix(solutions, reason, int(failed[i]), detected=detected_[i]))
         return fixes
 
 

@@ -159,6 +159,7 @@ class _CompiledSteps:
         roots, predicted = self.S[begin:end], self.predicted_S[begin:end]
         covariance = (roots @ roots.swapaxes(-1, -2))[:, :N_SOURCE, :N_SOURCE]
         learned = estimability(roots, predicted)[:, :N_SOURCE]
+        centroids = self.origins[begin:end] + self.rotations[begin:end] @ array.centroid
         return [
             TrackPoint(
                 times[i],
@@ -170,6 +171,9 @@ class _CompiledSteps:
                 float(self.nis[i]),
                 int(self.n_differences[i]),
                 _STATUS[int(self.status[i])],
+                weight=tracker.weight,
+                centroid_m=centroids[i - begin],
+                radius_m=array.circumradius,
             )
             for i in range(begin, end)
         ]

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from arrays.sensor import SensorArray
 from magloc.fix import DISTINCT_WITHIN, NOTHING_KNOWN, SILENT, Fix, Knowledge, Solution
 from magloc.joint import JointFits, JointProblem, fit_moments, refine_moments
+from magloc.range_set import is_detected
+from magloc.rivals import LARGEST_GAUSSIAN_SIGMA, log_volume, weights
 from magloc.rows import NO_SIGNAL, checked_rows, joint_problem, rows_of_equal_mask, whitenings_of
 from magloc.search import Beam
 from magloc.separable import fibonacci_directions
@@ -109,7 +111,7 @@ class MomentLocator:
         n_differences = whitenings[0].n_differences
         if n_differences < N_UNKNOWNS:
             reason = f"{int(mask.sum())} readings give {n_differences} independent differences, {N_UNKNOWNS} are needed"
-            return [Fix((), reason)] * len(readings)
+            return [Fix((), reason, detected=False)] * len(readings)
         problem, raw = joint_problem(self.array, mask, readings, whitenings, ambient)
         y = problem.whitened(raw)
         q = problem.homogeneous(positions)[:, None]
@@ -123,9 +125,19 @@ class MomentLocator:
             beam.q[of_row, of_fit], beam.mu[of_row, of_fit], chi2[of_row, of_fit], beam.iterations[of_row, of_fit]
         )
         covariance = _covariances(problem.rows(of_row), y[of_row], fits)
+        determined = np.isfinite(covariance).all(axis=(1, 2))
+        energy = np.sum((y - problem.predicted(np.zeros_like(problem.ambient))) ** 2, axis=1)
+        told, volume = np.full(chi2.shape, np.inf), np.zeros(chi2.shape)
+        told[of_row, of_fit] = np.where(determined, fits.chi2, np.inf)
+        volume[of_row, of_fit] = log_volume(covariance, moment[of_row, of_fit][:, None])
+        weight, detected = weights(told, volume), is_detected(energy, n_differences).tolist()
+        # The readings of vector sensors are linear in the moment, those of moduli only over a small part of it.
+        with np.errstate(invalid="ignore", divide="ignore"):
+            sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2)) / np.linalg.norm(moment[of_row, of_fit], axis=1)
+        gaussian = (sigma <= LARGEST_GAUSSIAN_SIGMA) | (not self.array.channel_is_scalar.any())
         distance = np.linalg.norm(positions - self.array.centroid, axis=-1)
         solutions: list[list[Solution]] = [[] for _ in readings]
-        for i in np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2))):
+        for i in np.flatnonzero(determined):
             row = int(of_row[i])
             solutions[row].append(
                 Solution(
@@ -138,11 +150,15 @@ class MomentLocator:
                     converged=True,
                     range_observable=True,
                     range_interval95_m=((float(distance[row]), float(distance[row])),),
+                    weight=float(weight[row, of_fit[i]]),
+                    gaussian=bool(gaussian[i]),
                 )
             )
         silent = np.sum(y * y, axis=1) < SILENT * n_differences
         return [
-            Fix((), NO_SIGNAL) if silent[i] else Fix(tuple(found), "" if found else _why_unsolved(beam, i))
+            Fix((), NO_SIGNAL, detected=False)
+            if silent[i]
+            else Fix(tuple(found), "" if found else _why_unsolved(beam, i), detected=detected[i])
             for i, found in enumerate(solutions)
         ]
 

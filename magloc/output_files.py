@@ -1,8 +1,9 @@
-"""Folders and CSV files that commands write, with errors that name the option."""
+"""Folders and files that commands write, whole or not at all, with errors that name the option."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,31 @@ def make_folder(folder: Path, option: str) -> None:
         raise InputError(f"{option} {folder}: found a file, expected a folder.") from None
     except OSError as error:
         raise InputError(f"{option} {folder} cannot be written ({error.strerror}).") from None
+
+
+def replace_file(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file beside its final place first, so that an interruption leaves the old one or the new one.
+
+    Parameters
+    ----------
+    path : Path
+        The final place.
+    write : callable
+        Writes the file to the path that it is given.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    unfinished = path.with_name(f".{path.name}.tmp")
+    try:
+        write(unfinished)
+        os.replace(unfinished, path)
+    except (OSError, RuntimeError) as error:  # netCDF's own errors are RuntimeErrors
+        raise InputError(f"{path} cannot be written ({getattr(error, 'strerror', None) or error}).") from None
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def write_columns(columns: Mapping[str, Column], path: Path) -> None:

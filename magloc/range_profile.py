@@ -1,6 +1,7 @@
-r"""How far the range of a source may be off: the profile of χ² over the range, all else fitted anew.
+r"""How far the range of a source may be off: the profile of χ² over the range, all else fitted anew, for any sensors.
 
-The range is followed as :math:`\alpha = \mathrm{atan2}(s, |u|)`: 0 at infinity, π/2 at the sensors' centroid.
+The range is followed as :math:`\alpha = \mathrm{atan2}(s, |u|)`: π/2 at the sensors' centroid, 0 at infinity, negative
+beyond it, on the other side.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from magloc.fix import RISE_95
 from magloc.joint import JointFits, JointProblem, refine
+from magloc.range_set import ranges_of, relative_range_sigma
 
 FloatArray = NDArray[np.float64]
 
@@ -19,10 +21,15 @@ _STEPS = np.array([0.6, 0.85, 1.0, 1.15, 1.5, 2.2, 4.0, 9.0, 25.0, 80.0])
 _ROUNDS = 3
 
 
-def range_intervals(
-    problem: JointProblem, y: FloatArray, fits: JointFits, source: int, sigma_over_range: FloatArray
+def profile_stretches(
+    problem: JointProblem,
+    y: FloatArray,
+    fits: JointFits,
+    source: int,
+    sigma_over_range: FloatArray,
+    rise: FloatArray,
 ) -> FloatArray:
-    """Ends of the 95 % interval of the range of one source, for b fits.
+    """Stretches of α of one source, of b fits, in which the profile of χ² stays within a rise.
 
     Parameters
     ----------
@@ -35,56 +42,67 @@ def range_intervals(
         Which source's range.
     sigma_over_range : ndarray, shape (b,)
         Relative standard deviation of the range as the covariance has it, for the first steps; NaN if unknown.
+    rise : ndarray, shape (b,)
+        Above each optimum, positive.
 
     Returns
     -------
     ndarray, shape (b, 2)
-        Where χ² has risen by 3.84 [radii]: 0 and infinity where it does not.
+        Least and largest α; -π/2 and π/2 where χ² does not rise so much.
     """
     n = len(y)
+    if not n:
+        return np.empty((0, 2))
     q = fits.q[:, source]
     alpha = np.arctan2(np.abs(q[:, 3]), np.linalg.norm(q[:, :3], axis=-1))
     sigma = np.abs(np.nan_to_num(sigma_over_range, nan=1.0)) * np.sin(alpha) * np.cos(alpha)
-    step = np.clip(np.sqrt(RISE_95) * sigma, 1e-7, 0.05)
-    # Both sides at once: inwards, where α grows, for all fits, then outwards.
+    step = np.clip(np.sqrt(rise) * sigma, 1e-7, 0.05)
+    # Both sides at once: outwards, where α falls, for all fits, then inwards.
     rows = np.tile(np.arange(n), 2)
-    sign = np.repeat([1.0, -1.0], n)
-    at_optimum = alpha[rows]
+    sign = np.repeat([-1.0, 1.0], n)
+    at_optimum, allowed = alpha[rows], rise[rows]
     # The last point of the grid is the bound itself.
     grid = at_optimum[:, None] + (sign * step[rows])[:, None] * np.append(_STEPS, np.inf)
-    grid = np.clip(grid, _SMALLEST_ALPHA, 0.5 * np.pi - _SMALLEST_ALPHA)
-    rise = _rises(problem, y, fits, source, rows, grid)
-    above = rise > RISE_95
+    grid = np.clip(grid, _SMALLEST_ALPHA - 0.5 * np.pi, 0.5 * np.pi - _SMALLEST_ALPHA)
+    grid = np.where(np.abs(grid) < _SMALLEST_ALPHA, _SMALLEST_ALPHA, grid)
+    risen = _rises(problem, y, fits, source, rows, grid)
+    above = risen > allowed[:, None]
     first, found, each = np.argmax(above, axis=1), above.any(axis=1), np.arange(2 * n)
     before = np.maximum(first - 1, 0)
-    outside, f_outside = grid[each, first], rise[each, first]
+    outside, f_outside = grid[each, first], risen[each, first]
     inside = np.where(first > 0, grid[each, before], at_optimum)
-    f_inside = np.where(first > 0, rise[each, before], 0.0)
+    f_inside = np.where(first > 0, risen[each, before], 0.0)
     for _ in range(_ROUNDS):
         # The profile is nearly a parabola: interpolate its square root.
         a, b = np.sqrt(np.clip(f_inside, 0.0, None)), np.sqrt(np.clip(f_outside, 0.0, 1e6))
         with np.errstate(divide="ignore", invalid="ignore"):
-            share = np.clip((np.sqrt(RISE_95) - a) / (b - a), 0.05, 0.95)
+            share = np.clip((np.sqrt(allowed) - a) / (b - a), 0.05, 0.95)
         middle = inside + np.nan_to_num(share, nan=0.5) * (outside - inside)
         f = _rises(problem, y, fits, source, rows, middle[:, None])[:, 0]
-        higher = f > RISE_95
+        higher = f > allowed
         outside, f_outside = np.where(higher, middle, outside), np.where(higher, f, f_outside)
         inside, f_inside = np.where(higher, inside, middle), np.where(higher, f_inside, f)
-    end = np.where(f_outside - RISE_95 < RISE_95 - f_inside, outside, inside)
-    ends: FloatArray = np.where(found, 1.0 / np.tan(end), np.repeat([0.0, np.inf], n)).reshape(2, n).T
-    return ends
+    end = np.where(f_outside - allowed < allowed - f_inside, outside, inside)
+    stretches: FloatArray = np.where(found, end, sign * 0.5 * np.pi).reshape(2, n).T
+    return stretches
 
 
-def range_intervals_m(
-    problem: JointProblem, y: FloatArray, fits: JointFits, source: int, covariance: FloatArray
+def ranges_within(
+    problem: JointProblem,
+    y: FloatArray,
+    fits: JointFits,
+    source: int,
+    covariance: FloatArray,
+    rise: FloatArray | None = None,
 ) -> FloatArray:
-    """:func:`range_intervals` in metres, (b, 2), with first steps from the covariances of the fits (b, 6 K, 6 K)."""
+    """Ends (b, 2) of the ranges [m] of one source in which χ² stays within a rise (b,) of each fit, 3.84 by default.
+
+    The first steps are taken from the covariances of the fits (b, 6 K, 6 K).
+    """
+    allowed = np.full(len(y), RISE_95) if rise is None else rise
     offset = problem.position(fits.q)[:, source] - problem.centroid
-    of_position = slice(6 * source, 6 * source + 3)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        variance = np.einsum("bi,bij,bj->b", offset, covariance[:, of_position, of_position], offset)
-        relative = np.sqrt(variance) / np.sum(offset * offset, axis=-1)
-    return problem.radius * range_intervals(problem, y, fits, source, relative)
+    sigma = relative_range_sigma(covariance[:, 6 * source :, 6 * source :], offset)
+    return ranges_of(profile_stretches(problem, y, fits, source, sigma, allowed), problem.radius)
 
 
 def _rises(

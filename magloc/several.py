@@ -20,6 +20,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import chdtri
 
 from arrays.sensor import SensorArray
+from magloc.fit_uncertainty import fit_uncertainty
 from magloc.fix import (
     DISTINCT_WITHIN,
     NOTHING_KNOWN,
@@ -28,11 +29,9 @@ from magloc.fix import (
     JointSolution,
     Knowledge,
     Source,
-    is_observable,
-    open_ended,
 )
 from magloc.joint import JointFits, JointProblem, covariances, refine
-from magloc.range_profile import range_intervals_m
+from magloc.range_set import is_detected, is_observable_set
 from magloc.rows import NO_SIGNAL, checked_rows, joint_problem, rows_of_equal_mask, whitenings_of
 from magloc.search import Beam, Search, best_distinct, merged
 from magloc.separable import candidate_positions
@@ -160,11 +159,11 @@ class SeveralLocator:
         fewest = N_UNKNOWNS * (self.n_sources or 1)
         if n_differences < fewest:
             reason = f"{int(mask.sum())} readings give {n_differences} independent differences, {fewest} are needed"
-            return [JointFix((), reason)] * len(readings)
+            return [JointFix((), reason, detected=False)] * len(readings)
         problem, raw = joint_problem(self.array, mask, readings, whitenings, ambient)
         y = problem.whitened(raw)
         loud = np.flatnonzero(np.sum(y * y, axis=1) >= SILENT * n_differences)
-        fixes = [JointFix((), NO_SIGNAL)] * len(readings)
+        fixes = [JointFix((), NO_SIGNAL, detected=False)] * len(readings)
         if not loud.size:
             return fixes
         found = _Levels(self, problem.rows(loud), y[loud], n_differences).fixes()
@@ -240,7 +239,9 @@ class _Levels:
             # Against the chosen number: a single source may have no fit where several ones stand out.
             chosen = np.array([beams[n].chi2[row, 0] for row, n in enumerate(level)])
             for row in np.flatnonzero(np.isfinite(chosen) & (nothing - chosen <= threshold)):
-                fixes[row] = JointFix((), "noise alone explains the readings: no source stands out of it")
+                fixes[row] = JointFix(
+                    (), "noise alone explains the readings: no source stands out of it", detected=False
+                )
         return fixes
 
     def _first(self, rows: IntArray) -> Beam:
@@ -355,28 +356,38 @@ class _Levels:
         problem, y = self.problem.rows(rows[of_row]), self.y[rows[of_row]]
         position, moment = problem.position(fits.q), problem.moment(fits.q, fits.mu)
         covariance = covariances(problem, fits)
-        determined = np.isfinite(covariance).all(axis=(1, 2))
-        ends = [range_intervals_m(problem, y, fits, k, covariance) for k in range(beam.n_sources)]
+        nothing = self.y[rows] - self.problem.rows(rows).predicted(np.zeros_like(self.problem.ambient[rows]))
+        energy = np.sum(nothing * nothing, axis=1)
+        told = fit_uncertainty(problem, y, fits, covariance, of_row, energy, self.n_differences)
         dof = self.n_differences - N_UNKNOWNS * beam.n_sources
         solutions: list[list[JointSolution]] = [[] for _ in rows]
-        for i in np.flatnonzero(determined):
+        for i in np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2))):
             sources = tuple(
                 Source(
                     position_m=position[i, k],
                     moment_Am2=moment[i, k],
-                    covariance=covariance[i, 6 * k : 6 * k + 6, 6 * k : 6 * k + 6],
-                    range_observable=is_observable(*ends[k][i]),
-                    range_interval95_m=(open_ended(float(ends[k][i, 0]), float(ends[k][i, 1])),),
+                    covariance=told.covariance[i, 6 * k : 6 * k + 6, 6 * k : 6 * k + 6],
+                    range_observable=is_observable_set(told.sets[i][k]),
+                    range_interval95_m=told.sets[i][k],
+                    gaussian=bool(told.gaussian[i, k]),
                 )
                 for k in range(beam.n_sources)
             )
             solutions[of_row[i]].append(
-                JointSolution(sources, covariance[i], float(fits.chi2[i]), dof, int(fits.iterations[i]))
+                JointSolution(
+                    sources,
+                    told.covariance[i],
+                    float(fits.chi2[i]),
+                    dof,
+                    int(fits.iterations[i]),
+                    weight=float(told.weight[i]),
+                )
             )
         any_fit = np.isfinite(beam.chi2[:, 0])
+        detected = is_detected(energy, self.n_differences).tolist()
         return [
-            JointFix(tuple(found), "" if found else _why_unsolved(bool(any_fit[i])))
-            for i, found in enumerate(solutions)
+            JointFix(tuple(found), "" if found else _why_unsolved(bool(any_fit[i])), detected=seen)
+            for i, (found, seen) in enumerate(zip(solutions, detected, strict=True))
         ]
 
 
@@ -432,7 +443,7 @@ def _marked_as_merged(
         return replace(fix, reason=reason)
     sources = tuple(replace(source, merged=k == nearest) for k, source in enumerate(best.sources))
     solutions = (replace(best, sources=sources), *fix.solutions[1:])
-    return JointFix(solutions, f"{reason}: two are closer than the array resolves")
+    return replace(fix, solutions=solutions, reason=f"{reason}: two are closer than the array resolves")
 
 
 def in_stable_order(fixes: Sequence[JointFix]) -> list[JointFix]:

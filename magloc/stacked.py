@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from arrays.sensor import SensorArray
-from magloc.fix import DISTINCT_WITHIN, NOTHING_KNOWN, Fix, Knowledge, Solution, is_observable, open_ended
+from magloc.fit_uncertainty import fit_uncertainty
+from magloc.fix import DISTINCT_WITHIN, NOTHING_KNOWN, Fix, Knowledge, Solution
 from magloc.joint import JointProblem, covariances
-from magloc.range_profile import range_intervals_m
+from magloc.range_set import is_detected, is_observable_set
 from magloc.rows import NO_SIGNAL, ambient_fields, whitenings_of
 from magloc.search import Search
 from magloc.separable import fibonacci_directions
@@ -57,9 +58,10 @@ def stacked_fix(
     """
     problem, y, n_differences = _problem(array, readings_T, origins_m, R_world_from_array, ambient_T)
     if n_differences < N_UNKNOWNS:
-        return Fix((), f"{len(readings_T)} rows give {n_differences} independent differences, {N_UNKNOWNS} are needed")
+        reason = f"{len(readings_T)} rows give {n_differences} independent differences, {N_UNKNOWNS} are needed"
+        return Fix((), reason, detected=False)
     if np.sum(y * y) < 1e-9 * n_differences:
-        return Fix((), NO_SIGNAL)
+        return Fix((), NO_SIGNAL, detected=False)
 
     def allowed(q: FloatArray, mu: FloatArray) -> NDArray[np.bool_]:
         with np.errstate(invalid="ignore"):
@@ -71,25 +73,30 @@ def stacked_fix(
     listed = np.flatnonzero(fits.chi2 <= fits.chi2[0] + DISTINCT_WITHIN)
     listed = listed[np.isfinite(fits.chi2[listed])]
     fits = fits.rows(listed)
-    same = problem.rows(np.zeros(len(listed), dtype=np.intp))
+    of_row = np.zeros(len(listed), dtype=np.intp)
+    same = problem.rows(of_row)
     covariance = covariances(same, fits)
     position, moment = problem.position(fits.q)[:, 0], problem.moment(fits.q, fits.mu)[:, 0]
-    ends = range_intervals_m(same, np.repeat(y, len(listed), axis=0), fits, 0, covariance)
+    energy = np.sum((y - problem.predicted(np.zeros_like(problem.ambient))) ** 2, axis=1)
+    told = fit_uncertainty(same, y[of_row], fits, covariance, of_row, energy, n_differences)
     solutions = tuple(
         Solution(
             position_m=position[i],
             moment_Am2=moment[i],
-            covariance=covariance[i],
+            covariance=told.covariance[i],
             chi2=float(fits.chi2[i]),
             dof=n_differences - N_UNKNOWNS,
             iterations=int(fits.iterations[i]),
             converged=True,
-            range_observable=is_observable(*ends[i]),
-            range_interval95_m=(open_ended(float(ends[i, 0]), float(ends[i, 1])),),
+            range_observable=is_observable_set(told.sets[i][0]),
+            range_interval95_m=told.sets[i][0],
+            weight=float(told.weight[i]),
+            gaussian=bool(told.gaussian[i, 0]),
         )
         for i in np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2)))
     )
-    return Fix(solutions, "" if solutions else "the rows together do not determine the source")
+    reason = "" if solutions else "the rows together do not determine the source"
+    return Fix(solutions, reason, detected=bool(is_detected(energy, n_differences)[0]))
 
 
 def _problem(

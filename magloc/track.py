@@ -22,7 +22,7 @@ from scipy.special import chdtri
 from arrays.differences import Differences, decorrelated_differences, reading_covariance
 from arrays.sensor import SensorArray
 from magloc.acquisition import CONFIRMED_RANGE_ERROR, STACKED_POSITION_ERROR, Acquisition
-from magloc.fix import NOTHING_KNOWN, Knowledge
+from magloc.fix import NOTHING_KNOWN, Knowledge, Solution
 from magloc.kalman import (
     block_update,
     estimability,
@@ -110,6 +110,7 @@ class Tracker:
         self._time_s = math.nan
         self._contradictions = 0
         self._n_rows = 0
+        self._weight = math.nan
 
     def advance(self, row: Row) -> TrackPoint:
         """What is known of the source after one more row.
@@ -184,6 +185,11 @@ class Tracker:
             yield self.advance(row)
             if progress is not None:
                 progress(1)
+
+    @property
+    def weight(self) -> float:
+        """How likely the present track is among those that could have been started."""
+        return self._weight
 
     @property
     def is_tracking(self) -> bool:
@@ -304,7 +310,7 @@ class Tracker:
     ) -> TrackPoint:
         if self._range_error(x, S, row) > LARGEST_RANGE_ERROR:
             self._x = None
-            return TrackPoint(row.time_s, nis=nis, nis_dof=nis_dof, status="lost: the range is no longer known")
+            return self._lost(row, "lost: the range is no longer known", nis=nis, nis_dof=nis_dof)
         self._x, self._S = x, S
         if self.keep_steps:
             self.steps.append(Step(index, prediction, x, S))
@@ -318,28 +324,52 @@ class Tracker:
             nis,
             nis_dof,
             status,
+            weight=self._weight,
+            centroid_m=self.centroid(row),
+            radius_m=self.array.circumradius,
+        )
+
+    def centroid(self, row: Row) -> FloatArray:
+        """Of the sensors in the world frame, shape (3,)."""
+        place: FloatArray = row.origin_m + row.R_world_from_array @ self.array.centroid
+        return place
+
+    def _lost(
+        self, row: Row, reason: str, rivals: tuple[Solution, ...] = (), nis: float = math.nan, nis_dof: int = 0
+    ) -> TrackPoint:
+        """What is known of a row without a track."""
+        return TrackPoint(
+            row.time_s,
+            nis=nis,
+            nis_dof=nis_dof,
+            status=reason,
+            rivals=rivals,
+            centroid_m=self.centroid(row),
+            radius_m=self.array.circumradius,
         )
 
     def _acquired(self, row: Row, index: int, near: tuple[FloatArray, FloatArray] | None = None) -> TrackPoint:
         """A new track, if one can be started."""
         start, reason = self._acquisition.start(row, near)
+        alone = self._acquisition.of_last_row.solutions
         if start is None:
-            return TrackPoint(row.time_s, status=reason)
+            return self._lost(row, reason, alone)
         solution = start.solution
         source = np.concatenate([solution.position_m, solution.moment_Am2])
         found = self.start(source, solution.covariance, start.rows)
         if found is None:
-            return TrackPoint(row.time_s, status="not acquired: no dipole fits the latest rows together")
+            return self._lost(row, "not acquired: no dipole fits the latest rows together", alone)
         x, S = found.x, found.S
         certain = self._range_error(x, S, row) <= CONFIRMED_RANGE_ERROR
         if len(start.rows) > 1:
-            offset = x[:3] - row.origin_m - row.R_world_from_array @ self.array.centroid
+            offset = x[:3] - self.centroid(row)
             certain = float(np.linalg.norm(S[:3])) <= STACKED_POSITION_ERROR * float(np.linalg.norm(offset))
         if not certain:
-            return TrackPoint(row.time_s, status="not acquired: the range is not certain enough")
+            return self._lost(row, "not acquired: the range is not certain enough", alone)
         self._acquisition.forget()
         self._x, self._S = x, S
         self._contradictions = 0
+        self._weight = solution.weight
         if self.keep_steps:
             self.steps.append(Step(index, None, self._x, self._S))
         return TrackPoint(
@@ -350,11 +380,15 @@ class Tracker:
             np.ones(N_SOURCE),
             solution.iterations,
             status="acquired",
+            weight=self._weight,
+            rivals=start.rivals,
+            centroid_m=self.centroid(row),
+            radius_m=self.array.circumradius,
         )
 
     def _range_error(self, x: FloatArray, S: FloatArray, row: Row) -> float:
         """Standard deviation of the range over the range."""
-        offset = x[:3] - row.origin_m - row.R_world_from_array @ self.array.centroid
+        offset = x[:3] - self.centroid(row)
         square = float(offset @ offset)
         along = offset @ S[:3]
         return math.sqrt(float(along @ along)) / square if square > 0.0 else math.inf

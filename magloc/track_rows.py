@@ -10,6 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from magloc.fix import Solution
+from magloc.range_set import EVERYWHERE, Intervals, gaussian_ranges, is_observable_set, union
+from magloc.rivals import LARGEST_GAUSSIAN_SIGMA, relative_sigma
+
 FloatArray = NDArray[np.float64]
 
 
@@ -54,6 +58,15 @@ class TrackPoint:
     status : str
         "tracked", "acquired" (a new track started here), "predicted" (no readings), "outlier" (readings that contradict
         the track, not used), or why there is no track.
+    weight : float
+        How likely the track is the right one of all solutions that explained the readings which it started from; rows
+        that it explains since then only make it more likely. NaN without a track.
+    rivals : tuple of Solution
+        Where a track starts, the other solutions of these readings; where there is none, all solutions of the row.
+    centroid_m : ndarray, shape (3,), optional
+        Of the sensors, where the range is counted from.
+    radius_m : float
+        Largest distance of a sensor from it.
     """
 
     time_s: float
@@ -65,6 +78,37 @@ class TrackPoint:
     nis: float = math.nan
     nis_dof: int = 0
     status: str = ""
+    weight: float = math.nan
+    rivals: tuple[Solution, ...] = ()
+    centroid_m: FloatArray | None = None
+    radius_m: float = math.nan
+
+    @property
+    def range_interval95_m(self) -> Intervals | None:
+        """95 % set of the distance from the sensors' centroid [m], None where the sensors are not known.
+
+        Of a track it is :func:`magloc.range_set.gaussian_ranges` of its covariance; without one it is that of the row
+        alone, or every range where the row says nothing.
+        """
+        if self.position_m is None or self.covariance is None:
+            return self.rivals[0].range_interval95_m if self.rivals else EVERYWHERE
+        if self.centroid_m is None:
+            return None
+        ends = gaussian_ranges(self.covariance, self.position_m - self.centroid_m, self.radius_m)
+        return union([ends.tolist()])
+
+    @property
+    def range_observable(self) -> bool:
+        """Whether that set is closed, and its ends differ by a factor of two at most."""
+        return is_observable_set(self.range_interval95_m or EVERYWHERE)
+
+    @property
+    def gaussian(self) -> bool:
+        """Whether the standard deviations are so small that the covariance describes the uncertainty."""
+        if self.position_m is None or self.moment_Am2 is None or self.covariance is None or self.centroid_m is None:
+            return False
+        sigma = relative_sigma(self.covariance, self.position_m - self.centroid_m, self.moment_Am2)
+        return bool(sigma <= LARGEST_GAUSSIAN_SIGMA)
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,11 +31,21 @@ _JSON_KEYS = (
     "converged",
     "range_observable",
     "range_interval95_m",
+    "gaussian",
+    "weight",
 )
 # Probability of χ² under noise.
 _MISFIT = 1e-6
-_SOURCE_KEYS = ("position_m", "moment_Am2", "covariance", "range_observable", "range_interval95_m", "merged")
-_JOINT_KEYS = ("covariance", "chi2", "dof", "iterations", "converged")
+_SOURCE_KEYS = (
+    "position_m",
+    "moment_Am2",
+    "covariance",
+    "range_observable",
+    "range_interval95_m",
+    "gaussian",
+    "merged",
+)
+_JOINT_KEYS = ("covariance", "chi2", "dof", "iterations", "converged", "weight")
 
 
 def in_world(fix: AnyFix, readings: Readings, row: int) -> AnyFix:
@@ -95,7 +105,7 @@ def json_entry(time_s: float, fix: AnyFix, saturated: tuple[str, ...], near: boo
             }
             for solution in fix.solutions
         ]
-    entry: dict[str, object] = {"time_s": time_s, "solutions": solutions}
+    entry: dict[str, object] = {"time_s": time_s, "detected": fix.detected, "solutions": solutions}
     if fix.reason:
         entry["reason"] = fix.reason
     if fix.dropped:
@@ -126,6 +136,12 @@ def warn_of(
         print_note(
             f"warning: in {misfits} of {len(fixes)} rows χ² is far beyond noise: the noise is understated, or the model"
             " does not hold, and the standard deviations say too little"
+        )
+    weak = sum(bool(fix.solutions) and not fix.detected for fix in fixes)
+    if weak:
+        print_note(
+            f"note: in {weak} of {len(fixes)} rows nothing stands out of the noise: their solutions are fits of noise,"
+            " and a source may be at any range"
         )
     lost = Counter(name for names in saturated for name in names)
     if lost:

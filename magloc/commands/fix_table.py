@@ -79,8 +79,8 @@ def _cells(fix: Fix | JointFix, source: Solution | Source, per_m: float, decimal
     deviations = np.sqrt(np.diagonal(source.covariance))
     of_position = deviations[:3] if deviations.size == 6 else np.zeros(3)
     flags = [
-        *([] if source.range_observable else ["range?"]),
-        *([f"+{others}"] if others else []),
+        *(_of_uncertainty(source) if fix.detected else ["weak"]),
+        *([f"+{others}({100.0 * best.weight:.0f}%)"] if others else []),
         *(["misfit"] if is_misfit(fix) else []),
         *(["merged"] if isinstance(source, Source) and source.merged else []),
         *(["near"] if too_near else []),
@@ -98,6 +98,13 @@ def _cells(fix: Fix | JointFix, source: Solution | Source, per_m: float, decimal
         _intervals(source.range_interval95_m, per_m),
         ",".join(flags),
     ]
+
+
+def _of_uncertainty(source: Solution | Source) -> list[str]:
+    """What has to be said of the standard deviations."""
+    if not source.range_observable:
+        return ["range?"]
+    return [] if source.gaussian else ["bent"]
 
 
 def _two_digits(value: float) -> str:

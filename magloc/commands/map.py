@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,6 +10,7 @@ from cyclopts.validators import Number
 
 from arrays.errors import InputError
 from magloc.commands.common import CommonOptions, Flag, print_json, print_note, progress, whole_number
+from magloc.output_files import make_folder, replace_file
 
 if TYPE_CHECKING:
     from magloc.cubes import CubeMap, MapSummary
@@ -75,7 +74,7 @@ def map_(
     name = cube.attributes["method"] if over == "starts" else over
     drawn = f"-seed{common.seed}" if noise or (over == "sources" and common.seed) else ""
     folder = Path(f"map-{Path(scenario).stem}-{name}-{cube.grid}{drawn}") if out is None else out
-    _make_folder(folder)
+    make_folder(folder, "--out")
     with Sweep(cube, folder / "map.zarr") as sweep:
         for sentence in sweep.unreadable:
             print_note(sentence)
@@ -156,8 +155,8 @@ def _export(folder: Path, counts: MapSummary, *, netcdf: bool) -> None:
         else:
             figure = convergence_figure(dataset, counts)
         if netcdf:
-            _replace(folder / "convergence.nc", lambda path: dataset.to_netcdf(path))
-    _replace(folder / "convergence.png", lambda path: save(figure, path))
+            replace_file(folder / "convergence.nc", lambda path: dataset.to_netcdf(path))
+    replace_file(folder / "convergence.png", lambda path: save(figure, path))
 
 
 def _how_done(before: int, counts: MapSummary, sweep: Sweep, folder: Path) -> str:
@@ -181,24 +180,3 @@ def _in_words(counts: MapSummary) -> str:
         f"front half {counts.front_fraction:.1%}, back half {counts.back_fraction:.1%}, "
         f"median {counts.median_iterations:.0f} passes"
     )
-
-
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        raise InputError(f"--out {folder}: found a file, expected a folder.") from None
-    except OSError as error:
-        raise InputError(f"--out {folder} cannot be written ({error.strerror}).") from None
-
-
-def _replace(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file beside its final place first, so that an interruption leaves the old one or the new one."""
-    unfinished = path.with_name(f".{path.name}.tmp")
-    try:
-        write(unfinished)
-        os.replace(unfinished, path)
-    except (OSError, RuntimeError) as error:  # netCDF's own errors are RuntimeErrors
-        raise InputError(f"{path} cannot be written ({getattr(error, 'strerror', None) or error}).") from None
-    finally:
-        unfinished.unlink(missing_ok=True)

@@ -20,12 +20,16 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
+_RIVAL_KEYS = ("position_m", "moment_Am2", "chi2", "dof", "weight")
 # Of the truth's usual interval: over a longer one it is not interpolated.
 _LONGEST_STEP = 2.0
 
 
 def json_entry(point: TrackPoint) -> dict[str, object]:
-    """What ``--json`` and ``--jsonl`` print of one row; null where the source is not tracked."""
+    """What ``--json`` and ``--jsonl`` print of one row; null where the source is not tracked.
+
+    What is said of the range is then that of the row alone, and its solutions are the rivals.
+    """
     tracked = point.position_m is not None
     return {
         "time_s": point.time_s,
@@ -37,6 +41,11 @@ def json_entry(point: TrackPoint) -> dict[str, object]:
         "nis": point.nis,
         "nis_dof": point.nis_dof,
         "status": point.status,
+        "range_observable": point.range_observable,
+        "range_interval95_m": point.range_interval95_m,
+        "gaussian": point.gaussian if tracked else None,
+        "weight": point.weight,
+        "rivals": [{key: getattr(rival, key) for key in _RIVAL_KEYS} for rival in point.rivals],
     }
 
 
@@ -56,7 +65,7 @@ def track_table(points: Sequence[TrackPoint]) -> list[str]:
                 *(f"{value:.2g}" for value in deviations),
                 f"{np.linalg.norm(point.moment_Am2):.4g}",
                 f"{point.nis:.1f}/{point.nis_dof}" if np.isfinite(point.nis) else "-",
-                point.status,
+                point.status if point.range_observable or point.centroid_m is None else f"{point.status}, range?",
             ]
         )
     widths = [max(len(row[i]) for row in rows) for i in range(len(header) - 1)]

@@ -33,6 +33,8 @@ CONVERGED, KNOWN, FAILED = 0, 1, 2
 OPTIMUM_TOLERANCE = 1e-9
 # The same for the profile over the range, which is read at a rise of 3.84 to 0.01.
 PROFILE_TOLERANCE = 1e-3
+# No step of the profile is longer, in α: it would leap over what is between.
+LARGEST_PROFILE_STEP = 0.2
 
 
 @compiled
@@ -436,7 +438,7 @@ def _scaled_covariance(
 
 
 @compiled
-def _range_end(
+def _profile_end(
     q: FloatArray,
     chi2: float,
     rise: float,
@@ -449,10 +451,10 @@ def _range_end(
     common: FloatArray,
     shrinkage: FloatArray,
 ) -> float:
-    """Range/radius where the profile χ² has risen by `rise`; inf outward or 0 inward where it never does.
+    """Angle α where the profile χ² has risen by `rise`; π/2 inward or -π/2 outward where it never does.
 
-    The angle α = atan2(s, |u|) is the coordinate: 0 at infinity, π/2 at the centroid. The direction is re-optimised at
-    every step, starting from the step before.
+    The angle α = atan2(s, |u|) is the coordinate: π/2 at the centroid, 0 at infinity, negative beyond it on the other
+    side. The direction is re-optimised at every step, starting from the step before.
     """
     mu = np.empty(3)
     norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
@@ -464,13 +466,16 @@ def _range_end(
     if q[3] < 0.0:
         for d in range(3):
             best[d] = -best[d]
-    bound = SMALLEST_S if outward else 0.5 * math.pi - SMALLEST_S
+    toward = -1.0 if outward else 1.0
+    bound = toward * (0.5 * math.pi - SMALLEST_S)
     inside, f_inside = alpha, -rise
     step = first_step
     outside, f_outside = alpha, 0.0
     found = False
     for _ in range(60):
-        outside = max(inside - step, bound) if outward else min(inside + step, bound)
+        outside = inside + toward * step
+        if toward * (outside - bound) > 0.0:
+            outside = bound
         f_outside = (
             _profile(best, trial, outside, y, sensors, channel_sensor, gain, common, shrinkage, mu) - chi2 - rise
         )
@@ -482,25 +487,25 @@ def _range_end(
         for d in range(3):
             best[d] = trial[d]
         inside, f_inside = outside, f_outside
-        step *= 1.7
+        step = min(1.7 * step, LARGEST_PROFILE_STEP)
     if not found:
-        return math.inf if outward else 0.0
+        return toward * 0.5 * math.pi
     for _ in range(40):
         # The profile is nearly a parabola in α: interpolate its square root, with bisection as a guard.
-        a, b = math.sqrt(f_inside + rise), math.sqrt(f_outside + rise)
+        a, b = math.sqrt(max(f_inside + rise, 0.0)), math.sqrt(f_outside + rise)
         t = (math.sqrt(rise) - a) / (b - a) if b > a else 0.5
         t = min(max(t, 0.05), 0.95)
         middle = inside + t * (outside - inside)
         f = _profile(best, trial, middle, y, sensors, channel_sensor, gain, common, shrinkage, mu) - chi2 - rise
+        if abs(f) < 0.01 or abs(outside - inside) < 1e-4 * min(abs(inside), abs(outside)):
+            return middle
         if f > 0.0:
             outside, f_outside = middle, f
         else:
             inside, f_inside = middle, max(f, -rise)
             for d in range(3):
                 best[d] = trial[d]
-        if abs(f) < 0.01 or abs(outside - inside) < 1e-4 * min(inside, outside):
-            return 1.0 / math.tan(middle)
-    return 1.0 / math.tan(inside)
+    return inside
 
 
 @compiled
@@ -516,7 +521,9 @@ def _profile(
     shrinkage: FloatArray,
     mu: FloatArray,
 ) -> float:
-    """Smallest χ² at one range, searched from a direction; trial becomes the best direction (unit u)."""
+    """Smallest χ² at one α, searched from a direction; trial becomes the best direction (unit u)."""
+    if abs(alpha) < SMALLEST_S:
+        alpha = math.copysign(SMALLEST_S, alpha)
     q = np.empty(4)
     for d in range(3):
         q[d] = direction[d] * math.cos(alpha)
@@ -711,11 +718,9 @@ def search_rows(
 
 
 @compiled
-def uncertainty_rows(
+def covariance_rows(
     begin: int,
     end: int,
-    y: FloatArray,
-    rise: float,
     sensors: FloatArray,
     channel_sensor: NDArray[np.intp],
     gain: FloatArray,
@@ -724,25 +729,56 @@ def uncertainty_rows(
     set_of_row: NDArray[np.intp],
     q: FloatArray,
     mu: FloatArray,
-    chi2: FloatArray,
     counts: NDArray[np.int64],
     out_covariance: FloatArray,
-    out_range: FloatArray,
 ) -> None:
-    """Scaled covariance and range interval [radii] of the optima of :func:`search_rows`, rows begin to end.
+    """Scaled covariances of the optima of :func:`search_rows`, rows begin to end, into (rows, starts, 6, 6).
 
-    Into the outputs (rows, starts, …), which are left as they are where the information is singular.
+    They are left as they are where the information is singular.
     """
     for row in range(begin, end):
         w = set_of_row[row]
         for j in range(counts[row, 0]):
-            first_step = 0.05
-            if _scaled_covariance(
+            _scaled_covariance(
                 q[row, j], mu[row, j], sensors, channel_sensor, gain[w], common[w], shrinkage[w], out_covariance[row, j]
-            ):
-                first_step = _gaussian_step(q[row, j], out_covariance[row, j], rise)
+            )
+
+
+@compiled
+def profile_rows(
+    begin: int,
+    end: int,
+    y: FloatArray,
+    rise: FloatArray,
+    sensors: FloatArray,
+    channel_sensor: NDArray[np.intp],
+    gain: FloatArray,
+    common: FloatArray,
+    shrinkage: FloatArray,
+    set_of_row: NDArray[np.intp],
+    q: FloatArray,
+    chi2: FloatArray,
+    counts: NDArray[np.int64],
+    covariance: FloatArray,
+    out_alpha: FloatArray,
+) -> None:
+    """Ends of the profiles of the optima of :func:`search_rows`, rows begin to end, into (rows, starts, 2).
+
+    rise (rows,) is how far they may rise above the χ² of a row's first optimum. The least and the largest α of every
+    optimum are left as they are where its own χ² is higher than that, or where rise is infinite: then nothing bounds
+    the range. The scaled covariances serve for the first steps.
+    """
+    for row in range(begin, end):
+        w = set_of_row[row]
+        for j in range(counts[row, 0]):
+            left = rise[row] - (chi2[row, j] - chi2[row, 0])
+            if not (left > 0.0 and math.isfinite(left)):
+                continue
+            first_step = _gaussian_step(q[row, j], covariance[row, j], left)
+            if not math.isfinite(first_step):
+                first_step = 0.05
             for side in range(2):
-                out_range[row, j, side] = _range_end(
-                    q[row, j], chi2[row, j], rise, side == 1, first_step, y[row],
+                out_alpha[row, j, side] = _profile_end(
+                    q[row, j], chi2[row, j], left, side == 0, first_step, y[row],
                     sensors, channel_sensor, gain[w], common[w], shrinkage[w],
                 )  # fmt: skip

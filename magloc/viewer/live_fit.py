@@ -15,6 +15,7 @@ from magloc.exact import ExactLocator
 from magloc.fix import RISE_95, Fix, Solution, is_observable, open_ended
 from magloc.locate import N_UNKNOWNS, Locator
 from magloc.measurement import DifferenceMeasurement, predicted_channels
+from magloc.range_set import gaussian_ranges
 
 FloatArray = NDArray[np.float64]
 
@@ -140,10 +141,9 @@ class LiveFit:
 
 
 def range_interval(offset_m: FloatArray, covariance_m2: FloatArray, radius_m: float) -> tuple[float, float]:
-    r"""95 % interval of a distance from a Gaussian of the position, symmetric in :math:`\alpha = \mathrm{atan}(R/r)`.
+    """95 % interval of a distance from a Gaussian of the position, as :func:`magloc.range_set.gaussian_ranges`.
 
-    χ² is nearly a parabola in α, which is 0 at infinity and π/2 at the centroid, and not at all one in the distance: so
-    does the interval open where the source is far.
+    A source in the centroid, which that knows nothing of, may be as far off as its position.
 
     Parameters
     ----------
@@ -162,13 +162,8 @@ def range_interval(offset_m: FloatArray, covariance_m2: FloatArray, radius_m: fl
     distance = float(np.linalg.norm(offset_m))
     if not distance > 0.0:
         return 0.0, float(np.sqrt(RISE_95 * np.trace(covariance_m2)))
-    direction = offset_m / distance
-    sigma = float(np.sqrt(direction @ covariance_m2 @ direction))
-    alpha = np.arctan2(radius_m, distance)
-    reach = np.sqrt(RISE_95) * np.sin(alpha) * np.cos(alpha) * sigma / distance
-    low = radius_m / np.tan(alpha + reach) if alpha + reach < 0.5 * np.pi else 0.0
-    high = radius_m / np.tan(alpha - reach) if alpha > reach else np.inf
-    return float(low), float(high)
+    low, high = gaussian_ranges(covariance_m2, offset_m, radius_m).tolist()
+    return low, high
 
 
 def suitable_dipole(array: SensorArray) -> tuple[FloatArray, FloatArray]:

@@ -83,8 +83,9 @@ class TestJson:
         results = results_of(outcome)
         assert outcome.err == ""
         assert [entry["time_s"] for entry in results] == [0.0, 1.0, 2.0]
-        assert [set(entry) for entry in results[:2]] == [{"time_s", "solutions"}] * 2
-        assert set(results[2]) == {"time_s", "solutions", "reason"}
+        assert [set(entry) for entry in results[:2]] == [{"time_s", "detected", "solutions"}] * 2
+        assert set(results[2]) == {"time_s", "detected", "solutions", "reason"}
+        assert [entry["detected"] for entry in results] == [True, True, False]
         assert results[2]["solutions"] == []
         assert results[2]["reason"]
 
@@ -102,6 +103,8 @@ class TestJson:
                 "converged",
                 "range_observable",
                 "range_interval95_m",
+                "gaussian",
+                "weight",
             }
             np.testing.assert_allclose(solution["position_m"], SOURCE, rtol=1e-5)
             np.testing.assert_allclose(solution["moment_Am2"], MOMENT, rtol=1e-4)
@@ -126,6 +129,22 @@ class TestJson:
         assert chi2 == sorted(chi2)
         assert entry["solutions"][0]["range_observable"] is False
         assert entry["solutions"][0]["range_interval95_m"][-1][1] is None
+
+    def test_noise_alone(self, run: Run, array: Path, tmp_path: Path) -> None:
+        """Nothing is detected: every range is possible, and so say JSON, table and a note."""
+        path = tmp_path / "noise.csv"
+        noise = np.random.default_rng(1).normal(size=(3, 15))
+        path.write_text(table(list(noise)), encoding="utf-8")
+        for entry in results_of(run("locate", path, "--array", array, "--json", "--quiet")):
+            assert entry["detected"] is False
+            assert sum(solution["weight"] for solution in entry["solutions"]) == pytest.approx(1.0)
+            for solution in entry["solutions"]:
+                assert solution["range_interval95_m"] == [[0.0, None]]
+                assert solution["range_observable"] is False
+                assert solution["gaussian"] is False
+        outcome = run("locate", path, "--array", array)
+        assert all("weak" in line for line in outcome.out.splitlines()[1:])
+        assert "in 3 of 3 rows nothing stands out of the noise" in outcome.err
 
     def test_results_do_not_depend_on_threads(self, run: Run, array: Path, readings: Path) -> None:
         one = run("locate", readings, "--array", array, "--json", "--threads", "1")

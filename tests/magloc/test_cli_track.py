@@ -115,6 +115,21 @@ class TestJson:
         assert results[N_EMPTY]["nis"] is None  # the track started from this row: nothing was predicted
         assert all(entry["nis"] > 0.0 for entry in results[N_EMPTY + 1 :])
 
+    def test_what_is_known_of_the_range(self, run: Run, array: Path, readings: Path) -> None:
+        """Of a track by its covariance; without one by the row alone, whose solutions are listed."""
+        results = results_of(run("track", readings, "--array", array, "--json", *MOTION))
+        for entry in results[:N_EMPTY]:
+            assert entry["range_observable"] is False
+            assert entry["range_interval95_m"][-1][1] is None
+            assert entry["weight"] is None
+            assert sum(rival["weight"] for rival in entry["rivals"]) == pytest.approx(1.0 if entry["rivals"] else 0.0)
+        for entry, p in zip(results[N_EMPTY:], source()[1][N_EMPTY:], strict=True):
+            ((low, high),) = entry["range_interval95_m"]
+            assert 0.9 * low < np.linalg.norm(p) < 1.1 * high
+            assert entry["range_observable"] is True
+            assert 0.9 < entry["weight"] <= 1.0
+            assert isinstance(entry["gaussian"], bool)
+
     def test_covariance_is_of_six_numbers_for_a_larger_state(self, run: Run, array: Path, readings: Path) -> None:
         for motion in ("wandering", "turn"):
             results = results_of(run("track", readings, "--array", array, "--json", *MOTION, "--motion", motion))

@@ -36,6 +36,7 @@ from magloc.detection import (
 from magloc.detection_range import detection_range
 from magloc.dipole import field
 from magloc.matched_filter import MatchedFilterDetector
+from magloc.separable import fibonacci_directions
 
 ARRAY = tetrahedron(1.5)
 SOURCE, MOMENT = np.array([4.0, 3.0, -2.0]), np.array([30.0, -20.0, 40.0])
@@ -255,14 +256,13 @@ class TestDetectionRange:
     @pytest.mark.parametrize("array", [ARRAY, square(0.4), hexagon(1.0)])
     def test_brentq_finds_the_same(self, array):
         detector = ChiSquareDetector(3)
-        found = detection_range(array, self.DIRECTIONS, 100.0, detector, n_moments=7)
-        from magloc.separable import fibonacci_directions
-
+        moments = 100.0 * fibonacci_directions(7)
+        found = detection_range(array, self.DIRECTIONS, moments, detector)
         matched = DipoleFilter(array)
         required = stats.chi2.isf(1e-3, 3)
         for i, direction in enumerate(self.DIRECTIONS):
             unit = direction / np.linalg.norm(direction)
-            for j, moment in enumerate(100.0 * fibonacci_directions(7)):
+            for j, moment in enumerate(moments):
 
                 def miss(r: float, unit=unit, moment=moment) -> float:
                     signal = matched.signal(array.centroid + r * unit, moment)
@@ -272,32 +272,36 @@ class TestDetectionRange:
 
     def test_far_field_law(self):
         """Differences fall as r⁻⁴, but for terms of the order radius/r = 0.01: 16 times the moment, twice as far."""
-        near, far = (detection_range(ARRAY, self.DIRECTIONS, m, ChiSquareDetector(9)) for m in (1e6, 16e6))
+        near, far = (
+            detection_range(ARRAY, self.DIRECTIONS, size * fibonacci_directions(200), ChiSquareDetector(9))
+            for size in (1e6, 16e6)
+        )
         np.testing.assert_allclose(far / near, 2.0, rtol=2e-3)
 
     def test_detectors_are_in_order(self, detector):
         ranges = [
-            np.median(detection_range(ARRAY, self.DIRECTIONS, 100.0, one, n_moments=50))
+            np.median(detection_range(ARRAY, self.DIRECTIONS, 100.0 * fibonacci_directions(50), one))
             for one in (ChiSquareDetector(9, 2e-2), detector, ChiSquareDetector(3, 2e-2))
         ]
         assert ranges[0] < 1.005 * ranges[1]
         assert ranges[1] < ranges[2]
 
     def test_moment_too_weak(self):
-        assert np.all(detection_range(ARRAY, self.DIRECTIONS, 1e-6, ChiSquareDetector(9)) == 0.0)
+        assert np.all(detection_range(ARRAY, self.DIRECTIONS, 1e-6 * np.eye(3), ChiSquareDetector(9)) == 0.0)
 
     @pytest.mark.parametrize(
-        ("directions", "moment", "probability", "name"),
+        ("directions", "moments", "probability", "name"),
         [
-            ([[0.0, 0.0, 0.0]], 1.0, 0.9, "directions"),
-            ([1.0, 0.0, 0.0], 1.0, 0.9, "directions"),
-            ([[1.0, 0.0, 0.0]], -1.0, 0.9, "moment_Am2"),
-            ([[1.0, 0.0, 0.0]], 1.0, 1e-4, "probability"),
+            ([[0.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]], 0.9, "directions"),
+            ([1.0, 0.0, 0.0], [[1.0, 0.0, 0.0]], 0.9, "directions"),
+            ([[1.0, 0.0, 0.0]], [1.0, 0.0, 0.0], 0.9, "moments_Am2"),
+            ([[1.0, 0.0, 0.0]], [[np.nan, 0.0, 0.0]], 0.9, "moments_Am2"),
+            ([[1.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]], 1e-4, "probability"),
         ],
     )
-    def test_misuse(self, directions, moment, probability, name):
+    def test_misuse(self, directions, moments, probability, name):
         with pytest.raises(ValueError, match=f"Input {name} must be"):
-            detection_range(ARRAY, directions, moment, ChiSquareDetector(9), probability=probability)
+            detection_range(ARRAY, directions, moments, ChiSquareDetector(9), probability=probability)
 
 
 class TestMisuse:
@@ -305,7 +309,7 @@ class TestMisuse:
         few = replace(square(1.0, "scalar"), ambient_T=(0.0, 0.0, 5e-5))
         with pytest.raises(ValueError, match="6 independent differences"):
             MatchedFilterDetector.of(few)
-        assert detection_range(few, [[0.0, 0.0, 1.0]], 100.0, ChiSquareDetector(3), n_moments=5).shape == (1, 5)
+        assert detection_range(few, [[0.0, 0.0, 1.0]], 100.0 * np.eye(3), ChiSquareDetector(3)).shape == (1, 3)
         with pytest.raises(ValueError, match="3 independent differences"):
             DipoleFilter(replace(few, sensors=few.sensors[:3]))
 

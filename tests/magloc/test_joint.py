@@ -35,7 +35,7 @@ from magloc.joint import (
 )
 from magloc.locate import Locator
 from magloc.measurement import DifferenceMeasurement
-from magloc.range_profile import range_intervals
+from magloc.range_profile import ranges_within
 from magloc.rows import joint_problem, whitenings_of
 from tests import oracles
 from tests.arrays.test_differences import random_array
@@ -560,10 +560,7 @@ class TestLocator:
         moment = np.stack([s.moment_Am2 for s in solutions])[:, None]
         fits = refined_from(problem, y, 1.01 * start, moment)
         covariance = covariances(problem, fits)
-        offset = problem.position(fits.q)[:, 0] - problem.centroid
-        variance = np.einsum("bi,bij,bj->b", offset, covariance[:, :3, :3], offset)
-        sigma_over_range = np.sqrt(variance) / np.sum(offset**2, axis=-1)
-        ends = problem.radius * range_intervals(problem, y, fits, 0, sigma_over_range)
+        ends = ranges_within(problem, y, fits, 0, covariance)
         for i, s in enumerate(solutions):
             sigma = np.sqrt(np.diagonal(s.covariance))
             assert fits.chi2[i] == pytest.approx(s.chi2, rel=1e-6, abs=1e-6)

@@ -21,8 +21,9 @@ from scipy.stats import chi2 as chi2_distribution
 from arrays.differences import decorrelated_differences, proportional_noise, whitening
 from arrays.geometries import axial, cross, square, tetrahedron
 from arrays.sensor import Sensor, SensorArray
+from magloc.fix import RISE_95, Knowledge
 from magloc.kernels import separable as kernels
-from magloc.locate import RISE_95, Knowledge, Locator
+from magloc.locate import Locator
 from magloc.measurement import DifferenceMeasurement, predicted_channels
 from magloc.separable import SeparableProblem, candidate_positions
 from tests import oracles
