@@ -15,7 +15,9 @@ from adcs.commands.compare import compare
 from adcs.commands.estimate import estimate
 from adcs.commands.run_complementary import complementary
 from adcs.commands.run_ellipsoid import ellipsoid
+from adcs.commands.run_mockup import mockup
 from adcs.commands.run_tabletsat import run_attitude
+from adcs.commands.stars import stars
 from adcs.commands.tables import tables
 from magloc import command_line
 
@@ -33,10 +35,12 @@ run = App(
 run.default(run_attitude)
 run.command(complementary)
 run.command(ellipsoid)
+run.command(mockup)
 app.command(run)
 app.command(compare)
 app.command(tables)
 app.command(estimate)
+app.command(stars)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

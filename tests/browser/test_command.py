@@ -29,7 +29,7 @@ def array_file(tmp_path: Path) -> Path:
 def interrupted(process: subprocess.Popen[str]) -> str:
     """What it writes to stderr until it has ended after Ctrl-C."""
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=30.0)
+    out, err = process.communicate(timeout=120.0)
     assert process.returncode == 0
     assert out == ""
     assert "Traceback" not in err

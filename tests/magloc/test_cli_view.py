@@ -351,7 +351,7 @@ class TestServer:
                 with direct.open(address, timeout=20.0) as reply:
                     assert b"<html" in reply.read()
                 process.send_signal(signal.SIGINT)
-                out, err = process.communicate(timeout=30.0)
+                out, err = process.communicate(timeout=120.0)
         assert process.returncode == 0
         assert out == ""
         assert f"port {port} is in use" in err

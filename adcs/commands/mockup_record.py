@@ -1,0 +1,260 @@
+"""``adcs run mockup --part fusion --samples … --fixes …``: fusion of a recording, of which no truth is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adcs.commands.common import write_table
+from adcs.commands.mockup_fusion import SETTLED_S, Method
+from adcs.mockup.delayed_filter import DelayedFilter, FilterTrack, StartSigma
+from adcs.mockup.fixes import FixRecord, Fused, Fusion, Outcome, fuse
+from adcs.mockup.inertial import ImuRecord, PlanarState, wrapped
+from adcs.mockup.late_fixes import CameraOnly, ImuOnly, Reintegration, corrected_velocity, finite_difference
+from arrays.errors import InputError
+from magloc.tables import Table, read_table
+
+FloatArray = NDArray[np.float64]
+
+SAMPLE_COLUMNS = ("time_s", "acceleration_x_m_s2", "acceleration_y_m_s2", "rate_deg_s")
+FIX_COLUMNS = ("exposure_s", "arrival_s", "x_m", "y_m", "heading_deg")
+
+# The velocity at the start is not known, and nothing was calibrated for certain.
+_START = StartSigma(velocity_m_s=0.2, zero_m_s2=0.01, zero_rad_s=math.radians(0.2))
+
+
+@dataclass(frozen=True, eq=False)
+class RecordRun:
+    """A recording and its estimate.
+
+    Attributes
+    ----------
+    method : str
+    imu : ImuRecord
+        From the exposure of the first fix on.
+    fixes : FixRecord
+        After the first one, which is the start.
+    fused : Fused
+    """
+
+    method: Method
+    imu: ImuRecord
+    fixes: FixRecord
+    fused: Fused
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """Fixes that were used, of those that arrived within the record."""
+        good = (Outcome.USED, Outcome.REACQUIRED)
+        return np.array([outcome in good for outcome in self.fused.outcomes], dtype=np.bool_)
+
+    def summary(self) -> dict[str, Any]:
+        """What ``--json`` prints; the difference is that of fused and measured positions at the exposures."""
+        track, used = self.fused.track, self.used
+        fixes = self.fixes.rows(np.flatnonzero(used))
+        late = fixes.time_s >= self.imu.begin_s + SETTLED_S
+        fused = np.stack([np.interp(fixes.time_s, track.time_s, axis) for axis in track.position_m.T], axis=1)
+        apart_m = np.linalg.norm(fused - fixes.position_m, axis=1)[late]
+        return {
+            "samples": len(self.imu),
+            "fixes": len(used),
+            "used_fixes": int(used.sum()),
+            "rejected_fixes": self.fused.outcomes.count(Outcome.REJECTED),
+            "difference_rms_mm": 1e3 * math.sqrt(np.mean(apart_m**2)) if apart_m.size else None,
+            "time_s": float(track.time_s[-1]),
+            "position_m": track.position_m[-1].tolist(),
+            "heading_deg": math.degrees(float(wrapped(track.heading_rad[-1]))),
+        }
+
+
+def fused_record(samples: Path, fixes: Path, method: Method) -> RecordRun:
+    """Read a recording and fuse it.
+
+    The first fix is the start, at rest.
+
+    Parameters
+    ----------
+    samples, fixes : Path
+        CSV files; see :func:`read_samples` and :func:`read_fixes`.
+    method : str
+
+    Returns
+    -------
+    RecordRun
+
+    Raises
+    ------
+    InputError
+        A file is not what it should be, or no fix is within the samples.
+    """
+    imu, record = read_samples(samples), read_fixes(fixes)
+    within = (record.time_s >= imu.begin_s) & (record.time_s < imu.end_s)
+    if not within.any():
+        raise InputError(
+            f"{fixes}: found no exposure from {imu.begin_s:.6g} to {imu.end_s:.6g} s, the time of {samples}, expected "
+            "one at least."
+        )
+    first = int(np.argmax(within))
+    later = record.rows(np.flatnonzero(np.arange(len(record)) > first))
+    start = PlanarState(record.position_m[first], np.zeros(2), float(record.heading_rad[first]))
+    part = imu.between(float(record.time_s[first]), imu.end_s)
+    return RecordRun(method, part, later, fuse(_fusion_of(method, start, part.begin_s), part, later))
+
+
+def _fusion_of(method: Method, start: PlanarState, begin_s: float) -> Fusion:
+    if method == "camera":
+        return CameraOnly(start)
+    if method == "imu":
+        return ImuOnly(start)
+    if method == "ekf":
+        return DelayedFilter(start, begin_s, sigma=_START)
+    rule = finite_difference if method == "paper" else corrected_velocity
+    return Reintegration(start, begin_s, rule)
+
+
+def read_samples(path: Path) -> ImuRecord:
+    """Samples from a CSV file with the columns of :data:`SAMPLE_COLUMNS`; others are left out.
+
+    Parameters
+    ----------
+    path : Path
+        A time is when the interval of its sample ends; an empty cell is a missing reading.
+
+    Returns
+    -------
+    ImuRecord
+
+    Raises
+    ------
+    InputError
+        It is no such file, has fewer than two rows, or its times go back.
+    """
+    table = _table_with(path, SAMPLE_COLUMNS)
+    time_s = table.complete(["time_s"])[:, 0]
+    if len(time_s) < 2:
+        raise InputError(f"{path}: found one row, expected two samples at least.")
+    _refuse_back(table, "time_s", time_s, ~(np.diff(time_s) > 0.0), "times that increase")
+    readings = table.finite_or_missing(list(SAMPLE_COLUMNS[1:]))
+    begin_s = float(2.0 * time_s[0] - time_s[1])
+    return ImuRecord(begin_s, time_s, readings[:, :2], np.radians(readings[:, 2]))
+
+
+def read_fixes(path: Path) -> FixRecord:
+    """Fixes from a CSV file with the columns of :data:`FIX_COLUMNS`, in the order of their arrival.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    FixRecord
+
+    Raises
+    ------
+    InputError
+        It is no such file, arrivals go back, or a fix arrives before its exposure.
+    """
+    table = _table_with(path, FIX_COLUMNS)
+    values = table.complete(list(FIX_COLUMNS))
+    _refuse_back(table, "arrival_s", values[:, 1], np.diff(values[:, 1]) < 0.0, "arrivals that do not go back")
+    early = np.flatnonzero(values[:, 1] < values[:, 0])
+    if early.size:
+        exposure_s, arrival_s = values[early[0], :2]
+        raise InputError(
+            f"{table.place(int(table.line_numbers[early[0]]), 'arrival_s')}: found {arrival_s:.6g} s for an exposure "
+            f"at {exposure_s:.6g} s, expected an arrival after the exposure."
+        )
+    return FixRecord(values[:, 0], values[:, 1], values[:, 2:4], np.radians(values[:, 4]))
+
+
+def _table_with(path: Path, columns: tuple[str, ...]) -> Table:
+    table = read_table(path, f"a header with the columns {', '.join(columns)}")
+    for column in columns:
+        table.require(column, columns)
+    return table
+
+
+def _refuse_back(table: Table, column: str, time_s: FloatArray, bad: NDArray[np.bool_], expected: str) -> None:
+    if bad.any():
+        row = int(np.argmax(bad)) + 1
+        raise InputError(
+            f"{table.place(int(table.line_numbers[row]), column)}: found {time_s[row]:.6g} s after "
+            f"{time_s[row - 1]:.6g} s, expected {expected}."
+        )
+
+
+def write_record(run: RecordRun, out: Path) -> list[str]:
+    """Write the estimate and its figure.
+
+    Parameters
+    ----------
+    run : RecordRun
+    out : Path
+        Folder that exists.
+
+    Returns
+    -------
+    list of str
+        Names of the files.
+    """
+    from adcs.plots.mockup_figures import FusionPicture, fusion_figure
+    from magloc.plots import style
+
+    track = run.fused.track
+    table = {
+        "time_s": track.time_s,
+        "x_m": track.position_m[:, 0],
+        "y_m": track.position_m[:, 1],
+        "vx_m_s": track.velocity_m_s[:, 0],
+        "vy_m_s": track.velocity_m_s[:, 1],
+        "heading_deg": np.degrees(track.heading_rad),
+    }
+    if isinstance(track, FilterTrack):
+        table |= {
+            "zero_x_m_s2": track.zero_m_s2[:, 0],
+            "zero_y_m_s2": track.zero_m_s2[:, 1],
+            "zero_rate_deg_s": np.degrees(track.zero_rad_s),
+            "sigma_x_mm": 1e3 * track.sigma[:, 0],
+            "sigma_y_mm": 1e3 * track.sigma[:, 1],
+            "sigma_heading_deg": np.degrees(track.sigma[:, 4]),
+        }
+    write_table(out / "mockup-estimate.csv", tuple(table), np.stack(list(table.values()), axis=1))
+    # There is no truth; this figure shows none.
+    picture = FusionPicture(
+        f"Recording, fusion {run.method}",
+        track,
+        track,
+        run.fixes.rows(slice(len(run.used))),
+        run.fused.outcomes,
+        begin_s=run.imu.begin_s + SETTLED_S,
+    )
+    style.save(fusion_figure(picture), out / "mockup-fusion.png")
+    return ["mockup-fusion.png", "mockup-estimate.csv"]
+
+
+def record_lines(run: RecordRun) -> list[str]:
+    """The result as text.
+
+    Parameters
+    ----------
+    run : RecordRun
+
+    Returns
+    -------
+    list of str
+    """
+    result = run.summary()
+    x, y = result["position_m"]
+    apart = result["difference_rms_mm"]
+    return [
+        f"{result['samples']} samples, {result['fixes']} fixes after the first, fusion {run.method}",
+        f"fixes used / rejected              {result['used_fixes']} / {result['rejected_fixes']}",
+        f"fused less camera, undelayed [mm]  {'none' if apart is None else f'{apart:.2f}'}",
+        f"at the end, {result['time_s']:.2f} s: X {x:.4f} m, Y {y:.4f} m, heading {result['heading_deg']:.2f}°",
+    ]

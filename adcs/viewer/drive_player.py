@@ -1,0 +1,184 @@
+"""A drive played through time: slider, play and pause, speed, enlargement of errors; the camera's frame beside it.
+
+Use::
+
+    player = DrivePlayer(server, drive, scene)
+    player.show_time(90.0)
+    player.play(); player.pause()
+    player.close()                           # ends the playing thread; call it before server.stop()
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from threading import Event, Lock, Thread, current_thread
+from time import perf_counter
+
+import numpy as np
+import viser
+
+from adcs.viewer.drive import Drive
+from adcs.viewer.error_dial import ErrorDial, words_of
+from adcs.viewer.frame_image import marked_image, named_stars
+from adcs.viewer.table_scene import ENLARGEMENTS, TableScene
+from magloc.viewer import words
+from magloc.viewer.inputs import SharedInput
+from magloc.viewer.latest import Latest
+
+_FRAMES_PER_SECOND = 15.0
+_SPEEDS = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
+_STEP_S = 0.05
+_FRAMES_KEPT = 32
+_JPEG_QUALITY = 85
+
+
+class DrivePlayer:
+    """A drive in the scene at one time, and the panels that move the time.
+
+    Frames are rendered and identified when they are to be seen, and a few are kept.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+        The panels are added where its GUI is at present.
+    drive : Drive
+    scene : TableScene
+        Of this drive.
+
+    Attributes
+    ----------
+    row : int
+        That is shown.
+    """
+
+    def __init__(self, server: viser.ViserServer, drive: Drive, scene: TableScene) -> None:
+        self._drive, self._scene = drive, scene
+        self.row = 0
+        self._frame_of = lru_cache(_FRAMES_KEPT)(drive.frame_of)
+        self._dial = ErrorDial(drive)
+        self._pictured: int | None = None
+        self._wanted_s = 0.0
+        self._follow = Latest(self._show)
+        self._lock = Lock()
+        self._stop = Event()
+        self._thread: Thread | None = None
+        self._add_panels(server.gui)
+        self.show_time(0.0)
+
+    @property
+    def is_playing(self) -> bool:
+        """Whether time runs."""
+        return self._thread is not None and not self._stop.is_set()
+
+    def show_time(self, time_s: float) -> None:
+        """Show the drive at a time.
+
+        Parameters
+        ----------
+        time_s : float
+            Times before the beginning and after the end are those.
+        """
+        self._wanted_s = min(max(time_s, 0.0), self._drive.duration_s)
+        self._follow()
+
+    def play(self) -> None:
+        """Let time run, from the beginning if it is at the end."""
+        with self._lock:
+            if self.is_playing:
+                return
+            if self._wanted_s >= self._drive.duration_s:
+                self._wanted_s = 0.0
+            # An event of its own for every thread: one that is about to end must not go on with the next.
+            self._stop = Event()
+            self._thread = Thread(target=self._run, args=(self._stop,), name="adcs-drive-player", daemon=True)
+            self.play_button.label = "Pause"
+            self._thread.start()
+
+    def pause(self) -> None:
+        """Let time stand still."""
+        with self._lock:
+            thread, self._thread = self._thread, None
+            self._stop.set()
+            self.play_button.label = "Play"
+        if thread is not None and thread is not current_thread():
+            thread.join()
+
+    def close(self) -> None:
+        """End the thread that plays; to be called before the server is stopped."""
+        self.pause()
+
+    def _add_panels(self, gui: viser.GuiApi) -> None:
+        duration = self._drive.duration_s
+        with gui.add_folder("Time"):
+            self.time_slider = gui.add_slider("Time [s]", 0.0, duration, _STEP_S, 0.0)
+            self.play_button = gui.add_button("Play")
+            self.speed_dropdown = gui.add_dropdown("Speed", [f"{s:g} ×" for s in _SPEEDS], initial_value="2 ×")
+            self.enlarge_dropdown = gui.add_dropdown(
+                "Errors",
+                [f"{value:g} ×" for value in ENLARGEMENTS],
+                initial_value=f"{self._scene.enlarged:g} ×",
+                hint="how many times larger the scene shows the estimate's error and its ellipse",
+            )
+        self.row_panel = gui.add_html("")
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Camera"):
+            height, width = self._drive.camera.height_px, self._drive.camera.width_px
+            self._blank = np.full((height, width, 3), 40, dtype=np.uint8)
+            self.frame_image = gui.add_image(self._blank, format="jpeg", jpeg_quality=_JPEG_QUALITY)
+            self.frame_panel = gui.add_html("")
+        with tabs.add_tab("Error"):
+            self.dial_panel = gui.add_html("")
+        self._time = SharedInput(self.time_slider, self._time_moved)
+        self.play_button.on_click(lambda _: self.pause() if self.is_playing else self.play())
+        self.enlarge_dropdown.on_update(self._enlarged)
+
+    def _time_moved(self) -> None:
+        self._wanted_s = float(self.time_slider.value)
+        self._follow()
+
+    def _enlarged(self, _: object) -> None:
+        self._scene.enlarged = _times(self.enlarge_dropdown.value)
+        self._follow()
+
+    def _run(self, stop: Event) -> None:
+        last = perf_counter()
+        try:
+            while self._wanted_s < self._drive.duration_s and not stop.wait(1.0 / _FRAMES_PER_SECOND):
+                now = perf_counter()
+                self._wanted_s += (now - last) * _times(self.speed_dropdown.value)
+                last = now
+                self._follow()
+        finally:
+            # Unless it was stopped, and started anew with another thread.
+            if self._stop is stop:
+                self.pause()
+
+    def _show(self) -> None:
+        drive = self._drive
+        self.row = row = drive.row_at(self._wanted_s)
+        fix = drive.last_fix(row)
+        frame = None if fix is None else self._frame_of(fix)
+        self._scene.show(row, frame)
+        self._time.show(round(float(drive.truth.time_s[row]) / _STEP_S) * _STEP_S)
+        self.row_panel.content = words.panel(words_of(drive, row))
+        self.dial_panel.content = self._dial.svg(row) + words.panel(
+            [
+                f"cross: truth; dot: estimate{'' if drive.sigma_m is None else ', with its 3σ ellipse'}; "
+                "line: the last 5 s. Table axes."
+            ]
+        )
+        if fix == self._pictured:
+            return
+        self._pictured = fix
+        if frame is None:
+            self.frame_image.image = self._blank
+            self.frame_panel.content = words.panel(["no fix has arrived"])
+            return
+        self.frame_image.image = marked_image(frame)
+        named = len(named_stars(frame))
+        text = f"frame that the last fix came from: {named} of {len(frame.stars_px)} stars identified"
+        self.frame_panel.content = words.panel([text])
+
+
+def _times(text: str) -> float:
+    return float(text.split()[0])

@@ -1,0 +1,77 @@
+"""The camera's frame as it is shown: with marks in the panel, and as a sheet of the ceiling."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+from adcs.mockup.matching import CameraFix
+from adcs.viewer.drive import SeenFrame
+from magloc.viewer.legend import Colour
+
+ByteArray = NDArray[np.uint8]
+IntArray = NDArray[np.intp]
+
+IDENTIFIED_COLOUR: Colour = (0, 158, 115)
+OTHER_STAR_COLOUR: Colour = (230, 159, 0)
+
+_BRIGHTER = 2.0  # lights are faint where nothing saturates
+_RING_PX, _LINE_PX = 13, 3
+_SHEET_STEP = 2  # every second pixel is enough on the ceiling
+_SHEET_COLOUR = (30, 36, 48, 150)
+_LIGHT_DN = 30
+
+
+def named_stars(frame: SeenFrame) -> IntArray:
+    """Numbers of the image's stars that the fix names."""
+    return frame.fix.stars[:, 0] if isinstance(frame.fix, CameraFix) else np.empty(0, dtype=np.intp)
+
+
+def marked_image(frame: SeenFrame) -> ByteArray:
+    """The frame, brightened, with a ring around each star: green where it is identified, else orange.
+
+    Parameters
+    ----------
+    frame : SeenFrame
+
+    Returns
+    -------
+    ndarray of uint8, shape (height, width, 3)
+    """
+    bright = np.minimum(frame.image * _BRIGHTER, 255.0).astype(np.uint8)
+    picture = Image.fromarray(bright).convert("RGB")
+    _draw_rings(picture, frame, _RING_PX, 1)
+    return np.asarray(picture)
+
+
+def ceiling_sheet(frame: SeenFrame) -> ByteArray:
+    """The frame as a translucent sheet: dark, with the stars and their rings.
+
+    Parameters
+    ----------
+    frame : SeenFrame
+
+    Returns
+    -------
+    ndarray of uint8, shape (height / 2, width / 2, 4)
+        Red, green, blue and opacity.
+    """
+    height, width = (size // _SHEET_STEP * _SHEET_STEP for size in frame.image.shape)
+    blocks = frame.image[:height, :width].reshape(height // _SHEET_STEP, _SHEET_STEP, width // _SHEET_STEP, -1)
+    brightest = blocks.max(axis=(1, 3))
+    sheet = np.empty((*brightest.shape, 4), dtype=np.uint8)
+    sheet[:] = _SHEET_COLOUR
+    sheet[brightest > int(np.median(brightest)) + _LIGHT_DN] = 255
+    picture = Image.fromarray(sheet)
+    _draw_rings(picture, frame, _RING_PX // _SHEET_STEP + 2, _SHEET_STEP)
+    return np.asarray(picture)
+
+
+def _draw_rings(picture: Image.Image, frame: SeenFrame, radius: int, step: int) -> None:
+    draw = ImageDraw.Draw(picture)
+    named = set(named_stars(frame).tolist())
+    for star, (column, row) in enumerate(frame.stars_px / step):
+        colour = IDENTIFIED_COLOUR if star in named else OTHER_STAR_COLOUR
+        box = (column - radius, row - radius, column + radius, row + radius)
+        draw.ellipse(box, outline=colour, width=_LINE_PX)

@@ -1,0 +1,306 @@
+"""The table under its sky in three dimensions: lights, camera's view, true and estimated satellite, late fix."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+import viser
+from numpy.typing import ArrayLike, NDArray
+
+from adcs.mockup.camera import Pose, footprint
+from adcs.mockup.fixes import Outcome
+from adcs.mockup.matching import CameraFix
+from adcs.viewer.drive import Drive, SeenFrame
+from adcs.viewer.frame_image import IDENTIFIED_COLOUR, OTHER_STAR_COLOUR, ceiling_sheet
+from magloc.viewer.framing import Extent, extent_of
+from magloc.viewer.legend import Colour, Swatch
+from magloc.viewer.scene import screen_label
+from magloc.viewer.shapes import Surface, joined, line_segments
+
+FloatArray = NDArray[np.float64]
+
+CEILING_M = 1.5
+"""Height of the sky above the table; the source does not tell it."""
+
+TRUTH_COLOUR: Colour = (70, 76, 85)
+ESTIMATE_COLOUR: Colour = (0, 114, 178)
+FIX_COLOUR: Colour = (213, 94, 0)
+VIEW_COLOUR: Colour = (86, 180, 233)
+LIGHT_COLOUR: Colour = (150, 156, 165)
+TABLE_COLOUR: Colour = (196, 214, 228)
+_PATH_COLOUR: Colour = (176, 182, 190)
+_REJECTED_COLOUR: Colour = (204, 121, 167)
+
+TRAIL_S = 20.0
+_TABLE_HALF_M = (1.35, 1.05, 0.02)
+_LEG_M = 0.8
+_RADIUS_M, _HEIGHT_M = 0.085, 0.1
+_RING_M, _ARROW_M = 0.105, 0.24
+_LIGHT_M = 0.016
+_TRAIL_POINTS = 400
+_AROUND = 40
+
+
+class Mark(NamedTuple):
+    """A ring with an arrow, and the frame that moves them."""
+
+    frame: viser.FrameHandle
+    lines: viser.LineSegmentsHandle
+
+    def show(self, place_m: ArrayLike, heading_rad: float) -> None:
+        """Move it, and show it."""
+        x, y = np.asarray(place_m, dtype=np.float64).tolist()
+        self.frame.position = np.array([x, y, 0.0])
+        self.frame.wxyz = turn_about_z(heading_rad)
+        self.frame.visible = True
+
+
+class TableScene:
+    """Table, sky, satellite and what is believed of it, at one time of a drive.
+
+    Parameters
+    ----------
+    scene : viser.SceneApi
+    drive : Drive
+
+    Attributes
+    ----------
+    enlarged : float
+        How many times the estimate's error and its 3σ ellipse are drawn larger than they are.
+    """
+
+    def __init__(self, scene: viser.SceneApi, drive: Drive) -> None:
+        self._scene, self._drive = scene, drive
+        self.enlarged = suitable_enlargement(drive.usual_error_m)
+        self._fix: int | None = None
+        self._add_room()
+        path = np.column_stack([drive.truth.position_m, np.full(len(drive.truth), 0.003)])
+        step = max(1, len(path) // (5 * _TRAIL_POINTS))
+        scene.add_line_segments(
+            "/path/whole", line_segments(path[::step]), _PATH_COLOUR, thickness=1.0, thickness_units="screen"
+        )
+        self._trails = [
+            scene.add_line_segments(
+                f"/path/{name}", np.zeros((1, 2, 3)), colour, thickness=width, thickness_units="screen", visible=False
+            )
+            for name, colour, width in (("truth", TRUTH_COLOUR, 2.5), ("estimate", ESTIMATE_COLOUR, 2.0))
+        ]
+        self._satellite = scene.add_frame("/satellite", show_axes=False)
+        body = satellite_body()
+        scene.add_mesh_simple(
+            "/satellite/body", body.vertices, body.faces, color=TRUTH_COLOUR, flat_shading=True, cast_shadow=False,
+            receive_shadow=False,
+        )  # fmt: skip
+        self._estimate = self._mark("/estimate", ESTIMATE_COLOUR, _HEIGHT_M + 0.01, 4.0)
+        self._late = self._mark("/fix", FIX_COLOUR, _HEIGHT_M + 0.006, 3.0)
+        self._rejected = self._mark("/rejected-fix", _REJECTED_COLOUR, _HEIGHT_M + 0.006, 3.0)
+        rim = unit_circle()
+        disc = np.concatenate([np.zeros((1, 3)), rim[:-1]])
+        faces = np.array([[0, i + 1, (i + 1) % (_AROUND) + 1] for i in range(_AROUND)])
+        self._ellipse = scene.add_mesh_simple(
+            "/ellipse", disc, faces, color=ESTIMATE_COLOUR, opacity=0.3, side="double", visible=False,
+            cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+        # What the camera sees moves with it: only poses change.
+        outline = self._outline_from_body()
+        lens = np.array([0.0, 0.0, _HEIGHT_M])
+        edges = np.stack([np.broadcast_to(lens, (4, 3)), outline[: -1 : len(outline) // 4]], axis=1)
+        scene.add_line_segments(
+            "/satellite/view", np.concatenate([line_segments(outline), edges]), VIEW_COLOUR, thickness=1.6,
+            thickness_units="screen",
+        )  # fmt: skip
+        self._exposure = scene.add_frame("/exposure", show_axes=False, visible=False)
+        scene.add_line_segments(
+            "/exposure/edge", line_segments(outline), FIX_COLOUR, thickness=2.0, thickness_units="screen"
+        )
+        self._sheet: viser.ImageHandle | None = None
+        self._age = screen_label(scene, "/age", "", np.zeros(3))
+        self._age.visible = False
+
+    def show(self, row: int, frame: SeenFrame | None) -> None:
+        """Show a row of the drive.
+
+        Parameters
+        ----------
+        row : int
+        frame : SeenFrame, optional
+            That the last fix came from.
+        """
+        drive = self._drive
+        truth, pose = drive.truth.position_m[row], drive.true_pose(row)
+        self._satellite.position = np.array([*truth, 0.0])
+        self._satellite.wxyz = turn_about_z(float(pose.heading_rad))
+        place = truth + self.enlarged * drive.errors_m[row]
+        self._estimate.show(place, float(drive.track.heading_rad[row]))
+        if drive.sigma_m is not None:
+            semi_axes = 3.0 * self.enlarged * drive.sigma_m[row]
+            self._ellipse.scale = (float(semi_axes[0]), float(semi_axes[1]), 1.0)
+            self._ellipse.position = np.array([*place, _HEIGHT_M + 0.008])
+            self._ellipse.visible = True
+        self._show_trails(row)
+        self._show_fix(row, frame)
+
+    def _show_trails(self, row: int) -> None:
+        drive = self._drive
+        times = drive.truth.time_s
+        first = int(np.searchsorted(times, times[row] - TRAIL_S))
+        rows = np.unique(np.append(np.arange(first, row + 1, max(1, (row - first) // _TRAIL_POINTS)), row))
+        shown = drive.truth.position_m[rows] + self.enlarged * drive.errors_m[rows]
+        for trail, places, z in zip(self._trails, (drive.truth.position_m[rows], shown), (0.006, 0.009), strict=True):
+            segments = line_segments(np.column_stack([places, np.full(len(rows), z)]))
+            trail.visible = bool(len(segments))
+            if len(segments):
+                trail.points = segments.astype(np.float32)
+
+    def _show_fix(self, row: int, frame: SeenFrame | None) -> None:
+        drive = self._drive
+        fix = drive.last_fix(row)
+        if fix is None or frame is None:
+            for handle in (self._late.frame, self._rejected.frame, self._exposure, self._age):
+                handle.visible = False
+            if self._fix is not None:
+                self._lights.batched_colors = self._light_colours(None)
+            self._fix = None
+            return
+        age_s = float(drive.truth.time_s[row] - drive.fixes.time_s[fix])
+        self._age.text = f"fix of {age_s:.1f} s ago"
+        if fix == self._fix:
+            return
+        self._fix = fix
+        rejected = drive.outcomes[fix] is Outcome.REJECTED
+        shown, hidden = (self._rejected, self._late) if rejected else (self._late, self._rejected)
+        shown.show(drive.fixes.position_m[fix], float(drive.fixes.heading_rad[fix]))
+        hidden.frame.visible = False
+        self._age.position = np.array([*drive.fixes.position_m[fix], _HEIGHT_M + 0.16])
+        self._age.visible = True
+        self._show_frame(frame, drive.pose_of_exposure(fix))
+        self._lights.batched_colors = self._light_colours(frame)
+
+    def _show_frame(self, frame: SeenFrame, pose: Pose) -> None:
+        # Image's right and down are the body's x and y: seen from above it is as it lies on the ceiling.
+        sheet = ceiling_sheet(frame)
+        if self._sheet is None:
+            width, height = self._drive.camera.footprint_m
+            self._sheet = self._scene.add_image(
+                "/exposure/sheet", sheet, width, height, format="png", position=(0.0, 0.0, CEILING_M - 0.004),
+                cast_shadow=False, receive_shadow=False,
+            )  # fmt: skip
+        self._sheet.image = sheet
+        self._exposure.position = np.array([pose.x_m, pose.y_m, 0.0])
+        self._exposure.wxyz = turn_about_z(float(pose.heading_rad))
+        self._exposure.visible = True
+
+    def _light_colours(self, frame: SeenFrame | None) -> NDArray[np.uint8]:
+        colours = np.tile(np.array(LIGHT_COLOUR, dtype=np.uint8), (len(self._drive.lights_m), 1))
+        if frame is not None and isinstance(frame.fix, CameraFix):
+            colours[frame.fix.stars[:, 1]] = IDENTIFIED_COLOUR
+        return colours
+
+    def _outline_from_body(self) -> FloatArray:
+        """What the camera sees of the ceiling, from the satellite; the first point again at the end."""
+        outline = footprint(self._drive.camera, Pose(0.0, 0.0, 0.0), 4)
+        closed = np.concatenate([outline, outline[:1]])
+        return np.column_stack([closed, np.full(len(closed), CEILING_M)])
+
+    def _mark(self, name: str, colour: Colour, height_m: float, width: float) -> Mark:
+        frame = self._scene.add_frame(name, show_axes=False, visible=False)
+        tip = np.array([_ARROW_M, 0.0, 0.0])
+        barbs = [tip + np.array([-0.06, side * 0.045, 0.0]) for side in (1.0, -1.0)]
+        shaft = np.array([[[_RING_M, 0.0, 0.0], tip], [barbs[0], tip], [barbs[1], tip]])
+        lines = np.concatenate([line_segments(_RING_M * unit_circle()), shaft]) + np.array([0.0, 0.0, height_m])
+        return Mark(
+            frame,
+            self._scene.add_line_segments(f"{name}/lines", lines, colour, thickness=width, thickness_units="screen"),
+        )
+
+    def _add_room(self) -> None:
+        scene, lights = self._scene, self._drive.lights_m
+        ball = trimesh.creation.icosphere(subdivisions=1, radius=_LIGHT_M)
+        self._lights = scene.add_batched_meshes_simple(
+            "/sky", ball.vertices, ball.faces, np.tile([1.0, 0.0, 0.0, 0.0], (len(lights), 1)),
+            np.column_stack([lights, np.full(len(lights), CEILING_M)]), batched_colors=self._light_colours(None),
+            lod="off", cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+        (x0, y0), (x1, y1) = lights.min(axis=0) - 0.05, lights.max(axis=0) + 0.05
+        corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
+        scene.add_line_segments(
+            "/ceiling", line_segments(np.column_stack([corners, np.full(5, CEILING_M)])), LIGHT_COLOUR, thickness=1.5,
+            thickness_units="screen",
+        )  # fmt: skip
+        table = table_body()
+        scene.add_mesh_simple(
+            "/table", table.vertices, table.faces, color=TABLE_COLOUR, flat_shading=True, cast_shadow=False,
+            receive_shadow=False,
+        )  # fmt: skip
+
+
+def scene_extent(drive: Drive) -> Extent:
+    """What should be in view: sky and table."""
+    lights = np.column_stack([drive.lights_m, np.full(len(drive.lights_m), CEILING_M)])
+    x, y, _ = _TABLE_HALF_M
+    return extent_of(lights, [[a * x, b * y, -0.1] for a in (-1.0, 1.0) for b in (-1.0, 1.0)])
+
+
+def scene_entries(drive: Drive) -> tuple[Swatch, ...]:
+    """Legend of the scene."""
+    enlarged = ", errors enlarged" if suitable_enlargement(drive.usual_error_m) > 1.0 else ""
+    believed = "estimate" + ("" if drive.sigma_m is None else " with its 3σ ellipse")
+    return (
+        Swatch(TRUTH_COLOUR, "satellite, where it is, and its trail"),
+        Swatch(ESTIMATE_COLOUR, believed + enlarged),
+        Swatch(FIX_COLOUR, "late fix: where it was, and the frame on the ceiling"),
+        Swatch(VIEW_COLOUR, "what the camera sees now"),
+        Swatch(IDENTIFIED_COLOUR, "light identified in that frame"),
+        Swatch(OTHER_STAR_COLOUR, "star that is not"),
+        *((Swatch(_REJECTED_COLOUR, "fix that was rejected"),) if Outcome.REJECTED in drive.outcomes else ()),
+    )
+
+
+def suitable_enlargement(usual_error_m: float) -> float:
+    """The largest of :data:`ENLARGEMENTS` that draws an error no longer than 12 cm."""
+    fitting = [value for value in ENLARGEMENTS if value * usual_error_m <= 0.12]
+    return max(fitting, default=1.0)
+
+
+ENLARGEMENTS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+
+
+def turn_about_z(angle_rad: float) -> FloatArray:
+    """Quaternion (w, x, y, z)."""
+    return np.array([np.cos(0.5 * angle_rad), 0.0, 0.0, np.sin(0.5 * angle_rad)])
+
+
+def unit_circle() -> FloatArray:
+    """Points around the z axis, the first one again at the end, shape (n + 1, 3)."""
+    angle = 2.0 * np.pi * np.arange(_AROUND + 1) / _AROUND
+    return np.stack([np.cos(angle), np.sin(angle), np.zeros(_AROUND + 1)], axis=1)
+
+
+def satellite_body() -> Surface:
+    """A can with a lens on top and a nose along x."""
+    can = trimesh.creation.cylinder(_RADIUS_M, sections=32, segment=[[0.0, 0.0, 0.012], [0.0, 0.0, _HEIGHT_M - 0.015]])
+    lens = trimesh.creation.cylinder(0.3 * _RADIUS_M, sections=24, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, _HEIGHT_M]])
+    nose = trimesh.creation.box(extents=[0.06, 0.035, 0.03])
+    nose.apply_translation([_RADIUS_M + 0.02, 0.0, 0.05])
+    return _joined(can, lens, nose)
+
+
+def table_body() -> Surface:
+    """A slab with its top at z = 0, on four legs."""
+    x, y, z = _TABLE_HALF_M
+    slab = trimesh.creation.box(extents=[2.0 * x, 2.0 * y, 2.0 * z])
+    slab.apply_translation([0.0, 0.0, -z])
+    legs = [
+        trimesh.creation.cylinder(
+            0.03, sections=12, segment=[[a * (x - 0.1), b * (y - 0.1), -_LEG_M], [a * (x - 0.1), b * (y - 0.1), -z]]
+        )
+        for a in (-1.0, 1.0)
+        for b in (-1.0, 1.0)
+    ]
+    return _joined(slab, *legs)
+
+
+def _joined(*parts: trimesh.Trimesh) -> Surface:
+    return joined(Surface(np.array(part.vertices), np.array(part.faces, dtype=np.int64)) for part in parts)
