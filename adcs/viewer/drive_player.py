@@ -11,8 +11,6 @@ Use::
 from __future__ import annotations
 
 from functools import lru_cache
-from threading import Event, Lock, Thread, current_thread
-from time import perf_counter
 
 import numpy as np
 import viser
@@ -24,8 +22,8 @@ from adcs.viewer.table_scene import ENLARGEMENTS, TableScene
 from magloc.viewer import words
 from magloc.viewer.inputs import SharedInput
 from magloc.viewer.latest import Latest
+from magloc.viewer.played_time import PlayedTime, speed_text
 
-_FRAMES_PER_SECOND = 15.0
 _SPEEDS = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 _STEP_S = 0.05
 _FRAMES_KEPT = 32
@@ -57,18 +55,17 @@ class DrivePlayer:
         self._frame_of = lru_cache(_FRAMES_KEPT)(drive.frame_of)
         self._dial = ErrorDial(drive)
         self._pictured: int | None = None
-        self._wanted_s = 0.0
         self._follow = Latest(self._show)
-        self._lock = Lock()
-        self._stop = Event()
-        self._thread: Thread | None = None
         self._add_panels(server.gui)
+        self._played = PlayedTime(
+            drive.duration_s, self._follow, self.play_button, self.speed_dropdown, "adcs-drive-player"
+        )
         self.show_time(0.0)
 
     @property
     def is_playing(self) -> bool:
         """Whether time runs."""
-        return self._thread is not None and not self._stop.is_set()
+        return self._played.is_playing
 
     def show_time(self, time_s: float) -> None:
         """Show the drive at a time.
@@ -78,30 +75,15 @@ class DrivePlayer:
         time_s : float
             Times before the beginning and after the end are those.
         """
-        self._wanted_s = min(max(time_s, 0.0), self._drive.duration_s)
-        self._follow()
+        self._played.move_to(time_s)
 
     def play(self) -> None:
         """Let time run, from the beginning if it is at the end."""
-        with self._lock:
-            if self.is_playing:
-                return
-            if self._wanted_s >= self._drive.duration_s:
-                self._wanted_s = 0.0
-            # An event of its own for every thread: one that is about to end must not go on with the next.
-            self._stop = Event()
-            self._thread = Thread(target=self._run, args=(self._stop,), name="adcs-drive-player", daemon=True)
-            self.play_button.label = "Pause"
-            self._thread.start()
+        self._played.play()
 
     def pause(self) -> None:
         """Let time stand still."""
-        with self._lock:
-            thread, self._thread = self._thread, None
-            self._stop.set()
-            self.play_button.label = "Play"
-        if thread is not None and thread is not current_thread():
-            thread.join()
+        self._played.pause()
 
     def close(self) -> None:
         """End the thread that plays; to be called before the server is stopped."""
@@ -112,7 +94,9 @@ class DrivePlayer:
         with gui.add_folder("Time"):
             self.time_slider = gui.add_slider("Time [s]", 0.0, duration, _STEP_S, 0.0)
             self.play_button = gui.add_button("Play")
-            self.speed_dropdown = gui.add_dropdown("Speed", [f"{s:g} ×" for s in _SPEEDS], initial_value="2 ×")
+            self.speed_dropdown = gui.add_dropdown(
+                "Speed", [speed_text(s) for s in _SPEEDS], initial_value=speed_text(2.0)
+            )
             self.enlarge_dropdown = gui.add_dropdown(
                 "Errors",
                 [f"{value:g} ×" for value in ENLARGEMENTS],
@@ -129,33 +113,18 @@ class DrivePlayer:
         with tabs.add_tab("Error"):
             self.dial_panel = gui.add_html("")
         self._time = SharedInput(self.time_slider, self._time_moved)
-        self.play_button.on_click(lambda _: self.pause() if self.is_playing else self.play())
         self.enlarge_dropdown.on_update(self._enlarged)
 
     def _time_moved(self) -> None:
-        self._wanted_s = float(self.time_slider.value)
-        self._follow()
+        self._played.move_to(float(self.time_slider.value))
 
     def _enlarged(self, _: object) -> None:
-        self._scene.enlarged = _times(self.enlarge_dropdown.value)
+        self._scene.enlarged = float(self.enlarge_dropdown.value.split()[0])
         self._follow()
-
-    def _run(self, stop: Event) -> None:
-        last = perf_counter()
-        try:
-            while self._wanted_s < self._drive.duration_s and not stop.wait(1.0 / _FRAMES_PER_SECOND):
-                now = perf_counter()
-                self._wanted_s += (now - last) * _times(self.speed_dropdown.value)
-                last = now
-                self._follow()
-        finally:
-            # Unless it was stopped, and started anew with another thread.
-            if self._stop is stop:
-                self.pause()
 
     def _show(self) -> None:
         drive = self._drive
-        self.row = row = drive.row_at(self._wanted_s)
+        self.row = row = drive.row_at(self._played.now_s)
         fix = drive.last_fix(row)
         frame = None if fix is None else self._frame_of(fix)
         self._scene.show(row, frame)
@@ -178,7 +147,3 @@ class DrivePlayer:
         named = len(named_stars(frame))
         text = f"frame that the last fix came from: {named} of {len(frame.stars_px)} stars identified"
         self.frame_panel.content = words.panel([text])
-
-
-def _times(text: str) -> float:
-    return float(text.split()[0])

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from arrays.errors import InputError
-from magloc.commands.common import CommonOptions, Count, Flag, print_json, print_note, progress, whole_number
+from magloc.commands.common import CommonOptions, Count, Flag, Vector, print_json, print_note, progress, whole_number
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from magloc.sweep import Sweep
 
 Grid = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=2))]
-Vector = tuple[float, float, float]
 
 _SLICE_GRID = 121
 _STEP_DEG = 5.0

@@ -5,7 +5,19 @@ from __future__ import annotations
 from magloc import command_line
 from magloc.command_line import CommonOptions, Count, Flag, Seed, print_json, progress, whole_number
 
-__all__ = ["CommonOptions", "Count", "Flag", "Seed", "print_json", "print_note", "progress", "whole_number"]
+__all__ = [
+    "CommonOptions",
+    "Count",
+    "Flag",
+    "Seed",
+    "Vector",
+    "print_json",
+    "print_note",
+    "progress",
+    "whole_number",
+]
+
+Vector = tuple[float, float, float]
 
 
 def print_note(text: str) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from arrays.errors import InputError
-from magloc.commands.common import CommonOptions, Flag, print_json, print_note, progress
+from magloc.commands.common import CommonOptions, Flag, Vector, print_json, print_note, progress
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _BOUNDS = re.compile(rf"(?:(?P<below>{_NUMBER})<(?=[xyz]<))?(?P<axis>[xyz])(?P<sign>[<>])(?P<bound>{_NUMBER})")
-
-Vector = tuple[float, float, float]
 
 
 def locate(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import Parameter
 
 from arrays.errors import InputError
-from magloc.commands.common import CommonOptions, Flag, print_json, print_note, progress
+from magloc.commands.common import CommonOptions, Flag, Vector, print_json, print_note, progress
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from magloc.track import Tracker
     from magloc.track_rows import TrackPoint
 
-Vector = tuple[float, float, float]
 STREAM = "-"
 
 

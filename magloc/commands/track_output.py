@@ -16,7 +16,7 @@ from magloc.readings import SAME_TIME_S, Readings, Truth
 from magloc.track_rows import TrackPoint
 
 if TYPE_CHECKING:
-    from magloc.commands.track import Vector
+    from magloc.commands.common import Vector
 
 FloatArray = NDArray[np.float64]
 

@@ -19,8 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from html import escape
-from threading import Event, Lock, Thread, current_thread
-from time import perf_counter
 
 import numpy as np
 import viser
@@ -30,13 +28,13 @@ from magloc.track_rows import TrackPoint
 from magloc.viewer import words
 from magloc.viewer.inputs import SharedInput
 from magloc.viewer.latest import Latest
+from magloc.viewer.played_time import PlayedTime, speed_text
 from magloc.viewer.scene import DIPOLE_COLOUR, TRACK_COLOUR, DipoleGlyph, TrackGlyph, length_text, round_length
 from magloc.viewer.shapes import line_segments
 
 FloatArray = NDArray[np.float64]
 Poses = tuple[FloatArray, FloatArray]
 
-_FRAMES_PER_SECOND = 15.0
 _SPEEDS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 1000.0)
 _SUITABLE_DURATION_S = 30.0
 _STEPS_OF_SLIDER = 1000.0
@@ -95,17 +93,16 @@ class TrackPlayer:
         self.dipole = DipoleGlyph(server.scene, f"{name}/moment", size_m, DIPOLE_COLOUR)
         self.index = int(np.flatnonzero(self._tracked)[-1]) if self._tracked.any() else 0
         self._follow = Latest(self._show)
-        self._lock = Lock()
-        self._stop = Event()
-        self._thread: Thread | None = None
-        self._wanted_s = float(self._since_first_s[self.index])
         self._add_panels(server)
+        self._played = PlayedTime(
+            self._span_s, self._follow, self.play_button, self.speed_dropdown, "magloc-track-player"
+        )
         self.show_row(self.index)
 
     @property
     def is_playing(self) -> bool:
         """Whether time runs."""
-        return self._thread is not None and not self._stop.is_set()
+        return self._played.is_playing
 
     def show_row(self, index: int) -> None:
         """Show the track at the time of a row.
@@ -116,30 +113,15 @@ class TrackPlayer:
             Rows before the first and after the last are those.
         """
         index = min(max(index, 0), len(self.points) - 1)
-        self._wanted_s = float(self._since_first_s[index])
-        self._follow()
+        self._played.move_to(float(self._since_first_s[index]))
 
     def play(self) -> None:
         """Let time run, from the beginning if it is at the end."""
-        with self._lock:
-            if self.is_playing or self._span_s == 0.0:
-                return
-            if self._wanted_s >= self._span_s:
-                self._wanted_s = 0.0
-            # An event of its own for every thread: one that is about to end must not go on with the next.
-            self._stop = Event()
-            self._thread = Thread(target=self._run, args=(self._stop,), name="magloc-track-player", daemon=True)
-            self.play_button.label = "Pause"
-            self._thread.start()
+        self._played.play()
 
     def pause(self) -> None:
         """Let time stand still."""
-        with self._lock:
-            thread, self._thread = self._thread, None
-            self._stop.set()
-            self.play_button.label = "Play"
-        if thread is not None and thread is not current_thread():
-            thread.join()
+        self._played.pause()
 
     def close(self) -> None:
         """End the thread that plays; to be called before the server is stopped."""
@@ -149,7 +131,7 @@ class TrackPlayer:
         gui, span = server.gui, self._span_s
         step = round_length(span / _STEPS_OF_SLIDER) if span > 0.0 else 1.0
         self._step_s, still = step, span == 0.0
-        speeds = [f"{speed:g} ×" for speed in _SPEEDS]
+        speeds = [speed_text(speed) for speed in _SPEEDS]
         suitable = next((s for s in reversed(_SPEEDS) if s <= max(1.0, span / _SUITABLE_DURATION_S)), 1.0)
         with gui.add_folder("Time"):
             self.strip_panel = gui.add_html(_strip(self._since_first_s, self._tracked))
@@ -158,7 +140,7 @@ class TrackPlayer:
             )
             self.play_button = gui.add_button("Play", disabled=still)
             self.row_buttons = gui.add_button_group("Row", ("previous", "next"))
-            self.speed_dropdown = gui.add_dropdown("Speed", speeds, initial_value=f"{suitable:g} ×")
+            self.speed_dropdown = gui.add_dropdown("Speed", speeds, initial_value=speed_text(suitable))
             self.tail_slider = gui.add_slider(
                 "Tail [s]", 0.0, max(span, step), step, max(span, step), disabled=still, hint="length of the tail"
             )
@@ -166,14 +148,12 @@ class TrackPlayer:
         with gui.add_folder("At this time"):
             self.row_panel = gui.add_html("")
         self._time = SharedInput(self.time_slider, self._time_moved)
-        self.play_button.on_click(lambda _: self.pause() if self.is_playing else self.play())
         self.row_buttons.on_click(lambda _: self._step_row(self.row_buttons.value))
         self.tail_slider.on_update(self._follow)
         self.whole_checkbox.on_update(self._whole_switched)
 
     def _time_moved(self) -> None:
-        self._wanted_s = float(self.time_slider.value) + 0.5 * self._step_s
-        self._follow()
+        self._played.move_to(float(self.time_slider.value) + 0.5 * self._step_s)
 
     def _step_row(self, direction: str) -> None:
         self.pause()
@@ -182,21 +162,8 @@ class TrackPlayer:
     def _whole_switched(self, *_: object) -> None:
         self.whole.visible = self.whole_checkbox.value
 
-    def _run(self, stop: Event) -> None:
-        last = perf_counter()
-        try:
-            while self._wanted_s < self._span_s and not stop.wait(1.0 / _FRAMES_PER_SECOND):
-                now = perf_counter()
-                self._wanted_s += (now - last) * float(self.speed_dropdown.value.split()[0])
-                last = now
-                self._follow()
-        finally:
-            # Unless it was stopped, and started anew with another thread.
-            if self._stop is stop:
-                self.pause()
-
     def _show(self) -> None:
-        index = max(0, int(np.searchsorted(self._since_first_s, self._wanted_s, side="right")) - 1)
+        index = max(0, int(np.searchsorted(self._since_first_s, self._played.now_s, side="right")) - 1)
         self.index, point, now = index, self.points[index], float(self._since_first_s[index])
         first = int(np.searchsorted(self._since_first_s, now - self.tail_slider.value - 1e-9 * self._span_s))
         self.glyph.show_until(index, index - first)
