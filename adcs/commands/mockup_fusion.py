@@ -123,6 +123,7 @@ class FusionRuns:
             "velocity_rms_mm_s": float(np.mean([error.velocity_rms_mm_s for error in errors])),
             "heading_rms_deg": float(np.mean([error.heading_rms_deg for error in errors])),
             "fixes": len(outcomes),
+            "used_fixes": outcomes.count("used") + outcomes.count("reacquired"),
             "rejected_fixes": outcomes.count("rejected"),
             "false_fixes": int(sum(result.run.false[: len(result.fused.outcomes)].sum() for result in self.results)),
             "runs": len(errors),
@@ -339,6 +340,11 @@ def _zeros_result(unknowns: Unknowns, start_fixes: int, seed: int, run: TableRun
     from adcs.mockup.zeros import constant_zeros_after, heading_from_fixes, zero_problem, zeros_and_start
 
     fixes = run.fixes.in_time_order()
+    if unknowns == "two" and not 2 <= start_fixes < len(fixes):
+        raise InputError(
+            f"--start-fixes: found {start_fixes}, expected 2 to {len(fixes) - 1}, less than the {len(fixes)} fixes of "
+            f"the run with seed {seed}."
+        )
     heading, gyro_zero = heading_from_fixes(run.imu, fixes)
     imu = run.imu.less(0.0, gyro_zero)
     courses = (imu.time_s - 0.5 * imu.steps_s)[None] if unknowns == "drift" else None

@@ -174,6 +174,7 @@ class MockupOptions:
             self._check_range(name, 0.0, 1.0, "a fraction between 0 and 1")
         for name in ("noise_dn", "speed_m_s", "turn_deg_s"):
             self._check_range(name, 0.0, 1e6, "0 or more")
+        self._check_range("hot_pixels", 0, 640 * 480, f"0 to {640 * 480}, all pixels of the frame")
         self._check_range("delay_s", 0.0, 10.0, "0 to 10 s, as long as samples are kept")
         if self.footprint_m is not None and not 0.01 <= self.footprint_m <= 100.0:
             raise InputError(f"--footprint-m: found {self.footprint_m:g}, expected 0.01 to 100 m.")

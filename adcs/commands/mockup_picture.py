@@ -213,9 +213,13 @@ def write_zeros(runs: ZerosRuns, out: Path) -> list[str]:
     from adcs.plots.mockup_figures import ZerosPicture, zeros_figure
 
     first = runs.results[0]
-    (x, y), (true_x, true_y) = first.fit.zero_m_s2, first.run.zero_m_s2.mean(axis=0)
+    # With slopes, what is found is the zeros at the beginning.
+    true_zeros, when = first.run.zero_m_s2, "on average"
+    if runs.unknowns == "drift":
+        true_zeros, when = true_zeros[:1], "at first"
+    (x, y), (true_x, true_y) = first.fit.zero_m_s2, true_zeros.mean(axis=0)
     title = (
-        f"zeros {x:.4f}, {y:.4f} m/s² found, {true_x:.4f}, {true_y:.4f} true on average; "
+        f"zeros {x:.4f}, {y:.4f} m/s² found, {true_x:.4f}, {true_y:.4f} true {when}; "
         f"unknowns {runs.unknowns}, seed {first.seed}"
     ).replace("-", "\N{MINUS SIGN}")
     picture = ZerosPicture(

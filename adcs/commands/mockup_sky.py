@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adcs.mockup.camera import Camera, Pose, camera_of_footprint, undistorted
-from adcs.mockup.centroids import Stars, find_stars
+from adcs.mockup.centroids import NoLightsError, Stars, find_stars
 from adcs.mockup.frame_files import read_frame
 from adcs.mockup.matching import CameraFix, Matcher, NoFix
 from adcs.mockup.sky import LedSky
@@ -77,6 +77,9 @@ class SkySetup:
     def __post_init__(self) -> None:
         if self.poses < 1:
             raise ValueError(f"Input poses must be 1 or more; instead received {self.poses}.")
+        most = Camera.width_px * Camera.height_px
+        if not 0 <= self.hot_pixels <= most:
+            raise ValueError(f"Input hot_pixels must be 0 to {most}; instead received {self.hot_pixels}.")
         for name in ("speed_m_s", "turn_rate_rad_s"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"Input {name} must not be negative; instead received {getattr(self, name)}.")
@@ -197,7 +200,7 @@ class FrameResult:
 
 
 def frame_result(image: ByteArray, camera: Camera, matcher: Matcher, finder: Finder = find_stars) -> FrameResult:
-    """Fix of one frame, timed.
+    """Fix of one frame, timed; a frame in which nothing can shine, such as a black one, has no stars.
 
     Parameters
     ----------
@@ -215,10 +218,13 @@ def frame_result(image: ByteArray, camera: Camera, matcher: Matcher, finder: Fin
     Raises
     ------
     ValueError
-        The image is black, saturated or none.
+        This is no grey image of bytes.
     """
     begin = time.perf_counter()
-    stars = finder(image)
+    try:
+        stars = finder(image)
+    except NoLightsError:
+        stars = Stars(np.empty((0, 2)), np.empty(0), np.empty(0, dtype=np.intp), float(np.median(image)), math.nan)
     points = undistorted(camera, stars.positions_px)
     located = time.perf_counter()
     fix = matcher.identify(points)

@@ -188,7 +188,8 @@ def fusion_lines(runs: FusionRuns, duration_s: float) -> list[str]:
         f" {result['position_max_mm']:.2f}",
         f"velocity, rms [mm/s]                 {result['velocity_rms_mm_s']:.2f}",
         f"heading, rms [°]                     {result['heading_rms_deg']:.4f}",
-        f"fixes, of them rejected / false      {result['fixes']}, {result['rejected_fixes']} / {result['false_fixes']}",
+        f"fixes, used / rejected / false       {result['fixes']}, {result['used_fixes']} / {result['rejected_fixes']} /"
+        f" {result['false_fixes']}",
     ]
 
 

@@ -37,6 +37,10 @@ _BACKGROUND_STRIDE = 3  # every third row is enough for medians: 100,000 pixels
 _ALL_NEIGHBOURS = np.ones((3, 3), dtype=np.int8)
 
 
+class NoLightsError(ValueError):
+    """A frame is black, saturated or of one value throughout."""
+
+
 @dataclass(frozen=True, eq=False)
 class Stars:
     """Lights found in a frame, brightest first.
@@ -80,8 +84,10 @@ def find_stars(frame: ArrayLike) -> Stars:
 
     Raises
     ------
+    NoLightsError
+        It is black, saturated or of one value throughout.
     ValueError
-        This is no grey image of bytes, or it is black, saturated or of one value throughout.
+        This is no grey image of bytes.
     """
     image = checked_frame(frame)
     background, sigma = _background(image)
@@ -106,8 +112,10 @@ def find_faint_stars(frame: ArrayLike) -> Stars:
 
     Raises
     ------
+    NoLightsError
+        It is black, saturated or of one value throughout.
     ValueError
-        This is no grey image of bytes, or it is black, saturated or of one value throughout.
+        This is no grey image of bytes.
     """
     image = checked_frame(frame).astype(np.uint16)
     if min(image.shape) < 3:
@@ -134,9 +142,10 @@ def find_stars_between_extremes(frame: ArrayLike, level: float = 0.3) -> Stars:
 
     Raises
     ------
+    NoLightsError
+        It is black, saturated or of one value throughout.
     ValueError
-        This is no grey image of bytes, or it is black, saturated or of one value throughout; the level is not between 0
-        and 1.
+        This is no grey image of bytes, or the level is not between 0 and 1.
     """
     if not 0.0 < level < 1.0:
         raise ValueError(f"Input level must be between 0 and 1; instead received {level}.")
@@ -158,8 +167,10 @@ def checked_frame(frame: ArrayLike) -> ByteArray:
 
     Raises
     ------
+    NoLightsError
+        It is black, saturated (more than half of it) or of one value throughout.
     ValueError
-        This is no grey image of bytes, or it is black, saturated (more than half of it) or of one value throughout.
+        This is no grey image of bytes.
     """
     image = np.asarray(frame)
     if image.ndim != 2 or image.size == 0:
@@ -168,11 +179,11 @@ def checked_frame(frame: ArrayLike) -> ByteArray:
         raise ValueError(f"Input frame must have whole numbers from 0 to 255 (uint8); instead received {image.dtype}.")
     brightest = int(image.max())
     if brightest == 0:
-        raise ValueError("Input frame must show lights; instead received a black image.")
+        raise NoLightsError("Input frame must show lights; instead received a black image.")
     if brightest == WHITE and 2 * np.count_nonzero(image == WHITE) > image.size:
-        raise ValueError("Input frame must show lights; instead received a saturated image.")
+        raise NoLightsError("Input frame must show lights; instead received a saturated image.")
     if brightest == int(image.min()):
-        raise ValueError(f"Input frame must show lights; instead received {brightest} in all pixels.")
+        raise NoLightsError(f"Input frame must show lights; instead received {brightest} in all pixels.")
     return image
 
 

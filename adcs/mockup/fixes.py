@@ -156,6 +156,8 @@ class Fused:
 def fuse(fusion: Fusion, imu: ImuRecord, fixes: FixRecord) -> Fused:
     """Give a record's samples and fixes to a method in the order in which they arrive.
 
+    A fix that is faster than the sample of its exposure waits for the end of that sample.
+
     Parameters
     ----------
     fusion : Fusion
@@ -173,7 +175,8 @@ def fuse(fusion: Fusion, imu: ImuRecord, fixes: FixRecord) -> Fused:
     tracks: list[PlanarTrack] = []
     outcomes: list[Outcome] = []
     done = 0
-    rows = np.searchsorted(imu.time_s, fixes.arrival_s, side="right")
+    exposed = np.searchsorted(imu.time_s, fixes.time_s) + 1
+    rows = np.maximum(np.searchsorted(imu.time_s, fixes.arrival_s, side="right"), exposed)
     for k in np.flatnonzero(fixes.arrival_s <= imu.end_s):
         if rows[k] > done:
             tracks.append(fusion.add_samples(imu.part(done, int(rows[k]))))

@@ -7,7 +7,8 @@ r"""A matcher that stands lost lights, lights that are none and blurred stars: h
    fails here. The best by their angles remain.
 4. Each is checked by all stars of the image: those that fall near a light are counted.
 5. The best are fitted again to their own stars, and the best of these is the fix if it explains enough of the image,
-   and better than chance would: five stars within 8 mm of lights are not rare enough among six false ones.
+   more of it than any other, and better than chance would: five stars within 8 mm of lights are not rare enough among
+   six false ones.
 
 Compare :mod:`adcs.mockup.matching`, the paper's.
 """
@@ -108,6 +109,8 @@ class RobustMatcher:
         a_best, b_best, stars = max(fits, key=lambda fit: len(fit[2]))
         if len(stars) < needed:
             return NoFix(f"{len(stars)} of {len(image)} stars fit, {needed} needed")
+        if any(len(fit[2]) == len(stars) and not self._are_one(fit, a_best, b_best) for fit in fits):
+            return NoFix(f"{len(stars)} of {len(image)} stars fit at several places")
         fix = camera_fix(self.catalogue, image, stars, a_best, b_best, len(stars))
         chance = self._chance(fix, len(image), len(a))
         if chance > self.most_chance:

@@ -138,8 +138,10 @@ def _read_camera(path: Path) -> StarCamera:
             raise InputError(f"{path}: found no line {name}=…, expected one.")
         line, text = known[name]
         value = _number(text)
-        if not 0.0 < value < math.inf:
-            raise InputError(f"{path}, line {line}: found {name}={text}, expected a positive number.")
+        of_pixels = name != "PIXSCALE"
+        if not 0.0 < value < math.inf or (of_pixels and value != round(value)):
+            kind = "whole number" if of_pixels else "number"
+            raise InputError(f"{path}, line {line}: found {name}={text}, expected a positive {kind}.")
         numbers[name] = value
     return StarCamera(int(numbers["IMG_X"]), int(numbers["IMG_Y"]), math.radians(numbers["PIXSCALE"] / 3600.0))
 

@@ -101,7 +101,8 @@ def frame_figure(picture: FramePicture) -> Figure:
     ceiling.set_aspect("equal")
     style.dress(ceiling, "X [m]", "Y [m]", words)
     handles, labels = frame.get_legend_handles_labels()
-    style.legend(figure, handles=handles, labels=labels, loc="outside lower center", ncols=2)
+    if handles:
+        style.legend(figure, handles=handles, labels=labels, loc="outside lower center", ncols=2)
     style.headline(figure, picture.title)
     return figure
 

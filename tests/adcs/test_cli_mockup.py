@@ -369,6 +369,8 @@ class TestReplay:
         (("--poses", "0"), "--poses"),
         (("--poses", "1.5"), "found '1.5', expected a whole number"),
         (("--spurious", "-1"), "--spurious"),
+        (("--hot-pixels", "400000"), "--hot-pixels: found 400000, expected 0 to 307200, all pixels of the frame."),
+        (("--part", "zeros", "--unknowns", "two", "--start-fixes", "60"), "--start-fixes: found 60, expected 2 to "),
         (("--matcher", "best"), "--matcher"),
         (("--seeds", "0"), "--seeds"),
         (("--seed", "-1"), "--seed"),

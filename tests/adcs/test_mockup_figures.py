@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from adcs.commands.mockup_fusion import zeros_run
+from adcs.commands.mockup_picture import write_zeros
 from adcs.mockup.camera import Camera
 from adcs.mockup.fixes import FixRecord, Outcome
 from adcs.mockup.inertial import ImuRecord, PlanarTrack
 from adcs.mockup.matching import CameraFix, NoFix
+from adcs.plots import mockup_figures
 from adcs.plots.mockup_figures import (
     FusionPicture,
     ZerosPicture,
@@ -85,6 +89,18 @@ class TestZeros:
             line(before, "Y, camera"), np.column_stack([fixes().time_s, fixes().position_m[:, 1]])
         )
         assert panel(figure, "position after it: 1.4 mm").get_ylim() == before.get_ylim()
+
+    @pytest.mark.parametrize(
+        ("unknowns", "words"), [("six", "0.0051, −0.0041 true on average"), ("drift", "true at first")]
+    )
+    def test_found_zeros_stand_beside_true_ones_of_the_same_time(self, monkeypatch, tmp_path, unknowns, words):
+        """Slopes start at the beginning; constant zeros are those of the middle, 7.5 s of drift later."""
+        pictures: list[ZerosPicture] = []
+        monkeypatch.setattr(mockup_figures, "zeros_figure", lambda picture: pictures.append(picture) or Figure())
+        runs = zeros_run(unknowns, 1)
+        write_zeros(runs, tmp_path)
+        assert words in pictures[0].title
+        assert (f"{runs.results[0].run.zero_m_s2[0, 0]:.4f}, " in pictures[0].title) == (unknowns == "drift")
 
     def test_the_cameras_heading_is_drawn_when_it_arrives_and_counts_full_turns(self, figure):
         seen = line(panel(figure, "heading"), "camera, on arrival")
@@ -171,6 +187,10 @@ class TestSky:
     def test_frame_without_fix(self):
         figure = drawn(frame_figure(self.frame(NoFix("3 stars, 5 needed"))))
         assert "3 stars, 5 needed" in figure.axes[1].get_title(loc="left")
+
+    def test_frame_without_stars(self):
+        dark = replace(self.frame(NoFix("0 stars, 5 needed")), stars_px=np.empty((0, 2)))
+        assert "0 stars, 5 needed" in drawn(frame_figure(dark)).axes[1].get_title(loc="left")
 
     @pytest.mark.parametrize("n_good", [0, 1, 12])
     def test_many_frames(self, n_good):

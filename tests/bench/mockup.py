@@ -67,13 +67,17 @@ def _search_rows(catalogues: dict[int, TriangleCatalogue], size: Size) -> Iterat
         *pairwise((n, len(one)) for n in catalogues),
         ((max(catalogues), len(one)), (max(catalogues), len(four))),
     ):
+        growth = {
+            "all": f"f n grows {more_n * more_f / (n * f):.1f} times",
+            "tree": f"f lg n grows {more_f * math.log(more_n) / (f * math.log(n)):.1f} times, beside the matches",
+        }
         for way, what in (("all", "all against all"), ("tree", "k-d tree")):
             yield Row(
                 f"search {what}, {f} of {2 * n}",
                 timings[n, f, way],
                 f"{more_f} of {2 * more_n}",
                 timings[more_n, more_f, way],
-                f"f n grows {more_n * more_f / (n * f):.1f} times",
+                growth[way],
             )
     for n in catalogues:
         yield Row(

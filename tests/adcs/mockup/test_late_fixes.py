@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from adcs.mockup.delayed_filter import DelayedFilter
 from adcs.mockup.fixes import Fix, FixRecord, Outcome, fuse
 from adcs.mockup.inertial import Gate, ImuRecord, PlanarState, strapdown
 from adcs.mockup.late_fixes import CameraOnly, ImuOnly, Reintegration, corrected_velocity, finite_difference
@@ -169,6 +170,19 @@ class TestArrival:
                 other.add_fix(fixes[k])
                 k += 1
         np.testing.assert_allclose(other.state.velocity_m_s, at_once.velocity_m_s[-1], atol=1e-11)
+
+    @pytest.mark.parametrize("delay_s", [0.0, 0.002, 0.02])
+    def test_fixes_faster_than_a_sample_wait_for_its_end(self, delay_s: float) -> None:
+        """All exposures are within intervals, and so no sample has reached them when a fix without delay arrives."""
+        imu = thrust(0.03, 3.0)
+        exposure_s = np.array([0.503, 1.004, 1.008, 2.001])
+        position = 0.5 * 0.03 * np.stack([exposure_s**2, 0.0 * exposure_s], axis=1)
+        fixes = FixRecord(exposure_s, exposure_s + delay_s, position, np.zeros(4))
+        true, wrong = (PlanarState(np.array([x, 0.0]), np.zeros(2), 0.0) for x in (0.0, 0.1))
+        for fusion in (Reintegration(wrong, 0.0, corrected_velocity), DelayedFilter(true, 0.0)):
+            fused = fuse(fusion, imu, fixes)
+            assert set(fused.outcomes) == {Outcome.USED}
+            np.testing.assert_allclose(fused.track.position_m[-1], [0.5 * 0.03 * 9.0, 0.0], rtol=0, atol=1e-12)
 
     def test_an_exposure_within_an_interval(self) -> None:
         imu, _, fusion = self.used(corrected_velocity)

@@ -52,7 +52,7 @@ class TestFusion:
         summary = runs.summary()
         assert summary["false_fixes"] >= 20
         assert summary["position_rms_mm"] <= 6.0
-        assert summary["rejected_fixes"] == summary["false_fixes"]
+        assert summary["rejected_fixes"] == summary["false_fixes"] == summary["fixes"] - summary["used_fixes"]
         for result in runs.results:
             used = np.array([outcome is Outcome.USED for outcome in result.fused.outcomes])
             assert not np.any(used & result.run.false[: used.size])
@@ -69,6 +69,13 @@ class TestFusion:
             assert distance[k].max() < 0.015
             # 15 s of drop-out, with zeros known to 0.0003 m/s².
             assert distance.max() < 0.1
+
+    def test_fixes_that_come_too_late_are_not_counted_as_used(self) -> None:
+        """Samples are kept for 10 s, so that fixes after 9.9 s and three periods find none; none is rejected."""
+        camera = CameraErrors(delay_s=9.9, overtaken=0.5)
+        summary = fused_runs("ekf", TableScenario(duration_s=40.0, camera=camera), [0]).summary()
+        assert 0 < summary["used_fixes"] < summary["fixes"]
+        assert summary["rejected_fixes"] == 0
 
     def test_the_zeros_are_found(self) -> None:
         result = fusion_run("ekf", seeds=1).results[0]
@@ -181,6 +188,8 @@ class TestRefusals:
             (lambda: fusion_run("ekf", false_fixes=1.5), "--false-fixes: found 1.5"),
             (lambda: zeros_run("nine"), "--unknowns: found 'nine'"),
             (lambda: zeros_run(duration_s=5.0), "--duration: found 5 s"),
+            (lambda: zeros_run(seeds=1, start_fixes=60), "--start-fixes: found 60, expected 2 to"),
+            (lambda: zeros_run(seeds=1, start_fixes=1), "--start-fixes: found 1, expected 2 to"),
         ],
     )
     def test_options(self, call, text: str) -> None:

@@ -12,11 +12,12 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 import pytest
 
+from adcs.commands import mockup_sky
 from adcs.commands.mockup_sky import SkyRun, SkySetup, frame_result, identified_files, random_frame, sky_run
 from adcs.mockup.camera import Camera, Pose
 from adcs.mockup.centroids import find_faint_stars
@@ -33,6 +34,14 @@ MOVING = SkySetup(60, speed_m_s=0.6, turn_rate_rad_s=math.radians(29.0))
 DISTORTED = SkySetup(60, k1=-0.05)
 DAMAGED = SkySetup(lost=0.25, spurious=4)
 BADLY_DAMAGED = SkySetup(lost=0.4, spurious=6)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def frames_are_rendered_once():
+    """Rendering takes most of the time, and matchers share the frames of a set-up."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mockup_sky, "random_frame", lru_cache(maxsize=128)(random_frame))
+        yield
 
 
 @cache
@@ -255,6 +264,12 @@ class TestRun:
         assert len(printed[0]) > 200
         assert printed[0] == printed[1]
 
+    def test_frames_in_which_nothing_shines_have_no_stars(self):
+        """All lights dark, and no noise: one value in all pixels, which as a file is refused."""
+        result = sky_run(sky(), robust(SkySetup()), SkySetup(2, noise_DN=0.0, lost=1.0))
+        np.testing.assert_array_equal(result.n_stars, 0)
+        assert result.reasons == ("0 stars, 5 needed",) * 2
+
     def test_progress(self):
         steps = []
         sky_run(sky(), robust(SkySetup()), SkySetup(poses=4), progress=steps.append)
@@ -268,6 +283,7 @@ class TestRun:
             ({"turn_rate_rad_s": math.nan}, "turn_rate_rad_s"),
             ({"lost": 1.5}, "lost"),
             ({"spurious": -1}, "spurious"),
+            ({"hot_pixels": 640 * 480 + 1}, "hot_pixels"),
             ({"footprint_m": 0.0}, "m_per_px"),
             ({"k1": -0.5}, "k1"),
         ],

@@ -11,12 +11,15 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from adcs.commands.mockup_sky import SkySetup
+from adcs.mockup.camera import Pose
 from adcs.mockup.matching import CameraFix, NoFix, PaperMatcher
 from adcs.mockup.robust_matching import RobustMatcher, one_to_one
 from adcs.mockup.similarity import mirrored_image
+from adcs.mockup.triangles import TriangleCatalogue
 from tests.adcs.mockup.stars_of_poses import (
     Field,
     catalogue,
+    projected,
     projected_set,
     random_points,
     rendered_set,
@@ -74,6 +77,16 @@ class TestGates:
         as_specified = replace(matcher, most_chance=math.inf)
         assert not any(isinstance(matcher.identify(points), CameraFix) for points in frames)
         assert any(isinstance(as_specified.identify(points), CameraFix) for points in frames)
+
+    def test_a_sky_that_repeats_itself_gives_no_fix(self):
+        """On a regular grid any place is like those a spacing away, and more stars can fit only at its border."""
+        grid = 0.2 * np.stack(np.meshgrid(np.arange(-7.0, 8.0), np.arange(-5.0, 6.0)), axis=-1).reshape(-1, 2)
+        known = TriangleCatalogue.of(grid)
+        rng = np.random.default_rng(0)
+        poses = [Pose(*rng.uniform(-0.6, 0.6, 2), rng.uniform(-math.pi, math.pi)) for _ in range(40)]
+        frames = [(pose, projected(known, Field(), pose, rng)) for pose in poses]
+        result = score(RobustMatcher(known, M_PER_PX), frames)
+        assert (result.success, result.false) == (0.0, 0)
 
     def test_another_scale_is_refused(self):
         """A camera half as high sees triangles of the same angles; they are not taken for this one's."""

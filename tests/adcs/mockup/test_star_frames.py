@@ -312,6 +312,11 @@ class TestCommand:
         [
             ("calibration.txt", "IMG_X=10\nIMG_Y=10\n", ["found no line PIXSCALE="]),
             ("calibration.txt", "IMG_X=-1\nIMG_Y=10\nPIXSCALE=1\n", ["line 1: found IMG_X=-1, expected a positive"]),
+            (
+                "calibration.txt",
+                "IMG_X=0.5\nIMG_Y=10\nPIXSCALE=1\n",
+                ["line 1: found IMG_X=0.5, expected a positive whole number"],
+            ),
             ("input.csv", "1,2,3,4\n", ["line 1: found 4 numbers, expected three for each star"]),
             ("input.csv", "1,2,x\n", ["line 1: found 'x', expected a finite number"]),
             ("input.csv", "\n", ["found no frame, expected one at least"]),
