@@ -10,13 +10,27 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtrc
 
 from magloc.joint import JointFits, JointProblem
 from magloc.range_profile import profile_stretches, ranges_within
 from magloc.range_set import EVERYWHERE, Intervals, is_detected, is_observable_set, relative_range_sigma, span, union
-from magloc.rivals import CERTAIN_WEIGHT, LARGEST_GAUSSIAN_SIGMA, Rivals, log_volume, relative_sigma, weights, widened
+from magloc.rivals import (
+    CERTAIN_WEIGHT,
+    LARGEST_GAUSSIAN_SIGMA,
+    MISFIT,
+    Rivals,
+    log_volume,
+    longest_axes,
+    relative_sigma,
+    weights,
+    widened,
+)
 
 FloatArray = NDArray[np.float64]
+
+# By how much the rise of χ² at one standard deviation may differ from one where errors are Gaussian.
+_BEND = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +88,48 @@ def fit_uncertainty(
     """
     if fits.q.shape[1] == 1:
         return _of_one(problem, y, fits, covariance, of_row, energy, n_differences)
-    return _of_several(problem, y, fits, covariance, of_row, is_detected(energy, n_differences))
+    return _of_several(problem, y, fits, covariance, of_row, is_detected(energy, n_differences), n_differences)
+
+
+def is_described(
+    problem: JointProblem,
+    y: FloatArray,
+    position_m: FloatArray,
+    moment_Am2: FloatArray,
+    chi2: FloatArray,
+    dof: int,
+    covariance: FloatArray,
+) -> NDArray[np.bool_]:
+    """Whether covariances describe the errors of f fits of K sources, as far as the model near the fits tells.
+
+    They do where χ² is one of noise, and rises by one, give or take a half, at one standard deviation along the longest
+    axis, to either side: not where the errors follow a curve.
+
+    Parameters
+    ----------
+    problem : JointProblem
+        Of f fits.
+    y : ndarray, shape (f, C)
+        Whitened readings.
+    position_m, moment_Am2 : ndarray, shape (f, K, 3)
+    chi2 : ndarray, shape (f,)
+    dof : int
+        Zero where every χ² is as it must be.
+    covariance : ndarray, shape (f, 6 K, 6 K)
+        Inverse information.
+
+    Returns
+    -------
+    ndarray of bool, shape (f,)
+    """
+    axis = longest_axes(covariance, position_m - problem.centroid, moment_Am2).reshape(*position_m.shape[:2], 2, 3)
+    described = chdtrc(dof, chi2) >= MISFIT if dof > 0 else np.ones(len(y), dtype=bool)
+    for side in (axis, -axis):
+        q = problem.homogeneous(position_m + side[:, :, 0])
+        mu = problem.scaled_moment(q, moment_Am2 + side[:, :, 1])
+        residual = y - problem.predicted(problem.source_fields(q, mu))
+        described &= np.abs(np.sum(residual**2, axis=1) - chi2 - 1.0) <= _BEND
+    return np.asarray(described)
 
 
 def _of_one(
@@ -108,8 +163,32 @@ def _of_one(
         problem.rows(inside), y[inside], fits.rows(inside), 0, sigma[inside], left[inside]
     )
     ranges = rivals.ranges(table(alpha, np.nan), problem.radius)
+    gaussian = ranges.gaussian[at]
+    gaussian[gaussian] = _described(problem, y, fits, covariance, n_differences, np.flatnonzero(gaussian))
     return FitUncertainty(
-        [[ranges.sets[row]] for row in of_row], ranges.covariance[at], ranges.gaussian[at][:, None], rivals.weight[at]
+        [[ranges.sets[row]] for row in of_row], ranges.covariance[at], gaussian[:, None], rivals.weight[at]
+    )
+
+
+def _described(
+    problem: JointProblem,
+    y: FloatArray,
+    fits: JointFits,
+    covariance: FloatArray,
+    n_differences: int,
+    which: NDArray[np.intp],
+) -> NDArray[np.bool_]:
+    """:func:`is_described` of some of the fits."""
+    q, mu = fits.q[which], fits.mu[which]
+    dof = n_differences - 6 * q.shape[1]
+    return is_described(
+        problem.rows(which),
+        y[which],
+        problem.position(q),
+        problem.moment(q, mu),
+        fits.chi2[which],
+        dof,
+        covariance[which],
     )
 
 
@@ -120,6 +199,7 @@ def _of_several(
     covariance: FloatArray,
     of_row: NDArray[np.intp],
     detected: NDArray[np.bool_],
+    n_differences: int,
 ) -> FitUncertainty:
     offset, moment = problem.position(fits.q) - problem.centroid, problem.moment(fits.q, fits.mu)
     n_fits, n_sources = offset.shape[:2]
@@ -141,4 +221,7 @@ def _of_several(
     volume, weight = log_volume(covariance, moment, offset), np.zeros(n_fits)
     for row in np.unique(of_row):
         weight[of_row == row] = weights(chi2[of_row == row], volume[of_row == row])
-    return FitUncertainty(sets, wide, gaussian & (weight >= CERTAIN_WEIGHT)[:, None], weight)
+    gaussian &= (weight >= CERTAIN_WEIGHT)[:, None]
+    claimed = np.flatnonzero(gaussian.any(axis=1))
+    gaussian[claimed] &= _described(problem, y, fits, covariance, n_differences, claimed)[:, None]
+    return FitUncertainty(sets, wide, gaussian, weight)

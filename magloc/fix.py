@@ -49,8 +49,9 @@ class Solution:
         How likely the solution is among those of the fix; they add up to one (:func:`magloc.rivals.weights`).
     gaussian : bool
         Whether the covariance describes the uncertainty: the range is observable in one interval, no other solution has
-        a weight to speak of, and the standard deviations of position and moment are so small against the range and the
-        moment that errors are Gaussian (:data:`magloc.rivals.LARGEST_GAUSSIAN_SIGMA`).
+        a weight to speak of, the standard deviations of position and moment are small against the range and the moment
+        (:data:`magloc.rivals.LARGEST_GAUSSIAN_SIGMA`), and χ² is one of noise and rises as that of a Gaussian does
+        (:func:`magloc.fit_uncertainty.is_described`).
     """
 
     position_m: FloatArray

@@ -18,7 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from arrays.differences import Whitening, reading_covariance, whitening, whitenings
 from arrays.sensor import SensorArray
 from magloc.dipole import MU0_OVER_4PI
+from magloc.fit_uncertainty import is_described
 from magloc.fix import DISTINCT_WITHIN, NOTHING_KNOWN, SILENT, Fix, Knowledge, Solution
+from magloc.joint import JointProblem
 from magloc.kernels import over_rows
 from magloc.kernels import separable as kernels
 from magloc.range_set import is_detected
@@ -353,7 +355,20 @@ class Locator:
         ranges = rivals.ranges(alpha, problem.radius)
         determined, silent = np.isfinite(rivals.chi2), energy < SILENT * n_differences
         chi2_, iterations_, dof = chi2.tolist(), found.iterations.tolist(), n_differences - N_UNKNOWNS
-        weight_, gaussian_, observable_ = rivals.weight.tolist(), ranges.gaussian.tolist(), ranges.observable.tolist()
+        gaussian, claimed = ranges.gaussian.copy(), np.nonzero(ranges.gaussian)
+        if claimed[0].size:
+            without_ambient = np.zeros((len(of_rows), self.array.n_sensors, 3))
+            same = JointProblem.of(self.array, of_rows, without_ambient).rows(found.model[-1][claimed[0]])
+            gaussian[claimed] = is_described(
+                same,
+                y[claimed[0]],
+                position[claimed][:, None],
+                moment[claimed][:, None],
+                chi2[claimed],
+                dof,
+                covariance[claimed],
+            )
+        weight_, gaussian_, observable_ = rivals.weight.tolist(), gaussian.tolist(), ranges.observable.tolist()
         detected_ = is_detected(energy, n_differences).tolist()
         fixes = []
         for i, n in enumerate(kept.tolist()):

@@ -129,6 +129,8 @@ def levels(chi2: FloatArray, weight: FloatArray) -> FloatArray:
     """
     result = np.full(len(chi2), RISE_95)
     several = np.flatnonzero((weight > 0.0).sum(axis=1) > 1)
+    if not several.size:
+        return result
     above, share = chi2[several] - chi2[several].min(axis=1, keepdims=True), weight[several]
     above = np.where(share > 0.0, above, 0.0)
     low, high = np.full(several.size, RISE_95), RISE_95 + above.max(axis=1, initial=0.0)

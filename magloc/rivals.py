@@ -27,6 +27,8 @@ LARGEST_GAUSSIAN_SIGMA = 0.04
 """Standard deviations of position and moment, over range and moment, up to which their errors are Gaussian."""
 CERTAIN_WEIGHT = 0.99
 """Weight from which on a solution is as good as the only one."""
+MISFIT = 1e-6
+"""Probability of χ² under noise below which the model does not hold, or the search missed the best solution."""
 
 
 def log_volume(covariance: FloatArray, moment: FloatArray, offset_m: FloatArray | None = None) -> FloatArray:
@@ -102,6 +104,27 @@ def relative_sigma(covariance: FloatArray, offset_m: FloatArray, moment: FloatAr
         ]
     larger: FloatArray = np.maximum(*parts)
     return larger
+
+
+def longest_axes(covariance: FloatArray, offset_m: FloatArray, moment: FloatArray) -> FloatArray:
+    """Longest half axes of the ellipsoids of one standard deviation, lengths being in units of ranges and moments.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (..., 6 K, 6 K)
+        Of position and moment of the first of K sources, then of the second, and so on.
+    offset_m, moment : ndarray, shape (..., K, 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 6 K)
+        In the units of the covariance.
+    """
+    lengths = np.stack([np.linalg.norm(vector, axis=-1) for vector in (offset_m, moment)], axis=-1)
+    unit = np.repeat(lengths.reshape(*lengths.shape[:-2], covariance.shape[-1] // 3), 3, axis=-1)
+    variance, axis = np.linalg.eigh(covariance / (unit[..., :, None] * unit[..., None, :]))
+    longest: FloatArray = unit * axis[..., -1] * np.sqrt(np.maximum(variance[..., -1:], 0.0))
+    return longest
 
 
 def widened(

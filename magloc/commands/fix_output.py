@@ -16,6 +16,7 @@ from arrays.sensor import SensorArray
 from magloc.commands.common import print_note
 from magloc.fix import Fix, JointFix, Solution, Source
 from magloc.readings import Readings
+from magloc.rivals import MISFIT
 
 FloatArray = NDArray[np.float64]
 AnyFix = Fix | JointFix
@@ -34,8 +35,6 @@ _JSON_KEYS = (
     "gaussian",
     "weight",
 )
-# Probability of χ² under noise.
-_MISFIT = 1e-6
 _SOURCE_KEYS = (
     "position_m",
     "moment_Am2",
@@ -89,7 +88,7 @@ def is_misfit(fix: AnyFix) -> bool:
     """Whether χ² is far beyond noise: then neither the position nor its standard deviations are to be trusted."""
     if not fix.solutions or fix.solutions[0].dof <= 0:
         return False
-    return bool(chdtrc(fix.solutions[0].dof, fix.solutions[0].chi2) < _MISFIT)
+    return bool(chdtrc(fix.solutions[0].dof, fix.solutions[0].chi2) < MISFIT)
 
 
 def json_entry(time_s: float, fix: AnyFix, saturated: tuple[str, ...], near: bool) -> dict[str, object]:

@@ -79,7 +79,7 @@ def _cells(fix: Fix | JointFix, source: Solution | Source, per_m: float, decimal
     deviations = np.sqrt(np.diagonal(source.covariance))
     of_position = deviations[:3] if deviations.size == 6 else np.zeros(3)
     flags = [
-        *(_of_uncertainty(source) if fix.detected else ["weak"]),
+        *(_of_uncertainty(source, misfit=is_misfit(fix)) if fix.detected else ["weak"]),
         *([f"+{others}({100.0 * best.weight:.0f}%)"] if others else []),
         *(["misfit"] if is_misfit(fix) else []),
         *(["merged"] if isinstance(source, Source) and source.merged else []),
@@ -100,11 +100,11 @@ def _cells(fix: Fix | JointFix, source: Solution | Source, per_m: float, decimal
     ]
 
 
-def _of_uncertainty(source: Solution | Source) -> list[str]:
-    """What has to be said of the standard deviations."""
+def _of_uncertainty(source: Solution | Source, *, misfit: bool) -> list[str]:
+    """What has to be said of the standard deviations; of a misfit that alone."""
     if not source.range_observable:
         return ["range?"]
-    return [] if source.gaussian else ["bent"]
+    return [] if source.gaussian or misfit else ["bent"]
 
 
 def _two_digits(value: float) -> str:

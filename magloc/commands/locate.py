@@ -54,9 +54,9 @@ def locate(
     centroid, of all solutions together. Flags: "weak" = nothing stands out of the noise, which alone makes one of a
     thousand rows look like a source, and the range may be anything; "range?" = the range is not observable: s is
     widened until it is as long as range95; "bent" = position or moment are uncertain by more than 4 %, or there is
-    another solution, and errors are not Gaussian: trust range95 rather than s; "+2(70%)" = two other solutions fit
-    almost as well, and the best one has 70 % of the probability, see --json; "-s3" = sensor s3 contradicts all others
-    and is not used; "merged" = two sources that the array does not tell apart; "near" = too near for a dipole;
+    another solution, or χ² does not rise as a Gaussian's: trust range95 rather than s; "+2(70%)" = two other solutions
+    fit almost as well, and the best one has 70 % of the probability, see --json; "-s3" = sensor s3 contradicts all
+    others and is not used; "merged" = two sources that the array does not tell apart; "near" = too near for a dipole;
     "misfit" = χ² is far beyond noise.
 
     Parameters

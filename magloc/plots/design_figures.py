@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
+from scipy.spatial.distance import pdist
 
 from magloc.design import BEST_START, Design, random_sample
 from magloc.design_judgement import Judgement, range_spread
@@ -30,6 +31,8 @@ _LINES = {
 # More sensors than this would hide behind their names.
 _MOST_NAMED = 12
 _ELEVATION, _AZIMUTH = 22.0, -55.0
+# About the azimuth, and behind the array [°]: the first of them that is clearest.
+_TURNS = (0.0, -15.0, 15.0, 90.0, -90.0, 180.0, 75.0, 105.0, -75.0, -105.0, 165.0, 195.0)
 _REACH, _ARROW, _ARROW_LABEL, _FLAT = 1.25, 1.2, 1.42, 0.5
 
 
@@ -129,12 +132,13 @@ def _scene(ax: Any, result: Design) -> None:
     ax.scatter(*sensors.T, color=style.BLUE, s=26, depthshade=False, edgecolor=style.BLACK, linewidth=0.5)
     for name, place in zip(result.array.ids, sensors, strict=True) if len(sensors) <= _MOST_NAMED else ():
         ax.text(*place, f"  {name}", fontsize=style.SMALL_LETTERS, ha="left", va="bottom", zorder=9)
-    _sources_arrow(ax, result)
+    arrow_name = _sources_arrow(ax, result)
     reach = _REACH * volume.radius
     for set_limits, centre in zip((ax.set_xlim, ax.set_ylim, ax.set_zlim), volume.centre, strict=True):
         set_limits(centre - reach, centre + reach)
     ax.set_box_aspect((1.0, 1.0, 1.0), zoom=0.92)
-    ax.view_init(_ELEVATION, _AZIMUTH)
+    named = np.vstack([sensors, arrow_name])
+    ax.view_init(_ELEVATION, clear_azimuth(named) if len(sensors) <= _MOST_NAMED else _AZIMUTH)
     for label, axis in (("x [m]", ax.xaxis), ("y [m]", ax.yaxis), ("z [m]", ax.zaxis)):
         axis.set_label_text(label, fontsize=style.SMALL_LETTERS)
         axis.labelpad = -6.0
@@ -143,19 +147,33 @@ def _scene(ax: Any, result: Design) -> None:
         axis.set_major_locator(MaxNLocator(5, prune="both"))
 
 
-def _sources_arrow(ax: Any, result: Design) -> None:
-    """An arrow towards the middle of the sources, where they have one side."""
+def clear_azimuth(points: FloatArray) -> float:
+    """Direction to look from [°] in which points (n, 3) that have a name are farthest apart in the picture."""
+    rise = np.radians(_ELEVATION)
+
+    def least_distance(azimuth: float) -> float:
+        a = np.radians(azimuth)
+        right = [-np.sin(a), np.cos(a), 0.0]
+        up = [-np.sin(rise) * np.cos(a), -np.sin(rise) * np.sin(a), np.cos(rise)]
+        # Names are written to the right: above one another they are clear sooner.
+        return float(pdist(points @ np.array([right, up]).T * [0.5, 1.0]).min())
+
+    return max((_AZIMUTH + turn for turn in _TURNS), key=least_distance)
+
+
+def _sources_arrow(ax: Any, result: Design) -> FloatArray:
+    """An arrow towards the middle of the sources, where they have one side; the places of its name, none or one."""
     volume, region = result.task.volume, result.task.region
     if isinstance(region, Cap):
         if region.half_angle_rad > 0.6 * np.pi:
-            return
+            return np.empty((0, 3))
         towards = np.array(region.towards)
     else:
         middle = region.positions(np.full((1, 3), 0.5))[0]
         towards = middle - volume.centre
     length = float(np.linalg.norm(towards))
     if length == 0.0:
-        return
+        return np.empty((0, 3))
     direction = towards / length
     ax.quiver(
         *volume.centre, *(_ARROW * volume.radius * direction), color=style.ORANGE, lw=1.4, arrow_length_ratio=0.12
@@ -164,6 +182,7 @@ def _sources_arrow(ax: Any, result: Design) -> None:
     flat = abs(direction[2]) < _FLAT
     label = volume.centre + volume.radius * ((_ARROW if flat else _ARROW_LABEL) * direction - [0.0, 0.0, 0.25 * flat])
     ax.text(*label, "sources", fontsize=style.SMALL_LETTERS, ha="center", va="center")
+    return np.array([label])
 
 
 def _outline(volume: Volume) -> list[FloatArray]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from functools import partial
+from functools import partial, partialmethod
 
 import numpy as np
 import pytest
@@ -50,11 +50,13 @@ def run_json(*arguments, capsys):
 
 @pytest.fixture
 def coarse(monkeypatch):
-    """Slices and spheres of few points, and little noise to set a threshold with."""
+    """Slices and spheres of few points, and little noise for thresholds and probabilities of detection."""
     from magloc.matched_filter import MatchedFilterDetector
 
     rough = partial(MatchedFilterDetector.of, false_alarm_rate=1e-2, n_draws=2_000)
+    required = partialmethod(MatchedFilterDetector.required_energy, n_draws=200)
     monkeypatch.setattr(MatchedFilterDetector, "of", lambda array, *_, **__: rough(array))
+    monkeypatch.setattr(MatchedFilterDetector, "required_energy", required)
     for name, value in (("_SLICE_GRID", 15), ("_STEP_DEG", 30.0), ("_FRAMES", 3)):
         monkeypatch.setattr(f"magloc.commands.bounds.{name}", value)
 

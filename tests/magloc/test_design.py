@@ -37,6 +37,7 @@ from magloc.design_task import Block, Cap, DesignTask, Mean, Quantile
 from magloc.design_volumes import Ball, Box, Cylinder, Surface
 from magloc.dipole import field
 from magloc.locate import Locator
+from magloc.plots.design_figures import clear_azimuth
 
 RADIUS = 0.92
 BALL = Ball((0.0, 0.0, 0.0), RADIUS)
@@ -360,3 +361,16 @@ class TestGain:
         assert tetrahedron_.gain < most
         assert ("tetrahedron" in result.near_optimal) == (distance == 8.0)
         assert result.converged
+
+
+class TestPicture:
+    """It is looked at from where the names of the sensors do not cover each other."""
+
+    @pytest.mark.parametrize("azimuth", [-55.0, 35.0])
+    def test_two_sensors_behind_one_another_are_seen_from_elsewhere(self, azimuth):
+        e, a = np.radians([22.0, azimuth])
+        sight = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        points = np.array([sight, -sight, [0.0, 0.0, 2.0]])
+        e, a = np.radians([22.0, clear_azimuth(points)])
+        towards = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        assert np.linalg.norm(np.cross(towards, 2.0 * sight)) > 1.0

@@ -91,7 +91,10 @@ class Problems:
 
     @classmethod
     def of(cls, case: str, n: int, seed: int) -> Problems:
-        array, nearest, farthest = CASES[case]
+        return cls.around(*CASES[case], n, seed)
+
+    @classmethod
+    def around(cls, array: SensorArray, nearest: float, farthest: float, n: int, seed: int) -> Problems:
         rng = np.random.default_rng(seed)
         direction, moment = rng.normal(size=(2, n, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
@@ -546,6 +549,82 @@ class TestCovariance:
             for s in fix.solutions:
                 assert not (s.gaussian and s.weight < 0.99)
                 assert not (s.gaussian and not s.range_observable)
+
+
+class TestBentErrors:
+    """A small ellipse is not Gaussian either where χ² does not follow it: near a long array, most of all."""
+
+    # Five sensors of unequal noise, nearly in a line.
+    ARRAY = SensorArray(
+        tuple(
+            Sensor(f"s{i}", "vector", place, noise)
+            for i, (place, noise) in enumerate(
+                zip(
+                    (np.random.default_rng(2).normal(size=(5, 3)) * [1.0, 0.6, 0.3]).tolist(),
+                    (1e-9, 5e-10, 2e-9, 1e-9, 7e-10),
+                    strict=True,
+                )
+            )
+        )
+    )
+
+    def problems(self) -> Problems:
+        return Problems.around(self.ARRAY, 2.0, 4.0, 600, 18)
+
+    def test_chi2_rises_by_one_along_the_longest_axis(self) -> None:
+        """By the differences that share a base sensor; the axis by a singular value decomposition."""
+        problems = self.problems()
+        measurement = DifferenceMeasurement.of(self.ARRAY)
+        told, found = [], []
+        for fix, readings in zip(problems.fixes, problems.readings_T, strict=True):
+            s = fix.solutions[0]
+            offset = s.position_m - self.ARRAY.centroid
+            unit = np.repeat([np.linalg.norm(offset), np.linalg.norm(s.moment_Am2)], 3)
+            jacobian = measurement.jacobian(s.position_m, s.moment_Am2) * unit / np.sqrt(measurement.variance)[:, None]
+            _, w, Vt = np.linalg.svd(jacobian)
+            sigma = [np.sqrt(np.sum((Vt.T[part] / w) ** 2)) for part in (slice(3), slice(3, 6))]
+            if max(sigma) > 0.04 or s.weight < 0.99 or len(s.range_interval95_m) > 1 or not s.range_observable:
+                assert not s.gaussian
+                continue
+            rises = []
+            for step in (unit * Vt[-1] / w[-1], -unit * Vt[-1] / w[-1]):
+                moved = measurement.predicted(s.position_m + step[:3], s.moment_Am2 + step[3:])
+                rises.append(np.sum((measurement.measured(readings) - moved) ** 2 / measurement.variance) - s.chi2)
+            told.append(s.gaussian)
+            found.append(np.abs(np.array(rises) - 1.0).max())
+        bends, gaussian = np.array(found), np.array(told)
+        assert gaussian[bends < 0.49].all()
+        assert not gaussian[bends > 0.51].any()
+        assert np.count_nonzero(bends > 0.51) >= 3
+        assert gaussian.mean() > 0.9
+
+    @pytest.mark.slow
+    def test_nees_of_ten_thousand(self) -> None:
+        """1.01; 2.0 without looking at the longest axis, and thousands with the row that the search misses."""
+        problems = Problems.around(self.ARRAY, 2.0, 8.0, 10_000, 2)
+        cartesian, _ = TestCovariance().nees(problems)
+        assert 0.9 < cartesian.mean() < 1.1
+
+    def test_a_misfit_is_not_gaussian(self) -> None:
+        problems = self.problems()
+        wrong = problems.readings_T + 100.0 * self.ARRAY.channel_noise_T * (np.arange(15) == 4)
+        misfits = 0
+        for fix in Locator(self.ARRAY).fit_rows(wrong):
+            s = fix.solutions[0]
+            if scipy.stats.chi2.sf(s.chi2, s.dof) < 1e-6:
+                misfits += 1
+                assert not s.gaussian
+        assert misfits > 100
+
+    def test_joint_fits_say_the_same(self) -> None:
+        problems = self.problems()
+        rows = slice(0, 60)
+        for one, other in zip(
+            ExactLocator(self.ARRAY).fit_rows(problems.readings_T[rows]), problems.fixes[rows], strict=True
+        ):
+            a, b = one.solutions[0], other.solutions[0]
+            if abs(a.chi2 - b.chi2) < 1e-6 and len(one.solutions) == len(other.solutions):
+                assert a.gaussian == b.gaussian
 
 
 class TestOtherLocators:
