@@ -3,8 +3,10 @@
 Sources at rest are matched exactly by the model of a source at rest; the paths of the others are no model's. Seeds are
 not tuned. Every test says how often a right program fails it. `make test-full` takes the sizes that count.
 
-Measured over 200 runs of the paper's scenario (seeds 1000 to 1199): rms 1.07 of the posterior bound, NEES 1.03 to 1.07
-per dimension at any instant, NIS 1.003, no run farther from the truth at its end than 4.04 σ.
+Measured over 100 runs of the paper's scenario (seeds 0 to 99): rms 1.11 of the posterior bound of the rows that the
+tracks use, 1.28 of that of all rows. A track that starts near the limit of a start drops the rows before the one that
+confirms it, as they were selected by their noise, and the first rows weigh most. Over 600 runs (seeds 0 to 199, 1000 to
+1199, 2000 to 2199) no run ends farther from the truth than 4.3 σ.
 """
 
 from __future__ import annotations
@@ -78,14 +80,20 @@ def at_rest(simulation: Simulation) -> dict[str, Any]:
 
 
 def at_rest_with_bound(simulation: Simulation) -> dict[str, Any]:
-    """Of a source at rest; and mean squares of errors and of their posterior bound over all rows that are tracked."""
+    """Of a source at rest; and mean squares of errors and of their posterior bound over the rows of the track.
+
+    The bound is that of the rows from the track's first one on: what the start drops is not held against the filter.
+    """
     readings, truth = simulation.readings, simulation.truth
     rows = list(rows_of(readings.time_s, readings.values_T))
     tracker = Tracker(simulation.array, REST)
     assert truth.moment_Am2 is not None
-    bound = posterior_bound(tracker, rows, truth.position_m, truth.moment_Am2)
     points = track_record(tracker, rows)
-    result = consistency(points, tracker, rows, truth.position_m, truth.moment_Am2, bound)
+    first = next(i for i, point in enumerate(points) if point.covariance is not None)
+    seen = slice(first, None)
+    position_m, moment_Am2 = truth.position_m[seen], truth.moment_Am2[seen]
+    bound = posterior_bound(tracker, rows[seen], position_m, moment_Am2)
+    result = consistency(points[seen], tracker, rows[seen], position_m, moment_Am2, bound)
     squares = {"error_m2": result.position_rms_m**2, "bound_m2": result.position_bound_m**2}
     return {**track_statistics(simulation, REST), **squares}
 
@@ -152,8 +160,8 @@ class TestPaper:
     def test_is_consistent_and_reaches_the_bound(self, n_runs: int) -> None:
         """False-alarm rate 1 % for NEES and for NIS, 1.2e-4 for 200 runs that end within 5 σ.
 
-        The rms is held to 1.15 of the bound over 200 runs: measured 1.07, with a standard error of 0.04. Over 20, where
-        it is 0.13, to 1.5.
+        The rms is held to 1.15 of the bound over 200 runs, with a standard error of 0.03; over 20, where it is 0.1, to
+        1.5.
         """
         result = found(read_scenario("paper"), at_rest_with_bound, n_runs)
         assert_nees_inside_bounds(result)
