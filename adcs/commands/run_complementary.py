@@ -16,6 +16,7 @@ from adcs.commands.common import Flag, QuietOptions, print_json, print_note, pro
 from adcs.complementary import Gains, VectorRecord
 from adcs.outage import Rule, Substitution
 from arrays.errors import InputError
+from magloc.output_files import refuse_file
 
 if TYPE_CHECKING:
     from sims.complementary import SatelliteRuns, SatelliteScenario
@@ -179,8 +180,8 @@ def run_complementary(
     from sims.complementary import satellite_runs
 
     options.check()
-    if out is not None and out.exists() and not out.is_dir():
-        raise InputError(f"{out}: found a file, expected a folder.")
+    if out is not None:
+        refuse_file(out, "--out")
     rows: list[FloatArray] = []
     last = options.seed + options.seeds
     for begin in range(options.seed, last, _RUNS_AT_ONCE):

@@ -16,6 +16,7 @@ from adcs.commands.common import Flag, QuietOptions, print_json, print_note, pro
 from adcs.roll_yaw import STEP_S, YAW, SetTrack
 from adcs.strip_steps import StepRule
 from arrays.errors import InputError
+from magloc.output_files import refuse_file
 
 FloatArray = NDArray[np.float64]
 
@@ -118,8 +119,8 @@ def run_ellipsoid(
         A file cannot be written.
     """
     options.check()
-    if out is not None and out.exists() and not out.is_dir():
-        raise InputError(f"{out}: found a file, expected a folder.")
+    if out is not None:
+        refuse_file(out, "--out")
     rows: list[FloatArray] = []
     last = options.seed + options.seeds
     for begin in range(options.seed, last, _RUNS_AT_ONCE):

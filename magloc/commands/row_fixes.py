@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from arrays.sensor import SensorArray
+from magloc.commands.common import Vector
 from magloc.exact import ExactLocator
 from magloc.fix import Fix, JointFix, Knowledge
 from magloc.locate import Locator
@@ -22,7 +23,6 @@ from magloc.several import SeveralLocator, in_stable_order
 
 FloatArray = NDArray[np.float64]
 AnyFix = Fix | JointFix
-Vector = tuple[float, float, float]
 
 _ROWS_AT_ONCE = 256
 # Probability of a χ² under noise below which what is left is looked at.
