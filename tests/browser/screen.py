@@ -199,18 +199,19 @@ class Screen:
 
         if self.evaluate(checked) != on:
             click()
-        if not self._told(label, on):
+        if not self._told(label, checked):
             # Off and on again, as a user would.
             click()
             time.sleep(_BETWEEN_CHANGES_S)
             click()
-            assert self._told(label, on), f"the server does not know that {label!r} is {'on' if on else 'off'}"
+            assert self._told(label, checked), f"the server does not know that {label!r} is {'on' if on else 'off'}"
 
     def slide(self, label: str, share: float) -> None:
         """Drag a slider with the mouse to a share of its length, until the server knows."""
+        value = f"Number(({_FIND_LINE})({json.dumps(label)}).querySelector('[role=slider]').ariaValueNow)"
         for where in (share, 0.9 * share + 0.05, share):
             self._drag_slider(label, where)
-            if self._told(label, self.numbers(label)[0]):
+            if self._told(label, value):
                 return
         raise AssertionError(f"the server does not know where the slider {label!r} is")
 
@@ -222,14 +223,17 @@ class Screen:
         beyond = 4.0 if share == 1.0 else 0.0
         self.browser.drag((begin, y), (track["x"] + share * track["width"] + beyond, y), steps=4)
 
-    def _told(self, label: str, value: float) -> bool:
-        """Whether the server comes to know the value of an input; always true of a page without a server."""
+    def _told(self, label: str, value: str) -> bool:
+        """Whether page and server come to agree on an input, whose value in the page is a JavaScript expression.
+
+        Always true of a page without a server.
+        """
         if self._server is None:
             return True
         identity = self.evaluate(f"({_FIND_LINE})({json.dumps(label)}).querySelector('label[for]').htmlFor")
-        inputs = self._server.gui._gui_input_handle_from_uuid
+        handle = self._server.gui._gui_input_handle_from_uuid[identity]
         try:
-            self.until(lambda: abs(inputs[identity].value - value) < 1e-6, f"{label} is told", _TOLD_S)
+            self.until(lambda: abs(handle.value - self.evaluate(value)) < 1e-6, f"{label} is told", _TOLD_S)
         except AssertionError:
             return False
         time.sleep(_BETWEEN_CHANGES_S)
