@@ -56,6 +56,9 @@ _OF_FRAMES = ("part", "frames", "sky", "matcher", "footprint_m", "believed_k1", 
 _OF_RECORDS = ("part", "samples", "fixes", "fusion")
 """The same of a recording."""
 
+_CLOSEST_PX = 4.0
+"""Lights that are nearer to each other are one blob."""
+
 
 @Parameter(name="*")
 @dataclass(frozen=True)
@@ -231,7 +234,16 @@ class MockupOptions:
         """Lights on the ceiling."""
         from adcs.mockup.sky import led_sky, read_sky
 
-        return led_sky() if self.sky is None else read_sky(self.sky)
+        if self.sky is None:
+            return led_sky()
+        sky, camera = read_sky(self.sky), self.camera()
+        least_m, most_m = _CLOSEST_PX * camera.m_per_px, math.hypot(*camera.footprint_m)
+        if not least_m <= sky.spacing_m <= most_m:
+            raise InputError(
+                f"{self.sky}, key positions_m: found lights {sky.spacing_m:.3g} m apart, expected {least_m:.2g} to "
+                f"{most_m:.2g} m in frames {camera.footprint_m[0]:g} m wide; the file's unit is the metre."
+            )
+        return sky
 
     def matcher_of(self, sky: LedSky) -> Matcher:
         """What identifies the stars of an image of a sky."""

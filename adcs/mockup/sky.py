@@ -108,6 +108,11 @@ class LedSky:
     def __len__(self) -> int:
         return len(self.positions_m)
 
+    @property
+    def spacing_m(self) -> float:
+        """Distance of a light from the nearest other one, median of all [m]."""
+        return float(np.median(np.asarray(cKDTree(self.positions_m).query(self.positions_m, k=2)[0])[:, 1]))
+
     @cached_property
     def hull(self) -> IntArray:
         """Lights on the convex hull, in ascending order, shape (h,)."""

@@ -218,6 +218,12 @@ class TestFrames:
         sky.write_text("positions_m = [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]\n")
         assert_refused(adcs("run", "mockup", "--sky", sky), "few.toml", "at least 4 lights", "received 3")
 
+    @pytest.mark.parametrize("unit", [1e3, 1e-3])
+    def test_a_sky_in_another_unit(self, adcs, tmp_path, unit):
+        positions = (unit * led_sky().positions_m).tolist()
+        (tmp_path / "unit.toml").write_text(f"positions_m = {positions}\n")
+        assert_refused(adcs("run", "mockup", "--sky", tmp_path / "unit.toml"), "unit.toml", "m apart", "the metre")
+
     @pytest.mark.filterwarnings("always::UserWarning")
     def test_a_regular_grid_is_warned_of(self, adcs, tmp_path):
         points = [[0.2 * x, 0.2 * y] for x in range(-6, 7) for y in range(-5, 6)]
