@@ -12,11 +12,11 @@ import numpy as np
 from adcs.mockup.camera import Camera, Pose, camera_of_footprint, centred_from_table, distorted, in_frame, undistorted
 from adcs.mockup.centroids import find_stars
 from adcs.mockup.led_tracking import LightTracker
-from adcs.mockup.matching import SLIVER_RAD, Matcher, PaperMatcher
+from adcs.mockup.matching import SLIVER_RAD, Matcher, PaperMatcher, longest_close_subset
 from adcs.mockup.odds_matching import OddsMatcher
 from adcs.mockup.pose_odds import PoseOdds
 from adcs.mockup.robust_matching import RobustMatcher
-from adcs.mockup.similarity import mirrored_image
+from adcs.mockup.similarity import fitted_similarity, mirrored_image
 from adcs.mockup.sky import led_sky
 from adcs.mockup.triangles import TriangleCatalogue, delaunay_triangles
 from sims.mockup.frames import rendered_frame
@@ -34,6 +34,7 @@ def rows(size: Size) -> Iterator[Row]:
     catalogues = {n: wide_catalogue(n) for n in lights}
     yield from _delaunay_rows(catalogues[lights[-1]], size)
     yield from _search_rows(catalogues, size)
+    yield from _validation_rows(catalogues[lights[-1]], size)
     yield from _memory_rows(catalogues)
     yield from _identification_rows(catalogues, size)
     yield from _frame_rows(size)
@@ -87,6 +88,34 @@ def _search_rows(catalogues: dict[int, TriangleCatalogue], size: Size) -> Iterat
             timings[n, len(one), "all"],
             "the same triangles",
         )
+
+
+def _validation_rows(catalogue: TriangleCatalogue, size: Size) -> Iterator[Row]:
+    """Centres of the c pairs of triangles that match, O(c), and the longest list of close ones.
+
+    All distances are O(c²), as is a list around one centre. Where the spread of the true centres nears what counts as
+    close, as in the widest image, a list is made around most of them: O(c³).
+    """
+    candidates = []
+    for width in (0.9, 1.8, 3.6):
+        image = stars_of(catalogue, camera_of_footprint(width))
+        triangles = delaunay_triangles(image, SLIVER_RAD)
+        mine, theirs = PaperMatcher(catalogue).matches(triangles)
+        seen, known = image[triangles.corners[mine]], catalogue.plane[catalogue.triangles.corners[theirs]]
+        candidates.append((seen, known))
+    contestants = {}
+    for seen, known in candidates:
+        centres = fitted_similarity(seen, known)[1]
+        contestants["centres", len(seen)] = Contestant(lambda p=seen, q=known: fitted_similarity(p, q))
+        contestants["validation", len(seen)] = Contestant(
+            lambda b=centres: longest_close_subset(b, PaperMatcher(catalogue).closeness_m)
+        )
+    timings = interleaved(contestants, size.rounds)
+    for stage, note in (("centres", "c grows {0:.1f} times"), ("validation", "c² grows {1:.1f} times, c³ {2:.1f}")):
+        for c, more in pairwise(len(seen) for seen, _ in candidates):
+            growth = more / c
+            note = note.format(growth, growth**2, growth**3)
+            yield Row(f"{stage}, c = {c}", timings[stage, c], f"c = {more}", timings[stage, more], note)
 
 
 def _memory_rows(catalogues: dict[int, TriangleCatalogue]) -> Iterator[Row]:
