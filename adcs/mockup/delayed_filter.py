@@ -1,13 +1,21 @@
 r"""Error-state Kalman filter of the table-top satellite that takes late camera fixes where they belong.
 
-The state is (X, Y, v_X, v_Y, φ, α, β, b): position, velocity, heading, zeros of the accelerometer along body x and y,
-zero of the gyro. A sample predicts by the formulas of :func:`adcs.mockup.inertial.step` with the zeros taken off; with
-``a`` the acceleration in table axes,
+The state is (X, Y, v_X, v_Y, φ, α, β, b, α', β'): position, velocity, heading, zeros of the accelerometer along body x
+and y, zero of the gyro, drifts of the accelerometer's zeros. A sample predicts by the formulas of
+:func:`adcs.mockup.inertial.step` with the zeros taken off; with ``a`` the acceleration in table axes,
 
 .. math::
 
     \frac{∂a}{∂φ} = \begin{pmatrix} -a_Y \\ a_X \end{pmatrix}, \quad \frac{∂a}{∂(α, β)} = -R(φ + ωΔ/2), \quad
     \frac{∂a}{∂b} = -\frac{Δ}{2} \frac{∂a}{∂φ}
+
+The zeros of a sensor that warms drift steadily, and a walk alone would lag behind them by more than it admits. So they
+go on by α'Δ and β'Δ, and walk, and so do their drifts; a sample has the zeros of its beginning:
+
+.. math::
+
+    Q_{(α, α')} = w^2 \begin{pmatrix} Δ & 0 \\ 0 & 0 \end{pmatrix}
+        + u^2 \begin{pmatrix} Δ^3/3 & Δ^2/2 \\ Δ^2/2 & Δ \end{pmatrix}
 
 A fix measures X, Y and φ. State and covariance of every sample are kept. A fix of exposure t_s takes the filter back to
 t_s, corrects it there, and predicts the samples since again; fixes of later exposures that had come before are taken
@@ -38,7 +46,10 @@ from magloc.kalman import block_update, normalised_innovation_squared, symmetric
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-STATES = ("X_m", "Y_m", "vX_m_s", "vY_m_s", "heading_rad", "zero_x_m_s2", "zero_y_m_s2", "zero_rate_rad_s")
+STATES = (
+    *("X_m", "Y_m", "vX_m_s", "vY_m_s", "heading_rad"),
+    *("zero_x_m_s2", "zero_y_m_s2", "zero_rate_rad_s", "drift_x_m_s3", "drift_y_m_s3"),
+)
 H_FIX: FloatArray = np.eye(N)[[0, 1, 4]]
 
 
@@ -57,8 +68,10 @@ class FilterSettings:
     missing_acceleration_m_s2, missing_rate_rad_s : float
         What may be missed in a sample that the gate of the samples does not believe.
     zero_walk_m_s2_rs, zero_walk_rad_s_rs : float
-        Growth of the zeros' standard deviations in one second [unit per √s]. Zeros that drift steadily, by
-        0.002 m/s² in 180 s, lag by 2.5 of the standard deviations that this gives; positions do not.
+        Walks of the zeros: growth of their standard deviations in one second [unit per √s].
+    drift_walk_m_s3_rs : float
+        Walk of the drifts: 7e-6 m/s³ in 200 s, for a sensor whose warming levels off within minutes. If it does so
+        within one minute, errors of zeros and drifts are 1.1 and 1.4 of their standard deviations.
     fix_m, fix_rad : float
         Noise of a fix, each axis.
     fix_gate : float
@@ -80,6 +93,7 @@ class FilterSettings:
     missing_rate_rad_s: float = math.radians(20.0)
     zero_walk_m_s2_rs: float = 2e-5
     zero_walk_rad_s_rs: float = math.radians(0.002)
+    drift_walk_m_s3_rs: float = 5e-7
     fix_m: float = 1.5e-3
     fix_rad: float = math.radians(0.1)
     fix_gate: float = 25.0
@@ -97,29 +111,33 @@ class FilterSettings:
 
     @property
     def densities(self) -> FloatArray:
-        """Noise of accelerations and rates, of both where missing, walks of both zeros: squared densities, (6,)."""
+        """Noise of acceleration and rate, of both where missing, walks of zeros and drifts: squared densities, (7,)."""
         white = np.array(
             [self.acceleration_m_s2, self.rate_rad_s, self.missing_acceleration_m_s2, self.missing_rate_rad_s]
         )
-        walks = np.array([self.zero_walk_m_s2_rs, self.zero_walk_rad_s_rs])
+        walks = np.array([self.zero_walk_m_s2_rs, self.zero_walk_rad_s_rs, self.drift_walk_m_s3_rs])
         return np.concatenate([self.sample_s * white**2, walks**2])
 
 
 @dataclass(frozen=True)
 class StartSigma:
-    """Standard deviations of the start, each axis."""
+    """Standard deviations of the start, each axis.
+
+    The accelerometer's zeros may drift by 0.0003 m/s² per °C, so that 2e-5 m/s³ is 4 °C in a minute.
+    """
 
     position_m: float = 1.5e-3
     velocity_m_s: float = 0.01
     heading_rad: float = math.radians(0.1)
     zero_m_s2: float = 0.002
     zero_rad_s: float = math.radians(0.05)
+    drift_m_s3: float = 2e-5
 
     @property
     def covariance(self) -> FloatArray:
-        """Diagonal, shape (8, 8)."""
-        p, v, z = self.position_m, self.velocity_m_s, self.zero_m_s2
-        return np.diag(np.square([p, p, v, v, self.heading_rad, z, z, self.zero_rad_s]))
+        """Diagonal, shape (10, 10)."""
+        p, v, z, d = self.position_m, self.velocity_m_s, self.zero_m_s2, self.drift_m_s3
+        return np.diag(np.square([p, p, v, v, self.heading_rad, z, z, self.zero_rad_s, d, d]))
 
 
 LOST = StartSigma(position_m=10.0, velocity_m_s=0.5, heading_rad=math.pi)
@@ -136,12 +154,15 @@ class FilterTrack(PlanarTrack):
         Of the accelerometer.
     zero_rad_s : ndarray, shape (n,)
         Of the gyro.
-    sigma : ndarray, shape (n, 8)
+    drift_m_s3 : ndarray, shape (n, 2)
+        Of the accelerometer's zeros.
+    sigma : ndarray, shape (n, 10)
         Standard deviations of the states in the order of :data:`STATES`.
     """
 
     zero_m_s2: FloatArray
     zero_rad_s: FloatArray
+    drift_m_s3: FloatArray
     sigma: FloatArray
 
 
@@ -152,14 +173,14 @@ def predicted(
 
     Parameters
     ----------
-    x : ndarray, shape (8,)
-    P : ndarray, shape (8, 8)
+    x : ndarray, shape (10,)
+    P : ndarray, shape (10, 10)
     step_s : float
     reading : array_like, shape (3,)
         Accelerations along body x and y, and the rate.
     there : array_like of bool, shape (3,)
         Which of them are believed. One that is not counts as zero acceleration, or as the rate that is given.
-    densities : ndarray, shape (6,)
+    densities : ndarray, shape (7,)
         Of :attr:`FilterSettings.densities`.
 
     Returns
@@ -178,18 +199,23 @@ def predicted(
     F[0:2, 4:8] = 0.5 * h**2 * da
     F[2:4, 4:8] = h * da
     F[4, 7] = -h
+    F[5:7, 8:10] = h * np.eye(2)
     Q = np.zeros((N, N))
     to_table = turned(middle, np.eye(2)).T
     q = to_table @ np.diag(np.where(use[:2], densities[0], densities[2])) @ to_table.T
     Q[0:2, 0:2], Q[0:2, 2:4] = h**3 / 3.0 * q, h**2 / 2.0 * q
     Q[2:4, 0:2], Q[2:4, 2:4] = h**2 / 2.0 * q, h * q
     Q[4, 4] = h * (densities[1] if use[2] else densities[3])
-    Q[5, 5] = Q[6, 6] = h * densities[4]
     Q[7, 7] = h * densities[5]
+    for zero, drift in ((5, 8), (6, 9)):
+        Q[zero, zero] = h * densities[4] + h**3 / 3.0 * densities[6]
+        Q[zero, drift] = Q[drift, zero] = h**2 / 2.0 * densities[6]
+        Q[drift, drift] = h * densities[6]
     x_next = x.copy()
     x_next[0:2] += h * x[2:4] + 0.5 * h**2 * a
     x_next[2:4] += h * a
     x_next[4] += h * rate
+    x_next[5:7] += h * x[8:10]
     return x_next, F @ P @ F.T + Q
 
 
@@ -217,14 +243,14 @@ class DelayedFilter:
         Where the first samples begin.
     settings : FilterSettings
     sigma : StartSigma
-        How well the start is known. The zeros start at 0.
+        How well the start is known. The zeros and their drifts start at 0.
 
     Attributes
     ----------
-    x, P : ndarray, shape (8,), (8, 8)
+    x, P : ndarray, shape (10,), (10, 10)
         Estimate and covariance at the last sample.
     state : PlanarState
-        The same without the zeros.
+        The same without the zeros and drifts.
     nis : list of float
         Normalised innovation squared of every fix that came and could be taken, when it was first taken.
     """
@@ -243,7 +269,7 @@ class DelayedFilter:
         # Row 0 is where the history begins; the reading of a row is that of the interval which ends there.
         self._time_s = np.full(1, float(begin_s))
         self._readings, self._there = np.zeros((1, 3)), np.zeros((1, 3), dtype=np.bool_)
-        self._x = np.concatenate([start.position_m, start.velocity_m_s, [float(start.heading_rad)], np.zeros(3)])[None]
+        self._x = np.concatenate([start.position_m, start.velocity_m_s, [float(start.heading_rad)], np.zeros(5)])[None]
         self._P = sigma.covariance[None]
         self._history: list[_Taken] = []
 
@@ -297,10 +323,10 @@ class DelayedFilter:
         self._predict(last, self._n - 1)
         x, P = self._x[rows], self._P[rows]
         sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-        position, velocity, heading, zeros, rate_zero = (
-            x[:, k].copy() for k in (slice(0, 2), slice(2, 4), 4, slice(5, 7), 7)
+        position, velocity, heading, zeros, rate_zero, drifts = (
+            x[:, k].copy() for k in (slice(0, 2), slice(2, 4), 4, slice(5, 7), 7, slice(8, 10))
         )
-        return FilterTrack(imu.time_s, position, velocity, heading, zeros, rate_zero, sigma)
+        return FilterTrack(imu.time_s, position, velocity, heading, zeros, rate_zero, drifts, sigma)
 
     def add_fix(self, fix: Fix) -> Outcome:
         """Go back to the exposure of a fix, correct the estimate there, and come back.

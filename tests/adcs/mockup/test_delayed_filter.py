@@ -10,7 +10,8 @@ predict_rows (compiled)    predicted, its readable twin
 predicted                  the integration step; derivatives by finite differences; the integral of
                            white noise (van Loan)
 the filter                 a textbook filter of ten lines that gets the fixes without delay; filterpy
-consistency                NEES of all states, NIS of the fixes, with truth of the filter's own noises
+consistency                NEES of all states and of each, NIS of the fixes, with truth of the filter's
+                           own noises; zeros that drift steadily: test_delayed_filter_zeros.py
 =========================  ============================================================================
 
 Statistical tests have fixed seeds, not chosen, and state the probability with which a right program fails them.
@@ -30,8 +31,8 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.differentiate import jacobian
 
-from adcs.kernels.mockup import predict_rows
-from adcs.mockup.delayed_filter import H_FIX, DelayedFilter, FilterSettings, FilterTrack, StartSigma, predicted
+from adcs.kernels.mockup import N, predict_rows
+from adcs.mockup.delayed_filter import H_FIX, STATES, DelayedFilter, FilterSettings, FilterTrack, StartSigma, predicted
 from adcs.mockup.fixes import Fix, FixRecord, Outcome, fuse
 from adcs.mockup.inertial import ImuRecord, PlanarState, step, strapdown
 
@@ -42,24 +43,26 @@ FALSE_ALARM = 1e-4
 
 
 def random_covariance(rng):
-    root = rng.standard_normal((8, 8)) * np.sqrt(np.diagonal(SIGMA.covariance))[:, None]
+    root = rng.standard_normal((N, N)) * np.sqrt(np.diagonal(SIGMA.covariance))[:, None]
     return root @ root.T
 
 
 def own_world(rng, duration_s, settings=SETTINGS, sigma=SIGMA, period_s=0.6, delay_s=0.6):
-    """Truth with the noises that the filter assumes: (track, zeros (n, 3), samples, fixes)."""
+    """Truth with the noises that the filter assumes: (track, zeros and drifts (n, 5), samples, fixes)."""
     n = int(100 * duration_s)
     dt, t = 0.01, 0.01 * np.arange(1.0, n + 1.0)
-    off = np.sqrt(np.diagonal(sigma.covariance)) * rng.standard_normal(8)
+    off = np.sqrt(np.diagonal(sigma.covariance)) * rng.standard_normal(N)
     true_start = PlanarState(
         START.position_m + off[0:2], START.velocity_m_s + off[2:4], float(START.heading_rad) + float(off[4])
     )
     thrust = 0.04 * np.sign(np.sin(np.outer(t, [1.3, 0.9]) + rng.uniform(0.0, 6.0, 2)))
     rate = 0.5 * np.sin(0.4 * t + rng.uniform(0.0, 6.0))
     track = strapdown(ImuRecord(0.0, t, thrust, rate), true_start)
-    walk = np.array([settings.zero_walk_m_s2_rs, settings.zero_walk_m_s2_rs, settings.zero_walk_rad_s_rs])
+    walk = math.sqrt(dt) * np.repeat([settings.zero_walk_m_s2_rs, settings.zero_walk_rad_s_rs], [2, 1])
+    drifts = off[8:] + np.cumsum(math.sqrt(dt) * settings.drift_walk_m_s3_rs * rng.standard_normal((n + 1, 2)), axis=0)
     # A sample has the zero of its beginning, as the filter has it.
-    zeros = off[5:] + np.cumsum(math.sqrt(dt) * walk * rng.standard_normal((n + 1, 3)), axis=0)
+    zeros = off[5:8] + np.cumsum(walk * rng.standard_normal((n + 1, 3)), axis=0)
+    zeros[1:, :2] += dt * np.cumsum(drifts[:-1], axis=0)
     noise = np.array([settings.acceleration_m_s2, settings.acceleration_m_s2, settings.rate_rad_s])
     readings = np.column_stack([thrust, rate]) + zeros[:-1] + noise * rng.standard_normal((n, 3))
     imu = ImuRecord(0.0, t, readings[:, :2], readings[:, 2])
@@ -71,12 +74,12 @@ def own_world(rng, duration_s, settings=SETTINGS, sigma=SIGMA, period_s=0.6, del
         track.position_m[rows] + fix_noise[:, :2],
         np.angle(np.exp(1j * (track.heading_rad[rows] + fix_noise[:, 2]))),
     )
-    return track, zeros[1:], imu, fixes
+    return track, np.concatenate([zeros, drifts], axis=1)[1:], imu, fixes
 
 
 def textbook(imu, fixes, settings=SETTINGS, sigma=SIGMA):
-    """Means (n, 8) and covariances of a Kalman filter in its usual form; fixes at the ends of samples, at once."""
-    x = np.concatenate([START.position_m, START.velocity_m_s, [START.heading_rad], np.zeros(3)])
+    """Means (n, N) and covariances of a Kalman filter in its usual form; fixes at the ends of samples, at once."""
+    x = np.concatenate([START.position_m, START.velocity_m_s, [START.heading_rad], np.zeros(N - 5)])
     P, R = sigma.covariance, np.diag(np.square([settings.fix_m, settings.fix_m, settings.fix_rad]))
     xs, Ps, k = [], [], 0
     for i, dt in enumerate(imu.steps_s):
@@ -87,7 +90,7 @@ def textbook(imu, fixes, settings=SETTINGS, sigma=SIGMA):
             S = H_FIX @ P @ H_FIX.T + R
             K = P @ H_FIX.T @ np.linalg.inv(S)
             if y @ np.linalg.solve(S, y) <= settings.fix_gate:
-                x, P = x + K @ y, (np.eye(8) - K @ H_FIX) @ P @ (np.eye(8) - K @ H_FIX).T + K @ R @ K.T
+                x, P = x + K @ y, (np.eye(N) - K @ H_FIX) @ P @ (np.eye(N) - K @ H_FIX).T + K @ R @ K.T
             k += 1
         xs.append(x)
         Ps.append(P)
@@ -104,20 +107,22 @@ class TestPrediction:
     @given(seeds)
     def test_the_mean_is_the_integration_step(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
-        x, dt, z = rng.standard_normal(8), rng.uniform(0.001, 0.1), rng.standard_normal(3)
+        x, dt, z = rng.standard_normal(N), rng.uniform(0.001, 0.1), rng.standard_normal(3)
         state = step(PlanarState(x[0:2], x[2:4], x[4]), dt, z[:2] - x[5:7], z[2] - x[7])
-        mean, _ = predicted(x, np.eye(8), dt, z, [True] * 3, SETTINGS.densities)
+        mean, _ = predicted(x, np.eye(N), dt, z, [True] * 3, SETTINGS.densities)
         np.testing.assert_allclose(mean[0:2], state.position_m, atol=1e-14)
         np.testing.assert_allclose(mean[2:4], state.velocity_m_s, atol=1e-14)
-        np.testing.assert_allclose(mean[4:], [state.heading_rad, *x[5:]], atol=1e-14)
+        zeros = x[5:7] + dt * x[8:10]
+        np.testing.assert_allclose(mean[4:], [state.heading_rad, *zeros, *x[7:]], atol=1e-14)
 
     @pytest.mark.parametrize("there", [(True, True, True), (False, True, True), (True, False, False)])
     def test_the_transition_is_its_derivative(self, there) -> None:
         rng = np.random.default_rng(1)
-        x, z, P, none = rng.standard_normal(8), rng.standard_normal(3), random_covariance(rng), np.zeros(6)
+        x, z, P = rng.standard_normal(N), rng.standard_normal(3), random_covariance(rng)
+        none = np.zeros_like(SETTINGS.densities)
 
         def mean(points):
-            flat = points.reshape(8, -1).T
+            flat = points.reshape(N, -1).T
             return np.array([predicted(p, P, 0.1, z, there, none)[0] for p in flat]).T.reshape(points.shape)
 
         F = jacobian(mean, x, initial_step=0.05).df
@@ -126,20 +131,25 @@ class TestPrediction:
 
     def test_the_noise_is_that_of_a_white_acceleration(self) -> None:
         # In one axis: x'' = w of density q; van Loan's integral of it over a step.
-        _, Q = predicted(np.zeros(8), np.zeros((8, 8)), 0.3, [0.0] * 3, [True] * 3, SETTINGS.densities)
+        _, Q = predicted(np.zeros(N), np.zeros((N, N)), 0.3, [0.0] * 3, [True] * 3, SETTINGS.densities)
         _, other = van_loan_discretization(
             np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [math.sqrt(SETTINGS.densities[0])]]), 0.3
         )
         for axis in (0, 1):
             np.testing.assert_allclose(Q[np.ix_([axis, axis + 2], [axis, axis + 2])], other, rtol=1e-9)
-        walks = [SETTINGS.zero_walk_m_s2_rs**2] * 2 + [SETTINGS.zero_walk_rad_s_rs**2]
-        np.testing.assert_allclose(np.diagonal(Q)[5:], 0.3 * np.array(walks))
+        # A zero that walks, with a drift that walks too.
+        _, other = van_loan_discretization(
+            np.array([[0.0, 1.0], [0.0, 0.0]]), np.diag([SETTINGS.zero_walk_m_s2_rs, SETTINGS.drift_walk_m_s3_rs]), 0.3
+        )
+        for axis in (5, 6):
+            np.testing.assert_allclose(Q[np.ix_([axis, axis + 3], [axis, axis + 3])], other, rtol=1e-9)
+        assert Q[7, 7] == pytest.approx(0.3 * SETTINGS.zero_walk_rad_s_rs**2)
         assert Q[4, 4] == pytest.approx(0.3 * 0.01 * SETTINGS.rate_rad_s**2)
 
     def test_a_missing_axis_is_uncertain_along_itself(self) -> None:
-        x = np.zeros(8)
+        x = np.zeros(N)
         x[4] = math.pi / 2  # body x is table Y
-        _, Q = predicted(x, np.zeros((8, 8)), 0.01, [0.0] * 3, [False, True, True], SETTINGS.densities)
+        _, Q = predicted(x, np.zeros((N, N)), 0.01, [0.0] * 3, [False, True, True], SETTINGS.densities)
         assert Q[3, 3] == pytest.approx(0.01 * 0.01 * SETTINGS.missing_acceleration_m_s2**2)
         assert Q[2, 2] == pytest.approx(0.01 * 0.01 * SETTINGS.acceleration_m_s2**2)
 
@@ -150,13 +160,15 @@ class TestPrediction:
         n = 20
         time_s = np.cumsum(rng.uniform(0.001, 0.05, n))
         readings, there = rng.standard_normal((n, 3)), rng.random((n, 3)) < 0.8
-        x, P = np.zeros((n, 8)), np.zeros((n, 8, 8))
-        x[0], P[0] = rng.standard_normal(8), random_covariance(rng)
-        predict_rows(0, n - 1, time_s, readings, there, SETTINGS.densities, x, P)
+        x, P = np.zeros((n, N)), np.zeros((n, N, N))
+        # Covariance and noises of order one, so that no term is lost in rounding.
+        densities, root = rng.uniform(0.5, 2.0, SETTINGS.densities.size), rng.standard_normal((N, N))
+        x[0], P[0] = rng.standard_normal(N), root @ root.T
+        predict_rows(0, n - 1, time_s, readings, there, densities, x, P)
         mean, covariance = x[0], P[0]
         for i in range(1, n):
             dt = time_s[i] - time_s[i - 1]
-            mean, covariance = predicted(mean, covariance, dt, readings[i], there[i], SETTINGS.densities)
+            mean, covariance = predicted(mean, covariance, dt, readings[i], there[i], densities)
             np.testing.assert_allclose(x[i], mean, rtol=0, atol=1e-12)
             np.testing.assert_allclose(scaled(P[i], covariance), scaled(covariance, covariance), atol=1e-10)
         np.testing.assert_array_equal(P, P.transpose(0, 2, 1))
@@ -181,14 +193,15 @@ class TestDelay:
         np.testing.assert_allclose(at_once.position_m[between], xs[between, 0:2], rtol=0, atol=1e-11)
         np.testing.assert_allclose(at_once.heading_rad[between], xs[between, 4], rtol=0, atol=1e-11)
         np.testing.assert_allclose(at_once.zero_m_s2[between], xs[between, 5:7], rtol=0, atol=1e-11)
+        np.testing.assert_allclose(at_once.drift_m_s3[between], xs[between, 8:10], rtol=0, atol=1e-11)
         sigma = np.sqrt(np.diagonal(Ps, axis1=1, axis2=2))
         np.testing.assert_allclose(at_once.sigma[between], sigma[between], rtol=1e-8)
         assert end > 1800
 
     def test_it_is_filterpy_s_filter(self) -> None:
         _, _, imu, fixes = own_world(np.random.default_rng(3), 8.0)
-        other = ExtendedKalmanFilter(8, 3)
-        other.x = np.concatenate([START.position_m, START.velocity_m_s, [START.heading_rad], np.zeros(3)])
+        other = ExtendedKalmanFilter(N, 3)
+        other.x = np.concatenate([START.position_m, START.velocity_m_s, [START.heading_rad], np.zeros(N - 5)])
         other.P = SIGMA.covariance
         other.R = np.diag(np.square([SETTINGS.fix_m, SETTINGS.fix_m, SETTINGS.fix_rad]))
         k = 0
@@ -256,24 +269,28 @@ class TestDelay:
 
 
 class TestConsistency:
-    def nees(self, runs, duration_s, seed):
-        """Normalised error squared at the end of each run, and the NIS of all fixes."""
-        values, nis = [], []
+    def errors(self, runs, duration_s, seed):
+        """At the end of each run, error squared of every state over its variance, and NEES; the NIS of all fixes."""
+        squared, nees, nis = [], [], []
         for k in range(runs):
             track, zeros, imu, fixes = own_world(np.random.default_rng([seed, k]), duration_s)
             late = DelayedFilter(START, 0.0)
             fuse(late, imu, fixes)
             true = np.concatenate([track.position_m[-1], track.velocity_m_s[-1], [track.heading_rad[-1]], zeros[-1]])
-            error = late.x - true
-            scale = np.sqrt(np.diagonal(late.P))
-            values.append(float(error / scale @ np.linalg.solve(scaled(late.P, late.P), error / scale)))
+            error = (late.x - true) / np.sqrt(np.diagonal(late.P))
+            squared.append(error**2)
+            nees.append(float(error @ np.linalg.solve(scaled(late.P, late.P), error)))
             nis.extend(late.nis)
-        return np.array(values), np.array(nis)
+        return np.array(squared), np.array(nees), np.array(nis)
 
     def check(self, runs, duration_s, seed):
-        values, nis = self.nees(runs, duration_s, seed)
-        low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], 8 * runs)
-        assert low < values.sum() < high
+        squared, nees, nis = self.errors(runs, duration_s, seed)
+        low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], N * runs)
+        assert low < nees.sum() < high
+        # Each state alone, too: what is too sure of its zeros may be less sure of its heading. Bonferroni.
+        low, high = stats.chi2.ppf([FALSE_ALARM / 2 / N, 1 - FALSE_ALARM / 2 / N], runs)
+        for state, sum_of_squares in zip(STATES, squared.sum(axis=0), strict=True):
+            assert low < sum_of_squares < high, state
         # Innovations of one run are independent, and those of several: χ² of 3 numbers each.
         low, high = stats.chi2.ppf([FALSE_ALARM / 2, 1 - FALSE_ALARM / 2], 3 * len(nis))
         assert low < nis.sum() < high

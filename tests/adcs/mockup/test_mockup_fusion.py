@@ -67,7 +67,7 @@ class TestFusion:
             k = result.run.truth.time_s >= 80.0
             distance = np.linalg.norm(result.fused.track.position_m - result.run.truth.position_m, axis=1)
             assert distance[k].max() < 0.015
-            # 15 s of drop-out, with zeros known to 0.0003 m/s².
+            # 15 s of drop-out, with zeros known to 0.00015 m/s².
             assert distance.max() < 0.1
 
     def test_fixes_that_come_too_late_are_not_counted_as_used(self) -> None:
