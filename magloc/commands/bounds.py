@@ -11,19 +11,25 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from arrays.errors import InputError
-from magloc.commands.common import CommonOptions, Count, Flag, Vector, print_json, print_note, progress, whole_number
+from magloc.commands.common import CommonOptions, Flag, Vector, print_json, print_note, progress, whole_number
+from magloc.commands.sweeping import Grid, complete
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from arrays.differences import FloatArray
     from arrays.sensor import SensorArray
     from magloc.bound_map import BoundScenario
     from magloc.bounds import Bounds, MomentBounds
     from magloc.matched_filter import MatchedFilterDetector
     from magloc.sweep import Sweep
 
-Grid = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=2))]
+Directions = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1, lte=10_000))]
 
+_LARGEST_AM2 = 1e12
+# In circumradii of the array: the least distance of a source from a sensor and from the centroid, and of a sphere.
+_LEAST_DISTANCE = 1e-4
+_REACH = (1e-4, 1e6)
 _SLICE_GRID = 121
 _STEP_DEG = 5.0
 _FRAMES = 24
@@ -43,7 +49,7 @@ def bounds(
     ambient_uncertainty_nT: Annotated[float, Parameter(name="--ambient-uncertainty-nT")] = 0.0,
     probability: float = 0.9,
     false_alarm_rate: float = 1e-3,
-    moments: Count = 50,
+    moments: Directions = 50,
     grid: Grid = 41,
     gif: Flag = False,
     out: Path | None = None,
@@ -81,9 +87,9 @@ def bounds(
     false_alarm_rate : float
         Share of the rows without a source in which one may be found, 0.0001 or more.
     moments : int
-        Directions of the moment.
+        Directions of the moment, 10,000 at most.
     grid : int
-        Points along every axis of the cube.
+        Points along every axis of the cube, 2,000 at most.
     gif : bool
         Write bounds.gif as well: the sphere, from half to twice the range.
     out : Path
@@ -119,11 +125,18 @@ def bounds(
         raise InputError(f"--probability: found {probability:g}, expected it between the false-alarm rate and 1.")
     if not 0.0 <= ambient_uncertainty_nT < np.inf:
         raise InputError(f"--ambient-uncertainty-nT: found {ambient_uncertainty_nT:g}, expected zero or more.")
-    if position is not None and not np.isfinite(place).all():
-        raise InputError(f"--position: found {_plain(place)}, expected three finite numbers.")
+    _check_place(used, place)
     radius = distance if range_m is None else range_m
-    if not 1e-9 < radius < 1e9:
-        raise InputError(f"--position: found {_plain(place)}, the sensors' centroid, expected a place away from it.")
+    nearest_m, farthest_m = (factor * used.circumradius for factor in _REACH)
+    if not nearest_m <= radius <= farthest_m:
+        raise InputError(
+            f"--range-m: found {radius:g}, expected {nearest_m:.3g} to {farthest_m:.3g} m, by the size of the array."
+        )
+    if moment_Am2 is not None and not 0.0 < max(map(abs, moment_Am2)) <= _LARGEST_AM2:
+        raise InputError(
+            f"--moment-Am2: found {_plain(moment_Am2)}, expected three finite numbers, not all zero, up to "
+            f"{_LARGEST_AM2:g} A·m²."
+        )
     task = _scenario(
         used,
         source.moment_Am2 if moment_Am2 is None else moment_Am2,
@@ -156,6 +169,25 @@ def bounds(
     if not common.quiet:
         counts = sweep.summary
         print_note(f"{counts.starts} sources × {moments + 1} moments in {counts.seconds:.2f} s; wrote {folder}/")
+
+
+def _check_place(array: SensorArray, place: FloatArray) -> None:
+    """Refuse a source in a sensor, at the centroid, where range and bearing are none, and beyond all reach."""
+    import numpy as np
+
+    if not np.isfinite(place).all():
+        raise InputError(f"--position: found {_plain(place)}, expected three finite numbers.")
+    if not np.abs(place - array.centroid).max() <= _REACH[1] * array.circumradius:
+        raise InputError(
+            f"--position: found {_plain(place)}, expected a place within {_REACH[1] * array.circumradius:.3g} m."
+        )
+    least_m = _LEAST_DISTANCE * array.circumradius
+    if np.linalg.norm(place - array.centroid) < least_m:
+        raise InputError(f"--position: found {_plain(place)}, the sensors' centroid, expected a place away from it.")
+    distances = np.linalg.norm(place - array.positions, axis=1)
+    if distances.min() < least_m:
+        sensor = array.sensors[int(distances.argmin())].id
+        raise InputError(f"--position: found {_plain(place)}, at sensor {sensor}, expected a place away from it.")
 
 
 def _array_of(path: Path) -> SensorArray:
@@ -193,13 +225,10 @@ def _cube(task: BoundScenario, grid: int, folder: Path, *, quiet: bool) -> Sweep
     from magloc.sweep import Sweep
 
     cube = BoundMap(task, grid)
-    with (
-        Sweep(cube, folder / "map.zarr") as sweep,
-        progress(grid**3, "sources", quiet=quiet, initial=sweep.points_done) as advance,
-    ):
+    with Sweep(cube, folder / "map.zarr") as sweep:
         for sentence in sweep.unreadable:
             print_note(sentence)
-        sweep.write(computed_here(cube, sweep.unfinished()), advance)
+        complete(sweep, computed_here(cube, sweep.unfinished()), quiet=quiet)
     return sweep
 
 

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
-
-from cyclopts import Parameter
-from cyclopts.validators import Number
+from typing import TYPE_CHECKING, Literal
 
 from arrays.errors import InputError
-from magloc.commands.common import CommonOptions, Flag, print_json, print_note, progress, whole_number
+from magloc.commands.common import CommonOptions, Flag, print_json, print_note
+from magloc.commands.sweeping import Grid, complete
 from magloc.output_files import make_folder, replace_file
 
 if TYPE_CHECKING:
@@ -17,7 +15,6 @@ if TYPE_CHECKING:
     from magloc.sweep import Sweep
 
 Over = Literal["starts", "sources"]
-Grid = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=2))]
 
 
 def map_(
@@ -118,29 +115,16 @@ def _sources_map(scenario: str, method: str | None, grid: int, seed: int) -> Cub
 
 
 def _run(sweep: Sweep, scheduler: str | None, *, quiet: bool) -> None:
-    """Compute what is not done yet; however that ends, say how to go on."""
+    """Compute what is not done yet."""
     from magloc.cubes import computed_here
 
-    cube = sweep.cube
     if scheduler is None:
-        chunks = computed_here(cube, sweep.unfinished())
+        chunks = computed_here(sweep.cube, sweep.unfinished())
     else:
         from magloc.cluster import computed_by
 
-        chunks = computed_by(scheduler, cube, sweep.unfinished())
-
-    def kept() -> str:
-        return f"{sweep.chunks_done} of {sweep.n_chunks} chunks are done, the same command goes on with the others"
-
-    with progress(cube.grid**3, f"{cube.point}s", quiet=quiet, initial=sweep.points_done) as advance:
-        try:
-            sweep.write(chunks, advance)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"interrupted: {kept()}") from None
-        except InputError as error:
-            raise InputError(f"{str(error).rstrip('.')}; {kept()}.") from None
-        except OSError as error:
-            raise InputError(f"{sweep.path} cannot be written ({error.strerror or error}); {kept()}.") from None
+        chunks = computed_by(scheduler, sweep.cube, sweep.unfinished())
+    complete(sweep, chunks, quiet=quiet)
 
 
 def _export(folder: Path, counts: MapSummary, *, netcdf: bool) -> None:

@@ -358,7 +358,7 @@ def _sphere(
     _contours(ax, azimuth, elevation, values, norm, levels, accuracy)
     if accuracy is not None:
         ax.plot([], [], color=style.ORANGE, lw=1.8, label=f"required: {accuracy:g} m")
-    ax.set_title(title, fontsize=style.LETTERS, pad=4)
+    ax.set_title(title, fontsize=style.LETTERS, pad=8)
     ax.grid(visible=False)
     ax.set_xticks(np.radians([-90.0, 90.0]), ["−90°", "90°"], color=_ON_DARK)
     ax.set_yticks(np.radians([-60.0, -30.0, 0.0, 30.0, 60.0]), ["−60°", "−30°", "0°", "30°", "60°"])
@@ -374,7 +374,7 @@ def _moment_marks(ax: Axes, scenario: BoundScenario) -> None:
         x, y, z = sign * m
         ax.plot(
             np.arctan2(y, x), np.arcsin(np.clip(z, -1.0, 1.0)), marker, color=style.ORANGE, mec=style.BLACK, ms=6,
-            mew=0.7, ls="none", label=label,
+            mew=0.7, ls="none", label=label, clip_on=False,
         )  # fmt: skip
 
 

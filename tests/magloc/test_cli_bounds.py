@@ -15,7 +15,7 @@ from arrays.geometries import tetrahedron
 from magloc.bounds import bounds_of
 from magloc.cli import main
 from magloc.plots import style
-from magloc.sweep import open_map
+from magloc.sweep import Sweep, open_map
 
 KEYS = [
     "position_m",
@@ -221,10 +221,19 @@ class TestBadInput:
         [
             (["nowhere.toml"], "nowhere.toml"),
             (["--array", "nowhere.toml"], "nowhere.toml"),
-            (["--moment-Am2", "0", "0", "0"], "--moment-Am2: Input moment_Am2 must be 3 numbers, not all zero"),
+            (
+                ["--moment-Am2", "0", "0", "0"],
+                "--moment-Am2: found (0, 0, 0), expected three finite numbers, not all zero",
+            ),
+            (["--moment-Am2", "1e300", "0", "0"], "--moment-Am2: found (1e+300, 0, 0), expected"),
             (["--moment-Am2", "1", "2"], "--moment-Am2"),
             (["--moment-Am2", "nan", "0", "0"], "--moment-Am2"),
             (["--position", "0", "0", "0"], "--position: found (0, 0, 0), the sensors' centroid"),
+            (["--position", "0", "0", "0", "--range-m", "2"], "--position: found (0, 0, 0), the sensors' centroid"),
+            (["--position", "0", "0", "0.91855865"], "--position: found (0, 0, 0.918559), at sensor s4"),
+            (["--position", "1e10", "0", "0"], "--position: found (1e+10, 0, 0), expected a place within 9.19e+05 m"),
+            (["--range-m", "1e10"], "--range-m: found 1e+10, expected 9.19e-05 to 9.19e+05 m"),
+            (["--range-m", "1e-12"], "--range-m: found 1e-12, expected 9.19e-05 to 9.19e+05 m"),
             (["--position", "inf", "0", "0"], "--position: found (inf, 0, 0), expected three finite numbers"),
             (["--range-m", "0"], "--range-m: found 0, expected a positive length"),
             (["--range-m", "nan"], "--range-m: found nan, expected a positive length"),
@@ -235,7 +244,9 @@ class TestBadInput:
             (["--false-alarm-rate", "0"], "--false-alarm-rate: found 0, expected 0.0001 or more"),
             (["--grid", "1"], "--grid"),
             (["--grid", "2.5"], "--grid"),
+            (["--grid", "100000"], "--grid"),
             (["--moments", "0"], "--moments"),
+            (["--moments", "10000000"], "--moments"),
             (["--nonsense"], "--nonsense"),
         ],
     )
@@ -247,6 +258,14 @@ class TestBadInput:
         assert len(err.splitlines()) == 1
         assert expected in err
         assert not list(tmp_path.iterdir())
+
+    def test_an_interruption_says_what_is_done(self, tmp_path, capsys, monkeypatch):
+        def interrupted(*_):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr(Sweep, "write", interrupted)
+        assert main(["bounds", *QUICK, "--out", str(tmp_path)]) == 130
+        assert "0 of 1 chunks are done, the same command goes on" in capsys.readouterr().err
 
     def test_a_file_in_place_of_the_folder(self, tmp_path, capsys):
         path = tmp_path / "file"
