@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from arrays.geometries import tetrahedron
 from arrays.sensor import SensorArray
-from magloc.bounds import FloatArray, bounds_over_moments, moment_directions, sigma_table
+from magloc.bounds import FloatArray, moment_directions, table_and_spreads
 from magloc.cubes import Box, MapSummary, Tally, Values, Variable, in_memory
 
 if TYPE_CHECKING:
@@ -143,9 +143,13 @@ def bounds_at(scenario: BoundScenario, positions_m: ArrayLike) -> dict[str, Floa
     """
     positions = np.asarray(positions_m, dtype=np.float64)
     flat = positions.reshape(-1, 3)
-    options = {"ambient_uncertainty_T": scenario.ambient_uncertainty_T}
-    given = sigma_table(scenario.array, flat, np.array([scenario.moment_Am2]), **options)
-    spreads = bounds_over_moments(scenario.array, flat, scenario.moments_Am2, **options)
+    given, spreads = table_and_spreads(
+        scenario.array,
+        flat,
+        [scenario.moment_Am2],
+        scenario.moments_Am2,
+        ambient_uncertainty_T=scenario.ambient_uncertainty_T,
+    )
     values = {}
     for name, one, spread in zip(_UNITS, given, spreads, strict=True):
         for case, sigma in zip(CASES, (one[:, 0], spread.median, spread.q95, spread.worst), strict=True):

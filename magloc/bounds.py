@@ -310,12 +310,54 @@ def bounds_over_moments(
     ValueError
         A shape is wrong, or the uncertainty is negative or not finite.
     """
-    from magloc.kernels.bounds import BoundModel, spreads
+    none = np.empty((0, 3))
+    _, spreads = table_and_spreads(array, positions_m, none, moments_Am2, ambient_uncertainty_T=ambient_uncertainty_T)
+    return spreads
+
+
+def table_and_spreads(
+    array: SensorArray,
+    positions_m: ArrayLike,
+    alone_Am2: ArrayLike,
+    moments_Am2: ArrayLike,
+    *,
+    ambient_uncertainty_T: float = 0.0,
+) -> tuple[SigmaTable, MomentBounds]:
+    """:func:`sigma_table` of some moments and :func:`bounds_over_moments` of others, in one pass over the sources.
+
+    Parameters
+    ----------
+    array : SensorArray
+    positions_m : array_like, shape (P, 3)
+        Sources in the array's frame [m].
+    alone_Am2 : array_like, shape (K, 3)
+        Moments of the table, or none [A·m²].
+    moments_Am2 : array_like, shape (M, 3)
+        Moments of the spreads [A·m²].
+    ambient_uncertainty_T : float
+        As for :func:`bounds_of`.
+
+    Returns
+    -------
+    tuple
+        Of shape (P, K) and (P,).
+
+    Raises
+    ------
+    ValueError
+        A shape is wrong, or the uncertainty is negative or not finite.
+    """
+    from magloc.kernels import bounds
+    from magloc.kernels.bound_model import BoundModel
 
     positions, moments = _table_inputs(positions_m, moments_Am2)
+    alone = np.ascontiguousarray(alone_Am2, dtype=np.float64)
+    if alone.ndim != 2 or alone.shape[1] != 3:
+        raise ValueError(f"Input alone_Am2 must have shape (n, 3); instead received {alone.shape}.")
     _check_uncertainty(ambient_uncertainty_T)
-    values = spreads(BoundModel.of(array, ambient_uncertainty_T), positions, moments, np.array(QUANTILES))
-    return MomentBounds(*(Spread(*values[:, i].T) for i in range(3)))
+    model = BoundModel.of(array, ambient_uncertainty_T)
+    table, spreads = bounds.table_and_spreads(model, positions, alone, moments, np.array(QUANTILES))
+    return SigmaTable(*table), MomentBounds(*(Spread(*spreads[:, i].T) for i in range(3)))
 
 
 def sigma_table(
@@ -345,11 +387,14 @@ def sigma_table(
     ValueError
         A shape is wrong, or the uncertainty is negative or not finite.
     """
-    from magloc.kernels.bounds import BoundModel, table
+    from magloc.kernels import bounds
+    from magloc.kernels.bound_model import BoundModel
 
     positions, moments = _table_inputs(positions_m, moments_Am2)
     _check_uncertainty(ambient_uncertainty_T)
-    return SigmaTable(*table(BoundModel.of(array, ambient_uncertainty_T), positions, moments))
+    model, none = BoundModel.of(array, ambient_uncertainty_T), np.empty((0, 3))
+    table, _ = bounds.table_and_spreads(model, positions, moments, none, np.empty(0))
+    return SigmaTable(*table)
 
 
 def spread_over(sigma: ArrayLike) -> Spread:

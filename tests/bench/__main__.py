@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
-from tests.bench import complementary, fields, filters, fixes, machine, maps, mockup, recording, sources
+from tests.bench import bounds, complementary, fields, filters, fixes, machine, maps, mockup, recording, sources
 from tests.bench.table import header, table
 from tests.bench.timing import FULL, QUICK, Size
 
@@ -16,6 +16,7 @@ GROUPS = {
     "filters": filters,
     "complementary": complementary,
     "maps": maps,
+    "bounds": bounds,
     "mockup": mockup,
     "machine": machine,
     "recording": recording,

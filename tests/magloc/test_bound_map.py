@@ -212,7 +212,7 @@ class TestScenario:
             bound_slices(SCENARIO, 1)
 
     def test_any_noise_and_sensors(self):
-        # Not compiled: noise that depends on the readings, and an ambient field that is not known exactly.
+        # Noise that depends on the readings, and an ambient field that is not known exactly.
         fraction = replace(SCENARIO, array=replace(tetrahedron(1.5), noise_fraction=0.01))
         scalars = replace(
             SCENARIO,

@@ -35,6 +35,7 @@ from magloc.bounds import (
     sigma_table,
     sphere_directions,
     spread_over,
+    table_and_spreads,
     whitened_jacobian,
 )
 from magloc.locate import Locator
@@ -401,15 +402,15 @@ class TestTable:
             expected = {"range_m": twin.sigma_range_m, "bearing_rad": twin.sigma_bearing_rad}.get(
                 name, twin.sigma_position_m
             )
-            assert_allclose(values, expected, rtol=1e-7, err_msg=name)
+            assert_allclose(values, expected, rtol=1e-10, err_msg=name)
 
     def test_equals_its_twin_with_an_uncertain_ambient_field(self):
         array = ARRAYS["mixed"]
         positions, moments = places(array), 100.0 * moment_directions(array, 5)
         twin = bounds_of(array, positions[:, None], moments, ambient_uncertainty_T=3e-8)
         table = sigma_table(array, positions, moments, ambient_uncertainty_T=3e-8)
-        assert_allclose(table.range_m, twin.sigma_range_m, rtol=1e-7)
-        assert_allclose(table.bearing_rad, twin.sigma_bearing_rad, rtol=1e-7)
+        assert_allclose(table.range_m, twin.sigma_range_m, rtol=1e-10)
+        assert_allclose(table.bearing_rad, twin.sigma_bearing_rad, rtol=1e-10)
 
     def test_singular_and_undefined_ones_too(self):
         array = replace(hexagon(1.0, kind="scalar", noise_T=1e-10), ambient_T=AMBIENT)  # five differences
@@ -431,15 +432,40 @@ class TestTable:
             assert_allclose(spread.q95, np.quantile(sigma, 0.95, axis=1, method="inverted_cdf"), rtol=1e-12)
             assert_allclose(spread.worst, sigma.max(axis=1), rtol=1e-12)
 
-    def test_does_not_depend_on_the_number_of_threads(self):
-        positions, moments = places(TETRAHEDRON, 101), 100.0 * moment_directions(TETRAHEDRON, 7)
+    @each_array
+    @pytest.mark.parametrize("n_moments", [65, 130])
+    def test_many_moments_are_those_of_a_few_at_a_time(self, array, n_moments):
+        # These are more than a block has lanes, and leave some of the last block idle.
+        positions, moments = places(array, 3), 100.0 * moment_directions(array, n_moments)
+        together = np.array(sigma_table(array, positions, moments))
+        parts = [sigma_table(array, positions, part) for part in (moments[:1], *np.array_split(moments[1:], 4))]
+        assert_allclose(together, np.concatenate(parts, axis=-1), rtol=1e-10)
+
+    @each_array
+    def test_table_and_spreads_are_those_of_the_two(self, array):
+        positions, moments = places(array, 4), 100.0 * moment_directions(array, 23)
+        table, spreads = table_and_spreads(array, positions, moments[:3], moments[3:])
+        for values, expected in zip(table, sigma_table(array, positions, moments[:3]), strict=True):
+            assert_allclose(values, expected, rtol=1e-10)
+        for values, expected in zip(spreads, bounds_over_moments(array, positions, moments[3:]), strict=True):
+            assert_allclose(np.array(values), np.array(expected), rtol=1e-10)
+
+    def test_a_modulus_of_no_field_has_no_bound_and_leaves_the_others_theirs(self):
+        array = cube(1.5, kind="scalar", noise_T=1e-11)
+        positions, moments = places(array, 3), np.array([[0.0, 0.0, 0.0], [60.0, 50.0, 60.0]])
+        range_m = sigma_table(array, positions, moments).range_m
+        assert np.isnan(range_m[:, 0]).all()
+        assert_allclose(range_m, bounds_of(array, positions[:, None], moments).sigma_range_m, rtol=1e-9)
+
+    @pytest.mark.parametrize("array", [TETRAHEDRON, ARRAYS["uncertain calibration"]], ids=["constant", "varying"])
+    def test_does_not_depend_on_the_number_of_threads(self, array):
+        positions, moments = places(array, 101), 100.0 * moment_directions(array, 7)
         before = numba.get_num_threads()
         results = []
         try:
             for threads in (1, before):
                 numba.set_num_threads(threads)
-                results.append((sigma_table(TETRAHEDRON, positions, moments), bounds_over_moments(
-                    TETRAHEDRON, positions, moments)))  # fmt: skip
+                results.append((sigma_table(array, positions, moments), bounds_over_moments(array, positions, moments)))
         finally:
             numba.set_num_threads(before)
         for one, other in zip(*results, strict=True):
@@ -451,6 +477,11 @@ class TestTable:
             sigma_table(TETRAHEDRON, np.ones(shape), np.eye(3))
         with pytest.raises(ValueError, match="Input moments_Am2 must have shape"):
             bounds_over_moments(TETRAHEDRON, np.eye(3), np.ones(shape))
+
+    @pytest.mark.parametrize("shape", [(3,), (2, 2)])
+    def test_wrong_shape_of_moments_alone(self, shape):
+        with pytest.raises(ValueError, match="Input alone_Am2 must have shape"):
+            table_and_spreads(TETRAHEDRON, np.eye(3), np.ones(shape), np.eye(3))
 
 
 class TestSpread:

@@ -1,0 +1,58 @@
+"""Cramér-Rao bounds of a map, against their readable twin."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numba
+import numpy as np
+
+from arrays.geometries import cube, tetrahedron
+from arrays.sensor import SensorArray
+from magloc.bounds import bounds_of, moment_directions, sigma_table
+from tests.bench.table import Row
+from tests.bench.timing import Contestant, Size, interleaved
+
+TITLE = "bounds: one source with one of 51 moments, in a cube of 40 m; peer: the NumPy twin on a sample"
+N_MOMENTS = 51
+EARTH_T = (2e-5, 1e-6, 4.5e-5)
+
+
+def arrays() -> dict[str, SensorArray]:
+    """Constant axes and noise; axes that turn with the field; noise that depends on the field."""
+    uncertain = tuple(replace(s, misalignment_rad=1e-4, gain_uncertainty=1e-4) for s in tetrahedron(1.5).sensors)
+    return {
+        "4 vector sensors": tetrahedron(1.5),
+        "8 scalar sensors": replace(cube(1.5, kind="scalar", noise_T=1e-11), ambient_T=EARTH_T),
+        "4 vector sensors of uncertain axes": SensorArray(uncertain, ambient_T=EARTH_T),
+    }
+
+
+def rows(size: Size) -> Iterator[Row]:
+    """Ours with all threads and with one; NumPy with one."""
+    threads = numba.get_num_threads()
+    for name, array in arrays().items():
+        positions = np.random.default_rng(8).uniform(-20.0, 20.0, (size.rows, 3))
+        moments = 100.0 * moment_directions(array, N_MOMENTS)
+        sample = positions[: size.sample]
+
+        def ours(array=array, positions=positions, moments=moments):
+            return sigma_table(array, positions, moments)
+
+        def twin(array=array, sample=sample, moments=moments):
+            return bounds_of(array, sample[:, None], moments)
+
+        timings = interleaved(
+            {
+                "ours": Contestant(ours, threads, len(positions) * N_MOMENTS),
+                "one thread": Contestant(ours, 1, len(positions) * N_MOMENTS),
+                "twin": Contestant(twin, 1, len(sample) * N_MOMENTS),
+            },
+            size.rounds,
+        )
+        difference = np.abs(ours().range_m[: len(sample)] / twin().sigma_range_m - 1.0).max()
+        yield Row(f"{name}, {threads} thr.", timings["ours"])
+        yield Row(
+            name, timings["one thread"], "NumPy twin", timings["twin"], f"σ of the range differ by {difference:.0e}"
+        )
