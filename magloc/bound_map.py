@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from arrays.geometries import tetrahedron
 from arrays.sensor import SensorArray
-from magloc.bounds import FloatArray, moment_directions, table_and_spreads
+from magloc.bound_tables import FloatArray, moment_directions, table_and_spreads
 from magloc.cubes import Box, MapSummary, Tally, Values, Variable, in_memory
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from arrays.geometries import GEOMETRIES
 from arrays.sensor import SensorArray
-from magloc.bounds import sigma_table
+from magloc.bound_tables import sigma_table
 from magloc.design_search import Sample
 from magloc.design_task import DesignTask
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magloc.bound_map import ANGLES, CASES_IN_WORDS, BoundScenario, sphere_grid
-from magloc.bounds import spread_over
+from magloc.bound_tables import spread_over
 from magloc.detection import Detector
 from magloc.detection_range import detection_range
 

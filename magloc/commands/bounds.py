@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from arrays.differences import FloatArray
     from arrays.sensor import SensorArray
     from magloc.bound_map import BoundScenario
-    from magloc.bounds import Bounds, MomentBounds
+    from magloc.bound_tables import MomentBounds
+    from magloc.bounds import Bounds
     from magloc.matched_filter import MatchedFilterDetector
     from magloc.sweep import Sweep
 
@@ -108,7 +109,8 @@ def bounds(
     """
     import numpy as np
 
-    from magloc.bounds import bounds_of, bounds_over_moments
+    from magloc.bound_tables import bounds_over_moments
+    from magloc.bounds import bounds_of
     from magloc.output_files import make_folder
     from magloc.scenarios import read_starts_scenario
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from arrays.geometries import cube, tetrahedron
 from arrays.sensor import SensorArray
-from magloc.bounds import bounds_of, moment_directions, sigma_table
+from magloc.bound_tables import moment_directions, sigma_table
+from magloc.bounds import bounds_of
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
 

@@ -30,7 +30,8 @@ from magloc.bound_map import (
     bound_spheres,
     bounds_at,
 )
-from magloc.bounds import bounds_of, sphere_directions
+from magloc.bound_tables import sphere_directions
+from magloc.bounds import bounds_of
 from magloc.cubes import boxes, computed_here
 from magloc.sweep import Sweep, open_map
 

@@ -27,17 +27,15 @@ from scipy.stats import chi2
 from arrays.differences import decorrelated_differences
 from arrays.geometries import cube, hexagon, square, tetrahedron
 from arrays.sensor import SensorArray
-from magloc.bounds import (
-    bounds_of,
+from magloc.bound_tables import (
     bounds_over_moments,
-    fisher_information,
     moment_directions,
     sigma_table,
     sphere_directions,
     spread_over,
     table_and_spreads,
-    whitened_jacobian,
 )
+from magloc.bounds import bounds_of, fisher_information, whitened_jacobian
 from magloc.locate import Locator
 from magloc.measurement import DifferenceMeasurement, predicted_channels
 from tests.arrays.test_differences import random_array
