@@ -113,9 +113,15 @@ class FusionRuns:
     results: tuple[FusionResult, ...]
 
     def summary(self) -> dict[str, Any]:
-        """What ``--json`` prints: means over the runs, but the largest error of all runs, and counts of all fixes."""
+        """What ``--json`` prints: means over the runs, but the largest error of all runs, and counts of all fixes.
+
+        Those that were used and the unused ones of all reasons are the fixes; pending ones would have arrived later.
+        """
+        from adcs.mockup.fixes import Outcome, unused_counts
+
         errors = [result.errors for result in self.results]
-        outcomes = [outcome.value for result in self.results for outcome in result.fused.outcomes]
+        outcomes = [outcome for result in self.results for outcome in result.fused.outcomes]
+        used = sum(int(result.fused.used.sum()) for result in self.results)
         return {
             "position_rms_mm": float(np.mean([error.position_rms_mm for error in errors])),
             "position_p95_mm": float(np.mean([error.position_p95_mm for error in errors])),
@@ -123,8 +129,10 @@ class FusionRuns:
             "velocity_rms_mm_s": float(np.mean([error.velocity_rms_mm_s for error in errors])),
             "heading_rms_deg": float(np.mean([error.heading_rms_deg for error in errors])),
             "fixes": len(outcomes),
-            "used_fixes": outcomes.count("used") + outcomes.count("reacquired"),
-            "rejected_fixes": outcomes.count("rejected"),
+            "used_fixes": used,
+            "rejected_fixes": outcomes.count(Outcome.REJECTED),
+            "unused_fixes": unused_counts(outcomes),
+            "pending_fixes": sum(len(result.run.fixes) for result in self.results) - len(outcomes),
             "false_fixes": int(sum(result.run.false[: len(result.fused.outcomes)].sum() for result in self.results)),
             "runs": len(errors),
         }

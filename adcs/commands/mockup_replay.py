@@ -12,6 +12,7 @@ from adcs.commands.mockup_fusion import FusionResult, FusionRuns
 from adcs.commands.mockup_options import ReplayOptions
 from adcs.commands.mockup_picture import METHOD_WORDS
 from arrays.errors import InputError
+from magloc.output_files import refuse_unwritable
 
 if TYPE_CHECKING:
     from adcs.viewer.drive import Drive, SeenFrame
@@ -31,10 +32,10 @@ def check_places(replay: ReplayOptions) -> None:
     """
     from magloc.viewer.browser import find_chromium
 
-    for option, file in (("--html", replay.html), ("--png", replay.png)):
-        if file is not None and not file.absolute().parent.is_dir():
-            raise InputError(f"{option} {file}: found no folder {file.absolute().parent}, expected one.")
+    if replay.html is not None:
+        refuse_unwritable(replay.html, "--html")
     if replay.png is not None:
+        refuse_unwritable(replay.png, "--png", ".png")
         try:
             find_chromium()
         except InputError as error:

@@ -181,6 +181,8 @@ def fusion_lines(runs: FusionRuns, duration_s: float) -> list[str]:
     -------
     list of str
     """
+    from adcs.mockup.fixes import counts_in_words
+
     result = runs.summary()
     return [
         f"{_runs(result['runs'])} of {duration_s:g} s, fusion {runs.method}, errors after {SETTLED_S:g} s:",
@@ -188,8 +190,8 @@ def fusion_lines(runs: FusionRuns, duration_s: float) -> list[str]:
         f" {result['position_max_mm']:.2f}",
         f"velocity, rms [mm/s]                 {result['velocity_rms_mm_s']:.2f}",
         f"heading, rms [°]                     {result['heading_rms_deg']:.4f}",
-        f"fixes, used / rejected / false       {result['fixes']}, {result['used_fixes']} / {result['rejected_fixes']} /"
-        f" {result['false_fixes']}",
+        f"fixes                                {result['fixes']}:"
+        f" {counts_in_words(result['used_fixes'], result['unused_fixes'])}; {result['false_fixes']} of them false",
     ]
 
 
@@ -281,7 +283,7 @@ def mockup(
     if options.frames is not None:
         result, lines, written = _frames(options, out)
     elif options.samples is not None and options.fixes is not None:
-        result, lines, written = _recording(options.samples, options.fixes, options, out)
+        result, lines, written = _recording(options.samples, options.fixes, options, out, quiet=common.quiet)
     elif options.part == "sky":
         result, lines, written = _sky(options, out, quiet=common.quiet)
     elif options.part == "zeros":
@@ -309,10 +311,13 @@ def _frames(options: MockupOptions, out: Path | None) -> Told:
     return {"frames": entries, "identified": fixed}, frame_lines(entries), written
 
 
-def _recording(samples: Path, fixes: Path, options: MockupOptions, out: Path | None) -> Told:
+def _recording(samples: Path, fixes: Path, options: MockupOptions, out: Path | None, *, quiet: bool) -> Told:
     from adcs.commands.mockup_record import fused_record, record_lines, write_record
 
     run = fused_record(samples, fixes, value_or(options.fusion, "ekf"))
+    if not quiet:
+        for line in run.warnings:
+            print_note(f"warning: {line}")
     written = []
     if out is not None:
         make_folder(out, "--out")

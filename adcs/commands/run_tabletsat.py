@@ -32,7 +32,7 @@ _ECLIPSE: dict[str, Any] = {
 _ECLIPSE_DURATION_S = 3000.0
 # As in eclipse.toml: what is learnt in the Sun must last half an hour. Too small without the torque in the state.
 _ECLIPSE_NOISE = {"rate_rad_s": 1e-8, "gyro_bias_rad_s": 1e-9, "disturbance_s2": 1e-10}
-_OTHERS = ("complementary", "ellipsoid")
+_OTHERS = ("complementary", "ellipsoid", "mockup")
 _STAR_NOISE_DEG = {"angle": 0.001, "paper": 0.002}
 
 

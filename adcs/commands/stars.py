@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from adcs.mockup.star_frame_files import StarFrame
     from adcs.mockup.star_frames import StarCatalogue, StarFix
 
+_LARGEST_NOISE = 0.1
+"""Of the shorter side of an image."""
+
 
 def stars(
     frames: Path,
@@ -34,7 +37,8 @@ def stars(
     catalogue : Path
         CSV file with the columns hip, ra_deg, dec_deg and mag, at the date of the frames.
     noise_px : float
-        Standard deviation of a star's place, per axis.
+        Standard deviation of a star's place, per axis. Up to a tenth of the image's shorter side: stars that may be
+        anywhere in it cannot be told apart.
     json : bool
         Print one JSON object.
     common : QuietOptions
@@ -49,6 +53,12 @@ def stars(
     if not 0.0 < noise_px < math.inf:
         raise InputError(f"--noise-px: found {noise_px:g}, expected a positive number.")
     camera, images = read_star_frames(frames)
+    most_px = _LARGEST_NOISE * min(camera.width_px, camera.height_px)
+    if noise_px > most_px:
+        raise InputError(
+            f"--noise-px: found {noise_px:g}, expected at most {most_px:g}, a tenth of the image's shorter side: "
+            "beyond it, stars cannot be told apart."
+        )
     known = read_star_catalogue(catalogue)
     matcher = StarMatcher.of(known, camera, noise_px)
     fixes: list[StarFix | NoFix] = []

@@ -67,6 +67,11 @@ class FilterSettings:
         Noise of a sample of the gyro.
     missing_acceleration_m_s2, missing_rate_rad_s : float
         What may be missed in a sample that the gate of the samples does not believe.
+    lost_after_s : float
+        Readings that stay missing for longer are lost: what is missed then lasts, and is no noise of each sample.
+    lost_m_s_rs, lost_rad_rs : float
+        What may be missed meanwhile: growth of the standard deviations of velocity and heading in one second [unit per
+        √s]. Thrust of 0.04 m/s² and turns of 20°/s that last for a second or two.
     zero_walk_m_s2_rs, zero_walk_rad_s_rs : float
         Walks of the zeros: growth of their standard deviations in one second [unit per √s].
     drift_walk_m_s3_rs : float
@@ -91,6 +96,9 @@ class FilterSettings:
     rate_rad_s: float = math.radians(0.1)
     missing_acceleration_m_s2: float = 0.1
     missing_rate_rad_s: float = math.radians(20.0)
+    lost_after_s: float = 0.05
+    lost_m_s_rs: float = 0.03
+    lost_rad_rs: float = math.radians(30.0)
     zero_walk_m_s2_rs: float = 2e-5
     zero_walk_rad_s_rs: float = math.radians(0.002)
     drift_walk_m_s3_rs: float = 5e-7
@@ -117,6 +125,13 @@ class FilterSettings:
         )
         walks = np.array([self.zero_walk_m_s2_rs, self.zero_walk_rad_s_rs, self.drift_walk_m_s3_rs])
         return np.concatenate([self.sample_s * white**2, walks**2])
+
+    @property
+    def all_densities(self) -> FloatArray:
+        """The same, shape (2, 2, 7): where accelerations are not and are lost, and where the rate is not and is."""
+        densities = np.tile(self.densities, (2, 2, 1))
+        densities[1, :, 2], densities[:, 1, 3] = self.lost_m_s_rs**2, self.lost_rad_rs**2
+        return densities
 
 
 @dataclass(frozen=True)
@@ -233,7 +248,10 @@ class DelayedFilter:
 
     - A fix of the same exposure as another one is left out (duplicate), and so is one older than ``buffer_s``.
     - Through a drop-out the covariance grows by the noises of the samples; the gate opens with it.
-    - A rate that the gate of the samples does not believe is held, an acceleration is zero; both get a larger noise.
+    - A rate that the gate of the samples does not believe is held, an acceleration is zero; both get a larger noise,
+      and a still larger one where they are lost.
+    - A gap between samples is not seen here: :meth:`adcs.mockup.inertial.ImuRecord.with_gaps_filled` makes it samples
+      whose readings are missing.
 
     Parameters
     ----------
@@ -264,11 +282,13 @@ class DelayedFilter:
     ) -> None:
         self.settings = settings
         self.nis: list[float] = []
-        self._densities = settings.densities
+        self._densities = settings.all_densities
         self._n = 1
         # Row 0 is where the history begins; the reading of a row is that of the interval which ends there.
         self._time_s = np.full(1, float(begin_s))
         self._readings, self._there = np.zeros((1, 3)), np.zeros((1, 3), dtype=np.bool_)
+        self._lost = np.zeros((1, 2), dtype=np.bool_)  # accelerations, rate
+        self._read_s = np.full(3, float(begin_s))  # when each reading was last there
         self._x = np.concatenate([start.position_m, start.velocity_m_s, [float(start.heading_rad)], np.zeros(5)])[None]
         self._P = sigma.covariance[None]
         self._history: list[_Taken] = []
@@ -319,6 +339,11 @@ class DelayedFilter:
         rows = slice(self._n, self._n + n)
         self._time_s[rows], self._there[rows] = imu.time_s, there
         self._readings[rows, :2], self._readings[rows, 2] = believed.acceleration_m_s2, believed.rate_rad_s
+        read_s = np.maximum.accumulate(
+            np.concatenate([self._read_s[None], np.where(there, imu.time_s[:, None], -math.inf)]), axis=0
+        )
+        lost = imu.time_s[:, None] - read_s[1:] > self.settings.lost_after_s
+        self._lost[rows], self._read_s = np.stack([lost[:, :2].any(axis=1), lost[:, 2]], axis=1), read_s[-1]
         self._n += n
         self._predict(last, self._n - 1)
         x, P = self._x[rows], self._P[rows]
@@ -398,7 +423,12 @@ class DelayedFilter:
         return True
 
     def _predict(self, first: int, last: int) -> None:
-        predict_rows(first, last, self._time_s, self._readings, self._there, self._densities, self._x, self._P)
+        """Predict rows, with the noises of what is lost in each of them."""
+        lost = self._lost[first + 1 : last + 1]
+        changes = first + 1 + np.flatnonzero((lost[1:] != lost[:-1]).any(axis=1))
+        for begin, end in pairwise([first, *changes.tolist(), last]):
+            densities = self._densities[*self._lost[end].astype(np.intp)]
+            predict_rows(begin, end, self._time_s, self._readings, self._there, densities, self._x, self._P)
 
     def _row_at(self, time_s: float) -> int:
         """Row of an instant; an interval that holds it is cut there."""
@@ -407,7 +437,7 @@ class DelayedFilter:
             return row
         self._make_room(1)
         row = int(np.searchsorted(self._time_s[: self._n], time_s))
-        for values in (self._time_s, self._readings, self._there, self._x, self._P):
+        for values in (self._time_s, self._readings, self._there, self._lost, self._x, self._P):
             values[row + 1 : self._n + 1] = values[row : self._n].copy()
         self._time_s[row] = time_s
         self._n += 1
@@ -421,7 +451,7 @@ class DelayedFilter:
         first = max(0, int(np.searchsorted(self._time_s[: self._n], horizon)) - 1)
         kept = self._n - first
         capacity = max(256, 2 * (kept + rows))
-        for name in ("_time_s", "_readings", "_there", "_x", "_P"):
+        for name in ("_time_s", "_readings", "_there", "_lost", "_x", "_P"):
             old = getattr(self, name)
             new = np.zeros((capacity, *old.shape[1:]), dtype=old.dtype)
             new[:kept] = old[first : self._n]

@@ -8,6 +8,7 @@ begins on the arrival of the fix before: one failed frame breaks that.
 from __future__ import annotations
 
 import enum
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from adcs.mockup.inertial import ImuRecord, PlanarTrack
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +95,7 @@ class FixRecord:
         """One fix."""
         return Fix(float(self.time_s[row]), self.position_m[row], float(self.heading_rad[row]))
 
-    def rows(self, rows: slice | NDArray[np.bool_] | NDArray[np.intp]) -> FixRecord:
+    def rows(self, rows: slice | BoolArray | NDArray[np.intp]) -> FixRecord:
         """Some of the fixes."""
         return FixRecord(self.time_s[rows], self.arrival_s[rows], self.position_m[rows], self.heading_rad[rows])
 
@@ -151,6 +153,45 @@ class Fused:
 
     track: PlanarTrack
     outcomes: tuple[Outcome, ...]
+
+    @property
+    def used(self) -> BoolArray:
+        """Whether each fix was taken into the estimate, shape (k,)."""
+        return np.array([outcome in _TAKEN for outcome in self.outcomes], dtype=np.bool_)
+
+
+_TAKEN = (Outcome.USED, Outcome.REACQUIRED)
+
+
+def unused_counts(outcomes: Sequence[Outcome]) -> dict[str, int]:
+    """Number of the fixes that were not used, by the reason; with those that were used they are all.
+
+    Parameters
+    ----------
+    outcomes : sequence of Outcome
+
+    Returns
+    -------
+    dict
+        Every reason in words, also where it has none.
+    """
+    return {reason.value: outcomes.count(reason) for reason in Outcome if reason not in _TAKEN}
+
+
+def counts_in_words(used: int, unused: Mapping[str, int]) -> str:
+    """Numbers of fixes by what became of them, which add up: "187 used, 75 too old".
+
+    Parameters
+    ----------
+    used : int
+    unused : mapping
+        Of :func:`unused_counts`; reasons without fixes are left out.
+
+    Returns
+    -------
+    str
+    """
+    return ", ".join([f"{used} used", *(f"{count} {reason}" for reason, count in unused.items() if count)])
 
 
 def fuse(fusion: Fusion, imu: ImuRecord, fixes: FixRecord) -> Fused:

@@ -25,6 +25,9 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+GAP_STEPS = 5.0
+"""A longer interval, in medians of a record's intervals, is a gap: nobody takes a mean over it."""
+
 
 def turned(heading_rad: ArrayLike, vector_body: ArrayLike) -> FloatArray:
     """Vector in table axes, ``R(φ) v``.
@@ -110,6 +113,39 @@ class ImuRecord:
     def steps_s(self) -> FloatArray:
         """Length of each interval, shape (n,)."""
         return np.diff(self.time_s, prepend=self.begin_s)
+
+    @property
+    def usual_step_s(self) -> float:
+        """Median length of the intervals; the record has one at least."""
+        return float(np.median(self.steps_s))
+
+    @property
+    def gaps_s(self) -> FloatArray:
+        """Where samples are missing, shape (k, 2): from the last sample before to the interval of the next one.
+
+        An interval is a gap where it is longer than :data:`GAP_STEPS` median ones. The sample that ends it is the mean
+        over one median interval.
+        """
+        if not len(self):
+            return np.empty((0, 2))
+        steps_s, usual_s = self.steps_s, self.usual_step_s
+        long = np.flatnonzero(steps_s > GAP_STEPS * usual_s)
+        return np.stack([self.time_s[long] - steps_s[long], self.time_s[long] - usual_s], axis=1)
+
+    def with_gaps_filled(self) -> ImuRecord:
+        """The record with samples whose readings are missing in its gaps, so that time goes on in steps there, too."""
+        gaps = self.gaps_s
+        if not len(gaps):
+            return self
+        counts = np.ceil((gaps[:, 1] - gaps[:, 0]) / self.usual_step_s - 1e-6).astype(np.intp)
+        times = [np.linspace(gap[0], gap[1], count + 1)[1:] for gap, count in zip(gaps, counts, strict=True)]
+        rows = np.repeat(np.searchsorted(self.time_s, gaps[:, 1]), counts)
+        return ImuRecord(
+            self.begin_s,
+            np.insert(self.time_s, rows, np.concatenate(times)),
+            np.insert(self.acceleration_m_s2, rows, np.nan, axis=-2),
+            np.insert(self.rate_rad_s, rows, np.nan, axis=-1),
+        )
 
     def between(self, first_s: float, last_s: float) -> ImuRecord:
         """Samples from one instant to another, of which the intervals at both ends are cut.

@@ -8,9 +8,9 @@ A folder of frames has
   the sky), magnitude;
 - ``result.csv``, optional: for each star of each frame its number in the catalogue, or -1 of one that is none.
 
-A catalogue is a CSV file with the columns ``hip`` (any whole numbers, each once), ``ra_deg``, ``dec_deg`` and ``mag``,
-and any others. Its positions should be of the frames' date: a star that moves by a second of arc a year is elsewhere
-after a few years.
+A catalogue is a CSV file with the columns ``hip`` (whole numbers from 0, each once), ``ra_deg``, ``dec_deg`` and
+``mag``, and any others. Its positions should be of the frames' date: a star that moves by a second of arc a year is
+elsewhere after a few years.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from adcs.mockup.star_frames import StarCamera, StarCatalogue
+from adcs.mockup.star_frames import MOST_PIXELS, SCALE_ARCSEC, WIDEST_RAD, StarCamera, StarCatalogue
 from arrays.errors import InputError
 from arrays.toml import read_text
 from magloc.tables import read_table
@@ -33,6 +33,8 @@ IntArray = NDArray[np.intp]
 
 NO_STAR = -1
 COLUMNS = ("hip", "ra_deg", "dec_deg", "mag")
+_LARGEST_NUMBER = 10**15
+"""Of a star: numbers of files are floating-point ones, which have whole numbers up to it and beyond."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +77,10 @@ def read_star_catalogue(path: str | PathLike[str]) -> StarCatalogue:
     hip = table.complete_and_distinct("hip")
     values = table.complete(COLUMNS)
     table.refuse((hip != np.round(hip))[:, None], COLUMNS, "found a fraction, expected a whole number")
+    outside = (hip < 0.0) | (hip > _LARGEST_NUMBER)
+    if outside.any():
+        found = f"found {hip[np.argmax(outside)]:.15g}, expected a number from 0 to {_LARGEST_NUMBER}"
+        table.refuse(outside[:, None], COLUMNS, f"{found} ({NO_STAR} stands for no star)")
     table.refuse(np.abs(values[:, 2:3]) > 90.0, COLUMNS[2:], "found a declination beyond 90°, expected -90 to 90")
     table.refuse(np.abs(values[:, 1:2]) > 360.0, COLUMNS[1:], "found more than a turn, expected 0 to 360")
     try:
@@ -122,6 +128,12 @@ def _read_labels(path: Path, frames_path: Path, stars: list[FloatArray]) -> list
             )
         if (row != np.round(row)).any():
             raise InputError(f"{path}, line {line}: found a fraction, expected whole numbers.")
+        outside = row[(row < NO_STAR) | (row > _LARGEST_NUMBER)]
+        if outside.size:
+            raise InputError(
+                f"{path}, line {line}: found {outside[0]:.15g}, "
+                f"expected numbers of stars, from 0 to {_LARGEST_NUMBER}, or {NO_STAR} for none."
+            )
     return [row.astype(np.intp) for _, row in rows]
 
 
@@ -142,8 +154,19 @@ def _read_camera(path: Path) -> StarCamera:
         if not 0.0 < value < math.inf or (of_pixels and value != round(value)):
             kind = "whole number" if of_pixels else "number"
             raise InputError(f"{path}, line {line}: found {name}={text}, expected a positive {kind}.")
+        low, high = (1, MOST_PIXELS) if of_pixels else SCALE_ARCSEC
+        if not low <= value <= high:
+            unit = "pixels" if of_pixels else "arc seconds per pixel"
+            raise InputError(f"{path}, line {line}: found {name}={text}, expected {low:g} to {high:g} {unit}.")
         numbers[name] = value
-    return StarCamera(int(numbers["IMG_X"]), int(numbers["IMG_Y"]), math.radians(numbers["PIXSCALE"] / 3600.0))
+    try:
+        return StarCamera(int(numbers["IMG_X"]), int(numbers["IMG_Y"]), math.radians(numbers["PIXSCALE"] / 3600.0))
+    except ValueError:
+        size = math.hypot(numbers["IMG_X"], numbers["IMG_Y"])
+        raise InputError(
+            f"{path}, line {known['PIXSCALE'][0]}: found PIXSCALE={known['PIXSCALE'][1]} for {size:.0f} pixels from "
+            f"corner to corner, expected an image that shows {math.degrees(WIDEST_RAD):.0f}° at most."
+        ) from None
 
 
 def _read_lines(path: Path, what: str) -> list[tuple[int, FloatArray]]:

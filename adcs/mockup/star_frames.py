@@ -40,7 +40,16 @@ _NEIGHBOURS = 24
 _BRIGHT_PER_IMAGE = 20
 _IMAGE_STARS = 30
 _CHECKED_AGAIN = 8
+# Triangles that agree and are checked, of an image: seconds of work, and some hundred megabytes.
+_MOST_HYPOTHESES = 250_000
 _REFITS = 3
+
+MOST_PIXELS = 100_000
+"""Of either side of an image."""
+SCALE_ARCSEC = (0.01, 3600.0)
+"""Of a pixel: from the largest telescopes to a degree."""
+WIDEST_RAD = math.radians(150.0)
+"""Between opposite corners: no lens that maps like a pinhole shows more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +111,7 @@ class StarCamera:
     Raises
     ------
     ValueError
-        A value is not positive.
+        A value is not positive, or out of the range of :data:`MOST_PIXELS`, :data:`SCALE_ARCSEC` or :data:`WIDEST_RAD`.
     """
 
     width_px: int
@@ -113,6 +122,20 @@ class StarCamera:
         for name in ("width_px", "height_px", "rad_per_px"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise ValueError(f"Input {name} must be positive and finite; instead received {getattr(self, name)}.")
+        if max(self.width_px, self.height_px) > MOST_PIXELS:
+            raise ValueError(
+                f"Inputs width_px and height_px must be at most {MOST_PIXELS}; "
+                f"instead received {self.width_px} and {self.height_px}."
+            )
+        low, high = SCALE_ARCSEC
+        arcsec = math.degrees(self.rad_per_px) * 3600.0
+        if not low * (1.0 - 1e-9) <= arcsec <= high * (1.0 + 1e-9):
+            raise ValueError(f"Input rad_per_px must be {low:g} to {high:g} arc seconds; instead received {arcsec:g}.")
+        if self.diagonal_rad > WIDEST_RAD:
+            raise ValueError(
+                f"An image must be at most {math.degrees(WIDEST_RAD):.0f}° wide from corner to corner; "
+                f"instead received a camera of {math.degrees(self.diagonal_rad):.1f}°."
+            )
 
     @property
     def diagonal_rad(self) -> float:
@@ -305,7 +328,11 @@ class StarMatcher:
         brightest = order[:_IMAGE_STARS]
         if len(brightest) < 4:
             return NoFix(f"{len(brightest)} stars, 4 needed")
-        R = self._hypotheses(directions[brightest])
+        mine = star_triangles(directions[brightest], 2.0)
+        agreeing = self._agreeing(mine)
+        if agreeing > _MOST_HYPOTHESES:
+            return NoFix(f"{agreeing} triangles agree within the noise, {_MOST_HYPOTHESES} can be told apart")
+        R = self._hypotheses(directions[brightest], mine)
         if not len(R):
             return NoFix("no triangle of the image is in the catalogue")
         near = self._near(directions[brightest], R)[1]
@@ -318,11 +345,18 @@ class StarMatcher:
             return NoFix(f"chance matches {len(best.stars)} of {len(directions)} stars too easily")
         return best
 
-    def _hypotheses(self, directions: FloatArray) -> FloatArray:
+    @property
+    def _side_gate(self) -> float:
+        return 4.0 * self.noise_px * self.camera.rad_per_px
+
+    def _agreeing(self, mine: StarTriangles) -> int:
+        """Number of triangles whose three sides agree; it grows with the cube of the noise."""
+        return int(np.sum(self.tree.query_ball_point(mine.sides, self._side_gate, return_length=True)))
+
+    def _hypotheses(self, directions: FloatArray, mine: StarTriangles) -> FloatArray:
         """Rotations (h, 3, 3) of triangles whose three sides and sense agree."""
-        mine = star_triangles(directions, 2.0)
-        radius = 4.0 * self.noise_px * self.camera.rad_per_px
-        found: list[list[int]] = np.asarray(self.tree.query_ball_point(mine.sides, radius), dtype=object).tolist()
+        agreeing = self.tree.query_ball_point(mine.sides, self._side_gate)
+        found: list[list[int]] = np.asarray(agreeing, dtype=object).tolist()
         image = np.repeat(np.arange(len(found)), [len(matches) for matches in found])
         known = np.array([match for matches in found for match in matches], dtype=np.intp)
         agree = mine.is_counter_clockwise[image] == self.triangles.is_counter_clockwise[known]

@@ -182,10 +182,11 @@ def fusion_figure(picture: FusionPicture) -> Figure:
     style.dress(position, "", "position [m]", "fused position")
     fixes = picture.fixes.rows(picture.used).in_time_order() if picture.used.any() else picture.fixes
     fused = _at(track, track.position_m, fixes.time_s)
-    _differences(apart, fixes.time_s, 1e3 * (fused - fixes.position_m), picture.begin_s)
+    _differences(apart, fixes.time_s, 1e3 * (fused - fixes.position_m), picture.begin_s, "no fixes")
     style.dress(apart, "", "difference [mm]", "fused position less the camera's, undelayed")
     middle_s, mean = _camera_velocity(fixes)
-    _differences(slower, middle_s, 1e3 * (_at(track, track.velocity_m_s, middle_s) - mean), picture.begin_s)
+    less = 1e3 * (_at(track, track.velocity_m_s, middle_s) - mean)
+    _differences(slower, middle_s, less, picture.begin_s, "no two fixes")
     style.dress(slower, "time [s]", "difference [mm/s]", "fused velocity less that of two fixes in a row")
     for ax in (velocity, position, apart, slower):
         style.legend(ax)
@@ -318,7 +319,15 @@ def _velocities(ax: Axes, track: PlanarTrack, fixes: FixRecord) -> None:
         ax.plot(middle_s, mean[:, column], mark, color=colour, ms=_dot(len(middle_s)), mfc="white", mew=0.7)
 
 
-def _differences(ax: Axes, time_s: FloatArray, values: FloatArray, begin_s: float) -> None:
+def _nothing(ax: Axes, why: str) -> None:
+    ax.text(0.5, 0.5, why, transform=ax.transAxes, ha="center", va="center", color=style.GREY)
+    ax.set_yticks([])
+
+
+def _differences(ax: Axes, time_s: FloatArray, values: FloatArray, begin_s: float, without: str) -> None:
+    if not len(time_s):
+        _nothing(ax, without)
+        return
     late = time_s >= begin_s
     shown = [values[late] if late.any() else values]
     # All of them, unless few are far from the others.

@@ -9,10 +9,12 @@ from importlib.metadata import version
 import pytest
 
 from adcs.cli import app, main
+from adcs.cli import run as run_app
 from magloc import command_line
 from tests.adcs.refusals import assert_refused
 
 COMMANDS = ("run", "compare", "tables", "estimate")
+SCENARIOS = [name for name in run_app if not name.startswith("-")]
 
 
 class TestHelp:
@@ -44,7 +46,8 @@ class TestRefusals:
             (["run", "tabletsat", "--sensor", "st"], ["--sensor", "--sensors"]),
             (["run", "tabletsat", "--seeds", "1.5"], ["--seeds"]),
             (["run", "tabletsat", "--filter", "ukf"], ["--filter", "mekf"]),
-            (["run", "--json", "ellipsoid"], ["expected its name right after run"]),
+            *((["run", "--json", name], ["expected its name right after run"]) for name in SCENARIOS),
+            (["run", "nosuch"], ["nosuch does not exist", *SCENARIOS]),
             (["run", "tabletsatt"], ["tabletsatt", "tabletsat", "ellipsoid", "complementary"]),
             (["compare"], ["no scenario"]),
             (["estimate", "telemetry.csv"], ["--config"]),

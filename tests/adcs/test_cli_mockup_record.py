@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from adcs.cli import main
+from adcs.commands.mockup_record import fused_record
+from adcs.mockup.inertial import wrapped
 from tests.adcs.refusals import assert_refused
 
 SAMPLES_HEADER = "time_s,acceleration_x_m_s2,acceleration_y_m_s2,rate_deg_s"
@@ -57,6 +59,87 @@ class TestRecording:
         assert lines[2].endswith("none")
 
 
+def table_of(path):
+    return np.genfromtxt(path, delimiter=",", names=True)
+
+
+class TestGaps:
+    """Samples are missing from 15 to 25 s, fixes are not."""
+
+    @pytest.fixture
+    def gap(self, folder, tmp_path):
+        rows = (folder / "mockup-fusion.csv").read_text().splitlines()
+        (tmp_path / "s.csv").write_text("\n".join([*rows[:1501], *rows[2501:], ""]))
+        fixes = (folder / "mockup-fixes.csv").read_text()
+        (tmp_path / "f.csv").write_text(
+            "".join(row for row in fixes.splitlines(keepends=True) if not row.endswith(",1,0\n"))
+        )
+        return ("run", "mockup", "--part", "fusion", "--samples", tmp_path / "s.csv", "--fixes", tmp_path / "f.csv")
+
+    def test_fixes_within_are_used_and_sigma_covers_the_errors(self, folder, gap):
+        """12,000 errors, normal with these σ, would go beyond 6 σ with a probability of less than 3e-5."""
+        run = fused_record(gap[5], gap[7], "ekf")
+        result, found = run.summary(), run.fused.track
+        assert result["used_fixes"] == result["fixes"] == len(table_of(gap[7])) - 1
+        assert result["samples"] < 3000
+        (gap_s,) = result["gaps_s"]
+        assert gap_s == pytest.approx([15.0, 25.0])
+        truth = table_of(folder / "mockup-fusion.csv")
+        rows = np.searchsorted(truth["time_s"], found.time_s - 1e-4)
+        within = (found.time_s > 15.001) & (found.time_s < 25.001)
+        assert within.sum() == 1000
+        true_m = np.column_stack([truth["true_x_m"], truth["true_y_m"]])[rows]
+        apart_m, sigma_m = np.abs(found.position_m - true_m), found.sigma[:, :2]
+        assert (apart_m < 6.0 * sigma_m).all()
+        assert apart_m[within].max() < 0.15
+        assert 0.005 < sigma_m[within].mean() < 0.06
+        apart_rad = np.abs(wrapped(found.heading_rad - np.radians(truth["true_heading_deg"][rows])))
+        assert (apart_rad < 6.0 * found.sigma[:, 4]).all()
+
+    @pytest.mark.parametrize("method", ["ekf", "paper", "velocity-corrected", "imu", "camera"])
+    def test_every_method_names_it(self, adcs, gap, method):
+        outcome = adcs(*gap, "--fusion", method)
+        assert outcome.status == 0
+        assert outcome.err.count("\n") == 1
+        assert outcome.err.startswith("adcs: warning: ")
+        assert "s.csv: found no samples from 15 to 25 s, expected one every 0.01 s; " in outcome.err
+        assert adcs(*gap, "--fusion", method, "--quiet").err == ""
+
+
+class TestCounts:
+    def test_they_add_up_to_the_fixes_of_the_file(self, adcs, folder, files, tmp_path):
+        """One fix is early, one comes again, one when nobody waits for it any more, one after the samples."""
+        rows = (folder / "mockup-fixes.csv").read_text().splitlines()
+        header, first, *later = rows
+        early = ",".join(["-5", "0.1", *first.split(",")[2:]])
+        again, old = later[3], ",".join(["1.01", "39.99", *first.split(",")[2:]])
+        after = ",".join(["39.9", "41", *first.split(",")[2:]])
+        late = sorted([*later, again, old], key=lambda row: float(row.split(",")[1]))
+        (tmp_path / "f.csv").write_text("\n".join([header, early, first, *late, after, ""]))
+        arguments = ("run", "mockup", "--part", "fusion", *files[:2], "--fixes", tmp_path / "f.csv")
+        result = json.loads(adcs(*arguments, "--json").out)
+        unused = result["unused_fixes"]
+        assert (unused["duplicate"], unused["too old"], unused["rejected"]) == (1, 1, result["rejected_fixes"])
+        assert result["used_fixes"] + sum(unused.values()) == result["fixes"]
+        assert (result["early_fixes"], result["pending_fixes"]) == (1, 1)
+        assert 1 + 1 + result["fixes"] + 1 == len(rows) - 1 + 4
+        text = adcs(*arguments).out.splitlines()[1]
+        assert text.endswith(
+            f"{result['used_fixes']} used, {unused['rejected']} rejected, 1 duplicate, 1 too old; "
+            "1 more before the first; 1 more after the last sample"
+        )
+
+    def test_they_add_up_to_the_fixes_of_simulated_drives(self, adcs):
+        short = ("--part", "fusion", "--seeds", "1", "--duration", "20", "--repeated", "0.3", "--false-fixes", "0.1")
+        result = json.loads(adcs("run", "mockup", *short, "--json").out)
+        unused = result["unused_fixes"]
+        assert unused["duplicate"] > 0
+        assert result["used_fixes"] + sum(unused.values()) == result["fixes"]
+        text = adcs("run", "mockup", *short).out.splitlines()[-1]
+        numbers = [int(word) for word in text.split(";")[0].replace(":", "").split() if word.isdigit()]
+        assert numbers[0] == sum(numbers[1:]) == result["fixes"]
+
+
 class TestRefusals:
     @pytest.fixture
     def refused(self, adcs, tmp_path):
@@ -80,6 +163,14 @@ class TestRefusals:
             (["0,0,0,0", "1,0,0,0"], ["0,0.6,0,0,0", "0.1,0.5,0,0,0"], ("f.csv, line 3", "do not go back")),
             (["0,0,0,0", "1,0,0,0"], ["0.7,0.6,0,0,0"], ("f.csv, line 2, column arrival_s", "after the exposure")),
             (["0,0,0,0", "1,0,0,0"], ["5,5.6,0,0,0"], ("f.csv", "found no exposure from -1 to 1 s")),
+            (["0,0,0,0", "1,0,0,0"], ["0,0.6,1e300,0,0"], ("f.csv, line 2, column x_m", "from -100 to 100 m")),
+            (["0,0,0,0", "1,0,0,0"], ["0,0.6,0,-101,0"], ("f.csv, line 2, column y_m", "from -100 to 100 m")),
+            (["0,0,0,0", "1,0,0,0"], ["0,0.6,0,0,1e300"], ("f.csv, line 2, column heading_deg", "a heading")),
+            (["0,,0,0", "1,,0,0"], ["0,0.6,0,0,0"], ("s.csv, line 1, column acceleration_x_m_s2", "found no reading")),
+            (["0,0,9.81,0", "1,0,9.8,0"], ["0,0.6,0,0,0"], ("column acceleration_y_m_s2", "up to 0.5 m/s²")),
+            (["0,0,0,", "1,0,0,999"], ["0,0.6,0,0,0"], ("column rate_deg_s", "found no reading up to 200 °/s")),
+            (["0,0,0,0", "1,0,0,0", "2,0,0,0", "1e300,0,0,0"], ["0,0.6,0,0,0"],
+             ("s.csv, line 5, column time_s", "found 1e+300 s after 2 s", "within 1e+05 s")),
             (["0,0,0,0", "1,0,0,0"], ["0,0.6,0,,0"], ("f.csv, line 2, column y_m", "found no value")),
         ],
     )  # fmt: skip

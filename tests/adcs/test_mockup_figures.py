@@ -145,6 +145,13 @@ class TestFusion:
         figure = drawn(fusion_figure(self.picture(outcomes)))
         assert len(line(panel(figure, "fused position less"), "X")) == 39
 
+    @pytest.mark.parametrize(("n", "texts"), [(0, ["no fixes"]), (1, [])])
+    def test_without_fixes_the_panels_say_so(self, n, texts):
+        picture = replace(self.picture((Outcome.USED,) * n), fixes=fixes(n))
+        figure = drawn(fusion_figure(picture))
+        assert [text.get_text() for text in panel(figure, "fused position less").texts] == texts
+        assert [text.get_text() for text in panel(figure, "fused velocity less").texts] == ["no two fixes"]
+
     def test_errors(self):
         figure = drawn(errors_figure(self.picture()))
         assert_labels_have_units(figure)

@@ -404,6 +404,42 @@ class TestArrival:
         assert np.all(np.abs(fused.position_m - track.position_m) < 5.0 * fused.sigma[:, :2])
         assert np.all(np.abs(fused.heading_rad - track.heading_rad) < 5.0 * fused.sigma[:, 4])
 
+    def test_lost_readings_have_noises_of_their_own(self) -> None:
+        """Each channel is lost on its own, 50 ms after its last reading; the twin goes row by row."""
+        rng, n = np.random.default_rng(6), 120
+        acceleration, rate = 0.01 * rng.standard_normal((n, 2)), 0.1 * rng.standard_normal(n)
+        acceleration[20:60, 1], rate[40:100], acceleration[110:113, 0] = np.nan, np.nan, np.nan
+        time_s = 0.01 * np.arange(1.0, n + 1.0)
+        late = DelayedFilter(START, 0.0)
+        # In pieces, of which some begin within what is lost.
+        for first, last in ((0, 30), (30, 31), (31, 75), (75, n)):
+            begin_s = 0.0 if first == 0 else time_s[first - 1]
+            rows = slice(first, last)
+            late.add_samples(ImuRecord(begin_s, time_s[rows], acceleration[rows], rate[rows]))
+        x, P = np.concatenate([START.position_m, START.velocity_m_s, [0.4], np.zeros(5)]), SIGMA.covariance
+        held_rate, dt = 0.0, np.diff(time_s, prepend=0.0)
+        for i in range(n):
+            there = np.isfinite([*acceleration[i], rate[i]])
+            held_rate = rate[i] if there[2] else held_rate
+            lost = (int(25 <= i < 60), int(45 <= i < 100))
+            reading = [*np.nan_to_num(acceleration[i]), held_rate]
+            x, P = predicted(x, P, dt[i], reading, there, SETTINGS.all_densities[lost])
+        np.testing.assert_allclose(late.x, x, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(scaled(late.P, P), scaled(P, P), atol=1e-9)
+
+    def test_a_minute_without_readings(self) -> None:
+        """σ of velocity and heading grow with √t; a fix of the middle is taken there."""
+        n = 6000
+        late = DelayedFilter(START, 0.0)
+        track = late.add_samples(
+            ImuRecord(0.0, 0.01 * np.arange(1.0, n + 1.0), np.full((n, 2), np.nan), np.full(n, np.nan))
+        )
+        assert track.sigma[-1, 2] == pytest.approx(SETTINGS.lost_m_s_rs * math.sqrt(60.0), rel=0.01)
+        assert track.sigma[-1, 4] == pytest.approx(SETTINGS.lost_rad_rs * math.sqrt(60.0), rel=0.01)
+        far = START.position_m + START.velocity_m_s * 55.0 + [3.0, -2.0]
+        assert late.add_fix(Fix(55.0, far, 2.5)) is Outcome.USED
+        assert math.sqrt(late.P[0, 0]) < 0.2 * track.sigma[-1, 0]
+
     def test_samples_follow_one_another(self) -> None:
         _, _, imu, _ = own_world(np.random.default_rng(14), 1.0)
         with pytest.raises(ValueError, match=r"at 0 s; instead received samples that begin at 0\.05 s"):

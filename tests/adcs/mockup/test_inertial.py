@@ -192,6 +192,36 @@ class TestTimeStamps:
             PlanarState(np.zeros(3), np.zeros(2), 0.0)
 
 
+class TestGaps:
+    def test_time_goes_on_in_steps_without_readings(self) -> None:
+        """Of 60 intervals, 20 are missing after the 30th sample; the next sample is the mean over its own one."""
+        rng = np.random.default_rng(4)
+        whole = ImuRecord(2.0, 2.0 + 0.01 * np.arange(1.0, 61.0), rng.standard_normal((3, 60, 2)), np.ones((3, 60)))
+        there = np.r_[0:30, 50:60]
+        imu = ImuRecord(2.0, whole.time_s[there], whole.acceleration_m_s2[:, there], whole.rate_rad_s[:, there])
+        np.testing.assert_allclose(imu.gaps_s, [[2.3, 2.5]], atol=1e-12)
+        filled = imu.with_gaps_filled()
+        np.testing.assert_allclose(filled.time_s, whole.time_s, atol=1e-12)
+        np.testing.assert_array_equal(filled.acceleration_m_s2[:, there], imu.acceleration_m_s2)
+        assert np.isnan(filled.acceleration_m_s2[:, 30:50]).all()
+        assert np.isnan(filled.rate_rad_s[:, 30:50]).all()
+        assert len(filled.gaps_s) == 0
+
+    def test_several_gaps_of_no_whole_number_of_steps(self) -> None:
+        time_s = np.concatenate([0.1 * np.arange(1, 11), 2.33 + 0.1 * np.arange(10), 9.871 + 0.1 * np.arange(10)])
+        filled = ImuRecord(0.0, time_s, np.zeros((30, 2)), np.zeros(30)).with_gaps_filled()
+        assert np.isin(time_s, filled.time_s).all()
+        assert 0.05 < filled.steps_s.min() < filled.steps_s.max() < 0.1 + 1e-9
+        assert np.isnan(filled.rate_rad_s).sum() == len(filled) - 30
+
+    @pytest.mark.parametrize("n", [0, 1, 9])
+    def test_a_few_intervals_are_no_gap(self, n: int) -> None:
+        time_s = 0.01 * np.cumsum([*[1.0] * 4, 4.9, *[1.0] * 4])[:n]
+        imu = ImuRecord(0.0, time_s, np.zeros((n, 2)), np.zeros(n))
+        assert imu.gaps_s.shape == (0, 2)
+        assert imu.with_gaps_filled() is imu
+
+
 class TestGate:
     def imu(self) -> ImuRecord:
         """Ten samples; a spike on x in sample 3, a missing y in sample 5, a wild rate in sample 7."""

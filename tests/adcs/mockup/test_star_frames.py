@@ -120,6 +120,20 @@ class TestGeometry:
         assert (np.diff(many.sides, axis=1) >= 0.0).all()
         assert many.sides.max() <= 0.3
 
+    @pytest.mark.parametrize(
+        ("camera", "text"),
+        [
+            ((1392, 1040, 1e-170), "must be 0.01 to 3600 arc seconds"),
+            ((1392, 1040, 1e300), "must be 0.01 to 3600 arc seconds"),
+            ((10**6, 1040, 1e-5), "at most 100000"),
+            ((9000, 9000, 1e-2), "at most 150° wide"),
+            ((0, 9000, 1e-2), "must be positive"),
+        ],
+    )
+    def test_no_camera(self, camera, text):
+        with pytest.raises(ValueError, match=text):
+            StarCamera(*camera)
+
     @pytest.mark.parametrize("points", [[1.0, 2.0], [[1.0, 2.0, 3.0]], [[np.nan, 0.0]]])
     def test_no_points(self, points):
         with pytest.raises(ValueError, match="Input points_px must be finite numbers of shape"):
@@ -300,6 +314,8 @@ class TestCommand:
             ("hip,ra_deg,dec_deg,mag\n1,2,north,3\n", ["line 2, column dec_deg"]),
             ("hip,ra_deg,dec_deg,mag\n1.5,2,5,3\n", ["line 2, column hip", "expected a whole number"]),
             ("hip,ra_deg,dec_deg,mag\n1,2,5,3\n1,3,5,3\n", ["line 3, column hip", "expected every value once"]),
+            ("hip,ra_deg,dec_deg,mag\n1e30,2,5,3\n", ["line 2, column hip: found 1e+30, expected a number from 0"]),
+            ("hip,ra_deg,dec_deg,mag\n1,2,5,3\n-1,3,5,3\n", ["line 3, column hip: found -1, expected a number from 0"]),
             ("hip,ra_deg,dec_deg,mag\n1,2,5,3\n", ["found 1 stars, expected 4 at least"]),
         ],
     )
@@ -317,6 +333,23 @@ class TestCommand:
                 "IMG_X=0.5\nIMG_Y=10\nPIXSCALE=1\n",
                 ["line 1: found IMG_X=0.5, expected a positive whole number"],
             ),
+            (
+                "calibration.txt",
+                "IMG_X=9\nIMG_Y=9\nPIXSCALE=1e-170\n",
+                ["line 3: found PIXSCALE=1e-170", "0.01 to 3600"],
+            ),
+            ("calibration.txt", "IMG_X=9\nIMG_Y=9\nPIXSCALE=1e300\n", ["found PIXSCALE=1e300", "0.01 to 3600"]),
+            ("calibration.txt", "IMG_X=9\nIMG_Y=9\nPIXSCALE=4e5\n", ["found PIXSCALE=4e5", "0.01 to 3600"]),
+            (
+                "calibration.txt",
+                "IMG_X=1e300\nIMG_Y=9\nPIXSCALE=9\n",
+                ["line 1: found IMG_X=1e300", "1 to 100000 pixels"],
+            ),
+            (
+                "calibration.txt",
+                "IMG_X=900\nIMG_Y=1200\nPIXSCALE=3000\n",
+                ["found PIXSCALE=3000 for 1500 pixels", "150°"],
+            ),
             ("input.csv", "1,2,3,4\n", ["line 1: found 4 numbers, expected three for each star"]),
             ("input.csv", "1,2,x\n", ["line 1: found 'x', expected a finite number"]),
             ("input.csv", "\n", ["found no frame, expected one at least"]),
@@ -331,12 +364,35 @@ class TestCommand:
         outcome = adcs("stars", tmp_path, "--catalogue", sky_files / "sky.csv")
         assert_refused(outcome, name, *fragments)
 
+    @pytest.mark.parametrize("label", ["1e30", "-2"])
+    def test_labels_that_are_no_numbers_of_stars(self, adcs, sky_files, tmp_path, label):
+        for name in ("calibration.txt", "input.csv", "result.csv"):
+            (tmp_path / name).write_text((sky_files / "frames" / name).read_text())
+        labels = (tmp_path / "result.csv").read_text()
+        (tmp_path / "result.csv").write_text(labels.replace(labels.split(",")[0], label, 1))
+        found = f"result.csv, line 1: found {float(label):.15g}, expected numbers of stars"
+        assert_refused(adcs("stars", tmp_path, "--catalogue", sky_files / "sky.csv"), found)
+
     def test_no_such_folder(self, adcs, sky_files, tmp_path):
         assert_refused(adcs("stars", tmp_path / "none", "--catalogue", sky_files / "sky.csv"), "does not exist")
 
     def test_noise_must_be_positive(self, adcs, sky_files):
         outcome = adcs("stars", sky_files / "frames", "--catalogue", sky_files / "sky.csv", "--noise-px", "0")
         assert_refused(outcome, "--noise-px", "expected a positive number")
+
+    @pytest.mark.parametrize("noise", ["105", "1e308"])
+    def test_noise_as_large_as_the_image(self, adcs, sky_files, noise):
+        outcome = adcs("stars", sky_files / "frames", "--catalogue", sky_files / "sky.csv", "--noise-px", noise)
+        assert_refused(outcome, "--noise-px", "expected at most 104, a tenth of the image's shorter side")
+
+    def test_noise_in_which_all_triangles_agree_is_no_long_work(self, adcs, sky_files):
+        outcome = adcs(
+            "stars", sky_files / "frames", "--catalogue", sky_files / "sky.csv", "--noise-px", "50", "--json"
+        )
+        found = json.loads(outcome.out)
+        assert found["fixes"] == 0
+        for frame in found["frames"]:
+            assert "triangles agree within the noise, 250000 can be told apart" in frame["reason"]
 
 
 def test_a_folder_that_is_none(tmp_path):
