@@ -5,7 +5,9 @@ The results come back to this process, which alone writes them: workers need no 
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import re
 import threading
 from collections.abc import Iterable, Iterator
 from concurrent.futures import CancelledError
@@ -18,8 +20,18 @@ from magloc.cubes import Box, Chunk, CubeMap, computed
 
 # Boxes sent ahead for every worker: one that it computes, one that it has ready.
 _PER_WORKER = 2
+# Those of TLS need dask's own configuration besides.
+_ADDRESS = re.compile(r"(?:(?:tcp|tls)://)?(?:[^\s/:@\[\]]+|\[[0-9a-fA-F:.]+\]):(?P<port>[0-9]{1,5})")
+_LARGEST_PORT = 65535
 # numba's threads serve one chunk of a process at a time.
 _one_chunk = threading.Lock()
+
+
+def check_address(scheduler: str) -> None:
+    """Refuse what cannot be the address of a scheduler, with an :class:`arrays.errors.InputError`."""
+    address = _ADDRESS.fullmatch(scheduler)
+    if address is None or not 0 < int(address["port"]) <= _LARGEST_PORT:
+        raise InputError(f"--scheduler: found {scheduler!r}, expected tcp://HOST:PORT or HOST:PORT.")
 
 
 def computed_by(scheduler: str, cube: CubeMap, wanted: Iterable[Box], timeout_s: float = 10.0) -> Iterator[Chunk]:
@@ -45,6 +57,7 @@ def computed_by(scheduler: str, cube: CubeMap, wanted: Iterable[Box], timeout_s:
     InputError
         There is no scheduler, it has no workers, it went away, or a worker failed.
     """
+    check_address(scheduler)
     try:
         from distributed import as_completed
     except ImportError:
@@ -85,6 +98,7 @@ def _client(scheduler: str, timeout_s: float) -> Iterator[Any]:
     level = logger.level
     logger.setLevel(logging.CRITICAL)
     try:
+        _check_answer(scheduler, timeout_s)
         try:
             client = Client(scheduler, timeout=timeout_s, set_as_default=False)
         except (OSError, ValueError) as error:
@@ -97,3 +111,31 @@ def _client(scheduler: str, timeout_s: float) -> Iterator[Any]:
             yield client
     finally:
         logger.setLevel(level)
+
+
+def _check_answer(scheduler: str, timeout_s: float) -> None:
+    """Refuse an address where no scheduler answers.
+
+    A client that cannot connect is not asked: it waits for itself when it is deleted, and prints a traceback then.
+    """
+    from distributed import rpc
+
+    async def answer() -> object:
+        async with rpc(scheduler, timeout=timeout_s) as there:
+            return (await there.identity())["type"]
+
+    async def answer_in_time() -> object:
+        return await asyncio.wait_for(answer(), timeout_s)
+
+    try:
+        found = asyncio.run(answer_in_time())
+    except TimeoutError:
+        raise InputError(
+            f"--scheduler {scheduler}: found no scheduler there (no answer within {timeout_s:g} s)."
+        ) from None
+    except OSError as error:
+        raise InputError(f"--scheduler {scheduler}: found no scheduler there ({error}).") from None
+    except Exception:  # what another service says may mean anything to dask
+        raise InputError(f"--scheduler {scheduler}: found another service there, expected a scheduler.") from None
+    if found != "Scheduler":
+        raise InputError(f"--scheduler {scheduler}: found a {found} of dask there, expected a scheduler.")

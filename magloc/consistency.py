@@ -2,8 +2,10 @@ r"""How true a track is: its errors against what it claims, and against what is 
 
 The normalised estimation error squared, NEES, of an estimate of n numbers with covariance P is
 :math:`e^T P^{-1} e`; over independent rows its mean times their number is a χ² of n numbers each. The posterior
-Cramér-Rao bound is the least covariance that any filter can reach with a motion model, by the recursion of Tichavský,
-Muravchik and Nehorai (1998), for linear motion :math:`J_{j+1} = (Q + F J_j^{-1} F^T)^{-1} + H^T R^{-1} H` at the truth.
+Cramér-Rao bound is the least covariance that any estimator can reach with a motion model: of a filter by the recursion
+of Tichavský, Muravchik and Nehorai (1998), for linear motion
+:math:`J_{j+1} = (Q + F J_j^{-1} F^T)^{-1} + H^T R^{-1} H` at the truth, and of a smoother, which knows later rows too,
+by the same information carried backwards.
 """
 
 from __future__ import annotations
@@ -19,8 +21,9 @@ from scipy.special import chdtri
 from magloc.kalman import block_update
 from magloc.motion import N_SOURCE
 from magloc.row_measurement import RowMeasurement
+from magloc.smoother import smoothed
 from magloc.track import Tracker
-from magloc.track_rows import Row, TrackPoint
+from magloc.track_rows import Row, Step, TrackPoint
 
 FloatArray = NDArray[np.float64]
 
@@ -40,7 +43,8 @@ class Consistency:
     position_rms_m : float
         Root of the mean squared distance from the truth.
     position_bound_m : float
-        The same of the posterior Cramér-Rao bound, over the same rows; NaN where the true moment is not known.
+        The same of the posterior Cramér-Rao bound, over the same rows: that of a filter, or of a smoother if the track
+        is smoothed. NaN where the true moment is not known.
     nees_per_dimension : float
         Mean NEES over the number of its dimensions: 1 if the covariance is right. It is counted in coordinates in
         which an uncertain one is Gaussian, see :func:`nees_of`.
@@ -92,7 +96,8 @@ def consistency(
         Truth of every row in the track's frame; NaN where a coordinate is not known.
         With the moment NEES is that of all six numbers, else that of the position.
     bound_m : ndarray, shape (n,), optional
-        Posterior Cramér-Rao bound of every row, as of :func:`posterior_bound`.
+        Posterior Cramér-Rao bound of every row: :func:`posterior_bound` of a filtered track, :func:`smoothing_bound`
+        of a smoothed one.
 
     Returns
     -------
@@ -189,7 +194,7 @@ def nees_of(
 def posterior_bound(
     tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
 ) -> FloatArray:
-    """Posterior Cramér-Rao bound of the distance from the truth, for every row.
+    """Posterior Cramér-Rao bound of the distance from the truth, for every row, from this row and those before.
 
     Nothing is known before the first row but the standard deviations of the sensors' lasting errors, which count as
     unknowns of their own, and until the readings determine it the source counts as at rest. Speed and turn rate are
@@ -208,23 +213,64 @@ def posterior_bound(
     ndarray, shape (n,)
         Root of the trace of the position's bound [m]; infinite as long as the readings do not determine it.
     """
+    bounds = np.full(len(rows), np.inf)
+    for step in _steps_at_truth(tracker, rows, position_m, moment_Am2):
+        bounds[step.row] = float(np.linalg.norm(step.S[:3]))
+    return bounds
+
+
+def smoothing_bound(
+    tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
+) -> FloatArray:
+    r"""Posterior Cramér-Rao bound of the distance from the truth, for every row, from all rows.
+
+    The diagonal blocks of the inverse of the information of all states together (Šimandl, Královec and Tichavský 2001),
+    by the recursion of Rauch, Tung and Striebel from the last row backwards:
+    :math:`P_{j|n} = P_j + G (P_{j+1|n} - P_{j+1|j}) G^T` with :math:`G = P_j F^T P_{j+1|j}^{-1}`.
+
+    Parameters
+    ----------
+    tracker, rows, position_m, moment_Am2
+        As of :func:`posterior_bound`.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        As of :func:`posterior_bound`, and infinite at the same rows: a track that has not begun is not smoothed.
+    """
+    steps = _steps_at_truth(tracker, rows, position_m, moment_Am2)
+    at_truth = [TrackPoint(row.time_s, place) for row, place in zip(rows, position_m, strict=True)]
+    points = smoothed(at_truth, steps)
+    bounds = np.full(len(rows), np.inf)
+    for step in steps:
+        covariance = points[step.row].covariance
+        if covariance is not None:
+            bounds[step.row] = math.sqrt(float(np.trace(covariance[:3, :3])))
+    return bounds
+
+
+def _steps_at_truth(
+    tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
+) -> list[Step]:
+    """What a filter that linearises at the truth knows at every row, from the first one that determines the source."""
     motion, n_errors = tracker.motion, tracker.errors.n_states
     truth = np.concatenate([position_m, moment_Am2], axis=1)
     velocity, rate = _velocities(np.array([row.time_s for row in rows]), truth)
-    bounds = np.full(len(rows), np.inf)
+    steps: list[Step] = []
     S: FloatArray | None = None
     seen: list[FloatArray] = []
     measurements: list[RowMeasurement] = []
     for i, row in enumerate(rows):
         measurement = tracker.measurement(row)
         before = max(i - 1, 0)
+        prediction = None
         if S is not None:
             state = np.concatenate([motion.state_of(truth[before], velocity[before], rate[before]), np.zeros(n_errors)])
-            S = tracker.predicted(state, S, row.time_s - rows[before].time_s).S
+            prediction = tracker.predicted(state, S, row.time_s - rows[before].time_s)
         state = np.concatenate([motion.state_of(truth[i], velocity[i], rate[i]), np.zeros(n_errors)])
         H = measurement.jacobian(state)
-        if S is not None:
-            _, S = block_update(state, S, H, np.zeros(len(H)), np.ones(len(H)))
+        if prediction is not None:
+            _, S = block_update(state, prediction.S, H, np.zeros(len(H)), np.ones(len(H)))
         else:
             # Lasting errors of sensors as noise of the row: only to see whether the source is determined, and how well.
             lasting = H[:, motion.n_states :] * tracker.errors.sigma
@@ -235,8 +281,8 @@ def posterior_bound(
             if covariance is None:
                 continue
             S = tracker.filtered_start(truth[i], covariance, measurements).S
-        bounds[i] = float(np.linalg.norm(S[:3]))
-    return bounds
+        steps.append(Step(i, prediction, state, S))
+    return steps
 
 
 def _bound_at_rest(H: FloatArray) -> FloatArray | None:

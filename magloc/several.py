@@ -95,9 +95,10 @@ class SeveralLocator:
         # A single source may be exactly determined: no χ² to judge it by, but a solution.
         most = max(1, most_sources(whitening.n_differences))
         if n_sources is not None and not 1 <= n_sources <= most:
+            allowed = "1" if most == 1 else f"between 1 and {most}"
             raise ValueError(
-                f"Input n_sources must be between 1 and {most} for an array of {whitening.n_differences} independent"
-                f" differences and {N_UNKNOWNS} unknowns a source; instead received {n_sources}."
+                f"Input n_sources must be {allowed}, as an array of {whitening.n_differences} independent differences"
+                f" can tell no more, with {N_UNKNOWNS} unknowns a source; instead received {n_sources}."
             )
         self.array = array
         self.n_sources = n_sources

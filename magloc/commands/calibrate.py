@@ -115,10 +115,11 @@ def calibrate(
 
     from arrays.files import read_array, read_sensors, write_array
     from magloc.calibration import calibrate_on_path, self_calibrate
-    from magloc.commands.calibrate_by_turning import calibrate_by_turning, check_folder
-    from magloc.output_files import refuse_file
+    from magloc.commands.calibrate_by_turning import calibrate_by_turning
+    from magloc.output_files import refuse_file, refuse_unwritable
     from magloc.readings import read_readings, read_truth, without_saturated
 
+    refuse_unwritable(out, "--out")
     if figures is not None:
         refuse_file(figures, "--figures")
     if modulus_nT is not None:
@@ -137,7 +138,6 @@ def calibrate(
     nominal = read_array(array)
     prior = _prior(known, nominal, array)
     rows = without_saturated(read_readings(readings, nominal), nominal)
-    check_folder(out)
     if truth is None and height_m is not None:
         raise InputError("--height-m: found no --truth, expected it because the height is that of its path.")
     attitude, readings_T = _world_from_array(rows), rows.values_T

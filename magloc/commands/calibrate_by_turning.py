@@ -17,12 +17,6 @@ from magloc.readings import read_readings, without_saturated
 _LARGEST_CHANGE = 3.0
 
 
-def check_folder(out: Path) -> None:
-    """Refuse a file to write whose folder is not there, before long work."""
-    if not out.absolute().parent.is_dir():
-        raise InputError(f"--out {out}: found no folder {out.absolute().parent}, expected one.")
-
-
 def calibrate_by_turning(readings: Path, array: Path, modulus_nT: float, out: Path, *, json: bool, quiet: bool) -> None:
     """Calibrate every vector sensor of an array file, or its only one, and write the array file.
 
@@ -35,7 +29,6 @@ def calibrate_by_turning(readings: Path, array: Path, modulus_nT: float, out: Pa
         raise InputError(f"--modulus-nT: found {modulus_nT:g}, expected a positive number.")
     nominal = read_sensors(array)
     rows = without_saturated(read_readings(readings, nominal), nominal)
-    check_folder(out)
     try:
         calibrated, results = calibrated_in_modulus(nominal, rows.values_T, 1e-9 * modulus_nT)
     except ValueError as error:

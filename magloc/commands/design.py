@@ -46,13 +46,15 @@ def design(
     """
     from arrays.files import write_array
     from magloc.design import design as designed
+    from magloc.output_files import refuse_one_for_two, refuse_unwritable
     from magloc.tasks import read_task
 
     file = read_task(task)
     target = Path(f"design-{file.task.name}.toml") if out is None else out
-    for option, path in (("--out", target), ("--png", png)):
-        if path is not None:
-            _check_target(option, path)
+    refuse_one_for_two({"--out": target, "--png": png})
+    refuse_unwritable(target, "--out")
+    if png is not None:
+        refuse_unwritable(png, "--png", ".png")
     best: list[SensorArray] = []
     begin = time.perf_counter()
     try:
@@ -79,14 +81,6 @@ def design(
             f"{result.n_converged} of {result.n_descents} refined starts converged, {seconds:.1f} s; wrote"
             f" {target}{drawn}"
         )
-
-
-def _check_target(option: str, path: Path) -> None:
-    """Refuse a file that cannot be written, before long work."""
-    if path.is_dir():
-        raise InputError(f"{option} {path}: found a folder, expected a file.")
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{option} {path}: found no folder {path.absolute().parent}, expected one.")
 
 
 def _draw(result: Design, seed: int, path: Path) -> None:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _BOUNDS = re.compile(rf"(?:(?P<below>{_NUMBER})<(?=[xyz]<))?(?P<axis>[xyz])(?P<sign>[<>])(?P<bound>{_NUMBER})")
+# Of a known place from the array, along each axis: farther than any field that can be measured, and not out of range.
+_FARTHEST_M = 1e6
 
 
 def locate(
@@ -126,6 +128,8 @@ def locate(
     rows = without_saturated(measured, used)
     if average:
         rows, used = _averaged(rows, used, readings, quiet=common.quiet)
+    if position is not None:
+        _refuse_farther(position, rows)
     used, ambient_T = with_ambient_field(used, rows, where, gradient=ambient_gradient)
     true_position_m = None if truth is None else _true_position(rows, truth)
     try:
@@ -173,6 +177,18 @@ def subset_of(array: SensorArray, ids: Sequence[str] | None, path: Path) -> Sens
         return array.subset(ids)
     except ValueError as error:
         raise InputError(f"--sensors {','.join(ids)}: {error}") from None
+
+
+def _refuse_farther(position: Vector, rows: Readings) -> None:
+    """Refuse a place that is too far away from the array in some row."""
+    import numpy as np
+
+    array_m = np.zeros(3) if rows.array_position_m is None else rows.array_position_m
+    farthest = float(np.abs(np.array(position) - array_m).max())
+    if farthest > _FARTHEST_M:
+        raise InputError(
+            f"--position: found a place {farthest:g} m from the array, expected one within {_FARTHEST_M:g} m."
+        )
 
 
 def _true_position(rows: Readings, path: Path) -> NDArray[np.float64]:

@@ -71,6 +71,10 @@ def map_(
     name = cube.attributes["method"] if over == "starts" else over
     drawn = f"-seed{common.seed}" if noise or (over == "sources" and common.seed) else ""
     folder = Path(f"map-{Path(scenario).stem}-{name}-{cube.grid}{drawn}") if out is None else out
+    if scheduler is not None:
+        from magloc.cluster import check_address
+
+        check_address(scheduler)
     make_folder(folder, "--out")
     with Sweep(cube, folder / "map.zarr") as sweep:
         for sentence in sweep.unreadable:

@@ -34,11 +34,14 @@ def simulate(
         Common options.
     """
     # The command line stands on top of all packages; nothing that it imports imports it.
-    from sims.files import write_simulation
+    from magloc.output_files import refuse_unwritable
+    from sims.files import files_beside, write_simulation
     from sims.scenarios import read_scenario
     from sims.simulation import simulate as simulated
 
     wanted = read_scenario(scenario)
+    for path in files_beside(out, len(wanted.sources)).all:
+        refuse_unwritable(path, "--out")
     try:
         result = simulated(wanted, common.seed)
     except ValueError as error:

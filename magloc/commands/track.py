@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from arrays.sensor import SensorArray
     from magloc.commands.ambient import Place
+    from magloc.consistency import Consistency
     from magloc.motion import MotionModel
     from magloc.readings import Readings
     from magloc.track import Tracker
@@ -110,7 +111,8 @@ def track(
     array : Path
         Array file (TOML).
     truth : Path
-        Truth file (CSV): errors, NEES and NIS with their 99 % bounds, and the least error that is possible.
+        Truth file (CSV): errors, NEES and NIS with their 99 % bounds, and the least error that is possible on average
+        over the motions that the options allow: a source that moves less may be found better.
     smooth : bool
         Use later rows too (fixed-interval smoother).
     json : bool
@@ -143,10 +145,10 @@ def track(
     from arrays.files import read_array
     from magloc.commands.ambient import place_of_options
     from magloc.commands.locate import knowledge_of, subset_of
-    from magloc.commands.track_output import geojson_text, json_entry, report, track_table, truth_of_rows
-    from magloc.consistency import consistency, nees_of_rows, posterior_bound
+    from magloc.commands.track_output import geojson_text, report, truth_of_rows
+    from magloc.consistency import consistency, nees_of_rows, posterior_bound, smoothing_bound
     from magloc.long_record import track_record
-    from magloc.output_files import refuse_file
+    from magloc.output_files import refuse_file, refuse_one_for_two, refuse_unwritable
     from magloc.readings import read_readings, read_truth, without_saturated
     from magloc.smoother import smoothed
     from magloc.track import Tracker
@@ -158,6 +160,9 @@ def track(
         refuse_file(out, "--out")
     if geojson is not None and place is None:
         raise InputError("--geojson: found no --place, expected the origin of the world frame with it.")
+    refuse_one_for_two({"--out": out, "--geojson": geojson})
+    if geojson is not None:
+        refuse_unwritable(geojson, "--geojson")
     where = None if place is not None and date is None else place_of_options(place, date, geomagnetic_model)
     ids = None if sensors is None else [name.strip() for name in sensors.split(",")]
     used = subset_of(read_array(array), ids, array)
@@ -189,13 +194,16 @@ def track(
     if smooth:
         points = smoothed(points, tracker.steps)
     if not any(point.position_m is not None for point in points):
-        reasons = sorted({point.status for point in points})
-        raise InputError(f"{readings}: found no row where a source can be tracked ({'; '.join(reasons[:3])}).")
+        _print_points(points, None, json=json, jsonl=jsonl, printed=jsonl and not smooth)
+        raise _no_track(str(readings), {point.status for point in points})
     result = truth_position = bound = nees = None
     if truth is not None:
         truth_position, moment = truth_of_rows(rows, read_truth(truth), truth)
         complete = moment is not None and bool(np.isfinite(truth_position).all() and np.isfinite(moment).all())
-        bound = posterior_bound(tracker, records, truth_position, moment) if complete and moment is not None else None
+        if complete and moment is not None:
+            # Later rows make less error possible.
+            bound_of = smoothing_bound if smooth else posterior_bound
+            bound = bound_of(tracker, records, truth_position, moment)
         result = consistency(points, tracker, records, truth_position, moment, bound)
         if out is not None:
             nees = nees_of_rows(points, tracker, records, truth_position, moment)
@@ -215,14 +223,7 @@ def track(
             array_m=rows.array_position_m,
             quiet=common.quiet,
         )
-    if json:
-        entries = {"results": [json_entry(point) for point in points]}
-        print_json(entries if result is None else {**entries, "consistency": result})
-    elif jsonl and smooth:
-        for point in points:
-            _print_line(point)
-    elif not jsonl:
-        print("\n".join(track_table(points)))
+    _print_points(points, result, json=json, jsonl=jsonl, printed=jsonl and not smooth)
     if result is not None and not json:
         print("\n".join(report(result)), file=sys.stderr if jsonl else sys.stdout)
     if not (json or jsonl or common.quiet):
@@ -286,6 +287,27 @@ def _ambient(array: SensorArray, rows: Readings, where: Place | None) -> tuple[S
     return with_ambient_field(array, rows, where, gradient=False)
 
 
+def _print_points(
+    points: Sequence[TrackPoint], result: Consistency | None, *, json: bool, jsonl: bool, printed: bool
+) -> None:
+    """Print a finished track as it is asked for, unless its lines are `printed` already."""
+    from magloc.commands.track_output import json_entry, track_table
+
+    if json:
+        entries = {"results": [json_entry(point) for point in points]}
+        print_json(entries if result is None else {**entries, "consistency": result})
+    elif not jsonl:
+        print("\n".join(track_table(points)))
+    elif not printed:
+        for point in points:
+            _print_line(point)
+
+
+def _no_track(readings: str, statuses: Collection[str]) -> InputError:
+    reasons = "; ".join(sorted(statuses)[:3])
+    return InputError(f"{readings}: found no row where a source can be tracked ({reasons}).")
+
+
 def _print_line(point: TrackPoint) -> None:
     from magloc.commands.track_output import json_entry
 
@@ -296,7 +318,7 @@ def _print_line(point: TrackPoint) -> None:
 def _stream(
     array: SensorArray, ids: list[str] | None, model: MotionModel, knowledge: object, where: Place | None
 ) -> None:
-    """Answer every row of standard input by one line."""
+    """Answer every row of standard input by one line; none that is tracked is an InputError at its end."""
     from magloc.readings import readings_of_text, without_saturated
     from magloc.track import Tracker
     from magloc.track_rows import rows_of
@@ -306,6 +328,8 @@ def _stream(
     if header is None:
         raise InputError("standard input: found nothing, expected a header with time_s and the sensors' columns.")
     tracker: Tracker | None = None
+    statuses: set[str] = set()
+    is_tracked = False
     last = -math.inf
     for number, line in enumerate(lines, start=2):
         if not line.strip():
@@ -324,7 +348,14 @@ def _stream(
         if tracker is None:
             tracker = Tracker(array_here, model, knowledge=knowledge)  # type: ignore[arg-type]
         (row,) = rows_of(rows.time_s, rows.values_T, rows.array_position_m, rows.array_rotation_xyzw, ambient)
-        _print_line(tracker.advance(row))
+        point = tracker.advance(row)
+        _print_line(point)
+        statuses.add(point.status)
+        is_tracked = is_tracked or point.position_m is not None
+    if not statuses:
+        raise InputError("standard input, line 1: found a header without rows, expected a row below it.")
+    if not is_tracked:
+        raise _no_track("standard input", statuses)
 
 
 def _lines_of_stdin() -> Iterator[str]:

@@ -82,7 +82,10 @@ def report(result: Consistency) -> list[str]:
     ]
     if np.isfinite(result.position_bound_m):
         ratio = result.position_rms_m / result.position_bound_m
-        lines[-1] += f", least possible {result.position_bound_m:.4g} m (posterior Cramér-Rao bound), ratio {ratio:.2f}"
+        lines[-1] += (
+            f", least possible {result.position_bound_m:.4g} m on average over such motions (posterior Cramér-Rao"
+            f" bound), ratio {ratio:.2f}"
+        )
     for name, value, (low, high) in (
         ("NEES", result.nees_per_dimension, result.nees_bounds),
         ("NIS", result.nis_per_dimension, result.nis_bounds),

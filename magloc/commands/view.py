@@ -10,6 +10,7 @@ from cyclopts.validators import Number
 
 from arrays.errors import InputError
 from magloc.commands.common import CommonOptions, Flag, print_note, progress, whole_number
+from magloc.output_files import refuse_unwritable
 
 if TYPE_CHECKING:
     import viser
@@ -66,9 +67,10 @@ def view(
     from magloc.viewer.files import ReadingsResult, read_result
     from magloc.viewer.server import address, free_port, opened, wait_for_interruption, write_page, write_picture
 
-    for option, file in (("--html", html), ("--png", png)):
-        if file is not None and not file.absolute().parent.is_dir():
-            raise InputError(f"{option} {file}: found no folder {file.absolute().parent}, expected one.")
+    if html is not None:
+        refuse_unwritable(html, "--html")
+    if png is not None:
+        refuse_unwritable(png, "--png", ".png")
     if png is not None:
         try:
             find_chromium()

@@ -212,7 +212,14 @@ class TestBadInput:
         assert_refused(run("design", task, "--out", tmp_path), "--out", "found a folder")
         assert_refused(run("design", task, "--out", tmp_path / "none" / "a.toml"), "--out", "found no folder")
         assert_refused(run("design", task, "--out", tmp_path / "a.toml", "--png", tmp_path), "--png", "found a folder")
+        assert_refused(run("design", task, "--out", "/proc/x.toml"), "--out /proc/x.toml", "no file can be made")
         assert not (tmp_path / "a.toml").exists()
+
+    def test_picture_and_array_in_one_file(self, run, task, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        assert_refused(run("design", task, "--out", "a.png", "--png", tmp_path / "a.png"), "--png", "--out")
+        assert_refused(run("design", task, "--out", "a.toml", "--png", "a.xyz"), "--png a.xyz", "expected .png")
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["task.toml"]
 
     def test_a_missing_table(self, tmp_path):
         with pytest.raises(InputError, match="found no key volume"):

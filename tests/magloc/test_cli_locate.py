@@ -319,6 +319,35 @@ class TestBadInput:
         assert_refused(outcome, fragment)
         assert outcome.out == ""
 
+    @pytest.mark.parametrize("number", ["2", "0"])
+    def test_an_array_that_can_tell_one_source_only(self, run: Run, array: Path, readings: Path, number: str) -> None:
+        """Four sensors: nine differences, of which two sources would leave none to judge them by."""
+        outcome = run("locate", readings, "--array", array, "--sensors", "s1,s2,s3,s4", "--sources", number)
+        assert_refused(outcome, f"--sources {number}: ", "must be 1, as an array of 9 independent", "can tell no more")
+        assert "between" not in outcome.err
+
+    @pytest.mark.parametrize("far", ["1e300", "-1e300", "1.1e6", "inf"])
+    def test_a_place_that_is_out_of_reach(self, run: Run, array: Path, readings: Path, far: str) -> None:
+        outcome = run("locate", readings, "--array", array, "--position", "0", far, "0")
+        assert_refused(outcome, "--position: found a place", "from the array", "within 1e+06 m")
+
+    def test_a_place_counts_from_an_array_that_is_far_from_the_origin(
+        self, run: Run, array: Path, tmp_path: Path
+    ) -> None:
+        header = f"{HEADER},array_x_m,array_y_m,array_z_m,array_qx,array_qy,array_qz,array_qw"
+        origin = np.array([0.0, 5.4e6, 0.0])  # a northing
+        path = tmp_path / "north.csv"
+        path.write_text(table([np.concatenate([fields_nT(), origin, [0.0, 0.0, 0.0, 1.0]])], header), encoding="utf-8")
+        command = ("locate", path, "--array", array, "--json", "--position")
+        (entry,) = results_of(run(*command, *map(str, origin + SOURCE)))
+        np.testing.assert_allclose(entry["solutions"][0]["moment_Am2"], MOMENT, rtol=1e-4)
+        assert_refused(run(*command, *map(str, SOURCE)), "--position: found a place 5.4e+06 m from the array")
+
+    def test_a_folder_that_cannot_be_written(self, run: Run, array: Path, tmp_path: Path) -> None:
+        """Found before the readings are looked for."""
+        outcome = run("locate", tmp_path / "absent.csv", "--array", array, "--out", "/proc/x")
+        assert_refused(outcome, "--out /proc/x", "no file can be made in /proc")
+
     def test_no_row_solvable(self, run: Run, array: Path, readings: Path) -> None:
         rows = np.tile(fields_nT(), (2, 1))
         rows[:, 6:] = np.nan

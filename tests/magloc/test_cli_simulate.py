@@ -105,8 +105,15 @@ class TestBadInput:
 
     def test_a_folder_where_a_file_should_be(self, run: Run, tmp_path: Path) -> None:
         (tmp_path / "run-truth.csv").mkdir()
-        assert_refused(run("simulate", "paper", "--out", tmp_path / "run.csv"), "run-truth.csv", "directory")
+        assert_refused(
+            run("simulate", "paper", "--out", tmp_path / "run.csv"), "--out", "run-truth.csv", "found a folder"
+        )
         assert [path.name for path in tmp_path.iterdir()] == ["run-truth.csv"]
+
+    def test_a_folder_where_nothing_can_be_made(self, run: Run) -> None:
+        outcome = run("simulate", "paper", "--out", "/proc/x.csv")
+        assert_refused(outcome, "--out /proc/x.csv", "no file can be made in /proc")
+        assert ".magloc-" not in outcome.err
 
     def test_no_out(self, run: Run) -> None:
         assert_refused(run("simulate", "paper"), "--out")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from arrays import geometries
 from arrays.files import read_array
 from magloc.commands.track_output import truth_of_rows
+from magloc.consistency import posterior_bound, smoothing_bound
 from magloc.long_record import track_record
 from magloc.motion import UnknownMotion, WanderingMotion
 from magloc.readings import Readings, Truth, read_readings
@@ -241,6 +243,22 @@ class TestTruth:
         assert result["nis_per_dimension"] == pytest.approx(np.sum(nis) / (9 * len(nis)))
         assert (result["rows"], result["tracked_rows"]) == (N_ROWS, N_ROWS - N_EMPTY)
 
+    def test_bound_of_a_smoothed_track_is_that_of_a_smoother(
+        self, run: Run, array: Path, readings: Path, truth: Path
+    ) -> None:
+        """Later rows make less error possible: a filter's bound would be beaten."""
+        outcome = run("track", readings, "--array", array, "--truth", truth, "--json", "--smooth", *MOTION)
+        found = json.loads(outcome.out)["consistency"]["position_bound_m"]
+        tracker = Tracker(read_array(array), WanderingMotion(0.1, float(np.deg2rad(1.2))))
+        table, (_, p, m) = read_readings(readings, tracker.array), source()
+        rows = list(rows_of(table.time_s, table.values_T))
+        of_smoother, of_filter = (
+            float(np.sqrt(np.mean(bound(tracker, rows, p, m)[N_EMPTY:] ** 2)))
+            for bound in (smoothing_bound, posterior_bound)
+        )
+        assert found == pytest.approx(of_smoother, rel=1e-9)
+        assert of_smoother < 0.9 * of_filter
+
     def test_goes_to_stderr_beside_json_lines(self, run: Run, array: Path, readings: Path, truth: Path) -> None:
         outcome = run("track", readings, "--array", array, "--truth", truth, "--jsonl", *MOTION)
         assert len(lines_of(outcome)) == N_ROWS
@@ -303,6 +321,16 @@ class TestGeojson:
         assert_refused(
             run("track", readings, "--array", array, "--place", *self.PLACE, "--geojson", path), str(tmp_path / "none")
         )
+
+    def test_what_cannot_be_written_is_found_before_the_readings(self, run: Run, array: Path, tmp_path: Path) -> None:
+        """The readings are not there: who looks at the output first says so first."""
+        absent = ("track", tmp_path / "absent.csv", "--array", array, "--place", *self.PLACE)
+        path = tmp_path / "none" / "track.geojson"
+        assert_refused(run(*absent, "--geojson", path), f"--geojson {path}", "found no folder")
+        assert_refused(run(*absent, "--geojson", tmp_path), f"--geojson {tmp_path}", "found a folder")
+        same = tmp_path / "same"
+        assert_refused(run(*absent, "--out", same, "--geojson", same), "--geojson", "--out")
+        assert_refused(run(*absent, "--out", "/proc/x"), "--out /proc/x", "no file can be made")
 
 
 class TestOut:
@@ -413,6 +441,22 @@ class TestStream:
         stream.send(second.rsplit(",", 1)[0] + ",much")
         assert_refused(stream.finish(), "standard input, line 3", "s4_z_nT", "much")
 
+    def test_nothing_that_can_be_tracked(
+        self, run: Run, array: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        """The rows stay as they were answered; at their end the status is that of the file with the same rows."""
+        lines = [HEADER, *row_texts(N_EMPTY)]
+        monkeypatch.setattr("sys.stdin", io.StringIO("\n".join([*lines, ""])))
+        outcome = run("track", "-", "--array", array)
+        assert_refused(outcome, "standard input: found no row", "not acquired")
+        assert [json.loads(line)["time_s"] for line in outcome.out.splitlines()] == [0.5 * i for i in range(N_EMPTY)]
+        of_file = run("track", write(tmp_path / "empty.csv", lines), "--array", array, "--jsonl")
+        assert (of_file.status, of_file.out) == (outcome.status, outcome.out)
+
+    def test_a_header_alone(self, run: Run, array: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("sys.stdin", io.StringIO(HEADER + "\n"))
+        assert_refused(run("track", "-", "--array", array), "standard input, line 1", "without rows")
+
     def test_nothing_on_standard_input(self, stream: Stream) -> None:
         assert_refused(stream.finish(), "standard input: found nothing")
 
@@ -486,6 +530,21 @@ class TestBadInput:
     def test_no_source(self, run: Run, array: Path, tmp_path: Path) -> None:
         path = write(tmp_path / "empty.csv", [HEADER, *row_texts(N_EMPTY)])
         assert_refused(run("track", path, "--array", array, "--json"), str(path), "no row", "not acquired")
+
+    @pytest.mark.parametrize("options", [("--json",), ("--jsonl",), ("--jsonl", "--smooth"), ("--json", "--smooth")])
+    def test_no_source_and_why_in_every_row(
+        self, run: Run, array: Path, tmp_path: Path, options: tuple[str, ...]
+    ) -> None:
+        path = write(tmp_path / "empty.csv", [HEADER, *row_texts(N_EMPTY)])
+        outcome = run("track", path, "--array", array, *options)
+        assert_refused(outcome, str(path), "no row")
+        entries = (
+            json.loads(outcome.out)["results"]
+            if "--json" in options
+            else [json.loads(line) for line in outcome.out.splitlines()]
+        )
+        assert [entry["position_m"] for entry in entries] == [None] * N_EMPTY
+        assert all(entry["status"].startswith("not acquired: ") for entry in entries)
 
     def test_a_place_alone_is_for_geojson_only(self, run: Run, array: Path, readings: Path) -> None:
         assert_refused(run("track", readings, "--array", array, "--date", "2026-11-21"), "--date", "no --place")

@@ -286,7 +286,7 @@ class TestPages:
     def test_one_that_cannot_be_written_leaves_nothing(self, run: Run, array_file: Path, tmp_path: Path) -> None:
         (tmp_path / "page.html").mkdir()
         before = sorted(tmp_path.iterdir())
-        assert_refused(run("view", array_file, "--html", tmp_path / "page.html"), "--html", "cannot be written")
+        assert_refused(run("view", array_file, "--html", tmp_path / "page.html"), "--html", "found a folder")
         assert sorted(tmp_path.iterdir()) == before
 
     @needs_chromium

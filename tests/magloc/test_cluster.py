@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
+import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -15,7 +18,7 @@ import xarray as xr
 
 from arrays.errors import InputError
 from magloc.cli import main
-from magloc.cluster import computed_by
+from magloc.cluster import check_address, computed_by
 from magloc.convergence import IekfFilter, StartsMap, StartsScenario
 from magloc.cubes import boxes, computed_here, in_memory
 from magloc.sweep import Sweep, open_map
@@ -106,12 +109,38 @@ class TestNoCluster:
         with pytest.raises(InputError, match=r"--scheduler tcp://127\.0\.0\.1:9: found no scheduler there"):
             list(computed_by("tcp://127.0.0.1:9", CUBE, boxes(CUBE), timeout_s=0.2))
 
-    @pytest.mark.parametrize("address", ["nonsense:::", "", "http://x"])
+    @pytest.mark.parametrize("address", ["foo", "nonsense:::", "", "http://x", "tcp://x", "x:0", "x:65536", "a b:1"])
     def test_not_an_address(self, address, tmp_path, capsys):
-        assert main(["map", "--grid", "3", "--scheduler", address, "--out", str(tmp_path)]) == 2
+        """Refused before anything is written."""
+        out = tmp_path / "map"
+        assert main(["map", "--grid", "3", "--scheduler", address, "--out", str(out)]) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith(f"magloc: --scheduler {address}: found no scheduler there")
-        assert "0 of 1 chunks are done" in line
+        assert line == f"magloc: --scheduler: found {address!r}, expected tcp://HOST:PORT or HOST:PORT."
+        assert not out.exists()
+
+    @pytest.mark.parametrize("address", ["127.0.0.1:8786", "tcp://h.example:1", "tls://h:65535", "tcp://[::1]:8786"])
+    def test_addresses(self, address):
+        check_address(address)
+
+    @pytest.mark.parametrize("answer", [b"HTTP/1.0 400 Bad Request\r\n\r\n", b"", None])
+    @pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
+    def test_another_service_there(self, answer):
+        """It answers, hangs up, or says nothing: one error in time, and no client that complains when it is deleted."""
+        with socket.create_server(("127.0.0.1", 0)) as server:
+
+            def serve():
+                connection, _ = server.accept()
+                with connection:
+                    connection.sendall(answer)
+
+            if answer is not None:
+                threading.Thread(target=serve, daemon=True).start()
+            address = "{}:{}".format(*server.getsockname())
+            begin = time.perf_counter()
+            with pytest.raises(InputError, match=f"--scheduler {address}: found (no scheduler|another service) there"):
+                list(computed_by(address, CUBE, boxes(CUBE), timeout_s=0.3))
+            gc.collect()
+        assert time.perf_counter() - begin < 3.0
 
     def test_not_installed(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "distributed", None)

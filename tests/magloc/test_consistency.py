@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from arrays import geometries
 from arrays.differences import contrasts, difference_covariance
-from magloc.consistency import consistency, mean_bounds, nees_of, posterior_bound
+from magloc.consistency import consistency, mean_bounds, nees_of, posterior_bound, smoothing_bound
 from magloc.motion import UnknownMotion, WanderingMotion
 from magloc.row_measurement import RowMeasurement
 from magloc.track import Tracker
@@ -194,7 +194,9 @@ def jacobian_of(state: FloatArray, rotation: FloatArray, origin: FloatArray) -> 
     return derivative(differences, state / scale, step=1e-2, atol=1e-9) * 1e-9 / scale
 
 
-class TestPosteriorBound:
+class MovingArray:
+    """A source that moves, and an array that moves and turns."""
+
     N_ROWS = 6
 
     def truth(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -211,6 +213,8 @@ class TestPosteriorBound:
         rows = list(rows_of(t, np.zeros((self.N_ROWS, 12)), origin, rotation.as_quat()))
         return rows, rotation.as_matrix(), origin
 
+
+class TestPosteriorBound(MovingArray):
     def test_is_tichavskys_recursion_in_information_form(self) -> None:
         """J' = D22 - D21 (J + D11)⁻¹ D12 with D11 = F⊤Q⁻¹F, D12 = -F⊤Q⁻¹, D22 = Q⁻¹ + H⊤R⁻¹H."""
         t, p, m = self.truth()
@@ -273,3 +277,69 @@ class TestPosteriorBound:
         assert np.isinf(bounds[:2]).all()
         assert np.isfinite(bounds[2:]).all()
         assert bounds[4] > bounds[3]
+
+
+class TestSmoothingBound(MovingArray):
+    """Against the information of all states at once, inverted: block-tridiagonal, one block for every row."""
+
+    def test_of_unknown_motion(self) -> None:
+        t, p, m = self.truth()
+        rows, rotations, origin = self.rows(t)
+        bounds = smoothing_bound(Tracker(ARRAY, UnknownMotion(0.2, 0.05)), rows, p, m)
+        unit = np.repeat([1.0, 100.0], 3)
+        J = np.zeros((6 * self.N_ROWS,) * 2)
+        for i in range(self.N_ROWS):
+            here = slice(6 * i, 6 * i + 6)
+            J[here, here] += information_of(np.concatenate([p[i], m[i]]), rotations[i], origin[i])
+            if i:
+                dt_s = t[i] - t[i - 1]
+                sigma = np.repeat([0.2 * dt_s, 0.05 * float(np.linalg.norm(m[i])) * dt_s], 3)
+                self.add_step(J, i, np.eye(6), np.diag(sigma**2))
+        np.testing.assert_allclose(bounds, self.of_information(J, unit), rtol=1e-5)
+
+    def test_of_wandering_motion_with_a_gap(self) -> None:
+        """Velocity and turn rate are known from the start by their standard deviations alone."""
+        t, p, m = self.truth()
+        readings = np.zeros((self.N_ROWS, 12))
+        readings[3] = np.nan
+        rows = list(rows_of(t, readings))
+        motion = WanderingMotion(0.2, 0.05)
+        tracker = Tracker(ARRAY, motion)
+        bounds = smoothing_bound(tracker, rows, p, m)
+        velocity, rest = np.array([-0.2, 0.1, 0.0]), np.zeros(3)
+        states = [motion.state_of(np.concatenate([place, m[0]]), velocity, rest) for place in p]
+        J = np.zeros((12 * self.N_ROWS,) * 2)
+        J[6:12, 6:12] = np.diag(np.repeat([0.2, 0.05], 3) ** -2)
+        for i, (row, state) in enumerate(zip(rows, states, strict=True)):
+            H = tracker.measurement(row).jacobian(state)
+            here = slice(12 * i, 12 * i + 12)
+            J[here, here] += H.T @ H
+            if i:
+                _, F, root = motion.step(states[i - 1], t[i] - t[i - 1])
+                self.add_step(J, i, F, root @ root.T)
+        np.testing.assert_allclose(bounds, self.of_information(J, np.repeat([1.0, 100.0, 0.2, 0.05], 3)), rtol=1e-5)
+
+    def test_is_below_that_of_a_filter_but_at_the_last_row(self) -> None:
+        t, p, m = self.truth()
+        readings = np.zeros((self.N_ROWS, 12))
+        readings[0, 6:] = np.nan  # three differences: no source yet
+        rows, tracker = list(rows_of(t, readings)), Tracker(ARRAY, WanderingMotion(0.2, 0.05))
+        filtered, with_later_rows = posterior_bound(tracker, rows, p, m), smoothing_bound(tracker, rows, p, m)
+        assert np.isinf(with_later_rows[0])
+        assert np.all(with_later_rows[1:-1] < filtered[1:-1])
+        assert with_later_rows[-1] == pytest.approx(filtered[-1], rel=1e-12)
+
+    def add_step(self, J: FloatArray, i: int, F: FloatArray, Q: FloatArray) -> None:
+        """Information that a step gives of the states before and after it, in place."""
+        n = len(F)
+        scale = np.sqrt(np.diagonal(Q))
+        inverse = np.linalg.inv(Q / np.outer(scale, scale)) / np.outer(scale, scale)
+        both = np.concatenate([-F, np.eye(n)], axis=1)
+        here = slice(n * (i - 1), n * (i + 1))
+        J[here, here] += both.T @ inverse @ both
+
+    def of_information(self, J: FloatArray, unit: FloatArray) -> FloatArray:
+        """Bounds of the positions [m]; inverted in units that are alike in size."""
+        units = np.tile(unit, self.N_ROWS)
+        P = np.linalg.inv(J * np.outer(units, units)) * np.outer(units, units)
+        return np.sqrt(np.diagonal(P).reshape(self.N_ROWS, -1)[:, :3].sum(axis=1))

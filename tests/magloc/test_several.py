@@ -152,7 +152,7 @@ class TestNumberAsked:
     )
     def test_more_than_the_array_can_tell(self, array, n_sources, most):
         with pytest.raises(
-            ValueError, match=rf"n_sources must be between 1 and {most} .*; instead received {n_sources}"
+            ValueError, match=rf"n_sources must be (between 1 and )?{most}, .*; instead received {n_sources}"
         ):
             SeveralLocator(array, n_sources=n_sources)
 
