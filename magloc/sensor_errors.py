@@ -29,6 +29,8 @@ IntArray = NDArray[np.intp]
 
 # Corner frequencies of the processes that make up 1/f noise [Hz].
 _FLICKER_HZ = tuple(10.0**-decade for decade in range(FLICKER_DECADES))
+FASTEST_FLICKER_HZ = math.sqrt(10.0) * _FLICKER_HZ[0]
+"""Upper end of the decades that they stand for [Hz]: 1/f noise above it counts as noise of one sample."""
 _SECONDS_PER_HOUR = 3600.0
 # Where the turns, the gains and the field start among the errors of a sensor.
 _TURN, _GAIN, _FIELD = 0, 3, 6

@@ -106,6 +106,30 @@ def white_sigma(rate_Hz: float, density: float, bandwidth_Hz: float) -> float:
     return density * math.sqrt(band)
 
 
+def flicker_sigma(rate_Hz: float, density: float, corner_Hz: float, bandwidth_Hz: float, lowest_Hz: float) -> float:
+    r"""Standard deviation of the 1/f part of :func:`coloured_noise` above a frequency, in one sample.
+
+    :math:`σ² = N² f_c ∫_{f_1}^{f_s/2} df/(f (1 + (f/f_b)²))`, zero where the rate does not reach that frequency.
+
+    Parameters
+    ----------
+    rate_Hz, density, corner_Hz, bandwidth_Hz : float
+        As there.
+    lowest_Hz : float
+        f_1, positive.
+
+    Returns
+    -------
+    float
+        [unit]
+    """
+    nyquist = rate_Hz / 2.0
+    if nyquist <= lowest_Hz:
+        return 0.0
+    low, high = lowest_Hz / math.hypot(1.0, lowest_Hz / bandwidth_Hz), nyquist / math.hypot(1.0, nyquist / bandwidth_Hz)
+    return density * math.sqrt(corner_Hz * math.log(high / low))
+
+
 def random_walk(n: int, channels: int, rate_Hz: float, per_root_hour: float, rng: np.random.Generator) -> FloatArray:
     """Drift that starts at zero and whose variance grows by ``per_root_hour²`` in an hour.
 

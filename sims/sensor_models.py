@@ -13,7 +13,8 @@ import math
 from dataclasses import dataclass, replace
 
 from arrays.sensor import Sensor, SensorArray, SensorKind
-from sims.noise import white_sigma
+from magloc.sensor_errors import FASTEST_FLICKER_HZ
+from sims.noise import flicker_sigma, white_sigma
 
 _DIGITS = 12  # of a noise that comes from a square root: what was 0.2 nT is written as such again
 
@@ -63,12 +64,17 @@ class SensorModel:
         return self.noise_T_rtHz * math.sqrt(self.corner_Hz * math.log(10.0))
 
     def sigma_T(self, rate_Hz: float) -> float:
-        """Standard deviation of white noise and rounding in one sample [T]; that of 1/f noise depends on the record."""
+        """Standard deviation of what is as good as independent from sample to sample [T].
+
+        White noise, rounding, and the 1/f noise above the decades that an array states as lasting; that of the rest of
+        the 1/f noise depends on the record.
+        """
         white = white_sigma(rate_Hz, self.noise_T_rtHz, self.bandwidth_Hz)
-        return float(f"{math.hypot(white, self.resolution_T / math.sqrt(12.0)):.{_DIGITS}g}")
+        flicker = flicker_sigma(rate_Hz, self.noise_T_rtHz, self.corner_Hz, self.bandwidth_Hz, FASTEST_FLICKER_HZ)
+        return float(f"{math.hypot(white, self.resolution_T / math.sqrt(12.0), flicker):.{_DIGITS}g}")
 
     def with_sigma(self, sigma_T: float, rate_Hz: float) -> SensorModel:
-        """The same with the density of white noise of this standard deviation in one sample, rounding aside."""
+        """The same with the density of white noise of this standard deviation in one sample, all else aside."""
         return replace(self, noise_T_rtHz=sigma_T / white_sigma(rate_Hz, 1.0, self.bandwidth_Hz))
 
 

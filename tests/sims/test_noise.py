@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import integrate, signal, stats
 
-from sims.noise import coloured_noise, low_passed, random_walk, stream, white_sigma
+from sims.noise import coloured_noise, flicker_sigma, low_passed, random_walk, stream, white_sigma
 
 FloatArray = NDArray[np.float64]
 
@@ -71,6 +71,12 @@ class TestSpectrum:
     def test_standard_deviation_is_the_integral_of_the_density(self, bandwidth_Hz: float) -> None:
         variance, _ = integrate.quad(lambda f: 4.0 / (1 + (f / bandwidth_Hz) ** 2), 0, RATE_HZ / 2)
         assert white_sigma(RATE_HZ, 2.0, bandwidth_Hz) == pytest.approx(math.sqrt(variance), rel=1e-9)
+
+    @pytest.mark.parametrize("bandwidth_Hz", [1.0, 25.0, 1000.0, math.inf])
+    def test_so_is_that_of_the_fast_part_of_flicker_noise(self, bandwidth_Hz: float) -> None:
+        variance, _ = integrate.quad(lambda f: 4.0 * 0.5 / f / (1 + (f / bandwidth_Hz) ** 2), 3.0, RATE_HZ / 2)
+        assert flicker_sigma(RATE_HZ, 2.0, 0.5, bandwidth_Hz, 3.0) == pytest.approx(math.sqrt(variance), rel=1e-9)
+        assert flicker_sigma(RATE_HZ, 2.0, 0.5, bandwidth_Hz, RATE_HZ / 2) == 0.0
 
     def test_the_record_has_that_standard_deviation(self) -> None:
         noise = coloured_noise(50_000, 1, RATE_HZ, 2.0, 0.0, math.inf, np.random.default_rng(4))
