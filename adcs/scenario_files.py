@@ -82,6 +82,13 @@ class Estimate:
     forgetting: float
     closed_loop_F: bool
 
+    @property
+    def in_words(self) -> str:
+        """Sensors, states and filter."""
+        used = self.settings.sensors
+        states = f", estimating {', '.join(used.states)}" if used.states else ""
+        return f"{used.sensors}{states}; filter {self.filter}"
+
 
 @dataclass(frozen=True, eq=False)
 class AttitudeFile:

@@ -79,7 +79,6 @@ def write_attitude_files(
     list of str
         Names of the files.
     """
-    from adcs.commands.run_tabletsat import describe
     from adcs.plots.attitude_figures import ConsistencyPicture, StatesPicture, consistency_figure, states_figure
     from magloc.plots import style
 
@@ -88,7 +87,7 @@ def write_attitude_files(
     # Truth minus estimate is what the filter's state is; an error is estimate minus truth.
     errors = -errors_in_units(first)[0]
     sigma = sigma_in_units(first.estimates)[0]
-    title = f"{name}: {describe(estimate)}"
+    title = f"{name}: {estimate.in_words}"
     gaps = sensor_gaps(first.runs, estimate.settings.sensors)
     seed = int(outcome.seeds[0])
     picture = StatesPicture(f"{title}; seed {seed}", time_s, errors, sigma, are_errors=True, gaps=gaps)

@@ -209,13 +209,12 @@ def _write(
     columns: dict[str, Any],
 ) -> None:
     from adcs.commands.attitude_files import sensor_gaps, sigma_in_units
-    from adcs.commands.run_tabletsat import describe
     from adcs.plots.attitude_figures import ConsistencyPicture, StatesPicture, consistency_figure, states_figure
     from magloc.output_files import write_columns
     from magloc.plots import style
 
     write_columns({name: values[record.rows] for name, values in columns.items()}, out / "estimates.csv")
-    title = f"{file.name}: {describe(chosen)}"
+    title = f"{file.name}: {chosen.in_words}"
     gaps = sensor_gaps(record, chosen.settings.sensors)
     picture = StatesPicture(
         title,
@@ -248,9 +247,7 @@ def summary_lines(
     -------
     list of str
     """
-    from adcs.commands.run_tabletsat import describe
-
-    lines = [f"{len(record.rows)} rows from {record.time_s[0]:g} to {record.time_s[-1]:g} s; {describe(chosen)}"]
+    lines = [f"{len(record.rows)} rows from {record.time_s[0]:g} to {record.time_s[-1]:g} s; {chosen.in_words}"]
     q = ", ".join(f"{columns[name][-1]:.6f}" for name in ("qw", "qx", "qy", "qz"))
     lines.append(f"attitude at the end, orbital from body (w, x, y, z)   {q}")
     for first, what, unit in (

@@ -243,13 +243,6 @@ def run_attitude(
         print("\n".join(summary_lines(file, estimate, numbers)))
 
 
-def describe(estimate: Estimate) -> str:
-    """Sensors, states and filter in words."""
-    used = estimate.settings.sensors
-    states = f", estimating {', '.join(used.states)}" if used.states else ""
-    return f"{used.sensors}{states}; filter {estimate.filter}"
-
-
 _ROWS = (
     ("angle_rms_deg", "angle, rms of the last minute", "°"),
     ("rate_rms_deg_s", "rate", "°/s"),
@@ -274,7 +267,7 @@ def summary_lines(file: AttitudeFile, estimate: Estimate, numbers: dict[str, Any
     sequence of str
     """
     runs = "1 run" if numbers["runs"] == 1 else f"{numbers['runs']} runs"
-    lines = [f"{file.name}: {runs} of {file.duration_s:g} s; {describe(estimate)}"]
+    lines = [f"{file.name}: {runs} of {file.duration_s:g} s; {estimate.in_words}"]
     lines += [f"{what:34s}{numbers[key]:.3g} {unit}" for key, what, unit in _ROWS if numbers[key] is not None]
     lines.append(f"{'NEES / numbers (1 is consistent)':34s}{numbers['nees_per_dimension']:.3g}")
     lines.append(f"{'diverged runs':34s}{numbers['diverged_runs']}")
