@@ -3,11 +3,11 @@ r"""Frames of a satellite's attitude, and the one place that converts between th
 ==========  ======================================================================================================
 eci         inertial, origin in the Earth's centre: axes of the GCRS, which are those of J2000 within 0.03″
 teme        inertial axes of SGP4's results: true equator, mean equinox of date
-ecef        turns with the Earth, see :mod:`magloc.geomagnetic`
+ecef        turns with the Earth, see :mod:`magloc.fields.geomagnetic`
 orbital     e3 local vertical outwards, e2 orbit normal (along r×v), e1 = e2×e3, along the velocity of a circular
             orbit; it turns at (0, n, 0) against eci
 body        of the satellite
-ned         north, east, down of a place: geodetic, see :func:`magloc.geomagnetic.R_ned_from_ecef`
+ned         north, east, down of a place: geodetic, see :func:`magloc.fields.geomagnetic.R_ned_from_ecef`
 ==========  ======================================================================================================
 
 Matrices are called ``R_to_from``: ``v_to = R_to_from @ v_from``. Everything is computed offline, so that the Earth's
@@ -23,10 +23,10 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.float64]
+from arrays.typing import FloatArray
+
 Instants = NDArray[np.datetime64]
 Dates = ArrayLike | datetime.date
-
 DAY_S = 86_400.0
 _J2000 = np.datetime64("2000-01-01T12:00:00", "us")
 _JD_J2000 = 2_451_545.0

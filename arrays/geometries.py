@@ -11,11 +11,10 @@ from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from arrays.sensor import Sensor, SensorArray, SensorKind
-
-FloatArray = NDArray[np.float64]
+from arrays.array import SensorArray
+from arrays.sensor import Sensor, SensorKind
+from arrays.typing import FloatArray
 
 
 def tetrahedron(edge_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9) -> SensorArray:

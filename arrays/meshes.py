@@ -10,22 +10,19 @@ from typing import cast
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
-from arrays.sensor import Sensor, SensorArray
-
-FloatArray = NDArray[np.float64]
+from arrays.array import SensorArray
+from arrays.sensor import Sensor
+from arrays.typing import FloatArray
 
 BODY_COLOUR = (90, 96, 105, 255)
 AXIS_COLOURS = ((214, 66, 62, 255), (68, 160, 71, 255), (52, 101, 204, 255))
-
 # In units of the glyph's size, the reach of the rods from the sensor's position.
 _CUBE_SIDE = 0.6
 _ROD_RADIUS = 0.08
 _SPHERE_RADIUS = 0.4
-
 _SIZE_OF_SPACING = 0.4  # rods of neighbours that point at each other leave a fifth of the way free
 _SAME_PLACE_RTOL = 1e-9
 

@@ -9,14 +9,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import butter, iirnotch, sosfiltfilt, tf2sos
 
-from arrays.errors import InputError
-from arrays.sensor import SensorArray
+from arrays.array import SensorArray
+from arrays.io.errors import InputError
+from arrays.typing import FloatArray
 from magloc.readings import Readings
-
-FloatArray = NDArray[np.float64]
 
 _NOTCH_QUALITY = 30.0
 _HIGH_PASS_ORDER = 2

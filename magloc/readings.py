@@ -6,35 +6,42 @@ groups of columns, each complete or absent: the pose of a moving array in the wo
 array_z_m, array_qx, array_qy, array_qz, array_qw``) and the ambient field in the array's frame (``ambient_x_nT,
 ambient_y_nT, ambient_z_nT``). A truth file has ``time_s, x_m, y_m[, z_m][, mx_Am2, my_Am2, mz_Am2]``.
 
-Whatever is wrong with a file is an :class:`arrays.errors.InputError` of one sentence: the file, the line as an editor
-counts it, the column, what was found and what was expected.
+Whatever is wrong with a file is an :class:`arrays.io.errors.InputError` of one sentence: the file, the line as an
+editor counts it, the column, what was found and what was expected.
 """
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from os import PathLike
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from arrays.errors import InputError
-from arrays.sensor import AMBIENT_CHANNELS, Sensor, SensorArray
-from arrays.toml import write_text
-from magloc.tables import Table, read_table, table_of_text
+from arrays.array import SensorArray
+from arrays.io.errors import InputError
 
-FloatArray = NDArray[np.float64]
+if TYPE_CHECKING:
+    pass
+import math
+import re
+from dataclasses import dataclass
+from os import PathLike
+
+from arrays.array import AMBIENT_CHANNELS
+from arrays.io.csv import Table, read_table, table_of_text
+from arrays.io.text import write_text
+from arrays.sensor import Sensor
+from arrays.typing import FloatArray
+
 IntArray = NDArray[np.int64]
-
 POSITION_COLUMNS = ("array_x_m", "array_y_m", "array_z_m")
 ROTATION_COLUMNS = ("array_qx", "array_qy", "array_qz", "array_qw")
 AMBIENT_COLUMNS = tuple(f"{name}_nT" for name in AMBIENT_CHANNELS)
 TRUE_POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 TRUE_MOMENT_COLUMNS = ("mx_Am2", "my_Am2", "mz_Am2")
-
 _T_IN_nT = 1e9
 SAME_TIME_S = 1e-6
 _SATURATION_RTOL = 1e-12
@@ -441,3 +448,38 @@ def _unit_quaternions(table: Table) -> FloatArray:
         )
     unit: FloatArray = quaternion / norm[:, None]
     return unit
+
+
+def saturated_channels(measured: Readings, rows: Readings, array: SensorArray) -> list[tuple[str, ...]]:
+    """Names of the channels that saturate, for every row."""
+    lost = np.isfinite(measured.values_T) & ~np.isfinite(rows.values_T)
+    return [tuple(array.channel_names[channel] for channel in np.flatnonzero(row)) for row in lost]
+
+
+# Of the truth's usual interval: over a longer one it is not interpolated.
+_LONGEST_STEP = 2.0
+
+
+def truth_of_rows(readings: Readings, truth: Truth, path: Path) -> tuple[FloatArray, FloatArray | None]:
+    """True position, and moment if it is known, of every row (n, 3); NaN where the truth says nothing of that time.
+
+    Between two rows of the truth, as the mean time of a window may be, it is interpolated, but not over a gap.
+    """
+    order = np.argsort(truth.time_s, kind="stable")
+    times, wanted = truth.time_s[order], readings.time_s
+    after = np.clip(np.searchsorted(times, wanted - SAME_TIME_S), 0, len(times) - 1)
+    exact = np.abs(times[after] - wanted) <= SAME_TIME_S
+    before = np.where(exact, after, np.maximum(after - 1, 0))
+    length = times[after] - times[before]
+    longest = _LONGEST_STEP * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    known = exact | ((times[before] <= wanted) & (wanted <= times[after]) & (length <= longest))
+    if not known.any():
+        raise InputError(f"{path}: found none of the times of the readings, expected rows with the same time_s.")
+    share = np.divide(wanted - times[before], length, out=np.zeros_like(wanted), where=length > 0.0)[:, None]
+
+    def of_rows(values: FloatArray) -> FloatArray:
+        values = values[order]
+        between = values[before] + share * (values[after] - values[before])
+        return np.asarray(np.where(known[:, None], between, np.nan))
+
+    return of_rows(truth.position_m), None if truth.moment_Am2 is None else of_rows(truth.moment_Am2)

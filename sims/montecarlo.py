@@ -15,15 +15,13 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-from sims.scenario import Scenario
-from sims.simulation import Simulation, simulate
+from arrays.typing import FloatArray
+from sims.magnetics.scenario import Scenario
+from sims.magnetics.simulation import Simulation, simulate
 
-FloatArray = NDArray[np.float64]
 Result = Mapping[str, Any]
 Estimator = Callable[[Simulation], Result]
-
 _RESERVED = ("seed", "error")
 _Outcome = dict[str, FloatArray] | str
 
@@ -44,9 +42,9 @@ def run(
     ----------
     scenario : Scenario
     estimator : callable
-        Takes a :class:`sims.simulation.Simulation` and returns a mapping of names to numbers, or to arrays of numbers
-        of the same shape for all seeds. With more than one process it must be a function of a module, or something else
-        that can be pickled.
+        Takes a :class:`sims.magnetics.simulation.Simulation` and returns a mapping of names to numbers, or to arrays of
+        numbers of the same shape for all seeds. With more than one process it must be a function of a module, or
+        something else that can be pickled.
     seeds : sequence of int
         Each once.
     processes : int, optional

@@ -16,11 +16,10 @@ import math
 import zlib
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 from scipy.signal import lfilter
 
-FloatArray = NDArray[np.float64]
+from arrays.typing import FloatArray
 
 HOUR_S = 3600.0
 

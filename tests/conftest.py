@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from magloc.cli import main
+from adcs.cli.app import main as adcs_main
+from magloc.cli.app import main
 from tests.command_line import Outcome, Run
 
 REPOSITORY = Path(__file__).parents[1]
@@ -30,6 +31,17 @@ def run(capsys: pytest.CaptureFixture[str]) -> Run:
 
     def run_in_process(*arguments: str | Path) -> Outcome:
         status = main([str(argument) for argument in arguments])
+        return Outcome(status, *capsys.readouterr())
+
+    return run_in_process
+
+
+@pytest.fixture
+def adcs(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run ``adcs`` with arguments in this process."""
+
+    def run_in_process(*arguments: str | Path) -> Outcome:
+        status = adcs_main([str(argument) for argument in arguments])
         return Outcome(status, *capsys.readouterr())
 
     return run_in_process

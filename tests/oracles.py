@@ -20,7 +20,6 @@ from stonesoup.types.state import StateVector
 from stonesoup.updater.kalman import IteratedKalmanUpdater
 
 Array = NDArray[np.float64]
-
 K = 1e-7
 CHOCLO_K: float = choclo.constants.VACUUM_MAGNETIC_PERMEABILITY / (4.0 * np.pi)
 

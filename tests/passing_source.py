@@ -9,14 +9,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from arrays import geometries
-from arrays.sensor import SensorArray
-from magloc.measurement import predicted_channels
-from magloc.motion import UnknownMotion
-from magloc.track import Tracker
-from magloc.track_rows import Row, TrackPoint, rows_of
+from arrays.array import SensorArray
+from magloc.measurement.differences import predicted_channels
+from magloc.tracking.motion import UnknownMotion
+from magloc.tracking.results import Row, TrackPoint, rows_of
+from magloc.tracking.tracker import Tracker
 
 FloatArray = NDArray[np.float64]
-
 EDGE_M, NOISE_T = 1.5, 2e-10
 POSITION = np.array([3.0, 1.5, 0.8])
 MOMENT = np.array([120.0, -150.0, 160.0])

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from adcs.mockup.camera import Camera, Pose
-from adcs.mockup.fixes import FixRecord, Outcome
-from adcs.mockup.inertial import PlanarTrack
-from adcs.mockup.matching import CameraFix, NoFix
-
-FloatArray = NDArray[np.float64]
-ByteArray = NDArray[np.uint8]
+from adcs.mockup.navigation.fixes import FixRecord, Outcome
+from adcs.mockup.navigation.strapdown import PlanarTrack
+from adcs.mockup.vision.camera import Camera, Pose
+from adcs.mockup.vision.paper_matcher import CameraFix
+from adcs.stars.identification import NoFix
+from arrays.typing import ByteArray, FloatArray
 
 SETTLED_S = 10.0
 """Scales are chosen for what comes after it."""

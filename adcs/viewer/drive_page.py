@@ -11,11 +11,11 @@ import viser
 from adcs.viewer.drive import Drive
 from adcs.viewer.drive_player import DrivePlayer
 from adcs.viewer.table_scene import TableScene, scene_entries, scene_extent
-from arrays.errors import InputError
-from arrays.toml import write_text
-from magloc.viewer.framing import aim, prepare
-from magloc.viewer.legend import add_legend, legend_html
-from magloc.viewer.pages import Page
+from arrays.io.errors import InputError
+from arrays.io.text import write_text
+from magloc.viewer.pages.pages import Page
+from magloc.viewer.scene.framing import aim, prepare
+from magloc.viewer.scene.legend import add_legend, legend_html
 
 _STEP_S = 0.2
 _MOST_STEPS = 1500
@@ -84,7 +84,7 @@ def write_playing_page(server: viser.ViserServer, page: Page, player: DrivePlaye
 
 
 def _with_legend(html: str, page: Page) -> str:
-    """As :func:`magloc.viewer.legend.with_legend`, but above the bar that plays."""
+    """As :func:`magloc.viewer.scene.legend.with_legend`, but above the bar that plays."""
     box = (
         '<div style="position:fixed;bottom:4em;left:.8em;z-index:1000;max-width:19rem;background:rgba(255,255,255,.9);'
         "color:#222;border-radius:.4em;box-shadow:0 1px 4px rgba(0,0,0,.25);font-family:sans-serif;"

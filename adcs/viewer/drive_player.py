@@ -19,10 +19,10 @@ from adcs.viewer.drive import Drive
 from adcs.viewer.error_dial import ErrorDial, words_of
 from adcs.viewer.frame_image import marked_image, named_stars
 from adcs.viewer.table_scene import ENLARGEMENTS, TableScene
-from magloc.viewer import words
-from magloc.viewer.inputs import SharedInput
-from magloc.viewer.latest import Latest
-from magloc.viewer.played_time import PlayedTime, speed_text
+from magloc.viewer.pages import words
+from magloc.viewer.panels.inputs import SharedInput
+from magloc.viewer.panels.latest import Latest
+from magloc.viewer.panels.played_time import PlayedTime, speed_text
 
 _SPEEDS = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
 _STEP_S = 0.05

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from adcs.mockup.fixes import Outcome
-from adcs.mockup.inertial import wrapped
+from adcs.mockup.navigation.fixes import Outcome
+from adcs.mockup.navigation.strapdown import wrapped
 from adcs.viewer.drive import SETTLED_S, Drive
-from magloc.viewer.scene import length_text, round_length
-
-FloatArray = NDArray[np.float64]
+from arrays.typing import FloatArray
+from magloc.viewer.scene.glyphs import length_text, round_length
 
 TRAIL_S = 5.0
 _HALF = 100.0

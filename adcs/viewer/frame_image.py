@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from adcs.mockup.matching import CameraFix
+from adcs.mockup.vision.paper_matcher import CameraFix
 from adcs.viewer.drive import SeenFrame
-from magloc.viewer.legend import Colour
-
-ByteArray = NDArray[np.uint8]
-IntArray = NDArray[np.intp]
+from arrays.typing import ByteArray, IntArray
+from magloc.viewer.scene.legend import Colour
 
 IDENTIFIED_COLOUR: Colour = (0, 158, 115)
 OTHER_STAR_COLOUR: Colour = (230, 159, 0)
-
 _BRIGHTER = 2.0  # lights are faint where nothing saturates
 _RING_PX, _LINE_PX = 13, 3
 _SHEET_STEP = 2  # every second pixel is enough on the ceiling

@@ -9,21 +9,19 @@ import trimesh
 import viser
 from numpy.typing import ArrayLike, NDArray
 
-from adcs.mockup.camera import Pose, footprint
-from adcs.mockup.fixes import Outcome
-from adcs.mockup.matching import CameraFix
+from adcs.mockup.navigation.fixes import Outcome
+from adcs.mockup.vision.camera import Pose, footprint
+from adcs.mockup.vision.paper_matcher import CameraFix
 from adcs.viewer.drive import Drive, SeenFrame
 from adcs.viewer.frame_image import IDENTIFIED_COLOUR, OTHER_STAR_COLOUR, ceiling_sheet
-from magloc.viewer.framing import Extent, extent_of
-from magloc.viewer.legend import Colour, Swatch
-from magloc.viewer.scene import screen_label
-from magloc.viewer.shapes import Surface, joined, line_segments
-
-FloatArray = NDArray[np.float64]
+from arrays.typing import FloatArray
+from magloc.viewer.scene.framing import Extent, extent_of
+from magloc.viewer.scene.glyphs import screen_label
+from magloc.viewer.scene.legend import Colour, Swatch
+from magloc.viewer.scene.shapes import Surface, joined, line_segments
 
 CEILING_M = 1.5
 """Height of the sky above the table; the source does not tell it."""
-
 TRUTH_COLOUR: Colour = (70, 76, 85)
 ESTIMATE_COLOUR: Colour = (0, 114, 178)
 FIX_COLOUR: Colour = (213, 94, 0)
@@ -32,7 +30,6 @@ LIGHT_COLOUR: Colour = (150, 156, 165)
 TABLE_COLOUR: Colour = (196, 214, 228)
 _PATH_COLOUR: Colour = (176, 182, 190)
 _REJECTED_COLOUR: Colour = (204, 121, 167)
-
 TRAIL_S = 20.0
 _TABLE_HALF_M = (1.35, 1.05, 0.02)
 _LEG_M = 0.8

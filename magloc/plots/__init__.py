@@ -1,10 +1,10 @@
 """Figures of results, in one house style (:mod:`magloc.plots.style`): units on every axis, fit for print."""
 
-from magloc.plots.calibration_figures import calibration_figure, turning_figure
-from magloc.plots.fix_figures import fix_figure, residual_figure
-from magloc.plots.map_figures import convergence_figure, source_figure
+from magloc.plots.calibration import calibration_figure, turning_figure
+from magloc.plots.fixes import fix_figure, residual_figure
+from magloc.plots.maps import convergence_figure, source_figure
 from magloc.plots.style import save
-from magloc.plots.track_figures import consistency_figure, track_figure
+from magloc.plots.tracks import consistency_figure, track_figure
 
 __all__ = [
     "calibration_figure",

@@ -19,20 +19,17 @@ from scipy.special import chdtri
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-FloatArray = NDArray[np.float64]
+from arrays.typing import FloatArray
 
 WIDTH_IN = 7.1
 DPI = 200
 LETTERS = 8.0
 SMALL_LETTERS = 7.0
-
 BLACK, BLUE, ORANGE = "#000000", "#0072b2", "#e69f00"
 GREY, PALE_GREY, LIGHT_GREY = "#7f7f7f", "#adadad", "#d9d9d9"
 ESTIMATE, TRUTH, BOUND = BLUE, BLACK, ORANGE
 COMPONENTS = (("x", BLACK, "o", "-"), ("y", BLUE, "s", "--"), ("z", ORANGE, "^", ":"))
 """Name, colour, marker and line of the components of a vector."""
-
 LEVEL = 0.95
 SIGMAS_95 = 1.959963984540054
 _MILLIMETRES_BELOW_M = 1.0

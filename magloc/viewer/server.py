@@ -14,11 +14,11 @@ from pathlib import Path
 
 import viser
 
-from arrays.errors import InputError
-from arrays.toml import write_text
-from magloc.viewer.browser import BrowserError, Chromium
-from magloc.viewer.legend import with_legend
-from magloc.viewer.pages import Page
+from arrays.io.errors import InputError
+from arrays.io.text import write_text
+from magloc.viewer.chromium import BrowserError, Chromium
+from magloc.viewer.pages.pages import Page
+from magloc.viewer.scene.legend import with_legend
 
 HOST = "127.0.0.1"  # a viewer for whoever sits at this machine, not for the network
 FIRST_PORT = 8080

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from adcs.scenario_files import AttitudeFile, naming
+from adcs.io.scenario_files import AttitudeFile
+from arrays.io.errors import naming
 from sims.attitude.scenario import AttitudeScenario, StartConditions
 
 
@@ -14,7 +15,7 @@ def simulation_of(file: AttitudeFile) -> AttitudeScenario:
     Parameters
     ----------
     file : AttitudeFile
-        Of :func:`adcs.scenario_files.read_scenario`.
+        Of :func:`adcs.io.scenario_files.read_scenario`.
 
     Returns
     -------

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from adcs.dynamics import RigidBody, WheelControl, wheel_control
-from adcs.orbit import CircularOrbit, Orbit, node_of_local_time
-from adcs.sensors import Gyro, Magnetometer, StarTracker, SunSensor
-from magloc.geomagnetic import Model
+from adcs.environment.orbit import CircularOrbit, Orbit, node_of_local_time
+from adcs.satellite.dynamics import RigidBody, WheelControl, wheel_control
+from adcs.satellite.sensors import Gyro, Magnetometer, StarTracker, SunSensor
+from magloc.fields.geomagnetic import Model
 
 
 @dataclass(frozen=True)

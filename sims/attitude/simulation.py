@@ -12,17 +12,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from adcs import dynamics, quaternion, sensors
-from adcs.environment import Environment, environment
-from adcs.orbit import EARTH_RADIUS_M
+from adcs import quaternion
+from adcs.environment.environment import Environment, environment
+from adcs.environment.orbit import EARTH_RADIUS_M
+from adcs.satellite import dynamics, sensors
+from arrays.typing import BoolArray, FloatArray
 from sims.attitude.scenario import AttitudeScenario
 from sims.attitude.starts import starts
 from sims.noise import stream
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 State = tuple[FloatArray, FloatArray, FloatArray]
 
 
@@ -217,8 +216,8 @@ def simulate(scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
     ValueError
         As :func:`prepare`.
     """
-    from adcs.kernels import rigid_body
-    from magloc.kernels import over_rows
+    from adcs.satellite import dynamics_compiled as rigid_body
+    from magloc.compilation import over_rows
 
     prepared = prepare(scenario, seeds)
     runs, n = prepared.torque_Nm.shape[:2]
@@ -286,7 +285,7 @@ def advance(prepared: Prepared, state: State, wheel_torque_Nm: FloatArray, row: 
     prepared : Prepared
     state : tuple of ndarray, shapes (runs, 4), (runs, 3), (runs, 3)
     wheel_torque_Nm : ndarray, shape (runs, 3)
-        As set, by :func:`adcs.dynamics.commanded_torque` of an estimate.
+        As set, by :func:`adcs.satellite.dynamics.commanded_torque` of an estimate.
     row : int
 
     Returns

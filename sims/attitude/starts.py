@@ -6,16 +6,14 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
-from adcs.environment import Environment, environment
+from adcs.environment.environment import Environment, environment
+from adcs.environment.orbit import Orbit
 from adcs.frames import DAY_S, Instants
-from adcs.orbit import Orbit
-from magloc.geomagnetic import Model
+from arrays.typing import BoolArray
+from magloc.fields.geomagnetic import Model
 from sims.attitude.scenario import AttitudeScenario, StartConditions
 from sims.noise import stream
-
-BoolArray = NDArray[np.bool_]
 
 GRID_S = 10.0
 """Conditions are checked at instants this far apart, so that they may be missed by what changes in 10 s."""

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adcs.mockup.camera import Camera, Pose, image_from_table, in_frame, table_from_image
-from adcs.mockup.sky import LedSky
-
-FloatArray = NDArray[np.float64]
-ByteArray = NDArray[np.uint8]
+from adcs.mockup.vision.camera import Camera, Pose, image_from_table, in_frame, table_from_image
+from adcs.mockup.vision.sky import LedSky
+from arrays.typing import ByteArray, FloatArray
 
 _PSF_REACH = 4.0  # a Gaussian is cut off where it is below 0.04 % of its peak
 _STEP_PSF = 0.25  # along a smear: the sum of Gaussians this far apart is its integral to 0.05 DN

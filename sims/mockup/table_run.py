@@ -21,23 +21,18 @@ from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
-from adcs.mockup.fixes import FixRecord
-from adcs.mockup.inertial import ImuRecord, PlanarState, PlanarTrack, strapdown
-from adcs.mockup.inertial_sensors import Inclinometer, RateGyro
+from adcs.mockup.navigation.fixes import FixRecord
+from adcs.mockup.navigation.imu import Inclinometer, RateGyro
+from adcs.mockup.navigation.strapdown import ImuRecord, PlanarState, PlanarTrack, strapdown
+from arrays.typing import BoolArray, FloatArray
 from sims.noise import stream
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-
 DriveName = Literal["perimeter", "two-firings"]
-
 POLL_S = 1e-3
 THRUST_M_S2 = 0.04
 SPEED_M_S = 0.085
 """Of the point that the perimeter drive follows."""
-
 _CONTROL_S = 0.1
 _STRAIGHT_M = (1.4, 0.9)
 _CORNER_M = 0.2

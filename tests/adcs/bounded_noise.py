@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from adcs.ellipsoid import Ellipsoid, quadratic_form, segment_shape
-from adcs.ellipsoid_observer import BoundedSystem, EllipsoidBatch
+from adcs.ellipsoids.ellipsoid import Ellipsoid, quadratic_form, segment_shape
+from adcs.ellipsoids.observer import BoundedSystem, EllipsoidBatch
 
 
 class Containment(NamedTuple):

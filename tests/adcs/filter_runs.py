@@ -9,14 +9,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from adcs import dynamics, quaternion
-from adcs.multiplicative import FilterSettings, Start, start_near
-from adcs.sensor_sets import SensorSet, sensor_set, tuned_noise
+from adcs import quaternion
+from adcs.kalman.error_state import FilterSettings, SensorSet, Start, sensor_set, start_near, tuned_noise
+from adcs.satellite import dynamics
 from sims.attitude.scenario import AttitudeScenario, StartConditions, tabletsat
 from sims.attitude.simulation import AttitudeRuns, Prepared, prepare, sense, simulate, start_estimates
 
 Array = NDArray[np.float64]
-
 START_RAD, START_RAD_S = math.radians(5.0), math.radians(0.1)
 GYRO_BIAS_RAD_S, FIELD_BIAS_T = math.radians(0.027), 500e-9
 SEEDS = range(10)

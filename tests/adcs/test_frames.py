@@ -23,7 +23,7 @@ from adcs.frames import (
     terrestrial_dates,
     turned,
 )
-from magloc.geomagnetic import ecef_from_geodetic
+from magloc.fields.geomagnetic import ecef_from_geodetic
 
 UTC = instants(["2000-01-01T12:00:00", "2008-03-01T00:00:00", "2014-09-01T17:03:21.5", "2027-06-30T23:59:59"])
 

@@ -13,11 +13,9 @@ from scipy.spatial.transform import Rotation
 from adcs import quaternion as quat
 
 Array = NDArray[np.float64]
-
 RNG = np.random.default_rng(7)
 P, Q = quat.random_attitudes(50, RNG), quat.random_attitudes(50, RNG)
 V = RNG.standard_normal((50, 3))
-
 seeds = st.integers(0, 2**32 - 1)
 
 

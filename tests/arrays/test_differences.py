@@ -21,21 +21,18 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from arrays.array import SensorArray
 from arrays.differences import (
-    calibration_errors,
     contrasts,
     decorrelated_differences,
     difference_covariance,
     eigen_decorrelation,
     helmert_decorrelation,
-    proportional_noise,
-    reading_covariance,
-    reading_errors,
-    whitening,
-    whitenings,
 )
 from arrays.geometries import tetrahedron
-from arrays.sensor import Calibration, Sensor, SensorArray
+from arrays.noise import calibration_errors, proportional_noise, reading_covariance, reading_errors
+from arrays.sensor import Calibration, Sensor
+from arrays.whitening import whitening, whitenings
 
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -10,9 +10,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
+from arrays.array import SensorArray
 from arrays.geometries import GEOMETRIES, cube, tetrahedron
 from arrays.meshes import AXIS_COLOURS, array_mesh, array_scene, glyph_size, sensor_mesh
-from arrays.sensor import Sensor, SensorArray
+from arrays.sensor import Sensor
 
 BODIES = {"vector": 4, "scalar": 1}  # a cube and three rods, or a sphere
 

@@ -22,8 +22,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from arrays.errors import InputError
-from arrays.sensor import Calibration, Sensor, SensorArray
+from arrays.array import SensorArray
+from arrays.io.errors import InputError
+from arrays.sensor import Calibration, Sensor
 
 SEEDS = st.integers(0, 2**32 - 1)
 QUARTER_TURN_Z = (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))

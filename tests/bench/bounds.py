@@ -8,10 +8,10 @@ from dataclasses import replace
 import numba
 import numpy as np
 
+from arrays.array import SensorArray
 from arrays.geometries import cube, tetrahedron
-from arrays.sensor import SensorArray
-from magloc.bound_tables import moment_directions, sigma_table
-from magloc.bounds import bounds_of
+from magloc.bounds.crlb import bounds_of
+from magloc.bounds.over_moments import moment_directions, sigma_table
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from adcs.adaptive import adaptive_track
-from adcs.complementary import explicit_track
-from adcs.gauss_newton import gauss_newton_track
-from sims.complementary import SatelliteScenario, satellite_runs
+from adcs.complementary.adaptive import adaptive_track
+from adcs.complementary.explicit import explicit_track
+from adcs.complementary.gauss_newton import gauss_newton_track
+from sims.attitude.complementary import SatelliteScenario, satellite_runs
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
 

@@ -8,8 +8,8 @@ from functools import cache
 import numba
 import numpy as np
 
-from magloc.dipole import total_field
-from magloc.kernels.dipole import field_at_points
+from magloc.fields.dipole import total_field
+from magloc.fields.dipole_compiled import field_at_points
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, installed, interleaved
 

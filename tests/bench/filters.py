@@ -9,15 +9,17 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from arrays.geometries import tetrahedron
-from magloc.convergence import IekfFilter, StartsScenario, simulated_measurement
+from magloc.convergence.filters import IekfFilter
+from magloc.convergence.over_starts import StartsScenario, simulated_measurement
 from magloc.kalman import IteratedExtendedKalmanFilter
-from magloc.long_record import track_record
-from magloc.measurement import DifferenceMeasurement
-from magloc.motion import UnknownMotion
-from magloc.track import Tracker
-from magloc.track_rows import Row as TrackRow
-from magloc.track_rows import rows_of
-from sims import read_scenario, simulate
+from magloc.measurement.differences import DifferenceMeasurement
+from magloc.tracking.batch import track_record
+from magloc.tracking.motion import UnknownMotion
+from magloc.tracking.results import Row as TrackRow
+from magloc.tracking.results import rows_of
+from magloc.tracking.tracker import Tracker
+from sims.magnetics.scenario_files import read_scenario
+from sims.magnetics.simulation import simulate
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, installed, interleaved
 

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from arrays.geometries import tetrahedron
-from magloc.locate import Locator
-from magloc.measurement import DifferenceMeasurement, predicted_channels
+from magloc.localization.search.single_source import Locator
+from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
 

@@ -8,8 +8,9 @@ import numba
 import numpy as np
 from numba import prange
 
-from magloc.convergence import DampedFilter, IekfFilter, RepeatedFilter, StartsScenario, simulated_measurement
-from magloc.kernels import compiled, compiled_parallel
+from magloc.compilation import compiled, compiled_parallel
+from magloc.convergence.filters import DampedFilter, IekfFilter, RepeatedFilter
+from magloc.convergence.over_starts import StartsScenario, simulated_measurement
 from tests.bench.maps import starts_of
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved

@@ -8,9 +8,10 @@ from functools import partial
 import numba
 import numpy as np
 
-from magloc.convergence import Ends, IekfFilter, RepeatedFilter, StartsScenario, simulated_measurement
-from magloc.locate import Locator
-from magloc.measurement import DifferenceMeasurement
+from magloc.convergence.filters import Ends, IekfFilter, RepeatedFilter
+from magloc.convergence.over_starts import StartsScenario, simulated_measurement
+from magloc.localization.search.single_source import Locator
+from magloc.measurement.differences import DifferenceMeasurement
 from tests.bench.filters import TIME, functions, stonesoup_update
 from tests.bench.fixes import best_fit
 from tests.bench.table import Row
@@ -19,7 +20,6 @@ from tests.bench.timing import Contestant, Size, installed, interleaved
 TITLE = (
     "map: one start of a cube of 40 m around a tetrahedron, source at 5 m; peers on a sample; iekf is chaotic far away"
 )
-
 Loop = Callable[[np.ndarray], tuple[np.ndarray, bool]]
 """State and whether the iteration stopped, of one start."""
 

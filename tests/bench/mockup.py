@@ -9,16 +9,24 @@ from itertools import pairwise
 
 import numpy as np
 
-from adcs.mockup.camera import Camera, Pose, camera_of_footprint, centred_from_table, distorted, in_frame, undistorted
-from adcs.mockup.centroids import find_stars
-from adcs.mockup.led_tracking import LightTracker
-from adcs.mockup.matching import SLIVER_RAD, Matcher, PaperMatcher, longest_close_subset
-from adcs.mockup.odds_matching import OddsMatcher
-from adcs.mockup.pose_odds import PoseOdds
-from adcs.mockup.robust_matching import RobustMatcher
-from adcs.mockup.similarity import fitted_similarity, mirrored_image
-from adcs.mockup.sky import led_sky
-from adcs.mockup.triangles import TriangleCatalogue, delaunay_triangles
+from adcs.mockup.vision.camera import (
+    Camera,
+    Pose,
+    camera_of_footprint,
+    centred_from_table,
+    distorted,
+    in_frame,
+    undistorted,
+)
+from adcs.mockup.vision.centroids import find_stars
+from adcs.mockup.vision.odds_matcher import OddsMatcher
+from adcs.mockup.vision.paper_matcher import SLIVER_RAD, Matcher, PaperMatcher, longest_close_subset
+from adcs.mockup.vision.pose_odds import PoseOdds
+from adcs.mockup.vision.predicted_matcher import LightTracker
+from adcs.mockup.vision.robust_matcher import RobustMatcher
+from adcs.mockup.vision.similarity import fitted_similarity, mirrored_image
+from adcs.mockup.vision.sky import led_sky
+from adcs.mockup.vision.triangles import TriangleCatalogue, delaunay_triangles
 from sims.mockup.frames import rendered_frame
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numba
 
-from arrays.files import read_array
-from magloc.locate import Locator
+from arrays.array_file import read_array
+from magloc.localization.search.single_source import Locator
 from magloc.readings import read_readings
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved

@@ -7,10 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.optimize import least_squares
 
-from arrays.sensor import Sensor, SensorArray
-from magloc.exact import ExactLocator
-from magloc.measurement import DifferenceMeasurement, predicted_channels
-from magloc.several import SeveralLocator
+from arrays.array import SensorArray
+from arrays.sensor import Sensor
+from magloc.localization.locator import ExactLocator
+from magloc.localization.search.multi_source import SeveralLocator
+from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 from tests.bench.fixes import REACHED, best_fit, multi_start, random_directions
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved

@@ -10,8 +10,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from arrays.geometries import tetrahedron
-from magloc.dipole import total_field
-from magloc.measurement import DifferenceMeasurement
+from magloc.fields.dipole import total_field
+from magloc.measurement.differences import DifferenceMeasurement
 from tests.bench import fields, filters
 from tests.bench.__main__ import GROUPS, report
 from tests.bench.fixes import simulated

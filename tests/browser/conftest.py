@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from arrays.errors import InputError
-from magloc.viewer.browser import Chromium, find_chromium
+from arrays.io.errors import InputError
+from magloc.viewer.chromium import Chromium, find_chromium
 from tests.browser.screen import Screen
 from tests.conftest import REPOSITORY
 

@@ -16,12 +16,11 @@ from matplotlib.colors import rgb_to_hsv
 from matplotlib.image import imread
 from numpy.typing import ArrayLike, NDArray
 
-from magloc.viewer.browser import Chromium
+from magloc.viewer.chromium import Chromium
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Look = Callable[[FloatArray], BoolArray]
-
 PATIENCE_S = 40.0
 # viser's page sends at most one change of an input in this time; of several, to whatever inputs, only the last.
 _BETWEEN_CHANGES_S = 0.06

@@ -11,19 +11,17 @@ import viser
 from numpy.typing import NDArray
 
 from arrays.geometries import tetrahedron
-from magloc.viewer.files import ArrayResult
-from magloc.viewer.live_fit import suitable_dipole
-from magloc.viewer.pages import array_page
-from magloc.viewer.scene import DIPOLE_COLOUR, FIELD_LINE_COLOUR, FIT_COLOUR, ArrayGlyphs
+from magloc.viewer.pages.live_fit import suitable_dipole
+from magloc.viewer.pages.open_result import ArrayResult
+from magloc.viewer.pages.pages import array_page
+from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, FIELD_LINE_COLOUR, FIT_COLOUR, ArrayGlyphs
+from magloc.viewer.scene.shapes import field_lines
 from magloc.viewer.server import opened
-from magloc.viewer.shapes import field_lines
 from tests.browser.screen import Camera, Screen, Sight, dark_grey, hue_of
 
 # All in one process of a parallel run: one browser is enough.
 pytestmark = pytest.mark.xdist_group("browser")
-
 FloatArray = NDArray[np.float64]
-
 ARRAY = tetrahedron(30.0)  # the static page is of one of 3 cm
 START_M, START_AM2 = suitable_dipole(ARRAY)
 ARROW_M = 0.6 * ARRAY.circumradius

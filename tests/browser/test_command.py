@@ -9,14 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from arrays.files import write_array
+from arrays.array_file import write_array
 from arrays.geometries import tetrahedron
 from tests.browser.screen import Screen
 from tests.command_line import viewer_started
 
 # All in one process of a parallel run: one browser is enough.
 pytestmark = pytest.mark.xdist_group("browser")
-
 ARRAY = tetrahedron(1.5)
 
 

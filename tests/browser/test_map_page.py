@@ -11,18 +11,16 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from arrays.geometries import tetrahedron
-from magloc.viewer.files import MapResult
-from magloc.viewer.map_view import FAILED_COLOUR
-from magloc.viewer.pages import map_page
-from magloc.viewer.scene import DIPOLE_COLOUR, REGION_COLOUR
+from magloc.viewer.pages.map import FAILED_COLOUR
+from magloc.viewer.pages.open_result import MapResult
+from magloc.viewer.pages.pages import map_page
+from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, REGION_COLOUR
 from magloc.viewer.server import opened
 from tests.browser.screen import Camera, Screen, Sight, close_to, dark_grey, hue_of
 
 # All in one process of a parallel run: one browser is enough.
 pytestmark = pytest.mark.xdist_group("browser")
-
 FloatArray = NDArray[np.float64]
-
 AXIS = np.linspace(-4.0, 4.0, 17)
 SOURCE = np.array([2.0, 0.0, 0.0])
 DIPOLE = np.array([SOURCE, SOURCE])  # its ball, and the head of its arrow

@@ -11,24 +11,22 @@ import pytest
 import viser
 from numpy.typing import NDArray
 
-from adcs.commands.mockup_fusion import fused_runs
-from adcs.commands.mockup_replay import drive_of
-from adcs.mockup.camera import footprint
+from adcs.mockup.vision.camera import footprint
 from adcs.viewer.drive import Drive
 from adcs.viewer.drive_page import drive_page, write_playing_page
 from adcs.viewer.drive_player import DrivePlayer
 from adcs.viewer.frame_image import IDENTIFIED_COLOUR
 from adcs.viewer.table_scene import CEILING_M, ESTIMATE_COLOUR, FIX_COLOUR, VIEW_COLOUR
-from magloc.viewer.pages import Page
+from magloc.viewer.pages.pages import Page
 from magloc.viewer.server import opened
+from sims.cli.mockup_replay import drive_of
+from sims.experiments.mockup_navigation import fused_runs
 from sims.mockup.table_run import TableScenario
 from tests.browser.screen import Camera, Screen, Sight, dark_grey, hue_of
 
 # All in one process of a parallel run: one browser is enough.
 pytestmark = pytest.mark.xdist_group("browser")
-
 FloatArray = NDArray[np.float64]
-
 DURATION_S = 20.0
 
 

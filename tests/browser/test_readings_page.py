@@ -9,18 +9,17 @@ import pytest
 import viser
 
 from arrays.geometries import tetrahedron
-from magloc.measurement import predicted_channels
+from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
-from magloc.viewer.files import ReadingsResult
-from magloc.viewer.live_fit import LiveFit
-from magloc.viewer.pages import readings_page
-from magloc.viewer.scene import DIPOLE_COLOUR, FIT_COLOUR
+from magloc.viewer.pages.live_fit import LiveFit
+from magloc.viewer.pages.open_result import ReadingsResult
+from magloc.viewer.pages.pages import readings_page
+from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, FIT_COLOUR
 from magloc.viewer.server import opened
 from tests.browser.screen import Screen, Sight, dark_grey, hue_of
 
 # All in one process of a parallel run: one browser is enough.
 pytestmark = pytest.mark.xdist_group("browser")
-
 ARRAY = tetrahedron(1.5)
 POSITIONS = np.stack([np.linspace(-2.0, 2.0, 9), np.full(9, 2.0), np.full(9, 0.5)], axis=-1)
 MOMENT = np.array([0.0, 0.0, 80.0])

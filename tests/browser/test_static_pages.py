@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from arrays.files import write_array
+from arrays.array_file import write_array
 from arrays.geometries import tetrahedron
-from magloc.viewer.files import ArrayResult, MapResult
-from magloc.viewer.pages import array_page, map_page
-from magloc.viewer.scene import DIPOLE_COLOUR
+from magloc.viewer.pages.open_result import ArrayResult, MapResult
+from magloc.viewer.pages.pages import array_page, map_page
+from magloc.viewer.scene.glyphs import DIPOLE_COLOUR
 from magloc.viewer.server import opened, write_page
 from tests.browser.screen import Screen, Sight, dark_grey, hue_of
 from tests.browser.test_map_page import DIPOLE, RESULT, sights
@@ -19,7 +19,6 @@ from tests.command_line import Run
 
 # All in one process of a parallel run: one browser is enough.
 pytestmark = pytest.mark.xdist_group("browser")
-
 LARGEST = 15_000_000
 
 

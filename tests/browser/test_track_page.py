@@ -11,20 +11,17 @@ import viser
 from numpy.typing import NDArray
 
 from arrays.geometries import tetrahedron
-from magloc.measurement import predicted_channels
+from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
-from magloc.track_rows import TrackPoint
-from magloc.viewer.files import TrackResult
-from magloc.viewer.pages import track_page
-from magloc.viewer.scene import DIPOLE_COLOUR, TRACK_COLOUR
+from magloc.tracking.results import TrackPoint, TrackResult
+from magloc.viewer.pages.pages import track_page
+from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, TRACK_COLOUR
 from magloc.viewer.server import opened
 from tests.browser.screen import Screen, Sight, dark_grey, hue_of
 
 # All in one process of a parallel run: one browser is enough.
 pytestmark = pytest.mark.xdist_group("browser")
-
 FloatArray = NDArray[np.float64]
-
 ARRAY = tetrahedron(1.5)
 TIMES = 0.5 * np.arange(41)
 POSITIONS = np.stack([np.linspace(-4.0, 4.0, 41), np.full(41, 3.0), np.linspace(0.0, 1.0, 41)], axis=-1)

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from scipy.signal import butter, detrend, freqz_sos
 
 from arrays import geometries
-from arrays.errors import InputError
-from arrays.sensor import Sensor, SensorArray
+from arrays.array import SensorArray
+from arrays.io.errors import InputError
+from arrays.sensor import Sensor
 from magloc.conditioning import detrended, high_passed, window_averages, window_averaging_array, without_hum
 from magloc.readings import Readings
 
 FloatArray = NDArray[np.float64]
-
 RATE_HZ = 200.0
 
 

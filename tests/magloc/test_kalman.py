@@ -31,7 +31,7 @@ from magloc.kalman import (
     sequential_update,
     symmetric_square_root,
 )
-from magloc.measurement import DifferenceMeasurement
+from magloc.measurement.differences import DifferenceMeasurement
 from tests import oracles
 
 

@@ -13,9 +13,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from arrays.errors import InputError
-from arrays.files import read_array
-from arrays.sensor import Sensor, SensorArray
+from arrays.array import SensorArray
+from arrays.array_file import read_array
+from arrays.io.errors import InputError
+from arrays.sensor import Sensor
 from magloc.readings import (
     Readings,
     average,
@@ -29,9 +30,7 @@ from magloc.readings import (
 HEADER = "time_s,s1_x_nT,s1_y_nT,s1_z_nT,s2_x_nT,s2_y_nT,s2_z_nT,s3_nT"
 ROW = "0,1,2,3,4,5,6,7"
 POSE = "array_x_m,array_y_m,array_z_m,array_qx,array_qy,array_qz,array_qw"
-
 HALF_OF_DIGIT_15 = 5e-15 + 4.0 * np.finfo(np.float64).eps  # and the rounding of nT to T and back
-
 WriteFile = Callable[[str | bytes], Path]
 
 

@@ -10,16 +10,15 @@ import base64
 import io
 import os
 from pathlib import Path
-
 import nbformat
 from nbclient import NotebookClient
 from nbformat import NotebookNode
 from PIL import Image
 
+
 FOLDER = Path(__file__).parents[2] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 DOCS = FOLDER.parent / "docs"
-
 # Which picture of a notebook stands in the README, as docs/notebook-NAME.png.
 SHOWN = {
     "01-first-fix": 2,
@@ -31,7 +30,6 @@ SHOWN = {
 }
 LONGEST_CELL_S = 300
 """A cell that compiles what it uses, on slow cores."""
-
 # Otherwise jupyter_core warns that its folders will move.
 os.environ.setdefault("JUPYTER_PLATFORM_DIRS", "1")
 

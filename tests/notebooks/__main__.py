@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import sys
 import time
-
 import nbformat
-
 from tests.notebooks import DOCS, FOLDER, NOTEBOOKS, SHOWN, executed, kept, pictures
+
+
 
 
 def main(names: list[str]) -> None:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 import shutil
 from pathlib import Path
-
 import nbformat
 import pytest
 from nbformat import NotebookNode
-
 from tests.notebooks import DOCS, FOLDER, NOTEBOOKS, SHOWN, executed, pictures, texts
+
 
 LARGEST_BYTES = 400_000
 # Folders of a machine: no output may name one.

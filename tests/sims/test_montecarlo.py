@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from sims.magnetics.scenario import Scenario
+from sims.magnetics.scenario_files import read_scenario
+from sims.magnetics.simulation import Simulation, simulate
 from sims.montecarlo import run
-from sims.scenario import Scenario
-from sims.scenarios import read_scenario
-from sims.simulation import Simulation, simulate
 
 
 def statistics(simulation: Simulation) -> dict[str, Any]:

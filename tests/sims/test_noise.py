@@ -15,7 +15,6 @@ from scipy import integrate, signal, stats
 from sims.noise import coloured_noise, flicker_sigma, low_passed, random_walk, stream, white_sigma
 
 FloatArray = NDArray[np.float64]
-
 RATE_HZ = 50.0
 FALSE_ALARM = 1e-4
 

@@ -8,11 +8,12 @@ from functools import cache
 
 import numpy as np
 
-from adcs.commands.mockup_sky import FALSE_HEADING_RAD, FALSE_POSITION_M, REACH_M, SkySetup, sky_run
-from adcs.mockup.camera import Camera, Pose, centred_from_table, distorted, in_frame
-from adcs.mockup.matching import CameraFix, NoFix
-from adcs.mockup.sky import led_sky
-from adcs.mockup.triangles import TriangleCatalogue
+from adcs.mockup.vision.camera import Camera, Pose, centred_from_table, distorted, in_frame
+from adcs.mockup.vision.paper_matcher import CameraFix
+from adcs.mockup.vision.sky import led_sky
+from adcs.mockup.vision.triangles import TriangleCatalogue
+from adcs.stars.identification import NoFix
+from sims.experiments.mockup_vision import FALSE_HEADING_RAD, FALSE_POSITION_M, REACH_M, SkySetup, sky_run
 
 BORDER_PX = 5.0
 

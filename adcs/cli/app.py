@@ -1,0 +1,58 @@
+"""The command line ``adcs``.
+
+Every command is a function in a module of :mod:`adcs.cli`; its NumPy docstring is its help text. What the command
+lines have in common is in :mod:`magloc.cli.framework`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from cyclopts import App, Parameter
+
+from arrays.io import outputs
+from magloc.cli import framework
+
+app = App(
+    name="adcs",
+    help="Determine the attitude of satellites.",
+    version=outputs.installed_version,
+    default_parameter=Parameter(negative=()),
+)
+# By name, so that a command loads when it is called, and its help line is here; sims stands above this package.
+for _name, _where, _help in (
+    ("run", "sims.cli.run:run", "Simulate a scenario, estimate its attitude, and say how good that is."),
+    (
+        "compare",
+        "sims.cli.compare:compare",
+        "Run several scenarios, sets of sensors or filters on the same seeds and show them side by side.",
+    ),
+    ("tables", "sims.cli.tables:tables", "Tables 3, 4 and 5 of the paper: its value, ours, and the ratio."),
+    (
+        "estimate",
+        "adcs.cli.estimate:estimate",
+        "Estimate attitude and rate from telemetry, with the filters of `adcs run`.",
+    ),
+    (
+        "stars",
+        "adcs.cli.stars:stars",
+        "Identify the stars of images by a catalogue, without knowing where the camera looked.",
+    ),
+):
+    app.command(_where, name=_name, help=_help)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        The command and its arguments; by default those of the process.
+
+    Returns
+    -------
+    int
+        Exit status: 0 done, 2 bad input, 130 interrupted, 141 the reader of the output is gone.
+    """
+    return framework.run(app, arguments)

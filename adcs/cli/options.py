@@ -1,0 +1,104 @@
+"""What all commands share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from adcs.kalman.bank import Filter, Noise, StartKind
+from arrays.io.arguments import Flag
+from magloc.cli import framework
+
+
+def print_note(text: str) -> None:
+    """Print one line on stderr, whatever the text."""
+    framework.print_note(text, "adcs")
+
+
+_ECLIPSE: dict[str, Any] = {
+    "sunlit": False,
+    "least_separation_deg": 0.0,
+    "least_field_nT": 0.0,
+    "eclipse_after_s": 600.0,
+}
+_ECLIPSE_DURATION_S = 3000.0
+# As in eclipse.toml: what is learnt in the Sun must last half an hour. Too small without the torque in the state.
+_ECLIPSE_NOISE = {"rate_rad_s": 1e-8, "gyro_bias_rad_s": 1e-9, "disturbance_s2": 1e-10}
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ScenarioOptions:
+    """What replaces keys of the scenario file; by default nothing does.
+
+    Parameters
+    ----------
+    sensors : str
+        Sensors in use: any of st, gyro, mag and sun that observe attitude, in any order, as in st+gyro+mag+sun.
+    states : str
+        What is estimated besides attitude and rate: any of gyro-bias, field-bias and disturbance with commas, or none.
+    filter : str
+        Error-state Kalman filter ("mekf"); with its converged gain ("constant-gain"); with a filter of the disturbance
+        beside it ("parallel-disturbance"); of attitude and gyro bias alone ("reduced"); with a smoother of the whole
+        run after it ("smoother").
+    process_noise : str
+        Found by us ("tuned"), or as printed ("paper").
+    star_noise : str
+        The star tracker's 0.001° are the noise of its angle ("angle"), or of its quaternion's components ("paper").
+    field_error_nT : float
+        True field minus its model.
+    eclipse : bool
+        The satellite enters the Earth's shadow at 600 s.
+    start : str
+        The filter starts near the truth ("near"), from the first readings of two sensors ("vectors"), or from nowhere
+        ("any").
+    start_error_deg : float
+        Error per axis of what the filter starts from.
+    closed_loop_F : bool
+        The Jacobian of the paper, which takes the feedback of the control for dynamics.
+    """
+
+    sensors: str | None = None
+    states: str | None = None
+    filter: Filter | None = None
+    process_noise: Noise | None = None
+    star_noise: Literal["angle", "paper"] | None = None
+    field_error_nT: Annotated[float | None, Parameter(name="--field-error-nT")] = None
+    eclipse: Flag = False
+    start: StartKind | None = None
+    start_error_deg: float | None = None
+    closed_loop_F: Annotated[Flag, Parameter(name="--closed-loop-F")] = False
+
+    def changes(self, duration_s: float | None) -> dict[str, Any]:
+        """Keys of the scenario file, and what replaces them."""
+        changes: dict[str, Any] = {}
+        states = None if self.states is None else _names(self.states)
+        estimate = {
+            "sensors": self.sensors,
+            "states": states,
+            "filter": self.filter,
+            "process_noise": self.process_noise,
+            "start": self.start,
+            "start_error_deg": self.start_error_deg,
+            "closed_loop_F": self.closed_loop_F or None,
+        }
+        if self.sensors is not None and self.states is None:
+            estimate["states"] = []  # those of the file belong to its sensors
+        changes["estimate"] = {key: value for key, value in estimate.items() if value is not None}
+        if self.field_error_nT is not None:
+            changes["disturbance"] = {"field_error_nT": self.field_error_nT}
+        if self.eclipse:
+            changes["start"] = _ECLIPSE
+            if self.process_noise is None and "disturbance" in (states or []):
+                changes["estimate"]["process_noise"] = _ECLIPSE_NOISE
+            changes["duration_s"] = _ECLIPSE_DURATION_S
+        if duration_s is not None:
+            changes["duration_s"] = duration_s
+        return changes
+
+
+def _names(text: str) -> list[str]:
+    names = [name.strip() for name in text.replace("+", ",").split(",")]
+    return [name for name in names if name and name != "none"]

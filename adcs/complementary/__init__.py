@@ -1,0 +1,1 @@
+"""Complementary filters of the attitude, and inertial-magnetic units."""

@@ -1,0 +1,221 @@
+r"""Adaptive error-state filter: field, Sun and gyro, with a bias whose steps it finds by itself.
+
+The state is the error of attitude and bias: :math:`q = \hat q \circ \exp(\delta\theta)`, :math:`\beta = \hat\beta +
+\delta\beta`, and with the gyro's reading less the bias, ω,
+
+.. math:: \delta\theta_{i+1} = e^{-[\omega h \times]} \delta\theta_i - h\,\delta\beta_i, \qquad
+    v_{body} - A(\hat q) v_{reference} = [A(\hat q) v_{reference} \times]\, \delta\theta + \text{noise}
+
+A measured unit vector has two degrees of freedom, along axes across it. The bias is taken for nearly constant, which
+makes the filter good and slow; when it steps, the innovations grow, and whenever their smoothed normalised square (NIS
+for each degree of freedom) exceeds a threshold, the covariance of the bias grows until they are as small as they
+should be. Estimates at an instant have seen its readings.
+
+A gyro whose reading is missing is not foreseen; a vector that is missing is left out, so that an outage needs nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adcs import quaternion
+from adcs.complementary.explicit import first_attitude, turned
+from adcs.satellite.vector_record import VectorRecord
+from arrays.typing import FloatArray
+from magloc.compilation import over_rows
+
+
+@dataclass(frozen=True)
+class AdaptiveTuning:
+    """What the filter assumes.
+
+    Attributes
+    ----------
+    first_sigma : float
+        Noise of the first vector, each axis, in its own unit: tesla.
+    second_sigma_rad : float
+        Of the direction of the second one.
+    attitude_noise_rad, bias_noise_rad_s : float
+        Growth of the errors of attitude and bias in a step.
+    memory : float
+        Of the smoothed NIS.
+    threshold : float
+        Smoothed NIS for each degree of freedom, 1 on average, above which the bias is taken to change.
+    growth_rad_s : float
+        By which the bias's standard deviation then grows in a step, in the root of the sum of squares.
+    start_attitude_rad, start_bias_rad_s : float
+        Standard deviations at the start, each axis.
+
+    Raises
+    ------
+    ValueError
+        A number is not positive and finite (noise of the attitude may be zero), or the memory is 1 or more.
+    """
+
+    first_sigma: float = 1000e-9
+    second_sigma_rad: float = 1e-3
+    attitude_noise_rad: float = 0.0
+    bias_noise_rad_s: float = 3e-10
+    memory: float = 0.95
+    threshold: float = 2.3
+    growth_rad_s: float = math.radians(0.004)
+    start_attitude_rad: float = math.radians(10.0)
+    start_bias_rad_s: float = math.radians(0.02)
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (0.0 < value < math.inf or (name == "attitude_noise_rad" and value == 0.0)):
+                raise ValueError(f"Input {name} must be positive and finite; instead received {value}.")
+        if not self.memory < 1.0:
+            raise ValueError(f"Input memory must be less than 1; instead received {self.memory}.")
+
+    @property
+    def start_covariance(self) -> FloatArray:
+        """Of attitude and bias, shape (6, 6)."""
+        return np.diag(np.repeat([self.start_attitude_rad, self.start_bias_rad_s], 3) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class AdaptiveTrack:
+    """Estimates of every run at every instant, with its readings.
+
+    Attributes
+    ----------
+    q : ndarray, shape (R, n, 4)
+        Reference from body.
+    bias_rad_s : ndarray, shape (R, n, 3)
+        Of the gyro.
+    covariance : ndarray, shape (R, n, 6, 6)
+        Of the error angle in body axes and the bias [rad, rad/s].
+    smoothed_nis : ndarray, shape (R, n)
+        For each degree of freedom.
+    """
+
+    q: FloatArray
+    bias_rad_s: FloatArray
+    covariance: FloatArray
+    smoothed_nis: FloatArray
+
+    def nees(self, q_true: ArrayLike, bias_true_rad_s: ArrayLike) -> FloatArray:
+        """Squared errors in units of the covariance, 6 on average where it is right, shape (R, n).
+
+        Parameters
+        ----------
+        q_true : array_like, shape (R, n, 4)
+        bias_true_rad_s : array_like
+            Broadcasts to (R, n, 3).
+        """
+        angle = 2.0 * quaternion.error_vector(self.q, q_true)
+        x = np.concatenate([angle, np.broadcast_to(bias_true_rad_s, angle.shape) - self.bias_rad_s], axis=-1)
+        # Angles and rates differ by a factor of millions: scaled, the covariance is well-conditioned.
+        sigma = np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+        scaled = self.covariance / (sigma[..., :, None] * sigma[..., None, :])
+        z = x / sigma
+        return np.sum(z * np.linalg.solve(scaled, z[..., None])[..., 0], axis=-1)
+
+
+def adaptive_track(
+    record: VectorRecord, tuning: AdaptiveTuning = AdaptiveTuning(), *, q_start: ArrayLike = quaternion.IDENTITY
+) -> AdaptiveTrack:
+    """The adaptive filter over whole records, compiled.
+
+    Parameters
+    ----------
+    record : VectorRecord
+    tuning : AdaptiveTuning
+    q_start : array_like, shape (4,) or (R, 4)
+        First estimate.
+
+    Returns
+    -------
+    AdaptiveTrack
+
+    Raises
+    ------
+    ValueError
+        The first estimate has no length.
+    """
+    from adcs.complementary.filters_compiled import adaptive
+
+    shape = (record.n_runs, len(record))
+    track = AdaptiveTrack(np.empty((*shape, 4)), np.zeros((*shape, 3)), np.empty((*shape, 6, 6)), np.empty(shape))
+    if len(record) == 0:
+        return track
+    track.q[:, 0] = first_attitude(q_start)
+    track.covariance[:, 0] = tuning.start_covariance
+    over_rows(
+        adaptive,
+        record.n_runs,
+        *record.arrays,
+        record.dt_s,
+        np.array([tuning.first_sigma, tuning.second_sigma_rad]),
+        np.array([tuning.attitude_noise_rad, tuning.bias_noise_rad_s]),
+        np.array([tuning.memory, tuning.threshold, tuning.growth_rad_s]),
+        track.q,
+        track.bias_rad_s,
+        track.covariance,
+        track.smoothed_nis,
+    )
+    return track
+
+
+def adaptive_steps(
+    record: VectorRecord,
+    tuning: AdaptiveTuning = AdaptiveTuning(),
+    *,
+    q_start: ArrayLike = quaternion.IDENTITY,
+    run: int = 0,
+) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
+    """Readable twin of :func:`adaptive_track`: attitude, bias and covariance of one run at every instant.
+
+    Yields
+    ------
+    q : ndarray, shape (4,)
+    bias : ndarray, shape (3,)
+    covariance : ndarray, shape (6, 6)
+    """
+    h = record.dt_s
+    shared = 0 if record.first_reference.shape[0] == 1 else run
+    q, bias, P, smoothed = first_attitude(q_start), np.zeros(3), tuning.start_covariance, 1.0
+    for i in range(len(record)):
+        rows, residuals, variances = [], [], []
+        first, second = record.first_body[run, i], record.second_body[run, i]
+        for measured, reference, sigma in (
+            (first, record.first_reference[shared, i], tuning.first_sigma / np.linalg.norm(first)),
+            (second, record.second_reference[shared, i], tuning.second_sigma_rad),
+        ):
+            if np.isnan(measured).any():
+                continue
+            predicted = quaternion.rotate_back(q, reference / np.linalg.norm(reference))
+            # Two axes across the predicted vector.
+            across = np.linalg.svd(predicted[None])[2][1:]
+            rows.append(across @ quaternion.cross_matrix(predicted))
+            residuals.append(across @ (measured / np.linalg.norm(measured)))
+            variances.append(np.full(2, sigma**2))
+        if rows:
+            H = np.column_stack([np.concatenate(rows), np.zeros((2 * len(rows), 3))])
+            nu = np.concatenate(residuals)
+            S = H @ P @ H.T + np.diag(np.concatenate(variances))
+            K = np.linalg.solve(S, H @ P).T
+            x = K @ nu
+            P = P - K @ S @ K.T
+            q = quaternion.normalised(quaternion.multiply(q, quaternion.exp(x[:3])))
+            bias = bias + x[3:]
+            nis = float(nu @ np.linalg.solve(S, nu)) / len(nu)
+            smoothed = tuning.memory * smoothed + (1.0 - tuning.memory) * nis
+        yield q, bias, P
+        w = record.rate_rad_s[run, i] - bias
+        Phi = np.eye(6)
+        Phi[:3, :3] = quaternion.matrix(quaternion.exp(w * h)).T
+        Phi[:3, 3:] = -h * np.eye(3)
+        # Only readings show that the bias changes.
+        growth = tuning.growth_rad_s if rows and smoothed > tuning.threshold else 0.0
+        P = Phi @ P @ Phi.T + np.diag(
+            np.repeat([tuning.attitude_noise_rad**2, tuning.bias_noise_rad_s**2 + growth**2], 3)
+        )
+        q = turned(q, w * h, record.frame_rate_rad_s[shared, i] * h)

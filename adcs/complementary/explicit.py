@@ -1,0 +1,311 @@
+r"""Complementary filters: a gyro's rate, corrected by two measured vectors, such as field and Sun.
+
+In one axis an angle of a vector sensor and the gyro's integral are blended by :math:`G_a = k/(s+k)` and
+:math:`G_g = s/(s+k)`, whose sum is 1: what the filter passes of one, it takes away of the other. In three axes
+
+.. math:: \dot{\hat q} = \tfrac12 \hat q \circ (\omega_{gyro} - A(\hat q)\,\omega_{frame} + K_P e + I), \qquad
+    \dot I = K_I e
+
+in steps :math:`\hat q \leftarrow \exp(-\omega_{frame} h) \circ \hat q \circ \exp((\omega_{gyro} + K_P e + I) h)`. Here
+e is the error angle that the vectors show, and I becomes minus the bias of the gyro. The explicit filter has
+:math:`e = \sum v \times A(\hat q) v_{reference}`; that of :mod:`adcs.complementary.gauss_newton` has the angle to a
+measured quaternion. Both are taken of unit vectors.
+
+The reference frame may turn (the orbital frame does) and need not (north, west, up on Earth). When the second vector is
+missing, :mod:`adcs.complementary.outage` may put another one in its place, and the gains of the outage hold: an
+integral that is not frozen then takes the turning of the field for a bias. Estimates at an instant have not seen its
+readings.
+
+Source: a Ukrainian paper on the attitude of a magnetically stabilised satellite, by its equations. Ours: the rate of
+the frame, unit vectors, gains, frozen integral.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adcs import quaternion
+from adcs.complementary.outage import NO_SUBSTITUTE, Substitute, Substitution, delay_steps, substitute_code
+from adcs.satellite.vector_record import VectorRecord
+from arrays.typing import ComplexArray, FloatArray
+from magloc.compilation import over_rows
+
+LARGEST_EIGENVALUE = 2.0
+"""Of e against the error angle, for unit vectors: the eigenvalues are 1 ± |cos| of their angle, and 2."""
+WARNING_FRACTION = 0.9
+"""Of the stability limit."""
+
+
+def low_pass(k: float, s: ArrayLike) -> ComplexArray:
+    """G_a(s) = k/(s + k), what the filter passes of the vector sensor's angle; s is complex [1/s], k the gain [1/s]."""
+    values = np.asarray(s, dtype=np.complex128)
+    passed: ComplexArray = k / (values + k)
+    return passed
+
+
+def high_pass(k: float, s: ArrayLike) -> ComplexArray:
+    """G_g(s) = s/(s + k), what the filter passes of the gyro's integral; as :func:`low_pass`."""
+    values = np.asarray(s, dtype=np.complex128)
+    passed: ComplexArray = values / (values + k)
+    return passed
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Gains of a complementary filter.
+
+    Attributes
+    ----------
+    kp_per_s, ki_per_s2 : float
+        K_P sets the crossover between vectors and gyro, K_I removes the gyro's bias.
+    outage_kp_per_s, outage_ki_per_s2 : float
+        The same while the second vector is missing; by default K_P stays and the integral is frozen.
+    boost, boost_level_rad, boost_memory : float
+        K_I is multiplied by ``boost`` while the smoothed error (``boost_memory`` of it, the rest of e) is longer than
+        the level: three times what noise makes of it finds a step of the bias soon.
+    first_weight, second_weight : float
+        Of the two vectors in the explicit filter's e.
+
+    Raises
+    ------
+    ValueError
+        A number is negative or NaN.
+    """
+
+    kp_per_s: float = 0.02
+    ki_per_s2: float = 1e-4
+    outage_kp_per_s: float | None = None
+    outage_ki_per_s2: float = 0.0
+    boost: float = 1.0
+    boost_level_rad: float = math.inf
+    boost_memory: float = 0.95
+    first_weight: float = 1.0
+    second_weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value is not None and not value >= 0.0:
+                raise ValueError(f"Input {name} must be 0 or more; instead received {value}.")
+
+    def during(self, outage: bool) -> tuple[float, float]:
+        """(K_P, K_I)."""
+        if not outage:
+            return self.kp_per_s, self.ki_per_s2
+        kp = self.kp_per_s if self.outage_kp_per_s is None else self.outage_kp_per_s
+        return kp, self.outage_ki_per_s2
+
+    @property
+    def largest_kp_per_s(self) -> float:
+        """The larger one of the two K_P, times the larger weight."""
+        return max(self.kp_per_s, self.during(outage=True)[0]) * max(self.first_weight, self.second_weight)
+
+    def check(self, dt_s: float) -> None:
+        """Raise ValueError beyond the stability limit K_P·h·2 = 2."""
+        limit = 2.0 / (LARGEST_EIGENVALUE * dt_s)
+        if not self.largest_kp_per_s <= limit:
+            raise ValueError(
+                f"Input kp_per_s must be {limit:g} 1/s at most, where K_P·h·2 is 2 and a filter with steps of "
+                f"{dt_s:g} s becomes unstable; instead received {self.largest_kp_per_s:g}."
+            )
+
+    def warning(self, dt_s: float) -> str | None:
+        """One sentence if the gains are within a tenth of the stability limit, else None."""
+        limit = 2.0 / (LARGEST_EIGENVALUE * dt_s)
+        if self.largest_kp_per_s < WARNING_FRACTION * limit:
+            return None
+        return (
+            f"K_P = {self.largest_kp_per_s:g} 1/s is close to {limit:g} 1/s, where a filter with steps of {dt_s:g} s "
+            "becomes unstable: it amplifies noise."
+        )
+
+
+BEST_GAINS = Gains()
+"""Of a magnetometer of 1000 nT."""
+
+
+@dataclass(frozen=True, eq=False)
+class ComplementaryTrack:
+    """Estimates of every run at every instant, before its readings.
+
+    Attributes
+    ----------
+    q : ndarray, shape (R, n, 4)
+        Reference from body.
+    integral_rad_s : ndarray, shape (R, n, 3)
+        I; minus the bias of the gyro.
+    q_measured : ndarray, shape (R, n, 4)
+        Measured quaternions, of the instant's readings; NaN of the explicit filter.
+    """
+
+    q: FloatArray
+    integral_rad_s: FloatArray
+    q_measured: FloatArray
+
+
+def explicit_error(
+    q: FloatArray,
+    vectors: list[tuple[FloatArray, FloatArray]],
+    weights: tuple[float, ...] = (1.0, 1.0),
+) -> FloatArray:
+    """Error angle e = Σ weight · v × A(q̂) v_reference.
+
+    Parameters
+    ----------
+    q : ndarray, shape (4,)
+        Estimate, reference from body.
+    vectors : list of (body, reference)
+        Unit vectors (3,), NaN where missing.
+    weights : tuple of float
+
+    Returns
+    -------
+    ndarray, shape (3,)
+        Body axes [rad]: for two unit vectors Σ (E - vvᵀ) δθ of a small error δθ.
+    """
+    e = np.zeros(3)
+    for (body, reference), weight in zip(vectors, weights, strict=True):
+        if np.isfinite(body).all():
+            e = e + weight * np.cross(body, quaternion.rotate_back(q, reference))
+    return e
+
+
+def explicit_track(
+    record: VectorRecord,
+    gains: Gains = BEST_GAINS,
+    *,
+    q_start: ArrayLike = quaternion.IDENTITY,
+    substitution: Substitution = NO_SUBSTITUTE,
+) -> ComplementaryTrack:
+    """The explicit filter over whole records, compiled.
+
+    Parameters
+    ----------
+    record : VectorRecord
+    gains : Gains
+    q_start : array_like, shape (4,) or (R, 4)
+        First estimate.
+    substitution : Substitution
+        In place of a second vector that is missing.
+
+    Returns
+    -------
+    ComplementaryTrack
+
+    Raises
+    ------
+    ValueError
+        The gains are beyond the stability limit, or the first estimate has no length.
+    """
+    from adcs.complementary.filters_compiled import EXPLICIT
+
+    return compiled_track(EXPLICIT, record, gains, q_start, substitution, 0.0)
+
+
+def compiled_track(
+    method: int, record: VectorRecord, gains: Gains, q_start: ArrayLike, substitution: Substitution, mu: float
+) -> ComplementaryTrack:
+    """Call the compiled filter.
+
+    See :func:`explicit_track` and :func:`adcs.complementary.gauss_newton.gauss_newton_track`.
+    """
+    from adcs.complementary.filters_compiled import complementary
+
+    gains.check(record.dt_s)
+    shape = (record.n_runs, len(record))
+    q, integral, measured = np.empty((*shape, 4)), np.zeros((*shape, 3)), np.full((*shape, 4), np.nan)
+    if len(record) == 0:
+        return ComplementaryTrack(q, integral, measured)
+    q[:, 0] = first_attitude(q_start)
+    over_rows(
+        complementary,
+        record.n_runs,
+        *record.arrays,
+        record.dt_s,
+        np.array([gains.first_weight, gains.second_weight]),
+        np.array([*gains.during(False), *gains.during(True)]),
+        np.array([gains.boost, gains.boost_level_rad, gains.boost_memory]),
+        method,
+        substitute_code(substitution),
+        delay_steps(substitution, record.dt_s),
+        mu,
+        q,
+        integral,
+        measured,
+    )
+    return ComplementaryTrack(q, integral, measured)
+
+
+def first_attitude(q_start: ArrayLike) -> FloatArray:
+    """Unit quaternions (..., 4); raise ValueError if one is not finite or has no length."""
+    q = quaternion.normalised(q_start)
+    if not np.isfinite(q).all():
+        raise ValueError("Input q_start must be quaternions with a length; instead received one without.")
+    return q
+
+
+Correction = Callable[[FloatArray, list[tuple[FloatArray, FloatArray]]], FloatArray]
+
+
+def steps(
+    record: VectorRecord,
+    correction: Correction,
+    gains: Gains = BEST_GAINS,
+    *,
+    q_start: ArrayLike = quaternion.IDENTITY,
+    substitution: Substitution = NO_SUBSTITUTE,
+    run: int = 0,
+) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """Readable twin of the compiled filters: (q̂, I) of one run at every instant.
+
+    Parameters
+    ----------
+    record : VectorRecord
+    correction : callable
+        Error angle e of an estimate and the instant's two unit vectors, such as :func:`explicit_error` or
+        :class:`adcs.complementary.gauss_newton.MeasuredQuaternion`.
+    gains, q_start, substitution
+        As :func:`explicit_track`.
+    run : int
+
+    Yields
+    ------
+    q : ndarray, shape (4,)
+    integral : ndarray, shape (3,)
+    """
+    h = record.dt_s
+    shared = 0 if record.first_reference.shape[0] == 1 else run
+    q, integral, smooth = first_attitude(q_start), np.zeros(3), np.zeros(3)
+    line = Substitute(substitution, delay_steps(substitution, h))
+    for i in range(len(record)):
+        yield q, integral
+        first = _unit(record.first_body[run, i]), _unit(record.first_reference[shared, i])
+        second = _unit(record.second_body[run, i]), _unit(record.second_reference[shared, i])
+        outage = bool(np.isnan(second[0]).any())
+        e = correction(q, [first, line.vector(first) if outage else second])
+        kp, ki = gains.during(outage)
+        smooth = gains.boost_memory * smooth + (1.0 - gains.boost_memory) * e
+        if np.linalg.norm(smooth) > gains.boost_level_rad:
+            ki *= gains.boost
+        integral = integral + ki * h * e
+        w = record.rate_rad_s[run, i] + integral
+        frame = record.frame_rate_rad_s[shared, i]
+        line.turn(first, w * h, frame * h)
+        q = turned(q, (w + kp * e) * h, frame * h)
+
+
+def turned(q: FloatArray, body_rad: FloatArray, frame_rad: FloatArray) -> FloatArray:
+    """Attitude after a turn of the body and one of the reference frame, both against inertial space, rotation vectors.
+
+    Shapes (4,), (3,), (3,) -> (4,).
+    """
+    of_frame = quaternion.multiply(quaternion.exp(-frame_rad), q)
+    return quaternion.normalised(quaternion.multiply(of_frame, quaternion.exp(body_rad)))
+
+
+def _unit(v: FloatArray) -> FloatArray:
+    return v / np.linalg.norm(v)

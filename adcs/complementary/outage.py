@@ -1,0 +1,108 @@
+r"""What stands in for the second vector while its sensor is out: an old first vector, as the field turns.
+
+- "magnetometer-only": nothing. The turning field shows all three angles within a fraction of an orbit.
+- "raw": the field M samples ago, in body and reference, as in the source paper. It is wrong by what the body has turned
+  against the reference frame in between.
+- "transported": the same, turned to the present by the gyro, :math:`A(p^*_{n-M} \circ p_n)\,B_b[n-M]`, and by the
+  frame's own rate, :math:`C_n C^T_{n-M} B_o[n-M]`; p and C are integrated from the rates, less the bias found so far.
+
+The outage begins where the second vector is NaN and ends where it is not. The estimate goes on from where it is, so
+that no hand-over makes a jump: the largest step of a correction is K_P·h·\|e\|, \|e\| being 2 at most.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from adcs import quaternion
+from arrays.typing import FloatArray
+
+Pair = tuple[FloatArray, FloatArray]
+Rule = Literal["magnetometer-only", "raw", "transported"]
+RULES: tuple[Rule, ...] = get_args(Rule)  # in the order of the codes of the compiled filter
+
+
+@dataclass(frozen=True)
+class Substitution:
+    """What stands in for a missing second vector.
+
+    Attributes
+    ----------
+    rule : {'magnetometer-only', 'raw', 'transported'}
+        See the module.
+    delay_s : float
+        Age of the field that is taken.
+
+    Raises
+    ------
+    ValueError
+        The rule is unknown or the delay is not positive.
+    """
+
+    rule: Rule = "magnetometer-only"
+    delay_s: float = 500.0
+
+    def __post_init__(self) -> None:
+        if self.rule not in RULES:
+            raise ValueError(f"Input rule must be one of {', '.join(RULES)}; instead received {self.rule!r}.")
+        if not 0.0 < self.delay_s < math.inf:
+            raise ValueError(f"Input delay_s must be positive and finite; instead received {self.delay_s}.")
+
+
+NO_SUBSTITUTE = Substitution()
+
+
+def delay_steps(substitution: Substitution, dt_s: float) -> int:
+    """Delay M in samples, 1 at least."""
+    return 0 if substitution.rule == "magnetometer-only" else max(1, round(substitution.delay_s / dt_s))
+
+
+def substitute_code(substitution: Substitution) -> int:
+    """Code of the compiled filter."""
+    return RULES.index(substitution.rule)
+
+
+class Substitute:
+    """The delay line of one run: measured first vectors, never one that was put in place of another.
+
+    Parameters
+    ----------
+    substitution : Substitution
+    n_steps : int
+        M.
+    """
+
+    def __init__(self, substitution: Substitution, n_steps: int) -> None:
+        self._rule = substitution.rule
+        self._line: deque[tuple[Pair, FloatArray, FloatArray]] = deque(maxlen=max(n_steps, 1))
+        self._p = self._c = quaternion.IDENTITY
+
+    def vector(self, first: Pair) -> Pair:
+        """(body, reference) in place of the second vector now; NaN where there is none.
+
+        Parameters
+        ----------
+        first : (ndarray, ndarray)
+            Of this instant, the shapes of the answer.
+        """
+        missing = np.full_like(first[0], np.nan)
+        if self._rule == "magnetometer-only" or len(self._line) < (self._line.maxlen or 0):
+            return missing, missing
+        (body, reference), p_then, c_then = self._line[0]
+        if self._rule == "raw":
+            return body, reference
+        return (
+            quaternion.rotate_back(quaternion.multiply(quaternion.conjugate(p_then), self._p), body),
+            quaternion.rotate_back(quaternion.multiply(quaternion.conjugate(c_then), self._c), reference),
+        )
+
+    def turn(self, first: Pair, body_rad: FloatArray, frame_rad: FloatArray) -> None:
+        """Store this instant's first vector, and go on to the next one by the rotations of body and frame [rad]."""
+        self._line.append((first, self._p, self._c))
+        self._p = quaternion.normalised(quaternion.multiply(self._p, quaternion.exp(body_rad)))
+        self._c = quaternion.normalised(quaternion.multiply(self._c, quaternion.exp(frame_rad)))

@@ -1,0 +1,1 @@
+"""Guaranteed state ellipsoids under bounded noise."""

@@ -1,0 +1,405 @@
+r"""Guaranteed ellipsoids: sets that contain the state for certain, where all that is known of the noise is a bound.
+
+An ellipsoid :math:`E(\tilde x, H)` is :math:`\{x : (x-\tilde x)^T H^{-1} (x-\tilde x) \le 1\}`, and for a singular H
+:math:`\{x : l^T (x-\tilde x) \le \sqrt{l^T H l}` for every l :math:`\}`. The set of all states that readings and bounds
+allow is no ellipsoid; every operation here returns one that contains it, of the smallest trace of H (the sum of the
+squared semi-axes) in a family of one parameter:
+
+* :func:`transformed`, a linear map, exact;
+* :func:`sum_with_segment`, :func:`sum_with_ellipsoid`, what a bounded disturbance adds;
+* :func:`intersect_strip`, what one scalar reading with bounded noise leaves.
+
+They hold for any linear system, see :mod:`adcs.ellipsoids.observer`. The trace adds squares of all state components:
+scale the state so that they are comparable.
+
+Source: Pankratova, Sholokhov, Cybernetics and Systems Analysis 55(1), 2019.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adcs.ellipsoids.strip import STEP_RULES, StepRule, cut, tightened_strip
+from arrays.typing import BoolArray, FloatArray
+
+# Eigenvalues below zero by this much of the largest one are rounding, as is a difference from the transpose.
+_PSD_RTOL = 1e-9
+# A direction along which the ellipsoid is thinner than this much of its trace is not seen by a reading.
+UNSEEN_RTOL = 1e-12
+# Addition to a shape, in units of its trace, with which points are tested against a flat one.
+_FLAT_RTOL = 1e-13
+# Enlargement of the bounds and of the shape's diagonal that covers rounding.
+BOUND_MARGIN = 1e-12
+EPS = float(np.finfo(np.float64).eps)
+
+
+@dataclass(frozen=True, eq=False)
+class Ellipsoid:
+    """An ellipsoid, flat ones and points included.
+
+    Attributes
+    ----------
+    centre : ndarray, shape (n,)
+    shape : ndarray, shape (n, n)
+        H, symmetric positive semidefinite: its eigenvalues are the squared semi-axes.
+
+    Raises
+    ------
+    ValueError
+        The sizes do not match, a number is not finite, or the shape is not symmetric positive semidefinite.
+    """
+
+    centre: FloatArray
+    shape: FloatArray
+
+    def __post_init__(self) -> None:
+        centre = np.array(self.centre, dtype=np.float64)
+        if centre.ndim != 1 or centre.size == 0 or not np.isfinite(centre).all():
+            raise ValueError(f"Input centre must be a vector of finite numbers; instead received {self.centre}.")
+        object.__setattr__(self, "centre", centre)
+        object.__setattr__(self, "shape", shape_matrix(self.shape, centre.size))
+
+    @property
+    def n(self) -> int:
+        """Dimension of the space."""
+        return int(self.centre.size)
+
+    @property
+    def trace(self) -> float:
+        """Sum of the squared semi-axes."""
+        return float(np.trace(self.shape))
+
+    @property
+    def semi_axes(self) -> FloatArray:
+        """Lengths of the semi-axes, largest first, shape (n,)."""
+        return np.sqrt(np.maximum(np.linalg.eigvalsh(self.shape)[::-1], 0.0))
+
+    @property
+    def half_widths(self) -> FloatArray:
+        """Half-widths of the box around the ellipsoid, √H_ii, shape (n,)."""
+        return np.sqrt(np.diagonal(self.shape))
+
+    def support(self, direction: ArrayLike) -> FloatArray:
+        """Largest lᵀx of its points, for directions l of shape (..., n)."""
+        direction = np.asarray(direction, dtype=np.float64)
+        squared = np.einsum("...i,ij,...j->...", direction, self.shape, direction)
+        value: FloatArray = direction @ self.centre + np.sqrt(np.maximum(squared, 0.0))
+        return value
+
+    def form(self, points: ArrayLike) -> FloatArray:
+        """Quadratic form of points, see :func:`quadratic_form`.
+
+        Parameters
+        ----------
+        points : array_like, shape (..., n)
+
+        Returns
+        -------
+        ndarray, shape (...)
+            At most 1 inside.
+        """
+        return quadratic_form(self.centre, self.shape, points)
+
+    def contains(self, points: ArrayLike, tolerance: float = 1e-9) -> BoolArray:
+        """Whether the form of points, shape (..., n), is at most 1 + tolerance."""
+        inside: BoolArray = self.form(points) <= 1.0 + tolerance
+        return inside
+
+
+def quadratic_form(centres: ArrayLike, shapes: ArrayLike, points: ArrayLike) -> FloatArray:
+    """(x - x̃)ᵀ (H + 1e-13 tr(H) I)⁻¹ (x - x̃): the addition keeps flat ellipsoids invertible.
+
+    Parameters
+    ----------
+    centres : array_like, shape (..., n)
+    shapes : array_like, shape (..., n, n)
+    points : array_like, shape (..., n)
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Of an ellipsoid that is a point: 0 there and infinite elsewhere.
+    """
+    shapes = np.asarray(shapes, dtype=np.float64)
+    offset = np.asarray(points, dtype=np.float64) - np.asarray(centres, dtype=np.float64)
+    trace = np.trace(shapes, axis1=-2, axis2=-1)
+    is_point = trace == 0.0
+    margin = np.where(is_point, 1.0, _FLAT_RTOL * trace)
+    regular = shapes + margin[..., None, None] * np.eye(shapes.shape[-1])
+    solved = np.linalg.solve(regular, offset[..., None])[..., 0]
+    form = np.sum(offset * solved, axis=-1)
+    value: FloatArray = np.where(is_point & (form > 0.0), np.inf, form)
+    return value
+
+
+def transformed(ellipsoid: Ellipsoid, A: ArrayLike, offset: ArrayLike = 0.0) -> Ellipsoid:
+    """Ellipsoid of all A x + offset.
+
+    Parameters
+    ----------
+    ellipsoid : Ellipsoid
+    A : array_like, shape (m, n)
+        May be singular or map to another dimension.
+    offset : array_like, shape (m,)
+
+    Returns
+    -------
+    Ellipsoid
+        Exact but for an addition of some eps, which covers rounding: a flat or tiny ellipsoid would lose its points to
+        it.
+    """
+    A, offset = np.asarray(A, dtype=np.float64), np.asarray(offset, dtype=np.float64)
+    # An entry of A H Aᵀ is known to n eps r_i r_j, see the notes of intersect_strip.
+    reach = np.abs(A) @ np.sqrt(np.diagonal(ellipsoid.shape))
+    shape = A @ ellipsoid.shape @ A.T + 4.0 * ellipsoid.n * EPS * np.diag(reach**2)
+    size = np.abs(A) @ np.abs(ellipsoid.centre) + np.abs(offset)
+    return Ellipsoid(A @ ellipsoid.centre + offset, _around_rounded(_symmetric(shape), size))
+
+
+def minimum_trace_sum(H: FloatArray, Q: FloatArray) -> FloatArray:
+    r"""Shape of the ellipsoid of least trace around the sum of two ellipsoids.
+
+    :math:`(1 + 1/k) Q + (1 + k) H` with :math:`k^2 = \mathrm{tr} Q / \mathrm{tr} H`; its trace is
+    :math:`(\sqrt{\mathrm{tr} H} + \sqrt{\mathrm{tr} Q})^2`.
+
+    Parameters
+    ----------
+    H, Q : ndarray, shape (n, n)
+        Positive semidefinite; either may be zero or of low rank.
+
+    Returns
+    -------
+    ndarray, shape (n, n)
+    """
+    trace_H, trace_Q = float(np.trace(H)), float(np.trace(Q))
+    if trace_Q == 0.0:
+        return H
+    if trace_H == 0.0:
+        return Q
+    # Of the roots, not of the traces: these may differ by more than a number can hold.
+    k = math.sqrt(trace_Q) / math.sqrt(trace_H)
+    return (1.0 + 1.0 / k) * Q + (1.0 + k) * H
+
+
+def sum_with_ellipsoid(ellipsoid: Ellipsoid, Q: ArrayLike) -> Ellipsoid:
+    """Ellipsoid of least trace around all x + w with wᵀ Q⁻¹ w ≤ 1.
+
+    Parameters
+    ----------
+    ellipsoid : Ellipsoid
+    Q : array_like, shape (n, n)
+        Positive semidefinite, singular ones as in :class:`Ellipsoid`.
+
+    Returns
+    -------
+    Ellipsoid
+
+    Raises
+    ------
+    ValueError
+        Q is not symmetric positive semidefinite.
+    """
+    added = shape_matrix(Q, ellipsoid.n, "Q")
+    return Ellipsoid(ellipsoid.centre, minimum_trace_sum(ellipsoid.shape, added))
+
+
+def sum_with_segment(ellipsoid: Ellipsoid, direction: ArrayLike, half_length: float) -> Ellipsoid:
+    r"""Ellipsoid of least trace around all x + f η with \|η\| ≤ d.
+
+    Parameters
+    ----------
+    ellipsoid : Ellipsoid
+    direction : array_like, shape (n,)
+        f; only its direction counts.
+    half_length : float
+        d, positive.
+
+    Returns
+    -------
+    Ellipsoid
+
+    Raises
+    ------
+    ValueError
+        The direction has no length, or half_length is not positive.
+    """
+    return Ellipsoid(
+        ellipsoid.centre, minimum_trace_sum(ellipsoid.shape, segment_shape(direction, half_length, ellipsoid.n))
+    )
+
+
+def segment_shape(direction: ArrayLike, half_length: float, n: int) -> FloatArray:
+    """Shape d² f fᵀ of rank one of the segment from -d f to d f, f of length 1; see :func:`sum_with_segment`."""
+    f = unit_direction(direction, n)
+    d = positive_bound(half_length, "half_length")
+    return d * d * np.outer(f, f)
+
+
+class Outcome(IntEnum):
+    """What a reading did to an ellipsoid."""
+
+    UNINFORMATIVE = 0
+    REDUCED = 1
+    INCONSISTENT = 2
+
+
+@dataclass(frozen=True, eq=False)
+class StripUpdate:
+    """Result of a reading.
+
+    Attributes
+    ----------
+    ellipsoid : Ellipsoid
+        Contains what the strip leaves of the ellipsoid before; the same where the outcome is not ``REDUCED``.
+    outcome : Outcome
+        ``INCONSISTENT`` where strip and ellipsoid have no point in common.
+    """
+
+    ellipsoid: Ellipsoid
+    outcome: Outcome
+
+
+def intersect_strip(
+    ellipsoid: Ellipsoid, direction: ArrayLike, value: float, bound: float, rule: StepRule = "optimal"
+) -> StripUpdate:
+    r"""Ellipsoid around its intersection with the strip \|y - hᵀx\| ≤ c.
+
+    Parameters
+    ----------
+    ellipsoid : Ellipsoid
+    direction : array_like, shape (n,)
+        h, of any length but zero.
+    value : float
+        y, the reading.
+    bound : float
+        c, the largest error of the reading, positive.
+    rule : {'optimal', 'tightened', 'lemma'}
+        ``optimal`` has the least trace for the strip as it is; ``tightened`` first narrows the strip to where it
+        touches the ellipsoid, which usually gives the smallest set (2 % above the true minimum in the plane, on
+        average); ``lemma`` is the source paper's simplified step.
+
+    Returns
+    -------
+    StripUpdate
+
+    Raises
+    ------
+    ValueError
+        The direction has no length, the reading is not finite, the bound is not positive, or there is no such rule.
+
+    Notes
+    -----
+    See :mod:`adcs.ellipsoids.strip`. In one dimension the intersection of two intervals is an interval, and every rule
+    gives it.
+
+    Rounding is covered. With r = Σ \|h_i\| √H_ii, the largest half-width that an ellipsoid in the same box could have
+    along h, e² is known to n eps r², and an entry of the cut shape to n eps (r/e)² √(H_ii H_jj); a matrix of entries
+    below √(H_ii H_jj) is below n diag(H). So some n eps (r/e)² diag(H) is added.
+    """
+    h = measurement_direction(direction, ellipsoid.n)
+    c = positive_bound(bound, "bound")
+    if rule not in STEP_RULES:
+        raise ValueError(f"Input rule must be one of {', '.join(STEP_RULES)}; instead received {rule!r}.")
+    if not math.isfinite(value):
+        raise ValueError(f"Input value must be finite; instead received {value}.")
+    x, H = ellipsoid.centre, ellipsoid.shape
+    Hh = H @ h
+    e2, trace = float(h @ Hh), ellipsoid.trace
+    e = math.sqrt(max(e2, 0.0))
+    nu = float(value - h @ x)
+    c += BOUND_MARGIN * c + 4.0 * EPS * (abs(value) + float(np.abs(h) @ np.abs(x)))
+    rounding = 4.0 * ellipsoid.n * EPS * float(np.abs(h) @ np.sqrt(np.diagonal(H))) ** 2
+    if abs(nu) > c + math.sqrt(max(e2, 0.0) + rounding):
+        return StripUpdate(ellipsoid, Outcome.INCONSISTENT)
+    if e2 <= UNSEEN_RTOL * trace * float(h @ h):
+        return StripUpdate(ellipsoid, Outcome.UNINFORMATIVE)
+    mu, delta = nu / e, c / e
+    if ellipsoid.n == 1:
+        if abs(mu) + 1.0 <= delta:
+            return StripUpdate(ellipsoid, Outcome.UNINFORMATIVE)
+        mu, delta = tightened_strip(mu, delta)
+        shape = _around_rounded(delta * delta * H, np.abs(x))
+        return StripUpdate(Ellipsoid(x + (mu / e) * Hh, shape), Outcome.REDUCED)
+    g = min(float(Hh @ Hh) / (e2 * trace), 1.0)
+    found = cut(mu, delta, g, rule)
+    margin = rounding / e2
+    if found is None or found[2] * (1.0 - found[1] * g + margin) >= 1.0:
+        return StripUpdate(ellipsoid, Outcome.UNINFORMATIVE)
+    mu, step, beta2 = found
+    shape = beta2 * (H - (step / e2) * np.outer(Hh, Hh) + margin * np.diag(np.diagonal(H)))
+    return StripUpdate(
+        Ellipsoid(x + step * (mu / e) * Hh, _around_rounded(_symmetric(shape), np.abs(x))), Outcome.REDUCED
+    )
+
+
+def shape_matrix(shape: ArrayLike, n: int, name: str = "shape") -> FloatArray:
+    """Symmetric copy of a positive semidefinite matrix, checked.
+
+    Parameters
+    ----------
+    shape : array_like, shape (n, n)
+    n : int
+    name : str
+        What an error calls it.
+
+    Returns
+    -------
+    ndarray, shape (n, n)
+
+    Raises
+    ------
+    ValueError
+        It is not of that size, not finite, not symmetric, or not positive semidefinite.
+    """
+    matrix = np.asarray(shape, dtype=np.float64)
+    if matrix.shape != (n, n) or not np.isfinite(matrix).all():
+        raise ValueError(f"Input {name} must be {n} by {n} finite numbers; instead received shape {matrix.shape}.")
+    scale = float(np.abs(matrix).max())
+    if np.abs(matrix - matrix.T).max() > _PSD_RTOL * scale:
+        raise ValueError(f"Input {name} must be symmetric; instead received {matrix.tolist()}.")
+    matrix = _symmetric(matrix)
+    smallest = float(np.linalg.eigvalsh(matrix)[0])
+    if smallest < -_PSD_RTOL * scale:
+        raise ValueError(
+            f"Input {name} must be positive semidefinite; instead received one with the eigenvalue {smallest:.3g}."
+        )
+    return matrix
+
+
+def measurement_direction(direction: ArrayLike, n: int) -> FloatArray:
+    """Direction of a reading, checked: shape (n,), finite and of a length that is not zero."""
+    h = np.asarray(direction, dtype=np.float64)
+    if h.shape != (n,) or not np.isfinite(h).all() or not h.any():
+        raise ValueError(
+            f"Input direction must be {n} finite numbers that are not all zero; instead received {h.tolist()}."
+        )
+    return h
+
+
+def unit_direction(direction: ArrayLike, n: int) -> FloatArray:
+    """Direction of length 1, checked as :func:`measurement_direction`."""
+    h = measurement_direction(direction, n)
+    h = h / np.abs(h).max()
+    unit: FloatArray = h / np.linalg.norm(h)
+    return unit
+
+
+def positive_bound(bound: float, name: str) -> float:
+    """Bound of a noise, checked: positive and finite."""
+    if not 0.0 < bound < math.inf:
+        raise ValueError(f"Input {name} must be positive and finite; instead received {bound}.")
+    return float(bound)
+
+
+def _around_rounded(shape: FloatArray, size: FloatArray) -> FloatArray:
+    """Shape that also holds what rounding of the centre, a sum of terms up to size (n,), moves out of it."""
+    return minimum_trace_sum(shape, np.diag(len(size) * (4.0 * EPS * size) ** 2))
+
+
+def _symmetric(matrix: FloatArray) -> FloatArray:
+    return 0.5 * (matrix + matrix.T)

@@ -1,0 +1,255 @@
+r"""Guaranteed observer of a linear system whose disturbances and reading errors are only bounded.
+
+.. math:: x_{j+1} = A x_j + u_j + w_j, \qquad y_j = H x_j + \xi_j
+
+with known inputs u, disturbances w in an ellipsoid (or a segment, see :func:`adcs.ellipsoids.ellipsoid.segment_shape`)
+around zero, and :math:`|\xi_i| \le c_i`. :func:`predict` and :func:`correct` carry the ellipsoid that contains the
+state for certain, one run at a time; :class:`EllipsoidBatch` does the same for many runs, compiled.
+
+A reading that contradicts the set shows that a bound was too small. Then the bound grows to the larger one of \|ν\| and
+1.5 times itself, and is kept; the set may be enlarged too. That repairs the compatibility, not the guarantee: a state
+that was lost before it showed may be outside of the set.
+
+Source: Pankratova, Sholokhov, Cybernetics and Systems Analysis 55(1), 2019; the factor and the enlargement are ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from adcs.ellipsoids.ellipsoid import (
+    Ellipsoid,
+    Outcome,
+    intersect_strip,
+    measurement_direction,
+    minimum_trace_sum,
+    positive_bound,
+    shape_matrix,
+    sum_with_ellipsoid,
+    transformed,
+)
+from adcs.ellipsoids.strip import STEP_RULES, StepRule
+from arrays.typing import FloatArray
+
+IntArray = NDArray[np.int64]
+INFLATION = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class BoundedSystem:
+    """A linear system with bounded noise.
+
+    Attributes
+    ----------
+    A : ndarray, shape (n, n)
+        Transition matrix; may be unstable.
+    disturbance : ndarray, shape (n, n)
+        Q, shape of the ellipsoid of the disturbances; of rank one for a segment, zero for none.
+    directions : ndarray, shape (m, n)
+        H, the measured direction of every channel.
+    bounds : ndarray, shape (m,)
+        c, the largest error of every channel, positive.
+
+    Raises
+    ------
+    ValueError
+        The sizes do not match, Q is not positive semidefinite, a direction has no length or a bound is not positive.
+    """
+
+    A: FloatArray
+    disturbance: FloatArray
+    directions: FloatArray
+    bounds: FloatArray
+
+    def __post_init__(self) -> None:
+        A = np.array(self.A, dtype=np.float64)
+        if A.ndim != 2 or A.shape[0] != A.shape[1] or A.size == 0 or not np.isfinite(A).all():
+            raise ValueError(f"Input A must be a square matrix of finite numbers; instead received shape {A.shape}.")
+        n = len(A)
+        directions = np.array([measurement_direction(h, n) for h in np.atleast_2d(self.directions)])
+        bounds = np.array([positive_bound(c, "bounds") for c in np.atleast_1d(self.bounds)])
+        if len(bounds) != len(directions):
+            raise ValueError(f"Input bounds must be {len(directions)} numbers; instead received {len(bounds)}.")
+        object.__setattr__(self, "A", A)
+        object.__setattr__(self, "disturbance", shape_matrix(self.disturbance, n, "disturbance"))
+        object.__setattr__(self, "directions", directions)
+        object.__setattr__(self, "bounds", bounds)
+
+    @property
+    def n(self) -> int:
+        """Dimension of the state."""
+        return len(self.A)
+
+    @property
+    def m(self) -> int:
+        """Number of channels."""
+        return len(self.directions)
+
+
+def predict(system: BoundedSystem, ellipsoid: Ellipsoid, known_input: ArrayLike = 0.0) -> Ellipsoid:
+    """Set of the next state: A x + u + w for all x and w of their ellipsoids.
+
+    Parameters
+    ----------
+    system : BoundedSystem
+    ellipsoid : Ellipsoid
+    known_input : array_like, shape (n,)
+        u.
+
+    Returns
+    -------
+    Ellipsoid
+    """
+    mapped = transformed(ellipsoid, system.A, known_input)
+    return Ellipsoid(mapped.centre, minimum_trace_sum(mapped.shape, system.disturbance))
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """Result of the readings of one instant.
+
+    Attributes
+    ----------
+    ellipsoid : Ellipsoid
+    bounds : ndarray, shape (m,)
+        Bounds that the readings do not contradict: to be used from now on.
+    resets : int
+        Channels that contradicted the set.
+    """
+
+    ellipsoid: Ellipsoid
+    bounds: FloatArray
+    resets: int
+
+
+def correct(
+    system: BoundedSystem,
+    ellipsoid: Ellipsoid,
+    readings: ArrayLike,
+    bounds: FloatArray,
+    *,
+    rule: StepRule = "optimal",
+    reinflation: FloatArray | None = None,
+) -> Correction:
+    """Set of the states that the readings of one instant allow, channel after channel.
+
+    Parameters
+    ----------
+    system : BoundedSystem
+    ellipsoid : Ellipsoid
+        Predicted set.
+    readings : array_like, shape (m,)
+        NaN where missing.
+    bounds : ndarray, shape (m,)
+        Bounds in force: ``system.bounds`` at first, then those of the correction before.
+    rule : {'optimal', 'tightened', 'lemma'}
+        See :func:`adcs.ellipsoids.ellipsoid.intersect_strip`.
+    reinflation : ndarray, shape (n, n), optional
+        Shape of an ellipsoid that is added to the set where a reading contradicts it.
+
+    Returns
+    -------
+    Correction
+    """
+    bounds, resets = bounds.copy(), 0
+    for channel, y in enumerate(np.atleast_1d(np.asarray(readings, dtype=np.float64))):
+        if np.isnan(y):
+            continue
+        h = system.directions[channel]
+        update = intersect_strip(ellipsoid, h, float(y), float(bounds[channel]), rule)
+        if update.outcome is Outcome.INCONSISTENT:
+            if reinflation is not None:
+                ellipsoid = sum_with_ellipsoid(ellipsoid, reinflation)
+            bounds[channel] = max(abs(float(y - h @ ellipsoid.centre)), INFLATION * bounds[channel])
+            resets += 1
+            update = intersect_strip(ellipsoid, h, float(y), float(bounds[channel]), rule)
+        ellipsoid = update.ellipsoid
+    return Correction(ellipsoid, bounds, resets)
+
+
+class EllipsoidBatch:
+    """Observers of many runs of one system, compiled; :func:`predict` and :func:`correct` for every run.
+
+    Parameters
+    ----------
+    system : BoundedSystem
+    start : Ellipsoid
+        Set of the first state.
+    n_runs : int
+    rule : {'optimal', 'tightened', 'lemma'}
+    reinflation : array_like, shape (n, n), optional
+        See :func:`correct`.
+
+    Attributes
+    ----------
+    centres : ndarray, shape (n_runs, n)
+    shapes : ndarray, shape (n_runs, n, n)
+    bounds : ndarray, shape (n_runs, m)
+        In force.
+    resets : ndarray of int, shape (n_runs,)
+        Contradictions so far.
+
+    Raises
+    ------
+    ValueError
+        The sizes do not match, the reinflation is not positive semidefinite, or there is no such rule.
+    """
+
+    def __init__(
+        self,
+        system: BoundedSystem,
+        start: Ellipsoid,
+        n_runs: int,
+        *,
+        rule: StepRule = "optimal",
+        reinflation: ArrayLike | None = None,
+    ) -> None:
+        if start.n != system.n:
+            raise ValueError(f"Input start must have {system.n} dimensions; instead received {start.n}.")
+        if rule not in STEP_RULES:
+            raise ValueError(f"Input rule must be one of {', '.join(STEP_RULES)}; instead received {rule!r}.")
+        self.system, self.rule = system, rule
+        added = np.zeros((system.n, system.n)) if reinflation is None else reinflation
+        self._reinflation = shape_matrix(added, system.n, "reinflation")
+        self.centres = np.tile(start.centre, (n_runs, 1))
+        self.shapes = np.tile(start.shape, (n_runs, 1, 1))
+        self.bounds = np.tile(system.bounds, (n_runs, 1))
+        self.resets: IntArray = np.zeros(n_runs, dtype=np.int64)
+
+    def __len__(self) -> int:
+        return len(self.centres)
+
+    def predict(self, known_inputs: ArrayLike = 0.0) -> None:
+        """Advance all sets by one step; known_inputs of shape (n_runs, n), or one (n,) for all runs."""
+        from adcs.ellipsoids import observer_compiled as ellipsoids
+
+        inputs = np.ascontiguousarray(np.broadcast_to(np.asarray(known_inputs, dtype=np.float64), self.centres.shape))
+        A, Q = self.system.A, self.system.disturbance
+        ellipsoids.over_runs(ellipsoids.predict, len(self), self.centres, self.shapes, A, Q, inputs)
+
+    def correct(self, readings: ArrayLike) -> None:
+        """Correct all sets by the readings of one instant, shape (n_runs, m), NaN where missing."""
+        from adcs.ellipsoids import observer_compiled as ellipsoids
+
+        shape = (len(self), self.system.m)
+        values = np.asarray(readings, dtype=np.float64)
+        if values.shape != shape or np.isinf(values).any():
+            raise ValueError(
+                f"Input readings must have shape {shape} and be finite or NaN; instead received shape {values.shape}."
+            )
+        ellipsoids.over_runs(
+            ellipsoids.correct,
+            len(self),
+            self.centres,
+            self.shapes,
+            self.bounds,
+            self.resets,
+            self.system.directions,
+            np.ascontiguousarray(values),
+            STEP_RULES.index(self.rule),
+            INFLATION,
+            self._reinflation,
+        )

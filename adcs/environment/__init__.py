@@ -1,0 +1,1 @@
+"""Orbit, Sun and geomagnetic field along the orbit."""

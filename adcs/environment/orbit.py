@@ -1,0 +1,184 @@
+"""Orbits around the Earth: a circle, or the elements of a real satellite.
+
+An orbit is anything with :meth:`Orbit.position_velocity_eci`. Positions and velocities are in the inertial frame of
+:mod:`adcs.frames`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from adcs.frames import Dates, Instants, R_eci_from_teme, instants, julian_dates, turned
+from arrays.typing import FloatArray
+
+MU_M3_S2 = 3.986004418e14
+"""Gravitational parameter of the Earth, WGS-84."""
+EARTH_RADIUS_M = 6_378_137.0
+"""Equatorial radius, WGS-84: altitudes of circular orbits are above it."""
+
+
+class Orbit(Protocol):
+    """Where a satellite is."""
+
+    def __hash__(self) -> int: ...
+
+    def position_velocity_eci(self, utc: Instants) -> tuple[FloatArray, FloatArray]:
+        """Position [m] and velocity [m/s] in eci, two arrays (..., 3), at instants of any shape (...)."""
+        ...
+
+
+@dataclass(frozen=True)
+class CircularOrbit:
+    """Circle around a point mass, whose plane stays.
+
+    Attributes
+    ----------
+    altitude_m : float
+        Above the equatorial radius, 6378.137 km.
+    inclination_rad, node_rad : float
+        Inclination to the equator of J2000 and right ascension of the ascending node.
+    epoch : datetime64
+        When the satellite is at ``latitude_argument_rad``, UTC.
+    latitude_argument_rad : float
+        Angle from the ascending node at the epoch.
+
+    Raises
+    ------
+    ValueError
+        The altitude is not positive, or a number is not finite.
+    """
+
+    altitude_m: float
+    inclination_rad: float
+    node_rad: float
+    epoch: np.datetime64
+    latitude_argument_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.altitude_m < math.inf:
+            raise ValueError(f"Input altitude_m must be positive and finite; instead received {self.altitude_m}.")
+        for name in ("inclination_rad", "node_rad", "latitude_argument_rad"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"Input {name} must be finite; instead received {getattr(self, name)}.")
+        object.__setattr__(self, "epoch", instants(self.epoch)[()])
+
+    @property
+    def radius_m(self) -> float:
+        """Distance from the Earth's centre."""
+        return EARTH_RADIUS_M + self.altitude_m
+
+    @property
+    def rate_rad_s(self) -> float:
+        """Mean motion n = √(μ/r³)."""
+        return math.sqrt(MU_M3_S2 / self.radius_m**3)
+
+    @property
+    def period_s(self) -> float:
+        """Time of one revolution."""
+        return 2.0 * math.pi / self.rate_rad_s
+
+    def position_velocity_eci(self, utc: Instants) -> tuple[FloatArray, FloatArray]:
+        """Position [m] and velocity [m/s] in eci: instants (...) -> two arrays (..., 3)."""
+        seconds = (instants(utc) - self.epoch).astype(np.float64) / 1e6
+        u = self.latitude_argument_rad + self.rate_rad_s * seconds
+        cos_node, sin_node = math.cos(self.node_rad), math.sin(self.node_rad)
+        cos_i, sin_i = math.cos(self.inclination_rad), math.sin(self.inclination_rad)
+        to_node = np.array([cos_node, sin_node, 0.0])
+        across = np.array([-sin_node * cos_i, cos_node * cos_i, sin_i])
+        cosine, sine = np.cos(u)[..., None], np.sin(u)[..., None]
+        position = self.radius_m * (cosine * to_node + sine * across)
+        velocity = self.radius_m * self.rate_rad_s * (cosine * across - sine * to_node)
+        return position, velocity
+
+
+def node_of_local_time(local_time_h: float, date: Dates) -> float:
+    """Right ascension of an ascending node that is crossed at a mean solar time, LTAN, on a date [rad, 0 to 2π].
+
+    The mean Sun is 12 h minus UT away from Greenwich, whose right ascension is the mean sidereal time.
+
+    Parameters
+    ----------
+    local_time_h : float
+        Local mean solar time at the node [h].
+    date : datetime, datetime64 or str
+        UTC.
+
+    Returns
+    -------
+    float
+    """
+    import erfa
+
+    day, fraction = julian_dates(instants(date))
+    greenwich = float(erfa.gmst82(day, fraction))
+    since_midnight = float(day + 0.5 + fraction) % 1.0
+    return (greenwich + 2.0 * math.pi * (local_time_h / 24.0 - since_midnight)) % (2.0 * math.pi)
+
+
+class Sgp4Orbit:
+    """Orbit of published two-line elements, by SGP4 (WGS-72, as the elements are made).
+
+    Parameters
+    ----------
+    line1, line2 : str
+        The two lines of the elements.
+
+    Raises
+    ------
+    ValueError
+        A line is malformed, or its checksum is wrong.
+    """
+
+    def __init__(self, line1: str, line2: str) -> None:
+        from sgp4.api import Satrec
+
+        for number, line in (("1", line1), ("2", line2)):
+            if len(line) < 69 or line[0] != number or line[68] != str(_checksum(line)):
+                raise ValueError(
+                    f"Input line{number} must be line {number} of two-line elements with a right checksum; "
+                    f"instead received {line!r}."
+                )
+        self._satellite = Satrec.twoline2rv(line1, line2)
+
+    @property
+    def epoch(self) -> np.datetime64:
+        """Of the elements, UTC."""
+        microseconds = round((self._satellite.jdsatepoch - 2_440_587.5 + self._satellite.jdsatepochF) * 86_400e6)
+        return np.datetime64(microseconds, "us")
+
+    def position_velocity_teme(self, utc: Instants) -> tuple[FloatArray, FloatArray]:
+        """Position [m] and velocity [m/s] in teme: instants (...) -> two arrays (..., 3).
+
+        Raises
+        ------
+        ValueError
+            SGP4 fails, as for a satellite that has decayed; the message has its reason.
+        """
+        from sgp4.api import SGP4_ERRORS
+
+        day, fraction = julian_dates(utc)
+        errors, position, velocity = self._satellite.sgp4_array(np.ravel(day), np.ravel(fraction))
+        if errors.any():
+            first = int(np.flatnonzero(errors)[0])
+            raise ValueError(
+                f"Input utc must be instants that SGP4 reaches; instead received {np.ravel(utc)[first]}: "
+                f"{SGP4_ERRORS[int(errors[first])]}."
+            )
+        shape = (*np.shape(utc), 3)
+        return 1e3 * position.reshape(shape), 1e3 * velocity.reshape(shape)
+
+    def position_velocity_eci(self, utc: Instants) -> tuple[FloatArray, FloatArray]:
+        """Position [m] and velocity [m/s] in eci, as :meth:`position_velocity_teme`."""
+        utc = instants(utc)
+        rotation = R_eci_from_teme(utc)
+        position, velocity = self.position_velocity_teme(utc)
+        return turned(rotation, position), turned(rotation, velocity)
+
+
+def _checksum(line: str) -> int:
+    """Sum of the digits before the last place, a minus counting 1, modulo 10."""
+    return sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10

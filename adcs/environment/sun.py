@@ -1,0 +1,75 @@
+"""The Sun from an orbit around the Earth: where it is, and how much of it the Earth hides."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adcs.environment.orbit import EARTH_RADIUS_M
+from adcs.frames import Instants, terrestrial_dates
+from arrays.typing import FloatArray
+
+SUN_RADIUS_M = 695_700e3
+"""Nominal solar radius, IAU 2015."""
+ASTRONOMICAL_UNIT_M = 149_597_870_700.0
+_SPEED_OF_LIGHT_AU_DAY = 173.144632674
+
+
+def sun_position_eci(utc: Instants) -> FloatArray:
+    """Apparent position of the Sun from the Earth's centre in eci [m]; the annual aberration is in it.
+
+    Parameters
+    ----------
+    utc : ndarray of datetime64, shape (...)
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Good to some arc seconds from 1900 to 2100 (erfa's series of the Earth's orbit; TT stands for TDB).
+    """
+    import erfa
+
+    heliocentric, barycentric = erfa.epv00(*terrestrial_dates(utc))
+    distance = np.linalg.norm(heliocentric["p"], axis=-1)
+    direction = -heliocentric["p"] / distance[..., None]
+    velocity = barycentric["v"] / _SPEED_OF_LIGHT_AU_DAY
+    contraction = np.sqrt(1.0 - np.sum(velocity * velocity, axis=-1))
+    apparent: FloatArray = erfa.ab(direction, velocity, distance, contraction)
+    return ASTRONOMICAL_UNIT_M * distance[..., None] * apparent
+
+
+def illuminated_fraction(position_eci_m: ArrayLike, sun_position_eci_m: ArrayLike) -> FloatArray:
+    r"""Part of the Sun's disc that the Earth, a sphere of its equatorial radius without air, leaves to be seen.
+
+    Both are circles on the sky, of angular radii a (Sun) and b (Earth) and c apart; the hidden part is the lens that
+    two circles have in common, over :math:`\pi a^2`.
+
+    Parameters
+    ----------
+    position_eci_m : array_like, shape (..., 3)
+        Of the satellite, outside of the Earth.
+    sun_position_eci_m : array_like, shape (..., 3)
+
+    Returns
+    -------
+    ndarray, shape (...)
+        1 in the sunlight, 0 in the umbra, between them in the penumbra.
+
+    References
+    ----------
+    O. Montenbruck, E. Gill, Satellite Orbits, 3.4.2.
+    """
+    position = np.asarray(position_eci_m, dtype=np.float64)
+    to_sun = np.asarray(sun_position_eci_m, dtype=np.float64) - position
+    sun_distance, radius = np.linalg.norm(to_sun, axis=-1), np.linalg.norm(position, axis=-1)
+    a = np.arcsin(np.minimum(SUN_RADIUS_M / sun_distance, 1.0))
+    b = np.arcsin(np.minimum(EARTH_RADIUS_M / radius, 1.0))
+    c = np.arccos(np.clip(-np.sum(position * to_sun, axis=-1) / (radius * sun_distance), -1.0, 1.0))
+    # Distance of the common chord from the Sun's centre; clipped where the circles do not cross.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = np.clip((c * c + a * a - b * b) / (2.0 * c), -a, a)
+    y = np.sqrt(np.clip(a * a - x * x, 0.0, None))
+    lens = a * a * np.arccos(x / a) + b * b * np.arcsin(np.clip(y / b, 0.0, 1.0)) - c * y
+    partly = 1.0 - lens / (np.pi * a * a)
+    whole = np.where(c >= a + b, 1.0, np.where(c <= b - a, 0.0, 1.0 - (b / a) ** 2))
+    return np.where((np.abs(a - b) < c) & (c < a + b), partly, whole)

@@ -1,0 +1,1 @@
+"""Files of :mod:`adcs`: scenarios, telemetry, estimates, recordings."""

@@ -1,0 +1,83 @@
+"""Trials of the BROAD benchmark, and errors of an attitude as it defines them.
+
+Source: D. Laidig, M. Caruso, A. Cereatti, T. Seel, BROAD - A Benchmark for Robust Inertial Orientation Estimation,
+Data 6(7), 2021.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from adcs import quaternion
+from adcs.complementary.inertial_magnetic import InertialMagneticRecord
+from arrays.typing import BoolArray, FloatArray
+
+
+@dataclass(frozen=True)
+class OrientationErrors:
+    """Root mean squares of an attitude's errors [rad], as the BROAD benchmark defines them."""
+
+    total: float
+    heading: float
+    inclination: float
+
+
+def orientation_errors(q: FloatArray, q_true: FloatArray, counted: BoolArray) -> OrientationErrors:
+    """Errors where they are counted and the truth is known: angle, its part around the vertical, and the rest.
+
+    Parameters
+    ----------
+    q, q_true : ndarray, shape (n, 4)
+        East, north, up from body; NaN where the truth is unknown.
+    counted : ndarray of bool, shape (n,)
+    """
+    known = counted & np.isfinite(q_true).all(axis=1)
+    error = quaternion.multiply(q[known], quaternion.conjugate(quaternion.normalised(q_true[known])))
+    w, x, y, z = np.abs(error).T
+    angles = (
+        2.0 * np.arctan2(np.sqrt(x * x + y * y + z * z), w),
+        2.0 * np.arctan2(z, w),
+        2.0 * np.arctan2(np.hypot(x, y), np.hypot(w, z)),
+    )
+    return OrientationErrors(*(float(np.sqrt(np.mean(angle**2))) for angle in angles))
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A recording with optical truth.
+
+    Attributes
+    ----------
+    record : InertialMagneticRecord
+    q_true : ndarray, shape (n, 4)
+        East, north, up from body, NaN where unknown.
+    position_m : ndarray, shape (n, 3)
+        NaN where unknown.
+    moving : ndarray of bool, shape (n,)
+        Where errors are counted.
+    """
+
+    record: InertialMagneticRecord
+    q_true: FloatArray
+    position_m: FloatArray
+    moving: BoolArray
+
+
+def read_broad(path: Path) -> Trial:
+    """Read a trial of the BROAD benchmark, a MAT file.
+
+    Raises
+    ------
+    OSError
+        The file cannot be read.
+    """
+    from scipy.io import loadmat
+
+    content = loadmat(path)
+    record = InertialMagneticRecord(
+        1.0 / float(content["sampling_rate"].item()), content["imu_gyr"], content["imu_acc"], 1e-6 * content["imu_mag"]
+    )
+    return Trial(record, content["opt_quat"], content["opt_pos"], content["movement"].ravel().astype(bool))

@@ -1,0 +1,413 @@
+r"""Which sensors a filter has, what it estimates besides attitude and rate, and the process noise that suits them.
+
+The error state is (δq, δω, Δb, Δω, d): vector part of the quaternion's error, rate, bias of the magnetometer, bias of
+the gyro, disturbing acceleration; the last three where the set has them, always in this order.
+
+==================  ===========================================  =============================================
+set                 optional states                              what the source's tables call it
+==================  ===========================================  =============================================
+st+gyro+mag+sun                                                  ST+G+M+S
+st+gyro+mag                                                      ST+G+M
+st+mag+sun                                                       ST+M+S
+st+mag              field-bias                                   ST+M, Δb
+st+gyro             none, gyro-bias                              ST+G; ST+G, Δω
+st                                                               ST
+mag+sun+gyro        none, gyro-bias, field-bias                  Mag+Sun+G; with Δω; with Δb
+mag+sun                                                          Mag+Sun
+mag+gyro                                                         Mag+G
+==================  ===========================================  =============================================
+
+``disturbance`` may be added to every one of them.
+
+Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014, Tables 3 to 5. Its exponents are lost
+or unsure: those of :func:`paper_noise` are ours, found from what the filter then reaches.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from arrays.typing import FloatArray
+
+SENSORS = ("st", "gyro", "mag", "sun")
+STATES = ("field-bias", "gyro-bias", "disturbance")
+"""Optional states in the order of the error state."""
+ALWAYS = 6
+"""Numbers of attitude and rate, which every filter has."""
+
+
+@dataclass(frozen=True)
+class SensorSet:
+    """Sensors in use and optional states; made by :func:`sensor_set`, which checks them.
+
+    Attributes
+    ----------
+    star, gyro, magnetometer, sun : bool
+        Sensors.
+    field_bias, gyro_bias, disturbance : bool
+        States.
+    """
+
+    star: bool = False
+    gyro: bool = False
+    magnetometer: bool = False
+    sun: bool = False
+    field_bias: bool = False
+    gyro_bias: bool = False
+    disturbance: bool = False
+
+    @property
+    def sensors(self) -> str:
+        """Names of the sensors, such as ``"st+gyro"``."""
+        used = (self.star, self.gyro, self.magnetometer, self.sun)
+        return "+".join(name for name, one in zip(SENSORS, used, strict=True) if one)
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the optional states."""
+        used = (self.field_bias, self.gyro_bias, self.disturbance)
+        return tuple(name for name, one in zip(STATES, used, strict=True) if one)
+
+    @property
+    def size(self) -> int:
+        """Numbers of the error state."""
+        return ALWAYS + 3 * len(self.states)
+
+    def first_of(self, state: str) -> int:
+        """Where an optional state begins in the error state; -1 where the set does not have it."""
+        return ALWAYS + 3 * self.states.index(state) if state in self.states else -1
+
+    @property
+    def vectors(self) -> int:
+        """Directions in use that are measured without the star tracker."""
+        return int(self.magnetometer) + int(self.sun)
+
+
+def sensor_set(sensors: str, states: Iterable[str] = ()) -> SensorSet:
+    """Set of sensors and states by their names.
+
+    Parameters
+    ----------
+    sensors : str
+        Names of :data:`SENSORS` in any order with + between them.
+    states : iterable of str
+        Names of :data:`STATES` in any order.
+
+    Returns
+    -------
+    SensorSet
+
+    Raises
+    ------
+    ValueError
+        A name is unknown or comes twice, a state belongs to a sensor that is not there, or the sensors cannot observe
+        attitude; the sentence says what is missing.
+    """
+    names = [name.strip().lower() for name in sensors.split("+")]
+    optional = [state.strip().lower() for state in states]
+    for given, known, what in ((names, SENSORS, "sensors"), (optional, STATES, "states")):
+        unknown = [name for name in given if name not in known]
+        if unknown or len(set(given)) != len(given):
+            raise ValueError(
+                f"Input {what} must be different names of {', '.join(known)}; instead received {'+'.join(given)!r}."
+            )
+    used = SensorSet(
+        star="st" in names,
+        gyro="gyro" in names,
+        magnetometer="mag" in names,
+        sun="sun" in names,
+        field_bias="field-bias" in optional,
+        gyro_bias="gyro-bias" in optional,
+        disturbance="disturbance" in optional,
+    )
+    check_observable(used)
+    return used
+
+
+def check_observable(used: SensorSet) -> None:
+    """Raise where a set cannot observe attitude, or a state that it has.
+
+    A direction leaves the rotation about it open. The field turns along the orbit, and with a gyro that closes the gap;
+    the Sun stays where it is, so that no time helps there. A magnetometer alone, with the known motion, finds attitude
+    to a degree after a whole orbit; it is refused as well.
+
+    Parameters
+    ----------
+    used : SensorSet
+
+    Raises
+    ------
+    ValueError
+    """
+    if used.gyro_bias and not used.gyro:
+        raise ValueError("Input states must not have gyro-bias without a gyro; add gyro to the sensors.")
+    if used.field_bias and not used.magnetometer:
+        raise ValueError("Input states must not have field-bias without a magnetometer; add mag to the sensors.")
+    if used.star or (used.magnetometer and (used.sun or used.gyro)):
+        return
+    seen, missing = "nothing measures attitude", "a star tracker (st), or mag with sun or gyro"
+    if used.sun:
+        seen = "the Sun sensor leaves the rotation about the Sun open"
+        missing = "a star tracker (st) or a magnetometer (mag)"
+    elif used.magnetometer:
+        seen = "the magnetometer leaves the rotation about the field open for an orbit"
+        missing = "a star tracker (st), a Sun sensor (sun) or a gyro"
+    raise ValueError(
+        f"Input sensors must observe attitude; instead received {used.sensors!r}: {seen}; missing is {missing}."
+    )
+
+
+@dataclass(frozen=True)
+class ProcessNoise:
+    """Standard deviations that every step of the filter adds to each component of the error state.
+
+    Attributes
+    ----------
+    attitude : float
+        q_λ, of the vector part of the quaternion.
+    rate_rad_s : float
+        q_ω.
+    field_bias_T : float
+        q_b.
+    gyro_bias_rad_s : float
+        q_g.
+    disturbance_s2 : float
+        q_d.
+
+    Raises
+    ------
+    ValueError
+        One is negative or not finite.
+    """
+
+    attitude: float
+    rate_rad_s: float
+    field_bias_T: float = 1e-9
+    gyro_bias_rad_s: float = 1e-8
+    disturbance_s2: float = 1e-8
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f"Input {name} must be 0 or more and finite; instead received {value}.")
+
+
+def tuned_noise(used: SensorSet) -> ProcessNoise:
+    """Process noise with which the filter is accurate and its covariance true, for a constant torque of 8e-7 N·m.
+
+    Parameters
+    ----------
+    used : SensorSet
+
+    Returns
+    -------
+    ProcessNoise
+    """
+    if used.disturbance:
+        # The torque is in the state: what is left for the rate is almost nothing.
+        if used.star and not used.gyro_bias:
+            return ProcessNoise(1e-8, 1e-8, disturbance_s2=3e-8)
+        return ProcessNoise(1e-8, 1e-7, disturbance_s2=1e-8)
+    # The torque moves the rate by up to 1.5e-6 rad/s a step. A star tracker sees that within seconds; vectors average
+    # over minutes, in which a constant torque is far from white: ten times as much keeps the covariance true.
+    return ProcessNoise(1e-8, 1.5e-6) if used.star else ProcessNoise(1e-8, 1.5e-5)
+
+
+PAPER_NOISE: dict[tuple[str, tuple[str, ...]], ProcessNoise] = {
+    # Table 3. Mantissas are printed, exponents ours. Biases of the field are printed for a field of unit length: they
+    # are multiplied by 40 µT here.
+    ("st+gyro+mag+sun", ()): ProcessNoise(1e-5, 1.2e-6),
+    ("st+gyro+mag", ()): ProcessNoise(1e-5, 1.2e-6),
+    ("st+gyro", ()): ProcessNoise(1e-5, 1.2e-6),
+    ("st+mag+sun", ()): ProcessNoise(1e-5, 1.2e-6),
+    ("st+mag", ("field-bias",)): ProcessNoise(1e-5, 1.2e-6, field_bias_T=40e-9),
+    ("st+gyro", ("gyro-bias",)): ProcessNoise(1e-5, 1.2e-6, gyro_bias_rad_s=1e-5),
+    ("gyro+mag+sun", ()): ProcessNoise(5e-6, 5e-4),
+    ("gyro+mag+sun", ("gyro-bias",)): ProcessNoise(1e-6, 3e-4, gyro_bias_rad_s=1e-6),
+    ("gyro+mag+sun", ("field-bias",)): ProcessNoise(5e-6, 3e-4, field_bias_T=20e-9),
+    ("mag+sun", ()): ProcessNoise(5e-3, 2e-5),
+    ("gyro+mag", ()): ProcessNoise(1e-4, 5e-4),
+    ("st", ()): ProcessNoise(1e-5, 1.2e-6),
+    # Table 4.
+    ("st", ("disturbance",)): ProcessNoise(3e-7, 3e-7, disturbance_s2=5e-9),
+    ("st+gyro", ("gyro-bias", "disturbance")): ProcessNoise(3e-7, 3e-7, gyro_bias_rad_s=1e-8, disturbance_s2=5e-9),
+    ("mag+sun", ("disturbance",)): ProcessNoise(1e-5, 5e-6, disturbance_s2=5e-8),
+    ("gyro+mag+sun", ("gyro-bias", "disturbance")): ProcessNoise(1e-6, 3e-6, gyro_bias_rad_s=1e-7, disturbance_s2=5e-8),
+}
+
+
+def paper_noise(used: SensorSet) -> ProcessNoise:
+    """Process noise of the source's tables.
+
+    Parameters
+    ----------
+    used : SensorSet
+
+    Returns
+    -------
+    ProcessNoise
+
+    Raises
+    ------
+    ValueError
+        The tables do not have this set.
+    """
+    try:
+        return PAPER_NOISE[used.sensors, used.states]
+    except KeyError:
+        raise ValueError(
+            f"Input used must be a set of the source's tables; instead received {used.sensors!r} with the states "
+            f"{list(used.states)}."
+        ) from None
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """What a filter is.
+
+    Attributes
+    ----------
+    sensors : SensorSet
+    noise : ProcessNoise
+    field_error_T : float
+        Standard deviation of each component of the field model's error, added to the magnetometer's noise.
+    field_bias_sigma_T, gyro_bias_sigma_rad_s, disturbance_sigma_s2 : float
+        Standard deviations of those states at the start, where they are zero.
+    """
+
+    sensors: SensorSet
+    noise: ProcessNoise
+    field_error_T: float = 0.0
+    field_bias_sigma_T: float = 1000e-9
+    gyro_bias_sigma_rad_s: float = 1e-3
+    disturbance_sigma_s2: float = 2e-6
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.field_error_T < np.inf:
+            raise ValueError(
+                f"Input field_error_T must be 0 or more and finite; instead received {self.field_error_T}."
+            )
+        for name in ("field_bias_sigma_T", "gyro_bias_sigma_rad_s", "disturbance_sigma_s2"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise ValueError(f"Input {name} must be positive and finite; instead received {getattr(self, name)}.")
+
+    @property
+    def process_variance(self) -> FloatArray:
+        """Diagonal of Q, shape (N,)."""
+        n = self.noise
+        by_state = {
+            "field-bias": n.field_bias_T,
+            "gyro-bias": n.gyro_bias_rad_s,
+            "disturbance": n.disturbance_s2,
+        }
+        deviations = [n.attitude, n.rate_rad_s, *(by_state[state] for state in self.sensors.states)]
+        return np.repeat(np.square(deviations), 3)
+
+    @property
+    def start_variance(self) -> FloatArray:
+        """Variances of the optional states at the start, shape (N - 6,)."""
+        by_state = {
+            "field-bias": self.field_bias_sigma_T,
+            "gyro-bias": self.gyro_bias_sigma_rad_s,
+            "disturbance": self.disturbance_sigma_s2,
+        }
+        return np.repeat(np.square([by_state[state] for state in self.sensors.states]), 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where the filter starts; the optional states start from zero.
+
+    Attributes
+    ----------
+    q, w : ndarray, shape (runs, 4), (runs, 3)
+    covariance : ndarray, shape (runs, 6, 6)
+        Of (δq, δω): δq is half of the angle.
+    """
+
+    q: FloatArray
+    w: FloatArray
+    covariance: FloatArray
+
+
+def start_near(q: FloatArray, w: FloatArray, attitude_rad: float, rate_rad_s: float) -> Start:
+    """Start from estimates with independent errors.
+
+    Parameters
+    ----------
+    q, w : ndarray, shape (runs, 4), (runs, 3)
+    attitude_rad, rate_rad_s : float
+        Standard deviations per axis, of the angle and of the rate.
+
+    Returns
+    -------
+    Start
+    """
+    variance = np.repeat(np.square([0.5 * attitude_rad, rate_rad_s]), 3)
+    return Start(np.array(q), np.array(w), np.tile(np.diag(variance), (len(q), 1, 1)))
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Estimate of all runs at one instant.
+
+    Attributes
+    ----------
+    q, w, field_bias_T, gyro_bias_rad_s, disturbance_s2 : ndarray, shape (runs, 4), then (runs, 3)
+        A state that the filter does not have is zero.
+    P : ndarray, shape (runs, N, N)
+        Covariance of the error state.
+    """
+
+    q: FloatArray
+    w: FloatArray
+    field_bias_T: FloatArray
+    gyro_bias_rad_s: FloatArray
+    disturbance_s2: FloatArray
+    P: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Estimates:
+    """Estimates at the n instants of some runs.
+
+    Attributes
+    ----------
+    settings : FilterSettings
+    q, w, field_bias_T, gyro_bias_rad_s, disturbance_s2 : ndarray, shape (runs, n, 4), then (runs, n, 3)
+        Attitude (orbital from body), rate against inertial space; a state that the filter does not have is zero.
+    covariance : ndarray, shape (runs, n, N, N)
+        Of the error state, see :mod:`adcs.kalman.error_state`; δq is half of the angle.
+    nis : ndarray, shape (runs, n, 4)
+        Normalised innovation squared of star tracker, gyro, magnetometer and Sun sensor, each given those before it;
+        NaN where there was no reading. It is a χ² of 3 numbers, of 2 for the Sun sensor.
+    """
+
+    settings: FilterSettings
+    q: FloatArray
+    w: FloatArray
+    field_bias_T: FloatArray
+    gyro_bias_rad_s: FloatArray
+    disturbance_s2: FloatArray
+    covariance: FloatArray
+    nis: FloatArray
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations of the error state, shape (runs, n, N)."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+    def at(self, row: int) -> State:
+        """Estimate of all runs at one instant."""
+        return State(
+            self.q[:, row],
+            self.w[:, row],
+            self.field_bias_T[:, row],
+            self.gyro_bias_rad_s[:, row],
+            self.disturbance_s2[:, row],
+            self.covariance[:, row],
+        )

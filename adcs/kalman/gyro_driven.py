@@ -1,0 +1,115 @@
+r"""Filter of attitude and gyro bias alone, (δq, δΔω): the gyro is its input, not a measurement.
+
+.. math::
+
+    \dot q = \tfrac12\, q\circ(0, \hat\omega - A\omega_o), \quad \hat\omega = \omega_m - \Delta\hat\omega, \qquad
+    F = \begin{pmatrix} -W(\hat\omega) & -\tfrac12 E \\ 0 & 0 \end{pmatrix}
+
+It needs no inertia, no wheels and no torque. The rate over a step is the mean of the readings at its two ends; in
+place of a reading that is missing stands the last one before it. The rate has the noise of the gyro.
+
+Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014, Table 5, row [λ, Δω].
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from adcs import quaternion
+from adcs.kalman.error_state import Estimates, FilterSettings, Start, State
+from adcs.kalman.mekf import check_start, collected, joseph_update, nis_of, stacked_residuals
+from adcs.quaternion import cross_matrix
+from adcs.satellite.dynamics import relative_rate
+from adcs.satellite.telemetry import Record, is_read
+from arrays.typing import FloatArray
+
+
+def run_reduced(record: Record, settings: FilterSettings, start: Start) -> Estimates:
+    """Reduced filter of whole runs.
+
+    Parameters
+    ----------
+    record : Record
+    settings : FilterSettings
+        Of a set with a gyro, the state ``gyro-bias`` and no other. Its q_λ and q_g are used, the gyro's noise is added
+        to the attitude.
+    start : Start
+        Its attitude; the rate is the gyro's.
+
+    Returns
+    -------
+    Estimates
+        Of the set (δq, δω, δΔω): δω is minus the error of the bias, with the gyro's noise.
+
+    Raises
+    ------
+    ValueError
+        The set is another one, a run's first reading of the gyro is missing, or the start does not suit the record.
+    """
+    used = settings.sensors
+    if not used.gyro or used.states != ("gyro-bias",):
+        raise ValueError(
+            "Input settings must have a gyro and the state gyro-bias alone; "
+            f"instead received {used.sensors!r} with the states {list(used.states)}."
+        )
+    check_start(record, start)
+    rates = _filled(record.readings.gyro_rad_s)
+    h, gyro_rad_s = record.scenario.dt_s, record.scenario.gyro.sigma_rad_s
+    runs, n = rates.shape[:2]
+    Q = np.diag(
+        np.repeat([settings.noise.attitude**2 + (0.5 * gyro_rad_s * h) ** 2, settings.noise.gyro_bias_rad_s**2], 3)
+    )
+    others = replace(settings, sensors=replace(used, gyro=False, gyro_bias=False))
+    P = np.zeros((runs, 6, 6))
+    P[:, :3, :3], P[:, 3:, 3:] = start.covariance[:, :3, :3], settings.gyro_bias_sigma_rad_s**2 * np.eye(3)
+    q, bias, zero = start.q, np.zeros((runs, 3)), np.zeros((runs, 3))
+    states, nis = [], []
+    for row in range(n):
+        if row:
+            w = 0.5 * (rates[:, row - 1] + rates[:, row]) - bias
+            q, Phi = _moved(q, w, record.environment.orbital_rate_rad_s[:, row - 1], h)
+            P = Phi @ P @ Phi.mT + Q
+        state = State(q, rates[:, row] - bias, zero, zero, zero, P)
+        H, residual = stacked_residuals(record, row, state, others)
+        noise = H @ P @ H.mT + np.eye(H.shape[1])
+        nis.append(nis_of(noise, H, residual, others.sensors))
+        dx, P = joseph_update(P, H, residual)
+        q = quaternion.normalised(quaternion.multiply(q, quaternion.from_error_vector(dx[:, :3])))
+        bias = bias + dx[:, 3:]
+        whole = _with_rate(P, gyro_rad_s)
+        states.append(replace(state, q=q, w=rates[:, row] - bias, gyro_bias_rad_s=bias, P=whole))
+    return collected(settings, states, np.stack(nis, axis=1))
+
+
+def _moved(q: FloatArray, w: FloatArray, orbital_rate: FloatArray, h: float) -> tuple[FloatArray, FloatArray]:
+    """Attitude after a step at a constant rate, and Φ (runs, 6, 6)."""
+    relative = relative_rate(q, w, orbital_rate)
+    # The orbital frame turns on in the middle of the step.
+    half = quaternion.multiply(q, quaternion.exp(0.5 * h * relative))
+    turned = quaternion.multiply(q, quaternion.exp(h * relative_rate(half, w, orbital_rate)))
+    F = np.zeros((len(q), 6, 6))
+    F[:, :3, :3] = -cross_matrix(w)
+    F[:, :3, 3:] = -0.5 * np.eye(3)
+    step = F * h
+    squared = step @ step
+    return quaternion.normalised(turned), np.eye(6) + step + squared / 2.0 + squared @ step / 6.0
+
+
+def _with_rate(P: FloatArray, gyro_rad_s: float) -> FloatArray:
+    """Covariance (runs, 9, 9) of (δq, δω, δΔω) from that of (δq, δΔω): δω = noise - δΔω."""
+    full = np.zeros((9, 6))
+    full[:3, :3], full[3:6, 3:], full[6:, 3:] = np.eye(3), -np.eye(3), np.eye(3)
+    noise = np.zeros((9, 9))
+    noise[3:6, 3:6] = gyro_rad_s**2 * np.eye(3)
+    return full @ P @ full.T + noise
+
+
+def _filled(values: FloatArray) -> FloatArray:
+    """Readings (runs, n, 3) whose gaps hold the last one before them."""
+    seen = is_read(values)
+    if not seen[:, 0].all():
+        raise ValueError("Input record must have a reading of the gyro at the first instant of every run.")
+    last = np.maximum.accumulate(np.where(seen, np.arange(values.shape[1]), 0), axis=-1)
+    return np.take_along_axis(values, last[..., None], axis=1)

@@ -1,0 +1,168 @@
+r"""Where a filter starts when nobody knows the attitude.
+
+A multiplicative filter that starts tens of degrees off may never find back: its first corrections are linearised at
+the wrong place, and its covariance believes them. With a star tracker, or with two directions, the first readings fix
+the attitude (:func:`vector_start`, Wahba's problem by :meth:`scipy.spatial.transform.Rotation.align_vectors`). With one
+direction, or two that nearly coincide, the turn about it stays open: then filters start at all turns and the one whose
+innovations are smallest is taken (:func:`any_start`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adcs import quaternion
+from adcs.kalman.error_state import FilterSettings, Start
+from adcs.kalman.mekf import deviations, run_filter
+from adcs.quaternion import cross_matrix, rotate_back
+from adcs.satellite.dynamics import absolute_rate
+from adcs.satellite.telemetry import Record, is_read, part
+from arrays.typing import FloatArray
+
+RATE_RAD_S = math.radians(0.5)
+"""Standard deviation of the rate against the orbital frame, where there is no gyro."""
+AGAIN = 10.0
+"""Standard deviations of a start are those of its readings times this: the filter takes the same readings again."""
+KNOWN_RAD = math.radians(75.0)
+"""An attitude is known where no axis of its start has a larger standard deviation: 10° by the readings themselves."""
+_OPEN_RAD = 2.0
+"""Standard deviation of an axis of which nothing is known, about that of a uniform turn."""
+
+
+def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = RATE_RAD_S) -> Start:
+    """Start from the readings of the first instant alone.
+
+    Parameters
+    ----------
+    record : Record
+    settings : FilterSettings
+    rate_rad_s : float
+        Standard deviation of each component of the rate against the orbital frame; the gyro's reading is used where the
+        set has one.
+
+    Returns
+    -------
+    Start
+        The covariance tells where the readings leave a turn open: standard deviation 2 rad about it. Elsewhere it is
+        wider than the readings by :data:`AGAIN`.
+    """
+    used, readings, around = settings.sensors, record.readings, record.environment
+    sigma = deviations(record, settings)
+    b_orbital, b = around.b_orbital_T[:, 0], readings.field_T[:, 0]
+    length_T = np.linalg.norm(b_orbital, axis=-1)
+    runs = len(b)
+    seen_field = is_read(b) & used.magnetometer
+    seen_sun = is_read(readings.sun[:, 0]) & used.sun
+    q = np.tile(quaternion.IDENTITY, (runs, 1))
+    for run in np.flatnonzero(seen_field | seen_sun):
+        orbital = np.stack([b_orbital[run] / length_T[run], around.sun_orbital[run, 0]])
+        body = np.stack([b[run] / np.linalg.norm(b[run]), readings.sun[run, 0]])
+        weights = np.array([(length_T[run] / sigma[2]) ** 2, 1.0 / sigma[3] ** 2])
+        seen = np.array([seen_field[run], seen_sun[run]])
+        q[run] = _aligned(orbital[seen], body[seen], weights[seen])
+    seen_star = is_read(readings.star[:, 0]) & used.star
+    q[seen_star] = readings.star[seen_star, 0]
+    information = np.tile(np.eye(3) * (2.0 / _OPEN_RAD) ** 2, (runs, 1, 1))
+    for seen, v, noise in (
+        (seen_field, rotate_back(q, b_orbital), sigma[2]),
+        (seen_sun, rotate_back(q, around.sun_orbital[:, 0]), sigma[3]),
+    ):
+        H = 2.0 * cross_matrix(v) / (AGAIN * noise)
+        information[seen] += (H.mT @ H)[seen]
+    information[seen_star] += np.eye(3) / (AGAIN * sigma[0]) ** 2
+    w = absolute_rate(q, np.zeros((runs, 3)), around.orbital_rate_rad_s[:, 0])
+    rate_variance = np.full(runs, rate_rad_s**2)
+    if used.gyro:
+        read = is_read(readings.gyro_rad_s[:, 0])
+        w[read] = readings.gyro_rad_s[read, 0]
+        bias_rad_s = settings.gyro_bias_sigma_rad_s if used.gyro_bias else 0.0
+        rate_variance[read] = (AGAIN * sigma[1]) ** 2 + bias_rad_s**2
+    covariance = np.zeros((runs, 6, 6))
+    covariance[:, :3, :3] = np.linalg.inv(information)
+    covariance[:, 3:, 3:] = rate_variance[:, None, None] * np.eye(3)
+    return Start(quaternion.normalised(q), w, covariance)
+
+
+def largest_deviation_rad(start: Start) -> FloatArray:
+    """Largest standard deviation of an axis of every start's attitude, as an angle, shape (runs,)."""
+    return 2.0 * np.sqrt(np.linalg.eigvalsh(start.covariance[:, :3, :3])[:, -1])
+
+
+def any_start(
+    record: Record,
+    settings: FilterSettings,
+    turns: int = 36,
+    window_s: float = 300.0,
+    rate_rad_s: float = RATE_RAD_S,
+) -> Start:
+    """Start from any attitude: :func:`vector_start`, and where it leaves a turn open the best of several hypotheses.
+
+    Parameters
+    ----------
+    record : Record
+    settings : FilterSettings
+    turns : int
+        Hypotheses, at equal angles about the axis that is left open.
+    window_s : float
+        How much of the record decides between them.
+    rate_rad_s : float
+        As :func:`vector_start`.
+
+    Returns
+    -------
+    Start
+        Where a hypothesis was chosen, the deviation about the open axis is the distance between hypotheses.
+
+    Raises
+    ------
+    ValueError
+        A run has neither attitude nor direction at its first instant, so that there is no axis to turn about.
+    """
+    start = vector_start(record, settings, rate_rad_s)
+    open_runs = np.flatnonzero(largest_deviation_rad(start) > KNOWN_RAD)
+    # The first reading of a star tracker corrects any attitude: its residual is exact, not linearised.
+    if settings.sensors.star or not open_runs.size:
+        return start
+    variances, axes = np.linalg.eigh(start.covariance[open_runs, :3, :3])
+    if (2.0 * np.sqrt(variances[:, 1]) > KNOWN_RAD).any():
+        raise ValueError("Input record must have a direction at the first instant of every run; one has none.")
+    n = 1 + round(min(window_s / record.scenario.dt_s, record.momentum_Nms.shape[1] - 1))
+    spacing = 2.0 * math.pi / turns
+    angles = spacing * np.arange(turns)
+    repeated = np.repeat(open_runs, turns)
+    turn = quaternion.exp(angles[None, :, None] * axes[:, None, :, 2])
+    hypotheses = _narrowed(start, repeated, np.repeat(axes[..., 2], turns, axis=0), spacing)
+    hypotheses = replace(
+        hypotheses, q=quaternion.multiply(start.q[open_runs, None], turn).reshape(-1, 4), w=start.w[repeated]
+    )
+    tried = run_filter(part(record, repeated, slice(n)), settings, hypotheses)
+    best = np.nansum(tried.nis, axis=(1, 2)).reshape(-1, turns).argmin(axis=-1) + turns * np.arange(len(open_runs))
+    q, w, covariance = start.q.copy(), start.w.copy(), start.covariance.copy()
+    q[open_runs], w[open_runs] = hypotheses.q[best], hypotheses.w[best]
+    covariance[open_runs] = hypotheses.covariance[best]
+    return Start(q, w, covariance)
+
+
+def _narrowed(start: Start, runs: NDArray[np.intp], axis: FloatArray, deviation_rad: float) -> Start:
+    """Runs of a start with another standard deviation about an axis (m, 3), an eigenvector of the covariance."""
+    covariance = start.covariance[runs].copy()
+    across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
+    along = (0.5 * deviation_rad) ** 2 * axis[:, :, None] * axis[:, None, :]
+    covariance[:, :3, :3] = across @ covariance[:, :3, :3] @ across + along
+    return Start(start.q[runs], start.w[runs], covariance)
+
+
+def _aligned(orbital: FloatArray, body: FloatArray, weights: FloatArray) -> FloatArray:
+    """Quaternion, orbital from body, of one or two directions (k, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    if len(orbital) == 1:
+        # The shortest turn from one to the other: about one direction every turn is as good.
+        rotation, _ = Rotation.align_vectors(orbital[0], body[0])
+    else:
+        rotation, _ = Rotation.align_vectors(orbital, body, weights=weights / weights.max())
+    return quaternion.from_rotation(rotation)

@@ -1,0 +1,404 @@
+r"""Multiplicative (error-state) Kalman filter of attitude and rate, assembled from any sensors and optional states.
+
+Use::
+
+    used = sensor_set("st+gyro", ["gyro-bias"])                     # adcs.kalman.error_state
+    settings = FilterSettings(used, tuned_noise(used))
+    q, w = start_estimates(runs.prepared, math.radians(5), math.radians(0.1))   # sims, or adcs.kalman.initialisation
+    start = start_near(q, w, math.radians(5), math.radians(0.1))
+    estimates = run_filter(runs, settings, start)                   # Estimates: compiled, all runs at once
+    numbers = evaluate(runs, estimates)                             # adcs.kalman.accuracy: the keys of `adcs run
+    --json`
+
+    run_readable(record, settings, start, jacobian=..., update=...) # adcs.kalman.mekf: the reference twin
+    smoothed(record, estimates)                                     # adcs.kalman.smoother -> Estimates
+    run_constant_gain(record, settings, start)                      # adcs.kalman.constant_gain -> Estimates
+    run_parallel(record, settings, start, forgetting=0.99)          # adcs.kalman.separate_bias -> Estimates
+    vector_start(record, settings), any_start(record, settings)     # adcs.kalman.initialisation -> Start
+    warnings_of(record, estimates)                                  # adcs.kalman.diagnostics -> tuple of str for every
+    run
+
+The state is (q, ω, Δb, Δω, d), its error (δq, δω, δΔb, δΔω, δd) with :math:`q = \hat q \circ (\sqrt{1-|\delta q|^2},
+\delta q)`, which is put into q̂ after every update. A step predicts by the full equations of motion with the torque that
+was given to the wheels, and the covariance with
+
+.. math::
+
+    \Phi = E + Fh + \tfrac12 (Fh)^2 + \tfrac16 (Fh)^3, \qquad P^- = \Phi P \Phi^T + Q
+
+F being the mean over the step; then every sensor with a reading corrects it:
+
+==============  ====================================  ===========================
+sensor          residual                              rows for (δq, δω, Δb, Δω)
+==============  ====================================  ===========================
+star tracker    vec(q̂*∘q_m), sign of positive scalar  E      0   0   0
+gyro            ω_m - ω̂ - Δω̂                          0      E   0   E
+magnetometer    b_m - A b_o - Δb̂                      2W(b̂)  0   E   0
+Sun sensor      s_m - A s_o                           2W(ŝ)  0   0   0
+==============  ====================================  ===========================
+
+The first reading of directions is linearised at the start. From 5° off that costs consistency for minutes, and the set
+with a bias of the field twice the accuracy: start from :func:`adcs.kalman.initialisation.vector_start` where there is
+no reason not to.
+
+Everything here takes all runs at once as leading axis, and :mod:`adcs.kalman.mekf_compiled` is its compiled twin.
+
+Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014, with the corrections of
+:mod:`adcs.satellite.dynamics`; the factors 2 (δq is half an angle) are missing there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from adcs import quaternion
+from adcs.kalman.error_state import ALWAYS, SENSORS, Estimates, FilterSettings, SensorSet, Start, State
+from adcs.quaternion import cross_matrix, rotate_back
+from adcs.satellite import dynamics
+from adcs.satellite.telemetry import Record, is_read
+from arrays.typing import FloatArray
+from magloc.kalman import sequential_update, symmetric_square_root
+
+Jacobian = Callable[[Record, int, FloatArray, FloatArray], FloatArray]
+"""F (runs, 6, 6) of attitude and rate from record, row, q (runs, 4) and w (runs, 3)."""
+Update = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+"""Correction (runs, N) and covariance from P (runs, N, N), H (runs, k, N) and residual (runs, k), in noise units."""
+
+
+def first_state(settings: FilterSettings, start: Start) -> State:
+    """State before the first reading."""
+    runs, size = len(start.q), settings.sensors.size
+    P = np.zeros((runs, size, size))
+    P[:, :ALWAYS, :ALWAYS] = start.covariance
+    P[:, range(ALWAYS, size), range(ALWAYS, size)] = settings.start_variance
+    zero = np.zeros((runs, 3))
+    return State(start.q, start.w, zero, zero, zero, P)
+
+
+def known_torque_jacobian(record: Record, row: int, q: FloatArray, w: FloatArray) -> FloatArray:
+    """F (runs, 6, 6) of a filter that is told the wheels' torque.
+
+    See :func:`adcs.satellite.dynamics.error_jacobian`.
+    """
+    around = record.environment
+    return dynamics.error_jacobian(
+        record.scenario.body, q, w, record.momentum_Nms[:, row], around.gravity_s2[:, row], around.b_orbital_T[:, row]
+    )
+
+
+def closed_loop_jacobian(record: Record, row: int, q: FloatArray, w: FloatArray) -> FloatArray:
+    """F of the source paper (``closed_loop_F``), wrong.
+
+    See :func:`adcs.satellite.dynamics.closed_loop_error_jacobian`.
+    """
+    scenario = record.scenario
+    return dynamics.closed_loop_error_jacobian(
+        scenario.body, scenario.control, q, w, quaternion.IDENTITY, record.environment.gravity_s2[:, row]
+    )
+
+
+def transition(F: FloatArray, used: SensorSet, dt_s: float) -> FloatArray:
+    """Φ (runs, N, N) of the error state from F (runs, 6, 6) of attitude and rate, to the third order of the step."""
+    full = np.zeros((len(F), used.size, used.size))
+    full[:, :ALWAYS, :ALWAYS] = F
+    if used.disturbance:
+        first = used.first_of("disturbance")
+        full[:, 3:6, first : first + 3] = np.eye(3)
+    step = full * dt_s
+    squared = step @ step
+    return np.eye(used.size) + step + squared / 2.0 + squared @ step / 6.0
+
+
+def moved(record: Record, row: int, state: State) -> tuple[FloatArray, FloatArray]:
+    """Attitude and rate (runs, 4), (runs, 3) one step after instant ``row``, by the equations of motion."""
+    scenario, around = record.scenario, record.environment
+    q, w, _ = dynamics.step(
+        scenario.body,
+        state.q,
+        state.w,
+        record.momentum_Nms[:, row],
+        record.wheel_torque_Nm[:, row],
+        state.disturbance_s2 @ scenario.body.inertia_kgm2,
+        around.orbital_rate_rad_s[:, row],
+        around.gravity_s2[:, row],
+        around.b_orbital_T[:, row],
+        scenario.dt_s,
+    )
+    return q, w
+
+
+def predicted(
+    record: Record, row: int, state: State, settings: FilterSettings, jacobian: Jacobian = known_torque_jacobian
+) -> tuple[State, FloatArray]:
+    """State one step after instant ``row`` before its readings, and Φ (runs, N, N)."""
+    q, w = moved(record, row, state)
+    F = 0.5 * (jacobian(record, row, state.q, state.w) + jacobian(record, row + 1, q, w))
+    Phi = transition(F, settings.sensors, record.scenario.dt_s)
+    P = Phi @ state.P @ Phi.mT + np.diag(settings.process_variance)
+    return replace(state, q=q, w=w, P=0.5 * (P + P.mT)), Phi
+
+
+def deviations(record: Record, settings: FilterSettings) -> FloatArray:
+    """Noise of one component of the readings of star tracker, gyro, magnetometer and Sun sensor, shape (4,)."""
+    satellite = record.scenario
+    return np.array(
+        [
+            satellite.star_tracker.sigma_rad,
+            satellite.gyro.sigma_rad_s,
+            np.hypot(satellite.magnetometer.sigma_T, settings.field_error_T),
+            satellite.sun_sensor.sigma_rad,
+        ]
+    )
+
+
+def residuals(record: Record, row: int, state: State, used: SensorSet) -> list[tuple[int, FloatArray, FloatArray]]:
+    """Sensor's place in SENSORS, residual (runs, 3) and H (runs, 3, N) of every sensor of a set at instant ``row``.
+
+    NaN where there is no reading.
+    """
+    readings, around = record.readings, record.environment
+    H = np.zeros((len(state.q), 3, used.size))
+    parts: list[tuple[int, FloatArray, FloatArray]] = []
+    if used.star:
+        rows = H.copy()
+        rows[..., :3] = np.eye(3)
+        parts.append((SENSORS.index("st"), quaternion.error_vector(state.q, readings.star[:, row]), rows))
+    if used.gyro:
+        rows = H.copy()
+        rows[..., 3:6] = np.eye(3)
+        if used.gyro_bias:
+            first = used.first_of("gyro-bias")
+            rows[..., first : first + 3] = np.eye(3)
+        parts.append((SENSORS.index("gyro"), readings.gyro_rad_s[:, row] - state.w - state.gyro_bias_rad_s, rows))
+    if used.magnetometer:
+        rows = H.copy()
+        b = rotate_back(state.q, around.b_orbital_T[:, row])
+        rows[..., :3] = 2.0 * cross_matrix(b)
+        if used.field_bias:
+            first = used.first_of("field-bias")
+            rows[..., first : first + 3] = np.eye(3)
+        parts.append((SENSORS.index("mag"), readings.field_T[:, row] - b - state.field_bias_T, rows))
+    if used.sun:
+        rows = H.copy()
+        s = rotate_back(state.q, around.sun_orbital[:, row])
+        rows[..., :3] = 2.0 * cross_matrix(s)
+        parts.append((SENSORS.index("sun"), readings.sun[:, row] - s, rows))
+    return parts
+
+
+def stacked_residuals(
+    record: Record, row: int, state: State, settings: FilterSettings
+) -> tuple[FloatArray, FloatArray]:
+    """H (runs, k, N) and residual (runs, k) of all sensors at instant ``row``, in units of their noise.
+
+    Both are zero where there is no reading, which teaches nothing.
+    """
+    sigma = deviations(record, settings)
+    H, residual = [], []
+    for sensor, one, rows in residuals(record, row, state, settings.sensors):
+        seen = is_read(one)
+        H.append(np.where(seen[:, None, None], rows / sigma[sensor], 0.0))
+        residual.append(np.where(seen[:, None], one / sigma[sensor], 0.0))
+    return np.concatenate(H, axis=1), np.concatenate(residual, axis=1)
+
+
+def nis_of(noise: FloatArray, H: FloatArray, residual: FloatArray, used: SensorSet) -> FloatArray:
+    """NIS (runs, 4) of every sensor given those before it, from stacked residuals and their covariance (runs, k, k)."""
+    whitened = np.linalg.solve(np.linalg.cholesky(noise), residual[..., None])[..., 0]
+    each = np.sum(whitened.reshape(len(H), -1, 3) ** 2, axis=-1)
+    read = (H != 0.0).any(axis=-1)[:, ::3] | (H != 0.0).any(axis=-1)[:, 1::3]
+    nis = np.full((len(H), len(SENSORS)), np.nan)
+    nis[:, [used.star, used.gyro, used.magnetometer, used.sun]] = np.where(read, each, np.nan)
+    return nis
+
+
+def joseph_update(P: FloatArray, H: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Correction and covariance (E - KH) P (E - KH)ᵀ + KKᵀ, in noise units; see :data:`Update`."""
+    PHt = P @ H.mT
+    K = np.linalg.solve(H @ PHt + np.eye(H.shape[-2]), PHt.mT).mT
+    rest = np.eye(P.shape[-1]) - K @ H
+    return (K @ residual[..., None])[..., 0], rest @ P @ rest.mT + K @ K.mT
+
+
+def square_root_update(P: FloatArray, H: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The same by Potter's square roots, one scalar after the other; see :func:`magloc.kalman.sequential_update`."""
+    corrections, covariances = [], []
+    for P_run, H_run, residual_run in zip(P, H, residual, strict=True):
+        S = symmetric_square_root(P_run)
+        dx, S = sequential_update(np.zeros(len(P_run)), S, H_run, residual_run, np.ones(len(residual_run)))
+        corrections.append(dx)
+        covariances.append(S @ S.T)
+    return np.array(corrections), np.array(covariances)
+
+
+def information_update(P: FloatArray, H: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The same by adding information, P⁻¹ + HᵀH: for tests, since it loses digits where P is nearly singular."""
+    updated = np.asarray(np.linalg.inv(np.linalg.inv(P) + H.mT @ H), dtype=np.float64)
+    return (updated @ H.mT @ residual[..., None])[..., 0], updated
+
+
+def corrected(
+    record: Record, row: int, state: State, settings: FilterSettings, update: Update = joseph_update
+) -> tuple[State, FloatArray]:
+    """State with the readings of instant ``row``, and NIS (runs, 4); all sensors are linearised at ``state``."""
+    sigma = deviations(record, settings)
+    P, dx = state.P, np.zeros(state.P.shape[:-1])
+    nis = np.full((len(state.q), len(SENSORS)), np.nan)
+    for sensor, residual, H in residuals(record, row, state, settings.sensors):
+        seen = is_read(residual)
+        # Without a reading: rows of zeros, which teach nothing.
+        H = np.where(seen[:, None, None], H / sigma[sensor], 0.0)
+        left = np.where(seen[:, None], residual / sigma[sensor], 0.0) - (H @ dx[..., None])[..., 0]
+        S = H @ P @ H.mT + np.eye(3)
+        nis[:, sensor] = np.where(seen, np.sum(left * np.linalg.solve(S, left[..., None])[..., 0], axis=-1), np.nan)
+        step, P = update(P, H, left)
+        dx = dx + step
+    return replace(with_error(state, dx, settings.sensors), P=P), nis
+
+
+def with_error(state: State, dx: FloatArray, used: SensorSet) -> State:
+    """State into which an error (runs, N) is put."""
+
+    def moved_by(values: FloatArray, name: str) -> FloatArray:
+        first = used.first_of(name)
+        return values + dx[:, first : first + 3] if name in used.states else values
+
+    q = quaternion.multiply(state.q, quaternion.from_error_vector(dx[:, :3]))
+    return replace(
+        state,
+        q=quaternion.normalised(q),
+        w=state.w + dx[:, 3:6],
+        field_bias_T=moved_by(state.field_bias_T, "field-bias"),
+        gyro_bias_rad_s=moved_by(state.gyro_bias_rad_s, "gyro-bias"),
+        disturbance_s2=moved_by(state.disturbance_s2, "disturbance"),
+    )
+
+
+def run_readable(
+    record: Record,
+    settings: FilterSettings,
+    start: Start,
+    jacobian: Jacobian = known_torque_jacobian,
+    update: Update = joseph_update,
+) -> Estimates:
+    """Filter of whole runs in NumPy, the reference of :func:`run_filter`.
+
+    Parameters
+    ----------
+    record : Record
+    settings : FilterSettings
+    start : Start
+    jacobian : callable
+        :func:`known_torque_jacobian`, or :func:`closed_loop_jacobian` to reproduce the source paper.
+    update : callable
+        :func:`joseph_update` or :func:`square_root_update`.
+
+    Returns
+    -------
+    Estimates
+    """
+    check_start(record, start)
+    state, nis = corrected(record, 0, first_state(settings, start), settings, update)
+    states, innovations = [state], [nis]
+    for row in range(record.momentum_Nms.shape[1] - 1):
+        state, _ = predicted(record, row, state, settings, jacobian)
+        state, nis = corrected(record, row + 1, state, settings, update)
+        states.append(state)
+        innovations.append(nis)
+    return collected(settings, states, np.stack(innovations, axis=1))
+
+
+def collected(settings: FilterSettings, states: list[State], nis: FloatArray) -> Estimates:
+    """Estimates of the states of all instants."""
+
+    def all_of(values: Callable[[State], FloatArray]) -> FloatArray:
+        return np.stack([values(state) for state in states], axis=1)
+
+    return Estimates(
+        settings,
+        all_of(lambda state: state.q),
+        all_of(lambda state: state.w),
+        all_of(lambda state: state.field_bias_T),
+        all_of(lambda state: state.gyro_bias_rad_s),
+        all_of(lambda state: state.disturbance_s2),
+        all_of(lambda state: state.P),
+        nis,
+    )
+
+
+def check_start(record: Record, start: Start) -> None:
+    """Raise ValueError unless a start has as many runs as the record, and none of it is missing."""
+    runs = record.momentum_Nms.shape[0]
+    for name, shape in (("q", (runs, 4)), ("w", (runs, 3)), ("covariance", (runs, ALWAYS, ALWAYS))):
+        values = getattr(start, name)
+        if values.shape != shape or not np.isfinite(values).all():
+            raise ValueError(f"Input start.{name} must be finite with shape {shape}; instead received {values.shape}.")
+
+
+def run_filter(record: Record, settings: FilterSettings, start: Start) -> Estimates:
+    """Filter of whole runs, compiled; runs are shared out among the threads of numba.
+
+    Parameters
+    ----------
+    record : Record
+        Of any number of runs, such as :class:`sims.attitude.simulation.AttitudeRuns`.
+    settings : FilterSettings
+    start : Start
+        One for every run: :func:`start_near`, or :mod:`adcs.kalman.initialisation`.
+
+    Returns
+    -------
+    Estimates
+
+    Raises
+    ------
+    ValueError
+        The start does not have as many runs as the record.
+    """
+    from adcs.kalman import mekf_compiled as kernel
+    from magloc.compilation import over_rows
+
+    check_start(record, start)
+    used, first, around, body = settings.sensors, first_state(settings, start), record.environment, record.scenario.body
+    runs, n = record.momentum_Nms.shape[:2]
+    q, w, optional = np.empty((runs, n, 4)), np.empty((runs, n, 3)), np.zeros((3, runs, n, 3))
+    covariance, nis = np.empty((runs, n, used.size, used.size)), np.full((runs, n, len(SENSORS)), np.nan)
+    readings = record.readings
+    given = (
+        record.momentum_Nms,
+        record.wheel_torque_Nm,
+        readings.star,
+        readings.gyro_rad_s,
+        readings.field_T,
+        readings.sun,
+        around.b_orbital_T,
+        around.sun_orbital,
+        around.orbital_rate_rad_s,
+        around.gravity_s2,
+    )
+    over_rows(
+        kernel.run,
+        runs,
+        q,
+        w,
+        optional,
+        covariance,
+        nis,
+        np.ascontiguousarray(first.q),
+        np.ascontiguousarray(first.w),
+        first.P,
+        body.inertia_kgm2,
+        body.inverse,
+        body.residual_dipole_Am2,
+        # One layout in memory, for which the kernel is compiled.
+        *(np.ascontiguousarray(values, dtype=np.float64) for values in given),
+        np.array([used.star, used.gyro, used.magnetometer, used.sun]),
+        deviations(record, settings),
+        np.array([used.first_of("field-bias"), used.first_of("gyro-bias"), used.first_of("disturbance")]),
+        settings.process_variance,
+        record.scenario.dt_s,
+    )
+    return Estimates(settings, q, w, optional[0], optional[1], optional[2], covariance, nis)

@@ -1,0 +1,73 @@
+r"""Estimates of a finished record with what later readings tell as well: a fixed-interval smoother of the error state.
+
+Rauch, Tung and Striebel's recursion, backwards from the last instant, with Φ and the prediction of the filter's step:
+
+.. math::
+
+    C = P \Phi^T (P^-)^{-1}, \qquad \delta x = C\,(x^s_{i+1} \ominus x^-_{i+1}), \qquad
+    P^s = P + C (P^s_{i+1} - P^-_{i+1}) C^T
+
+where the difference of two attitudes is the error vector between them, and δx is put into the filter's state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from adcs import quaternion
+from adcs.kalman.error_state import Estimates, SensorSet, State
+from adcs.kalman.mekf import Jacobian, collected, known_torque_jacobian, predicted, with_error
+from adcs.satellite.telemetry import Record
+from arrays.typing import FloatArray
+
+
+def smoothed(record: Record, estimates: Estimates, jacobian: Jacobian = known_torque_jacobian) -> Estimates:
+    """Smoothed estimates of whole runs.
+
+    Parameters
+    ----------
+    record : Record
+    estimates : Estimates
+        Of :func:`adcs.kalman.mekf.run_filter`, or of its readable twin.
+    jacobian : callable
+        That of the filter.
+
+    Returns
+    -------
+    Estimates
+        ``nis`` is that of the filter.
+    """
+    settings, n = estimates.settings, estimates.q.shape[1]
+    later = estimates.at(n - 1)
+    states = [later]
+    for row in reversed(range(n - 1)):
+        state = estimates.at(row)
+        ahead, Phi = predicted(record, row, state, settings, jacobian)
+        # States of mixed units: solve with the correlations.
+        scale = np.sqrt(np.diagonal(ahead.P, axis1=-2, axis2=-1))
+        correlation = ahead.P / (scale[:, :, None] * scale[:, None, :])
+        C = np.linalg.solve(correlation, (Phi @ state.P) / scale[:, :, None]).mT / scale[:, None, :]
+        dx = (C @ difference(later, ahead, settings.sensors)[..., None])[..., 0]
+        P = state.P + C @ (later.P - ahead.P) @ C.mT
+        later = replace(with_error(state, dx, settings.sensors), P=0.5 * (P + P.mT))
+        states.append(later)
+    return collected(settings, states[::-1], estimates.nis)
+
+
+def difference(state: State, other: State, used: SensorSet) -> FloatArray:
+    """Error state (runs, N) that :func:`adcs.kalman.mekf.with_error` puts into ``other`` to make it ``state``."""
+    optional = {
+        "field-bias": state.field_bias_T - other.field_bias_T,
+        "gyro-bias": state.gyro_bias_rad_s - other.gyro_bias_rad_s,
+        "disturbance": state.disturbance_s2 - other.disturbance_s2,
+    }
+    return np.concatenate(
+        [
+            quaternion.error_vector(other.q, state.q),
+            state.w - other.w,
+            *(optional[name] for name in used.states),
+        ],
+        axis=-1,
+    )

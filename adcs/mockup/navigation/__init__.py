@@ -1,0 +1,1 @@
+"""Fusion of late camera fixes with the inertial unit in the plane."""

@@ -1,0 +1,460 @@
+r"""Error-state Kalman filter of the table-top satellite that takes late camera fixes where they belong.
+
+The state is (X, Y, v_X, v_Y, φ, α, β, b, α', β'): position, velocity, heading, zeros of the accelerometer along body x
+and y, zero of the gyro, drifts of the accelerometer's zeros. A sample predicts by the formulas of
+:func:`adcs.mockup.navigation.strapdown.step` with the zeros taken off; with ``a`` the acceleration in table axes,
+
+.. math::
+
+    \frac{∂a}{∂φ} = \begin{pmatrix} -a_Y \\ a_X \end{pmatrix}, \quad \frac{∂a}{∂(α, β)} = -R(φ + ωΔ/2), \quad
+    \frac{∂a}{∂b} = -\frac{Δ}{2} \frac{∂a}{∂φ}
+
+The zeros of a sensor that warms drift steadily, and a walk alone would lag behind them by more than it admits. So they
+go on by α'Δ and β'Δ, and walk, and so do their drifts; a sample has the zeros of its beginning:
+
+.. math::
+
+    Q_{(α, α')} = w^2 \begin{pmatrix} Δ & 0 \\ 0 & 0 \end{pmatrix}
+        + u^2 \begin{pmatrix} Δ^3/3 & Δ^2/2 \\ Δ^2/2 & Δ \end{pmatrix}
+
+A fix measures X, Y and φ. State and covariance of every sample are kept. A fix of exposure t_s takes the filter back to
+t_s, corrects it there, and predicts the samples since again; fixes of later exposures that had come before are taken
+again on the way. So the estimate does not depend on the order of arrival, and is the one of fixes without delay.
+
+A fix whose normalised innovation squared exceeds the gate is left out. A filter that is lost would leave all of them
+out for ever: where ``reacquire_after`` fixes in a row are rejected which agree with one another, position, velocity and
+heading start anew from the last of them.
+
+Ours, after section 6 of our summary of Bindel et al.; the source integrates again
+(:mod:`adcs.mockup.navigation.reintegration`).
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left, bisect_right
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adcs.mockup.navigation.delayed_ekf_compiled import N, predict_rows
+from adcs.mockup.navigation.fixes import Fix, Outcome
+from adcs.mockup.navigation.strapdown import Gate, ImuRecord, PlanarState, PlanarTrack, held, turned, wrapped
+from arrays.typing import FloatArray
+from magloc.kalman import block_update, normalised_innovation_squared, symmetric_square_root
+
+STATES = (
+    *("X_m", "Y_m", "vX_m_s", "vY_m_s", "heading_rad"),
+    *("zero_x_m_s2", "zero_y_m_s2", "zero_rate_rad_s", "drift_x_m_s3", "drift_y_m_s3"),
+)
+H_FIX: FloatArray = np.eye(N)[[0, 1, 4]]
+
+
+@dataclass(frozen=True)
+class FilterSettings:
+    """Noises and rules of :class:`DelayedFilter`, all positive.
+
+    Attributes
+    ----------
+    sample_s : float
+        Interval of a sample that the next two belong to.
+    acceleration_m_s2 : float
+        Noise of a sample, each axis: the sensor's 0.002 and the valves' spikes of ±0.07 about once in a second.
+    rate_rad_s : float
+        Noise of a sample of the gyro.
+    missing_acceleration_m_s2, missing_rate_rad_s : float
+        What may be missed in a sample that the gate of the samples does not believe.
+    lost_after_s : float
+        Readings that stay missing for longer are lost: what is missed then lasts, and is no noise of each sample.
+    lost_m_s_rs, lost_rad_rs : float
+        What may be missed meanwhile: growth of the standard deviations of velocity and heading in one second [unit per
+        √s]. Thrust of 0.04 m/s² and turns of 20°/s that last for a second or two.
+    zero_walk_m_s2_rs, zero_walk_rad_s_rs : float
+        Walks of the zeros: growth of their standard deviations in one second [unit per √s].
+    drift_walk_m_s3_rs : float
+        Walk of the drifts: 7e-6 m/s³ in 200 s, for a sensor whose warming levels off within minutes. If it does so
+        within one minute, errors of zeros and drifts are 1.1 and 1.4 of their standard deviations.
+    fix_m, fix_rad : float
+        Noise of a fix, each axis.
+    fix_gate : float
+        Largest normalised innovation squared of a fix, a χ² of 3 numbers: 25 rejects one good fix in 65,000.
+    reacquire_after : int
+        Rejected fixes in a row that make the filter give up.
+    agree_rad, agree_m, agree_m_s : float
+        Fixes agree where the heading between them changes as the gyro says but for ``agree_rad``, and the position by
+        no more than ``agree_m`` and ``agree_m_s`` times the time between them.
+    buffer_s : float
+        How old a fix may be.
+    sample_gate : Gate
+    """
+
+    sample_s: float = 0.01
+    acceleration_m_s2: float = math.hypot(0.002, 0.0035)
+    rate_rad_s: float = math.radians(0.1)
+    missing_acceleration_m_s2: float = 0.1
+    missing_rate_rad_s: float = math.radians(20.0)
+    lost_after_s: float = 0.05
+    lost_m_s_rs: float = 0.03
+    lost_rad_rs: float = math.radians(30.0)
+    zero_walk_m_s2_rs: float = 2e-5
+    zero_walk_rad_s_rs: float = math.radians(0.002)
+    drift_walk_m_s3_rs: float = 5e-7
+    fix_m: float = 1.5e-3
+    fix_rad: float = math.radians(0.1)
+    fix_gate: float = 25.0
+    reacquire_after: int = 3
+    agree_rad: float = math.radians(2.0)
+    agree_m: float = 0.01
+    agree_m_s: float = 0.5
+    buffer_s: float = 10.0
+    sample_gate: Gate = Gate()  # noqa: RUF009 - frozen
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if name != "sample_gate" and not value > 0.0:
+                raise ValueError(f"Input {name} must be positive; instead received {value}.")
+
+    @property
+    def densities(self) -> FloatArray:
+        """Noise of acceleration and rate, of both where missing, walks of zeros and drifts: squared densities, (7,)."""
+        white = np.array(
+            [self.acceleration_m_s2, self.rate_rad_s, self.missing_acceleration_m_s2, self.missing_rate_rad_s]
+        )
+        walks = np.array([self.zero_walk_m_s2_rs, self.zero_walk_rad_s_rs, self.drift_walk_m_s3_rs])
+        return np.concatenate([self.sample_s * white**2, walks**2])
+
+    @property
+    def all_densities(self) -> FloatArray:
+        """The same, shape (2, 2, 7): where accelerations are not and are lost, and where the rate is not and is."""
+        densities = np.tile(self.densities, (2, 2, 1))
+        densities[1, :, 2], densities[:, 1, 3] = self.lost_m_s_rs**2, self.lost_rad_rs**2
+        return densities
+
+
+@dataclass(frozen=True)
+class StartSigma:
+    """Standard deviations of the start, each axis.
+
+    The accelerometer's zeros may drift by 0.0003 m/s² per °C, so that 2e-5 m/s³ is 4 °C in a minute.
+    """
+
+    position_m: float = 1.5e-3
+    velocity_m_s: float = 0.01
+    heading_rad: float = math.radians(0.1)
+    zero_m_s2: float = 0.002
+    zero_rad_s: float = math.radians(0.05)
+    drift_m_s3: float = 2e-5
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Diagonal, shape (10, 10)."""
+        p, v, z, d = self.position_m, self.velocity_m_s, self.zero_m_s2, self.drift_m_s3
+        return np.diag(np.square([p, p, v, v, self.heading_rad, z, z, self.zero_rad_s, d, d]))
+
+
+LOST = StartSigma(position_m=10.0, velocity_m_s=0.5, heading_rad=math.pi)
+"""Where the filter gives up: position, velocity and heading of this are put in place of the estimate's."""
+
+
+@dataclass(frozen=True, eq=False)
+class FilterTrack(PlanarTrack):
+    """Estimates as they were known at each sample, with all states.
+
+    Attributes
+    ----------
+    zero_m_s2 : ndarray, shape (n, 2)
+        Of the accelerometer.
+    zero_rad_s : ndarray, shape (n,)
+        Of the gyro.
+    drift_m_s3 : ndarray, shape (n, 2)
+        Of the accelerometer's zeros.
+    sigma : ndarray, shape (n, 10)
+        Standard deviations of the states in the order of :data:`STATES`.
+    """
+
+    zero_m_s2: FloatArray
+    zero_rad_s: FloatArray
+    drift_m_s3: FloatArray
+    sigma: FloatArray
+
+
+def predicted(
+    x: FloatArray, P: FloatArray, step_s: float, reading: ArrayLike, there: ArrayLike, densities: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """State and covariance after one sample, :math:`F P F^T + Q`: the readable twin of the compiled prediction.
+
+    Parameters
+    ----------
+    x : ndarray, shape (10,)
+    P : ndarray, shape (10, 10)
+    step_s : float
+    reading : array_like, shape (3,)
+        Accelerations along body x and y, and the rate.
+    there : array_like of bool, shape (3,)
+        Which of them are believed. One that is not counts as zero acceleration, or as the rate that is given.
+    densities : ndarray, shape (7,)
+        Of :attr:`FilterSettings.densities`.
+
+    Returns
+    -------
+    x, P : ndarray
+    """
+    h, z, use = step_s, np.asarray(reading, dtype=np.float64), np.asarray(there, dtype=np.bool_)
+    rate = z[2] - x[7]
+    middle = x[4] + 0.5 * h * rate
+    R = turned(middle, np.eye(2)).T * use[:2]
+    a = R @ (z[:2] - x[5:7])
+    by_heading = np.array([-a[1], a[0]])
+    da = np.column_stack([by_heading, -R, -0.5 * h * by_heading])  # by φ, α, β, b
+    F = np.eye(N)
+    F[0:2, 2:4] = h * np.eye(2)
+    F[0:2, 4:8] = 0.5 * h**2 * da
+    F[2:4, 4:8] = h * da
+    F[4, 7] = -h
+    F[5:7, 8:10] = h * np.eye(2)
+    Q = np.zeros((N, N))
+    to_table = turned(middle, np.eye(2)).T
+    q = to_table @ np.diag(np.where(use[:2], densities[0], densities[2])) @ to_table.T
+    Q[0:2, 0:2], Q[0:2, 2:4] = h**3 / 3.0 * q, h**2 / 2.0 * q
+    Q[2:4, 0:2], Q[2:4, 2:4] = h**2 / 2.0 * q, h * q
+    Q[4, 4] = h * (densities[1] if use[2] else densities[3])
+    Q[7, 7] = h * densities[5]
+    for zero, drift in ((5, 8), (6, 9)):
+        Q[zero, zero] = h * densities[4] + h**3 / 3.0 * densities[6]
+        Q[zero, drift] = Q[drift, zero] = h**2 / 2.0 * densities[6]
+        Q[drift, drift] = h * densities[6]
+    x_next = x.copy()
+    x_next[0:2] += h * x[2:4] + 0.5 * h**2 * a
+    x_next[2:4] += h * a
+    x_next[4] += h * rate
+    x_next[5:7] += h * x[8:10]
+    return x_next, F @ P @ F.T + Q
+
+
+@dataclass(eq=False)
+class _Taken:
+    """A fix of the history, what became of it, and the heading that was predicted for it."""
+
+    fix: Fix
+    outcome: Outcome
+    heading_rad: float
+
+
+class DelayedFilter:
+    """The filter as samples and fixes arrive.
+
+    - A fix of the same exposure as another one is left out (duplicate), and so is one older than ``buffer_s``.
+    - Through a drop-out the covariance grows by the noises of the samples; the gate opens with it.
+    - A rate that the gate of the samples does not believe is held, an acceleration is zero; both get a larger noise,
+      and a still larger one where they are lost.
+    - A gap between samples is not seen here: :meth:`adcs.mockup.navigation.strapdown.ImuRecord.with_gaps_filled` makes
+      it samples whose readings are missing.
+
+    Parameters
+    ----------
+    start : PlanarState
+        At ``begin_s``.
+    begin_s : float
+        Where the first samples begin.
+    settings : FilterSettings
+    sigma : StartSigma
+        How well the start is known. The zeros and their drifts start at 0.
+
+    Attributes
+    ----------
+    x, P : ndarray, shape (10,), (10, 10)
+        Estimate and covariance at the last sample.
+    state : PlanarState
+        The same without the zeros and drifts.
+    nis : list of float
+        Normalised innovation squared of every fix that came and could be taken, when it was first taken.
+    """
+
+    def __init__(
+        self,
+        start: PlanarState,
+        begin_s: float,
+        settings: FilterSettings = FilterSettings(),
+        sigma: StartSigma = StartSigma(),
+    ) -> None:
+        self.settings = settings
+        self.nis: list[float] = []
+        self._densities = settings.all_densities
+        self._n = 1
+        # Row 0 is where the history begins; the reading of a row is that of the interval which ends there.
+        self._time_s = np.full(1, float(begin_s))
+        self._readings, self._there = np.zeros((1, 3)), np.zeros((1, 3), dtype=np.bool_)
+        self._lost = np.zeros((1, 2), dtype=np.bool_)  # accelerations, rate
+        self._read_s = np.full(3, float(begin_s))  # when each reading was last there
+        self._x = np.concatenate([start.position_m, start.velocity_m_s, [float(start.heading_rad)], np.zeros(5)])[None]
+        self._P = sigma.covariance[None]
+        self._history: list[_Taken] = []
+
+    @property
+    def x(self) -> FloatArray:
+        """Estimate."""
+        return self._x[self._n - 1].copy()
+
+    @property
+    def P(self) -> FloatArray:
+        """Its covariance."""
+        return self._P[self._n - 1].copy()
+
+    @property
+    def state(self) -> PlanarState:
+        """Estimate of position, velocity and heading."""
+        x = self.x
+        return PlanarState(x[0:2], x[2:4], float(x[4]))
+
+    def add_samples(self, imu: ImuRecord) -> FilterTrack:
+        """Predict over some samples.
+
+        Parameters
+        ----------
+        imu : ImuRecord
+            One run; begins where the last samples ended.
+
+        Returns
+        -------
+        FilterTrack
+
+        Raises
+        ------
+        ValueError
+            It begins elsewhere.
+        """
+        last, n = self._n - 1, len(imu)
+        if imu.begin_s != self._time_s[last]:
+            raise ValueError(
+                f"Input imu must begin where the last samples ended, at {self._time_s[last]:.6g} s; "
+                f"instead received samples that begin at {imu.begin_s:.6g} s."
+            )
+        there = self.settings.sample_gate.accepted(imu)
+        believed = held(imu, there, self._readings[last, 2])
+        self._make_room(n)
+        last = self._n - 1
+        rows = slice(self._n, self._n + n)
+        self._time_s[rows], self._there[rows] = imu.time_s, there
+        self._readings[rows, :2], self._readings[rows, 2] = believed.acceleration_m_s2, believed.rate_rad_s
+        read_s = np.maximum.accumulate(
+            np.concatenate([self._read_s[None], np.where(there, imu.time_s[:, None], -math.inf)]), axis=0
+        )
+        lost = imu.time_s[:, None] - read_s[1:] > self.settings.lost_after_s
+        self._lost[rows], self._read_s = np.stack([lost[:, :2].any(axis=1), lost[:, 2]], axis=1), read_s[-1]
+        self._n += n
+        self._predict(last, self._n - 1)
+        x, P = self._x[rows], self._P[rows]
+        sigma = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
+        position, velocity, heading, zeros, rate_zero, drifts = (
+            x[:, k].copy() for k in (slice(0, 2), slice(2, 4), 4, slice(5, 7), 7, slice(8, 10))
+        )
+        return FilterTrack(imu.time_s, position, velocity, heading, zeros, rate_zero, drifts, sigma)
+
+    def add_fix(self, fix: Fix) -> Outcome:
+        """Go back to the exposure of a fix, correct the estimate there, and come back.
+
+        Parameters
+        ----------
+        fix : Fix
+
+        Returns
+        -------
+        Outcome
+        """
+        now = float(self._time_s[self._n - 1])
+        if fix.time_s > now:
+            return Outcome.AHEAD
+        if any(fix.time_s == taken.fix.time_s for taken in self._history):
+            return Outcome.DUPLICATE
+        if fix.time_s < now - self.settings.buffer_s or fix.time_s <= self._time_s[0]:
+            return Outcome.TOO_OLD
+        row = self._row_at(fix.time_s) - 1
+        taken = _Taken(fix, Outcome.USED, math.nan)
+        place = bisect_left(self._history, fix.time_s, key=lambda entry: entry.fix.time_s)
+        self._history.insert(place, taken)
+        for later in range(place, len(self._history)):
+            k = self._row_at(self._history[later].fix.time_s)
+            self._predict(row, k)
+            nis = self._correct(k, later)
+            if later == place:
+                self.nis.append(nis)
+            row = k
+        self._predict(row, self._n - 1)
+        return taken.outcome
+
+    def _correct(self, row: int, place: int) -> float:
+        """Correct the estimate of a row by a fix of the history, or leave the fix out; its normalised innovation²."""
+        s, taken = self.settings, self._history[place]
+        fix, x = taken.fix, self._x[row]
+        taken.heading_rad = float(x[4])
+        innovation = np.append(fix.position_m - x[0:2], wrapped(fix.heading_rad - x[4]))
+        variance = np.square([s.fix_m, s.fix_m, s.fix_rad])
+        S = symmetric_square_root(self._P[row])
+        nis = normalised_innovation_squared(S, H_FIX, innovation, variance)
+        taken.outcome = Outcome.USED
+        if not nis <= s.fix_gate:
+            taken.outcome = Outcome.REACQUIRED if self._is_lost(place) else Outcome.REJECTED
+        if taken.outcome is Outcome.REJECTED:
+            return nis
+        if taken.outcome is Outcome.REACQUIRED:
+            P = LOST.covariance
+            P[5:, 5:] = self._P[row, 5:, 5:]
+            S = symmetric_square_root(P)
+        self._x[row], S = block_update(x, S, H_FIX, innovation, variance)
+        self._P[row] = S @ S.T
+        return nis
+
+    def _is_lost(self, place: int) -> bool:
+        """Whether a rejected fix and those before it were rejected in a row, and agree."""
+        s = self.settings
+        first = place - s.reacquire_after + 1
+        if first < 0 or any(entry.outcome is not Outcome.REJECTED for entry in self._history[first:place]):
+            return False
+        row = self._history[first : place + 1]
+        for one, two in pairwise(row):
+            turn = two.fix.heading_rad - one.fix.heading_rad - (two.heading_rad - one.heading_rad)
+            moved = float(np.linalg.norm(two.fix.position_m - one.fix.position_m))
+            reach = s.agree_m + s.agree_m_s * (two.fix.time_s - one.fix.time_s)
+            if abs(float(wrapped(turn))) > s.agree_rad or moved > reach:
+                return False
+        return True
+
+    def _predict(self, first: int, last: int) -> None:
+        """Predict rows, with the noises of what is lost in each of them."""
+        lost = self._lost[first + 1 : last + 1]
+        changes = first + 1 + np.flatnonzero((lost[1:] != lost[:-1]).any(axis=1))
+        for begin, end in pairwise([first, *changes.tolist(), last]):
+            densities = self._densities[*self._lost[end].astype(np.intp)]
+            predict_rows(begin, end, self._time_s, self._readings, self._there, densities, self._x, self._P)
+
+    def _row_at(self, time_s: float) -> int:
+        """Row of an instant; an interval that holds it is cut there."""
+        row = int(np.searchsorted(self._time_s[: self._n], time_s))
+        if self._time_s[row] == time_s:
+            return row
+        self._make_room(1)
+        row = int(np.searchsorted(self._time_s[: self._n], time_s))
+        for values in (self._time_s, self._readings, self._there, self._lost, self._x, self._P):
+            values[row + 1 : self._n + 1] = values[row : self._n].copy()
+        self._time_s[row] = time_s
+        self._n += 1
+        return row
+
+    def _make_room(self, rows: int) -> None:
+        """Make room for more rows, by forgetting what is older than the buffer, or by longer arrays."""
+        if self._n + rows <= len(self._time_s):
+            return
+        horizon = self._time_s[self._n - 1] - self.settings.buffer_s
+        first = max(0, int(np.searchsorted(self._time_s[: self._n], horizon)) - 1)
+        kept = self._n - first
+        capacity = max(256, 2 * (kept + rows))
+        for name in ("_time_s", "_readings", "_there", "_lost", "_x", "_P"):
+            old = getattr(self, name)
+            new = np.zeros((capacity, *old.shape[1:]), dtype=old.dtype)
+            new[:kept] = old[first : self._n]
+            setattr(self, name, new)
+        self._n = kept
+        forgotten = bisect_right(self._history, self._time_s[0], key=lambda entry: entry.fix.time_s)
+        del self._history[: max(0, forgotten - self.settings.reacquire_after)]

@@ -1,0 +1,248 @@
+r"""The mock-up's gyro and its inclinometer, which serves as accelerometer, and their calibration at rest.
+
+A reading is the true value plus a zero that is linear in temperature, plus noise; beyond the range there is none (NaN).
+An inclinometer that is mounted with a tilt also reads g·sin(tilt), which nothing tells from a zero.
+
+Calibration averages readings at rest and is repeated after every power-on. A pulse of a valve meanwhile would shift the
+zeros by up to 0.005 m/s², so readings that are not those of a satellite at rest are refused.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import stats
+
+from adcs.mockup.navigation.strapdown import ImuRecord
+from arrays.typing import FloatArray
+
+G_M_S2 = 9.80665
+FALSE_ALARM = 1e-3
+"""Of a calibration at rest: how often one that nothing disturbs is refused."""
+
+
+def _zero_vector() -> FloatArray:
+    return np.zeros(2)
+
+
+@dataclass(frozen=True)
+class RateGyro:
+    """The ADIS16100: ±300 °/s, noise 0.1 °/s, a zero that is linear in temperature, -40 to 85 °C.
+
+    Attributes
+    ----------
+    sigma_rad_s : float
+        Noise of a sample.
+    range_rad_s : float
+    zero_rad_s : float
+        At ``reference_C``.
+    zero_slope_rad_s_K : float
+        The source does not state it.
+    reference_C : float
+    lowest_C, highest_C : float
+        Temperatures that it works at.
+    """
+
+    sigma_rad_s: float = math.radians(0.1)
+    range_rad_s: float = math.radians(300.0)
+    zero_rad_s: float = 0.0
+    zero_slope_rad_s_K: float = 0.0
+    reference_C: float = 20.0
+    lowest_C: float = -40.0
+    highest_C: float = 85.0
+
+    def __post_init__(self) -> None:
+        _check_noise_and_range(self.sigma_rad_s, self.range_rad_s)
+
+    def readings(self, rate_rad_s: ArrayLike, noise: ArrayLike, temperature_C: ArrayLike = 20.0) -> FloatArray:
+        """What it reads, NaN beyond its range.
+
+        Parameters
+        ----------
+        rate_rad_s : array_like, shape (...)
+        noise : array_like, shape (...)
+            Standard normal numbers.
+        temperature_C : array_like, shape (...)
+
+        Returns
+        -------
+        ndarray, shape (...)
+
+        Raises
+        ------
+        ValueError
+            It does not work at such a temperature.
+        """
+        warmer_K = _checked_temperature(temperature_C, self.lowest_C, self.highest_C) - self.reference_C
+        zero = self.zero_rad_s + self.zero_slope_rad_s_K * warmer_K
+        noise = np.asarray(noise, dtype=np.float64)
+        return _within(np.asarray(rate_rad_s) + zero + self.sigma_rad_s * noise, self.range_rad_s)
+
+
+@dataclass(frozen=True, eq=False)
+class Inclinometer:
+    """The SCA103T-D04 as accelerometer of two axes: ±0.26 g, noise 0.002 m/s², ±0.0003 m/s² per °C, -40 to 125 °C.
+
+    Attributes
+    ----------
+    sigma_m_s2 : float
+        Noise of a sample, each axis.
+    range_m_s2 : float
+        Of each axis.
+    zero_m_s2 : ndarray, shape (2,)
+        At ``reference_C``.
+    zero_slope_m_s2_K : ndarray, shape (2,)
+        0.0003 at most.
+    tilt_rad : ndarray, shape (2,)
+        Of the axes x and y above the horizontal.
+    reference_C : float
+    lowest_C, highest_C : float
+        Temperatures that it works at.
+    """
+
+    sigma_m_s2: float = 0.002
+    range_m_s2: float = 0.26 * G_M_S2
+    zero_m_s2: FloatArray = field(default_factory=_zero_vector)
+    zero_slope_m_s2_K: FloatArray = field(default_factory=_zero_vector)
+    tilt_rad: FloatArray = field(default_factory=_zero_vector)
+    reference_C: float = 20.0
+    lowest_C: float = -40.0
+    highest_C: float = 125.0
+
+    def __post_init__(self) -> None:
+        _check_noise_and_range(self.sigma_m_s2, self.range_m_s2)
+        for name in ("zero_m_s2", "zero_slope_m_s2_K", "tilt_rad"):
+            vector = np.asarray(getattr(self, name), dtype=np.float64)
+            if vector.shape != (2,) or not np.isfinite(vector).all():
+                raise ValueError(f"Input {name} must be two finite numbers; instead received {vector.tolist()}.")
+            object.__setattr__(self, name, vector)
+
+    def readings(self, acceleration_m_s2: ArrayLike, noise: ArrayLike, temperature_C: ArrayLike = 20.0) -> FloatArray:
+        """What it reads, NaN beyond its range.
+
+        Parameters
+        ----------
+        acceleration_m_s2 : array_like, shape (..., 2)
+            Along body x and y.
+        noise : array_like, shape (..., 2)
+            Standard normal numbers.
+        temperature_C : array_like, shape (...)
+
+        Returns
+        -------
+        ndarray, shape (..., 2)
+
+        Raises
+        ------
+        ValueError
+            It does not work at such a temperature.
+        """
+        warmer_K = _checked_temperature(temperature_C, self.lowest_C, self.highest_C) - self.reference_C
+        zero = self.zero_m_s2 + G_M_S2 * np.sin(self.tilt_rad) + self.zero_slope_m_s2_K * warmer_K[..., None]
+        noise = np.asarray(noise, dtype=np.float64)
+        return _within(np.asarray(acceleration_m_s2) + zero + self.sigma_m_s2 * noise, self.range_m_s2)
+
+
+class NotAtRestError(ValueError):
+    """Readings for a calibration are not those of a satellite at rest."""
+
+
+@dataclass(frozen=True, eq=False)
+class RestZeros:
+    """Zeros of all channels, of a calibration at rest.
+
+    Attributes
+    ----------
+    acceleration_m_s2 : ndarray, shape (2,)
+        Zero and tilt.
+    rate_rad_s : float
+    acceleration_sigma_m_s2, rate_sigma_rad_s : float
+        Standard deviations of these means.
+    """
+
+    acceleration_m_s2: FloatArray
+    rate_rad_s: float
+    acceleration_sigma_m_s2: float
+    rate_sigma_rad_s: float
+
+
+def zeros_at_rest(
+    imu: ImuRecord, accelerometer: Inclinometer, gyro: RateGyro, *, false_alarm: float = FALSE_ALARM
+) -> RestZeros:
+    """Zeros of a satellite at rest: the means of its readings.
+
+    Whether it is at rest is seen in means over 1, 4, 16, … samples: none may be farther from the mean over all than
+    noise explains.
+
+    Parameters
+    ----------
+    imu : ImuRecord
+        One run, two samples at least; missing readings are left out.
+    accelerometer, gyro : Inclinometer, RateGyro
+        For their noise.
+    false_alarm : float
+        How often readings at rest are refused.
+
+    Returns
+    -------
+    RestZeros
+
+    Raises
+    ------
+    NotAtRestError
+        A pulse of a valve, a push or a turn: the text says when.
+    ValueError
+        There are fewer than two samples.
+
+    Notes
+    -----
+    A mean of k among n samples differs from that of all by σ√(1/k - 1/n); the quantile is shared by all means
+    (Bonferroni). A thrust that lasts throughout is not told from a zero.
+    """
+    channels = np.concatenate([imu.acceleration_m_s2, imu.rate_rad_s[:, None]], axis=1)
+    channels = np.where(np.isnan(channels).any(axis=1, keepdims=True), np.nan, channels)
+    there = ~np.isnan(channels[:, 0])
+    readings, time_s = channels[there], imu.time_s[there]
+    n = len(readings)
+    if n < 2:
+        raise ValueError(f"Input imu must have two samples at least; instead received {n}.")
+    sigma = np.array([accelerometer.sigma_m_s2, accelerometer.sigma_m_s2, gyro.sigma_rad_s])
+    mean = readings.mean(axis=0)
+    lengths = [4**power for power in range(12) if 2 * 4**power <= n]
+    limit = float(stats.norm.isf(0.5 * false_alarm / (3 * sum(n // k for k in lengths))))
+    for k in lengths:
+        blocks = readings[: n // k * k].reshape(-1, k, 3).mean(axis=1)
+        far = np.abs(blocks - mean) > limit * sigma * math.sqrt(1.0 / k - 1.0 / n)
+        if far.any():
+            block, channel = np.argwhere(far)[0]
+            raise NotAtRestError(
+                "Input imu must be of a satellite at rest; instead received "
+                f"{('an acceleration along x', 'an acceleration along y', 'a rate')[channel]} that noise does not "
+                f"explain at {time_s[block * k]:.2f} s (mean of {k} samples)."
+            )
+    return RestZeros(mean[:2], float(mean[2]), float(sigma[0]) / math.sqrt(n), float(sigma[2]) / math.sqrt(n))
+
+
+def _within(readings: FloatArray, largest: float) -> FloatArray:
+    return np.where(np.abs(readings) <= largest, readings, np.nan)
+
+
+def _check_noise_and_range(sigma: float, largest: float) -> None:
+    if not (0.0 <= sigma < math.inf and 0.0 < largest < math.inf):
+        raise ValueError(
+            "Input sigma must be 0 or more and range positive, both finite; "
+            f"instead received {sigma:g} and {largest:g}."
+        )
+
+
+def _checked_temperature(temperature_C: ArrayLike, lowest_C: float, highest_C: float) -> FloatArray:
+    temperature = np.asarray(temperature_C, dtype=np.float64)
+    outside = temperature[~((temperature >= lowest_C) & (temperature <= highest_C))]
+    if outside.size:
+        raise ValueError(
+            f"Input temperature_C must be {lowest_C:g} to {highest_C:g}; instead received {outside.flat[0]:g}."
+        )
+    return temperature

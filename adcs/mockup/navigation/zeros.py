@@ -1,0 +1,358 @@
+r"""Zeros of the accelerometer in closed form, from what its integral and the camera disagree by over a run.
+
+Table axes are written as complex numbers, X + iY: turning by φ is then a product with :math:`e^{iφ}`, and so is the
+zero ζ = α + iβ of the body axes x and y. With :math:`D_t[u]` the double integral of what is constant over each
+interval, the integrated position is
+
+.. math:: p(t) = p_0 + v_0 t + D_t[a e^{iφ}] - ζ\,D_t[e^{iφ}]
+
+and D is a single sum, :math:`D_t[u] = \sum_j u_j Δ_j (t - \tfrac12(t_j + t_{j-1}))`. Least squares against the fixes
+with start position and velocity known give
+
+.. math:: α = f_1/a_{11}, \quad β = f_2/a_{11}, \quad a_{11} = \sum |D[e^{iφ}]|^2, \quad
+    f_1 + i f_2 = \sum \overline{D[e^{iφ}]}\,(p_0 + v_0 t + D[a e^{iφ}] - p_c)
+
+without a matrix and without a condition: the source's a₁₂ is 0 and its a₂₂ = a₁₁ for every history of the heading,
+since a complex number has one square only. Where the start is a straight line through the first fixes, the zeros' share
+in it goes along, and the same holds. With the start unknown too there are six unknowns, three complex ones.
+
+Constant zeros fit runs of some ten seconds. Over minutes the sensor warms: further zeros may go along with any known
+course, such as time or temperature.
+
+Source: Bindel et al., the section on least squares (its minus sign is lost in print); complex numbers, the start and
+the courses are ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adcs.mockup.navigation.fixes import FixRecord
+from adcs.mockup.navigation.strapdown import ImuRecord, PlanarState, wrapped
+from arrays.typing import ComplexArray, FloatArray
+
+SIGMA_M = 1e-3
+"""Noise of the camera's fixes, each axis."""
+
+
+def double_integral(begin_s: float, time_s: ArrayLike, values: ArrayLike, at_s: ArrayLike) -> ComplexArray:
+    r"""Twice integrated from rest, :math:`\sum_j u_j Δ_j (t - \tfrac12(t_j + t_{j-1}))`, in O(n).
+
+    Parameters
+    ----------
+    begin_s : float
+        Where the first interval begins.
+    time_s : array_like, shape (n,)
+        Where each interval ends.
+    values : array_like of real or complex, shape (..., n)
+        Constant over each interval.
+    at_s : array_like, shape (k,)
+        Within the record; where it is within an interval, that one counts up to it.
+
+    Returns
+    -------
+    ndarray of complex, shape (..., k)
+
+    Raises
+    ------
+    ValueError
+        An instant is outside of the record.
+    """
+    t = np.asarray(time_s, dtype=np.float64) - begin_s
+    u = np.asarray(values, dtype=np.complex128)
+    at = np.asarray(at_s, dtype=np.float64) - begin_s
+    if at.size and not (at.min() >= 0.0 and at.max() <= t[-1]):
+        raise ValueError(
+            f"Input at_s must be within {begin_s:.6g} to {begin_s + t[-1]:.6g} s; "
+            f"instead received {begin_s + at.min():.6g} to {begin_s + at.max():.6g} s."
+        )
+    edges = np.concatenate([[0.0], t])
+    gained = u * np.diff(edges)
+    lead = np.zeros((*u.shape[:-1], 1), dtype=np.complex128)
+    speed = np.concatenate([lead, np.cumsum(gained, axis=-1)], axis=-1)
+    moment = np.concatenate([lead, np.cumsum(gained * 0.5 * (edges[1:] + edges[:-1]), axis=-1)], axis=-1)
+    row = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, t.size - 1)
+    part: ComplexArray = at * speed[..., row] - moment[..., row] + 0.5 * u[..., row] * (at - edges[row]) ** 2
+    return part
+
+
+def heading_from_fixes(imu: ImuRecord, fixes: FixRecord) -> tuple[FloatArray, float]:
+    """Heading in the middle of every interval, from the gyro, its start and zero fitted to the camera's headings.
+
+    Parameters
+    ----------
+    imu : ImuRecord
+        One run, all readings there.
+    fixes : FixRecord
+        Two at least, with exposures within the record.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Counter-clockwise [rad].
+    float
+        Zero of the gyro [rad/s].
+
+    Raises
+    ------
+    ValueError
+        There are fewer than two fixes.
+    """
+    if len(fixes) < 2:
+        raise ValueError(f"Input fixes must be two at least; instead received {len(fixes)}.")
+    angle = imu.rate_rad_s * imu.steps_s
+    turned_by = np.cumsum(angle)
+    edges = np.concatenate([[imu.begin_s], imu.time_s])
+    t = fixes.time_s - imu.begin_s
+    misfit = fixes.heading_rad - np.interp(fixes.time_s, edges, np.concatenate([[0.0], turned_by]))
+    # Against the first one, so that a misfit near half a turn is not torn apart.
+    misfit = misfit[0] + wrapped(misfit - misfit[0])
+    zero, start = np.linalg.lstsq(np.stack([-t, np.ones(t.size)], axis=1), misfit, rcond=None)[0]
+    middle: FloatArray = start + turned_by - 0.5 * angle - zero * (imu.time_s - 0.5 * imu.steps_s - imu.begin_s)
+    return middle, float(zero)
+
+
+@dataclass(frozen=True, eq=False)
+class ZeroProblem:
+    """What the fits need, at the exposures of k fixes; table axes as complex numbers.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (k,)
+        Since the beginning of the record.
+    moved : ndarray of complex, shape (k,)
+        D[a e^{iφ}] of the readings [m].
+    by_zero : ndarray of complex, shape (m, k)
+        D[s e^{iφ}] for each course s of a zero [s²]; the first one is constant.
+    measured : ndarray of complex, shape (k,)
+        Positions of the fixes [m].
+    """
+
+    time_s: FloatArray
+    moved: ComplexArray
+    by_zero: ComplexArray
+    measured: ComplexArray
+
+
+def zero_problem(
+    imu: ImuRecord, heading_rad: ArrayLike, fixes: FixRecord, courses: ArrayLike | None = None
+) -> ZeroProblem:
+    """Gather what the fits need.
+
+    Parameters
+    ----------
+    imu : ImuRecord
+        One run, all readings there.
+    heading_rad : array_like, shape (n,)
+        In the middle of every interval: of :func:`heading_from_fixes`, or from a filter.
+    fixes : FixRecord
+        With exposures within the record.
+    courses : array_like, shape (m, n), optional
+        What further zeros go along with, such as the time or the temperature less that at the beginning.
+
+    Returns
+    -------
+    ZeroProblem
+
+    Raises
+    ------
+    ValueError
+        The shapes do not match, there are missing readings, or an exposure is outside of the record.
+    """
+    n = len(imu)
+    heading = np.asarray(heading_rad, dtype=np.float64)
+    further = np.empty((0, n)) if courses is None else np.asarray(courses, dtype=np.float64)
+    if heading.shape != (n,):
+        raise ValueError(f"Input heading_rad must have shape ({n},); instead received {heading.shape}.")
+    if further.ndim != 2 or further.shape[1] != n:
+        raise ValueError(f"Input courses must have shape (m, {n}); instead received {further.shape}.")
+    if not np.isfinite(imu.acceleration_m_s2).all():
+        raise ValueError(
+            "Input imu must have all readings; instead received missing ones: see"
+            " adcs.mockup.navigation.strapdown.held."
+        )
+    turn = np.exp(1j * heading)
+    values = np.concatenate([[_complex(imu.acceleration_m_s2) * turn, turn], further * turn])
+    integrals = double_integral(imu.begin_s, imu.time_s, values, fixes.time_s)
+    return ZeroProblem(fixes.time_s - imu.begin_s, integrals[0], integrals[1:], _complex(fixes.position_m))
+
+
+@dataclass(frozen=True, eq=False)
+class ZeroFit:
+    """Zeros, and the start that goes with them.
+
+    Attributes
+    ----------
+    zeros : ndarray, shape (m, 2)
+        Along body x and y: the constant ones [m/s²], and those along each course [m/s² per its unit].
+    start_position_m, start_velocity_m_s : ndarray, shape (2,)
+        At the beginning of the record.
+    covariance : ndarray
+        Of what was fitted, two rows each: the zeros, and where fitted, the position and the velocity.
+    residual_rms_m : float
+        Distance between integrated position and fix, rms.
+    """
+
+    zeros: FloatArray
+    start_position_m: FloatArray
+    start_velocity_m_s: FloatArray
+    covariance: FloatArray
+    residual_rms_m: float
+
+    @property
+    def zero_m_s2(self) -> FloatArray:
+        """The constant zeros, shape (2,)."""
+        return self.zeros[0]
+
+    def zero_course(self, courses: ArrayLike | None = None) -> FloatArray:
+        """Zeros of every sample, shape (n, 2), or (2,) without courses (m, n), which are those of the problem."""
+        if courses is None:
+            return self.zeros[0]
+        return self.zeros[0] + np.asarray(courses, dtype=np.float64).T @ self.zeros[1:]
+
+    def start(self, heading_rad: float) -> PlanarState:
+        """State at the beginning of the record, with a heading."""
+        return PlanarState(self.start_position_m, self.start_velocity_m_s, heading_rad)
+
+
+def constant_zeros(
+    problem: ZeroProblem, start_position_m: ArrayLike, start_velocity_m_s: ArrayLike, sigma_m: float = SIGMA_M
+) -> ZeroFit:
+    """Two zeros in closed form, f₁/a₁₁ and f₂/a₁₁, with a known start.
+
+    Parameters
+    ----------
+    problem : ZeroProblem
+        Without further courses.
+    start_position_m, start_velocity_m_s : array_like, shape (2,)
+        At the beginning of the record. The source takes them from two fixes, and the error of that velocity dominates
+        that of the zeros: see :func:`constant_zeros_after`.
+    sigma_m : float
+        Noise of a fix, each axis, for the covariance.
+
+    Returns
+    -------
+    ZeroFit
+
+    Raises
+    ------
+    ValueError
+        The problem has further courses, or no fix is later than the beginning.
+    """
+    turn = _only_constant(problem)
+    a11 = float(np.sum(np.abs(turn) ** 2))
+    if not a11 > 0.0:
+        raise ValueError("Input problem must have a fix after the beginning; instead received none.")
+    p0 = _complex(np.asarray(start_position_m, dtype=np.float64))
+    v0 = _complex(np.asarray(start_velocity_m_s, dtype=np.float64))
+    f = p0 + v0 * problem.time_s + problem.moved
+    zeta = np.sum(turn.conj() * (f - problem.measured)) / a11
+    residual = f - zeta * turn - problem.measured
+    return ZeroFit(_real([zeta]), _real(p0), _real(v0), sigma_m**2 / a11 * np.eye(2), _rms(residual))
+
+
+def constant_zeros_after(problem: ZeroProblem, first: int = 4, sigma_m: float = SIGMA_M) -> ZeroFit:
+    """Two zeros in closed form, with the start of a straight line through the first fixes.
+
+    The line is that of the fixes less what the samples moved by up to each, which depends on the zeros.
+
+    Parameters
+    ----------
+    problem : ZeroProblem
+        Without further courses.
+    first : int
+        Fixes that the line goes through; two as in the source, whose velocity then has √2 times the noise of a fix over
+        one period.
+    sigma_m : float
+        Noise of a fix, each axis, for the covariance.
+
+    Returns
+    -------
+    ZeroFit
+
+    Raises
+    ------
+    ValueError
+        The problem has further courses, or not more fixes than ``first``, which must be two at least.
+    """
+    turn, t = _only_constant(problem), problem.time_s
+    if not 2 <= first < t.size:
+        raise ValueError(f"Input first must be 2 or more and less than the {t.size} fixes; instead received {first}.")
+    middle = t[:first].mean()
+    weight = (t[:first] - middle) / np.sum((t[:first] - middle) ** 2)
+    line = 1.0 / first + np.outer(t - middle, weight)  # what each of the first fixes does to the line at each instant
+    rest = problem.measured - problem.moved
+    g, y = turn - line @ turn[:first], rest - line @ rest[:first]
+    a11 = float(np.sum(np.abs(g) ** 2))
+    zeta = -np.sum(g.conj() * y) / a11
+    start = rest[:first] + zeta * turn[:first]
+    v0 = np.sum(weight * start)
+    by_fix = g.conj()
+    by_fix[:first] -= g.conj() @ line
+    variance = sigma_m**2 * float(np.sum(np.abs(by_fix) ** 2)) / a11**2
+    return ZeroFit(
+        _real([zeta]), _real(start.mean() - v0 * middle), _real(v0), variance * np.eye(2), _rms(y + zeta * g)
+    )
+
+
+def zeros_and_start(problem: ZeroProblem, sigma_m: float = SIGMA_M) -> ZeroFit:
+    """Zeros of all courses, start position and start velocity: six unknowns with constant zeros alone.
+
+    Parameters
+    ----------
+    problem : ZeroProblem
+    sigma_m : float
+        Noise of a fix, each axis, for the covariance.
+
+    Returns
+    -------
+    ZeroFit
+
+    Raises
+    ------
+    ValueError
+        The fixes do not determine the unknowns: too few, or too close in time.
+    """
+    t, m = problem.time_s, len(problem.by_zero)
+    A = np.stack([*(-problem.by_zero), np.ones(t.size, dtype=np.complex128), t.astype(np.complex128)], axis=1)
+    size = np.linalg.norm(A, axis=0)
+    if t.size < A.shape[1] or not (size > 0.0).all() or np.linalg.matrix_rank(A / size) < A.shape[1]:
+        raise ValueError(
+            f"Input problem must have fixes that determine {A.shape[1]} complex unknowns; "
+            f"instead received {t.size} that do not."
+        )
+    q, r = np.linalg.qr(A / size)
+    unknown = np.linalg.solve(r, q.conj().T @ (problem.measured - problem.moved)) / size
+    residual = problem.moved + A @ unknown - problem.measured
+    inverse = np.linalg.inv(r) / size[:, None]
+    covariance = _real_covariance(sigma_m**2 * (inverse @ inverse.conj().T))
+    return ZeroFit(_real(unknown[:m]), _real(unknown[m]), _real(unknown[m + 1]), covariance, _rms(residual))
+
+
+def _complex(vector: FloatArray) -> ComplexArray:
+    return np.asarray(vector[..., 0] + 1j * vector[..., 1])
+
+
+def _real(value: ArrayLike) -> FloatArray:
+    number = np.asarray(value, dtype=np.complex128)
+    return np.stack([number.real, number.imag], axis=-1)
+
+
+def _rms(residual: ComplexArray) -> float:
+    return float(np.sqrt(np.mean(np.abs(residual) ** 2)))
+
+
+def _only_constant(problem: ZeroProblem) -> ComplexArray:
+    if len(problem.by_zero) != 1:
+        raise ValueError(f"Input problem must be without further courses; instead received {len(problem.by_zero) - 1}.")
+    return problem.by_zero[0]
+
+
+def _real_covariance(C: ComplexArray) -> FloatArray:
+    """Of real and imaginary parts in turn: noise that is the same along both axes makes blocks [[R, -I], [I, R]]."""
+    m = len(C)
+    blocks = np.stack([np.stack([C.real, -C.imag], axis=-1), np.stack([C.imag, C.real], axis=-1)], axis=-2)
+    return blocks.transpose(0, 2, 1, 3).reshape(2 * m, 2 * m)

@@ -1,0 +1,1 @@
+"""From the light on the camera to a fix: camera, centroids, triangles, matchers."""

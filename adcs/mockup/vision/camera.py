@@ -1,0 +1,280 @@
+r"""The camera that looks up at the sky of lights: where a light is in the image, and where on the ceiling a pixel is.
+
+Pixels are (column, row) with whole numbers at the pixels' centres, rows downwards, as in every image file. The body's
+x axis is the image's right and its y axis the image's down: with Z up and away from the camera that is the only way an
+image that is not mirrored by optics can be.
+
+Estimators work with *centred* pixels, relative to the optical centre, the lens undone, x to the right and y **up** as
+one looks at the picture. Seen so the ceiling is mirrored relative to the table seen from above: triangles turn the
+other way. In complex numbers, with p a centred pixel and s the size of a pixel on the ceiling,
+
+.. math:: X + iY = s\, e^{i\varphi}\, \bar p + (X_c + i Y_c).
+
+The lens moves a light radially, :math:`r_\mathrm{image} = r\,(1 + k_1 (r / 320\,\mathrm{px})^2)` with r from the
+optical centre; :math:`k_1 < 0` is a barrel. The optical axis is vertical, so a pixel has one size on the whole ceiling.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from arrays.typing import BoolArray, FloatArray
+
+REFERENCE_RADIUS_PX = 320.0
+"""Radius at which the lens moves a light by k1 of its distance to the optical centre."""
+_NO_LENS = 1e-17  # less is lost in rounding, and the closed form of the inverse would overflow
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Place and heading of the satellite, of one or of many (numbers or arrays of one shape).
+
+    Attributes
+    ----------
+    x_m, y_m : float or ndarray
+        Of the optical axis, where it meets the ceiling, in the table's frame [m].
+    heading_rad : float or ndarray
+        Counter-clockwise seen from above, from the table's X to the body's x [rad].
+    """
+
+    x_m: float | FloatArray
+    y_m: float | FloatArray
+    heading_rad: float | FloatArray
+
+    @property
+    def position_m(self) -> FloatArray:
+        """X and Y, shape (..., 2)."""
+        return np.stack(np.broadcast_arrays(np.float64(self.x_m), np.float64(self.y_m)), axis=-1)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera with a vertical optical axis.
+
+    Attributes
+    ----------
+    width_px, height_px : int
+    m_per_px : float
+        Size of a pixel on the ceiling, at the optical centre [m].
+    centre_px : tuple, shape (2,), optional
+        Column and row of the optical centre; the middle of the image if it is not given.
+    k1 : float
+        Radial distortion at 320 px, relative.
+    exposure_s : float
+        A light that moves is smeared over this time; a pose belongs to its middle.
+
+    Raises
+    ------
+    ValueError
+        A size is not positive, a number is not finite, or the lens folds the image onto itself within the frame.
+    """
+
+    width_px: int = 640
+    height_px: int = 480
+    m_per_px: float = 0.9 / 640
+    centre_px: tuple[float, float] | None = None
+    k1: float = 0.0
+    exposure_s: float = 1.0 / 30.0
+
+    def __post_init__(self) -> None:
+        for name in ("width_px", "height_px"):
+            value = getattr(self, name)
+            if not (0 < value < math.inf and value == int(value)):
+                raise ValueError(f"Input {name} must be a positive whole number; instead received {value}.")
+        if not 0.0 < self.m_per_px < math.inf:
+            raise ValueError(f"Input m_per_px must be a positive number; instead received {self.m_per_px}.")
+        if not 0.0 <= self.exposure_s < math.inf:
+            raise ValueError(f"Input exposure_s must not be negative; instead received {self.exposure_s}.")
+        centre = self.centre_px or (0.5 * (self.width_px - 1), 0.5 * (self.height_px - 1))
+        if len(centre) != 2 or not all(map(math.isfinite, centre)):
+            raise ValueError(f"Input centre_px must be two finite numbers; instead received {self.centre_px}.")
+        object.__setattr__(self, "centre_px", (float(centre[0]), float(centre[1])))
+        corners = np.array([[x, y] for x in (0, self.width_px - 1) for y in (0, self.height_px - 1)])
+        if not math.isfinite(self.k1) or np.isnan(undistorted(self, corners)).any():
+            raise ValueError(f"Input k1 must leave each pixel its own place; instead received {self.k1}.")
+
+    @property
+    def centre(self) -> FloatArray:
+        """Optical centre, shape (2,)."""
+        return np.array(self.centre_px)
+
+    @property
+    def footprint_m(self) -> tuple[float, float]:
+        """Width and height of the seen part of the ceiling, the lens left out."""
+        return self.width_px * self.m_per_px, self.height_px * self.m_per_px
+
+
+def camera_of_footprint(width_m: float, k1: float = 0.0) -> Camera:
+    """Camera of 640 × 480 px that sees a width of the ceiling."""
+    return Camera(m_per_px=width_m / 640, k1=k1)
+
+
+def centred_from_table(camera: Camera, pose: Pose, points_m: ArrayLike) -> FloatArray:
+    """Where points of the ceiling are relative to the optical centre, with an ideal lens.
+
+    Parameters
+    ----------
+    camera : Camera
+    pose : Pose
+        Numbers, or arrays of shape (...).
+    points_m : array_like, shape (..., n, 2)
+        In the table's frame [m].
+
+    Returns
+    -------
+    ndarray, shape (..., n, 2)
+        Centred pixels, y up.
+    """
+    offset = np.asarray(points_m, dtype=np.float64) - pose.position_m[..., None, :]
+    cos, sin = np.cos(pose.heading_rad)[..., None], np.sin(pose.heading_rad)[..., None]
+    right, down = cos * offset[..., 0] + sin * offset[..., 1], cos * offset[..., 1] - sin * offset[..., 0]
+    return np.stack([right, -down], axis=-1) / camera.m_per_px
+
+
+def table_from_centred(camera: Camera, pose: Pose, points_px: ArrayLike) -> FloatArray:
+    """Points of the ceiling from centred pixels; inverse of :func:`centred_from_table`.
+
+    Parameters
+    ----------
+    camera : Camera
+    pose : Pose
+        Numbers, or arrays of shape (...).
+    points_px : array_like, shape (..., n, 2)
+
+    Returns
+    -------
+    ndarray, shape (..., n, 2)
+        In the table's frame [m].
+    """
+    body = np.asarray(points_px, dtype=np.float64) * [camera.m_per_px, -camera.m_per_px]
+    cos, sin = np.cos(pose.heading_rad)[..., None], np.sin(pose.heading_rad)[..., None]
+    turned = np.stack([cos * body[..., 0] - sin * body[..., 1], sin * body[..., 0] + cos * body[..., 1]], axis=-1)
+    place: FloatArray = turned + pose.position_m[..., None, :]
+    return place
+
+
+def distorted(camera: Camera, points_px: ArrayLike) -> FloatArray:
+    """Pixels of the image from centred pixels.
+
+    Parameters
+    ----------
+    camera : Camera
+    points_px : array_like, shape (..., 2)
+        Centred, y up.
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        Column and row. NaN of a point so far out that the lens would fold it back (of k1 < 0 beyond
+        320 px/√(-3 k1)): such a point is not seen.
+    """
+    points = np.asarray(points_px, dtype=np.float64)
+    squared = np.sum(points**2, axis=-1, keepdims=True) / REFERENCE_RADIUS_PX**2
+    moved = points * np.where(1.0 + 3.0 * camera.k1 * squared > 0.0, 1.0 + camera.k1 * squared, np.nan)
+    image: FloatArray = moved * [1.0, -1.0] + camera.centre
+    return image
+
+
+def undistorted(camera: Camera, image_px: ArrayLike) -> FloatArray:
+    r"""Centred pixels from pixels of the image; inverse of :func:`distorted`.
+
+    With :math:`\rho = r/320` the cubic :math:`\rho + k_1 \rho^3 = d` is solved in closed form, :math:`\rho = A
+    \sin(\tfrac13 \arcsin(3d/A))` with :math:`A = \sqrt{-4/(3k_1)}`, and with hyperbolic functions for :math:`k_1 > 0`.
+
+    Parameters
+    ----------
+    camera : Camera
+    image_px : array_like, shape (..., 2)
+        Column and row.
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        Centred, y up. NaN where the lens shows nothing.
+    """
+    points: FloatArray = (np.asarray(image_px, dtype=np.float64) - camera.centre) * [1.0, -1.0]
+    if abs(camera.k1) < _NO_LENS:
+        return points
+    d = np.linalg.norm(points, axis=-1, keepdims=True) / REFERENCE_RADIUS_PX
+    A = math.sqrt(4.0 / (3.0 * abs(camera.k1)))
+    if camera.k1 < 0.0:
+        inside = 3.0 * d <= A
+        rho = A * np.sin(np.arcsin(np.where(inside, 3.0 * d / A, np.nan)) / 3.0)
+    else:
+        rho = A * np.sinh(np.arcsinh(3.0 * d / A) / 3.0)
+    inner: FloatArray = points * np.divide(rho, d, out=np.ones_like(d), where=d > 0.0)
+    return inner
+
+
+def image_from_table(camera: Camera, pose: Pose, points_m: ArrayLike) -> FloatArray:
+    """Where points of the ceiling are in the image.
+
+    Parameters
+    ----------
+    camera : Camera
+    pose : Pose
+        Numbers, or arrays of shape (...).
+    points_m : array_like, shape (..., n, 2)
+        In the table's frame [m].
+
+    Returns
+    -------
+    ndarray, shape (..., n, 2)
+        Column and row [px], also outside of the frame; NaN where the lens shows no such point, see
+        :func:`distorted`.
+    """
+    return distorted(camera, centred_from_table(camera, pose, points_m))
+
+
+def table_from_image(camera: Camera, pose: Pose, image_px: ArrayLike) -> FloatArray:
+    """Points of the ceiling from pixels; inverse of :func:`image_from_table`.
+
+    Parameters
+    ----------
+    camera : Camera
+    pose : Pose
+        Numbers, or arrays of shape (...).
+    image_px : array_like, shape (..., n, 2)
+        Column and row.
+
+    Returns
+    -------
+    ndarray, shape (..., n, 2)
+        In the table's frame [m].
+    """
+    return table_from_centred(camera, pose, undistorted(camera, image_px))
+
+
+def in_frame(camera: Camera, image_px: ArrayLike, margin_px: float = 0.0) -> BoolArray:
+    """Whether pixels, shape (..., 2), are within the frame, by a margin; no for NaN."""
+    points = np.asarray(image_px, dtype=np.float64)
+    last = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
+    inside: BoolArray = np.all((points >= margin_px) & (points <= last - margin_px), axis=-1)
+    return inside
+
+
+def footprint(camera: Camera, pose: Pose, points_per_side: int = 1) -> FloatArray:
+    """Outline of the seen part of the ceiling.
+
+    Parameters
+    ----------
+    camera : Camera
+    pose : Pose
+        Numbers, or arrays of shape (...).
+    points_per_side : int
+        With a lens that bends straight lines more than the corners are wanted.
+
+    Returns
+    -------
+    ndarray, shape (..., 4 points_per_side, 2)
+        In the table's frame [m], beginning at the image's upper left.
+    """
+    right, bottom = camera.width_px - 0.5, camera.height_px - 0.5
+    corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom], [-0.5, -0.5]])
+    along = np.arange(4 * points_per_side) / points_per_side
+    outline = np.stack([np.interp(along, np.arange(5), corners[:, axis]) for axis in range(2)], axis=1)
+    return table_from_image(camera, pose, outline)

@@ -1,0 +1,225 @@
+r"""Calibration of the camera: scale, distortion and optical centre from frames taken at known poses.
+
+Each light found in a frame is paired with the light of the sky that the pose predicts nearest to it. The parameters
+:math:`\theta = (s, k_1, c_x, c_y)` are those of least squares of the pairs' distances in the image, each frame weighted
+by :math:`R = \sigma^2 I + J_p P_p J_p^T`: the noise of centroids and what the uncertainty of the pose makes of
+it. :math:`\sigma` is estimated from the residuals that no shift or turn of a frame explains.
+
+Where the optical centre is cannot be told from where the satellite is, but for the lens: it is only as well known as
+the poses are, which its standard deviation says.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from adcs.mockup.vision.camera import REFERENCE_RADIUS_PX, Camera, Pose, centred_from_table, distorted
+from adcs.mockup.vision.sky import LedSky
+from arrays.typing import FloatArray
+
+PARAMETERS = ("m_per_px", "k1", "centre_x_px", "centre_y_px")
+# Pairs are farther apart than this only by mistake: as long as the lens is unknown, and at the end.
+_GATES_PX = (30.0, 10.0, 3.0)
+_STEPS_PER_GATE = 2
+_FEWEST_PAIRS = 8
+_FEWEST_OF_FRAME = 2  # one light tells nothing that a shift does not explain
+_RANK_RTOL = 1e-12
+_LEAST_NOISE_PX = 1e-7  # of made-up centroids without noise
+
+
+@dataclass(frozen=True, eq=False)
+class KnownFrame:
+    """Lights found in a frame of which the pose is known.
+
+    Attributes
+    ----------
+    pose : Pose
+    positions_px : ndarray, shape (n, 2)
+        Column and row.
+    """
+
+    pose: Pose
+    positions_px: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCalibration:
+    """A calibrated camera.
+
+    Attributes
+    ----------
+    camera : Camera
+    covariance : ndarray, shape (4, 4)
+        Of :data:`PARAMETERS`, in m/px, 1 and px.
+    noise_px : float
+        Standard deviation of a centroid's coordinate, from the residuals.
+    residual_rms_px : float
+        Root mean square of the coordinates' residuals, what the poses' errors make of them included.
+    n_pairs : int
+        Lights that were used.
+    """
+
+    camera: Camera
+    covariance: FloatArray
+    noise_px: float
+    residual_rms_px: float
+    n_pairs: int
+
+    @property
+    def values(self) -> FloatArray:
+        """Values of :data:`PARAMETERS`, shape (4,)."""
+        return np.array([self.camera.m_per_px, self.camera.k1, *self.camera.centre])
+
+    @property
+    def std(self) -> FloatArray:
+        """Standard deviations of :data:`PARAMETERS`, shape (4,)."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+
+def calibrated_camera(
+    sky: LedSky,
+    frames: Sequence[KnownFrame],
+    camera: Camera = Camera(),  # noqa: B008 - frozen
+    position_sigma_m: float = 0.0,
+    heading_sigma_rad: float = 0.0,
+) -> CameraCalibration:
+    """Camera that explains where the lights of some frames are.
+
+    Parameters
+    ----------
+    sky : LedSky
+    frames : sequence of KnownFrame
+    camera : Camera
+        To start from: the scale to some percent, the lens to some hundredths.
+    position_sigma_m, heading_sigma_rad : float
+        Standard deviations of X, Y and heading of the poses, independent from frame to frame.
+
+    Returns
+    -------
+    CameraCalibration
+
+    Raises
+    ------
+    ValueError
+        A standard deviation is negative, too few lights are where the poses predict them, or they do not determine the
+        camera.
+    """
+    sigmas = np.array([position_sigma_m, position_sigma_m, heading_sigma_rad])
+    if not ((sigmas >= 0.0) & np.isfinite(sigmas)).all():
+        raise ValueError(f"Input sigmas must be finite and not negative; instead received {sigmas[1:].tolist()}.")
+    # As far as the poses may be off, pairs are apart whatever the camera is.
+    slack_px = 3.0 * math.hypot(position_sigma_m / camera.m_per_px, heading_sigma_rad * REFERENCE_RADIUS_PX)
+    pairs = [_paired(sky, camera, frame, _GATES_PX[0] + slack_px) for frame in frames]
+    for gate in _GATES_PX:
+        for _ in range(_STEPS_PER_GATE):
+            camera = _refined(camera, pairs, sigmas).camera
+        pairs = [_paired(sky, camera, frame, gate + slack_px) for frame in frames]
+    return _refined(camera, pairs, sigmas)
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Lights of one frame: where they are on the ceiling and in the image, shapes (k, 2)."""
+
+    pose: Pose
+    points_m: FloatArray
+    image_px: FloatArray
+
+
+def _paired(sky: LedSky, camera: Camera, frame: KnownFrame, gate_px: float) -> _Pairs:
+    """Lights of the sky and of the frame that are each other's nearest, within a gate."""
+    stars = np.asarray(frame.positions_px, dtype=np.float64).reshape(-1, 2)
+    predicted = distorted(camera, centred_from_table(camera, frame.pose, sky.positions_m))
+    shown = np.flatnonzero(np.isfinite(predicted).all(axis=1))
+    distance = np.linalg.norm(predicted[shown, None] - stars, axis=-1)
+    if distance.size == 0:
+        return _Pairs(frame.pose, np.empty((0, 2)), np.empty((0, 2)))
+    light, star = distance.argmin(axis=0), np.arange(len(stars))
+    kept = (distance.argmin(axis=1)[light] == star) & (distance[light, star] <= gate_px)
+    return _Pairs(frame.pose, sky.positions_m[shown[light[kept]]], stars[kept])
+
+
+def _refined(camera: Camera, frames: Sequence[_Pairs], sigmas: FloatArray) -> CameraCalibration:
+    """One step of Gauss and Newton, and what is known after it."""
+    usable = [pairs for pairs in frames if len(pairs.points_m) >= _FEWEST_OF_FRAME]
+    n_pairs = sum(len(pairs.points_m) for pairs in usable)
+    if n_pairs < _FEWEST_PAIRS:
+        raise ValueError(
+            f"Input frames must show {_FEWEST_PAIRS} lights where their poses predict them; instead received {n_pairs}."
+        )
+    rows = [_rows(camera, pairs) for pairs in usable]
+    noise_px = _noise(rows)
+    equations = _NormalEquations()
+    for residual, by_camera, by_pose in rows:
+        # The inverse of R = noise² I + E Eᵀ.
+        E = by_pose * sigmas
+        inner = np.linalg.solve(noise_px**2 * np.eye(3) + E.T @ E, E.T)
+        equations = equations.with_rows(residual, by_camera, (np.eye(residual.size) - E @ inner) / noise_px**2)
+    step, inverse, rank = equations.solved()
+    if rank < len(PARAMETERS):
+        raise ValueError("Input frames must determine the camera; instead received lights too few or too close.")
+    centre = camera.centre + step[2:]
+    refined = replace(
+        camera, m_per_px=camera.m_per_px + step[0], k1=camera.k1 + step[1], centre_px=(centre[0], centre[1])
+    )
+    left = np.concatenate([residual - by_camera @ step for residual, by_camera, _ in rows])
+    return CameraCalibration(refined, inverse, noise_px, float(np.sqrt(np.mean(left**2))), n_pairs)
+
+
+@dataclass(frozen=True, eq=False)
+class _NormalEquations:
+    """Weighted sums over frames: JᵀWJ, JᵀWr, rᵀWr."""
+
+    matrix: FloatArray = field(default_factory=lambda: np.zeros((4, 4)))
+    right: FloatArray = field(default_factory=lambda: np.zeros(4))
+    squares: float = 0.0
+
+    def with_rows(self, residual: FloatArray, by_camera: FloatArray, weight: FloatArray) -> _NormalEquations:
+        weighted = by_camera.T @ weight
+        squares = float(residual @ weight @ residual)
+        return _NormalEquations(
+            self.matrix + weighted @ by_camera, self.right + weighted @ residual, self.squares + squares
+        )
+
+    def solved(self) -> tuple[FloatArray, FloatArray, int]:
+        """Solution, inverse of the matrix, and rank; what is not determined stays zero."""
+        scale = np.sqrt(np.maximum(np.diagonal(self.matrix), np.finfo(np.float64).tiny))
+        scaled = self.matrix / scale / scale[:, None]
+        inverse = np.linalg.pinv(scaled, rcond=_RANK_RTOL, hermitian=True) / scale / scale[:, None]
+        return inverse @ self.right, inverse, int(np.linalg.matrix_rank(scaled, tol=_RANK_RTOL, hermitian=True))
+
+
+def _rows(camera: Camera, pairs: _Pairs) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Residuals (2k,) of a frame in the image, and their derivatives by camera (2k, 4) and pose (2k, 3)."""
+    ideal = centred_from_table(camera, pairs.pose, pairs.points_m)
+    residual = pairs.image_px - distorted(camera, ideal)
+    rho2 = np.sum(ideal**2, axis=1) / REFERENCE_RADIUS_PX**2
+    flip = np.array([1.0, -1.0])  # rows count downwards
+    outer = ideal[:, :, None] * ideal[:, None, :] / REFERENCE_RADIUS_PX**2
+    by_ideal = flip[:, None] * ((1.0 + camera.k1 * rho2)[:, None, None] * np.eye(2) + 2.0 * camera.k1 * outer)
+    by_camera = np.empty((len(ideal), 2, 4))
+    by_camera[..., 0] = -(by_ideal @ ideal[..., None])[..., 0] / camera.m_per_px
+    by_camera[..., 1] = flip * rho2[:, None] * ideal
+    by_camera[..., 2:] = np.eye(2)
+    # Ideal pixels are right = (cos dX + sin dY)/s and up = (sin dX - cos dY)/s of the offset d from the satellite.
+    cos, sin = np.cos(pairs.pose.heading_rad), np.sin(pairs.pose.heading_rad)
+    by_place = np.array([[-cos, -sin], [-sin, cos]]) / camera.m_per_px
+    by_turn = np.stack([-ideal[:, 1], ideal[:, 0]], axis=1)
+    by_pose = by_ideal @ np.concatenate([np.broadcast_to(by_place, (len(ideal), 2, 2)), by_turn[..., None]], axis=2)
+    return residual.reshape(-1), by_camera.reshape(-1, 4), by_pose.reshape(-1, 3)
+
+
+def _noise(rows: Sequence[tuple[FloatArray, FloatArray, FloatArray]]) -> float:
+    """Standard deviation of a coordinate, from what neither the camera nor a shift or turn of each frame explains."""
+    equations, freedom = _NormalEquations(), 0
+    for residual, by_camera, by_pose in rows:
+        basis = np.linalg.qr(by_pose)[0]
+        equations = equations.with_rows(residual, by_camera, np.eye(residual.size) - basis @ basis.T)
+        freedom += residual.size - basis.shape[1]
+    step, _, rank = equations.solved()
+    squares = equations.squares - float(equations.right @ step)
+    return max(math.sqrt(max(squares, 0.0) / max(freedom - rank, 1)), _LEAST_NOISE_PX)

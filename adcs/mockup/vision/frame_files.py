@@ -1,0 +1,127 @@
+"""Frames of the camera as PNG files: grey, 8 bits."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import struct
+import warnings
+import zlib
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from adcs.mockup.vision.camera import Camera
+from adcs.mockup.vision.centroids import checked_frame
+from arrays.io.errors import InputError
+from arrays.typing import ByteArray
+
+_EXPECTED = "expected a grey PNG image of 8 bits"
+_MODES = {"1": "an image of black and white alone", "I;16": "an image of 16 bits", "I": "an image of more than 8 bits"}
+
+
+def read_frame(path: str | PathLike[str], camera: Camera = Camera()) -> ByteArray:  # noqa: B008 - frozen
+    """Frame from a PNG file.
+
+    Parameters
+    ----------
+    path : path-like
+    camera : Camera
+        That took it; gives its size.
+
+    Returns
+    -------
+    ndarray of uint8, shape (height_px, width_px)
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, is no PNG image, has colours or another size or depth, or is black or saturated.
+    """
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(path, formats=["PNG"]) as opened:
+                _check_kind(path, opened, camera)
+                image = np.array(opened, dtype=np.uint8)
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist, {_EXPECTED}.") from None
+    except IsADirectoryError:
+        raise InputError(f"{path} is a directory, {_EXPECTED}.") from None
+    except UnidentifiedImageError:
+        raise InputError(f"{path}: found no PNG image, {_EXPECTED}.") from None
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+        raise InputError(f"{path}: found far too many pixels, expected {_size_of(camera)}.") from None
+    except InputError:
+        raise
+    except (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error) as error:
+        reason = getattr(error, "strerror", None) or str(error).rstrip(".")
+        raise InputError(f"{path}: found a damaged image ({reason}), {_EXPECTED}.") from None
+    try:
+        return checked_frame(image)
+    except ValueError as error:
+        raise InputError(f"{path}: {str(error).removeprefix('Input ')}") from None
+
+
+def _check_kind(path: str | PathLike[str], image: Image.Image, camera: Camera) -> None:
+    if image.mode != "L":
+        found = _MODES.get(image.mode, f"an image with colours or transparency (mode {image.mode})")
+        raise InputError(f"{path}: found {found}, {_EXPECTED}.")
+    if image.size != (camera.width_px, camera.height_px):
+        raise InputError(f"{path}: found {image.size[0]} × {image.size[1]} pixels, expected {_size_of(camera)}.")
+
+
+def _size_of(camera: Camera) -> str:
+    return f"{camera.width_px} × {camera.height_px}"
+
+
+def frame_paths(path: str | PathLike[str]) -> list[Path]:
+    """Frames that a path stands for: itself, or all PNG files of a folder in the order of their names.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    list of Path
+
+    Raises
+    ------
+    InputError
+        There is no such file, or no PNG file in the folder.
+    """
+    place = Path(path)
+    if not place.is_dir():
+        if not place.exists():
+            raise InputError(f"{path} does not exist, expected a PNG image or a folder of them.")
+        return [place]
+    found = sorted(file for file in place.iterdir() if file.suffix.lower() == ".png" and file.is_file())
+    if not found:
+        raise InputError(f"{path}: found no file *.png, expected frames of the camera.")
+    return found
+
+
+def write_frame(frame: ByteArray, path: str | PathLike[str]) -> None:
+    """Write a frame as a PNG file, in one step.
+
+    Parameters
+    ----------
+    frame : ndarray of uint8, shape (height, width)
+    path : path-like
+        Replaced if it exists.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    target = Path(os.path.realpath(path))
+    written = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        Image.fromarray(frame).save(written, format="PNG")
+        os.replace(written, target)
+    finally:
+        written.unlink(missing_ok=True)

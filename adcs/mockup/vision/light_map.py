@@ -1,0 +1,71 @@
+"""Which light is nearest, for very many points at once: a table over the ceiling instead of a search."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adcs.mockup.vision.light_map_compiled import misses_of_poses
+from adcs.mockup.vision.triangles import TriangleCatalogue
+from arrays.typing import ComplexArray, FloatArray, IntArray
+
+# Of the distance between the closest two lights.
+_CELLS_PER_SPACING = 4
+_MOST_CELLS = 2_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class LightMap:
+    """Nearest light of every cell of a grid over the ceiling; made by :meth:`of`.
+
+    Attributes
+    ----------
+    plane : ndarray, shape (n,)
+        The lights, X + iY [m].
+    corner : complex
+        Lower left corner of the grid [m].
+    cell_m : float
+    nearest : ndarray, shape (rows, columns)
+        Number of the light that is nearest to the cell's middle.
+    """
+
+    plane: ComplexArray
+    corner: complex
+    cell_m: float
+    nearest: IntArray
+
+    @classmethod
+    def of(cls, catalogue: TriangleCatalogue) -> LightMap:
+        """Map of a catalogue's lights.
+
+        A cell is a quarter of the smallest distance d between two lights, so that the light that is found for a point
+        within 0.32 d of one is that one.
+        """
+        positions = catalogue.positions_m
+        distance = np.asarray(catalogue.star_tree.query(positions, k=2)[0])
+        low, high = positions.min(axis=0), positions.max(axis=0)
+        smallest = float(np.sqrt(np.prod(high - low) / _MOST_CELLS))
+        cell = max(float(distance[:, 1].min()) / _CELLS_PER_SPACING, smallest)
+        x, y = (np.arange(low[axis] - cell, high[axis] + 2.0 * cell, cell) for axis in range(2))
+        middles = np.stack(np.meshgrid(x, y), axis=-1) + 0.5 * cell
+        nearest = np.asarray(catalogue.star_tree.query(middles)[1], dtype=np.intp)
+        return cls(catalogue.plane, complex(x[0], y[0]), cell, nearest)
+
+    def lights_near(self, points: ComplexArray) -> IntArray:
+        """Number of the light nearest to points X + iY of any shape [m]; outside the grid, of one near its border."""
+        offset = (points - self.corner) * (1.0 / self.cell_m)
+        rows, columns = self.nearest.shape
+        column = np.clip(offset.real.astype(np.intp), 0, columns - 1)
+        row = np.clip(offset.imag.astype(np.intp), 0, rows - 1)
+        return self.nearest[row, column]
+
+    def misses(self, points: ComplexArray, limit_m: float) -> FloatArray:
+        """Sum over the last axis of points of the squared distance to the nearest light, at most the limit² each."""
+        offset = points - self.plane[self.lights_near(points)]
+        summed: FloatArray = np.minimum(offset.real**2 + offset.imag**2, limit_m**2).sum(axis=-1)
+        return summed
+
+    def misses_of_poses(self, image: ComplexArray, a: ComplexArray, b: ComplexArray, limit_m: float) -> FloatArray:
+        """:meth:`misses` of an image under poses (h,), compiled; see :mod:`adcs.mockup.vision.similarity`."""
+        return misses_of_poses(a, b, image, self.plane, self.nearest, self.corner, 1.0 / self.cell_m, limit_m**2)

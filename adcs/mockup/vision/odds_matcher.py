@@ -1,0 +1,272 @@
+r"""A matcher that wins on sparse fields as on damaged ones: pairs of stars, weighed by what all stars say.
+
+The camera's scale is known, so that two stars at a distance of r px are two lights at r s metres; with the handedness
+known too, one such pair gives the pose. (A Delaunay triangle is in the catalogue only if none of its corners is lost
+and no light between them is added, and needs three stars and more for a vote.)
+
+1. Of the shortest pairs of the image, all pairs of lights of about the same length are hypotheses, in both orders.
+2. Each is checked by all stars at once: the nearest light of every star is looked up in a table over the ceiling.
+3. The best are fitted to their stars, and weighed by :mod:`adcs.mockup.vision.pose_odds`: stars matched and how well,
+   lights missing, stars left over.
+4. The best pose is the fix if its odds against all other poses and against "all clutter" together are high enough.
+
+Nothing is known beforehand of where the camera is. :func:`odds_matcher` is the one to use: it tries again with wide
+tolerances where the calibrated camera finds nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adcs.mockup.vision.camera import Camera
+from adcs.mockup.vision.paper_matcher import CameraFix, Matcher, camera_fix
+from adcs.mockup.vision.pose_odds import NOISE_PX, PoseOdds, Poses
+from adcs.mockup.vision.similarity import mirrored_image
+from adcs.mockup.vision.triangles import TriangleCatalogue
+from adcs.stars.identification import NoFix
+from arrays.typing import ComplexArray, FloatArray, IntArray
+
+ROUGH_NOISE_PX = (*NOISE_PX, 3.2, 6.4)
+# More than this are no sky of lights but noise, and their pairs would fill the memory.
+_MOST_STARS = 500
+# A cell of hypotheses that are checked once: of position, and of heading.
+_CELL_PX = 10.0
+_CELL_RAD = 0.05
+# Best hypotheses among which the candidates are looked for: each true pair of stars gives the same pose again.
+_PER_CANDIDATE = 16
+
+
+@dataclass(frozen=True, eq=False)
+class LightPairs:
+    """Pairs of lights by their distance; made by :meth:`of`.
+
+    Attributes
+    ----------
+    lights : ndarray, shape (k, 2)
+    lengths_m : ndarray, shape (k,)
+        Ascending.
+    """
+
+    lights: IntArray
+    lengths_m: FloatArray
+
+    @classmethod
+    def of(cls, catalogue: TriangleCatalogue, longest_m: float) -> LightPairs:
+        """All pairs up to a distance [m]."""
+        pairs = np.asarray(catalogue.star_tree.query_pairs(longest_m, output_type="ndarray"), dtype=np.intp)
+        lengths = np.abs(catalogue.plane[pairs[:, 0]] - catalogue.plane[pairs[:, 1]])
+        order = np.argsort(lengths, kind="stable")
+        return cls(pairs[order], lengths[order])
+
+    def between(self, least_m: FloatArray, most_m: FloatArray) -> tuple[IntArray, IntArray]:
+        """Pairs whose lengths are in any of several ranges.
+
+        Parameters
+        ----------
+        least_m, most_m : ndarray, shape (r,)
+
+        Returns
+        -------
+        tuple of ndarray, shapes (c,) and (c, 2)
+            Number of the range, and lights; a pair may be in several ranges.
+        """
+        first, last = np.searchsorted(self.lengths_m, least_m), np.searchsorted(self.lengths_m, most_m)
+        counts = np.maximum(last - first, 0)
+        entry = np.arange(counts.sum()) + np.repeat(first - (np.cumsum(counts) - counts), counts)
+        return np.repeat(np.arange(len(counts)), counts), self.lights[entry]
+
+
+@dataclass(frozen=True, eq=False)
+class OddsMatcher:
+    """Pairs of stars, weighed by odds; made by :meth:`of`.
+
+    Attributes
+    ----------
+    odds : PoseOdds
+    pairs : LightPairs
+        Up to the image's diagonal on the ceiling.
+    image_pairs : int
+        Shortest pairs of the image that are looked up: one of two true stars is enough.
+    length_tolerance_px : float
+        Largest error of a pair's length [px].
+    coarse_px : float
+        How far off a pose from one pair may place another star [px].
+    candidates : int
+        Hypotheses that are fitted.
+    minimum_log_odds : float
+        Of the fix; by default a thousand to one.
+    minimum_stars : int
+        That the fix must explain.
+    """
+
+    odds: PoseOdds
+    pairs: LightPairs
+    image_pairs: int = 20
+    length_tolerance_px: float = 3.0
+    coarse_px: float = 6.0
+    candidates: int = 24
+    minimum_log_odds: float = math.log(1000.0)
+    minimum_stars: int = 3
+
+    @classmethod
+    def of(cls, catalogue: TriangleCatalogue, camera: Camera) -> OddsMatcher:
+        """Matcher with the default settings.
+
+        Parameters
+        ----------
+        catalogue : TriangleCatalogue
+        camera : Camera
+            Calibrated: its scale and its lens are used.
+
+        Returns
+        -------
+        OddsMatcher
+        """
+        diagonal = math.hypot(*camera.footprint_m)
+        return cls(PoseOdds.of(catalogue, camera), LightPairs.of(catalogue, 1.05 * diagonal))
+
+    def rough(self) -> OddsMatcher:
+        """The same with wide tolerances: for a lens that is not calibrated, a scale off by 1 %, badly smeared stars."""
+        odds = replace(self.odds, gate_px=16.0, scale_sigma=0.01, noise_px=ROUGH_NOISE_PX)
+        return replace(self, odds=odds, length_tolerance_px=6.0, coarse_px=24.0)
+
+    def identify(self, points_px: ArrayLike) -> CameraFix | NoFix:
+        """Pose of the camera from the stars of an image.
+
+        Parameters
+        ----------
+        points_px : array_like, shape (f, 2)
+            Centred pixels: relative to the optical centre, the lens undone, y up.
+
+        Returns
+        -------
+        CameraFix or NoFix
+
+        Raises
+        ------
+        ValueError
+            The shape is another one, or a number is not finite.
+        """
+        image = mirrored_image(points_px)
+        if not self.minimum_stars <= len(image) <= _MOST_STARS:
+            return NoFix(f"{len(image)} stars, {self.minimum_stars} to {_MOST_STARS} needed")
+        a, b = self._hypotheses(image)
+        if not len(a):
+            return NoFix("no two stars are as far apart as two lights")
+        best = self._best_cells(image, a, b)
+        poses = self.odds.fitted(image, a[best], b[best], self.coarse_px)
+        log_odds = self.odds.log_odds(image, poses, self.odds.log_anywhere)
+        return best_fix(self.odds, image, poses, log_odds, self.minimum_log_odds, self.minimum_stars)
+
+    def _hypotheses(self, image: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+        """Poses under which a short pair of stars is a pair of lights of about its length."""
+        i, j = np.triu_indices(len(image), 1)
+        length = np.abs(image[j] - image[i])
+        shortest = np.argsort(length, kind="stable")[: self.image_pairs]
+        i, j, length = i[shortest], j[shortest], length[shortest]
+        s = self.odds.camera.m_per_px
+        slack = self.length_tolerance_px + 3.0 * self.odds.scale_sigma * length
+        pair, lights = self.pairs.between(s * (length - slack), s * (length + slack))
+        pair, lights = np.concatenate([pair, pair]), np.concatenate([lights, lights[:, ::-1]])
+        first, second = self.odds.catalogue.plane[lights].T
+        first_px, second_px = image[i][pair], image[j][pair]
+        apart = length[pair] > 0.0
+        turn = (second - first) * np.conj(second_px - first_px)
+        a = s * turn[apart] / np.abs(turn[apart])
+        return a, 0.5 * (first + second)[apart] - a * 0.5 * (first_px + second_px)[apart]
+
+    def _best_cells(self, image: ComplexArray, a: ComplexArray, b: ComplexArray) -> IntArray:
+        """Numbers of the hypotheses that place the stars best, one of each cell of poses."""
+        s = self.odds.camera.m_per_px
+        misses = self.odds.light_map.misses_of_poses(image, a, b, self.coarse_px * s)
+        best = np.argpartition(misses, min(_PER_CANDIDATE * self.candidates, len(misses)) - 1)
+        best = best[: _PER_CANDIDATE * self.candidates]
+        order = best[np.lexsort((best, misses[best]))]
+        cells = np.stack([b.real / (_CELL_PX * s), b.imag / (_CELL_PX * s), np.angle(a) / _CELL_RAD])
+        x, y, heading = np.round(cells[:, order]).astype(np.int64)
+        # Far apart enough for any ceiling: a million cells either way.
+        _, first = np.unique((x << 40) + (y << 12) + heading, return_index=True)
+        return order[np.sort(first)[: self.candidates]]
+
+
+@dataclass(frozen=True)
+class FirstFix:
+    """Matchers that are tried in turn, until one has a fix.
+
+    Attributes
+    ----------
+    matchers : tuple of Matcher
+    """
+
+    matchers: tuple[Matcher, ...]
+
+    def identify(self, points_px: ArrayLike) -> CameraFix | NoFix:
+        """First fix, or why the first matcher has none; see :class:`adcs.mockup.vision.paper_matcher.Matcher`."""
+        first: NoFix | None = None
+        for matcher in self.matchers:
+            fix = matcher.identify(points_px)
+            if isinstance(fix, CameraFix):
+                return fix
+            first = first or fix
+        return first or NoFix("there is no matcher")
+
+
+def odds_matcher(catalogue: TriangleCatalogue, camera: Camera) -> FirstFix:
+    """Recommended matcher: :class:`OddsMatcher`, precise and then rough.
+
+    Parameters
+    ----------
+    catalogue : TriangleCatalogue
+    camera : Camera
+        As well calibrated as it is.
+
+    Returns
+    -------
+    FirstFix
+    """
+    precise = OddsMatcher.of(catalogue, camera)
+    return FirstFix((precise, precise.rough()))
+
+
+def best_fix(
+    odds: PoseOdds,
+    image: ComplexArray,
+    poses: Poses,
+    log_odds: FloatArray,
+    minimum_log_odds: float,
+    minimum_stars: int,
+) -> CameraFix | NoFix:
+    """Fix of the best pose, if it stands out.
+
+    Parameters
+    ----------
+    odds : PoseOdds
+    image : ndarray, shape (f,)
+        Mirrored centred pixels x - iy.
+    poses : Poses
+    log_odds : ndarray, shape (h,)
+        Of each against "all clutter".
+    minimum_log_odds : float
+        That the best must have against all others and "all clutter" together.
+    minimum_stars : int
+        That it must explain.
+
+    Returns
+    -------
+    CameraFix or NoFix
+    """
+    distinct = odds.distinct(poses, log_odds)
+    if not len(distinct):
+        return NoFix("no two stars fit the catalogue")
+    best, others = int(distinct[0]), distinct[1:]
+    against = float(log_odds[best] - np.logaddexp.reduce(np.append(log_odds[others], 0.0)))
+    stars = poses.stars(best)
+    if len(stars) < minimum_stars:
+        return NoFix(f"{len(stars)} of {len(image)} stars fit, {minimum_stars} needed")
+    if against < minimum_log_odds:
+        return NoFix(f"odds of the best pose are e^{against:.1f}, e^{minimum_log_odds:.1f} needed")
+    return camera_fix(odds.catalogue, image, stars, complex(poses.a[best]), complex(poses.b[best]), len(stars))

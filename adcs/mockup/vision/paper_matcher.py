@@ -1,0 +1,203 @@
+r"""Where the camera is, from the stars of one image alone: what all matchers return, and the paper's matcher.
+
+A matcher takes the places of the stars in the image (centred pixels, see :mod:`adcs.mockup.vision.camera`) and returns
+a :class:`CameraFix`, or :class:`NoFix` with the reason. It knows nothing of earlier images.
+
+The paper's matcher [1]_ compares each Delaunay triangle of the image with all of the catalogue by smallest and largest
+angle, places the image's centre by every pair of triangles that agree, and takes the longest list of centres that are
+mutually close. See :mod:`adcs.mockup.vision.robust_matcher` and :mod:`adcs.mockup.vision.odds_matcher` for stronger
+ones.
+
+.. [1] Bindel, Ivanov, Nuzhdin, Ovchinnikov, Trofimov, KIAM preprint.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adcs.mockup.vision.similarity import fitted_similarity, mirrored_image
+from adcs.mockup.vision.triangles import TriangleCatalogue, Triangles, delaunay_triangles
+from adcs.stars.identification import NoFix
+from arrays.typing import ComplexArray, FloatArray, IntArray
+
+SLIVER_RAD = math.radians(3.0)
+"""A triangle of an image with a smaller angle is not looked for: noise changes its angles most."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFix:
+    """Pose of the camera that an image gives.
+
+    Attributes
+    ----------
+    position_m : ndarray, shape (2,)
+        X, Y of the camera in the table frame, where its optical axis meets the ceiling [m].
+    heading_rad : float
+        φ, counter-clockwise seen from above, from -π to π [rad].
+    stars : ndarray, shape (k, 2)
+        Pairs of a star's number in the image and in the catalogue.
+    rms_m : float
+        Root mean square distance of these stars from their catalogue's places, on the ceiling [m].
+    votes : int
+        What spoke for the fix: triangles that agree for the paper's matcher, stars for the others.
+    m_per_px : float
+        Scale of the image on the ceiling, as fitted [m/px].
+    """
+
+    position_m: FloatArray
+    heading_rad: float
+    stars: IntArray
+    rms_m: float
+    votes: int
+    m_per_px: float
+
+
+class Matcher(Protocol):
+    """Lost-in-space identification of one image."""
+
+    def identify(self, points_px: ArrayLike) -> CameraFix | NoFix:
+        """Pose of the camera from stars of shape (f, 2), centred pixels: relative to the optical centre, y up."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class PaperMatcher:
+    """The paper's matcher: all triangles against all, centres that agree.
+
+    Attributes
+    ----------
+    catalogue : TriangleCatalogue
+    tolerance_rad : float
+        Largest difference of either angle of two triangles that match [rad].
+    closeness_m : float
+        Largest distance between two centres that agree [m].
+    minimum_votes : int
+        Triangles that have to agree.
+    opposite_handedness : bool
+        Whether a triangle of the image must go round the other way than the catalogue's, as the image of a camera that
+        looks up does. The paper does not ask it, and so doubles its false matches.
+    """
+
+    catalogue: TriangleCatalogue
+    tolerance_rad: float = math.radians(0.5)
+    closeness_m: float = 0.02
+    minimum_votes: int = 2
+    opposite_handedness: bool = True
+
+    def identify(self, points_px: ArrayLike) -> CameraFix | NoFix:
+        """Pose of the camera from the stars of an image.
+
+        Parameters
+        ----------
+        points_px : array_like, shape (f, 2)
+            Centred pixels: relative to the optical centre, the lens undone, y up.
+
+        Returns
+        -------
+        CameraFix or NoFix
+            The position is the mean of the centres that agree, the heading the mean on the circle.
+
+        Raises
+        ------
+        ValueError
+            The shape is another one, or a number is not finite.
+        """
+        image = mirrored_image(points_px)
+        triangles = delaunay_triangles(image, SLIVER_RAD)
+        if not len(triangles):
+            return NoFix(f"no triangle between {len(image)} stars")
+        mine, theirs = self.matches(triangles)
+        if not len(mine):
+            return NoFix(f"none of {len(triangles)} triangles is in the catalogue")
+        corners, lights = triangles.corners[mine], self.catalogue.triangles.corners[theirs]
+        # Seen from above, a triangle that goes round the same way as the catalogue's fits as it is; one that does not,
+        # if asked for at all, fits the mirrored image only.
+        turned = triangles.is_counter_clockwise[mine] != self.catalogue.triangles.is_counter_clockwise[theirs]
+        seen = np.where(turned[:, None], np.conj(image[corners]), image[corners])
+        a, b = fitted_similarity(seen, self.catalogue.plane[lights])
+        agreeing = longest_close_subset(b, self.closeness_m)
+        votes = min(len(np.unique(mine[agreeing])), len(np.unique(theirs[agreeing])))
+        if votes < self.minimum_votes:
+            return NoFix(f"{votes} of {len(triangles)} triangles agree on a centre, {self.minimum_votes} needed")
+        stars = np.stack([corners[agreeing].ravel(), lights[agreeing].ravel()], axis=1)
+        heading = np.exp(1j * np.angle(a[agreeing])).sum()
+        scale = np.abs(a[agreeing]).mean()
+        fitted = scale * heading / max(abs(heading), 1e-300)
+        if np.mean(turned[agreeing]) > 0.5:
+            image = np.conj(image)
+        return camera_fix(self.catalogue, image, stars, complex(fitted), complex(b[agreeing].mean()), votes)
+
+    def matches(self, triangles: Triangles) -> tuple[IntArray, IntArray]:
+        """All against all: numbers of the image's and of the catalogue's triangles that match, one pair per match."""
+        known = self.catalogue.triangles
+        difference = np.abs(triangles.angles_rad[:, None] - known.angles_rad)
+        close = (difference <= self.tolerance_rad).all(axis=2)
+        if self.opposite_handedness:
+            # The image has been mirrored, so that a true match goes round the same way.
+            close &= triangles.is_counter_clockwise[:, None] == known.is_counter_clockwise
+        mine, theirs = np.nonzero(close)
+        return mine, theirs
+
+
+def camera_fix(
+    catalogue: TriangleCatalogue, image: ComplexArray, stars: IntArray, a: complex, b: complex, votes: int
+) -> CameraFix:
+    """Fix of a fit q = a p̄ + b, see :mod:`adcs.mockup.vision.similarity`.
+
+    Parameters
+    ----------
+    catalogue : TriangleCatalogue
+    image : ndarray, shape (f,)
+        Mirrored image points x - iy [px].
+    stars : ndarray, shape (k, 2)
+        Pairs of numbers in image and catalogue; pairs may repeat.
+    a, b : complex
+    votes : int
+
+    Returns
+    -------
+    CameraFix
+    """
+    pairs = np.unique(stars, axis=0)
+    residual = a * image[pairs[:, 0]] + b - catalogue.plane[pairs[:, 1]]
+    rms = float(np.sqrt(np.mean(residual.real**2 + residual.imag**2)))
+    return CameraFix(np.array([b.real, b.imag]), float(np.angle(a)), pairs, rms, votes, abs(a))
+
+
+def longest_close_subset(points: ComplexArray, closeness: float) -> IntArray:
+    """Numbers of points that are all within a distance of one another, as many as a greedy search finds.
+
+    Around every point in turn the others are added by their distance while they are close to all before.
+
+    Parameters
+    ----------
+    points : ndarray, shape (c,)
+        x + iy.
+    closeness : float
+
+    Returns
+    -------
+    ndarray, shape (k,)
+        Of the longest subset; of equally long ones, that around the point with most neighbours.
+    """
+    distance = np.abs(points[:, None] - points)
+    close = distance <= closeness
+    neighbours = close.sum(axis=1)
+    longest: list[int] = []
+    for centre in np.argsort(-neighbours, kind="stable"):
+        if neighbours[centre] <= len(longest):
+            break
+        mutual = close[centre].copy()
+        subset: list[int] = []
+        for point in np.argsort(distance[centre], kind="stable")[: neighbours[centre]]:
+            if mutual[point]:
+                subset.append(int(point))
+                mutual &= close[point]
+        if len(subset) > len(longest):
+            longest = subset
+    return np.array(longest, dtype=np.intp)

@@ -1,0 +1,221 @@
+r"""How much better than chance a pose explains the stars of an image.
+
+Under a pose with the fit :math:`q = a \bar p + b` of :mod:`adcs.mockup.vision.similarity` every catalogued light that
+the camera should see is found or missing, and every star of the image is one of these lights or clutter. With m of f
+stars matched at the distances d_i [px], k lights missing and an image of A square pixels the odds against "all clutter"
+are
+
+.. math:: \frac{B(\alpha + m, \beta + k)}{B(\alpha, \beta)} \left(\frac{A}{f}\right)^m \int p(\theta)
+          \prod_i N(d_i(\theta); \sigma) \, d\theta
+
+* The share of lights that are found is unknown, with the prior Beta(α, β): a field in which few lights are missing is
+  likelier, but a quarter lost is no contradiction.
+* The integral over the pose θ (X, Y, φ and the scale, which is known to a few per mille) is Laplace's: the likelihood
+  at the fit times the volume that the stars leave of the pose, times the prior's density there. The larger the ceiling
+  where the camera might be, the more the stars have to prove; a prediction needs fewer of them.
+* The noise σ of centroids depends on motion and is unknown too: the mean over a few values is taken.
+
+Three stars at known distances prove a pose if their centroids are good; that two poses explain the same image shows as
+odds between them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import betaln
+
+from adcs.mockup.vision.camera import Camera, distorted, in_frame
+from adcs.mockup.vision.light_map import LightMap
+from adcs.mockup.vision.similarity import pairs_of
+from adcs.mockup.vision.triangles import TriangleCatalogue
+from arrays.typing import BoolArray, ComplexArray, FloatArray, IntArray
+
+NOISE_PX = (0.1, 0.2, 0.4, 0.8, 1.6)
+"""Noise of centroids that is taken to be equally likely, from a standing image to a smeared one."""
+# From the rough pose that it begins with to its own stars.
+_FITS = 3
+# Two fits that differ by less, all over the image, are one.
+_IMAGE_RADIUS_PX = 400.0
+_DISTINCT_PX = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Fits to one image of f stars, and which star is which light under each.
+
+    Attributes
+    ----------
+    a, b : ndarray, shape (h,)
+        Of q = a p̄ + b.
+    lights : ndarray, shape (h, f)
+        The light nearest to each star.
+    matched : ndarray, shape (h, f)
+        Whether the star is that light; no light is matched twice.
+    """
+
+    a: ComplexArray
+    b: ComplexArray
+    lights: IntArray
+    matched: BoolArray
+
+    def stars(self, index: int) -> IntArray:
+        """Pairs (k, 2) of numbers in image and catalogue under one of them."""
+        star = np.flatnonzero(self.matched[index])
+        return np.stack([star, self.lights[index, star]], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseOdds:
+    """Model of what a camera sees of a catalogue; made by :meth:`of`.
+
+    Attributes
+    ----------
+    catalogue : TriangleCatalogue
+    camera : Camera
+        Calibrated: its scale and its lens are used.
+    light_map : LightMap
+    gate_px : float
+        A star farther from a light is another one [px].
+    scale_sigma : float
+        Relative standard deviation of the camera's scale.
+    detection : tuple of two floats
+        α and β of the share of lights that are found; by default 0.8 ± 0.16.
+    border_px : float
+        A light nearer to the image's border may or may not be found [px].
+    noise_px : tuple of floats
+        Noise of centroids, each taken to be equally likely [px].
+    """
+
+    catalogue: TriangleCatalogue
+    camera: Camera
+    light_map: LightMap
+    gate_px: float = 3.0
+    scale_sigma: float = 0.002
+    detection: tuple[float, float] = (4.0, 1.0)
+    border_px: float = 12.0
+    noise_px: tuple[float, ...] = NOISE_PX
+
+    @classmethod
+    def of(cls, catalogue: TriangleCatalogue, camera: Camera) -> PoseOdds:
+        """Model with the default settings."""
+        return cls(catalogue, camera, LightMap.of(catalogue))
+
+    @property
+    def log_anywhere(self) -> float:
+        """Logarithm of the density of poses, per px² and rad, when nothing is known but the ceiling's extent."""
+        positions = self.catalogue.positions_m / self.camera.m_per_px
+        return -math.log(2.0 * math.pi * float(np.prod(np.ptp(positions, axis=0))))
+
+    def fitted(self, image: ComplexArray, a: ComplexArray, b: ComplexArray, first_gate_px: float) -> Poses:
+        """Fits of least squares that begin at rough poses.
+
+        Parameters
+        ----------
+        image : ndarray, shape (f,)
+            Mirrored centred pixels x - iy.
+        a, b : ndarray, shape (h,)
+            Rough poses.
+        first_gate_px : float
+            How far off the rough poses may place a star; it shrinks to ``gate_px`` in steps.
+
+        Returns
+        -------
+        Poses
+            The scale is a compromise of fit and calibration.
+        """
+        s = self.camera.m_per_px
+        stiffness = (float(np.median(self.noise_px)) / self.scale_sigma) ** 2
+        for gate in np.linspace(max(first_gate_px, self.gate_px), self.gate_px, _FITS).tolist():
+            lights, matched = self._matched(image, a, b, gate)
+            n = np.maximum(matched.sum(axis=1), 1)
+            places = self.catalogue.plane[lights]
+            p, q = (matched @ image) / n, (matched * places).sum(axis=1) / n
+            centred = image - p[:, None]
+            turn = (matched * np.conj(centred) * (places - q[:, None])).sum(axis=1)
+            inertia = (matched * _squared(centred)).sum(axis=1)
+            length = np.abs(turn)
+            can = length > 0.0
+            scale = (length + s * stiffness) / (inertia + stiffness)
+            a = np.where(can, scale * turn / np.where(can, length, 1.0), a)
+            b = np.where(can, q - a * p, b)
+        return Poses(a, b, *self._matched(image, a, b, self.gate_px))
+
+    def log_odds(self, image: ComplexArray, poses: Poses, log_density: FloatArray | float) -> FloatArray:
+        """Logarithm of the odds of poses against "all clutter", shape (h,); see the module.
+
+        Parameters
+        ----------
+        image : ndarray, shape (f,)
+            Mirrored centred pixels x - iy.
+        poses : Poses
+        log_density : float or ndarray, shape (h,)
+            Logarithm of the prior density of a pose, per px² and rad, such as :attr:`log_anywhere`.
+
+        Returns
+        -------
+        ndarray, shape (h,)
+            -inf for a pose of fewer than two stars.
+        """
+        s = self.camera.m_per_px
+        matched = poses.matched
+        m = matched.sum(axis=1)
+        n = np.maximum(m, 1)
+        offset = poses.a[:, None] * image + poses.b[:, None] - self.catalogue.plane[poses.lights]
+        squares = (matched * _squared(offset)).sum(axis=1) / s**2
+        centred = image - ((matched @ image) / n)[:, None]
+        inertia = np.maximum((matched * _squared(centred)).sum(axis=1), 1.0)
+        scale_error = (np.abs(poses.a) / s - 1.0) / self.scale_sigma
+        alpha, beta = self.detection
+        found = betaln(alpha + m, beta + self._missing(poses)) - betaln(alpha, beta)
+        clutter = m * math.log(self.camera.width_px * self.camera.height_px / max(len(image), 1))
+        variance = np.array(self.noise_px)[:, None] ** 2
+        likelihood = -m * np.log(2.0 * np.pi * variance) - 0.5 * (squares / variance + scale_error**2)
+        # Of X, Y, φ, and what the stars leave of the scale's prior.
+        volume = 1.5 * np.log(2.0 * np.pi * variance) - np.log(n) - 0.5 * np.log(inertia)
+        volume -= 0.5 * np.log1p(self.scale_sigma**2 * inertia / variance)
+        total = np.logaddexp.reduce(likelihood + volume, axis=0) - math.log(len(self.noise_px))
+        return np.where(m >= 2, total + found + clutter + log_density, -np.inf)
+
+    def distinct(self, poses: Poses, log_odds: FloatArray) -> IntArray:
+        """Numbers of poses, best first, without those that are the same as a better one."""
+        kept: list[int] = []
+        limit = _DISTINCT_PX * self.camera.m_per_px
+        for i in np.argsort(-log_odds, kind="stable"):
+            apart = np.abs(poses.a[kept] - poses.a[i]) * _IMAGE_RADIUS_PX + np.abs(poses.b[kept] - poses.b[i])
+            if np.isfinite(log_odds[i]) and np.all(apart > limit):
+                kept.append(int(i))
+        return np.array(kept, dtype=np.intp)
+
+    def _matched(
+        self, image: ComplexArray, a: ComplexArray, b: ComplexArray, gate_px: float
+    ) -> tuple[IntArray, BoolArray]:
+        """Light nearest to each star, and whether it is within the gate and no other star is nearer to it."""
+        placed = a[:, None] * image + b[:, None]
+        lights = self.light_map.lights_near(placed)
+        distance = np.abs(placed - self.catalogue.plane[lights]) / (gate_px * self.camera.m_per_px)
+        # Sorted by light and then by distance, which is below 1, the first of a light is the nearest to it.
+        key = np.where(distance < 1.0, lights + distance, np.inf)
+        order = np.argsort(key, axis=1)
+        light = np.floor(np.take_along_axis(key, order, axis=1))
+        first = np.isfinite(light)
+        first[:, 1:] &= light[:, 1:] != light[:, :-1]
+        matched = np.zeros(first.shape, dtype=np.bool_)
+        np.put_along_axis(matched, order, first, axis=1)
+        return lights, matched
+
+    def _missing(self, poses: Poses) -> IntArray:
+        """Lights well within the image that no star is matched to, shape (h,)."""
+        seen = np.conj((self.catalogue.plane - poses.b[:, None]) / poses.a[:, None])
+        expected = in_frame(self.camera, distorted(self.camera, pairs_of(seen)), self.border_px)
+        found = np.take_along_axis(expected, poses.lights, axis=1) & poses.matched
+        missing: IntArray = expected.sum(axis=1) - found.sum(axis=1)
+        return missing
+
+
+def _squared(plane: ComplexArray) -> FloatArray:
+    """Squared modulus."""
+    squared: FloatArray = plane.real**2 + plane.imag**2
+    return squared

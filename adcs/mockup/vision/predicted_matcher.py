@@ -1,0 +1,200 @@
+r"""Tracking: a predicted pose says which lights to expect and where, and so two stars are enough for a fix.
+
+The prediction has the covariance P of (X, Y, φ). Light q is expected at :math:`p = \overline{(q - b)/a}`, with the
+covariance :math:`J P J^T + \sigma^2`, whose largest axis gives the radius of search. A prediction of the heading by a
+gyro is good to a fraction of a degree, and so every star within the radius of an expected light gives a shift of the
+whole image. The shifts are fitted and weighed as in :mod:`adcs.mockup.vision.pose_odds`, with the prediction in place
+of "any pose above the table". A prediction that is wrong by more than it says finds no pose of good odds and gives no
+fix.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adcs.mockup.vision.camera import Camera, Pose, distorted
+from adcs.mockup.vision.odds_matcher import best_fix
+from adcs.mockup.vision.paper_matcher import CameraFix
+from adcs.mockup.vision.pose_odds import PoseOdds, Poses
+from adcs.mockup.vision.similarity import mirrored_image, pairs_of
+from adcs.mockup.vision.triangles import TriangleCatalogue
+from adcs.stars.identification import NoFix
+from arrays.typing import ComplexArray, FloatArray, IntArray
+
+CENTROID_PX = 0.3
+"""Noise of a centroid that a search allows for [px]; what smears more is caught by the least radius."""
+# A heading that is more uncertain than this at the image's border is for a matcher that needs no prediction.
+_MOST_TURNED_PX = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedLights:
+    """What an image should show.
+
+    Attributes
+    ----------
+    lights : ndarray, shape (k,)
+        Numbers in the catalogue.
+    points_px : ndarray, shape (k, 2)
+        Centred pixels: relative to the optical centre, the lens undone, y up.
+    radius_px : ndarray, shape (k,)
+        Within which the light's star is expected.
+    """
+
+    lights: IntArray
+    points_px: FloatArray
+    radius_px: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.lights)
+
+
+def expected_lights(
+    catalogue: TriangleCatalogue, camera: Camera, pose: Pose, covariance: ArrayLike, sigmas: float = 4.0
+) -> ExpectedLights:
+    """Lights that a camera should see from a predicted pose, and where.
+
+    Parameters
+    ----------
+    catalogue : TriangleCatalogue
+    camera : Camera
+    pose : Pose
+        One pose.
+    covariance : array_like, shape (3, 3)
+        Of X, Y [m] and heading [rad].
+    sigmas : float
+        Radius in standard deviations along the worst direction.
+
+    Returns
+    -------
+    ExpectedLights
+        Also those outside of the image by no more than their radius.
+
+    Raises
+    ------
+    ValueError
+        The covariance is not symmetric and positive semidefinite.
+    """
+    P = _checked_covariance(covariance)
+    a, b = _fit_of(camera, pose)
+    offset = catalogue.plane - b
+    seen = np.conj(offset / a)
+    # A shift of the pose moves a light by its negative in the ceiling's plane, a turn by -i (q - b) a radian.
+    J = np.zeros((len(seen), 2, 3))
+    J[:, 0, 0] = J[:, 1, 1] = -1.0
+    J[:, :, 2] = pairs_of(-1j * offset)
+    S = J @ P @ np.swapaxes(J, 1, 2) / camera.m_per_px**2
+    radius = sigmas * np.sqrt(np.linalg.eigvalsh(S)[:, 1].clip(0.0) + CENTROID_PX**2)
+    points = pairs_of(seen)
+    place = distorted(camera, points)
+    nearest_in_frame = np.clip(place, 0.0, [camera.width_px - 1.0, camera.height_px - 1.0])
+    visible = np.linalg.norm(place - nearest_in_frame, axis=1) <= radius
+    return ExpectedLights(np.flatnonzero(visible), points[visible], radius[visible])
+
+
+@dataclass(frozen=True, eq=False)
+class LightTracker:
+    """Fixes from images near a predicted pose.
+
+    Attributes
+    ----------
+    odds : PoseOdds
+    sigmas : float
+        Radius of search, in standard deviations.
+    least_radius_px : float
+        Of search, for smeared stars.
+    most_shifts : int
+        Shifts that are weighed: the likeliest by their prediction.
+    minimum_log_odds : float
+        Of a fix against all others and "all clutter"; by default a thousand to one.
+    minimum_stars : int
+        That a fix must explain.
+    """
+
+    odds: PoseOdds
+    sigmas: float = 4.0
+    least_radius_px: float = 3.0
+    most_shifts: int = 64
+    minimum_log_odds: float = math.log(1000.0)
+    minimum_stars: int = 2
+
+    def identify_near(self, points_px: ArrayLike, pose: Pose, covariance: ArrayLike) -> CameraFix | NoFix:
+        """Pose of the camera from the stars of an image and a prediction.
+
+        The prediction helps to find the lights and to weigh what is found; the fix itself is that of the stars alone.
+
+        Parameters
+        ----------
+        points_px : array_like, shape (f, 2)
+            Centred pixels: relative to the optical centre, the lens undone, y up.
+        pose : Pose
+            Predicted for the middle of the exposure.
+        covariance : array_like, shape (3, 3)
+            Of the prediction's X, Y [m] and heading [rad].
+
+        Returns
+        -------
+        CameraFix or NoFix
+
+        Raises
+        ------
+        ValueError
+            The points have another shape or are not finite, or the covariance is not symmetric and positive
+            semidefinite.
+        """
+        image = mirrored_image(points_px)
+        P = _checked_covariance(covariance)
+        expected = expected_lights(self.odds.catalogue, self.odds.camera, pose, P, self.sigmas)
+        shifts = self._shifts(image, expected)
+        if not len(shifts):
+            return NoFix(f"none of {len(image)} stars is near one of {len(expected)} expected lights")
+        a, b = _fit_of(self.odds.camera, pose)
+        turned_px = self.sigmas * math.sqrt(P[2, 2]) * float(np.abs(image).max())
+        poses = self.odds.fitted(
+            image, np.full(len(shifts), a), b + a * shifts, self.least_radius_px + min(turned_px, _MOST_TURNED_PX)
+        )
+        log_odds = self.odds.log_odds(image, poses, self._log_density(poses, pose, P))
+        return best_fix(self.odds, image, poses, log_odds, self.minimum_log_odds, self.minimum_stars)
+
+    def _shifts(self, image: ComplexArray, expected: ExpectedLights) -> ComplexArray:
+        """Shifts of the mirrored image that put a star on a light within its radius, the smallest first [px]."""
+        offset = np.conj(expected.points_px[:, 0] + 1j * expected.points_px[:, 1])[:, None] - image
+        radius = np.maximum(expected.radius_px, self.least_radius_px)
+        shifts = offset[np.abs(offset) <= radius[:, None]]
+        return shifts[np.argsort(np.abs(shifts), kind="stable")[: self.most_shifts]]
+
+    def _log_density(self, poses: Poses, pose: Pose, P: FloatArray) -> FloatArray:
+        """Density of the prediction at fits, per px² and rad, blurred by what a fit of two stars is uncertain by."""
+        s = self.odds.camera.m_per_px
+        error = np.stack(
+            [poses.b.real - pose.x_m, poses.b.imag - pose.y_m, np.angle(poses.a * np.exp(-1j * pose.heading_rad))]
+        )
+        blurred = P + np.diag([(CENTROID_PX * s) ** 2, (CENTROID_PX * s) ** 2, (CENTROID_PX / 100.0) ** 2])
+        factor = np.linalg.cholesky(blurred)
+        whitened = np.linalg.solve(factor, error)
+        log_volume = 1.5 * math.log(2.0 * math.pi) + float(np.log(np.diagonal(factor)).sum())
+        density: FloatArray = -0.5 * (whitened**2).sum(axis=0) - log_volume + 2.0 * math.log(s)
+        return density
+
+
+def _fit_of(camera: Camera, pose: Pose) -> tuple[complex, complex]:
+    """Fit of a pose: a and b of :mod:`adcs.mockup.vision.similarity`."""
+    a = camera.m_per_px * complex(math.cos(float(pose.heading_rad)), math.sin(float(pose.heading_rad)))
+    return a, complex(float(pose.x_m), float(pose.y_m))
+
+
+def _checked_covariance(covariance: ArrayLike) -> FloatArray:
+    """Covariance of X, Y and heading, checked."""
+    P = np.asarray(covariance, dtype=np.float64)
+    if P.shape != (3, 3) or not np.isfinite(P).all():
+        raise ValueError(f"Input covariance must be 3 by 3 finite numbers; instead received shape {P.shape}.")
+    scale = float(np.abs(P).max())
+    if np.abs(P - P.T).max() > 1e-9 * scale or np.linalg.eigvalsh(P)[0] < -1e-9 * scale:
+        raise ValueError(
+            f"Input covariance must be symmetric and positive semidefinite; instead received {P.tolist()}."
+        )
+    return P

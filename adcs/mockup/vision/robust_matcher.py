@@ -1,0 +1,201 @@
+r"""A matcher that stands lost lights, lights that are none and blurred stars: hypotheses of triangles, checked by all.
+
+1. Triangles of the image are looked up in a k-d tree of the catalogue's pairs of angles, within a radius that is wider
+   than the paper's tolerance: a false match costs little, as it is checked.
+2. A match must have the right handedness and about the nominal scale.
+3. Three corners give a similarity, whose residual must be small: an isosceles triangle whose corners noise has swapped
+   fails here. The best by their angles remain.
+4. Each is checked by all stars of the image: those that fall near a light are counted.
+5. The best are fitted again to their own stars, and the best of these is the fix if it explains enough of the image,
+   more of it than any other, and better than chance would: five stars within 8 mm of lights are not rare enough among
+   six false ones.
+
+Compare :mod:`adcs.mockup.vision.paper_matcher`, the paper's.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adcs.mockup.vision.paper_matcher import SLIVER_RAD, CameraFix, camera_fix
+from adcs.mockup.vision.similarity import fitted_similarity, mirrored_image, pairs_of
+from adcs.mockup.vision.triangles import TriangleCatalogue, Triangles, delaunay_triangles
+from adcs.stars.identification import NoFix
+from arrays.typing import ComplexArray, FloatArray, IntArray
+
+# Hypotheses that are fitted again: the counts of the best are often equal.
+_CHECKED_AGAIN = 6
+# Where two fits are compared: they agree in the whole image if they do here.
+_IMAGE_RADIUS_PX = 400.0
+
+
+@dataclass(frozen=True, eq=False)
+class RobustMatcher:
+    """Triangles by k-d tree, gates, and the count of all stars that fit.
+
+    Attributes
+    ----------
+    catalogue : TriangleCatalogue
+    m_per_px : float
+        Nominal scale of the image on the ceiling [m/px].
+    radius_rad : float
+        Largest distance of two pairs of angles [rad].
+    scale_range : tuple of two floats
+        Least and largest ratio of a fitted scale to the nominal one.
+    triangle_residual_m : float
+        Largest root mean square residual of a similarity of three corners [m].
+    inlier_m, refit_m : float
+        Distance from a light within which a star counts in the first check, and in the fits [m].
+    hypotheses : int
+        Matches that are checked at most.
+    refits : int
+        How often the best are fitted again.
+    minimum_inliers : int
+        Stars that the fix must explain.
+    minimum_fraction : float
+        Part of the image's stars that it must explain.
+    most_chance : float
+        Hypotheses in one image, on average, that may fit as well by chance. Far below what is wanted: the fit moves the
+        pose and the scale so that chance fits better than it would.
+    """
+
+    catalogue: TriangleCatalogue
+    m_per_px: float
+    radius_rad: float = math.radians(1.5)
+    scale_range: tuple[float, float] = (0.8, 1.25)
+    triangle_residual_m: float = 0.008
+    inlier_m: float = 0.024
+    refit_m: float = 0.008
+    hypotheses: int = 400
+    refits: int = 3
+    minimum_inliers: int = 5
+    minimum_fraction: float = 0.5
+    most_chance: float = 1e-7
+
+    def identify(self, points_px: ArrayLike) -> CameraFix | NoFix:
+        """Pose of the camera from the stars of an image.
+
+        Parameters
+        ----------
+        points_px : array_like, shape (f, 2)
+            Centred pixels: relative to the optical centre, the lens undone, y up.
+
+        Returns
+        -------
+        CameraFix or NoFix
+
+        Raises
+        ------
+        ValueError
+            The shape is another one, or a number is not finite.
+        """
+        image = mirrored_image(points_px)
+        needed = max(self.minimum_inliers, math.ceil(self.minimum_fraction * len(image)))
+        if len(image) < needed:
+            return NoFix(f"{len(image)} stars, {needed} needed")
+        a, b = self._hypotheses(image, delaunay_triangles(image, SLIVER_RAD))
+        if not len(a):
+            return NoFix("no triangle of the image is in the catalogue")
+        counts, misses = self._checked(image, a, b)
+        fits: list[tuple[complex, complex, IntArray]] = []
+        for i in np.lexsort((misses, -counts))[:_CHECKED_AGAIN]:
+            if not any(self._are_one(fit, complex(a[i]), complex(b[i])) for fit in fits):
+                fits.append(self._refitted(image, complex(a[i]), complex(b[i])))
+        a_best, b_best, stars = max(fits, key=lambda fit: len(fit[2]))
+        if len(stars) < needed:
+            return NoFix(f"{len(stars)} of {len(image)} stars fit, {needed} needed")
+        if any(len(fit[2]) == len(stars) and not self._are_one(fit, a_best, b_best) for fit in fits):
+            return NoFix(f"{len(stars)} of {len(image)} stars fit at several places")
+        fix = camera_fix(self.catalogue, image, stars, a_best, b_best, len(stars))
+        chance = self._chance(fix, len(image), len(a))
+        if chance > self.most_chance:
+            return NoFix(f"{len(stars)} of {len(image)} stars fit, as do {chance:.1g} false hypotheses per image")
+        return fix
+
+    def _hypotheses(self, image: ComplexArray, triangles: Triangles) -> tuple[ComplexArray, ComplexArray]:
+        """Similarities of the matches that pass the gates, the best by their angles first."""
+        known = self.catalogue.triangles
+        near = self.catalogue.angle_tree.query_ball_point(triangles.angles_rad, self.radius_rad)
+        found: list[list[int]] = np.asarray(near, dtype=object).tolist()
+        mine = np.repeat(np.arange(len(triangles)), [len(matches) for matches in found])
+        theirs = np.array([match for matches in found for match in matches], dtype=np.intp)
+        # The image has been mirrored, so that a true match goes round the same way.
+        handed = triangles.is_counter_clockwise[mine] == known.is_counter_clockwise[theirs]
+        mine, theirs = mine[handed], theirs[handed]
+        seen, lights = image[triangles.corners[mine]], self.catalogue.plane[known.corners[theirs]]
+        a, b = fitted_similarity(seen, lights)
+        residual = np.abs(a[:, None] * seen + b[:, None] - lights)
+        scale = np.abs(a) / self.m_per_px
+        passed = np.sqrt((residual**2).mean(axis=1)) < self.triangle_residual_m
+        passed &= (self.scale_range[0] <= scale) & (scale <= self.scale_range[1])
+        difference = np.hypot(*(triangles.angles_rad[mine] - known.angles_rad[theirs]).T)
+        order = np.argsort(difference[passed], kind="stable")[: self.hypotheses]
+        return a[passed][order], b[passed][order]
+
+    def _checked(self, image: ComplexArray, a: ComplexArray, b: ComplexArray) -> tuple[IntArray, FloatArray]:
+        """Lights that have a star near them and the stars' summed squared distances, under every hypothesis."""
+        placed = pairs_of(a[:, None] * image + b[:, None])
+        distance, light = self.catalogue.star_tree.query(placed, distance_upper_bound=self.inlier_m)
+        light = np.sort(np.where(np.isfinite(distance), light, -1), axis=1)
+        is_first = np.diff(light, axis=1, prepend=-1) > 0
+        misses = np.minimum(distance, self.inlier_m) ** 2
+        return is_first.sum(axis=1), misses.sum(axis=1)
+
+    def _chance(self, fix: CameraFix, stars: int, hypotheses: int) -> float:
+        """Expected number of hypotheses under which as many stars fall as near to lights by chance.
+
+        Three corners fit by construction; each of the others is within r of a light with the probability of the part
+        of the ceiling that is, and any of them may be.
+        """
+        density = self.catalogue.n_stars / float(np.prod(np.ptp(self.catalogue.positions_m, axis=0)))
+        # The mean square of the distances that chance leaves within r is half of r².
+        covered = min(density * math.pi * 2.0 * fix.rms_m**2, 1.0)
+        others = len(fix.stars) - 3
+        return hypotheses * math.comb(stars - 3, others) * covered**others
+
+    def _are_one(self, fit: tuple[complex, complex, IntArray], a: complex, b: complex) -> bool:
+        """Whether a hypothesis is near a fit, all over the image."""
+        return abs(fit[0] - a) * _IMAGE_RADIUS_PX + abs(fit[1] - b) < self.inlier_m
+
+    def _refitted(self, image: ComplexArray, a: complex, b: complex) -> tuple[complex, complex, IntArray]:
+        """Fit by the stars that stay near their lights, and these stars."""
+        stars = one_to_one(self.catalogue, image, a, b, self.inlier_m)
+        for _ in range(self.refits):
+            if len(stars) < 2:
+                break
+            fitted = fitted_similarity(image[stars[:, 0]], self.catalogue.plane[stars[:, 1]])
+            a, b = complex(fitted[0]), complex(fitted[1])
+            near = one_to_one(self.catalogue, image, a, b, self.refit_m)
+            if np.array_equal(near, stars):
+                break
+            stars = near
+        return a, b, stars
+
+
+def one_to_one(catalogue: TriangleCatalogue, image: ComplexArray, a: complex, b: complex, radius_m: float) -> IntArray:
+    """Pairs (k, 2) of a star's number in image and catalogue that a fit brings within a distance, each light once.
+
+    Parameters
+    ----------
+    catalogue : TriangleCatalogue
+    image : ndarray, shape (f,)
+        Mirrored image points x - iy [px].
+    a, b : complex
+        See :mod:`adcs.mockup.vision.similarity`.
+    radius_m : float
+
+    Returns
+    -------
+    ndarray, shape (k, 2)
+        A light to which several stars fall has the nearest.
+    """
+    found = catalogue.star_tree.query(pairs_of(a * image + b), distance_upper_bound=radius_m)
+    distance, light = np.asarray(found[0]), np.asarray(found[1], dtype=np.intp)
+    star = np.argsort(distance, kind="stable")[: np.count_nonzero(np.isfinite(distance))]
+    _, first = np.unique(light[star], return_index=True)
+    star = star[first]
+    return np.stack([star, light[star]], axis=1)

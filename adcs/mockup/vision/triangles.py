@@ -1,0 +1,155 @@
+r"""Delaunay triangles of lights, and the catalogue of them that images are compared with.
+
+Of a triangle the smallest and the largest interior angle are kept: they stay the same under shift, turn, change of
+scale and reflection, so that an image need not be calibrated to find its triangles in the catalogue. The corners are
+kept in the order of their angles (smallest, largest, third), so that two triangles of the same angles are paired corner
+by corner. What the angles do not see is the reflection: the sense in which the ordered corners go round is kept too,
+and an image of a camera that looks up has the opposite one.
+
+n lights of which h lie on the hull have T = 2n - 2 - h triangles.
+
+Source: Bindel, Ivanov, Nuzhdin, Ovchinnikov, Trofimov, KIAM preprint, "Star image processing".
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import Delaunay, QhullError, cKDTree
+
+from adcs.mockup.vision.similarity import complex_points, pairs_of
+from adcs.mockup.vision.sky import interior_angles
+from arrays.typing import BoolArray, ComplexArray, FloatArray, IntArray
+
+# Lights in one line on the hull: what rounding makes of them is no triangle.
+FLAT_RAD = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """Triangles between numbered points.
+
+    Attributes
+    ----------
+    corners : ndarray, shape (T, 3)
+        Numbers of the points at the smallest, the largest and the third angle.
+    angles_rad : ndarray, shape (T, 2)
+        Smallest and largest interior angle [rad].
+    is_counter_clockwise : ndarray, shape (T,)
+        Whether the corners, in that order, go round counter-clockwise.
+    """
+
+    corners: IntArray
+    angles_rad: FloatArray
+    is_counter_clockwise: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.corners)
+
+    def only(self, chosen: BoolArray) -> Triangles:
+        """Those of a mask, shape (T,)."""
+        return Triangles(self.corners[chosen], self.angles_rad[chosen], self.is_counter_clockwise[chosen])
+
+
+def triangles_between(plane: ComplexArray, corners: IntArray) -> Triangles:
+    """Triangles with given corners (T, 3) in any order, between points x + iy."""
+    angles = interior_angles(pairs_of(plane[corners]))
+    order = np.argsort(angles, axis=1)[:, [0, 2, 1]]
+    ordered = np.take_along_axis(corners, order, axis=1)
+    first, second, third = plane[ordered].T
+    turn = np.conj(second - first) * (third - first)
+    return Triangles(ordered, np.take_along_axis(angles, order[:, :2], axis=1), turn.imag > 0.0)
+
+
+def delaunay_triangles(plane: ComplexArray, smallest_rad: float = FLAT_RAD) -> Triangles:
+    """Triangles of Delaunay's triangulation, without slivers.
+
+    Parameters
+    ----------
+    plane : ndarray, shape (n,)
+        Points x + iy. There is no triangle of fewer than three points, nor of points in one line.
+    smallest_rad : float
+        A triangle with a smaller angle is a sliver and left out [rad].
+
+    Returns
+    -------
+    Triangles
+        In the order of the numbers of their points, so that it does not depend on that of the computation.
+    """
+    corners = np.empty((0, 3), dtype=np.intp)
+    if len(plane) >= 3:
+        with suppress(QhullError):  # all in one line or one place
+            corners = Delaunay(pairs_of(plane)).simplices.astype(np.intp)
+    numbers = np.sort(corners, axis=1)
+    triangles = triangles_between(plane, corners[np.lexsort(numbers.T[::-1])])
+    return triangles.only(triangles.angles_rad[:, 0] >= smallest_rad)
+
+
+@dataclass(frozen=True, eq=False)
+class TriangleCatalogue:
+    """Lights of a sky and the triangles between them; made by :meth:`of`.
+
+    Attributes
+    ----------
+    positions_m : ndarray, shape (n, 2)
+        Lights in the table frame [m].
+    triangles : Triangles
+        Delaunay's, of all lights.
+    """
+
+    positions_m: FloatArray
+    triangles: Triangles
+
+    @classmethod
+    def of(cls, positions_m: ArrayLike) -> TriangleCatalogue:
+        """Catalogue of lights.
+
+        Parameters
+        ----------
+        positions_m : array_like, shape (n, 2)
+
+        Returns
+        -------
+        TriangleCatalogue
+
+        Raises
+        ------
+        ValueError
+            There are fewer than four lights, one is not finite, or all lie in one line.
+        """
+        plane = complex_points(positions_m, "positions_m")
+        if len(plane) < 4:
+            raise ValueError(f"Input positions_m must have four lights at least; instead received {len(plane)}.")
+        triangles = delaunay_triangles(plane)
+        if not len(triangles):
+            raise ValueError(f"Input positions_m must not lie in one line; instead received {len(plane)} that do.")
+        return cls(pairs_of(plane), triangles)
+
+    @property
+    def n_stars(self) -> int:
+        """Number of lights."""
+        return len(self.positions_m)
+
+    @property
+    def n_hull(self) -> int:
+        """Lights on the hull, from T = 2n - 2 - h."""
+        return 2 * self.n_stars - 2 - len(self.triangles)
+
+    @cached_property
+    def plane(self) -> ComplexArray:
+        """Lights as X + iY, shape (n,) [m]."""
+        return complex_points(self.positions_m)
+
+    @cached_property
+    def angle_tree(self) -> cKDTree:
+        """The triangles' pairs of angles, for search."""
+        return cKDTree(self.triangles.angles_rad)
+
+    @cached_property
+    def star_tree(self) -> cKDTree:
+        """The lights' positions, for search."""
+        return cKDTree(self.positions_m)

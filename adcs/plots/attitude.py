@@ -1,0 +1,269 @@
+"""Figures of attitude filters: errors or estimates through time with ±3σ, and how true the filter is to itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from scipy.special import chdtri
+
+from magloc.plots import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+from arrays.typing import BoolArray, FloatArray
+
+GROUPS = (
+    ("attitude", "°"),
+    ("rate", "°/s"),
+    ("gyro bias", "°/s"),
+    ("field bias", "nT"),
+    ("disturbance", "1e-6/s²"),
+)
+"""What the columns of a picture's states are, three axes each, and their units; the last is in millionths here."""
+_SCALES = np.repeat([1.0, 1.0, 1.0, 1.0, 1e6], 3)
+_SETTLED = 0.25
+_SENSORS = ("star tracker", "gyro", "magnetometer", "Sun sensor")
+_SENSOR_COLOURS = (style.BLACK, style.BLUE, style.ORANGE, "#009e73")
+_SENSOR_LINES = ("-", "--", "-.", ":")
+
+
+@dataclass(frozen=True, eq=False)
+class StatesPicture:
+    """One run through time.
+
+    Attributes
+    ----------
+    title : str
+    time_s : ndarray, shape (n,)
+    values : ndarray, shape (n, 15)
+        Errors (estimate minus truth) or estimates, in the units of ``adcs``' files; NaN of a state that is not there.
+    sigma : ndarray, shape (n, 15)
+        Standard deviations that the filter gives.
+    are_errors : bool
+        Whether values are errors: their band is around zero.
+    gaps : sequence of (str, ndarray of bool, shape (n,))
+        What was missing, and whether it was there.
+    """
+
+    title: str
+    time_s: FloatArray
+    values: FloatArray
+    sigma: FloatArray
+    are_errors: bool
+    gaps: Sequence[tuple[str, BoolArray]] = ()
+
+
+def states_figure(picture: StatesPicture) -> Figure:
+    """Every state's three axes side by side, with the filter's ±3σ.
+
+    Parameters
+    ----------
+    picture : StatesPicture
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    rows = [row for row in range(len(GROUPS)) if not np.isnan(picture.values[:, 3 * row]).all()]
+    figure = style.new_figure(1.25 * len(rows) + 0.75)
+    axes = figure.subplots(len(rows), 3, sharex=True, sharey="row", squeeze=False)
+    settled = picture.time_s >= picture.time_s[0] + _SETTLED * np.ptp(picture.time_s)
+    for across, row in zip(axes, rows, strict=True):
+        name, unit = GROUPS[row]
+        columns = slice(3 * row, 3 * row + 3)
+        values = picture.values[:, columns] * _SCALES[columns]
+        wide = 3.0 * picture.sigma[:, columns] * _SCALES[columns]
+        middle = np.zeros_like(values) if picture.are_errors else values
+        for axis, ax in enumerate(across):
+            ax.fill_between(
+                picture.time_s,
+                (middle - wide)[:, axis],
+                (middle + wide)[:, axis],
+                color=style.LIGHT_GREY,
+                lw=0.0,
+                label="±3σ of the filter",
+            )
+            ax.plot(
+                picture.time_s,
+                values[:, axis],
+                color=style.BLUE,
+                lw=0.8,
+                label="error" if picture.are_errors else "estimate",
+            )
+            for label, there in picture.gaps:
+                style.shade_gaps(ax, picture.time_s, there, label)
+            outside = float(np.mean(np.abs(values[settled, axis]) > wide[settled, axis]))
+            style.dress(ax, "", f"{name} [{unit}]" if axis == 0 else "", "xyz"[axis] if row == rows[0] else "")
+            if picture.are_errors and outside > 0.0:
+                ax.text(
+                    0.98,
+                    0.95,
+                    f"{_percent(outside)} beyond 3σ",
+                    transform=ax.transAxes,
+                    ha="right",
+                    va="top",
+                    fontsize=style.SMALL_LETTERS,
+                )
+            # The band at rest fills half of the panel; what happens at the start may leave it.
+            ax.axhline(0.0, color=style.GREY, lw=0.5, zorder=1.5)
+        shown = [(middle - wide)[settled], (middle + wide)[settled], values[settled]]
+        low, high = style.limits_of(shown, share=1.0, margin=0.25)
+        across[0].set_ylim(low, high)
+    for ax in axes[-1]:
+        ax.set_xlabel("time [s]", fontsize=style.LETTERS)
+        ax.set_xlim(picture.time_s[0], picture.time_s[-1])
+        ax.xaxis.set_major_locator(MaxNLocator(4))
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    named = dict(zip(labels, handles, strict=True))
+    style.legend(figure, handles=named.values(), labels=named.keys(), loc="outside lower center", ncols=6)
+    style.headline(figure, picture.title)
+    return figure
+
+
+def _percent(part: float) -> str:
+    return f"{100.0 * part:.0f} %" if part >= 0.01 else f"{100.0 * part:.1g} %"
+
+
+@dataclass(frozen=True, eq=False)
+class ConsistencyPicture:
+    """All runs through time.
+
+    Attributes
+    ----------
+    title : str
+    time_s : ndarray, shape (n,)
+    error_deg : ndarray, shape (runs, n), optional
+        Angle between truth and estimate.
+    sigma_deg : ndarray, shape (n,), optional
+        What the filter believes of it, root of the sum of squares of the axes, in the first run.
+    nees : ndarray, shape (runs, n), optional
+        Over its numbers.
+    size : int
+        Numbers of the error state.
+    nis : ndarray, shape (runs, n, 4)
+    """
+
+    title: str
+    time_s: FloatArray
+    error_deg: FloatArray | None
+    sigma_deg: FloatArray | None
+    nees: FloatArray | None
+    size: int
+    nis: FloatArray
+
+
+def consistency_figure(picture: ConsistencyPicture) -> Figure:
+    """Errors of all runs, NEES and NIS with their bounds.
+
+    Parameters
+    ----------
+    picture : ConsistencyPicture
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    n_panels = 1 + 2 * (picture.error_deg is not None)
+    figure = style.new_figure(1.75 * n_panels + 0.5)
+    axes = list(figure.subplots(n_panels, 1, sharex=True, squeeze=False)[:, 0])
+    if picture.error_deg is not None and picture.nees is not None:
+        _errors(axes[0], picture.time_s, picture.error_deg, picture.sigma_deg)
+        _nees(axes[1], picture.time_s, picture.nees, picture.size)
+    _nis(axes[-1], picture.time_s, picture.nis)
+    for ax in axes:
+        ax.set_xlim(picture.time_s[0], picture.time_s[-1])
+        if ax is not axes[-1]:
+            ax.set_xlabel("")
+    style.headline(figure, picture.title)
+    return figure
+
+
+def _errors(ax: Axes, time_s: FloatArray, error_deg: FloatArray, sigma_deg: FloatArray | None) -> None:
+    for i, run in enumerate(error_deg):
+        ax.plot(time_s, run, color=style.PALE_GREY, lw=0.4, label="each run" if i == 0 else "_", zorder=2.0)
+    ax.plot(time_s, np.median(error_deg, axis=0), color=style.BLUE, lw=1.2, label="median")
+    if sigma_deg is not None:
+        ax.plot(time_s, sigma_deg, color=style.ORANGE, lw=1.0, ls="--", label="σ of the filter, first run")
+    style.logarithmic(ax, [error_deg[:, 1:], np.empty(0)])
+    n = len(error_deg)
+    style.dress(ax, "time [s]", "attitude error [°]", f"{n} runs" if n > 1 else "one run")
+    style.legend(ax)
+
+
+def bounds_of_mean(numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Two-sided 99 % bounds of χ² of so many numbers, over these; NaN where there are none."""
+    known = np.where(numbers > 0.0, numbers, np.nan)
+    return chdtri(known, 0.995) / known, chdtri(known, 0.005) / known
+
+
+def _nees(ax: Axes, time_s: FloatArray, nees: FloatArray, size: int) -> None:
+    low, high = bounds_of_mean(np.full(len(time_s), float(size * len(nees))))
+    mean = nees.mean(axis=0)
+    ax.fill_between(time_s, low, high, color=style.LIGHT_GREY, lw=0.0, label="99 % bounds of χ²")
+    ax.plot(time_s, mean, color=style.BLUE, lw=0.9, label="mean of the runs")
+    ax.axhline(1.0, color=style.GREY, lw=0.5)
+    inside = float(np.mean((mean >= low) & (mean <= high)))
+    style.logarithmic(ax, [mean, low, high])
+    style.dress(ax, "time [s]", "NEES / numbers [1]", f"NEES: {100.0 * inside:.0f} % of the instants within")
+    style.legend(ax)
+
+
+def _nis(ax: Axes, time_s: FloatArray, nis: FloatArray) -> None:
+    """Means over the runs, and over so many instants that a picture can show."""
+    width = max(1, len(time_s) // 100)
+    n = len(time_s) // width * width
+    times = time_s[:n].reshape(-1, width).mean(axis=1)
+    drawn: list[FloatArray] = []
+    for sensor, (name, colour, line) in enumerate(zip(_SENSORS, _SENSOR_COLOURS, _SENSOR_LINES, strict=True)):
+        values = nis[:, :n, sensor].reshape(len(nis), -1, width)
+        count = np.isfinite(values).sum(axis=(0, 2)).astype(np.float64)
+        if not count.any():
+            continue
+        numbers = 2.0 if name == "Sun sensor" else 3.0
+        mean = np.where(count > 0.0, np.nansum(values, axis=(0, 2)) / np.maximum(count, 1.0), np.nan) / numbers
+        if not drawn:
+            low, high = bounds_of_mean(numbers * count)
+            ax.fill_between(times, low, high, color=style.LIGHT_GREY, lw=0.0, label="99 % bounds of χ²")
+            drawn += [low, high]
+        ax.plot(times, mean, color=colour, ls=line, lw=0.9, label=name)
+        drawn.append(mean)
+    ax.axhline(1.0, color=style.GREY, lw=0.5)
+    style.logarithmic(ax, drawn)
+    title = f"NIS, mean of {width} instants" if width > 1 else "NIS"
+    style.dress(ax, "time [s]", "NIS / numbers [1]", title)
+    style.legend(ax)
+
+
+_COMPARE_COLOURS = (style.BLACK, style.BLUE, style.ORANGE, "#009e73", "#cc79a7", "#56b4e9")
+_COMPARE_LINES = ("-", "--", "-.", ":")
+
+
+def compare_figure(lines: Sequence[tuple[str, FloatArray, FloatArray]]) -> Figure:
+    """Attitude errors of several filters through time.
+
+    Parameters
+    ----------
+    lines : sequence of (str, ndarray, ndarray)
+        Name, times [s] and median errors [°].
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    figure = style.new_figure(3.4 + 0.15 * len(lines))
+    ax = figure.add_subplot()
+    for i, (name, time_s, error_deg) in enumerate(lines):
+        colour = _COMPARE_COLOURS[i % len(_COMPARE_COLOURS)]
+        dashes = _COMPARE_LINES[i // len(_COMPARE_COLOURS) % len(_COMPARE_LINES)]
+        ax.plot(time_s, error_deg, color=colour, ls=dashes, lw=1.0, label=name)
+    style.logarithmic(ax, [error_deg[1:] for _, _, error_deg in lines])
+    ax.set_xlim(0.0, max(float(time_s[-1]) for _, time_s, _ in lines))
+    style.dress(ax, "time [s]", "attitude error [°]", "median of the runs")
+    handles, labels = ax.get_legend_handles_labels()
+    style.legend(figure, handles=handles, labels=labels, loc="outside lower center", ncols=2)
+    return figure

@@ -1,0 +1,279 @@
+"""Figures of the sky of LEDs: a frame and what was identified in it, how good many are, and a drive.
+
+:func:`drive_figure` has what figures 8 to 10 of the source show.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+from numpy.typing import NDArray
+
+from adcs.mockup.vision.camera import Camera, Pose, footprint
+from adcs.mockup.vision.paper_matcher import CameraFix
+from adcs.stars.identification import NoFix
+from magloc.plots import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+from arrays.typing import BoolArray, FloatArray, IntArray
+
+_FOUND = "#009e73"
+_NONE = style.ORANGE
+_FALSE = "#d55e00"
+_PER_SIDE = 12
+_BRIGHT_DN = 120
+
+
+@dataclass(frozen=True, eq=False)
+class FramePicture:
+    """A frame and its fix.
+
+    Attributes
+    ----------
+    title : str
+    image : ndarray of uint8, shape (height, width)
+    stars_px : ndarray, shape (f, 2)
+        Column and row of the stars that were found.
+    fix : CameraFix or NoFix
+    lights_m : ndarray, shape (n, 2)
+        The sky.
+    camera : Camera
+        As it is believed to be.
+    """
+
+    title: str
+    image: NDArray[np.uint8]
+    stars_px: FloatArray
+    fix: CameraFix | NoFix
+    lights_m: FloatArray
+    camera: Camera
+
+
+def frame_figure(picture: FramePicture) -> Figure:
+    """The frame with its stars, and the ceiling with what it shows of it.
+
+    Parameters
+    ----------
+    picture : FramePicture
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    figure = style.new_figure(3.4)
+    frame, ceiling = figure.subplots(1, 2)
+    fix = picture.fix
+    stars = fix.stars if isinstance(fix, CameraFix) else np.empty((0, 2), dtype=np.intp)
+    named = np.isin(np.arange(len(picture.stars_px)), stars[:, 0])
+    # Lights of the real camera are faint too: half of the range shows them.
+    frame.imshow(picture.image, cmap="gray", vmin=0, vmax=_BRIGHT_DN)
+    for rows, colour, mark, name in ((named, _FOUND, "o", "identified"), (~named, _NONE, "s", "not identified")):
+        if rows.any():
+            frame.plot(*picture.stars_px[rows].T, mark, color=colour, mfc="none", ms=9.0, mew=1.0, label=name)
+    for star, light in stars:
+        x, y = picture.stars_px[star]
+        inside = x < 0.9 * picture.image.shape[1]
+        frame.text(
+            x + (12.0 if inside else -12.0), y, str(light), color="white", fontsize=5.5, va="center",
+            ha="left" if inside else "right",
+        )  # fmt: skip
+    frame.set_xlim(-0.5, picture.image.shape[1] - 0.5)
+    frame.set_ylim(picture.image.shape[0] - 0.5, -0.5)
+    style.dress(frame, "column [px]", "row [px]", "frame, with numbers of the lights")
+    frame.grid(visible=False)
+    lights = picture.lights_m
+    ceiling.plot(*lights.T, ".", color=style.PALE_GREY, ms=3.0)
+    if isinstance(fix, CameraFix):
+        ceiling.plot(*lights[stars[:, 1]].T, "o", color=_FOUND, ms=4.0)
+        draw_footprint(ceiling, picture.camera, fix)
+        x, y = 1e3 * fix.position_m
+        words = f"ceiling: X {x:.1f} mm, Y {y:.1f} mm, heading {np.degrees(fix.heading_rad):.2f}°"
+    else:
+        words = f"ceiling; no fix: {fix.reason}"
+    ceiling.set_aspect("equal")
+    style.dress(ceiling, "X [m]", "Y [m]", words)
+    handles, labels = frame.get_legend_handles_labels()
+    if handles:
+        style.legend(figure, handles=handles, labels=labels, loc="outside lower center", ncols=2)
+    style.headline(figure, picture.title)
+    return figure
+
+
+def draw_footprint(ax: Axes, camera: Camera, fix: CameraFix) -> None:
+    """Outline of the seen part of the ceiling, and the camera's place and heading."""
+    x, y = fix.position_m.tolist()
+    pose = Pose(x, y, fix.heading_rad)
+    outline = footprint(camera, pose, _PER_SIDE)
+    ax.plot(*np.concatenate([outline, outline[:1]]).T, color=style.BLUE, lw=1.0)
+    length = 0.22 * camera.footprint_m[0]
+    tip = (x + length * math.cos(fix.heading_rad), y + length * math.sin(fix.heading_rad))
+    ax.annotate("", tip, (x, y), arrowprops={"arrowstyle": "->", "color": style.BLUE, "lw": 1.3})
+    ax.plot(x, y, "o", color=style.BLUE, ms=4.0)
+
+
+@dataclass(frozen=True, eq=False)
+class SkyPicture:
+    """Many frames.
+
+    Attributes
+    ----------
+    title : str
+    lights_m : ndarray, shape (n, 2)
+    places_m : ndarray, shape (p, 2)
+        True places of the camera.
+    errors_mm : ndarray, shape (p,)
+        NaN without a fix.
+    good, false : ndarray of bool, shape (p,)
+        Fixes near the truth, and others.
+    n_stars : ndarray of int, shape (p,)
+        Found in the frame.
+    """
+
+    title: str
+    lights_m: FloatArray
+    places_m: FloatArray
+    errors_mm: FloatArray
+    good: BoolArray
+    false: BoolArray
+    n_stars: IntArray
+
+
+def sky_figure(picture: SkyPicture) -> Figure:
+    """Where there are fixes, how good they are, and how both depend on the number of stars.
+
+    Parameters
+    ----------
+    picture : SkyPicture
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    figure = style.new_figure(3.7)
+    panels = figure.subplot_mosaic([["map", "errors"], ["map", "stars"]], width_ratios=[1.35, 1.0])
+    _outcomes(panels["map"], picture)
+    _sorted_errors(panels["errors"], picture)
+    _by_stars(panels["stars"], picture)
+    style.headline(figure, picture.title)
+    return figure
+
+
+def _outcomes(ax: Axes, picture: SkyPicture) -> None:
+    ax.plot(*picture.lights_m.T, ".", color=style.PALE_GREY, ms=2.5, label="lights")
+    groups = (
+        ("good fix", picture.good, _FOUND, "o", 3.5),
+        ("no fix", ~(picture.good | picture.false), _NONE, "s", 4.5),
+        ("false fix", picture.false, _FALSE, "X", 7.0),
+    )
+    for name, rows, colour, mark, size in groups:
+        if rows.any():
+            ax.plot(*picture.places_m[rows].T, mark, color=colour, ms=size, mew=0.3, label=f"{name}: {rows.sum()}")
+    ax.set_aspect("equal")
+    style.dress(ax, "X [m]", "Y [m]", "places of the camera")
+    style.legend(ax, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4, columnspacing=1.0, handletextpad=0.3)
+
+
+def _sorted_errors(ax: Axes, picture: SkyPicture) -> None:
+    errors = np.sort(picture.errors_mm[picture.good])
+    n = len(picture.good)
+    if errors.size:
+        share = 100.0 * np.arange(1, errors.size + 1) / n
+        ax.step(errors, share, where="post", color=style.BLUE, lw=1.2)
+        ax.set_xscale("log")
+        ax.xaxis.set_major_locator(LogLocator(10.0, (1.0, 2.0, 5.0), numticks=9))
+        ax.xaxis.set_minor_formatter(NullFormatter())
+        ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        rms = float(np.sqrt(np.mean(errors**2)))
+        ax.axvline(rms, color=style.BLACK, lw=0.7, ls="--", label=f"rms {rms:.2g} mm")
+    ax.set_ylim(0.0, 104.0)
+    style.dress(ax, "error of position [mm]", "frames below [%]", "good fixes")
+    style.legend(ax)
+
+
+def _by_stars(ax: Axes, picture: SkyPicture) -> None:
+    counts = np.arange(picture.n_stars.min(), picture.n_stars.max() + 1)
+    below = np.zeros(len(counts))
+    groups = (
+        ("good", picture.good, _FOUND),
+        ("none", ~(picture.good | picture.false), _NONE),
+        ("false", picture.false, _FALSE),
+    )
+    for name, rows, colour in groups:
+        numbers = np.array([np.sum(rows & (picture.n_stars == count)) for count in counts], dtype=np.float64)
+        if numbers.any():
+            ax.bar(counts, numbers, bottom=below, width=0.85, color=colour, label=name)
+        below += numbers
+    ax.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+    ax.xaxis.set_major_locator(MaxNLocator(8, integer=True))
+    style.dress(ax, "stars found in the frame", "frames", "fixes by stars")
+    style.legend(ax)
+
+
+@dataclass(frozen=True, eq=False)
+class DrivePicture:
+    """A drive along the perimeter, and a satellite at rest, seen by the camera.
+
+    Attributes
+    ----------
+    title : str
+    lights_m : ndarray, shape (n, 2)
+    truth_m, fixes_m : ndarray, shape (p, 2)
+        Of the frames of the drive; fixes NaN where there is none.
+    rest_s : ndarray, shape (r,)
+        Times of the frames at rest.
+    rest_m, rest_truth_m : ndarray, shapes (r, 2) and (2,)
+    """
+
+    title: str
+    lights_m: FloatArray
+    truth_m: FloatArray
+    fixes_m: FloatArray
+    rest_s: FloatArray
+    rest_m: FloatArray
+    rest_truth_m: FloatArray
+
+
+def drive_figure(picture: DrivePicture) -> Figure:
+    """The path as the camera sees it, and X and Y at rest.
+
+    Parameters
+    ----------
+    picture : DrivePicture
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    figure = style.new_figure(3.7)
+    panels = figure.subplot_mosaic([["path", "X"], ["path", "Y"]], width_ratios=[1.35, 1.0])
+    path = panels["path"]
+    seen = np.isfinite(picture.fixes_m).all(axis=1)
+    path.plot(*picture.lights_m.T, ".", color=style.LIGHT_GREY, ms=2.5, label="lights", zorder=1.5)
+    style.draw_truth(path, *picture.truth_m.T)
+    path.plot(*picture.fixes_m[seen].T, ".", color=style.BLUE, ms=4.0, label="fixes")
+    if not seen.all():
+        path.plot(
+            *picture.truth_m[~seen].T, "s", color=_NONE, ms=4.5, mfc="none", label=f"no fix: {int((~seen).sum())}"
+        )
+    path.set_aspect("equal")
+    error_mm = 1e3 * np.linalg.norm((picture.fixes_m - picture.truth_m)[seen], axis=1)
+    text = f": {np.sqrt(np.mean(error_mm**2)):.2g} mm rms" if error_mm.size else ""
+    style.dress(path, "X [m]", "Y [m]", f"perimeter drive{text}")
+    style.legend(path, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4, columnspacing=1.0, handletextpad=0.5)
+    for column, name in enumerate("XY"):
+        ax = panels[name]
+        apart_mm = 1e3 * (picture.rest_m[:, column] - picture.rest_truth_m[column])
+        known = np.isfinite(apart_mm)
+        ax.plot(picture.rest_s[known], apart_mm[known], ".-", color=style.BLUE, lw=0.6, ms=3.0)
+        ax.axhline(0.0, color=style.TRUTH, lw=0.7, ls="--")
+        spread = f": σ {np.std(apart_mm[known]):.2g} mm" if known.any() else ""
+        middle = f"{picture.rest_truth_m[column]:.4f} m"
+        style.dress(ax, "time [s]" if name == "Y" else "", f"{name} less\n{middle} [mm]", f"{name} at rest{spread}")
+    style.headline(figure, picture.title)
+    return figure

@@ -1,0 +1,1 @@
+"""The satellite: its dynamics, its sensors, and the record of what they read."""

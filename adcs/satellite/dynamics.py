@@ -1,0 +1,387 @@
+r"""Rotation of a rigid satellite with reaction wheels, its wheel control, and the Jacobians of its error.
+
+.. math::
+
+    J \dot\omega = -\dot k + 3\frac{\mu}{r^3}\,\eta\times J\eta + m\times B - \omega\times(J\omega + k) + M, \qquad
+    \dot q = \tfrac12\, q\circ(0, \omega - A\omega_o)
+
+with the rate ω of the body against inertial space, the momentum k of the wheels and their torque :math:`\dot k`, the
+local vertical :math:`\eta = A e_3`, the residual dipole m in the field B, any other torque M, all in body axes, and the
+attitude q of body against the orbital frame, which turns at :math:`\omega_o = (0, n, 0)`.
+
+All functions take leading batch axes; :mod:`adcs.satellite.dynamics_compiled` is the compiled twin.
+
+Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014. The orbital rate in the kinematics,
+missing there, is ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adcs import quaternion
+from adcs.frames import turned
+from adcs.quaternion import cross_matrix, rotate_back
+from arrays.typing import FloatArray
+
+ERROR_STATES = 6
+"""δq (3) and δω (3) [rad/s], of :func:`error_jacobian`."""
+_E2 = np.array([0.0, 1.0, 0.0])
+_E3 = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class RigidBody:
+    """A satellite.
+
+    Attributes
+    ----------
+    inertia_kgm2 : ndarray, shape (3, 3)
+        J, wheels included, body axes.
+    residual_dipole_Am2 : ndarray, shape (3,)
+        Magnetic moment that stays with the satellite, body axes.
+    inverse : ndarray, shape (3, 3)
+        J⁻¹.
+
+    Raises
+    ------
+    ValueError
+        The inertia is not symmetric and positive definite, or one of its principal moments is larger than the other two
+        together, which no body has.
+    """
+
+    inertia_kgm2: FloatArray
+    residual_dipole_Am2: FloatArray = field(default_factory=lambda: np.zeros(3))
+    inverse: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        J = np.array(self.inertia_kgm2, dtype=np.float64)
+        dipole = np.array(self.residual_dipole_Am2, dtype=np.float64)
+        if J.shape != (3, 3) or not np.isfinite(J).all():
+            raise ValueError(f"Input inertia_kgm2 must be 3×3 finite numbers; instead received shape {J.shape}.")
+        if not np.allclose(J, J.T, rtol=0.0, atol=1e-9 * np.abs(J).max()):
+            raise ValueError("Input inertia_kgm2 must be symmetric; instead received a matrix that is not.")
+        J = 0.5 * (J + J.T)
+        moments = np.linalg.eigvalsh(J)
+        listed = ", ".join(f"{moment:.6g}" for moment in moments)
+        if moments[0] <= 1e-12 * moments[2]:
+            raise ValueError(
+                f"Input inertia_kgm2 must be positive definite; instead received principal moments {listed}."
+            )
+        if moments[2] > (moments[0] + moments[1]) * (1.0 + 1e-9):
+            raise ValueError(
+                "Input inertia_kgm2 must satisfy the triangle inequality, no principal moment larger than the other "
+                f"two together; instead received principal moments {listed}."
+            )
+        if dipole.shape != (3,) or not np.isfinite(dipole).all():
+            raise ValueError(f"Input residual_dipole_Am2 must be 3 finite numbers; instead received {dipole.tolist()}.")
+        object.__setattr__(self, "inertia_kgm2", J)
+        object.__setattr__(self, "residual_dipole_Am2", dipole)
+        object.__setattr__(self, "inverse", np.linalg.inv(J))
+
+
+@dataclass(frozen=True, eq=False)
+class WheelControl:
+    """Proportional-derivative control by wheels on the three axes.
+
+    Attributes
+    ----------
+    attitude_gain_Nm : ndarray, shape (3,)
+        K_λ, torque per vector part of the quaternion.
+    rate_gain_Nms : ndarray, shape (3,)
+        K_ω.
+    torque_limit_Nm, momentum_limit_Nms : float
+        Of every wheel.
+
+    Raises
+    ------
+    ValueError
+        A gain is negative, or a limit is not positive.
+    """
+
+    attitude_gain_Nm: FloatArray
+    rate_gain_Nms: FloatArray
+    torque_limit_Nm: float = 5e-3
+    momentum_limit_Nms: float = 0.17
+
+    def __post_init__(self) -> None:
+        for name in ("attitude_gain_Nm", "rate_gain_Nms"):
+            gain = np.array(getattr(self, name), dtype=np.float64)
+            if gain.shape != (3,) or not np.isfinite(gain).all() or (gain < 0.0).any():
+                raise ValueError(f"Input {name} must be 3 finite numbers from 0 up; instead received {gain.tolist()}.")
+            object.__setattr__(self, name, gain)
+        for name in ("torque_limit_Nm", "momentum_limit_Nms"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"Input {name} must be positive; instead received {getattr(self, name)}.")
+
+
+def wheel_control(body: RigidBody, natural_rad_s: float = 0.03, damping: float = 0.8) -> WheelControl:
+    """Gains K_λ = 2 ω² J_ii and K_ω = 2 ζ ω J_ii of a natural frequency ω and a damping ratio ζ of small angles."""
+    moments = np.diagonal(body.inertia_kgm2)
+    return WheelControl(2.0 * natural_rad_s**2 * moments, 2.0 * damping * natural_rad_s * moments)
+
+
+def relative_rate(q: ArrayLike, w: ArrayLike, orbital_rate_rad_s: ArrayLike) -> FloatArray:
+    """Rate ω - Aω_o of the body against the orbital frame, body axes [rad/s].
+
+    Parameters
+    ----------
+    q : array_like, shape (..., 4)
+        Attitude, orbital from body.
+    w : array_like, shape (..., 3)
+        Rate against inertial space, body axes [rad/s].
+    orbital_rate_rad_s : array_like, shape (...)
+        n.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+    """
+    return np.asarray(w, dtype=np.float64) - rotate_back(q, np.asarray(orbital_rate_rad_s)[..., None] * _E2)
+
+
+def absolute_rate(q: ArrayLike, w_relative: ArrayLike, orbital_rate_rad_s: ArrayLike) -> FloatArray:
+    """Rate ω of the body against inertial space; inverse of :func:`relative_rate`."""
+    return np.asarray(w_relative, dtype=np.float64) + rotate_back(q, np.asarray(orbital_rate_rad_s)[..., None] * _E2)
+
+
+def environment_torque(body: RigidBody, q: ArrayLike, gravity_s2: ArrayLike, b_orbital_T: ArrayLike) -> FloatArray:
+    """Torque of the gravity gradient, 3(μ/r³) η×Jη, and of the residual dipole, m×B, body axes [N·m].
+
+    Parameters
+    ----------
+    body : RigidBody
+    q : array_like, shape (..., 4)
+        Attitude, orbital from body.
+    gravity_s2 : array_like, shape (...)
+        μ/r³.
+    b_orbital_T : array_like, shape (..., 3)
+        Field in the orbital frame.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+    """
+    eta = rotate_back(q, _E3)
+    gradient = 3.0 * np.asarray(gravity_s2)[..., None] * np.cross(eta, eta @ body.inertia_kgm2)
+    return gradient + np.cross(body.residual_dipole_Am2, rotate_back(q, b_orbital_T))
+
+
+def angular_acceleration(
+    body: RigidBody, w: ArrayLike, momentum_Nms: ArrayLike, wheel_torque_Nm: ArrayLike, torque_Nm: ArrayLike
+) -> FloatArray:
+    r"""Acceleration :math:`\dot\omega = J^{-1}(M - \dot k - \omega\times(J\omega + k))`, body axes [rad/s²].
+
+    Parameters
+    ----------
+    body : RigidBody
+    w : array_like, shape (..., 3)
+        ω [rad/s].
+    momentum_Nms, wheel_torque_Nm : array_like, shape (..., 3)
+        k and its rate of change.
+    torque_Nm : array_like, shape (..., 3)
+        M, all torques from outside.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+    """
+    w = np.asarray(w, dtype=np.float64)
+    gyroscopic = np.cross(w, w @ body.inertia_kgm2 + np.asarray(momentum_Nms, dtype=np.float64))
+    net = np.asarray(torque_Nm, dtype=np.float64) - np.asarray(wheel_torque_Nm, dtype=np.float64) - gyroscopic
+    return net @ body.inverse
+
+
+def step(
+    body: RigidBody,
+    q: ArrayLike,
+    w: ArrayLike,
+    momentum_Nms: ArrayLike,
+    wheel_torque_Nm: ArrayLike,
+    torque_Nm: ArrayLike,
+    orbital_rate_rad_s: ArrayLike,
+    gravity_s2: ArrayLike,
+    b_orbital_T: ArrayLike,
+    dt_s: float,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """State after one step of the classical Runge-Kutta method of order four.
+
+    Torque, wheel torque and surroundings are held over the step, the momentum of the wheels is linear in time; the
+    attitude is normalised after it.
+
+    Parameters
+    ----------
+    body : RigidBody
+    q, w, momentum_Nms : array_like, shape (..., 4), (..., 3), (..., 3)
+        Attitude (orbital from body), rate against inertial space [rad/s], momentum of the wheels, body axes.
+    wheel_torque_Nm, torque_Nm : array_like, shape (..., 3)
+        Rate of change of that momentum, and the torque of the disturbances, body axes.
+    orbital_rate_rad_s, gravity_s2 : array_like, shape (...)
+    b_orbital_T : array_like, shape (..., 3)
+        Field that the residual dipole feels.
+    dt_s : float
+
+    Returns
+    -------
+    q, w, momentum_Nms : ndarray
+    """
+    q, w, k = (np.asarray(one, dtype=np.float64) for one in (q, w, momentum_Nms))
+    k_dot, disturbance = (np.asarray(one, dtype=np.float64) for one in (wheel_torque_Nm, torque_Nm))
+
+    def slope(q_at: FloatArray, w_at: FloatArray, after_s: float) -> tuple[FloatArray, FloatArray]:
+        outside = disturbance + environment_torque(body, q_at, gravity_s2, b_orbital_T)
+        return (
+            quaternion.derivative(q_at, relative_rate(q_at, w_at, orbital_rate_rad_s)),
+            angular_acceleration(body, w_at, k + k_dot * after_s, k_dot, outside),
+        )
+
+    half = 0.5 * dt_s
+    q1, w1 = slope(q, w, 0.0)
+    q2, w2 = slope(q + half * q1, w + half * w1, half)
+    q3, w3 = slope(q + half * q2, w + half * w2, half)
+    q4, w4 = slope(q + dt_s * q3, w + dt_s * w3, dt_s)
+    return (
+        quaternion.normalised(q + dt_s / 6.0 * (q1 + 2.0 * q2 + 2.0 * q3 + q4)),
+        w + dt_s / 6.0 * (w1 + 2.0 * w2 + 2.0 * w3 + w4),
+        k + k_dot * dt_s,
+    )
+
+
+def commanded_torque(
+    body: RigidBody,
+    control: WheelControl,
+    q: ArrayLike,
+    w: ArrayLike,
+    momentum_Nms: ArrayLike,
+    q_reference: ArrayLike,
+    orbital_rate_rad_s: ArrayLike,
+    dt_s: float,
+) -> FloatArray:
+    r"""Wheel torque :math:`\dot k = K_\lambda\lambda + K_\omega\omega_{rel} - \omega\times(J\omega + k)`, limited.
+
+    λ is the vector part of :math:`q_r^*\circ q`, with the sign of the shorter way, for a reference that rests in the
+    orbital frame. The torque is limited, and then the momentum after the step.
+
+    Parameters
+    ----------
+    body : RigidBody
+    control : WheelControl
+    q, w : array_like, shape (..., 4), (..., 3)
+        Attitude and rate as the controller knows them: the estimate.
+    momentum_Nms : array_like, shape (..., 3)
+        k.
+    q_reference : array_like, shape (..., 4)
+        Wanted attitude, orbital from body.
+    orbital_rate_rad_s : array_like, shape (...)
+    dt_s : float
+        How long the torque will be held.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        [N·m]
+    """
+    k = np.asarray(momentum_Nms, dtype=np.float64)
+    w = np.asarray(w, dtype=np.float64)
+    wanted = (
+        control.attitude_gain_Nm * quaternion.error_vector(q_reference, q)
+        + control.rate_gain_Nms * relative_rate(q, w, orbital_rate_rad_s)
+        - np.cross(w, w @ body.inertia_kgm2 + k)
+    )
+    limited = np.clip(wanted, -control.torque_limit_Nm, control.torque_limit_Nm)
+    limit = control.momentum_limit_Nms
+    return (np.clip(k + limited * dt_s, -limit, limit) - k) / dt_s
+
+
+def error_jacobian(
+    body: RigidBody, q: ArrayLike, w: ArrayLike, momentum_Nms: ArrayLike, gravity_s2: ArrayLike, b_orbital_T: ArrayLike
+) -> FloatArray:
+    r"""F of the error (δq, δω) for a known wheel torque: d/dt (δq, δω) = F (δq, δω).
+
+    .. math::
+
+        F_{11} = -W(\omega), \quad F_{12} = \tfrac12 E, \quad
+        F_{21} = J^{-1}\left(6\frac{\mu}{r^3}(W(\eta)JW(\eta) - W(J\eta)W(\eta)) + 2W(m)W(AB)\right), \quad
+        F_{22} = J^{-1}(W(J\omega + k) - W(\omega)J)
+
+    δq is defined by :func:`adcs.quaternion.error_vector`. ω in F11 is the rate against inertial space, although q is
+    against the orbital frame.
+
+    Parameters
+    ----------
+    body : RigidBody
+    q, w, momentum_Nms : array_like, shape (..., 4), (..., 3), (..., 3)
+    gravity_s2 : array_like, shape (...)
+    b_orbital_T : array_like, shape (..., 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 6, 6)
+    """
+    w = np.asarray(w, dtype=np.float64)
+    J = body.inertia_kgm2
+    b_body = rotate_back(q, b_orbital_T)
+    dipole: FloatArray = 2.0 * cross_matrix(body.residual_dipole_Am2) @ cross_matrix(b_body)
+    by_attitude = body.inverse @ (_gradient_part(body, q, gravity_s2) + dipole)
+    total = w @ J + np.asarray(momentum_Nms, dtype=np.float64)
+    return _error_matrix(w, by_attitude, body.inverse @ (cross_matrix(total) - cross_matrix(w) @ J))
+
+
+def closed_loop_error_jacobian(
+    body: RigidBody,
+    control: WheelControl,
+    q: ArrayLike,
+    w: ArrayLike,
+    q_reference: ArrayLike,
+    gravity_s2: ArrayLike,
+) -> FloatArray:
+    r"""F of the error as the source paper has it, as if the control saw the true state (``closed_loop_F``).
+
+    .. math:: F_{21} = J^{-1}\left(6\frac{\mu}{r^3}F_g - K_\lambda W_\lambda\right), \quad F_{22} = -J^{-1}K_\omega
+
+    with :math:`W_\lambda = \lambda_0 E + W(\lambda)`. The torque is computed from the estimate, so this is not the F of
+    an estimate's error, and filters with it are overconfident; even as the Jacobian of the closed loop it lacks
+    :math:`2J^{-1}K_\omega W(A\omega_o)` in F21. It is here to reproduce the paper; see :func:`error_jacobian`.
+
+    Parameters
+    ----------
+    body : RigidBody
+    control : WheelControl
+    q, w : array_like, shape (..., 4), (..., 3)
+    q_reference : array_like, shape (..., 4)
+        Wanted attitude, orbital from body.
+    gravity_s2 : array_like, shape (...)
+
+    Returns
+    -------
+    ndarray, shape (..., 6, 6)
+    """
+    relative = quaternion.multiply(quaternion.conjugate(q_reference), q)
+    relative = np.where(relative[..., :1] < 0.0, -relative, relative)
+    W_lambda = relative[..., 0, None, None] * np.eye(3) + cross_matrix(relative[..., 1:])
+    feedback = control.attitude_gain_Nm[:, None] * W_lambda
+    return _error_matrix(
+        np.asarray(w, dtype=np.float64),
+        body.inverse @ (_gradient_part(body, q, gravity_s2) - feedback),
+        -body.inverse * control.rate_gain_Nms,
+    )
+
+
+def _gradient_part(body: RigidBody, q: ArrayLike, gravity_s2: ArrayLike) -> FloatArray:
+    """6 (μ/r³) F_g, torque of the gravity gradient by δq, shape (..., 3, 3)."""
+    eta = rotate_back(q, _E3)
+    W = cross_matrix(eta)
+    J = body.inertia_kgm2
+    return 6.0 * np.asarray(gravity_s2)[..., None, None] * (W @ J @ W - cross_matrix(turned(J, eta)) @ W)
+
+
+def _error_matrix(w: FloatArray, by_attitude: FloatArray, by_rate: FloatArray) -> FloatArray:
+    F = np.zeros((*np.broadcast_shapes(w.shape[:-1], by_attitude.shape[:-2], by_rate.shape[:-2]), 6, 6))
+    F[..., :3, :3] = -cross_matrix(w)
+    F[..., :3, 3:] = 0.5 * np.eye(3)
+    F[..., 3:, :3] = by_attitude
+    F[..., 3:, 3:] = by_rate
+    return F

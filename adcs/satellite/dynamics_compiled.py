@@ -1,0 +1,313 @@
+"""Compiled rotation of a satellite with wheels.
+
+:mod:`adcs.satellite.dynamics` is the readable twin and has the formulas.
+
+Vectors and quaternions are tuples of scalars, which the compiler keeps in registers; matrices are arrays (3, 3). The
+functions of this module are made to be called by other kernels; :func:`run` follows whole runs, one row each.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magloc.compilation import compiled
+
+Array = NDArray[np.float64]
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+@compiled
+def vector_at(values: Array) -> Vector:
+    """Tuple of a row (3,)."""
+    return values[0], values[1], values[2]
+
+
+@compiled
+def quaternion_at(values: Array) -> Quaternion:
+    """Tuple of a row (4,)."""
+    return values[0], values[1], values[2], values[3]
+
+
+@compiled
+def combined(a: Vector, scale: float, b: Vector) -> Vector:
+    """Vector a + scale·b."""
+    return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]
+
+
+@compiled
+def cross(a: Vector, b: Vector) -> Vector:
+    """Vector a×b."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@compiled
+def applied(M: Array, v: Vector) -> Vector:
+    """Vector M v of a matrix (3, 3)."""
+    return (
+        M[0, 0] * v[0] + M[0, 1] * v[1] + M[0, 2] * v[2],
+        M[1, 0] * v[0] + M[1, 1] * v[1] + M[1, 2] * v[2],
+        M[2, 0] * v[0] + M[2, 1] * v[1] + M[2, 2] * v[2],
+    )
+
+
+@compiled
+def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
+    """Hamilton product p∘q."""
+    return (
+        p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3],
+        p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2],
+        p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1],
+        p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0],
+    )
+
+
+@compiled
+def conjugate(q: Quaternion) -> Quaternion:
+    """Conjugate q*."""
+    return q[0], -q[1], -q[2], -q[3]
+
+
+@compiled
+def moved(q: Quaternion, scale: float, dq: Quaternion) -> Quaternion:
+    """Quaternion q + scale·dq, not normalised."""
+    return q[0] + scale * dq[0], q[1] + scale * dq[1], q[2] + scale * dq[2], q[3] + scale * dq[3]
+
+
+@compiled
+def normalised(q: Quaternion) -> Quaternion:
+    """Quaternion of length 1."""
+    inverse = 1.0 / np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    return q[0] * inverse, q[1] * inverse, q[2] * inverse, q[3] * inverse
+
+
+@compiled
+def rotate_back(q: Quaternion, v: Vector) -> Vector:
+    """Vector A(q) v = q*∘v∘q."""
+    p = (q[1], q[2], q[3])
+    twice = cross(p, v)
+    twice = (2.0 * twice[0], 2.0 * twice[1], 2.0 * twice[2])
+    return combined(combined(v, -q[0], twice), 1.0, cross(p, twice))
+
+
+@compiled
+def error_vector(q_estimated: Quaternion, q_true: Quaternion) -> Vector:
+    """Vector part of q̂*∘q with the sign that makes the scalar part positive."""
+    e = multiply(conjugate(q_estimated), q_true)
+    sign = -1.0 if e[0] < 0.0 else 1.0
+    return sign * e[1], sign * e[2], sign * e[3]
+
+
+@compiled
+def relative_rate(q: Quaternion, w: Vector, orbital_rate: float) -> Vector:
+    """Rate against the orbital frame."""
+    return combined(w, -orbital_rate, rotate_back(q, (0.0, 1.0, 0.0)))
+
+
+@compiled
+def environment_torque(J: Array, dipole: Vector, q: Quaternion, gravity: float, b_orbital: Vector) -> Vector:
+    """Torque of the gravity gradient and of the residual dipole."""
+    eta = rotate_back(q, (0.0, 0.0, 1.0))
+    magnetic = cross(dipole, rotate_back(q, b_orbital))
+    return combined(magnetic, 3.0 * gravity, cross(eta, applied(J, eta)))
+
+
+@compiled
+def angular_acceleration(
+    J: Array, J_inverse: Array, w: Vector, momentum: Vector, wheel_torque: Vector, torque: Vector
+) -> Vector:
+    """Acceleration of the body."""
+    gyroscopic = cross(w, combined(momentum, 1.0, applied(J, w)))
+    return applied(J_inverse, combined(combined(torque, -1.0, wheel_torque), -1.0, gyroscopic))
+
+
+@compiled
+def quaternion_rate(q: Quaternion, w_relative: Vector) -> Quaternion:
+    """Rate of change ½ q∘(0, ω)."""
+    return multiply(q, (0.0, 0.5 * w_relative[0], 0.5 * w_relative[1], 0.5 * w_relative[2]))
+
+
+@compiled
+def step(
+    J: Array,
+    J_inverse: Array,
+    dipole: Vector,
+    q: Quaternion,
+    w: Vector,
+    momentum: Vector,
+    wheel_torque: Vector,
+    torque: Vector,
+    orbital_rate: float,
+    gravity: float,
+    b_orbital: Vector,
+    dt: float,
+) -> tuple[Quaternion, Vector, Vector]:
+    """One Runge-Kutta step of attitude, rate and wheel momentum."""
+    half = 0.5 * dt
+    middle = combined(momentum, half, wheel_torque)
+    end = combined(momentum, dt, wheel_torque)
+
+    q1 = quaternion_rate(q, relative_rate(q, w, orbital_rate))
+    outside = combined(torque, 1.0, environment_torque(J, dipole, q, gravity, b_orbital))
+    w1 = angular_acceleration(J, J_inverse, w, momentum, wheel_torque, outside)
+
+    q_at, w_at = moved(q, half, q1), combined(w, half, w1)
+    q2 = quaternion_rate(q_at, relative_rate(q_at, w_at, orbital_rate))
+    outside = combined(torque, 1.0, environment_torque(J, dipole, q_at, gravity, b_orbital))
+    w2 = angular_acceleration(J, J_inverse, w_at, middle, wheel_torque, outside)
+
+    q_at, w_at = moved(q, half, q2), combined(w, half, w2)
+    q3 = quaternion_rate(q_at, relative_rate(q_at, w_at, orbital_rate))
+    outside = combined(torque, 1.0, environment_torque(J, dipole, q_at, gravity, b_orbital))
+    w3 = angular_acceleration(J, J_inverse, w_at, middle, wheel_torque, outside)
+
+    q_at, w_at = moved(q, dt, q3), combined(w, dt, w3)
+    q4 = quaternion_rate(q_at, relative_rate(q_at, w_at, orbital_rate))
+    outside = combined(torque, 1.0, environment_torque(J, dipole, q_at, gravity, b_orbital))
+    w4 = angular_acceleration(J, J_inverse, w_at, end, wheel_torque, outside)
+
+    sixth = dt / 6.0
+    q = moved(moved(moved(moved(q, sixth, q1), 2.0 * sixth, q2), 2.0 * sixth, q3), sixth, q4)
+    w = combined(combined(combined(combined(w, sixth, w1), 2.0 * sixth, w2), 2.0 * sixth, w3), sixth, w4)
+    return normalised(q), w, end
+
+
+@compiled
+def error_jacobian(
+    J: Array,
+    J_inverse: Array,
+    dipole: Vector,
+    q: Quaternion,
+    w: Vector,
+    momentum: Vector,
+    gravity: float,
+    b_orbital: Vector,
+    F: Array,
+) -> None:
+    """F of the error (δq, δω) for a known wheel torque, into all 36 elements of ``F`` (6, 6).
+
+    Its columns are what the linear map makes of the three unit vectors e: with δη = 2 η×e for δq = e, and so for B.
+    """
+    eta = rotate_back(q, (0.0, 0.0, 1.0))
+    J_eta = applied(J, eta)
+    b = rotate_back(q, b_orbital)
+    total = combined(momentum, 1.0, applied(J, w))
+    for i in range(3):
+        e = (1.0 if i == 0 else 0.0, 1.0 if i == 1 else 0.0, 1.0 if i == 2 else 0.0)
+        turned = cross(e, w)
+        F[0, i], F[1, i], F[2, i] = turned
+        F[0, 3 + i], F[1, 3 + i], F[2, 3 + i] = 0.5 * e[0], 0.5 * e[1], 0.5 * e[2]
+        d_eta = cross(eta, e)
+        gradient = combined(cross(d_eta, J_eta), 1.0, cross(eta, applied(J, d_eta)))
+        magnetic = cross(dipole, cross(b, e))
+        torque = (
+            6.0 * gravity * gradient[0] + 2.0 * magnetic[0],
+            6.0 * gravity * gradient[1] + 2.0 * magnetic[1],
+            6.0 * gravity * gradient[2] + 2.0 * magnetic[2],
+        )
+        F[3, i], F[4, i], F[5, i] = applied(J_inverse, torque)
+        gyroscopic = combined(cross(total, e), -1.0, cross(w, applied(J, e)))
+        F[3, 3 + i], F[4, 3 + i], F[5, 3 + i] = applied(J_inverse, gyroscopic)
+
+
+@compiled
+def _clipped(value: float, limit: float) -> float:
+    return min(max(value, -limit), limit)
+
+
+@compiled
+def commanded_torque(
+    J: Array,
+    attitude_gain: Vector,
+    rate_gain: Vector,
+    torque_limit: float,
+    momentum_limit: float,
+    q: Quaternion,
+    w: Vector,
+    momentum: Vector,
+    q_reference: Quaternion,
+    orbital_rate: float,
+    dt: float,
+) -> Vector:
+    """Wheel torque of the proportional-derivative control, within its limits."""
+    angle = error_vector(q_reference, q)
+    rate = relative_rate(q, w, orbital_rate)
+    gyroscopic = cross(w, combined(momentum, 1.0, applied(J, w)))
+    x = _clipped(attitude_gain[0] * angle[0] + rate_gain[0] * rate[0] - gyroscopic[0], torque_limit)
+    y = _clipped(attitude_gain[1] * angle[1] + rate_gain[1] * rate[1] - gyroscopic[1], torque_limit)
+    z = _clipped(attitude_gain[2] * angle[2] + rate_gain[2] * rate[2] - gyroscopic[2], torque_limit)
+    return (
+        (_clipped(momentum[0] + x * dt, momentum_limit) - momentum[0]) / dt,
+        (_clipped(momentum[1] + y * dt, momentum_limit) - momentum[1]) / dt,
+        (_clipped(momentum[2] + z * dt, momentum_limit) - momentum[2]) / dt,
+    )
+
+
+@compiled
+def run(
+    begin: int,
+    end: int,
+    q: Array,
+    w: Array,
+    momentum: Array,
+    wheel_torque: Array,
+    J: Array,
+    J_inverse: Array,
+    dipole: Array,
+    attitude_gain: Array,
+    rate_gain: Array,
+    torque_limit: float,
+    momentum_limit: float,
+    q_reference: Array,
+    torque: Array,
+    orbital_rate: Array,
+    gravity: Array,
+    b_orbital: Array,
+    dt: float,
+) -> None:
+    """Runs begin to end under control that sees the true state, from their first rows on.
+
+    ``q`` (R, n, 4), ``w`` and ``momentum`` (R, n, 3) hold the start in their rows 0, and get the rest; ``wheel_torque``
+    (R, n, 3) gets what is held from each instant to the next (the last row: what would be). ``torque`` (R, n, 3) is
+    held likewise; surroundings, (R, n) and (R, n, 3), are those at the start of every step.
+    """
+    n = q.shape[1]
+    reference = quaternion_at(q_reference)
+    m = vector_at(dipole)
+    for r in range(begin, end):
+        q_now = quaternion_at(q[r, 0])
+        w_now = vector_at(w[r, 0])
+        k_now = vector_at(momentum[r, 0])
+        for i in range(n):
+            u = commanded_torque(
+                J,
+                vector_at(attitude_gain),
+                vector_at(rate_gain),
+                torque_limit,
+                momentum_limit,
+                q_now,
+                w_now,
+                k_now,
+                reference,
+                orbital_rate[r, i],
+                dt,
+            )
+            q[r, i, 0], q[r, i, 1], q[r, i, 2], q[r, i, 3] = q_now
+            w[r, i, 0], w[r, i, 1], w[r, i, 2] = w_now
+            momentum[r, i, 0], momentum[r, i, 1], momentum[r, i, 2] = k_now
+            wheel_torque[r, i, 0], wheel_torque[r, i, 1], wheel_torque[r, i, 2] = u
+            if i == n - 1:
+                break
+            q_now, w_now, k_now = step(
+                J,
+                J_inverse,
+                m,
+                q_now,
+                w_now,
+                k_now,
+                u,
+                vector_at(torque[r, i]),
+                orbital_rate[r, i],
+                gravity[r, i],
+                vector_at(b_orbital[r, i]),
+                dt,
+            )

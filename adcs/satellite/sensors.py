@@ -1,0 +1,334 @@
+r"""Models of the attitude sensors: what they read, and when they read nothing.
+
+==============  ==========================  ==================================================================
+sensor          reading                     missing (NaN)
+==============  ==========================  ==================================================================
+star tracker    q∘(error), orbital from     rate above its limit; Sun or Earth in the way of its axis
+                body
+gyro            ω + Δω + noise              an axis beyond the range
+magnetometer    B + Δb + noise              an axis beyond the range
+Sun sensor      unit vector with noise      eclipse; no head has the Sun in its field
+==============  ==========================  ==================================================================
+
+All readings are in body axes. Every sensor may be misaligned: it is then turned against its nominal axes by a small
+rotation vector that its user does not know. Random numbers are an argument: standard normal, of the shape of the
+readings. All functions take leading batch axes.
+
+Defaults are Table 1 of the source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014. Limits of
+the star tracker's view are ours, and so is the square field of a Sun head: with cones of 45° five heads would leave a
+quarter of the sky unseen.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adcs import quaternion
+from arrays.typing import BoolArray, FloatArray
+
+ANGLE_NOISE_RAD = math.radians(0.0005)
+"""Noise of the star tracker's quaternion where 0.001° is the angle, twice that."""
+PAPER_NOISE_RAD = math.radians(0.001)
+"""The same where 0.001° is the noise of the quaternion's components, which the source's tables need."""
+FIVE_HEADS: FloatArray = np.array(
+    [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
+)
+"""Axes of Sun heads on ±x, ±y and z, which points to the zenith in the orbital frame."""
+
+
+def _aligned() -> FloatArray:
+    return np.zeros(3)
+
+
+@dataclass(frozen=True, eq=False)
+class StarTracker:
+    """Measures the attitude.
+
+    Attributes
+    ----------
+    sigma_rad : float
+        Standard deviation of each component of the vector part of the quaternion's error: half of that of the angle.
+    rate_limit_rad_s : float
+        No stars are found above it.
+    boresight_body : ndarray, shape (3,)
+        Its axis.
+    sun_exclusion_rad, earth_exclusion_rad : float
+        The axis must be farther than these from the Sun, and from the limb of the Earth; 0 = only not on it.
+    misalignment_rad : ndarray, shape (3,)
+        Rotation vector.
+
+    Raises
+    ------
+    ValueError
+        A number is not finite, or not positive where it must be.
+    """
+
+    sigma_rad: float = ANGLE_NOISE_RAD
+    rate_limit_rad_s: float = math.radians(2.0)
+    boresight_body: FloatArray = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))
+    sun_exclusion_rad: float = 0.0
+    earth_exclusion_rad: float = 0.0
+    misalignment_rad: FloatArray = field(default_factory=_aligned)
+
+    def __post_init__(self) -> None:
+        _check(self)
+        length = float(np.linalg.norm(self.boresight_body))
+        if not length > 0.0:
+            raise ValueError("Input boresight_body must have a length; instead received a zero vector.")
+        object.__setattr__(self, "boresight_body", self.boresight_body / length)
+
+
+@dataclass(frozen=True, eq=False)
+class Gyro:
+    """Measures the rate against inertial space.
+
+    Attributes
+    ----------
+    sigma_rad_s : float
+        Standard deviation of one reading of one axis.
+    range_rad_s : float
+        Largest rate of an axis.
+    bias_walk_rad_s : float
+        Growth of the bias's standard deviation in one second [rad/s per √s].
+    misalignment_rad : ndarray, shape (3,)
+        Rotation vector.
+
+    Raises
+    ------
+    ValueError
+        As :class:`StarTracker`.
+    """
+
+    sigma_rad_s: float = math.radians(0.005)
+    range_rad_s: float = math.radians(250.0)
+    bias_walk_rad_s: float = 0.0
+    misalignment_rad: FloatArray = field(default_factory=_aligned)
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Magnetometer:
+    """Measures the field.
+
+    Attributes
+    ----------
+    sigma_T : float
+        Standard deviation of one reading of one axis.
+    range_T : float
+        Largest field along an axis.
+    bias_walk_T : float
+        Growth of the bias's standard deviation in one second [T per √s].
+    misalignment_rad : ndarray, shape (3,)
+        Rotation vector.
+
+    Raises
+    ------
+    ValueError
+        As :class:`StarTracker`.
+    """
+
+    sigma_T: float = 250e-9
+    range_T: float = 200_000e-9
+    bias_walk_T: float = 0.0
+    misalignment_rad: FloatArray = field(default_factory=_aligned)
+
+    def __post_init__(self) -> None:
+        _check(self)
+
+
+@dataclass(frozen=True, eq=False)
+class SunSensor:
+    """Heads that measure the direction to the Sun.
+
+    Attributes
+    ----------
+    sigma_rad : float
+        Standard deviation of the direction along each of two axes across it.
+    heads_body : ndarray, shape (h, 3)
+        Axes of the heads.
+    half_field_rad : float
+        Half the side of the square field: a head sees the Sun where both angles, of its projections on the planes
+        through the head's axis and its two sides, are within it.
+    misalignment_rad : ndarray, shape (3,)
+        Rotation vector of all heads together.
+
+    Raises
+    ------
+    ValueError
+        As :class:`StarTracker`, or a head has no direction.
+    """
+
+    sigma_rad: float = math.radians(0.1)
+    heads_body: FloatArray = field(default_factory=lambda: FIVE_HEADS.copy())
+    half_field_rad: float = math.radians(45.0)
+    misalignment_rad: FloatArray = field(default_factory=_aligned)
+
+    def __post_init__(self) -> None:
+        _check(self)
+        heads = np.atleast_2d(self.heads_body)
+        lengths = np.linalg.norm(heads, axis=-1, keepdims=True)
+        if heads.ndim != 2 or heads.shape[1] != 3 or not (lengths > 0.0).all():
+            raise ValueError("Input heads_body must be rows of 3 numbers that are not all zero.")
+        object.__setattr__(self, "heads_body", heads / lengths)
+
+
+def star_tracker_readings(
+    tracker: StarTracker,
+    q: ArrayLike,
+    w: ArrayLike,
+    sun_orbital: ArrayLike,
+    earth_radius_rad: ArrayLike,
+    illuminated: ArrayLike,
+    unit_noise: ArrayLike,
+) -> FloatArray:
+    """Attitudes that a star tracker reports, q∘exp of misalignment and noise.
+
+    Parameters
+    ----------
+    tracker : StarTracker
+    q : array_like, shape (..., 4)
+        True attitude, orbital from body.
+    w : array_like, shape (..., 3)
+        True rate [rad/s].
+    sun_orbital : array_like, shape (..., 3)
+        Unit vector to the Sun; it blinds the tracker only where some of it is seen.
+    earth_radius_rad : array_like, shape (...)
+        Angular radius of the Earth, around nadir.
+    illuminated : array_like, shape (...)
+        Part of the Sun that is seen.
+    unit_noise : array_like, shape (..., 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 4)
+        Orbital from body, NaN where there is none.
+    """
+    delta = tracker.sigma_rad * np.asarray(unit_noise, dtype=np.float64)
+    turned_by = quaternion.multiply(quaternion.exp(tracker.misalignment_rad), quaternion.from_error_vector(delta))
+    axis = quaternion.rotate(q, tracker.boresight_body)
+    sun_away = np.arccos(np.clip(np.sum(axis * np.asarray(sun_orbital, dtype=np.float64), axis=-1), -1.0, 1.0))
+    nadir_away = np.arccos(np.clip(-axis[..., 2], -1.0, 1.0))
+    seen = (
+        (np.linalg.norm(w, axis=-1) <= tracker.rate_limit_rad_s)
+        & ((sun_away > tracker.sun_exclusion_rad) | (np.asarray(illuminated) <= 0.0))
+        & (nadir_away > np.asarray(earth_radius_rad) + tracker.earth_exclusion_rad)
+    )
+    return np.where(seen[..., None], quaternion.multiply(q, turned_by), np.nan)
+
+
+def gyro_readings(gyro: Gyro, w: ArrayLike, bias_rad_s: ArrayLike, unit_noise: ArrayLike) -> FloatArray:
+    """Rates that a gyro reports [rad/s]; all arguments (..., 3), NaN for all axes where one is beyond the range."""
+    return _vector_readings(w, gyro.misalignment_rad, bias_rad_s, gyro.sigma_rad_s, unit_noise, gyro.range_rad_s)
+
+
+def magnetometer_readings(
+    magnetometer: Magnetometer, b_body_T: ArrayLike, bias_T: ArrayLike, unit_noise: ArrayLike
+) -> FloatArray:
+    """Fields that a magnetometer reports [T]; all arguments (..., 3), NaN as :func:`gyro_readings`."""
+    m = magnetometer
+    return _vector_readings(b_body_T, m.misalignment_rad, bias_T, m.sigma_T, unit_noise, m.range_T)
+
+
+def sun_readings(sensor: SunSensor, sun_body: ArrayLike, illuminated: ArrayLike, unit_noise: ArrayLike) -> FloatArray:
+    """Directions that the Sun heads report.
+
+    Noise turns the direction by ``sigma_rad`` along each of two axes across it: three numbers per component are added
+    and the sum is normalised, which leaves nothing along it.
+
+    Parameters
+    ----------
+    sensor : SunSensor
+    sun_body : array_like, shape (..., 3)
+        True unit vector.
+    illuminated : array_like, shape (...)
+        Part of the Sun that is seen; at least half is needed.
+    unit_noise : array_like, shape (..., 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Unit vectors, NaN where no head sees the Sun.
+    """
+    sun = np.asarray(sun_body, dtype=np.float64)
+    seen = in_field(sensor, sun).any(axis=-1) & (np.asarray(illuminated) >= 0.5)
+    noise = sensor.sigma_rad * np.asarray(unit_noise, dtype=np.float64)
+    reading = quaternion.rotate_back(quaternion.exp(sensor.misalignment_rad), sun) + noise
+    return np.where(seen[..., None], reading / np.linalg.norm(reading, axis=-1, keepdims=True), np.nan)
+
+
+def in_field(sensor: SunSensor, direction_body: ArrayLike) -> BoolArray:
+    """Which heads have a direction in their square fields. Directions (..., 3) -> (..., h)."""
+    axes = np.stack([_head_axes(axis) for axis in sensor.heads_body])
+    along = np.einsum("hij,...j->...hi", axes, np.asarray(direction_body, dtype=np.float64))
+    angles = np.abs(np.arctan2(along[..., :2], along[..., 2:]))
+    # A direction on the edge between two heads must not fall between them by rounding.
+    return np.asarray((angles <= sensor.half_field_rad + 1e-12).all(axis=-1))
+
+
+def bias_walk(start: ArrayLike, walk: float, dt_s: float, unit_noise: ArrayLike) -> FloatArray:
+    """Biases whose derivative is white noise.
+
+    Parameters
+    ----------
+    start : array_like, shape (..., 3)
+        First bias.
+    walk : float
+        Growth of the standard deviation in one second [unit/√s].
+    dt_s : float
+        Between readings.
+    unit_noise : array_like, shape (..., n, 3)
+
+    Returns
+    -------
+    ndarray, shape (..., n, 3)
+    """
+    steps = walk * math.sqrt(dt_s) * np.asarray(unit_noise, dtype=np.float64)
+    steps[..., 0, :] = start
+    return np.cumsum(steps, axis=-2)
+
+
+def _vector_readings(
+    true: ArrayLike,
+    misalignment_rad: FloatArray,
+    bias: ArrayLike,
+    sigma: float,
+    unit_noise: ArrayLike,
+    largest: float,
+) -> FloatArray:
+    in_sensor = quaternion.rotate_back(quaternion.exp(misalignment_rad), true)
+    noise = sigma * np.asarray(unit_noise, dtype=np.float64)
+    reading = in_sensor + np.asarray(bias, dtype=np.float64) + noise
+    within = (np.abs(reading) <= largest).all(axis=-1, keepdims=True)
+    return np.where(within, reading, np.nan)
+
+
+def _head_axes(axis: FloatArray) -> FloatArray:
+    """Rows: two sides of the square field and the axis. The first side is along the body axis that is most across."""
+    side = np.eye(3)[np.argmin(np.abs(axis))]
+    x = side - axis * (axis @ side)
+    x = x / np.linalg.norm(x)
+    return np.stack([x, np.cross(axis, x), axis])
+
+
+def _check(sensor: StarTracker | Gyro | Magnetometer | SunSensor) -> None:
+    """Raise if a number is not finite or negative, or a noise, range, limit or field not positive."""
+    for one in fields(sensor):
+        values = np.array(getattr(sensor, one.name), dtype=np.float64)
+        if np.isnan(values).any():
+            raise ValueError(f"Input {one.name} must be numbers; instead received NaN.")
+        if one.name in ("misalignment_rad", "boresight_body", "heads_body"):
+            if values.shape[-1:] != (3,) or not np.isfinite(values).all():
+                raise ValueError(f"Input {one.name} must be 3 finite numbers; instead received shape {values.shape}.")
+            object.__setattr__(sensor, one.name, values)
+            continue
+        may_be_zero = one.name.endswith("exclusion_rad") or one.name.startswith("bias_walk")
+        if values < 0.0 or (values == 0.0 and not may_be_zero):
+            raise ValueError(
+                f"Input {one.name} must be {'0 or more' if may_be_zero else 'positive'}; instead received {values}."
+            )

@@ -1,0 +1,1 @@
+"""Stars identified in frames of a star camera."""

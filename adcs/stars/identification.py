@@ -1,0 +1,420 @@
+r"""Stars of the real sky in an image: which they are, and where the camera looks, from the image and a catalogue alone.
+
+The idea is that of the LED sky, on the sphere:
+
+1. Triangles. Delaunay's need the same stars on both sides. Real stars have magnitudes, and these say which are the
+   same: every star makes triangles with its nearest *brighter* neighbours, which are in the catalogue whatever its
+   limit.
+2. The camera's scale is known, and so all three sides are compared, by a k-d tree; in the order of their lengths they
+   pair the corners. The image is not mirrored: the sense in which the corners go round must agree.
+3. A triangle gives an attitude, which all bright stars of the image check.
+4. The best is fitted again to all its stars, and accepted if chance alone would not have matched as many: with the
+   density of catalogued stars around, the expected number of hypotheses that match as well by chance must be tiny.
+
+Directions are unit vectors. The frame's axes are x to the right and y up in the image as one looks at the sky, z out
+of the sky towards the camera (east is to the left of north).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
+from scipy.stats import binom
+
+from arrays.typing import BoolArray, FloatArray, IntArray
+
+# Brighter neighbours with which a star makes triangles, and the neighbours among which they are looked for.
+_BRIGHTER = 4
+_NEIGHBOURS = 24
+# Stars of the catalogue in the triangles, per image on average, and of an image.
+_BRIGHT_PER_IMAGE = 20
+_IMAGE_STARS = 30
+_CHECKED_AGAIN = 8
+# Triangles that agree and are checked, of an image: seconds of work, and some hundred megabytes.
+_MOST_HYPOTHESES = 250_000
+_REFITS = 3
+MOST_PIXELS = 100_000
+"""Of either side of an image."""
+SCALE_ARCSEC = (0.01, 3600.0)
+"""Of a pixel: from the largest telescopes to a degree."""
+WIDEST_RAD = math.radians(150.0)
+"""Between opposite corners: no lens that maps like a pinhole shows more."""
+
+
+@dataclass(frozen=True, eq=False)
+class StarCatalogue:
+    """Stars of the sky; made by :meth:`of`.
+
+    Attributes
+    ----------
+    numbers : ndarray, shape (n,)
+        Such as those of Hipparcos.
+    directions : ndarray, shape (n, 3)
+        Unit vectors in the catalogue's frame.
+    magnitudes : ndarray, shape (n,)
+    """
+
+    numbers: IntArray
+    directions: FloatArray
+    magnitudes: FloatArray
+
+    @classmethod
+    def of(
+        cls, numbers: ArrayLike, right_ascension_rad: ArrayLike, declination_rad: ArrayLike, magnitudes: ArrayLike
+    ) -> StarCatalogue:
+        """Catalogue from right ascension and declination, of shape (n,) each.
+
+        Raises
+        ------
+        ValueError
+            The shapes differ, a number is not finite, or there are fewer than four stars.
+        """
+        ra, dec = np.asarray(right_ascension_rad, dtype=np.float64), np.asarray(declination_rad, dtype=np.float64)
+        hip, magnitude = np.asarray(numbers, dtype=np.intp), np.asarray(magnitudes, dtype=np.float64)
+        if not (ra.shape == dec.shape == hip.shape == magnitude.shape and ra.ndim == 1 and ra.size >= 4):
+            raise ValueError(
+                "Input numbers, right_ascension_rad, declination_rad and magnitudes must be of one shape (n,), "
+                f"n at least 4; instead received shapes {hip.shape}, {ra.shape}, {dec.shape} and {magnitude.shape}."
+            )
+        if not (np.isfinite(ra).all() and np.isfinite(dec).all() and np.isfinite(magnitude).all()):
+            raise ValueError("Inputs of a star catalogue must be finite; instead received NaN or infinity.")
+        directions = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+        return cls(hip, directions, magnitude)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Directions, for search."""
+        return cKDTree(self.directions)
+
+
+@dataclass(frozen=True)
+class StarCamera:
+    """A pinhole camera.
+
+    Attributes
+    ----------
+    width_px, height_px : int
+    rad_per_px : float
+        Scale at the centre [rad/px].
+
+    Raises
+    ------
+    ValueError
+        A value is not positive, or out of the range of :data:`MOST_PIXELS`, :data:`SCALE_ARCSEC` or :data:`WIDEST_RAD`.
+    """
+
+    width_px: int
+    height_px: int
+    rad_per_px: float
+
+    def __post_init__(self) -> None:
+        for name in ("width_px", "height_px", "rad_per_px"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"Input {name} must be positive and finite; instead received {getattr(self, name)}.")
+        if max(self.width_px, self.height_px) > MOST_PIXELS:
+            raise ValueError(
+                f"Inputs width_px and height_px must be at most {MOST_PIXELS}; "
+                f"instead received {self.width_px} and {self.height_px}."
+            )
+        low, high = SCALE_ARCSEC
+        arcsec = math.degrees(self.rad_per_px) * 3600.0
+        if not low * (1.0 - 1e-9) <= arcsec <= high * (1.0 + 1e-9):
+            raise ValueError(f"Input rad_per_px must be {low:g} to {high:g} arc seconds; instead received {arcsec:g}.")
+        if self.diagonal_rad > WIDEST_RAD:
+            raise ValueError(
+                f"An image must be at most {math.degrees(WIDEST_RAD):.0f}° wide from corner to corner; "
+                f"instead received a camera of {math.degrees(self.diagonal_rad):.1f}°."
+            )
+
+    @property
+    def diagonal_rad(self) -> float:
+        """Angle between opposite corners."""
+        return 2.0 * math.atan(0.5 * math.hypot(self.width_px, self.height_px) * math.tan(self.rad_per_px))
+
+    @property
+    def solid_angle_sr(self) -> float:
+        """Part of the sphere that an image shows, as if it were flat."""
+        return self.width_px * self.height_px * self.rad_per_px**2
+
+    def directions(self, points_px: ArrayLike) -> FloatArray:
+        """Unit vectors (f, 3) in the frame's axes of points (f, 2), y up; see the module.
+
+        Raises
+        ------
+        ValueError
+            The shape is another one, or a number is not finite.
+        """
+        points = np.asarray(points_px, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
+            raise ValueError(
+                f"Input points_px must be finite numbers of shape (f, 2); instead received shape {points.shape}."
+            )
+        offset = (points - 0.5 * np.array([self.width_px, self.height_px])) * math.tan(self.rad_per_px)
+        outward = np.concatenate([offset, np.full((len(offset), 1), -1.0)], axis=1)
+        directions: FloatArray = outward / np.linalg.norm(outward, axis=1, keepdims=True)
+        return directions
+
+
+@dataclass(frozen=True, eq=False)
+class StarFix:
+    """Attitude of a camera and its stars.
+
+    Attributes
+    ----------
+    R_catalogue_from_frame : ndarray, shape (3, 3)
+        Rotation of components in the frame's axes into those of the catalogue.
+    stars : ndarray, shape (k, 2)
+        Pairs of a star's number in the image and its row in the catalogue.
+    rms_rad : float
+        Root mean square angle of these stars from their catalogue's places [rad].
+    log10_chance : float
+        Logarithm of the number of attitudes expected to match as many stars by chance alone.
+    """
+
+    R_catalogue_from_frame: FloatArray
+    stars: IntArray
+    rms_rad: float
+    log10_chance: float
+
+
+@dataclass(frozen=True, eq=False)
+class StarTriangles:
+    """Triangles of stars: corners ordered by the opposite side, shortest first.
+
+    Attributes
+    ----------
+    corners : ndarray, shape (T, 3)
+    sides : ndarray, shape (T, 3)
+        Chords, ascending.
+    is_counter_clockwise : ndarray, shape (T,)
+        Seen from the centre of the sphere.
+    """
+
+    corners: IntArray
+    sides: FloatArray
+    is_counter_clockwise: BoolArray
+
+
+def star_triangles(directions: FloatArray, longest: float) -> StarTriangles:
+    """Triangles of every star with its nearest brighter neighbours.
+
+    Parameters
+    ----------
+    directions : ndarray, shape (n, 3)
+        Unit vectors, brightest first.
+    longest : float
+        Longest side, a chord.
+
+    Returns
+    -------
+    StarTriangles
+        Each triangle once.
+    """
+    n = len(directions)
+    k = min(_NEIGHBOURS + 1, n)
+    found = np.asarray(cKDTree(directions).query(directions, k=k)[1], dtype=np.intp).reshape(n, k)
+    own = np.arange(n)[:, None]
+    first = np.argsort(found >= own, axis=1, kind="stable")[:, : min(_BRIGHTER, k)]
+    brighter = np.take_along_axis(found, first, axis=1)
+    pairs = list(combinations(range(brighter.shape[1]), 2))
+    if not pairs:
+        return StarTriangles(np.empty((0, 3), dtype=np.intp), np.empty((0, 3)), np.empty(0, dtype=np.bool_))
+    corners = np.concatenate([np.column_stack([own[:, 0], brighter[:, i], brighter[:, j]]) for i, j in pairs])
+    corners = corners[(corners[:, 1:] < corners[:, :1]).all(axis=1)]
+    opposite = np.stack(
+        [
+            np.linalg.norm(directions[corners[:, (i + 1) % 3]] - directions[corners[:, (i + 2) % 3]], axis=1)
+            for i in range(3)
+        ],
+        axis=1,
+    )
+    order = np.argsort(opposite, axis=1)
+    corners, sides = np.take_along_axis(corners, order, axis=1), np.take_along_axis(opposite, order, axis=1)
+    short = sides[:, 2] <= longest
+    # Turned inside out: the triple product is positive for corners that go round clockwise seen from the centre.
+    sense = np.linalg.det(directions[corners[short]]) < 0.0
+    return StarTriangles(corners[short], sides[short], sense)
+
+
+@dataclass(frozen=True, eq=False)
+class StarMatcher:
+    """Lost-in-space identification of star images; made by :meth:`of`.
+
+    Attributes
+    ----------
+    catalogue : StarCatalogue
+    camera : StarCamera
+    bright : ndarray
+        Rows of the catalogue that make triangles, brightest first.
+    triangles : StarTriangles
+        Corners count in ``bright``.
+    tree : cKDTree
+        Of their sides.
+    noise_px : float
+        Standard deviation of a centroid, per axis [px].
+    most_chance : float
+        Attitudes as good as the fix that chance may produce.
+    """
+
+    catalogue: StarCatalogue
+    camera: StarCamera
+    bright: IntArray
+    triangles: StarTriangles
+    tree: cKDTree
+    noise_px: float = 1.0
+    most_chance: float = 1e-6
+
+    @classmethod
+    def of(cls, catalogue: StarCatalogue, camera: StarCamera, noise_px: float = 1.0) -> StarMatcher:
+        """Matcher of a camera.
+
+        Parameters
+        ----------
+        catalogue : StarCatalogue
+            At the date of the images.
+        camera : StarCamera
+        noise_px : float
+            Standard deviation of a centroid, per axis [px].
+
+        Returns
+        -------
+        StarMatcher
+        """
+        per_image = camera.solid_angle_sr / (4.0 * math.pi)
+        bright = np.argsort(catalogue.magnitudes, kind="stable")[: math.ceil(_BRIGHT_PER_IMAGE / per_image)]
+        longest = 2.0 * math.sin(0.5 * camera.diagonal_rad)
+        triangles = star_triangles(catalogue.directions[bright], longest)
+        return cls(catalogue, camera, bright, triangles, cKDTree(triangles.sides), noise_px)
+
+    @property
+    def gate_rad(self) -> float:
+        """Within which a star of the image is one of the catalogue: three standard deviations."""
+        return 3.0 * self.noise_px * self.camera.rad_per_px
+
+    def identify(self, points_px: ArrayLike, magnitudes: ArrayLike) -> StarFix | NoFix:
+        """Attitude and stars of an image.
+
+        Parameters
+        ----------
+        points_px : array_like, shape (f, 2)
+            x to the right, y up.
+        magnitudes : array_like, shape (f,)
+            Only their order counts.
+
+        Returns
+        -------
+        StarFix or NoFix
+
+        Raises
+        ------
+        ValueError
+            The shapes do not agree, or a number is not finite.
+        """
+        directions = self.camera.directions(points_px)
+        order = np.argsort(np.asarray(magnitudes, dtype=np.float64), kind="stable")
+        if order.shape != (len(directions),):
+            raise ValueError(f"Input magnitudes must have shape ({len(directions)},); instead received {order.shape}.")
+        brightest = order[:_IMAGE_STARS]
+        if len(brightest) < 4:
+            return NoFix(f"{len(brightest)} stars, 4 needed")
+        mine = star_triangles(directions[brightest], 2.0)
+        agreeing = self._agreeing(mine)
+        if agreeing > _MOST_HYPOTHESES:
+            return NoFix(f"{agreeing} triangles agree within the noise, {_MOST_HYPOTHESES} can be told apart")
+        R = self._hypotheses(directions[brightest], mine)
+        if not len(R):
+            return NoFix("no triangle of the image is in the catalogue")
+        near = self._near(directions[brightest], R)[1]
+        fixes = [
+            self._fitted(directions, R[i], len(R))
+            for i in np.argsort(-near.sum(axis=1), kind="stable")[:_CHECKED_AGAIN]
+        ]
+        best = min(fixes, key=lambda fix: fix.log10_chance)
+        if best.log10_chance > math.log10(self.most_chance):
+            return NoFix(f"chance matches {len(best.stars)} of {len(directions)} stars too easily")
+        return best
+
+    @property
+    def _side_gate(self) -> float:
+        return 4.0 * self.noise_px * self.camera.rad_per_px
+
+    def _agreeing(self, mine: StarTriangles) -> int:
+        """Number of triangles whose three sides agree; it grows with the cube of the noise."""
+        return int(np.sum(self.tree.query_ball_point(mine.sides, self._side_gate, return_length=True)))
+
+    def _hypotheses(self, directions: FloatArray, mine: StarTriangles) -> FloatArray:
+        """Rotations (h, 3, 3) of triangles whose three sides and sense agree."""
+        agreeing = self.tree.query_ball_point(mine.sides, self._side_gate)
+        found: list[list[int]] = np.asarray(agreeing, dtype=object).tolist()
+        image = np.repeat(np.arange(len(found)), [len(matches) for matches in found])
+        known = np.array([match for matches in found for match in matches], dtype=np.intp)
+        agree = mine.is_counter_clockwise[image] == self.triangles.is_counter_clockwise[known]
+        seen = directions[mine.corners[image[agree]]]
+        there = self.catalogue.directions[self.bright[self.triangles.corners[known[agree]]]]
+        return rotation_between(seen, there)
+
+    def _near(self, directions: FloatArray, R: FloatArray) -> tuple[IntArray, BoolArray]:
+        """Row of the catalogue nearest to each star under rotations (..., 3, 3), and whether it is within the gate."""
+        found = self.catalogue.tree.query(directions @ np.swapaxes(R, -1, -2), distance_upper_bound=self.gate_rad)
+        return np.asarray(found[1], dtype=np.intp), np.isfinite(np.asarray(found[0]))
+
+    def _fitted(self, directions: FloatArray, R: FloatArray, hypotheses: int) -> StarFix:
+        """Fix by all stars near their places, with the chance of as many."""
+        for _ in range(_REFITS):
+            row, near = self._near(directions, R)
+            if np.count_nonzero(near) < 3:
+                break
+            R = rotation_between(directions[near], self.catalogue.directions[row[near]])
+        row, near = self._near(directions, R)
+        star = np.flatnonzero(near)
+        distance = np.linalg.norm(directions[star] @ R.T - self.catalogue.directions[row[star]], axis=1)
+        order = np.argsort(distance, kind="stable")
+        _, first = np.unique(row[star][order], return_index=True)
+        kept = np.sort(order[first])
+        star, distance = star[kept], distance[kept]
+        rms = float(np.sqrt(np.mean(distance**2))) if len(star) else math.inf
+        return StarFix(
+            R, np.stack([star, row[star]], axis=1), rms, self._chance(R, len(star), len(directions), hypotheses)
+        )
+
+    def _chance(self, R: FloatArray, matched: int, stars: int, hypotheses: int) -> float:
+        """Expected number of hypotheses, as a decimal logarithm, that match as many stars besides their three."""
+        axis = -R[:, 2]
+        radius = 2.0 * math.sin(0.25 * self.camera.diagonal_rad)
+        around = self.catalogue.tree.query_ball_point(axis, radius, return_length=True)
+        covered = float(np.asarray(around)) * (self.gate_rad / radius) ** 2
+        # Of at least `matched` - 3: the survival function counts what is more than its argument.
+        chance = float(binom.logsf(matched - 4, max(stars - 3, 0), min(covered, 1.0)))
+        return (chance + math.log(hypotheses)) / math.log(10.0)
+
+
+def rotation_between(seen: FloatArray, there: FloatArray) -> FloatArray:
+    """Rotations of least squares with there ≈ R seen, by the singular values of Σ there seenᵀ (Kabsch).
+
+    Parameters
+    ----------
+    seen, there : ndarray, shape (..., k, 3)
+        Unit vectors, k ≥ 2.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+    """
+    U, _, Vt = np.linalg.svd(np.swapaxes(there, -1, -2) @ seen)
+    sign = np.ones(U.shape[:-1])
+    sign[..., 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    R: FloatArray = (U * sign[..., None, :]) @ Vt
+    return R
+
+
+@dataclass(frozen=True)
+class NoFix:
+    """There is no fix, and why."""
+
+    reason: str

@@ -1,0 +1,15 @@
+from arrays.array import SensorArray as SensorArray
+from arrays.array_file import array_toml as array_toml
+from arrays.array_file import read_array as read_array
+from arrays.array_file import write_array as write_array
+from arrays.geometries import GEOMETRIES as GEOMETRIES
+from arrays.geometries import axial as axial
+from arrays.geometries import cross as cross
+from arrays.geometries import cube as cube
+from arrays.geometries import hexagon as hexagon
+from arrays.geometries import square as square
+from arrays.geometries import tetrahedron as tetrahedron
+from arrays.io.errors import InputError as InputError
+from arrays.sensor import Calibration as Calibration
+from arrays.sensor import Sensor as Sensor
+from arrays.sensor import SensorKind as SensorKind

@@ -1,0 +1,413 @@
+"""The TOML file of an array.
+
+Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, or the sensors one by one::
+
+    name = "tetrahedron-1.5"        # optional
+    geometry = "tetrahedron"
+    edge_m = 1.5
+    kind = "vector"                 # or "scalar"
+    noise_nT = 1.0
+    saturation_nT = 100_000.0       # optional, readings that reach it are no measurements
+    misalignment_mrad = 1.0         # optional, unknown small rotation of a vector sensor's axes, 1 sigma per axis
+    gain_uncertainty = 0.001        # optional, relative, 1 sigma per axis
+    offset_uncertainty_nT = 0.5     # optional, unknown field fixed to the array, 1 sigma per axis
+    flicker_nT = 0.01               # optional, 1/f noise: 1 sigma in every decade of frequency
+    drift_nT_rth = 0.1              # optional, random walk of the offset: 1 sigma after an hour
+
+    [[sensor]]                      # in place of geometry, its size, and the keys from kind to drift_nT_rth
+    id = "s1"
+    kind = "vector"
+    position_m = [0.0, 0.0, 0.918]  # array frame
+    rotation_xyzw = [0, 0, 0, 1]    # optional, sensor axes -> array frame
+    noise_nT = 1.0
+    saturation_nT = 100_000.0       # this and the following optional, as above
+    misalignment_mrad = 1.0
+    gain_uncertainty = 0.001
+    offset_uncertainty_nT = 0.5
+    flicker_nT = 0.01
+    drift_nT_rth = 0.1
+    [sensor.calibration]            # optional, reading = scale · (field in sensor axes) + offset
+    scale = 1.0                     # a number, 3 numbers or a 3×3 matrix
+    offset_nT = [0.0, 0.0, 0.0]     # one number for a scalar sensor
+
+Both may have ``noise_fraction``, ``common_field_nT``, ``ambient_nT = [x, y, z]``, the gradient of that field
+``ambient_gradient_nT_m = [[…], […], […]]`` (symmetric and traceless) and ``format_version = 1``; see
+:class:`arrays.array.SensorArray` for what they mean.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from decimal import Context, Decimal
+from os import PathLike
+from typing import Any
+
+import msgspec
+
+from arrays.array import SensorArray
+from arrays.geometries import GEOMETRIES
+from arrays.io.errors import InputError
+from arrays.io.text import write_text
+from arrays.io.toml import check_keys, converted, place_of, read_toml
+from arrays.sensor import Calibration, Sensor
+
+FORMAT_VERSION = 1
+# Units are converted, nT to T and mrad to rad, by shifting the decimal point of what is written, never by a
+# multiplication: 1.0 nT is the number 1e-9 to the last digit, and every float survives the way to a file and back.
+_SHIFT = Context(prec=1000, traps=[])
+_Number = int | Decimal
+_Vector = tuple[float, float, float]
+_NumberVector = tuple[_Number, _Number, _Number]
+
+
+class _Header(msgspec.Struct, kw_only=True):
+    format_version: int = FORMAT_VERSION
+    name: str | None = None
+    noise_fraction: float = 0.0
+    common_field_nT: _Number | None = None
+    ambient_nT: _NumberVector | None = None
+    ambient_gradient_nT_m: tuple[_NumberVector, _NumberVector, _NumberVector] | None = None
+
+
+class _Quality(msgspec.Struct, kw_only=True):
+    noise_nT: _Number
+    saturation_nT: _Number | None = None
+    misalignment_mrad: _Number = 0
+    gain_uncertainty: float = 0.0
+    offset_uncertainty_nT: _Number = 0
+    flicker_nT: _Number = 0
+    drift_nT_rth: _Number = 0
+
+
+class _GeometryFile(_Header, kw_only=True):
+    geometry: str
+    kind: str
+
+
+class _CalibrationTable(msgspec.Struct, kw_only=True):
+    scale: float | list[float | list[float]] = 1.0
+    offset_nT: _Number | list[_Number] | None = None
+
+
+class _SensorTable(_Quality, kw_only=True):
+    id: str
+    kind: str
+    position_m: _Vector
+    rotation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    calibration: _CalibrationTable = msgspec.field(default_factory=_CalibrationTable)
+
+
+class _SensorsFile(_Header, kw_only=True):
+    sensor: list[_SensorTable]
+
+
+def read_array(path: str | PathLike[str]) -> SensorArray:
+    """Array from its TOML file.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    SensorArray
+        A geometry without a name in the file is called after its shape.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or does not describe an array; the text says where and why.
+    """
+    array = read_sensors(path)
+    if array.n_sensors < 2:
+        raise InputError(f"{path}: sensors must be at least 2; instead received {array.n_sensors}.")
+    return array
+
+
+def read_sensors(path: str | PathLike[str]) -> SensorArray:
+    """Array from its TOML file as :func:`read_array`, which may also be a single sensor, to be calibrated."""
+    return array_of_table(str(path), read_toml(path, "a TOML file of an array"))
+
+
+def array_of_table(place: str, table: dict[str, Any]) -> SensorArray:
+    """Array from the keys of an array file, which another file may hold as a table of its own.
+
+    Parameters
+    ----------
+    place : str
+        Name of the file, and of the table within it, for errors.
+    table : dict
+        As :func:`read_toml` returns it, with decimal numbers.
+
+    Returns
+    -------
+    SensorArray
+
+    Raises
+    ------
+    InputError
+        The table does not describe an array; the text says where and why.
+    """
+    if not table:
+        raise InputError(f"{place} is empty, expected an array: a geometry with its size, or [[sensor]] tables.")
+    if "geometry" in table and "sensor" in table:
+        raise InputError(f"{place}, keys geometry and sensor: found both, expected one of them.")
+    if "geometry" in table:
+        return _array_of_geometry(place, table)
+    if "sensor" in table:
+        return _array_of_sensors(place, table)
+    check_keys(place, table, {*_keys(_GeometryFile), *_keys(_Quality), *_keys(_SensorsFile), *_size_keys()})
+    raise InputError(f"{place}: found neither the key geometry nor [[sensor]] tables, expected one of them.")
+
+
+def write_array(array: SensorArray, path: str | PathLike[str]) -> None:
+    """Write an array's TOML file, from which :func:`read_array` makes an equal array.
+
+    Parameters
+    ----------
+    array : SensorArray
+    path : path-like
+        Replaced if it exists, in one step: nobody sees half a file.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    write_text(array_toml(array), path)
+
+
+def array_toml(array: SensorArray) -> str:
+    """Text of an array's TOML file, sensor by sensor.
+
+    Parameters
+    ----------
+    array : SensorArray
+
+    Returns
+    -------
+    str
+    """
+    lines = [f"format_version = {FORMAT_VERSION}"]
+    if array.name:
+        lines.append(f"name = {_quoted(array.name)}")
+    if array.noise_fraction:
+        lines.append(f"noise_fraction = {array.noise_fraction!r}")
+    if array.common_field_T is not None:
+        lines.append(f"common_field_nT = {_nanotesla(array.common_field_T)}")
+    if array.ambient_T is not None:
+        lines.append(f"ambient_nT = {_nanotesla_list(array.ambient_T)}")
+    if array.ambient_gradient_T_m is not None:
+        rows = ", ".join(map(_nanotesla_list, array.ambient_gradient_T_m))
+        lines.append(f"ambient_gradient_nT_m = [{rows}]")
+    for sensor in array.sensors:
+        lines += ["", "[[sensor]]", f"id = {_quoted(sensor.id)}", f'kind = "{sensor.kind}"']
+        lines.append(f"position_m = {list(sensor.position_m)}")
+        if sensor.rotation_xyzw != (0.0, 0.0, 0.0, 1.0):
+            lines.append(f"rotation_xyzw = {list(sensor.rotation_xyzw)}")
+        lines.append(f"noise_nT = {_nanotesla(sensor.noise_T)}")
+        if sensor.saturation_T is not None:
+            lines.append(f"saturation_nT = {_nanotesla(sensor.saturation_T)}")
+        if sensor.misalignment_rad:
+            lines.append(f"misalignment_mrad = {_shifted(sensor.misalignment_rad, 3)}")
+        if sensor.gain_uncertainty:
+            lines.append(f"gain_uncertainty = {sensor.gain_uncertainty!r}")
+        for key, value in (
+            ("offset_uncertainty_nT", sensor.offset_uncertainty_T),
+            ("flicker_nT", sensor.flicker_T),
+            ("drift_nT_rth", sensor.drift_T_rth),
+        ):
+            if value:
+                lines.append(f"{key} = {_nanotesla(value)}")
+        if sensor.calibration != Calibration.of(sensor.kind):
+            offsets = sensor.calibration.offset_T
+            offset = _nanotesla_list(offsets) if sensor.kind == "vector" else _nanotesla(offsets[0])
+            lines += ["[sensor.calibration]", f"scale = {_shortest_scale(sensor.calibration)}"]
+            lines.append(f"offset_nT = {offset}")
+    return "\n".join(lines) + "\n"
+
+
+def _array_of_geometry(path: str, table: dict[str, Any]) -> SensorArray:
+    name = table["geometry"]
+    if not isinstance(name, str) or name not in GEOMETRIES:
+        raise InputError(f"{path}, key geometry: found {name!r}, expected one of {', '.join(GEOMETRIES)}.")
+    make, size_key = GEOMETRIES[name]
+    foreign = next((key for key in table if key in _size_keys() and key != size_key), None)
+    if foreign is not None:
+        raise InputError(f"{path}, key {foreign}: found the size of another geometry, expected {size_key} of a {name}.")
+    check_keys(path, table, {*_keys(_GeometryFile), *_keys(_Quality), size_key})
+    if size_key not in table:
+        raise InputError(f"{path}: found no key {size_key}, expected the size of the {name}.")
+    file = converted(path, table, _GeometryFile)
+    size = getattr(converted(path, table, msgspec.defstruct("_Size", [(size_key, float)])), size_key)
+    quality = _quality(path, converted(path, table, _Quality))
+    with _naming(path):
+        array = make(size, file.kind, quality["noise_T"])  # type: ignore[arg-type]  # the kind is checked there
+        array = replace(array, sensors=tuple(replace(sensor, **quality) for sensor in array.sensors))
+    return _with_header(path, array, file)
+
+
+def _array_of_sensors(path: str, table: dict[str, Any]) -> SensorArray:
+    misplaced = next((key for key in ("kind", *_keys(_Quality)) if key in table), None)
+    if misplaced is not None:
+        raise InputError(f"{path}, key {misplaced}: found at the top, expected in each [[sensor]] table.")
+    check_keys(path, table, _keys(_SensorsFile))
+    for i, sensor in _tables(table["sensor"]):
+        place = place_of(path, table, f"sensor[{i}]")
+        check_keys(place, sensor, _keys(_SensorTable))
+        if isinstance(sensor.get("calibration"), dict):
+            check_keys(place, sensor["calibration"], _keys(_CalibrationTable), within="calibration.")
+    file = converted(path, table, _SensorsFile)
+    sensors = tuple(_sensor(place_of(path, table, f"sensor[{i}]"), sensor) for i, sensor in enumerate(file.sensor))
+    with _naming(path):
+        array = SensorArray(sensors)
+    return _with_header(path, array, file)
+
+
+def _sensor(place: str, table: _SensorTable) -> Sensor:
+    quality = _quality(place, table)
+    with _naming(place):
+        sensor = Sensor(
+            id=table.id,
+            kind=table.kind,  # type: ignore[arg-type]  # checked there
+            position_m=table.position_m,
+            rotation_xyzw=table.rotation_xyzw,
+            **quality,
+        )
+    offset_nT: list[_Number] = [0] * sensor.n_channels
+    if table.calibration.offset_nT is not None:
+        given = table.calibration.offset_nT
+        offset_nT = given if isinstance(given, list) else [given]
+    key = f"{place}, key calibration.offset_nT"
+    if len(offset_nT) != sensor.n_channels:
+        raise InputError(
+            f"{key}: found {_count(len(offset_nT))}, expected {_count(sensor.n_channels)} for a {sensor.kind} sensor."
+        )
+    with _naming(place):
+        calibration = Calibration.of(sensor.kind, table.calibration.scale, [_tesla(key, x) for x in offset_nT])
+    return replace(sensor, calibration=calibration)
+
+
+def _with_header(path: str, array: SensorArray, header: _Header) -> SensorArray:
+    if header.format_version != FORMAT_VERSION:
+        raise InputError(f"{path}, key format_version: found {header.format_version}, expected {FORMAT_VERSION}.")
+    common_T = ambient_T = gradient_T_m = None
+    if header.common_field_nT is not None:
+        common_T = _tesla(f"{path}, key common_field_nT", header.common_field_nT)
+        if common_T < 0.0:
+            raise InputError(
+                f"{path}, key common_field_nT: found {header.common_field_nT}, expected a number that is not negative."
+            )
+    if header.ambient_nT is not None:
+        ambient_T = _tesla_vector(f"{path}, key ambient_nT", header.ambient_nT)
+    if header.ambient_gradient_nT_m is not None:
+        place = f"{path}, key ambient_gradient_nT_m"
+        gradient_T_m = tuple(_tesla_vector(place, row) for row in header.ambient_gradient_nT_m)
+    name = array.name if header.name is None else header.name
+    with _naming(path):
+        return SensorArray(array.sensors, name, header.noise_fraction, common_T, ambient_T, gradient_T_m)
+
+
+def _quality(place: str, table: _Quality) -> dict[str, Any]:
+    """How good a sensor is, as arguments of Sensor."""
+    for key in ("noise_nT", "saturation_nT"):
+        value = getattr(table, key)
+        if value is not None and _tesla(f"{place}, key {key}", value) <= 0.0:
+            raise InputError(f"{place}, key {key}: found {value}, expected a positive number.")
+    key = f"{place}, key misalignment_mrad"
+    misalignment_rad = _scaled(key, table.misalignment_mrad, -3)
+    if not 0.0 <= misalignment_rad < 1.0:
+        raise InputError(f"{key}: found {table.misalignment_mrad}, expected a number from 0 to below 1000.")
+    lasting = {}
+    for name in ("offset_uncertainty_nT", "flicker_nT", "drift_nT_rth"):
+        value = getattr(table, name)
+        lasting[name.replace("nT", "T")] = _tesla(f"{place}, key {name}", value)
+        if value < 0:
+            raise InputError(f"{place}, key {name}: found {value}, expected a number that is not negative.")
+    return {
+        "noise_T": _tesla(place, table.noise_nT),
+        "saturation_T": None if table.saturation_nT is None else _tesla(place, table.saturation_nT),
+        "misalignment_rad": misalignment_rad,
+        "gain_uncertainty": table.gain_uncertainty,
+        **lasting,
+    }
+
+
+def _tesla(place: str, nanotesla: _Number) -> float:
+    """Field in T from a number in nT as it is written."""
+    return _scaled(place, nanotesla, -9)
+
+
+def _tesla_vector(place: str, nanotesla: _NumberVector) -> _Vector:
+    x, y, z = (_tesla(place, component) for component in nanotesla)
+    return (x, y, z)
+
+
+def _scaled(place: str, number: _Number, exponent: int) -> float:
+    """A number as it is written, times a power of ten."""
+    result = float(Decimal(number).scaleb(exponent, _SHIFT))
+    if not abs(result) < float("inf"):
+        raise InputError(f"{place}: found {number}, expected a finite number.")
+    return result
+
+
+def _nanotesla(tesla: float) -> str:
+    """A field in T as a TOML float in nT."""
+    return _shifted(tesla, 9)
+
+
+def _nanotesla_list(tesla: Iterable[float]) -> str:
+    return f"[{', '.join(map(_nanotesla, tesla))}]"
+
+
+def _shifted(value: float, exponent: int) -> str:
+    """A number times a power of ten as a TOML float."""
+    shifted = Decimal(repr(value)).scaleb(exponent, _SHIFT)
+    text = f"{shifted:f}" if not shifted or -7 < shifted.adjusted() < 16 else str(shifted)
+    return text if set(text) & set(".E") else f"{text}.0"
+
+
+def _shortest_scale(calibration: Calibration) -> float | list[float] | list[list[float]]:
+    """A number, 3 numbers or the matrix."""
+    rows = [list(row) for row in calibration.scale]
+    diagonal = [row[i] for i, row in enumerate(rows)]
+    if any(x for i, row in enumerate(rows) for j, x in enumerate(row) if i != j):
+        return rows
+    return diagonal[0] if len(set(diagonal)) == 1 else diagonal
+
+
+def _quoted(text: str) -> str:
+    """A TOML string; what JSON escapes TOML escapes alike, and printable text needs nothing else."""
+    return json.dumps(text, ensure_ascii=False)
+
+
+def _keys(struct: type[msgspec.Struct]) -> tuple[str, ...]:
+    return struct.__struct_fields__
+
+
+def _size_keys() -> set[str]:
+    return {geometry.size_key for geometry in GEOMETRIES.values()}
+
+
+def _tables(value: object) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Those members of a list that are tables; anything else is the type check's to refuse."""
+    if isinstance(value, list):
+        yield from ((i, item) for i, item in enumerate(value) if isinstance(item, dict))
+
+
+@contextmanager
+def _naming(place: str) -> Iterator[None]:
+    """Turn what the sensors and arrays say of their inputs into errors of a place in the file."""
+    try:
+        yield
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{place}: {str(error).removeprefix('Input ')}") from None
+
+
+def _count(n: int) -> str:
+    return "1 number" if n == 1 else f"{n} numbers"

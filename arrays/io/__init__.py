@@ -1,0 +1,1 @@
+"""What every package reads and writes with: errors, text, TOML, CSV, outputs."""

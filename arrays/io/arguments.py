@@ -1,0 +1,22 @@
+"""Types of command-line arguments, checked as they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+from cyclopts import Parameter, Token
+from cyclopts.validators import Number
+
+
+def whole_number(_: type, tokens: Sequence[Token]) -> int:
+    """Convert one argument; cyclopts alone would round 1.5."""
+    try:
+        return int(tokens[0].value)
+    except ValueError:
+        raise ValueError(f"found {tokens[0].value!r}, expected a whole number.") from None
+
+
+Flag = Annotated[bool, Parameter(show_default=False)]
+Count = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1))]
+Seed = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0))]

@@ -1,0 +1,278 @@
+"""Tables of numbers from CSV files, read strictly: whatever is wrong is named with its line and column.
+
+The first line names the columns; every other one has a number, or an empty cell, for each of them. A byte order mark,
+any line ends, blank lines and spaces around cells are tolerated.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+import csv
+import difflib
+import io
+import math
+from array import array as packed
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from os import PathLike
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.io.errors import InputError
+from arrays.io.text import read_text, write_text
+from arrays.typing import FloatArray
+
+IntArray = NDArray[np.int64]
+_SHOWN_CHARACTERS = 40
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A CSV file of numbers.
+
+    Attributes
+    ----------
+    path : str
+    header : tuple of str
+        Names of the columns, each once.
+    header_line : int
+        Line that they stand on.
+    values : ndarray, shape (n, columns)
+        NaN where a cell is empty.
+    line_numbers : ndarray of int, shape (n,)
+        Line of every row as an editor counts it.
+    """
+
+    path: str
+    header: tuple[str, ...]
+    header_line: int
+    values: FloatArray
+    line_numbers: IntArray
+
+    def place(self, line: int, column: str) -> str:
+        """Where a cell is, for the start of an error's sentence."""
+        return f"{self.path}, line {line}, column {column}"
+
+    def header_place(self, column: str) -> str:
+        """Where a column's name is, or should be, for the start of an error's sentence."""
+        return self.place(self.header_line, column)
+
+    def require(self, column: str, known: Sequence[str]) -> None:
+        """Raise an InputError if a column is missing, with the nearest name in the file that is not a known one."""
+        if column in self.header:
+            return
+        nearest = difflib.get_close_matches(column, [name for name in self.header if name not in known], n=1)
+        hint = f" (the nearest is {nearest[0]})" if nearest else ""
+        raise InputError(f"{self.header_place(column)}: found no such column{hint}, expected {column}.")
+
+    def has_group(self, columns: Sequence[str]) -> bool:
+        """Whether the file has these columns; some of them without the others are an InputError."""
+        present = [name for name in columns if name in self.header]
+        missing = [name for name in columns if name not in self.header]
+        if present and missing:
+            raise InputError(
+                f"{self.header_place(missing[0])}: found {', '.join(present)} without it, expected all or none of them."
+            )
+        return bool(present)
+
+    def finite_or_missing(self, columns: Sequence[str]) -> FloatArray:
+        """Values of some columns (n, k); an infinite one is an InputError."""
+        values = self.values[:, [self.header.index(name) for name in columns]]
+        self.refuse(np.isinf(values), columns, "found an infinite number, expected a finite number or an empty cell")
+        return values
+
+    def complete(self, columns: Sequence[str]) -> FloatArray:
+        """Values of some columns (n, k); a missing or infinite one is an InputError."""
+        values = self.values[:, [self.header.index(name) for name in columns]]
+        self.refuse(np.isnan(values), columns, "found no value, expected a number")
+        self.refuse(np.isinf(values), columns, "found an infinite number, expected a finite number")
+        return values
+
+    def complete_and_distinct(self, column: str) -> FloatArray:
+        """Values of one column (n,); a missing, infinite or repeated one is an InputError."""
+        values = self.complete([column])[:, 0]
+        order = np.argsort(values, kind="stable")
+        repeated = order[1:][np.diff(values[order]) == 0.0]
+        if repeated.size:
+            second = repeated.min()
+            first = np.flatnonzero(values == values[second])[0]
+            raise InputError(
+                f"{self.place(self.line_numbers[second], column)}: found {values[second]:.15g} "
+                f"as on line {self.line_numbers[first]}, expected every value once."
+            )
+        return values
+
+    def refuse(self, bad: NDArray[np.bool_], columns: Sequence[str], fault: str) -> None:
+        """Raise an InputError with the place of the first bad cell (n, k) of some columns, and the fault in words."""
+        if bad.any():
+            row, column = np.argwhere(bad)[0]
+            raise InputError(f"{self.place(self.line_numbers[row], columns[column])}: {fault}.")
+
+
+def read_table(path: str | PathLike[str], expected_header: str) -> Table:
+    """Read a CSV file of numbers.
+
+    Parameters
+    ----------
+    path : path-like
+    expected_header : str
+        What the header should be, in words, for errors.
+
+    Returns
+    -------
+    Table
+        With one row at least.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or is not such a table.
+    """
+    return table_of_text(read_text(path, "a CSV file"), str(path), expected_header)
+
+
+def table_of_text(text: str, name: str, expected_header: str, *, first_line: int | None = None) -> Table:
+    """Table as of :func:`read_table`, from text.
+
+    Parameters
+    ----------
+    text : str
+    name : str
+        What the text is called in errors.
+    expected_header : str
+        What the header should be, in words, for errors.
+    first_line : int, optional
+        Line number of the first row, where the text is a part of a longer one.
+
+    Returns
+    -------
+    Table
+
+    Raises
+    ------
+    InputError
+        The text is not such a table.
+    """
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    if "\0" in text:
+        line = text.count("\n", 0, text.index("\0")) + 1
+        raise InputError(f"{name}, line {line}: found a NUL byte, expected UTF-8 text.")
+    rows = _csv_rows(name, text)
+    header_line, cells = next(rows, (1, []))
+    if not cells:
+        raise InputError(f"{name} is empty, expected {expected_header}.")
+    header = _checked_header(f"{name}, line {header_line}", cells, expected_header)
+    # float() would also take 1_000 and digits of other scripts: only text without them may go through it directly.
+    read = float if text.isascii() and "_" not in text[text.find("\n") :] else _number
+    values, line_numbers = packed("d"), packed("q")
+    shift = 0 if first_line is None else first_line - header_line - 1
+    for row_line, cells in rows:
+        line = row_line + shift
+        if len(cells) != len(header):
+            raise InputError(f"{name}, line {line}: found {len(cells)} cells, expected {len(header)} as in the header.")
+        try:
+            numbers = [read(cell or "nan") for cell in cells]
+        except ValueError:
+            numbers = _careful_numbers(f"{name}, line {line}", header, cells)
+        values.extend(numbers)
+        line_numbers.append(line)
+    if not line_numbers:
+        raise InputError(f"{name}, line {header_line}: found a header without rows, expected a row below it.")
+    table = np.array(values).reshape(-1, len(header))
+    return Table(name, header, header_line, table, np.array(line_numbers, dtype=np.int64))
+
+
+def _csv_rows(path: str, text: str) -> Iterator[tuple[int, list[str]]]:
+    """Line number and cells of every row that is not blank."""
+    rows = csv.reader(io.StringIO(text))
+    line = 1
+    try:
+        for cells in rows:
+            if len(cells) > 1 or (cells and cells[0].strip()):
+                yield line, cells
+            line = rows.line_num + 1
+    except csv.Error as error:
+        raise InputError(f"{path}, line {line}: found what is not CSV ({error}), expected a row of cells.") from None
+
+
+def _checked_header(place: str, cells: Sequence[str], expected: str) -> tuple[str, ...]:
+    header = tuple(cell.strip() for cell in cells)
+    for separator, called in ((";", "semicolons"), ("\t", "tabs")):
+        if separator in header[0]:
+            raise InputError(f"{place}: found columns separated by {called}, expected commas.")
+    seen: set[str] = set()
+    for position, name in enumerate(header, start=1):
+        if _is_number_or_empty(name):
+            found = f"{name!r} in place of a name" if name else "no name"
+            raise InputError(f"{place}, column {position}: found {found}, expected {expected}.")
+        if name in seen:
+            raise InputError(f"{place}, column {name}: found a second time, expected once.")
+        seen.add(name)
+    return header
+
+
+def _careful_numbers(place: str, header: Sequence[str], cells: Sequence[str]) -> list[float]:
+    """Numbers of one row, NaN for empty cells; names the column of a cell that is neither."""
+    numbers = []
+    for name, cell in zip(header, cells, strict=True):
+        try:
+            numbers.append(_number(cell))
+        except ValueError:
+            found = repr(cell.strip()[:_SHOWN_CHARACTERS])
+            raise InputError(f"{place}, column {name}: found {found}, expected a number or an empty cell.") from None
+    return numbers
+
+
+def _number(cell: str) -> float:
+    cell = cell.strip()
+    if "_" in cell or not cell.isascii():
+        raise ValueError(cell)
+    return float(cell) if cell else math.nan
+
+
+def _is_number_or_empty(cell: str) -> bool:
+    try:
+        _number(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def write_table(path: Path, columns: tuple[str, ...], table: NDArray[np.float64]) -> None:
+    """Write a table (n, k) of numbers as CSV, to nine digits."""
+    from arrays.io.text import write_text
+
+    lines = [",".join(columns), *(",".join(f"{value:.9g}" for value in row) for row in table.tolist()), ""]
+    write_text("\n".join(lines), path)
+
+
+Column = NDArray[np.float64] | NDArray[np.int64] | NDArray[np.bool_] | Sequence[str]
+
+
+def write_columns(columns: Mapping[str, Column], path: Path) -> None:
+    """Write columns of equal length as CSV; numbers in full, those that are not finite as empty cells, texts quoted.
+
+    Parameters
+    ----------
+    columns : mapping
+        From names, with units, to columns.
+    path : Path
+    """
+    cells = [[_cell(value) for value in column] for column in columns.values()]
+    lines = [",".join(columns), *(",".join(row) for row in zip(*cells, strict=True))]
+    write_text("\n".join([*lines, ""]), path)
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, str):
+        return '"' + value.replace('"', '""') + '"'
+    if isinstance(value, (bool, np.bool_, int, np.integer)):
+        return str(int(value))
+    number = float(value)  # type: ignore[arg-type]
+    return repr(number) if np.isfinite(number) else ""

@@ -1,0 +1,37 @@
+"""What is raised for files that cannot be used."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from arrays.typing import FloatArray
+
+
+class InputError(ValueError):
+    """Bad input from outside: a file, a command's option.
+
+    The text is one sentence that names the file, the line or key, what was found and what was expected, fit to be shown
+    to a user as it is.
+    """
+
+
+@contextmanager
+def naming(place: str) -> Iterator[None]:
+    """Turn what the library refuses into bad input at a place of a file or command."""
+    try:
+        yield
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{place}: {str(error).removeprefix('Input ').removeprefix('Inputs ')}") from None
+
+
+def _vector(name: str, value: ArrayLike) -> FloatArray:
+    vector = np.asarray(value, dtype=np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ValueError(f"Input {name} must be finite and have shape (3,); instead received {vector.tolist()}.")
+    return vector

@@ -1,0 +1,107 @@
+"""Folders and files that commands write, whole or not at all, with errors that name the option."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+
+from arrays.io.errors import InputError
+
+
+def refuse_file(folder: Path, option: str) -> None:
+    """Refuse what cannot become a folder with files in it, before long work; `option` names it.
+
+    A folder that is not there is made later, with those above it: nothing is left behind here.
+    """
+    place = folder.absolute()
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    if not place.is_dir():
+        raise InputError(f"{option} {folder}: found a file, expected a folder.")
+    _refuse_closed(place, folder, option)
+
+
+def refuse_unwritable(path: Path, option: str, suffix: str | None = None) -> None:
+    """Refuse an output file that cannot be written, before long work.
+
+    Parameters
+    ----------
+    path : Path
+        It may be there: it is replaced in the end, and left alone here.
+    option : str
+        That names it, for errors.
+    suffix : str, optional
+        That its name has to end with, such as ``".png"``.
+
+    Raises
+    ------
+    InputError
+        It is a folder, its folder is not there, nothing can be written in that, or the suffix is another one.
+    """
+    if path.is_dir():
+        raise InputError(f"{option} {path}: found a folder, expected a file.")
+    if suffix is not None and path.suffix.lower() != suffix:
+        raise InputError(f"{option} {path}: found a name that ends with {path.suffix!r}, expected {suffix}.")
+    if path.exists() and not path.is_file():
+        return  # a pipe or a terminal: nothing has to be made beside it
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise InputError(f"{option} {path}: found no folder {folder}, expected one.")
+    _refuse_closed(Path(os.path.realpath(path)).parent, path, option, prefix=f".{path.name}.")
+
+
+def refuse_one_for_two(outputs: Mapping[str, Path | None]) -> None:
+    """Refuse outputs, by their options, of which one would replace another."""
+    seen: dict[str, str] = {}
+    for option, path in outputs.items():
+        if path is None:
+            continue
+        same = seen.setdefault(os.path.realpath(path), option)
+        if same != option:
+            raise InputError(f"{option} {path}: found the file of {same}, expected another one.")
+
+
+def _refuse_closed(folder: Path, wanted: Path, option: str, prefix: str = ".") -> None:
+    """Refuse a folder in which no file can be made: only an attempt tells, of whatever user and file system."""
+    try:
+        with tempfile.NamedTemporaryFile(dir=folder, prefix=prefix, suffix=".tmp"):
+            pass
+    except OSError as error:
+        raise InputError(
+            f"{option} {wanted}: no file can be made in {folder} ({error.strerror}), expected a folder that can be"
+            " written to."
+        ) from None
+
+
+def make_folder(folder: Path, option: str) -> None:
+    """Make a folder if it is not there.
+
+    Parameters
+    ----------
+    folder : Path
+    option : str
+        That names it, for errors.
+
+    Raises
+    ------
+    InputError
+        There is a file of that name, it cannot be made, or nothing can be written in it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise InputError(f"{option} {folder}: found a file, expected a folder.") from None
+    except OSError as error:
+        raise InputError(f"{option} {folder} cannot be written ({error.strerror}).") from None
+    _refuse_closed(folder, folder, option)
+
+
+def installed_version() -> str:
+    """Version of the package that holds the command lines."""
+    try:
+        return metadata.version("magloc")
+    except metadata.PackageNotFoundError:
+        return "unknown (not installed)"

@@ -1,0 +1,103 @@
+"""Text files, read strictly and written in one step."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
+
+from arrays.io.errors import InputError
+
+
+def read_text(path: str | PathLike[str], expected: str) -> str:
+    """Text of a UTF-8 file, with or without a byte order mark.
+
+    Parameters
+    ----------
+    path : path-like
+    expected : str
+        What the file should be, in words, for errors.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    InputError
+        The file does not exist, cannot be read, or is not UTF-8.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path} does not exist, expected {expected}.") from None
+    except IsADirectoryError:
+        raise InputError(f"{path} is a directory, expected {expected}.") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path} cannot be read ({reason}), expected {expected}.") from None
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise InputError(
+            f"{path}, line {line}: found the byte 0x{data[error.start]:02x}, which is not UTF-8, expected UTF-8 text."
+        ) from None
+
+
+def write_text(text: str, path: str | PathLike[str]) -> None:
+    """Write a UTF-8 file in one step: a reader finds the old text or the new one, also after an interruption.
+
+    Parameters
+    ----------
+    text : str
+    path : path-like
+        Replaced if it exists; the target of a link, if it is one.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    target = Path(path)
+    in_place = target.exists() and not target.is_file()  # a pipe or a terminal cannot be replaced
+    if not in_place:
+        target = Path(os.path.realpath(path))
+    written = target if in_place else target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        try:
+            written.write_text(text, encoding="utf-8", newline="\n")
+            if not in_place:
+                os.replace(written, target)
+        finally:
+            if not in_place:
+                written.unlink(missing_ok=True)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from None
+
+
+def replace_file(path: Path, write: Callable[[Path], object]) -> None:
+    """Write a file beside its final place first, so that an interruption leaves the old one or the new one.
+
+    Parameters
+    ----------
+    path : Path
+        The final place.
+    write : callable
+        Writes the file to the path that it is given.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    unfinished = path.with_name(f".{path.name}.tmp")
+    try:
+        write(unfinished)
+        os.replace(unfinished, path)
+    except (OSError, RuntimeError) as error:  # netCDF's own errors are RuntimeErrors
+        raise InputError(f"{path} cannot be written ({getattr(error, 'strerror', None) or error}).") from None
+    finally:
+        unfinished.unlink(missing_ok=True)

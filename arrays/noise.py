@@ -1,0 +1,195 @@
+"""Covariance of readings: noise that grows with the field, and errors of calibration."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from arrays.array import SensorArray
+from arrays.typing import BoolArray, FloatArray
+
+# Relative addition to the variances of an uncertain calibration, which are singular: above rounding, below any effect.
+_REGULAR_RTOL = 1e-13
+
+
+def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray:
+    """Noise of every channel when a part of it is proportional to the field.
+
+    ``σ² = noise² + (noise_fraction · |B|)²`` with |B| the modulus of the calibrated reading minus the array's mean
+    (vector sensors), or the deviation of the modulus from the mean modulus (scalar sensors). The noise is in the
+    readings' units, so |B| is multiplied by the channel's gain.
+
+    Parameters
+    ----------
+    array : SensorArray
+    readings_T : ndarray, shape (..., C)
+        Raw readings [T], NaN where missing.
+
+    Returns
+    -------
+    ndarray, shape (..., C)
+        Standard deviations [T], in the units of the readings. Of a sensor whose reading is incomplete the known axes
+        stand for the missing ones, and the largest |B| of a complete sensor is the least it is given.
+    """
+    readings_T = np.asarray(readings_T, dtype=np.float64)
+    noise = np.broadcast_to(array.channel_noise_T, readings_T.shape)
+    if array.noise_fraction == 0.0:
+        return noise.copy()
+    vector = ~array.channel_is_scalar
+    modulus = np.zeros_like(readings_T)
+    if vector.any():
+        modulus[..., vector] = _deviations(array, readings_T)[..., array.channel_sensor[vector]]
+    if not vector.all():
+        scalar = ~vector
+        moduli = (readings_T[..., scalar] - array.channel_offset_T[scalar]) / array.channel_gain[scalar, 0]
+        modulus[..., scalar] = np.abs(moduli - _mean_of_finite(moduli, axis=-1))
+    gain = np.linalg.norm(array.channel_gain, axis=1)
+    result: FloatArray = np.hypot(noise, array.noise_fraction * gain * np.nan_to_num(modulus))
+    return result
+
+
+def reading_covariance(array: SensorArray, readings_T: FloatArray) -> FloatArray:
+    r"""Covariance of the readings' errors: noise, proportional noise, and what the calibration does not know.
+
+    A vector sensor of scale S in the field b, in its own axes, that is turned by a small unknown rotation θ and has
+    relative errors g of its gains reads :math:`S (b + θ × b + g ∘ b)`. Its block is
+
+    .. math:: diag(σ²) + S (σ_θ² (|b|² I - b b^T) + σ_g² diag(b²)) S^T
+
+    with σ of :func:`proportional_noise`; the error of an angle stands at right angles to the field. That of a scalar
+    sensor is :math:`σ² + σ_g² (reading - offset)²`. The rotations and gains are constant, so that the errors of one
+    sensor's rows are not independent of each other: this is their covariance within one row.
+
+    Parameters
+    ----------
+    array : SensorArray
+    readings_T : ndarray, shape (..., C)
+        Raw readings of the whole field [T], NaN where missing. For a missing axis of b stands the known ambient field,
+        else the mean of the other sensors' fields, else zero.
+
+    Returns
+    -------
+    ndarray, shape (..., C, C)
+        Block-diagonal by sensor, in the units of the readings [T²]. Entries of missing channels are finite.
+    """
+    return _block_diagonal(array, _covariance_blocks(array, readings_T), array.sensor_channels >= 0)
+
+
+def reading_errors(array: SensorArray, readings_T: FloatArray, normal: FloatArray) -> FloatArray:
+    """Errors of the covariance of :func:`reading_covariance`, from independent standard normal numbers.
+
+    Parameters
+    ----------
+    array : SensorArray
+    readings_T : ndarray, shape (..., C)
+        Readings without errors [T].
+    normal : ndarray, shape (..., C)
+        The numbers.
+
+    Returns
+    -------
+    ndarray, shape (..., C)
+        To be added to the readings [T].
+    """
+    if not array.noise_depends_on_reading:
+        return array.channel_noise_T * normal
+    channel, used = array.sensor_channels, array.sensor_channels >= 0
+    root = np.linalg.cholesky(_covariance_blocks(array, readings_T))
+    slots = np.where(used, np.asarray(normal, dtype=np.float64)[..., channel], 0.0)
+    errors: FloatArray = np.einsum("...nij,...nj->...ni", root, slots)
+    return errors[..., used]
+
+
+def _covariance_blocks(array: SensorArray, readings_T: FloatArray) -> FloatArray:
+    """Blocks of :func:`reading_covariance`, (..., N, 3, 3) [T²], with unit variances in the slots that are not used."""
+    readings_T = np.asarray(readings_T, dtype=np.float64)
+    channel, used = array.sensor_channels, array.sensor_channels >= 0
+    variance = np.where(used, proportional_noise(array, readings_T)[..., channel] ** 2, 1.0)
+    blocks: FloatArray = variance[..., None] * np.eye(3)
+    misalignment = np.array([sensor.misalignment_rad for sensor in array.sensors])
+    gain_error = np.array([sensor.gain_uncertainty for sensor in array.sensors])
+    if not (misalignment.any() or gain_error.any()):
+        return blocks
+    turns, gains = np.split(calibration_errors(array, readings_T), 2, axis=-1)
+    factor = np.concatenate([misalignment[:, None, None] * turns, gain_error[:, None, None] * gains], axis=-1)
+    # Formed from its factor, the product is singular to the rounding of its diagonal, also for a field along an axis.
+    calibration = factor @ np.swapaxes(factor, -1, -2)
+    return blocks + calibration * (1.0 + _REGULAR_RTOL * np.eye(3))
+
+
+def calibration_errors(array: SensorArray, readings_T: FloatArray) -> FloatArray:
+    """What small errors of a calibration do to the readings: derivatives with respect to turns θ and gains g.
+
+    Parameters
+    ----------
+    array : SensorArray
+    readings_T : ndarray, shape (..., C)
+        Raw readings [T], NaN where missing; see :func:`reading_covariance` for what stands for those.
+
+    Returns
+    -------
+    ndarray, shape (..., N, 3, 6)
+        By sensor, its three axes, and (θ, g): ``S (θ × b + g ∘ b)`` [T]. A scalar sensor has its first axis only.
+    """
+    readings_T = np.asarray(readings_T, dtype=np.float64)
+    scale = np.tile(np.eye(3), (array.n_sensors, 1, 1))
+    for i, sensor in enumerate(array.sensors):
+        scale[i, : sensor.n_channels, : sensor.n_channels] = sensor.calibration.scale
+    b = _fields_in_sensor_axes(array, readings_T, scale)
+    turned = np.swapaxes(np.cross(np.eye(3), b[..., None, :]), -1, -2)  # column k is e_k × b
+    derivative: FloatArray = scale @ np.concatenate([turned, b[..., None] * np.eye(3)], axis=-1)
+    return derivative
+
+
+def _fields_in_sensor_axes(array: SensorArray, readings_T: FloatArray, scale: FloatArray) -> FloatArray:
+    """Field that each sensor saw, in its own axes, complete: (..., N, 3) [T]; (modulus, 0, 0) of a scalar sensor."""
+    channel, used = array.sensor_channels, array.sensor_channels >= 0
+    response = np.where(used, (readings_T - array.channel_offset_T)[..., channel], 0.0)
+    missing = np.isnan(response)
+    if missing.any():
+        if array.ambient_T is not None:
+            elsewhere = array.ambient_fields
+        else:
+            elsewhere = _mean_of_finite(array.calibrated_field(readings_T), axis=-2)
+        in_axes = np.einsum("nji,...nj->...ni", array.rotation_matrices, elsewhere + np.zeros((array.n_sensors, 1)))
+        response = np.where(missing, np.einsum("nij,...nj->...ni", scale, in_axes), response)
+    field: FloatArray = np.einsum("nij,...nj->...ni", np.linalg.inv(scale), response)
+    return field
+
+
+def _deviations(array: SensorArray, readings_T: FloatArray) -> FloatArray:
+    """Modulus of every sensor's field minus the array's mean: (..., N) [T]."""
+    fields = array.calibrated_field(readings_T)
+    mean = _mean_of_finite(fields, axis=-2)
+    deviation: FloatArray = np.linalg.norm(fields - mean, axis=-1)
+    missing = np.isnan(deviation)
+    if missing.any():
+        vector = np.flatnonzero(~array.channel_is_scalar)
+        gain = array.channel_gain[vector]
+        axes = (readings_T - array.channel_offset_T)[..., vector] - mean[..., 0, :] @ gain.T
+        axes = np.where(np.isfinite(axes), axes / np.linalg.norm(gain, axis=1), np.nan)
+        of_sensor = np.stack(
+            [
+                _mean_of_finite(axes[..., array.channel_sensor[vector] == i] ** 2, axis=-1)
+                for i in range(array.n_sensors)
+            ],
+            axis=-2,
+        )[..., 0]
+        largest = np.max(np.where(missing, 0.0, deviation), axis=-1, keepdims=True)
+        deviation = np.where(missing, np.maximum(np.sqrt(3.0 * of_sensor), largest), deviation)
+    return deviation
+
+
+def _mean_of_finite(values: FloatArray, axis: int) -> FloatArray:
+    finite = np.isfinite(values)
+    count = np.maximum(finite.sum(axis=axis, keepdims=True), 1)
+    mean: FloatArray = np.where(finite, values, 0.0).sum(axis=axis, keepdims=True) / count
+    return mean
+
+
+def _block_diagonal(array: SensorArray, blocks: FloatArray, present: BoolArray) -> FloatArray:
+    """Matrices (..., C, C) of the sensors' blocks (..., N, 3, 3), zero for channels that are not present (N, 3)."""
+    n = array.n_channels
+    slot = np.where(present, array.sensor_channels, n)  # the others end in a row and a column that are cut off
+    matrix = np.zeros((*blocks.shape[:-3], n + 1, n + 1))
+    matrix[..., slot[:, :, None], slot[:, None, :]] = blocks
+    return matrix[..., :n, :n]

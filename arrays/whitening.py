@@ -1,0 +1,114 @@
+"""Decorrelation of differences: the common field taken out, the rest at unit variance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from arrays.array import SensorArray
+from arrays.differences import _channels, _common_field, _groups
+from arrays.noise import _block_diagonal
+from arrays.typing import BoolArray, FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """The differences' likelihood as a projection: ``w = e - Q (g ∘ Qᵀ e)``, ``e = L⁻¹ y``, noise covariance ``L Lᵀ``.
+
+    ``wᵀ w`` equals the χ² of :class:`Differences`, for the same readings.
+
+    Attributes
+    ----------
+    root : ndarray, shape (C, C)
+        ``L⁻¹`` [1/T], block-diagonal by sensor: 1/σ of every channel where the channels' noise is independent. Rows and
+        columns of missing channels are zero; a sensor's other channels keep the covariance that they have without them.
+    basis : ndarray, shape (C, q)
+        Orthonormal basis of the common field in channels of unit noise.
+    shrinkage : ndarray, shape (q,)
+        1 where the common field is unknown, less where a prior bounds it.
+    n_differences : int
+        Number of independent scalars in w.
+    """
+
+    root: FloatArray
+    basis: FloatArray
+    shrinkage: FloatArray
+    n_differences: int
+
+    def apply(self, channels: FloatArray) -> FloatArray:
+        """Whitened channels.
+
+        Parameters
+        ----------
+        channels : ndarray, shape (..., C)
+            Readings with their offset removed, or predictions, or one column of a Jacobian [T]. Missing entries must
+            be finite; they do not count.
+
+        Returns
+        -------
+        ndarray, shape (..., C)
+            Residuals of unit variance once the common field is projected out.
+        """
+        e = channels @ self.root.T
+        w: FloatArray = e - ((e @ self.basis) * self.shrinkage) @ self.basis.T
+        return w
+
+
+def whitening(
+    array: SensorArray, available: BoolArray | None = None, *, covariance_T2: FloatArray | None = None
+) -> Whitening:
+    """The projection form of :func:`decorrelated_differences`, with the same parameters.
+
+    With channels ``y = U c + n``, n of covariance ``L Lᵀ`` and c the common field of prior variance λ:
+    ``L⁻¹ U = Q diag(s) Vᵀ`` gives the shrinkage ``1 - 1/√(1 + s² λ)``, which is 1 for an unknown field.
+    """
+    mask, covariance = _channels(array, available, covariance_T2)
+    return whitenings(array, mask, covariance[None])[0]
+
+
+def whitenings(array: SensorArray, available: BoolArray, covariances_T2: FloatArray) -> list[Whitening]:
+    """Whitening of each of n covariances at once, for rows that have the same readings.
+
+    Parameters
+    ----------
+    array : SensorArray
+    available : ndarray of bool, shape (C,)
+        Channels that have a reading.
+    covariances_T2 : ndarray, shape (n, C, C)
+        As one of :func:`reading_covariance` [T²].
+
+    Returns
+    -------
+    list of Whitening
+        As :func:`whitening` makes them one by one.
+    """
+    n_rows, n = len(covariances_T2), array.n_channels
+    root = _inverse_root(array, available, covariances_T2)
+    gain = root @ array.channel_gain
+    basis, shrinkage, keep = np.zeros((n_rows, n, 0)), np.zeros((n_rows, 0)), np.zeros((n_rows, 0), dtype=np.bool_)
+    for group in _groups(array, available):
+        q, s, _ = np.linalg.svd(_common_field(array, group, gain), full_matrices=False)
+        of_group = np.zeros((n_rows, n, s.shape[1]))
+        of_group[:, group] = q
+        basis = np.concatenate([basis, of_group], axis=2)
+        keep = np.concatenate([keep, s > s.max(axis=1, keepdims=True, initial=0.0) * 1e-10], axis=1)
+        prior = np.inf if array.common_field_T is None else array.common_field_T
+        with np.errstate(invalid="ignore"):  # zero times infinity, for what is not kept
+            shrinkage = np.concatenate([shrinkage, 1.0 - 1.0 / np.sqrt(1.0 + (s * prior) ** 2)], axis=1)
+    lost = keep.sum(axis=1) if array.common_field_T is None else np.zeros(n_rows, dtype=np.intp)
+    n_differences = (int(available.sum()) - lost).tolist()
+    return [Whitening(root[i], basis[i][:, keep[i]], shrinkage[i, keep[i]], n_differences[i]) for i in range(n_rows)]
+
+
+def _inverse_root(array: SensorArray, mask: BoolArray, covariance: FloatArray) -> FloatArray:
+    """``L⁻¹`` of ``covariance = L Lᵀ`` among the channels that have a reading, zero elsewhere: (..., C, C)."""
+    channel = array.sensor_channels
+    present = (channel >= 0) & mask[channel]
+    blocks = covariance[..., channel[:, :, None], channel[:, None, :]]
+    blocks = np.where(present[:, :, None] & present[:, None, :], blocks, np.eye(3))
+    try:
+        inverse = np.linalg.inv(np.linalg.cholesky(blocks))
+    except np.linalg.LinAlgError:
+        raise ValueError("Input covariance_T2 must be positive definite; instead received one that is not.") from None
+    return _block_diagonal(array, inverse, present)

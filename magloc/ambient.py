@@ -1,0 +1,113 @@
+"""The ambient field of a readings file's rows, from wherever it is known."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from arrays.io.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from arrays.array import SensorArray
+    from magloc.readings import Readings
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where and when the geomagnetic field is wanted.
+
+    Attributes
+    ----------
+    latitude_deg, longitude_deg, height_m : float
+        Geodetic; above the WGS-84 ellipsoid.
+    date : str
+        ISO 8601.
+    model : str
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    date: str
+    model: str
+
+
+def with_ambient_field(
+    array: SensorArray, readings: Readings, place: Place | None, *, gradient: bool
+) -> tuple[SensorArray, NDArray[np.float64] | None]:
+    """The array with the ambient field that its readings were taken in, and that of every row if it differs.
+
+    The readings' own columns come first, then the array file, then the geomagnetic model. Its axes, east, north and up,
+    are those of the world frame, and of the array if the readings do not have its pose.
+    """
+    model_T = gradient_T_m = None
+    if place is not None:
+        model_T, gradient_T_m = _of_model(place)
+    if gradient:
+        if gradient_T_m is None:
+            raise InputError("--ambient-gradient: found no --place, expected --place LAT LON ALT_M and --date with it.")
+        if readings.array_rotation_xyzw is not None:
+            raise InputError("--ambient-gradient: found an array with a pose, expected one that stands east-north-up.")
+        rows = [(float(x), float(y), float(z)) for x, y, z in gradient_T_m]
+        array = replace(array, ambient_gradient_T_m=tuple(rows))
+    scalar = bool(array.channel_is_scalar.any())
+    if scalar and readings.ambient_T is None and array.ambient_T is not None and _turns(readings):
+        raise InputError(
+            "key ambient_nT of the array file: found an array that turns, for which it is not constant; expected"
+            " columns ambient_x_nT and so on in the readings, or --place and --date without that key."
+        )
+    if scalar and array.common_field_T is not None:
+        _LOG.warning(
+            "common_field_nT stands for one offset of all moduli; how a change of the ambient field differs"
+            " between scalar sensors is not modelled"
+        )
+    if readings.ambient_T is not None or array.ambient_T is not None:
+        if place is not None and not gradient:
+            where = "readings have" if readings.ambient_T is not None else "array file has"
+            _LOG.info(f"--place is not used: the {where} the ambient field")
+        return array, readings.ambient_T
+    if model_T is None:
+        if scalar:
+            _LOG.warning(
+                "no ambient field is known (ambient_x_nT and so on in the readings, ambient_nT in the array"
+                " file, or --place and --date): moduli are taken as those of the source alone"
+            )
+        return array, None
+    if scalar:
+        _LOG.info("note: the geomagnetic model is taken as exact; crust and storms make it wrong by some 100 nT")
+    if readings.array_rotation_xyzw is None:
+        return replace(array, ambient_T=tuple(model_T.tolist())), None
+    from scipy.spatial.transform import Rotation
+
+    return array, Rotation.from_quat(readings.array_rotation_xyzw).inv().apply(model_T)
+
+
+def _turns(readings: Readings) -> bool:
+    """Whether the array turns between the rows, by more than a milliradian."""
+    rotations = readings.array_rotation_xyzw
+    return rotations is not None and bool((abs(rotations @ rotations[0]) < 1.0 - 1e-7).any())
+
+
+def _of_model(place: Place) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    import numpy as np
+
+    from magloc.fields.geomagnetic import MODELS, field_enu, gradient_enu
+
+    if place.model not in MODELS:
+        raise InputError(f"--geomagnetic-model: found {place.model!r}, expected one of {', '.join(MODELS)}.")
+    try:
+        date = np.datetime64(place.date)
+    except ValueError:
+        raise InputError(f"--date: found {place.date!r}, expected a date such as 2026-11-21.") from None
+    where = (place.latitude_deg, place.longitude_deg, place.height_m, date, place.model)
+    try:
+        return field_enu(*where), gradient_enu(*where)
+    except ValueError as error:
+        option = "--date" if "date" in str(error) else "--place"
+        raise InputError(f"{option}: {str(error).removeprefix('Input ')}") from None

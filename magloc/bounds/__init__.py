@@ -1,0 +1,1 @@
+"""Cramér-Rao bounds: what an array can know."""

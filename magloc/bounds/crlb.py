@@ -1,0 +1,313 @@
+r"""Cramér-Rao bounds: how well one set of readings can tell where a dipole is, and what it is, whatever the method.
+
+The information about (p, m) is :math:`I = H^T C^{-1} H` with the Jacobian H of the readings and the covariance C of
+all that is not the source. What else is not known is marginalised: a nuisance x that enters the readings as N x, with a
+Gaussian prior of covariance Λ, adds :math:`N Λ N^T` to C. Nuisances are
+
+* the field common to all sensors, unknown or with the prior ``common_field_T`` of the array;
+* what the calibration does not know: ``misalignment_rad``, ``gain_uncertainty`` and ``offset_uncertainty_T`` of every
+  sensor, as errors of one row, in the whole field, the array's ``ambient_T`` included;
+* the ambient field, whose direction scalar sensors need, if it is known to ``ambient_uncertainty_T`` only.
+
+With ``noise_fraction`` the covariance depends on the readings. It counts as known here, as it does for every fix: the
+little that its size tells of the source is left out.
+
+Where the information is singular a bound is infinite: for every source if there are too few readings. The nine
+differences of four vector sensors lose the rank six under four conditions, and a source and its moment have four
+angles: at every range there are isolated pairs of directions for which the bound is infinite, whatever the array. So
+the worst case over directions is infinite in truth, and only grows with the number of directions that are tried.
+Quantiles over directions do not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from arrays.array import SensorArray
+from arrays.noise import reading_covariance
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.measurement.differences import channel_jacobian, predicted_channels
+
+LOST = 1e-6
+"""A combination of parameters is not estimable if the readings tell of it so much less than of others."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Least standard deviations of any unbiased estimate from one set of readings, over leading axes.
+
+    Attributes
+    ----------
+    position_m, moment_Am2 : ndarray, shape (..., 3)
+        The source, in the array's frame.
+    range_m : ndarray, shape (...)
+        Its distance from the sensors' centroid.
+    covariance : ndarray, shape (..., 6, 6)
+        Of (p, m) [m, A·m²]. A parameter that is not estimable has an infinite variance and NaN beside it.
+    sigma_range_m : ndarray, shape (...)
+        Along the line from the centroid to the source.
+    sigma_bearing_rad : ndarray, shape (...)
+        Of the direction of that line: root of the sum of the variances of its two angles, taken about any two axes at
+        right angles to each other and to the line. So ``σ_position² = σ_range² + (range · σ_bearing)²``.
+    sigma_position_m, sigma_moment_Am2 : ndarray, shape (...)
+        Roots of the sum of the variances of the three components.
+    rank : ndarray of int, shape (...)
+        Independent combinations of the six parameters that are estimable.
+    """
+
+    position_m: FloatArray
+    moment_Am2: FloatArray
+    range_m: FloatArray
+    covariance: FloatArray
+    sigma_range_m: FloatArray
+    sigma_bearing_rad: FloatArray
+    sigma_position_m: FloatArray
+    sigma_moment_Am2: FloatArray
+    rank: IntArray
+
+    @property
+    def is_regular(self) -> BoolArray:
+        """Whether all six parameters are estimable, shape (...)."""
+        return self.rank == 6
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviation of every component of (p, m), shape (..., 6) [m, A·m²]."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+
+def whitened_jacobian(
+    array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, *, ambient_uncertainty_T: float = 0.0
+) -> FloatArray:
+    """Jacobian of readings that are freed of all nuisances and have unit variance.
+
+    Parameters
+    ----------
+    array : SensorArray
+    position_m, moment_Am2 : array_like, shape (..., 3)
+        Source in the array's frame [m], its moment [A·m²].
+    ambient_uncertainty_T : float
+        Standard deviation, per axis, of the error of ``array.ambient_T``, the same for all sensors [T].
+
+    Returns
+    -------
+    ndarray, shape (..., C, 6)
+        W with the information ``Wᵀ W``; columns (p, m) in 1/m and 1/(A·m²). NaN for a source on a sensor.
+    """
+    p, m = _sources(position_m, moment_Am2)
+    check_uncertainty(ambient_uncertainty_T)
+    W = channel_jacobian(array, p, m)
+    root = _inverse_root(array, p, m)
+    with np.errstate(invalid="ignore"):
+        W = root @ W
+        common = root @ _common_field(array)
+        ambient = root @ _ambient_effect(array, p, m) if ambient_uncertainty_T else None
+    prior = np.inf if array.common_field_T is None else array.common_field_T
+    for group in _kinds(array):
+        # Written out for every kind: one of them has no effect on the readings of the other.
+        part = np.where(group[:, None], common[..., 3:] if array.channel_is_scalar[group][0] else common[..., :3], 0.0)
+        W = _marginalised(W, part, prior)
+        if ambient is not None:
+            ambient = _marginalised(ambient, part, prior)
+    return W if ambient is None else _marginalised(W, ambient, ambient_uncertainty_T)
+
+
+def fisher_information(
+    array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, *, ambient_uncertainty_T: float = 0.0
+) -> FloatArray:
+    """Information that one set of readings holds about (p, m), all nuisances marginalised.
+
+    Parameters
+    ----------
+    array : SensorArray
+    position_m, moment_Am2 : array_like, shape (..., 3)
+        Source in the array's frame [m], its moment [A·m²].
+    ambient_uncertainty_T : float
+        Standard deviation, per axis, of the error of ``array.ambient_T``, the same for all sensors [T].
+
+    Returns
+    -------
+    ndarray, shape (..., 6, 6)
+        In 1/m² and so on. NaN for a source on a sensor.
+
+    Raises
+    ------
+    ValueError
+        A shape is wrong, or the uncertainty is negative or not finite.
+    """
+    W = whitened_jacobian(array, position_m, moment_Am2, ambient_uncertainty_T=ambient_uncertainty_T)
+    return W.mT @ W
+
+
+def bounds_of(
+    array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, *, ambient_uncertainty_T: float = 0.0
+) -> Bounds:
+    """Cramér-Rao bounds of a source, or of many over leading axes.
+
+    Parameters
+    ----------
+    array : SensorArray
+    position_m, moment_Am2 : array_like, shape (..., 3)
+        Source in the array's frame [m], its moment [A·m²].
+    ambient_uncertainty_T : float
+        Standard deviation, per axis, of the error of ``array.ambient_T``, the same for all sensors [T].
+
+    Returns
+    -------
+    Bounds
+        All NaN for a source on a sensor; range and bearing NaN for one in the centroid, which has no direction.
+
+    Raises
+    ------
+    ValueError
+        A shape is wrong, or the uncertainty is negative or not finite.
+    """
+    p, m = _sources(position_m, moment_Am2)
+    W = whitened_jacobian(array, p, m, ambient_uncertainty_T=ambient_uncertainty_T)
+    line = p - array.centroid
+    distance = np.linalg.norm(line, axis=-1)
+    known: BoolArray = np.all(np.isfinite(W), axis=(-2, -1))
+    # In units of the distance and the moment's size the singular values compare.
+    size = np.linalg.norm(m, axis=-1)
+    unit = np.concatenate(
+        [
+            np.repeat(np.maximum(distance, array.circumradius)[..., None], 3, axis=-1),
+            np.repeat(np.where(size > 0.0, size, 1.0)[..., None], 3, axis=-1),
+        ],
+        axis=-1,
+    )
+    scaled = np.where(known[..., None, None], W * unit[..., None, :], 0.0)
+    missing = max(0, 6 - scaled.shape[-2])
+    scaled = np.concatenate([scaled, np.zeros((*scaled.shape[:-2], missing, 6))], axis=-2)
+    _, s, Vt = np.linalg.svd(scaled, full_matrices=False)
+    lost = s <= LOST * s[..., :1]
+    inverse = np.where(lost, 0.0, 1.0 / np.where(lost, 1.0, s))
+    V = Vt.mT * unit[..., None]  # columns are the combinations, in the units of (p, m)
+
+    root = V * inverse[..., None, :]
+    covariance = root @ root.mT
+    hidden: BoolArray = np.greater(_sum_of_squares(Vt.mT, lost), LOST**2)
+    covariance = np.where(hidden[..., :, None] | hidden[..., None, :], np.nan, covariance)
+    diagonal = np.arange(6)
+    covariance[..., diagonal, diagonal] = np.where(hidden, np.inf, covariance[..., diagonal, diagonal])
+
+    with np.errstate(invalid="ignore", divide="ignore"):
+        n = line / distance[..., None]
+    along = (n[..., None, :] @ Vt.mT[..., :3, :])[..., 0, :]
+    across = Vt.mT[..., :3, :] - n[..., :, None] * along[..., None, :]
+    place_unit, moment_unit = unit[..., 0], unit[..., 3]
+    sigma_range = place_unit * _root_of_sum(along[..., None, :], inverse, lost)
+    sigma_across = place_unit * _root_of_sum(across, inverse, lost)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sigma_bearing = sigma_across / distance
+    blank = np.where(known, 0.0, np.nan)
+    return Bounds(
+        position_m=p,
+        moment_Am2=m,
+        range_m=distance,
+        covariance=covariance + blank[..., None, None],
+        sigma_range_m=sigma_range + blank,
+        sigma_bearing_rad=sigma_bearing + blank,
+        sigma_position_m=place_unit * _root_of_sum(Vt.mT[..., :3, :], inverse, lost) + blank,
+        sigma_moment_Am2=moment_unit * _root_of_sum(Vt.mT[..., 3:, :], inverse, lost) + blank,
+        rank=np.where(known, (~lost).sum(axis=-1), 0),
+    )
+
+
+def _inverse_root(array: SensorArray, position: FloatArray, moment: FloatArray) -> FloatArray:
+    """``L⁻¹`` of the readings' noise ``L Lᵀ``: (C, C), or (..., C, C) where it depends on the readings [1/T]."""
+    if not array.noise_depends_on_reading:
+        return np.diag(1.0 / array.channel_noise_T)
+    readings = predicted_channels(array, position, moment) + array.channel_offset_T
+    complete: BoolArray = np.all(np.isfinite(readings), axis=-1, keepdims=True)
+    known = complete[..., None]
+    covariance = reading_covariance(array, np.where(complete, readings, 0.0))
+    scale = 1.0 / array.channel_noise_T  # LAPACK's tolerances are absolute
+    unit = np.where(known, covariance * scale[:, None] * scale, np.eye(array.n_channels))
+    root: FloatArray = np.linalg.inv(np.linalg.cholesky(unit)) * scale
+    return np.where(known, root, np.nan)
+
+
+def _kinds(array: SensorArray) -> list[BoolArray]:
+    """Channels (C,) of the vector sensors, then of the scalar ones: each kind has a common field of its own."""
+    return [kind for kind in (~array.channel_is_scalar, array.channel_is_scalar) if kind.any()]
+
+
+def _common_field(array: SensorArray) -> FloatArray:
+    """How the common field enters the channels: its three components vector sensors, a common modulus scalar ones."""
+    scalar = array.channel_is_scalar[:, None]
+    gain = array.channel_gain
+    return np.concatenate([np.where(scalar, 0.0, gain), np.where(scalar, gain[:, :1], 0.0)], axis=1)
+
+
+def _ambient_effect(array: SensorArray, position: FloatArray, moment: FloatArray) -> FloatArray:
+    """Derivative (..., C, 3) of the channels with respect to the ambient field, the same at all sensors."""
+    from magloc.fields.dipole import field
+
+    fields = field(array.positions, position[..., None, :], moment[..., None, :]) + array.ambient_fields
+    with np.errstate(invalid="ignore", divide="ignore"):
+        direction = fields / np.linalg.norm(fields, axis=-1, keepdims=True)
+    of_modulus = array.channel_gain[:, :1] * direction[..., array.channel_sensor, :]
+    return np.where(array.channel_is_scalar[:, None], of_modulus, array.channel_gain)
+
+
+def _marginalised(W: FloatArray, nuisance: FloatArray, sigma: float) -> FloatArray:
+    """Whitened rows (..., C, n) freed of nuisances (..., C, q) of prior σ: ``(I + σ² N Nᵀ)^(-1/2) W`` by an SVD of N.
+
+    An infinite σ projects the nuisances out.
+    """
+    known = np.isfinite(nuisance).all(axis=(-2, -1), keepdims=True)
+    Q, s, _ = np.linalg.svd(np.where(known, nuisance, 0.0), full_matrices=False)
+    present = s > 1e-10 * s.max(axis=-1, keepdims=True, initial=0.0)
+    with np.errstate(invalid="ignore"):
+        shrinkage = np.where(present, 1.0 - 1.0 / np.sqrt(1.0 + (s * sigma) ** 2), 0.0)
+    result: FloatArray = W - Q @ (shrinkage[..., None] * (Q.mT @ W))
+    return np.where(known, result, np.nan)
+
+
+def _sum_of_squares(rows: FloatArray, which: BoolArray) -> FloatArray:
+    """Over the last axis (..., r, n), of those entries that count (..., n): (..., r)."""
+    total: FloatArray = np.sum(np.where(which[..., None, :], rows, 0.0) ** 2, axis=-1)
+    return total
+
+
+def _root_of_sum(rows: FloatArray, inverse: FloatArray, lost: BoolArray) -> FloatArray:
+    """σ of quantities together, by their parts (..., r, n) in the singular vectors; infinite with a part in a lost one.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (..., r, n)
+    inverse : ndarray, shape (..., n)
+        Inverse singular values, zero for lost ones.
+    lost : ndarray of bool, shape (..., n)
+
+    Returns
+    -------
+    ndarray, shape (...)
+    """
+    sigma = np.sqrt(np.sum((rows * inverse[..., None, :]) ** 2, axis=(-2, -1)))
+    hidden = np.sum(_sum_of_squares(rows, lost), axis=-1) > LOST**2
+    result: FloatArray = np.where(hidden, np.inf, sigma)
+    return result
+
+
+def _sources(position_m: ArrayLike, moment_Am2: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    vectors = []
+    for name, value in (("position_m", position_m), ("moment_Am2", moment_Am2)):
+        vector = np.asarray(value, dtype=np.float64)
+        if vector.ndim == 0 or vector.shape[-1] != 3:
+            raise ValueError(f"Input {name} must have shape (..., 3); instead received shape {vector.shape}.")
+        vectors.append(vector)
+    p, m = np.broadcast_arrays(*vectors)
+    return p, m
+
+
+def check_uncertainty(ambient_uncertainty_T: float) -> None:
+    """Raise ValueError for an uncertainty of the ambient field that is none."""
+    if not 0.0 <= ambient_uncertainty_T < np.inf:
+        raise ValueError(
+            f"Input ambient_uncertainty_T must be finite and not negative; instead received {ambient_uncertainty_T}."
+        )

@@ -1,0 +1,130 @@
+"""What the compiled Cramér-Rao bounds of :mod:`magloc.bounds.table_compiled` need of an array.
+
+And the axes they work in.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.array import SensorArray
+from arrays.typing import FloatArray
+from magloc.compilation import compiled
+
+# Information about a parameter that is less than this part of what it would be were the others known is none.
+LOST_INFORMATION = 1e-12
+# Nuisances: components of the common field, its modulus for scalar sensors, components of the ambient field's error.
+COMMON, COMMON_MODULUS, AMBIENT = 0, 3, 4
+
+
+class BoundModel(NamedTuple):
+    """What the kernel needs of an array.
+
+    Attributes
+    ----------
+    centroid : ndarray, shape (3,)
+    sensors : ndarray, shape (N, 3)
+        Positions [m].
+    ambient : ndarray, shape (N, 3)
+        Ambient field at the sensors [T].
+    scalar : ndarray of bool, shape (N,)
+    channel : ndarray, shape (N,)
+        First channel of every sensor.
+    axes : ndarray, shape (C, 3)
+        Row a of every vector channel; (g, 0, 0) of a scalar one.
+    rotations, scales : ndarray, shape (N, 3, 3)
+        From the sensors' axes to the array's; calibration.
+    noise : ndarray, shape (C,)
+        [T]
+    uncertainty : ndarray, shape (N, 2)
+        Standard deviations of turns [rad] and gains.
+    noise_fraction : float
+    nuisances : ndarray, shape (q,)
+        Which ones there are.
+    prior : ndarray, shape (q,)
+        Their inverse standard deviations, 0 if nothing is known [1/T].
+    varies : bool
+        Whether axes or noise depend on the moment.
+    """
+
+    centroid: FloatArray
+    sensors: FloatArray
+    ambient: FloatArray
+    scalar: NDArray[np.bool_]
+    channel: NDArray[np.intp]
+    axes: FloatArray
+    rotations: FloatArray
+    scales: FloatArray
+    noise: FloatArray
+    uncertainty: FloatArray
+    noise_fraction: float
+    nuisances: NDArray[np.intp]
+    prior: FloatArray
+    varies: bool
+
+    @classmethod
+    def of(cls, array: SensorArray, ambient_uncertainty_T: float = 0.0) -> BoundModel:
+        """Model of an array whose ambient field is known to a standard deviation [T] per axis."""
+        scales = np.tile(np.eye(3), (array.n_sensors, 1, 1))
+        for scale, sensor in zip(scales, array.sensors, strict=True):
+            scale[: sensor.n_channels, : sensor.n_channels] = sensor.calibration.scale
+        scalar = np.array([sensor.kind == "scalar" for sensor in array.sensors])
+        deviation = 3 * [0.0 if scalar.all() else _or_infinite(array.common_field_T)]
+        deviation += [_or_infinite(array.common_field_T) if scalar.any() else 0.0]
+        deviation += 3 * [ambient_uncertainty_T if scalar.any() else 0.0]
+        nuisances = np.flatnonzero(deviation)
+        return cls(
+            centroid=read_only(array.centroid),
+            sensors=read_only(array.positions),
+            ambient=read_only(array.ambient_fields),
+            scalar=read_only(scalar),
+            channel=read_only(array.sensor_channels[:, 0]),
+            axes=read_only(array.channel_gain),
+            rotations=read_only(array.rotation_matrices),
+            scales=read_only(scales),
+            noise=read_only(array.channel_noise_T),
+            uncertainty=read_only(np.array([(s.misalignment_rad, s.gain_uncertainty) for s in array.sensors])),
+            noise_fraction=float(array.noise_fraction),
+            nuisances=read_only(nuisances),
+            prior=read_only(1.0 / np.array(deviation)[nuisances]),
+            varies=bool(scalar.any() or array.noise_depends_on_reading),
+        )
+
+
+def read_only(values: NDArray) -> NDArray:  # type: ignore[type-arg]
+    """Contiguous and read-only: numba compiles again for each mix of both."""
+    array = np.ascontiguousarray(values).view()
+    array.setflags(write=False)
+    return array
+
+
+def _or_infinite(deviation: float | None) -> float:
+    return math.inf if deviation is None else deviation
+
+
+@compiled
+def fill_frame(line: FloatArray, frame: FloatArray) -> float:
+    """Axes u, v, n as rows, n along a line, and its length. Duff et al., "Building an orthonormal basis, revisited"."""
+    length = math.sqrt(line[0] * line[0] + line[1] * line[1] + line[2] * line[2])
+    x, y, z = line[0] / length, line[1] / length, line[2] / length
+    sign = math.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    frame[0, 0], frame[0, 1], frame[0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
+    frame[1, 0], frame[1, 1], frame[1, 2] = b, sign + y * y * a, -y
+    frame[2, 0], frame[2, 1], frame[2, 2] = x, y, z
+    return length
+
+
+@compiled
+def turned(frame: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Components of a vector along the rows of a frame."""
+    return (
+        frame[0, 0] * x + frame[0, 1] * y + frame[0, 2] * z,
+        frame[1, 0] * x + frame[1, 1] * y + frame[1, 2] * z,
+        frame[2, 0] * x + frame[2, 1] * y + frame[2, 2] * z,
+    )

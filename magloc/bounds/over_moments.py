@@ -1,0 +1,215 @@
+"""Cramér-Rao bounds of many sources, each with many moments: tables, and statistics over the directions of the moment.
+
+Compiled and parallel; the readable twin of every entry is :func:`magloc.bounds.crlb.bounds_of`, which says what the
+bounds mean and when they are infinite.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from arrays.array import SensorArray
+from arrays.typing import FloatArray
+from magloc.bounds.crlb import check_uncertainty
+from magloc.directions import _fibonacci, sphere_directions
+
+QUANTILES = (0.5, 0.95)
+"""Quantiles over the directions of the moment: the smallest σ that is not exceeded by this share of the directions."""
+
+
+class Spread(NamedTuple):
+    """A σ over the directions of the moment, each of shape (...)."""
+
+    mean: FloatArray
+    median: FloatArray
+    q95: FloatArray
+    worst: FloatArray
+
+
+class MomentBounds(NamedTuple):
+    """Bounds over moments of one size; the worst is that of the sampled directions, see :mod:`magloc.bounds.crlb`."""
+
+    sigma_range_m: Spread
+    sigma_bearing_rad: Spread
+    sigma_position_m: Spread
+
+
+class SigmaTable(NamedTuple):
+    """Bounds of P sources with M moments each, shape (P, M)."""
+
+    range_m: FloatArray
+    bearing_rad: FloatArray
+    position_m: FloatArray
+
+
+def moment_directions(array: SensorArray, n: int = 50) -> FloatArray:
+    """Evenly spread directions of a moment: a Fibonacci lattice.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Bounds of vector sensors are the same for m and -m, so theirs cover half of the sphere.
+    n : int
+        At least 1.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        Unit vectors.
+
+    Raises
+    ------
+    ValueError
+        n is less than 1.
+    """
+    if n < 1:
+        raise ValueError(f"Input n must be at least 1; instead received {n}.")
+    return sphere_directions(n) if array.channel_is_scalar.any() else _fibonacci(n, 0.0)
+
+
+def bounds_over_moments(
+    array: SensorArray,
+    positions_m: ArrayLike,
+    moments_Am2: ArrayLike,
+    *,
+    ambient_uncertainty_T: float = 0.0,
+) -> MomentBounds:
+    """Mean, median, 95 % quantile and worst of the bounds over moments.
+
+    Parameters
+    ----------
+    array : SensorArray
+    positions_m : array_like, shape (P, 3)
+        Sources in the array's frame [m].
+    moments_Am2 : array_like, shape (M, 3)
+        Moments that each of them may have [A·m²]: a size times :func:`moment_directions`.
+    ambient_uncertainty_T : float
+        As for :func:`magloc.bounds.crlb.bounds_of`.
+
+    Returns
+    -------
+    MomentBounds
+        Each of shape (P,).
+
+    Raises
+    ------
+    ValueError
+        A shape is wrong, or the uncertainty is negative or not finite.
+    """
+    none = np.empty((0, 3))
+    _, spreads = table_and_spreads(array, positions_m, none, moments_Am2, ambient_uncertainty_T=ambient_uncertainty_T)
+    return spreads
+
+
+def table_and_spreads(
+    array: SensorArray,
+    positions_m: ArrayLike,
+    alone_Am2: ArrayLike,
+    moments_Am2: ArrayLike,
+    *,
+    ambient_uncertainty_T: float = 0.0,
+) -> tuple[SigmaTable, MomentBounds]:
+    """:func:`sigma_table` of some moments and :func:`bounds_over_moments` of others, in one pass over the sources.
+
+    Parameters
+    ----------
+    array : SensorArray
+    positions_m : array_like, shape (P, 3)
+        Sources in the array's frame [m].
+    alone_Am2 : array_like, shape (K, 3)
+        Moments of the table, or none [A·m²].
+    moments_Am2 : array_like, shape (M, 3)
+        Moments of the spreads [A·m²].
+    ambient_uncertainty_T : float
+        As for :func:`magloc.bounds.crlb.bounds_of`.
+
+    Returns
+    -------
+    tuple
+        Of shape (P, K) and (P,).
+
+    Raises
+    ------
+    ValueError
+        A shape is wrong, or the uncertainty is negative or not finite.
+    """
+    from magloc.bounds import table_compiled as bounds
+    from magloc.bounds.frame_compiled import BoundModel
+
+    positions, moments = _table_inputs(positions_m, moments_Am2)
+    alone = np.ascontiguousarray(alone_Am2, dtype=np.float64)
+    if alone.ndim != 2 or alone.shape[1] != 3:
+        raise ValueError(f"Input alone_Am2 must have shape (n, 3); instead received {alone.shape}.")
+    check_uncertainty(ambient_uncertainty_T)
+    model = BoundModel.of(array, ambient_uncertainty_T)
+    table, spreads = bounds.table_and_spreads(model, positions, alone, moments, np.array(QUANTILES))
+    return SigmaTable(*table), MomentBounds(*(Spread(*spreads[:, i].T) for i in range(3)))
+
+
+def sigma_table(
+    array: SensorArray, positions_m: ArrayLike, moments_Am2: ArrayLike, *, ambient_uncertainty_T: float = 0.0
+) -> SigmaTable:
+    """Bounds of range, bearing and position for every pair of a position and a moment.
+
+    Compiled and parallel; its readable twin is :func:`magloc.bounds.crlb.bounds_of`.
+
+    Parameters
+    ----------
+    array : SensorArray
+    positions_m : array_like, shape (P, 3)
+        Sources in the array's frame [m].
+    moments_Am2 : array_like, shape (M, 3)
+        Moments that each of them may have [A·m²].
+    ambient_uncertainty_T : float
+        As for :func:`magloc.bounds.crlb.bounds_of`.
+
+    Returns
+    -------
+    SigmaTable
+        Infinite where the information is singular, NaN where :class:`magloc.bounds.crlb.Bounds` is.
+
+    Raises
+    ------
+    ValueError
+        A shape is wrong, or the uncertainty is negative or not finite.
+    """
+    from magloc.bounds import table_compiled as bounds
+    from magloc.bounds.frame_compiled import BoundModel
+
+    positions, moments = _table_inputs(positions_m, moments_Am2)
+    check_uncertainty(ambient_uncertainty_T)
+    model, none = BoundModel.of(array, ambient_uncertainty_T), np.empty((0, 3))
+    table, _ = bounds.table_and_spreads(model, positions, moments, none, np.empty(0))
+    return SigmaTable(*table)
+
+
+def spread_over(sigma: ArrayLike) -> Spread:
+    """Statistics of σ over its last axis; infinite ones count.
+
+    Parameters
+    ----------
+    sigma : array_like, shape (..., M)
+
+    Returns
+    -------
+    Spread
+        Each of shape (...). Quantiles are order statistics, so that an infinite neighbour does not spoil them.
+    """
+    ordered = np.sort(np.asarray(sigma, dtype=np.float64), axis=-1)
+    n = ordered.shape[-1]
+    median, q95 = (ordered[..., int(np.ceil(q * n)) - 1] for q in QUANTILES)
+    blank = np.where(np.isnan(ordered[..., -1]), np.nan, 0.0)
+    return Spread(ordered.mean(axis=-1), median + blank, q95 + blank, ordered[..., -1])
+
+
+def _table_inputs(positions_m: ArrayLike, moments_Am2: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    tables = []
+    for name, value in (("positions_m", positions_m), ("moments_Am2", moments_Am2)):
+        rows = np.ascontiguousarray(value, dtype=np.float64)
+        if rows.ndim != 2 or rows.shape[1] != 3 or len(rows) == 0:
+            raise ValueError(f"Input {name} must have shape (n, 3), n at least 1; instead received {rows.shape}.")
+        tables.append(rows)
+    return tables[0], tables[1]

@@ -1,0 +1,1 @@
+"""Calibration of arrays: gains, axes, offsets and places of sensors."""

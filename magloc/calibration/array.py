@@ -1,0 +1,375 @@
+"""Calibration of an array of vector sensors from readings of a source that moves past it.
+
+Positions, gains, axes and offsets of the sensors are estimated together with the source, by least squares over all
+rows (:mod:`magloc.calibration.least_squares`), with the nominal array as a prior. :func:`calibrate_on_path` needs the
+path of the source; :func:`self_calibrate` finds it as well. What the readings do not tell is listed
+(:mod:`magloc.calibration.observability`): there the nominal array speaks alone.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from arrays.array import SensorArray
+from arrays.noise import proportional_noise
+from arrays.typing import BoolArray, FloatArray
+from magloc.calibration import continuation as calibration_steps
+from magloc.calibration import least_squares as source_fit
+from magloc.calibration import model as moving_source
+from magloc.calibration.least_squares import Optimum
+from magloc.calibration.model import AXES, GAINS, OFFSET, PER_SENSOR, POSITION, MomentModel, Problem
+from magloc.calibration.observability import Unobservable, unobservable
+from magloc.localization.search.single_source import Locator
+
+Quantity = Literal["positions", "gains", "axes", "offsets"]
+QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
+# Of the source to the nominal array, whose χ² is a comparison only.
+_ITERATIONS_BEFORE = 10
+_PLACES = {"positions": POSITION, "gains": GAINS, "axes": AXES, "offsets": OFFSET}
+
+
+@dataclass(frozen=True)
+class Prior:
+    """How well the nominal array is known, and what of it is estimated.
+
+    Attributes
+    ----------
+    position_m, gain, axes_rad, offset_T : float
+        Standard deviations: of a position along each axis [m], of a channel's gain (relative), of the direction in
+        which a channel looks, along each of the two other axes [rad], and of an offset [T].
+    estimate : tuple of str
+        Which of positions, gains, axes and offsets are estimated; the others are exactly the nominal ones.
+    trusted_positions, trusted_scales : tuple of str
+        Ids of sensors whose position is exactly the nominal one, or whose gains and axes are.
+
+    Raises
+    ------
+    ValueError
+        A standard deviation is not positive, or nothing of that name can be estimated.
+    """
+
+    position_m: float = 5e-3
+    gain: float = 0.2
+    axes_rad: float = math.radians(3.0)
+    offset_T: float = 1e-4
+    estimate: tuple[Quantity, ...] = QUANTITIES
+    trusted_positions: tuple[str, ...] = ()
+    trusted_scales: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("position_m", "gain", "axes_rad", "offset_T"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise ValueError(f"Input {name} must be positive and finite; instead received {getattr(self, name)}.")
+        for quantity in self.estimate:
+            if quantity not in QUANTITIES:
+                raise ValueError(
+                    f"Input estimate must be some of {', '.join(QUANTITIES)}; instead received {quantity!r}."
+                )
+        if not self.estimate:
+            raise ValueError(f"Input estimate must be some of {', '.join(QUANTITIES)}; instead received none.")
+
+    def deviations(self, n_sensors: int) -> FloatArray:
+        """Standard deviations of all unknowns of the sensors, shape (N, 15)."""
+        row = np.empty(PER_SENSOR)
+        row[POSITION], row[GAINS], row[AXES], row[OFFSET] = self.position_m, self.gain, self.axes_rad, self.offset_T
+        return np.tile(row, (n_sensors, 1))
+
+    def free(self, array: SensorArray) -> BoolArray:
+        """Which unknowns of an array's sensors are estimated, shape (N, 15)."""
+        free = np.zeros((array.n_sensors, PER_SENSOR), dtype=np.bool_)
+        for quantity in self.estimate:
+            free[:, _PLACES[quantity]] = True
+        for ids, places in ((self.trusted_positions, (POSITION,)), (self.trusted_scales, (GAINS, AXES))):
+            for name in ids:
+                if name not in array.ids:
+                    raise ValueError(f"Input prior must trust ids of sensors of the array; instead received {name!r}.")
+                for place in places:
+                    free[array.ids.index(name), place] = False
+        return free
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationResult:
+    """A calibrated array, and how far it can be trusted.
+
+    Attributes
+    ----------
+    array : SensorArray
+        With the estimated positions, scale matrices and offsets; all else as in the nominal array.
+    converged : bool
+        Whether the iteration ended at an optimum; else nothing here is a result.
+    iterations : int
+        Linearisations of the last and finest fit.
+    rows : ndarray of bool, shape (n,)
+        Rows that were used.
+    chi2_before, chi2_after : float
+        Σ ((reading - prediction)/noise)² over the rows, with the nominal and the calibrated sensors, the source fitted
+        to either; with ``common_field_T`` and its prior's term. Both with the noise of the calibrated array.
+    dof_before, dof_after : float
+        Readings minus unknowns, where an unknown of a sensor counts by how much of it the readings tell and not the
+        prior.
+    residual_rms_T : ndarray, shape (N,)
+        Root mean square of the calibrated array's residuals, of every sensor [T].
+    change, standard_deviation : ndarray, shape (N, 15)
+        What the estimate adds to the nominal array, and its posterior standard deviation: position x y z [m], relative
+        gain of channel x y z, axes [rad] (x towards y, x towards z, y towards x, …), offset x y z [T]. The standard
+        deviation is 0 where nothing is estimated.
+    estimated : ndarray of bool, shape (N, 15)
+        Which of them were estimated.
+    covariance : ndarray, shape (F, F)
+        Posterior covariance of ``change[estimated]``.
+    unobservable : tuple of Unobservable
+        Directions that only the prior determines.
+    position_m, moment_Am2 : ndarray, shape (T, 3)
+        The source in the rows that were used: in the array's frame, and in the world frame.
+    """
+
+    array: SensorArray
+    converged: bool
+    iterations: int
+    rows: BoolArray
+    chi2_before: float
+    chi2_after: float
+    dof_before: float
+    dof_after: float
+    residual_rms_T: FloatArray
+    change: FloatArray
+    standard_deviation: FloatArray
+    estimated: BoolArray
+    covariance: FloatArray
+    unobservable: tuple[Unobservable, ...]
+    position_m: FloatArray
+    moment_Am2: FloatArray
+
+
+def calibrate_on_path(
+    array: SensorArray,
+    readings_T: ArrayLike,
+    position_m: ArrayLike,
+    *,
+    moment_Am2: ArrayLike | None = None,
+    moment: Literal["constant", "free"] = "constant",
+    unknown_height: bool = False,
+    prior: Prior = Prior(),
+    world_from_array: ArrayLike | None = None,
+) -> CalibrationResult:
+    """Calibrate an array by a source whose path is known.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Nominal array of vector sensors; its noise weights the readings.
+    readings_T : array_like, shape (n, C)
+        Raw readings in channel order [T]; NaN where missing.
+    position_m : array_like, shape (n, 3)
+        Source in the array's frame [m].
+    moment_Am2 : array_like, shape (n, 3), optional
+        Its moment in the world frame [A·m²], where it is known; `moment` is not used then.
+    moment : {"constant", "free"}
+        Whether the unknown moment is one vector in the world frame, of a source that does not turn, or one for every
+        row.
+    unknown_height : bool
+        Whether a constant is to be added to all positions along the world's z, and estimated.
+    prior : Prior
+    world_from_array : array_like, shape (n, 3, 3), optional
+        Attitude of the array in every row; by default its axes are the world's.
+
+    Returns
+    -------
+    CalibrationResult
+
+    Raises
+    ------
+    ValueError
+        The shapes do not agree, the array has scalar sensors, or there are fewer readings than unknowns.
+    """
+    readings, attitude = _checked(array, readings_T, world_from_array)
+    position = _rows_of_3("position_m", position_m, len(readings))
+    known = None if moment_Am2 is None else _rows_of_3("moment_Am2", moment_Am2, len(readings))
+    model: MomentModel = moment if known is None else "known"
+    problem = _problem(array, readings, attitude, prior, False, unknown_height, model)
+    rows = _usable(problem)
+    problem = _of_rows(problem, rows)
+    _check_counts(problem)
+    start = calibration_steps.untouched(
+        problem, position[rows], np.zeros_like(position[rows]) if known is None else known[rows]
+    )
+    return _result(problem, calibration_steps.fitted(problem, calibration_steps.source_on_path(problem, start)), rows)
+
+
+def self_calibrate(
+    array: SensorArray,
+    readings_T: ArrayLike,
+    *,
+    moment: Literal["constant", "free"] = "constant",
+    prior: Prior = Prior(),
+    world_from_array: ArrayLike | None = None,
+) -> CalibrationResult:
+    """Calibrate an array by a source whose path is unknown.
+
+    The path is found with the sensors, starting from fixes with the nominal array. The array as a whole can be moved,
+    turned and scaled without any effect on the readings: there the prior decides, or the trusted sensors do. A mirror
+    image, all sensors and the path inverted through one point, fits equally well too; the nominal array tells which of
+    the two it is.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Nominal array of vector sensors; its noise weights the readings.
+    readings_T : array_like, shape (n, C)
+        Raw readings in channel order [T]; NaN where missing.
+    moment : {"constant", "free"}
+        Whether the moment is one vector in the world frame, of a source that does not turn, or one for each row.
+    prior : Prior
+    world_from_array : array_like, shape (n, 3, 3), optional
+        Attitude of the array in every row; by default its axes are the world's.
+
+    Returns
+    -------
+    CalibrationResult
+
+    Raises
+    ------
+    ValueError
+        The shapes do not agree, the array has scalar sensors, no row can be located with the nominal array, or there
+        are fewer readings than unknowns.
+    """
+    readings, attitude = _checked(array, readings_T, world_from_array)
+    problem = _problem(array, readings, attitude, prior, True, False, moment)
+    nowhere = np.zeros((len(readings), 3))
+    doubtful = calibration_steps.with_doubted_fields(problem, calibration_steps.untouched(problem, nowhere, nowhere))
+    fixes = Locator(doubtful).fit_rows(readings)
+    rows = np.array([bool(fix.solutions) for fix in fixes]) & _usable(problem)
+    if not rows.any():
+        raise ValueError(
+            "Input readings_T must have rows that can be located with the nominal array; instead none can."
+        )
+    problem = _of_rows(problem, rows)
+    _check_counts(problem)
+    start = calibration_steps.located(problem, [fix for fix, used in zip(fixes, rows, strict=True) if used])
+    # Rows whose sources each have a moment of their own are independent and find their optimum from rough fixes.
+    start = calibration_steps.approached(replace(problem, moment="free"), start, calibration_steps.SHARES[:1])
+    if moment == "constant":
+        # A row on the wrong side of the array would drag the common moment with it: all are looked for once more.
+        start = calibration_steps.with_one_moment(problem, start)
+    return _result(problem, calibration_steps.fitted(problem, start), rows)
+
+
+def _checked(
+    array: SensorArray, readings_T: ArrayLike, world_from_array: ArrayLike | None
+) -> tuple[FloatArray, FloatArray]:
+    if array.channel_is_scalar.any():
+        raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
+    readings = np.asarray(readings_T, dtype=np.float64)
+    if readings.ndim != 2 or readings.shape[1] != array.n_channels:
+        raise ValueError(
+            f"Input readings_T must have shape (n, {array.n_channels}); instead received {readings.shape}."
+        )
+    attitude = np.eye(3) if world_from_array is None else np.asarray(world_from_array, dtype=np.float64)
+    if attitude.shape not in ((3, 3), (len(readings), 3, 3)):
+        raise ValueError(
+            f"Input world_from_array must have shape ({len(readings)}, 3, 3); instead received {attitude.shape}."
+        )
+    return readings, np.broadcast_to(attitude, (len(readings), 3, 3))
+
+
+def _rows_of_3(name: str, value: ArrayLike, n: int) -> FloatArray:
+    rows = np.asarray(value, dtype=np.float64)
+    if rows.shape != (n, 3) or not np.isfinite(rows).all():
+        raise ValueError(f"Input {name} must be finite and have shape ({n}, 3); instead received shape {rows.shape}.")
+    return rows
+
+
+def _problem(
+    array: SensorArray,
+    readings: FloatArray,
+    attitude: FloatArray,
+    prior: Prior,
+    unknown_position: bool,
+    unknown_height: bool,
+    moment: MomentModel,
+) -> Problem:
+    return Problem(
+        array=array,
+        readings_T=readings,
+        noise_T=proportional_noise(array, readings),
+        prior=prior.deviations(array.n_sensors),
+        free=prior.free(array),
+        world_from_array=attitude,
+        unknown_position=unknown_position,
+        unknown_height=unknown_height,
+        moment=moment,
+    )
+
+
+def _usable(problem: Problem) -> BoolArray:
+    """Rows with more readings than unknowns of their own."""
+    usable: BoolArray = np.isfinite(problem.readings_T).sum(axis=1) > problem.n_row_unknowns
+    return usable
+
+
+def _of_rows(problem: Problem, rows: BoolArray) -> Problem:
+    return replace(
+        problem,
+        readings_T=problem.readings_T[rows],
+        noise_T=problem.noise_T[rows],
+        world_from_array=problem.world_from_array[rows],
+    )
+
+
+def _n_readings(problem: Problem) -> int:
+    """Readings minus the unknowns of the rows."""
+    unknown = problem.n_row_unknowns - 3 * (problem.array.common_field_T is not None)
+    return int(np.isfinite(problem.readings_T).sum()) - unknown * len(problem.readings_T)
+
+
+def _check_counts(problem: Problem) -> None:
+    unknowns, left = len(problem.estimated), _n_readings(problem)
+    if left < unknowns:
+        raise ValueError(
+            f"Input readings_T must have more readings than unknowns; instead {len(problem.readings_T)} usable rows "
+            f"leave {left} numbers for {unknowns} unknowns of the sensors and the source."
+        )
+
+
+def _result(problem: Problem, fitted: tuple[Problem, Optimum], rows: BoolArray) -> CalibrationResult:
+    problem, optimum = fitted
+    state = optimum.state
+    nominal = replace(problem, free=np.zeros_like(problem.free))
+    untouched = replace(state, sensors=np.zeros_like(state.sensors))
+    before = source_fit.minimised(nominal, untouched, max_iterations=_ITERATIONS_BEFORE)
+    after = moving_source.chi2(problem, state)
+    told = source_fit.information_of_sensors(problem, state)
+    n = len(told)
+    relative = np.linalg.inv(told + np.eye(n))
+    covariance = relative * np.outer(problem.prior[problem.free], problem.prior[problem.free])
+    deviation = np.zeros(problem.prior.shape)
+    deviation[problem.free] = np.sqrt(np.diagonal(covariance))
+    told_numbers = n - float(np.trace(relative))
+    residual = moving_source.residuals(problem, state) * problem.noise_T
+    squares = (residual**2).reshape(len(residual), -1, 3)
+    counts = np.isfinite(problem.readings_T).reshape(squares.shape).sum(axis=(0, 2))
+    array_from_world = np.swapaxes(problem.world_from_array, -1, -2)
+    return CalibrationResult(
+        array=calibration_steps.calibrated_array(problem.array, state.sensors),
+        converged=optimum.converged,
+        iterations=optimum.iterations,
+        rows=rows,
+        chi2_before=moving_source.chi2(nominal, before.state),
+        chi2_after=after,
+        dof_before=_n_readings(problem) - problem.n_globals,
+        dof_after=_n_readings(problem) - problem.n_globals - told_numbers,
+        residual_rms_T=np.sqrt(squares.sum(axis=(0, 2)) / np.maximum(counts, 1)),
+        change=state.sensors,
+        standard_deviation=deviation,
+        estimated=problem.free,
+        covariance=covariance,
+        unobservable=unobservable(problem, state, told),
+        position_m=state.position_m + state.height_m * array_from_world[..., 2],
+        moment_Am2=np.array(state.moment_Am2),
+    )

@@ -1,0 +1,211 @@
+"""Least squares for an array and a source that moves past it, the unknowns of the rows eliminated.
+
+The unknowns of a row touch no other row. They are eliminated by a QR factorisation of their own few columns, batched
+over the rows (the Schur complement in its orthogonal form), so that a step solves one linear system in the unknowns of
+the sensors and of the source alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from arrays.typing import FloatArray
+from magloc.calibration.model import PER_SENSOR, Linearisation, Problem, State, common_weight, cost, linearised
+
+# Enough to hold what no reading shows, too little to be taken for information.
+_NO_DAMPING = 1e-20
+_LEAST_DAMPING = 1e-10
+_FIRST_DAMPING = 1e-3
+_LARGEST_DAMPING = 1e12
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """Normal equations of the unknowns of sensors and source that are estimated, those of the rows eliminated.
+
+    Attributes
+    ----------
+    information : ndarray, shape (P, P)
+        Of the readings alone; P counts the F free unknowns of the sensors, then those of the source.
+    gradient : ndarray, shape (P,)
+        Of half of χ².
+    by_row, row_gradient, row_factor : ndarray, shapes (T, n, P), (T, n), (T, n, n)
+        What :func:`row_step` needs.
+    """
+
+    information: FloatArray
+    gradient: FloatArray
+    by_row: FloatArray
+    row_gradient: FloatArray
+    row_factor: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """Where the iteration ended.
+
+    Attributes
+    ----------
+    state : State
+    cost : float
+        χ² of the readings and of all priors.
+    iterations : int
+    converged : bool
+        Whether a full step would lower the cost by less than the tolerance.
+    """
+
+    state: State
+    cost: float
+    iterations: int
+    converged: bool
+
+
+def reduced(problem: Problem, state: State, linear: Linearisation, damping: float = _NO_DAMPING) -> Reduced:
+    """Normal equations of sensors and source; the damping is that of the rows' unknowns, relative to their information.
+
+    With the rows' columns ``J = Q R`` (priors and damping appended as further rows) what remains of the other columns
+    is their part orthogonal to Q.
+    """
+    n_rows, n_channels, n = linear.by_row.shape
+    n_sensors = problem.array.n_sensors
+    prior = np.zeros((3, n))
+    prior[:, -3:] = common_weight(problem) * np.eye(3)
+    size = np.sqrt(np.einsum("tcn,tcn->tn", linear.by_row, linear.by_row) + np.sum(prior**2, axis=0))
+    # An unknown that no reading shows keeps a column of its own: it stays where it is.
+    damped = np.sqrt(damping) * np.where(size > 0.0, size, 1.0)[..., None] * np.eye(n)
+    stacked = np.concatenate([linear.by_row, np.broadcast_to(prior, (n_rows, 3, n)), damped], axis=1)
+    q, r = np.linalg.qr(stacked)
+    q_readings = q[:, :n_channels]
+    row_gradient: FloatArray = np.einsum("tcn,tc->tn", q_readings, linear.residual)
+    row_gradient += np.einsum("tan,ta->tn", q[:, n_channels : n_channels + 3], state.common_T * common_weight(problem))
+
+    blocks = np.swapaxes(q_readings.reshape(n_rows, n_sensors, 3, n), -1, -2) @ linear.by_sensor
+    by_row = np.concatenate(
+        [
+            blocks.transpose(0, 2, 1, 3).reshape(n_rows, n, -1)[..., problem.free.ravel()],
+            np.swapaxes(q_readings, -1, -2) @ linear.by_source,
+        ],
+        axis=-1,
+    )
+    flat = by_row.reshape(n_rows * n, by_row.shape[-1])
+    information, gradient = _not_reduced(linear)
+    information = information[np.ix_(problem.estimated, problem.estimated)] - flat.T @ flat
+    gradient = gradient[problem.estimated] - flat.T @ row_gradient.ravel()
+    return Reduced(information, gradient, by_row, row_gradient, r)
+
+
+def row_step(equations: Reduced, step: FloatArray) -> FloatArray:
+    """Step of the rows' unknowns (T, n) that goes with a step of those of sensors and source (P,)."""
+    right = equations.row_gradient + equations.by_row @ step
+    return np.asarray(-np.linalg.solve(equations.row_factor, right[..., None])[..., 0], dtype=np.float64)
+
+
+def information_of_sensors(problem: Problem, state: State) -> FloatArray:
+    """What the readings alone tell of the sensors' free unknowns, all else eliminated: (F, F), in prior deviations."""
+    information = reduced(problem, state, linearised(problem, state)).information
+    n = int(problem.free.sum())
+    cross, own = information[:n, n:], information[n:, n:]
+    # A constant of the source that no reading shows has no information to eliminate.
+    result: FloatArray = information[:n, :n] - cross @ np.linalg.pinv(own, hermitian=True) @ cross.T
+    return result
+
+
+def minimised(
+    problem: Problem,
+    start: State,
+    *,
+    tolerance: float = 1e-3,
+    max_iterations: int = 100,
+) -> Optimum:
+    """Levenberg-Marquardt from a start; only steps that lower the cost are taken.
+
+    Parameters
+    ----------
+    problem : Problem
+    start : State
+    tolerance : float
+        The iteration has converged when a full step promises to lower χ² by less than this, or by less than a part in
+        10¹⁰.
+    max_iterations : int
+        Linearisations at most.
+
+    Returns
+    -------
+    Optimum
+    """
+    state, value = start, cost(problem, start)
+    n_free = int(problem.free.sum())
+    # The priors of the sensors' unknowns, which are counted in prior deviations; the source has none.
+    prior = np.diag((np.arange(n_free + problem.n_globals) < n_free).astype(np.float64))
+    damping = _FIRST_DAMPING
+    for iteration in range(1, max_iterations + 1):
+        linear = linearised(problem, state)
+        while True:
+            equations = reduced(problem, state, linear, damping)
+            gradient = equations.gradient.copy()
+            gradient[:n_free] += (state.sensors / problem.prior)[problem.free]
+            information = equations.information + prior
+            size = np.maximum(np.diagonal(information), np.finfo(np.float64).tiny)
+            step = -np.asarray(np.linalg.solve(information + np.diag(damping * size), gradient), dtype=np.float64)
+            promised = float(-gradient @ step + np.sum(equations.row_gradient**2))
+            # No step goes farther than the prior: the field is far from linear in the positions.
+            step /= max(1.0, float(np.abs(step[:n_free]).max(initial=0.0)))
+            of_rows = row_step(equations, step)
+            candidate = moved(problem, state, step, of_rows)
+            with np.errstate(over="ignore", invalid="ignore"):
+                candidate_value = cost(problem, candidate)
+            if candidate_value <= value or promised <= tolerance:
+                break
+            damping *= 8.0
+            if damping > _LARGEST_DAMPING:
+                return Optimum(state, value, iteration, False)
+        decrease = value - candidate_value
+        if decrease >= 0.0:
+            state, value = candidate, candidate_value
+        if damping <= 1e-2 and (promised <= tolerance or decrease <= 1e-10 * value):
+            return Optimum(state, value, iteration, True)
+        damping = max(damping / 8.0, _LEAST_DAMPING)
+    return Optimum(state, value, max_iterations, False)
+
+
+def moved(problem: Problem, state: State, step: FloatArray, of_rows: FloatArray) -> State:
+    """A state after a step of the unknowns of sensors and source (P,) and of the rows (T, n)."""
+    n = int(problem.free.sum())
+    sensors = state.sensors.copy()
+    sensors[problem.free] += problem.prior[problem.free] * step[:n]
+    position, height, moment = state.position_m, state.height_m, state.moment_Am2
+    if problem.unknown_position:
+        # A source that is thrown far away would not come back: its field, and with it every slope, is gone.
+        length = np.linalg.norm(of_rows[:, :3], axis=1, keepdims=True)
+        radius = problem.array.circumradius
+        of_rows = of_rows * (radius / np.maximum(length, radius))
+        position = position + of_rows[:, :3]
+    if problem.unknown_height:
+        height = height + float(step[-1])
+    if problem.moment == "free":
+        moment = moment + of_rows[:, -6:-3]
+    elif problem.moment == "constant":
+        moment = moment + step[n : n + 3]
+    return State(sensors, position, height, moment, state.common_T + of_rows[:, -3:])
+
+
+def _not_reduced(linear: Linearisation) -> tuple[FloatArray, FloatArray]:
+    """Information and gradient before the rows' unknowns are eliminated."""
+    n_rows, n_sensors = linear.by_sensor.shape[:2]
+    n, g = n_sensors * PER_SENSOR, linear.by_source.shape[-1]
+    information, gradient = np.zeros((n + g, n + g)), np.zeros(n + g)
+    by_source = linear.by_source.reshape(n_rows, n_sensors, 3, g)
+    residual = linear.residual.reshape(n_rows, n_sensors, 3)
+    for i in range(n_sensors):
+        block = slice(i * PER_SENSOR, (i + 1) * PER_SENSOR)
+        own = linear.by_sensor[:, i].reshape(-1, PER_SENSOR)
+        information[block, block] = own.T @ own
+        information[block, n:] = own.T @ by_source[:, i].reshape(3 * n_rows, g)
+        gradient[block] = own.T @ residual[:, i].ravel()
+    flat = by_source.reshape(3 * n_rows * n_sensors, g)
+    information[n:, :n] = information[:n, n:].T
+    information[n:, n:] = flat.T @ flat
+    gradient[n:] = flat.T @ linear.residual.ravel()
+    return information, gradient

@@ -1,0 +1,233 @@
+r"""What an array of vector sensors reads of a source that moves past it, as a function of every unknown.
+
+In row t (one instant) sensor i reads
+
+.. math:: y_{ti} = (I + E_i) K_i \left( B(s_i + d_i;\, p_t, m_t) + c_t \right) + o_i + h_i,
+
+with the nominal calibration and rotation :math:`K_i`, nominal position :math:`s_i` and offset :math:`o_i`, the field B
+of the dipole of moment :math:`m_t` at :math:`p_t`, and a field :math:`c_t` common to all sensors. Unknown are
+
+* of every sensor 15 numbers: the displacement d, the relative gains diag E, the axes (E off its diagonal: which way
+  each channel looks) and the offset h;
+* of the source as a whole: its moment in the world frame if it does not turn, its height if the path does not give it;
+* of every row: the position if the path is unknown, the moment if it is free, the common field.
+
+Unknowns of the sensors are counted in units of their prior standard deviations. :mod:`magloc.calibration.least_squares`
+fits them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.array import SensorArray
+from arrays.typing import BoolArray, FloatArray
+from magloc.fields import dipole
+
+MomentModel = Literal["constant", "free", "known"]
+"""The moment in the world frame: one unknown vector for all rows, one for every row, or known."""
+PER_SENSOR = 15
+POSITION, GAINS, AXES, OFFSET = slice(0, 3), slice(3, 6), slice(6, 12), slice(12, 15)
+AXIS_PAIRS = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
+"""Channel and component of the six axis unknowns."""
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """Values of all unknowns.
+
+    Attributes
+    ----------
+    sensors : ndarray, shape (N, 15)
+        Displacement [m], relative gains, axes [rad], offset [T] of every sensor, as deviations from the nominal array.
+    position_m : ndarray, shape (T, 3)
+        Source in the array's frame, without the unknown height.
+    height_m : float
+        Added along the world's z.
+    moment_Am2 : ndarray, shape (T, 3)
+        Moment in the world frame; equal rows if it is constant.
+    common_T : ndarray, shape (T, 3)
+        Field common to all sensors, in the array's frame.
+    """
+
+    sensors: FloatArray
+    position_m: FloatArray
+    height_m: float
+    moment_Am2: FloatArray
+    common_T: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Readings, and what is unknown of sensors, source and rows.
+
+    Attributes
+    ----------
+    array : SensorArray
+        Nominal; vector sensors only.
+    readings_T : ndarray, shape (T, C)
+        Raw readings; NaN where missing.
+    noise_T : ndarray, shape (T, C)
+        Standard deviations.
+    prior : ndarray, shape (N, 15)
+        Standard deviations of the sensors' unknowns around the nominal array.
+    free : ndarray of bool, shape (N, 15)
+        Which of them are estimated.
+    world_from_array : ndarray, shape (T, 3, 3)
+        Attitude of the array in every row.
+    unknown_position : bool
+        Whether the rows' positions are unknown.
+    unknown_height : bool
+        Whether one height of all rows, along the world's z, is unknown.
+    moment : {"constant", "free", "known"}
+    """
+
+    array: SensorArray
+    readings_T: FloatArray
+    noise_T: FloatArray
+    prior: FloatArray
+    free: BoolArray
+    world_from_array: FloatArray
+    unknown_position: bool
+    unknown_height: bool
+    moment: MomentModel
+
+    @property
+    def n_globals(self) -> int:
+        """Unknowns of the source as a whole."""
+        return 3 * (self.moment == "constant") + self.unknown_height
+
+    @property
+    def n_row_unknowns(self) -> int:
+        """Unknowns of one row."""
+        return 3 * self.unknown_position + 3 * (self.moment == "free") + 3
+
+    @property
+    def estimated(self) -> NDArray[np.intp]:
+        """Indices of the estimated unknowns among the 15 N of the sensors and the g of the source."""
+        n = self.free.size
+        return np.concatenate([np.flatnonzero(self.free.ravel()), np.arange(n, n + self.n_globals)])
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """Whitened residuals and their derivatives.
+
+    Attributes
+    ----------
+    residual : ndarray, shape (T, C)
+        (prediction - reading) / noise; zero where missing.
+    by_sensor : ndarray, shape (T, N, 3, 15)
+        By the unknowns of the channel's sensor, in prior standard deviations.
+    by_source : ndarray, shape (T, C, g)
+        By the constant moment and the height.
+    by_row : ndarray, shape (T, C, n)
+        By the row's position, moment and common field.
+    """
+
+    residual: FloatArray
+    by_sensor: FloatArray
+    by_source: FloatArray
+    by_row: FloatArray
+
+
+def responses(problem: Problem, state: State) -> FloatArray:
+    """(I + E) K of every sensor, shape (N, 3, 3): from fields in the array's frame to readings."""
+    result: FloatArray = response_factors(state.sensors) @ problem.array.channel_gain.reshape(-1, 3, 3)
+    return result
+
+
+def response_factors(sensors: FloatArray) -> FloatArray:
+    """I + E of every sensor, shape (N, 3, 3), from its unknowns (N, 15)."""
+    factors = np.tile(np.eye(3), (len(sensors), 1, 1))
+    factors[:, range(3), range(3)] += sensors[:, GAINS]
+    for k, (channel, component) in enumerate(AXIS_PAIRS):
+        factors[:, channel, component] = sensors[:, AXES.start + k]
+    return factors
+
+
+def predicted_T(problem: Problem, state: State) -> FloatArray:
+    """Predicted readings, shape (T, C) [T]."""
+    points, sources, moments = _geometry(problem, state)
+    fields = dipole.field(points, sources, moments) + state.common_T[:, None, :]
+    readings = np.einsum("iab,tib->tia", responses(problem, state), fields) + state.sensors[:, OFFSET]
+    return readings.reshape(len(fields), -1) + problem.array.channel_offset_T
+
+
+def residuals(problem: Problem, state: State) -> FloatArray:
+    """Whitened residuals of all readings, shape (T, C); zero where a reading is missing."""
+    difference = predicted_T(problem, state) - problem.readings_T
+    return np.where(np.isfinite(problem.readings_T), difference / problem.noise_T, 0.0)
+
+
+def chi2(problem: Problem, state: State) -> float:
+    """χ² of the readings, the prior of the common field included if there is one."""
+    common = state.common_T * common_weight(problem)
+    return float(np.sum(residuals(problem, state) ** 2) + np.sum(common**2))
+
+
+def cost(problem: Problem, state: State) -> float:
+    """χ² of the readings and of all priors."""
+    return chi2(problem, state) + float(np.sum((state.sensors / problem.prior)[problem.free] ** 2))
+
+
+def linearised(problem: Problem, state: State) -> Linearisation:
+    """Residuals of a state and their derivatives by every unknown."""
+    array = problem.array
+    n_rows, n_sensors = len(state.position_m), array.n_sensors
+    points, sources, moments = _geometry(problem, state)
+    weight = np.where(np.isfinite(problem.readings_T), 1.0 / problem.noise_T, 0.0).reshape(n_rows, n_sensors, 3, 1)
+    response = weight * responses(problem, state)
+    gradient = response @ dipole.gradient_tensor(points, sources, moments)
+    by_moment = response @ dipole.field_matrix(points, sources)
+    fields = dipole.field(points, sources, moments) + state.common_T[:, None, :]
+    nominal = np.einsum("iab,tib->tia", array.channel_gain.reshape(-1, 3, 3), fields)
+
+    by_sensor = np.zeros((n_rows, n_sensors, 3, PER_SENSOR))
+    by_sensor[..., POSITION] = gradient
+    by_sensor[..., GAINS] = nominal[..., None] * np.eye(3)
+    for k, (channel, component) in enumerate(AXIS_PAIRS):
+        by_sensor[..., channel, AXES.start + k] = nominal[..., component]
+    by_sensor[..., OFFSET] = np.eye(3)
+    by_sensor[..., GAINS.start :] *= weight
+    by_sensor *= np.where(problem.free, problem.prior, 0.0)[:, None, :]
+
+    array_from_world = np.swapaxes(problem.world_from_array, -1, -2)[:, None]
+    by_world_moment = by_moment @ array_from_world
+    up = -gradient @ array_from_world[..., 2:]
+    none = np.empty((n_rows, n_sensors, 3, 0))
+    by_source = [
+        by_world_moment if problem.moment == "constant" else none,
+        up if problem.unknown_height else none,
+    ]
+    by_row = [
+        -gradient if problem.unknown_position else none,
+        by_world_moment if problem.moment == "free" else none,
+        response,
+    ]
+    shape = (n_rows, array.n_channels)
+    return Linearisation(
+        residual=residuals(problem, state),
+        by_sensor=by_sensor,
+        by_source=np.concatenate(by_source, axis=-1).reshape(*shape, problem.n_globals),
+        by_row=np.concatenate(by_row, axis=-1).reshape(*shape, problem.n_row_unknowns),
+    )
+
+
+def _geometry(problem: Problem, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sensors (N, 3), sources and moments (T, 1, 3), all in the array's frame."""
+    points = problem.array.positions + state.sensors[:, POSITION]
+    array_from_world = np.swapaxes(problem.world_from_array, -1, -2)
+    sources = state.position_m + state.height_m * array_from_world[..., 2]
+    moments = np.einsum("tab,tb->ta", array_from_world, state.moment_Am2)
+    return points, sources[:, None, :], moments[:, None, :]
+
+
+def common_weight(problem: Problem) -> float:
+    """1/σ of the common field [1/T]; zero if nothing is known of it."""
+    sigma = problem.array.common_field_T
+    return 0.0 if sigma is None else 1.0 / max(sigma, 1e-15)

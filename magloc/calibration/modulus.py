@@ -1,0 +1,388 @@
+r"""Calibration of one vector sensor from the modulus of the field alone, while the sensor is turned in it.
+
+The readings of a sensor that is turned in a field of known modulus M lie on an ellipsoid,
+
+.. math:: r = o + M P u + n, \qquad |u| = 1,
+
+with the offset o and the scale matrix S = P Q, P symmetric and positive definite, Q a rotation. The modulus says
+nothing of Q: a turn of the sensor's axes is not observable (attitude-independent calibration), P and o are.
+
+Estimated is the maximum of the likelihood with every direction u unknown: the sum of the squared distances of the
+readings from their ellipsoids. The nearest point has two unknowns per reading, which biases the distance by
+:math:`σ^2 (κ_1 + κ_2) / 2` with the principal curvatures κ of the ellipsoid; that is subtracted. To second order in σ/M
+the distance is then unbiased, uncorrelated with the error of the nearest point, and of variance σ² for every reading,
+whatever P is.
+
+TWOSTEP (R. Alonso, M. D. Shuster, "Complete linear attitude-independent magnetometer calibration", Journal of the
+Astronautical Sciences 50, 2002) uses the same likelihood of |field|² with mean -tr Σ and variance 4 Bᵀ Σ B + 2 tr Σ², Σ
+being isotropic in the axes of the field; the two agree to first order in σ/M. Its centred start needs a modulus that
+varies; here it may be constant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from arrays.array import SensorArray
+from arrays.sensor import Calibration
+from arrays.typing import FloatArray
+
+N_PARAMETERS = 9
+"""Three of the offset, six of the symmetric scale matrix."""
+_ROW, _COLUMN = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
+_MAX_ITERATIONS = 100
+_LARGEST_DAMPING = 1e12
+# A step that changes the fit by less than this, in standard deviations or relative to the rounding of the readings.
+_SETTLED = 1e-9
+_SETTLED_RTOL = 1e-13
+_NEAREST_ITERATIONS = 50
+# Where the algebraic fit looks for the squared distance of the readings' mean from the offset, in squared mean moduli.
+_LARGEST_SHIFT = 2.0
+_SHIFTS = 81
+_BISECTIONS = 40
+# Relative standard deviation beyond which a linearised fit is none.
+_LARGEST_UNCERTAINTY = 0.02
+# Factor by which χ² two standard deviations along the least known direction may be off.
+_LARGEST_BEND = 2.0
+# Noise over the least radius of curvature beyond which the distance's bias is no longer that of second order.
+_LARGEST_NOISE = 0.2
+# Noise spreads the readings by σ/M and feigns information of that size about what they do not cover.
+_FEIGNED = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class EllipsoidCalibration:
+    """Scale and offset of a sensor, as far as the modulus of the field tells them.
+
+    Where `converged` is false, nothing is known: `reason` says why, and all numbers are NaN.
+
+    Attributes
+    ----------
+    scale : ndarray, shape (3, 3)
+        Symmetric positive definite P; the sensor's scale matrix is P Q with an unknown rotation Q.
+    offset_T : ndarray, shape (3,)
+        Reading in zero field [T].
+    covariance : ndarray, shape (9, 9)
+        Of (offset x y z [T], scale xx yy zz xy xz yz), from the stated noise and an exactly known modulus.
+    chi2 : float
+        Sum of squared distances from the ellipsoid, bias removed, over the noise squared.
+    dof : int
+        Readings minus nine.
+    iterations : int
+    converged : bool
+    reason : str
+        Empty if it converged.
+    """
+
+    scale: FloatArray
+    offset_T: FloatArray
+    covariance: FloatArray
+    chi2: float
+    dof: int
+    iterations: int
+    converged: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Readings and moduli in units of their own size, so that P is about 1."""
+
+    readings: FloatArray
+    modulus: FloatArray
+    noise: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    offset: FloatArray
+    scale: FloatArray
+    residual: FloatArray
+    jacobian: FloatArray
+    chi2: float
+
+
+def ellipsoid_calibration(readings_T: ArrayLike, modulus_T: ArrayLike, noise_T: float) -> EllipsoidCalibration:
+    """Calibrate a vector sensor that was turned in a field of known modulus.
+
+    Parameters
+    ----------
+    readings_T : array_like, shape (n, 3)
+        Raw readings [T]; rows with a NaN are left out.
+    modulus_T : array_like, shape () or (n,)
+        Modulus of the field in every row [T].
+    noise_T : float
+        Standard deviation of the readings per axis [T].
+
+    Returns
+    -------
+    EllipsoidCalibration
+        Not converged where there are fewer than nine complete readings, or where they do not determine all nine
+        parameters: readings in one plane, in one small cap or along a few directions.
+
+    Raises
+    ------
+    ValueError
+        The shapes do not agree, or a modulus or the noise is not positive and finite.
+    """
+    readings, modulus = _checked(readings_T, modulus_T, noise_T)
+    if len(readings) < N_PARAMETERS:
+        return _failure(f"{len(readings)} complete readings are fewer than the nine unknowns", len(readings), 0)
+    centre, field_unit = readings.mean(axis=0), float(np.sqrt(np.mean(modulus**2)))
+    unit = float(np.sqrt(np.mean(np.sum((readings - centre) ** 2, axis=1))))
+    if unit == 0.0:
+        return _failure("all readings are the same", len(readings), 0)
+    problem = _Problem((readings - centre) / unit, modulus / field_unit, noise_T / unit)
+    fit, iterations, converged = _best_fit(problem)
+    if not converged:
+        return _failure("the iteration did not converge", len(readings), iterations)
+    if problem.noise > _LARGEST_NOISE * _least_radius_of_curvature(problem, fit):
+        return _failure("the noise is not small against the ellipsoid's radii of curvature", len(readings), iterations)
+    root = _root_covariance(problem, fit)
+    if root is None:
+        return _failure("the readings do not determine all nine parameters", len(readings), iterations)
+    to_si = np.repeat([unit, unit / field_unit], [3, 6])
+    root = to_si[:, None] * root
+    return EllipsoidCalibration(
+        scale=fit.scale * (unit / field_unit),
+        offset_T=centre + unit * fit.offset,
+        covariance=root @ root.T,
+        chi2=fit.chi2,
+        dof=len(readings) - N_PARAMETERS,
+        iterations=iterations,
+        converged=True,
+    )
+
+
+def calibrated_in_modulus(
+    array: SensorArray, readings_T: ArrayLike, modulus_T: ArrayLike
+) -> tuple[SensorArray, dict[str, EllipsoidCalibration]]:
+    """Calibrate every vector sensor of an array that was turned in a field of known modulus.
+
+    Of all scale matrices P Q that the readings allow, the one nearest to the sensor's previous scale matrix is taken,
+    because the readings do not tell how the sensor's axes are turned. What is not known of that belongs into the
+    sensor's ``misalignment_rad``.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Its noise is that of the readings.
+    readings_T : array_like, shape (n, C)
+        Raw readings in channel order [T]; NaN where missing.
+    modulus_T : array_like, shape () or (n,)
+        Modulus of the field in every row, the same at all sensors [T].
+
+    Returns
+    -------
+    array : SensorArray
+        With the calibrations of the sensors whose fit converged; the other sensors as they were.
+    results : dict
+        The fit of every vector sensor, by its id.
+
+    Raises
+    ------
+    ValueError
+        The shapes do not agree, a modulus is not positive and finite, or the array has no vector sensor.
+    """
+    readings = np.asarray(readings_T, dtype=np.float64)
+    if readings.ndim != 2 or readings.shape[1] != array.n_channels:
+        raise ValueError(
+            f"Input readings_T must have shape (n, {array.n_channels}); instead received {readings.shape}."
+        )
+    if array.channel_is_scalar.all():
+        raise ValueError("Input array must have a vector sensor; instead received scalar sensors only.")
+    sensors, results = list(array.sensors), {}
+    for i, sensor in enumerate(array.sensors):
+        if sensor.kind != "vector":
+            continue
+        result = ellipsoid_calibration(readings[:, array.sensor_channels[i]], modulus_T, sensor.noise_T)
+        results[sensor.id] = result
+        if result.converged:
+            # The rotation Q that brings P Q nearest to the previous scale matrix: orthogonal Procrustes.
+            left, _, right = np.linalg.svd(result.scale @ np.asarray(sensor.calibration.scale))
+            calibration = Calibration.of("vector", result.scale @ left @ right, result.offset_T)
+            sensors[i] = replace(sensor, calibration=calibration)
+    return replace(array, sensors=tuple(sensors)), results
+
+
+def _checked(readings_T: ArrayLike, modulus_T: ArrayLike, noise_T: float) -> tuple[FloatArray, FloatArray]:
+    readings = np.asarray(readings_T, dtype=np.float64)
+    if readings.ndim != 2 or readings.shape[1] != 3:
+        raise ValueError(f"Input readings_T must have shape (n, 3); instead received {readings.shape}.")
+    modulus = np.asarray(modulus_T, dtype=np.float64)
+    if modulus.shape not in ((), (len(readings),)):
+        raise ValueError(
+            f"Input modulus_T must be a number or have shape ({len(readings)},); instead received {modulus.shape}."
+        )
+    if not (np.isfinite(modulus).all() and (modulus > 0.0).all()):
+        raise ValueError(
+            f"Input modulus_T must be positive and finite; instead received {modulus.min(initial=np.inf)}."
+        )
+    if not 0.0 < noise_T < np.inf:
+        raise ValueError(f"Input noise_T must be positive and finite; instead received {noise_T}.")
+    complete = np.isfinite(readings).all(axis=1)
+    return readings[complete], np.broadcast_to(modulus, len(readings))[complete]
+
+
+def _failure(reason: str, n_readings: int, iterations: int) -> EllipsoidCalibration:
+    return EllipsoidCalibration(
+        scale=np.full((3, 3), np.nan),
+        offset_T=np.full(3, np.nan),
+        covariance=np.full((N_PARAMETERS, N_PARAMETERS), np.nan),
+        chi2=np.nan,
+        dof=n_readings - N_PARAMETERS,
+        iterations=iterations,
+        converged=False,
+        reason=reason,
+    )
+
+
+def _best_fit(problem: _Problem) -> tuple[_Fit, int, bool]:
+    """The best of the fits from all starts."""
+    fits = [_minimised(problem, offset, scale) for offset, scale in _starts(problem)]
+    return min(fits, key=lambda fit: (not fit[2], fit[0].chi2))
+
+
+def _starts(problem: _Problem) -> list[tuple[FloatArray, FloatArray]]:
+    """A sphere about the readings' mean, and every algebraic fit that is an ellipsoid.
+
+    ``rᵀ A r - 2 bᵀ r = M² - c`` is linear in A = P⁻² and b = A o but for c = oᵀ A o, which is found by bisection.
+    """
+    r = problem.readings
+    columns = np.concatenate([r[:, _ROW] * r[:, _COLUMN] * np.where(_ROW == _COLUMN, 1.0, 2.0), -2.0 * r], axis=1)
+    right = np.stack([problem.modulus**2, np.ones(len(r))], axis=1)
+    of_modulus, of_one = np.linalg.lstsq(columns, right, rcond=None)[0].T
+
+    def algebraic(c: float) -> tuple[FloatArray, FloatArray, float] | None:
+        x = of_modulus - c * of_one
+        value, vector = np.linalg.eigh(_symmetric(x[:6]))
+        if value[0] <= 0.0:
+            return None
+        offset = (vector / value) @ vector.T @ x[6:]
+        return offset, (vector / np.sqrt(value)) @ vector.T, float(offset @ x[6:]) - c
+
+    starts = [(np.zeros(3), np.eye(3))]
+    grid = np.linspace(0.0, _LARGEST_SHIFT, _SHIFTS)
+    for low, high in pairwise(grid.tolist()):
+        first, last = algebraic(low), algebraic(high)
+        if first is None or last is None or first[2] * last[2] > 0.0:
+            continue
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (low + high)
+            between = algebraic(middle)
+            if between is None:
+                break
+            low, high = (middle, high) if between[2] * first[2] > 0.0 else (low, middle)
+            last = between
+        starts.append(last[:2])
+    return starts
+
+
+def _minimised(problem: _Problem, offset: FloatArray, scale: FloatArray) -> tuple[_Fit, int, bool]:
+    """Damped Gauss-Newton on the squared distances."""
+    fit = _linearised(problem, offset, scale)
+    rounding = _SETTLED_RTOL * np.sqrt(len(problem.readings)) / problem.noise
+    damping = 1e-3
+    for iteration in range(1, _MAX_ITERATIONS + 1):
+        q, triangle = np.linalg.qr(fit.jacobian)
+        right = np.concatenate([q.T @ fit.residual, np.zeros(N_PARAMETERS)])
+        weights = np.diag(np.linalg.norm(triangle, axis=0))
+        while True:
+            # By orthogonal transformations, because normal equations would square the condition of a poor coverage.
+            step = -np.linalg.lstsq(np.concatenate([triangle, np.sqrt(damping) * weights]), right, rcond=None)[0]
+            trial = _linearised(problem, fit.offset + step[:3], fit.scale + _symmetric(step[3:]))
+            settled = float(np.linalg.norm(fit.jacobian @ step)) <= max(_SETTLED, rounding)
+            if trial.chi2 <= fit.chi2 or settled or damping > _LARGEST_DAMPING:
+                break
+            damping = max(10.0 * damping, 1e-6)
+        if trial.chi2 <= fit.chi2:
+            fit, damping = trial, 0.0 if damping < 1e-9 else 0.1 * damping
+        if settled or damping > _LARGEST_DAMPING:
+            return fit, iteration, bool(settled)
+    return fit, _MAX_ITERATIONS, False
+
+
+def _linearised(problem: _Problem, offset: FloatArray, scale: FloatArray) -> _Fit:
+    """Distances over the noise, bias removed, and their derivatives by (offset, P); χ² is infinite without P > 0."""
+    size, axes = np.linalg.eigh(scale)
+    if size[0] <= 0.0:
+        return _Fit(offset, scale, np.empty(0), np.empty((0, N_PARAMETERS)), np.inf)
+    semi_axes = problem.modulus[:, None] * size
+    points = (problem.readings - offset) @ axes
+    nearest = _nearest(points, semi_axes)
+    normal = nearest / semi_axes**2
+    steepness = np.linalg.norm(normal, axis=1)
+    normal /= steepness[:, None]
+    # Sum of the principal curvatures of x²/a² + y²/b² + z²/c² = 1: the divergence of its unit normal.
+    curvature = (np.sum(semi_axes**-2, axis=1) - np.sum((normal / semi_axes) ** 2, axis=1)) / steepness
+    distance = np.sum((points - nearest) * normal, axis=1)
+    residual = distance / problem.noise - 0.5 * problem.noise * curvature
+    # The foot point is stationary: only the normal's product with the change of o + M P u counts.
+    normal = normal @ axes.T
+    moved = problem.modulus[:, None] * ((nearest / semi_axes) @ axes.T)
+    by_scale = np.where(
+        _ROW == _COLUMN,
+        normal[:, _ROW] * moved[:, _COLUMN],
+        normal[:, _ROW] * moved[:, _COLUMN] + normal[:, _COLUMN] * moved[:, _ROW],
+    )
+    jacobian = -np.concatenate([normal, by_scale], axis=1) / problem.noise
+    return _Fit(offset, scale, residual, jacobian, float(residual @ residual))
+
+
+def _nearest(points: FloatArray, semi_axes: FloatArray) -> FloatArray:
+    """Nearest point of the ellipsoid Σ (x_i/a_i)² = 1 to each point, both (n, 3).
+
+    ``x_i = a_i² q_i / (a_i² + t)``, where t is the largest root of ``|s(t)| = 1``, ``s_i = a_i q_i / (a_i² + t)``. The
+    function 1/|s| is concave in t, so that Newton's method from below climbs to the root.
+    """
+    product = semi_axes * points
+    square = semi_axes**2
+    # A component of zero would leave a pole without a residue, where the iteration may start.
+    product = np.where(np.abs(product) > 1e-12 * square, product, 1e-12 * square)
+    t = np.max(np.abs(product) - square, axis=1)
+    for _ in range(_NEAREST_ITERATIONS):
+        s = product / (square + t[:, None])
+        length = np.linalg.norm(s, axis=1)
+        step = (length - 1.0) * length**2 / np.sum(s**2 / (square + t[:, None]), axis=1)
+        t = t + step
+        if np.all(np.abs(step) <= 1e-12 * square.min(axis=1)):
+            break
+    result: FloatArray = semi_axes * product / (square + t[:, None])
+    return result
+
+
+def _least_radius_of_curvature(problem: _Problem, fit: _Fit) -> float:
+    size = np.linalg.eigvalsh(fit.scale)
+    return float(problem.modulus.min() * size[0] ** 2 / size[-1])
+
+
+def _root_covariance(problem: _Problem, fit: _Fit) -> FloatArray | None:
+    """A root of the covariance of (offset, P); None where the readings do not determine it."""
+    # In units in which every parameter shifts a reading by about the radius of the ellipsoid.
+    radius = float(np.linalg.det(fit.scale)) ** (1.0 / 3.0)
+    _, singular, right = np.linalg.svd(fit.jacobian * (radius * problem.noise), full_matrices=False)
+    sensitivity = float(singular[-1]) / np.sqrt(len(problem.readings))
+    relative_noise = problem.noise / radius
+    if sensitivity <= max(_FEIGNED * relative_noise, 1e-7):
+        return None
+    if relative_noise / float(singular[-1]) > _LARGEST_UNCERTAINTY:
+        return None
+    root: FloatArray = right.T / singular * (radius * problem.noise)
+    for deviations in (-2.0, 2.0):
+        # χ² must rise by four there, or the uncertainty is bent and no covariance describes it.
+        step = deviations * root[:, -1]
+        rise = _linearised(problem, fit.offset + step[:3], fit.scale + _symmetric(step[3:])).chi2 - fit.chi2
+        if not 4.0 / _LARGEST_BEND < rise < 4.0 * _LARGEST_BEND:
+            return None
+    return root
+
+
+def _symmetric(entries: FloatArray) -> FloatArray:
+    """Symmetric matrix of its entries xx yy zz xy xz yz."""
+    matrix = np.zeros((3, 3))
+    matrix[_ROW, _COLUMN] = matrix[_COLUMN, _ROW] = entries
+    return matrix

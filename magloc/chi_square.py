@@ -1,0 +1,166 @@
+"""χ² tests: thresholds of detection, their operating characteristics, and bounds of means."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import chdtri, chndtr, chndtrinc
+
+from arrays.typing import FloatArray
+
+_LEVEL = 0.99
+
+
+def mean_bounds(degrees_of_freedom: int, level: float = _LEVEL) -> tuple[float, float]:
+    """Two-sided bounds of a χ² over its degrees of freedom."""
+    if degrees_of_freedom <= 0:
+        return math.nan, math.nan
+    tail = 0.5 * (1.0 - level)
+    low, high = chdtri(degrees_of_freedom, 1.0 - tail), chdtri(degrees_of_freedom, tail)
+    return float(low) / degrees_of_freedom, float(high) / degrees_of_freedom
+
+
+FALSE_ALARM = 1e-3
+
+
+class Detector(Protocol):
+    """A statistic with a threshold, and the energy of a signal that it finds."""
+
+    @property
+    def threshold(self) -> float:
+        """Value of the statistic above which there is a source."""
+
+    def required_energy(self, probability: float) -> float:
+        """Energy of a signal, in units of the noise's variance, that is found with a probability."""
+
+
+def energy_threshold(n_differences: int, false_alarm_rate: float = FALSE_ALARM) -> float:
+    r"""Energy of the whitened differences that noise alone exceeds at a given rate.
+
+    Parameters
+    ----------
+    n_differences : int
+        Number of independent differences k.
+    false_alarm_rate : float
+        Share of the sets of readings without a source that exceed the threshold.
+
+    Returns
+    -------
+    float
+        Quantile of :math:`\|z'\|^2 \sim \chi^2_k`, every difference in units of its noise.
+
+    Raises
+    ------
+    ValueError
+        There is no difference, or the rate is not between 0 and 1.
+    """
+    if n_differences < 1:
+        raise ValueError(f"Input n_differences must be at least 1; instead received {n_differences}.")
+    check_share("false_alarm_rate", false_alarm_rate)
+    return float(chdtri(n_differences, false_alarm_rate))
+
+
+@dataclass(frozen=True)
+class ChiSquareDetector:
+    r"""Energy in a space that is known beforehand: all differences, or the moments of a source of known position.
+
+    Attributes
+    ----------
+    n_dimensions : int
+        Dimensions of the space: the number of differences, or 3.
+    false_alarm_rate : float
+    """
+
+    n_dimensions: int
+    false_alarm_rate: float = FALSE_ALARM
+
+    @property
+    def threshold(self) -> float:
+        """Value of the energy above which there is a source."""
+        return energy_threshold(self.n_dimensions, self.false_alarm_rate)
+
+    def probability(self, signal_energy: ArrayLike) -> FloatArray:
+        """Probability of detection: the noncentral χ² beyond the threshold.
+
+        Parameters
+        ----------
+        signal_energy : array_like
+            Of the noise-free differences, in units of the noise's variance.
+
+        Returns
+        -------
+        ndarray
+        """
+        energy = np.asarray(signal_energy, dtype=np.float64)
+        found: FloatArray = 1.0 - chndtr(self.threshold, float(self.n_dimensions), energy)
+        return found
+
+    def required_energy(self, probability: float) -> float:
+        """Energy of a signal that is found with a probability.
+
+        Parameters
+        ----------
+        probability : float
+            Above the false-alarm rate.
+
+        Returns
+        -------
+        float
+            In units of the noise's variance.
+        """
+        check_probability(probability, self.false_alarm_rate)
+        return float(chndtrinc(self.threshold, float(self.n_dimensions), 1.0 - probability))
+
+
+def receiver_operating_characteristic(
+    without_source: ArrayLike, with_source: ArrayLike, false_alarm_rate: ArrayLike
+) -> FloatArray:
+    """Probability of detection at given false-alarm rates, from draws of any statistic.
+
+    Parameters
+    ----------
+    without_source, with_source : array_like, shapes (n,) and (m,)
+        The statistic of simulated readings.
+    false_alarm_rate : array_like, shape (...)
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Share of `with_source` above the quantile of `without_source`; its standard error is √(P (1 − P)/m), and that of
+        the rate √(rate (1 − rate)/n).
+    """
+    thresholds = np.quantile(np.asarray(without_source), 1.0 - np.asarray(false_alarm_rate))
+    sorted_ = np.sort(np.asarray(with_source))
+    found: FloatArray = 1.0 - np.searchsorted(sorted_, thresholds, side="right") / sorted_.size
+    return found
+
+
+def check_differences(n: int, least: int, what: str) -> None:
+    """Refuse an array that gives fewer than the least number of differences for what is wanted."""
+    if n < least:
+        raise ValueError(
+            f"Input array must give {least} independent differences at least for {what}; instead it gives {n}."
+        )
+
+
+def check_share(name: str, value: float) -> None:
+    """Refuse a share that is not between 0 and 1."""
+    if not 0.0 < value < 1.0:
+        raise ValueError(f"Input {name} must be between 0 and 1; instead received {value}.")
+
+
+def check_probability(probability: float, false_alarm_rate: float) -> None:
+    """Refuse a probability of detection that noise alone reaches."""
+    if not false_alarm_rate < probability < 1.0:
+        raise ValueError(
+            f"Input probability must be between the false-alarm rate {false_alarm_rate:g} and 1;"
+            f" instead received {probability}."
+        )
+
+
+# Δχ² of a 95 % interval of one parameter, and within which another optimum is a solution too.
+RISE_95 = 3.841458820694124

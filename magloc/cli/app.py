@@ -1,0 +1,67 @@
+"""The command line ``magloc``.
+
+Every command is a function in a module of :mod:`magloc.cli`; its NumPy docstring is its help text. It raises
+:class:`arrays.io.errors.InputError` for bad input. What the command lines have in common is in
+:mod:`magloc.cli.framework`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from cyclopts import App, Parameter
+
+from arrays.io import outputs
+from magloc.cli import framework
+
+app = App(
+    name="magloc",
+    help="Find magnetic dipoles from the differences between magnetometers.",
+    version=outputs.installed_version,
+    default_parameter=Parameter(negative=()),
+)
+# By name, so that a command loads when it is called, and its help line is here; sims stands above this package.
+for _name, _where, _help in (
+    (
+        "calibrate",
+        "magloc.cli.calibrate:calibrate",
+        "Calibrate vector sensors by a source that moves past them, or by turning them in a field of known modulus.",
+    ),
+    ("locate", "magloc.cli.locate:locate", "Find the sources in every row of a readings file, each row on its own."),
+    (
+        "map",
+        "magloc.cli.map:map_",
+        "Draw the convergence map of a filter over a cube of starts, or that of start-free fixes over a cube of"
+        " sources.",
+    ),
+    ("track", "magloc.cli.track:track", "Follow one source through time."),
+    (
+        "bounds",
+        "magloc.cli.bounds:bounds",
+        "Tell how well an array can know a source at best (Cramér-Rao bounds), and how far it reaches.",
+    ),
+    (
+        "design",
+        "magloc.cli.design:design",
+        "Design an array: place its sensors for the sources that it is to locate.",
+    ),
+    ("simulate", "sims.cli.simulate:simulate", "Simulate the readings of an array."),
+    ("view", "magloc.cli.view:view", "See an array, readings, a track or a map in three dimensions."),
+):
+    app.command(_where, name=_name, help=_help)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        The command and its arguments; by default those of the process.
+
+    Returns
+    -------
+    int
+        Exit status: 0 done, 2 bad input, 130 interrupted, 141 the reader of the output is gone.
+    """
+    return framework.run(app, arguments)

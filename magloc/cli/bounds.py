@@ -1,0 +1,398 @@
+"""``magloc bounds``: how well can an array know a source, wherever it is?"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from arrays.io.arguments import Flag, whole_number
+from arrays.io.errors import InputError
+from arrays.typing import Vector
+from magloc.cli.framework import CommonOptions, print_json, progress
+from magloc.cli.options import Grid, complete, print_note
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from arrays.array import SensorArray
+    from arrays.typing import FloatArray
+    from magloc.bounds.crlb import Bounds
+    from magloc.bounds.maps import BoundScenario
+    from magloc.bounds.over_moments import MomentBounds
+    from magloc.detection.matched_filter import MatchedFilterDetector
+    from magloc.grids.store import Sweep
+
+
+Directions = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1, lte=10_000))]
+_LARGEST_AM2 = 1e12
+# In circumradii of the array: the least distance of a source from a sensor and from the centroid, and of a sphere.
+_LEAST_DISTANCE = 1e-4
+_REACH = (1e-4, 1e6)
+_SLICE_GRID = 121
+_STEP_DEG = 5.0
+_FRAMES = 24
+_COMPONENTS = "xyz"
+
+
+def bounds(
+    scenario: str = "paper",
+    /,
+    *,
+    array: Path | None = None,
+    position: Vector | None = None,
+    moment_Am2: Annotated[Vector | None, Parameter(name="--moment-Am2")] = None,
+    range_m: float | None = None,
+    accuracy_m: float = 0.5,
+    half_width_m: float | None = None,
+    ambient_uncertainty_nT: Annotated[float, Parameter(name="--ambient-uncertainty-nT")] = 0.0,
+    probability: float = 0.9,
+    false_alarm_rate: float = 1e-3,
+    moments: Directions = 50,
+    grid: Grid = 41,
+    gif: Flag = False,
+    out: Path | None = None,
+    json: Flag = False,
+    common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Tell how well an array can know a source at best (Cramér-Rao bounds), and how far it reaches.
+
+    Prints the bounds of the scenario's source, how far away the range is known as well as required, and how far away
+    the matched filter finds a source at all. Writes map.zarr (a cube of sources), slices.nc and spheres.nc, and
+    pictures: bounds-slices.png, bounds-sphere.png, bounds-reach.png. All bounds come for the given moment, and over
+    moments of its size in all directions. The same command continues a map that was interrupted.
+
+    Parameters
+    ----------
+    scenario : str
+        Built-in scenario or scenario file (TOML) of magloc map, for its array and source. "paper" is the source
+        paper's.
+    array : Path
+        Array file (TOML), in place of the scenario's array.
+    position : tuple of 3 floats
+        Where the source is [m], in the array's frame, in place of the scenario's position.
+    moment_Am2 : tuple of 3 floats
+        Its moment [A·m²], in place of the scenario's.
+    range_m : float
+        Distance from the sensors' centroid [m] for the picture of a sphere; by default that of the source.
+    accuracy_m : float
+        Required standard deviation of the range [m].
+    half_width_m : float
+        The cube and the slices reach so far from the centroid [m]; by default twice the range.
+    ambient_uncertainty_nT : float
+        Standard deviation per axis of the ambient field that the array file states, for scalar sensors [nT].
+    probability : float
+        Of detection, for the distances at which a source is found.
+    false_alarm_rate : float
+        Share of the rows without a source in which one may be found, 0.0001 or more.
+    moments : int
+        Directions of the moment, 10,000 at most.
+    grid : int
+        Points along every axis of the cube, 2,000 at most.
+    gif : bool
+        Write bounds.gif as well: the sphere, from half to twice the range.
+    out : Path
+        Folder to write; by default bounds-SCENARIO-GRID, or bounds-ARRAY-GRID.
+    json : bool
+        Print one JSON object: "position_m", "moment_Am2", "range_m"; "rank" of the information, 6 if everything is
+        estimable; "sigma_position_m", "sigma_moment_Am2" (three numbers), "sigma_range_m", "sigma_bearing_deg" (null:
+        infinite); "over_moments": "sigma_range_m" and "sigma_bearing_deg" with "mean", "median", "q95",
+        "worst_sampled" for the same position; "accuracy_m"; "accuracy_range_m": for "moment", "median", "q95",
+        "worst_sampled" the "least", "median" and "greatest" over all directions; "detection": "probability",
+        "false_alarm_rate", "threshold" of the matched filter and its "threshold_error", null without one;
+        "detection_range_m" in the form of "accuracy_range_m"; "grid", "moments", "points",
+        "accurate_fraction" of the cube (95 % of the moments), "seconds" of the cube alone, "out".
+    common : CommonOptions
+        Common options. The seed is that of the noise which sets the threshold of detection; no bound depends on it.
+    """
+    import numpy as np
+
+    from arrays.io.outputs import make_folder
+    from magloc.bounds.crlb import bounds_of
+    from magloc.bounds.over_moments import bounds_over_moments
+    from magloc.convergence.scenario_files import read_starts_scenario
+
+    source = read_starts_scenario(scenario)
+    used = source.array if array is None else _array_of(array)
+    place = np.asarray(source.position_m if position is None else position)
+    distance = float(np.linalg.norm(place - used.centroid))
+    for option, value in (("--range-m", range_m), ("--half-width-m", half_width_m), ("--accuracy-m", accuracy_m)):
+        if value is not None and not 0.0 < value < np.inf:
+            raise InputError(f"{option}: found {value:g}, expected a positive length.")
+    if not 1e-4 <= false_alarm_rate < 0.5:
+        raise InputError(f"--false-alarm-rate: found {false_alarm_rate:g}, expected 0.0001 or more, and less than 0.5.")
+    if not false_alarm_rate < probability < 1.0:
+        raise InputError(f"--probability: found {probability:g}, expected it between the false-alarm rate and 1.")
+    if not 0.0 <= ambient_uncertainty_nT < np.inf:
+        raise InputError(f"--ambient-uncertainty-nT: found {ambient_uncertainty_nT:g}, expected zero or more.")
+    _check_place(used, place)
+    radius = distance if range_m is None else range_m
+    nearest_m, farthest_m = (factor * used.circumradius for factor in _REACH)
+    if not nearest_m <= radius <= farthest_m:
+        raise InputError(
+            f"--range-m: found {radius:g}, expected {nearest_m:.3g} to {farthest_m:.3g} m, by the size of the array."
+        )
+    if moment_Am2 is not None and not 0.0 < max(map(abs, moment_Am2)) <= _LARGEST_AM2:
+        raise InputError(
+            f"--moment-Am2: found {_plain(moment_Am2)}, expected three finite numbers, not all zero, up to "
+            f"{_LARGEST_AM2:g} A·m²."
+        )
+    task = _scenario(
+        used,
+        source.moment_Am2 if moment_Am2 is None else moment_Am2,
+        half_width_m=2.0 * radius if half_width_m is None else half_width_m,
+        accuracy_m=accuracy_m,
+        n_moments=moments,
+        ambient_uncertainty_T=1e-9 * ambient_uncertainty_nT,
+    )
+    if used.channel_is_scalar.any() and used.ambient_T is None:
+        print_note("warning: the array has scalar sensors and no ambient_nT, the ambient field is taken to be zero")
+    options = {"ambient_uncertainty_T": task.ambient_uncertainty_T}
+    of_source = bounds_of(used, place, task.moment_Am2, **options)
+    over_moments = bounds_over_moments(used, place[None], task.moments_Am2, **options)
+    folder = Path(f"bounds-{Path(scenario).stem if array is None else array.stem}-{grid}") if out is None else out
+    make_folder(folder, "--out")
+    detector = _detector(used, false_alarm_rate, common.seed)
+    sweep = _cube(task, grid, folder, quiet=common.quiet)
+    spheres = _pictures(task, detector, probability, radius, folder, gif=gif, quiet=common.quiet)
+    if json:
+        print_json(
+            {
+                **_json(of_source, over_moments, spheres, task),
+                **_detection_json(detector, probability, spheres),
+                **_cube_json(sweep, moments),
+                "out": str(folder),
+            }
+        )
+        return
+    print(_table(of_source, over_moments, spheres, task))
+    if not common.quiet:
+        counts = sweep.summary
+        print_note(f"{counts.starts} sources × {moments + 1} moments in {counts.seconds:.2f} s; wrote {folder}/")
+
+
+def _check_place(array: SensorArray, place: FloatArray) -> None:
+    """Refuse a source in a sensor, at the centroid, where range and bearing are none, and beyond all reach."""
+    import numpy as np
+
+    if not np.isfinite(place).all():
+        raise InputError(f"--position: found {_plain(place)}, expected three finite numbers.")
+    if not np.abs(place - array.centroid).max() <= _REACH[1] * array.circumradius:
+        raise InputError(
+            f"--position: found {_plain(place)}, expected a place within {_REACH[1] * array.circumradius:.3g} m."
+        )
+    least_m = _LEAST_DISTANCE * array.circumradius
+    if np.linalg.norm(place - array.centroid) < least_m:
+        raise InputError(f"--position: found {_plain(place)}, the sensors' centroid, expected a place away from it.")
+    distances = np.linalg.norm(place - array.positions, axis=1)
+    if distances.min() < least_m:
+        sensor = array.sensors[int(distances.argmin())].id
+        raise InputError(f"--position: found {_plain(place)}, at sensor {sensor}, expected a place away from it.")
+
+
+def _array_of(path: Path) -> SensorArray:
+    from arrays.array_file import read_array
+
+    array = read_array(path)
+    # A figure calls an array by its name; one without is called after its file.
+    return array if array.name else replace(array, name=path.stem)
+
+
+def _scenario(array: SensorArray, moment_Am2: Vector, **options: Any) -> BoundScenario:
+    from magloc.bounds.maps import BoundScenario
+
+    try:
+        return BoundScenario(array, moment_Am2, **options)
+    except ValueError as error:
+        raise InputError(f"--moment-Am2: {error}") from None
+
+
+def _detector(array: SensorArray, false_alarm_rate: float, seed: int) -> MatchedFilterDetector | None:
+    """Matched filter of the array; None, with a note, where it has none."""
+    from magloc.detection.matched_filter import MatchedFilterDetector
+
+    try:
+        return MatchedFilterDetector.of(array, false_alarm_rate, n_draws=round(100 / false_alarm_rate), seed=seed)
+    except ValueError as error:
+        print_note(f"how far a source is found is left out: {error}")
+        return None
+
+
+def _cube(task: BoundScenario, grid: int, folder: Path, *, quiet: bool) -> Sweep:
+    """The cube, computed as far as it is not done; closed."""
+    from magloc.bounds.maps import BoundMap
+    from magloc.grids.cube import computed_here
+    from magloc.grids.store import Sweep
+
+    cube = BoundMap(task, grid)
+    with Sweep(cube, folder / "map.zarr") as sweep:
+        for sentence in sweep.unreadable:
+            print_note(sentence)
+        complete(sweep, computed_here(cube, sweep.unfinished()), quiet=quiet)
+    return sweep
+
+
+def _pictures(
+    task: BoundScenario,
+    detector: MatchedFilterDetector | None,
+    probability: float,
+    range_m: float,
+    folder: Path,
+    *,
+    gif: bool,
+    quiet: bool,
+) -> xr.Dataset:
+    """Slices and spheres, as data and as figures; returns the spheres."""
+    import numpy as np
+
+    from arrays.io.text import replace_file
+    from magloc.bounds.detection_map import with_detection_ranges
+    from magloc.bounds.maps import bound_slices, bound_spheres
+    from magloc.plots.bounds import bound_slices_figure, bound_sphere_figure, reach_figure, write_bound_animation
+    from magloc.plots.style import save
+
+    nearest = min(max(0.5 * range_m, 1.1 * task.array.circumradius), range_m)
+    ranges = np.geomspace(nearest, 2.0 * range_m, _FRAMES) if gif else np.empty(0)
+    slices = bound_slices(task, _SLICE_GRID)
+    spheres = bound_spheres(task, np.union1d(ranges, [range_m]).tolist(), _STEP_DEG)
+    if detector is not None:
+        spheres = with_detection_ranges(spheres, task, detector, probability)
+    replace_file(folder / "slices.nc", lambda path: slices.to_netcdf(path))
+    replace_file(folder / "spheres.nc", lambda path: spheres.to_netcdf(path))
+    figures = {
+        "bounds-slices.png": bound_slices_figure(slices, task),
+        "bounds-sphere.png": bound_sphere_figure(spheres, task, range_m),
+        "bounds-reach.png": reach_figure(spheres, task),
+    }
+    for name, figure in figures.items():
+        replace_file(folder / name, partial(save, figure))
+    if gif:
+        frames = spheres.sel(range=ranges)
+        with progress(_FRAMES, "pictures", quiet=quiet) as advance:
+            replace_file(folder / "bounds.gif", lambda path: write_bound_animation(frames, task, path, advance))
+    return spheres
+
+
+def _json(of: Bounds, over: MomentBounds, spheres: xr.Dataset, task: BoundScenario) -> dict[str, Any]:
+    import numpy as np
+
+    return {
+        "position_m": of.position_m,
+        "moment_Am2": of.moment_Am2,
+        "range_m": float(of.range_m),
+        "rank": int(of.rank),
+        "sigma_position_m": _finite(of.sigma[:3]),
+        "sigma_moment_Am2": _finite(of.sigma[3:]),
+        "sigma_range_m": float(of.sigma_range_m),
+        "sigma_bearing_deg": float(np.degrees(of.sigma_bearing_rad)),
+        "over_moments": {
+            name: dict(zip(_SPREAD, (factor * float(value[0]) for value in spread), strict=True))
+            for name, spread, factor in (
+                ("sigma_range_m", over.sigma_range_m, 1.0),
+                ("sigma_bearing_deg", over.sigma_bearing_rad, float(np.degrees(1.0))),
+            )
+        },
+        "accuracy_m": task.accuracy_m,
+        "accuracy_range_m": _reach(spheres, "accuracy_range"),
+    }
+
+
+def _detection_json(detector: MatchedFilterDetector | None, probability: float, spheres: xr.Dataset) -> dict[str, Any]:
+    if detector is None:
+        return {"detection": None, "detection_range_m": None}
+    return {
+        "detection": {
+            "probability": probability,
+            "false_alarm_rate": detector.false_alarm_rate,
+            "threshold": detector.threshold,
+            "threshold_error": detector.threshold_error,
+        },
+        "detection_range_m": _reach(spheres, "detection_range"),
+    }
+
+
+_SPREAD = ("mean", "median", "q95", "worst_sampled")
+
+
+def _cube_json(sweep: Sweep, moments: int) -> dict[str, Any]:
+    counts = sweep.summary
+    return {
+        "grid": sweep.cube.grid,
+        "moments": moments,
+        "points": counts.starts,
+        "accurate_fraction": counts.fraction,
+        "seconds": counts.seconds,
+    }
+
+
+def _reach(spheres: xr.Dataset, variable: str) -> dict[str, dict[str, float]]:
+    """Least, median and greatest reach over the directions, each with its share of the sphere."""
+    import numpy as np
+
+    from magloc.bounds.maps import CASES
+
+    weights = np.cos(np.radians(spheres["elevation"].to_numpy()))[:, None] * np.ones(spheres.sizes["azimuth"] - 1)
+    result = {}
+    for case, name in zip(CASES, ("moment", *_SPREAD[1:]), strict=True):
+        reach = spheres[f"{variable}{case}"].to_numpy()[:, :-1]  # the last azimuth is the first one again
+        order = np.argsort(reach, axis=None)
+        share = np.cumsum(weights.ravel()[order])
+        middle = order[np.searchsorted(share, 0.5 * share[-1])]
+        result[name] = {
+            "least": float(reach.min()),
+            "median": float(reach.ravel()[middle]),
+            "greatest": float(reach.max()),
+        }
+    return result
+
+
+def _table(of: Bounds, over: MomentBounds, spheres: xr.Dataset, task: BoundScenario) -> str:
+    import numpy as np
+
+    place, moment = _plain(of.position_m), _plain(of.moment_Am2)
+    lines = [
+        f"source at {place} m, moment {moment} A·m², {float(of.range_m):.4g} m from the sensors' centroid",
+        f"{'least σ':<22}" + "".join(f"{name:>10}" for name in _COMPONENTS),
+        f"{'position [m]':<22}" + "".join(f"{value:>10.4g}" for value in of.sigma[:3]),
+        f"{'moment [A·m²]':<22}" + "".join(f"{value:>10.4g}" for value in of.sigma[3:]),
+        "",
+        f"{'least σ':<22}{'given':>10}" + "".join(f"{name:>10}" for name in ("mean", "median", "95 %", "worst")),
+        _row("range [m]", of.sigma_range_m, over.sigma_range_m, 1.0),
+        _row("bearing [°]", of.sigma_bearing_rad, over.sigma_bearing_rad, float(np.degrees(1.0))),
+        *_reach_lines(f"σ of range ≤ {task.accuracy_m:g} m up to", _reach(spheres, "accuracy_range")),
+    ]
+    if "detection_range" in spheres:
+        share = f"{100.0 * spheres.attrs['detection_probability']:g} %"
+        lines += _reach_lines(f"found with {share} up to", _reach(spheres, "detection_range"))
+    if not of.is_regular:
+        lines.insert(
+            4, f"Only {int(of.rank)} of the six combinations of position and moment are estimable: inf = not at all."
+        )
+    return "\n".join(lines)
+
+
+def _reach_lines(title: str, reach: dict[str, dict[str, float]]) -> list[str]:
+    names = ("given moment [m]", "median of moments [m]", "95 % of moments [m]", "worst of those sampled [m]")
+    lines = ["", f"{title:<32}{'least':>10}{'median':>10}{'greatest':>10}"]
+    for name, of_case in zip(names, reach.values(), strict=True):
+        lines.append(f"{name:<32}" + "".join(f"{value:>10.4g}" for value in of_case.values()))
+    return lines
+
+
+def _row(name: str, given: Any, spread: Any, factor: float) -> str:
+    values = [given, *(value[0] for value in spread)]
+    return f"{name:<22}" + "".join(f"{factor * float(value):>10.4g}" for value in values)
+
+
+def _finite(values: Any) -> list[float | None]:
+    import numpy as np
+
+    return [float(value) if np.isfinite(value) else None for value in values]
+
+
+def _plain(vector: Any) -> str:
+    return f"({', '.join(f'{value:g}' for value in vector)})"

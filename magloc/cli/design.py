@@ -1,0 +1,188 @@
+"""``magloc design``: where should the sensors of an array stand?"""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from arrays.io.arguments import Flag
+from arrays.io.errors import InputError
+from magloc.cli.framework import CommonOptions, print_json, progress
+from magloc.cli.options import print_note
+
+if TYPE_CHECKING:
+    from arrays.array import SensorArray
+    from magloc.design.evaluation import Judgement
+    from magloc.design.optimise import Design
+
+
+def design(
+    task: str = "half-space-2m",
+    /,
+    *,
+    out: Path | None = None,
+    png: Path | None = None,
+    json: Flag = False,
+    common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Design an array: place its sensors for the sources that it is to locate.
+
+    Makes a quantile or the mean, over sources and moments, of the least standard deviation of the range (the
+    Cramér-Rao bound) as small as it can, and compares the array with a tetrahedron, a cube and a cross of the same
+    span. Interrupted, it writes the best array so far.
+
+    Parameters
+    ----------
+    task : str
+        Built-in task, or task file (TOML): sensors, volume or surface, sources, criterion.
+    out : Path
+        Array file to write; by default design-TASK.toml.
+    png : Path
+        Picture to write: the sensors, and the range's standard deviation over the distance.
+    json : bool
+        Print one JSON object with the array and the comparison.
+    common : CommonOptions
+        Common options.
+    """
+    from arrays.array_file import write_array
+    from arrays.io.outputs import refuse_one_for_two, refuse_unwritable
+    from magloc.design.optimise import design as designed
+    from magloc.design.task_files import read_task
+
+    file = read_task(task)
+    target = Path(f"design-{file.task.name}.toml") if out is None else out
+    refuse_one_for_two({"--out": target, "--png": png})
+    refuse_unwritable(target, "--out")
+    if png is not None:
+        refuse_unwritable(png, "--png", ".png")
+    best: list[SensorArray] = []
+    begin = time.perf_counter()
+    try:
+        with progress(file.search.n_steps, "steps", quiet=common.quiet) as advance:
+            result = designed(file.task, search=file.search, seed=common.seed, progress=advance, better=best.append)
+    except KeyboardInterrupt:
+        if not best:
+            raise KeyboardInterrupt("interrupted: nothing is written, no start had been judged") from None
+        write_array(best[-1], target)
+        raise KeyboardInterrupt(f"interrupted: the best array so far is in {target}") from None
+    except ValueError as error:
+        raise InputError(f"{task}: {str(error).removeprefix('Input ')}") from None
+    seconds = time.perf_counter() - begin
+    write_array(result.array, target)
+    if png is not None:
+        _draw(result, common.seed, png)
+    if json:
+        print_json(_report(result, target, png, seconds))
+        return
+    print("\n".join([*_table(result), "", *_findings(result)]))
+    if not common.quiet:
+        drawn = "" if png is None else f" and {png}"
+        print_note(
+            f"{result.n_converged} of {result.n_descents} refined starts converged, {seconds:.1f} s; wrote"
+            f" {target}{drawn}"
+        )
+
+
+def _draw(result: Design, seed: int, path: Path) -> None:
+    from magloc.plots.design import design_figure
+    from magloc.plots.style import save
+
+    save(design_figure(result, seed), path)
+
+
+def _report(result: Design, out: Path, png: Path | None, seconds: float) -> dict[str, Any]:
+    return {
+        "task": result.task.name,
+        "criterion": str(result.task.criterion),
+        "converged": result.converged,
+        "converged_starts": result.n_converged,
+        "refined_starts": result.n_descents,
+        "positions_m": result.array.positions,
+        "fitted_m": result.fitted_m,
+        "best_start_m": result.start_m,
+        "near_optimal": list(result.near_optimal),
+        "worst_found_m": result.worst_m,
+        "worst_is_bounded": result.worst_is_bounded,
+        "arrays": [_of_array(judged) for judged in result.judged],
+        "seconds": seconds,
+        "out": str(out),
+        "png": None if png is None else str(png),
+    }
+
+
+def _of_array(judged: Judgement) -> dict[str, Any]:
+    return {
+        "name": judged.name,
+        "sensors": judged.array.n_sensors,
+        "fits_volume": judged.fits,
+        "criterion_m": judged.criterion_m,
+        "design_gain": judged.gain,
+        "design_gain_standard_error": judged.gain_error,
+        "distance_m": judged.distance_m,
+        **{f"sigma_range_{name}": values for name, values in judged.sigma_range._asdict().items()},
+        "sigma_bearing_q95_rad": judged.bearing_q95_rad,
+    }
+
+
+def _table(result: Design) -> list[str]:
+    """Bounds of all arrays at all distances."""
+    statistics = "".join(f"{name:>11}" for name in ("q50_m", "q95_m", "mean_m"))
+    head = f"{'array':<24}{'sensors':>8}{'distance_m':>12}{statistics}{'bearing_q95_deg':>17}"
+    lines = ["standard deviations of range and bearing (Cramér-Rao bounds)", head]
+    for judged in result.judged:
+        if not math.isfinite(judged.criterion_m):
+            continue
+        for i, distance in enumerate(judged.distance_m):
+            bearing = math.degrees(judged.bearing_q95_rad[i])
+            lines.append(
+                f"{judged.name[:23] if i == 0 else '':<24}{judged.array.n_sensors if i == 0 else '':>8}{distance:>12g}"
+                + "".join(f"{_number(value):>11}" for value in (values[i] for values in judged.sigma_range))
+                + f"{_number(bearing) if bearing < 180.0 else 'unknown':>17}"
+            )
+    return lines
+
+
+def _findings(result: Design) -> list[str]:
+    """What the table says, in sentences."""
+    from magloc.design.optimise import NEAR_OPTIMAL
+
+    criterion = result.task.criterion
+    own = result.judged[0]
+    lines = [f"{criterion} of the range's standard deviation: {_number(own.criterion_m)} m, on independent sources"]
+    for other in result.judged[1:]:
+        lines.append(f"  {_compared(other)}")
+    lines += [
+        f"The {name} of the same span is near-optimal for this task: the design gains less than"
+        f" {100.0 * NEAR_OPTIMAL:g} % on it."
+        for name in result.near_optimal
+    ]
+    lines.append(_worst_case(result))
+    if not result.converged:
+        lines.append("The descent to this array had not stopped falling: a little better ones may be near.")
+    return lines
+
+
+def _worst_case(result: Design) -> str:
+    if result.worst_is_bounded:
+        return f"Worst case that was found: {_number(result.worst_m)} m."
+    text = "The worst case is infinite: at isolated directions and moments the differences lose rank"
+    four_vector_sensors = result.task.kind == "vector" and result.task.n_sensors == 4
+    return f"{text}, as those of every array of four vector sensors do." if four_vector_sensors else f"{text}."
+
+
+def _compared(other: Judgement) -> str:
+    outside = "" if other.fits else ", outside the volume"
+    name = f"{other.name} ({other.array.n_sensors} sensors{outside})"
+    if not math.isfinite(other.criterion_m):
+        return f"{name}: determines no range"
+    better = "better" if other.gain >= 0.0 else "worse"
+    return (
+        f"{name}: {_number(other.criterion_m)} m, the design is {100.0 * abs(other.gain):.1f} ±"
+        f" {100.0 * other.gain_error:.1f} % {better}"
+    )
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else "infinite"

@@ -1,0 +1,202 @@
+"""What the command lines have in common: one main loop, the options of every command, JSON, notes and progress.
+
+Commands are functions that :mod:`cyclopts` calls. They raise :class:`arrays.io.errors.InputError` for bad input;
+whatever is wrong with the input becomes one line on stderr and exit status 2, an interruption becomes 130.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from cyclopts import App, CycloptsError, Parameter
+
+from arrays.io.arguments import Count, Flag, Seed
+from arrays.io.errors import InputError
+
+DONE = 0
+BAD_INPUT = 2
+INTERRUPTED = 130
+BROKEN_PIPE = 141
+
+
+@Parameter(name="*", group="Common options")
+@dataclass(frozen=True)
+class QuietOptions:
+    """Options of every command.
+
+    Parameters
+    ----------
+    threads : int
+        Threads at most; by default all cores. Results do not depend on it.
+    quiet : bool
+        No progress and no summary on stderr, only errors.
+    """
+
+    threads: Count | None = None
+    quiet: Flag = False
+
+    def apply(self) -> None:
+        """Limit the threads of compiled code."""
+        if self.threads is not None:
+            import numba
+
+            numba.set_num_threads(min(self.threads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+
+
+@Parameter(name="*", group="Common options")
+@dataclass(frozen=True)
+class CommonOptions(QuietOptions):
+    """Options of every command that draws random numbers once.
+
+    Parameters
+    ----------
+    threads : int
+        Threads at most; by default all cores. Results do not depend on it.
+    quiet : bool
+        No progress and no summary on stderr, only errors.
+    seed : int
+        Seed of whatever is random; the same seed gives the same result.
+    """
+
+    seed: Seed = 0
+
+
+def run(app: App, arguments: Sequence[str] | None = None) -> int:
+    """Run one command of a command line.
+
+    Parameters
+    ----------
+    app : App
+    arguments : sequence of str, optional
+        The command and its arguments; by default those of the process.
+
+    Returns
+    -------
+    int
+        Exit status: 0 done, 2 bad input, 130 interrupted, 141 the reader of the output is gone.
+    """
+    program = app.name[0]
+    tokens = sys.argv[1:] if arguments is None else list(arguments)
+    # Before numpy is loaded: threads of linear algebra only wait for each other over matrices as small as ours.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    try:
+        with _one_line_warnings(program), _notes_of_the_library(program):
+            _run(app, tokens)
+            sys.stdout.flush()
+    except (InputError, CycloptsError) as error:
+        print_note(str(error), program)
+        return BAD_INPUT
+    except KeyboardInterrupt as interruption:
+        print_note(str(interruption) or "interrupted", program)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # The interpreter flushes stdout once more when it exits, which must not fail again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BROKEN_PIPE
+    except OSError as error:
+        print_note(f"{error.filename}: {error.strerror}" if error.filename else str(error), program)
+        return BAD_INPUT
+    return DONE
+
+
+def _run(app: App, tokens: Sequence[str]) -> None:
+    _show_whole_help(app, tokens)
+    command, bound, _ = app.parse_args(tokens, print_error=False, exit_on_error=False)
+    for value in bound.arguments.values():
+        if isinstance(value, QuietOptions):
+            value.apply()
+    command(*bound.args, **bound.kwargs)
+
+
+def _show_whole_help(app: App, tokens: Sequence[str]) -> None:
+    """Let the help of a command be its docstring: the line that it is registered with is for the list of commands."""
+    chain, apps, _ = app.parse_commands(tokens)
+    for name, command in zip(chain, apps[1:], strict=True):
+        if not name.startswith("-") and all(inner.startswith("-") for inner in command):
+            command.help = None
+
+
+@contextmanager
+def _one_line_warnings(program: str) -> Iterator[None]:
+    """Show warnings without the source line that raised them."""
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_, **__: print_note(f"warning: {message}", program)
+        yield
+
+
+class _Notes(logging.Handler):
+    """Prints what the library logs as notes of a program."""
+
+    def __init__(self, program: str) -> None:
+        super().__init__()
+        self.program = program
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print one record."""
+        prefix = "warning: " if record.levelno >= logging.WARNING else ""
+        print_note(prefix + record.getMessage(), self.program)
+
+
+@contextmanager
+def _notes_of_the_library(program: str) -> Iterator[None]:
+    """Show what the packages log, one line each."""
+    handler = _Notes(program)
+    loggers = [logging.getLogger(name) for name in ("arrays", "magloc", "adcs", "sims")]
+    for logger in loggers:
+        logger.addHandler(handler)
+        logger.setLevel(logging.INFO)
+        logger.propagate = False
+    try:
+        yield
+    finally:
+        for logger in loggers:
+            logger.removeHandler(handler)
+            logger.setLevel(logging.NOTSET)
+            logger.propagate = True
+
+
+def print_json(value: object) -> None:
+    """Print one JSON value on stdout; numbers that are not finite become null, numpy arrays lists."""
+    import msgspec
+
+    print(msgspec.json.encode(value, enc_hook=lambda array: array.tolist()).decode())
+
+
+def print_note(text: str, program: str) -> None:
+    """Print one line of a program on stderr, whatever the text."""
+    print(f"{program}: {' '.join(text.split())}", file=sys.stderr)
+
+
+@contextmanager
+def progress(total: int, unit: str, *, quiet: bool, initial: int = 0) -> Iterator[Callable[[int], None]]:
+    """Count up to a total on a terminal's stderr.
+
+    Parameters
+    ----------
+    total : int
+    unit : str
+        What is counted.
+    quiet : bool
+    initial : int
+        Finished before; does not count in the estimate of the time left.
+
+    Yields
+    ------
+    callable
+        To be called with the number finished since the last call.
+    """
+    from tqdm import tqdm
+
+    hidden = quiet or not sys.stderr.isatty()
+    with tqdm(total=total, initial=initial, unit=f" {unit}", disable=hidden, leave=False) as bar:
+
+        def advance(finished: int) -> None:
+            bar.update(finished)
+
+        yield advance

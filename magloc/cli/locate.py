@@ -1,0 +1,323 @@
+"""``magloc locate``: one fix for every row of a readings file."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from cyclopts import Parameter
+from numpy.typing import NDArray
+
+from arrays.array import SensorArray
+from arrays.io.arguments import Flag
+from arrays.io.errors import InputError
+from arrays.typing import Vector
+from magloc.cli.framework import CommonOptions, print_json, progress
+from magloc.cli.options import print_note
+from magloc.readings import Readings
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from arrays.array import SensorArray
+    from magloc.localization.fit.prior import Knowledge
+    from magloc.readings import Readings
+from magloc.localization.fit.results import AnyFix
+from magloc.localization.uncertainty.covariance import is_misfit
+
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_BOUNDS = re.compile(rf"(?:(?P<below>{_NUMBER})<(?=[xyz]<))?(?P<axis>[xyz])(?P<sign>[<>])(?P<bound>{_NUMBER})")
+# Of a known place from the array, along each axis: farther than any field that can be measured, and not out of range.
+_FARTHEST_M = 1e6
+
+
+def locate(
+    readings: Path,
+    /,
+    *,
+    array: Path,
+    sensors: str | None = None,
+    sources: str | None = None,
+    position: Vector | None = None,
+    average: Flag = False,
+    region: str | None = None,
+    max_moment_Am2: Annotated[float | None, Parameter(name="--max-moment-Am2")] = None,
+    place: Vector | None = None,
+    date: str | None = None,
+    geomagnetic_model: str | None = None,
+    ambient_gradient: Flag = False,
+    body_length_m: float | None = None,
+    keep_sensors: Flag = False,
+    truth: Path | None = None,
+    out: Path | None = None,
+    json: Flag = False,
+    common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Find the sources in every row of a readings file, each row on its own.
+
+    Positions are in the array's frame, or in the world frame if the readings have the array's pose. The table has the
+    best solution of every row: s is the standard deviation, range95 the 95 % set of distances from the sensors'
+    centroid, of all solutions together. Flags: "weak" = nothing stands out of the noise, which alone makes one of a
+    thousand rows look like a source, and the range may be anything; "range?" = the range is not observable: s is
+    widened until it is as long as range95; "bent" = position or moment are uncertain by more than 4 %, or there is
+    another solution, or χ² does not rise as a Gaussian's: trust range95 rather than s; "+2(70%)" = two other solutions
+    fit almost as well, and the best one has 70 % of the probability, see --json; "-s3" = sensor s3 contradicts all
+    others and is not used; "merged" = two sources that the array does not tell apart; "near" = too near for a dipole;
+    "misfit" = χ² is far beyond noise.
+
+    Parameters
+    ----------
+    readings : Path
+        Readings file (CSV).
+    array : Path
+        Array file (TOML).
+    sensors : str
+        Ids of the sensors to use, separated by commas; columns of others are ignored. All by default.
+    sources : str
+        Number of sources in every row, or "auto": as many as the readings support, five at most. One by default.
+    position : tuple of 3 floats
+        Where the source is [m], in the frame of the results: only its moment is looked for.
+    average : bool
+        Average all rows to one fix. The array and the source must stand still.
+    region : str
+        Where the source is known to be, in m in the array's frame, as "z>0" or "-1<x<1,z>0"; solutions elsewhere are
+        left out.
+    max_moment_Am2 : float
+        Largest moment that the source can have [A·m²]; solutions with a larger one are left out.
+    place : tuple of 3 floats
+        Latitude, longitude [deg] and height [m] of the array, for the ambient field of scalar sensors. The world frame,
+        or that of the array if the readings have no pose, is then east, north, up.
+    date : str
+        When, such as 2026-11-21; goes with --place.
+    geomagnetic_model : str
+        IGRF-14 (1900 to 2030) or WMM2025 (2025 to 2030). IGRF-14 by default.
+    ambient_gradient : bool
+        Take the gradient of the geomagnetic field into account too (tens of pT/m).
+    body_length_m : float
+        Length of the object; flags fixes that are nearer than three lengths, where it is no dipole.
+    keep_sensors : bool
+        Use all sensors, also those that contradict the others.
+    truth : Path
+        Truth file (CSV) to draw in the figures, with the errors; goes with --out.
+    out : Path
+        Folder for figures and the data behind them: the fixes with 95 % ellipses, standard deviations and χ² with its
+        bounds, and what is left of every sensor's readings.
+    json : bool
+        Print one JSON object with every solution in place of the table.
+    common : CommonOptions
+        Common options.
+    """
+    from arrays.array_file import read_array
+    from arrays.io.outputs import refuse_file
+    from magloc.ambient import with_ambient_field
+    from magloc.cli.options import place_of_options
+    from magloc.cli.tables import fix_table
+    from magloc.localization.files import json_entry
+    from magloc.localization.fit.results import in_world
+    from magloc.localization.locator import RowFixes
+    from magloc.readings import read_readings, saturated_channels, without_saturated
+
+    ids = None if sensors is None else [name.strip() for name in sensors.split(",")]
+    where = place_of_options(place, date, geomagnetic_model)
+    knowledge, n_sources = knowledge_of(region, max_moment_Am2), _n_sources(sources)
+    if body_length_m is not None and not body_length_m > 0.0:
+        raise InputError(f"--body-length-m: found {body_length_m:g}, expected a positive length.")
+    if position is not None and (sources is not None or region is not None):
+        other = "--sources" if sources is not None else "--region"
+        raise InputError(f"--position: found it together with {other}, expected one of them.")
+    if truth is not None and out is None:
+        raise InputError("--truth: found no --out, expected a folder for the figures with it.")
+    if out is not None:
+        refuse_file(out, "--out")
+    used = subset_of(read_array(array), ids, array)
+    measured = read_readings(readings, used, sensors=ids)
+    rows = without_saturated(measured, used)
+    if average:
+        rows, used = _averaged(rows, used, readings, quiet=common.quiet)
+    if position is not None:
+        _refuse_farther(position, rows)
+    used, ambient_T = with_ambient_field(used, rows, where, gradient=ambient_gradient)
+    true_position_m = None if truth is None else _true_position(rows, truth)
+    try:
+        task = RowFixes(used, rows, ambient_T, knowledge, n_sources, position, keep_sensors, common.seed)
+    except ValueError as error:
+        sentence = str(error).removeprefix("Input ")
+        option = "" if sentence.startswith("array") else _option_of(sentence, region, sources)
+        raise InputError(f"{option or array}: {sentence}{_advice(sentence, used)}") from None
+    with progress(len(rows), "rows", quiet=common.quiet) as advance:
+        fixes = task.fixes(advance)
+    near = task.too_near(fixes, body_length_m)
+    in_array = fixes
+    fixes = [in_world(fix, rows, i) for i, fix in enumerate(fixes)]
+
+    times = rows.time_s.tolist()
+    saturated = saturated_channels(measured, rows, used) if not average else [()] * len(rows)
+    if json:
+        entries = (json_entry(*of_row) for of_row in zip(times, fixes, saturated, near, strict=True))
+        print_json({"results": list(entries)})
+    else:
+        print("\n".join(fix_table(times, fixes, near)))
+    reasons = counted_reasons(fix.reason for fix in fixes if not fix.solutions)
+    solved = sum(bool(fix.solutions) for fix in fixes)
+    if not solved:
+        raise InputError(f"{readings}: found no row that can be solved ({reasons}).")
+    if out is not None:
+        from magloc.localization.residuals import fix_residuals
+        from magloc.plots.fixes import write_pictures
+
+        residuals = fix_residuals(used, rows.values_T, in_array, ambient_T)
+        write_pictures(rows, used, fixes, residuals, true_position_m, out, quiet=common.quiet)
+    if not (json or common.quiet):
+        print_note(f"{solved} of {len(fixes)} rows solved" + (f"; not solved: {reasons}" if reasons else ""))
+    warn_of(fixes, saturated, near, quiet=common.quiet)
+
+
+def subset_of(array: SensorArray, ids: Sequence[str] | None, path: Path) -> SensorArray:
+    """The sensors of an array that the fixes use."""
+    if ids is None:
+        return array
+    for name in ids:
+        if name not in array.ids:
+            raise InputError(f"--sensors: found {name!r}, expected ids of sensors in {path}: {', '.join(array.ids)}.")
+    try:
+        return array.subset(ids)
+    except ValueError as error:
+        raise InputError(f"--sensors {','.join(ids)}: {error}") from None
+
+
+def _refuse_farther(position: Vector, rows: Readings) -> None:
+    """Refuse a place that is too far away from the array in some row."""
+    import numpy as np
+
+    array_m = np.zeros(3) if rows.array_position_m is None else rows.array_position_m
+    farthest = float(np.abs(np.array(position) - array_m).max())
+    if farthest > _FARTHEST_M:
+        raise InputError(
+            f"--position: found a place {farthest:g} m from the array, expected one within {_FARTHEST_M:g} m."
+        )
+
+
+def _true_position(rows: Readings, path: Path) -> NDArray[np.float64]:
+    from magloc.readings import read_truth, truth_of_rows
+
+    position_m, _ = truth_of_rows(rows, read_truth(path), path)
+    return position_m
+
+
+def _n_sources(option: str | None) -> int | Literal["auto"] | None:
+    """The number of sources that is asked for; None for the plain fix of one."""
+    if option is None:
+        return None
+    if option == "auto":
+        return "auto"
+    try:
+        return int(option)
+    except ValueError:
+        raise InputError(f"--sources: found {option!r}, expected a whole number or auto.") from None
+
+
+def _option_of(sentence: str, region: str | None, sources: str | None) -> str:
+    """The option that an error of the library is about."""
+    if sentence.startswith("n_sources"):
+        return f"--sources {sources}"
+    if sentence.startswith("position_m"):
+        return "--position"
+    return f"--region {region}" if sentence.startswith("knowledge") and region is not None else ""
+
+
+def _advice(sentence: str, array: SensorArray) -> str:
+    if sentence.startswith("array must give") and array.channel_is_scalar.any():
+        return " Add sensors, or name the place of the source with --position."
+    return ""
+
+
+def knowledge_of(region: str | None, largest_moment: float | None) -> Knowledge:
+    """What the options say of the source."""
+    from magloc.localization.fit.prior import Knowledge
+
+    low, high = [-math.inf] * 3, [math.inf] * 3
+    for part in [] if region is None else region.split(","):
+        bounds = _BOUNDS.fullmatch(part.replace(" ", ""))
+        if not bounds:
+            raise InputError(f"--region: found {part.strip()!r}, expected bounds such as z>0 or -1<x<1, in m.")
+        i = "xyz".index(bounds["axis"])
+        lower = bounds["below"] or (bounds["bound"] if bounds["sign"] == ">" else None)
+        upper = bounds["bound"] if bounds["sign"] == "<" else None
+        low[i] = max(low[i], float(lower)) if lower else low[i]
+        high[i] = min(high[i], float(upper)) if upper else high[i]
+        if not low[i] < high[i]:
+            raise InputError(
+                f"--region: found {region!r}, expected bounds that leave some room along {bounds['axis']}."
+            )
+    if largest_moment is not None and not largest_moment > 0.0:
+        raise InputError(f"--max-moment-Am2: found {largest_moment:g}, expected a positive number.")
+    return Knowledge(
+        (low[0], low[1], low[2]),
+        (high[0], high[1], high[2]),
+        math.inf if largest_moment is None else largest_moment,
+    )
+
+
+def _averaged(readings: Readings, array: SensorArray, path: Path, *, quiet: bool) -> tuple[Readings, SensorArray]:
+    from magloc.readings import average, averaging_array, complete_rows
+
+    n_complete = int(complete_rows(readings).sum())
+    if 0 < n_complete < len(readings) and not quiet:
+        print_note(f"note: {n_complete} of {len(readings)} rows are averaged, the others miss some readings")
+
+    try:
+        return average(readings), averaging_array(array, readings)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def warn_of(
+    fixes: Sequence[AnyFix], saturated: Sequence[tuple[str, ...]], near: Sequence[bool], *, quiet: bool
+) -> None:
+    """Name what is wrong with the sensors and with the source, on stderr."""
+    if quiet:
+        return
+    dropped = Counter(name for fix in fixes for name in fix.dropped)
+    if dropped:
+        print_note(f"warning: sensors that contradict all others are not used: {_rows_of(dropped)}")
+    fewer = Counter(fix.reason for fix in fixes if fix.solutions and fix.reason)
+    for reason, n in fewer.most_common():
+        print_note(f"note: in {n} of {len(fixes)} rows {reason}")
+    misfits = sum(is_misfit(fix) for fix in fixes)
+    if misfits:
+        print_note(
+            f"warning: in {misfits} of {len(fixes)} rows χ² is far beyond noise: the noise is understated, or the model"
+            " does not hold, and the standard deviations say too little"
+        )
+    weak = sum(bool(fix.solutions) and not fix.detected for fix in fixes)
+    if weak:
+        print_note(
+            f"note: in {weak} of {len(fixes)} rows nothing stands out of the noise: their solutions are fits of noise,"
+            " and a source may be at any range"
+        )
+    lost = Counter(name for names in saturated for name in names)
+    if lost:
+        print_note(f"warning: saturated readings are not used: {_rows_of(lost)}")
+    if any(near):
+        print_note(
+            f"warning: in {sum(near)} of {len(near)} rows the source is too near, or too large, for a dipole: what is"
+            " left has the pattern of an extended source, or it is nearer than three body lengths"
+        )
+
+
+def _rows_of(counts: Counter[str]) -> str:
+    return ", ".join(f"{name} ({n} row{'s' if n > 1 else ''})" for name, n in counts.most_common())
+
+
+def counted_reasons(reasons: Iterable[str], most: int = 3) -> str:
+    """Reasons with the number of rows that each applies to, the commonest first."""
+    counts = Counter(reasons).most_common()
+    others = sum(n for _, n in counts[most:])
+    parts = counts[:most] + [("other reasons", others)] * (others > 0)
+    return "; ".join(f"{n} row{'s' if n > 1 else ''}: {reason}" for reason, n in parts)

@@ -1,0 +1,1 @@
+"""Convergence maps: from which starts, and to which sources, a filter finds its way."""

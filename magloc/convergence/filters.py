@@ -1,0 +1,362 @@
+"""The filters whose convergence is mapped."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magloc.convergence import filters_compiled as lanes
+from magloc.convergence.relinearised_compiled import relinearised_map
+from magloc.kalman import IteratedUpdate, iterated_update, predict_square_root, scalar_update, sequential_update
+from magloc.localization.search.single_source import Locator
+from magloc.measurement.differences import DifferenceMeasurement
+
+if TYPE_CHECKING:
+    pass
+from arrays.typing import FloatArray
+
+# χ² above the maximum-likelihood χ² within which a stop counts as having reached it.
+CHI2_REACHED = 0.05
+# Distance from the maximum-likelihood position that a filter with a prior may keep.
+PRIOR_REACHED_M = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Ends:
+    """Ends of many starts.
+
+    Attributes
+    ----------
+    states : ndarray, shape (n, 6)
+        (position [m], moment [A·m²]).
+    chi2 : ndarray, shape (n,)
+    iterations : ndarray of int, shape (n,)
+        Passes over the readings.
+    stopped : ndarray of bool, shape (n,)
+        Whether the stop rule was met.
+    """
+
+    states: FloatArray
+    chi2: FloatArray
+    iterations: NDArray[np.int64]
+    stopped: NDArray[np.bool_]
+
+
+class Filter(Protocol):
+    """What a map needs of a filter."""
+
+    @property
+    def name(self) -> str:
+        """Name on the command line."""
+
+    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
+        """End of every start (n, 6) for the decorrelated differences z (k,)."""
+
+    def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
+        """Which of the ends are the maximum-likelihood optimum."""
+
+
+@dataclass(frozen=True)
+class RepeatedFilter:
+    r"""Extended Kalman filter that processes the same readings again and again.
+
+    Attributes
+    ----------
+    position_step_m, moment_step_Am2 : float
+        Diagonal of :math:`S_q`, which is added before every pass; the first covariance is :math:`S_q S_q^T` as well.
+    noise_inflation : float
+        Factor on the variances of the readings inside the filter.
+    relinearise_every_scalar : bool
+        Linearise before every scalar rather than once a pass.
+    tolerance_T : float
+        Stop when the predicted differences change by less than this between passes [T].
+    max_iterations : int
+        Passes at most.
+    """
+
+    position_step_m: float = 0.1
+    moment_step_Am2: float = 100.0
+    noise_inflation: float = 1.0
+    relinearise_every_scalar: bool = False
+    tolerance_T: float = 1e-12
+    max_iterations: int = 200
+
+    @property
+    def name(self) -> str:
+        """Name on the command line."""
+        return "repeated"
+
+    @property
+    def s_q(self) -> FloatArray:
+        """Diagonal of the square root of the process noise, shape (6,)."""
+        return np.repeat([self.position_step_m, self.moment_step_Am2], 3)
+
+    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
+        """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
+        run_all = relinearised_map if self.relinearise_every_scalar else lanes.repeated_map
+        return Ends(
+            *run_all(
+                starts,
+                _of_source(measurement, z),
+                measurement.variance,
+                measurement.array.positions,
+                field_weights(measurement),
+                self.noise_inflation,
+                self.position_step_m,
+                self.moment_step_Am2,
+                self.tolerance_T,
+                self.max_iterations,
+            )
+        )
+
+    def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
+        """End of one start (6,), by the square-root filter of :mod:`magloc.kalman`."""
+        variance = self.noise_inflation * measurement.variance
+        x, S, S_q = start, np.diag(self.s_q), np.diag(self.s_q)
+        predicted = measurement.predicted(x[:3], x[3:])
+        innovation = z - predicted
+        for iteration in range(1, self.max_iterations + 1):
+            S = predict_square_root(S, np.eye(6), S_q)
+            if self.relinearise_every_scalar:
+                for j in range(z.size):
+                    nu = z[j] - measurement.predicted(x[:3], x[3:])[j]
+                    x, S = scalar_update(x, S, measurement.jacobian(x[:3], x[3:])[j], float(nu), float(variance[j]))
+            else:
+                x, S = sequential_update(x, S, measurement.jacobian(x[:3], x[3:]), z - predicted, variance)
+            predicted, before = measurement.predicted(x[:3], x[3:]), predicted
+            change = float(np.linalg.norm(predicted - before))
+            if not np.isfinite(change) or change < self.tolerance_T:
+                return IteratedUpdate(x, S, iteration, change < self.tolerance_T, innovation, np.nan)
+        return IteratedUpdate(x, S, self.max_iterations, False, innovation, np.nan)
+
+    def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
+        """Stopped with the χ² of the maximum-likelihood optimum."""
+        return ends.stopped & (ends.chi2 < chi2_optimum + CHI2_REACHED)
+
+
+@dataclass(frozen=True)
+class IekfFilter:
+    """Iterated extended Kalman filter with the start as the mean of its prior.
+
+    Attributes
+    ----------
+    position_sigma_m, moment_sigma_Am2 : float
+        Standard deviations of the prior around the start, per axis.
+    tolerance_T : float
+        Stop when the predicted differences change by less than this between iterations [T].
+    max_iterations : int
+        Linearisations at most.
+    """
+
+    position_sigma_m: float = 3.0
+    moment_sigma_Am2: float = 300.0
+    tolerance_T: float = 1e-12
+    max_iterations: int = 200
+
+    @property
+    def name(self) -> str:
+        """Name on the command line."""
+        return "iekf"
+
+    @property
+    def s_0(self) -> FloatArray:
+        """Diagonal of the square root of the prior covariance, shape (6,)."""
+        return np.repeat([self.position_sigma_m, self.moment_sigma_Am2], 3)
+
+    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
+        """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
+        return Ends(
+            *lanes.iekf_map(
+                starts,
+                _of_source(measurement, z),
+                measurement.variance,
+                measurement.array.positions,
+                field_weights(measurement),
+                self.position_sigma_m,
+                self.moment_sigma_Am2,
+                self.tolerance_T,
+                self.max_iterations,
+            )
+        )
+
+    def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
+        """End of one start (6,), by :func:`magloc.kalman.iterated_update`."""
+        return iterated_update(
+            start,
+            np.diag(self.s_0),
+            z,
+            measurement.variance,
+            lambda x: measurement.predicted(x[:3], x[3:]),
+            lambda x: measurement.jacobian(x[:3], x[3:]),
+            tolerance=self.tolerance_T,
+            max_iterations=self.max_iterations,
+        )
+
+    def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
+        """Stopped at the prior's own optimum, near the maximum-likelihood position (the prior pulls, so χ² differs)."""
+        distance = np.linalg.norm(ends.states[:, :3] - position_optimum, axis=1)
+        return ends.stopped & (distance < PRIOR_REACHED_M)
+
+
+@dataclass(frozen=True)
+class DampedFilter:
+    r"""Levenberg-Marquardt iteration on the cost of :class:`IekfFilter`: no accepted step raises it.
+
+    A step solves :math:`(M + \lambda\,\mathrm{diag} M)\,\delta = -\nabla` with :math:`M = H^T R^{-1} H + P_0^{-1}` and
+    the gradient of half the cost. One that lowers the cost is taken and divides the damping λ by 5; any other is not,
+    and multiplies it by 4. Where Gauss-Newton steps wander without end, this one stops at an optimum; a wide prior
+    makes it one of the likelihood.
+
+    Attributes
+    ----------
+    position_sigma_m, moment_sigma_Am2 : float
+        Standard deviations of the prior around the start, per axis.
+    first_damping : float
+        λ of the first step, positive.
+    tolerance_T : float
+        A step that changes the predicted differences by less than this [T] is followed by one without damping; if that
+        changes them by less as well, stop.
+    max_iterations : int
+        Linearisations at most, at states that are not taken as well.
+
+    Notes
+    -----
+    D. W. Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", J. SIAM 11 (1963).
+    """
+
+    position_sigma_m: float = 3.0
+    moment_sigma_Am2: float = 300.0
+    first_damping: float = 1.0
+    tolerance_T: float = 1e-12
+    max_iterations: int = 200
+
+    @property
+    def name(self) -> str:
+        """Name on the command line."""
+        return "damped"
+
+    @property
+    def s_0(self) -> FloatArray:
+        """Diagonal of the square root of the prior covariance, shape (6,)."""
+        return np.repeat([self.position_sigma_m, self.moment_sigma_Am2], 3)
+
+    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
+        """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
+        return Ends(
+            *lanes.damped_map(
+                starts,
+                _of_source(measurement, z),
+                measurement.variance,
+                measurement.array.positions,
+                field_weights(measurement),
+                self.position_sigma_m,
+                self.moment_sigma_Am2,
+                self.first_damping,
+                self.tolerance_T,
+                self.max_iterations,
+            )
+        )
+
+    def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
+        """End of one start (6,), in units of the standard deviations of readings and prior."""
+        sigma = np.sqrt(measurement.variance)
+
+        def linearised(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+            """Predicted differences; residuals of readings and prior, and minus their Jacobian."""
+            predicted = measurement.predicted(x[:3], x[3:])
+            residual = np.concatenate([(z - predicted) / sigma, (start - x) / self.s_0])
+            jacobian = measurement.jacobian(x[:3], x[3:]) * self.s_0 / sigma[:, None]
+            return predicted, residual, np.concatenate([jacobian, np.eye(6)])
+
+        x, damping, kept = start, self.first_damping, self.first_damping
+        predicted, residual, J = linearised(x)
+        innovation = z - predicted
+        iteration, ended = 0, False
+        while not ended:
+            iteration += 1
+            # The normal equations of M + λ diag M, without M: its diagonal is the columns' square norm.
+            Q, R = np.linalg.qr(np.concatenate([J, np.diag(np.sqrt(damping) * np.linalg.norm(J, axis=0))]))
+            trial = x + self.s_0 * np.linalg.solve(R, Q[: residual.size].T @ residual)
+            at_trial = linearised(trial)
+            change = float(np.linalg.norm(at_trial[0] - predicted))
+            small = change < self.tolerance_T
+            stopped = small and damping == 0.0
+            if at_trial[1] @ at_trial[1] < residual @ residual:
+                x, kept = trial, kept / lanes.DAMPING_DECREASE
+                predicted, residual, J = at_trial
+            else:
+                kept *= lanes.DAMPING_INCREASE
+            # Damping alone can make a step small: the stop rule is left to the step without it.
+            damping = 0.0 if small else kept
+            ended = stopped or iteration >= self.max_iterations or not np.all(np.isfinite(residual))
+        S: FloatArray = self.s_0[:, None] * np.linalg.inv(np.linalg.qr(J, mode="r"))
+        return IteratedUpdate(x, S, iteration, stopped, innovation, np.nan)
+
+    def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
+        """As :meth:`IekfFilter.reached`."""
+        distance = np.linalg.norm(ends.states[:, :3] - position_optimum, axis=1)
+        return ends.stopped & (distance < PRIOR_REACHED_M)
+
+
+@dataclass(frozen=True)
+class GlobalFilter:
+    """The start-free search of :class:`magloc.localization.search.single_source.Locator`.
+
+    With the map's start refined before its candidates.
+
+    Attributes
+    ----------
+    max_iterations : int
+        Linearisations of one refinement at most. The map counts those of all refinements of a start together.
+    """
+
+    max_iterations: int = 100
+
+    @property
+    def name(self) -> str:
+        """Name on the command line."""
+        return "global"
+
+    def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
+        """Best end of every start (n, 6), compiled.
+
+        The readable twin of its cost is :mod:`magloc.measurement.whitened`.
+        """
+        array = measurement.array
+        # Any readings with these differences have the same likelihood.
+        readings = np.linalg.lstsq(measurement.differences.transform, z, rcond=None)[0] + array.channel_offset_T
+        ends = Locator(array, max_iterations=self.max_iterations).fit_from(readings, starts[:, :3])
+        return Ends(
+            states=np.concatenate([ends.position_m, ends.moment_Am2], axis=1),
+            chi2=ends.chi2,
+            iterations=ends.linearisations,
+            stopped=np.isfinite(ends.chi2),
+        )
+
+    def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
+        """Stopped with the χ² of the maximum-likelihood optimum."""
+        return ends.stopped & (ends.chi2 < chi2_optimum + CHI2_REACHED)
+
+
+# Every method of a map by its name, with its default settings; scenario files and the command line take them from here.
+FILTERS: dict[str, Filter] = {
+    method.name: method for method in (RepeatedFilter(), IekfFilter(), DampedFilter(), GlobalFilter())
+}
+
+
+def _of_source(measurement: DifferenceMeasurement, z: FloatArray) -> FloatArray:
+    """Differences (k,) without those of the known ambient field, which the compiled filters do not model."""
+    array = measurement.array
+    return z - measurement.measured(array.readings_of(array.ambient_fields))
+
+
+def field_weights(measurement: DifferenceMeasurement) -> FloatArray:
+    """Weight of the field at every sensor in every decorrelated difference, shape (k, N, 3), for vector sensors."""
+    array = measurement.array
+    weights = np.zeros((measurement.variance.size, array.n_sensors, 3))
+    for c, sensor in enumerate(array.channel_sensor):
+        weights[:, sensor] += measurement.differences.transform[:, c, None] * array.channel_gain[c]
+    return weights

@@ -1,0 +1,414 @@
+"""Maps over sources: where around an array does one start-free fix find the source?
+
+A cube of positions; at each a dipole whose moment has a given size and a random direction, one set of readings with the
+array's noise, and one fix. It succeeds if no better solution than the fix's best one is found by searching from the
+truth. Whether that solution is any good is physics, not search: the Cramér-Rao bound is part of the map.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from functools import cached_property
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from arrays.array import SensorArray
+from arrays.geometries import tetrahedron
+from arrays.noise import reading_covariance, reading_errors
+from arrays.typing import FloatArray
+from arrays.whitening import whitening
+from magloc.grids.cube import Box, MapSummary, Tally, Values, Variable, histogram, in_memory
+from magloc.localization.fit.results import Fix
+from magloc.localization.search.single_source import N_UNKNOWNS, Locator
+from magloc.measurement.differences import channel_jacobian, predicted_channels
+from magloc.measurement.whitened import SeparableProblem
+
+if TYPE_CHECKING:
+    import xarray as xr
+from magloc.localization.fit import variable_projection_compiled
+
+# χ² above that of the optimum searched from the truth within which a fix has found it.
+CHI2_FOUND = 0.05
+_EDGE = 16
+_MAX_ITERATIONS = 200
+
+
+class SourceStatus(IntEnum):
+    """How the fix of a source ended."""
+
+    FOUND = 0
+    MISSED = 1
+    UNSOLVED = 2
+    LEFT_OUT = 3
+
+
+@dataclass(frozen=True)
+class SourcesScenario:
+    """A cube of sources around an array.
+
+    Attributes
+    ----------
+    array : SensorArray
+        Vector sensors.
+    half_width_m : float
+        The cube reaches from -half_width to +half_width along every axis, around the array's centroid.
+    nearest_m, farthest_m : float
+        Sources nearer to the centroid, or farther from it, are left out.
+    moment_Am2 : float
+        Size of every source's moment.
+    seed : int
+        Of the moments' directions and the noise. Those of a source depend on the seed and its place in the cube alone.
+    """
+
+    array: SensorArray = field(default_factory=lambda: tetrahedron(1.5, noise_T=1e-9))
+    half_width_m: float = 12.0
+    nearest_m: float = 1.0
+    farthest_m: float = 12.0
+    moment_Am2: float = 300.0
+    seed: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class SourcesMap:
+    """Map of fixes over a cube of sources, as :class:`magloc.grids.cube.CubeMap`.
+
+    Raises
+    ------
+    ValueError
+        The grid is less than 2, or the array has scalar sensors or too few of them.
+    """
+
+    scenario: SourcesScenario
+    grid: int
+
+    def __post_init__(self) -> None:
+        if self.grid < 2:
+            raise ValueError(f"Input grid must be at least 2; instead received {self.grid}.")
+        if self.scenario.array.channel_is_scalar.any():
+            raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
+        n_differences = self._problem.whitening.n_differences
+        if n_differences < N_UNKNOWNS:
+            raise ValueError(f"The array gives {n_differences} independent differences, {N_UNKNOWNS} are needed.")
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"scenario": self.scenario, "grid": self.grid}  # the rest is large, and soon made again
+
+    @cached_property
+    def _locator(self) -> Locator:
+        return Locator(self.scenario.array)
+
+    @cached_property
+    def _problem(self) -> SeparableProblem:
+        return SeparableProblem.of(self.scenario.array, whitening(self.scenario.array))
+
+    @property
+    def edge(self) -> int:
+        """Sources along the edges of a box; a fix takes the time of many starts, so boxes are smaller than theirs."""
+        return _EDGE
+
+    @property
+    def axis(self) -> FloatArray:
+        """Coordinates of the sources relative to the array's centroid [m], shape (grid,)."""
+        return np.linspace(-self.scenario.half_width_m, self.scenario.half_width_m, self.grid)
+
+    @property
+    def point(self) -> str:
+        """What a point is."""
+        return "source"
+
+    @property
+    def variables(self) -> Mapping[str, Variable]:
+        """Variables over the cube."""
+        return _VARIABLES
+
+    @property
+    def attributes(self) -> Mapping[str, Any]:
+        """All that determines the map."""
+        from arrays.array_file import array_toml
+
+        scenario = self.scenario
+        return {
+            "Conventions": "CF-1.10",
+            "title": "Start-free fixes over a cube of sources",
+            "source": f"magloc {version('magloc')}",
+            "grid": self.grid,
+            "method": "global",
+            "array": array_toml(scenario.array),
+            "half_width_m": scenario.half_width_m,
+            "nearest_m": scenario.nearest_m,
+            "farthest_m": scenario.farthest_m,
+            "moment_magnitude_Am2": scenario.moment_Am2,
+            "seed": str(scenario.seed),  # of any size
+        }
+
+    @property
+    def findings(self) -> Mapping[str, Any]:
+        """Where the cube is."""
+        return {"centroid_m": self.scenario.array.centroid}
+
+    def warm_up(self) -> None:
+        """Compile, or load what was compiled."""
+        array = self.scenario.array
+        position = array.centroid + 3.0 * array.circumradius * np.eye(3)[:1]
+        moment = self.scenario.moment_Am2 * np.eye(3)[:1]
+        readings = self._readings(position, moment, np.zeros((1, array.n_channels)))
+        self._lists(self._locator.fit_rows(readings)[0], *self._searched_from(position, readings)[0])
+
+    def values(self, box: Box) -> Values:
+        """Fixes of the sources of a box."""
+        relative = box.points(self.axis)
+        distance = np.linalg.norm(relative, axis=1)
+        used = (distance >= self.scenario.nearest_m) & (distance <= self.scenario.farthest_m)
+        moment, noise = (part[used] for part in self._random(box))
+        position = self.scenario.array.centroid + relative[used]
+        readings = self._readings(position, moment, noise)
+        fixes = self._locator.fit_rows(readings)
+        from_truth = self._searched_from(position, readings)
+        reference = np.array([chi2 for _, chi2 in from_truth])
+        chi2 = np.array([fix.solutions[0].chi2 if fix.solutions else np.nan for fix in fixes])
+        found = np.where(chi2 <= reference + CHI2_FOUND, SourceStatus.FOUND, SourceStatus.MISSED)
+        sigma_range, sigma_position = self._bounds(position, moment, readings)
+        of_used: dict[str, Any] = {
+            "status": np.where(np.isnan(chi2), SourceStatus.UNSOLVED, found),
+            "iterations": [fix.solutions[0].iterations if fix.solutions else 0 for fix in fixes],
+            "chi2": chi2,
+            "chi2_from_truth": reference,
+            "distance": [_error(fix, truth) for fix, truth in zip(fixes, position, strict=True)],
+            "solutions": [len(fix.solutions) for fix in fixes],
+            "truth_listed": [self._lists(fix, *end) for fix, end in zip(fixes, from_truth, strict=True)],
+            "range_observable": [bool(fix.solutions) and fix.solutions[0].range_observable for fix in fixes],
+            "sigma_range": sigma_range,
+            "sigma_position": sigma_position,
+        }
+        values = {}
+        for name, variable in _VARIABLES.items():
+            of_all = np.full(box.size, _LEFT_OUT.get(name, np.nan), variable.dtype)
+            of_all[used] = of_used[name]
+            values[name] = of_all.reshape(box.shape)
+        return values
+
+    def tally(self, values: Values) -> Tally:
+        """Counts of a part's values."""
+        return sources_tally(values)
+
+    def summary(self, tally: Tally, seconds: float) -> SourceMapSummary:
+        """Summary of the whole cube."""
+        return sources_summary(tally, seconds)
+
+    def _random(self, box: Box) -> tuple[FloatArray, FloatArray]:
+        """Moments (n, 3) [A·m²] and standard normal noise (n, C) of a box's sources.
+
+        Every line along z has a counter-based generator of its own, so they do not depend on the boxes.
+        """
+        key = np.random.SeedSequence(self.scenario.seed).generate_state(2, np.uint64)
+        x, y, z = box.region
+        lines = []
+        for i in range(x.start, x.stop):
+            for j in range(y.start, y.stop):
+                generator = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, i, j]))
+                lines.append(generator.standard_normal((z.stop, 3 + self.scenario.array.n_channels))[z])
+        normal = np.concatenate(lines)
+        direction = normal[:, :3] / np.linalg.norm(normal[:, :3], axis=1, keepdims=True)
+        return self.scenario.moment_Am2 * direction, normal[:, 3:]
+
+    def _readings(self, position: FloatArray, moment: FloatArray, noise: FloatArray) -> FloatArray:
+        """Raw readings (n, C) [T]; noise as standard normal numbers."""
+        array = self.scenario.array
+        exact = predicted_channels(array, position, moment) + array.channel_offset_T
+        return exact + reading_errors(array, exact, noise)
+
+    def _problems(self, readings: FloatArray) -> list[SeparableProblem]:
+        """Problem of every row, with the whitening of its fix."""
+        array = self.scenario.array
+        if not array.noise_depends_on_reading:
+            return [self._problem] * len(readings)
+        covariances = (reading_covariance(array, row) for row in readings)
+        return [SeparableProblem.of(array, whitening(array, covariance_T2=covariance)) for covariance in covariances]
+
+    def _searched_from(self, truth: FloatArray, readings: FloatArray) -> list[tuple[FloatArray, float]]:
+        """Ends q (4,) and χ² of the refinements that start at the truth (n, 3).
+
+        One that has not converged only ever has a χ² that is too high, so it counts like the others: a fix is held
+        against it where it is lower.
+        """
+        array = self.scenario.array
+        without_source = array.readings_of(array.ambient_fields)
+        ends = []
+        for position, row, problem in zip(truth, readings, self._problems(readings), strict=True):
+            white = problem.whitening
+            q = problem.homogeneous(position)
+            chi2, _, _ = variable_projection_compiled.refine(
+                q,
+                white.apply(row - without_source),
+                problem.sensors,
+                problem.channel_sensor,
+                problem.gain,
+                np.ascontiguousarray(white.basis.T),
+                white.shrinkage,
+                3,
+                variable_projection_compiled.OPTIMUM_TOLERANCE,
+                _MAX_ITERATIONS,
+                np.empty((0, 4)),
+                np.empty(0),
+                0,
+                np.empty(3),
+            )
+            ends.append((q, chi2))
+        return ends
+
+    def _lists(self, fix: Fix, q: FloatArray, chi2: float) -> bool:
+        """Whether a solution is the optimum that the search from the truth ended at."""
+        return any(
+            variable_projection_compiled.same_optimum(
+                self._problem.homogeneous(solution.position_m), solution.chi2, q, chi2
+            )
+            for solution in fix.solutions
+        )
+
+    def _bounds(self, position: FloatArray, moment: FloatArray, readings: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Cramér-Rao bounds (n,) of the range's and the position's standard deviation [m]."""
+        array = self.scenario.array
+        columns = np.swapaxes(channel_jacobian(array, position, moment), -1, -2)
+        rows = np.empty_like(columns)
+        for i, problem in enumerate(self._problems(readings)):
+            rows[i] = problem.whitening.apply(columns[i])
+        covariance = _covariance(rows)[:, :3, :3]
+        u = position - array.centroid
+        u = u / np.linalg.norm(u, axis=1, keepdims=True)
+        return (
+            np.sqrt(np.einsum("ni,nij,nj->n", u, covariance, u)),
+            np.sqrt(np.trace(covariance, axis1=1, axis2=2)),
+        )
+
+
+def _covariance(rows: FloatArray) -> FloatArray:
+    """Inverse (n, 6, 6) of the information ``rows rowsᵀ`` of whitened rows (n, 6, C); infinite where singular."""
+    scale = np.linalg.norm(rows, axis=-1)
+    unit = rows / scale[..., None]
+    eigenvalues, vectors = np.linalg.eigh(unit @ np.swapaxes(unit, -1, -2))
+    singular = eigenvalues[:, :1] <= 1e-15 * eigenvalues[:, -1:]
+    part = vectors / np.sqrt(np.where(singular, 1.0, eigenvalues))[:, None, :] / scale[..., None]
+    covariance: FloatArray = np.where(singular[..., None], np.inf, part @ np.swapaxes(part, -1, -2))
+    return covariance
+
+
+def _error(fix: Fix, truth: FloatArray) -> float:
+    return float(np.linalg.norm(fix.solutions[0].position_m - truth)) if fix.solutions else np.nan
+
+
+_NO_YES = {"flag_values": np.array([-1, 0, 1], dtype=np.int8), "flag_meanings": "left_out no yes"}
+_LEFT_OUT = {
+    "status": SourceStatus.LEFT_OUT,
+    "iterations": 0,
+    "solutions": 0,
+    "truth_listed": -1,
+    "range_observable": -1,
+}
+_VARIABLES = {
+    "status": Variable(
+        np.int8,
+        {
+            "long_name": "how the fix of the source ended",
+            "flag_values": np.array([s.value for s in SourceStatus], dtype=np.int8),
+            "flag_meanings": " ".join(s.name.lower() for s in SourceStatus),
+        },
+    ),
+    "iterations": Variable(np.int32, {"long_name": "linearisations that led to the best solution", "units": "1"}),
+    "chi2": Variable(np.float64, {"long_name": "chi-square of the best solution", "units": "1"}),
+    "chi2_from_truth": Variable(
+        np.float64, {"long_name": "chi-square of the optimum searched from the truth", "units": "1"}
+    ),
+    "distance": Variable(np.float64, {"long_name": "distance of the best solution from the truth", "units": "m"}),
+    "solutions": Variable(np.int32, {"long_name": "distinct solutions within 20 of the best chi-square", "units": "1"}),
+    "truth_listed": Variable(
+        np.int8, {"long_name": "whether the optimum searched from the truth is among the solutions", **_NO_YES}
+    ),
+    "range_observable": Variable(
+        np.int8, {"long_name": "whether the readings fix the range of the best solution", **_NO_YES}
+    ),
+    "sigma_range": Variable(
+        np.float64, {"long_name": "Cramer-Rao bound of the standard deviation of the range", "units": "m"}
+    ),
+    "sigma_position": Variable(
+        np.float64, {"long_name": "Cramer-Rao bound of the position, root of the trace", "units": "m"}
+    ),
+}
+
+
+@dataclass(frozen=True)
+class SourceMapSummary(MapSummary):
+    """Counts of a map over sources: ``starts`` are the sources that were fixed, ``converged`` those that were found.
+
+    Attributes
+    ----------
+    truth_listed : float
+        Fraction of them whose solutions have the optimum that the search from the truth ended at.
+    """
+
+    truth_listed: float
+
+
+def sources_tally(values: Values) -> Tally:
+    """Counts of ``status``, ``truth_listed`` and ``iterations`` of a part of a map over sources."""
+    found = values["status"] == SourceStatus.FOUND
+    counts = {
+        "sources": (values["status"] != SourceStatus.LEFT_OUT).sum(),
+        "found": found.sum(),
+        "truth listed": (values["truth_listed"] == 1).sum(),
+        "iterations": values["iterations"].sum(dtype=np.int64),
+    }
+    return Tally(Counter({name: int(count) for name, count in counts.items()}), histogram(values["iterations"][found]))
+
+
+def sources_summary(tally: Tally, seconds: float) -> SourceMapSummary:
+    """Summary of a map over sources from its tally."""
+    return SourceMapSummary(
+        starts=tally.counts["sources"],
+        converged=tally.counts["found"],
+        fraction=tally.fraction("found", "sources"),
+        front_fraction=float("nan"),
+        back_fraction=float("nan"),
+        median_iterations=tally.median_iterations(),
+        iterations_total=tally.counts["iterations"],
+        seconds=seconds,
+        truth_listed=tally.fraction("truth listed", "sources"),
+    )
+
+
+def source_map(scenario: SourcesScenario, grid: int = 21, progress: Callable[[int], None] | None = None) -> xr.Dataset:
+    r"""Fix every source of a cube once.
+
+    Parameters
+    ----------
+    scenario : SourcesScenario
+    grid : int
+        Sources along every axis, at least 2. For maps that do not fit into memory see :mod:`magloc.grids.store`.
+    progress : callable, optional
+        Called with the number of sources finished since the last call.
+
+    Returns
+    -------
+    xarray.Dataset
+        Over the source's (x, y, z) relative to the centroid [m]: ``status`` (found: the best solution's χ² is at most
+        0.05 above that of the optimum searched from the truth), ``iterations``, ``chi2``, ``chi2_from_truth``,
+        ``distance`` of the best solution from the truth [m], number of ``solutions``, ``truth_listed``,
+        ``range_observable``, and the Cramér-Rao bounds of the range and the position, ``sigma_range``
+        :math:`\sqrt{u^T C_{pp} u}` and ``sigma_position`` :math:`\sqrt{\mathrm{tr}\, C_{pp}}` [m].
+
+    Raises
+    ------
+    ValueError
+        The array has scalar sensors or too few of them.
+    """
+    return in_memory(SourcesMap(scenario, grid), progress)
+
+
+def summary(dataset: xr.Dataset) -> SourceMapSummary:
+    """Counts of a map made by :func:`source_map`."""
+    values = {name: dataset[name].to_numpy() for name in ("status", "truth_listed", "iterations")}
+    return sources_summary(sources_tally(values), float(dataset.attrs["seconds"]))

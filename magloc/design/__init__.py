@@ -1,0 +1,1 @@
+"""Arrays designed for a task."""

@@ -1,0 +1,218 @@
+"""Descent of a design criterion over the places of the sensors, within a volume or on a surface.
+
+The criterion is that of a fixed sample of sources, and its slope is exact. Steps are those of a spectral projected
+gradient: the gradient, as long as its change since the last step suggests, brought back into the volume, and shortened
+until the criterion is below the worst of the last few ones.
+
+Source: E. G. Birgin, J. M. Martínez, M. Raydan, "Nonmonotone spectral projected gradient methods on convex sets",
+SIAM Journal on Optimization 10 (2000); on a surface, which is not convex, every trial is brought back to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.distance import pdist
+
+from arrays.typing import FloatArray
+from magloc.compilation import over_rows
+from magloc.design.criterion_compiled import range_deviation_rows
+from magloc.design.task import DesignTask
+
+# Weights of order statistics below this share of the largest do not move the slope.
+_NEGLIGIBLE = 1e-6
+_MEMORY = 8
+_SUFFICIENT = 1e-4
+_SHORTEST = 1e-8
+_FIRST_STEP = 0.05
+# It has converged where so many steps have gained less than this share of the criterion.
+_PATIENCE, _LEAST_GAIN = 30, 2e-4
+_MOST_SPACING_ROUNDS = 300
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """A fixed sample of a task's sources.
+
+    Attributes
+    ----------
+    positions, moments : ndarray, shape (n, 3)
+        [m], [A·m²].
+    """
+
+    positions: FloatArray
+    moments: FloatArray
+
+    def deviations(self, task: DesignTask, sensors: FloatArray) -> FloatArray:
+        """Cramér-Rao bounds of the range [m], infinite where there is none: (n,).
+
+        Parameters
+        ----------
+        task : DesignTask
+        sensors : ndarray, shape (N, 3)
+            Places of sensors of the task's kind and noise [m].
+
+        Returns
+        -------
+        ndarray, shape (n,)
+        """
+        return self._deviations_and_slopes(task, sensors, with_slopes=False)[0]
+
+    def value(self, task: DesignTask, sensors: FloatArray) -> float:
+        """The criterion [m], smoothed as it is for the descent."""
+        deviations = np.sort(self.deviations(task, sensors))
+        weights = task.criterion.weights(deviations.size)
+        used = weights > _NEGLIGIBLE * weights.max()
+        return float(weights[used] @ deviations[used] / weights[used].sum())
+
+    def log_value_and_slope(self, task: DesignTask, sensors: FloatArray) -> tuple[float, FloatArray]:
+        """Logarithm of :meth:`value`, and its derivative (N, 3) by the places of the sensors [1/m]."""
+        deviations = self.deviations(task, sensors)
+        order = np.argsort(deviations, kind="stable")
+        weights = task.criterion.weights(order.size)
+        used = np.flatnonzero(weights > _NEGLIGIBLE * weights.max())
+        part = Sample(self.positions[order[used]], self.moments[order[used]])
+        share = weights[used] / weights[used].sum() * deviations[order[used]]
+        value = float(share.sum())
+        if not np.isfinite(value):
+            return np.inf, np.zeros_like(sensors)
+        _, slopes = part._deviations_and_slopes(task, sensors, with_slopes=True)
+        return float(np.log(value)), np.einsum("n,njk->jk", share / value, slopes)
+
+    def _deviations_and_slopes(
+        self, task: DesignTask, sensors: FloatArray, *, with_slopes: bool
+    ) -> tuple[FloatArray, FloatArray]:
+        n = len(self.positions)
+        deviations, slopes = np.empty(n), np.empty((n if with_slopes else 0, *sensors.shape))
+        over_rows(
+            range_deviation_rows,
+            n,
+            np.ascontiguousarray(sensors),
+            task.kind == "scalar",
+            np.zeros(3) if task.ambient_T is None else np.array(task.ambient_T),
+            task.noise_T,
+            self.positions,
+            self.moments,
+            deviations,
+            slopes,
+        )
+        return deviations, slopes
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """Where a descent ended.
+
+    Attributes
+    ----------
+    sensors : ndarray, shape (N, 3)
+        The best places that it came to [m].
+    value : float
+        Criterion of its sample there [m].
+    iterations : int
+    converged : bool
+        Whether the criterion had stopped falling; else the iterations were used up.
+    """
+
+    sensors: FloatArray
+    value: float
+    iterations: int
+    converged: bool
+
+
+def feasible(task: DesignTask, sensors: FloatArray) -> FloatArray:
+    """Sensors (N, 3) brought into the task's volume and apart from each other [m]."""
+    inside = task.volume.nearest(sensors)
+    if not task.least_spacing_m:
+        return inside
+    i, j = np.triu_indices(len(inside), 1)
+    for _ in range(_MOST_SPACING_ROUNDS):
+        apart = inside[i] - inside[j]
+        distance = np.linalg.norm(apart, axis=1, keepdims=True)
+        close = distance[:, 0] < task.least_spacing_m * (1.0 - 1e-9)
+        if not close.any():
+            break
+        # Sensors in one place have no direction to part in; the axes of their numbers serve as well as any.
+        parting = np.where(distance > 1e-12, apart / np.maximum(distance, 1e-12), np.eye(3)[(i + j) % 3])
+        push = 0.5 * (1.0 + 1e-6) * np.maximum(0.0, task.least_spacing_m - distance) * parting
+        moved = inside.copy()
+        np.add.at(moved, i, push)
+        np.add.at(moved, j, -push)
+        inside = task.volume.nearest(moved)
+    return inside
+
+
+def is_spaced(task: DesignTask, sensors: FloatArray) -> bool:
+    """Whether no two sensors are closer than the task's least spacing, to a part in a million."""
+    return bool(pdist(sensors).min() >= task.least_spacing_m * (1.0 - 1e-6))
+
+
+def descend(
+    task: DesignTask,
+    sample: Sample,
+    start: FloatArray,
+    *,
+    max_iterations: int,
+    step_done: Callable[[int], None] = lambda _: None,
+) -> Descent:
+    """Move sensors from a start until the criterion of a sample falls no more.
+
+    Parameters
+    ----------
+    task : DesignTask
+    sample : Sample
+    start : ndarray, shape (N, 3)
+        Places of the sensors; brought into the volume first [m].
+    max_iterations : int
+    step_done : callable, optional
+        Called with 1 after every iteration, and with what is left of them at the end.
+
+    Returns
+    -------
+    Descent
+        Never worse on this sample than the start, once that is in the volume.
+    """
+    x = feasible(task, start)
+    value, slope = sample.log_value_and_slope(task, x)
+    best, best_x = value, x
+    history, bests = [value], [value]
+    steepest = float(np.abs(slope).max())
+    length = _FIRST_STEP * task.volume.radius / steepest if steepest > 0.0 else 0.0
+    longest = task.volume.radius**2 * 10.0
+    iteration, converged = 0, steepest == 0.0 and np.isfinite(value)
+    while iteration < max_iterations and not converged and np.isfinite(value):
+        iteration += 1
+        new = _step(task, sample, x, slope, length, max(history[-_MEMORY:]))
+        step_done(1)
+        if new is None:
+            converged = True
+            break
+        new_x, new_value, new_slope = new
+        change, bend = new_x - x, np.sum((new_x - x) * (new_slope - slope))
+        length = float(np.clip(np.sum(change * change) / bend, 1e-6 * longest, longest)) if bend > 0.0 else longest
+        x, value, slope = new_x, new_value, new_slope
+        history.append(value)
+        if value < best:
+            best, best_x = value, x
+        bests.append(best)
+        converged = iteration > _PATIENCE and bests[-1 - _PATIENCE] - best < _LEAST_GAIN
+    step_done(max_iterations - iteration)
+    return Descent(best_x, float(np.exp(best)), iteration, bool(converged))
+
+
+def _step(
+    task: DesignTask, sample: Sample, x: FloatArray, slope: FloatArray, length: float, bar: float
+) -> tuple[FloatArray, float, FloatArray] | None:
+    """Next places with their value and slope; None where no step is short enough."""
+    direction = feasible(task, x - length * slope) - x
+    steepness = float(np.sum(slope * direction))
+    share = 1.0
+    while share > _SHORTEST:
+        trial = feasible(task, x + share * direction)
+        value, new_slope = sample.log_value_and_slope(task, trial)
+        if value <= bar + _SUFFICIENT * share * min(steepness, 0.0) and is_spaced(task, trial):
+            return trial, value, new_slope
+        share *= 0.4
+    return None

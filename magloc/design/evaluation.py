@@ -1,0 +1,213 @@
+"""How good an array is for a task, judged on sources that it was not designed on, and the arrays to compare it with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from arrays.array import SensorArray
+from arrays.geometries import GEOMETRIES
+from arrays.typing import FloatArray
+from magloc.bounds.over_moments import sigma_table
+from magloc.design.descent import Sample
+from magloc.design.task import DesignTask
+
+REFERENCES = ("tetrahedron", "cube", "cross")
+_LEVELS = (0.5, 0.95)
+_N_ATTITUDES = 24
+_N_RESAMPLES = 200
+_N_BEARINGS, _N_BEARING_MOMENTS = 1000, 16
+_N_WORST = 6
+_FITS_RTOL = 1e-9
+_INFINITE = 1e300
+
+
+class RangeSpread(NamedTuple):
+    """Median, 95 % quantile and mean of the σ of the range over sources [m], each of shape (k,) or a number."""
+
+    q50_m: FloatArray
+    q95_m: FloatArray
+    mean_m: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """How well an array does at several distances.
+
+    Attributes
+    ----------
+    name : str
+    array : SensorArray
+    criterion_m : float
+        The task's criterion on the independent sources.
+    fits : bool
+        Whether its sensors are within the task's volume.
+    gain, gain_error : float
+        Share by which the design's criterion is lower, and its standard error from resampled sources; zero for the
+        design itself.
+    distance_m : ndarray, shape (k,)
+        Distance of the sources from the origin, in the directions of the task's region.
+    sigma_range : RangeSpread
+        At these distances.
+    bearing_q95_rad : ndarray, shape (k,)
+        95 % quantile of the σ of the bearing.
+    """
+
+    name: str
+    array: SensorArray
+    criterion_m: float
+    fits: bool
+    gain: float
+    gain_error: float
+    distance_m: FloatArray
+    sigma_range: RangeSpread
+    bearing_q95_rad: FloatArray
+
+
+def references(task: DesignTask, sample: Sample, rng: np.random.Generator) -> list[SensorArray]:
+    """Tetrahedron, cube and cross that have the volume's span, each in the best of 24 random attitudes for a sample.
+
+    They need not fit into the volume: what they share with it is the enclosing ball.
+    """
+    arrays = []
+    for name in REFERENCES:
+        shape = task.volume.radius * unit_shape(name)
+        turns = [random_rotation(rng) for _ in range(_N_ATTITUDES)]
+        turned = [task.volume.centre + turn.apply(shape) for turn in turns]
+        best = min(turned, key=lambda sensors: sample.value(task, sensors))
+        arrays.append(task.array(best, name))
+    return arrays
+
+
+def judged(
+    task: DesignTask, arrays: Sequence[SensorArray], sources: Sample, rng: np.random.Generator
+) -> tuple[Judgement, ...]:
+    """Arrays on independent sources.
+
+    Parameters
+    ----------
+    task : DesignTask
+    arrays : sequence of SensorArray
+        Of the task's kind and noise; the first one is what the others are compared with.
+    sources : Sample
+    rng : numpy.random.Generator
+        Of the resampling for the standard errors.
+
+    Returns
+    -------
+    tuple of Judgement
+        In the order of the arrays.
+    """
+    distances = judged_distances(sources)
+    own = sources.deviations(task, arrays[0].positions)
+    result = []
+    for array in arrays:
+        theirs = own if array is arrays[0] else sources.deviations(task, array.positions)
+        gain, error = (0.0, 0.0) if array is arrays[0] else _gain(task, own, theirs, rng)
+        result.append(
+            Judgement(
+                name=array.name,
+                array=array,
+                criterion_m=task.criterion.of(theirs),
+                fits=fits(task, array),
+                gain=gain,
+                gain_error=error,
+                distance_m=distances,
+                sigma_range=range_spread(task, array, sources, distances),
+                bearing_q95_rad=np.array([_bearing_q95(array, sources, distance) for distance in distances]),
+            )
+        )
+    return tuple(result)
+
+
+def judged_distances(sources: Sample) -> FloatArray:
+    """Distances [m] at which arrays are compared: those of the sources, and twice and four times as far."""
+    distance = np.linalg.norm(sources.positions, axis=1)
+    near, middle, far = np.quantile(distance, [0.05, 0.5, 0.95])
+    rounded = [float(f"{d:.3g}") for d in (near, middle, far, 2.0 * far, 4.0 * far)]
+    return np.unique(rounded)
+
+
+def worst_case(task: DesignTask, sensors: FloatArray, sample: Sample) -> float:
+    """Largest σ of the range [m] that a simplex search over sources finds, from the worst of a sample.
+
+    It is no bound, only a lower one of the worst case: where the Jacobian loses rank, it grows until rounding stops it.
+    """
+    worst = np.argsort(sample.deviations(task, sensors))[-_N_WORST:]
+    return max(_worst_near(task, sensors, sample.positions[i], sample.moments[i]) for i in worst)
+
+
+def _worst_near(task: DesignTask, sensors: FloatArray, position: FloatArray, moment: FloatArray) -> float:
+    """Largest σ of the range [m] near a source, at its distance: farther ones are worse without any loss of rank."""
+    distance, size = np.linalg.norm(position), np.linalg.norm(moment)
+
+    def deviation(x: FloatArray) -> float:
+        p, m = position / distance + x[:3], moment / size + x[3:]
+        one = Sample((distance * p / np.linalg.norm(p))[None], (size * m / np.linalg.norm(m))[None])
+        return float(one.deviations(task, sensors)[0])
+
+    options = {"maxiter": 2000, "maxfev": 2000, "xatol": 1e-12, "fatol": 1e-6, "initial_simplex": _simplex(0.02)}
+    found = minimize(  # type: ignore[call-overload]
+        lambda x: -np.log(min(deviation(x), _INFINITE)), np.zeros(6), method="Nelder-Mead", options=options
+    )
+    return deviation(found.x)
+
+
+def _simplex(size: float) -> FloatArray:
+    return np.concatenate([np.zeros((1, 6)), size * np.eye(6)])
+
+
+def _gain(task: DesignTask, own: FloatArray, theirs: FloatArray, rng: np.random.Generator) -> tuple[float, float]:
+    """Gain over another array, and its standard error from resampled pairs."""
+    value = task.criterion.of(theirs)
+    if not np.isfinite(value):
+        return 1.0, 0.0
+    ratios = np.empty(_N_RESAMPLES)
+    for k in range(_N_RESAMPLES):
+        drawn = rng.integers(own.size, size=own.size)
+        ratios[k] = task.criterion.of(own[drawn]) / task.criterion.of(theirs[drawn])
+    return 1.0 - task.criterion.of(own) / value, float(np.std(ratios))
+
+
+def fits(task: DesignTask, array: SensorArray) -> bool:
+    """Whether all sensors are within the task's volume."""
+    inside = task.volume.nearest(array.positions)
+    return bool(np.abs(inside - array.positions).max() <= _FITS_RTOL * task.volume.radius)
+
+
+def _at(sources: Sample, distance: float) -> FloatArray:
+    """Positions of sources moved to one distance from the origin."""
+    moved: FloatArray = distance * sources.positions / np.linalg.norm(sources.positions, axis=1, keepdims=True)
+    return moved
+
+
+def range_spread(task: DesignTask, array: SensorArray, sources: Sample, distance_m: FloatArray) -> RangeSpread:
+    """How the σ of the range is distributed over sources that are moved to given distances (k,) from the origin [m]."""
+    spreads = []
+    for distance in distance_m:
+        deviations = Sample(_at(sources, distance), sources.moments).deviations(task, array.positions)
+        quantiles = np.quantile(deviations, _LEVELS, method="inverted_cdf")
+        spreads.append([*quantiles, np.mean(deviations)])
+    return RangeSpread(*np.array(spreads).T)
+
+
+def _bearing_q95(array: SensorArray, sources: Sample, distance: float) -> float:
+    """95 % quantile of the σ of the bearing at one distance, over some of the sources."""
+    sigma = sigma_table(array, _at(sources, distance)[:_N_BEARINGS], sources.moments[:_N_BEARING_MOMENTS]).bearing_rad
+    return float(np.quantile(sigma, 0.95, method="inverted_cdf"))
+
+
+def random_rotation(rng: np.random.Generator) -> Rotation:
+    """An evenly distributed rotation."""
+    return Rotation.from_quat(rng.normal(size=4))
+
+
+def unit_shape(name: str) -> FloatArray:
+    """Points (n, 3) of a named geometry of circumradius 1 around its centroid."""
+    array = GEOMETRIES[name].make(1.0)
+    return (array.positions - array.centroid) / array.circumradius

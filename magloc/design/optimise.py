@@ -1,0 +1,217 @@
+r"""Better places for the sensors of an array, for a task (:class:`magloc.design.task.DesignTask`).
+
+The criterion is a quantile or the mean, over sources and directions of the moment, of the Cramér-Rao bound of the
+range: range is what an array knows least about. It is never the worst case, for that is infinite for every array of
+four vector sensors: their nine differences lose rank at isolated combinations of direction and moment
+(:func:`magloc.design.evaluation.worst_case` comes to them).
+
+Many starts, the references and other shapes among them, descend on a small sample of sources, the best of them on a
+large one. Then everything, starts and references too, is judged on sources of its own, so that what a design gains is
+no accident of the sample that it was fitted to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import qmc
+
+from arrays.array import SensorArray
+from arrays.geometries import GEOMETRIES
+from arrays.typing import FloatArray
+from magloc.design.descent import Descent, Sample, descend, feasible, is_spaced
+from magloc.design.evaluation import Judgement, fits, judged, random_rotation, references, unit_shape, worst_case
+from magloc.design.task import N_DRAWN, DesignTask
+from magloc.directions import fibonacci_directions
+
+BEST_START = "best start"
+NEAR_OPTIMAL = 0.1
+"""A reference that a design betters by less than this share is near-optimal."""
+# A σ that exceeds the criterion by this much is a loss of rank.
+_UNBOUNDED = 1e3
+
+
+@dataclass(frozen=True)
+class DesignSearch:
+    """How hard to search.
+
+    Attributes
+    ----------
+    n_starts : int
+        Shapes and random places to start from.
+    n_refined : int
+        Best of them, which descend again on the large sample.
+    log2_small, log2_large : int
+        Sizes of the samples, as powers of two: scrambled Sobol points.
+    small_iterations, large_iterations : int
+        Steps of a descent at most.
+    n_judged : int
+        Independent sources that everything is judged on.
+    """
+
+    n_starts: int = 16
+    n_refined: int = 4
+    log2_small: int = 11
+    log2_large: int = 14
+    small_iterations: int = 84
+    large_iterations: int = 250
+    n_judged: int = 40_000
+
+    @property
+    def n_steps(self) -> int:
+        """Steps of all descents together, at most."""
+        return self.n_starts * self.small_iterations + self.n_refined * self.large_iterations
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """Result of :func:`design`.
+
+    Attributes
+    ----------
+    task : DesignTask
+    array : SensorArray
+    fitted_m, start_m : float
+        Criterion on the large sample: of the design, and of the best of its starts.
+    converged : bool
+        Whether the descent to the design had stopped falling.
+    n_converged, n_descents : int
+        The same, counted over all refined starts.
+    judged : tuple of Judgement
+        The design first, then the best of its starts, then the references.
+    worst_m : float
+        Largest σ of the range that a search over sources found for the design.
+    """
+
+    task: DesignTask
+    array: SensorArray
+    fitted_m: float
+    start_m: float
+    converged: bool
+    n_converged: int
+    n_descents: int
+    judged: tuple[Judgement, ...]
+    worst_m: float
+
+    @property
+    def worst_is_bounded(self) -> bool:
+        """Whether the worst case that was found is of the size of the others, not a loss of rank."""
+        return self.worst_m < _UNBOUNDED * self.judged[0].criterion_m
+
+    @property
+    def near_optimal(self) -> tuple[str, ...]:
+        """References that could be built, and that the design betters by less than :data:`NEAR_OPTIMAL`."""
+        return tuple(
+            other.name
+            for other in self.judged[2:]
+            if other.fits and other.array.n_sensors <= self.array.n_sensors and other.gain < NEAR_OPTIMAL
+        )
+
+
+def design(
+    task: DesignTask,
+    *,
+    search: DesignSearch = DesignSearch(),
+    seed: int = 0,
+    progress: Callable[[int], None] = lambda _: None,
+    better: Callable[[SensorArray], None] = lambda _: None,
+) -> Design:
+    """Design an array for a task.
+
+    Parameters
+    ----------
+    task : DesignTask
+    search : DesignSearch
+    seed : int
+        Of the starts and of all samples; the same seed gives the same array, whatever the number of threads.
+    progress : callable, optional
+        Called with steps done, of ``search.n_steps``.
+    better : callable, optional
+        Called with every array that is better, on the large sample, than all before.
+
+    Returns
+    -------
+    Design
+
+    Raises
+    ------
+    ValueError
+        No start leaves the sensors their least spacing, or determines the range of the sources.
+    """
+    of_starts, of_small, of_large, of_references, of_judge = np.random.SeedSequence(seed).spawn(5)
+    small = sobol_sample(task, search.log2_small, np.random.default_rng(of_small))
+    large = sobol_sample(task, search.log2_large, np.random.default_rng(of_large))
+    known = references(task, large, np.random.default_rng(of_references))
+    buildable = [array.positions for array in known if array.n_sensors == task.n_sensors and fits(task, array)]
+    shapes = starts_of(task, search.n_starts, np.random.default_rng(of_starts))
+    starts = [feasible(task, start) for start in [*buildable, *shapes][: search.n_starts]]
+    starts = [start for start in starts if is_spaced(task, start) and np.isfinite(small.value(task, start))]
+    if not starts:
+        raise ValueError(
+            "Input task must leave room for its sensors, least_spacing_m apart, where they determine the range of its"
+            " sources; instead no start does."
+        )
+    values = [large.value(task, start) for start in starts]
+    first = int(np.argmin(values))
+    best = Descent(starts[first], values[first], 0, False)
+    better(task.array(best.sensors))
+
+    def descended(sample: Sample, start: FloatArray, max_iterations: int) -> Descent:
+        """A descent; its end is kept if it is the best one on the large sample so far."""
+        nonlocal best
+        end = descend(task, sample, start, max_iterations=max_iterations, step_done=progress)
+        value = large.value(task, end.sensors)
+        if value <= best.value:
+            best = Descent(end.sensors, value, end.iterations, end.converged and sample is large)
+            better(task.array(best.sensors))
+        return end
+
+    rough = [descended(small, start, search.small_iterations) for start in starts]
+    progress((search.n_starts - len(starts)) * search.small_iterations)
+    chosen = sorted(rough, key=lambda end: end.value)[: search.n_refined]
+    fine = [descended(large, end.sensors, search.large_iterations) for end in chosen]
+    array = task.array(best.sensors)
+    return Design(
+        task=task,
+        array=array,
+        fitted_m=best.value,
+        start_m=values[first],
+        converged=best.converged,
+        n_converged=sum(end.converged for end in fine),
+        n_descents=len(fine),
+        judged=judged(
+            task,
+            (array, task.array(starts[first], BEST_START), *known),
+            random_sample(task, search.n_judged, np.random.default_rng(of_judge)),
+            np.random.default_rng(of_judge.spawn(1)[0]),
+        ),
+        worst_m=worst_case(task, best.sensors, large),
+    )
+
+
+def sobol_sample(task: DesignTask, log2_n: int, rng: np.random.Generator) -> Sample:
+    """Sources of a task on scrambled Sobol points, which fill its region more evenly than random ones."""
+    return Sample(*task.sources(qmc.Sobol(N_DRAWN, rng=rng).random_base2(log2_n)))
+
+
+def random_sample(task: DesignTask, n: int, rng: np.random.Generator) -> Sample:
+    """Independent random sources of a task."""
+    return Sample(*task.sources(rng.random((n, N_DRAWN))))
+
+
+def starts_of(task: DesignTask, n: int, rng: np.random.Generator) -> list[FloatArray]:
+    """Places to start from (N, 3) [m]: known shapes of the volume's span in random attitudes, then random places."""
+    volume = task.volume
+    shapes = [*_shapes(task.n_sensors), *_shapes(task.n_sensors)][: max(1, n // 2)]
+    turned = [volume.centre + volume.radius * random_rotation(rng).apply(shape) for shape in shapes]
+    return [*turned, *(volume.random(task.n_sensors, rng) for _ in range(n - len(turned)))]
+
+
+def _shapes(n: int) -> list[FloatArray]:
+    """Shapes (n, 3) of n points within the unit ball."""
+    named = [unit_shape(name) for name in GEOMETRIES]
+    ring = 2.0 * np.pi * np.arange(n) / n
+    flat = np.stack([np.cos(ring), np.sin(ring), np.zeros(n)], axis=1)
+    return [*(shape for shape in named if len(shape) == n), fibonacci_directions(n), flat]

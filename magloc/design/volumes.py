@@ -1,0 +1,235 @@
+"""Where the sensors of a design may stand: solid bodies, or the surface of a mesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from os import PathLike
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+from arrays.io.errors import InputError
+from arrays.typing import FloatArray
+
+MESH_FORMATS = ("stl", "obj", "ply")
+
+
+class Volume(Protocol):
+    """A set of points to which others can be brought."""
+
+    @property
+    def centre(self) -> FloatArray:
+        """Centre of the enclosing ball, shape (3,) [m]."""
+
+    @property
+    def radius(self) -> float:
+        """Radius of the enclosing ball [m]."""
+
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """The nearest points of the set to points (n, 3) [m]."""
+
+    def random(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Points of the set, evenly distributed, (n, 3) [m]."""
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A solid ball.
+
+    Attributes
+    ----------
+    centre_m : tuple, shape (3,)
+    radius_m : float
+    """
+
+    centre_m: tuple[float, float, float]
+    radius_m: float
+
+    @property
+    def centre(self) -> FloatArray:
+        """Its centre [m]."""
+        return np.array(self.centre_m)
+
+    @property
+    def radius(self) -> float:
+        """Its radius [m]."""
+        return self.radius_m
+
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """The nearest points of the ball to points (n, 3) [m]."""
+        offset = points - self.centre
+        length = np.linalg.norm(offset, axis=-1, keepdims=True)
+        return self.centre + offset * np.minimum(1.0, self.radius_m / np.maximum(length, 1e-300))
+
+    def random(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Evenly distributed points (n, 3) [m]."""
+        direction = rng.normal(size=(n, 3))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        return self.centre + self.radius_m * np.cbrt(rng.uniform(size=(n, 1))) * direction
+
+
+@dataclass(frozen=True)
+class Box:
+    """A solid box along the axes.
+
+    Attributes
+    ----------
+    centre_m : tuple, shape (3,)
+    size_m : tuple, shape (3,)
+        Full lengths; a plate has a zero among them.
+    """
+
+    centre_m: tuple[float, float, float]
+    size_m: tuple[float, float, float]
+
+    @property
+    def centre(self) -> FloatArray:
+        """Its centre [m]."""
+        return np.array(self.centre_m)
+
+    @property
+    def radius(self) -> float:
+        """Half of its diagonal [m]."""
+        return 0.5 * float(np.linalg.norm(self.size_m))
+
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """The nearest points of the box to points (n, 3) [m]."""
+        half = 0.5 * np.array(self.size_m)
+        nearest: FloatArray = np.clip(points, self.centre - half, self.centre + half)
+        return nearest
+
+    def random(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Evenly distributed points (n, 3) [m]."""
+        return self.centre + rng.uniform(-0.5, 0.5, (n, 3)) * np.array(self.size_m)
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A solid cylinder along z.
+
+    Attributes
+    ----------
+    centre_m : tuple, shape (3,)
+    radius_m, height_m : float
+        A disc has the height zero, a rod the radius zero.
+    """
+
+    centre_m: tuple[float, float, float]
+    radius_m: float
+    height_m: float
+
+    @property
+    def centre(self) -> FloatArray:
+        """Its centre [m]."""
+        return np.array(self.centre_m)
+
+    @property
+    def radius(self) -> float:
+        """Distance of its rims from its centre [m]."""
+        return float(np.hypot(self.radius_m, 0.5 * self.height_m))
+
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """The nearest points of the cylinder to points (n, 3) [m]."""
+        offset = points - self.centre
+        across = np.linalg.norm(offset[..., :2], axis=-1, keepdims=True)
+        in_plane = offset[..., :2] * np.minimum(1.0, self.radius_m / np.maximum(across, 1e-300))
+        height = np.clip(offset[..., 2:], -0.5 * self.height_m, 0.5 * self.height_m)
+        return self.centre + np.concatenate([in_plane, height], axis=-1)
+
+    def random(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Evenly distributed points (n, 3) [m]."""
+        across, angle = self.radius_m * np.sqrt(rng.uniform(size=n)), rng.uniform(0.0, 2.0 * np.pi, n)
+        height = self.height_m * rng.uniform(-0.5, 0.5, n)
+        return self.centre + np.stack([across * np.cos(angle), across * np.sin(angle), height], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """The surface of a triangle mesh.
+
+    Attributes
+    ----------
+    mesh : trimesh.Trimesh
+        In metres, array frame.
+    """
+
+    mesh: trimesh.Trimesh
+
+    @cached_property
+    def _enclosing(self) -> tuple[FloatArray, float]:
+        centre, radius = trimesh.nsphere.minimum_nsphere(self.mesh)  # type: ignore[no-untyped-call]
+        return np.asarray(centre, dtype=np.float64), float(radius)
+
+    @property
+    def centre(self) -> FloatArray:
+        """Centre of the smallest enclosing ball [m]."""
+        return self._enclosing[0]
+
+    @property
+    def radius(self) -> float:
+        """Radius of the smallest enclosing ball [m]."""
+        return self._enclosing[1]
+
+    @cached_property
+    def _triangles(self) -> tuple[FloatArray, cKDTree, float]:
+        """Corners (f, 3, 3), a tree of their centroids, and the largest distance of a corner from its centroid."""
+        corners = np.asarray(self.mesh.triangles, dtype=np.float64)
+        centroids = corners.mean(axis=1)
+        largest = np.linalg.norm(corners - centroids[:, None], axis=-1).max()
+        return corners, cKDTree(centroids), float(largest)
+
+    def nearest(self, points: FloatArray) -> FloatArray:
+        """The nearest points of the surface to points (n, 3) [m]."""
+        corners, tree, largest = self._triangles
+        # No triangle whose centroid is farther than the nearest centroid and the largest triangle together is nearest.
+        reach = tree.query(points)[0] + largest
+        found = np.empty_like(points)
+        for i, faces in enumerate(tree.query_ball_point(points, reach * (1.0 + 1e-9))):
+            here = np.tile(points[i], (len(faces), 1))
+            on_each = trimesh.triangles.closest_point(corners[faces], here)  # type: ignore[no-untyped-call]
+            found[i] = on_each[np.argmin(np.linalg.norm(on_each - points[i], axis=1))]
+        return found
+
+    def random(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Evenly distributed points (n, 3) [m]."""
+        corners = self._triangles[0]
+        area = np.asarray(self.mesh.area_faces)
+        a, b, c = np.moveaxis(corners[rng.choice(len(corners), size=n, p=area / area.sum())], 1, 0)
+        s, t = np.sqrt(rng.uniform(size=(n, 1))), rng.uniform(size=(n, 1))
+        return (1.0 - s) * a + s * (1.0 - t) * b + s * t * c
+
+
+def read_surface(path: str | PathLike[str]) -> Surface:
+    """Surface of a mesh file, its numbers in metres.
+
+    Parameters
+    ----------
+    path : path-like
+        STL, OBJ or PLY.
+
+    Returns
+    -------
+    Surface
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, is no such mesh, or has no surface.
+    """
+    expected = f"a mesh ({', '.join(MESH_FORMATS).upper()})"
+    if Path(path).suffix.lower().lstrip(".") not in MESH_FORMATS:
+        raise InputError(f"{path}: found the name of another kind of file, expected {expected}.")
+    if not Path(path).is_file():
+        raise InputError(f"{path} does not exist, expected {expected}.")
+    try:
+        mesh = trimesh.load_mesh(str(path), process=True)
+    except Exception as error:  # every reader has errors of its own
+        raise InputError(f"{path}: found what is no mesh ({str(error).rstrip('.')}), expected {expected}.") from None
+    faces = np.asarray(getattr(mesh, "faces", ()))
+    if not faces.size or not np.isfinite(mesh.triangles).all() or not mesh.area > 0.0:
+        raise InputError(f"{path}: found no triangles with an area, expected {expected}.")
+    return Surface(mesh)

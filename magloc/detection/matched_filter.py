@@ -1,0 +1,151 @@
+"""The matched filter as a detector: its threshold, and the signals that it finds, from simulated noise.
+
+The largest of the energies that sources at all positions explain has no closed form. Its threshold is an order
+statistic of simulated noise; only the draws that candidates explain most of are refined, as the others stay below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
+
+from arrays.array import SensorArray
+from arrays.typing import FloatArray
+from magloc.chi_square import FALSE_ALARM, ChiSquareDetector, check_differences, check_probability, check_share
+from magloc.detection.dipole_filter import DipoleFilter
+from magloc.directions import fibonacci_directions
+
+N_UNKNOWNS = 6
+# Noise that may reach the threshold is among this many times as many of the draws that candidates explain most of.
+_SCREENED = 10.0
+_DRAWS_AT_ONCE = 50_000
+# Sources that a required energy is simulated with stand this many circumradii away.
+_FAR = 5.0
+
+
+@dataclass(frozen=True)
+class MatchedFilterDetector:
+    """The matched filter of an array with the threshold that simulated noise sets.
+
+    Attributes
+    ----------
+    filter : DipoleFilter
+    threshold : float
+    threshold_error : float
+        Standard error of the threshold, from the order statistics beside it.
+    false_alarm_rate : float
+    seed : int
+        Of the draws for the threshold and for required energies.
+    """
+
+    filter: DipoleFilter
+    threshold: float
+    threshold_error: float
+    false_alarm_rate: float
+    seed: int
+
+    @classmethod
+    def of(
+        cls, array: SensorArray, false_alarm_rate: float = FALSE_ALARM, *, n_draws: int = 100_000, seed: int = 0
+    ) -> MatchedFilterDetector:
+        """Detector whose threshold noise alone exceeds at a given rate.
+
+        Parameters
+        ----------
+        array : SensorArray
+        false_alarm_rate : float
+        n_draws : int
+            Sets of noise; a hundred exceedances, n_draws = 100 / rate, know the rate to a tenth.
+        seed : int
+
+        Returns
+        -------
+        MatchedFilterDetector
+
+        Raises
+        ------
+        ValueError
+            There are fewer than ten exceedances, the array gives fewer than six differences, or it has scalar sensors
+            without an ambient field.
+        """
+        check_share("false_alarm_rate", false_alarm_rate)
+        n_above = round(false_alarm_rate * n_draws)
+        if n_above < 10:
+            raise ValueError(
+                f"Input n_draws must be at least {10.0 / false_alarm_rate:.0f} for a false-alarm rate of"
+                f" {false_alarm_rate:g}; instead received {n_draws}."
+            )
+        matched = DipoleFilter(array)
+        check_differences(matched.n_differences, N_UNKNOWNS, "a position and a moment")
+        rng = np.random.default_rng(seed)
+        noise = np.concatenate(
+            [_loudest(matched, rng, n, min(1.0, _SCREENED * false_alarm_rate)) for n in _parts(n_draws, _DRAWS_AT_ONCE)]
+        )
+        statistic = np.sort(matched.largest_energy(noise))[::-1]
+        spread = max(1, round(np.sqrt(n_above)))
+        low, high = statistic[min(n_above + spread, statistic.size - 1)], statistic[max(n_above - spread, 0)]
+        return cls(matched, float(statistic[n_above]), float(0.5 * (high - low)), false_alarm_rate, seed)
+
+    def detects(self, readings_T: ArrayLike) -> NDArray[np.bool_]:
+        """Whether there is a source in each set of raw readings (n, C) [T]: (n,)."""
+        above: NDArray[np.bool_] = self.filter.largest_energy(self.filter.whitened(readings_T)) > self.threshold
+        return above
+
+    def probability(self, signals: FloatArray, rng: np.random.Generator) -> float:
+        """Share of whitened signals (n, C) that are detected in noise, one draw of noise each."""
+        return float(np.mean(self._above(signals + self.filter.noise(len(signals), rng))))
+
+    def required_energy(self, probability: float, *, n_draws: int = 4_000) -> float:
+        """Energy of a signal that is found with a probability, on average over directions and moments.
+
+        Parameters
+        ----------
+        probability : float
+            Above the false-alarm rate.
+        n_draws : int
+            Sources, and sets of noise, that it is simulated with.
+
+        Returns
+        -------
+        float
+            In units of the noise's variance. It hardly depends on where the source is: how much it does is tested.
+        """
+        check_probability(probability, self.false_alarm_rate)
+        rng = np.random.default_rng([self.seed, 1])
+        array = self.filter.array
+        directions = fibonacci_directions(n_draws)
+        moments = rng.normal(size=(n_draws, 3))
+        signals = self.filter.signal(array.centroid + _FAR * array.circumradius * directions, moments)
+        unit = signals / np.linalg.norm(signals, axis=1, keepdims=True)
+        noise = self.filter.noise(n_draws, rng)
+
+        def surplus(amplitude: float) -> float:
+            return float(np.mean(self._above(amplitude * unit + noise))) - probability
+
+        high = np.sqrt(ChiSquareDetector(self.filter.n_differences, self.false_alarm_rate).required_energy(probability))
+        while surplus(high) < 0.0:
+            high *= 1.5
+        # The draws may exceed the rate already without a signal where the probability is hardly above it.
+        return float(brentq(surplus, 0.0, high, xtol=1e-3)) ** 2 if surplus(0.0) < 0.0 else 0.0
+
+    def _above(self, whitened: FloatArray) -> NDArray[np.bool_]:
+        """Whether the statistic is above the threshold; refined only where candidates and energy leave it open."""
+        above = self.filter.candidate_energy(whitened) > self.threshold
+        open_ = np.flatnonzero(~above & (self.filter.energy(whitened) > self.threshold))
+        if open_.size:
+            above[open_] = self.filter.largest_energy(whitened[open_]) > self.threshold
+        return above
+
+
+def _loudest(matched: DipoleFilter, rng: np.random.Generator, n: int, share: float) -> FloatArray:
+    """The share of n draws of noise of which candidates explain most."""
+    noise = matched.noise(n, rng)
+    kept = max(1, round(share * n))
+    return noise[np.argsort(-matched.candidate_energy(noise))[:kept]]
+
+
+def _parts(n: int, most: int) -> list[int]:
+    return [len(part) for part in np.array_split(np.empty(n), -(-n // most))]

@@ -1,0 +1,31 @@
+"""Directions spread evenly over the sphere."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from arrays.typing import FloatArray
+
+_GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
+
+
+def sphere_directions(n: int) -> FloatArray:
+    """Evenly spread directions over the whole sphere, shape (n, 3): a Fibonacci lattice, from +z to -z."""
+    return _fibonacci(n, -1.0)
+
+
+def _fibonacci(n: int, lowest: float) -> FloatArray:
+    """Lattice (n, 3) on the part of the unit sphere above z = lowest, each point with an equal area."""
+    i = np.arange(n)
+    z = 1.0 - (1.0 - lowest) * (i + 0.5) / n
+    radius = np.sqrt(1.0 - z * z)
+    return np.stack([radius * np.cos(_GOLDEN_ANGLE * i), radius * np.sin(_GOLDEN_ANGLE * i), z], axis=-1)
+
+
+def fibonacci_directions(n: int) -> FloatArray:
+    """Nearly uniform unit vectors, shape (n, 3), on a Fibonacci spiral."""
+    i = np.arange(n) + 0.5
+    z = 1.0 - 2.0 * i / n
+    azimuth = np.pi * (1.0 + np.sqrt(5.0)) * i
+    in_plane = np.sqrt(1.0 - z * z)
+    return np.stack([in_plane * np.cos(azimuth), in_plane * np.sin(azimuth), z], axis=-1)

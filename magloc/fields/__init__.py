@@ -1,0 +1,1 @@
+"""Forward models: fields of dipoles, multipoles, bodies, coils, and of the Earth."""

@@ -1,0 +1,165 @@
+r"""Sources that are no points: when a dipole describes them, and the dipole that stands for a magnetic body.
+
+Two checks tell whether a source is too near for a dipole: its distance in body lengths, where its size is known
+(:func:`dipole_validity`), and the pattern of the residuals of a fix, where it is not (:func:`nearness_test`): the next
+terms of the multipole expansion about the solution,
+
+.. math::  B = k \frac{(2l + 1)\,(S : n^l)\,n - l\, S : n^{l-1}}{r^{l+2}}, \qquad k = μ_0/4π,
+
+with a symmetric traceless tensor S of rank l (l = 1 is the moment itself), must not explain them better than noise
+does. A uniformly magnetised body that is symmetric about its centre has no quadrupole (l = 2) there; what it has is an
+octupole (l = 3), smaller by (length/distance)². Of the five numbers of a quadrupole a shift of the dipole makes up
+three, so that only two are left to be seen in a fix.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike
+from scipy.special import elliprd
+
+from arrays.io.errors import _vector
+from arrays.typing import FloatArray
+from magloc.fields.dipole import MU0_OVER_4PI
+
+"""Distance in body lengths from which on a body counts as a dipole."""
+_MU0 = 4.0 * np.pi * MU0_OVER_4PI
+
+
+@dataclass(frozen=True, eq=False)
+class EquivalentDipole:
+    """The dipole of a magnetised body, with the ellipsoid that stands for the body.
+
+    Attributes
+    ----------
+    position_m : ndarray, shape (3,)
+        Centroid of the body [m].
+    moment_Am2 : ndarray, shape (3,)
+        [A·m²].
+    volume_m3 : float
+    semi_axes_m : ndarray, shape (3,)
+        Of the ellipsoid, longest first [m].
+    axes : ndarray, shape (3, 3)
+        Their directions as rows, in the frame of the body.
+    demagnetising_factors : ndarray, shape (3,)
+        Along the axes.
+    body_length_m : float
+        Greatest distance between two points of the body [m].
+    """
+
+    position_m: FloatArray
+    moment_Am2: FloatArray
+    volume_m3: float
+    semi_axes_m: FloatArray
+    axes: FloatArray
+    demagnetising_factors: FloatArray
+    body_length_m: float
+
+
+def demagnetising_factors(semi_axes_m: ArrayLike) -> FloatArray:
+    r"""Demagnetising factors of an ellipsoid along its axes.
+
+    They are 0 along a long needle, 1/3 in a sphere, 1 across a thin disc.
+
+    .. math:: N_i = \frac{abc}{2} \int_0^\infty \frac{ds}{(a_i^2 + s)\sqrt{(a^2 + s)(b^2 + s)(c^2 + s)}}
+              = \frac{abc}{3} R_D(a_j^2, a_k^2, a_i^2)
+
+    with Carlson's integral R_D, which is accurate for every shape, near the sphere too, where the closed forms of
+    spheroids lose their digits. J. A. Osborn, "Demagnetizing factors of the general ellipsoid", Physical Review 67,
+    1945.
+
+    Parameters
+    ----------
+    semi_axes_m : array_like, shape (..., 3)
+        Positive, in any order; only their ratios count.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        In the order of the axes; their sum is 1.
+
+    Raises
+    ------
+    ValueError
+        A semi-axis is not positive and finite.
+    """
+    axes = np.asarray(semi_axes_m, dtype=np.float64)
+    if axes.ndim == 0 or axes.shape[-1] != 3:
+        raise ValueError(f"Input semi_axes_m must have shape (..., 3); instead received shape {axes.shape}.")
+    if not (np.isfinite(axes).all() and (axes > 0.0).all()):
+        raise ValueError(f"Input semi_axes_m must be positive and finite; instead received {axes.tolist()}.")
+    axes = axes / axes.max(axis=-1, keepdims=True)
+    square = axes**2
+    others = [(1, 2), (2, 0), (0, 1)]
+    integrals = [elliprd(square[..., j], square[..., k], square[..., i]) for i, (j, k) in enumerate(others)]
+    factors: FloatArray = np.prod(axes, axis=-1)[..., None] / 3.0 * np.stack(integrals, axis=-1)
+    return factors
+
+
+def equivalent_dipole(
+    mesh: trimesh.Trimesh,
+    susceptibility: float,
+    ambient_T: ArrayLike,
+    remanence_A_m: ArrayLike = (0.0, 0.0, 0.0),
+) -> EquivalentDipole:
+    r"""Dipole of a magnetic body in a uniform field.
+
+    The body is replaced by the ellipsoid of its volume and of the principal axes and the proportions of its second
+    moments. In an ellipsoid the magnetisation is uniform,
+
+    .. math:: M = (1 + χ N)^{-1} (χ B_0 / μ_0 + M_r), \qquad m = V M,
+
+    with N its demagnetising factors along its axes: m = 3 V B_0/μ_0 of a sphere of large χ, χ V B_0/μ_0 of a long
+    needle.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+        Closed surface of the body [m], in the frame of the fields.
+    susceptibility : float
+        χ of the material, relative to the field inside it; from -1 (a superconductor) to 1e6 and more (soft iron).
+    ambient_T : array_like, shape (3,)
+        Field without the body [T].
+    remanence_A_m : array_like, shape (3,)
+        Magnetisation M_r that the material has without a field inside it [A/m].
+
+    Returns
+    -------
+    EquivalentDipole
+        In the frame of the mesh.
+
+    Raises
+    ------
+    ValueError
+        The mesh is not closed or has no volume, or a number is not finite or out of bounds.
+    """
+    if not mesh.is_volume:
+        raise ValueError("Input mesh must be a closed surface with outward normals; instead received one that is not.")
+    if not -1.0 <= susceptibility < np.inf:
+        raise ValueError(f"Input susceptibility must be finite and at least -1; instead received {susceptibility}.")
+    ambient, remanence = _vector("ambient_T", ambient_T), _vector("remanence_A_m", remanence_A_m)
+    volume = float(mesh.volume)
+    inertia = np.asarray(mesh.moment_inertia) / float(mesh.density)
+    second_moment = 0.5 * np.trace(inertia) * np.eye(3) - inertia
+    value, vector = np.linalg.eigh(second_moment)
+    shape, axes = np.sqrt(value[::-1]), vector.T[::-1]
+    semi_axes = shape * (volume / (4.0 / 3.0 * np.pi * float(np.prod(shape)))) ** (1.0 / 3.0)
+    factors = demagnetising_factors(semi_axes)
+    driving = axes @ (susceptibility / _MU0 * ambient + remanence)
+    magnetisation = (driving / (1.0 + susceptibility * factors)) @ axes
+    return EquivalentDipole(
+        position_m=np.array(mesh.center_mass),
+        moment_Am2=volume * magnetisation,
+        volume_m3=volume,
+        semi_axes_m=semi_axes,
+        axes=axes,
+        demagnetising_factors=factors,
+        body_length_m=_greatest_distance(np.asarray(mesh.convex_hull.vertices)),
+    )
+
+
+def _greatest_distance(points: FloatArray) -> float:
+    return max(float(np.linalg.norm(points - point, axis=1).max()) for point in points)

@@ -1,0 +1,329 @@
+"""Field of a magnetic dipole: potential, induction, gradient tensor and their Jacobians.
+
+A dipole of moment m at the position p (the source) is seen from a point s. With
+
+    d = s - p,   r = |d|,   n = d/r,   k = mu_0/4 pi,
+
+    (1)  U = -k (n.m)/r^2,  and B = +grad U (the sign of the paper below)
+    (2)  B = A(d) m,  A(d) = k (3 n n^T - I)/r^3
+    (3)  G = dB/ds = (3k/r^4) [(n.m) I + n m^T + m n^T - 5 (n.m) n n^T]
+    (4)  grad |B| = G B/|B|
+
+Everything is in SI units: metres, A m^2, tesla, T/m. Each argument is a vector in its last axis, and the leading axes
+of all arguments broadcast against each other, as in NumPy; all vectors share one Cartesian frame, whichever it is.
+
+Exactly on the source every function returns NaN for that point only, without an exception or a warning. Distances
+from 1e-75 m to 1e75 m neither overflow nor underflow, because each formula starts from the unit vector n.
+
+References
+----------
+B. V. Pavlov, E. V. Karshakov, D. A. Goldin, "Determination of the magnetic field parameters of an object from remote
+magnetogradient measurements", Large-Scale Systems Control, issue 109. The numbers above are its equations.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+MU0_OVER_4PI = 1e-7
+"""Magnetic constant over 4 pi, T m/A: exact until the SI of 2019, and 1.3e-10 above the measured value since."""
+
+
+def potential(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> Array:
+    """
+    Scalar potential U = -k (n.m)/r^2 of a dipole, equation (1), whose gradient is the field: B = +grad U.
+
+    Parameters
+    ----------
+    points : array_like, shape (..., 3)
+        Where the potential is wanted, m.
+    source : array_like, shape (..., 3)
+        Position of the dipole, m.
+    moment : array_like, shape (..., 3)
+        Moment of the dipole, A m^2.
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Potential in T m; NaN on the source.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not an array of 3-vectors, or the leading axes do not broadcast.
+    """
+    n, r = _direction_and_distance(points, source)
+    return -MU0_OVER_4PI * _dot(n, _vectors("moment", moment)) / (r * r)[..., 0]
+
+
+def field(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> Array:
+    """
+    Induction B = k [3 (n.m) n - m]/r^3 of a dipole, equation (2).
+
+    Parameters
+    ----------
+    points : array_like, shape (..., 3)
+        Where the field is wanted, m.
+    source : array_like, shape (..., 3)
+        Position of the dipole, m.
+    moment : array_like, shape (..., 3)
+        Moment of the dipole, A m^2.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Induction in T; NaN on the source.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not an array of 3-vectors, or the leading axes do not broadcast.
+    """
+    n, r = _direction_and_distance(points, source)
+    m = _vectors("moment", moment)
+    return MU0_OVER_4PI / (r * r * r) * (3.0 * _dot(n, m)[..., None] * n - m)
+
+
+def field_matrix(points: ArrayLike, source: ArrayLike) -> Array:
+    """
+    Matrix A = k (3 n n^T - I)/r^3 that turns a moment into its field, B = A m, equation (2).
+
+    The field is linear in the moment, so A is also its Jacobian dB/dm. It is symmetric and traceless.
+
+    Parameters
+    ----------
+    points : array_like, shape (..., 3)
+        Where the field is wanted, m.
+    source : array_like, shape (..., 3)
+        Position of the dipole, m.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+        Matrix in T/(A m^2); NaN on the source.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not an array of 3-vectors, or the leading axes do not broadcast.
+    """
+    n, r = _direction_and_distance(points, source)
+    return (MU0_OVER_4PI / (r * r * r))[..., None] * (3.0 * _outer(n, n) - np.eye(3))
+
+
+def gradient_tensor(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> Array:
+    """
+    Gradient tensor G = dB/ds of the field of a dipole, equation (3): G[i, j] = dB_i/ds_j.
+
+    It is symmetric (bit for bit) because the field has no curl, and traceless because it has no divergence.
+
+    Parameters
+    ----------
+    points : array_like, shape (..., 3)
+        Where the gradient is wanted, m.
+    source : array_like, shape (..., 3)
+        Position of the dipole, m.
+    moment : array_like, shape (..., 3)
+        Moment of the dipole, A m^2.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+        Gradient tensor in T/m; NaN on the source.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not an array of 3-vectors, or the leading axes do not broadcast.
+    """
+    n, r = _direction_and_distance(points, source)
+    m = _vectors("moment", moment)
+    radial = _dot(n, m)[..., None, None]
+    mixed = _outer(n, m)
+    shape = radial * np.eye(3) + (mixed + mixed.mT) - 5.0 * radial * _outer(n, n)
+    return (3.0 * MU0_OVER_4PI / (r * r * r * r))[..., None] * shape
+
+
+def modulus_gradient(
+    points: ArrayLike, source: ArrayLike, moment: ArrayLike, ambient: ArrayLike | None = None
+) -> Array:
+    """
+    Gradient of the modulus of the total field, grad |B_a + B| = G e with e along B_a + B, equation (4).
+
+    The ambient field B_a (the geomagnetic field, say) is uniform, so it only turns e; without it e is along B.
+
+    Parameters
+    ----------
+    points : array_like, shape (..., 3)
+        Where the gradient is wanted, m.
+    source : array_like, shape (..., 3)
+        Position of the dipole, m.
+    moment : array_like, shape (..., 3)
+        Moment of the dipole, A m^2.
+    ambient : array_like, shape (..., 3), optional
+        Uniform ambient induction, T.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Gradient of the modulus in T/m; NaN on the source and where the total field vanishes, for a modulus has a
+        corner there.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not an array of 3-vectors, or the leading axes do not broadcast.
+    """
+    total = field(points, source, moment)
+    if ambient is not None:
+        total = total + _vectors("ambient", ambient)
+    e, _ = _unit(total)
+    return _dot(gradient_tensor(points, source, moment), e[..., None, :])
+
+
+def field_jacobian(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> Array:
+    """
+    Jacobian of the field with respect to the dipole's state (p, m): [dB/dp, dB/dm] = [-G, A].
+
+    Parameters
+    ----------
+    points : array_like, shape (..., 3)
+        Where the field is observed, m.
+    source : array_like, shape (..., 3)
+        Position p of the dipole, m.
+    moment : array_like, shape (..., 3)
+        Moment m of the dipole, A m^2.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 6)
+        The first three columns in T/m, the last three in T/(A m^2); NaN on the source.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not an array of 3-vectors, or the leading axes do not broadcast.
+    """
+    by_position = -gradient_tensor(points, source, moment)
+    by_moment = np.broadcast_to(field_matrix(points, source), by_position.shape)
+    return np.concatenate([by_position, by_moment], axis=-1)
+
+
+def total_field(points: ArrayLike, sources: ArrayLike, moments: ArrayLike) -> Array:
+    """
+    Induction of several dipoles together: the sum of their fields, equation (2).
+
+    Parameters
+    ----------
+    points : array_like, shape (..., 3)
+        Where the field is wanted, m.
+    sources : array_like, shape (..., K, 3)
+        Positions of the K dipoles, m.
+    moments : array_like, shape (..., K, 3)
+        Moments of the K dipoles, A m^2.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Induction in T; NaN on any of the sources, zero for K = 0.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not an array of 3-vectors, the numbers of sources and moments differ, or the leading axes
+        do not broadcast.
+
+    See Also
+    --------
+    magloc.fields.dipole_compiled.field_at_points : the same, compiled and parallel, for many points.
+    """
+    return _sum_over_dipoles(field, (3,), points, sources, moments)
+
+
+def total_gradient_tensor(points: ArrayLike, sources: ArrayLike, moments: ArrayLike) -> Array:
+    """
+    Gradient tensor of the field of several dipoles together: the sum of their tensors, equation (3).
+
+    Parameters
+    ----------
+    points : array_like, shape (..., 3)
+        Where the gradient is wanted, m.
+    sources : array_like, shape (..., K, 3)
+        Positions of the K dipoles, m.
+    moments : array_like, shape (..., K, 3)
+        Moments of the K dipoles, A m^2.
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+        Gradient tensor in T/m; NaN on any of the sources, zero for K = 0.
+
+    Raises
+    ------
+    ValueError
+        If an argument is not an array of 3-vectors, the numbers of sources and moments differ, or the leading axes
+        do not broadcast.
+
+    See Also
+    --------
+    magloc.fields.dipole_compiled.gradient_at_points : the same, compiled and parallel, for many points.
+    """
+    return _sum_over_dipoles(gradient_tensor, (3, 3), points, sources, moments)
+
+
+def _sum_over_dipoles(
+    quantity: Callable[[Array, Array, Array], Array],
+    quantity_shape: tuple[int, ...],
+    points: ArrayLike,
+    sources: ArrayLike,
+    moments: ArrayLike,
+) -> Array:
+    """Sum one dipole's quantity over the second-to-last axis of sources and moments."""
+    s = _vectors("points", points)
+    p = _vectors("sources", sources)
+    m = _vectors("moments", moments)
+    if p.ndim < 2 or m.ndim < 2 or p.shape[-2] != m.shape[-2]:
+        raise ValueError(
+            "Inputs sources and moments must have shapes (..., K, 3) with one K; "
+            f"instead received shapes {p.shape} and {m.shape}."
+        )
+    batch = np.broadcast_shapes(s.shape[:-1], p.shape[:-2], m.shape[:-2])
+    total = np.zeros(batch + quantity_shape)
+    # One dipole at a time: a broadcast over K would hold K times the memory of the result.
+    for j in range(p.shape[-2]):
+        total += quantity(s, p[..., j, :], m[..., j, :])
+    return total
+
+
+def _vectors(name: str, values: ArrayLike) -> Array:
+    """Return values as a float array whose last axis has length 3 (a length of 1 would broadcast to nonsense)."""
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 0 or array.shape[-1] != 3:
+        raise ValueError(f"Input {name} must have shape (..., 3); instead received shape {array.shape}.")
+    return array
+
+
+def _direction_and_distance(points: ArrayLike, source: ArrayLike) -> tuple[Array, Array]:
+    """Unit vectors (..., 3) and distances (..., 1) from the source to the points, NaN on the source."""
+    return _unit(_vectors("points", points) - _vectors("source", source))
+
+
+def _unit(vectors: Array) -> tuple[Array, Array]:
+    """Directions (..., 3) and lengths (..., 1) of vectors; both are NaN for a vector of length zero."""
+    lengths = np.sqrt(_dot(vectors, vectors))[..., None]
+    # NaN in place of zero spreads quietly through the arithmetic that follows; 0/0 would warn.
+    lengths = np.where(lengths > 0.0, lengths, np.nan)
+    return vectors / lengths, lengths
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Scalar products a.b, shape (...)."""
+    product: Array = np.vecdot(a, b)
+    return product
+
+
+def _outer(a: Array, b: Array) -> Array:
+    """Outer products a b^T, shape (..., 3, 3)."""
+    return a[..., :, None] * b[..., None, :]

@@ -1,0 +1,1 @@
+"""Cubes of points, swept on one machine or many, streamed to disk."""

@@ -1,0 +1,141 @@
+"""Boxes of a map on the workers of a dask cluster.
+
+The results come back to this process, which alone writes them: workers need no disk in common, only magloc.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+import threading
+from collections.abc import Iterable, Iterator
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
+from itertools import islice
+from typing import Any
+
+from arrays.io.errors import InputError
+from magloc.grids.cube import Box, Chunk, CubeMap, computed
+
+# Boxes sent ahead for every worker: one that it computes, one that it has ready.
+_PER_WORKER = 2
+# Those of TLS need dask's own configuration besides.
+_ADDRESS = re.compile(r"(?:(?:tcp|tls)://)?(?:[^\s/:@\[\]]+|\[[0-9a-fA-F:.]+\]):(?P<port>[0-9]{1,5})")
+_LARGEST_PORT = 65535
+# numba's threads serve one chunk of a process at a time.
+_one_chunk = threading.Lock()
+
+
+def check_address(scheduler: str) -> None:
+    """Refuse what cannot be the address of a scheduler, with an :class:`arrays.io.errors.InputError`."""
+    address = _ADDRESS.fullmatch(scheduler)
+    if address is None or not 0 < int(address["port"]) <= _LARGEST_PORT:
+        raise InputError(f"--scheduler: found {scheduler!r}, expected tcp://HOST:PORT or HOST:PORT.")
+
+
+def computed_by(scheduler: str, cube: CubeMap, wanted: Iterable[Box], timeout_s: float = 10.0) -> Iterator[Chunk]:
+    """Values of some boxes, computed by the workers of a cluster, in the order in which they are ready.
+
+    Parameters
+    ----------
+    scheduler : str
+        Address of a running scheduler, such as ``tcp://127.0.0.1:8786``.
+    cube : CubeMap
+    wanted : iterable of Box
+        Only a few for every worker are under way at any time.
+    timeout_s : float
+        How long to wait for the scheduler, and for its first worker.
+
+    Yields
+    ------
+    Chunk
+        The same values as those of :func:`magloc.grids.cube.computed_here`.
+
+    Raises
+    ------
+    InputError
+        There is no scheduler, it has no workers, it went away, or a worker failed.
+    """
+    check_address(scheduler)
+    try:
+        from distributed import as_completed
+    except ImportError:
+        raise InputError(
+            "--scheduler needs the package distributed, which is not installed: pip install 'magloc[cluster]'."
+        ) from None
+    waiting = iter(wanted)
+    with _client(scheduler, timeout_s) as client:
+        try:
+            running = as_completed(loop=client.loop)
+            while True:
+                for box in islice(waiting, max(0, _PER_WORKER * len(client.nthreads()) - running.count())):
+                    running.add(client.submit(_computed_by_worker, cube, box, pure=False))
+                if running.is_empty():
+                    return
+                yield next(running).result()
+        except (CancelledError, OSError):
+            raise InputError(f"--scheduler {scheduler}: the connection to the scheduler was lost.") from None
+        except Exception as error:
+            raise InputError(f"--scheduler {scheduler}: a worker failed ({type(error).__name__}: {error}).") from None
+
+
+def _computed_by_worker(cube: CubeMap, box: Box) -> Chunk:
+    import numba
+    from distributed import get_worker
+
+    with _one_chunk:
+        numba.set_num_threads(min(get_worker().state.nthreads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+        return computed(cube, box)
+
+
+@contextmanager
+def _client(scheduler: str, timeout_s: float) -> Iterator[Any]:
+    """Connection to a scheduler that has workers, without the log of a connection that breaks."""
+    from distributed import Client
+
+    logger = logging.getLogger("distributed")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        _check_answer(scheduler, timeout_s)
+        try:
+            client = Client(scheduler, timeout=timeout_s, set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise InputError(f"--scheduler {scheduler}: found no scheduler there ({error}).") from None
+        with client:
+            try:
+                client.wait_for_workers(1, timeout=timeout_s)
+            except TimeoutError:
+                raise InputError(f"--scheduler {scheduler}: found no workers there within {timeout_s:g} s.") from None
+            yield client
+    finally:
+        logger.setLevel(level)
+
+
+def _check_answer(scheduler: str, timeout_s: float) -> None:
+    """Refuse an address where no scheduler answers.
+
+    A client that cannot connect is not asked: it waits for itself when it is deleted, and prints a traceback then.
+    """
+    from distributed import rpc
+
+    async def answer() -> object:
+        async with rpc(scheduler, timeout=timeout_s) as there:
+            return (await there.identity())["type"]
+
+    async def answer_in_time() -> object:
+        return await asyncio.wait_for(answer(), timeout_s)
+
+    try:
+        found = asyncio.run(answer_in_time())
+    except TimeoutError:
+        raise InputError(
+            f"--scheduler {scheduler}: found no scheduler there (no answer within {timeout_s:g} s)."
+        ) from None
+    except OSError as error:
+        raise InputError(f"--scheduler {scheduler}: found no scheduler there ({error}).") from None
+    except Exception:  # what another service says may mean anything to dask
+        raise InputError(f"--scheduler {scheduler}: found another service there, expected a scheduler.") from None
+    if found != "Scheduler":
+        raise InputError(f"--scheduler {scheduler}: found a {found} of dask there, expected a scheduler.")

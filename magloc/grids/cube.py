@@ -1,0 +1,268 @@
+"""Maps over a cube of points, computed box by box: what all of them have in common.
+
+A map says what it holds (:class:`CubeMap`) and computes the values of any box of its points. Where that happens is not
+its business (here, or on other machines: :mod:`magloc.grids.cluster`), nor where the values go (:func:`in_memory`, or
+into a store on disk: :mod:`magloc.grids.store`).
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import xarray as xr
+from arrays.typing import FloatArray
+
+Values = Mapping[str, NDArray[Any]]
+DIMENSIONS = ("x", "y", "z")
+
+
+class Box(NamedTuple):
+    """A box of the cube's points.
+
+    Attributes
+    ----------
+    place : tuple of 3 ints
+        Which one of the boxes that tile the cube.
+    region : tuple of 3 slices
+        Its points, along x, y, z.
+    """
+
+    place: tuple[int, int, int]
+    region: tuple[slice, slice, slice]
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Points along x, y, z."""
+        x, y, z = (part.stop - part.start for part in self.region)
+        return x, y, z
+
+    @property
+    def size(self) -> int:
+        """Number of points."""
+        x, y, z = self.shape
+        return x * y * z
+
+    def points(self, axis: FloatArray) -> FloatArray:
+        """Points (n, 3) in the order of the flattened box, for a cube with the same axis along x, y and z."""
+        return np.stack(np.meshgrid(*(axis[part] for part in self.region), indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+class Variable(NamedTuple):
+    """Type of one variable of a map, and its CF attributes."""
+
+    dtype: Any
+    attributes: Mapping[str, Any]
+
+    @property
+    def not_done(self) -> Any:
+        """Value where nothing was computed yet; no result is the smallest integer."""
+        return np.nan if np.issubdtype(self.dtype, np.floating) else int(np.iinfo(self.dtype).min)
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What the summary of a map needs of its values; tallies of boxes add up to that of the cube.
+
+    Attributes
+    ----------
+    counts : Counter
+        Points of every kind, and ``iterations`` of all of them.
+    iterations_of_converged : Counter
+        Converged points by their number of iterations.
+    """
+
+    counts: Counter[str] = field(default_factory=Counter)
+    iterations_of_converged: Counter[int] = field(default_factory=Counter)
+
+    def __add__(self, other: Tally) -> Tally:
+        return Tally(self.counts + other.counts, self.iterations_of_converged + other.iterations_of_converged)
+
+    def fraction(self, part: str, whole: str) -> float:
+        """Of the points of one kind those that are of another as well; NaN if there are none."""
+        return self.counts[part] / self.counts[whole] if self.counts[whole] else float("nan")
+
+    def median_iterations(self) -> float:
+        """Over the converged points; NaN if there are none."""
+        if not self.iterations_of_converged:
+            return float("nan")
+        values, counts = np.array(sorted(self.iterations_of_converged.items())).T
+        last_of_value = np.cumsum(counts)
+        middle = [(last_of_value[-1] - 1) // 2, last_of_value[-1] // 2]
+        return float(values[np.searchsorted(last_of_value, middle, side="right")].mean())
+
+
+def histogram(iterations: NDArray[Any]) -> Counter[int]:
+    """How often every number of iterations occurs."""
+    values, counts = np.unique(iterations, return_counts=True)
+    return Counter(dict(zip(values.tolist(), counts.tolist(), strict=True)))
+
+
+@dataclass(frozen=True)
+class MapSummary:
+    """Counts of a map.
+
+    Attributes
+    ----------
+    starts, converged : int
+    fraction, front_fraction, back_fraction : float
+        Converged starts over all starts, over those in front of the plane and over those behind it; NaN where the map
+        has no such plane.
+    median_iterations : float
+        Over the converged starts; NaN if there are none.
+    iterations_total : int
+        Of all starts.
+    seconds : float
+        Duration of the computation alone; that of all machines together.
+    """
+
+    starts: int
+    converged: int
+    fraction: float
+    front_fraction: float
+    back_fraction: float
+    median_iterations: float
+    iterations_total: int
+    seconds: float
+
+
+class CubeMap(Protocol):
+    """A map over a cube of points. It is sent to other processes: keep it small when pickled."""
+
+    @property
+    def grid(self) -> int:
+        """Points along every axis."""
+
+    @property
+    def edge(self) -> int:
+        """Points along the edges of a box."""
+
+    @property
+    def axis(self) -> FloatArray:
+        """Coordinates [m] along every axis, shape (grid,)."""
+
+    @property
+    def point(self) -> str:
+        """What a point is, in one word."""
+
+    @property
+    def variables(self) -> Mapping[str, Variable]:
+        """Variables over the cube; with an integer one among them."""
+
+    @property
+    def attributes(self) -> Mapping[str, Any]:
+        """All that determines the values: two maps with equal attributes are the same."""
+
+    @property
+    def findings(self) -> Mapping[str, Any]:
+        """Further attributes, which follow from the others."""
+
+    def warm_up(self) -> None:
+        """Compile, or load what was compiled."""
+
+    def values(self, box: Box) -> Values:
+        """Values of every variable, of the box's shape. They depend neither on the box nor on the number of threads."""
+
+    def tally(self, values: Values) -> Tally:
+        """Counts of a part's values."""
+
+    def summary(self, tally: Tally, seconds: float) -> MapSummary:
+        """Summary of the whole cube from its tally."""
+
+
+class Chunk(NamedTuple):
+    """Values of one box, and how long they took."""
+
+    box: Box
+    values: Values
+    seconds: float
+
+
+def boxes(cube: CubeMap) -> Iterator[Box]:
+    """Boxes that tile a cube."""
+    parts = [slice(i, min(i + cube.edge, cube.grid)) for i in range(0, cube.grid, cube.edge)]
+    n = len(parts)
+    for i, j, k in np.ndindex(n, n, n):
+        yield Box((i, j, k), (parts[i], parts[j], parts[k]))
+
+
+def computed(cube: CubeMap, box: Box) -> Chunk:
+    """Values of one box, with their time; compiling is not part of it."""
+    cube.warm_up()
+    began = time.perf_counter()
+    values = cube.values(box)
+    return Chunk(box, values, time.perf_counter() - began)
+
+
+def computed_here(cube: CubeMap, wanted: Iterable[Box]) -> Iterator[Chunk]:
+    """Values of some boxes, one after the other, in this process."""
+    for box in wanted:
+        with uninterrupted():
+            chunk = computed(cube, box)
+        yield chunk
+
+
+@contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Let Ctrl-C wait for the end of the block: compiled code and writing would fail with errors of their own."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # which no signal interrupts
+        return
+    signals: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: signals.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if signals:
+        raise KeyboardInterrupt
+
+
+def coordinates(cube: CubeMap) -> dict[str, tuple[FloatArray, dict[str, str]]]:
+    """Coordinates of a cube's points along every dimension, with CF attributes."""
+    return {
+        name: (cube.axis, {"long_name": f"{cube.point} {name}, array frame", "units": "m", "axis": name.upper()})
+        for name in DIMENSIONS
+    }
+
+
+def in_memory(cube: CubeMap, progress: Callable[[int], None] | None = None) -> xr.Dataset:
+    """All values of a map.
+
+    Parameters
+    ----------
+    cube : CubeMap
+    progress : callable, optional
+        Called with the number of points finished since the last call.
+
+    Returns
+    -------
+    xarray.Dataset
+        Over (x, y, z), with the map's attributes and the duration ``seconds``.
+    """
+    import xarray as xr
+
+    shape = (cube.grid,) * 3
+    whole = {name: np.full(shape, variable.not_done, variable.dtype) for name, variable in cube.variables.items()}
+    seconds = 0.0
+    for chunk in computed_here(cube, boxes(cube)):
+        for name, values in chunk.values.items():
+            whole[name][chunk.box.region] = values
+        seconds += chunk.seconds
+        if progress is not None:
+            progress(chunk.box.size)
+    return xr.Dataset(
+        {name: (DIMENSIONS, whole[name], dict(variable.attributes)) for name, variable in cube.variables.items()},
+        coords={name: (name, axis, attributes) for name, (axis, attributes) in coordinates(cube).items()},
+        attrs={**cube.attributes, **cube.findings, "seconds": seconds},
+    )

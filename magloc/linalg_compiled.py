@@ -1,0 +1,91 @@
+"""Small linear algebra for compiled loops: Gram-Schmidt, tangents of spheres, damped solutions."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from arrays.typing import FloatArray
+from magloc.compilation import compiled
+
+
+@compiled
+def orthonormalise(rows: FloatArray, triangle: FloatArray) -> None:
+    """Gram-Schmidt, twice, of rows (k, c) in place; triangle (k, k) becomes R with rows = Rᵀ · orthonormal rows."""
+    n_rows, n = rows.shape
+    for j in range(n_rows):
+        for k in range(j):
+            triangle[k, j] = 0.0
+        for _ in range(2):
+            for k in range(j):
+                t = 0.0
+                for c in range(n):
+                    t += rows[k, c] * rows[j, c]
+                triangle[k, j] += t
+                for c in range(n):
+                    rows[j, c] -= t * rows[k, c]
+        t = 0.0
+        for c in range(n):
+            t += rows[j, c] * rows[j, c]
+        norm = math.sqrt(t)
+        triangle[j, j] = norm
+        inverse = 1.0 / norm if norm > 0.0 else 0.0
+        for c in range(n):
+            rows[j, c] *= inverse
+
+
+@compiled
+def _tangent(q: FloatArray, tangent: FloatArray) -> None:
+    """Orthonormal basis (3, 4) of the plane orthogonal to the unit vector q, from a Householder reflection."""
+    sign = 1.0 if q[3] >= 0.0 else -1.0
+    beta = 1.0 / (1.0 + sign * q[3])
+    for j in range(3):
+        for a in range(4):
+            w = q[a] if a < 3 else q[3] + sign
+            tangent[j, a] = (1.0 if a == j else 0.0) - beta * q[j] * w
+
+
+@compiled
+def _directional_tangent(q: FloatArray, tangent: FloatArray) -> None:
+    """Two orthonormal rows orthogonal to u that leave s, and with it the range, alone."""
+    norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
+    u0, u1, u2 = q[0] / norm, q[1] / norm, q[2] / norm
+    sign = 1.0 if u2 >= 0.0 else -1.0
+    a = -1.0 / (sign + u2)
+    b = u0 * u1 * a
+    tangent[0, 3] = tangent[1, 3] = 0.0
+    tangent[0, 0], tangent[0, 1], tangent[0, 2] = 1.0 + sign * u0 * u0 * a, sign * b, -sign * u0
+    tangent[1, 0], tangent[1, 1], tangent[1, 2] = b, sign + u1 * u1 * a, -u1
+
+
+@compiled
+def _solve_damped(a: FloatArray, b: FloatArray, n: int, damping: float, step: FloatArray) -> None:
+    """Step = (a + damping · diag(a))⁻¹ b for n ≤ 3 by Cholesky; columns without information do not move."""
+    m = np.empty((3, 3))
+    largest = 0.0
+    for i in range(n):
+        largest = max(largest, a[i, i])
+    for i in range(n):
+        for j in range(n):
+            m[i, j] = a[i, j]
+        m[i, i] += damping * a[i, i] + 1e-14 * largest
+    for i in range(n):
+        for j in range(i + 1):
+            t = m[i, j]
+            for k in range(j):
+                t -= m[i, k] * m[j, k]
+            if i == j:
+                m[i, i] = math.sqrt(t) if t > 0.0 else math.inf
+            else:
+                m[i, j] = t / m[j, j]
+    for i in range(n):
+        t = b[i]
+        for k in range(i):
+            t -= m[i, k] * step[k]
+        step[i] = t / m[i, i]
+    for i in range(n - 1, -1, -1):
+        t = step[i]
+        for k in range(i + 1, n):
+            t -= m[k, i] * step[k]
+        step[i] = t / m[i, i]

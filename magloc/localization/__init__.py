@@ -1,0 +1,1 @@
+"""One fix: where a dipole is, from one set of readings."""

@@ -1,0 +1,231 @@
+"""Whether a source is near enough to be told from a dipole."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.stats import chi2 as chi2_distribution
+from scipy.stats import f as f_distribution
+
+from arrays.array import SensorArray
+from arrays.differences import decorrelated_differences
+from arrays.io.errors import _vector
+from arrays.noise import reading_covariance
+from arrays.typing import BoolArray, FloatArray
+from magloc.fields import dipole
+from magloc.fields.multipole import multipole_field_matrix
+from magloc.measurement.differences import DifferenceMeasurement, channel_jacobian
+
+BODY_LENGTHS = 3.0
+_ORDERS = (2, 3)
+_NAMES = {2: "a quadrupole", 3: "an octupole"}
+_NO_OTHER_MISFIT = 0.05
+# Columns whose part outside the earlier ones is smaller than this are not seen by the array.
+_UNSEEN_RTOL = 1e-6
+
+
+@dataclass(frozen=True)
+class MultipoleGain:
+    """What one more order of the multipole expansion explains of the readings.
+
+    Attributes
+    ----------
+    order : int
+        2 for the quadrupole, 3 for the octupole.
+    gain : float
+        By how much χ² decreases.
+    n_parameters : int
+        How many more parameters the array sees.
+    noise_probability : float
+        Probability that noise of the stated size gains as much: χ² test.
+    misfit_probability : float
+        Probability that a misfit without any pattern gains as much: F test against what is left. 1 where nothing is
+        left to compare it with.
+    """
+
+    order: int
+    gain: float
+    n_parameters: int
+    noise_probability: float
+    misfit_probability: float
+
+
+@dataclass(frozen=True)
+class NearnessTest:
+    """Whether a fix leaves residuals that a dipole does not, and whether they have the pattern of an extended source.
+
+    Attributes
+    ----------
+    misfit : bool
+        Whether χ² is larger than noise explains.
+    extended : bool
+        Whether a quadrupole or an octupole explains significantly more than noise, and more than a misfit of another
+        kind does: the source is too near or too large for a dipole. So near that the expansion about one point does
+        not hold, and with few sensors, there is a misfit only.
+    chi2 : float
+        Of the dipole, at the end of one linearised step.
+    dof : int
+        Differences minus the unknowns of a dipole that the array sees.
+    gains : tuple of MultipoleGain
+        Each beyond the orders before it.
+    warning : str
+        A sentence for the user; empty if there is neither.
+    """
+
+    misfit: bool
+    extended: bool
+    chi2: float
+    dof: int
+    gains: tuple[MultipoleGain, ...]
+    warning: str
+
+
+def dipole_validity(distance_m: ArrayLike, body_length_m: ArrayLike) -> BoolArray:
+    """Whether a body is at least three body lengths away, so that it counts as a dipole.
+
+    At three lengths, the length being the longest side, the field of a uniformly magnetised cube differs from that of a
+    dipole by 0.3 % at most, that of a cylinder as long as it is wide by 1.3 %, of a flat brick by 5 % and of a thin rod
+    by 6 %, on whose axis the ratio of the two is ``1/(1 - (L/2r)²)²``.
+
+    Parameters
+    ----------
+    distance_m : array_like
+        From the body's centre to the sensors [m].
+    body_length_m : array_like
+        Greatest extent of the body [m].
+
+    Returns
+    -------
+    ndarray of bool
+        Their shapes broadcast; False where either is NaN.
+
+    Raises
+    ------
+    ValueError
+        A distance or a length is negative.
+    """
+    distance, length = np.asarray(distance_m, dtype=np.float64), np.asarray(body_length_m, dtype=np.float64)
+    for name, values in (("distance_m", distance), ("body_length_m", length)):
+        if np.any(values < 0.0):
+            raise ValueError(f"Input {name} must not be negative; instead received {values.min()}.")
+    return np.asarray(distance >= BODY_LENGTHS * length)
+
+
+def nearness_test(
+    array: SensorArray,
+    position_m: ArrayLike,
+    moment_Am2: ArrayLike,
+    readings_T: ArrayLike,
+    *,
+    false_alarm: float = 1e-3,
+) -> NearnessTest:
+    """Whether the residuals of a fix have the pattern of a source that is extended or too near.
+
+    A quadrupole and then an octupole at the solution are added to the linearised dipole. Either is a finding if χ²
+    decreases by more than noise explains, and by more, per parameter, than what is left of the misfit (F test at 5 %).
+    The octupole is left out where it would leave no degree of freedom. That χ² itself is too large is a finding too.
+    Each of the three tests has a third of the rate of false alarms.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Its noise decides what is significant.
+    position_m, moment_Am2 : array_like, shape (3,)
+        Solution of a fix, in the array's frame [m], [A·m²].
+    readings_T : array_like, shape (C,)
+        The readings of that fix [T]; NaN where missing.
+    false_alarm : float
+        Probability at most of any finding for a dipole with noise of the stated size.
+
+    Returns
+    -------
+    NearnessTest
+
+    Raises
+    ------
+    ValueError
+        The shapes do not agree, or the rate of false alarms is not between 0 and 1.
+    """
+    position, moment = _vector("position_m", position_m), _vector("moment_Am2", moment_Am2)
+    readings = np.asarray(readings_T, dtype=np.float64)
+    if readings.shape != (array.n_channels,):
+        raise ValueError(f"Input readings_T must have shape ({array.n_channels},); instead received {readings.shape}.")
+    if not 0.0 < false_alarm < 1.0:
+        raise ValueError(f"Input false_alarm must be between 0 and 1; instead received {false_alarm}.")
+    covariance = reading_covariance(array, readings)
+    measurement = DifferenceMeasurement(
+        array, decorrelated_differences(array, np.isfinite(readings), covariance_T2=covariance)
+    )
+    whitener = measurement.differences.transform / np.sqrt(measurement.variance)[:, None]
+    residual = (measurement.measured(readings) - measurement.predicted(position, moment)) / np.sqrt(
+        measurement.variance
+    )
+    known = _orthonormal(whitener @ channel_jacobian(array, position, moment), np.zeros((residual.size, 0)))
+    residual = residual - known @ (known.T @ residual)
+    chi2, dof = float(residual @ residual), residual.size - known.shape[1]
+    steps: list[tuple[int, float, int]] = []
+    left = dof
+    for order in _ORDERS:
+        fields = multipole_field_matrix(array.positions, position, order)[array.channel_sensor]
+        columns = np.einsum("ci,cij->cj", _channel_rows(array, position, moment), fields)
+        new = _orthonormal(whitener @ columns, known)
+        if new.shape[1] == 0 or (steps and left - new.shape[1] <= 0):
+            break
+        steps.append((order, float(np.sum((new.T @ residual) ** 2)), new.shape[1]))
+        known, left = np.concatenate([known, new], axis=1), left - new.shape[1]
+    rest = max(chi2 - sum(gain for _, gain, _ in steps), 0.0)
+    gains = tuple(_tested(order, gain, n, rest, left) for order, gain, n in steps)
+    level = false_alarm / 3.0
+    misfit = dof > 0 and bool(chi2_distribution.sf(chi2, dof) < level)
+    extended = any(gain.noise_probability < level and gain.misfit_probability < _NO_OTHER_MISFIT for gain in gains)
+    return NearnessTest(misfit, extended, chi2, dof, gains, _warning(misfit, extended, chi2, dof, gains))
+
+
+def _tested(order: int, gain: float, n_parameters: int, rest: float, left: int) -> MultipoleGain:
+    comparable = left > 0 and rest > 0.0
+    ratio = (gain / n_parameters) / (rest / left) if comparable else 0.0
+    return MultipoleGain(
+        order=order,
+        gain=gain,
+        n_parameters=n_parameters,
+        noise_probability=float(chi2_distribution.sf(gain, n_parameters)),
+        misfit_probability=float(f_distribution.sf(ratio, n_parameters, left)) if comparable else 1.0,
+    )
+
+
+def _warning(misfit: bool, extended: bool, chi2: float, dof: int, gains: Sequence[MultipoleGain]) -> str:
+    if extended:
+        best = min(gains, key=lambda gain: gain.misfit_probability)
+        return (
+            f"The source is too near or too large for a dipole: {_NAMES[best.order]} explains {best.gain:.4g} of "
+            f"χ² {chi2:.4g}."
+        )
+    if misfit:
+        return (
+            f"The readings are not those of one dipole (χ² {chi2:.4g} for {dof} degrees of freedom): the source may be "
+            "too near, too large or one of several, or the noise or the calibration is wrong."
+        )
+    return ""
+
+
+def _channel_rows(array: SensorArray, position: FloatArray, moment: FloatArray) -> FloatArray:
+    """What each channel reads of a small change of the field, (C, 3)."""
+    if not array.channel_is_scalar.any():
+        return array.channel_gain
+    total = dipole.field(array.positions, position, moment) + array.ambient_fields
+    direction = total / np.linalg.norm(total, axis=-1, keepdims=True)
+    of_modulus = array.channel_gain[:, :1] * direction[array.channel_sensor]
+    return np.where(array.channel_is_scalar[:, None], of_modulus, array.channel_gain)
+
+
+def _orthonormal(columns: FloatArray, known: FloatArray) -> FloatArray:
+    """Orthonormal basis of what columns (k, n) add to the orthonormal ones that are known."""
+    length = np.linalg.norm(columns, axis=0)
+    unit = columns / np.where(length > 0.0, length, 1.0)
+    new = unit - known @ (known.T @ unit)
+    basis, size, _ = np.linalg.svd(new, full_matrices=False)
+    result: FloatArray = basis[:, size > _UNSEEN_RTOL]
+    return result

@@ -1,0 +1,1 @@
+"""What a fit is, and the iterations that lead to one."""

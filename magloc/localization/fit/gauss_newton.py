@@ -1,0 +1,324 @@
+r"""Any number of dipoles seen by any sensors: the exact model and its damped Gauss-Newton fit, many at once.
+
+Vector sensors read components, scalar sensors the exact modulus :math:`|B_a + B|` of the sum with the ambient field, so
+that the readings are not linear in the moments. Every source has the homogeneous coordinates q = (u, s) and the scaled
+moment μ of :mod:`magloc.measurement.whitened`: infinity (s = 0) is an ordinary point.
+
+Positions are damped, moments are not: after every step of the positions the moments are fitted anew, which for vector
+sensors makes the iteration that of variable projection.
+
+Shapes: b fits, K sources, N sensors, C channels, c columns of the whitening's common field.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.typing import FloatArray
+from magloc.fields.dipole import MU0_OVER_4PI
+from magloc.measurement.whitened import JointProblem
+
+# A refinement has converged where the linearised model promises to lower χ² by less than this, absolute and relative.
+PROMISE_ABSOLUTE = 1e-8
+PROMISE_RELATIVE = 1e-11
+_LARGEST_STEP_RAD = 0.5
+_LARGEST_DAMPING = 1e9
+
+
+@dataclass(frozen=True, eq=False)
+class JointFits:
+    """Results of :func:`refine` and :func:`refine_moments`.
+
+    Attributes
+    ----------
+    q : ndarray, shape (b, K, 4)
+    mu : ndarray, shape (b, K, 3)
+    chi2 : ndarray, shape (b,)
+        Infinite where the fit did not converge.
+    iterations : ndarray of int, shape (b,)
+        Linearisations.
+    """
+
+    q: FloatArray
+    mu: FloatArray
+    chi2: FloatArray
+    iterations: NDArray[np.int64]
+
+    @property
+    def converged(self) -> NDArray[np.bool_]:
+        """Whether the iteration ended at an optimum, shape (b,)."""
+        return np.isfinite(self.chi2)
+
+    def with_opposite_moments(self, n_rows: int) -> JointFits:
+        """The fits of n rows, equally many each, and beside every fit that of the opposite moment."""
+        both = np.repeat(np.arange(len(self.q)).reshape(n_rows, -1), 2, axis=1).ravel()
+        fits = self.rows(both)
+        fits.mu[1::2] *= -1.0
+        return fits
+
+    def rows(self, index: NDArray[np.intp]) -> JointFits:
+        """Some of the fits."""
+        return JointFits(self.q[index], self.mu[index], self.chi2[index], self.iterations[index])
+
+
+def tangents(q: FloatArray) -> FloatArray:
+    """Orthonormal tangents of the unit sphere at q (..., 4): (..., 4, 3).
+
+    The first two turn the direction u at one range, the third changes the range alone.
+    """
+    u, s = q[..., :3], q[..., 3:]
+    length = np.linalg.norm(u, axis=-1, keepdims=True)
+    direction = np.where(length > 1e-12, u / np.maximum(length, 1e-12), [0.0, 0.0, 1.0])
+    # Any vector that is not along u: the axis of its smallest component.
+    axis = np.eye(3)[np.argmin(np.abs(direction), axis=-1)]
+    first = np.cross(direction, axis)
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    second = np.cross(direction, first)
+    zero = np.zeros_like(s)
+    columns = (
+        np.concatenate([first, zero], axis=-1),
+        np.concatenate([second, zero], axis=-1),
+        np.concatenate([direction * s, -length], axis=-1),
+    )
+    return np.stack(columns, axis=-1)
+
+
+def fit_moments(problem: JointProblem, y: FloatArray, q: FloatArray) -> FloatArray:
+    """Scaled moments (b, K, 3) that fit y (b, C) best at q, the channels linearised about the ambient field alone."""
+    gain = problem.linear_gain(np.zeros_like(problem.ambient))
+    return _moment_step(problem.moment_jacobian(q, gain), y - problem.predicted(np.zeros_like(problem.ambient)))
+
+
+def _moment_step(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
+    step, _ = _NormalEquations.of(jacobian, residual).step()
+    return step.reshape(len(residual), -1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class _NormalEquations:
+    """Normal equations of many fits, in columns of unit norm."""
+
+    norm: FloatArray
+    gradient: FloatArray
+    information: FloatArray
+
+    @classmethod
+    def of(cls, jacobian: FloatArray, residual: FloatArray) -> _NormalEquations:
+        """From Jacobians (b, C, n) and residuals (b, C)."""
+        norm = np.linalg.norm(jacobian, axis=1)
+        norm = np.where(norm > 0.0, norm, 1.0)
+        unit = jacobian / norm[:, None]
+        transposed = unit.transpose(0, 2, 1)
+        return cls(norm, (transposed @ residual[..., None])[..., 0], transposed @ unit)
+
+    def step(self, damping: FloatArray | float = 0.0) -> tuple[FloatArray, FloatArray]:
+        """The step (b, n) with a damping of every column, and by how much it promises to lower χ² (b,)."""
+        diagonal = np.arange(self.norm.shape[-1])
+        system = self.information.copy()
+        system[:, diagonal, diagonal] += 1e-13 + damping
+        with np.errstate(all="ignore"):
+            step = np.linalg.solve(system, self.gradient[..., None])[..., 0]
+            curvature = np.sum(step * (self.information @ step[..., None])[..., 0], axis=-1)
+            promised = 2.0 * np.sum(step * self.gradient, axis=-1) - curvature
+        return step / self.norm, promised
+
+
+def refine_moments(
+    problem: JointProblem, y: FloatArray, q: FloatArray, mu: FloatArray, *, max_iterations: int = 60
+) -> JointFits:
+    """Moments of sources at known places, from starts: a damped Gauss-Newton iteration.
+
+    Parameters
+    ----------
+    problem : JointProblem
+    y : ndarray, shape (b, C)
+        Whitened readings.
+    q, mu : ndarray, shapes (b, K, 4) and (b, K, 3)
+        The places, which stay, and the moments to start from.
+    max_iterations : int
+        Linearisations at most.
+
+    Returns
+    -------
+    JointFits
+    """
+    return _descend(problem, y, q, mu, np.zeros((q.shape[1], 3), dtype=bool), max_iterations)
+
+
+def refine(
+    problem: JointProblem,
+    y: FloatArray,
+    q: FloatArray,
+    mu: FloatArray,
+    *,
+    free: NDArray[np.bool_] | None = None,
+    max_iterations: int = 60,
+) -> JointFits:
+    """Positions and moments from starts: a damped Gauss-Newton iteration that never raises χ².
+
+    Parameters
+    ----------
+    problem : JointProblem
+    y : ndarray, shape (b, C)
+        Whitened readings.
+    q, mu : ndarray, shapes (b, K, 4) and (b, K, 3)
+        Starts.
+    free : ndarray of bool, shape (K, 3), optional
+        Which of the :func:`tangents` of a source may change; all by default. Without the third one its range stays.
+    max_iterations : int
+        Linearisations at most.
+
+    Returns
+    -------
+    JointFits
+    """
+    free = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
+    return _descend(problem, y, q, mu, free, max_iterations)
+
+
+def _descend(
+    problem: JointProblem,
+    y: FloatArray,
+    q: FloatArray,
+    mu: FloatArray,
+    free: NDArray[np.bool_],
+    max_iterations: int,
+) -> JointFits:
+    n_fits, n_sources = q.shape[:2]
+    columns = np.flatnonzero(free.ravel())
+    # Without free positions the moments themselves are what has to be damped.
+    damped = np.repeat([1.0, 0.0 if columns.size else 1.0], [columns.size, 3 * n_sources])
+    q, mu = q.copy(), mu.copy()
+    chi2, iterations = np.full(n_fits, np.inf), np.zeros(n_fits, dtype=np.int64)
+    live = np.arange(n_fits)
+    damping = np.full(n_fits, 1e-3)
+    fields = problem.source_fields(q, mu)
+    residual = y - problem.predicted(fields)
+    current = _squares(residual)
+    fresh = np.ones(n_fits, dtype=bool)
+    jacobian = np.empty((n_fits, y.shape[1], damped.size))
+    tangent = np.empty((n_fits, n_sources, 4, 3))
+    sub = problem
+    for _ in range(max_iterations):
+        if not live.size:
+            break
+        new = np.flatnonzero(fresh)
+        if new.size:
+            at = sub if new.size == live.size else sub.rows(new)
+            gain = at.linear_gain(fields[new])
+            tangent[new] = tangents(q[live[new]])
+            along = at.position_jacobian(q[live[new]], mu[live[new]], gain, tangent[new])[..., columns]
+            jacobian[new] = np.concatenate([along, at.moment_jacobian(q[live[new]], gain)], axis=-1)
+            iterations[live[new]] += 1
+        normal = _NormalEquations.of(jacobian, residual)
+        step, promised = normal.step(damping[:, None] * damped)
+        _, reachable = normal.step()
+        new_q, new_mu, step_share = _moved(q[live], mu[live], step, tangent, columns)
+        new_fields = sub.source_fields(new_q, new_mu)
+        new_residual = y[live] - sub.predicted(new_fields)
+        new_chi2 = _squares(new_residual)
+        if columns.size:
+            gain = sub.linear_gain(new_fields)
+            better_mu = new_mu + _moment_step(sub.moment_jacobian(new_q, gain), new_residual)
+            better_fields = sub.source_fields(new_q, better_mu)
+            better_residual = y[live] - sub.predicted(better_fields)
+            better_chi2 = _squares(better_residual)
+            better = better_chi2 < new_chi2
+            new_mu = np.where(better[:, None, None], better_mu, new_mu)
+            new_fields = np.where(better[:, None, None], better_fields, new_fields)
+            new_residual = np.where(better[:, None], better_residual, new_residual)
+            new_chi2 = np.where(better, better_chi2, new_chi2)
+        with np.errstate(invalid="ignore"):
+            accepted = new_chi2 < current
+            gained = current - new_chi2
+            small = np.abs(reachable) < PROMISE_ABSOLUTE + PROMISE_RELATIVE * current
+            # A step that rounding refuses is the end too, if next to nothing was promised.
+            ended = small | (~accepted & (damping > _LARGEST_DAMPING))
+            at_optimum = small | (np.abs(reachable) < 1e-6 * (1.0 + current))
+            well = gained > 0.75 * promised
+            badly = gained < 0.5 * promised
+        q[live[accepted]], mu[live[accepted]] = new_q[accepted], new_mu[accepted]
+        fields, residual = (
+            np.where(accepted[:, None, None], new_fields, fields),
+            np.where(accepted[:, None], new_residual, residual),
+        )
+        current = np.where(accepted, new_chi2, current)
+        damping = np.where(
+            accepted,
+            np.where(
+                well & (step_share == 1.0), 0.1 * damping, np.where(badly, np.maximum(damping, 0.1) * 3.0, damping)
+            ),
+            np.maximum(damping, 1e-4) * 5.0,
+        )
+        finished = ended | ~np.isfinite(current)
+        chi2[live[finished]] = np.where(at_optimum, current, np.inf)[finished]
+        fresh = accepted
+        if finished.any():
+            stay = np.flatnonzero(~finished)
+            live, fresh, damping, current = live[stay], fresh[stay], damping[stay], current[stay]
+            fields, residual, jacobian, tangent = fields[stay], residual[stay], jacobian[stay], tangent[stay]
+            sub = sub.rows(stay)
+    return JointFits(q, mu, np.where(np.isnan(chi2), np.inf, chi2), iterations)
+
+
+def _squares(residual: FloatArray) -> FloatArray:
+    squares: FloatArray = np.sum(residual * residual, axis=-1)
+    return squares
+
+
+def _moved(
+    q: FloatArray, mu: FloatArray, step: FloatArray, tangent: FloatArray, columns: NDArray[np.intp]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Coordinates and moments after a step, shortened where it would turn q too far, and the share that was taken."""
+    n_fits, n_sources = q.shape[:2]
+    along = np.zeros((n_fits, 3 * n_sources))
+    along[:, columns] = step[:, : columns.size]
+    along = along.reshape(n_fits, n_sources, 3)
+    longest = np.max(np.linalg.norm(along, axis=-1), axis=-1)
+    share = np.minimum(1.0, _LARGEST_STEP_RAD / np.maximum(longest, 1e-300))
+    moved = q + (tangent @ (share[:, None, None] * along)[..., None])[..., 0]
+    # A step along the tangents lengthens u a little: where the range is held, u keeps its length.
+    held = ~np.isin(3 * np.arange(n_sources) + 2, columns)
+    before, after = (np.linalg.norm(x[:, held, :3], axis=-1, keepdims=True) for x in (q, moved))
+    moved[:, held, :3] *= before / np.maximum(after, 1e-300)
+    turned = step[:, columns.size :].reshape(n_fits, n_sources, 3)
+    new_mu = mu + share[:, None, None] * turned
+    norm = np.linalg.norm(moved, axis=-1, keepdims=True)
+    return moved / norm, new_mu / norm**3, share
+
+
+def covariances(problem: JointProblem, fits: JointFits) -> FloatArray:
+    """Inverse information of (p₁, m₁, p₂, m₂, …) of every fit: (b, 6 K, 6 K) [m, A·m²], NaN where it is singular."""
+    n_fits, n_sources = fits.q.shape[:2]
+    if not n_fits:
+        return np.empty((0, 6 * n_sources, 6 * n_sources))
+    s = fits.q[..., 3:]
+    rho = np.concatenate([fits.q[..., :3] / s, np.ones_like(s)], axis=-1)
+    mu = fits.mu / np.abs(s) ** 3
+    gain = problem.linear_gain(problem.source_fields(rho, mu))
+    along = np.broadcast_to(np.eye(4)[:, :3], (n_fits, n_sources, 4, 3))
+    by_position = problem.position_jacobian(rho, mu, gain, along).reshape(n_fits, -1, n_sources, 3)
+    by_moment = problem.moment_jacobian(rho, gain).reshape(n_fits, -1, n_sources, 3)
+    jacobian = np.concatenate([by_position, by_moment], axis=-1).reshape(n_fits, -1, 6 * n_sources)
+    unit = np.tile(np.repeat([problem.radius, problem.radius**3 / MU0_OVER_4PI], 3), n_sources)
+    return _inverse_information(jacobian) * np.outer(unit, unit)
+
+
+def _inverse_information(jacobian: FloatArray) -> FloatArray:
+    """``(JᵀJ)⁻¹`` of every fit by singular values of the Jacobian in columns of unit norm."""
+    norm = np.linalg.norm(jacobian, axis=1)
+    good = np.isfinite(norm).all(axis=-1) & (norm > 0.0).all(axis=-1)
+    safe = np.where(good[:, None], norm, 1.0)
+    unit = np.where(good[:, None, None], jacobian, 0.0) / safe[:, None]
+    singular, vt = np.linalg.svd(unit, full_matrices=False)[1:]
+    good &= (singular.shape[-1] == norm.shape[-1]) & (singular[:, -1] > 1e-13 * singular[:, 0])
+    if not good.any():
+        return np.full((len(norm), norm.shape[-1], norm.shape[-1]), np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        rooted = vt / singular[..., None] / safe[:, None]
+        inverse: FloatArray = rooted.transpose(0, 2, 1) @ rooted
+    inverse[~good] = np.nan
+    return inverse

@@ -1,0 +1,248 @@
+"""Distance of a source that recedes or approaches along a straight line, from one vector sensor.
+
+The source keeps its moment and its attitude, and does not pass the sensor. Readings at known distances along the line
+give where the line is as the sensor sees it, and the moment (:func:`fit_line`, :func:`fit_coil_line`); after that every
+single reading gives a distance (:func:`distance_along_line`). The field of a dipole is the same on both sides of it, so
+that the line may as well be inverted through the sensor: distances are not affected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import least_squares, minimize_scalar
+
+from arrays.typing import FloatArray
+from magloc.fields import dipole
+from magloc.fields.coil import loop_field
+
+_N_UNKNOWNS = 8
+_N_DIRECTIONS = 24
+_GRID = 4000
+# Radii of a coil that a fit starts from, relative to the distance of its start.
+_RADII = (0.3, 0.8)
+
+
+@dataclass(frozen=True, eq=False)
+class SourceLine:
+    """A source on a straight line, as a vector sensor at the origin sees it.
+
+    Attributes
+    ----------
+    start_m : ndarray, shape (3,)
+        Source at distance zero, in the sensor's axes [m], up to the sign of (start, direction) together.
+    direction : ndarray, shape (3,)
+        Unit vector in which the distance grows.
+    moment_Am2 : ndarray, shape (3,)
+        [A·m²].
+    radius_m : float
+        Of the current loop that the source is; 0 for a dipole.
+    chi2 : float
+        Sum of squared residuals over the noise.
+    dof : int
+        Readings minus unknowns.
+    converged : bool
+        Whether the iteration ended at an optimum; else nothing here is a result.
+    """
+
+    start_m: FloatArray
+    direction: FloatArray
+    moment_Am2: FloatArray
+    radius_m: float
+    chi2: float
+    dof: int
+    converged: bool
+
+    def field(self, distance_m: ArrayLike) -> FloatArray:
+        """Field at the sensor, (..., 3) [T], for distances (...) [m]."""
+        distance = np.asarray(distance_m, dtype=np.float64)
+        source = self.start_m + distance[..., None] * self.direction
+        return loop_field(np.zeros(3), source, self.moment_Am2, self.radius_m)
+
+
+def fit_line(
+    distance_m: ArrayLike,
+    field_T: ArrayLike,
+    noise_T: float,
+    *,
+    noise_fraction: float = 0.0,
+) -> SourceLine:
+    """Find the line and the moment of a source from fields at known distances along the line.
+
+    Parameters
+    ----------
+    distance_m : array_like, shape (n,)
+        Distances along the line from its unknown start [m].
+    field_T : array_like, shape (n, 3)
+        Field of the source alone, in the sensor's axes [T].
+    noise_T : float
+        Standard deviation per axis [T].
+    noise_fraction : float
+        Noise proportional to the field, as of an array: variance = noise² + (fraction · |B|)².
+
+    Returns
+    -------
+    SourceLine
+        Of a dipole: the best of the fits from many directions of the line.
+
+    Raises
+    ------
+    ValueError
+        The shapes do not agree, a number is not finite, the noise is not positive, or there are fewer readings than
+        unknowns.
+    """
+    distance, field, sigma = _checked(distance_m, field_T, noise_T, noise_fraction)
+    return _best_line(distance, field, sigma, _starts(distance, field))
+
+
+def fit_coil_line(
+    distance_m: ArrayLike, field_T: ArrayLike, noise_T: float, *, noise_fraction: float = 0.0
+) -> SourceLine:
+    """As :func:`fit_line`, for a coil of unknown radius, which is one more unknown.
+
+    Parameters
+    ----------
+    distance_m, field_T, noise_T, noise_fraction
+        As of :func:`fit_line`.
+
+    Returns
+    -------
+    SourceLine
+        With the radius of the single loop that fits best.
+    """
+    distance, field, sigma = _checked(distance_m, field_T, noise_T, noise_fraction)
+    starts = [
+        np.append(start, share * np.linalg.norm(start[:3])) for start in _starts(distance, field) for share in _RADII
+    ]
+    return _best_line(distance, field, sigma, starts)
+
+
+def distance_along_line(
+    line: SourceLine,
+    field_T: ArrayLike,
+    noise_T: float,
+    *,
+    noise_fraction: float = 0.0,
+    within_m: tuple[float, float],
+) -> tuple[FloatArray, FloatArray]:
+    """Distance of the source along its line, of every reading on its own.
+
+    Parameters
+    ----------
+    line : SourceLine
+    field_T : array_like, shape (..., 3)
+        Field of the source alone, in the sensor's axes [T].
+    noise_T, noise_fraction
+        As of :func:`fit_line`.
+    within_m : tuple of 2 floats
+        Where the source may be [m].
+
+    Returns
+    -------
+    distance_m : ndarray, shape (...)
+        Where the field of the line is nearest to the reading [m]; a bound where that is the nearest.
+    standard_deviation_m : ndarray, shape (...)
+        Of the noise alone, for a line that is exactly known [m].
+
+    Raises
+    ------
+    ValueError
+        The shapes do not agree, or the bounds are none.
+    """
+    field = np.asarray(field_T, dtype=np.float64)
+    if field.ndim == 0 or field.shape[-1] != 3:
+        raise ValueError(f"Input field_T must have shape (..., 3); instead received shape {field.shape}.")
+    low, high = within_m
+    if not -np.inf < low < high < np.inf:
+        raise ValueError(f"Input within_m must be two finite bounds, the lower first; instead received {within_m}.")
+    grid = np.linspace(low, high, _GRID)
+    on_grid = line.field(grid)
+    found = np.empty(field.shape[:-1])
+    for index in np.ndindex(found.shape):
+        reading = field[index]
+        nearest = int(np.argmin(np.sum((on_grid - reading) ** 2, axis=1)))
+        around = grid[max(nearest - 1, 0)], grid[min(nearest + 1, _GRID - 1)]
+        found[index] = minimize_scalar(
+            lambda s, reading=reading: float(np.sum((line.field(s) - reading) ** 2)) / float(reading @ reading),
+            bounds=around,
+            method="bounded",
+            options={"xatol": 1e-9 * (high - low)},
+        ).x
+    step = 1e-5 * (high - low)
+    slope = np.linalg.norm(line.field(found + step) - line.field(found - step), axis=-1) / (2.0 * step)
+    sigma = np.hypot(noise_T, noise_fraction * np.linalg.norm(field, axis=-1))
+    return found, sigma / slope
+
+
+def _checked(
+    distance_m: ArrayLike, field_T: ArrayLike, noise_T: float, noise_fraction: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    distance, field = np.asarray(distance_m, dtype=np.float64), np.asarray(field_T, dtype=np.float64)
+    if distance.ndim != 1 or field.shape != (distance.size, 3):
+        raise ValueError(
+            "Inputs distance_m and field_T must have shapes (n,) and (n, 3); "
+            f"instead received {distance.shape} and {field.shape}."
+        )
+    if not (np.isfinite(distance).all() and np.isfinite(field).all() and field.any(axis=1).all()):
+        raise ValueError("Inputs distance_m and field_T must be finite, and no field zero; instead received others.")
+    if not noise_T > 0.0:
+        raise ValueError(f"Input noise_T must be positive; instead received {noise_T}.")
+    if field.size < _N_UNKNOWNS:
+        raise ValueError(
+            f"Input field_T must have more numbers than the {_N_UNKNOWNS} unknowns; instead received {field.size}."
+        )
+    return distance, field, np.hypot(noise_T, noise_fraction * np.linalg.norm(field, axis=1))
+
+
+def _starts(distance: FloatArray, field: FloatArray) -> list[FloatArray]:
+    """Lines through or near the sensor, in directions all over a hemisphere, at the range that the decay tells.
+
+    Along a line through the sensor |B|^(-1/3) is linear in the distance, and zero at the sensor.
+    """
+    slope, intercept = np.polyfit(distance, np.linalg.norm(field, axis=1) ** (-1.0 / 3.0), 1)
+    at_zero = intercept / slope if slope != 0.0 else np.ptp(distance)
+    i = np.arange(_N_DIRECTIONS) + 0.5
+    z = 1.0 - i / _N_DIRECTIONS
+    turn = np.pi * (1.0 + np.sqrt(5.0)) * i
+    directions = np.stack([np.cos(turn) * np.sqrt(1 - z**2), np.sin(turn) * np.sqrt(1 - z**2), z], axis=1)
+    lines = []
+    for direction in directions:
+        source = (at_zero + distance[:, None]) * direction
+        matrix = dipole.field_matrix(np.zeros(3), source) / np.linalg.norm(field, axis=1)[:, None, None]
+        relative = field / np.linalg.norm(field, axis=1)[:, None]
+        moment = np.linalg.lstsq(matrix.reshape(-1, 3), relative.ravel(), rcond=None)[0]
+        lines.append(np.concatenate([at_zero * direction, _angles(direction), moment]))
+    return lines
+
+
+def _best_line(distance: FloatArray, field: FloatArray, sigma: FloatArray, starts: list[FloatArray]) -> SourceLine:
+    """Best of the fits of (start, angles of the direction, moment) or, with a ninth number, of the radius too."""
+
+    def residuals(x: FloatArray) -> FloatArray:
+        return ((_line(x, np.nan, 0, False).field(distance) - field) / sigma[:, None]).ravel()
+
+    fits = []
+    for start in starts:
+        length, size = float(np.linalg.norm(start[:3])), float(np.linalg.norm(start[5:8]))
+        x_scale = np.concatenate(
+            [np.full(3, length), np.full(2, 1.0), np.full(3, size), np.full(len(start) - 8, length)]
+        )
+        fits.append(least_squares(residuals, start, x_scale=x_scale, max_nfev=200))
+    best = min(fits, key=lambda fit: float(fit.cost))
+    return _line(best.x, 2.0 * float(best.cost), field.size - len(best.x), bool(best.status > 0))
+
+
+def _line(x: FloatArray, chi2: float, dof: int, converged: bool) -> SourceLine:
+    elevation, azimuth = x[3:5]
+    across = np.cos(elevation)
+    direction = np.array([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
+    # The field of a loop is even in its radius.
+    radius = float(abs(x[8])) if len(x) > 8 else 0.0
+    return SourceLine(x[:3], direction, x[5:8], radius, chi2, dof, converged)
+
+
+def _angles(direction: FloatArray) -> FloatArray:
+    """Elevation and azimuth."""
+    return np.array([np.arcsin(np.clip(direction[2], -1.0, 1.0)), np.arctan2(direction[1], direction[0])])

@@ -1,0 +1,1 @@
+"""Searches for the optima of the likelihood, without a start."""

@@ -1,0 +1,322 @@
+"""Search for several dipoles at once: beams of the best distinct fits, one more source at a time, and random restarts.
+
+Everything works on b sets of readings of one :class:`magloc.measurement.whitened.JointProblem` at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.typing import FloatArray
+from magloc.localization.fit.gauss_newton import JointFits, fit_moments, refine
+from magloc.localization.search.candidates import (
+    SingleArray,
+    distinct_best,
+    hemisphere,
+    linear_bases,
+    linear_scores,
+    modulus_scores,
+    modulus_templates,
+    rows_of_equal_gain,
+)
+from magloc.measurement.whitened import JointProblem
+
+Allowed = Callable[[FloatArray, FloatArray], NDArray[np.bool_]]
+_SAME_RAD = 0.02
+_SAME_MOMENT = 0.05
+_SAME_CHI2 = 0.01
+_N_TEMPLATE_DIRECTIONS = 24
+# A restart draws its new source from this many of the best candidates.
+_RESTART_CANDIDATES = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Beam:
+    """The best distinct fits of K sources to every set of readings, best first.
+
+    Attributes
+    ----------
+    q : ndarray, shape (b, w, K, 4)
+    mu : ndarray, shape (b, w, K, 3)
+    chi2 : ndarray, shape (b, w)
+        Infinite where there is no such fit; the first is then one that did not converge or is not allowed.
+    iterations : ndarray of int, shape (b, w)
+    """
+
+    q: FloatArray
+    mu: FloatArray
+    chi2: FloatArray
+    iterations: NDArray[np.int64]
+
+    @property
+    def n_sources(self) -> int:
+        """Number of sources K."""
+        return self.q.shape[2]
+
+    def rows(self, index: NDArray[np.intp]) -> Beam:
+        """Beams of some of the readings."""
+        return Beam(self.q[index], self.mu[index], self.chi2[index], self.iterations[index])
+
+    def flat(self) -> JointFits:
+        """All fits in one row after the other."""
+        n_sources = self.n_sources
+        return JointFits(
+            self.q.reshape(-1, n_sources, 4),
+            self.mu.reshape(-1, n_sources, 3),
+            self.chi2.ravel(),
+            self.iterations.ravel(),
+        )
+
+    def replaced(self, index: NDArray[np.intp], beam: Beam) -> Beam:
+        """With the beams of some of the readings replaced."""
+        q, mu, chi2, iterations = self.q.copy(), self.mu.copy(), self.chi2.copy(), self.iterations.copy()
+        q[index], mu[index], chi2[index], iterations[index] = beam.q, beam.mu, beam.chi2, beam.iterations
+        return Beam(q, mu, chi2, iterations)
+
+
+def best_distinct(fits: JointFits, n_rows: int, width: int) -> Beam:
+    """The best fits of every row that differ from each other.
+
+    Parameters
+    ----------
+    fits : JointFits
+        The same number of fits for every row, row after row.
+    n_rows, width : int
+        Rows b, and fits w to keep of each.
+
+    Returns
+    -------
+    Beam
+    """
+    n_sources = fits.q.shape[1]
+    chi2 = fits.chi2.reshape(n_rows, -1).copy()
+    # q and -q are the same source.
+    sign = np.where(fits.q[..., 3:] < 0.0, -1.0, 1.0)
+    q = (fits.q * sign).reshape(n_rows, -1, n_sources, 4)
+    mu = fits.mu.reshape(n_rows, -1, n_sources, 3)
+    iterations = fits.iterations.reshape(n_rows, -1)
+    rows = np.arange(n_rows)
+    kept = Beam(
+        np.full((n_rows, width, n_sources, 4), np.nan),
+        np.full((n_rows, width, n_sources, 3), np.nan),
+        np.full((n_rows, width), np.inf),
+        np.zeros((n_rows, width), dtype=np.int64),
+    )
+    for k in range(width):
+        best = np.argmin(chi2, axis=1)
+        value = chi2[rows, best]
+        # A row without any fit keeps its first one, infinite χ² and all: the next source starts better beside it.
+        fit = np.isfinite(value) | (k == 0)
+        if not fit.any():
+            break
+        kept.q[fit, k], kept.mu[fit, k], kept.chi2[fit, k] = q[rows, best][fit], mu[rows, best][fit], value[fit]
+        kept.iterations[fit, k] = iterations[rows, best][fit]
+        with np.errstate(invalid="ignore"):
+            same = np.abs(chi2 - value[:, None]) < _SAME_CHI2 * (1.0 + 1e-6 * value[:, None])
+            same &= _same_sources(q, mu, kept.q[:, None, k], kept.mu[:, None, k])
+        chi2[same] = np.inf
+        chi2[rows, best] = np.inf
+    return kept
+
+
+def _same_sources(q: FloatArray, mu: FloatArray, other_q: FloatArray, other_mu: FloatArray) -> NDArray[np.bool_]:
+    """Whether two sets of sources are the same in some order."""
+    angle = np.abs(np.einsum("...kd,...ld->...kl", q, other_q)) > np.cos(_SAME_RAD)
+    apart = np.linalg.norm(mu[..., :, None, :] - other_mu[..., None, :, :], axis=-1)
+    near = angle & (apart < _SAME_MOMENT * np.linalg.norm(mu, axis=-1)[..., None])
+    same: NDArray[np.bool_] = near.any(axis=-1).all(axis=-1) & near.any(axis=-2).all(axis=-1)
+    return same
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """How to search; the same for all readings of a problem.
+
+    Attributes
+    ----------
+    candidates : ndarray, shape (n, 4)
+        Homogeneous coordinates of the positions to start from.
+    allowed : callable
+        Whether sources (..., 4), (..., 3) agree with what is known.
+    width : int
+        Fits kept of every set of readings.
+    n_starts : int
+        Starts for every fit that is to be extended by a source.
+    apart_rad : float
+        Least angle between two starts.
+    """
+
+    candidates: FloatArray
+    allowed: Allowed
+    width: int = 3
+    n_starts: int = 6
+    apart_rad: float = 0.25
+
+    def first(self, problem: JointProblem, y: FloatArray) -> Beam:
+        """One source, from the candidates that explain most."""
+        silent = np.zeros_like(problem.ambient)
+        gain = problem.linear_gain(silent)
+        residual = y - problem.predicted(silent)
+        starts: list[tuple[FloatArray, FloatArray]] = []
+        if np.any(gain):
+            chosen = self._linear_starts(problem, gain, residual)
+            q = self.candidates[chosen]
+            row = np.repeat(np.arange(len(y)), self.n_starts)
+            mu = fit_moments(problem.rows(row), y[row], q.reshape(-1, 1, 4))
+            starts.append((q, mu.reshape(len(y), self.n_starts, 3)))
+        if self._needs_templates(problem, y):
+            starts.append(self._template_starts(problem, y))
+        q, mu = (np.concatenate(parts, axis=1) for parts in zip(*starts, strict=True))
+        row = np.repeat(np.arange(len(y)), q.shape[1])
+        fits = refine(problem.rows(row), y[row], q.reshape(-1, 1, 4), mu.reshape(-1, 1, 3))
+        if problem.is_even:
+            fits = fits.with_opposite_moments(len(y))
+        return best_distinct(self._known(fits), len(y), self.width)
+
+    def _needs_templates(self, problem: JointProblem, y: FloatArray) -> bool:
+        """Whether some moduli are far from linear: their source's field is not small against the ambient field."""
+        scalar = problem.channel_is_scalar
+        if not scalar.any():
+            return False
+        ambient = np.linalg.norm(problem.ambient[:, problem.channel_sensor[scalar]], axis=-1)
+        signal = np.abs(y[:, scalar])
+        return bool(np.any(signal > 0.2 * ambient * np.abs(problem.gain[:, scalar, 0])))
+
+    def _template_starts(self, problem: JointProblem, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        directions = hemisphere(_N_TEMPLATE_DIRECTIONS)
+        if not problem.channel_is_scalar.all():
+            directions = np.concatenate([directions, -directions])
+        scores = np.empty((len(y), len(self.candidates)))
+        best = np.empty(scores.shape, dtype=np.intp)
+        for rows in rows_of_equal_gain(problem.gain):
+            templates = modulus_templates(problem, int(rows[0]), self.candidates, directions)
+            scores[rows], best[rows] = modulus_scores(templates, y[rows])
+        n_starts = 3 * self.n_starts
+        chosen = distinct_best(scores, self.candidates, n_starts, self.apart_rad)
+        q = self.candidates[chosen]
+        direction = directions[np.take_along_axis(best, chosen, axis=1)]
+        row = np.repeat(np.arange(len(y)), n_starts)
+        at = problem.rows(row)
+        # The length of the moment, as if there were no ambient field.
+        fields = at.source_fields(q.reshape(-1, 1, 4), direction.reshape(-1, 1, 3))
+        unit = at.without_ambient().predicted(fields)
+        length = np.sum(unit * y[row], axis=-1) / np.maximum(np.sum(unit * unit, axis=-1), 1e-300)
+        return q, direction * np.maximum(length, 1e-30).reshape(len(y), n_starts, 1)
+
+    def _linear_starts(self, problem: JointProblem, gain: FloatArray, residual: FloatArray) -> NDArray[np.intp]:
+        return distinct_best(
+            self._linear_scores(problem, gain, residual), self.candidates, self.n_starts, self.apart_rad
+        )
+
+    def _linear_scores(self, problem: JointProblem, gain: FloatArray, residual: FloatArray) -> FloatArray:
+        scores = np.empty((len(residual), len(self.candidates)))
+        for rows in rows_of_equal_gain(gain):
+            bases = self._bases(problem, gain[rows[0]], int(rows[0]))
+            scores[rows] = linear_scores(bases, residual[rows])
+        return scores
+
+    def _bases(self, problem: JointProblem, gain: FloatArray, row: int) -> SingleArray:
+        return linear_bases(problem, gain, row, self.candidates)
+
+    def _known(self, fits: JointFits) -> JointFits:
+        """Fits that agree with what is known of the sources; the others count as none."""
+        allowed = np.all(self.allowed(fits.q, fits.mu), axis=1)
+        return JointFits(fits.q, fits.mu, np.where(allowed, fits.chi2, np.inf), fits.iterations)
+
+    def one_more(self, problem: JointProblem, y: FloatArray, beam: Beam) -> Beam:
+        """Beam with another source: every fit is extended by the candidates that explain most of what it leaves."""
+        width = beam.chi2.shape[1]
+        row = np.repeat(np.arange(len(y)), width)
+        q, mu = _filled(beam)
+        scores = self.left_scores(problem.rows(row), y[row], q, mu)
+        chosen = distinct_best(scores, self.candidates, width * self.n_starts, self.apart_rad)
+        # The best fit, where it stands in for one that there is not, goes on from the candidates that come next.
+        chosen = chosen.reshape(len(y), width, width, self.n_starts)
+        turn = np.where(np.isfinite(beam.chi2), 0, np.arange(width))
+        chosen = np.take_along_axis(chosen, turn[:, :, None, None], axis=2).reshape(-1, self.n_starts)
+        fits = self._extended(problem, y, np.repeat(row, self.n_starts), q, mu, chosen)
+        return best_distinct(fits, len(y), self.width)
+
+    def left_scores(self, problem: JointProblem, y: FloatArray, q: FloatArray, mu: FloatArray) -> FloatArray:
+        """Energy that every candidate explains of what the sources (b, K, …) leave: (b, n)."""
+        fields = problem.source_fields(q, mu)
+        return self._linear_scores(problem, problem.linear_gain(fields), y - problem.predicted(fields))
+
+    def _extended(
+        self,
+        problem: JointProblem,
+        y: FloatArray,
+        row: NDArray[np.intp],
+        q: FloatArray,
+        mu: FloatArray,
+        chosen: NDArray[np.intp],
+    ) -> JointFits:
+        """Refined fits of sources (f, K, …) and one of the chosen candidates (f, n) each; row is that of every fit."""
+        each = np.repeat(np.arange(len(q)), chosen.shape[1])
+        at, y_each = problem.rows(row), y[row]
+        new = self.candidates[chosen.ravel()][:, None]
+        fields = at.source_fields(q[each], mu[each])
+        gain, residual = at.linear_gain(fields), y_each - at.predicted(fields)
+        jacobian = at.moment_jacobian(new, gain)
+        normal = jacobian.transpose(0, 2, 1) @ jacobian
+        trace = np.trace(normal, axis1=1, axis2=2)
+        normal += (1e-12 * trace + 1e-300)[:, None, None] * np.eye(3)
+        new_mu = np.linalg.solve(normal, jacobian.transpose(0, 2, 1) @ residual[..., None])[:, None, :, 0]
+        fits = refine(at, y_each, np.concatenate([q[each], new], axis=1), np.concatenate([mu[each], new_mu], axis=1))
+        return self._known(fits)
+
+    def one_less(self, problem: JointProblem, y: FloatArray, beam: Beam) -> Beam:
+        """Beam without one source: every source of the best fits is left out in turn."""
+        n_sources, width = beam.n_sources, beam.chi2.shape[1]
+        q, mu = _filled(beam)
+        others = np.array([[k for k in range(n_sources) if k != out] for out in range(n_sources)])
+        q = q[:, others].reshape(-1, n_sources - 1, 4)
+        mu = mu[:, others].reshape(-1, n_sources - 1, 3)
+        row = np.repeat(np.arange(len(y)), width * n_sources)
+        return best_distinct(self._known(refine(problem.rows(row), y[row], q, mu)), len(y), self.width)
+
+    def restarted(self, problem: JointProblem, y: FloatArray, beam: Beam, rng: np.random.Generator) -> Beam:
+        """Beam after a random source of random fits is replaced by a random one of the best candidates."""
+        n_rows, width = beam.chi2.shape
+        n_sources, n_tries = beam.n_sources, self.n_starts * self.width
+        q, mu = _filled(beam)
+        q, mu = q.reshape(n_rows, width, n_sources, 4), mu.reshape(n_rows, width, n_sources, 3)
+        which = rng.integers(width, size=(n_rows, n_tries))
+        order = np.argsort(rng.random((n_rows, n_tries, n_sources)), axis=-1)[..., : n_sources - 1]
+        rows = np.arange(n_rows)[:, None, None]
+        kept_q = q[rows, which[..., None], order].reshape(-1, n_sources - 1, 4)
+        kept_mu = mu[rows, which[..., None], order].reshape(-1, n_sources - 1, 3)
+        row = np.repeat(np.arange(n_rows), n_tries)
+        scores = self.left_scores(problem.rows(row), y[row], kept_q, kept_mu)
+        best = distinct_best(scores, self.candidates, _RESTART_CANDIDATES, 0.5 * self.apart_rad)
+        chosen = best[np.arange(len(row)), rng.integers(_RESTART_CANDIDATES, size=len(row))][:, None]
+        fits = self._extended(problem, y, row, kept_q, kept_mu, chosen)
+        return merged(beam, best_distinct(fits, n_rows, self.width))
+
+
+def merged(first: Beam, second: Beam) -> Beam:
+    """The best distinct fits of two beams of equally many sources."""
+    n_rows, width = first.chi2.shape
+    both = Beam(
+        np.concatenate([first.q, second.q], axis=1),
+        np.concatenate([first.mu, second.mu], axis=1),
+        np.concatenate([first.chi2, second.chi2], axis=1),
+        np.concatenate([first.iterations, second.iterations], axis=1),
+    )
+    return best_distinct(both.flat(), n_rows, width)
+
+
+def _filled(beam: Beam) -> tuple[FloatArray, FloatArray]:
+    """Sources (b·w, K, …) with the best fit in place of those that there are not."""
+    missing = ~np.isfinite(beam.chi2)
+    q = np.where(missing[..., None, None], beam.q[:, :1], beam.q)
+    mu = np.where(missing[..., None, None], beam.mu[:, :1], beam.mu)
+    fit = np.isfinite(q).all(axis=(1, 2, 3), keepdims=True)
+    # Rows without any fit keep a source far away, which explains nothing.
+    q = np.where(fit, q, [1.0, 0.0, 0.0, 1e-3])
+    mu = np.where(fit, mu, 0.0)
+    return q.reshape(-1, beam.n_sources, 4), mu.reshape(-1, beam.n_sources, 3)

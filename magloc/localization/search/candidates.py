@@ -1,0 +1,174 @@
+r"""Where to start: positions on a grid, scored by how much of the readings they explain.
+
+Where the channels are linear in the moment (vector sensors, and moduli in an ambient field that is large against the
+source's), a position is scored by the energy of the readings in the space of its three unit moments. Moduli without an
+ambient field are even in the moment and only linear in its length; there a pair of position and moment direction is
+scored by the energy along one template.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.array import SensorArray
+from arrays.typing import FloatArray
+from magloc.compilation import over_rows
+from magloc.directions import fibonacci_directions
+from magloc.measurement.whitened import JointProblem
+from magloc.measurement.whitened_compiled import candidate_bases
+
+SingleArray = NDArray[np.float32]
+_SAME_GAIN = 0.02
+_CANDIDATES_AT_ONCE = 512
+
+
+def linear_bases(problem: JointProblem, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
+    """Orthonormal whitened bases of the three unit moments at candidates (n, 4), linear channels: (C, 3 n).
+
+    Parameters
+    ----------
+    problem : JointProblem
+    gain : ndarray, shape (C, 3)
+        What every channel reads of a small field, divided by its noise.
+    row : int
+        Whose whitening counts.
+    candidates : ndarray, shape (n, 4)
+        Homogeneous coordinates.
+
+    Returns
+    -------
+    ndarray, shape (C, 3 n)
+        In single precision, which ranks the candidates as well; columns by moment axis, then by candidate.
+    """
+    bases = np.zeros((len(candidates), 3, gain.shape[0]))
+    over_rows(
+        candidate_bases,
+        len(candidates),
+        candidates,
+        problem.sensors,
+        problem.channel_sensor,
+        np.ascontiguousarray(gain),
+        np.ascontiguousarray(problem.basis[row].T),
+        np.ascontiguousarray(problem.shrinkage[row]),
+        bases,
+    )
+    single: SingleArray = bases.transpose(2, 1, 0).astype(np.float32, order="C").reshape(gain.shape[0], -1)
+    return single
+
+
+def linear_scores(bases: SingleArray, residual: FloatArray) -> FloatArray:
+    """Energy of whitened residuals (b, C) that every candidate's moments explain: (b, n)."""
+    components = (residual.astype(np.float32) @ bases).reshape(len(residual), 3, -1)
+    scores: FloatArray = np.sum(components * components, axis=1, dtype=np.float64)
+    return np.nan_to_num(scores, nan=-1.0)
+
+
+def rows_of_equal_gain(gain: FloatArray) -> Iterator[NDArray[np.intp]]:
+    """Rows whose gains (b, C, 3) agree well enough to rank candidates alike."""
+    scale = np.max(np.abs(gain), axis=(1, 2), keepdims=True)
+    rounded = np.round(gain / np.where(scale > 0.0, scale, 1.0) / _SAME_GAIN)
+    if np.all(rounded == rounded[:1]):
+        yield np.arange(len(gain))
+        return
+    _, of_row = np.unique(rounded.reshape(len(gain), -1), axis=0, return_inverse=True)
+    for i in range(int(of_row.max()) + 1):
+        yield np.flatnonzero(of_row.ravel() == i)
+
+
+def modulus_templates(problem: JointProblem, row: int, candidates: FloatArray, directions: FloatArray) -> SingleArray:
+    """Whitened readings of unit length of moments along directions (d, 3) at candidates (n, 4): (n, d, C).
+
+    Without ambient field all channels, moduli too, are proportional to the length of the moment.
+    """
+    n_directions = len(directions)
+    templates = np.empty((len(candidates), n_directions, problem.gain.shape[1]), dtype=np.float32)
+    for begin in range(0, len(candidates), _CANDIDATES_AT_ONCE):
+        block = candidates[begin : begin + _CANDIDATES_AT_ONCE]
+        at = problem.rows(np.full(len(block) * n_directions, row)).without_ambient()
+        q = np.repeat(block, n_directions, axis=0)[:, None]
+        mu = np.tile(directions, (len(block), 1))[:, None]
+        predicted = at.predicted(at.source_fields(q, mu))
+        norm = np.linalg.norm(predicted, axis=-1, keepdims=True)
+        unit = predicted / np.where(norm > 0.0, norm, np.inf)
+        templates[begin : begin + len(block)] = np.nan_to_num(unit).reshape(len(block), n_directions, -1)
+    return templates
+
+
+def modulus_scores(templates: SingleArray, residual: FloatArray) -> tuple[FloatArray, NDArray[np.intp]]:
+    """Energy of residuals (b, C) along the best template of every candidate, and which direction that is: (b, n)."""
+    n, n_directions, n_channels = templates.shape
+    flat = residual.astype(np.float32) @ templates.reshape(-1, n_channels).T
+    along = np.maximum(flat, 0.0).reshape(len(residual), n, n_directions)
+    best = np.argmax(along, axis=-1)
+    return np.take_along_axis(along, best[..., None], axis=-1)[..., 0].astype(np.float64) ** 2, best
+
+
+def hemisphere(n: int) -> FloatArray:
+    """Nearly uniform unit vectors (n, 3) with z > 0."""
+    return fibonacci_directions(2 * n)[:n]
+
+
+def distinct_best(scores: FloatArray, candidates: FloatArray, n_starts: int, apart_rad: float) -> NDArray[np.intp]:
+    """Candidates (b, n_starts) of the best scores (b, n) that are some angle apart, best first.
+
+    Parameters
+    ----------
+    scores : ndarray, shape (b, n)
+    candidates : ndarray, shape (n, 4)
+        Homogeneous coordinates of unit norm; q and -q are the same point.
+    n_starts : int
+    apart_rad : float
+        Least angle between two that are chosen.
+
+    Returns
+    -------
+    ndarray of int, shape (b, n_starts)
+        The best one again where no other is left.
+    """
+    left = scores.copy()
+    chosen = np.empty((len(scores), n_starts), dtype=np.intp)
+    for k in range(n_starts):
+        best = np.argmax(left, axis=1)
+        exhausted = np.take_along_axis(left, best[:, None], axis=1)[:, 0] < 0.0
+        chosen[:, k] = np.where(exhausted, chosen[:, 0] if k else best, best)
+        near = np.abs(candidates[chosen[:, k]] @ candidates.T) > np.cos(apart_rad)
+        left[near] = -1.0
+    return chosen
+
+
+def candidate_positions(
+    array: SensorArray,
+    *,
+    n_directions: int = 200,
+    n_ranges: int = 10,
+    n_near_directions: int = 12,
+) -> FloatArray:
+    """Positions that a search scores before it refines the best of them.
+
+    Directions times geometric ranges of 0.6 to 60 circumradii around the centroid, and shells of 0.35, 0.7 and 1.4
+    times the distance of the next sensor around every sensor, for sources close to a large array.
+
+    Parameters
+    ----------
+    array : SensorArray
+    n_directions, n_ranges : int
+        Size of the outer grid.
+    n_near_directions : int
+        Directions of the shells around the sensors.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        Positions in the array's frame [m].
+    """
+    ranges = array.circumradius * np.geomspace(0.6, 60.0, n_ranges)
+    outer = array.centroid + (ranges[:, None, None] * fibonacci_directions(n_directions)).reshape(-1, 3)
+    distances = np.linalg.norm(array.positions[:, None] - array.positions, axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    shells = distances.min(axis=1)[:, None] * np.array([0.35, 0.7, 1.4])
+    offsets = shells[:, :, None, None] * fibonacci_directions(n_near_directions)
+    near = (array.positions[:, None, None] + offsets).reshape(-1, 3)
+    return np.concatenate([outer, near])

@@ -1,0 +1,166 @@
+"""Compiled search for one dipole by variable projection.
+
+The readable twin is :mod:`magloc.localization.search.single_source`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.typing import FloatArray
+from magloc.compilation import compiled, runtime_int
+from magloc.localization.fit.variable_projection_compiled import (
+    CONVERGED,
+    FAILED,
+    OPTIMUM_TOLERANCE,
+    refine,
+    same_optimum,
+)
+
+
+@compiled
+def _pick_starts(
+    y: FloatArray, bases: NDArray[np.float32], candidates: FloatArray, cos_apart: float, starts: FloatArray
+) -> int:
+    """Candidates that explain most of the energy of y, some angle apart on the sphere of homogeneous coordinates."""
+    n = candidates.shape[0]
+    components = np.zeros(3 * n, np.float32)
+    for c in range(y.size):
+        t = np.float32(y[c])
+        for i in range(3 * n):
+            components[i] += t * bases[c, i]
+    score = np.empty(n, np.float32)
+    for i in range(n):
+        score[i] = components[i] ** 2 + components[n + i] ** 2 + components[2 * n + i] ** 2
+    for k in range(starts.shape[0]):
+        best = 0
+        for i in range(n):
+            if score[i] > score[best]:
+                best = i
+        if score[best] < 0.0:
+            return k
+        for d in range(4):
+            starts[k, d] = candidates[best, d]
+        q0, q1, q2, q3 = starts[k]
+        for i in range(n):
+            t = candidates[i, 0] * q0 + candidates[i, 1] * q1 + candidates[i, 2] * q2 + candidates[i, 3] * q3
+            if abs(t) > cos_apart:
+                score[i] = -1.0
+    return int(starts.shape[0])
+
+
+@compiled
+def _search_row(
+    y: FloatArray,
+    ranked: FloatArray,
+    bases: NDArray[np.float32],
+    candidates: FloatArray,
+    first: FloatArray,
+    cos_apart: float,
+    keep_within: float,
+    max_iterations: int,
+    sensors: FloatArray,
+    channel_sensor: NDArray[np.intp],
+    gain: FloatArray,
+    common: FloatArray,
+    shrinkage: FloatArray,
+    out_q: FloatArray,
+    out_mu: FloatArray,
+    out_chi2: FloatArray,
+    out_iterations: NDArray[np.int64],
+    counts: NDArray[np.int64],
+) -> None:
+    """Distinct optima of one row into the outputs, best first; counts as in :func:`search_rows`."""
+    n_starts, n_first = out_chi2.size, first.shape[0]
+    starts = np.empty((n_starts, 4))
+    moments = np.empty((n_starts, 3))
+    chi2 = np.empty(n_starts)
+    iterations = np.empty(n_starts, np.int64)
+    for k in range(n_first):
+        for d in range(4):
+            starts[k, d] = first[k, d]
+    n = n_first + _pick_starts(ranked, bases, candidates, cos_apart, starts[n_first:])
+    found = runtime_int(0)
+    counts[1] = counts[2] = 0
+    for k in range(n):
+        # The optima found so far fill the places of the starts that led to them.
+        for d in range(4):
+            starts[found, d] = starts[k, d]
+        chi2[found], iterations[found], end = refine(
+            starts[found], y, sensors, channel_sensor, gain, common, shrinkage, runtime_int(3),
+            OPTIMUM_TOLERANCE, max_iterations, starts, chi2, found, moments[found],
+        )  # fmt: skip
+        counts[2] += iterations[found]
+        if end == FAILED:
+            counts[1] += 1
+        elif end == CONVERGED:
+            known = False
+            for j in range(found):
+                known = known or same_optimum(starts[found], chi2[found], starts[j], chi2[j])
+            if not known:
+                found += 1
+    kept = 0
+    best = math.inf
+    while kept < found:
+        k = 0
+        for i in range(1, found):
+            if chi2[i] < chi2[k]:
+                k = i
+        best = min(best, chi2[k])
+        if chi2[k] > best + keep_within or chi2[k] == math.inf:
+            break
+        for d in range(4):
+            out_q[kept, d] = starts[k, d]
+        for d in range(3):
+            out_mu[kept, d] = moments[k, d]
+        out_chi2[kept] = chi2[k]
+        out_iterations[kept] = iterations[k]
+        chi2[k] = math.inf
+        kept += 1
+    counts[0] = kept
+
+
+@compiled
+def search_rows(
+    begin: int,
+    end: int,
+    y: FloatArray,
+    ranked: FloatArray,
+    reading_of_row: NDArray[np.intp],
+    bases: NDArray[np.float32],
+    candidates: FloatArray,
+    first: FloatArray,
+    cos_apart: float,
+    keep_within: float,
+    max_iterations: int,
+    sensors: FloatArray,
+    channel_sensor: NDArray[np.intp],
+    gain: FloatArray,
+    common: FloatArray,
+    shrinkage: FloatArray,
+    set_of_row: NDArray[np.intp],
+    out_q: FloatArray,
+    out_mu: FloatArray,
+    out_chi2: FloatArray,
+    out_iterations: NDArray[np.int64],
+    counts: NDArray[np.int64],
+) -> None:
+    """Distinct optima of rows begin to end, best first; for :func:`magloc.compilation.over_rows`.
+
+    y (readings, c) are whitened readings, reading_of_row which of them a row has; ranked (readings, c) the same ones
+    under the whitening of bases (c, 3 · candidates), the candidates' orthonormal bases in single precision, which ranks
+    them as well; first (rows, f, 4) are starts of a row's own, refined before the best candidates; gain (sets, c, 3),
+    common (sets, q, c), shrinkage (sets, q) the whitening, set_of_row which of them a row has. Into the outputs
+    (rows, starts, …): q, mu, χ², linearisations; counts (rows, 3) are the optima kept, the starts that did not
+    converge, and all linearisations.
+    """
+    for row in range(begin, end):
+        w, r = set_of_row[row], reading_of_row[row]
+        _search_row(
+            y[r], ranked[r], bases, candidates, first[row], cos_apart, keep_within, max_iterations,
+            sensors, channel_sensor, gain[w], common[w], shrinkage[w],
+            out_q[row], out_mu[row], out_chi2[row], out_iterations[row], counts[row],
+        )  # fmt: skip

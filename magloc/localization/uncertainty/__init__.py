@@ -1,0 +1,1 @@
+"""How certain an optimum is: covariance, other optima, range."""

@@ -1,0 +1,242 @@
+"""All solutions of a row together: how likely each one is, and what their covariances are worth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from arrays.typing import FloatArray
+from magloc.chi_square import RISE_95
+from magloc.localization.uncertainty.range_interval import (
+    EVERYWHERE,
+    Intervals,
+    is_observable_set,
+    levels,
+    ranges_of,
+    relative_range_sigma,
+    rise,
+    span,
+    union,
+)
+
+LARGEST_GAUSSIAN_SIGMA = 0.04
+"""Standard deviations of position and moment, over range and moment, up to which their errors are Gaussian."""
+CERTAIN_WEIGHT = 0.99
+"""Weight from which on a solution is as good as the only one."""
+MISFIT = 1e-6
+"""Probability of χ² under noise below which the model does not hold, or the search missed the best solution."""
+
+
+def log_volume(covariance: FloatArray, moment: FloatArray, offset_m: FloatArray | None = None) -> FloatArray:
+    r"""Logarithm of how much of what may be thought of beforehand a solution stands for, up to a constant.
+
+    Nothing is known beforehand of the scale: direction, orientation and the logarithms of range and moment are uniform,
+    a density :math:`\propto r^{-3} |m|^{-3}` of position and moment. By Laplace's method a solution then stands for the
+    root of the determinant of its covariance in units of r and |m|. The logarithm of the range counts with a standard
+    deviation of one at most: χ² is no parabola over more than that.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (..., 6 K, 6 K)
+        Of position and moment of the first of K sources, then of the second, and so on; (..., 3, 3) of a moment alone.
+        NaN where there is no solution.
+    moment, offset_m : ndarray, shape (..., K, 3)
+        Moments, in the covariance's units, and positions from the sensors' centroid; no position where it is known.
+
+    Returns
+    -------
+    ndarray, shape (...)
+    """
+    vectors = [moment] if offset_m is None else [offset_m, moment]
+    lengths = np.stack([np.linalg.norm(vector, axis=-1) for vector in vectors], axis=-1)
+    unit = np.repeat(lengths.reshape(*lengths.shape[:-2], covariance.shape[-1] // 3), 3, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        relative = covariance / (unit[..., :, None] * unit[..., None, :])
+    known = np.isfinite(relative).all(axis=(-2, -1))
+    relative = np.where(known[..., None, None], relative, np.eye(unit.shape[-1]))
+    volume: FloatArray = 0.5 * np.linalg.slogdet(relative)[1]
+    if offset_m is not None:
+        for k in range(offset_m.shape[-2]):
+            sigma = relative_range_sigma(covariance[..., 6 * k :, 6 * k :], offset_m[..., k, :])
+            volume = volume - np.log(np.fmax(np.where(known, sigma, 1.0), 1.0))
+    return volume
+
+
+def weights(chi2: ArrayLike, volume: ArrayLike) -> FloatArray:
+    r"""How likely each of several solutions is, :math:`\propto V \exp(-\chi^2/2)`.
+
+    Parameters
+    ----------
+    chi2 : array_like, shape (..., n)
+        Infinite where there is no solution.
+    volume : array_like, shape (..., n)
+        :func:`log_volume`.
+
+    Returns
+    -------
+    ndarray, shape (..., n)
+        They add up to one, or are all zero.
+    """
+    values = np.asarray(volume, dtype=np.float64) - 0.5 * np.asarray(chi2, dtype=np.float64)
+    best = values.max(axis=-1, keepdims=True)
+    relative = np.exp(values - np.where(np.isfinite(best), best, 0.0))
+    result: FloatArray = relative / np.maximum(relative.sum(axis=-1, keepdims=True), 1e-300)
+    return result
+
+
+def relative_sigma(covariance: FloatArray, offset_m: FloatArray, moment: FloatArray) -> FloatArray:
+    """The larger one of the standard deviations of position and moment, over the range and the moment: (...).
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (..., 6, 6)
+    offset_m, moment : ndarray, shape (..., 3)
+    """
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        parts = [
+            np.sqrt(np.sum(of_vector, axis=-1) / np.sum(vector * vector, axis=-1))
+            for of_vector, vector in ((variance[..., :3], offset_m), (variance[..., 3:6], moment))
+        ]
+    larger: FloatArray = np.maximum(*parts)
+    return larger
+
+
+def longest_axes(covariance: FloatArray, offset_m: FloatArray, moment: FloatArray) -> FloatArray:
+    """Longest half axes of the ellipsoids of one standard deviation, lengths being in units of ranges and moments.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (..., 6 K, 6 K)
+        Of position and moment of the first of K sources, then of the second, and so on.
+    offset_m, moment : ndarray, shape (..., K, 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 6 K)
+        In the units of the covariance.
+    """
+    lengths = np.stack([np.linalg.norm(vector, axis=-1) for vector in (offset_m, moment)], axis=-1)
+    unit = np.repeat(lengths.reshape(*lengths.shape[:-2], covariance.shape[-1] // 3), 3, axis=-1)
+    variance, axis = np.linalg.eigh(covariance / (unit[..., :, None] * unit[..., None, :]))
+    longest: FloatArray = unit * axis[..., -1] * np.sqrt(np.maximum(variance[..., -1:], 0.0))
+    return longest
+
+
+def widened(
+    covariance: FloatArray, offset_m: FloatArray, low_m: FloatArray, high_m: FloatArray, source: int = 0
+) -> FloatArray:
+    r"""Covariances that are as long as the set of ranges, for ranges that are not observable.
+
+    The state follows the range along :math:`w = C e / e^T C e`, with e the gradient of the range: it is there that
+    variance is added. Given the range, all else is as certain as before.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (..., 6 K, 6 K)
+        Of position and moment of the first of K sources, then of the second, and so on: the inverse information.
+    offset_m : ndarray, shape (..., 3)
+        Of the positions of one of them from the sensors' centroid [m].
+    low_m, high_m : ndarray, shape (...)
+        Ends of its set of ranges [m], infinite where it is open.
+    source : int
+        Which of them.
+
+    Returns
+    -------
+    ndarray, shape (..., 6 K, 6 K)
+        Their 95 % intervals of the range reach the farther end of the set; where that is open, σ of the range is no
+        less than the range itself.
+    """
+    distance = np.linalg.norm(offset_m, axis=-1)
+    farther = np.maximum(distance - low_m, high_m - distance) / math.sqrt(RISE_95)
+    wanted = np.where(np.isfinite(farther), farther, distance)
+    place = slice(6 * source, 6 * source + 3)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        following = np.einsum("...ij,...j->...i", covariance[..., place], offset_m / distance[..., None])
+        variance = np.sum(following[..., place] * offset_m, axis=-1) / distance
+        missing = np.nan_to_num(np.maximum(wanted**2 - variance, 0.0) / variance**2, nan=0.0, posinf=0.0)
+    result: FloatArray = covariance + missing[..., None, None] * following[..., :, None] * following[..., None, :]
+    return result
+
+
+@dataclass(frozen=True, eq=False)
+class Rivals:
+    """Solutions of b rows of readings, n of each at most, and what they say together.
+
+    Attributes
+    ----------
+    chi2 : ndarray, shape (b, n)
+        Infinite where there is no solution.
+    covariance : ndarray, shape (b, n, 6, 6)
+        Inverse information of position and moment; NaN where there is no solution.
+    offset_m, moment : ndarray, shape (b, n, 3)
+        Positions from the sensors' centroid.
+    weight : ndarray, shape (b, n)
+    rise : ndarray, shape (b,)
+        By how much the profile of χ² may rise above the best solution's within the set of ranges.
+    """
+
+    chi2: FloatArray
+    covariance: FloatArray
+    offset_m: FloatArray
+    moment: FloatArray
+    weight: FloatArray
+    rise: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        chi2: FloatArray,
+        covariance: FloatArray,
+        offset_m: FloatArray,
+        moment: FloatArray,
+        energy: FloatArray,
+        n_differences: int,
+    ) -> Rivals:
+        """From solutions, best first, and the energy (b,) of the rows' differences as they are without a source."""
+        determined = np.isfinite(covariance).all(axis=(-2, -1))
+        listed = np.where(determined, chi2, np.inf)
+        weight = weights(listed, log_volume(covariance, moment[..., None, :], offset_m[..., None, :]))
+        raised = rise(energy, chi2[:, 0], n_differences, levels(listed, weight))
+        return cls(listed, covariance, offset_m, moment, weight, raised)
+
+    def ranges(self, alpha: FloatArray, unit_m: float) -> RowRanges:
+        """What is known of the ranges, from the stretches of α (b, n, 2) that the solutions' profiles cover."""
+        ends = ranges_of(alpha, unit_m).tolist()
+        bounded = np.isfinite(self.rise).tolist()
+        sets = [union(of_row) if known else EVERYWHERE for of_row, known in zip(ends, bounded, strict=True)]
+        low, high = np.array([span(intervals) for intervals in sets]).reshape(-1, 2).T
+        observable = np.array([is_observable_set(intervals) for intervals in sets], dtype=bool)
+        single = np.array([len(intervals) == 1 for intervals in sets], dtype=bool)
+        sharp = relative_sigma(self.covariance, self.offset_m, self.moment) <= LARGEST_GAUSSIAN_SIGMA
+        sharp &= self.weight >= CERTAIN_WEIGHT
+        covariance, blurred = self.covariance.copy(), ~observable
+        covariance[blurred] = widened(
+            covariance[blurred], self.offset_m[blurred], low[blurred, None], high[blurred, None]
+        )
+        return RowRanges(sets, observable, covariance, (observable & single)[:, None] & sharp)
+
+
+@dataclass(frozen=True, eq=False)
+class RowRanges:
+    """What is known of the range in b rows of n solutions at most.
+
+    Attributes
+    ----------
+    sets : list of tuple of (low, high)
+        95 % sets [m].
+    observable : ndarray of bool, shape (b,)
+    covariance : ndarray, shape (b, n, 6, 6)
+        Of the solutions, :func:`widened` where the range is not observable.
+    gaussian : ndarray of bool, shape (b, n)
+        Whether a covariance describes the uncertainty.
+    """
+
+    sets: list[Intervals]
+    observable: NDArray[np.bool_]
+    covariance: FloatArray
+    gaussian: NDArray[np.bool_]

@@ -1,0 +1,96 @@
+"""Compiled covariances of optima of one dipole."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.typing import FloatArray
+from magloc.compilation import compiled
+from magloc.linalg_compiled import orthonormalise
+from magloc.measurement.whitened_compiled import _project_common, homogeneous_jacobian, unit_basis
+
+
+@compiled
+def _scaled_covariance(
+    q: FloatArray,
+    mu: FloatArray,
+    sensors: FloatArray,
+    channel_sensor: NDArray[np.intp],
+    gain: FloatArray,
+    common: FloatArray,
+    shrinkage: FloatArray,
+    covariance: FloatArray,
+) -> bool:
+    """Inverse information of (ρ, μ), ρ = u/s and μ scaled at s = 1, by QR of the whitened Jacobian."""
+    n = channel_sensor.size
+    rho, mu1 = np.empty(4), np.empty(3)
+    for d in range(4):
+        rho[d] = q[d] / q[3]
+    inverse = 1.0 / abs(q[3]) ** 3
+    for d in range(3):
+        mu1[d] = mu[d] * inverse
+    rows, basis, jacobian = np.empty((6, n)), np.empty((3, n)), np.empty((4, n))
+    unit_basis(rho, sensors, channel_sensor, gain, common, shrinkage, basis)
+    homogeneous_jacobian(rho, mu1, sensors, channel_sensor, gain, jacobian)
+    _project_common(jacobian, 3, common, shrinkage)
+    scale = np.empty(6)
+    # Moment first: its three columns are the well-conditioned part.
+    for j in range(6):
+        t = 0.0
+        for c in range(n):
+            rows[j, c] = basis[j, c] if j < 3 else jacobian[j - 3, c]
+            t += rows[j, c] * rows[j, c]
+        scale[j] = math.sqrt(t)
+        if not (scale[j] > 0.0 and math.isfinite(scale[j])):
+            return False
+        for c in range(n):
+            rows[j, c] /= scale[j]
+    triangle = np.zeros((6, 6))
+    orthonormalise(rows, triangle)
+    inverse_triangle = np.zeros((6, 6))
+    for j in range(6):
+        if not triangle[j, j] > 1e-13:
+            return False
+        inverse_triangle[j, j] = 1.0 / triangle[j, j]
+        for i in range(j - 1, -1, -1):
+            t = 0.0
+            for k in range(i + 1, j + 1):
+                t += triangle[i, k] * inverse_triangle[k, j]
+            inverse_triangle[i, j] = -t / triangle[i, i]
+    for i in range(6):
+        for j in range(6):
+            t = 0.0
+            for k in range(max(i, j), 6):
+                t += inverse_triangle[i, k] * inverse_triangle[j, k]
+            covariance[(i + 3) % 6, (j + 3) % 6] = t / (scale[i] * scale[j])
+    return True
+
+
+@compiled
+def covariance_rows(
+    begin: int,
+    end: int,
+    sensors: FloatArray,
+    channel_sensor: NDArray[np.intp],
+    gain: FloatArray,
+    common: FloatArray,
+    shrinkage: FloatArray,
+    set_of_row: NDArray[np.intp],
+    q: FloatArray,
+    mu: FloatArray,
+    counts: NDArray[np.int64],
+    out_covariance: FloatArray,
+) -> None:
+    """Scaled covariances of the optima of :func:`search_rows`, rows begin to end, into (rows, starts, 6, 6).
+
+    They are left as they are where the information is singular.
+    """
+    for row in range(begin, end):
+        w = set_of_row[row]
+        for j in range(counts[row, 0]):
+            _scaled_covariance(
+                q[row, j], mu[row, j], sensors, channel_sensor, gain[w], common[w], shrinkage[w], out_covariance[row, j]
+            )

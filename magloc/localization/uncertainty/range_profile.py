@@ -1,0 +1,129 @@
+r"""How far the range of a source may be off: the profile of χ² over the range, all else fitted anew, for any sensors.
+
+The range is followed as :math:`\alpha = \mathrm{atan2}(s, |u|)`: π/2 at the sensors' centroid, 0 at infinity, negative
+beyond it, on the other side.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.typing import FloatArray
+from magloc.chi_square import RISE_95
+from magloc.localization.fit.gauss_newton import JointFits, refine
+from magloc.localization.uncertainty.range_interval import ranges_of, relative_range_sigma
+from magloc.measurement.whitened import JointProblem
+
+_SMALLEST_ALPHA = 1e-6
+# Steps outwards in standard deviations of a Gaussian profile, about the one where it would have risen enough.
+_STEPS = np.array([0.6, 0.85, 1.0, 1.15, 1.5, 2.2, 4.0, 9.0, 25.0, 80.0])
+_ROUNDS = 3
+
+
+def profile_stretches(
+    problem: JointProblem,
+    y: FloatArray,
+    fits: JointFits,
+    source: int,
+    sigma_over_range: FloatArray,
+    rise: FloatArray,
+) -> FloatArray:
+    """Stretches of α of one source, of b fits, in which the profile of χ² stays within a rise.
+
+    Parameters
+    ----------
+    problem : JointProblem
+    y : ndarray, shape (b, C)
+        Whitened readings.
+    fits : JointFits
+        Optima.
+    source : int
+        Which source's range.
+    sigma_over_range : ndarray, shape (b,)
+        Relative standard deviation of the range as the covariance has it, for the first steps; NaN if unknown.
+    rise : ndarray, shape (b,)
+        Above each optimum, positive.
+
+    Returns
+    -------
+    ndarray, shape (b, 2)
+        Least and largest α; -π/2 and π/2 where χ² does not rise so much.
+    """
+    n = len(y)
+    if not n:
+        return np.empty((0, 2))
+    q = fits.q[:, source]
+    alpha = np.arctan2(np.abs(q[:, 3]), np.linalg.norm(q[:, :3], axis=-1))
+    sigma = np.abs(np.nan_to_num(sigma_over_range, nan=1.0)) * np.sin(alpha) * np.cos(alpha)
+    step = np.clip(np.sqrt(rise) * sigma, 1e-7, 0.05)
+    # Both sides at once: outwards, where α falls, for all fits, then inwards.
+    rows = np.tile(np.arange(n), 2)
+    sign = np.repeat([-1.0, 1.0], n)
+    at_optimum, allowed = alpha[rows], rise[rows]
+    # The last point of the grid is the bound itself.
+    grid = at_optimum[:, None] + (sign * step[rows])[:, None] * np.append(_STEPS, np.inf)
+    grid = np.clip(grid, _SMALLEST_ALPHA - 0.5 * np.pi, 0.5 * np.pi - _SMALLEST_ALPHA)
+    grid = np.where(np.abs(grid) < _SMALLEST_ALPHA, _SMALLEST_ALPHA, grid)
+    risen = _rises(problem, y, fits, source, rows, grid)
+    above = risen > allowed[:, None]
+    first, found, each = np.argmax(above, axis=1), above.any(axis=1), np.arange(2 * n)
+    before = np.maximum(first - 1, 0)
+    outside, f_outside = grid[each, first], risen[each, first]
+    inside = np.where(first > 0, grid[each, before], at_optimum)
+    f_inside = np.where(first > 0, risen[each, before], 0.0)
+    for _ in range(_ROUNDS):
+        # The profile is nearly a parabola: interpolate its square root.
+        a, b = np.sqrt(np.clip(f_inside, 0.0, None)), np.sqrt(np.clip(f_outside, 0.0, 1e6))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.clip((np.sqrt(allowed) - a) / (b - a), 0.05, 0.95)
+        middle = inside + np.nan_to_num(share, nan=0.5) * (outside - inside)
+        f = _rises(problem, y, fits, source, rows, middle[:, None])[:, 0]
+        higher = f > allowed
+        outside, f_outside = np.where(higher, middle, outside), np.where(higher, f, f_outside)
+        inside, f_inside = np.where(higher, inside, middle), np.where(higher, f_inside, f)
+    end = np.where(f_outside - allowed < allowed - f_inside, outside, inside)
+    stretches: FloatArray = np.where(found, end, sign * 0.5 * np.pi).reshape(2, n).T
+    return stretches
+
+
+def ranges_within(
+    problem: JointProblem,
+    y: FloatArray,
+    fits: JointFits,
+    source: int,
+    covariance: FloatArray,
+    rise: FloatArray | None = None,
+) -> FloatArray:
+    """Ends (b, 2) of the ranges [m] of one source in which χ² stays within a rise (b,) of each fit, 3.84 by default.
+
+    The first steps are taken from the covariances of the fits (b, 6 K, 6 K).
+    """
+    allowed = np.full(len(y), RISE_95) if rise is None else rise
+    offset = problem.position(fits.q)[:, source] - problem.centroid
+    sigma = relative_range_sigma(covariance[:, 6 * source :, 6 * source :], offset)
+    return ranges_of(profile_stretches(problem, y, fits, source, sigma, allowed), problem.radius)
+
+
+def _rises(
+    problem: JointProblem, y: FloatArray, fits: JointFits, source: int, rows: NDArray[np.intp], alpha: FloatArray
+) -> FloatArray:
+    """Rise of χ² above the optima of rows (r,) at ranges (r, g), everything else fitted anew from the optimum."""
+    n, n_grid = alpha.shape
+    row = np.repeat(rows, n_grid)
+    q, mu = fits.q[row].copy(), fits.mu[row].copy()
+    u = q[:, source, :3]
+    length = np.linalg.norm(u, axis=-1, keepdims=True)
+    at = alpha.ravel()[:, None]
+    sign = np.where(q[:, source, 3:] < 0.0, -1.0, 1.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        direction = np.where(length > 1e-12, u / length, [0.0, 0.0, 1.0])
+        mu[:, source] *= np.clip(np.cos(at) / length, 1e-3, 1e3) ** 3
+    q[:, source] = np.concatenate([direction * np.cos(at), sign * np.sin(at)], axis=-1)
+    free = np.ones((q.shape[1], 3), dtype=bool)
+    free[source, 2] = False
+    profile = refine(problem.rows(row), y[row], q, mu, free=free, max_iterations=40)
+    # A refinement that did not end says nothing of the profile: the points beyond it decide.
+    chi2 = np.where(profile.converged, profile.chi2, -np.inf)
+    rise: FloatArray = chi2.reshape(n, n_grid) - fits.chi2[rows, None]
+    return rise

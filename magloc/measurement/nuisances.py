@@ -1,0 +1,163 @@
+r"""Errors of sensors that last from row to row, as states that are estimated along with a source.
+
+What a calibration does not know (turned axes, gains, the platform's field), 1/f noise and drift are the same, or nearly
+the same, in the next row: they do not average out as noise does, and a filter that takes them for noise believes itself
+too much. Here every one of them is a number e with a standard deviation at the beginning and a first-order Markov
+process
+
+.. math:: \dot e = -e/τ + w
+
+constant (τ infinite, no noise) for the calibration, a random walk for drift. 1/f noise is the sum of one process for
+each decade of frequency, of equal variance: with corner frequencies :math:`f_k` a factor 10 apart and variance
+:math:`s^2` each, the spectral density :math:`\sum_k (2 s^2/π) f_k/(f_k^2 + f^2)` is that of :math:`s^2/(f \ln 10)`
+within 15 % between the outermost of them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from arrays.array import SensorArray
+from arrays.noise import calibration_errors
+from arrays.sensor import FLICKER_DECADES
+from arrays.typing import FloatArray, IntArray
+
+# Corner frequencies of the processes that make up 1/f noise [Hz].
+_FLICKER_HZ = tuple(10.0**-decade for decade in range(FLICKER_DECADES))
+FASTEST_FLICKER_HZ = math.sqrt(10.0) * _FLICKER_HZ[0]
+"""Upper end of the decades that they stand for [Hz]: 1/f noise above it counts as noise of one sample."""
+_SECONDS_PER_HOUR = 3600.0
+# Where the turns, the gains and the field start among the errors of a sensor.
+_TURN, _GAIN, _FIELD = 0, 3, 6
+
+
+@dataclass(frozen=True, eq=False)
+class SensorErrors:
+    """The lasting errors of an array's sensors.
+
+    Attributes
+    ----------
+    array : SensorArray
+    sigma : ndarray, shape (n,)
+        Standard deviations before anything is known.
+    decay_Hz : ndarray, shape (n,)
+        1/τ [1/s].
+    walk : ndarray, shape (n,)
+        Standard deviation that a random walk adds in the root of a second.
+    of_sensor : ndarray, shape (a, 2)
+        What the first a states are: sensor, and which of its errors: turns about its three axes, gains of them, and
+        components of a field that is fixed to the array.
+    of_channel : ndarray, shape (n - a,)
+        Channel to which the others, drift and 1/f noise, are added.
+    """
+
+    array: SensorArray
+    sigma: FloatArray
+    decay_Hz: FloatArray
+    walk: FloatArray
+    of_sensor: IntArray
+    of_channel: IntArray
+
+    @classmethod
+    def of(cls, array: SensorArray) -> SensorErrors:
+        """All lasting errors that an array states."""
+        of_sensor: list[tuple[int, int]] = []
+        sigma: list[float] = []
+        for i, sensor in enumerate(array.sensors):
+            for first, value, n_axes in (
+                (_TURN, sensor.misalignment_rad, 3),
+                (_GAIN, sensor.gain_uncertainty, sensor.n_channels),
+                (_FIELD, sensor.offset_uncertainty_T, 3),
+            ):
+                if value:
+                    of_sensor += [(i, first + axis) for axis in range(n_axes)]
+                    sigma += [value] * n_axes
+        decay, walk = [0.0] * len(sigma), [0.0] * len(sigma)
+        of_channel: list[int] = []
+        for channel, i in enumerate(array.channel_sensor.tolist()):
+            drift, flicker = array.sensors[i].drift_T_rth / math.sqrt(_SECONDS_PER_HOUR), array.sensors[i].flicker_T
+            processes = [(0.0, 0.0, drift)] if drift else []
+            processes += [(flicker, 2.0 * math.pi * corner_Hz, 0.0) for corner_Hz in _FLICKER_HZ] if flicker else []
+            for at_first, rate, noise in processes:
+                of_channel.append(channel)
+                sigma.append(at_first)
+                decay.append(rate)
+                walk.append(noise)
+        return cls(
+            array,
+            np.array(sigma),
+            np.array(decay),
+            np.array(walk),
+            np.array(of_sensor, dtype=np.intp).reshape(-1, 2),
+            np.array(of_channel, dtype=np.intp),
+        )
+
+    @property
+    def n_states(self) -> int:
+        """Number of errors."""
+        return self.sigma.size
+
+    def step(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
+        """What remains of every error after a step, and the standard deviation of what is added: (n,) each."""
+        kept = np.exp(-self.decay_Hz * dt_s)
+        stationary = self.sigma * np.sqrt(-np.expm1(-2.0 * self.decay_Hz * dt_s))
+        return kept, np.hypot(stationary, self.walk * math.sqrt(dt_s))
+
+    def effect(self, array: SensorArray, readings_T: FloatArray) -> FloatArray:
+        """Derivative of the readings of one row with respect to the errors.
+
+        Parameters
+        ----------
+        array : SensorArray
+            With the ambient field of the row.
+        readings_T : ndarray, shape (C,)
+            Raw readings [T], NaN where missing.
+
+        Returns
+        -------
+        ndarray, shape (C, n)
+            Finite also for missing readings.
+        """
+        effect = np.zeros((array.n_channels, self.n_states))
+        n = len(self.of_sensor)
+        if n:
+            sensor, column = self.of_sensor.T
+            of_axes = np.concatenate([calibration_errors(array, readings_T), _of_fields(array)], axis=-1)
+            channel = array.sensor_channels[sensor]
+            state, axis = np.nonzero(channel >= 0)
+            effect[channel[state, axis], state] = of_axes[sensor[state], axis, column[state]]
+        effect[self.of_channel, n + np.arange(self.of_channel.size)] = 1.0
+        return effect
+
+
+def _of_fields(array: SensorArray) -> FloatArray:
+    """Derivative of the readings, by sensor and axis, with respect to a field in the array's frame: (N, 3, 3).
+
+    A modulus has that of the ambient field, whose direction it sees.
+    """
+    ambient = array.ambient_fields
+    modulus = np.linalg.norm(ambient, axis=1, keepdims=True)
+    direction = np.divide(ambient, modulus, out=np.zeros_like(ambient), where=modulus > 0.0)
+    along = array.channel_gain[:, :1] * direction[array.channel_sensor]
+    rows = np.where(array.channel_is_scalar[:, None], along, array.channel_gain)
+    derivative: FloatArray = np.where(array.sensor_channels[..., None] >= 0, rows[array.sensor_channels], 0.0)
+    return derivative
+
+
+def without_lasting_errors(array: SensorArray) -> SensorArray:
+    """The array with noise that is independent from row to row alone."""
+    sensors = tuple(
+        replace(
+            sensor,
+            misalignment_rad=0.0,
+            gain_uncertainty=0.0,
+            offset_uncertainty_T=0.0,
+            flicker_T=0.0,
+            drift_T_rth=0.0,
+        )
+        for sensor in array.sensors
+    )
+    return replace(array, sensors=sensors)

@@ -1,0 +1,252 @@
+r"""One dipole as a separable least-squares problem: the search is over the position alone.
+
+For a source at p the field is linear in the moment, so the best moment of every p is a 3-column least-squares problem
+and what remains is a function of three unknowns (variable projection). They are written as homogeneous coordinates
+:math:`q = (u, s)` on the unit sphere of :math:`R^4`,
+
+.. math:: p = c + \rho_0 \, u / s,
+
+with the sensors' centroid c and circumradius :math:`\rho_0`. With the sensors scaled to :math:`x_i = (s_i - c)/\rho_0`,
+:math:`v_i = s x_i - u`, the field of the moment m at sensor i is :math:`a(v_i) \mu`, where
+:math:`a(v) = (3 n n^T - I)/|v|^3` and :math:`\mu = k |s|^3 m / \rho_0^3`. Infinity (s = 0) is an ordinary point, passed
+smoothly, where (p, m) turns into (-p, -m): the two fit alike to first order, and only the finite size of the array
+tells them apart.
+
+This module is the readable form, and the reference that tests hold
+:mod:`magloc.localization.search.single_source_compiled` against.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from arrays.array import SensorArray
+from arrays.typing import FloatArray
+from arrays.whitening import Whitening
+from magloc.fields.dipole import MU0_OVER_4PI
+
+
+@dataclass(frozen=True, eq=False)
+class ScaledSensors:
+    """Sensors in units of their array's size, and what homogeneous coordinates mean there.
+
+    Attributes
+    ----------
+    centroid : ndarray, shape (3,)
+        Sensors' centroid [m], array frame.
+    radius : float
+        Largest distance of a sensor from it [m].
+    sensors : ndarray, shape (N, 3)
+        Sensors relative to the centroid, in radii.
+    channel_sensor : ndarray of int, shape (C,)
+        Sensor of every channel.
+    """
+
+    centroid: FloatArray
+    radius: float
+    sensors: FloatArray
+    channel_sensor: NDArray[np.intp]
+
+    def homogeneous(self, position_m: ArrayLike) -> FloatArray:
+        """Homogeneous coordinates (..., 4), of unit norm and s > 0, of positions (..., 3) [m]."""
+        rho = (np.asarray(position_m, dtype=np.float64) - self.centroid) / self.radius
+        q = np.concatenate([rho, np.ones_like(rho[..., :1])], axis=-1)
+        unit: FloatArray = q / np.linalg.norm(q, axis=-1, keepdims=True)
+        return unit
+
+    def position(self, q: FloatArray) -> FloatArray:
+        """Positions (..., 3) [m] of homogeneous coordinates (..., 4); not finite at s = 0."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            position: FloatArray = self.centroid + self.radius * q[..., :3] / q[..., 3:]
+        return position
+
+    def moment(self, q: FloatArray, mu: FloatArray) -> FloatArray:
+        """Moments (..., 3) [A·m²] of scaled moments μ (..., 3) [T] at q (..., 4); not finite at s = 0."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            moment: FloatArray = mu * (self.radius**3 / MU0_OVER_4PI) / np.abs(q[..., 3:]) ** 3
+        return moment
+
+    def scaled_moment(self, q: FloatArray, moment_Am2: ArrayLike) -> FloatArray:
+        """The inverse of :meth:`moment`."""
+        mu: FloatArray = np.asarray(moment_Am2) * (MU0_OVER_4PI / self.radius**3) * np.abs(q[..., 3:]) ** 3
+        return mu
+
+
+@dataclass(frozen=True, eq=False)
+class SeparableProblem(ScaledSensors):
+    """Geometry and noise of one set of channels, scaled for the search.
+
+    Attributes
+    ----------
+    whitening : Whitening
+    gain : ndarray, shape (C, 3)
+        Channel gains in channels of unit noise; zero rows where readings are missing.
+    """
+
+    whitening: Whitening
+    gain: FloatArray
+
+    @classmethod
+    def of(cls, array: SensorArray, whitening: Whitening) -> SeparableProblem:
+        """Problem of an array of vector sensors under a whitening of its channels."""
+        return cls(
+            centroid=array.centroid,
+            radius=array.circumradius,
+            sensors=(array.positions - array.centroid) / array.circumradius,
+            channel_sensor=array.channel_sensor.astype(np.intp),
+            whitening=whitening,
+            gain=whitening.root @ array.channel_gain,
+        )
+
+    def unit_basis(self, q: FloatArray) -> FloatArray:
+        """Whitened readings of the three unit scaled moments at q (..., 4): shape (..., C, 3)."""
+        v = q[..., None, 3:] * self.sensors - q[..., None, :3]
+        r = np.linalg.norm(v, axis=-1, keepdims=True)
+        n = (v / r)[..., self.channel_sensor, :]
+        along = np.sum(n * self.gain, axis=-1, keepdims=True)
+        rows = (3.0 * along * n - self.gain) / r[..., self.channel_sensor, :] ** 3
+        return self._free_of_common_field(rows)
+
+    def _free_of_common_field(self, rows: FloatArray) -> FloatArray:
+        common = self.whitening.basis
+        free: FloatArray = rows - (common * self.whitening.shrinkage) @ (common.T @ rows)
+        return free
+
+    def projected_chi2(self, q: FloatArray, y: FloatArray) -> FloatArray:
+        """χ² of whitened readings y (..., C) with the best moment at q (..., 4)."""
+        orthonormal = np.linalg.qr(self.unit_basis(q)).Q
+        residual: FloatArray = y - np.einsum("...cj,...c,...dj->...d", orthonormal, y, orthonormal)
+        chi2: FloatArray = np.einsum("...c,...c->...", residual, residual)
+        return chi2
+
+    def best_moment(self, q: FloatArray, y: FloatArray) -> FloatArray:
+        """Scaled moment (3,) that fits whitened readings y (C,) best at q (4,)."""
+        mu: FloatArray = np.asarray(np.linalg.lstsq(self.unit_basis(q), y, rcond=None)[0], dtype=np.float64)
+        return mu
+
+
+@dataclass(frozen=True, eq=False)
+class JointProblem(ScaledSensors):
+    """Geometry and whitening of b sets of readings of one array, scaled by the array's size.
+
+    Attributes
+    ----------
+    channel_is_scalar : ndarray of bool, shape (C,)
+    gain : ndarray, shape (b, C, 3)
+        Channel gains divided by the noise; of a scalar channel the first number counts.
+    ambient : ndarray, shape (b, N, 3)
+        Ambient field at the sensors [T]; only scalar channels see it.
+    basis : ndarray, shape (b, C, c)
+        Orthonormal common field of the whitening.
+    shrinkage : ndarray, shape (b, c)
+    """
+
+    channel_is_scalar: NDArray[np.bool_]
+    gain: FloatArray
+    ambient: FloatArray
+    basis: FloatArray
+    shrinkage: FloatArray
+
+    @classmethod
+    def of(cls, array: SensorArray, whitenings: list[Whitening], ambient_T: FloatArray) -> JointProblem:
+        """Problem of b sets of readings, each with its whitening and its ambient field (b, N, 3)."""
+        return cls(
+            centroid=array.centroid,
+            radius=array.circumradius,
+            sensors=(array.positions - array.centroid) / array.circumradius,
+            channel_sensor=array.channel_sensor.astype(np.intp),
+            channel_is_scalar=array.channel_is_scalar,
+            gain=np.stack([w.root @ array.channel_gain for w in whitenings]),
+            ambient=np.asarray(ambient_T, dtype=np.float64),
+            basis=np.stack([w.basis for w in whitenings]),
+            shrinkage=np.stack([w.shrinkage for w in whitenings]),
+        )
+
+    def __len__(self) -> int:
+        return len(self.gain)
+
+    def rows(self, index: NDArray[np.intp]) -> JointProblem:
+        """Problem of some of the readings, repeated at will."""
+        return replace(
+            self,
+            gain=self.gain[index],
+            ambient=self.ambient[index],
+            basis=self.basis[index],
+            shrinkage=self.shrinkage[index],
+        )
+
+    @property
+    def is_even(self) -> bool:
+        """Whether moments m and -m give the same readings: moduli without an ambient field, and nothing else."""
+        return bool(self.channel_is_scalar.all()) and not np.any(self.ambient)
+
+    def without_ambient(self) -> JointProblem:
+        """The same without an ambient field."""
+        return replace(self, ambient=np.zeros_like(self.ambient))
+
+    def whitened(self, channels: FloatArray) -> FloatArray:
+        """Channels (b, C) or columns of them (b, C, n), divided by the noise, without their common field."""
+        columns = channels if channels.ndim == 3 else channels[..., None]
+        common = self.shrinkage[..., None] * (self.basis.transpose(0, 2, 1) @ columns)
+        free: FloatArray = columns - self.basis @ common
+        return free if channels.ndim == 3 else free[..., 0]
+
+    def source_fields(self, q: FloatArray, mu: FloatArray) -> FloatArray:
+        """Field of all sources (b, K, ...) at the sensors: (b, N, 3) [T]."""
+        n, inverse3 = self._directions(q)
+        along = np.sum(n * mu[:, :, None], axis=-1, keepdims=True)
+        fields: FloatArray = np.sum((3.0 * along * n - mu[:, :, None]) * inverse3, axis=1)
+        return fields
+
+    def _directions(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Unit vectors from the sources to the sensors (b, K, N, 3) and the inverse cubes of the distances."""
+        v = q[:, :, None, 3:] * self.sensors - q[:, :, None, :3]
+        r = np.sqrt(np.sum(v * v, axis=-1, keepdims=True))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return v / r, 1.0 / r**3
+
+    def predicted(self, source_fields: FloatArray) -> FloatArray:
+        """Whitened predictions (b, C) of the fields of the sources at the sensors (b, N, 3)."""
+        channels = np.sum(source_fields[:, self.channel_sensor] * self.gain, axis=-1)
+        scalar = self.channel_is_scalar
+        if scalar.any():
+            owner = self.channel_sensor[scalar]
+            total = source_fields[:, owner] + self.ambient[:, owner]
+            channels[:, scalar] = self.gain[:, scalar, 0] * np.sqrt(np.sum(total * total, axis=-1))
+        return self.whitened(channels)
+
+    def linear_gain(self, source_fields: FloatArray) -> FloatArray:
+        """What every channel reads of a small change of the field: (b, C, 3), the direction of the sum for moduli."""
+        scalar = self.channel_is_scalar
+        if not scalar.any():
+            return self.gain
+        owner = self.channel_sensor[scalar]
+        total = source_fields[:, owner] + self.ambient[:, owner]
+        modulus = np.sqrt(np.sum(total * total, axis=-1, keepdims=True))
+        gain = self.gain.copy()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            gain[:, scalar] = self.gain[:, scalar, :1] * np.where(modulus > 0.0, total / modulus, 0.0)
+        return gain
+
+    def moment_jacobian(self, q: FloatArray, gain: FloatArray) -> FloatArray:
+        """Derivative of the predictions with respect to μ: (b, C, 3 K)."""
+        n, inverse3 = (x[:, :, self.channel_sensor] for x in self._directions(q))
+        along = np.sum(n * gain[:, None], axis=-1, keepdims=True)
+        columns = (3.0 * along * n - gain[:, None]) * inverse3
+        return self.whitened(columns.transpose(0, 2, 1, 3).reshape(len(q), gain.shape[1], -1))
+
+    def position_jacobian(self, q: FloatArray, mu: FloatArray, gain: FloatArray, tangent: FloatArray) -> FloatArray:
+        """Derivative of the predictions along tangents (b, K, 4, 3) of q: (b, C, 3 K)."""
+        n, inverse3 = (x[:, :, self.channel_sensor] for x in self._directions(q))
+        g, m = gain[:, None], mu[:, :, None]
+        n_m, n_g = np.sum(n * m, axis=-1, keepdims=True), np.sum(n * g, axis=-1, keepdims=True)
+        g_m = np.sum(g * m, axis=-1, keepdims=True)
+        # g · dB/dv, and v = s x - u.
+        with np.errstate(invalid="ignore"):
+            slope = (3.0 * np.cbrt(inverse3) * inverse3) * (n_m * g + n_g * m + (g_m - 5.0 * n_m * n_g) * n)
+        along_s = np.sum(slope * self.sensors[self.channel_sensor], axis=-1, keepdims=True)
+        columns = np.concatenate([-slope, along_s], axis=-1) @ tangent
+        return self.whitened(columns.transpose(0, 2, 1, 3).reshape(len(q), gain.shape[1], -1))

@@ -1,0 +1,121 @@
+"""Compiled whitened model of one dipole.
+
+The readable twin is :mod:`magloc.measurement.whitened`.
+
+The source is (u, s) on the unit sphere of R⁴: position = centroid + radius · u / s. Infinity (s = 0) and the centroid
+(u = 0) are ordinary points of it, and (u, s), (-u, -s) the same source. Arrays are transposed against the twin,
+(component, channel), so that the inner loops run over contiguous channels.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.typing import FloatArray
+from magloc.compilation import compiled
+from magloc.linalg_compiled import orthonormalise
+
+# |s| stays above this: below it the differences lose their digits, and no array resolves a range of 10⁵ radii.
+SMALLEST_S = 1e-5
+
+
+@compiled
+def _project_common(rows: FloatArray, n_rows: int, common: FloatArray, shrinkage: FloatArray) -> None:
+    """Remove the common field from whitened rows (k, c) in place."""
+    for j in range(n_rows):
+        for k in range(shrinkage.size):
+            t = 0.0
+            for c in range(rows.shape[1]):
+                t += common[k, c] * rows[j, c]
+            t *= shrinkage[k]
+            for c in range(rows.shape[1]):
+                rows[j, c] -= t * common[k, c]
+
+
+@compiled
+def unit_basis(
+    q: FloatArray,
+    sensors: FloatArray,
+    channel_sensor: NDArray[np.intp],
+    gain: FloatArray,
+    common: FloatArray,
+    shrinkage: FloatArray,
+    basis: FloatArray,
+) -> None:
+    """Whitened readings of the three unit moments at q, into basis (3, c)."""
+    last = -1
+    n0 = n1 = n2 = r3 = 0.0
+    for c in range(channel_sensor.size):
+        i = channel_sensor[c]
+        if i != last:
+            v0 = q[3] * sensors[i, 0] - q[0]
+            v1 = q[3] * sensors[i, 1] - q[1]
+            v2 = q[3] * sensors[i, 2] - q[2]
+            inverse = 1.0 / math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
+            n0, n1, n2 = v0 * inverse, v1 * inverse, v2 * inverse
+            r3 = inverse * inverse * inverse
+            last = i
+        g0, g1, g2 = gain[c, 0], gain[c, 1], gain[c, 2]
+        t = 3.0 * (n0 * g0 + n1 * g1 + n2 * g2)
+        basis[0, c] = (t * n0 - g0) * r3
+        basis[1, c] = (t * n1 - g1) * r3
+        basis[2, c] = (t * n2 - g2) * r3
+    _project_common(basis, 3, common, shrinkage)
+
+
+@compiled
+def homogeneous_jacobian(
+    q: FloatArray,
+    mu: FloatArray,
+    sensors: FloatArray,
+    channel_sensor: NDArray[np.intp],
+    gain: FloatArray,
+    jacobian: FloatArray,
+) -> None:
+    """Derivative of the readings of the scaled moment mu along (u, s), before the common field is removed: (4, c)."""
+    last = -1
+    n0 = n1 = n2 = r4 = nm = 0.0
+    for c in range(channel_sensor.size):
+        i = channel_sensor[c]
+        if i != last:
+            v0 = q[3] * sensors[i, 0] - q[0]
+            v1 = q[3] * sensors[i, 1] - q[1]
+            v2 = q[3] * sensors[i, 2] - q[2]
+            inverse = 1.0 / math.sqrt(v0 * v0 + v1 * v1 + v2 * v2)
+            n0, n1, n2 = v0 * inverse, v1 * inverse, v2 * inverse
+            r4 = 3.0 * inverse * inverse * inverse * inverse
+            nm = n0 * mu[0] + n1 * mu[1] + n2 * mu[2]
+            last = i
+        g0, g1, g2 = gain[c, 0], gain[c, 1], gain[c, 2]
+        ng = n0 * g0 + n1 * g1 + n2 * g2
+        mg = mu[0] * g0 + mu[1] * g1 + mu[2] * g2
+        along = mg - 5.0 * nm * ng
+        w0 = (nm * g0 + along * n0 + ng * mu[0]) * r4
+        w1 = (nm * g1 + along * n1 + ng * mu[1]) * r4
+        w2 = (nm * g2 + along * n2 + ng * mu[2]) * r4
+        jacobian[0, c] = -w0
+        jacobian[1, c] = -w1
+        jacobian[2, c] = -w2
+        jacobian[3, c] = w0 * sensors[i, 0] + w1 * sensors[i, 1] + w2 * sensors[i, 2]
+
+
+@compiled
+def candidate_bases(
+    begin: int,
+    end: int,
+    candidates: FloatArray,
+    sensors: FloatArray,
+    channel_sensor: NDArray[np.intp],
+    gain: FloatArray,
+    common: FloatArray,
+    shrinkage: FloatArray,
+    bases: FloatArray,
+) -> None:
+    """Orthonormal whitened bases (n, 3, c) of candidate positions q (n, 4), rows begin to end."""
+    triangle = np.zeros((3, 3))
+    for i in range(begin, end):
+        unit_basis(candidates[i], sensors, channel_sensor, gain, common, shrinkage, bases[i])
+        orthonormalise(bases[i], triangle)

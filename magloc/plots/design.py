@@ -1,0 +1,203 @@
+"""What a design looks like, and what it gains."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from scipy.spatial.distance import pdist
+
+from arrays.typing import FloatArray
+from magloc.design.evaluation import Judgement, range_spread
+from magloc.design.optimise import BEST_START, Design, random_sample
+from magloc.design.task import Cap
+from magloc.design.volumes import Ball, Box, Cylinder, Surface, Volume
+from magloc.plots import style
+
+_N_SOURCES = 8000
+_N_DISTANCES = 13
+_DESIGN = "design"
+_LINES = {
+    _DESIGN: (style.BLUE, "o", "-"),
+    "tetrahedron": (style.BLACK, "s", "--"),
+    "cube": (style.ORANGE, "^", "-."),
+    "cross": (style.GREY, "v", ":"),
+    BEST_START: (style.PALE_GREY, "D", (0, (4, 1))),
+}
+# More sensors than this would hide behind their names.
+_MOST_NAMED = 12
+_ELEVATION, _AZIMUTH = 22.0, -55.0
+# About the azimuth, and behind the array [°]: the first of them that is clearest.
+_TURNS = (0.0, -15.0, 15.0, 90.0, -90.0, 180.0, 75.0, 105.0, -75.0, -105.0, 165.0, 195.0)
+_REACH, _ARROW, _ARROW_LABEL, _FLAT = 1.25, 1.2, 1.42, 0.5
+
+
+def design_figure(result: Design, seed: int = 0) -> Figure:
+    """Sensors in their volume, and the 95 % quantile of the range's σ over the distance, against the references.
+
+    Parameters
+    ----------
+    result : Design
+    seed : int
+        Of the sources that the curves are drawn from.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    figure = style.new_figure(3.3, layout=None)
+    scene = figure.add_axes((0.0, 0.06, 0.375, 0.84), projection="3d")
+    _scene(scene, result)
+    ax = figure.add_axes((0.5, 0.15, 0.205, 0.68))
+    relative = figure.add_axes((0.785, 0.15, 0.205, 0.68))
+    sources = random_sample(result.task, _N_SOURCES, np.random.default_rng(seed))
+    distances = _distances(result)
+    arrays = _shown(result)
+    curves = [range_spread(result.task, judged.array, sources, distances).q95_m for judged in arrays]
+    for judged, curve in zip(arrays, curves, strict=True):
+        colour, marker, line = _LINES[_DESIGN if judged is result.judged[0] else judged.name]
+        options: dict[str, Any] = {"color": colour, "marker": marker, "ls": line, "lw": 1.0, "ms": 3.0, "markevery": 3}
+        shown = np.where(np.isfinite(curve), curve, np.nan)
+        ax.plot(distances, shown, label=_name(result, judged), **options)
+        with np.errstate(invalid="ignore"):
+            relative.plot(distances, shown / np.where(np.isfinite(curves[0]), curves[0], np.nan), **options)
+    for panel, up in ((ax, "q95 of the σ of the range [m]"), (relative, "relative to the design [1]")):
+        panel.set_xscale("log")
+        style.dress(panel, "distance of the source [m]", up)
+        panel.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        panel.xaxis.set_minor_formatter("")
+        ticks = [d for d in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200) if distances[0] <= d <= distances[-1]]
+        panel.set_xticks(ticks)
+    style.logarithmic(ax, curves)
+    relative.set_ylim(bottom=0.0)
+    style.legend(
+        figure, handles=ax.get_legend_handles_labels()[0], loc="upper right", bbox_to_anchor=(0.995, 0.92), ncols=4
+    )
+    style.headline(figure, _headline(result))
+    return figure
+
+
+def _shown(result: Design) -> list[Judgement]:
+    """The design and the references; the best start too where no reference could be built."""
+    some_fit = any(other.fits for other in result.judged[2:])
+    every = [judged for judged in result.judged if not (some_fit and judged.name == BEST_START)]
+    return [judged for judged in every if np.isfinite(judged.criterion_m)]
+
+
+def _headline(result: Design) -> str:
+    own = result.judged[0]
+    text = f"'{result.task.name}': {result.task.criterion} of the σ of the range {own.criterion_m:.3g} m"
+    others = [other for other in _shown(result)[1:] if other.fits]
+    if not others:
+        return text
+    first = others[0]
+    sign = "below" if first.gain >= 0.0 else "above"
+    what = f"that of its {first.name}" if first.name == BEST_START else f"a {first.name} of the same span"
+    return f"{text}, {100.0 * abs(first.gain):.0f} % {sign} {what}"
+
+
+def _name(result: Design, judged: Judgement) -> str:
+    name = _DESIGN if judged is result.judged[0] else judged.name
+    return f"{name} ({judged.array.n_sensors}{'' if judged.fits else ', outside'})"
+
+
+def _distances(result: Design) -> FloatArray:
+    stated = result.judged[0].distance_m
+    return np.geomspace(stated[0], stated[-1], _N_DISTANCES)
+
+
+def _scene(ax: Any, result: Design) -> None:
+    """The volume as a wire frame, the sensors, and where the sources are."""
+    volume, sensors = result.task.volume, result.array.positions
+    for line in _outline(volume):
+        ax.plot(*line.T, color=style.PALE_GREY, lw=0.6, zorder=1)
+    if isinstance(volume, Surface):
+        ax.plot_trisurf(
+            *volume.mesh.vertices.T,
+            triangles=volume.mesh.faces,
+            color=style.LIGHT_GREY,
+            alpha=0.25,
+            edgecolor=style.PALE_GREY,
+            linewidth=0.1,
+        )
+    low = volume.centre[2] - volume.radius
+    for place in sensors:
+        ax.plot(*np.stack([place, [place[0], place[1], low]]).T, color=style.PALE_GREY, lw=0.6, ls=":")
+        if len(sensors) <= _MOST_NAMED:
+            ax.plot(*np.stack([volume.centre, place]).T, color=style.BLUE, lw=0.8)
+    ax.scatter(*sensors.T, color=style.BLUE, s=26, depthshade=False, edgecolor=style.BLACK, linewidth=0.5)
+    for name, place in zip(result.array.ids, sensors, strict=True) if len(sensors) <= _MOST_NAMED else ():
+        ax.text(*place, f"  {name}", fontsize=style.SMALL_LETTERS, ha="left", va="bottom", zorder=9)
+    arrow_name = _sources_arrow(ax, result)
+    reach = _REACH * volume.radius
+    for set_limits, centre in zip((ax.set_xlim, ax.set_ylim, ax.set_zlim), volume.centre, strict=True):
+        set_limits(centre - reach, centre + reach)
+    ax.set_box_aspect((1.0, 1.0, 1.0), zoom=0.92)
+    named = np.vstack([sensors, arrow_name])
+    ax.view_init(_ELEVATION, clear_azimuth(named) if len(sensors) <= _MOST_NAMED else _AZIMUTH)
+    for label, axis in (("x [m]", ax.xaxis), ("y [m]", ax.yaxis), ("z [m]", ax.zaxis)):
+        axis.set_label_text(label, fontsize=style.SMALL_LETTERS)
+        axis.labelpad = -6.0
+        axis.set_tick_params(labelsize=style.SMALL_LETTERS - 1.0, pad=-1.0 if axis is ax.zaxis else -3.0)
+        # Ticks at the corners would run into those of the next axis.
+        axis.set_major_locator(MaxNLocator(5, prune="both"))
+
+
+def clear_azimuth(points: FloatArray) -> float:
+    """Direction to look from [°] in which points (n, 3) that have a name are farthest apart in the picture."""
+    rise = np.radians(_ELEVATION)
+
+    def least_distance(azimuth: float) -> float:
+        a = np.radians(azimuth)
+        right = [-np.sin(a), np.cos(a), 0.0]
+        up = [-np.sin(rise) * np.cos(a), -np.sin(rise) * np.sin(a), np.cos(rise)]
+        # Names are written to the right: above one another they are clear sooner.
+        return float(pdist(points @ np.array([right, up]).T * [0.5, 1.0]).min())
+
+    return max((_AZIMUTH + turn for turn in _TURNS), key=least_distance)
+
+
+def _sources_arrow(ax: Any, result: Design) -> FloatArray:
+    """An arrow towards the middle of the sources, where they have one side; the places of its name, none or one."""
+    volume, region = result.task.volume, result.task.region
+    if isinstance(region, Cap):
+        if region.half_angle_rad > 0.6 * np.pi:
+            return np.empty((0, 3))
+        towards = np.array(region.towards)
+    else:
+        middle = region.positions(np.full((1, 3), 0.5))[0]
+        towards = middle - volume.centre
+    length = float(np.linalg.norm(towards))
+    if length == 0.0:
+        return np.empty((0, 3))
+    direction = towards / length
+    ax.quiver(
+        *volume.centre, *(_ARROW * volume.radius * direction), color=style.ORANGE, lw=1.4, arrow_length_ratio=0.12
+    )
+    # Below the head of an arrow that lies flat, beyond that of one that does not.
+    flat = abs(direction[2]) < _FLAT
+    label = volume.centre + volume.radius * ((_ARROW if flat else _ARROW_LABEL) * direction - [0.0, 0.0, 0.25 * flat])
+    ax.text(*label, "sources", fontsize=style.SMALL_LETTERS, ha="center", va="center")
+    return np.array([label])
+
+
+def _outline(volume: Volume) -> list[FloatArray]:
+    """Lines (n, 3) that show a solid."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 73)
+    c, s, o = np.cos(angle), np.sin(angle), np.zeros_like(angle)
+    if isinstance(volume, Ball):
+        rings = [np.stack(ring, axis=1) for ring in ((c, s, o), (c, o, s), (o, c, s))]
+        return [volume.centre + volume.radius_m * ring for ring in rings]
+    if isinstance(volume, Cylinder):
+        ring = volume.radius_m * np.stack([c, s, o], axis=1)
+        half = np.array([0.0, 0.0, 0.5 * volume.height_m])
+        sides = [np.stack([ring[i] - half, ring[i] + half]) for i in range(0, 72, 9)]
+        return [volume.centre + line for line in (ring - half, ring + half, *sides)]
+    if isinstance(volume, Box):
+        corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+        corners = volume.centre + corners * np.array(volume.size_m)
+        edges = [(i, i | bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]
+        return [corners[list(edge)] for edge in edges]
+    return []

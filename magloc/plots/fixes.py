@@ -1,0 +1,380 @@
+"""Fixes row by row: where they are and how certain, their χ², and what they leave of every sensor's readings."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from arrays.array import SensorArray
+from arrays.io.csv import Column, write_columns
+from arrays.io.outputs import make_folder
+from magloc.localization.fit.results import Fix, JointFix, Solution, Source
+from magloc.plots import style
+from magloc.plots.style import bounds99, save
+from magloc.readings import Readings
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+from arrays.typing import FloatArray
+
+_LOG = logging.getLogger(__name__)
+
+_NAMES = ("x_m", "y_m", "z_m", "mx_Am2", "my_Am2", "mz_Am2")
+
+
+def write_pictures(
+    rows: Readings,
+    array: SensorArray,
+    fixes: Sequence[Fix | JointFix],
+    residuals: FloatArray,
+    truth_m: FloatArray | None,
+    folder: Path,
+    *,
+    quiet: bool = False,
+) -> None:
+    """Write fixes.png and residuals.png, and the data behind them as fixes.csv and residuals.csv.
+
+    Parameters
+    ----------
+    rows : Readings
+    array : SensorArray
+    fixes : sequence of Fix or JointFix
+        Of every row, in the world frame if the array's pose is known.
+    residuals : ndarray, shape (n, C)
+        Of their best solutions, in standard deviations of the noise.
+    truth_m : ndarray, shape (n, 3), optional
+        True positions in the frame of the fixes [m], NaN where they are not known.
+    folder : Path
+        Made if it is not there.
+    quiet : bool
+        Do not name the files on stderr.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written.
+    """
+    make_folder(folder, "--out")
+    found = fix_columns(rows.time_s.tolist(), fixes)
+    state = np.concatenate([found.position_m, found.moment_Am2], axis=1)
+    sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    columns: dict[str, Column] = {"time_s": found.time_s, "source": found.source}
+    columns |= dict(zip(_NAMES, state.T, strict=True))
+    columns |= dict(zip((f"s_{name}" for name in _NAMES), sigma.T, strict=True))
+    low, high = bounds99(found.dof)
+    columns |= {"chi2": found.chi2, "dof": found.dof, "chi2_low99": low * found.dof, "chi2_high99": high * found.dof}
+    columns |= {"range95_low_m": found.range95_m[:, 0], "range95_high_m": found.range95_m[:, 1]}
+    columns["range_observable"] = found.range_observable
+    if truth_m is not None:
+        columns |= dict(zip((f"true_{name}" for name in _NAMES), truth_m[found.row].T, strict=False))
+        columns["error_m"] = distances_from_truth(found, truth_m)
+    columns["dropped_sensors"] = [" ".join(fixes[row].dropped) for row in found.row]
+    columns["reason"] = [fixes[row].reason for row in found.row]
+    write_columns(columns, folder / "fixes.csv")
+    names = (f"{name}_residual_sigmas" for name in array.channel_names)
+    write_columns({"time_s": rows.time_s, **dict(zip(names, residuals.T, strict=True))}, folder / "residuals.csv")
+    save(fix_figure(found, sensors_of_rows(rows, array), truth_m), folder / "fixes.png")
+    save(
+        residual_figure(residuals, array.channel_names, array.ids, array.channel_sensor),
+        folder / "residuals.png",
+    )
+    if not quiet:
+        _LOG.info(f"wrote fixes.png, fixes.csv, residuals.png and residuals.csv into {folder}/")
+
+
+def sensors_of_rows(rows: Readings, array: SensorArray) -> FloatArray:
+    """Sensors in every row (n, N, 3) [m]: in the world frame if the array's pose is known, else in the array's."""
+    if rows.array_position_m is None or rows.array_rotation_xyzw is None:
+        return np.broadcast_to(array.positions, (len(rows), *array.positions.shape))
+    R = Rotation.from_quat(rows.array_rotation_xyzw).as_matrix()
+    result: FloatArray = np.einsum("nab,sb->nsa", R, array.positions) + rows.array_position_m[:, None]
+    return result
+
+
+_PLANES = ((0, 1), (0, 2), (1, 2))
+# How far beyond its fix an open interval of the range is drawn.
+_OPEN = 3.0
+_MOST_NAMED_SENSORS = 60
+_FEW_SENSORS = 10
+# Quantiles of the boxes: half and nine tenths of the rows; of a normal distribution in σ.
+_HALF, _MOST = (0.25, 0.75), (0.05, 0.95)
+_MOST_OF_NOISE = 1.6448536269514722
+
+
+@dataclass(frozen=True, eq=False)
+class FixColumns:
+    """Sources of the best solutions of all rows, k of them; NaN where a row has none.
+
+    Attributes
+    ----------
+    row : ndarray of int, shape (k,)
+        Which row a source belongs to.
+    source : ndarray of int, shape (k,)
+        Its number in the row, from 1; 0 where a row has no solution.
+    time_s, chi2 : ndarray, shape (k,)
+    dof : ndarray of int, shape (k,)
+    position_m, moment_Am2 : ndarray, shape (k, 3)
+    covariance : ndarray, shape (k, 6, 6)
+        Of (position, moment); zero for a position that is known beforehand.
+    range_observable : ndarray of bool, shape (k,)
+    range95_m : ndarray, shape (k, 2)
+        Least and largest distance from the sensors' centroid within the 95 % interval; infinite where it is open.
+    """
+
+    row: NDArray[np.intp]
+    source: NDArray[np.intp]
+    time_s: FloatArray
+    chi2: FloatArray
+    dof: NDArray[np.int64]
+    position_m: FloatArray
+    moment_Am2: FloatArray
+    covariance: FloatArray
+    range_observable: NDArray[np.bool_]
+    range95_m: FloatArray
+
+    @property
+    def first(self) -> NDArray[np.bool_]:
+        """One source of every row, for what belongs to the row."""
+        return self.source <= 1
+
+
+def fix_columns(times_s: Sequence[float], fixes: Sequence[Fix | JointFix]) -> FixColumns:
+    """Columns of the best solutions.
+
+    Parameters
+    ----------
+    times_s : sequence of float
+    fixes : sequence of Fix or JointFix
+
+    Returns
+    -------
+    FixColumns
+    """
+    entries: list[tuple[int, int, Solution | Source | None]] = []
+    for i, fix in enumerate(fixes):
+        if not fix.solutions:
+            entries.append((i, 0, None))
+            continue
+        best = fix.solutions[0]
+        sources: tuple[Solution | Source, ...] = (best,) if isinstance(best, Solution) else best.sources
+        entries += [(i, number, source) for number, source in enumerate(sources, start=1)]
+    n = len(entries)
+    position, moment, intervals = np.full((3, n, 3), np.nan)
+    covariance = np.full((n, 6, 6), np.nan)
+    for k, (_, _, source) in enumerate(entries):
+        if source is None:
+            continue
+        position[k], moment[k] = source.position_m, source.moment_Am2
+        size = len(source.covariance)
+        covariance[k] = 0.0
+        covariance[k, 6 - size :, 6 - size :] = source.covariance
+        if source.range_interval95_m:
+            highest = source.range_interval95_m[-1][1]
+            intervals[k, :2] = source.range_interval95_m[0][0], math.inf if highest is None else highest
+    rows = np.array([row for row, _, _ in entries], dtype=np.intp)
+    solved = [fixes[row].solutions for row in rows]
+    return FixColumns(
+        row=rows,
+        source=np.array([number for _, number, _ in entries], dtype=np.intp),
+        time_s=np.asarray(times_s, dtype=np.float64)[rows],
+        chi2=np.array([solutions[0].chi2 if solutions else math.nan for solutions in solved]),
+        dof=np.array([solutions[0].dof if solutions else 0 for solutions in solved]),
+        position_m=position,
+        moment_Am2=moment,
+        covariance=covariance,
+        range_observable=np.array([source is not None and source.range_observable for _, _, source in entries]),
+        range95_m=intervals[:, :2],
+    )
+
+
+def distances_from_truth(columns: FixColumns, truth_m: FloatArray) -> FloatArray:
+    """Distance of every source from the truth (n, 3) of its row, in the coordinates that are known of it (k,) [m]."""
+    offset = columns.position_m - truth_m[columns.row]
+    known = np.isfinite(truth_m[columns.row])
+    distance = np.sqrt(np.where(known, offset**2, 0.0).sum(axis=1))
+    return np.where(known.any(axis=1), distance, np.nan)
+
+
+def fix_figure(columns: FixColumns, sensors_m: FloatArray, truth_m: FloatArray | None = None) -> Figure:
+    """Fixes in three planes with 95 % ellipses, their standard deviation and error, and their χ².
+
+    Parameters
+    ----------
+    columns : FixColumns
+    sensors_m : ndarray, shape (n, N, 3)
+        Sensors in every row, in the frame of the fixes [m].
+    truth_m : ndarray, shape (n, 3), optional
+        True positions [m], NaN where they are not known.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Where the range is not observable there is no ellipse but a line, the 95 % interval of the range; it ends in an
+        arrow where the interval is open.
+    """
+    parts = [columns.position_m] + ([] if truth_m is None else [truth_m])
+    limits = [style.limits_of([part[:, i] for part in parts], [sensors_m[..., i]]) for i in range(3)]
+    half_m = 0.5 * max(high - low for low, high in limits)
+    unit, per_m = style.length_unit(2.0 * half_m)
+    figure = style.new_figure(6.2)
+    grid = figure.add_gridspec(3, 3, height_ratios=[1.75, 1.0, 1.0])
+    for k, plane in enumerate(_PLANES):
+        ax = figure.add_subplot(grid[0, k])
+        _plane(ax, columns, sensors_m, truth_m, plane, per_m)
+        # The same scale in all three planes.
+        across, up = (0.5 * per_m * sum(limits[i]) for i in plane)
+        ax.set_xlim(across - per_m * half_m, across + per_m * half_m)
+        ax.set_ylim(up - per_m * half_m, up + per_m * half_m)
+        ax.set_aspect("equal", adjustable="box")
+        style.dress(ax, f"{'xyz'[plane[0]]} [{unit}]", f"{'xyz'[plane[1]]} [{unit}]")
+        if k == 0:
+            style.legend(figure, handles=ax.get_legend_handles_labels()[0], loc="outside upper center", ncols=6)
+    spread = figure.add_subplot(grid[1, :])
+    if (columns.covariance[:, :3, :3] > 0.0).any():
+        _spread(spread, columns, truth_m, unit, per_m)
+    else:
+        _moments(spread, columns)
+    squares = figure.add_subplot(grid[2, :], sharex=spread)
+    one = columns.first
+    style.squares_panel(squares, columns.time_s[one], columns.chi2[one], columns.dof[one], "χ²")
+    spread.tick_params(labelbottom=False)
+    return figure
+
+
+def residual_figure(
+    residuals: FloatArray, channel_names: Sequence[str], sensor_ids: Sequence[str], channel_sensor: NDArray[np.int64]
+) -> Figure:
+    """What the fixes leave of every channel, in standard deviations of its noise.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (n, C)
+        NaN where a reading is missing or not used.
+    channel_names : sequence of str
+    sensor_ids : sequence of str
+    channel_sensor : ndarray of int, shape (C,)
+        Index of each channel's sensor.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Thick bars hold half of the rows, thin ones nine tenths; of noise alone, nine tenths are in the grey band.
+    """
+    few = len(sensor_ids) <= _FEW_SENSORS
+    figure = style.new_figure(3.0)
+    ax = figure.subplots()
+    ax.axhspan(-_MOST_OF_NOISE, _MOST_OF_NOISE, color=style.LIGHT_GREY, lw=0.0, label="nine tenths of the stated noise")
+    ax.axhline(0.0, color=style.GREY, lw=0.6)
+    named: set[str] = set()
+    bars = [np.array([-2.0, 2.0])]
+    for c, name in enumerate(channel_names):
+        sensor = int(channel_sensor[c])
+        of_sensor = np.flatnonzero(channel_sensor == sensor)
+        k = int(np.flatnonzero(of_sensor == c)[0])
+        component, colour, marker, _ = style.COMPONENTS[k]
+        label = "modulus" if len(of_sensor) == 1 else component
+        place = sensor + 0.26 * (k - 0.5 * (len(of_sensor) - 1))
+        values = residuals[np.isfinite(residuals[:, c]), c]
+        if not values.size:
+            continue
+        half, most = np.quantile(values, _HALF), np.quantile(values, _MOST)
+        bars.append(most)
+        ax.vlines(place, *most, color=colour, lw=0.7, gid=f"{name} most")
+        ax.vlines(place, *half, color=colour, lw=3.0 if few else 1.8, gid=f"{name} half")
+        ax.plot(
+            place, float(np.median(values)), marker, color="white", mec=colour, mew=0.7, ms=4 if few else 2.4,
+            ls="none", label="_" if label in named else label,
+        )  # fmt: skip
+        named.add(label)
+    step = -(-len(sensor_ids) // _MOST_NAMED_SENSORS)
+    shown = range(0, len(sensor_ids), step)
+    ax.set_ylim(style.limits_of(bars[1:], bars[:1]))
+    ax.set_xlim(-0.7, len(sensor_ids) - 0.3)
+    style.dress(ax, "sensor", "residual / σ of the noise [1]", "half and nine tenths of the rows")
+    ax.set_xticks(list(shown), [sensor_ids[i] for i in shown], rotation=0.0 if few else 90.0)
+    ax.grid(visible=False, axis="x")
+    style.legend(ax)
+    return figure
+
+
+def _plane(
+    ax: Axes,
+    columns: FixColumns,
+    sensors_m: FloatArray,
+    truth_m: FloatArray | None,
+    plane: tuple[int, int],
+    per_m: float,
+) -> None:
+    """Fixes, sensors and truth, seen along one axis."""
+    a, b = plane
+    position, sensors = per_m * columns.position_m, per_m * sensors_m
+    solved = np.flatnonzero(np.isfinite(position[:, 0]))
+    size = style.dot_size(len(solved))
+    known = columns.range_observable & (columns.covariance[:, 0, 0] > 0.0)
+    label = "95 % ellipses"
+    for k in style.some_of(solved[known[solved]]):
+        block = per_m**2 * columns.covariance[k][np.ix_(plane, plane)]
+        ax.add_patch(style.ellipse95(position[k, [a, b]], block, label=label))
+        label = "_"
+    label = "95 % of the range"
+    for k in style.some_of(solved[~columns.range_observable[solved] & np.isfinite(columns.range95_m[solved, 0])]):
+        centroid = sensors[columns.row[k]].mean(axis=0)
+        offset = position[k] - centroid
+        distance = float(np.linalg.norm(offset))
+        low, high = per_m * columns.range95_m[k]
+        ends = [centroid + offset * (end / distance) for end in (low, min(high, _OPEN * distance))]
+        line = np.array(ends)[:, [a, b]]
+        ax.plot(line[:, 0], line[:, 1], color=style.ORANGE, lw=0.7, zorder=1.8, label=label)
+        label = "_"
+        if high > _OPEN * distance:
+            ax.annotate(
+                "", xy=tuple(line[1]), xytext=tuple(line[0]),
+                arrowprops={"arrowstyle": "->", "color": style.ORANGE, "lw": 0.7, "mutation_scale": 6},
+            )  # fmt: skip
+    if truth_m is not None:
+        style.draw_truth(ax, per_m * truth_m[:, a], per_m * truth_m[:, b])
+    ax.plot(position[solved, a], position[solved, b], ".", color=style.ESTIMATE, ms=size, label="fixes", zorder=2.2)
+    if np.ptp(sensors.mean(axis=1), axis=0).max() > 0.0:
+        ax.plot(*sensors.mean(axis=1)[:, [a, b]].T, color=style.GREY, lw=1.0, ls="-.", label="path of the array")
+    ax.plot(*sensors[-1][:, [a, b]].T, "^", color="white", mec=style.BLACK, ms=4, mew=0.6, label="sensors", zorder=2.6)
+
+
+def _spread(ax: Axes, columns: FixColumns, truth_m: FloatArray | None, unit: str, per_m: float) -> None:
+    """Standard deviation of the position of every source by its covariance, and its distance from the truth."""
+    sigma = per_m * np.sqrt(np.trace(columns.covariance[:, :3, :3], axis1=1, axis2=2))
+    error = np.full_like(sigma, np.nan) if truth_m is None else per_m * distances_from_truth(columns, truth_m)
+    style.logarithmic(ax, [sigma, error])
+    style.dress(ax, "", f"distance [{unit}]", "certainty" if truth_m is None else "error and certainty")
+    size = style.dot_size(len(sigma))
+    if truth_m is not None:
+        ax.plot(columns.time_s, error, ".", color=style.ESTIMATE, ms=size, label="error")
+    told, untold = (known & (sigma > 0.0) for known in (columns.range_observable, ~columns.range_observable))
+    for rows, mark, colour, label in (
+        (told, "_", style.ORANGE, "σ (Cramér-Rao bound at the fix)"),
+        (untold, "x", style.BLACK, "σ where the range is unknown"),
+    ):
+        if rows.any():
+            ax.plot(columns.time_s[rows], sigma[rows], mark, color=colour, ms=size, mew=1.0, label=label)
+    style.legend(ax)
+
+
+def _moments(ax: Axes, columns: FixColumns) -> None:
+    """Modulus of the moments of sources whose place is known, with 95 % intervals."""
+    modulus = np.linalg.norm(columns.moment_Am2, axis=1)
+    along = columns.moment_Am2 / np.where(modulus > 0.0, modulus, np.nan)[:, None]
+    sigma = np.sqrt(np.einsum("ki,kij,kj->k", along, columns.covariance[:, 3:, 3:], along))
+    ax.errorbar(
+        columns.time_s, modulus, style.SIGMAS_95 * sigma, fmt=".", ms=style.dot_size(len(sigma)), color=style.ESTIMATE,
+        ecolor=style.ORANGE, elinewidth=0.8, label="moment, 95 % intervals",
+    )  # fmt: skip
+    style.dress(ax, "", "moment [A·m²]", "the moment of a source whose place is known")
+    style.legend(ax)

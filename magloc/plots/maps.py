@@ -1,0 +1,218 @@
+"""Slices through convergence maps and source maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from magloc.convergence.over_sources import SourceMapSummary, SourceStatus
+from magloc.convergence.over_sources import summary as source_summary
+from magloc.convergence.over_starts import Status, summary
+from magloc.grids.cube import MapSummary
+from magloc.plots import style
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+
+
+_SLICES = (("x", "y", "z"), ("x", "z", "y"), ("y", "z", "x"))
+_WHITE = "#ffffff"
+# Colour, hatching and name: the hatching tells them from the values in a grey print too.
+_NOT_CONVERGED = {
+    Status.OTHER_OPTIMUM: (_WHITE, "", "stopped elsewhere"),
+    Status.NOT_STOPPED: (_WHITE, "////", "did not stop"),
+    Status.DIVERGED: (_WHITE, "xxxx", "diverged"),
+}
+_STARTS_COLOURS = ListedColormap([_WHITE, *(colour for colour, _, _ in _NOT_CONVERGED.values())])
+_SOURCE_ENDS = {
+    SourceStatus.FOUND: (style.BLUE, "", "found"),
+    SourceStatus.MISSED: (style.ORANGE, "", "missed"),
+    SourceStatus.UNSOLVED: (style.BLACK, "", "no solution"),
+    SourceStatus.LEFT_OUT: (_WHITE, "", "left out"),
+}
+_SOURCES_COLOURS = ListedColormap([colour for colour, _, _ in _SOURCE_ENDS.values()])
+
+
+def convergence_figure(dataset: xr.Dataset, counts: MapSummary | None = None) -> Figure:
+    """Iterations to convergence on three slices through the source, as in the source paper.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        A map made by :func:`magloc.convergence.over_starts.convergence_map`, or one opened by
+        :func:`magloc.grids.store.open_map`, of which only the slices are loaded.
+    counts : MapSummary, optional
+        Its summary, where that is known; without it the whole map is loaded to count.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Starts that did not converge are white and hatched; the dashed line is the plane through the array, orthogonal
+        to the direction of the source.
+    """
+    counts = summary(dataset) if counts is None else counts
+    source = np.atleast_1d(dataset.attrs["position_m"])
+    centroid = np.atleast_1d(dataset.attrs["centroid_m"])
+    moment = np.atleast_1d(dataset.attrs["moment_Am2"])
+    # Places by hand: a layout engine draws everything twice.
+    figure = style.new_figure(3.0, layout=None)
+    places = {"left": 0.07, "right": 0.895, "bottom": 0.25, "top": 0.8, "wspace": 0.34}
+    axes = figure.subplots(1, 3, gridspec_kw=places)
+    parts = _slices(dataset[["status", "iterations"]], source)
+    shown = [part["iterations"].where(part["status"] == Status.CONVERGED) for part in parts]
+    converged = np.concatenate([values.to_numpy()[np.isfinite(values)] for values in shown])
+    top = float(np.percentile(converged, 99)) if converged.size else 1.0
+    for ax, part, values, (across, up, through) in zip(axes, parts, shown, _SLICES, strict=True):
+        _slice(ax, part["status"], _STARTS_COLOURS, values, across, up, "start", (0.0, top))
+        _hatch(ax, part["status"], across, up)
+        _scene(ax, dataset, source, centroid, moment, "xyz".index(across), "xyz".index(up))
+        ax.set_title(f"starts with {through} = {float(part[through]):g} m", fontsize=style.LETTERS)
+    bar = figure.colorbar(axes[-1].images[-1], cax=figure.add_axes((0.915, 0.25, 0.014, 0.55)), extend="max")
+    bar.set_label("passes until convergence [1]", fontsize=style.LETTERS)
+    bar.ax.tick_params(labelsize=style.SMALL_LETTERS)
+    handles = _handles(parts, _NOT_CONVERGED) + axes[0].get_legend_handles_labels()[0]
+    style.legend(figure, handles=handles, loc="lower center", ncols=6)
+    style.headline(
+        figure,
+        f"Convergence of '{dataset.attrs['method']}', moment ({', '.join(f'{m:g}' for m in moment)}) A·m²: "
+        f"front half {_percent(counts.front_fraction)}, back half {_percent(counts.back_fraction)}"
+        + (f", median {counts.median_iterations:.0f} passes" if counts.converged else ""),
+    )
+    return figure
+
+
+def source_figure(dataset: xr.Dataset, counts: SourceMapSummary | None = None) -> Figure:
+    """How fixes ended, over the Cramér-Rao bound of the range, on three slices through the array.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        A map made by :func:`magloc.convergence.over_sources.source_map`, or one opened by
+        :func:`magloc.grids.store.open_map`, of which only the slices are loaded.
+    counts : SourceMapSummary, optional
+        Its summary, where that is known; without it the whole map is loaded to count.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    counts = source_summary(dataset) if counts is None else counts
+    figure = style.new_figure(4.9, layout="compressed")
+    axes = figure.subplots(2, 3)
+    parts = _slices(dataset[["status", "sigma_range"]], np.zeros(3))
+    bounds = [part["sigma_range"].copy(data=np.log10(part["sigma_range"].to_numpy())) for part in parts]
+    finite = np.concatenate([bound.to_numpy()[np.isfinite(bound)] for bound in bounds])
+    low, high = np.percentile(finite, [1, 99]) if finite.size else (0.0, 1.0)
+    white = ListedColormap([_WHITE])
+    for column, part, bound, (across, up, through) in zip(axes.T, parts, bounds, _SLICES, strict=True):
+        _slice(column[0], part["status"], _SOURCES_COLOURS, bound.where(False), across, up, "source")
+        _slice(column[1], part["status"], white, bound, across, up, "source", (low, high))
+        column[0].set_title(f"sources with {through} = {float(part[through]):g} m", fontsize=style.LETTERS)
+        for ax in column:
+            ax.plot(0.0, 0.0, "^", color=_WHITE, mec=style.BLACK, ms=6, label="array")
+    bar = figure.colorbar(axes[1, 2].images[-1], ax=axes[1], shrink=0.9, extend="both")
+    bar.set_label("log10 of the range's\nCramér-Rao bound / m [1]", fontsize=style.LETTERS)
+    bar.ax.tick_params(labelsize=style.SMALL_LETTERS)
+    handles = _handles(parts, _SOURCE_ENDS) + axes[0, 0].get_legend_handles_labels()[0]
+    style.legend(figure, handles=handles, loc="outside lower center", ncols=6)
+    style.headline(
+        figure,
+        f"One start-free fix each of {counts.starts} sources of {dataset.attrs['moment_magnitude_Am2']:g} A·m²: "
+        f"{counts.fraction:.2%} found, truth listed {counts.truth_listed:.2%}",
+    )
+    return figure
+
+
+def _slices(dataset: xr.Dataset, through: np.ndarray) -> list[xr.Dataset]:
+    """The three planes through a point, loaded."""
+    planes = ({name: float(through["xyz".index(name)])} for _, _, name in _SLICES)
+    return [dataset.sel(plane, method="nearest").load() for plane in planes]
+
+
+def _handles(parts: Sequence[xr.Dataset], colours: Mapping[Any, tuple[str, str, str]]) -> list[Any]:
+    """Legend of the colours that occur."""
+    present = [status for status in colours if any(bool((part["status"] == status).any()) for part in parts)]
+    entries = (colours[status] for status in present)
+    return [
+        Patch(facecolor=colour, hatch=hatch, edgecolor=style.PALE_GREY, linewidth=0.5, label=name)
+        for colour, hatch, name in entries
+    ]
+
+
+def _percent(fraction: float) -> str:
+    return f"{100.0 * fraction:.1f} %"
+
+
+def _slice(
+    ax: Axes,
+    status: xr.DataArray,
+    colours: ListedColormap,
+    shown: xr.DataArray,
+    across: str,
+    up: str,
+    point: str,
+    limits: tuple[float, float] = (0.0, 1.0),
+) -> None:
+    """Colours of the status, and over them the values that are finite."""
+    axis = status[across].to_numpy()
+    half_cell = 0.5 * float(axis[1] - axis[0])
+    low, high = float(axis[0]) - half_cell, float(axis[-1]) + half_cell
+    options: dict[str, Any] = {"origin": "lower", "extent": (low, high, low, high), "interpolation": "nearest"}
+    ax.imshow(status.transpose(up, across), cmap=colours, vmin=-0.5, vmax=colours.N - 0.5, **options)
+    ax.imshow(shown.transpose(up, across), cmap="viridis", vmin=limits[0], vmax=limits[1], **options)
+    style.dress(ax, f"{point} {across} [m]", f"{point} {up} [m]")
+    ax.grid(visible=False)
+
+
+def _hatch(ax: Axes, status: xr.DataArray, across: str, up: str) -> None:
+    """Hatching over the cells that did not converge."""
+    axis = status[across].to_numpy()
+    half_cell = 0.5 * float(axis[1] - axis[0])
+    edges = np.append(axis - half_cell, axis[-1] + half_cell)
+    values = status.transpose(up, across).to_numpy()
+    for kind, (_, hatch, _) in _NOT_CONVERGED.items():
+        if not hatch or not (values == kind).any():
+            continue
+        # Corners of the cells, so that the hatching ends where they end.
+        fine = np.repeat(np.repeat(values == kind, 2, axis=0), 2, axis=1).astype(np.float64)
+        inner = 1e-3 * half_cell
+        corners = np.column_stack([edges[:-1] + inner, edges[1:] - inner]).ravel()
+        filled = ax.contourf(corners, corners, fine, levels=[0.5, 1.5], colors="none", hatches=[hatch])
+        filled.set_edgecolor(style.PALE_GREY)
+        filled.set_linewidth(0.0)
+
+
+def _scene(
+    ax: Axes, dataset: xr.Dataset, source: np.ndarray, centroid: np.ndarray, moment: np.ndarray, across: int, up: int
+) -> None:
+    """Array, source with its moment, and the line where the plane between the halves cuts the slice."""
+    limits = ax.get_xlim()
+    width = limits[1] - limits[0]
+    ax.plot(centroid[across], centroid[up], "^", color=_WHITE, mec=style.BLACK, ms=6, ls="none", label="array")
+    ax.plot(source[across], source[up], "*", color=style.ORANGE, mec=style.BLACK, ms=9, ls="none", label="source")
+    arrow = 0.14 * width * moment / np.linalg.norm(moment)
+    if np.hypot(arrow[across], arrow[up]) > 0.01 * width:
+        ax.annotate(
+            "",
+            xy=(source[across] + arrow[across], source[up] + arrow[up]),
+            xytext=(source[across], source[up]),
+            arrowprops={"arrowstyle": "-|>", "facecolor": style.ORANGE, "edgecolor": style.BLACK, "lw": 1.0},
+        )
+    through = 3 - across - up
+    normal = source - centroid
+    depth = dataset["xyz"[through]].sel({"xyz"[through]: source[through]}, method="nearest")
+    offset = normal @ centroid - normal[through] * float(depth)
+    if np.hypot(normal[across], normal[up]) > 0.2 * np.linalg.norm(normal):
+        foot = offset * np.array([normal[across], normal[up]]) / (normal[across] ** 2 + normal[up] ** 2)
+        ax.axline(
+            tuple(foot), (foot[0] - normal[up], foot[1] + normal[across]), color=style.BLACK, ls="--", lw=0.9,
+            label="plane between the halves",
+        )  # fmt: skip
+    ax.set_xlim(limits)
+    ax.set_ylim(limits)

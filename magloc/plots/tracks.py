@@ -1,0 +1,292 @@
+"""A track in space and time, and how true it is to its own covariance."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from arrays.io.csv import Column, write_columns
+from arrays.io.outputs import make_folder
+from magloc.plots import style
+from magloc.plots.style import bounds99, save
+from magloc.tracking.results import TrackPoint
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from magloc.tracking.results import TrackPoint
+from arrays.typing import FloatArray
+
+_LOG = logging.getLogger(__name__)
+
+IntArray = NDArray[np.int64]
+_NAMES = ("x_m", "y_m", "z_m", "mx_Am2", "my_Am2", "mz_Am2")
+
+
+def write_picture(
+    points: Sequence[TrackPoint],
+    truth_m: FloatArray | None,
+    folder: Path,
+    *,
+    nees: tuple[FloatArray, IntArray] | None = None,
+    bound_m: FloatArray | None = None,
+    array_m: FloatArray | None = None,
+    quiet: bool = False,
+) -> None:
+    """Write track.png and consistency.png, and track.csv with the data behind both.
+
+    Parameters
+    ----------
+    points : sequence of TrackPoint
+    truth_m : ndarray, shape (n, 3), optional
+        True positions [m], NaN where they are not known.
+    folder : Path
+        Made if it is not there.
+    nees : tuple of ndarray, shape (n,), optional
+        Normalised estimation error squared of every row, and its degrees of freedom.
+    bound_m : ndarray, shape (n,), optional
+        Posterior Cramér-Rao bound of the distance from the truth.
+    array_m : ndarray, shape (n, 3), optional
+        Origin of the array's frame in every row.
+    quiet : bool
+        Do not name the files on stderr.
+
+    Raises
+    ------
+    InputError
+        The folder cannot be written.
+    """
+    make_folder(folder, "--out")
+    time, position, moment, covariance = columns_of(points)
+    nis, nis_dof = np.array([point.nis for point in points]), np.array([point.nis_dof for point in points])
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    estimability = [np.full(6, np.nan) if point.estimability is None else point.estimability for point in points]
+    state = np.concatenate([position, moment], axis=1)
+    columns: dict[str, Column] = {"time_s": time}
+    columns |= dict(zip(_NAMES, state.T, strict=True))
+    columns |= dict(zip((f"s_{name}" for name in _NAMES), sigma.T, strict=True))
+    columns |= _square("nis", nis, nis_dof)
+    components = (name.split("_")[0] for name in _NAMES)
+    columns |= dict(zip((f"estimability_{name}" for name in components), np.array(estimability).T, strict=True))
+    if truth_m is not None:
+        columns |= dict(zip((f"true_{name}" for name in _NAMES), truth_m.T, strict=False))
+    if nees is not None:
+        columns |= _square("nees", *nees)
+    if bound_m is not None:
+        columns["bound_m"] = bound_m
+    if array_m is not None:
+        columns |= dict(zip(("array_x_m", "array_y_m", "array_z_m"), array_m.T, strict=True))
+    columns["status"] = [point.status for point in points]
+    write_columns(columns, folder / "track.csv")
+    save(track_figure(points, truth_m, array_m), folder / "track.png")
+    save(consistency_figure(points, truth_m, nees, bound_m), folder / "consistency.png")
+    if not quiet:
+        _LOG.info(f"wrote track.png, consistency.png and track.csv into {folder}/")
+
+
+def _square(name: str, square: FloatArray, dof: IntArray) -> dict[str, Column]:
+    """A normalised square, its degrees of freedom, and its 99 % bounds."""
+    low, high = bounds99(dof)
+    return {name: square, f"{name}_dof": dof, f"{name}_low99": low * dof, f"{name}_high99": high * dof}
+
+
+# Least and largest height of the plan, and its width [in].
+_PLAN_IN = (1.2, 3.4, 6.2)
+# Least ratio of the plan's sides.
+_NARROWEST = 0.2
+
+
+def track_figure(
+    points: Sequence[TrackPoint], truth_m: FloatArray | None = None, array_m: FloatArray | None = None
+) -> Figure:
+    """A track from above with 95 % ellipses, and its coordinates and its strength through time with 95 % bands.
+
+    Parameters
+    ----------
+    points : sequence of TrackPoint
+    truth_m : ndarray, shape (n, 3), optional
+        True positions [m], NaN where they are not known.
+    array_m : ndarray, shape (n, 3), optional
+        Origin of the array's frame in every row [m]; without it the array stands at the origin.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    time, position, moment, covariance = columns_of(points)
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    origin_m = np.zeros((1, 3)) if array_m is None else array_m
+    extent = [position] + ([] if truth_m is None else [truth_m])
+    across, up = (style.limits_of([part[:, i] for part in extent], [origin_m[:, i]]) for i in (0, 1))
+    widest = max(across[1] - across[0], up[1] - up[0])
+    across, up = (_at_least(_NARROWEST * widest, *limits) for limits in (across, up))
+    unit, per_m = style.length_unit(widest)
+    plan_in = min(max(_PLAN_IN[2] * (up[1] - up[0]) / (across[1] - across[0]), _PLAN_IN[0]), _PLAN_IN[1])
+    figure = style.new_figure(plan_in + 4.2)
+    grid = figure.add_gridspec(3, 2, height_ratios=[plan_in + 0.5, 1.4, 1.4])
+    plan = figure.add_subplot(grid[0, :])
+    _plan(plan, points, truth_m, origin_m, unit, per_m)
+    plan.set_xlim(per_m * across[0], per_m * across[1])
+    plan.set_ylim(per_m * up[0], per_m * up[1])
+    first: Axes | None = None
+    for i, name in enumerate("xyz"):
+        ax = figure.add_subplot(grid[1 + i // 2, i % 2], sharex=first)
+        first = ax if first is None else first
+        _through_time(ax, time, per_m * position[:, i], per_m * sigma[:, i])
+        if truth_m is not None:
+            ax.plot(time, per_m * truth_m[:, i], color=style.TRUTH, lw=0.8, ls="--", label="truth")
+        ax.set_ylim(style.limits_of([per_m * part[:, i] for part in extent], margin=0.15))
+        style.dress(ax, "time [s]", f"{name} [{unit}]")
+    strength = figure.add_subplot(grid[2, 1], sharex=first)
+    modulus = np.linalg.norm(moment, axis=1)
+    along = moment / np.where(modulus > 0.0, modulus, np.nan)[:, None]
+    spread = np.sqrt(np.einsum("ni,nij,nj->n", along, covariance[:, 3:, 3:], along))
+    _through_time(strength, time, modulus, spread)
+    strength.set_ylim(
+        style.limits_of([modulus - style.SIGMAS_95 * spread, modulus + style.SIGMAS_95 * spread], share=0.95)
+    )
+    style.dress(strength, "time [s]", "moment [A·m²]")
+    entries = {
+        label: handle
+        for ax in (plan, strength if first is None else first)
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
+    }
+    style.legend(
+        figure,
+        handles=entries.values(),
+        labels=entries.keys(),
+        loc="outside upper center",
+        ncols=8,
+        columnspacing=1.2,
+        handletextpad=0.5,
+    )
+    return figure
+
+
+def consistency_figure(
+    points: Sequence[TrackPoint],
+    truth_m: FloatArray | None = None,
+    nees: tuple[FloatArray, NDArray[np.int64]] | None = None,
+    bound_m: FloatArray | None = None,
+) -> Figure:
+    """Whether a track is as certain as it says: errors, NEES and NIS with bounds, and what the readings taught.
+
+    Parameters
+    ----------
+    points : sequence of TrackPoint
+    truth_m : ndarray, shape (n, 3), optional
+        True positions [m], NaN where they are not known; without them there are neither errors nor NEES.
+    nees : tuple of ndarray, shape (n,), optional
+        Normalised estimation error squared of every row and its degrees of freedom.
+    bound_m : ndarray, shape (n,), optional
+        Posterior Cramér-Rao bound of the distance from the truth [m].
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+    """
+    time, position, _, covariance = columns_of(points)
+    n_panels = 5 if truth_m is not None and nees is not None else 3
+    figure = style.new_figure(1.35 * n_panels + 0.3)
+    axes = list(figure.subplots(n_panels, 1, sharex=True))
+    if truth_m is not None and nees is not None:
+        _errors(axes[0], time, position - truth_m, covariance, bound_m)
+        style.squares_panel(axes[1], time, *nees, "NEES")
+    tracked = np.array([point.position_m is not None for point in points])
+    nis = np.array([point.nis for point in points])
+    nis_dof = np.array([point.nis_dof for point in points])
+    style.squares_panel(axes[-3], time, nis, nis_dof, "NIS")
+    estimability = np.array(
+        [np.full(6, np.nan) if point.estimability is None else point.estimability for point in points]
+    )
+    for ax, first, what in ((axes[-2], 0, "position"), (axes[-1], 3, "moment")):
+        for i, (name, colour, _, line) in enumerate(style.COMPONENTS):
+            label = name if first == 0 else f"m{name}"
+            ax.plot(time, estimability[:, first + i], color=colour, ls=line, lw=1.0, label=label)
+        ax.set_ylim(-0.03, 1.03)
+        style.dress(ax, "time [s]", f"estimability\nof the {what} [1]")
+        style.legend(ax)
+    axes[-2].set_title("what one row's readings teach: 1 - σ after / σ before", fontsize=style.LETTERS, loc="left")
+    for ax in axes:
+        style.shade_gaps(ax, time, tracked, "not tracked")
+        if ax is not axes[-1]:
+            ax.set_xlabel("")
+    return figure
+
+
+def columns_of(points: Sequence[TrackPoint]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Times (n,), positions, moments (n, 3) and covariances (n, 6, 6) of a track, NaN where there is none."""
+    time = np.array([point.time_s for point in points])
+    position = np.array([np.full(3, np.nan) if p.position_m is None else p.position_m for p in points])
+    moment = np.array([np.full(3, np.nan) if p.moment_Am2 is None else p.moment_Am2 for p in points])
+    covariance = np.array([np.full((6, 6), np.nan) if p.covariance is None else p.covariance for p in points])
+    return time, position, moment, covariance
+
+
+def _at_least(width: float, low: float, high: float) -> tuple[float, float]:
+    """Limits that are this wide at least."""
+    missing = max(0.0, width - (high - low))
+    return low - 0.5 * missing, high + 0.5 * missing
+
+
+def _plan(
+    ax: Axes,
+    points: Sequence[TrackPoint],
+    truth_m: FloatArray | None,
+    origin_m: FloatArray,
+    unit: str,
+    per_m: float,
+) -> None:
+    """Seen from above, with the array."""
+    _, position, _, covariance = columns_of(points)
+    shown = per_m * position
+    if truth_m is not None:
+        style.draw_truth(ax, per_m * truth_m[:, 0], per_m * truth_m[:, 1])
+    ax.plot(shown[:, 0], shown[:, 1], color=style.ESTIMATE, lw=1.2, label="track", zorder=2.2)
+    tracked = np.flatnonzero(np.isfinite(position[:, 0]))
+    label = "95 % ellipses"
+    for i in style.some_of(tracked):
+        ax.add_patch(style.ellipse95(shown[i, :2], per_m**2 * covariance[i, :2, :2], label=label))
+        label = "_"
+    begun = [i for i, point in enumerate(points) if point.status == "acquired"]
+    ax.plot(shown[begun, 0], shown[begun, 1], "o", ms=4.5, mfc="none", mec=style.BLACK, label="track begins")
+    origin = per_m * origin_m
+    if len(origin) > 1:
+        ax.plot(origin[:, 0], origin[:, 1], color=style.GREY, lw=1.0, ls="-.", label="path of the array")
+    ax.plot(origin[-1, 0], origin[-1, 1], "^", color="white", mec=style.BLACK, ms=6, ls="none", label="array")
+    ax.set_aspect("equal", adjustable="box")
+    style.dress(ax, f"x [{unit}]", f"y [{unit}]", "from above")
+
+
+def _through_time(ax: Axes, time: FloatArray, value: FloatArray, sigma: FloatArray) -> None:
+    """A number of every row with its 95 % band."""
+    low, high = value - style.SIGMAS_95 * sigma, value + style.SIGMAS_95 * sigma
+    ax.fill_between(time, low, high, color=style.ESTIMATE, alpha=0.25, lw=0.0, label="95 % band")
+    ax.plot(time, value, color=style.ESTIMATE, lw=1.0, label="track")
+    style.shade_gaps(ax, time, np.isfinite(value), "not tracked")
+
+
+def _errors(
+    ax: Axes, time: FloatArray, error_m: FloatArray, covariance: FloatArray, bound_m: FloatArray | None
+) -> None:
+    """Distance from the truth, in the coordinates that are known of it, against what it should be."""
+    known = np.isfinite(error_m)
+    distance = np.sqrt(np.where(known, error_m**2, 0.0).sum(axis=1))
+    distance[~known.any(axis=1)] = np.nan
+    variances = np.diagonal(covariance, axis1=1, axis2=2)[:, :3]
+    expected = np.sqrt(np.where(known, variances, 0.0).sum(axis=1))
+    expected[~known.any(axis=1)] = np.nan
+    style.logarithmic(ax, [distance, expected])
+    ax.plot(time, distance, ".", color=style.ESTIMATE, ms=3, label="error")
+    ax.plot(time, expected, color=style.ORANGE, lw=1.2, label="σ that the track states")
+    if bound_m is not None:
+        possible = np.where(np.isfinite(bound_m), bound_m, np.nan)
+        ax.plot(time, possible, color=style.BLACK, ls="--", lw=0.9, label="posterior Cramér-Rao bound")
+    style.dress(ax, "time [s]", "distance from\nthe truth [m]", "error")
+    style.legend(ax)

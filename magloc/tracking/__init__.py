@@ -1,0 +1,1 @@
+"""A source followed through time."""

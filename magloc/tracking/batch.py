@@ -1,0 +1,176 @@
+"""The track of a long record: :class:`magloc.tracking.tracker.Tracker` with compiled steps between its starts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.special import chdtri
+
+from magloc.kalman import estimability
+from magloc.measurement.rows import ambient_fields
+from magloc.tracking import batch_compiled as kernels
+from magloc.tracking.measurement import LEAST_SINGULAR
+from magloc.tracking.motion import N_SOURCE, LinearMotion
+from magloc.tracking.results import Prediction, Row, Step, TrackPoint
+from magloc.tracking.tracker import (
+    CONTRADICTION,
+    LARGEST_GROWTH,
+    LARGEST_RANGE_ERROR,
+    MOST_ITERATIONS,
+    REFIX_RANGE_ERROR,
+    ROWS_TO_LOSE,
+    SHRINK,
+    TOLERANCE,
+    Tracker,
+)
+
+_STATUS = {kernels.TRACKED: "tracked", kernels.PREDICTED: "predicted", kernels.OUTLIER: "outlier"}
+
+
+def track_record(
+    tracker: Tracker, rows: Sequence[Row], progress: Callable[[int], None] | None = None
+) -> list[TrackPoint]:
+    """Points of a whole record: as :meth:`Tracker.run`, with compiled steps where the motion is linear.
+
+    Sensors with lasting errors are tracked by the readable steps.
+
+    Parameters
+    ----------
+    tracker : Tracker
+    rows : sequence of Row
+    progress : callable, optional
+        Called with the number of rows finished since the last call.
+
+    Returns
+    -------
+    list of TrackPoint
+    """
+    points: list[TrackPoint] = []
+    can_be = isinstance(tracker.motion, LinearMotion) and not tracker.errors.n_states
+    compiled = _CompiledSteps(tracker, rows) if can_be and rows else None
+    while len(points) < len(rows):
+        before = len(points)
+        if compiled is not None and tracker.is_tracking:
+            points += compiled.follow(before)
+        if len(points) < len(rows):
+            points.append(tracker.advance(rows[len(points)]))
+        if progress is not None:
+            progress(len(points) - before)
+    return points
+
+
+class _CompiledSteps:
+    """A record in the layout of :func:`magloc.tracking.batch_compiled.follow`."""
+
+    def __init__(self, tracker: Tracker, rows: Sequence[Row]) -> None:
+        array, motion = tracker.array, tracker.motion
+        if not isinstance(motion, LinearMotion):
+            raise TypeError("Input tracker must have a linear motion; instead received one that is not.")
+        self.tracker = tracker
+        self.times = [row.time_s for row in rows]
+        differences = [tracker.differences_of(row) for row in rows]
+        distinct = {id(of_row): of_row for of_row in differences}
+        index = {key: i for i, key in enumerate(distinct)}
+        k = max(1, *(of_row.n_differences for of_row in distinct.values()))
+        self.transforms = np.zeros((len(distinct), k, array.n_channels))
+        for i, of_row in enumerate(distinct.values()):
+            self.transforms[i, : of_row.n_differences] = of_row.transform / np.sqrt(of_row.variance)[:, None]
+        self.transform_of_row = np.array([index[id(of_row)] for of_row in differences])
+        self.n_differences = np.array([of_row.n_differences for of_row in differences])
+        channels = np.nan_to_num(np.stack([row.readings_T for row in rows]) - array.channel_offset_T)
+        self.z = (self.transforms[self.transform_of_row] @ channels[..., None])[..., 0]
+        self.origins = np.stack([row.origin_m for row in rows])
+        self.rotations = np.stack([row.R_world_from_array for row in rows])
+        self.ambients, self.ambient_of_row = array.ambient_fields[None], np.zeros(len(rows), dtype=np.int64)
+        if any(row.ambient_T is not None for row in rows):
+            own = np.zeros(3) if array.ambient_T is None else np.asarray(array.ambient_T)
+            of_rows = np.stack([own if row.ambient_T is None else row.ambient_T for row in rows])
+            self.ambients, self.ambient_of_row = ambient_fields(array, len(rows), of_rows), np.arange(len(rows))
+        lengths, self.step_of_row = np.unique(np.diff(self.times, prepend=self.times[0]), return_inverse=True)
+        steps = [motion.linear_step(max(length, 0.0)) for length in lengths.tolist()]
+        self.F, self.A, self.B = (np.stack(part) for part in zip(*steps, strict=True))
+        self.nis_limits = np.asarray(chdtri(np.maximum(np.arange(k + 1), 1), CONTRADICTION), dtype=np.float64)
+        n = motion.n_states
+        self.x, self.predicted_x = np.empty((2, len(rows), n))
+        self.S, self.predicted_S = np.empty((2, len(rows), n, n))
+        self.nis = np.full(len(rows), np.nan)
+        self.iterations, self.status = np.zeros((2, len(rows)), dtype=np.int64)
+
+    def follow(self, begin: int) -> list[TrackPoint]:
+        """Points from a row to the one before the first that has to be acquired, or that goes back in time."""
+        tracker, array, times = self.tracker, self.tracker.array, self.times
+        x, S, contradictions = tracker.state()
+        end, contradictions = kernels.follow(
+            begin,
+            next((i for i in range(max(begin, 1), len(times)) if times[i] <= times[i - 1]), len(times)),
+            x,
+            S,
+            contradictions,
+            self.z,
+            self.n_differences,
+            self.transforms,
+            self.transform_of_row,
+            self.origins,
+            self.rotations,
+            self.ambients,
+            self.ambient_of_row,
+            self.F,
+            self.A,
+            self.B,
+            self.step_of_row,
+            array.positions,
+            array.centroid,
+            array.channel_sensor,
+            array.channel_is_scalar,
+            array.channel_gain,
+            self.nis_limits,
+            TOLERANCE,
+            MOST_ITERATIONS,
+            SHRINK,
+            LEAST_SINGULAR,
+            LARGEST_GROWTH,
+            ROWS_TO_LOSE,
+            REFIX_RANGE_ERROR,
+            LARGEST_RANGE_ERROR,
+            self.x,
+            self.S,
+            self.predicted_x,
+            self.predicted_S,
+            self.nis,
+            self.iterations,
+            self.status,
+        )
+        if end == begin:
+            return []
+        steps = [
+            Step(
+                i,
+                Prediction(self.predicted_x[i], self.predicted_S[i], self.F[self.step_of_row[i]]),
+                self.x[i],
+                self.S[i],
+            )
+            for i in range(begin, end)
+        ]
+        tracker.resume(x, S, times[end - 1], contradictions, steps)
+        roots, predicted = self.S[begin:end], self.predicted_S[begin:end]
+        covariance = (roots @ roots.swapaxes(-1, -2))[:, :N_SOURCE, :N_SOURCE]
+        learned = estimability(roots, predicted)[:, :N_SOURCE]
+        centroids = self.origins[begin:end] + self.rotations[begin:end] @ array.centroid
+        return [
+            TrackPoint(
+                times[i],
+                self.x[i, :3],
+                self.x[i, 3:6],
+                covariance[i - begin],
+                learned[i - begin],
+                int(self.iterations[i]),
+                float(self.nis[i]),
+                int(self.n_differences[i]),
+                _STATUS[int(self.status[i])],
+                weight=tracker.weight,
+                centroid_m=centroids[i - begin],
+                radius_m=array.circumradius,
+            )
+            for i in range(begin, end)
+        ]

@@ -1,0 +1,455 @@
+"""The tracker's steps over many rows: :meth:`magloc.tracking.tracker.Tracker.advance` where nothing has to be acquired.
+
+A state of n numbers begins with position and moment. Every row has a transition F, and a square root of its noise in
+two parts, ``S_q = A + |m| B``; its readings are whitened differences, padded to k with rows that are zero.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.typing import FloatArray
+from magloc.compilation import compiled
+from magloc.fields.dipole import MU0_OVER_4PI
+
+IntArray = NDArray[np.int64]
+TRACKED, PREDICTED, OUTLIER = 0, 1, 2
+
+
+@compiled
+def _triangularised(rows: FloatArray, out: FloatArray) -> None:
+    """Lower triangular ``L``, ``L Lᵀ = rows rowsᵀ``, by modified Gram-Schmidt on the rows (n, m), which are spoilt."""
+    n, m = rows.shape
+    for i in range(n):
+        for j in range(n):
+            out[i, j] = 0.0
+    for i in range(n):
+        norm = 0.0
+        for c in range(m):
+            norm += rows[i, c] * rows[i, c]
+        norm = math.sqrt(norm)
+        out[i, i] = norm
+        if norm > 0.0:
+            inverse = 1.0 / norm
+            for c in range(m):
+                rows[i, c] *= inverse
+            for j in range(i + 1, n):
+                t = 0.0
+                for c in range(m):
+                    t += rows[j, c] * rows[i, c]
+                out[j, i] = t
+                for c in range(m):
+                    rows[j, c] -= t * rows[i, c]
+
+
+@compiled
+def _predicted(
+    x: FloatArray,
+    origin: FloatArray,
+    R: FloatArray,
+    ambient: FloatArray,
+    positions: FloatArray,
+    channel_sensor: NDArray[np.intp],
+    channel_is_scalar: NDArray[np.bool_],
+    gain: FloatArray,
+    transform: FloatArray,
+    channels: FloatArray,
+    slopes: FloatArray,
+    predicted: FloatArray,
+    H: FloatArray,
+) -> None:
+    """Whitened differences (k,) of a state, and their Jacobian (k, 6) with respect to position and moment."""
+    n_channels, k = channel_sensor.size, predicted.size
+    p0 = R[0, 0] * (x[0] - origin[0]) + R[1, 0] * (x[1] - origin[1]) + R[2, 0] * (x[2] - origin[2])
+    p1 = R[0, 1] * (x[0] - origin[0]) + R[1, 1] * (x[1] - origin[1]) + R[2, 1] * (x[2] - origin[2])
+    p2 = R[0, 2] * (x[0] - origin[0]) + R[1, 2] * (x[1] - origin[1]) + R[2, 2] * (x[2] - origin[2])
+    m0 = R[0, 0] * x[3] + R[1, 0] * x[4] + R[2, 0] * x[5]
+    m1 = R[0, 1] * x[3] + R[1, 1] * x[4] + R[2, 1] * x[5]
+    m2 = R[0, 2] * x[3] + R[1, 2] * x[4] + R[2, 2] * x[5]
+    for c in range(n_channels):
+        s = channel_sensor[c]
+        d0, d1, d2 = positions[s, 0] - p0, positions[s, 1] - p1, positions[s, 2] - p2
+        r2 = d0 * d0 + d1 * d1 + d2 * d2
+        inverse = 1.0 / math.sqrt(r2)
+        n0, n1, n2 = d0 * inverse, d1 * inverse, d2 * inverse
+        scale = MU0_OVER_4PI * inverse * inverse * inverse
+        nm = n0 * m0 + n1 * m1 + n2 * m2
+        b0 = scale * (3.0 * nm * n0 - m0) + ambient[s, 0]
+        b1 = scale * (3.0 * nm * n1 - m1) + ambient[s, 1]
+        b2 = scale * (3.0 * nm * n2 - m2) + ambient[s, 2]
+        g0, g1, g2 = gain[c, 0], gain[c, 1], gain[c, 2]
+        if channel_is_scalar[c]:
+            modulus = math.sqrt(b0 * b0 + b1 * b1 + b2 * b2)
+            channels[c] = g0 * modulus
+            t = g0 / modulus if modulus > 0.0 else 0.0
+            g0, g1, g2 = t * b0, t * b1, t * b2
+        else:
+            channels[c] = g0 * b0 + g1 * b1 + g2 * b2
+        gn = g0 * n0 + g1 * n1 + g2 * n2
+        gm = g0 * m0 + g1 * m1 + g2 * m2
+        # dB/dp = -G, contracted with the gain; dB/dm is symmetric.
+        steep = -3.0 * scale * inverse
+        a = gm - 5.0 * nm * gn
+        q0 = steep * (nm * g0 + gn * m0 + a * n0)
+        q1 = steep * (nm * g1 + gn * m1 + a * n1)
+        q2 = steep * (nm * g2 + gn * m2 + a * n2)
+        u0, u1, u2 = scale * (3.0 * gn * n0 - g0), scale * (3.0 * gn * n1 - g1), scale * (3.0 * gn * n2 - g2)
+        for i in range(3):
+            slopes[c, i] = R[i, 0] * q0 + R[i, 1] * q1 + R[i, 2] * q2
+            slopes[c, 3 + i] = R[i, 0] * u0 + R[i, 1] * u1 + R[i, 2] * u2
+    for j in range(k):
+        predicted[j] = 0.0
+        for i in range(6):
+            H[j, i] = 0.0
+        for c in range(n_channels):
+            w = transform[j, c]
+            if w != 0.0:
+                predicted[j] += w * channels[c]
+                for i in range(6):
+                    H[j, i] += w * slopes[c, i]
+
+
+@compiled
+def _updated(
+    x: FloatArray,
+    S: FloatArray,
+    H: FloatArray,
+    innovation: FloatArray,
+    phi: FloatArray,
+) -> float:
+    """Potter's updates by all scalars of unit variance in turn, in place; the sum of normalised squared innovations."""
+    n, k = x.size, innovation.size
+    x0 = np.empty(6)
+    for i in range(6):
+        x0[i] = x[i]
+    squares = 0.0
+    for j in range(k):
+        nu = innovation[j]
+        for i in range(6):
+            nu -= H[j, i] * (x[i] - x0[i])
+        alpha = 1.0
+        for c in range(n):
+            t = 0.0
+            for i in range(6):
+                t += S[i, c] * H[j, i]
+            phi[c] = t
+            alpha += t * t
+        alpha = 1.0 / alpha
+        squares += nu * nu * alpha
+        shrink = 1.0 / (1.0 + math.sqrt(alpha))
+        for i in range(n):
+            t = 0.0
+            for c in range(n):
+                t += S[i, c] * phi[c]
+            t *= alpha
+            x[i] += t * nu
+            t *= shrink
+            for c in range(n):
+                S[i, c] -= t * phi[c]
+    return squares
+
+
+@compiled
+def _chart(H: FloatArray, predicted_S: FloatArray, least_singular: float, M: FloatArray) -> bool:
+    """M (6, k) with M H = I, by Gram and Schmidt on H's columns in units of what is known; whether there is one."""
+    k = H.shape[0]
+    n = predicted_S.shape[1]
+    Q, R, unit = np.empty((6, k)), np.zeros((6, 6)), np.empty(6)
+    for i in range(6):
+        t = 0.0
+        for c in range(n):
+            t += predicted_S[i, c] * predicted_S[i, c]
+        unit[i] = math.sqrt(t)
+        for j in range(k):
+            Q[i, j] = H[j, i] * unit[i]
+    smallest, largest = math.inf, 0.0
+    for i in range(6):
+        # Twice, or the columns lose their right angles to rounding.
+        for _ in range(2):
+            for before in range(i):
+                t = 0.0
+                for j in range(k):
+                    t += Q[before, j] * Q[i, j]
+                R[before, i] += t
+                for j in range(k):
+                    Q[i, j] -= t * Q[before, j]
+        t = 0.0
+        for j in range(k):
+            t += Q[i, j] * Q[i, j]
+        t = math.sqrt(t)
+        R[i, i] = t
+        smallest, largest = min(smallest, t), max(largest, t)
+        if t == 0.0:
+            return False
+        for j in range(k):
+            Q[i, j] /= t
+    if not smallest > least_singular * largest:
+        return False
+    for i in range(5, -1, -1):
+        for j in range(k):
+            t = Q[i, j]
+            for c in range(i + 1, 6):
+                t -= R[i, c] * M[c, j]
+            M[i, j] = t / R[i, i]
+    for i in range(6):
+        for j in range(k):
+            M[i, j] *= unit[i]
+    return True
+
+
+@compiled
+def _is_of_readings(S: FloatArray, predicted_S: FloatArray, largest_growth: float) -> bool:
+    """Whether no standard deviation of position and moment has grown by more than a factor."""
+    n = S.shape[1]
+    for i in range(6):
+        before, after = 0.0, 0.0
+        for c in range(n):
+            before += S[i, c] * S[i, c]
+            after += predicted_S[i, c] * predicted_S[i, c]
+        if after > largest_growth * largest_growth * before:
+            return False
+    return True
+
+
+@compiled
+def _solved(A: FloatArray, B: FloatArray) -> bool:
+    """B becomes the solution X (6, m) of A X = B, by elimination with pivots that destroys A; whether there is one."""
+    m = B.shape[1]
+    for i in range(6):
+        pivot = i
+        for r in range(i + 1, 6):
+            if abs(A[r, i]) > abs(A[pivot, i]):
+                pivot = r
+        if not abs(A[pivot, i]) > 0.0:
+            return False
+        if pivot != i:
+            for c in range(6):
+                A[i, c], A[pivot, c] = A[pivot, c], A[i, c]
+            for c in range(m):
+                B[i, c], B[pivot, c] = B[pivot, c], B[i, c]
+        inverse = 1.0 / A[i, i]
+        for r in range(i + 1, 6):
+            factor = A[r, i] * inverse
+            if factor != 0.0:
+                for c in range(i + 1, 6):
+                    A[r, c] -= factor * A[i, c]
+                for c in range(m):
+                    B[r, c] -= factor * B[i, c]
+    for i in range(5, -1, -1):
+        inverse = 1.0 / A[i, i]
+        for c in range(m):
+            t = B[i, c]
+            for r in range(i + 1, 6):
+                t -= A[i, r] * B[r, c]
+            B[i, c] = t * inverse
+    return True
+
+
+@compiled
+def _curved_prior(
+    M: FloatArray,
+    H: FloatArray,
+    predicted: FloatArray,
+    predicted_first: FloatArray,
+    x: FloatArray,
+    S: FloatArray,
+    x_k: FloatArray,
+    A: FloatArray,
+    B: FloatArray,
+    mean: FloatArray,
+    root: FloatArray,
+) -> None:
+    """Mean (6,) and root (6, n) that the prediction (x, S) has to first order at the state x_k."""
+    k, n = predicted.size, S.shape[1]
+    for i in range(6):
+        for c in range(6):
+            t = 0.0
+            for j in range(k):
+                t += M[i, j] * H[j, c]
+            A[i, c] = t
+        t = 0.0
+        for j in range(k):
+            t += M[i, j] * (predicted[j] - predicted_first[j])
+        B[i, 0] = t
+        for c in range(n):
+            B[i, 1 + c] = S[i, c]
+    solved = _solved(A, B)
+    for i in range(6):
+        mean[i] = x_k[i] - B[i, 0] if solved else x[i]
+        for c in range(n):
+            root[i, c] = B[i, 1 + c] if solved else S[i, c]
+
+
+@compiled
+def follow(
+    begin: int,
+    end: int,
+    x: FloatArray,
+    S: FloatArray,
+    contradictions: int,
+    z: FloatArray,
+    n_differences: IntArray,
+    transforms: FloatArray,
+    transform_of_row: IntArray,
+    origins: FloatArray,
+    rotations: FloatArray,
+    ambients: FloatArray,
+    ambient_of_row: IntArray,
+    F_steps: FloatArray,
+    A_steps: FloatArray,
+    B_steps: FloatArray,
+    step_of_row: IntArray,
+    positions: FloatArray,
+    centroid: FloatArray,
+    channel_sensor: NDArray[np.intp],
+    channel_is_scalar: NDArray[np.bool_],
+    gain: FloatArray,
+    nis_limits: FloatArray,
+    tolerance: float,
+    max_iterations: int,
+    step_shrink: float,
+    least_singular: float,
+    largest_growth: float,
+    rows_to_lose: int,
+    start_range_error: float,
+    largest_range_error: float,
+    out_x: FloatArray,
+    out_S: FloatArray,
+    out_predicted_x: FloatArray,
+    out_predicted_S: FloatArray,
+    out_nis: FloatArray,
+    out_iterations: IntArray,
+    out_status: IntArray,
+) -> tuple[int, int]:
+    """Follow a track from the state (x, S) before row begin, which are changed, to the first row that must be acquired.
+
+    Returns that row, or end, and the number of contradictions so far. Outputs of rows before it are filled: the state
+    after and before its readings.
+    """
+    n = x.size
+    k, n_channels = transforms.shape[1], channel_sensor.size
+    width = n + A_steps.shape[2]
+    rows = np.empty((n, width))
+    predicted_x, predicted_S = np.empty(n), np.empty((n, n))
+    x_k, S_k, x_next = np.empty(n), np.empty((n, n)), np.empty(n)
+    H, predicted, predicted_next = np.empty((k, 6)), np.empty(k), np.empty(k)
+    channels, slopes = np.empty(n_channels), np.empty((n_channels, 6))
+    innovation, phi = np.empty(k), np.empty(n)
+    predicted_first, M = np.empty(k), np.empty((6, k))
+    A, B, mean, root = np.empty((6, 6)), np.empty((6, 1 + n)), np.empty(n), np.empty((n, n))
+    for row in range(begin, end):
+        step = step_of_row[row]
+        strength = math.sqrt(x[3] * x[3] + x[4] * x[4] + x[5] * x[5])
+        for i in range(n):
+            t = 0.0
+            for j in range(n):
+                t += F_steps[step, i, j] * x[j]
+            predicted_x[i] = t
+            for c in range(n):
+                t = 0.0
+                for j in range(n):
+                    t += F_steps[step, i, j] * S[j, c]
+                rows[i, c] = t
+            for c in range(A_steps.shape[2]):
+                rows[i, n + c] = A_steps[step, i, c] + strength * B_steps[step, i, c]
+        _triangularised(rows, predicted_S)
+        status = TRACKED
+        nis = math.nan
+        iterations = 0
+        if n_differences[row] == 0:
+            status = PREDICTED
+        else:
+            if _range_error(predicted_x, predicted_S, origins[row], rotations[row], centroid) > start_range_error:
+                return row, contradictions
+            for i in range(n):
+                x_k[i] = predicted_x[i]
+            w, a = transform_of_row[row], ambient_of_row[row]
+            _predicted(
+                x_k, origins[row], rotations[row], ambients[a], positions, channel_sensor, channel_is_scalar, gain,
+                transforms[w], channels, slopes, predicted, H,
+            )  # fmt: skip
+            curved = _is_of_readings(S, predicted_S, largest_growth) and _chart(H, predicted_S, least_singular, M)
+            for j in range(k):
+                predicted_first[j] = predicted[j]
+            for i in range(n):
+                mean[i] = predicted_x[i]
+                for c in range(n):
+                    root[i, c] = predicted_S[i, c]
+            converged, change_before, length = False, math.inf, 1.0
+            for _ in range(max_iterations):
+                iterations += 1
+                if curved and iterations > 1:
+                    _curved_prior(
+                        M, H, predicted, predicted_first, predicted_x, predicted_S, x_k, A, B, mean, root
+                    )  # fmt: skip
+                for j in range(k):
+                    t = z[row, j] - predicted[j]
+                    for i in range(6):
+                        t -= H[j, i] * (mean[i] - x_k[i])
+                    innovation[j] = t
+                for i in range(n):
+                    x_next[i] = mean[i]
+                    for c in range(n):
+                        S_k[i, c] = root[i, c]
+                nis = _updated(x_next, S_k, H, innovation, phi)
+                for i in range(n):
+                    x_next[i] = x_k[i] + length * (x_next[i] - x_k[i])
+                _predicted(
+                    x_next, origins[row], rotations[row], ambients[a], positions, channel_sensor, channel_is_scalar,
+                    gain, transforms[w], channels, slopes, predicted_next, H,
+                )  # fmt: skip
+                change = 0.0
+                for j in range(k):
+                    change += (predicted_next[j] - predicted[j]) ** 2
+                    predicted[j] = predicted_next[j]
+                for i in range(n):
+                    x_k[i] = x_next[i]
+                change = math.sqrt(change) / length
+                if not math.isfinite(change):
+                    break
+                if change < tolerance:
+                    converged = True
+                    break
+                if change >= change_before:
+                    length *= step_shrink
+                change_before = change
+            if not converged or nis > nis_limits[n_differences[row]]:
+                if contradictions + 1 >= rows_to_lose:
+                    return row, contradictions
+                contradictions += 1
+                status = OUTLIER
+                iterations = 0
+            else:
+                contradictions = 0
+        used_x, used_S = (x_k, S_k) if status == TRACKED else (predicted_x, predicted_S)
+        if _range_error(used_x, used_S, origins[row], rotations[row], centroid) > largest_range_error:
+            return row, contradictions
+        for i in range(n):
+            x[i] = used_x[i]
+            out_x[row, i], out_predicted_x[row, i] = used_x[i], predicted_x[i]
+            for c in range(n):
+                S[i, c] = used_S[i, c]
+                out_S[row, i, c], out_predicted_S[row, i, c] = used_S[i, c], predicted_S[i, c]
+        out_nis[row], out_iterations[row], out_status[row] = nis, iterations, status
+    return end, contradictions
+
+
+@compiled
+def _range_error(x: FloatArray, S: FloatArray, origin: FloatArray, R: FloatArray, centroid: FloatArray) -> float:
+    """Standard deviation of the range over the range."""
+    offset = np.empty(3)
+    square = 0.0
+    for i in range(3):
+        t = x[i] - origin[i]
+        for j in range(3):
+            t -= R[i, j] * centroid[j]
+        offset[i] = t
+        square += t * t
+    variance = 0.0
+    for c in range(S.shape[1]):
+        t = offset[0] * S[0, c] + offset[1] * S[1, c] + offset[2] * S[2, c]
+        variance += t * t
+    return math.sqrt(variance) / square if square > 0.0 else math.inf

@@ -1,0 +1,174 @@
+r"""How true a track is: its errors against what it claims, and against what is possible.
+
+The normalised estimation error squared, NEES, of an estimate of n numbers with covariance P is
+:math:`e^T P^{-1} e`; over independent rows its mean times their number is a χ² of n numbers each. The posterior
+Cramér-Rao bound is the least covariance that any estimator can reach with a motion model: of a filter by the recursion
+of Tichavský, Muravchik and Nehorai (1998), for linear motion
+:math:`J_{j+1} = (Q + F J_j^{-1} F^T)^{-1} + H^T R^{-1} H` at the truth, and of a smoother, which knows later rows too,
+by the same information carried backwards.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.typing import FloatArray
+from magloc.chi_square import mean_bounds
+from magloc.tracking.measurement import RowMeasurement
+from magloc.tracking.results import Row, TrackPoint
+from magloc.tracking.tracker import Tracker
+
+
+@dataclass(frozen=True)
+class Consistency:
+    """A track against the truth.
+
+    Attributes
+    ----------
+    rows, tracked_rows : int
+        Rows with truth, and those of them that are tracked.
+    position_rms_m : float
+        Root of the mean squared distance from the truth.
+    position_bound_m : float
+        The same of the posterior Cramér-Rao bound, over the same rows: that of a filter, or of a smoother if the track
+        is smoothed. NaN where the true moment is not known.
+    nees_per_dimension : float
+        Mean NEES over the number of its dimensions: 1 if the covariance is right. It is counted in coordinates in
+        which an uncertain one is Gaussian, see :func:`nees_of`.
+    nees_bounds : tuple of 2 floats
+        Two-sided 99 % bounds of it for independent rows. A track's rows are not independent: over one record it may
+        well lie outside.
+    nis_per_dimension : float
+        Mean NIS over its degrees of freedom.
+    nis_bounds : tuple of 2 floats
+        Two-sided 99 % bounds of it; the innovations of a right filter are independent.
+    """
+
+    rows: int
+    tracked_rows: int
+    position_rms_m: float
+    position_bound_m: float
+    nees_per_dimension: float
+    nees_bounds: tuple[float, float]
+    nis_per_dimension: float
+    nis_bounds: tuple[float, float]
+
+
+def consistency(
+    points: Sequence[TrackPoint],
+    tracker: Tracker,
+    rows: Sequence[Row],
+    position_m: FloatArray,
+    moment_Am2: FloatArray | None,
+    bound_m: FloatArray | None = None,
+) -> Consistency:
+    """Errors of a track.
+
+    Parameters
+    ----------
+    points : sequence of TrackPoint
+    tracker : Tracker
+        That made them.
+    rows : sequence of Row
+    position_m, moment_Am2 : ndarray, shape (n, 3)
+        Truth of every row in the track's frame; NaN where a coordinate is not known.
+        With the moment NEES is that of all six numbers, else that of the position.
+    bound_m : ndarray, shape (n,), optional
+        Posterior Cramér-Rao bound of every row: :func:`posterior_bound` of a filtered track, :func:`smoothing_bound`
+        of a smoothed one.
+
+    Returns
+    -------
+    Consistency
+    """
+    squares, bounds, nis, nis_dof = [], [], 0.0, 0
+    for i, point in enumerate(points):
+        if point.position_m is None:
+            continue
+        if math.isfinite(point.nis) and point.nis_dof and point.status == "tracked":
+            nis, nis_dof = nis + point.nis, nis_dof + point.nis_dof
+        known = np.isfinite(position_m[i])
+        if known.any():
+            error = point.position_m[known] - position_m[i][known]
+            squares.append(float(error @ error))
+            if bound_m is not None:
+                bounds.append(float(bound_m[i]))
+    of_rows, dof_of_rows = nees_of_rows(points, tracker, rows, position_m, moment_Am2)
+    nees, nees_dof = float(np.nansum(of_rows)), int(dof_of_rows.sum())
+    return Consistency(
+        rows=int(np.isfinite(position_m).any(axis=1).sum()),
+        tracked_rows=len(squares),
+        position_rms_m=math.sqrt(float(np.mean(squares))) if squares else math.nan,
+        position_bound_m=math.sqrt(float(np.mean(np.square(bounds)))) if bounds else math.nan,
+        nees_per_dimension=nees / nees_dof if nees_dof else math.nan,
+        nees_bounds=mean_bounds(nees_dof),
+        nis_per_dimension=nis / nis_dof if nis_dof else math.nan,
+        nis_bounds=mean_bounds(nis_dof),
+    )
+
+
+def nees_of_rows(
+    points: Sequence[TrackPoint],
+    tracker: Tracker,
+    rows: Sequence[Row],
+    position_m: FloatArray,
+    moment_Am2: FloatArray | None,
+) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Normalised estimation error squared of every row, see :func:`nees_of`.
+
+    Parameters
+    ----------
+    points, tracker, rows, position_m, moment_Am2
+        As of :func:`consistency`.
+
+    Returns
+    -------
+    nees : ndarray, shape (n,)
+        NaN where the source is not tracked, or nothing is known of the truth.
+    dof : ndarray of int, shape (n,)
+    """
+    moments = np.full_like(position_m, np.nan) if moment_Am2 is None else moment_Am2
+    truth = np.concatenate([position_m, moments], axis=1)
+    nees, dof = np.full(len(points), np.nan), np.zeros(len(points), dtype=np.int64)
+    for i, point in enumerate(points):
+        if point.position_m is None or point.moment_Am2 is None or point.covariance is None:
+            continue
+        if np.isfinite(truth[i]).any():
+            estimate = np.concatenate([point.position_m, point.moment_Am2])
+            nees[i], dof[i] = nees_of(tracker.measurement(rows[i]), estimate, point.covariance, truth[i])
+    return nees, dof
+
+
+def nees_of(
+    measurement: RowMeasurement, estimate: FloatArray, covariance: FloatArray, truth: FloatArray
+) -> tuple[float, int]:
+    """Normalised estimation error squared of one estimate, and how many numbers it is of.
+
+    Parameters
+    ----------
+    measurement : RowMeasurement
+        Of the row.
+    estimate, covariance : ndarray, shapes (6,) and (6, 6)
+        Of position and moment.
+    truth : ndarray, shape (6,)
+        NaN where a number is not known: NEES is then that of what is known. If all six are, the error is counted in the
+        coordinates of :mod:`magloc.tracking.measurement`, in which it is Gaussian.
+
+    Returns
+    -------
+    float, int
+    """
+    known = np.isfinite(truth)
+    known[3:] &= known[3:].all()
+    error = truth - estimate
+    if known.all():
+        error, _ = measurement.coordinates(estimate, np.sqrt(np.diagonal(covariance))).at(truth)
+    error, covariance = error[known], covariance[np.ix_(known, known)]
+    scale = np.sqrt(np.diagonal(covariance))
+    normalised = error / scale
+    return float(normalised @ np.linalg.solve(covariance / np.outer(scale, scale), normalised)), int(known.sum())

@@ -1,0 +1,355 @@
+r"""How sources and arrays move between rows: transition matrices and the square roots of their noise.
+
+A model says which state it has, where position and moment are in it, and what one step of Δt does to it. Position and
+moment come first, whatever follows. With the array's pose known the state is in the world frame, which does not turn;
+:func:`array_axes_transition` is the source paper's model (17) in the axes of an array whose motion is known.
+
+=============  =============================================================
+MotionMT       :func:`array_axes_transition`, :class:`UnknownMotion`
+MotionMV       :func:`array_axes_transition`, its rows of the moment, (29)
+=============  =============================================================
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from filterpy.common import van_loan_discretization
+from numpy.typing import ArrayLike
+
+from arrays.typing import FloatArray
+
+N_SOURCE = 6
+
+
+def cross_matrix(vector: ArrayLike) -> FloatArray:
+    """Matrix ``[a]×`` with ``[a]× b = a × b``, equation (18): (..., 3, 3) of (..., 3)."""
+    a = np.asarray(vector, dtype=np.float64)
+    matrix: FloatArray = np.cross(a[..., None, :], -np.eye(3))
+    return matrix
+
+
+def array_axes_transition(
+    dt_s: float,
+    *,
+    object_velocity_m_s: ArrayLike = (0.0, 0.0, 0.0),
+    object_rate_rad_s: ArrayLike = (0.0, 0.0, 0.0),
+    array_velocity_m_s: ArrayLike = (0.0, 0.0, 0.0),
+    array_rate_rad_s: ArrayLike = (0.0, 0.0, 0.0),
+) -> tuple[FloatArray, FloatArray]:
+    r"""One step of position and moment in the axes of a moving array, equations (17) and (29).
+
+    .. math::
+
+        \dot p = v_{object} - v_{array} - ω_{array} × p, \qquad \dot m = (ω_{object} - ω_{array}) × m
+
+    with all vectors in the array's axes. The paper leaves out the term ω × p, and takes one Euler step; this is
+    the exact solution for constant rates.
+
+    Parameters
+    ----------
+    dt_s : float
+        Length of the step [s].
+    object_velocity_m_s, object_rate_rad_s, array_velocity_m_s, array_rate_rad_s : array_like, shape (3,)
+        Velocities [m/s] and angular rates [rad/s].
+
+    Returns
+    -------
+    F : ndarray, shape (6, 6)
+        Transition matrix of (p, m).
+    shift : ndarray, shape (6,)
+        What is added: ``x_next = F x + shift``.
+    """
+    from scipy.linalg import expm
+
+    object_rate, array_rate = np.asarray(object_rate_rad_s, float), np.asarray(array_rate_rad_s, float)
+    velocity = np.asarray(object_velocity_m_s, float) - np.asarray(array_velocity_m_s, float)
+    generator = np.zeros((4, 4))
+    generator[:3, :3], generator[:3, 3] = -cross_matrix(array_rate), velocity
+    step = expm(generator * dt_s)
+    F = np.zeros((N_SOURCE, N_SOURCE))
+    F[:3, :3] = step[:3, :3]
+    F[3:, 3:] = expm(cross_matrix(object_rate - array_rate) * dt_s)
+    return F, np.concatenate([step[:3, 3], np.zeros(3)])
+
+
+class MotionModel(Protocol):
+    """What a tracker needs to know of the motion."""
+
+    @property
+    def speed_m_s(self) -> float:
+        """Characteristic speed along each axis."""
+
+    @property
+    def n_states(self) -> int:
+        """Length of the state, of which the first six are position [m] and moment [A·m²]."""
+
+    def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """State and square root of its covariance from those of position and moment, (6,) and (6, 6)."""
+
+    def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Predicted state (n,), its Jacobian F (n, n), and a square root S_q (n, m) of the noise of the step."""
+
+    def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
+        """State (n,) of a source (6,) that moves and turns so, (3,) each."""
+
+
+@runtime_checkable
+class LinearMotion(MotionModel, Protocol):
+    """Motion whose step depends on the state by the strength of the moment only: for compiled tracking."""
+
+    def linear_step(self, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """F, and A and B (n, m) of the noise ``S_q = A + |m| B``."""
+
+
+def _stepped(motion: LinearMotion, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    F, of_position, of_moment = motion.linear_step(dt_s)
+    return F @ x, F, of_position + math.sqrt(float(x[3:6] @ x[3:6])) * of_moment
+
+
+def _without_rest(source: FloatArray, S: FloatArray, rest_sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A state whose further components are unknown but for their standard deviations."""
+    n = N_SOURCE + rest_sigma.size
+    x, root = np.zeros(n), np.zeros((n, n))
+    x[:N_SOURCE], root[:N_SOURCE, :N_SOURCE] = source, S
+    root[np.arange(N_SOURCE, n), np.arange(N_SOURCE, n)] = rest_sigma
+    return x, root
+
+
+@dataclass(frozen=True)
+class UnknownMotion:
+    """Position and moment as random walks of the characteristic speed and turn rate: the paper's S_q.
+
+    ``S_q = diag(V Δt, V Δt, V Δt, |m| W Δt, …)``: every step is as long as the object may have moved in that time.
+
+    Attributes
+    ----------
+    speed_m_s : float
+        Characteristic unknown speed V along each axis.
+    turn_rad_s : float
+        Characteristic unknown rate W, about each axis.
+    """
+
+    speed_m_s: float
+    turn_rad_s: float
+    n_states: int = N_SOURCE
+
+    def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As :class:`MotionModel`."""
+        return source.copy(), S.copy()
+
+    def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
+        """As :class:`MotionModel`."""
+        return source.copy()
+
+    def linear_step(self, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """As :class:`LinearMotion`."""
+        of_position = np.diag(np.repeat([self.speed_m_s * dt_s, 0.0], 3))
+        of_moment = np.diag(np.repeat([0.0, self.turn_rad_s * dt_s], 3))
+        return np.eye(N_SOURCE), of_position, of_moment
+
+    def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """As :class:`MotionModel`."""
+        return _stepped(self, x, dt_s)
+
+
+@dataclass(frozen=True)
+class WanderingMotion:
+    r"""Position, and a moment that turns: speed and turn rate wander about zero, and are forgotten in time.
+
+    State (p, m, v, ω), with
+
+    .. math:: \dot p = v, \quad \dot m = ω × m, \quad \dot v = -v/τ + w_v, \quad \dot ω = -ω/τ + w_ω
+
+    and white noises that keep the standard deviations of v and ω at the characteristic speed V and rate W; with τ
+    towards
+    infinity a constant velocity and turn. Discretised after van Loan.
+
+    Attributes
+    ----------
+    speed_m_s, turn_rad_s : float
+        Characteristic speed V and rate W, along and about each axis.
+    correlation_s : float, optional
+        Correlation time τ; by default 1/W, the time in which a course changes that turns at the rate W.
+    moment_change : float
+        How much the moment changes otherwise, relative to its modulus, in the root of a second [1/√s].
+    """
+
+    speed_m_s: float
+    turn_rad_s: float
+    correlation_s: float | None = None
+    moment_change: float = 3e-3
+    n_states: int = 12
+
+    def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As :class:`MotionModel`."""
+        return _without_rest(source, S, np.repeat([self.speed_m_s, self.turn_rad_s], 3))
+
+    def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
+        """As :class:`MotionModel`."""
+        return np.concatenate([source, velocity_m_s, rate_rad_s])
+
+    def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """As :class:`MotionModel`."""
+        correlation_s = 1.0 / self.turn_rad_s if self.correlation_s is None else self.correlation_s
+        moved, kept, root = _wandering_step(correlation_s, dt_s)
+        p, m, v, rate = x[:3], x[3:6], x[6:9], x[9:]
+        turn = rotation_matrix(moved * rate)
+        turned = turn @ m
+        by_rate = -cross_matrix(turned) @ _turn_of_change(moved * rate)
+        F = np.eye(12)
+        F[:3, 6:9] = moved * np.eye(3)
+        F[3:6, 3:6], F[3:6, 9:] = turn, moved * by_rate
+        F[6:, 6:] = kept * np.eye(6)
+        S_q = np.zeros((12, 15))
+        of_speed, of_rate = self.speed_m_s * np.eye(3), self.turn_rad_s * np.eye(3)
+        S_q[:3, :3], S_q[6:9, :3], S_q[6:9, 6:9] = root[0, 0] * of_speed, root[1, 0] * of_speed, root[1, 1] * of_speed
+        S_q[3:6, 3:6] = root[0, 0] * self.turn_rad_s * by_rate
+        S_q[9:, 3:6], S_q[9:, 9:12] = root[1, 0] * of_rate, root[1, 1] * of_rate
+        S_q[3:6, 12:] = self.moment_change * math.sqrt(dt_s * float(m @ m)) * np.eye(3)
+        return np.concatenate([p + moved * v, turned, kept * v, kept * rate]), F, S_q
+
+
+def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
+    """Rotation (3, 3) by a vector (3,), by Rodrigues' formula [rad]."""
+    angle = math.sqrt(float(rotation_vector @ rotation_vector))
+    K = cross_matrix(rotation_vector)
+    # sin(a)/a and (1 - cos(a))/a², without cancelling.
+    first = math.sin(angle) / angle if angle > 1e-8 else 1.0
+    half = 0.5 * angle
+    second = 0.5 * (math.sin(half) / half) ** 2 if angle > 1e-8 else 0.5
+    matrix: FloatArray = np.eye(3) + first * K + second * (K @ K)
+    return matrix
+
+
+def _turn_of_change(rotation_vector: FloatArray) -> FloatArray:
+    """The small turn J δ (3, 3) that follows a rotation by a vector (3,) when δ is added to the vector."""
+    square = float(rotation_vector @ rotation_vector)
+    angle = math.sqrt(square)
+    K = cross_matrix(rotation_vector)
+    # (1 - cos(a))/a² and (a - sin(a))/a³, by series where they cancel.
+    if angle < 1e-2:
+        first, second = 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
+    else:
+        first, second = (1.0 - math.cos(angle)) / square, (angle - math.sin(angle)) / (square * angle)
+    matrix: FloatArray = np.eye(3) + first * K + second * (K @ K)
+    return matrix
+
+
+@lru_cache(maxsize=64)
+def _wandering_step(correlation_s: float, dt_s: float) -> tuple[float, float, FloatArray]:
+    """Entries of F of (value, rate), and the square root of its noise for a rate of unit standard deviation."""
+    if dt_s == 0.0:
+        return 0.0, 1.0, np.zeros((2, 2))
+    if dt_s > correlation_s:
+        # Van Loan's exponential grows with exp(Δt/τ) and loses Q over long gaps; the closed form cancels in short ones.
+        kept = math.exp(-dt_s / correlation_s)
+        Q_vv, Q_pv = 1.0 - kept**2, correlation_s * (1.0 - kept) ** 2
+        Q_pp = correlation_s**2 * (2.0 * dt_s / correlation_s - 3.0 + 4.0 * kept - kept**2)
+        root = np.linalg.cholesky(np.array([[Q_pp, Q_pv], [Q_pv, Q_vv]]))
+        return correlation_s * (1.0 - kept), kept, root
+    drift = np.array([[0.0, 1.0], [0.0, -1.0 / correlation_s]])
+    noise = np.array([[0.0], [math.sqrt(2.0 / correlation_s)]])
+    F, Q = van_loan_discretization(drift, noise, dt_s)
+    # The value's own noise grows with Δt³: the factorisation must not see it cancel.
+    scale = np.sqrt(np.diagonal(Q))
+    root = scale[:, None] * np.linalg.cholesky(Q / np.outer(scale, scale))
+    return float(F[0, 1]), float(F[1, 1]), root
+
+
+@dataclass(frozen=True)
+class ConstantTurn:
+    r"""A vehicle on a steady turn about the vertical: velocity and moment turn with one rate, which wanders.
+
+    State (p, m, v, ω): :math:`\dot p = v`, :math:`\dot v = ω e_z × v`, :math:`\dot m = ω e_z × m`.
+
+    Attributes
+    ----------
+    speed_m_s, turn_rad_s : float
+        Standard deviations of the velocity along each axis, and of the turn rate, before anything is known.
+    acceleration_m_s2 : float
+        How much the velocity changes otherwise: its noise in the square root of a second [m/s²·√s].
+    turn_change_rad_s : float
+        The same for the turn rate [rad/s/√s].
+    moment_change : float
+        The same for the moment, relative to its modulus [1/√s].
+    """
+
+    speed_m_s: float
+    turn_rad_s: float
+    acceleration_m_s2: float = 0.01
+    turn_change_rad_s: float = 0.002
+    moment_change: float = 0.002
+    n_states: int = 10
+
+    def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As :class:`MotionModel`."""
+        return _without_rest(source, S, np.array([self.speed_m_s] * 3 + [self.turn_rad_s]))
+
+    def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
+        """As :class:`MotionModel`."""
+        return np.concatenate([source, velocity_m_s, rate_rad_s[2:]])
+
+    def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """As :class:`MotionModel`."""
+        p, m, v, rate = x[:3], x[3:6], x[6:9], float(x[9])
+        angle = rate * dt_s
+        sine, cosine = math.sin(angle), math.cos(angle)
+        # sin(a)/a and (1 - cos(a))/a, and their derivatives, by series where they cancel.
+        if abs(angle) < 1e-4:
+            along, across = 1.0 - angle**2 / 6.0, angle / 2.0 - angle**3 / 24.0
+            d_along, d_across = -angle / 3.0, 0.5 - angle**2 / 8.0
+        else:
+            along, across = sine / angle, (1.0 - cosine) / angle
+            d_along, d_across = (cosine - along) / angle, (sine - across) / angle
+        turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        d_turn = np.array([[-sine, -cosine, 0.0], [cosine, -sine, 0.0], [0.0, 0.0, 0.0]])
+        path = np.array([[along, -across, 0.0], [across, along, 0.0], [0.0, 0.0, 1.0]])
+        d_path = np.array([[d_along, -d_across, 0.0], [d_across, d_along, 0.0], [0.0, 0.0, 0.0]])
+        F = np.eye(10)
+        F[:3, 6:9] = dt_s * path
+        F[3:6, 3:6] = F[6:9, 6:9] = turn
+        F[:3, 9], F[3:6, 9], F[6:9, 9] = dt_s**2 * (d_path @ v), dt_s * (d_turn @ m), dt_s * (d_turn @ v)
+        root = math.sqrt(dt_s)
+        strength = math.sqrt(float(m @ m))
+        sigma = np.repeat([self.acceleration_m_s2 * root, self.moment_change * strength * root], 3)
+        S_q = np.zeros((10, 7))
+        S_q[:3, :3] = 0.5 * dt_s * np.diag(sigma[:3])
+        S_q[6:9, :3] = np.diag(sigma[:3])
+        S_q[3:6, 3:6] = np.diag(sigma[3:])
+        S_q[9, 6] = self.turn_change_rad_s * root
+        x_next = np.concatenate([p + dt_s * (path @ v), turn @ m, turn @ v, [rate]])
+        return x_next, F, S_q
+
+
+def induced_and_permanent_moment(
+    R_world_from_body: ArrayLike, permanent_Am2: ArrayLike, polarisability_Am2_T: ArrayLike, ambient_T: ArrayLike
+) -> FloatArray:
+    r"""Moment of a turning body in the world frame: what turns with it, and what the ambient field induces in it.
+
+    .. math:: m = R (m_p + α R^T B_a)
+
+    Parameters
+    ----------
+    R_world_from_body : array_like, shape (..., 3, 3)
+    permanent_Am2 : array_like, shape (..., 3)
+        Permanent moment in the body's axes [A·m²].
+    polarisability_Am2_T : array_like, shape (..., 3, 3)
+        Induced moment per field in the body's axes [A·m²/T], as of :func:`magloc.fields.body.equivalent_dipole`.
+    ambient_T : array_like, shape (..., 3)
+        Ambient field in the world frame [T].
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        [A·m²]
+    """
+    R = np.asarray(R_world_from_body, dtype=np.float64)
+    field_body = np.swapaxes(R, -1, -2) @ np.asarray(ambient_T, dtype=np.float64)[..., None]
+    moment_body = np.asarray(permanent_Am2, dtype=np.float64)[..., None] + np.asarray(polarisability_Am2_T) @ field_body
+    moment: FloatArray = (R @ moment_body)[..., 0]
+    return moment

@@ -1,0 +1,135 @@
+"""Posterior Cramér-Rao bounds of a filter and of a smoother along a true track."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from arrays.typing import FloatArray
+from magloc.kalman import block_update
+from magloc.tracking.measurement import RowMeasurement
+from magloc.tracking.motion import N_SOURCE
+from magloc.tracking.results import Row, Step, TrackPoint
+from magloc.tracking.smoother import smoothed
+from magloc.tracking.tracker import Tracker
+
+# Rows determine a source if their Jacobian, columns scaled, is not nearer to singular.
+_SINGULAR_RTOL = 1e-6
+
+
+def posterior_bound(
+    tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
+) -> FloatArray:
+    """Posterior Cramér-Rao bound of the distance from the truth, for every row, from this row and those before.
+
+    Nothing is known before the first row but the standard deviations of the sensors' lasting errors, which count as
+    unknowns of their own, and until the readings determine it the source counts as at rest. Speed and turn rate are
+    those of the truth.
+
+    Parameters
+    ----------
+    tracker : Tracker
+        Whose array and motion model count.
+    rows : sequence of Row
+    position_m, moment_Am2 : ndarray, shape (n, 3)
+        Truth in the track's frame.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Root of the trace of the position's bound [m]; infinite as long as the readings do not determine it.
+    """
+    bounds = np.full(len(rows), np.inf)
+    for step in _steps_at_truth(tracker, rows, position_m, moment_Am2):
+        bounds[step.row] = float(np.linalg.norm(step.S[:3]))
+    return bounds
+
+
+def smoothing_bound(
+    tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
+) -> FloatArray:
+    r"""Posterior Cramér-Rao bound of the distance from the truth, for every row, from all rows.
+
+    The diagonal blocks of the inverse of the information of all states together (Šimandl, Královec and Tichavský 2001),
+    by the recursion of Rauch, Tung and Striebel from the last row backwards:
+    :math:`P_{j|n} = P_j + G (P_{j+1|n} - P_{j+1|j}) G^T` with :math:`G = P_j F^T P_{j+1|j}^{-1}`.
+
+    Parameters
+    ----------
+    tracker, rows, position_m, moment_Am2
+        As of :func:`posterior_bound`.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        As of :func:`posterior_bound`, and infinite at the same rows: a track that has not begun is not smoothed.
+    """
+    steps = _steps_at_truth(tracker, rows, position_m, moment_Am2)
+    at_truth = [TrackPoint(row.time_s, place) for row, place in zip(rows, position_m, strict=True)]
+    points = smoothed(at_truth, steps)
+    bounds = np.full(len(rows), np.inf)
+    for step in steps:
+        covariance = points[step.row].covariance
+        if covariance is not None:
+            bounds[step.row] = math.sqrt(float(np.trace(covariance[:3, :3])))
+    return bounds
+
+
+def _steps_at_truth(
+    tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
+) -> list[Step]:
+    """What a filter that linearises at the truth knows at every row, from the first one that determines the source."""
+    motion, n_errors = tracker.motion, tracker.errors.n_states
+    truth = np.concatenate([position_m, moment_Am2], axis=1)
+    velocity, rate = _velocities(np.array([row.time_s for row in rows]), truth)
+    steps: list[Step] = []
+    S: FloatArray | None = None
+    seen: list[FloatArray] = []
+    measurements: list[RowMeasurement] = []
+    for i, row in enumerate(rows):
+        measurement = tracker.measurement(row)
+        before = max(i - 1, 0)
+        prediction = None
+        if S is not None:
+            state = np.concatenate([motion.state_of(truth[before], velocity[before], rate[before]), np.zeros(n_errors)])
+            prediction = tracker.predicted(state, S, row.time_s - rows[before].time_s)
+        state = np.concatenate([motion.state_of(truth[i], velocity[i], rate[i]), np.zeros(n_errors)])
+        H = measurement.jacobian(state)
+        if prediction is not None:
+            _, S = block_update(state, prediction.S, H, np.zeros(len(H)), np.ones(len(H)))
+        else:
+            # Lasting errors of sensors as noise of the row: only to see whether the source is determined, and how well.
+            lasting = H[:, motion.n_states :] * tracker.errors.sigma
+            root = np.linalg.cholesky(np.eye(len(H)) + lasting @ lasting.T)
+            seen.append(np.linalg.solve(root, H[:, :N_SOURCE]))
+            measurements.append(measurement)
+            covariance = _bound_at_rest(np.concatenate(seen))
+            if covariance is None:
+                continue
+            S = tracker.filtered_start(truth[i], covariance, measurements).S
+        steps.append(Step(i, prediction, state, S))
+    return steps
+
+
+def _bound_at_rest(H: FloatArray) -> FloatArray | None:
+    """Covariance (6, 6) of a source at rest from a whitened Jacobian (k, 6), or None where it is not determined."""
+    norm = np.linalg.norm(H, axis=0)
+    scaled = H / np.where(norm > 0.0, norm, 1.0)
+    singular = np.linalg.svd(scaled, compute_uv=False)
+    if len(H) < N_SOURCE or singular[-1] < _SINGULAR_RTOL * singular[0]:
+        return None
+    covariance: FloatArray = np.linalg.inv(scaled.T @ scaled) / np.outer(norm, norm)
+    return covariance
+
+
+def _velocities(time_s: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Velocities and turn rates (n, 3) of true positions and moments (n, 6), by differences of the rows."""
+    if len(time_s) < 2:
+        return np.zeros((len(time_s), 3)), np.zeros((len(time_s), 3))
+    derivative = np.gradient(truth, time_s, axis=0)
+    moment, change = truth[:, 3:], derivative[:, 3:]
+    square = np.sum(moment * moment, axis=1, keepdims=True)
+    rate = np.divide(np.cross(moment, change), square, out=np.zeros_like(moment), where=square > 0.0)
+    return derivative[:, :3], rate

@@ -1,0 +1,50 @@
+"""A finished track with what later rows tell as well."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from magloc.tracking.motion import N_SOURCE
+from magloc.tracking.results import Step, TrackPoint
+
+
+def smoothed(points: list[TrackPoint], steps: list[Step]) -> list[TrackPoint]:
+    """Points of a finished record with what later rows tell as well: a fixed-interval smoother over every track.
+
+    Rauch, Tung and Striebel's recursion on the filter's steps: its gain is :math:`P F^T P_{pred}^{-1}`.
+
+    Parameters
+    ----------
+    points : list of TrackPoint
+        Of every row.
+    steps : list of Step
+        Of the tracker that made them.
+
+    Returns
+    -------
+    list of TrackPoint
+    """
+    result = list(points)
+    x, P = np.empty(0), np.empty((0, 0))
+    after: Step | None = None
+    for step in reversed(steps):
+        later_x, later_P = x, P
+        x, P = step.x, step.S @ step.S.T
+        if after is not None and after.prediction is not None:
+            predicted = after.prediction
+            predicted_P = predicted.S @ predicted.S.T
+            # States of mixed units: solve with the correlations.
+            scale = np.sqrt(np.diagonal(predicted_P))
+            correlation = predicted_P / np.outer(scale, scale)
+            gain = np.linalg.solve(correlation, (predicted.F @ P) / scale[:, None]).T / scale
+            x = x + gain @ (later_x - predicted.x)
+            P = P + gain @ (later_P - predicted_P) @ gain.T
+            P = 0.5 * (P + P.T)
+        after = step
+        point = points[step.row]
+        if point.position_m is not None:
+            covariance = P[:N_SOURCE, :N_SOURCE]
+            result[step.row] = replace(point, position_m=x[:3], moment_Am2=x[3:6], covariance=covariance)
+    return result

@@ -1,0 +1,400 @@
+r"""One dipole through time: an iterated extended Kalman filter that starts by itself, and says when it is lost.
+
+A track is acquired from a start-free fix (:mod:`magloc.tracking.acquisition`), followed by
+:func:`magloc.kalman.iterated_update` with a :class:`magloc.tracking.motion.MotionModel`, and given up when the readings
+contradict it or the range is no longer known; then it is acquired anew. The state is in the world frame where the
+array's pose is known, else in the array's. Behind the states of the motion stand the lasting errors that the array
+states of its sensors (:mod:`magloc.measurement.nuisances`).
+
+This module is the readable form; :mod:`magloc.tracking.batch` steps long records, and a test holds the two together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtri
+
+from arrays.array import SensorArray
+from arrays.differences import Differences, decorrelated_differences
+from arrays.noise import reading_covariance
+from arrays.typing import FloatArray
+from magloc.kalman import (
+    block_update,
+    estimability,
+    iterated_update,
+    normalised_innovation_squared,
+    predict_square_root,
+    symmetric_square_root,
+)
+from magloc.localization.fit.prior import NOTHING_KNOWN, Knowledge
+from magloc.localization.fit.results import Solution
+from magloc.measurement.differences import DifferenceMeasurement
+from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
+from magloc.tracking.acquisition import CONFIRMED_RANGE_ERROR, STACKED_POSITION_ERROR, Acquisition
+from magloc.tracking.measurement import RowMeasurement
+from magloc.tracking.motion import N_SOURCE, MotionModel
+from magloc.tracking.results import Prediction, Row, Step, TrackPoint
+
+CONTRADICTION = 1e-6
+"""Probability under noise below which a row contradicts the track."""
+ROWS_TO_LOSE = 3
+"""Contradicting rows in a row that end a track."""
+REFIX_RANGE_ERROR = 0.15
+"""A prediction whose range is less certain, σ over range, is replaced by a fix, if there is one."""
+LARGEST_RANGE_ERROR = 0.4
+"""A track whose range is less certain is lost."""
+TOLERANCE = 1e-4
+"""Stop of the iteration, in standard deviations of the differences: equation (19)."""
+MOST_ITERATIONS = 50
+SHRINK = 0.5
+"""Of steps that swing: see :func:`magloc.kalman.iterated_update`."""
+LARGEST_GROWTH = 1.5
+"""A prediction bends as the readings do while no standard deviation grows by more in the step: beyond that it is the
+motion that it is uncertain of, which is Gaussian in Cartesian coordinates."""
+# How often the rows that a track starts from are linearised anew, until they move it by less than a share of its σ.
+_MOST_START_STEPS = 30
+_START_TOLERANCE = 1e-3
+# How much less is known of a source before them than after, in standard deviations.
+_UNKNOWN = 1e4
+
+
+@dataclass(frozen=True, eq=False)
+class FilteredStart:
+    """State at the start of a track, square root of its covariance, and χ² of the readings that it was found from."""
+
+    x: FloatArray
+    S: FloatArray
+    chi2: float
+
+
+class Tracker:
+    """Follows one dipole, row by row.
+
+    Parameters
+    ----------
+    array : SensorArray
+    motion : MotionModel
+    knowledge : Knowledge
+        Bounds for the fixes that start a track, in the array's frame.
+
+    Attributes
+    ----------
+    errors : SensorErrors
+        The lasting errors of the array's sensors, whose states follow those of the motion.
+    steps : list of Step
+        Of all tracks so far, if `keep_steps`.
+    """
+
+    def __init__(
+        self,
+        array: SensorArray,
+        motion: MotionModel,
+        *,
+        knowledge: Knowledge = NOTHING_KNOWN,
+        keep_steps: bool = False,
+    ) -> None:
+        self.array = array
+        self.motion = motion
+        self.errors = SensorErrors.of(array)
+        self.keep_steps = keep_steps
+        self.steps: list[Step] = []
+        self._noisy_array = without_lasting_errors(array)
+        self._acquisition = Acquisition(array, knowledge, motion.speed_m_s)
+        self._differences: dict[bytes, Differences] = {}
+        self._x: FloatArray | None = None
+        self._S: FloatArray = np.zeros((0, 0))
+        self._time_s = math.nan
+        self._contradictions = 0
+        self._n_rows = 0
+        self._weight = math.nan
+
+    def advance(self, row: Row) -> TrackPoint:
+        """What is known of the source after one more row.
+
+        Parameters
+        ----------
+        row : Row
+            Later than the one before.
+
+        Returns
+        -------
+        TrackPoint
+
+        Raises
+        ------
+        ValueError
+            Time goes backwards.
+        """
+        if row.time_s <= self._time_s:
+            raise ValueError(f"Input time_s must increase; instead {row.time_s} s follows {self._time_s} s.")
+        dt_s, self._time_s = row.time_s - self._time_s, row.time_s
+        index, self._n_rows = self._n_rows, self._n_rows + 1
+        if self._x is None:
+            return self._acquired(row, index)
+        prediction = self.predicted(self._x, self._S, dt_s)
+        x, S = prediction.x, prediction.S
+        measurement = self.measurement(row)
+        if not measurement.z.size:
+            return self._kept(row, index, x, S, prediction, status="predicted")
+        if self._range_error(x, S, row) > REFIX_RANGE_ERROR:
+            # The prediction says too little for an iteration to start from it.
+            self._x = None
+            point = self._acquired(row, index, near=(x, S))
+            if point.position_m is None and self._range_error(x, S, row) <= LARGEST_RANGE_ERROR:
+                return self._kept(row, index, x, S, prediction, status="predicted")
+            return point
+        k = measurement.z.size
+        update = iterated_update(
+            x,
+            S,
+            measurement.z,
+            np.ones(k),
+            measurement.predicted,
+            measurement.jacobian,
+            tolerance=TOLERANCE,
+            max_iterations=MOST_ITERATIONS,
+            shrink=SHRINK,
+            prior=measurement.curved_prior(x, S) if _is_of_readings(self._S, S) else None,
+        )
+        if not update.converged or update.nis > chdtri(k, CONTRADICTION):
+            self._contradictions += 1
+            if self._contradictions >= ROWS_TO_LOSE:
+                self._x = None
+                return self._acquired(row, index)
+            return self._kept(row, index, x, S, prediction, status="outlier", nis=update.nis, nis_dof=k)
+        self._contradictions = 0
+        return self._kept(
+            row,
+            index,
+            update.x,
+            update.S,
+            prediction,
+            status="tracked",
+            nis=update.nis,
+            nis_dof=k,
+            iterations=update.iterations,
+        )
+
+    def run(self, rows: Iterable[Row], progress: Callable[[int], None] | None = None) -> Iterator[TrackPoint]:
+        """Points of successive rows."""
+        for row in rows:
+            yield self.advance(row)
+            if progress is not None:
+                progress(1)
+
+    @property
+    def weight(self) -> float:
+        """How likely the present track is among those that could have been started."""
+        return self._weight
+
+    @property
+    def is_tracking(self) -> bool:
+        """Whether the next row continues a track."""
+        return self._x is not None
+
+    def state(self) -> tuple[FloatArray, FloatArray, int]:
+        """Copies of the state and its square root, and the number of contradicting rows before the next one."""
+        if self._x is None:
+            raise RuntimeError("The tracker has no track, and so no state.")
+        return self._x.copy(), self._S.copy(), self._contradictions
+
+    def resume(self, x: FloatArray, S: FloatArray, time_s: float, contradictions: int, steps: Sequence[Step]) -> None:
+        """Go on from where compiled steps ended."""
+        self._x, self._S, self._time_s, self._contradictions = x, S, time_s, contradictions
+        self._n_rows += len(steps)
+        if self.keep_steps:
+            self.steps += steps
+
+    def predicted(self, x: FloatArray, S: FloatArray, dt_s: float) -> Prediction:
+        """State, square root of its covariance and transition after a step without readings."""
+        n, n_errors = self.motion.n_states, self.errors.n_states
+        moved, F_motion, S_q_motion = self.motion.step(x[:n], dt_s)
+        kept, added = self.errors.step(dt_s)
+        noisy = np.flatnonzero(added)
+        F, S_q = np.zeros((n + n_errors,) * 2), np.zeros((n + n_errors, S_q_motion.shape[1] + noisy.size))
+        F[:n, :n], S_q[:n, : S_q_motion.shape[1]] = F_motion, S_q_motion
+        F[n + np.arange(n_errors), n + np.arange(n_errors)] = kept
+        S_q[n + noisy, S_q_motion.shape[1] + np.arange(noisy.size)] = added[noisy]
+        return Prediction(np.concatenate([moved, kept * x[n:]]), predict_square_root(S, F, S_q), F)
+
+    def measurement(self, row: Row) -> RowMeasurement:
+        """What a row's readings say of the state."""
+        array = self._noisy_array
+        if row.ambient_T is not None:
+            x, y, z = row.ambient_T.tolist()
+            array = replace(array, ambient_T=(x, y, z))
+        differences = self.differences_of(row)
+        sigma = np.sqrt(differences.variance)
+        effect = differences.transform @ self.errors.effect(array, row.readings_T) / sigma[:, None]
+        return RowMeasurement(DifferenceMeasurement(array, differences), sigma, row, self.motion.n_states, effect)
+
+    def differences_of(self, row: Row) -> Differences:
+        """The independent differences that a row's readings give, without the lasting errors."""
+        available, array = np.isfinite(row.readings_T), self._noisy_array
+        if array.noise_depends_on_reading:
+            covariance = reading_covariance(array, row.readings_T)
+            return decorrelated_differences(array, available, covariance_T2=covariance)
+        key = available.tobytes()
+        if key not in self._differences:
+            self._differences[key] = decorrelated_differences(array, available)
+        return self._differences[key]
+
+    def start(self, source: FloatArray, covariance: FloatArray, rows: Sequence[Row]) -> FilteredStart | None:
+        """State and square root of its covariance from a source and the readings that it was found from.
+
+        Parameters
+        ----------
+        source : ndarray, shape (6,)
+            Position and moment that fit all rows best, were it at rest and were errors of sensors new in every row.
+        covariance : ndarray, shape (6, 6)
+            Of that fit.
+        rows : sequence of Row
+            In the order of time.
+
+        Returns
+        -------
+        FilteredStart or None
+            At the last row. The rows are filtered once more, from a source that is hardly known, until they are
+            linearised where they lead: what moves between them, and the errors of sensors that they have in common,
+            are counted as in the rows to come. None where that does not converge, or they contradict each other then.
+        """
+        if len(rows) == 1 and not self.errors.n_states:
+            return FilteredStart(*self.motion.start(source, symmetric_square_root(covariance)), 0.0)
+        measurements = [self.measurement(row) for row in rows]
+        dof = sum(measurement.z.size for measurement in measurements) - N_SOURCE
+        centre = source
+        for _ in range(_MOST_START_STEPS):
+            found = self.filtered_start(centre, covariance, measurements)
+            step = found.x[:N_SOURCE] - centre
+            centre = found.x[:N_SOURCE]
+            if np.all(np.abs(step) < _START_TOLERANCE * np.linalg.norm(found.S[:N_SOURCE], axis=1)):
+                return found if dof <= 0 or found.chi2 < chdtri(dof, CONTRADICTION) else None
+        return None
+
+    def filtered_start(
+        self, source: FloatArray, covariance: FloatArray, measurements: Sequence[RowMeasurement]
+    ) -> FilteredStart:
+        """One pass of :meth:`start`, with the readings linearised at a source."""
+        n, n_errors = self.motion.n_states, self.errors.n_states
+        x, S = np.zeros(n + n_errors), np.zeros((n + n_errors,) * 2)
+        x[:n], S[:n, :n] = self.motion.start(source, np.diag(_UNKNOWN * np.sqrt(np.diagonal(covariance))))
+        S[n + np.arange(n_errors), n + np.arange(n_errors)] = self.errors.sigma
+        centre = x
+        chi2 = 0.0
+        for before, measurement in zip([measurements[0], *measurements], measurements, strict=False):
+            if measurement is not before:
+                prediction = self.predicted(x, S, measurement.row.time_s - before.row.time_s)
+                x, S = prediction.x, prediction.S
+            H, ones = measurement.jacobian(centre), np.ones(measurement.z.size)
+            innovation = measurement.z - measurement.predicted(centre) - H @ (x - centre)
+            chi2 += normalised_innovation_squared(S, H, innovation, ones)
+            x, S = block_update(x, S, H, innovation, ones)
+        return FilteredStart(x, S, chi2)
+
+    def _kept(
+        self,
+        row: Row,
+        index: int,
+        x: FloatArray,
+        S: FloatArray,
+        prediction: Prediction,
+        *,
+        status: str,
+        nis: float = math.nan,
+        nis_dof: int = 0,
+        iterations: int = 0,
+    ) -> TrackPoint:
+        if self._range_error(x, S, row) > LARGEST_RANGE_ERROR:
+            self._x = None
+            return self._lost(row, "lost: the range is no longer known", nis=nis, nis_dof=nis_dof)
+        self._x, self._S = x, S
+        if self.keep_steps:
+            self.steps.append(Step(index, prediction, x, S))
+        return TrackPoint(
+            row.time_s,
+            x[:3].copy(),
+            x[3:6].copy(),
+            S[:N_SOURCE] @ S[:N_SOURCE].T,
+            estimability(S, prediction.S)[:N_SOURCE],
+            iterations,
+            nis,
+            nis_dof,
+            status,
+            weight=self._weight,
+            centroid_m=self.centroid(row),
+            radius_m=self.array.circumradius,
+        )
+
+    def centroid(self, row: Row) -> FloatArray:
+        """Of the sensors in the world frame, shape (3,)."""
+        place: FloatArray = row.origin_m + row.R_world_from_array @ self.array.centroid
+        return place
+
+    def _lost(
+        self, row: Row, reason: str, rivals: tuple[Solution, ...] = (), nis: float = math.nan, nis_dof: int = 0
+    ) -> TrackPoint:
+        """What is known of a row without a track."""
+        return TrackPoint(
+            row.time_s,
+            nis=nis,
+            nis_dof=nis_dof,
+            status=reason,
+            rivals=rivals,
+            centroid_m=self.centroid(row),
+            radius_m=self.array.circumradius,
+        )
+
+    def _acquired(self, row: Row, index: int, near: tuple[FloatArray, FloatArray] | None = None) -> TrackPoint:
+        """A new track, if one can be started."""
+        start, reason = self._acquisition.start(row, near)
+        alone = self._acquisition.of_last_row.solutions
+        if start is None:
+            return self._lost(row, reason, alone)
+        solution = start.solution
+        source = np.concatenate([solution.position_m, solution.moment_Am2])
+        found = self.start(source, solution.covariance, start.rows)
+        if found is None:
+            return self._lost(row, "not acquired: no dipole fits the latest rows together", alone)
+        x, S = found.x, found.S
+        certain = self._range_error(x, S, row) <= CONFIRMED_RANGE_ERROR
+        if len(start.rows) > 1:
+            offset = x[:3] - self.centroid(row)
+            certain = float(np.linalg.norm(S[:3])) <= STACKED_POSITION_ERROR * float(np.linalg.norm(offset))
+        if not certain:
+            return self._lost(row, "not acquired: the range is not certain enough", alone)
+        self._acquisition.forget()
+        self._x, self._S = x, S
+        self._contradictions = 0
+        self._weight = solution.weight
+        if self.keep_steps:
+            self.steps.append(Step(index, None, self._x, self._S))
+        return TrackPoint(
+            row.time_s,
+            self._x[:3].copy(),
+            self._x[3:6].copy(),
+            self._S[:N_SOURCE] @ self._S[:N_SOURCE].T,
+            np.ones(N_SOURCE),
+            solution.iterations,
+            status="acquired",
+            weight=self._weight,
+            rivals=start.rivals,
+            centroid_m=self.centroid(row),
+            radius_m=self.array.circumradius,
+        )
+
+    def _range_error(self, x: FloatArray, S: FloatArray, row: Row) -> float:
+        """Standard deviation of the range over the range."""
+        offset = x[:3] - self.centroid(row)
+        square = float(offset @ offset)
+        along = offset @ S[:3]
+        return math.sqrt(float(along @ along)) / square if square > 0.0 else math.inf
+
+
+def _is_of_readings(S: FloatArray, S_predicted: FloatArray) -> bool:
+    """Whether what a prediction knows of a source is mostly what readings told, not what the motion leaves of it."""
+    before, after = (np.linalg.norm(root[:N_SOURCE], axis=1) for root in (S, S_predicted))
+    return bool(np.all(after <= LARGEST_GROWTH * before))

@@ -1,0 +1,360 @@
+"""A browser without a window: Chromium, driven over its DevTools protocol."""
+
+from __future__ import annotations
+
+import base64
+import itertools
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+import urllib.request
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal
+
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
+
+from arrays.io.errors import InputError
+
+Button = Literal["left", "middle", "right"]
+BINARIES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+# WebGL in software: without both of these the canvas stays blank on a machine without a graphics card.
+_SOFTWARE_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+_BUTTON_BITS: dict[Button, int] = {"left": 1, "right": 2, "middle": 4}
+_POLL_S = 0.05
+_REPLY_S = 60.0
+
+
+class BrowserError(RuntimeError):
+    """The browser ended, did not answer in time, or its page raised an error."""
+
+
+def find_chromium() -> str:
+    """Path of Chromium or Chrome.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    InputError
+        None is on the PATH.
+    """
+    for name in BINARIES:
+        found = shutil.which(name)
+        if found:
+            return found
+    raise InputError(f"found none of {', '.join(BINARIES)} on the PATH, expected one of them to draw a picture.")
+
+
+class Chromium:
+    """One page of a headless Chromium; a context manager.
+
+    Parameters
+    ----------
+    url : str
+        Page to open: ``http://…`` or ``file://…``.
+    size : tuple of 2 ints
+        Width and height of the page [px].
+    timeout_s : float
+        How long the browser may take to start.
+
+    Attributes
+    ----------
+    requests : list of str
+        Addresses that the page has asked for, in order; the page's own is the first. What the page itself carries
+        (``data:``, ``blob:``) does not count.
+    errors : list of str
+        Uncaught exceptions of the page and what it wrote as errors.
+
+    Raises
+    ------
+    InputError
+        There is no Chromium.
+    BrowserError
+        It does not start, or cannot reach the page.
+    """
+
+    def __init__(self, url: str, size: tuple[int, int] = (1280, 800), timeout_s: float = 60.0) -> None:
+        self.requests: list[str] = []
+        self.errors: list[str] = []
+        self._numbers = itertools.count(1)
+        self._profile = tempfile.mkdtemp(prefix="magloc-chromium-")
+        self._socket: ClientConnection | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        try:
+            self._process = _started(find_chromium(), self._profile, size)
+            self._socket = connect(self._page_address(timeout_s), max_size=None, proxy=None)
+            for domain in ("Network", "Page", "Runtime"):
+                self.call(f"{domain}.enable")
+            # The window's size counts its frame too; this one is the page's own.
+            metrics = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": False}
+            self.call("Emulation.setDeviceMetricsOverride", **metrics)
+            self.open(url)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Chromium:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the browser and remove its files."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+        if self._process is not None:
+            self._process.terminate()
+            try:
+                self._process.wait(10.0)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+            self._process = None
+        shutil.rmtree(self._profile, ignore_errors=True)
+
+    def open(self, url: str) -> None:
+        """Open another page. What the one before asked for and complained of is forgotten.
+
+        Parameters
+        ----------
+        url : str
+
+        Raises
+        ------
+        BrowserError
+            It cannot be reached.
+        """
+        self.requests.clear()
+        self.errors.clear()
+        fault = self.call("Page.navigate", url=url).get("errorText")
+        if fault:
+            raise BrowserError(f"Chromium cannot open {url}: {fault}.")
+
+    def call(self, method: str, **parameters: object) -> dict[str, Any]:
+        """Result of a DevTools method, such as ``Page.reload``.
+
+        Parameters
+        ----------
+        method : str
+        **parameters : object
+            As the protocol names them.
+
+        Returns
+        -------
+        dict
+
+        Raises
+        ------
+        BrowserError
+            The method fails, or the browser is gone.
+        """
+        if self._socket is None:
+            raise BrowserError("The browser is closed.")
+        number = next(self._numbers)
+        try:
+            self._socket.send(json.dumps({"id": number, "method": method, "params": parameters}))
+            while True:
+                message = json.loads(self._socket.recv(timeout=_REPLY_S))
+                if message.get("id") == number:
+                    break
+                self._note(message)
+        except (ConnectionClosed, TimeoutError) as error:
+            raise BrowserError(f"Chromium did not answer {method} ({type(error).__name__}).") from None
+        if "error" in message:
+            raise BrowserError(f"{method}: {message['error'].get('message', message['error'])}")
+        result: dict[str, Any] = message["result"]
+        return result
+
+    def evaluate(self, expression: str) -> Any:
+        """Value of a JavaScript expression in the page; promises are awaited.
+
+        Parameters
+        ----------
+        expression : str
+
+        Returns
+        -------
+        object
+            As JSON has it.
+
+        Raises
+        ------
+        BrowserError
+            The expression raises an exception.
+        """
+        answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        if "exceptionDetails" in answer:
+            raise BrowserError(_exception_text(answer["exceptionDetails"]))
+        return answer["result"].get("value")
+
+    def wait_for(self, expression: str, timeout_s: float = 30.0) -> Any:
+        """Wait until a JavaScript expression is true.
+
+        Parameters
+        ----------
+        expression : str
+        timeout_s : float
+
+        Returns
+        -------
+        object
+            Its value.
+
+        Raises
+        ------
+        BrowserError
+            It does not become true in time.
+        """
+        deadline = time.monotonic() + timeout_s
+        while not (value := self.evaluate(expression)):
+            if time.monotonic() > deadline:
+                raise BrowserError(f"The page did not get ready in {timeout_s:g} s: {expression}")
+            time.sleep(_POLL_S)
+        return value
+
+    def screenshot(self) -> bytes:
+        """The page as it is now, as a PNG file."""
+        return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
+
+    def settled_screenshot(
+        self, timeout_s: float = 60.0, interval_s: float = 0.3, same: int = 3, before: str = ""
+    ) -> bytes:
+        """The page when nothing moves any more.
+
+        Parameters
+        ----------
+        timeout_s : float
+        interval_s : float
+            Between two looks.
+        same : int
+            How many looks in a row have to be identical.
+        before : str
+            JavaScript that is evaluated before every look.
+
+        Returns
+        -------
+        bytes
+            A PNG file.
+
+        Raises
+        ------
+        BrowserError
+            The page goes on changing.
+        """
+        deadline = time.monotonic() + timeout_s
+        last, seen = b"", 0
+        while seen < same:
+            if time.monotonic() > deadline:
+                raise BrowserError(f"The page did not come to rest in {timeout_s:g} s.")
+            if before:
+                self.evaluate(before)
+            shot = self.screenshot()
+            seen = seen + 1 if shot == last else 1
+            last = shot
+            time.sleep(interval_s)
+        return last
+
+    def press(self, x: float, y: float, button: Button = "left") -> None:
+        """Press a mouse button at a place of the page [px]."""
+        self.move(x, y)
+        self._mouse("mousePressed", x, y, button, _BUTTON_BITS[button])
+
+    def move(self, x: float, y: float, button: Button | None = None) -> None:
+        """Move the mouse to a place [px], with a button held down or none."""
+        self._mouse("mouseMoved", x, y, button or "none", 0 if button is None else _BUTTON_BITS[button])
+
+    def release(self, x: float, y: float, button: Button = "left") -> None:
+        """Release a mouse button."""
+        self._mouse("mouseReleased", x, y, button, 0)
+
+    def click(self, x: float, y: float, button: Button = "left") -> None:
+        """Press and release a mouse button."""
+        self.press(x, y, button)
+        self.release(x, y, button)
+
+    def drag(
+        self, begin: tuple[float, float], end: tuple[float, float], steps: int = 10, interval_s: float = 0.02
+    ) -> None:
+        """Drag from one place to another [px] in a number of steps."""
+        self.press(*begin)
+        for i in range(1, steps + 1):
+            share = i / steps
+            self.move(begin[0] + share * (end[0] - begin[0]), begin[1] + share * (end[1] - begin[1]), "left")
+            time.sleep(interval_s)
+        self.release(*end)
+
+    def _mouse(self, kind: str, x: float, y: float, button: str, buttons: int) -> None:
+        clicks = 0 if kind == "mouseMoved" else 1
+        self.call(
+            "Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, buttons=buttons, clickCount=clicks
+        )  # fmt: skip
+
+    def _note(self, event: dict[str, Any]) -> None:
+        """Keep what the page asked for and complained of."""
+        parameters = event.get("params", {})
+        match event.get("method"):
+            case "Network.requestWillBeSent":
+                address = parameters["request"]["url"]
+                if not address.startswith(("data:", "blob:")):
+                    self.requests.append(address)
+            case "Network.webSocketCreated":
+                self.requests.append(parameters["url"])
+            case "Runtime.exceptionThrown":
+                self.errors.append(_exception_text(parameters["exceptionDetails"]))
+            case "Runtime.consoleAPICalled" if parameters["type"] == "error":
+                words = (str(argument.get("value", argument.get("description", ""))) for argument in parameters["args"])
+                self.errors.append(" ".join(words))
+
+    def _page_address(self, timeout_s: float) -> str:
+        """Address of the page's DevTools socket, once the browser has written its port."""
+        if self._process is None:
+            raise BrowserError("The browser is closed.")
+        port_file = Path(self._profile, "DevToolsActivePort")
+        # A proxy of the environment would not reach this machine.
+        direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            if self._process.poll() is not None:
+                raise BrowserError(f"Chromium ended at once, with status {self._process.returncode}.")
+            lines = port_file.read_text().split() if port_file.exists() else []
+            if len(lines) == 2:
+                with direct.open(f"http://127.0.0.1:{lines[0]}/json/list", timeout=timeout_s) as reply:
+                    for target in json.load(reply):
+                        if target["type"] == "page":
+                            address: str = target["webSocketDebuggerUrl"]
+                            return address
+            time.sleep(_POLL_S)
+        raise BrowserError(f"Chromium did not start within {timeout_s:g} s.")
+
+
+def _started(binary: str, profile: str, size: tuple[int, int]) -> subprocess.Popen[bytes]:
+    flags = [
+        "--headless=new",
+        "--disable-dev-shm-usage",
+        "--disable-background-networking",
+        "--no-first-run",
+        "--no-proxy-server",
+        "--hide-scrollbars",
+        *_SOFTWARE_WEBGL,
+        f"--window-size={size[0]},{size[1]}",
+        "--remote-debugging-port=0",
+        f"--user-data-dir={profile}",
+    ]
+    if hasattr(os, "geteuid") and os.geteuid() == 0:
+        flags.append("--no-sandbox")  # root has none
+    return subprocess.Popen([binary, *flags, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def _exception_text(details: dict[str, Any]) -> str:
+    return str(details.get("exception", {}).get("description", details.get("text", "an exception")))

@@ -1,0 +1,240 @@
+"""What kind of result a path holds, read completely before anything is opened.
+
+An array (``.toml``), readings or a truth (``.csv``, by their columns), a track (``.json`` or ``.jsonl``, as ``magloc
+track`` prints it), or a map (the folder that ``magloc map`` writes, or ``map.zarr`` in it).
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.array import SensorArray
+from arrays.array_file import array_of_table, read_sensors
+from arrays.io.csv import read_table
+from arrays.io.errors import InputError
+from arrays.typing import FloatArray
+from magloc.readings import Readings, Truth, read_readings, read_truth
+from magloc.tracking.files import _read_track
+from magloc.tracking.results import TrackPoint, TrackResult
+
+KINDS = (
+    "an array (.toml), readings or a truth (.csv), a track of `magloc track` (.json, .jsonl), or the folder of a map"
+)
+_STORE = "map.zarr"
+_MOST_POINTS = 64  # along an axis of a map: more would not be told apart
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayResult:
+    """An array file.
+
+    Attributes
+    ----------
+    array : SensorArray
+    """
+
+    array: SensorArray
+
+
+@dataclass(frozen=True, eq=False)
+class ReadingsResult:
+    """A readings file.
+
+    Attributes
+    ----------
+    readings : Readings
+        With a reading at least.
+    array : SensorArray
+    array_path : Path
+        Where the array was found.
+    """
+
+    readings: Readings
+    array: SensorArray
+    array_path: Path
+
+
+@dataclass(frozen=True, eq=False)
+class MapResult:
+    """A map over starts or sources.
+
+    Attributes
+    ----------
+    axis_m : ndarray, shape (n,)
+        Coordinates of the cube, the same along x, y and z [m].
+    values : ndarray, shape (n, n, n)
+        What is drawn; NaN where there is nothing to draw.
+    failed : ndarray of bool, shape (n, n, n)
+        Points that did not converge, or whose source was not found.
+    over : {"starts", "sources"}
+    quantity : str
+        What the values are, with their unit.
+    logarithmic : bool
+        Whether they are to be seen on a logarithmic scale.
+    array : SensorArray
+    source_m, moment_Am2 : ndarray, shape (3,), optional
+        The one source of a map over starts.
+    title : str
+    every : int
+        Points of the map for one that is drawn, along an axis.
+    """
+
+    axis_m: FloatArray
+    values: FloatArray
+    failed: NDArray[np.bool_]
+    over: str
+    quantity: str
+    logarithmic: bool
+    array: SensorArray
+    source_m: FloatArray | None
+    moment_Am2: FloatArray | None
+    title: str
+    every: int
+
+
+Result = ArrayResult | ReadingsResult | TrackResult | MapResult
+
+
+def read_result(path: Path, array_path: Path | None = None) -> Result:
+    """Whatever a path holds.
+
+    Parameters
+    ----------
+    path : Path
+    array_path : Path, optional
+        Array file that readings belong to; by default the one that stands beside them, NAME-array.toml or array.toml.
+
+    Returns
+    -------
+    ArrayResult, ReadingsResult, TrackResult or MapResult
+
+    Raises
+    ------
+    InputError
+        There is nothing, or something of another kind, or nothing in it that can be shown.
+    """
+    if path.is_dir():
+        return _read_map(path)
+    suffix = path.suffix.lower()
+    if not path.exists() and suffix in (".toml", ".csv", ".json", ".jsonl", ""):
+        raise InputError(f"{path} does not exist, expected {KINDS}.")
+    if suffix == ".toml":
+        return ArrayResult(read_sensors(path))
+    if suffix == ".csv":
+        return _read_csv(path, array_path)
+    if suffix in (".json", ".jsonl"):
+        return _read_track(path)
+    raise InputError(f"{path}: found a file of an unknown kind, expected {KINDS}.")
+
+
+def read_rows(path: Path, array_path: Path | None) -> ReadingsResult:
+    """A readings file with its array.
+
+    Parameters
+    ----------
+    path : Path
+    array_path : Path, optional
+        By default the array file that stands beside the readings.
+
+    Returns
+    -------
+    ReadingsResult
+
+    Raises
+    ------
+    InputError
+        One of them cannot be read, no array is found, or there is no reading.
+    """
+    where = _array_beside(path) if array_path is None else array_path
+    array = read_sensors(where)
+    readings = read_readings(path, array)
+    if not np.isfinite(readings.values_T).any():
+        raise InputError(f"{path}: found no reading in any row, expected one that is not missing.")
+    return ReadingsResult(readings, array, where)
+
+
+def _read_csv(path: Path, array_path: Path | None) -> ReadingsResult | TrackResult:
+    header = read_table(path, "a header with time_s and the sensors' columns").header
+    if "x_m" in header and "y_m" in header:
+        return _as_track(read_truth(path))
+    if not any(name.endswith("_nT") for name in header):
+        raise InputError(
+            f"{path}: found neither readings (columns in nT) nor a truth (columns x_m, y_m), expected {KINDS}."
+        )
+    return read_rows(path, array_path)
+
+
+def _array_beside(path: Path) -> Path:
+    for candidate in (path.with_name(f"{path.stem}-array.toml"), path.with_name("array.toml")):
+        if candidate.is_file():
+            return candidate
+    raise InputError(
+        f"{path}: found no array beside the readings ({path.stem}-array.toml or array.toml), expected one, or --array."
+    )
+
+
+def _as_track(truth: Truth) -> TrackResult:
+    position = np.where(np.isfinite(truth.position_m), truth.position_m, 0.0)  # a truth in the plane is at z = 0
+    moments = [None] * len(position) if truth.moment_Am2 is None else list(truth.moment_Am2)
+    order = np.argsort(truth.time_s, kind="stable")
+    points = (
+        TrackPoint(float(truth.time_s[i]), position_m=position[i], moment_Am2=moments[i], status="truth") for i in order
+    )
+    return TrackResult(tuple(points), is_truth=True)
+
+
+def _read_map(folder: Path) -> MapResult:
+    store = folder / _STORE if (folder / _STORE).is_dir() else folder
+    if not (store / "zarr.json").is_file():
+        what = "an empty folder" if not any(folder.iterdir()) else "a folder without a map"
+        raise InputError(f"{folder}: found {what}, expected one that `magloc map` wrote, with {_STORE}.")
+    from magloc.grids.store import open_map
+
+    try:
+        dataset = open_map(store)
+        axis = dataset["x"].to_numpy().astype(np.float64)
+        every = max(1, math.ceil(len(axis) / _MOST_POINTS))
+        part = dataset.isel(x=slice(None, None, every), y=slice(None, None, every), z=slice(None, None, every))
+        over = "starts" if "half" in dataset else "sources"
+        status = part["status"].to_numpy()
+        shown = part["iterations" if over == "starts" else "sigma_range"].to_numpy().astype(np.float64)
+        attributes = dataset.attrs
+        array = array_of_table(str(store), tomllib.loads(attributes["array"], parse_float=Decimal))
+    except (KeyError, ValueError, OSError, RuntimeError, EOFError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{store}: found something else than a map, expected one that `magloc map` wrote.") from None
+    # What is not computed yet has the smallest integer there is.
+    done = status >= 0
+    if not done.any():
+        raise InputError(f"{folder}: found a map of which nothing is computed yet, expected some points of it.")
+    if over == "starts":
+        values = np.where(status == 0, shown, np.nan)
+        failed = done & (status != 0)
+        quantity = "passes until convergence"
+        title = f"Convergence of '{attributes['method']}'"
+    else:
+        values = np.where(np.isfinite(shown) & done & (status != 3) & (shown > 0.0), shown, np.nan)
+        failed = (status == 1) | (status == 2)
+        quantity = "bound of the range's standard deviation (Cramér-Rao) [m]"
+        title = f"Fixes of sources of {float(attributes['moment_magnitude_Am2']):g} A·m²"
+    return MapResult(
+        axis[::every],
+        values,
+        failed,
+        over,
+        quantity,
+        over == "sources",
+        array,
+        np.atleast_1d(attributes["position_m"]).astype(np.float64) if over == "starts" else None,
+        np.atleast_1d(attributes["moment_Am2"]).astype(np.float64) if over == "starts" else None,
+        title,
+        every,
+    )

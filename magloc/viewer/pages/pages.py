@@ -1,0 +1,308 @@
+"""Which glyphs, panels and legend each kind of result gets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from arrays.array import SensorArray
+from arrays.typing import FloatArray
+from magloc.localization.fit.results import Fix
+from magloc.readings import Readings
+from magloc.tracking.results import TrackPoint, TrackResult
+from magloc.viewer.pages.fixes import FixView, best_positions
+from magloc.viewer.pages.map import MapControls, MapView
+from magloc.viewer.pages.open_result import ArrayResult, MapResult, ReadingsResult
+from magloc.viewer.pages.track_player import TrackPlayer
+from magloc.viewer.panels.readings_plot import ReadingsPlot
+from magloc.viewer.scene.framing import Extent, corners_of, extent_of, prepare
+from magloc.viewer.scene.glyphs import (
+    DIPOLE_COLOUR,
+    FIELD_LINE_COLOUR,
+    FIT_COLOUR,
+    REGION_COLOUR,
+    TRACK_COLOUR,
+    ArrayGlyphs,
+    DipoleGlyph,
+    length_text,
+    screen_label,
+)
+from magloc.viewer.scene.legend import Entry, Swatch, add_legend
+from magloc.viewer.scene.shapes import line_segments
+
+SENSOR_COLOUR = (90, 96, 105)
+ARRAY_PATH_COLOUR = (0, 158, 115)
+AXES_WORDS = "axes of array and sensors: x red, y green, z blue"
+# Fixes farther than this from the array, in medians, do not move the first camera away from the others.
+_FARTHEST_IN_MEDIANS = 3.0
+# Size of the glyphs, in radii of the scene, below which the sensors' ids are specks.
+_LEAST_LEGIBLE = 0.04
+_FIELD_UNITS = (("mT", 1e-3), ("µT", 1e-6), ("nT", 1e-9), ("pT", 1e-12))
+
+
+@dataclass(frozen=True)
+class Page:
+    """What is said beside the scene.
+
+    Attributes
+    ----------
+    title : str
+    entries : tuple of Entry
+        Of the legend.
+    notes : tuple of str
+        Below the legend.
+    close : callable
+        Ends what runs by itself; to be called before the server is stopped.
+    """
+
+    title: str
+    entries: tuple[Entry, ...]
+    notes: tuple[str, ...]
+    close: Callable[[], None] = lambda: None
+
+
+def array_page(server: viser.ViserServer, result: ArrayResult, *, live: bool) -> Page:
+    """An array.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    result : ArrayResult
+    live : bool
+        Whether somebody is there to drag a dipole and the sensors.
+
+    Returns
+    -------
+    Page
+    """
+    array = result.array
+    glyphs = ArrayGlyphs(server.scene, array)
+    ball = extent_of(*(corners_of(place, glyphs.size_m) for place in array.positions))
+    entries: list[Entry] = [_sensors_entry(array)]
+    legend = server.gui.add_folder("Legend")
+    if live and array.n_sensors > 1:
+        # What fits readings takes a second to load, and the other pages do without.
+        from magloc.viewer.pages.array_editor import ArrayEditor
+        from magloc.viewer.pages.dipole_editor import DipoleEditor
+
+        tabs = server.gui.add_tab_group()
+        with tabs.add_tab("Dipole"):
+            dipole = DipoleEditor(server, array)
+        with tabs.add_tab("Array"):
+            ArrayEditor(server, array, on_change=[glyphs.set_array, dipole.set_array], parent="/array")
+        # Its control and most of its field lines too.
+        ball = extent_of(ball.points_m, dipole.extent_m, corners_of(dipole.position_m, 0.8 * array.circumradius))
+        entries += [
+            Swatch(DIPOLE_COLOUR, "dipole to be dragged: the arrow is its moment"),
+            Swatch(FIELD_LINE_COLOUR, "its field lines"),
+            Swatch(FIT_COLOUR, "what a fix of its readings finds: thinner and longer"),
+            Swatch(REGION_COLOUR, "95 % region by the Cramér-Rao bound; long where the range is not observable"),
+        ]
+    return _finished(server, legend, ball, array.name or "array", entries)
+
+
+def readings_page(server: viser.ViserServer, result: ReadingsResult, fixes: Sequence[Fix], rows: Readings) -> Page:
+    """Readings and the fixes of their rows.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    result : ReadingsResult
+    fixes : sequence of Fix
+        Of rows that are shown; in the world frame if the array's pose is known.
+    rows : Readings
+        These rows.
+
+    Returns
+    -------
+    Page
+    """
+    array, gui = result.array, server.gui
+    glyphs = ArrayGlyphs(server.scene, array)
+    legend = gui.add_folder("Legend")
+    centroids = _centroids(array, rows)
+    near = _not_far(best_positions(fixes), centroids)
+    ball = extent_of(array.positions + (centroids - array.centroid)[:, None], near)
+    size, dot = max(0.4 * array.circumradius, 0.11 * ball.radius_m), 0.012 * ball.radius_m
+    view = FixView(server, rows.time_s, fixes, centroids, size_m=size, reach_m=1.4 * size, dot_m=dot)
+
+    def move_array(row: int) -> None:
+        if rows.array_position_m is not None and rows.array_rotation_xyzw is not None:
+            glyphs.set_pose(rows.array_position_m[row], rows.array_rotation_xyzw[row])
+
+    move_array(view.row)
+    # The plot stands below the choice of the row, which has to move its mark.
+    followers: list[Callable[[int], None]] = [move_array]
+    view.add_controls(followers)
+    if len(rows) > 1:
+        plot = ReadingsPlot(server, rows, array)
+        plot.show_row(view.row)
+        followers.append(plot.show_row)
+    if view.region.mesh is not None and view.region.visible:
+        ball = extent_of(ball.points_m, view.region.mesh.vertices)
+    entries = [*view.entries(), *_array_entries(server, glyphs, rows, ball)]
+    return _finished(server, legend, ball, array.name or "readings", entries)
+
+
+def track_page(
+    server: viser.ViserServer, result: TrackResult, array: SensorArray | None, rows: Readings | None
+) -> Page:
+    """A track.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    result : TrackResult
+    array : SensorArray, optional
+        That it was found with.
+    rows : Readings, optional
+        Of the array; needs `array`.
+
+    Returns
+    -------
+    Page
+    """
+    points, gui = result.points, server.gui
+    positions = np.array([np.full(3, np.nan) if p.position_m is None else p.position_m for p in points])
+    legend = gui.add_folder("Legend")
+    name = "true path" if result.is_truth else "track"
+    ellipsoids = "" if result.is_truth else ", with 95 % ellipsoids"
+    entries: list[Entry] = [
+        Swatch(TRACK_COLOUR, f"{name}{ellipsoids}"),
+        Swatch(DIPOLE_COLOUR, "direction of the moment at this time"),
+    ]
+    seen = [positions]
+    poses = on_pose = None
+    if array is not None:
+        glyphs = ArrayGlyphs(server.scene, array)
+        on_pose = glyphs.set_pose
+        if rows is not None and rows.array_position_m is not None and rows.array_rotation_xyzw is not None:
+            of_point = _nearest_rows(rows, points)
+            poses = (rows.array_position_m[of_point], rows.array_rotation_xyzw[of_point])
+            seen.append(poses[0])
+        else:
+            seen.append(array.positions)
+    ball = extent_of(*seen)
+    if array is not None:
+        entries += _array_entries(server, glyphs, rows, ball)
+    followers: list[Callable[[int], None]] = []
+    player = TrackPlayer(server, points, 0.2 * ball.radius_m, array_poses=poses, on_pose=on_pose, on_row=followers)
+    if array is not None and rows is not None:
+        plot = ReadingsPlot(server, rows, array)
+        of_point = _nearest_rows(rows, points)
+        plot.show_row(int(of_point[player.index]))
+        followers.append(lambda index: plot.show_row(int(of_point[index])))
+    tracked = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    for i in dict.fromkeys((tracked[0], tracked[-1])):
+        below = positions[i] - np.array([0.0, 0.0, 0.14 * ball.radius_m])  # above, the arrow of the moment may be
+        screen_label(server.scene, f"/times/{i}", f"{points[i].time_s:.6g} s", below)
+    return _finished(server, legend, ball, name, entries, close=player.close)
+
+
+def map_page(server: viser.ViserServer, result: MapResult) -> Page:
+    """A map over starts or sources.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    result : MapResult
+
+    Returns
+    -------
+    Page
+    """
+    legend = server.gui.add_folder("Legend")
+    view = MapView(server, result)
+    view.add_box()
+    axis, array = result.axis_m, result.array
+    glyphs = ArrayGlyphs(server.scene, array)
+    entries = view.entries()
+    if result.source_m is not None and result.moment_Am2 is not None:
+        size = 0.09 * float(axis[-1] - axis[0])
+        glyph = DipoleGlyph(server.scene, "/source", size, DIPOLE_COLOUR, label="source")
+        glyph.show(result.source_m, result.moment_Am2)
+        strength = float(np.linalg.norm(result.moment_Am2))
+        entries.append(Swatch(DIPOLE_COLOUR, f"source: the arrow is its moment, {strength:.3g} A·m²"))
+    MapControls(server, view)
+    half = 0.5 * float(axis[-1] - axis[0])
+    ball = extent_of(corners_of([axis[0] + half] * 3, half))
+    entries += _array_entries(server, glyphs, None, ball)
+    notes = [] if result.every == 1 else [f"Every {result.every}th point of the map along each axis is shown."]
+    return _finished(server, legend, ball, result.title, entries, notes)
+
+
+def _finished(
+    server: viser.ViserServer,
+    legend: viser.GuiFolderHandle,
+    ball: Extent,
+    title: str,
+    entries: Sequence[Entry],
+    notes: Sequence[str] = (),
+    close: Callable[[], None] = lambda: None,
+) -> Page:
+    """Floor, light, camera and legend."""
+    cell = prepare(server, ball)
+    all_notes = (*notes, AXES_WORDS, f"one square of the floor: {length_text(cell)}")
+    with legend:
+        add_legend(server.gui, entries, all_notes)
+    return Page(title, tuple(entries), all_notes, close)
+
+
+def field_text(field_T: float) -> str:
+    """A field with the unit that suits it, such as ``15 µT`` or ``0.2 nT``."""
+    for unit, tesla in _FIELD_UNITS:
+        if field_T >= tesla or (unit == "nT" and field_T >= 0.1 * tesla):
+            return f"{field_T / tesla:.3g} {unit}"
+    return f"{field_T * 1e12:.3g} pT"
+
+
+def _array_entries(server: viser.ViserServer, glyphs: ArrayGlyphs, rows: Readings | None, ball: Extent) -> list[Entry]:
+    """Lines of the legend for an array that may be small in the scene, and may move through it."""
+    entries: list[Entry] = [_sensors_entry(glyphs.array)]
+    if glyphs.size_m < _LEAST_LEGIBLE * ball.radius_m:
+        glyphs.name_as_a_whole("array")
+    if rows is not None and rows.array_position_m is not None:
+        path = line_segments(rows.array_position_m)
+        server.scene.add_line_segments(
+            "/array-path", path, ARRAY_PATH_COLOUR, thickness=1.5, thickness_units="screen", visible=bool(len(path))
+        )
+        entries.append(Swatch(ARRAY_PATH_COLOUR, "path of the array"))
+    return entries
+
+
+def _sensors_entry(array: SensorArray) -> Swatch:
+    kinds = {sensor.kind for sensor in array.sensors}
+    kind = f"{kinds.pop()} " if len(kinds) == 1 else ""
+    least, most = (field_text(bound([sensor.noise_T for sensor in array.sensors])) for bound in (min, max))
+    noise = least if least == most else f"{least} to {most}"
+    return Swatch(SENSOR_COLOUR, f"{array.n_sensors} {kind}sensor{'s' if array.n_sensors > 1 else ''}, noise {noise}")
+
+
+def _centroids(array: SensorArray, rows: Readings) -> FloatArray:
+    """Mean position of the sensors at every row, in the frame of the fixes (n, 3)."""
+    if rows.array_position_m is None or rows.array_rotation_xyzw is None:
+        return np.tile(array.centroid, (len(rows), 1))
+    turned: FloatArray = Rotation.from_quat(rows.array_rotation_xyzw).apply(
+        array.centroid.copy()
+    )  # scipy takes no read-only array
+    return rows.array_position_m + turned
+
+
+def _nearest_rows(rows: Readings, points: Sequence[TrackPoint]) -> NDArray[np.intp]:
+    """The row of the readings that is nearest in time, for every point of a track."""
+    times = np.array([point.time_s for point in points])
+    return np.abs(rows.time_s[:, None] - times).argmin(axis=0)
+
+
+def _not_far(positions_m: FloatArray, centroids_m: FloatArray) -> FloatArray:
+    """Positions without those that are much farther from the array than most."""
+    distance = np.linalg.norm(positions_m - centroids_m, axis=1)
+    known = np.isfinite(distance)
+    if not known.any():
+        return positions_m
+    return positions_m[known & (distance <= _FARTHEST_IN_MEDIANS * np.median(distance[known]))]

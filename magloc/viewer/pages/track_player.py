@@ -1,0 +1,217 @@
+"""A track played through time: slider, play and pause, speed, tail.
+
+Use, inside a tab or folder of the GUI::
+
+    player = TrackPlayer(
+        server,
+        points,                              # sequence of TrackPoint in the order of time, one for every row
+        size_m,                              # length of the arrow [m]
+        array_poses=(position_m (n, 3), rotation_xyzw (n, 4)) or None,     # where the readings hold them, row by row
+        on_pose=glyphs.set_pose,             # called with (position_m, rotation_xyzw) of the row
+        on_row=[readings_plot.show_row],     # called with the index of the row
+    )
+    player.show_row(index)
+    player.play(); player.pause()
+    player.close()                           # ends the playing thread; call it before server.stop()
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from html import escape
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from arrays.typing import FloatArray
+from magloc.tracking.results import TrackPoint
+from magloc.viewer.pages import words
+from magloc.viewer.panels.inputs import SharedInput
+from magloc.viewer.panels.latest import Latest
+from magloc.viewer.panels.played_time import PlayedTime, speed_text
+from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, TRACK_COLOUR, DipoleGlyph, TrackGlyph, length_text, round_length
+from magloc.viewer.scene.shapes import line_segments
+
+Poses = tuple[FloatArray, FloatArray]
+_SPEEDS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 1000.0)
+_SUITABLE_DURATION_S = 30.0
+_STEPS_OF_SLIDER = 1000.0
+_STRIP_PARTS = 200
+_WHOLE_COLOUR = (190, 196, 203)
+
+
+class TrackPlayer:
+    """A track in the scene at one time, and the panels that move the time.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+        The panels are added where its GUI is at present.
+    points : sequence of TrackPoint
+        In the order of time.
+    size_m : float
+        Length of the moment's arrow [m].
+    array_poses : tuple of ndarrays, shapes (n, 3) and (n, 4), optional
+        Position [m] and rotation (xyzw) of the array in every row.
+    on_pose : callable, optional
+        Called with the pose of the array in the row that is shown.
+    on_row : sequence of callable
+        Called with the index of the row that is shown.
+    name : str
+        Of the scene node that holds the track.
+
+    Attributes
+    ----------
+    index : int
+        Row that is shown.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        points: Sequence[TrackPoint],
+        size_m: float,
+        *,
+        array_poses: Poses | None = None,
+        on_pose: Callable[[FloatArray, FloatArray], None] | None = None,
+        on_row: Sequence[Callable[[int], None]] = (),
+        name: str = "/track",
+    ) -> None:
+        self.points = points
+        self._poses, self._on_pose, self._on_row = array_poses, on_pose, on_row
+        time = np.array([point.time_s for point in points])
+        self._since_first_s = time - time[0]
+        self._span_s = float(self._since_first_s[-1])
+        self._tracked = np.array([point.position_m is not None for point in points])
+        positions = np.array([_vector(point.position_m) for point in points])
+        self.whole = server.scene.add_line_segments(
+            f"{name}/whole", line_segments(positions), _WHOLE_COLOUR, thickness=1.5, thickness_units="screen"
+        )
+        self.glyph = TrackGlyph(server.scene, f"{name}/tail", positions, _covariances(points), size_m=0.15 * size_m)
+        self.dipole = DipoleGlyph(server.scene, f"{name}/moment", size_m, DIPOLE_COLOUR)
+        self.index = int(np.flatnonzero(self._tracked)[-1]) if self._tracked.any() else 0
+        self._follow = Latest(self._show)
+        self._add_panels(server)
+        self._played = PlayedTime(
+            self._span_s, self._follow, self.play_button, self.speed_dropdown, "magloc-track-player"
+        )
+        self.show_row(self.index)
+
+    @property
+    def is_playing(self) -> bool:
+        """Whether time runs."""
+        return self._played.is_playing
+
+    def show_row(self, index: int) -> None:
+        """Show the track at the time of a row.
+
+        Parameters
+        ----------
+        index : int
+            Rows before the first and after the last are those.
+        """
+        index = min(max(index, 0), len(self.points) - 1)
+        self._played.move_to(float(self._since_first_s[index]))
+
+    def play(self) -> None:
+        """Let time run, from the beginning if it is at the end."""
+        self._played.play()
+
+    def pause(self) -> None:
+        """Let time stand still."""
+        self._played.pause()
+
+    def close(self) -> None:
+        """End the thread that plays; to be called before the server is stopped."""
+        self.pause()
+
+    def _add_panels(self, server: viser.ViserServer) -> None:
+        gui, span = server.gui, self._span_s
+        step = round_length(span / _STEPS_OF_SLIDER) if span > 0.0 else 1.0
+        self._step_s, still = step, span == 0.0
+        speeds = [speed_text(speed) for speed in _SPEEDS]
+        suitable = next((s for s in reversed(_SPEEDS) if s <= max(1.0, span / _SUITABLE_DURATION_S)), 1.0)
+        with gui.add_folder("Time"):
+            self.strip_panel = gui.add_html(_strip(self._since_first_s, self._tracked))
+            self.time_slider = gui.add_slider(
+                "Time [s]", 0.0, max(span, step), step, 0.0, disabled=still, hint="since the first row"
+            )
+            self.play_button = gui.add_button("Play", disabled=still)
+            self.row_buttons = gui.add_button_group("Row", ("previous", "next"))
+            self.speed_dropdown = gui.add_dropdown("Speed", speeds, initial_value=speed_text(suitable))
+            self.tail_slider = gui.add_slider(
+                "Tail [s]", 0.0, max(span, step), step, max(span, step), disabled=still, hint="length of the tail"
+            )
+            self.whole_checkbox = gui.add_checkbox("Whole track", True, hint="a thin line, of all times")
+        with gui.add_folder("At this time"):
+            self.row_panel = gui.add_html("")
+        self._time = SharedInput(self.time_slider, self._time_moved)
+        self.row_buttons.on_click(lambda _: self._step_row(self.row_buttons.value))
+        self.tail_slider.on_update(self._follow)
+        self.whole_checkbox.on_update(self._whole_switched)
+
+    def _time_moved(self) -> None:
+        self._played.move_to(float(self.time_slider.value) + 0.5 * self._step_s)
+
+    def _step_row(self, direction: str) -> None:
+        self.pause()
+        self.show_row(self.index + (1 if direction == "next" else -1))
+
+    def _whole_switched(self, *_: object) -> None:
+        self.whole.visible = self.whole_checkbox.value
+
+    def _show(self) -> None:
+        index = max(0, int(np.searchsorted(self._since_first_s, self._played.now_s, side="right")) - 1)
+        self.index, point, now = index, self.points[index], float(self._since_first_s[index])
+        first = int(np.searchsorted(self._since_first_s, now - self.tail_slider.value - 1e-9 * self._span_s))
+        self.glyph.show_until(index, index - first)
+        self.dipole.show(_vector(point.position_m), _vector(point.moment_Am2))
+        if self._poses is not None and self._on_pose is not None:
+            self._on_pose(self._poses[0][index], self._poses[1][index])
+        self._time.show(now)
+        self.row_panel.content = row_words(point, index, len(self.points))
+        for follow in self._on_row:
+            follow(index)
+
+
+def row_words(point: TrackPoint, index: int, n_rows: int) -> str:
+    """What is known of the source in one row, as HTML."""
+    lines = [f"row {index + 1} of {n_rows}, time {point.time_s:.3f} s"]
+    if point.position_m is None:
+        return words.panel([*lines, f"<b>not tracked</b>: {escape(point.status or 'no reason given')}"], warning=True)
+    lines.append(f"{escape(point.status)} at {words.place(point.position_m)}")
+    if point.covariance is not None:
+        x, y, z = (length_text(sigma) for sigma in np.sqrt(np.diagonal(point.covariance)[:3]).tolist())
+        lines.append(f"σ x {x}, y {y}, z {z}")
+    if point.moment_Am2 is not None:
+        lines.append(f"moment {float(np.linalg.norm(point.moment_Am2)):.4g} A·m²")
+    if np.isfinite(point.nis) and point.nis_dof:
+        lines.append(f"NIS/dof {point.nis:.3g}/{point.nis_dof}")
+    return words.panel(lines)
+
+
+def _vector(value: FloatArray | None) -> FloatArray:
+    return np.full(3, np.nan) if value is None else value
+
+
+def _covariances(points: Sequence[TrackPoint]) -> FloatArray | None:
+    """Of the positions (n, 3, 3), NaN where there is none; None if there is none at all."""
+    if all(point.covariance is None for point in points):
+        return None
+    unknown = np.full((3, 3), np.nan)
+    return np.array([unknown if point.covariance is None else point.covariance[:3, :3] for point in points])
+
+
+def _strip(since_first_s: FloatArray, tracked: NDArray[np.bool_]) -> str:
+    """A strip along the time, coloured where the source is tracked."""
+    n = min(_STRIP_PARTS, len(tracked))
+    span = max(float(since_first_s[-1]), 1e-300)
+    part = np.minimum((since_first_s / span * n).astype(np.intp), n - 1)
+    rows, found = np.bincount(part, minlength=n), np.bincount(part, tracked, minlength=n)
+    colour = f"rgb({','.join(map(str, TRACK_COLOUR))})"
+    # A part counts as tracked only if all its rows are, so that a short gap is seen.
+    stops = [colour if count and hit == count else "#d5d9de" for count, hit in zip(rows, found, strict=True)]
+    cells = "".join(f'<div style="flex:1;background:{stop}"></div>' for stop in stops)
+    text = f"tracked in {int(tracked.sum())} of {len(tracked)} rows" + ("" if tracked.all() else "; grey: not tracked")
+    return words.panel([f'<div style="display:flex;height:0.6em;margin-top:0.4em">{cells}</div>{text}'])

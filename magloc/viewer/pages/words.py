@@ -1,0 +1,171 @@
+"""What the viewer's panels say: forecasts, fixes and readings as short HTML with units."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from html import escape
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from arrays.array import SensorArray
+from magloc.viewer.scene.glyphs import length_text
+
+if TYPE_CHECKING:
+    from magloc.localization.fit.results import Fix, Solution
+    from magloc.viewer.pages.live_fit import Forecast
+from arrays.typing import FloatArray
+
+_POSITIVE, _NEGATIVE = "0,114,178", "213,94,0"
+
+
+class Difference(NamedTuple):
+    """How far a solution is from the truth.
+
+    Attributes
+    ----------
+    position_m : float
+        Distance [m].
+    in_sigma : float, optional
+        The same over the root mean square that the Cramér-Rao bound allows; None where there is no bound.
+    moment : float
+        Length of the moment's error over the moment.
+    """
+
+    position_m: float
+    in_sigma: float | None
+    moment: float
+
+
+def difference(
+    solution: Solution, position_m: FloatArray, moment_Am2: FloatArray, covariance: FloatArray | None
+) -> Difference:
+    """How far a solution is from a known dipole, with the bound (6, 6) of the dipole's position and moment."""
+    distance = float(np.linalg.norm(solution.position_m - position_m))
+    moment = float(np.linalg.norm(solution.moment_Am2 - moment_Am2) / np.linalg.norm(moment_Am2))
+    if covariance is None:
+        return Difference(distance, None, moment)
+    return Difference(distance, distance / float(np.sqrt(np.trace(covariance[:3, :3]))), moment)
+
+
+def place(position_m: FloatArray) -> str:
+    """A position in metres, to four digits of its largest coordinate."""
+    largest = float(np.abs(position_m).max())
+    decimals = 3 if largest == 0.0 else max(0, 3 - int(np.floor(np.log10(largest))))
+    return f"({', '.join(f'{x:.{decimals}f}' for x in position_m)}) m"
+
+
+def range_words(interval_m: tuple[float, float | None], *, observable: bool) -> str:
+    """An interval of the distance from the array's centre in words."""
+    low, high = interval_m
+    if observable and high is not None:
+        return f"range observable: {length_text(low)} to {length_text(high)} from the array's centre (95 %)"
+    until = "any distance" if high is None else length_text(high)
+    return f"range <b>not observable</b>: anything from {length_text(low)} to {until} (95 %)"
+
+
+def bound_words(forecast: Forecast) -> list[str]:
+    """What the readings of a dipole can tell at best."""
+    lines = []
+    if not forecast.detectable:
+        lines.append("<b>too weak to be detected</b>: the signal is below the noise")
+    if np.isfinite(forecast.signal_to_noise):
+        lines.append(f"signal {_plain(forecast.signal_to_noise, 3)} σ of the sensors' differences")
+    if forecast.covariance is None:
+        return [*lines, f"no bound: {escape(forecast.reason)}"]
+    sigma = np.sqrt(np.diagonal(forecast.covariance))
+    x, y, z = (length_text(value) for value in sigma[:3])
+    return [
+        *lines,
+        f"σ x {x}, y {y}, z {z}",
+        f"σ of the moment {_plain(float(np.linalg.norm(sigma[3:])), 3)} A·m²",
+        range_words(forecast.range_interval95_m, observable=forecast.range_observable),
+    ]
+
+
+def fix_words(fix: Fix, forecast: Forecast, of_best: Difference | None) -> list[str]:
+    """What a fix of simulated readings found, and how far from the truth it is."""
+    if not fix.solutions or of_best is None:
+        return [f"<b>no solution</b>: {escape(fix.reason)}"]
+    best = fix.solutions[0]
+    lines = []
+    if not forecast.detectable:
+        lines.append("<b>this is a fit of noise</b>: the signal is too weak to be detected")
+    if not best.converged:
+        lines.append("<b>the fit did not converge</b>")
+    lines.append(f"found at {place(best.position_m)}")
+    error = f"error {length_text(of_best.position_m)}"
+    if of_best.in_sigma is not None:
+        error += f", {_plain(of_best.in_sigma, 2)} × the least rms error that is possible"
+    lines += [error, f"error of the moment {_plain(100.0 * of_best.moment, 2)} %", _chi2_words(best)]
+    lines += [range_words(interval, observable=best.range_observable) for interval in best.range_interval95_m]
+    others = len(fix.solutions) - 1
+    if others:
+        lines.append(f"<b>{others} other solution{'s fit' if others > 1 else ' fits'}</b> almost as well")
+    return lines
+
+
+def panel(lines: Iterable[str], *, warning: bool = False) -> str:
+    """Lines of HTML as a block of a GUI panel."""
+    colour = "color:#d55e00;" if warning else ""
+    return f'<div style="font-size:0.8em;line-height:1.5;padding:0 0.9em;{colour}">{"<br>".join(lines)}</div>'
+
+
+def readings_table(array: SensorArray, readings_T: FloatArray, signal_T: FloatArray) -> str:
+    """Readings of all channels as an HTML table: one row for each sensor, what the dipole adds, and the noise, in nT.
+
+    Parameters
+    ----------
+    array : SensorArray
+    readings_T, signal_T : ndarray, shape (C,)
+        Whole readings, shown on hovering, and what the dipole adds to them [T].
+
+    Returns
+    -------
+    str
+    """
+    largest = float(np.nanmax(np.abs(signal_T), initial=0.0))
+    kinds = {sensor.kind for sensor in array.sensors}
+    columns = [*("xyz" if "vector" in kinds else ""), *(["|B|"] if "scalar" in kinds else [])]
+    empty = '<td style="text-align:right">·</td>'
+    rows = []
+    for sensor, channels in zip(array.sensors, array.sensor_channels, strict=True):
+        cells = [_cell(1e9 * signal_T[c], 1e9 * readings_T[c], 1e9 * largest) for c in channels if c >= 0]
+        others = [empty] * (len(columns) - len(cells))
+        values = cells + others if sensor.kind == "vector" else others + cells
+        noise = f'<td style="text-align:right">{_plain(1e9 * sensor.noise_T, 2)}</td>'
+        rows.append(f"<tr><td>{escape(sensor.id)}</td>{''.join(values)}{noise}</tr>")
+    return (
+        '<div style="font-size:0.75em;padding:0 0.9em;max-height:22em;overflow-y:auto">what the dipole adds [nT]'
+        f'<table style="width:100%;border-collapse:collapse">{_head(["sensor", *columns, "noise"])}{"".join(rows)}'
+        "</table></div>"
+    )
+
+
+def _cell(signal_nT: float, reading_nT: float, largest_nT: float) -> str:
+    if not np.isfinite(signal_nT):
+        return '<td style="text-align:right">not finite</td>'
+    share = 0.0 if largest_nT == 0.0 else abs(signal_nT) / largest_nT
+    tint = f"rgba({_POSITIVE if signal_nT > 0.0 else _NEGATIVE},{0.6 * share:.2f})"
+    return (
+        f'<td style="text-align:right;background:{tint}" title="reading {reading_nT:.6g} nT">'
+        f"{_plain(signal_nT, 3)}</td>"
+    )
+
+
+def _head(texts: Sequence[str]) -> str:
+    cells = (f'<th style="text-align:{"right" if i else "left"}">{text}</th>' for i, text in enumerate(texts))
+    return f"<tr>{''.join(cells)}</tr>"
+
+
+def _chi2_words(solution: Solution) -> str:
+    if not solution.dof:
+        return "χ² cannot judge the fit: as many unknowns as differences"
+    return f"χ²/dof {solution.chi2:.3g}/{solution.dof} = {solution.chi2 / solution.dof:.2g}"
+
+
+def _plain(value: float, digits: int) -> str:
+    """A number without an exponent as far as it stays readable."""
+    if value == 0.0 or 1e-3 <= abs(value) < 1e5:
+        return f"{float(f'{value:.{digits}g}'):.10g}".replace("-", "\N{MINUS SIGN}")
+    return f"{value:.{digits - 1}e}".replace("-", "\N{MINUS SIGN}")

@@ -1,0 +1,275 @@
+"""Readings as a live plot beside the scene, with the player's time marked.
+
+Use, inside a tab or folder of the GUI::
+
+    plot = ReadingsPlot(server, readings, array)      # magloc.readings.Readings, arrays.array.SensorArray
+    plot.show_row(index)                              # marks the time of a row of the readings
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import viser
+from viser import uplot
+
+from arrays.array import SensorArray
+from arrays.typing import FloatArray
+from magloc.readings import Readings
+from magloc.viewer.panels.latest import Latest
+
+RAW = "readings"
+DIFFERENCES = "differences from the mean"
+# Okabe and Ito, without yellow, which is not seen on white.
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#666666")
+_DASHES: dict[str, tuple[float, ...]] = {"x": (), "y": (6.0, 3.0), "z": (2.0, 2.0), "": ()}
+_MOST_POINTS = 400
+_MOST_CHANNELS_AT_FIRST = 12
+
+
+class Channel(NamedTuple):
+    """What one line of the plot shows.
+
+    Attributes
+    ----------
+    label : str
+    sensor : str
+        Id of the sensor.
+    axis : {"x", "y", "z", ""}
+        Empty for a scalar sensor.
+    """
+
+    label: str
+    sensor: str
+    axis: str
+
+
+class ReadingsPlot:
+    """A plot of readings over time, and the panels that choose what it shows.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+        The panels are added where its GUI is at present.
+    readings : Readings
+    array : SensorArray
+        Whose channels they have.
+
+    Attributes
+    ----------
+    index : int
+        Row whose time is marked.
+    """
+
+    def __init__(self, server: viser.ViserServer, readings: Readings, array: SensorArray) -> None:
+        self._server, self._order = server, np.argsort(readings.time_s, kind="stable")
+        self._time_s = readings.time_s[self._order] - readings.time_s.min()
+        self._channels = channels_of(array)
+        ordered = readings.values_T[self._order]
+        self._values_nT = {RAW: 1e9 * ordered, DIFFERENCES: 1e9 * differences_from_mean(array, ordered)}
+        self._follow = Latest(self._show)
+        self.index = 0
+        gui = server.gui
+        with gui.add_folder("Readings"):
+            self.kind_dropdown = gui.add_dropdown(
+                "Show",
+                (RAW, DIFFERENCES),
+                hint="Differences are of the field in the array's axes, from the mean of the sensors with a reading.",
+            )
+            series, data, scales = self._lines([0])
+            self.plot = gui.add_uplot(
+                data,
+                series,
+                scales=scales,
+                axes=(
+                    uplot.Axis(label="time since the first row [s]"),
+                    uplot.Axis(label="field [nT]", size=76.0),
+                ),
+                aspect=1.2,
+            )
+            with gui.add_folder("Channels", expand_by_default=False):
+                axes = sorted({channel.axis for channel in self._channels if channel.axis})
+                self.axis_checkboxes = {axis: gui.add_checkbox(f"axis {axis}", True) for axis in axes}
+                at_first = _MOST_CHANNELS_AT_FIRST // max(len(axes), 1)
+                self.sensor_checkboxes = {
+                    sensor: gui.add_checkbox(sensor, i < at_first) for i, sensor in enumerate(array.ids)
+                }
+        self.kind_dropdown.on_update(self._follow)
+        for checkbox in (*self.axis_checkboxes.values(), *self.sensor_checkboxes.values()):
+            checkbox.on_update(self._follow)
+        self._follow()
+
+    def show_row(self, index: int) -> None:
+        """Mark the time of a row.
+
+        Parameters
+        ----------
+        index : int
+            Of the readings.
+        """
+        self.index = index
+        self._follow()
+
+    def _chosen(self) -> list[int]:
+        return [
+            i
+            for i, channel in enumerate(self._channels)
+            if self.sensor_checkboxes[channel.sensor].value
+            and (not channel.axis or self.axis_checkboxes[channel.axis].value)
+        ]
+
+    def _show(self) -> None:
+        series, data, scales = self._lines(self._chosen())
+        # All change together, or the page would draw a line without data. New series or scales make a new chart, which
+        # forgets how far the user has zoomed in.
+        with self._server.atomic():
+            if self.plot.series != series:
+                self.plot.series = series
+            if self.plot.scales != scales:
+                self.plot.scales = scales
+            self.plot.data = data
+
+    def _lines(
+        self, chosen: list[int]
+    ) -> tuple[tuple[uplot.Series, ...], tuple[FloatArray, ...], dict[str, uplot.Scale]]:
+        """What uPlot draws: the time, the channels, and the mark; and from where to where."""
+        values = self._values_nT[self.kind_dropdown.value][:, chosen]
+        row = int(np.flatnonzero(self._order == self.index)[0]) if len(self._order) else 0
+        time, shown = thinned(self._time_s, values, _MOST_POINTS)
+        time, shown, mark = with_mark(time, shown, float(self._time_s[row]), values[row])
+        sensors = list(self.sensor_index)
+        series = [uplot.Series(label="time [s]")]
+        for column, i in enumerate(chosen):
+            channel = self._channels[i]
+            colour = _COLOURS[sensors.index(channel.sensor) % len(_COLOURS)]
+            broken = bool(np.isnan(values[:, column]).any())
+            series.append(_series(channel, colour, broken=broken))
+        series.append(uplot.Series(label="now", scale="mark", stroke="#000000", width=1.5, points={"show": False}))
+        # uPlot finds no range of its own where a number is missing.
+        scales = {
+            "x": uplot.Scale(time=False),
+            "y": uplot.Scale(range=span_of(values)),
+            "mark": uplot.Scale(range=(0.0, 1.0)),
+        }
+        return tuple(series), (time, *shown.T, mark), scales
+
+    @property
+    def sensor_index(self) -> dict[str, None]:
+        """Ids of the sensors in their order."""
+        return dict.fromkeys(channel.sensor for channel in self._channels)
+
+
+def channels_of(array: SensorArray) -> list[Channel]:
+    """The channels of an array by sensor and axis."""
+    return [
+        Channel(name, sensor.id, axis)
+        for sensor in array.sensors
+        for name, axis in zip(sensor.channel_names, "xyz" if sensor.kind == "vector" else ("",), strict=True)
+    ]
+
+
+def differences_from_mean(array: SensorArray, readings_T: FloatArray) -> FloatArray:
+    """What every channel sees beyond the mean of the sensors of its kind, calibration undone.
+
+    Parameters
+    ----------
+    array : SensorArray
+    readings_T : ndarray, shape (n, C)
+        NaN where missing [T].
+
+    Returns
+    -------
+    ndarray, shape (n, C)
+        Of vector sensors the components along the array's axes; NaN where a reading of the sensor is missing [T].
+    """
+    fields = array.calibrated_field(readings_T)
+    result = np.full(readings_T.shape, np.nan)
+    channels = array.sensor_channels
+    vector = np.array([sensor.kind == "vector" for sensor in array.sensors])
+    if vector.any():
+        beyond = fields[:, vector] - _mean_of_known(fields[:, vector])
+        result[:, channels[vector].ravel()] = beyond.reshape(len(result), -1)
+    if not vector.all():
+        scalar = channels[~vector, 0]
+        moduli = (readings_T - array.channel_offset_T)[:, scalar] / array.channel_gain[scalar, 0]
+        result[:, scalar] = moduli - _mean_of_known(moduli)
+    return result
+
+
+def thinned(time_s: FloatArray, values: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
+    """No more points than a plot can show: the least and the greatest value of every stretch of time.
+
+    Parameters
+    ----------
+    time_s : ndarray, shape (n,)
+        Ascending [s].
+    values : ndarray, shape (n, C)
+        NaN where missing.
+    most : int
+        Points at most, of every channel.
+
+    Returns
+    -------
+    time_s : ndarray, shape (k,)
+    values : ndarray, shape (k, C)
+        All of them if there are no more than that. An extreme value is never lost.
+    """
+    if len(time_s) <= most:
+        return time_s, values
+    first = np.linspace(0, len(time_s), most // 2, endpoint=False).astype(np.intp)
+    last = np.append(first[1:], len(time_s)) - 1
+    extremes = np.stack([np.fmin.reduceat(values, first, axis=0), np.fmax.reduceat(values, first, axis=0)], axis=1)
+    return np.stack([time_s[first], time_s[last]], axis=1).ravel(), extremes.reshape(-1, values.shape[1])
+
+
+def with_mark(
+    time_s: FloatArray, values: FloatArray, at_s: float, values_there: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Lines, and a mark that is 1 at one time and 0 elsewhere: three points are put in there.
+
+    Parameters
+    ----------
+    time_s : ndarray, shape (k,)
+    values : ndarray, shape (k, C)
+    at_s : float
+    values_there : ndarray, shape (C,)
+        Values of the lines at that time.
+
+    Returns
+    -------
+    time_s : ndarray, shape (k + 3,)
+    values : ndarray, shape (k + 3, C)
+    mark : ndarray, shape (k + 3,)
+    """
+    place = int(np.searchsorted(time_s, at_s, side="right"))
+    mark = np.zeros(len(time_s) + 3)
+    mark[place + 1] = 1.0
+    return np.insert(time_s, place, [at_s] * 3), np.insert(values, place, [values_there] * 3, axis=0), mark
+
+
+def span_of(values: FloatArray) -> tuple[float, float]:
+    """From below the least to above the greatest finite value."""
+    known = values[np.isfinite(values)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (-1.0, 1.0)
+    margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
+    return low - margin, high + margin
+
+
+def _mean_of_known(values: FloatArray) -> FloatArray:
+    """Mean over the second axis of what is not NaN, that axis kept; NaN where nothing is known."""
+    known = np.isfinite(values)
+    with np.errstate(invalid="ignore"):
+        mean: FloatArray = np.where(known, values, 0.0).sum(axis=1, keepdims=True) / known.sum(axis=1, keepdims=True)
+    return mean
+
+
+def _series(channel: Channel, colour: str, *, broken: bool) -> uplot.Series:
+    """A line; only points where readings are missing, because the line would run across the gaps."""
+    if broken:
+        return uplot.Series(
+            label=channel.label, stroke=colour, width=0.0, points={"show": True, "size": 3.0, "fill": colour}
+        )
+    return uplot.Series(
+        label=channel.label, stroke=colour, width=1.2, dash=_DASHES[channel.axis], points={"show": False}
+    )

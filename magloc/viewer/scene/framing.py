@@ -1,0 +1,143 @@
+"""What is in view at first: the extent of a scene, its floor, and the first camera."""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+import viser
+from numpy.typing import ArrayLike
+
+from arrays.typing import FloatArray
+from magloc.viewer.scene.glyphs import round_length
+
+_FIELD_OF_VIEW_RAD = np.radians(40.0)
+# From where the first camera looks: from the front right, from above.
+_TOWARDS_CAMERA = np.array([0.55, -0.72, 0.42])
+_ASPECT = 1.15  # of the scene beside the panel, about
+_MARGIN = 1.2
+_CELLS_PER_RADIUS = 4.0
+_FLOOR_RADII = 3.0
+# Strengths of the lights beside the one from above, which has 3.
+_AMBIENT = 1.8
+_FRONT = 2.0
+
+
+class Extent(NamedTuple):
+    """What should be in view.
+
+    Attributes
+    ----------
+    centre_m : ndarray, shape (3,)
+        Middle of the points' box, about which the camera turns [m].
+    radius_m : float
+        Of the ball around it that holds the points [m]; positive.
+    points_m : ndarray, shape (k, 3)
+        [m].
+    """
+
+    centre_m: FloatArray
+    radius_m: float
+    points_m: FloatArray
+
+
+def extent_of(*points_m: ArrayLike) -> Extent:
+    """Extent of points.
+
+    Parameters
+    ----------
+    *points_m : array-like, shape (..., 3)
+        Those that are not finite do not count [m].
+
+    Returns
+    -------
+    Extent
+        With a radius of 1 m if there is no point, or only one place.
+    """
+    points = np.concatenate([np.asarray(some, dtype=np.float64).reshape(-1, 3) for some in points_m])
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        points = np.zeros((1, 3))
+    centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    radius = float(np.linalg.norm(points - centre, axis=1).max())
+    if radius > 0.0:
+        return Extent(centre, radius, points)
+    return Extent(centre, 1.0, corners_of(centre, 1.0 / np.sqrt(3.0)))
+
+
+def corners_of(centre_m: ArrayLike, half_side_m: float) -> FloatArray:
+    """Corners of a cube, shape (8, 3) [m]."""
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    return np.asarray(centre_m, dtype=np.float64) + half_side_m * signs
+
+
+def prepare(server: viser.ViserServer, extent: Extent) -> float:
+    """Up direction, light, floor and the first camera.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    extent : Extent
+        What should be in view.
+
+    Returns
+    -------
+    float
+        Side of the floor's squares [m].
+    """
+    scene, centre, radius = server.scene, extent.centre_m, extent.radius_m
+    scene.set_up_direction("+z")
+    scene.world_axes.visible = False
+    _light(scene)
+    cell = round_length(radius / _CELLS_PER_RADIUS * 1.5)
+    side = 2.0 * np.ceil(_FLOOR_RADII * radius / cell) * cell
+    middle = np.round(centre[:2] / cell) * cell
+    scene.add_grid(
+        "/floor",
+        width=side,
+        height=side,
+        cell_size=cell,
+        section_size=5.0 * cell,
+        cell_color=(222, 226, 230),
+        section_color=(196, 202, 208),
+        shadow_opacity=0.0,
+        fade_distance=20.0 * radius,
+        position=(middle[0], middle[1], centre[2] - 0.8 * radius),
+    )
+    aim(server, extent)
+    return cell
+
+
+def _light(scene: viser.SceneApi) -> None:
+    """From above, from where the first camera stands, and a little from everywhere."""
+    # Shadows fall on whatever is near, and say nothing.
+    scene.configure_default_lights(enabled=True, cast_shadow=False)
+    # The picture of surroundings that viser lights with costs a machine without a graphics card several seconds.
+    scene.configure_environment_map(hdri=None)
+    scene.add_light_ambient("/lights/everywhere", intensity=_AMBIENT)
+    scene.add_light_directional("/lights/front", intensity=_FRONT, position=tuple(_TOWARDS_CAMERA.tolist()))
+
+
+def aim(server: viser.ViserServer, extent: Extent) -> None:
+    """Point the first camera, and what "Reset View" returns to, so that all points are just in view.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    extent : Extent
+    """
+    back = _TOWARDS_CAMERA / np.linalg.norm(_TOWARDS_CAMERA)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(back, right), back])
+    across, up, towards = axes @ (extent.points_m - extent.centre_m).T
+    # A point is in view if it is no farther from the axis than the field of view is wide at its depth.
+    tangent = np.tan(0.5 * _FIELD_OF_VIEW_RAD) / _MARGIN
+    distance = np.max(towards + np.maximum(np.abs(up) / tangent, np.abs(across) / (_ASPECT * tangent)))
+    camera = server.initial_camera
+    camera.fov = float(_FIELD_OF_VIEW_RAD)
+    camera.position = extent.centre_m + max(float(distance), 0.5 * extent.radius_m) * back
+    camera.look_at = extent.centre_m
+    camera.near = 0.01 * extent.radius_m
+    camera.far = 200.0 * extent.radius_m

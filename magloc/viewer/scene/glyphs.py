@@ -1,0 +1,441 @@
+"""What is put into a viser scene: arrays, dipoles, uncertainty, tracks and texts.
+
+Every glyph is made once and then moved, so that a drag costs a few small messages. Sizes follow from the scene's
+extent, so that an array of 3 cm and one of 30 m look alike.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import viser
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from arrays.array import SensorArray
+from arrays.meshes import glyph_size, sensor_mesh
+from arrays.sensor import Sensor, SensorKind
+from arrays.typing import FloatArray
+from magloc.viewer.scene.shapes import (
+    CHI2_95,
+    NOTHING,
+    Surface,
+    dipole_body,
+    ellipsoid,
+    ellipsoid_axes,
+    field_lines,
+    frame_edges,
+    line_segments,
+)
+
+Colour = tuple[int, int, int]
+LabelAnchor = Literal["bottom-center", "center-left", "center-right"]
+# Okabe and Ito: told apart by colour-blind readers too.
+DIPOLE_COLOUR: Colour = (213, 94, 0)
+FIT_COLOUR: Colour = (0, 114, 178)
+FIELD_LINE_COLOUR: Colour = (230, 159, 0)
+TRACK_COLOUR: Colour = (0, 114, 178)
+REGION_COLOUR: Colour = (86, 180, 233)
+OTHER_COLOUR: Colour = (204, 121, 167)
+_EDGE_COLOUR: Colour = (150, 156, 165)
+_MOST_ELLIPSOIDS = 40
+
+
+def round_length(length_m: float) -> float:
+    """The nearest of …, 0.1, 0.2, 0.5, 1, 2, 5, … below a length [m]."""
+    decade = 10.0 ** np.floor(np.log10(length_m))
+    steps = decade * np.array([1.0, 2.0, 5.0])
+    return float(steps[steps <= length_m * (1.0 + 1e-9)][-1])
+
+
+def length_text(length_m: float) -> str:
+    """A length with the unit that suits it, such as ``5 mm``, ``0.5 m`` or ``2 km``."""
+    # Not a figure more than it takes, and no exponent.
+    for unit, metres, least in (("km", 1e3, 1e3), ("m", 1.0, 0.1), ("cm", 1e-2, 1e-2), ("mm", 1e-3, 0.0)):
+        if abs(length_m) >= least * (1.0 - 1e-9):
+            return f"{length_m / metres:.3g} {unit}"
+    return f"{length_m:g} m"
+
+
+class ArrayGlyphs:
+    """An array in a scene: sensors with their axes, bars between them, their ids, and the array's own axes.
+
+    Parameters
+    ----------
+    scene : viser.SceneApi
+    array : SensorArray
+    name : str
+        Of the node that holds it all.
+
+    Attributes
+    ----------
+    array : SensorArray
+        As it is shown.
+    size_m : float
+        Of the glyphs.
+    frame : viser.FrameHandle
+        The array's frame, to which everything else belongs.
+    labels : dict of str to viser.LabelHandle
+        By id of the sensor.
+    """
+
+    def __init__(self, scene: viser.SceneApi, array: SensorArray, name: str = "/array") -> None:
+        self.array = array
+        self._scene = scene
+        self.size_m = _size_of_glyphs(array)
+        self.frame = scene.add_frame(name, show_axes=False)
+        axes_length = max(0.55 * array.circumradius, 1.5 * self.size_m) if array.n_sensors > 1 else 2.5 * self.size_m
+        self.axes = scene.add_frame(
+            f"{name}/axes", axes_length=axes_length, axes_radius=0.012 * axes_length, origin_radius=0.03 * axes_length
+        )
+        self.axis_labels = [
+            _label(scene, f"{name}/axes/{axis}", axis, 1.05 * axes_length * np.eye(3)[i], 0.45 * self.size_m)
+            for i, axis in enumerate("xyz")
+        ]
+        edges = frame_edges(array.positions)
+        self._edges = scene.add_line_segments(f"{name}/bars", edges, _EDGE_COLOUR, thickness=0.08 * self.size_m)
+        kinds: tuple[SensorKind, ...] = ("vector", "scalar")
+        self._kinds = {kind: [i for i, sensor in enumerate(array.sensors) if sensor.kind == kind] for kind in kinds}
+        self._glyphs = {
+            kind: scene.add_batched_meshes_trimesh(
+                f"{name}/{kind}-sensors",
+                sensor_mesh(Sensor("glyph", kind, (0.0, 0.0, 0.0), 1e-9), self.size_m),
+                _wxyz_of_sensors(array)[members],
+                array.positions[members],
+                lod="off",
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            for kind, members in self._kinds.items()
+            if members
+        }
+        self.labels = {
+            sensor.id: _label(scene, f"{name}/ids/{i}", sensor.id, self._label_place(i), 0.5 * self.size_m)
+            for i, sensor in enumerate(array.sensors)
+        }
+
+    def set_pose(self, position_m: ArrayLike, rotation_xyzw: ArrayLike) -> None:
+        """Move the array.
+
+        Parameters
+        ----------
+        position_m : array-like, shape (3,)
+            Of the array's origin [m].
+        rotation_xyzw : array-like, shape (4,)
+            From the array's frame.
+        """
+        self.frame.position = np.asarray(position_m, dtype=np.float64)
+        self.frame.wxyz = np.roll(np.asarray(rotation_xyzw, dtype=np.float64), 1)
+
+    def set_array(self, array: SensorArray) -> None:
+        """Show the same sensors at other places.
+
+        Parameters
+        ----------
+        array : SensorArray
+            With the same ids and kinds, in the same order.
+        """
+        self.array = array
+        wxyz = _wxyz_of_sensors(array)
+        for kind, glyphs in self._glyphs.items():
+            members = self._kinds[kind]
+            glyphs.batched_positions = array.positions[members].astype(np.float32)
+            glyphs.batched_wxyzs = wxyz[members].astype(np.float32)
+        self._edges.points = frame_edges(array.positions).astype(np.float32)
+        for i, label in enumerate(self.labels.values()):
+            label.position = self._label_place(i)
+
+    def name_as_a_whole(self, text: str) -> None:
+        """One text for the array in place of the ids of its sensors, where these would be too small to be read.
+
+        Parameters
+        ----------
+        text : str
+        """
+        for label in (*self.labels.values(), *self.axis_labels):
+            label.visible = False
+        place = self.array.centroid + np.array([0.0, 0.0, 1.3 * self.array.circumradius])
+        screen_label(self._scene, f"{self.frame.name}/name", text, place)
+
+    def _label_place(self, i: int) -> FloatArray:
+        return self.array.positions[i] + np.array([0.0, 0.0, 1.15 * self.size_m])
+
+
+class DipoleGlyph:
+    """A dipole in a scene: body, arrow along the moment, field lines, and a text.
+
+    Parameters
+    ----------
+    scene : viser.SceneApi
+    name : str
+        Of the node that holds it all.
+    size_m : float
+        Length of the arrow.
+    colour : tuple of 3 ints
+        Of body and arrow.
+    reach_m : float, optional
+        Of the field lines; by default there are none.
+    label : str
+        Text beside the tip.
+    thickness_m : float, optional
+        As in :func:`~magloc.viewer.scene.shapes.dipole_body`.
+
+    Attributes
+    ----------
+    frame : viser.FrameHandle
+        At the source, its z axis along the moment.
+    """
+
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        name: str,
+        size_m: float,
+        colour: Colour = DIPOLE_COLOUR,
+        reach_m: float | None = None,
+        label: str = "",
+        thickness_m: float | None = None,
+    ) -> None:
+        # The moment is the frame's z axis: a turn of the frame turns all that belongs to it.
+        self.frame = scene.add_frame(name, show_axes=False, visible=False)
+        body = dipole_body(size_m, thickness_m)
+        scene.add_mesh_simple(
+            f"{name}/body", body.vertices, body.faces, color=colour, cast_shadow=False, receive_shadow=False
+        )
+        self.lines: viser.LineSegmentsHandle | None = None
+        if reach_m is not None:
+            segments = line_segments(field_lines(np.zeros(3), np.array([0.0, 0.0, 1.0]), reach_m))
+            self.lines = scene.add_line_segments(
+                f"{name}/field-lines", segments, FIELD_LINE_COLOUR, thickness=1.3, thickness_units="screen"
+            )
+        self.label: viser.LabelHandle | None = None
+        if label:
+            # Beside the tip, beyond which there may be the arrow of a control.
+            self.label = screen_label(scene, f"{name}/text", label, np.array([0.0, 0.0, 0.9 * size_m]), "center-right")
+        self._wanted = True
+        self._defined = False
+
+    @property
+    def visible(self) -> bool:
+        """Whether it may be seen."""
+        return self._wanted
+
+    @visible.setter
+    def visible(self, wanted: bool) -> None:
+        self._wanted = wanted
+        self.frame.visible = wanted and self._defined
+
+    def show(self, position_m: ArrayLike, moment_Am2: ArrayLike) -> None:
+        """Move it; it is not seen while a number of it is not finite, or there is no moment.
+
+        Parameters
+        ----------
+        position_m, moment_Am2 : array-like, shape (3,)
+            [m], [A·m²].
+        """
+        position, moment = np.asarray(position_m, dtype=np.float64), np.asarray(moment_Am2, dtype=np.float64)
+        strength = float(np.linalg.norm(moment))
+        self._defined = bool(np.isfinite(position).all() and np.isfinite(strength) and strength > 0.0)
+        if self._defined:
+            self.frame.position = position
+            self.frame.wxyz = _wxyz_along(moment / strength)
+        self.visible = self._wanted
+
+
+class SurfaceGlyph:
+    """A translucent surface in a scene that changes its shape.
+
+    Parameters
+    ----------
+    scene : viser.SceneApi
+    name : str
+    colour : tuple of 3 ints
+    opacity : float
+    """
+
+    def __init__(self, scene: viser.SceneApi, name: str, colour: Colour = REGION_COLOUR, opacity: float = 0.35) -> None:
+        self._scene, self._name, self._colour, self._opacity = scene, name, colour, opacity
+        self._faces: NDArray[np.int64] = NOTHING.faces
+        self._wanted = True
+        self.mesh: viser.MeshHandle | None = None
+
+    @property
+    def visible(self) -> bool:
+        """Whether it may be seen."""
+        return self._wanted
+
+    @visible.setter
+    def visible(self, wanted: bool) -> None:
+        self._wanted = wanted
+        if self.mesh is not None:
+            self.mesh.visible = wanted and bool(len(self._faces))
+
+    def show(self, surface: Surface | None) -> None:
+        """Change the shape.
+
+        Parameters
+        ----------
+        surface : Surface, optional
+            None, or one without faces, is not seen.
+        """
+        vertices, faces = NOTHING if surface is None else surface
+        if len(faces):
+            if self.mesh is not None and faces is self._faces:
+                self.mesh.vertices = vertices.astype(np.float32)
+            else:
+                # Vertices and faces have to change together: the node is replaced.
+                self.mesh = self._scene.add_mesh_simple(
+                    self._name,
+                    vertices,
+                    faces,
+                    color=self._colour,
+                    opacity=self._opacity,
+                    side="double",
+                    cast_shadow=False,
+                    receive_shadow=False,
+                )
+        self._faces = faces
+        self.visible = self._wanted
+
+
+class TrackGlyph:
+    """A track in a scene: its line, 95 % ellipsoids of some of its points, and the place at one time.
+
+    Parameters
+    ----------
+    scene : viser.SceneApi
+    name : str
+        Of the node that holds it all.
+    positions_m : ndarray, shape (n, 3)
+        NaN where the source is not tracked [m].
+    covariances_m2 : ndarray, shape (n, 3, 3), optional
+        Of the positions [m²]; without them there are no ellipsoids.
+    size_m : float
+        Diameter of the mark at one time.
+    colour : tuple of 3 ints
+    """
+
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        name: str,
+        positions_m: FloatArray,
+        covariances_m2: FloatArray | None = None,
+        *,
+        size_m: float,
+        colour: Colour = TRACK_COLOUR,
+    ) -> None:
+        self.positions_m, self.covariances_m2 = positions_m, covariances_m2
+        self._scene, self._name, self._colour = scene, name, colour
+        self.line = scene.add_line_segments(
+            f"{name}/line", line_segments(positions_m), colour, thickness=3.0, thickness_units="screen"
+        )
+        self.mark = scene.add_icosphere(
+            f"{name}/mark", radius=0.5 * size_m, color=colour, visible=False, cast_shadow=False, receive_shadow=False
+        )
+        self.region = SurfaceGlyph(scene, f"{name}/region-now", colour, 0.3)
+        self.regions: viser.BatchedMeshHandle | None = None
+        if covariances_m2 is not None:
+            self._add_ellipsoids(covariances_m2)
+
+    def show_until(self, index: int | None, tail: int | None = None) -> None:
+        """Show the track up to a point.
+
+        Parameters
+        ----------
+        index : int, optional
+            Of the point, which is marked, with its ellipsoid; None shows the whole track.
+        tail : int, optional
+            Intervals before the point that are shown; all by default.
+        """
+        first, last = 0, len(self.positions_m) - 1
+        position = np.full(3, np.nan)
+        if index is not None:
+            first, last = 0 if tail is None else max(0, index - tail), index
+            position = self.positions_m[index]
+        segments = line_segments(self.positions_m[first : last + 1])
+        self.line.visible = bool(len(segments))
+        if len(segments):
+            self.line.points = segments.astype(np.float32)
+        self.mark.visible = bool(np.isfinite(position).all())
+        if self.mark.visible:
+            self.mark.position = position
+        with_region = index is not None and self.covariances_m2 is not None
+        self.region.show(ellipsoid(position, self.covariances_m2[index]) if with_region else None)  # type: ignore[index]
+        if self.regions is not None:
+            # Those that are not to be seen shrink to nothing: their number cannot change.
+            seen = (self._chosen >= first) & (self._chosen <= last)
+            self.regions.batched_scales = np.where(seen[:, None], self._semi_axes, 0.0).astype(np.float32)
+
+    def _add_ellipsoids(self, covariances_m2: FloatArray) -> None:
+        """One node for all; at most 40, evenly among the points that are tracked."""
+        tracked = np.flatnonzero(
+            np.isfinite(self.positions_m).all(axis=1) & np.isfinite(covariances_m2).all(axis=(1, 2))
+        )
+        if not tracked.size:
+            return
+        self._chosen = tracked[:: int(np.ceil(len(tracked) / _MOST_ELLIPSOIDS))]
+        rotations, self._semi_axes = ellipsoid_axes(covariances_m2[self._chosen])
+        sphere = ellipsoid(np.zeros(3), np.eye(3) / CHI2_95[3])
+        self.regions = self._scene.add_batched_meshes_simple(
+            f"{self._name}/regions",
+            sphere.vertices,
+            sphere.faces,
+            np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=-1),
+            self.positions_m[self._chosen],
+            batched_scales=self._semi_axes,
+            batched_colors=self._colour,
+            opacity=0.18,
+            lod="off",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+
+def screen_label(
+    scene: viser.SceneApi, name: str, text: str, place_m: ArrayLike, anchor: LabelAnchor = "bottom-center"
+) -> viser.LabelHandle:
+    """A text that is as large on the screen from near as from far.
+
+    Parameters
+    ----------
+    scene : viser.SceneApi
+    name, text : str
+    place_m : array-like, shape (3,)
+        [m].
+    anchor : str
+        Which of the text's places that is.
+
+    Returns
+    -------
+    viser.LabelHandle
+    """
+    place = np.asarray(place_m, dtype=np.float64)
+    return scene.add_label(name, text, position=place, anchor=anchor)
+
+
+def _label(scene: viser.SceneApi, name: str, text: str, place: FloatArray, height_m: float) -> viser.LabelHandle:
+    return scene.add_label(
+        name, text, position=place, font_size_mode="scene", font_scene_height=height_m, anchor="bottom-center"
+    )
+
+
+def _size_of_glyphs(array: SensorArray) -> float:
+    """As :func:`arrays.meshes.glyph_size`, but no dots in a large array with two sensors close together."""
+    if array.n_sensors == 1:
+        return 0.1
+    return float(np.clip(glyph_size(array), 0.04 * array.circumradius, 0.2 * array.circumradius))
+
+
+def _wxyz_of_sensors(array: SensorArray) -> FloatArray:
+    return np.roll(np.array([sensor.rotation_xyzw for sensor in array.sensors]), 1, axis=-1)
+
+
+def _wxyz_along(direction: FloatArray) -> FloatArray:
+    """The shortest turn (w, x, y, z) of the z axis to a unit vector."""
+    x, y, z = direction
+    if z < -1.0 + 1e-12:
+        return np.array([0.0, 1.0, 0.0, 0.0])
+    quaternion = np.array([1.0 + z, -y, x, 0.0])
+    return quaternion / np.linalg.norm(quaternion)

@@ -1,0 +1,280 @@
+"""Truth of the roll/yaw satellite: the dynamics of the error alone, and the satellite in its attitude loop.
+
+:mod:`adcs.ellipsoids.roll_yaw` has the system, and the observers that read what is made here. Every run has its own
+stream of random numbers: run s is the same whatever runs are beside it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from adcs.ellipsoids.roll_yaw import ORBITAL_RATE, STEP_S, input_matrix, transition
+from arrays.typing import FloatArray
+from magloc.compilation import compiled
+from sims.noise import stream
+
+Controller = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
+ACTUAL_INERTIA_KGM2 = np.array([[90.0, 0.2, 0.2], [0.2, 60.0, 0.1], [0.2, 0.1, 90.0]])
+JUMP = 4.0
+_SUBSTEPS = 10  # Runge-Kutta steps of 0.2 s: a fifth of the disturbance torque's period
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorRuns:
+    """Runs of the dynamics of the error alone.
+
+    Attributes
+    ----------
+    states_rad : ndarray, shape (n_runs, n_steps + 1, 2)
+        (roll, yaw).
+    readings_rad : ndarray, shape (n_runs, n_steps)
+        Roll readings after every step.
+    """
+
+    states_rad: FloatArray
+    readings_rad: FloatArray
+
+
+@dataclass(frozen=True)
+class ErrorScenario:
+    """Settings of :func:`error_runs`.
+
+    Attributes
+    ----------
+    noise_rad : float
+        Readings are wrong by uniform random numbers within ±noise_rad.
+    drift_rad_s : float
+        Zero shift of the yaw gyro, constant.
+    n_steps : int
+    jump_s : float, optional
+        From this time on the readings are wrong by four times as much.
+    """
+
+    noise_rad: float
+    drift_rad_s: float
+    n_steps: int
+    jump_s: float | None = None
+
+
+def error_runs(scenario: ErrorScenario, seeds: Sequence[int]) -> ErrorRuns:
+    """Simulate errors of roll and yaw: uniform at the start in a circle of radius 3 c, then carried by the drift.
+
+    Parameters
+    ----------
+    scenario : ErrorScenario
+    seeds : sequence of int
+        One for each run.
+
+    Returns
+    -------
+    ErrorRuns
+    """
+    n_runs, n_steps = len(seeds), scenario.n_steps
+    amplitude = _amplitude(scenario)
+    states, noise = np.empty((n_runs, n_steps + 1, 2)), np.empty((n_runs, n_steps))
+    for run, seed in enumerate(seeds):
+        start = stream(seed, "start")
+        radius, angle = 3.0 * scenario.noise_rad * math.sqrt(start.random()), 2.0 * math.pi * start.random()
+        states[run, 0] = radius * math.cos(angle), radius * math.sin(angle)
+        noise[run] = stream(seed, "horizon").uniform(-1.0, 1.0, n_steps)
+    A, drift = transition(), input_matrix()[:, 1] * scenario.drift_rad_s * STEP_S
+    for step in range(n_steps):
+        # A product of matrices would round a run by how many are beside it.
+        states[:, step + 1] = np.einsum("ij,rj->ri", A, states[:, step]) + drift
+    return ErrorRuns(states, states[:, 1:, 0] + amplitude * noise)
+
+
+@dataclass(frozen=True, eq=False)
+class LoopScenario:
+    """Settings of :func:`fly`.
+
+    Attributes
+    ----------
+    noise_rad : float
+        Horizon readings are wrong by uniform random numbers within ±noise_rad.
+    drift_rad_s : float
+        Zero shift of the pitch and yaw gyros, constant. The roll gyro has none: the observer's disturbance is a
+        segment along yaw.
+    n_steps : int
+        Cycles of 2 s.
+    first_yaw_rad : float
+    jump_s : float, optional
+        From this time on the readings are wrong by four times as much.
+    torque_Nm : float
+        Amplitude of the disturbance torque b sin(ω t + φ) about every axis.
+    torque_rate : float
+        ω [rad/s].
+    torque_phases : ndarray, shape (3,)
+        φ [rad].
+    inertia_kgm2 : ndarray, shape (3, 3)
+    """
+
+    noise_rad: float
+    drift_rad_s: float
+    n_steps: int
+    first_yaw_rad: float
+    jump_s: float | None = None
+    torque_Nm: float = 1e-4
+    torque_rate: float = 6.0
+    torque_phases: FloatArray = field(default_factory=lambda: np.array([0.0, math.pi / 4.0, math.pi / 2.0]))
+    inertia_kgm2: FloatArray = field(default_factory=ACTUAL_INERTIA_KGM2.copy)
+
+
+@dataclass(frozen=True, eq=False)
+class LoopRuns:
+    """Flights in the attitude loop.
+
+    Attributes
+    ----------
+    angles_rad : ndarray, shape (n_runs, n_steps + 1, 3)
+        Roll, pitch and yaw of the body in the orbital frame.
+    rates_rad_s : ndarray, shape (n_runs, n_steps + 1, 3)
+        Angular rate of the body in the inertial frame, body axes.
+    torques_Nm : ndarray, shape (n_runs, n_steps, 3)
+        Control torque of every cycle.
+    increments_rad : ndarray, shape (n_runs, n_steps, 3)
+        Of the gyros in every cycle.
+    roll_readings_rad : ndarray, shape (n_runs, n_steps)
+    """
+
+    angles_rad: FloatArray
+    rates_rad_s: FloatArray
+    torques_Nm: FloatArray
+    increments_rad: FloatArray
+    roll_readings_rad: FloatArray
+
+
+def fly(scenario: LoopScenario, controller: Controller, seeds: Sequence[int]) -> LoopRuns:
+    """Fly satellites with a controller.
+
+    Every cycle of 2 s the horizon sensor is read once, the gyros give their increments and rates, and the controller's
+    torque is held during the next cycle; there is none in the first.
+
+    Parameters
+    ----------
+    scenario : LoopScenario
+    controller : callable
+        Takes horizon readings (n_runs, 2), gyro increments (n_runs, 3) and gyro rates (n_runs, 3), and returns torques
+        (n_runs, 3).
+    seeds : sequence of int
+        One for each run.
+
+    Returns
+    -------
+    LoopRuns
+    """
+    n_runs, n_steps = len(seeds), scenario.n_steps
+    noise = np.empty((n_runs, n_steps, 2))
+    for run, seed in enumerate(seeds):
+        noise[run] = _amplitude(scenario)[:, None] * stream(seed, "horizon").uniform(-1.0, 1.0, (n_steps, 2))
+    shift = scenario.drift_rad_s * np.array([0.0, 1.0, 1.0])
+    angles, rates = np.zeros((n_runs, n_steps + 1, 3)), np.zeros((n_runs, n_steps + 1, 3))
+    angles[:, 0, 2] = scenario.first_yaw_rad
+    # At rest in the orbital frame.
+    rates[:, 0] = ORBITAL_RATE * np.array([-scenario.first_yaw_rad, -1.0, 0.0])
+    torques, torque = np.empty((n_runs, n_steps, 3)), np.zeros((n_runs, 3))
+    increments = np.empty((n_runs, n_steps, 3))
+    for step in range(n_steps):
+        torques[:, step] = torque
+        state = advance(scenario, angles[:, step], rates[:, step], torque, step * STEP_S)
+        angles[:, step + 1], rates[:, step + 1] = state[:, :3], state[:, 3:6]
+        horizon = state[:, :2] + noise[:, step]
+        increments[:, step] = state[:, 6:] + shift * STEP_S
+        torque = controller(horizon, increments[:, step], state[:, 3:6] + shift)
+    return LoopRuns(angles, rates, torques, increments, angles[:, 1:, 0] + noise[..., 0])
+
+
+def _amplitude(scenario: ErrorScenario | LoopScenario) -> FloatArray:
+    """Largest error of every reading [rad], shape (n_steps,)."""
+    amplitude = np.full(scenario.n_steps, scenario.noise_rad)
+    if scenario.jump_s is not None:
+        amplitude[STEP_S * np.arange(1, scenario.n_steps + 1) >= scenario.jump_s] *= JUMP
+    return amplitude
+
+
+def advance(
+    scenario: LoopScenario, angles_rad: FloatArray, rates_rad_s: FloatArray, torque_Nm: FloatArray, time_s: float
+) -> FloatArray:
+    r"""Satellites one cycle of 2 s later, by Runge-Kutta steps of 0.2 s.
+
+    Euler's equations :math:`J\dot\omega = T - \omega \times J\omega`, and small angles against the orbital frame:
+    :math:`\dot\gamma = \omega_x + \omega_0\psi`, :math:`\dot\theta = \omega_y + \omega_0`,
+    :math:`\dot\psi = \omega_z - \omega_0\gamma`.
+
+    Parameters
+    ----------
+    scenario : LoopScenario
+    angles_rad, rates_rad_s, torque_Nm : ndarray, shape (n_runs, 3)
+        As in :class:`LoopRuns`; the torque is held.
+    time_s : float
+        Phase of the disturbance torque.
+
+    Returns
+    -------
+    ndarray, shape (n_runs, 9)
+        Angles [rad], rates [rad/s], and the integral of the rates over the cycle [rad].
+    """
+    state = np.concatenate([angles_rad, rates_rad_s, np.zeros_like(rates_rad_s)], axis=1)
+    inertia = np.ascontiguousarray(scenario.inertia_kgm2)
+    inverse: FloatArray = np.linalg.inv(inertia).astype(np.float64)
+    disturbance = (scenario.torque_Nm, scenario.torque_rate, scenario.torque_phases)
+    _advance(state, inertia, inverse, torque_Nm, disturbance, time_s)
+    return state
+
+
+@compiled
+def _advance(
+    state: FloatArray,
+    inertia: FloatArray,
+    inverse: FloatArray,
+    torque: FloatArray,
+    disturbance: tuple[float, float, FloatArray],
+    time: float,
+) -> None:
+    h = STEP_S / _SUBSTEPS
+    k1, k2, k3, k4 = np.empty(9), np.empty(9), np.empty(9), np.empty(9)
+    work = np.empty(9)
+    for run in range(len(state)):
+        x, u = state[run], torque[run]
+        for substep in range(_SUBSTEPS):
+            t = time + substep * h
+            _derivative(t, x, u, inertia, inverse, disturbance, k1)
+            for i in range(9):
+                work[i] = x[i] + 0.5 * h * k1[i]
+            _derivative(t + 0.5 * h, work, u, inertia, inverse, disturbance, k2)
+            for i in range(9):
+                work[i] = x[i] + 0.5 * h * k2[i]
+            _derivative(t + 0.5 * h, work, u, inertia, inverse, disturbance, k3)
+            for i in range(9):
+                work[i] = x[i] + h * k3[i]
+            _derivative(t + h, work, u, inertia, inverse, disturbance, k4)
+            for i in range(9):
+                x[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
+
+
+@compiled
+def _derivative(
+    t: float,
+    x: FloatArray,
+    torque: FloatArray,
+    inertia: FloatArray,
+    inverse: FloatArray,
+    disturbance: tuple[float, float, FloatArray],
+    out: FloatArray,
+) -> None:
+    amplitude, rate, phases = disturbance
+    w0, w1, w2 = x[3], x[4], x[5]
+    L0 = inertia[0, 0] * w0 + inertia[0, 1] * w1 + inertia[0, 2] * w2
+    L1 = inertia[1, 0] * w0 + inertia[1, 1] * w1 + inertia[1, 2] * w2
+    L2 = inertia[2, 0] * w0 + inertia[2, 1] * w1 + inertia[2, 2] * w2
+    m0 = torque[0] + amplitude * np.sin(rate * t + phases[0]) - (w1 * L2 - w2 * L1)
+    m1 = torque[1] + amplitude * np.sin(rate * t + phases[1]) - (w2 * L0 - w0 * L2)
+    m2 = torque[2] + amplitude * np.sin(rate * t + phases[2]) - (w0 * L1 - w1 * L0)
+    out[0], out[1], out[2] = w0 + ORBITAL_RATE * x[2], w1 + ORBITAL_RATE, w2 - ORBITAL_RATE * x[0]
+    for i in range(3):
+        out[3 + i] = inverse[i, 0] * m0 + inverse[i, 1] * m1 + inverse[i, 2] * m2
+        out[6 + i] = x[3 + i]

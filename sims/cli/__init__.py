@@ -1,0 +1,1 @@
+"""Commands that simulate; the command lines register them by name."""

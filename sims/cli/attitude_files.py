@@ -1,0 +1,181 @@
+"""Files of attitude runs: figures, the data behind them, and the telemetry that ``adcs estimate`` takes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from adcs.io.scenario_files import AttitudeFile, scenario_text
+from adcs.io.telemetry_files import telemetry_columns
+from adcs.kalman.bank import Estimate
+from adcs.kalman.error_state import SENSORS
+from arrays.io.csv import write_columns
+from arrays.io.text import write_text
+from sims.experiments.attitude import Outcome, Part, errors_in_units
+
+if TYPE_CHECKING:
+    import xarray as xr
+from adcs.kalman.results import STATE_COLUMNS, sensor_gaps, sigma_in_units
+from arrays.typing import FloatArray
+
+
+def write_attitude_files(
+    out: Path, file: AttitudeFile, estimate: Estimate, parts: Sequence[Part], outcome: Outcome
+) -> list[str]:
+    """Write everything of some runs into a folder.
+
+    Parameters
+    ----------
+    out : Path
+        The folder.
+    file : AttitudeFile
+    estimate : Estimate
+    parts : sequence of Part
+        All runs.
+    outcome : Outcome
+
+    Returns
+    -------
+    list of str
+        Names of the files.
+    """
+    from adcs.plots.attitude import ConsistencyPicture, StatesPicture, consistency_figure, states_figure
+    from magloc.plots import style
+
+    first = parts[0]
+    time_s, name = first.runs.time_s, file.name
+    # Truth minus estimate is what the filter's state is; an error is estimate minus truth.
+    errors = -errors_in_units(first)[0]
+    sigma = sigma_in_units(first.estimates)[0]
+    title = f"{name}: {estimate.in_words}"
+    gaps = sensor_gaps(first.runs, estimate.settings.sensors)
+    seed = int(outcome.seeds[0])
+    picture = StatesPicture(f"{title}; seed {seed}", time_s, errors, sigma, are_errors=True, gaps=gaps)
+    style.save(states_figure(picture), out / f"{name}-errors.png")
+    sigma_deg = np.sqrt(np.sum(sigma[:, :3] ** 2, axis=1))
+    consistency = ConsistencyPicture(
+        title, time_s, outcome.error_deg, sigma_deg, outcome.nees, outcome.size, outcome.nis
+    )
+    style.save(consistency_figure(consistency), out / f"{name}-consistency.png")
+    columns: dict[str, Any] = {"time_s": time_s}
+    columns |= {f"error_{key}": errors[:, i] for i, key in enumerate(STATE_COLUMNS) if not np.isnan(errors[:, i]).all()}
+    columns |= {f"sigma_{key}": sigma[:, i] for i, key in enumerate(STATE_COLUMNS) if not np.isnan(sigma[:, i]).all()}
+    columns |= {
+        "attitude_error_deg_median": np.median(outcome.error_deg, axis=0),
+        "nees_per_dimension_mean": outcome.nees.mean(axis=0),
+    }
+    write_columns(columns, out / f"{name}.csv")
+    write_columns(_runs_table(outcome), out / f"{name}-runs.csv")
+    dataset_of(parts, estimate, title).to_netcdf(out / f"{name}.nc")
+    write_columns(telemetry_columns(first.runs, file), out / "telemetry.csv")
+    write_columns(_truth_columns(first, file), out / "truth.csv")
+    write_text(scenario_text(file), out / "scenario.toml")
+    return [
+        *(f"{name}{ending}" for ending in ("-errors.png", "-consistency.png", ".csv", "-runs.csv", ".nc")),
+        "telemetry.csv",
+        "truth.csv",
+        "scenario.toml",
+    ]
+
+
+def _runs_table(outcome: Outcome) -> dict[str, Any]:
+    columns: dict[str, Any] = {"seed": outcome.seeds}
+    for i, key in enumerate(STATE_COLUMNS):
+        if not np.isnan(outcome.axis_rms[:, i]).all():
+            columns[f"rms_{key}"] = outcome.axis_rms[:, i]
+    return columns | {
+        "largest_error_last_minute_deg": outcome.error_deg[:, outcome.late].max(axis=1),
+        "nees_per_dimension": outcome.nees[:, outcome.late].mean(axis=1),
+        "diverged": outcome.diverged,
+    }
+
+
+def _truth_columns(part: Part, file: AttitudeFile) -> dict[str, Any]:
+    """What the estimates of the telemetry may be compared with."""
+    runs = part.runs
+    columns: dict[str, Any] = {"time_s": telemetry_columns(runs, file)["time_s"]}
+    groups = (
+        (["qw", "qx", "qy", "qz"], runs.q[0]),
+        ([f"rate_{axis}_deg_s" for axis in "xyz"], np.degrees(runs.w[0])),
+        ([f"gyro_bias_{axis}_deg_s" for axis in "xyz"], np.degrees(runs.prepared.gyro_bias_rad_s[0])),
+        ([f"field_bias_{axis}_nT" for axis in "xyz"], 1e9 * runs.prepared.field_bias_T[0]),
+        ([f"disturbance_{axis}_s2" for axis in "xyz"], runs.acceleration_s2[0]),
+    )
+    for names, values in groups:
+        columns |= dict(zip(names, values.T, strict=True))
+    return columns
+
+
+def dataset_of(parts: Sequence[Part], estimate: Estimate, title: str) -> xr.Dataset:
+    """Truth and estimates of all runs.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+    estimate : Estimate
+    title : str
+
+    Returns
+    -------
+    xarray.Dataset
+        Dimensions run, time and component; every variable with units.
+    """
+    import xarray as xr
+
+    from arrays.io.outputs import installed_version
+
+    def joined(values: Any) -> FloatArray:
+        return np.concatenate([values(part) for part in parts])
+
+    axis, n3 = ("run", "time", "axis"), ("run", "time", "component")
+    used = estimate.settings.sensors
+    variables: dict[str, Any] = {
+        "q": (n3, joined(lambda p: p.estimates.q), {"units": "1", "long_name": "attitude, orbital from body"}),
+        "q_true": (n3, joined(lambda p: p.runs.q), {"units": "1", "long_name": "true attitude"}),
+        "rate": (axis, joined(lambda p: p.estimates.w), {"units": "rad/s", "long_name": "rate, body axes"}),
+        "rate_true": (axis, joined(lambda p: p.runs.w), {"units": "rad/s", "long_name": "true rate"}),
+        "sigma_attitude": (
+            axis,
+            2.0 * joined(lambda p: p.estimates.sigma[..., :3]),
+            {"units": "rad", "long_name": "standard deviation of the angle"},
+        ),
+        "sigma_rate": (
+            axis,
+            joined(lambda p: p.estimates.sigma[..., 3:6]),
+            {"units": "rad/s", "long_name": "standard deviation of the rate"},
+        ),
+        "nis": (
+            ("run", "time", "sensor"),
+            joined(lambda p: p.estimates.nis),
+            {"units": "1", "long_name": "normalised innovation squared"},
+        ),
+    }
+    optional = {
+        "gyro-bias": ("gyro_bias_rad_s", "gyro_bias", "rad/s", lambda p: p.runs.prepared.gyro_bias_rad_s),
+        "field-bias": ("field_bias_T", "field_bias", "T", lambda p: p.runs.prepared.field_bias_T),
+        "disturbance": ("disturbance_s2", "disturbance", "s-2", lambda p: p.runs.acceleration_s2),
+    }
+    for state, (attribute, name, units, true) in optional.items():
+        if state not in used.states:
+            continue
+        values = joined(lambda p, attribute=attribute: getattr(p.estimates, attribute))
+        variables[name] = (axis, values, {"units": units, "long_name": name.replace("_", " ")})
+        variables[f"{name}_true"] = (axis, joined(true), {"units": units, "long_name": f"true {name}"})
+        first = used.first_of(state)
+        sigma = joined(lambda p, first=first: p.estimates.sigma[..., first : first + 3])
+        variables[f"sigma_{name}"] = (axis, sigma, {"units": units, "long_name": "standard deviation"})
+    seeds = [seed for part in parts for seed in part.runs.prepared.seeds]
+    return xr.Dataset(
+        variables,
+        coords={
+            "run": ("run", seeds, {"long_name": "seed"}),
+            "time": ("time", parts[0].runs.time_s, {"units": "s", "long_name": "time since the start of the run"}),
+            "axis": ("axis", ["x", "y", "z"]),
+            "component": ("component", ["w", "x", "y", "z"]),
+            "sensor": ("sensor", list(SENSORS)),
+        },
+        attrs={"Conventions": "CF-1.10", "title": title, "source": f"magloc {installed_version()}"},
+    )

@@ -1,0 +1,195 @@
+"""``adcs compare``: scenarios, sensors and filters side by side, on the same seeds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from cyclopts import Parameter
+
+from adcs.cli.options import ScenarioOptions, print_note
+from adcs.io.scenario_files import AttitudeFile
+from adcs.kalman.bank import FILTERS, Estimate
+from arrays.io.arguments import Flag
+from arrays.io.errors import InputError
+from magloc.cli.framework import QuietOptions, print_json, progress
+from sims.cli.run_tabletsat import RunOptions, wanted
+
+if TYPE_CHECKING:
+    from sims.experiments.attitude import Outcome
+from arrays.typing import FloatArray
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class CompareOptions:
+    """What is compared, besides the scenarios; lists have commas between their items.
+
+    Parameters
+    ----------
+    sensors : str
+        Sets of sensors, as in st,st+gyro,mag+sun+gyro; by default each scenario's.
+    states : str
+        Sets of states, as in none,gyro-bias,gyro-bias+disturbance; by default each scenario's.
+    filter : str
+        Filters: mekf, constant-gain, parallel-disturbance, reduced, smoother; by default each scenario's.
+    """
+
+    sensors: str | None = None
+    states: str | None = None
+    filter: str | None = None
+
+    def combinations(self) -> list[ScenarioOptions]:
+        """All combinations of what is listed."""
+        lists = [[None] if text is None else _items(text) for text in (self.sensors, self.states, self.filter)]
+        for name in lists[2]:
+            if name is not None and name not in FILTERS:
+                raise InputError(f"--filter: found {name!r}, expected some of {', '.join(FILTERS)}.")
+        empty = ScenarioOptions()
+        return [
+            replace(empty, sensors=sensors, states=states, filter=name)  # type: ignore[arg-type]
+            for sensors, states, name in product(*lists)
+        ]
+
+
+def _items(text: str) -> list[str | None]:
+    return [item.strip() for item in text.split(",") if item.strip()]
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One scenario with one filter.
+
+    Attributes
+    ----------
+    file : AttitudeFile
+    estimate : Estimate
+    outcome : Outcome
+    """
+
+    file: AttitudeFile
+    estimate: Estimate
+    outcome: Outcome
+
+    def report(self) -> dict[str, Any]:
+        """What ``--json`` prints of it."""
+        used = self.estimate.settings.sensors
+        return {
+            "scenario": self.file.name,
+            "sensors": used.sensors,
+            "states": list(used.states),
+            "filter": self.estimate.filter,
+            **self.outcome.numbers(),
+            "warnings": self.outcome.warning_lines(),
+        }
+
+
+def compare(
+    *scenarios: str,
+    options: CompareOptions = CompareOptions(),
+    runs: RunOptions = RunOptions(),  # noqa: B008 - frozen
+    out: Path | None = None,
+    json: Flag = False,
+    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Run several scenarios, sets of sensors or filters on the same seeds and show them side by side.
+
+    Parameters
+    ----------
+    scenarios : str
+        Scenario files (TOML) or names of built-in ones.
+    options : CompareOptions
+        Sensors, states and filters.
+    runs : RunOptions
+        Runs.
+    out : Path, optional
+        Folder for compare.png, with the median errors through time, and compare.csv.
+    json : bool
+        Print one JSON object.
+    common : QuietOptions
+        Common options.
+    """
+    from arrays.io.outputs import make_folder, refuse_file
+    from sims.experiments.attitude import run_scenario
+
+    if not scenarios:
+        raise InputError("adcs compare: found no scenario, expected one or more, such as tabletsat eclipse.")
+    if out is not None:
+        refuse_file(out, "--out")
+    pairs = [wanted(name, chosen, runs.duration) for name, chosen in product(scenarios, options.combinations())]
+    rows = []
+    with progress(len(pairs) * runs.seeds, "runs", quiet=common.quiet) as advance:
+        for file, estimate in pairs:
+            rows.append(Row(file, estimate, run_scenario(file, estimate, runs.numbers, advance=advance)))
+    reports = [row.report() for row in rows]
+    if out is not None:
+        make_folder(out, "--out")
+        _write(out, rows, reports)
+        if not common.quiet:
+            print_note(f"wrote compare.png and compare.csv into {out}")
+    if json:
+        print_json({"rows": reports})
+        return
+    print("\n".join(compare_lines(reports)))
+    if not common.quiet:
+        for report in reports:
+            for line in report["warnings"]:
+                print_note(f"warning: {report['scenario']}, {report['sensors']}: {line}")
+
+
+_COLUMNS = (
+    ("angle_rms_deg", "angle [°]"),
+    ("rate_rms_deg_s", "rate [°/s]"),
+    ("gyro_bias_rms_deg_s", "Δω [°/s]"),
+    ("field_bias_rms_nT", "Δb [nT]"),
+    ("disturbance_rms_s2", "d [1/s²]"),
+    ("nees_per_dimension", "NEES/n"),
+    ("diverged_runs", "diverged"),
+)
+
+
+def compare_lines(reports: list[dict[str, Any]]) -> list[str]:
+    """The comparison as text.
+
+    Parameters
+    ----------
+    reports : list of dict
+        Of :meth:`Row.report`.
+
+    Returns
+    -------
+    list of str
+    """
+    names = [label_of(report) for report in reports]
+    width = max(22, *(len(name) for name in names)) + 1
+    lines = [f"{'rms of the last minute':{width}s}" + "".join(f"{title:>12s}" for _, title in _COLUMNS)]
+    for name, report in zip(names, reports, strict=True):
+        cells = ["" if report[key] is None else f"{report[key]:.3g}" for key, _ in _COLUMNS]
+        lines.append(f"{name:{width}s}" + "".join(f"{cell:>12s}" for cell in cells))
+    return lines
+
+
+def label_of(report: dict[str, Any]) -> str:
+    """Scenario, sensors, states and filter in a few words."""
+    parts = [report["scenario"], report["sensors"], *report["states"]]
+    return " ".join(parts if report["filter"] == "mekf" else [*parts, report["filter"]])
+
+
+def _write(out: Path, rows: list[Row], reports: list[dict[str, Any]]) -> None:
+    from adcs.plots.attitude import compare_figure
+    from arrays.io.csv import write_columns
+    from magloc.plots import style
+
+    columns: dict[str, Any] = {"row": [label_of(report) for report in reports]}
+    for key, _ in _COLUMNS:
+        values = [report[key] for report in reports]
+        columns[key] = np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+    write_columns(columns, out / "compare.csv")
+    lines: list[tuple[str, FloatArray, FloatArray]] = []
+    for row, report in zip(rows, reports, strict=True):
+        error: FloatArray = np.median(row.outcome.error_deg, axis=0)
+        lines.append((label_of(report), row.file.step_s * np.arange(len(error), dtype=np.float64), error))
+    style.save(compare_figure(lines), out / "compare.png")

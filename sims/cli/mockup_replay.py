@@ -1,0 +1,213 @@
+"""The replay of ``adcs run mockup --part fusion``: --view, --html and --png."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cyclopts import Parameter
+
+from arrays.io.arguments import Flag
+from arrays.io.errors import InputError
+
+if TYPE_CHECKING:
+    pass
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from adcs.cli.options import print_note
+from arrays.io.outputs import refuse_unwritable
+from sims.cli.mockup_files import METHOD_WORDS
+from sims.experiments.mockup_navigation import FusionResult, FusionRuns
+
+if TYPE_CHECKING:
+    from adcs.viewer.drive import Drive, SeenFrame
+from sims.experiments.mockup_settings import MockupOptions, Port
+
+
+def check_places(replay: ReplayOptions) -> None:
+    """Refuse, before long work, files that cannot be written.
+
+    Parameters
+    ----------
+    replay : ReplayOptions
+
+    Raises
+    ------
+    InputError
+        There is no such folder, or no browser for a picture.
+    """
+    from magloc.viewer.chromium import find_chromium
+
+    if replay.html is not None:
+        refuse_unwritable(replay.html, "--html")
+    if replay.png is not None:
+        refuse_unwritable(replay.png, "--png", ".png")
+        try:
+            find_chromium()
+        except InputError as error:
+            raise InputError(f"--png: {error}") from None
+
+
+def show_replay(runs: FusionRuns, replay: ReplayOptions, *, quiet: bool) -> None:
+    """Show the first drive until Ctrl-C, or write it.
+
+    Parameters
+    ----------
+    runs : FusionRuns
+    replay : ReplayOptions
+    quiet : bool
+        No notes on stderr.
+
+    Raises
+    ------
+    InputError
+        A file cannot be written, there is no free port, or the browser fails.
+    """
+    from adcs.viewer.drive_page import drive_page, write_playing_page
+    from magloc.viewer.chromium import BrowserError
+    from magloc.viewer.server import address, free_port, opened, wait_for_interruption, write_picture
+
+    drive = drive_of(runs.results[0], runs.method)
+    at_s = 0.5 * drive.duration_s if replay.at is None else replay.at
+    used = free_port(replay.port) if replay.view else 0
+    if used not in (0, replay.port) and replay.port and not quiet:
+        print_note(f"port {replay.port} is in use, {used} is taken")
+    with opened(used, f"adcs · mockup {runs.method}") as server:
+        page, player = drive_page(server, drive, at_s)
+        try:
+            if replay.png is not None:
+                write_picture(server, replay.png)
+            if replay.html is not None:
+                write_playing_page(server, page, player, drive, replay.html)
+        except BrowserError as error:
+            raise InputError(f"--png: {error}") from None
+        if not replay.view:
+            if not quiet:
+                print_note(f"wrote {', '.join(str(file) for file in (replay.html, replay.png) if file is not None)}")
+            return
+        print(address(server), flush=True)
+        if not quiet:
+            print_note("open this address in a browser; Ctrl-C ends the viewer")
+        wait_for_interruption()
+        page.close()
+
+
+def drive_of(result: FusionResult, method: str) -> Drive:
+    """What a replay shows of a run.
+
+    Parameters
+    ----------
+    result : FusionResult
+    method : str
+
+    Returns
+    -------
+    Drive
+    """
+    from adcs.mockup.navigation.delayed_ekf import FilterTrack
+    from adcs.mockup.vision.camera import Camera
+    from adcs.mockup.vision.sky import led_sky
+    from adcs.viewer.drive import Drive
+
+    run, track = result.run, result.fused.track
+    sky, camera = led_sky(), Camera()
+    arrived = slice(len(result.fused.outcomes))
+    return Drive(
+        title=f"Table-top satellite: {METHOD_WORDS[method]}",
+        lights_m=sky.positions_m,
+        camera=camera,
+        truth=run.truth,
+        track=track,
+        fixes=run.fixes.rows(arrived),
+        exposure_s=run.exposure_s[arrived],
+        outcomes=result.fused.outcomes,
+        sigma_m=track.sigma[:, :2] if isinstance(track, FilterTrack) else None,
+        frame_of=_frames_of(result),
+    )
+
+
+def _frames_of(result: FusionResult) -> Callable[[int], SeenFrame]:
+    """Frames of a run's fixes, rendered where the satellite truly was, and identified."""
+    from adcs.mockup.vision.camera import Camera, Pose, undistorted
+    from adcs.mockup.vision.centroids import find_stars
+    from adcs.mockup.vision.robust_matcher import RobustMatcher
+    from adcs.mockup.vision.sky import led_sky
+    from adcs.mockup.vision.triangles import TriangleCatalogue
+    from adcs.viewer.drive import SeenFrame
+    from sims.mockup.frames import Motion, rendered_frame
+
+    sky, camera, truth = led_sky(), Camera(), result.run.truth
+    matcher = RobustMatcher(TriangleCatalogue.of(sky.positions_m), camera.m_per_px)
+    rate = np.gradient(truth.heading_rad, truth.time_s)
+
+    def frame_of(fix: int) -> SeenFrame:
+        at_s = result.run.exposure_s[fix]
+        x, y, heading, along_x, along_y, turn = (
+            float(np.interp(at_s, truth.time_s, values))
+            for values in (*truth.position_m.T, truth.heading_rad, *truth.velocity_m_s.T, rate)
+        )
+        # One image for a fix that comes twice.
+        rng = np.random.default_rng([result.seed, round(1e3 * at_s)])
+        frame = rendered_frame(sky, camera, Pose(x, y, heading), rng, Motion((along_x, along_y), turn))
+        stars = find_stars(frame.image)
+        return SeenFrame(frame.image, stars.positions_px, matcher.identify(undistorted(camera, stars.positions_px)))
+
+    return frame_of
+
+
+@Parameter(name="*", group="Replay")
+@dataclass(frozen=True)
+class ReplayOptions:
+    """Replay of the first drive, with --part fusion.
+
+    Parameters
+    ----------
+    view : bool
+        Start a server on this machine and print its address, which any browser on this machine opens.
+    html : Path, optional
+        Write a static HTML file that plays the drive and needs no server.
+    png : Path, optional
+        Write a picture; needs Chromium or Chrome.
+    at : float, optional
+        Seconds since the beginning that are shown at first; the middle of the drive by default.
+    port : int
+        Port of the server; the next one that is free if it is in use.
+    """
+
+    view: Flag = False
+    html: Path | None = None
+    png: Path | None = None
+    at: float | None = None
+    port: Port = 8080
+
+    @property
+    def wanted(self) -> bool:
+        """Whether there is something to be seen."""
+        return self.view or self.html is not None or self.png is not None
+
+    def check(self, options: MockupOptions, *, json: bool) -> None:
+        """Raise InputError for what cannot be shown."""
+        if not self.wanted:
+            for name, given in (("--at", self.at is not None), ("--port", self.port != ReplayOptions.port)):
+                if given:
+                    raise InputError(f"{name}: found it without a replay, expected --view, --html or --png too.")
+            return
+        option = "--view" if self.view else "--html" if self.html is not None else "--png"
+        if options.part != "fusion":
+            raise InputError(f"{option}: found it with --part {options.part}, expected it with --part fusion.")
+        if options.samples is not None:
+            raise InputError(
+                f"{option}: found it with --samples, expected it with simulated drives, whose truth it shows."
+            )
+        if options.fusion == "all":
+            raise InputError(f"{option}: found it with --fusion all, expected one method.")
+        if self.view and (self.html is not None or self.png is not None):
+            raise InputError("--view: found it with --html or --png, expected one or the other.")
+        if self.view and json:
+            raise InputError("--view: found it with --json, expected one or the other: the address is printed too.")
+        if self.at is not None and not 0.0 <= self.at <= options.duration_s:
+            raise InputError(f"--at: found {self.at:g} s, expected 0 to {options.duration_s:g} s.")

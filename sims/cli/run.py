@@ -1,0 +1,32 @@
+"""``adcs run``: a scenario simulated, its attitude estimated and judged."""
+
+from __future__ import annotations
+
+from cyclopts import App
+
+from sims.cli.run_tabletsat import run_attitude
+
+run = App(
+    name="run",
+    help="Simulate a scenario, estimate its attitude, and say how good that is.",
+    version_flags=[],
+)
+run.default(run_attitude)
+for _name, _where, _help in (
+    (
+        "complementary",
+        "sims.cli.run_complementary:complementary",
+        "Attitude of a satellite from magnetometer, Sun sensor and gyro by complementary filters.",
+    ),
+    (
+        "ellipsoid",
+        "sims.cli.run_ellipsoid:ellipsoid",
+        "Yaw of a satellite from a horizon sensor and gyros, in guaranteed ellipsoids.",
+    ),
+    (
+        "mockup",
+        "sims.cli.run_mockup:mockup",
+        "Table-top satellite that looks up at a sky of LEDs: star identification, zeros, and fusion of late fixes.",
+    ),
+):
+    run.command(_where, name=_name, help=_help)

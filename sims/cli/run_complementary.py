@@ -1,0 +1,350 @@
+"""``adcs run complementary``: attitude from field, Sun and gyro, with a step of the gyro's bias or without the Sun."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from cyclopts import Parameter
+
+from adcs.cli.options import print_note
+from adcs.complementary.explicit import Gains
+from adcs.complementary.outage import Rule, Substitution
+from adcs.satellite.vector_record import VectorRecord
+from arrays.io.arguments import Flag
+from arrays.io.csv import write_table
+from arrays.io.errors import InputError
+from arrays.io.outputs import refuse_file
+from magloc.cli.framework import QuietOptions, print_json, progress
+
+if TYPE_CHECKING:
+    from sims.attitude.complementary import SatelliteRuns, SatelliteScenario
+from arrays.typing import FloatArray
+
+Filter = Literal["explicit", "gauss-newton", "adaptive"]
+STEP_ORBITS, OUTAGE_STEP_ORBITS, OUTAGE_ORBITS = 1.7, 0.3, 1.5
+ORBITS, ORBITS_WITH_OUTAGE = 3.5, 4.0
+RMS_ORBITS = (0.5, 3.0)
+OUTAGE_MAX_FROM_ORBITS = 2.0
+_ALONE_KP_PER_S, _OUTAGE_KP_PER_S = 0.02, 0.005
+_LONGEST_ORBITS = 20.0
+_RUNS_AT_ONCE = 20  # 250 MB of the adaptive filter
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ComplementaryOptions:
+    """What is run.
+
+    Parameters
+    ----------
+    filter : str
+        Gain on vector products ("explicit"), on the angle to a quaternion measured from both vectors ("gauss-newton"),
+        or an error-state filter that finds steps of the bias ("adaptive", without gains).
+    kp : float, optional
+        K_P [1/s]: 0.02, or 0.005 with an outage.
+    ki : float, optional
+        K_I [1/s²]: kp²/4, 2e-6 at least; zero during an outage.
+    sigma_nT : float
+        Noise of the magnetometer, each axis [nT].
+    outage : str, optional
+        The Sun sensor fails, and in its place stands the field of 500 s ago as it was ("raw"), turned to the present by
+        the gyro ("transported"), or nothing ("magnetometer-only"). The adaptive filter uses nothing.
+    amplitude_deg : float
+        Of roll, pitch and yaw against the orbital frame [°].
+    seeds : int
+        Number of runs.
+    seed : int
+        Of the first run; the next ones follow.
+    duration : float, optional
+        Seconds: 3.5 orbits of 5881 s, or 4 with an outage.
+    """
+
+    filter: Filter = "explicit"
+    kp: float | None = None
+    ki: float | None = None
+    sigma_nT: Annotated[float, Parameter(name="--sigma-nT")] = 1000.0
+    outage: Rule | None = None
+    amplitude_deg: float = 5.0
+    seeds: Annotated[int, Parameter(name=["--seeds", "--runs"])] = 1
+    seed: int = 0
+    duration: float | None = None
+
+    def check(self) -> None:
+        """Raise InputError for what cannot be run."""
+        for name, value in (("--kp", self.kp), ("--ki", self.ki)):
+            if value is not None and not 0.0 <= value < math.inf:
+                raise InputError(f"{name}: found {value:g}, expected 0 or more.")
+            if value is not None and self.filter == "adaptive":
+                raise InputError(f"{name}: found {value:g}, expected no gain: --filter adaptive has none.")
+        if not 0.0 < self.sigma_nT < math.inf:
+            raise InputError(f"--sigma-nT: found {self.sigma_nT:g}, expected a positive number.")
+        if not 0.0 <= self.amplitude_deg < 90.0:
+            raise InputError(f"--amplitude-deg: found {self.amplitude_deg:g}, expected 0 to less than 90.")
+        if self.seed < 0:
+            raise InputError(f"--seed: found {self.seed}, expected 0 or more.")
+        if self.seeds < 1:
+            raise InputError(f"--seeds: found {self.seeds}, expected a positive number.")
+        from sims.attitude.complementary import ORBIT
+
+        least = (RMS_ORBITS[0] if self.outage is None else OUTAGE_MAX_FROM_ORBITS) * ORBIT.period_s
+        most = _LONGEST_ORBITS * ORBIT.period_s
+        if not least + 1.0 <= self.duration_s <= most:
+            raise InputError(
+                f"--duration: found {self.duration_s:g} s, expected {math.ceil(least + 1.0)} to {int(most)} s."
+            )
+        try:
+            self.gains.check(1.0)
+        except ValueError:
+            raise InputError(
+                f"--kp: found {self.gains.kp_per_s:g} 1/s, expected 1 1/s at most: with steps of 1 s the filter "
+                "becomes unstable where kp·h·2 exceeds 2."
+            ) from None
+
+    @property
+    def duration_s(self) -> float:
+        """Of a run."""
+        from sims.attitude.complementary import ORBIT
+
+        orbits = ORBITS if self.outage is None else ORBITS_WITH_OUTAGE
+        return orbits * ORBIT.period_s if self.duration is None else self.duration
+
+    @property
+    def gains(self) -> Gains:
+        """With their defaults."""
+        kp = (_ALONE_KP_PER_S if self.outage is None else _OUTAGE_KP_PER_S) if self.kp is None else self.kp
+        ki = max(kp * kp / 4.0, 2e-6) if self.ki is None else self.ki
+        return Gains(kp, ki)
+
+    @property
+    def scenario(self) -> SatelliteScenario:
+        """What is simulated."""
+        from sims.attitude.complementary import SatelliteScenario
+
+        return SatelliteScenario(
+            sigma_T=1e-9 * self.sigma_nT,
+            amplitude_rad=math.radians(self.amplitude_deg),
+            step_orbits=STEP_ORBITS if self.outage is None else OUTAGE_STEP_ORBITS,
+            outage_orbits=None if self.outage is None else OUTAGE_ORBITS,
+            duration_s=self.duration_s,
+        )
+
+    @property
+    def surroundings(self) -> str:
+        """What is simulated, as text."""
+        outage = "" if self.outage is None else f"; Sun sensor out from {OUTAGE_ORBITS} orbits: {self.outage}"
+        return (
+            f"magnetometer {self.sigma_nT:g} nT; angles of {self.amplitude_deg:g}°; bias step 0.02 °/s at "
+            f"{self.scenario.step_orbits} orbits{outage}"
+        )
+
+    @property
+    def gains_text(self) -> str:
+        """K_P and K_I as text."""
+        return f"K_P {self.gains.kp_per_s:g} 1/s, K_I {self.gains.ki_per_s2:g} 1/s²"
+
+
+def run_complementary(
+    options: ComplementaryOptions, out: Path | None = None, progress: Callable[[int], None] | None = None
+) -> dict[str, Any]:
+    """Run the scenario, and write its figure and data.
+
+    Parameters
+    ----------
+    options : ComplementaryOptions
+    out : Path, optional
+        Folder for ``complementary.png`` (the first run), ``complementary.csv`` (the first run through time, both
+        complementary filters and the adaptive one) and ``complementary-runs.csv`` (all runs); made if it is not there.
+    progress : callable, optional
+        Called with the number of runs finished since the last call.
+
+    Returns
+    -------
+    dict
+        ``rms_deg``, root mean square of the three axes' errors from 0.5 to 3 orbits, ``steady_rms_deg``, the same
+        before the step (with an outage from the time that the step is gone, 1 orbit, until it begins), ``peak_deg``,
+        the largest error of an axis after the step (before the outage), None in a run that ends before it; and
+        ``outage_max_deg``, the largest errors of roll, pitch and yaw from 2 orbits on, or None. Means over the runs;
+        the last one is their median.
+
+    Raises
+    ------
+    InputError
+        An option is out of range, or out is no folder.
+    OSError
+        A file cannot be written.
+    """
+    # The command line stands on top of all packages; nothing that it imports imports it.
+    from sims.attitude.complementary import satellite_runs
+
+    options.check()
+    if out is not None:
+        refuse_file(out, "--out")
+    rows: list[FloatArray] = []
+    last = options.seed + options.seeds
+    for begin in range(options.seed, last, _RUNS_AT_ONCE):
+        seeds = range(begin, min(begin + _RUNS_AT_ONCE, last))
+        runs = satellite_runs(options.scenario, seeds)
+        rows.append(_row_of_each(options, runs.scenario.orbits, errors_deg(options, options.filter, runs)))
+        if out is not None and begin == options.seed:
+            out.mkdir(parents=True, exist_ok=True)
+            _write_picture(options, runs, out)
+        if progress is not None:
+            progress(len(seeds))
+    table = np.concatenate(rows)
+    if out is not None:
+        numbers = np.arange(options.seed, last)
+        write_table(out / "complementary-runs.csv", ("seed", *_RUN_COLUMNS), np.column_stack([numbers, table]))
+    means = [float(value) for value in table[:, :3].mean(axis=0)]
+    return {
+        "rms_deg": means[0],
+        "steady_rms_deg": means[1],
+        "peak_deg": None if math.isnan(means[2]) else means[2],
+        "outage_max_deg": None if options.outage is None else np.median(table[:, 3:], axis=0).tolist(),
+    }
+
+
+def errors_deg(options: ComplementaryOptions, name: Filter, runs: SatelliteRuns) -> FloatArray:
+    """Errors of roll, pitch and yaw, in body axes, of one of the filters: shape (R, n, 3).
+
+    Parameters
+    ----------
+    options : ComplementaryOptions
+        Gains, noise and what stands in for the Sun.
+    name : {'explicit', 'gauss-newton', 'adaptive'}
+    runs : SatelliteRuns
+    """
+    from adcs import quaternion
+
+    q = _estimates(options, name, runs.record)
+    return np.degrees(2.0 * quaternion.error_vector(q, runs.q))
+
+
+def _estimates(options: ComplementaryOptions, name: Filter, record: VectorRecord) -> FloatArray:
+    from adcs.complementary.adaptive import AdaptiveTuning, adaptive_track
+    from adcs.complementary.explicit import explicit_track
+    from adcs.complementary.gauss_newton import gauss_newton_track
+
+    if name == "adaptive":
+        return adaptive_track(record, AdaptiveTuning(first_sigma=1e-9 * options.sigma_nT)).q
+    substitution = Substitution(options.outage or "magnetometer-only")
+    track = explicit_track if name == "explicit" else gauss_newton_track
+    return track(record, options.gains, substitution=substitution).q
+
+
+_RUN_COLUMNS = (
+    "rms_deg",
+    "steady_rms_deg",
+    "peak_deg",
+    "outage_max_roll_deg",
+    "outage_max_pitch_deg",
+    "outage_max_yaw_deg",
+)
+
+
+def _row_of_each(options: ComplementaryOptions, orbits: FloatArray, errors: FloatArray) -> FloatArray:
+    """Columns of _RUN_COLUMNS, NaN where a run has none."""
+    outage = options.outage is not None
+    step = options.scenario.step_orbits
+    steady = (orbits >= 1.0) & (orbits < OUTAGE_ORBITS) if outage else (orbits >= RMS_ORBITS[0]) & (orbits < step)
+    after = (orbits >= step) & (orbits < (OUTAGE_ORBITS if outage else math.inf))
+    rows = np.full((len(errors), len(_RUN_COLUMNS)), np.nan)
+    for row, error in zip(rows, errors, strict=True):
+        pooled = error[(orbits >= RMS_ORBITS[0]) & (orbits < RMS_ORBITS[1])]
+        row[0] = math.sqrt(np.mean(pooled**2))
+        row[1] = math.sqrt(np.mean(error[steady] ** 2))
+        if after.any():
+            row[2] = np.abs(error[after]).max()
+        if outage:
+            row[3:] = np.abs(error[orbits >= OUTAGE_MAX_FROM_ORBITS]).max(axis=0)
+    return rows
+
+
+def _write_picture(options: ComplementaryOptions, runs: SatelliteRuns, out: Path) -> None:
+    from adcs.plots.complementary import ComplementaryPicture, complementary_figure
+
+    names: tuple[Filter, ...] = ("gauss-newton", "explicit", "adaptive")
+    errors: dict[str, FloatArray] = {name: errors_deg(options, name, runs)[0] for name in names}
+    orbits = runs.scenario.orbits
+    picture = ComplementaryPicture(
+        f"{options.gains_text}; {options.surroundings}",
+        orbits,
+        errors,
+        runs.scenario.step_orbits,
+        runs.scenario.outage_orbits,
+    )
+    complementary_figure(picture).savefig(out / "complementary.png", dpi=130)
+    columns = [f"{name.replace('-', '_')}_{axis}_deg" for name in names for axis in ("roll", "pitch", "yaw")]
+    write_table(
+        out / "complementary.csv",
+        ("time_s", "orbits", *columns),
+        np.column_stack([runs.scenario.time_s, orbits, *(errors[name] for name in names)]),
+    )
+
+
+def summary_lines(options: ComplementaryOptions, result: dict[str, Any]) -> list[str]:
+    """The settings and the result as text.
+
+    Parameters
+    ----------
+    options : ComplementaryOptions
+    result : dict
+        Of :func:`run_complementary`.
+
+    Returns
+    -------
+    list of str
+    """
+    peak = result["peak_deg"]
+    lines = [
+        f"{options.filter} filter" + ("" if options.filter == "adaptive" else f", {options.gains_text}"),
+        options.surroundings,
+        f"{options.seeds} run{'' if options.seeds == 1 else 's'} of {options.duration_s:.0f} s, errors of all axes:",
+        f"rms from 0.5 to 3 orbits [°]             {result['rms_deg']:.3f}",
+        f"rms while steady [°]                     {result['steady_rms_deg']:.3f}",
+        f"largest after the step [°]               {'none' if peak is None else f'{peak:.3f}'}",
+    ]
+    if result["outage_max_deg"] is not None:
+        largest = " / ".join(f"{value:.3f}" for value in result["outage_max_deg"])
+        lines.append(f"largest in the outage, roll / pitch / yaw [°]  {largest}")
+    return lines
+
+
+def complementary(
+    *,
+    options: ComplementaryOptions = ComplementaryOptions(),
+    out: Path | None = None,
+    json: Flag = False,
+    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Attitude of a satellite from magnetometer, Sun sensor and gyro by complementary filters.
+
+    The gyro's bias steps, or the Sun sensor fails.
+
+    Parameters
+    ----------
+    options : ComplementaryOptions
+        What is run.
+    out : Path, optional
+        Folder for the figure and the data behind it.
+    json : bool
+        Print one JSON object.
+    common : QuietOptions
+        Common options.
+    """
+    options.check()
+    warning = None if options.filter == "adaptive" else options.gains.warning(1.0)
+    if warning is not None and not common.quiet:
+        print_note(f"warning: {warning}")
+    with progress(options.seeds, "runs", quiet=common.quiet) as advance:
+        result = run_complementary(options, out, advance)
+    if json:
+        print_json(result)
+    else:
+        print("\n".join(summary_lines(options, result)))
+    if out is not None and not common.quiet:
+        print_note(f"wrote complementary.png, complementary.csv and complementary-runs.csv into {out}")

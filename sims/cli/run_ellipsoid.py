@@ -1,0 +1,294 @@
+"""``adcs run ellipsoid``: yaw from roll alone, with guaranteed ellipsoids."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from cyclopts import Parameter
+
+from adcs.cli.options import print_note
+from adcs.ellipsoids.roll_yaw import STEP_S, YAW, SetTrack
+from adcs.ellipsoids.strip import StepRule
+from arrays.io.arguments import Flag
+from arrays.io.csv import write_table
+from arrays.io.errors import InputError
+from arrays.io.outputs import refuse_file
+from arrays.typing import FloatArray
+from magloc.cli.framework import QuietOptions, print_json, progress
+
+JUMP_S = 2000.0
+_RUNS_AT_ONCE = 500  # 90 MB of an orbit
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class EllipsoidOptions:
+    """What is run.
+
+    Parameters
+    ----------
+    noise_deg : float
+        Largest error of the horizon sensor [°]: 1 of a compensated one, 4 of a raw one.
+    drift_deg_s : float
+        Zero shift of the yaw gyro, and its bound [°/s]: 0.02, or 0.0001 of a better one.
+    step : str
+        How far a set shrinks to a reading: least trace of a strip that is narrowed first ("tightened"), of the strip as
+        it is ("optimal"), or the source paper's step ("lemma").
+    jump : bool
+        The readings become four times as bad as their bound at 2000 s.
+    closed_loop : bool
+        The satellite in its attitude loop in place of the dynamics of the error alone.
+    seeds : int
+        Number of runs.
+    seed : int
+        Of the first run; the next ones follow.
+    duration : float
+        Seconds; one orbit by default.
+    """
+
+    noise_deg: float = 1.0
+    drift_deg_s: float = 0.02
+    step: StepRule = "tightened"
+    jump: Annotated[bool, Parameter(negative=(), show_default=False)] = False
+    closed_loop: Annotated[bool, Parameter(negative=(), show_default=False)] = False
+    seeds: Annotated[int, Parameter(name=["--seeds", "--runs"])] = 300
+    seed: int = 0
+    duration: float = 5678.0
+
+    def check(self) -> None:
+        """Raise InputError for what cannot be run."""
+        for name, value in (("--noise-deg", self.noise_deg), ("--drift-deg-s", self.drift_deg_s)):
+            if not 0.0 < value < math.inf:
+                raise InputError(f"{name}: found {value:g}, expected a positive number.")
+        if not STEP_S <= self.duration <= 1e7:
+            raise InputError(f"--duration: found {self.duration:g} s, expected {STEP_S:g} to 1e7 s.")
+        if self.jump and self.duration <= JUMP_S:
+            raise InputError(f"--duration: found {self.duration:g} s, expected more than the {JUMP_S:g} s of --jump.")
+        if self.seed < 0:
+            raise InputError(f"--seed: found {self.seed}, expected 0 or more.")
+        if self.seeds < 1:
+            raise InputError(f"--seeds: found {self.seeds}, expected a positive number.")
+
+    @property
+    def n_steps(self) -> int:
+        """Steps of 2 s."""
+        return int(self.duration / STEP_S)
+
+
+@dataclass(frozen=True, eq=False)
+class _Runs:
+    """Truth and sets of some runs."""
+
+    seeds: range
+    states_rad: FloatArray
+    track: SetTrack
+    roll_readings_rad: FloatArray
+    increments_rad: FloatArray | None
+
+
+def run_ellipsoid(
+    options: EllipsoidOptions, out: Path | None = None, progress: Callable[[int], None] | None = None
+) -> dict[str, Any]:
+    """Run the scenario, and write its figure and data.
+
+    Parameters
+    ----------
+    options : EllipsoidOptions
+    out : Path, optional
+        Folder for ``ellipsoid.png`` (the first 500 runs at most), ``ellipsoid.csv`` (the first run through time) and
+        ``ellipsoid-runs.csv`` (all runs); made if it is not there.
+    progress : callable, optional
+        Called with the number of runs finished since the last call.
+
+    Returns
+    -------
+    dict
+        ``final_error_mean_deg``, ``final_error_p95_deg`` and ``final_error_max_deg`` of the estimated yaw,
+        ``half_width_mean_deg``, the guaranteed half-width of yaw at the end, ``containment_violations`` of all
+        ``steps``, and ``resets_mean``, contradictions in a run.
+
+    Raises
+    ------
+    InputError
+        An option is out of range, or out is no folder.
+    OSError
+        A file cannot be written.
+    """
+    options.check()
+    if out is not None:
+        refuse_file(out, "--out")
+    rows: list[FloatArray] = []
+    last = options.seed + options.seeds
+    for begin in range(options.seed, last, _RUNS_AT_ONCE):
+        runs = _run(options, range(begin, min(begin + _RUNS_AT_ONCE, last)))
+        rows.append(_row_of_each(runs))
+        if out is not None and begin == options.seed:
+            out.mkdir(parents=True, exist_ok=True)
+            _write_picture(options, runs, out)
+        if progress is not None:
+            progress(len(runs.seeds))
+    table = np.concatenate(rows)
+    if out is not None:
+        write_table(out / "ellipsoid-runs.csv", _RUN_COLUMNS, table)
+    error, half_width, resets, outside = table[:, 1], table[:, 2], table[:, 4], table[:, 5]
+    return {
+        "final_error_mean_deg": float(error.mean()),
+        "final_error_p95_deg": float(np.percentile(error, 95.0)),
+        "final_error_max_deg": float(error.max()),
+        "half_width_mean_deg": float(half_width.mean()),
+        "containment_violations": int(outside.sum()),
+        "steps": options.seeds * options.n_steps,
+        "resets_mean": float(resets.mean()),
+    }
+
+
+def _run(options: EllipsoidOptions, seeds: range) -> _Runs:
+    # The command line stands on top of all packages; nothing that it imports imports it.
+    from adcs.ellipsoids.roll_yaw import AttitudeLoop, observe, roll_yaw_observer, roll_yaw_system
+    from sims.attitude.roll_yaw import ErrorScenario, LoopScenario, error_runs, fly
+
+    noise, drift, n_steps = math.radians(options.noise_deg), math.radians(options.drift_deg_s), options.n_steps
+    jump_s = JUMP_S if options.jump else None
+    observer = roll_yaw_observer(roll_yaw_system(noise, drift), len(seeds), options.step)
+    if options.closed_loop:
+        loop = AttitudeLoop(observer, n_steps)
+        scenario = LoopScenario(noise, drift, n_steps, first_yaw_rad=2.0 * noise, jump_s=jump_s)
+        flown = fly(scenario, loop, seeds)
+        states = flown.angles_rad[..., [0, 2]]
+        return _Runs(seeds, states, loop.recorder.track, flown.roll_readings_rad, flown.increments_rad)
+    runs = error_runs(ErrorScenario(noise, drift, n_steps, jump_s=jump_s), seeds)
+    return _Runs(seeds, runs.states_rad, observe(observer, runs.readings_rad), runs.readings_rad, None)
+
+
+_RUN_COLUMNS = ("seed", "final_error_deg", "half_width_deg", "bound_deg", "resets", "violations", "yaw_max_1000s_deg")
+
+
+def _row_of_each(runs: _Runs) -> FloatArray:
+    """Columns of _RUN_COLUMNS; the last one is the largest yaw after 1000 s, NaN of a shorter run."""
+    from adcs.ellipsoids.roll_yaw import violations
+
+    track, yaw = runs.track, runs.states_rad[..., YAW]
+    late = np.abs(yaw[:, int(1000.0 / STEP_S) :])
+    columns = [
+        np.array(runs.seeds),
+        np.degrees(np.abs(track.centres[:, -1, YAW] - yaw[:, -1])),
+        np.degrees(track.yaw_half_widths[:, -1]),
+        np.degrees(track.bounds[:, -1]),
+        track.resets[:, -1],
+        violations(track, runs.states_rad),
+        np.degrees(late.max(axis=1)) if late.size else np.full(len(yaw), np.nan),
+    ]
+    return np.stack(columns, axis=1)
+
+
+def _write_picture(options: EllipsoidOptions, runs: _Runs, out: Path) -> None:
+    from adcs.ellipsoids.roll_yaw import kalman_track, roll_yaw_system
+    from adcs.plots.ellipsoids import RollYawPicture, roll_yaw_figure
+
+    system = roll_yaw_system(math.radians(options.noise_deg), math.radians(options.drift_deg_s))
+    increments = None if runs.increments_rad is None else runs.increments_rad[0]
+    kalman = kalman_track(system, runs.roll_readings_rad[0], increments)
+    time_s = STEP_S * np.arange(options.n_steps + 1, dtype=np.float64)
+    parts = [
+        "Attitude loop" if options.closed_loop else "Error dynamics",
+        f"horizon sensor ±{options.noise_deg:g}°"
+        + (f", ±{4.0 * options.noise_deg:g}° from {JUMP_S:g} s" if options.jump else ""),
+        f"gyro {options.drift_deg_s:g} °/s",
+        f"step '{options.step}'",
+    ]
+    jump_s = JUMP_S if options.jump else None
+    picture = RollYawPicture("; ".join(parts), time_s, runs.states_rad, runs.track, kalman, options.closed_loop, jump_s)
+    roll_yaw_figure(picture).savefig(out / "ellipsoid.png", dpi=130)
+    track, H, P = runs.track, runs.track.shapes[0], kalman.covariances
+    columns = [
+        time_s,
+        *np.degrees(runs.states_rad[0]).T,
+        *np.degrees(track.centres[0]).T,
+        *(np.degrees(np.degrees(H[:, i, j])) for i, j in ((0, 0), (0, 1), (1, 1))),
+        np.degrees(track.bounds[0]),
+        track.resets[0],
+        *np.degrees(kalman.means).T,
+        *(np.degrees(np.degrees(P[:, i, j])) for i, j in ((0, 0), (0, 1), (1, 1))),
+    ]
+    write_table(out / "ellipsoid.csv", _TIME_COLUMNS, np.stack(columns, axis=1))
+
+
+_TIME_COLUMNS = (
+    "time_s",
+    "true_roll_deg",
+    "true_yaw_deg",
+    "roll_deg",
+    "yaw_deg",
+    "shape_roll_roll_deg2",
+    "shape_roll_yaw_deg2",
+    "shape_yaw_yaw_deg2",
+    "bound_deg",
+    "resets",
+    "kalman_roll_deg",
+    "kalman_yaw_deg",
+    "kalman_roll_roll_deg2",
+    "kalman_roll_yaw_deg2",
+    "kalman_yaw_yaw_deg2",
+)
+
+
+def summary_lines(options: EllipsoidOptions, result: dict[str, Any]) -> list[str]:
+    """The result as text, one line for each number.
+
+    Parameters
+    ----------
+    options : EllipsoidOptions
+    result : dict
+        Of :func:`run_ellipsoid`.
+
+    Returns
+    -------
+    list of str
+    """
+    return [
+        f"{options.seeds} runs of {options.n_steps * STEP_S:g} s",
+        f"error of yaw at the end, mean / 95 % / largest [°]  {result['final_error_mean_deg']:.3f} /"
+        f" {result['final_error_p95_deg']:.3f} / {result['final_error_max_deg']:.3f}",
+        f"guaranteed half-width of yaw at the end, mean [°]   {result['half_width_mean_deg']:.3f}",
+        f"truth outside of the set                            {result['containment_violations']} of"
+        f" {result['steps']} steps",
+        f"readings that contradicted the set, in a run        {result['resets_mean']:.2f}",
+    ]
+
+
+def ellipsoid(
+    *,
+    options: EllipsoidOptions = EllipsoidOptions(),
+    out: Path | None = None,
+    json: Flag = False,
+    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Yaw of a satellite from a horizon sensor and gyros, in guaranteed ellipsoids.
+
+    Nothing measures yaw: the orbit turns it into roll and back. Of the errors only bounds are known, and the sets hold
+    the true attitude for certain.
+
+    Parameters
+    ----------
+    options : EllipsoidOptions
+        What is run.
+    out : Path, optional
+        Folder for the figure and the data behind it.
+    json : bool
+        Print one JSON object.
+    common : QuietOptions
+        Common options.
+    """
+    with progress(options.seeds, "runs", quiet=common.quiet) as advance:
+        result = run_ellipsoid(options, out, advance)
+    if json:
+        print_json(result)
+    else:
+        print("\n".join(summary_lines(options, result)))
+    if out is not None and not common.quiet:
+        print_note(f"wrote ellipsoid.png, ellipsoid.csv and ellipsoid-runs.csv into {out}")

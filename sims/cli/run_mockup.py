@@ -1,0 +1,403 @@
+"""``adcs run mockup``: the table-top satellite under its sky of LEDs: identification, zeros, fusion of late fixes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from adcs.cli.options import print_note
+from arrays.io.arguments import Flag
+from arrays.io.outputs import make_folder, refuse_file
+from magloc.cli.framework import QuietOptions, print_json, progress
+from sims.cli.mockup_replay import ReplayOptions
+from sims.experiments.mockup_navigation import METHODS, SETTLED_S, FusionRuns, Method, ZerosRuns, fused_runs, zeros_run
+from sims.experiments.mockup_settings import MockupOptions, value_or
+
+if TYPE_CHECKING:
+    from sims.experiments.mockup_vision import FrameResult, SkyRun
+
+
+Advance = Callable[[int], None]
+
+
+def sky_runs(options: MockupOptions, advance: Advance | None = None) -> SkyRun:
+    """Frames of all seeds, identified.
+
+    Parameters
+    ----------
+    options : MockupOptions
+    advance : callable, optional
+        Called with the number of frames finished since the last call.
+
+    Returns
+    -------
+    SkyRun
+        One seed after the other.
+
+    Raises
+    ------
+    InputError
+        The file of the sky is none, or the lens folds the image.
+    """
+    from sims.experiments.mockup_vision import sky_run
+
+    sky, setup = options.led_sky, options.sky_setup()
+    matcher = options.matcher_of(sky)
+    return joined([sky_run(sky, matcher, setup, seed, advance, options.finder()) for seed in options.runs(1)])
+
+
+def joined(runs: Sequence[SkyRun]) -> SkyRun:
+    """Runs as one, row after row."""
+    arrays = {name: np.concatenate([getattr(run, name) for run in runs]) for name in vars(runs[0]) if name != "reasons"}
+    return type(runs[0])(**arrays, reasons=tuple(reason for run in runs for reason in run.reasons))
+
+
+def frames_identified(options: MockupOptions) -> dict[Path, FrameResult]:
+    """Frames of files, identified.
+
+    Parameters
+    ----------
+    options : MockupOptions
+        With frames and sky.
+
+    Returns
+    -------
+    dict
+        From path to result.
+
+    Raises
+    ------
+    InputError
+        A file is no frame or no sky.
+    """
+    from adcs.mockup.vision.frame_files import frame_paths
+    from sims.experiments.mockup_vision import identified_files
+
+    sky = options.led_sky
+    paths = frame_paths(options.frames) if options.frames is not None else []
+    return identified_files(paths, options.camera(), options.matcher_of(sky), options.finder())
+
+
+def frame_entries(results: dict[Path, FrameResult]) -> list[dict[str, Any]]:
+    """What ``--json`` prints of every file.
+
+    Parameters
+    ----------
+    results : dict
+        Of :func:`frames_identified`.
+
+    Returns
+    -------
+    list of dict
+    """
+    from adcs.mockup.vision.paper_matcher import CameraFix
+
+    entries = []
+    for path, result in results.items():
+        fix = result.fix
+        entry: dict[str, Any] = {"file": path.name, "stars": len(result.stars)}
+        if isinstance(fix, CameraFix):
+            entry |= {
+                "position_m": fix.position_m.tolist(),
+                "heading_deg": math.degrees(fix.heading_rad),
+                "matched": len(fix.stars),
+                "rms_mm": 1e3 * fix.rms_m,
+            }
+        else:
+            entry |= {"position_m": None, "reason": fix.reason}
+        entries.append(entry)
+    return entries
+
+
+def sky_lines(options: MockupOptions, result: dict[str, Any]) -> list[str]:
+    """The result of frames as text.
+
+    Parameters
+    ----------
+    options : MockupOptions
+    result : dict
+        ``summary()`` of the run.
+
+    Returns
+    -------
+    list of str
+    """
+    setup = options.sky_setup()
+    damage = [f"noise {setup.noise_DN:g} DN"]
+    damage += [f"{100.0 * setup.lost:g} % of the lights lost"] if setup.lost else []
+    damage += [f"{setup.spurious} spurious"] if setup.spurious else []
+    damage += [f"{setup.hot_pixels} hot pixels"] if setup.hot_pixels else []
+    damage += [f"{setup.speed_m_s:g} m/s"] if setup.speed_m_s else []
+    damage += [f"{math.degrees(setup.turn_rate_rad_s):g} °/s"] if setup.turn_rate_rad_s else []
+    damage += [f"k1 {setup.k1:g} (believed {setup.believed_k1:g})"] if setup.k1 or setup.believed_k1 else []
+    poses, good = result["poses"], round(result["success"] * result["poses"])
+    return [
+        f"{poses} frames {setup.footprint_m:g} m wide, matcher {value_or(options.matcher, 'robust')}",
+        ", ".join(damage),
+        f"good fixes, within 20 mm and 2°    {good} of {poses} ({100.0 * result['success']:.1f} %)",
+        f"false fixes                        {result['false_fixes']}",
+        f"position of good fixes, rms [mm]   {_number(result['position_rms_mm'], 3)}",
+        f"heading of good fixes, rms [°]     {_number(result['heading_rms_deg'], 4)}",
+        f"identification, median [ms]        {result['identify_ms_median']:.2f}",
+        f"whole frame, median [ms]           {result['frame_ms_median']:.2f}",
+    ]
+
+
+def frame_lines(entries: Sequence[dict[str, Any]]) -> list[str]:
+    """Fixes of files as a table.
+
+    Parameters
+    ----------
+    entries : sequence of dict
+        Of :func:`frame_entries`.
+
+    Returns
+    -------
+    list of str
+    """
+    width = max(5, *(len(entry["file"]) for entry in entries))
+    lines = [f"{'frame':{width}s}  stars  matched    X [m]    Y [m]  heading [°]  rms [mm]"]
+    for entry in entries:
+        start = f"{entry['file']:{width}s}  {entry['stars']:5d}"
+        if entry["position_m"] is None:
+            lines.append(f"{start}  no fix: {entry['reason']}")
+            continue
+        x, y = entry["position_m"]
+        lines.append(
+            f"{start}  {entry['matched']:7d}  {x:7.4f}  {y:7.4f}  {entry['heading_deg']:11.3f}  {entry['rms_mm']:8.2f}"
+        )
+    return lines
+
+
+def fusion_lines(runs: FusionRuns, duration_s: float) -> list[str]:
+    """The result of drives as text.
+
+    Parameters
+    ----------
+    runs : FusionRuns
+    duration_s : float
+
+    Returns
+    -------
+    list of str
+    """
+    from adcs.mockup.navigation.fixes import counts_in_words
+
+    result = runs.summary()
+    return [
+        f"{_runs(result['runs'])} of {duration_s:g} s, fusion {runs.method}, errors after {SETTLED_S:g} s:",
+        f"position, rms / 95 % / largest [mm]  {result['position_rms_mm']:.2f} / {result['position_p95_mm']:.2f} /"
+        f" {result['position_max_mm']:.2f}",
+        f"velocity, rms [mm/s]                 {result['velocity_rms_mm_s']:.2f}",
+        f"heading, rms [°]                     {result['heading_rms_deg']:.4f}",
+        f"fixes                                {result['fixes']}:"
+        f" {counts_in_words(result['used_fixes'], result['unused_fixes'])}; {result['false_fixes']} of them false",
+    ]
+
+
+def methods_lines(every: Sequence[FusionRuns], duration_s: float) -> list[str]:
+    """The results of several methods as a table.
+
+    Parameters
+    ----------
+    every : sequence of FusionRuns
+        Of the same drives.
+    duration_s : float
+
+    Returns
+    -------
+    list of str
+    """
+    first = every[0].summary()
+    lines = [
+        f"{_runs(first['runs'])} of {duration_s:g} s, errors after {SETTLED_S:g} s:",
+        f"{'fusion':20s}{'position: rms':>14s}{'95 %':>9s}{'max [mm]':>10s}"
+        f"{'velocity [mm/s]':>17s}{'heading [°]':>13s}",
+    ]
+    for runs in every:
+        result = runs.summary()
+        lines.append(
+            f"{runs.method:20s}{result['position_rms_mm']:14.2f}{result['position_p95_mm']:9.2f}"
+            f"{result['position_max_mm']:10.2f}{result['velocity_rms_mm_s']:17.2f}{result['heading_rms_deg']:13.4f}"
+        )
+    return lines
+
+
+def zeros_lines(runs: ZerosRuns, duration_s: float) -> list[str]:
+    """The result of fits as text.
+
+    Parameters
+    ----------
+    runs : ZerosRuns
+    duration_s : float
+
+    Returns
+    -------
+    list of str
+    """
+    result = runs.summary()
+    return [
+        f"{_runs(result['runs'])} of {duration_s:g} s, unknowns {runs.unknowns}:",
+        f"integrated position before, rms [mm]  {result['position_before_rms_mm']:.2f}",
+        f"integrated position after, rms [mm]   {result['position_rms_mm']:.2f}",
+        f"error of the zeros, mean [m/s²]       {result['zero_error_m_s2']:.5f}",
+        f"distance from the fixes, rms [mm]     {result['residual_rms_mm']:.2f}",
+    ]
+
+
+def _number(value: float | None, decimals: int) -> str:
+    return "none" if value is None else f"{value:.{decimals}f}"
+
+
+def _runs(number: int) -> str:
+    return f"{number} run{'' if number == 1 else 's'}"
+
+
+def mockup(
+    *,
+    options: MockupOptions = MockupOptions(),  # noqa: B008 - frozen
+    replay: ReplayOptions = ReplayOptions(),  # noqa: B008 - frozen
+    out: Path | None = None,
+    json: Flag = False,
+    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Table-top satellite that looks up at a sky of LEDs: star identification, zeros, and fusion of late fixes.
+
+    Parameters
+    ----------
+    options : MockupOptions
+        What is run.
+    replay : ReplayOptions
+        Replay of the first drive.
+    out : Path, optional
+        Folder for figures and the data behind them.
+    json : bool
+        Print one JSON object.
+    common : QuietOptions
+        Common options.
+    """
+    options.check()
+    replay.check(options, json=json)
+    if out is not None:
+        refuse_file(out, "--out")
+    if options.frames is not None:
+        result, lines, written = _frames(options, out)
+    elif options.samples is not None and options.fixes is not None:
+        result, lines, written = _recording(options.samples, options.fixes, options, out, quiet=common.quiet)
+    elif options.part == "sky":
+        result, lines, written = _sky(options, out, quiet=common.quiet)
+    elif options.part == "zeros":
+        result, lines, written = _zeros(options, out, quiet=common.quiet)
+    else:
+        _drives(options, replay, out, json=json, quiet=common.quiet)
+        return
+    _tell(result, lines, written, out, json=json, quiet=common.quiet)
+
+
+Told = tuple[dict[str, Any], list[str], list[str]]
+"""What is printed as JSON, what as text, and which files were written."""
+
+
+def _frames(options: MockupOptions, out: Path | None) -> Told:
+    results = frames_identified(options)
+    entries = frame_entries(results)
+    fixed = sum(entry["position_m"] is not None for entry in entries)
+    written = []
+    if out is not None:
+        from sims.cli.mockup_files import write_frames
+
+        make_folder(out, "--out")
+        written = write_frames(results, options.led_sky, options.camera(), out)
+    return {"frames": entries, "identified": fixed}, frame_lines(entries), written
+
+
+def _recording(samples: Path, fixes: Path, options: MockupOptions, out: Path | None, *, quiet: bool) -> Told:
+    from sims.cli.mockup_files import write_record
+    from sims.experiments.mockup_recording import fused_record, record_lines
+
+    run = fused_record(samples, fixes, value_or(options.fusion, "ekf"))
+    if not quiet:
+        for line in run.warnings:
+            print_note(f"warning: {line}")
+    written = []
+    if out is not None:
+        make_folder(out, "--out")
+        written = write_record(run, out)
+    return run.summary(), record_lines(run), written
+
+
+def _sky(options: MockupOptions, out: Path | None, *, quiet: bool) -> Told:
+    setup, seeds = options.sky_setup(), options.runs(1)
+    with progress(setup.poses * len(seeds), "frames", quiet=quiet) as advance:
+        run = sky_runs(options, advance)
+    result = run.summary()
+    written = []
+    if out is not None:
+        from sims.cli.mockup_files import write_sky_run
+
+        make_folder(out, "--out")
+        written = write_sky_run(options, run, out)
+    return result, sky_lines(options, result), written
+
+
+def _zeros(options: MockupOptions, out: Path | None, *, quiet: bool) -> Told:
+    seeds = options.runs(6)
+    with progress(len(seeds), "runs", quiet=quiet) as advance:
+        runs = zeros_run(
+            value_or(options.unknowns, "six"),
+            len(seeds),
+            options.duration_s,
+            seed=options.seed,
+            start_fixes=value_or(options.start_fixes, 4),
+            progress=advance,
+        )
+    written = []
+    if out is not None:
+        from sims.cli.mockup_files import write_zeros
+
+        make_folder(out, "--out")
+        written = write_zeros(runs, out)
+    return runs.summary(), zeros_lines(runs, options.duration_s), written
+
+
+def _drives(options: MockupOptions, replay: ReplayOptions, out: Path | None, *, json: bool, quiet: bool) -> None:
+    if replay.wanted:
+        from sims.cli.mockup_replay import check_places
+
+        check_places(replay)
+    scenario, seeds = options.table_scenario(), options.runs(6)
+    wanted = value_or(options.fusion, "ekf")
+    methods: tuple[Method, ...] = METHODS if wanted == "all" else (wanted,)
+    with progress(len(seeds) * len(methods), "runs", quiet=quiet) as advance:
+        every = [fused_runs(method, scenario, seeds, advance) for method in methods]
+    runs, written = every[0], []
+    if out is not None:
+        from sims.cli.mockup_files import write_fusion, write_methods
+
+        make_folder(out, "--out")
+        written = write_methods(every, out) if wanted == "all" else write_fusion(runs, out)
+    result = runs.summary()
+    lines = fusion_lines(runs, options.duration_s)
+    if wanted == "all":
+        result = {str(one.method): one.summary() for one in every}
+        lines = methods_lines(every, options.duration_s)
+    _tell(result, lines, written, out, json=json, quiet=quiet)
+    if replay.wanted:
+        from sims.cli.mockup_replay import show_replay
+
+        show_replay(runs, replay, quiet=quiet)
+
+
+def _tell(
+    result: dict[str, Any], lines: list[str], written: list[str], out: Path | None, *, json: bool, quiet: bool
+) -> None:
+    if json:
+        print_json(result)
+    else:
+        print("\n".join(lines))
+    if written and not quiet:
+        print_note(f"wrote {', '.join(written)} into {out}")

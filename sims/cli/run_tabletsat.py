@@ -1,0 +1,183 @@
+"""``adcs run tabletsat``, any other scenario of a satellite with a Kalman filter, and a user's own scenario file."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from adcs.cli.options import ScenarioOptions, print_note
+from adcs.io.scenario_files import MOST_STEPS, AttitudeFile, built_in_scenarios, changed, estimate_of, read_scenario
+from adcs.kalman.bank import Estimate
+from arrays.io.arguments import Count, Flag, Seed
+from arrays.io.errors import InputError
+from magloc.cli.framework import QuietOptions, print_json, progress
+
+_OTHERS = ("complementary", "ellipsoid", "mockup")
+_STAR_NOISE_DEG = {"angle": 0.001, "paper": 0.002}
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class RunOptions:
+    """Runs.
+
+    Parameters
+    ----------
+    seeds : int
+        Number of runs.
+    seed : int
+        Of the first run; the next ones follow.
+    duration : float
+        Seconds; by default the scenario's.
+    """
+
+    seeds: Annotated[Count, Parameter(name=["--seeds", "--runs"])] = 10
+    seed: Seed = 0
+    duration: float | None = None
+
+    @property
+    def numbers(self) -> range:
+        """Seeds of all runs."""
+        return range(self.seed, self.seed + self.seeds)
+
+
+def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) -> tuple[AttitudeFile, Estimate]:
+    """The scenario with the options in it, and its filter.
+
+    Parameters
+    ----------
+    scenario : str
+        Name or file.
+    options : ScenarioOptions
+    duration_s : float, optional
+
+    Returns
+    -------
+    AttitudeFile, Estimate
+
+    Raises
+    ------
+    InputError
+        The file or an option cannot be used.
+    """
+    file = read_scenario(scenario)
+    changes = options.changes(duration_s)
+    if duration_s is not None and not 1.0 <= duration_s / file.step_s <= MOST_STEPS:
+        longest_s = MOST_STEPS * file.step_s
+        raise InputError(f"--duration: found {duration_s:g} s, expected {file.step_s:g} to {longest_s:g} s.")
+    if options.start_error_deg is not None and not 0.0 < options.start_error_deg <= 180.0:
+        raise InputError(f"--start-error-deg: found {options.start_error_deg:g}, expected more than 0 and at most 180.")
+    if options.field_error_nT is not None and not 0.0 <= options.field_error_nT <= 1e9:
+        raise InputError(f"--field-error-nT: found {options.field_error_nT:g}, expected 0 to 1e9.")
+    file = changed(file, changes)
+    if options.star_noise is not None:
+        tables = {**file.tables.get("sensors", {})}
+        tables["star_tracker"] = {**tables.get("star_tracker", {}), "noise_deg": _STAR_NOISE_DEG[options.star_noise]}
+        file = changed(file, {"sensors": tables})
+    given = [f"--{key}" for key in ("sensors", "states", "filter") if getattr(options, key) is not None]
+    return file, estimate_of(" and ".join(given) or file.path, file.estimate)
+
+
+def run_attitude(
+    scenario: str,
+    /,
+    *,
+    options: ScenarioOptions = ScenarioOptions(),
+    runs: RunOptions = RunOptions(),
+    out: Path | None = None,
+    json: Flag = False,
+    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Simulate a satellite, estimate its attitude with a Kalman filter, and say how good that is.
+
+    Errors are those of the last minute: the rms of every axis, its mean over the runs, of these the worst axis. A run
+    that is more than 10° off then has diverged. Beside the figures, --out writes telemetry.csv and scenario.toml, with
+    which `adcs estimate` does the same.
+
+    Parameters
+    ----------
+    scenario : str
+        Scenario file (TOML), or a built-in scenario: tabletsat, collinearity, eclipse, field-error, one-vector or
+        star-blinded.
+    options : ScenarioOptions
+        What differs from the scenario file.
+    runs : RunOptions
+        Runs.
+    out : Path, optional
+        Folder for figures and data.
+    json : bool
+        Print one JSON object.
+    common : QuietOptions
+        Common options.
+    """
+    from arrays.io.outputs import make_folder, refuse_file
+    from sims.experiments.attitude import Part, run_scenario
+
+    if scenario in _OTHERS:
+        raise InputError(f"adcs run: found options before {scenario}, expected its name right after run.")
+    names = sorted([*_OTHERS, *built_in_scenarios()])
+    if scenario not in names and not Path(scenario).exists():
+        nearest = difflib.get_close_matches(scenario, names, n=1, cutoff=0.0)[0]
+        raise InputError(
+            f"{scenario} does not exist, expected a scenario file, or one of {', '.join(names)} "
+            f"(the nearest is {nearest})."
+        )
+    file, estimate = wanted(scenario, options, runs.duration)
+    if out is not None:
+        refuse_file(out, "--out")
+    parts: list[Part] = []
+    with progress(runs.seeds, "runs", quiet=common.quiet) as advance:
+        outcome = run_scenario(
+            file, estimate, runs.numbers, look=None if out is None else parts.append, advance=advance
+        )
+    if not common.quiet:
+        for line in outcome.warning_lines():
+            print_note(f"warning: {line}")
+    numbers = outcome.numbers()
+    if out is not None:
+        from sims.cli.attitude_files import write_attitude_files
+
+        make_folder(out, "--out")
+        written = write_attitude_files(out, file, estimate, parts, outcome)
+        if not common.quiet:
+            print_note(f"wrote {', '.join(written)} into {out}")
+    if json:
+        print_json(numbers)
+    else:
+        print("\n".join(summary_lines(file, estimate, numbers)))
+
+
+_ROWS = (
+    ("angle_rms_deg", "angle, rms of the last minute", "°"),
+    ("rate_rms_deg_s", "rate", "°/s"),
+    ("gyro_bias_rms_deg_s", "bias of the gyro", "°/s"),
+    ("field_bias_rms_nT", "bias of the magnetometer", "nT"),
+    ("disturbance_rms_s2", "disturbing acceleration", "1/s²"),
+)
+
+
+def summary_lines(file: AttitudeFile, estimate: Estimate, numbers: dict[str, Any]) -> Sequence[str]:
+    """The result as text.
+
+    Parameters
+    ----------
+    file : AttitudeFile
+    estimate : Estimate
+    numbers : dict
+        What ``--json`` prints.
+
+    Returns
+    -------
+    sequence of str
+    """
+    runs = "1 run" if numbers["runs"] == 1 else f"{numbers['runs']} runs"
+    lines = [f"{file.name}: {runs} of {file.duration_s:g} s; {estimate.in_words}"]
+    lines += [f"{what:34s}{numbers[key]:.3g} {unit}" for key, what, unit in _ROWS if numbers[key] is not None]
+    lines.append(f"{'NEES / numbers (1 is consistent)':34s}{numbers['nees_per_dimension']:.3g}")
+    lines.append(f"{'diverged runs':34s}{numbers['diverged_runs']}")
+    return lines

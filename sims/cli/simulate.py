@@ -1,0 +1,65 @@
+"""``magloc simulate``: readings of a scenario, the truth behind them, and the array as its user knows it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from arrays.io.arguments import Flag
+from arrays.io.errors import InputError
+from magloc.cli.framework import CommonOptions, print_json
+from magloc.cli.options import print_note
+
+
+def simulate(
+    scenario: str,
+    /,
+    *,
+    out: Path,
+    json: Flag = False,
+    common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Simulate the readings of an array.
+
+    Beside READINGS.csv are written READINGS-truth.csv, with the position and the moment of the source in the world
+    frame (READINGS-truth-2.csv and so on of further sources), and READINGS-array.toml, with what the user of the array
+    knows of it: noise of one sample, saturation, and how uncertain axes and gains are.
+
+    Parameters
+    ----------
+    scenario : str
+        Scenario file (TOML), or a built-in scenario: diver, drone, hand-magnet, paper, ship or weaving.
+    out : Path
+        Readings file (CSV) to write. Existing files are replaced.
+    json : bool
+        Print one JSON object that names the files.
+    common : CommonOptions
+        Common options.
+    """
+    # The command line stands on top of all packages; nothing that it imports imports it.
+    from arrays.io.outputs import refuse_unwritable
+    from sims.magnetics.files import files_beside, write_simulation
+    from sims.magnetics.scenario_files import read_scenario
+    from sims.magnetics.simulation import simulate as simulated
+
+    wanted = read_scenario(scenario)
+    for path in files_beside(out, len(wanted.sources)).all:
+        refuse_unwritable(path, "--out")
+    try:
+        result = simulated(wanted, common.seed)
+    except ValueError as error:
+        raise InputError(f"{scenario}: {str(error).removeprefix('Input ')}") from None
+    files = write_simulation(result, out)
+    if json:
+        report = {
+            "scenario": wanted.name,
+            "seed": common.seed,
+            "rows": len(result.readings),
+            "channels": result.array.n_channels,
+            "readings": str(files.readings),
+            "array": str(files.array),
+            "truths": [str(path) for path in files.truths],
+        }
+        print_json(report)
+    if not (json or common.quiet):
+        listed = ", ".join(map(str, files.all))
+        print_note(f"{len(result.readings)} rows of {result.array.n_channels} channels; wrote {listed}")

@@ -1,0 +1,1 @@
+"""Runs that simulate and estimate; what repeats the papers."""

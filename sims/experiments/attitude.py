@@ -1,0 +1,240 @@
+"""Runs of an attitude scenario: truth, readings, estimates, and how good these are."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adcs import quaternion
+from adcs.io.scenario_files import AttitudeFile
+from adcs.kalman import accuracy
+from adcs.kalman.bank import Estimate
+from adcs.kalman.error_state import Estimates, start_near
+from arrays.io.errors import InputError
+
+if TYPE_CHECKING:
+    from sims.attitude.scenario import AttitudeScenario
+    from sims.attitude.simulation import AttitudeRuns
+from adcs.kalman.bank import estimated, start_of
+from arrays.typing import FloatArray
+
+_NUMBERS_AT_ONCE = 40_000_000
+"""Of all covariances that are held together: 320 MB."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Some runs that are held together.
+
+    Attributes
+    ----------
+    runs : AttitudeRuns
+    estimates : Estimates
+    """
+
+    runs: AttitudeRuns
+    estimates: Estimates
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """How good the estimates of all runs are.
+
+    Attributes
+    ----------
+    seeds : ndarray of int, shape (runs,)
+    axis_rms : ndarray, shape (runs, 15)
+        Rms over the last minute of the angle [°], the rate [°/s], the gyro's bias [°/s], the field's bias [nT] and the
+        disturbance [1/s²], three axes each; NaN of a state that the filter does not have.
+    nees : ndarray, shape (runs, n)
+        Normalised error squared, over its numbers.
+    nis : ndarray, shape (runs, n, 4)
+        Normalised innovation squared of every sensor, NaN where it has no reading.
+    error_deg : ndarray, shape (runs, n)
+        Angle between truth and estimate.
+    diverged : ndarray of bool, shape (runs,)
+    size : int
+        Numbers of the error state.
+    late : slice
+        Instants of the last minute.
+    warnings : list of list of str
+        What can be told of every run without the truth: what is degraded or not observable.
+    """
+
+    seeds: NDArray[np.int64]
+    axis_rms: FloatArray
+    nees: FloatArray
+    nis: FloatArray
+    error_deg: FloatArray
+    diverged: NDArray[np.bool_]
+    size: int
+    late: slice
+    warnings: list[list[str]]
+
+    def warning_lines(self) -> list[str]:
+        """One line for every kind of warning: that of the first run which has it, and in how many runs it comes."""
+        first: dict[str, str] = {}
+        count: dict[str, int] = {}
+        for texts in self.warnings:
+            for text in texts:
+                kind = re.sub(r"\d[\d.]*", "#", text)
+                first.setdefault(kind, text)
+                count[kind] = count.get(kind, 0) + 1
+        runs = len(self.warnings)
+        return [text + (f" ({count[kind]} of {runs} runs)" if runs > 1 else "") for kind, text in first.items()]
+
+    def numbers(self) -> dict[str, Any]:
+        """What ``--json`` prints: every axis' mean over the runs, and of these the worst axis."""
+        mean = self.axis_rms.mean(axis=0).reshape(5, 3).max(axis=1)
+        names = ("angle_rms_deg", "rate_rms_deg_s", "gyro_bias_rms_deg_s", "field_bias_rms_nT", "disturbance_rms_s2")
+        return {
+            **{name: None if math.isnan(value) else float(value) for name, value in zip(names, mean, strict=True)},
+            "nees_per_dimension": float(self.nees[:, self.late].mean()),
+            "diverged_runs": int(self.diverged.sum()),
+            "runs": len(self.seeds),
+        }
+
+
+def parts_of(file: AttitudeFile, estimate: Estimate, seeds: Sequence[int]) -> Iterator[Part]:
+    """All runs, as many at once as fit into memory.
+
+    Parameters
+    ----------
+    file : AttitudeFile
+    estimate : Estimate
+    seeds : sequence of int
+
+    Yields
+    ------
+    Part
+
+    Raises
+    ------
+    InputError
+        The conditions of the start hold at no time, or a date is outside of the model of the field.
+    """
+    # The command line stands on top of all packages; nothing that it imports imports it.
+    from sims.attitude.files import simulation_of
+    from sims.attitude.simulation import start_estimates
+
+    scenario = simulation_of(file)
+    at_once = max(1, _NUMBERS_AT_ONCE // (scenario.n_instants * estimate.settings.sensors.size**2))
+    for begin in range(0, len(seeds), at_once):
+        runs = _simulated(file, scenario, seeds[begin : begin + at_once])
+        if estimate.start == "near":
+            errors = estimate.start_attitude_rad, estimate.start_rate_rad_s
+            start = start_near(*start_estimates(runs.prepared, *errors), *errors)
+        else:
+            start = start_of(runs, estimate)
+        yield Part(runs, estimated(runs, estimate, start))
+
+
+def _simulated(file: AttitudeFile, scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
+    from sims.attitude.simulation import simulate
+
+    try:
+        return simulate(scenario, seeds)
+    except ValueError as error:
+        text = str(error).removeprefix("Input ")
+        if text.startswith("conditions"):
+            text = (
+                f"found no time within 24 hours from {file.start_utc.astype('datetime64[s]')} at which the conditions "
+                f"of the table start hold for {file.duration_s:g} s, expected weaker ones, or a shorter duration."
+            )
+        raise InputError(f"{file.path}: {text}") from None
+
+
+def run_scenario(
+    file: AttitudeFile,
+    estimate: Estimate,
+    seeds: Sequence[int],
+    *,
+    look: Callable[[Part], None] | None = None,
+    advance: Callable[[int], None] | None = None,
+) -> Outcome:
+    """Simulate and estimate all runs.
+
+    Parameters
+    ----------
+    file : AttitudeFile
+    estimate : Estimate
+    seeds : sequence of int
+    look : callable, optional
+        Called with every part of the runs.
+    advance : callable, optional
+        Called with the number of runs finished since the last call.
+
+    Returns
+    -------
+    Outcome
+
+    Raises
+    ------
+    InputError
+        As :func:`parts_of`.
+    """
+    outcomes = []
+    for part in parts_of(file, estimate, seeds):
+        outcomes.append(_outcome(part))
+        if look is not None:
+            look(part)
+        if advance is not None:
+            advance(len(outcomes[-1].seeds))
+    warnings = [texts for outcome in outcomes for texts in outcome.warnings]
+
+    def joined(name: str) -> Any:
+        return np.concatenate([getattr(outcome, name) for outcome in outcomes])
+
+    return replace(
+        outcomes[0],
+        seeds=joined("seeds"),
+        axis_rms=joined("axis_rms"),
+        nees=joined("nees"),
+        nis=joined("nis"),
+        error_deg=joined("error_deg"),
+        diverged=joined("diverged"),
+        warnings=warnings,
+    )
+
+
+def errors_in_units(part: Part) -> FloatArray:
+    """Truth minus estimate, shape (runs, n, 15), in the order and units of :attr:`Outcome.axis_rms`."""
+    runs, estimates = part.runs, part.estimates
+    states = estimates.settings.sensors.states
+    values = np.full((*estimates.w.shape[:2], 15), np.nan)
+    values[..., :3] = np.degrees(2.0 * quaternion.error_vector(estimates.q, runs.q))
+    values[..., 3:6] = np.degrees(runs.w - estimates.w)
+    if "gyro-bias" in states:
+        values[..., 6:9] = np.degrees(runs.prepared.gyro_bias_rad_s - estimates.gyro_bias_rad_s)
+    if "field-bias" in states:
+        values[..., 9:12] = 1e9 * (runs.prepared.field_bias_T - estimates.field_bias_T)
+    if "disturbance" in states:
+        values[..., 12:] = runs.acceleration_s2 - estimates.disturbance_s2
+    return values
+
+
+def _outcome(part: Part) -> Outcome:
+    from adcs.kalman.diagnostics import warnings_of
+
+    runs, estimates = part.runs, part.estimates
+    late = accuracy.last_rows(runs)
+    error_deg = accuracy.error_norm_deg(runs, estimates)
+    errors = errors_in_units(part)
+    size = estimates.settings.sensors.size
+    return Outcome(
+        seeds=np.array(runs.prepared.seeds),
+        axis_rms=np.sqrt(np.mean(errors[:, late] ** 2, axis=1)),
+        nees=accuracy.normalised_error_squared(runs, estimates) / size,
+        nis=estimates.nis,
+        error_deg=error_deg,
+        diverged=error_deg[:, late].max(axis=1) > math.degrees(accuracy.DIVERGED_RAD),
+        size=size,
+        late=late,
+        warnings=[list(texts) for texts in warnings_of(runs, estimates)],
+    )

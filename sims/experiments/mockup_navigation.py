@@ -1,0 +1,387 @@
+"""The mock-up's runs of fusion and of zeros: simulated table runs, estimates, and how good they are.
+
+``adcs run mockup --part fusion`` and ``--part zeros`` print the summaries.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+
+from adcs.mockup.navigation.strapdown import PlanarTrack, strapdown, wrapped
+from arrays.io.errors import InputError
+
+if TYPE_CHECKING:
+    from adcs.mockup.navigation.fixes import Fused, Fusion
+    from adcs.mockup.navigation.zeros import ZeroFit
+    from sims.mockup.table_run import TableRun, TableScenario
+from arrays.typing import FloatArray
+
+Method = Literal["paper", "velocity-corrected", "ekf", "camera", "imu"]
+METHODS: tuple[Method, ...] = get_args(Method)
+Unknowns = Literal["two", "six", "drift"]
+UNKNOWNS: tuple[Unknowns, ...] = get_args(Unknowns)
+SETTLED_S = 10.0
+"""Errors count after it."""
+SHORT_S = 20.0
+"""Runs of zeros up to it are the one with two firings, longer ones drive around the table."""
+ZERO_M_S2 = (0.005, -0.004)
+_DRIFT_M_S3 = (0.002 / 180.0, -0.0015 / 180.0)
+
+
+@dataclass(frozen=True)
+class TrackErrors:
+    """Errors of a track against the truth of the same instants.
+
+    Attributes
+    ----------
+    position_rms_mm, position_p95_mm, position_max_mm : float
+        Of the distance.
+    velocity_rms_mm_s : float
+    heading_rms_deg : float
+    """
+
+    position_rms_mm: float
+    position_p95_mm: float
+    position_max_mm: float
+    velocity_rms_mm_s: float
+    heading_rms_deg: float
+
+
+def track_errors(track: PlanarTrack, truth: PlanarTrack, after_s: float = SETTLED_S) -> TrackErrors:
+    """Errors of one run from an instant on.
+
+    Parameters
+    ----------
+    track, truth : PlanarTrack
+        At the same instants.
+    after_s : float
+
+    Returns
+    -------
+    TrackErrors
+    """
+    late = truth.time_s >= after_s
+    distance = 1e3 * np.linalg.norm(track.position_m - truth.position_m, axis=1)[late]
+    velocity = 1e3 * np.linalg.norm(track.velocity_m_s - truth.velocity_m_s, axis=1)[late]
+    heading = np.degrees(wrapped(track.heading_rad - truth.heading_rad))[late]
+    percentile, largest = float(np.percentile(distance, 95.0)), float(distance.max())
+    return TrackErrors(_rms(distance), percentile, largest, _rms(velocity), _rms(heading))
+
+
+@dataclass(frozen=True, eq=False)
+class FusionResult:
+    """One run of one method.
+
+    Attributes
+    ----------
+    seed : int
+    run : TableRun
+        Truth, samples and fixes.
+    fused : Fused
+        The track is a :class:`adcs.mockup.navigation.delayed_ekf.FilterTrack` for the delayed filter.
+    errors : TrackErrors
+    """
+
+    seed: int
+    run: TableRun
+    fused: Fused
+    errors: TrackErrors
+
+
+@dataclass(frozen=True, eq=False)
+class FusionRuns:
+    """All runs of one method.
+
+    Attributes
+    ----------
+    method : str
+    results : tuple of FusionResult
+    """
+
+    method: Method
+    results: tuple[FusionResult, ...]
+
+    def summary(self) -> dict[str, Any]:
+        """What ``--json`` prints: means over the runs, but the largest error of all runs, and counts of all fixes.
+
+        Those that were used and the unused ones of all reasons are the fixes; pending ones would have arrived later.
+        """
+        from adcs.mockup.navigation.fixes import Outcome, unused_counts
+
+        errors = [result.errors for result in self.results]
+        outcomes = [outcome for result in self.results for outcome in result.fused.outcomes]
+        used = sum(int(result.fused.used.sum()) for result in self.results)
+        return {
+            "position_rms_mm": float(np.mean([error.position_rms_mm for error in errors])),
+            "position_p95_mm": float(np.mean([error.position_p95_mm for error in errors])),
+            "position_max_mm": max(error.position_max_mm for error in errors),
+            "velocity_rms_mm_s": float(np.mean([error.velocity_rms_mm_s for error in errors])),
+            "heading_rms_deg": float(np.mean([error.heading_rms_deg for error in errors])),
+            "fixes": len(outcomes),
+            "used_fixes": used,
+            "rejected_fixes": outcomes.count(Outcome.REJECTED),
+            "unused_fixes": unused_counts(outcomes),
+            "pending_fixes": sum(len(result.run.fixes) for result in self.results) - len(outcomes),
+            "false_fixes": int(sum(result.run.false[: len(result.fused.outcomes)].sum() for result in self.results)),
+            "runs": len(errors),
+        }
+
+
+def fusion_run(
+    method: Method,
+    seeds: int = 6,
+    duration_s: float = 180.0,
+    *,
+    seed: int = 0,
+    false_fixes: float = 0.0,
+    progress: Callable[[int], None] | None = None,
+) -> FusionRuns:
+    """Drive around the table, and estimate by one method.
+
+    Parameters
+    ----------
+    method : {'paper', 'velocity-corrected', 'ekf', 'camera', 'imu'}
+    seeds : int
+        Number of runs.
+    duration_s : float
+    seed : int
+        Of the first run; the next ones follow.
+    false_fixes : float
+        Fraction of the fixes that are anywhere under the sky.
+    progress : callable, optional
+        Called with 1 after every run.
+
+    Returns
+    -------
+    FusionRuns
+
+    Raises
+    ------
+    InputError
+        An option is out of range.
+    """
+    from sims.mockup.table_run import CameraErrors, TableScenario
+
+    if method not in METHODS:
+        raise InputError(f"--fusion: found {method!r}, expected one of {', '.join(METHODS)}.")
+    _check(seeds, seed, duration_s, lowest_s=SETTLED_S)
+    if not 0.0 <= false_fixes <= 1.0:
+        raise InputError(f"--false-fixes: found {false_fixes:g}, expected a fraction between 0 and 1.")
+    scenario = TableScenario(duration_s=duration_s, camera=CameraErrors(false=false_fixes))
+    return fused_runs(method, scenario, range(seed, seed + seeds), progress)
+
+
+def fused_runs(
+    method: Method,
+    scenario: TableScenario,
+    seeds: Sequence[int],
+    progress: Callable[[int], None] | None = None,
+) -> FusionRuns:
+    """The same for any scenario, such as one with drop-outs or fixes out of order.
+
+    Parameters
+    ----------
+    method : str
+    scenario : TableScenario
+        Longer than 10 s.
+    seeds : sequence of int
+    progress : callable, optional
+        Called with 1 after every run.
+
+    Returns
+    -------
+    FusionRuns
+    """
+    from adcs.mockup.navigation.fixes import fuse
+
+    results = []
+    for seed in seeds:
+        run = _table_run(scenario, seed)
+        fused = fuse(_fusion_of(method, run), run.imu, run.fixes)
+        results.append(FusionResult(seed, run, fused, track_errors(fused.track, run.truth)))
+        if progress is not None:
+            progress(1)
+    return FusionRuns(method, tuple(results))
+
+
+@lru_cache(maxsize=8)
+def _table_run(scenario: TableScenario, seed: int) -> TableRun:
+    """One run, which several methods in turn may ask for."""
+    from sims.mockup.table_run import table_run
+
+    return table_run(scenario, seed)
+
+
+def _fusion_of(method: Method, run: TableRun) -> Fusion:
+    from adcs.mockup.navigation.delayed_ekf import DelayedFilter
+    from adcs.mockup.navigation.reintegration import (
+        CameraOnly,
+        ImuOnly,
+        Reintegration,
+        corrected_velocity,
+        finite_difference,
+    )
+
+    makers: dict[Method, Callable[[], Fusion]] = {
+        "paper": lambda: Reintegration(run.start, run.imu.begin_s, finite_difference),
+        "velocity-corrected": lambda: Reintegration(run.start, run.imu.begin_s, corrected_velocity),
+        "ekf": lambda: DelayedFilter(run.start, run.imu.begin_s),
+        "camera": lambda: CameraOnly(run.start),
+        "imu": lambda: ImuOnly(run.start),
+    }
+    return makers[method]()
+
+
+@dataclass(frozen=True, eq=False)
+class ZerosResult:
+    """One run, integrated with and without the zeros that were found.
+
+    Attributes
+    ----------
+    seed : int
+    run : TableRun
+    fit : ZeroFit
+    before, after : PlanarTrack
+        Integrated samples without zeros taken off, from a line through two fixes, and with them.
+    position_before_mm, position_rms_mm : float
+        Distance of both from the truth, rms over the run.
+    zero_error_m_s2 : float
+        Length of the error of the zeros, mean over the run.
+    """
+
+    seed: int
+    run: TableRun
+    fit: ZeroFit
+    before: PlanarTrack
+    after: PlanarTrack
+    position_before_mm: float
+    position_rms_mm: float
+    zero_error_m_s2: float
+
+
+@dataclass(frozen=True, eq=False)
+class ZerosRuns:
+    """All runs of one fit.
+
+    Attributes
+    ----------
+    unknowns : str
+    results : tuple of ZerosResult
+    """
+
+    unknowns: Unknowns
+    results: tuple[ZerosResult, ...]
+
+    def summary(self) -> dict[str, Any]:
+        """What ``--json`` prints: means over the runs."""
+        return {
+            "position_rms_mm": float(np.mean([result.position_rms_mm for result in self.results])),
+            "zero_error_m_s2": float(np.mean([result.zero_error_m_s2 for result in self.results])),
+            "position_before_rms_mm": float(np.mean([result.position_before_mm for result in self.results])),
+            "residual_rms_mm": float(1e3 * np.mean([result.fit.residual_rms_m for result in self.results])),
+            "runs": len(self.results),
+        }
+
+
+def zeros_run(
+    unknowns: Unknowns = "two",
+    seeds: int = 6,
+    duration_s: float = 15.0,
+    *,
+    seed: int = 0,
+    start_fixes: int = 4,
+    progress: Callable[[int], None] | None = None,
+) -> ZerosRuns:
+    """Find the zeros of the accelerometer from a run's samples and fixes.
+
+    They are 0.005 and -0.004 m/s² at the beginning, and drift by 0.002 and -0.0015 m/s² in 180 s.
+
+    Parameters
+    ----------
+    unknowns : {'two', 'six', 'drift'}
+        Constant zeros; these and the start; these, the start, and slopes of the zeros in time.
+    seeds : int
+        Number of runs.
+    duration_s : float
+        Up to 20 s the run with two firings, else a drive around the table.
+    seed : int
+        Of the first run; the next ones follow.
+    start_fixes : int
+        Fixes whose line is the start of "two"; two in the source.
+    progress : callable, optional
+        Called with 1 after every run.
+
+    Returns
+    -------
+    ZerosRuns
+
+    Raises
+    ------
+    InputError
+        An option is out of range.
+    """
+    from sims.mockup.table_run import ImuErrors, TableScenario
+
+    if unknowns not in UNKNOWNS:
+        raise InputError(f"--unknowns: found {unknowns!r}, expected one of {', '.join(UNKNOWNS)}.")
+    _check(seeds, seed, duration_s, lowest_s=SETTLED_S)
+    drift = (_DRIFT_M_S3[0] * duration_s, _DRIFT_M_S3[1] * duration_s)
+    scenario = TableScenario(
+        "two-firings" if duration_s <= SHORT_S else "perimeter",
+        duration_s,
+        imu=ImuErrors(calibration_m_s2=0.0, zero_m_s2=ZERO_M_S2, drift_m_s2=drift),
+    )
+    results = []
+    for each in range(seed, seed + seeds):
+        results.append(_zeros_result(unknowns, start_fixes, each, _table_run(scenario, each)))
+        if progress is not None:
+            progress(1)
+    return ZerosRuns(unknowns, tuple(results))
+
+
+def _zeros_result(unknowns: Unknowns, start_fixes: int, seed: int, run: TableRun) -> ZerosResult:
+    from adcs.mockup.navigation.zeros import constant_zeros_after, heading_from_fixes, zero_problem, zeros_and_start
+
+    fixes = run.fixes.in_time_order()
+    if unknowns == "two" and not 2 <= start_fixes < len(fixes):
+        raise InputError(
+            f"--start-fixes: found {start_fixes}, expected 2 to {len(fixes) - 1}, less than the {len(fixes)} fixes of "
+            f"the run with seed {seed}."
+        )
+    heading, gyro_zero = heading_from_fixes(run.imu, fixes)
+    imu = run.imu.less(0.0, gyro_zero)
+    courses = (imu.time_s - 0.5 * imu.steps_s)[None] if unknowns == "drift" else None
+    problem = zero_problem(imu, heading, fixes, courses)
+    velocity = (fixes.position_m[1] - fixes.position_m[0]) / (fixes.time_s[1] - fixes.time_s[0])
+    position = fixes.position_m[0] - velocity * (fixes.time_s[0] - imu.begin_s)
+    fit = constant_zeros_after(problem, start_fixes) if unknowns == "two" else zeros_and_start(problem)
+    heading_start = float(heading[0] - 0.5 * imu.rate_rad_s[0] * imu.steps_s[0])
+    start = fit.start(heading_start)
+    zeros = fit.zero_course(courses)
+    before = strapdown(imu, replace(start, position_m=position, velocity_m_s=velocity))
+    after = strapdown(imu.less(zeros, 0.0), start)
+    error = float(np.linalg.norm(np.mean(zeros - run.zero_m_s2, axis=0)))
+    return ZerosResult(seed, run, fit, before, after, _apart_mm(before, run), _apart_mm(after, run), error)
+
+
+def _apart_mm(track: PlanarTrack, run: TableRun) -> float:
+    return _rms(1e3 * np.linalg.norm(track.position_m - run.truth.position_m, axis=1))
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _check(seeds: int, seed: int, duration_s: float, lowest_s: float) -> None:
+    if seeds < 1:
+        raise InputError(f"--seeds: found {seeds}, expected a positive number.")
+    if seed < 0:
+        raise InputError(f"--seed: found {seed}, expected 0 or more.")
+    if not lowest_s < duration_s <= 1e4 or math.isnan(duration_s):
+        raise InputError(f"--duration: found {duration_s:g} s, expected more than {lowest_s:g} and up to 10000 s.")

@@ -1,0 +1,338 @@
+"""Many frames of the mock-up's camera, identified and compared with the truth: ``adcs run mockup --part sky``."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adcs.mockup.vision.camera import Camera, Pose, camera_of_footprint, undistorted
+from adcs.mockup.vision.centroids import NoLightsError, Stars, find_stars
+from adcs.mockup.vision.frame_files import read_frame
+from adcs.mockup.vision.paper_matcher import CameraFix, Matcher
+from adcs.mockup.vision.sky import LedSky
+from adcs.stars.identification import NoFix
+
+if TYPE_CHECKING:
+    from sims.mockup.frames import Frame, FrameQuality
+from arrays.typing import BoolArray, ByteArray, FloatArray
+
+Finder = Callable[[ByteArray], Stars]
+REACH_M = (1.25, 1.0)
+"""Largest |X| and |Y| of the poses: the range of the source paper's figures."""
+FALSE_POSITION_M = 0.02
+FALSE_HEADING_RAD = math.radians(2.0)
+
+
+@dataclass(frozen=True)
+class SkySetup:
+    """Frames that are taken and what is believed of the camera.
+
+    Attributes
+    ----------
+    poses : int
+        Number of frames, at random places and headings.
+    noise_DN : float
+        Of a pixel.
+    lost : float
+        Probability that a light is dark.
+    spurious : int
+        Lights in view that are in no catalogue.
+    hot_pixels : int
+    speed_m_s, turn_rate_rad_s : float
+        During the exposure, in random directions.
+    footprint_m : float
+        Width of the seen part of the ceiling.
+    k1, believed_k1 : float
+        Distortion of the camera, and what its user knows of it.
+    reach_m : tuple, shape (2,)
+        Largest |X| and |Y|.
+
+    Raises
+    ------
+    ValueError
+        A number is out of range.
+    """
+
+    poses: int = 120
+    noise_DN: float = 4.0
+    lost: float = 0.0
+    spurious: int = 0
+    hot_pixels: int = 0
+    speed_m_s: float = 0.0
+    turn_rate_rad_s: float = 0.0
+    footprint_m: float = 0.9
+    k1: float = 0.0
+    believed_k1: float = 0.0
+    reach_m: tuple[float, float] = REACH_M
+
+    def __post_init__(self) -> None:
+        if self.poses < 1:
+            raise ValueError(f"Input poses must be 1 or more; instead received {self.poses}.")
+        most = Camera.width_px * Camera.height_px
+        if not 0 <= self.hot_pixels <= most:
+            raise ValueError(f"Input hot_pixels must be 0 to {most}; instead received {self.hot_pixels}.")
+        for name in ("speed_m_s", "turn_rate_rad_s"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"Input {name} must not be negative; instead received {getattr(self, name)}.")
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that takes the frames."""
+        return camera_of_footprint(self.footprint_m, self.k1)
+
+    @property
+    def quality(self) -> FrameQuality:
+        """What the frames are like."""
+        from sims.mockup.frames import FrameQuality
+
+        return FrameQuality(noise_DN=self.noise_DN, lost=self.lost, spurious=self.spurious, hot_pixels=self.hot_pixels)
+
+    @property
+    def believed_camera(self) -> Camera:
+        """The camera as its user knows it."""
+        return camera_of_footprint(self.footprint_m, self.believed_k1)
+
+
+@dataclass(frozen=True, eq=False)
+class SkyRun:
+    """Frames and what was found in them, row by row.
+
+    Attributes
+    ----------
+    truth : ndarray, shape (n, 3)
+        X, Y [m] and heading [rad].
+    found : ndarray of bool, shape (n,)
+        Whether there is a fix.
+    estimates : ndarray, shape (n, 3)
+        X, Y and heading; NaN without a fix.
+    n_stars, n_matched : ndarray of int, shape (n,)
+        Stars in the image, and those of them that the fix names.
+    identify_s, frame_s : ndarray, shape (n,)
+        Time of the identification, and of all from the image to the fix.
+    reasons : tuple of str, length n
+        Why there is no fix; empty where there is one.
+    """
+
+    truth: FloatArray
+    found: BoolArray
+    estimates: FloatArray
+    n_stars: NDArray[np.intp]
+    n_matched: NDArray[np.intp]
+    identify_s: FloatArray
+    frame_s: FloatArray
+    reasons: tuple[str, ...]
+
+    @property
+    def position_errors_m(self) -> FloatArray:
+        """Distances from the truth, shape (n,); NaN without a fix."""
+        return np.hypot(*(self.estimates - self.truth)[:, :2].T)
+
+    @property
+    def heading_errors_rad(self) -> FloatArray:
+        """Between -π and π, shape (n,); NaN without a fix."""
+        error = self.estimates[:, 2] - self.truth[:, 2]
+        return np.angle(np.exp(1j * error))
+
+    @property
+    def good(self) -> BoolArray:
+        """Fixes within 20 mm and 2° of the truth, shape (n,)."""
+        near = self.position_errors_m <= FALSE_POSITION_M
+        good: BoolArray = near & (np.abs(self.heading_errors_rad) <= FALSE_HEADING_RAD)
+        return good
+
+    @property
+    def false_fixes(self) -> BoolArray:
+        """Fixes farther off than that, shape (n,)."""
+        return self.found & ~self.good
+
+    def summary(self) -> dict[str, Any]:
+        """Numbers of the whole run; root mean squares are those of the good fixes, None where there are none.
+
+        Returns
+        -------
+        dict
+            ``poses``, ``success`` (good fixes of all frames), ``false_fixes``, ``position_rms_mm``,
+            ``heading_rms_deg``, ``identify_ms_median`` and ``frame_ms_median``.
+        """
+        good = self.good
+        position = _rms(self.position_errors_m[good])
+        heading = _rms(self.heading_errors_rad[good])
+        return {
+            "poses": len(good),
+            "success": float(good.mean()),
+            "false_fixes": int(self.false_fixes.sum()),
+            "position_rms_mm": None if position is None else 1e3 * position,
+            "heading_rms_deg": None if heading is None else math.degrees(heading),
+            "identify_ms_median": 1e3 * float(np.median(self.identify_s)),
+            "frame_ms_median": 1e3 * float(np.median(self.frame_s)),
+        }
+
+
+def _rms(values: FloatArray) -> float | None:
+    return float(np.sqrt(np.mean(values**2))) if values.size else None
+
+
+@dataclass(frozen=True, eq=False)
+class FrameResult:
+    """What one frame gave.
+
+    Attributes
+    ----------
+    stars : Stars
+    fix : CameraFix or NoFix
+    identify_s, frame_s : float
+        Time of the identification, and of all from the image to the fix.
+    """
+
+    stars: Stars
+    fix: CameraFix | NoFix
+    identify_s: float
+    frame_s: float
+
+
+def frame_result(image: ByteArray, camera: Camera, matcher: Matcher, finder: Finder = find_stars) -> FrameResult:
+    """Fix of one frame, timed; a frame in which nothing can shine, such as a black one, has no stars.
+
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (height, width)
+    camera : Camera
+        As it is believed to be.
+    matcher : Matcher
+    finder : callable
+        Of :mod:`adcs.mockup.vision.centroids`.
+
+    Returns
+    -------
+    FrameResult
+
+    Raises
+    ------
+    ValueError
+        This is no grey image of bytes.
+    """
+    begin = time.perf_counter()
+    try:
+        stars = finder(image)
+    except NoLightsError:
+        stars = Stars(np.empty((0, 2)), np.empty(0), np.empty(0, dtype=np.intp), float(np.median(image)), math.nan)
+    points = undistorted(camera, stars.positions_px)
+    located = time.perf_counter()
+    fix = matcher.identify(points)
+    end = time.perf_counter()
+    return FrameResult(stars, fix, end - located, end - begin)
+
+
+def sky_run(
+    sky: LedSky,
+    matcher: Matcher,
+    setup: SkySetup = SkySetup(),
+    seed: int = 0,
+    progress: Callable[[int], None] | None = None,
+    finder: Finder = find_stars,
+) -> SkyRun:
+    """Render frames at random poses, find the lights, identify them, and compare with the truth.
+
+    Parameters
+    ----------
+    sky : LedSky
+    matcher : Matcher
+        For the catalogue of that sky, and a camera of that footprint.
+    setup : SkySetup
+    seed : int
+        Each frame has random numbers of its own, whatever the others do.
+    progress : callable, optional
+        Called with the number of frames finished since the last call.
+    finder : callable
+        Of :mod:`adcs.mockup.vision.centroids`.
+
+    Returns
+    -------
+    SkyRun
+    """
+    truth = np.empty((setup.poses, 3))
+    results = []
+    for row in range(setup.poses):
+        pose, frame = random_frame(sky, setup, seed, row)
+        truth[row] = *pose.position_m, pose.heading_rad
+        results.append(frame_result(frame.image, setup.believed_camera, matcher, finder))
+        if progress is not None:
+            progress(1)
+    return _run_of(truth, results)
+
+
+def random_frame(sky: LedSky, setup: SkySetup, seed: int, row: int) -> tuple[Pose, Frame]:
+    """Frame of a row of :func:`sky_run`, the same whatever the other rows are.
+
+    Parameters
+    ----------
+    sky : LedSky
+    setup : SkySetup
+    seed, row : int
+
+    Returns
+    -------
+    Pose
+        In the middle of the exposure.
+    Frame
+    """
+    # The command line stands on top of all packages; nothing that it imports imports it.
+    from sims.mockup.frames import Motion, rendered_frame
+
+    rng = np.random.default_rng([seed, row])
+    x, y, heading = rng.uniform(-1.0, 1.0, 3) * [*setup.reach_m, math.pi]
+    course, turn = rng.uniform(-math.pi, math.pi), rng.choice([-1.0, 1.0])
+    velocity = (setup.speed_m_s * math.cos(course), setup.speed_m_s * math.sin(course))
+    pose, motion = Pose(x, y, heading), Motion(velocity, turn * setup.turn_rate_rad_s)
+    return pose, rendered_frame(sky, setup.camera, pose, rng, motion, setup.quality)
+
+
+def _run_of(truth: FloatArray, results: list[FrameResult]) -> SkyRun:
+    fixes = [result.fix for result in results]
+    nothing = np.full(3, np.nan)
+    return SkyRun(
+        truth=truth,
+        found=np.array([isinstance(fix, CameraFix) for fix in fixes]),
+        estimates=np.array(
+            [[*fix.position_m, fix.heading_rad] if isinstance(fix, CameraFix) else nothing for fix in fixes]
+        ),
+        n_stars=np.array([len(result.stars) for result in results]),
+        n_matched=np.array([len(fix.stars) if isinstance(fix, CameraFix) else 0 for fix in fixes]),
+        identify_s=np.array([result.identify_s for result in results]),
+        frame_s=np.array([result.frame_s for result in results]),
+        reasons=tuple(fix.reason if isinstance(fix, NoFix) else "" for fix in fixes),
+    )
+
+
+def identified_files(
+    paths: Iterable[Path], camera: Camera, matcher: Matcher, finder: Finder = find_stars
+) -> dict[Path, FrameResult]:
+    """Fixes of frames in PNG files.
+
+    Parameters
+    ----------
+    paths : iterable of Path
+    camera : Camera
+        As it is believed to be; the frames must have its size.
+    matcher : Matcher
+    finder : callable
+        Of :mod:`adcs.mockup.vision.centroids`.
+
+    Returns
+    -------
+    dict
+        From path to result, in the order of the paths.
+
+    Raises
+    ------
+    InputError
+        A file is no frame of this camera.
+    """
+    return {path: frame_result(read_frame(path, camera), camera, matcher, finder) for path in paths}

@@ -1,0 +1,192 @@
+"""Tables 3 to 5 of Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014.
+
+In the scan that is left of the paper most exponents are lost. Mantissas are as printed; a (?) says that the exponent,
+or the digit, is what the context needs. "1" of a quantity is one standard deviation of the worst axis.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from adcs.kalman.bank import Filter
+
+Quantity = Literal["attitude", "rate", "gyro bias", "field bias", "disturbance"]
+UNITS: dict[Quantity, str] = {
+    "attitude": "°",
+    "rate": "°/s",
+    "gyro bias": "°/s",
+    "field bias": "nT",
+    "disturbance": "1/s²",
+}
+"""The attitude is σ of the quaternion's vector part in degrees, half of the angle, as the paper has it."""
+
+
+@dataclass(frozen=True)
+class Printed:
+    """A number of the paper.
+
+    Attributes
+    ----------
+    text : str
+        As it can be read.
+    low, high : float
+        Its value, or the range that is left of it.
+    """
+
+    text: str
+    low: float
+    high: float
+
+    def ratio(self, ours: float) -> float:
+        """Ours over the paper's, or over the nearer end of its range; 1 within it."""
+        return ours / min(max(ours, self.low), self.high)
+
+
+def printed(text: str) -> Printed:
+    """Number of a text such as ``"2e-2 (?)"`` or ``"3e-4…5e-3 (?)"``."""
+    ends = [float(part) for part in text.replace("(?)", "").split("…")]
+    return Printed(text, ends[0], ends[-1])
+
+
+@dataclass(frozen=True)
+class PaperRow:
+    """A row of a table.
+
+    Attributes
+    ----------
+    table : int
+    label : str
+        Sensors, and what is estimated where the table says so.
+    sensors : str
+    states : tuple of str
+    numbers : dict
+        What is printed.
+    filter : str
+    duration_s : float
+        After which ours is taken.
+    """
+
+    table: int
+    label: str
+    sensors: str
+    states: tuple[str, ...]
+    numbers: dict[Quantity, Printed]
+    filter: Filter = "mekf"
+    duration_s: float = 200.0
+
+
+def _row(
+    table: int,
+    label: str,
+    sensors: str,
+    states: tuple[str, ...],
+    numbers: dict[Quantity, str],
+    filter: Filter = "mekf",
+    duration_s: float = 200.0,
+) -> PaperRow:
+    return PaperRow(
+        table, label, sensors, states, {key: printed(text) for key, text in numbers.items()}, filter, duration_s
+    )
+
+
+_G, _B, _D = "gyro-bias", "field-bias", "disturbance"
+_STAR: dict[Quantity, str] = {"attitude": "5e-4", "rate": "4e-4"}
+PAPER_ROWS: tuple[PaperRow, ...] = (
+    _row(3, "ST+G+M+S", "st+gyro+mag+sun", (), _STAR),
+    _row(3, "ST+G+M", "st+gyro+mag", (), _STAR),
+    _row(3, "ST+G", "st+gyro", (), _STAR),
+    _row(3, "ST+M+S", "st+mag+sun", (), {"attitude": "7e-4", "rate": "6e-4"}),
+    _row(3, "ST+M, Δb", "st+mag", (_B,), {"attitude": "7e-4", "rate": "6e-4", "field bias": "80"}),
+    _row(3, "ST+G, Δω", "st+gyro", (_G,), {"attitude": "5e-4", "rate": "4e-4", "gyro bias": "3e-3 (?)"}),
+    _row(3, "Mag+Sun+G", "mag+sun+gyro", (), {"attitude": "2e-2 (?)", "rate": "4e-3 (?)"}),
+    _row(3, "Mag+Sun+G, Δω", "mag+sun+gyro", (_G,), {"attitude": "2e-2", "rate": "4e-3", "gyro bias": "5e-4"}),
+    _row(3, "Mag+Sun+G, Δb", "mag+sun+gyro", (_B,), {"attitude": "5e-2 (?)", "rate": "4e-3", "field bias": "400"}),
+    _row(3, "Mag+Sun", "mag+sun", (), {"attitude": "1.2e-1 (?)", "rate": "2e-2 (?)"}),
+    _row(3, "Mag+G", "mag+gyro", (), {"attitude": "2e-1 (?)", "rate": "5e-3 (?)"}),
+    _row(3, "ST", "st", (), {"attitude": "8e-4", "rate": "6e-4"}),
+    _row(4, "ST, d", "st", (_D,), {"attitude": "8e-4", "rate": "1e-4", "disturbance": "5e-8 (?)"}, duration_s=600.0),
+    _row(
+        4,
+        "ST+G, Δω, d",
+        "st+gyro",
+        (_G, _D),
+        {"attitude": "8e-4", "rate": "7e-5 (?)", "gyro bias": "1e-5…1e-3 (?)", "disturbance": "5e-8 (?)"},
+        duration_s=600.0,
+    ),
+    _row(
+        4,
+        "Mag+Sun, d",
+        "mag+sun",
+        (_D,),
+        {"attitude": "3e-2", "rate": "2e-3", "disturbance": "5e-7 (?)"},
+        duration_s=600.0,
+    ),
+    _row(
+        4,
+        "Mag+Sun+G, Δω, d",
+        "mag+sun+gyro",
+        (_G, _D),
+        {"attitude": "2e-2", "rate": "2e-3", "gyro bias": "5e-4", "disturbance": "8e-7"},
+        duration_s=600.0,
+    ),
+    _row(5, "ST", "st", (), {"attitude": "2e-3 (?)", "rate": "4e-4"}, "constant-gain", 600.0),
+    _row(
+        5,
+        "ST, d",
+        "st",
+        (_D,),
+        {"attitude": "8e-4", "rate": "1e-4", "disturbance": "5e-8 (?)"},
+        "constant-gain",
+        600.0,
+    ),
+    _row(
+        5,
+        "ST+G, Δω",
+        "st+gyro",
+        (_G,),
+        {"attitude": "1.5e-3", "rate": "3e-4…5e-3 (?)", "gyro bias": "4e-4"},
+        "constant-gain",
+        600.0,
+    ),
+    _row(
+        5,
+        "ST+G, Δω, d",
+        "st+gyro",
+        (_G, _D),
+        {"attitude": "8e-4", "rate": "7e-5", "gyro bias": "1e-5 (?)"},
+        "constant-gain",
+        600.0,
+    ),
+    _row(5, "Mag+Sun+G", "mag+sun+gyro", (), {"attitude": "2e-2", "rate": "2.2e-2"}, "constant-gain", 600.0),
+    _row(5, "Mag+Sun+G, Δb", "mag+sun+gyro", (_B,), {"attitude": "2e-2", "rate": "5e-3"}, "constant-gain", 600.0),
+    _row(
+        5,
+        "Mag+Sun+G, [λ, Δω]",
+        "mag+sun+gyro",
+        (_G,),
+        {"attitude": "2e-2", "rate": "5e-3", "gyro bias": "1e-3"},
+        "reduced",
+        600.0,
+    ),
+    _row(
+        5,
+        "Mag+Sun+G, Δω, d",
+        "mag+sun+gyro",
+        (_G, _D),
+        {"attitude": "2e-2", "rate": "2e-3", "gyro bias": "5e-4", "disturbance": "8e-7"},
+        "constant-gain",
+        600.0,
+    ),
+    _row(5, "Mag+Sun", "mag+sun", (), {"attitude": "0.1", "rate": "5e-3"}, "constant-gain", 600.0),
+    _row(
+        5,
+        "Mag+Sun, d",
+        "mag+sun",
+        (_D,),
+        {"attitude": "3e-2", "rate": "2e-3", "disturbance": "5e-7 (?)"},
+        "constant-gain",
+        600.0,
+    ),
+)
+"""All rows. What Table 5 prints for Δb, 6e-1°, has a lost exponent and another unit; it is left out."""

@@ -1,0 +1,1 @@
+"""Truth and readings of magnetometer arrays and dipoles."""

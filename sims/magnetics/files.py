@@ -1,0 +1,118 @@
+"""Files of a simulation: readings, truth and array."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from os import PathLike
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from arrays.array_file import write_array
+from arrays.io.errors import InputError
+from arrays.io.text import write_text
+from magloc.readings import TRUE_MOMENT_COLUMNS, TRUE_POSITION_COLUMNS, Truth, write_readings
+from sims.magnetics.simulation import Simulation
+
+
+class SimulationFiles(NamedTuple):
+    """Paths of the files of a simulation.
+
+    Attributes
+    ----------
+    readings : Path
+    array : Path
+    truths : tuple of Path
+        One for each source.
+    """
+
+    readings: Path
+    array: Path
+    truths: tuple[Path, ...]
+
+    @property
+    def all(self) -> tuple[Path, ...]:
+        """Every file."""
+        return (self.readings, self.array, *self.truths)
+
+
+def files_beside(readings: str | PathLike[str], n_sources: int) -> SimulationFiles:
+    """Paths of the files of a simulation, from that of the readings.
+
+    Parameters
+    ----------
+    readings : path-like
+    n_sources : int
+
+    Returns
+    -------
+    SimulationFiles
+        READINGS-array.toml, READINGS-truth.csv, READINGS-truth-2.csv and so on beside READINGS.csv.
+    """
+    path = Path(readings)
+    names = ["truth", *(f"truth-{number}" for number in range(2, n_sources + 1))][:n_sources]
+    truths = tuple(path.with_name(f"{path.stem}-{name}.csv") for name in names)
+    return SimulationFiles(path, path.with_name(f"{path.stem}-array.toml"), truths)
+
+
+def write_simulation(simulation: Simulation, readings: str | PathLike[str]) -> SimulationFiles:
+    """Write the files of a simulation; none of them appears before all of them are complete.
+
+    Parameters
+    ----------
+    simulation : Simulation
+    readings : path-like
+        Of the readings file; the others are written beside it (:func:`files_beside`). Existing files are replaced.
+
+    Returns
+    -------
+    SimulationFiles
+
+    Raises
+    ------
+    InputError
+        There is no such folder, or a folder stands where a file should.
+    OSError
+        The files cannot be written.
+    """
+    files = files_beside(readings, len(simulation.truths))
+    folder = files.readings.absolute().parent
+    if not folder.is_dir():
+        raise InputError(f"{readings}: found no folder {folder}, expected one.")
+    for path in files.all:
+        if path.is_dir():
+            raise InputError(f"{path} is a directory, expected a file that can be written.")
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".magloc-") as name:
+        hidden = Path(name)
+        write_readings(hidden / files.readings.name, simulation.readings, simulation.array)
+        write_array(simulation.array, hidden / files.array.name)
+        for path, truth in zip(files.truths, simulation.truths, strict=True):
+            write_truth(truth, hidden / path.name)
+        for path in files.all:
+            os.replace(hidden / path.name, path)
+    return files
+
+
+def write_truth(truth: Truth, path: str | PathLike[str]) -> None:
+    """Write a truth file, with exact numbers.
+
+    Parameters
+    ----------
+    truth : Truth
+    path : path-like
+        Replaced if it exists.
+
+    Raises
+    ------
+    OSError
+        The file cannot be written.
+    """
+    header = ["time_s", *TRUE_POSITION_COLUMNS]
+    columns = [truth.time_s[:, None], truth.position_m]
+    if truth.moment_Am2 is not None:
+        header += TRUE_MOMENT_COLUMNS
+        columns.append(truth.moment_Am2)
+    rows = (",".join(map(repr, row)) for row in np.hstack(columns).tolist())
+    write_text("\n".join([",".join(header), *rows, ""]), path)

@@ -1,0 +1,197 @@
+"""What is simulated: an array and its sensors, sources, fields and noise. All quantities are SI."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from arrays.array import SensorArray
+from arrays.typing import FloatArray
+from sims.magnetics.paths import Attitude, Path, Steered, Vector
+from sims.magnetics.sensors import SensorModel, nominal_array
+
+Matrix = tuple[Vector, Vector, Vector]
+MOST_ROWS = 5_000_000
+_ZERO: Vector = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Carrier:
+    """How an array or a source moves: its path in the world frame, and its attitude along it."""
+
+    path: Path = field(default_factory=Steered)
+    attitude: Attitude = field(default_factory=Attitude)
+
+    @property
+    def is_world(self) -> bool:
+        """Whether its frame is the world's: at rest in the origin, and not turned."""
+        path = self.path
+        if not isinstance(path, Steered) or path.speed_m_s or path.climb_m_s or any(path.start_m):
+            return False
+        return self.attitude.is_world
+
+
+@dataclass(frozen=True)
+class Source:
+    r"""A dipole fixed to a body.
+
+    Its moment in body axes is :math:`m = m_{permanent} + α B_a/μ_0` with the ambient field B_a in body axes. Only the
+    main ambient field magnetises it, not its pulsations.
+
+    Attributes
+    ----------
+    carrier : Carrier
+        Of the body.
+    moment_Am2 : tuple, shape (3,)
+        Permanent part, body axes.
+    polarisability_m3 : tuple of tuples, shape (3, 3)
+        α: volume times susceptibility, demagnetisation included; 4π a³ for a sphere of iron of radius a.
+    radius_m : float
+        Size of the body: no sensor may come nearer.
+    """
+
+    carrier: Carrier = field(default_factory=Carrier)
+    moment_Am2: Vector = _ZERO
+    polarisability_m3: Matrix = (_ZERO, _ZERO, _ZERO)
+    radius_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class Pulsation:
+    """A sinusoid of random phase in the ambient field, the same at all sensors.
+
+    Attributes
+    ----------
+    amplitude_T : tuple, shape (3,)
+        World frame.
+    period_s : float
+    """
+
+    amplitude_T: Vector
+    period_s: float
+
+
+@dataclass(frozen=True)
+class Platform:
+    r"""Noise of what carries the array.
+
+    Attributes
+    ----------
+    position_m, moment_Am2 : tuple, shape (3,)
+        A dipole fixed to the array, array frame.
+    frequency_Hz : float
+        It oscillates as :math:`\cos(2π f t + φ)` with a random φ; 0 = it is constant.
+    noise_T : float
+        White noise per axis and sample in the array's frame, the same at all sensors.
+    """
+
+    position_m: Vector = _ZERO
+    moment_Am2: Vector = _ZERO
+    frequency_Hz: float = 0.0
+    noise_T: float = 0.0
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Readings that are not there.
+
+    Attributes
+    ----------
+    dropout : float
+        Probability that a sensor misses a sample, all its axes together.
+    gaps_s : tuple of pairs
+        Times from which to which there are no rows at all.
+    """
+
+    dropout: float = 0.0
+    gaps_s: tuple[tuple[float, float], ...] = ()
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Everything that a simulation needs except its seed.
+
+    Attributes
+    ----------
+    array : SensorArray
+        Where the sensors stand, and the calibration that their user knows. Their noise, limits and uncertainties are
+        those of the models.
+    models : tuple of SensorModel
+        One for each sensor.
+    duration_s, rate_Hz : float
+        Rows are at 0, 1/rate, 2/rate, … up to and including the duration.
+    carrier : Carrier
+        Of the array.
+    sources : tuple of Source
+        None is allowed: a recording of noise.
+    ambient_T : tuple, shape (3,), optional
+        Geomagnetic field, world frame. None: there is none, and the readings have no columns for it.
+    pulsations : tuple of Pulsation
+    platform : Platform
+    missing : Missing
+    name : str
+
+    Raises
+    ------
+    ValueError
+        The models are not those of the array's sensors, or the times are not positive and finite or give more than five
+        million rows.
+    """
+
+    array: SensorArray
+    models: tuple[SensorModel, ...]
+    duration_s: float
+    rate_Hz: float
+    carrier: Carrier = field(default_factory=Carrier)
+    sources: tuple[Source, ...] = ()
+    ambient_T: Vector | None = None
+    pulsations: tuple[Pulsation, ...] = ()
+    platform: Platform = field(default_factory=Platform)
+    missing: Missing = field(default_factory=Missing)
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("duration_s", "rate_Hz"):
+            if not 0.0 < getattr(self, name) < math.inf:
+                raise ValueError(f"Input {name} must be positive and finite; instead received {getattr(self, name)}.")
+        if self.duration_s * self.rate_Hz >= MOST_ROWS:
+            raise ValueError(
+                f"Inputs duration_s and rate_Hz must give at most {MOST_ROWS} rows; "
+                f"instead received {self.duration_s:g} s at {self.rate_Hz:g} Hz."
+            )
+        if len(self.models) != self.array.n_sensors:
+            raise ValueError(
+                f"Input models must be one for each of the {self.array.n_sensors} sensors; "
+                f"instead received {len(self.models)}."
+            )
+        for sensor, model in zip(self.array.sensors, self.models, strict=True):
+            if sensor.kind != model.reads:
+                raise ValueError(
+                    f"Input models must read what the sensors do; instead received a {model.reads} model "
+                    f"for the {sensor.kind} sensor {sensor.id!r}."
+                )
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Instants of all samples, also of those in gaps, shape (n,) [s]."""
+        # A rounded product must not lose the last row: 0.1 s at 30 Hz are 3 periods.
+        return np.arange(math.floor(self.duration_s * self.rate_Hz * (1.0 + 1e-12)) + 1) / self.rate_Hz
+
+    @property
+    def nominal_array(self) -> SensorArray:
+        """The array as its user knows it."""
+        return nominal_array(self.array, self.models, self.rate_Hz)
+
+    def with_white_noise_only(self) -> Scenario:
+        """The same without anything that an array file with white noise does not describe.
+
+        No 1/f noise, bandwidth, rounding, misalignment, error of gain, drift and noise of the platform; saturation,
+        pulsations, the ambient field and missing readings stay, and so does the noise of one sample.
+        """
+        models = tuple(
+            SensorModel(model.reads, 0.0, range_T=model.range_T).with_sigma(model.sigma_T(self.rate_Hz), self.rate_Hz)
+            for model in self.models
+        )
+        return replace(self, models=models, platform=Platform())

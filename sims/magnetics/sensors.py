@@ -1,0 +1,200 @@
+"""What real sensors do to a field, with typical figures of their kinds.
+
+The figures are of the order that makers publish for calibrated instruments of a kind, not those of one instrument: a
+fluxgate such as Bartington's Mag-13, an optically pumped total-field sensor such as QuSpin's QTFM, an Overhauser sensor
+such as GEM's GSM-19, a low-temperature SQUID, a magnetoresistive chip such as Memsic's MMC5983MA. A scenario overrides
+whatever it knows better. Misalignment and error of the gain are what remains after a good calibration; that of the gain
+of a scalar sensor stands for its heading error.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from arrays.array import SensorArray
+from arrays.sensor import Sensor, SensorKind
+from magloc.measurement.nuisances import FASTEST_FLICKER_HZ
+from sims.noise import flicker_sigma, white_sigma
+
+_DIGITS = 12  # of a noise that comes from a square root: what was 0.2 nT is written as such again
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """Errors of a sensor.
+
+    Attributes
+    ----------
+    reads : {"vector", "scalar"}
+        Three components of the field, or its modulus.
+    noise_T_rtHz : float
+        Square root of the one-sided spectral density of the white noise, per channel [T/√Hz].
+    corner_Hz : float
+        Frequency below which the noise has the density 1/f; 0 = it is white.
+    bandwidth_Hz : float
+        Of a first-order low-pass for signal and noise; infinite = none.
+    range_T : float
+        Modulus at which a channel saturates; infinite = never.
+    resolution_T : float
+        Readings are multiples of it; 0 = they are not rounded.
+    misalignment_rad : float
+        Standard deviation, per axis, of a constant rotation of a vector sensor's axes.
+    gain_error : float
+        Standard deviation of the relative error of the gain, per channel.
+    drift_T_rth : float
+        Random walk of a channel's offset, from zero [T/√h].
+    offset_error_T : float
+        Standard deviation, per axis, of a constant field at the sensor that is fixed to the array.
+    """
+
+    reads: SensorKind
+    noise_T_rtHz: float
+    corner_Hz: float = 0.0
+    bandwidth_Hz: float = math.inf
+    range_T: float = math.inf
+    resolution_T: float = 0.0
+    misalignment_rad: float = 0.0
+    gain_error: float = 0.0
+    drift_T_rth: float = 0.0
+    offset_error_T: float = 0.0
+
+    @property
+    def flicker_T(self) -> float:
+        """Standard deviation of 1/f noise in a decade of frequency: ``N √(f_c ln 10)`` [T]."""
+        return self.noise_T_rtHz * math.sqrt(self.corner_Hz * math.log(10.0))
+
+    def sigma_T(self, rate_Hz: float) -> float:
+        """Standard deviation of what is as good as independent from sample to sample [T].
+
+        White noise, rounding, and the 1/f noise above the decades that an array states as lasting; that of the rest of
+        the 1/f noise depends on the record.
+        """
+        white = white_sigma(rate_Hz, self.noise_T_rtHz, self.bandwidth_Hz)
+        flicker = flicker_sigma(rate_Hz, self.noise_T_rtHz, self.corner_Hz, self.bandwidth_Hz, FASTEST_FLICKER_HZ)
+        return float(f"{math.hypot(white, self.resolution_T / math.sqrt(12.0), flicker):.{_DIGITS}g}")
+
+    def with_sigma(self, sigma_T: float, rate_Hz: float) -> SensorModel:
+        """The same with the density of white noise of this standard deviation in one sample, all else aside."""
+        return replace(self, noise_T_rtHz=sigma_T / white_sigma(rate_Hz, 1.0, self.bandwidth_Hz))
+
+
+SENSOR_KINDS: dict[str, SensorModel] = {
+    "fluxgate": SensorModel(
+        reads="vector",
+        noise_T_rtHz=5e-12,
+        corner_Hz=0.5,
+        bandwidth_Hz=3000.0,
+        range_T=100e-6,
+        resolution_T=10e-12,
+        misalignment_rad=1e-4,
+        gain_error=1e-4,
+        drift_T_rth=100e-12,
+    ),
+    "opm": SensorModel(
+        reads="scalar",
+        noise_T_rtHz=3e-12,
+        corner_Hz=0.1,
+        bandwidth_Hz=200.0,
+        range_T=150e-6,
+        resolution_T=1e-12,
+        gain_error=5e-6,
+        drift_T_rth=10e-12,
+    ),
+    "overhauser": SensorModel(
+        reads="scalar",
+        noise_T_rtHz=30e-12,
+        corner_Hz=0.0,
+        bandwidth_Hz=2.5,
+        range_T=120e-6,
+        resolution_T=10e-12,
+        gain_error=2e-6,
+        drift_T_rth=0.0,
+    ),
+    "squid": SensorModel(
+        reads="vector",
+        noise_T_rtHz=10e-15,
+        corner_Hz=1.0,
+        bandwidth_Hz=10_000.0,
+        range_T=150e-6,
+        resolution_T=1e-15,
+        misalignment_rad=1e-5,
+        gain_error=1e-6,
+        drift_T_rth=1e-12,
+    ),
+    "magnetoresistive": SensorModel(
+        reads="vector",
+        noise_T_rtHz=4e-9,
+        corner_Hz=1.0,
+        bandwidth_Hz=100.0,
+        range_T=800e-6,
+        resolution_T=6.25e-9,
+        misalignment_rad=2e-3,
+        gain_error=2e-3,
+        drift_T_rth=20e-9,
+    ),
+}
+"""Sensors by the name of their kind."""
+
+
+def model_of(sensor: Sensor, rate_Hz: float) -> SensorModel:
+    """The model that an array file's sensor describes, with nothing that the array does not state.
+
+    Parameters
+    ----------
+    sensor : Sensor
+    rate_Hz : float
+        Rate at which its noise is that of one sample.
+
+    Returns
+    -------
+    SensorModel
+    """
+    model = SensorModel(
+        reads=sensor.kind,
+        noise_T_rtHz=0.0,
+        range_T=math.inf if sensor.saturation_T is None else sensor.saturation_T,
+        misalignment_rad=sensor.misalignment_rad,
+        gain_error=sensor.gain_uncertainty,
+        drift_T_rth=sensor.drift_T_rth,
+        offset_error_T=sensor.offset_uncertainty_T,
+    ).with_sigma(sensor.noise_T, rate_Hz)
+    return replace(model, corner_Hz=(sensor.flicker_T / model.noise_T_rtHz) ** 2 / math.log(10.0))
+
+
+def nominal_array(array: SensorArray, models: tuple[SensorModel, ...], rate_Hz: float) -> SensorArray:
+    """The array as its user knows it: noise, limits and uncertainties of its sensors' models.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Where the sensors stand, and their nominal calibration.
+    models : tuple of SensorModel
+        One for each sensor.
+    rate_Hz : float
+
+    Returns
+    -------
+    SensorArray
+
+    Raises
+    ------
+    ValueError
+        A sensor's kind is not what its model reads, or it has no noise at all.
+    """
+    return replace(
+        array,
+        sensors=tuple(
+            replace(
+                sensor,
+                noise_T=model.sigma_T(rate_Hz),
+                saturation_T=None if math.isinf(model.range_T) else model.range_T,
+                misalignment_rad=model.misalignment_rad,
+                gain_uncertainty=model.gain_error,
+                offset_uncertainty_T=model.offset_error_T,
+                flicker_T=model.flicker_T,
+                drift_T_rth=model.drift_T_rth,
+            )
+            for sensor, model in zip(array.sensors, models, strict=True)
+        ),
+    )

@@ -1,0 +1,257 @@
+"""Readings and truth of a scenario."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from arrays.array import SensorArray
+from arrays.sensor import Calibration
+from arrays.typing import FloatArray
+from magloc.fields.dipole import MU0_OVER_4PI, field
+from magloc.readings import Readings, Truth
+from sims.magnetics.scenario import Carrier, Scenario, Source
+from sims.magnetics.sensors import SensorModel
+from sims.noise import coloured_noise, low_passed, random_walk, stream
+
+MU0 = 4.0 * math.pi * MU0_OVER_4PI
+NEAREST_M = 1e-3
+"""No sensor may come nearer to a source, whatever its size."""
+_HEADER_LINES = 2  # the first row of a readings file stands on its second line
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation:
+    """One realisation of a scenario.
+
+    Attributes
+    ----------
+    scenario : Scenario
+    seed : int
+    array : SensorArray
+        As its user knows it.
+    readings : Readings
+        With the pose of the array unless its frame is the world's, and with the ambient field if there is one.
+    truths : tuple of Truth
+        Position and moment of every source at the times of the readings, world frame.
+    true_array : SensorArray
+        The array with its true calibration: misalignments and errors of the gains are part of it.
+    """
+
+    scenario: Scenario
+    seed: int
+    array: SensorArray
+    readings: Readings
+    truths: tuple[Truth, ...]
+    true_array: SensorArray
+
+    @property
+    def truth(self) -> Truth:
+        """Truth of the first source.
+
+        Raises
+        ------
+        ValueError
+            The scenario has no source.
+        """
+        if not self.truths:
+            raise ValueError("Input scenario must have a source; instead received one without.")
+        return self.truths[0]
+
+
+@dataclass(frozen=True, eq=False)
+class _Pose:
+    """Position (n, 3) and attitude of a carrier in the world frame."""
+
+    position_m: FloatArray
+    rotation: Rotation
+
+
+def simulate(scenario: Scenario, seed: int) -> Simulation:
+    """One realisation of a scenario.
+
+    The field at every sensor is that of the ambient field with its pulsations, of the platform and of all sources at
+    that instant. Then come calibration with its errors, the sensor's low-pass, noise and drift, rounding, and
+    saturation: a reading beyond the range is the range.
+
+    Parameters
+    ----------
+    scenario : Scenario
+    seed : int
+        The same seed gives the same numbers. Every feature of every sensor, by its id, has its own stream: leaving out
+        one changes no other.
+
+    Returns
+    -------
+    Simulation
+
+    Raises
+    ------
+    ValueError
+        At one of the instants a sensor is inside a source, or within a millimetre of one or of the platform's dipole;
+        or no row is left between the gaps.
+    """
+    time_s = scenario.time_s
+    array_pose = _pose(scenario.carrier, time_s, seed, "array")
+    sensors_m = array_pose.position_m[:, None, :] + _applied(array_pose.rotation, scenario.array.positions)
+    ambient_T = np.zeros(3) if scenario.ambient_T is None else np.array(scenario.ambient_T)
+    fields_T = np.zeros_like(sensors_m) + (ambient_T + _pulsations(scenario, time_s, seed))[:, None, :]
+    truths = []
+    for number, source in enumerate(scenario.sources, start=1):
+        pose = _pose(source.carrier, time_s, seed, f"source {number}")
+        moment_Am2 = _moments(source, pose.rotation, ambient_T)
+        _refuse_contact(scenario, number, time_s, sensors_m - pose.position_m[:, None, :])
+        fields_T += field(sensors_m, pose.position_m[:, None, :], moment_Am2[:, None, :])
+        truths.append(Truth(time_s, pose.position_m, moment_Am2))
+    fields_T = _applied_each(array_pose.rotation.inv(), fields_T) + _platform_fields(scenario, time_s, seed)
+    fields_T += _stray_fields(scenario, seed)
+    true_array = _true_array(scenario, seed)
+    values_T = _sensed(scenario, true_array.readings_of(fields_T), seed)
+    present = np.ones(len(time_s), dtype=bool)
+    for start, end in scenario.missing.gaps_s:
+        present &= ~((time_s >= start) & (time_s <= end))
+    if not present.any():
+        raise ValueError("Input scenario must leave some rows; instead received gaps_s that leave none.")
+    posed = not scenario.carrier.is_world
+    readings = Readings(
+        time_s=time_s[present],
+        values_T=values_T[present],
+        line_numbers=np.arange(int(present.sum())) + _HEADER_LINES,
+        array_position_m=array_pose.position_m[present] if posed else None,
+        array_rotation_xyzw=array_pose.rotation.as_quat()[present] if posed else None,
+        ambient_T=None if scenario.ambient_T is None else array_pose.rotation.inv().apply(ambient_T)[present],
+    )
+    kept = tuple(Truth(t.time_s[present], t.position_m[present], _rows(t.moment_Am2, present)) for t in truths)
+    return Simulation(scenario, seed, scenario.nominal_array, readings, kept, true_array)
+
+
+def _pose(carrier: Carrier, time_s: FloatArray, seed: int, owner: str) -> _Pose:
+    motion = carrier.path.at(time_s)
+    phase = stream(seed, "wobble", owner).uniform(0.0, 2.0 * math.pi, 3)
+    return _Pose(motion.position_m, carrier.attitude.at(time_s, motion.course_rad, phase))
+
+
+def _moments(source: Source, rotation: Rotation, ambient_T: FloatArray) -> FloatArray:
+    """Moments in the world frame (n, 3): permanent and induced."""
+    ambient_in_body = rotation.inv().apply(ambient_T)
+    induced = ambient_in_body @ np.array(source.polarisability_m3).T / MU0
+    moments: FloatArray = rotation.apply(induced + source.moment_Am2)
+    return moments
+
+
+def _refuse_contact(scenario: Scenario, number: int, time_s: FloatArray, offset_m: FloatArray) -> None:
+    """Raise if a sensor is inside a source; offset (n, N, 3)."""
+    distance = np.linalg.norm(offset_m, axis=-1)
+    row, sensor = np.unravel_index(int(distance.argmin()), distance.shape)
+    nearest = max(scenario.sources[number - 1].radius_m, NEAREST_M)
+    if distance[row, sensor] < nearest:
+        raise ValueError(
+            f"Input scenario must keep its sensors at least {nearest:g} m from source {number}; "
+            f"instead received sensor {scenario.array.ids[int(sensor)]} at {distance[row, sensor]:.3g} m "
+            f"after {time_s[row]:g} s."
+        )
+
+
+def _pulsations(scenario: Scenario, time_s: FloatArray, seed: int) -> FloatArray:
+    """Variations of the ambient field (n, 3), world frame."""
+    total = np.zeros((len(time_s), 3))
+    for number, pulsation in enumerate(scenario.pulsations, start=1):
+        phase = stream(seed, "pulsation", str(number)).uniform(0.0, 2.0 * math.pi)
+        wave = np.sin(2.0 * math.pi * time_s / pulsation.period_s + phase)
+        total += wave[:, None] * np.array(pulsation.amplitude_T)
+    return total
+
+
+def _platform_fields(scenario: Scenario, time_s: FloatArray, seed: int) -> FloatArray:
+    """Fields of the carrier at the sensors (n, N, 3), array frame."""
+    platform, array = scenario.platform, scenario.array
+    total = np.zeros((len(time_s), array.n_sensors, 3))
+    if any(platform.moment_Am2):
+        distance = np.linalg.norm(array.positions - platform.position_m, axis=1)
+        if distance.min() < NEAREST_M:
+            raise ValueError(
+                f"Input scenario must keep its platform's dipole at least {NEAREST_M:g} m from the sensors; "
+                f"instead received sensor {array.ids[int(distance.argmin())]} at {distance.min():.3g} m."
+            )
+        phase = 0.0
+        if platform.frequency_Hz:
+            phase = stream(seed, "platform dipole").uniform(0.0, 2.0 * math.pi)
+        wave = np.cos(2.0 * math.pi * platform.frequency_Hz * time_s + phase)
+        constant = field(array.positions, platform.position_m, platform.moment_Am2)
+        total += wave[:, None, None] * constant
+    if platform.noise_T:
+        common = stream(seed, "platform noise").standard_normal((len(time_s), 1, 3))
+        total += platform.noise_T * common
+    return total
+
+
+def _stray_fields(scenario: Scenario, seed: int) -> FloatArray:
+    """Constant fields at the sensors (N, 3) that are fixed to the array."""
+    return np.stack(
+        [
+            model.offset_error_T * stream(seed, "offset", name).standard_normal(3)
+            for name, model in zip(scenario.array.ids, scenario.models, strict=True)
+        ]
+    )
+
+
+def _true_array(scenario: Scenario, seed: int) -> SensorArray:
+    """The array with the calibration that its sensors really have.
+
+    A vector sensor of nominal scale S reads S diag(1 + g) R b: R is a random rotation, g a random error of the gains.
+    """
+    sensors = []
+    for sensor, model in zip(scenario.array.sensors, scenario.models, strict=True):
+        gains = 1.0 + model.gain_error * stream(seed, "gain", sensor.id).standard_normal(sensor.n_channels)
+        scale = np.array(sensor.calibration.scale) @ np.diag(gains)
+        if sensor.kind == "vector":
+            turn = model.misalignment_rad * stream(seed, "misalignment", sensor.id).standard_normal(3)
+            scale = scale @ Rotation.from_rotvec(turn).as_matrix()
+        calibration = Calibration.of(sensor.kind, scale, sensor.calibration.offset_T)
+        sensors.append(replace(sensor, calibration=calibration))
+    return replace(scenario.array, sensors=tuple(sensors))
+
+
+def _sensed(scenario: Scenario, clean_T: FloatArray, seed: int) -> FloatArray:
+    """What the sensors make of their clean readings (n, C); NaN where a sensor misses a sample."""
+    values = np.empty_like(clean_T)
+    for i, (name, model) in enumerate(zip(scenario.array.ids, scenario.models, strict=True)):
+        channels = scenario.array.channel_sensor == i
+        values[:, channels] = _read(model, clean_T[:, channels], scenario.rate_Hz, seed, name)
+        lost = stream(seed, "dropout", name).random(len(values)) < scenario.missing.dropout
+        values[np.ix_(lost, channels)] = np.nan
+    return values
+
+
+def _read(model: SensorModel, clean_T: FloatArray, rate_Hz: float, seed: int, name: str) -> FloatArray:
+    """Readings of one sensor (n, c)."""
+    n, channels = clean_T.shape
+    values = low_passed(clean_T, rate_Hz, model.bandwidth_Hz)
+    values = values + coloured_noise(
+        n, channels, rate_Hz, model.noise_T_rtHz, model.corner_Hz, model.bandwidth_Hz, stream(seed, "noise", name)
+    )
+    values += random_walk(n, channels, rate_Hz, model.drift_T_rth, stream(seed, "drift", name))
+    if model.resolution_T:
+        values = np.round(values / model.resolution_T) * model.resolution_T
+    # Last, or rounding could lift a saturated reading off the limit by which it is known.
+    return np.clip(values, -model.range_T, model.range_T)
+
+
+def _rows(values: FloatArray | None, rows: NDArray[np.bool_]) -> FloatArray | None:
+    return None if values is None else values[rows]
+
+
+def _applied(rotation: Rotation, vectors: FloatArray) -> FloatArray:
+    """Every vector (N, 3) turned by every rotation: (n, N, 3)."""
+    turned: FloatArray = np.einsum("tij,kj->tki", rotation.as_matrix(), vectors)
+    return turned
+
+
+def _applied_each(rotation: Rotation, vectors: FloatArray) -> FloatArray:
+    """The vectors (n, N, 3) of every instant turned by its rotation."""
+    turned: FloatArray = np.einsum("tij,tkj->tki", rotation.as_matrix(), vectors)
+    return turned

@@ -1,0 +1,129 @@
+"""Telemetry: what a run writes is what filters read, gaps stay gaps, wrong files are refused with their place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from adcs import quaternion
+from adcs.io.scenario_files import changed, read_scenario
+from adcs.io.telemetry_files import FIELD, GROUPS, GYRO, STAR, SUN, TIME, WHEELS, read_telemetry, telemetry_columns
+from arrays.io.csv import write_columns
+from arrays.io.errors import InputError
+from sims.attitude.files import simulation_of
+from sims.attitude.simulation import simulate
+
+SCENARIO = changed(read_scenario("tabletsat"), {"duration_s": 20.0, "disturbance": {"gyro_bias_deg_s": 0.02}})
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return simulate(simulation_of(SCENARIO), [3])
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Write columns and read them as telemetry."""
+
+    def write_and_read(columns, scenario=SCENARIO):
+        path = tmp_path / "log.csv"
+        write_columns(columns, path)
+        return read_telemetry(path, scenario)
+
+    return write_and_read
+
+
+class TestRoundTrip:
+    def test_readings_and_wheels(self, runs, written):
+        record = written(telemetry_columns(runs, SCENARIO))
+        for name in ("gyro_rad_s", "field_T", "sun"):
+            np.testing.assert_allclose(getattr(record.readings, name), getattr(runs.readings, name), rtol=1e-12)
+        np.testing.assert_allclose(record.momentum_Nms, runs.momentum_Nms, rtol=1e-12)
+        np.testing.assert_allclose(record.wheel_torque_Nm[:, :-1], runs.wheel_torque_Nm[:, :-1], atol=1e-14)
+        assert record.sensors == ("st", "gyro", "mag", "sun")
+
+    def test_star_tracker_through_the_inertial_frame(self, runs, written):
+        """The file has the attitude against inertial space: the rotation of the orbital frame cancels."""
+        columns = telemetry_columns(runs, SCENARIO)
+        record = written(columns)
+        angle = quaternion.angle_between(record.readings.star, runs.readings.star)
+        assert angle.max() < 1e-7
+        in_file = np.stack([columns[name] for name in STAR], axis=1)
+        to_first = quaternion.angle_between(in_file, in_file[:1])
+        # The orbital frame turns by n = 0.062°/s, and the satellite with it.
+        assert np.degrees(to_first[-1]) == pytest.approx(20.0 * 0.062, abs=0.3)
+
+    def test_surroundings(self, runs, written):
+        record = written(telemetry_columns(runs, SCENARIO))
+        np.testing.assert_allclose(record.environment.b_orbital_T, runs.environment.b_orbital_T, atol=1e-12)
+        assert record.environment.utc[0, 0] == runs.environment.utc[0, 0]
+
+
+class TestGaps:
+    def test_rows_and_cells(self, runs, written):
+        columns = {name: values.copy() for name, values in telemetry_columns(runs, SCENARIO).items()}
+        columns[SUN[1]][4] = np.nan
+        kept = np.delete(np.arange(21), [7, 8])
+        record = written({name: values[kept] for name, values in columns.items()})
+        assert record.time_s.tolist() == columns[TIME].tolist()
+        assert record.rows.tolist() == kept.tolist()
+        missing = np.isnan(record.readings.sun[0]).all(axis=-1)
+        assert np.flatnonzero(missing).tolist() == [4, 7, 8]
+        assert np.isnan(record.readings.gyro_rad_s[0, 7:9]).all()
+        assert np.isfinite(record.momentum_Nms).all()
+
+    def test_absent_sensors(self, runs, written):
+        columns = telemetry_columns(runs, SCENARIO)
+        record = written({name: columns[name] for name in (TIME, *FIELD)})
+        assert record.sensors == ("mag",)
+        assert np.isnan(record.readings.star).all()
+        assert not record.momentum_Nms.any()
+
+    def test_later_part(self, runs, written):
+        record = written(telemetry_columns(runs, SCENARIO))
+        later = record.since(5)
+        assert later.time_s[0] == record.time_s[5]
+        np.testing.assert_array_equal(later.readings.sun, record.readings.sun[:, 5:])
+        assert later.rows.tolist() == list(range(16))
+        assert record.since(0) is record
+
+    def test_any_length_of_directions(self, runs, written):
+        columns = telemetry_columns(runs, SCENARIO)
+        for name in (*SUN, *STAR):
+            columns[name] = 7.0 * columns[name]
+        record = written(columns)
+        np.testing.assert_allclose(np.linalg.norm(record.readings.sun, axis=-1), 1.0)
+        np.testing.assert_allclose(np.linalg.norm(record.readings.star, axis=-1), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("header", "rows", "fragments"),
+    [
+        ("time_s,gyro_x", ["0,1"], ["line 1", "gyro_x", "nearest is gyro_x_deg_s"]),
+        (",".join(GYRO), ["1,2,3"], ["line 1", "expected time_s"]),
+        (f"time_s,{GYRO[0]}", ["0,1"], ["line 1", GYRO[1], "all or none"]),
+        (f"time_s,{','.join(FIELD)}", ["0,1,2,3", "1.5,1,2,3"], ["line 3", "time_s", "step_s = 1 s"]),
+        (f"time_s,{','.join(FIELD)}", ["0,1,2,3", "0,1,2,3"], ["line 3", "ascend"]),
+        (f"time_s,{','.join(FIELD)}", ["0,1,2,3", "9e9,1,2,3"], ["line 3", "fewer than"]),
+        (f"time_s,{','.join(FIELD)}", [",1,2,3"], ["line 2", "time_s", "no value"]),
+        (f"time_s,{','.join(SUN)}", ["0,1,2,3", "1,0,0,0"], ["line 3", "sun_x", "length 0"]),
+        (f"time_s,{','.join(STAR)}", ["0,0,0,0,0"], ["line 2", "star_qw", "length 0"]),
+        (f"time_s,{','.join(WHEELS)}", ["0,1,2,inf"], ["line 2", "wheels_z_Nms", "infinite"]),
+        (f"time_s,{','.join(FIELD)}", ["1e9,1,2,3"], ["2046", "2030"]),
+        ("time_s", [], ["without rows"]),
+    ],
+)
+def test_bad_files(tmp_path, header, rows, fragments):
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([header, *rows, ""]))
+    with pytest.raises(InputError) as refused:
+        read_telemetry(path, SCENARIO)
+    assert str(refused.value).startswith(str(path))
+    for fragment in fragments:
+        assert fragment in str(refused.value)
+
+
+def test_every_column_says_its_unit_or_has_none():
+    units = ("_deg_s", "_nT", "_Nms")
+    for group in GROUPS:
+        assert group in (STAR, SUN) or all(name.endswith(units) for name in group)

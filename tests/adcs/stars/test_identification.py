@@ -1,0 +1,407 @@
+"""Stars of the real sky.
+
+What is checked                  by what
+identification                   random skies of which the truth is known; frames of the same part of the sky, one as
+                                 the catalogue of the other; a catalogue that MAGLOC_STAR_CATALOGUE names
+the image's handedness           three bright stars of Cepheus, from any almanac
+rotation of least squares        scipy's Rotation.align_vectors
+"""
+
+import json
+import math
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cyclopts import App
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from adcs.cli.stars import stars
+from adcs.stars.files import read_star_catalogue, read_star_frames
+from adcs.stars.identification import (
+    NoFix,
+    StarCamera,
+    StarCatalogue,
+    StarFix,
+    StarMatcher,
+    rotation_between,
+    star_triangles,
+)
+from arrays.io.errors import InputError
+from magloc.cli import framework
+from tests.adcs.refusals import assert_refused
+from tests.command_line import Outcome
+
+CAMERA = StarCamera(1392, 1040, math.radians(15.78 / 3600.0))
+NOISE_PX = 0.8
+
+
+def random_sky(n, seed=0):
+    """Stars in random directions, three times as many with every magnitude."""
+    rng = np.random.default_rng(seed)
+    ra, dec = rng.uniform(0.0, 2.0 * math.pi, n), np.arcsin(rng.uniform(-1.0, 1.0, n))
+    return StarCatalogue.of(np.arange(1, n + 1), ra, dec, 10.0 + np.log(rng.random(n)) / math.log(3.0))
+
+
+def image_of(sky, R, rng, lost=0.05, false=3, camera=CAMERA):
+    """Points, magnitudes and rows of the stars that a camera of that attitude sees, and -1 of stars that are none."""
+    seen = sky.directions @ R
+    front = seen[:, 2] < 0.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        points = seen[:, :2] / -seen[:, 2:] / math.tan(camera.rad_per_px)
+    points = points + 0.5 * np.array([camera.width_px, camera.height_px])
+    inside = front & (points > 0.0).all(axis=1) & (points < [camera.width_px, camera.height_px]).all(axis=1)
+    rows = np.flatnonzero(inside & (rng.random(len(seen)) >= lost))
+    noisy = points[rows] + NOISE_PX * rng.standard_normal((len(rows), 2))
+    clutter = rng.uniform([0, 0], [camera.width_px, camera.height_px], (false, 2))
+    magnitudes = np.concatenate([sky.magnitudes[rows] + 0.2 * rng.standard_normal(len(rows)), rng.uniform(6, 9, false)])
+    return np.concatenate([noisy, clutter]), magnitudes, np.concatenate([rows, np.full(false, -1)])
+
+
+class TestRandomSky:
+    def test_stars_are_identified(self):
+        """30,000 stars, 20 in an image, with noise in places and magnitudes, 5 % lost and three false ones."""
+        sky, rng = random_sky(30_000), np.random.default_rng(1)
+        matcher = StarMatcher.of(sky, CAMERA)
+        right = identified = there = 0
+        for R in Rotation.random(20, random_state=2).as_matrix():
+            points, magnitudes, rows = image_of(sky, R, rng)
+            fix = matcher.identify(points, magnitudes)
+            assert isinstance(fix, StarFix)
+            # Across the axis to a fraction of a pixel; about it to that at the image's border, 500 px away.
+            assert np.linalg.norm(fix.R_catalogue_from_frame[:, 2] - R[:, 2]) < 2.0 * CAMERA.rad_per_px
+            assert Rotation.from_matrix(fix.R_catalogue_from_frame @ R.T).magnitude() < 2.0 / 500.0
+            right += np.count_nonzero(rows[fix.stars[:, 0]] == fix.stars[:, 1])
+            identified += len(fix.stars)
+            there += np.count_nonzero(rows >= 0)
+        assert right / there > 0.98
+        assert right / identified > 0.995
+
+    def test_an_unknown_sky_gives_no_fix(self):
+        matcher, rng = StarMatcher.of(random_sky(30_000), CAMERA), np.random.default_rng(3)
+        other = random_sky(30_000, seed=4)
+        for R in Rotation.random(20, random_state=5).as_matrix():
+            points, magnitudes, _ = image_of(other, R, rng)
+            assert isinstance(matcher.identify(points, magnitudes), NoFix)
+
+    def test_a_mirrored_image_gives_no_fix(self):
+        sky, rng = random_sky(30_000), np.random.default_rng(6)
+        matcher = StarMatcher.of(sky, CAMERA)
+        for R in Rotation.random(10, random_state=7).as_matrix():
+            points, magnitudes, _ = image_of(sky, R, rng)
+            assert isinstance(matcher.identify(points * [-1.0, 1.0] + [1392.0, 0.0], magnitudes), NoFix)
+
+    def test_turning_the_sky_turns_the_attitude(self):
+        sky, rng = random_sky(30_000), np.random.default_rng(8)
+        R, turn = Rotation.random(2, random_state=9).as_matrix()
+        points, magnitudes, _ = image_of(sky, R, rng)
+        before = StarMatcher.of(sky, CAMERA).identify(points, magnitudes)
+        turned = StarCatalogue(sky.numbers, sky.directions @ turn.T, sky.magnitudes)
+        order = rng.permutation(len(points))
+        after = StarMatcher.of(turned, CAMERA).identify(points[order], magnitudes[order])
+        assert_allclose(after.R_catalogue_from_frame, turn @ before.R_catalogue_from_frame, atol=1e-9)
+        assert {(order[i], j) for i, j in after.stars} == {tuple(pair) for pair in before.stars}
+
+    @pytest.mark.parametrize("n", [0, 1, 3])
+    def test_too_few_stars(self, n):
+        fix = StarMatcher.of(random_sky(1000), CAMERA).identify(np.zeros((n, 2)), np.zeros(n))
+        assert fix == NoFix(f"{n} stars, 4 needed")
+
+
+class TestGeometry:
+    def test_rotation_of_least_squares(self):
+        rng = np.random.default_rng(0)
+        seen, there = rng.standard_normal((2, 6, 3))
+        expected = Rotation.align_vectors(there, seen)[0].as_matrix()
+        assert_allclose(rotation_between(seen, there), expected, atol=1e-9)
+
+    def test_triangles_have_brighter_corners_and_do_not_depend_on_fainter_stars(self):
+        directions = random_sky(3000).directions
+        few, many = star_triangles(directions[:500], 0.3), star_triangles(directions, 0.3)
+        known = {frozenset(corners) for corners in many.corners.tolist()}
+        # Fainter stars may crowd brighter neighbours out of the nearest 24, no more.
+        assert np.mean([frozenset(corners) in known for corners in few.corners.tolist()]) > 0.2
+        assert (np.diff(many.sides, axis=1) >= 0.0).all()
+        assert many.sides.max() <= 0.3
+
+    @pytest.mark.parametrize(
+        ("camera", "text"),
+        [
+            ((1392, 1040, 1e-170), "must be 0.01 to 3600 arc seconds"),
+            ((1392, 1040, 1e300), "must be 0.01 to 3600 arc seconds"),
+            ((10**6, 1040, 1e-5), "at most 100000"),
+            ((9000, 9000, 1e-2), "at most 150° wide"),
+            ((0, 9000, 1e-2), "must be positive"),
+        ],
+    )
+    def test_no_camera(self, camera, text):
+        with pytest.raises(ValueError, match=text):
+            StarCamera(*camera)
+
+    @pytest.mark.parametrize("points", [[1.0, 2.0], [[1.0, 2.0, 3.0]], [[np.nan, 0.0]]])
+    def test_no_points(self, points):
+        with pytest.raises(ValueError, match="Input points_px must be finite numbers of shape"):
+            CAMERA.directions(points)
+
+
+@pytest.fixture(scope="module")
+def frames(data_folder):
+    return read_star_frames(data_folder / "star-frames")
+
+
+class TestRecordedFrames:
+    """50 frames with labels; nothing here was fitted to them."""
+
+    def test_handedness_and_scale(self, frames):
+        """ζ, δ and ε Cephei (Hipparcos 109492, 110991, 109857), J2000, to the second."""
+        camera, images = frames
+        image = next(image for image in images if {109492, 110991, 109857} <= set(image.numbers.tolist()))
+        ra = np.radians(
+            [15.0 * (22 + 10 / 60 + 51 / 3600), 15.0 * (22 + 29 / 60 + 10 / 3600), 15.0 * (22 + 15 / 60 + 2 / 3600)]
+        )
+        dec = np.radians([58 + 12 / 60 + 5 / 3600, 58 + 24 / 60 + 55 / 3600, 57 + 2 / 60 + 37 / 3600])
+        sky = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+        rows = [int(np.flatnonzero(image.numbers == number)[0]) for number in (109492, 110991, 109857)]
+        seen = camera.directions(image.points_px[rows])
+        R = rotation_between(seen, sky)
+        assert np.linalg.norm(seen @ R.T - sky, axis=1).max() < 3.0 * camera.rad_per_px
+        mirrored = seen * [-1.0, 1.0, 1.0]
+        assert (
+            np.linalg.norm(mirrored @ rotation_between(mirrored, sky).T - sky, axis=1).max() > 100 * camera.rad_per_px
+        )
+
+    def catalogue_of(self, images, camera, chosen):
+        """Labelled stars of frames, each frame turned to a place of its own."""
+        attitudes = Rotation.random(len(images), random_state=11).as_matrix()
+        parts = [
+            (image.numbers[known], camera.directions(image.points_px[known]) @ attitudes[i].T, image.magnitudes[known])
+            for i, image in enumerate(images)
+            if i in chosen and (known := image.numbers >= 0).any()
+        ]
+        return StarCatalogue(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    @pytest.mark.parametrize(("shown", "known"), [(26, 16), (16, 26), (35, 45), (45, 35)])
+    def test_a_frame_by_another_that_overlaps(self, frames, shown, known):
+        """Of the 49 others as a catalogue only one shows the same stars, 33 or 17 of them, with noise of its own."""
+        camera, images = frames
+        catalogue = self.catalogue_of(images, camera, set(range(50)) - {shown})
+        fix = StarMatcher.of(catalogue, camera).identify(images[shown].points_px, images[shown].magnitudes)
+        assert isinstance(fix, StarFix)
+        found, labels = catalogue.numbers[fix.stars[:, 1]], images[shown].numbers[fix.stars[:, 0]]
+        common = np.intersect1d(images[shown].numbers, images[known].numbers)
+        assert (found == labels).all()
+        assert len(found) >= 0.95 * np.count_nonzero(common >= 0)
+
+    def test_frames_that_no_other_overlaps_give_no_fix(self, frames):
+        camera, images = frames
+        alone = [i for i in range(50) if i not in (16, 26, 29, 43, 35, 45)]
+        for shown in alone[::4]:
+            catalogue = self.catalogue_of(images, camera, set(range(50)) - {shown})
+            fix = StarMatcher.of(catalogue, camera).identify(images[shown].points_px, images[shown].magnitudes)
+            assert isinstance(fix, NoFix)
+
+    def test_all_frames_by_their_own_places_among_a_hundred_thousand_others(self, frames):
+        """No catalogue comes with the frames: theirs is made of the labelled places, each frame at a place of its own,
+        hidden among random stars; the frames are shown with noise of another 0.8 px and 0.2 magnitudes. So patterns,
+        magnitudes and false stars are the recorded ones, the errors of the catalogue are not.
+        """
+        camera, images = frames
+        known, others = self.catalogue_of(images, camera, set(range(50))), random_sky(100_000, seed=12)
+        catalogue = StarCatalogue(
+            np.concatenate([known.numbers, 1_000_000 + others.numbers]),
+            np.concatenate([known.directions, others.directions]),
+            np.concatenate([known.magnitudes, others.magnitudes]),
+        )
+        matcher, rng = StarMatcher.of(catalogue, camera), np.random.default_rng(13)
+        right = identified = there = 0
+        for image in images:
+            n = len(image.points_px)
+            points = image.points_px + NOISE_PX * rng.standard_normal((n, 2))
+            fix = matcher.identify(points, image.magnitudes + 0.2 * rng.standard_normal(n))
+            there += np.count_nonzero(image.numbers >= 0)
+            if isinstance(fix, StarFix):
+                right += np.count_nonzero(catalogue.numbers[fix.stars[:, 1]] == image.numbers[fix.stars[:, 0]])
+                identified += len(fix.stars)
+        assert right / there > 0.97
+        assert right / identified > 0.99
+
+    def test_with_a_real_catalogue(self, frames):
+        """Per-star rates over all frames, with the catalogue that the environment names."""
+        path = os.environ.get("MAGLOC_STAR_CATALOGUE")
+        if not path:
+            pytest.skip("needs a star catalogue (CSV: hip, ra_deg, dec_deg, mag), but MAGLOC_STAR_CATALOGUE names none")
+        camera, images = frames
+        sky = read_star_catalogue(path)
+        matcher = StarMatcher.of(sky, camera)
+        right = identified = there = 0
+        for image in images:
+            there += np.count_nonzero(np.isin(image.numbers, sky.numbers))
+            fix = matcher.identify(image.points_px, image.magnitudes)
+            if isinstance(fix, StarFix):
+                right += np.count_nonzero(sky.numbers[fix.stars[:, 1]] == image.numbers[fix.stars[:, 0]])
+                identified += len(fix.stars)
+        assert right / there > 0.9
+        assert right / identified > 0.99
+
+
+def write_frames(folder, sky, attitudes, rng):
+    folder.mkdir()
+    (folder / "calibration.txt").write_text("IMG_X=1392\nIMG_Y=1040\nPIXSCALE=15.78\nOTHER=anything\n")
+    images = [image_of(sky, R, rng) for R in attitudes]
+    rows = [np.column_stack([points, magnitudes]).ravel() for points, magnitudes, _ in images]
+    (folder / "input.csv").write_text("".join(",".join(f"{value:.6f}" for value in row) + ",\n" for row in rows))
+    labels = [np.where(row >= 0, sky.numbers[row], -1) for *_, row in images]
+    (folder / "result.csv").write_text("".join(",".join(map(str, row)) + "\n" for row in labels))
+
+
+@pytest.fixture(scope="module")
+def sky_files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stars")
+    sky = random_sky(30_000)
+    ra, dec = (
+        np.degrees(np.arctan2(sky.directions[:, 1], sky.directions[:, 0])) % 360.0,
+        np.degrees(np.arcsin(sky.directions[:, 2])),
+    )
+    lines = [f"{n},{a:.9f},{d:.9f},{m:.3f}\n" for n, a, d, m in zip(sky.numbers, ra, dec, sky.magnitudes, strict=True)]
+    (folder / "sky.csv").write_text("hip,ra_deg,dec_deg,mag\n" + "".join(lines))
+    write_frames(folder / "frames", sky, Rotation.random(3, random_state=1).as_matrix(), np.random.default_rng(2))
+    return folder
+
+
+@pytest.fixture
+def adcs(capsys):
+    app = App(name="adcs")
+    app.command(stars)
+
+    def run(*arguments):
+        status = framework.run(app, [str(argument) for argument in arguments])
+        return Outcome(status, *capsys.readouterr())
+
+    return run
+
+
+class TestCommand:
+    def test_says_where_and_how_many(self, adcs, sky_files):
+        outcome = adcs("stars", sky_files / "frames", "--catalogue", sky_files / "sky.csv")
+        assert outcome.status == 0, outcome.err
+        *lines, last = outcome.out.splitlines()
+        directions = -Rotation.random(3, random_state=1).as_matrix()[:, :, 2]
+        for line, (x, y, z) in zip(lines, directions, strict=True):
+            ra, dec = map(float, re.findall(r"RA ([\d.]+)°, Dec ([-+\d.]+)°", line)[0])
+            assert ra == pytest.approx(math.degrees(math.atan2(y, x)) % 360.0, abs=0.02)
+            assert dec == pytest.approx(math.degrees(math.asin(z)), abs=0.02)
+        assert last.startswith("3 fixes")
+
+    def test_json(self, adcs, sky_files):
+        outcome = adcs("stars", sky_files / "frames", "--catalogue", sky_files / "sky.csv", "--json")
+        found = json.loads(outcome.out)
+        assert found["fixes"] == len(found["frames"]) == 3
+        assert found["identification_rate"] > 0.95
+        assert found["false_rate"] < 0.05
+        R = Rotation.random(3, random_state=1).as_matrix()[0]
+        north = np.array([0.0, 0.0, 1.0]) + R[2, 2] * R[:, 2] * -1.0
+        east = np.cross(north, -R[:, 2])
+        roll = math.degrees(math.atan2(R[:, 1] @ east, R[:, 1] @ north))
+        assert abs(math.remainder(found["frames"][0]["roll_deg"] - roll, 360.0)) < 0.05
+
+    def test_without_labels(self, adcs, sky_files, tmp_path):
+        for name in ("calibration.txt", "input.csv"):
+            (tmp_path / name).write_text((sky_files / "frames" / name).read_text())
+        outcome = adcs("stars", tmp_path, "--catalogue", sky_files / "sky.csv")
+        assert outcome.out.splitlines()[-1].endswith("stars identified")
+
+    @pytest.mark.parametrize(
+        ("text", "fragments"),
+        [
+            ("hip,ra_deg,mag\n1,2,3\n", ["column dec_deg", "found no such column"]),
+            ("hip,ra_deg,dec_deg,mag\n1,2,95,3\n", ["line 2, column dec_deg", "declination beyond 90°"]),
+            ("hip,ra_deg,dec_deg,mag\n1,2,north,3\n", ["line 2, column dec_deg"]),
+            ("hip,ra_deg,dec_deg,mag\n1.5,2,5,3\n", ["line 2, column hip", "expected a whole number"]),
+            ("hip,ra_deg,dec_deg,mag\n1,2,5,3\n1,3,5,3\n", ["line 3, column hip", "expected every value once"]),
+            ("hip,ra_deg,dec_deg,mag\n1e30,2,5,3\n", ["line 2, column hip: found 1e+30, expected a number from 0"]),
+            ("hip,ra_deg,dec_deg,mag\n1,2,5,3\n-1,3,5,3\n", ["line 3, column hip: found -1, expected a number from 0"]),
+            ("hip,ra_deg,dec_deg,mag\n1,2,5,3\n", ["found 1 stars, expected 4 at least"]),
+        ],
+    )
+    def test_bad_catalogues(self, adcs, sky_files, tmp_path, text, fragments):
+        (tmp_path / "bad.csv").write_text(text)
+        assert_refused(adcs("stars", sky_files / "frames", "--catalogue", tmp_path / "bad.csv"), "bad.csv", *fragments)
+
+    @pytest.mark.parametrize(
+        ("name", "text", "fragments"),
+        [
+            ("calibration.txt", "IMG_X=10\nIMG_Y=10\n", ["found no line PIXSCALE="]),
+            ("calibration.txt", "IMG_X=-1\nIMG_Y=10\nPIXSCALE=1\n", ["line 1: found IMG_X=-1, expected a positive"]),
+            (
+                "calibration.txt",
+                "IMG_X=0.5\nIMG_Y=10\nPIXSCALE=1\n",
+                ["line 1: found IMG_X=0.5, expected a positive whole number"],
+            ),
+            (
+                "calibration.txt",
+                "IMG_X=9\nIMG_Y=9\nPIXSCALE=1e-170\n",
+                ["line 3: found PIXSCALE=1e-170", "0.01 to 3600"],
+            ),
+            ("calibration.txt", "IMG_X=9\nIMG_Y=9\nPIXSCALE=1e300\n", ["found PIXSCALE=1e300", "0.01 to 3600"]),
+            ("calibration.txt", "IMG_X=9\nIMG_Y=9\nPIXSCALE=4e5\n", ["found PIXSCALE=4e5", "0.01 to 3600"]),
+            (
+                "calibration.txt",
+                "IMG_X=1e300\nIMG_Y=9\nPIXSCALE=9\n",
+                ["line 1: found IMG_X=1e300", "1 to 100000 pixels"],
+            ),
+            (
+                "calibration.txt",
+                "IMG_X=900\nIMG_Y=1200\nPIXSCALE=3000\n",
+                ["found PIXSCALE=3000 for 1500 pixels", "150°"],
+            ),
+            ("input.csv", "1,2,3,4\n", ["line 1: found 4 numbers, expected three for each star"]),
+            ("input.csv", "1,2,x\n", ["line 1: found 'x', expected a finite number"]),
+            ("input.csv", "\n", ["found no frame, expected one at least"]),
+            ("result.csv", "1,2\n", ["found 1 frames, expected 3"]),
+            ("result.csv", "1\n1\n1\n", ["line 1: found 1 numbers"]),
+        ],
+    )
+    def test_bad_frames(self, adcs, sky_files, tmp_path, name, text, fragments):
+        for other in ("calibration.txt", "input.csv", "result.csv"):
+            (tmp_path / other).write_text((sky_files / "frames" / other).read_text())
+        (tmp_path / name).write_text(text)
+        outcome = adcs("stars", tmp_path, "--catalogue", sky_files / "sky.csv")
+        assert_refused(outcome, name, *fragments)
+
+    @pytest.mark.parametrize("label", ["1e30", "-2"])
+    def test_labels_that_are_no_numbers_of_stars(self, adcs, sky_files, tmp_path, label):
+        for name in ("calibration.txt", "input.csv", "result.csv"):
+            (tmp_path / name).write_text((sky_files / "frames" / name).read_text())
+        labels = (tmp_path / "result.csv").read_text()
+        (tmp_path / "result.csv").write_text(labels.replace(labels.split(",")[0], label, 1))
+        found = f"result.csv, line 1: found {float(label):.15g}, expected numbers of stars"
+        assert_refused(adcs("stars", tmp_path, "--catalogue", sky_files / "sky.csv"), found)
+
+    def test_no_such_folder(self, adcs, sky_files, tmp_path):
+        assert_refused(adcs("stars", tmp_path / "none", "--catalogue", sky_files / "sky.csv"), "does not exist")
+
+    def test_noise_must_be_positive(self, adcs, sky_files):
+        outcome = adcs("stars", sky_files / "frames", "--catalogue", sky_files / "sky.csv", "--noise-px", "0")
+        assert_refused(outcome, "--noise-px", "expected a positive number")
+
+    @pytest.mark.parametrize("noise", ["105", "1e308"])
+    def test_noise_as_large_as_the_image(self, adcs, sky_files, noise):
+        outcome = adcs("stars", sky_files / "frames", "--catalogue", sky_files / "sky.csv", "--noise-px", noise)
+        assert_refused(outcome, "--noise-px", "expected at most 104, a tenth of the image's shorter side")
+
+    def test_noise_in_which_all_triangles_agree_is_no_long_work(self, adcs, sky_files):
+        outcome = adcs(
+            "stars", sky_files / "frames", "--catalogue", sky_files / "sky.csv", "--noise-px", "50", "--json"
+        )
+        found = json.loads(outcome.out)
+        assert found["fixes"] == 0
+        for frame in found["frames"]:
+            assert "triangles agree within the noise, 250000 can be told apart" in frame["reason"]
+
+
+def test_a_folder_that_is_none(tmp_path):
+    with pytest.raises(InputError, match="does not exist"):
+        read_star_frames(Path(tmp_path) / "nothing")

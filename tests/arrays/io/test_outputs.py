@@ -1,0 +1,77 @@
+"""Outputs that cannot be written are refused before long work, by the name of their option."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from arrays.io.errors import InputError
+from arrays.io.outputs import make_folder, refuse_file, refuse_one_for_two, refuse_unwritable
+
+# Nobody can make a file in it.
+CLOSED = Path("/proc")
+
+
+class TestRefuseUnwritable:
+    def test_leaves_a_file_and_its_folder_alone(self, tmp_path: Path) -> None:
+        path = tmp_path / "old.csv"
+        path.write_text("old")
+        refuse_unwritable(path, "--out")
+        refuse_unwritable(tmp_path / "new.PNG", "--png", ".png")
+        assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("old.csv", "old")]
+
+    def test_refused(self, tmp_path: Path) -> None:
+        for path, fault in (
+            (tmp_path, "found a folder, expected a file"),
+            (tmp_path / "none" / "a.csv", "found no folder"),
+            (CLOSED / "a.csv", f"no file can be made in {CLOSED}"),
+            (tmp_path / ("a" * 250), "File name too long"),
+        ):
+            with pytest.raises(InputError) as refused:
+                refuse_unwritable(path, "--out")
+            assert str(refused.value).startswith(f"--out {path}: ")
+            assert fault in str(refused.value)
+
+    def test_through_a_link(self, tmp_path: Path) -> None:
+        """The target is replaced, so that its folder counts."""
+        link = tmp_path / "link.csv"
+        link.symlink_to(CLOSED / "a.csv")
+        with pytest.raises(InputError, match=f"no file can be made in {CLOSED}"):
+            refuse_unwritable(link, "--out")
+
+    def test_suffix(self, tmp_path: Path) -> None:
+        with pytest.raises(InputError, match=r"--png .*found a name that ends with '.xyz', expected .png"):
+            refuse_unwritable(tmp_path / "a.xyz", "--png", ".png")
+
+    def test_what_is_no_file_is_written_in_place(self, tmp_path: Path) -> None:
+        refuse_unwritable(Path(os.devnull), "--out")
+
+
+class TestFolders:
+    def test_nothing_is_made(self, tmp_path: Path) -> None:
+        refuse_file(tmp_path / "new" / "folder", "--out")
+        assert not list(tmp_path.iterdir())
+
+    def test_refused(self, tmp_path: Path) -> None:
+        file = tmp_path / "file"
+        file.write_text("")
+        for folder in (file, file / "below"):
+            with pytest.raises(InputError, match=f"--out {folder}: found a file, expected a folder"):
+                refuse_file(folder, "--out")
+        for folder in (CLOSED, CLOSED / "new" / "folder"):
+            with pytest.raises(InputError, match=f"--out {folder}: no file can be made in {CLOSED}"):
+                refuse_file(folder, "--out")
+        with pytest.raises(InputError, match=f"--out {CLOSED}: no file can be made in {CLOSED}"):
+            make_folder(CLOSED, "--out")
+
+
+class TestOneForTwo:
+    def test_refused_by_whatever_name(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.chdir(tmp_path)
+        with pytest.raises(InputError, match="--png a: found the file of --out, expected another one"):
+            refuse_one_for_two({"--out": tmp_path / "b" / ".." / "a", "--png": Path("a")})
+
+    def test_several_and_none(self, tmp_path: Path) -> None:
+        refuse_one_for_two({"--out": tmp_path / "a", "--png": None, "--json": None, "--csv": tmp_path / "b"})

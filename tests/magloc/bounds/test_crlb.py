@@ -1,0 +1,511 @@
+"""Cramér-Rao bounds of sources before any array.
+
+| what | who checks it |
+|---|---|
+| bounds | the printed figures of the reference problem |
+| information, every nuisance marginalised | exact second derivatives (hyper-dual numbers) of the likelihood of all |
+| | readings with all nuisances as parameters, formed from the formulas and inverted whole |
+| bounds, whether they can be reached | scatter of the fits of magloc.localization.search.single_source |
+| scaling | dimensional analysis of the dipole's field |
+| compiled table and spreads | bounds_of; NumPy |
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from arrays.array import SensorArray
+from arrays.differences import decorrelated_differences
+from arrays.geometries import cube, hexagon, square, tetrahedron
+from magloc.bounds.crlb import bounds_of, fisher_information, whitened_jacobian
+from magloc.bounds.over_moments import (
+    bounds_over_moments,
+    moment_directions,
+    sigma_table,
+    spread_over,
+    table_and_spreads,
+)
+from magloc.directions import sphere_directions
+from magloc.localization.search.single_source import Locator
+from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
+from tests.arrays.test_differences import random_array
+from tests.magloc.bounds.hyper_dual import Model
+
+SOURCE = np.array([5.0, 0.0, 0.306])
+AMBIENT = (2e-5, 1e-6, 4.5e-5)
+TETRAHEDRON = tetrahedron(1.5, noise_T=1e-9)
+SCALARS = replace(cube(1.5, kind="scalar", noise_T=1e-11), ambient_T=AMBIENT)
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def random_source(seed, distance_m=4.0, moment_Am2=200.0):
+    direction, moment = np.random.default_rng([seed, 7]).normal(size=(2, 3))
+    return (size * v / np.linalg.norm(v) for size, v in ((distance_m, direction), (moment_Am2, moment)))
+
+
+def turned(array, rotation):
+    """The same array in another frame."""
+    sensors = tuple(
+        replace(
+            s,
+            position_m=rotation.apply(s.position_m),
+            rotation_xyzw=(rotation * Rotation.from_quat(s.rotation_xyzw)).as_quat(),
+        )
+        for s in array.sensors
+    )
+    ambient = None if array.ambient_T is None else tuple(rotation.apply(array.ambient_T))
+    return replace(array, sensors=sensors, ambient_T=ambient)
+
+
+class TestPrintedFigures:
+    """The reference problem, 1 nT and a source at (5, 0, 0.306) m, to the printed digits (a 4.2 stands for 4.1498)."""
+
+    @pytest.mark.parametrize(
+        ("edge", "moment", "sigma_m", "sigma_Am2"),
+        [
+            (1.5, (0, 0, 100), ("0.289", "0.082", "0.076"), ("4.15", "1.7", "23.6")),
+            (1.5, (60, 50, 60), ("0.169", "0.097", "0.082"), ("9.5", "8.7", "9.6")),
+            (1.5, (100, 0, 0), ("0.134", "0.230", "0.254"), ()),
+            (0.5, (0, 0, 100), ("2.74", "0.22", "0.21"), ("11.9", "4.5", "220")),
+        ],
+    )
+    def test_position_and_moment(self, edge, moment, sigma_m, sigma_Am2):
+        sigma = bounds_of(tetrahedron(edge, noise_T=1e-9), SOURCE, moment).sigma
+        for value, printed in zip(sigma, sigma_m + sigma_Am2, strict=False):
+            assert f"{value:.{len(printed.partition('.')[2])}f}" == printed
+
+    def test_moment_by_moduli_where_the_geometry_is_known(self):
+        e = np.array([0.4, 0.0, 0.917])
+        array = replace(tetrahedron(1.5, kind="scalar", noise_T=1e-9), ambient_T=tuple(5e-5 * e / np.linalg.norm(e)))
+        information = fisher_information(array, SOURCE, (60.0, 50.0, 60.0))
+        sigma = np.sqrt(np.diagonal(np.linalg.inv(information[3:, 3:])))
+        assert_allclose(sigma, [1.3, 5.9, 2.8], atol=0.06)
+
+
+class TestLikelihood:
+    """The bound is the inverse of the expected Hessian of the exact likelihood, to 1e-8 of the standard deviations."""
+
+    @staticmethod
+    def check(array, position, moment, ambient_uncertainty_T=0.0):
+        expected = Model(array, position, moment, ambient_uncertainty_T).covariance()
+        bounds = bounds_of(array, position, moment, ambient_uncertainty_T=ambient_uncertainty_T)
+        unit = np.sqrt(np.diagonal(expected))
+        assert_allclose(bounds.covariance / unit / unit[:, None], expected / unit / unit[:, None], rtol=0.0, atol=1e-8)
+        information = fisher_information(array, position, moment, ambient_uncertainty_T=ambient_uncertainty_T)
+        assert_allclose(information * unit * unit[:, None] @ (expected / unit / unit[:, None]), np.eye(6), atol=1e-6)
+
+    @pytest.mark.parametrize("uncertain", [False, True], ids=["", "uncertain calibration"])
+    @pytest.mark.parametrize("common_field_T", [None, 30e-9], ids=["unknown common field", "common field of 30 nT"])
+    @pytest.mark.parametrize("seed", [1, 2])
+    def test_vector_sensors(self, seed, common_field_T, uncertain):
+        array = random_array(seed, 5, common_field_T=common_field_T, uncertain=uncertain)
+        self.check(array, *random_source(seed))
+
+    def test_vector_sensors_of_uncertain_axes_in_the_field_of_the_earth(self):
+        array = replace(random_array(3, 6, uncertain=True), ambient_T=AMBIENT)
+        self.check(array, *random_source(3))
+
+    @pytest.mark.parametrize("ambient_uncertainty_T", [0.0, 20e-9], ids=["", "ambient field to 20 nT"])
+    @pytest.mark.parametrize("common_field_T", [None, 1e-9], ids=["unknown common field", "common field of 1 nT"])
+    def test_scalar_sensors(self, common_field_T, ambient_uncertainty_T):
+        array = random_array(4, 10, kinds=("scalar",), common_field_T=common_field_T)
+        self.check(replace(array, ambient_T=AMBIENT), *random_source(4), ambient_uncertainty_T)
+
+    @pytest.mark.parametrize("common_field_T", [None, 30e-9], ids=["unknown common field", "common field of 30 nT"])
+    def test_all_at_once(self, common_field_T):
+        array = random_array(5, 8, kinds=("vector", "scalar"), common_field_T=common_field_T, uncertain=True)
+        array = replace(array, ambient_T=AMBIENT)
+        sensors = tuple(replace(s, offset_uncertainty_T=5e-10) for s in array.sensors)
+        self.check(replace(array, sensors=sensors), *random_source(5), 20e-9)
+
+
+class TestInvariance:
+    @given(SEEDS)
+    @settings(max_examples=10, deadline=None)
+    def test_base_sensor(self, seed):
+        array = random_array(seed, 5)
+        position, moment = random_source(seed)
+        information = fisher_information(array, position, moment)
+        for base in range(5):
+            model = DifferenceMeasurement(array, decorrelated_differences(array, base=base))
+            scale = np.sqrt(np.diagonal(information))
+            other = model.fisher_information(position, moment)
+            assert_allclose(other / scale / scale[:, None], information / scale / scale[:, None], atol=1e-9)
+
+    @given(SEEDS)
+    @settings(max_examples=10, deadline=None)
+    def test_rotation_of_the_frame(self, seed):
+        array = replace(random_array(seed, 8, kinds=("vector", "scalar"), uncertain=True), ambient_T=AMBIENT)
+        position, moment = random_source(seed)
+        rotation = Rotation.random(rng=np.random.default_rng(seed))
+        before = bounds_of(array, position, moment, ambient_uncertainty_T=1e-8)
+        after = bounds_of(
+            turned(array, rotation), rotation.apply(position), rotation.apply(moment), ambient_uncertainty_T=1e-8
+        )
+        for name in ("range_m", "sigma_range_m", "sigma_bearing_rad", "sigma_position_m", "sigma_moment_Am2"):
+            assert_allclose(getattr(after, name), getattr(before, name), rtol=1e-7, err_msg=name)
+        R = np.kron(np.eye(2), rotation.as_matrix())
+        sigma = after.sigma
+        turned_covariance = R @ before.covariance @ R.T
+        assert_allclose(
+            after.covariance / sigma / sigma[:, None], turned_covariance / sigma / sigma[:, None], atol=1e-6
+        )
+
+    @given(SEEDS)
+    @settings(max_examples=10, deadline=None)
+    def test_order_of_the_sensors_and_origin_of_the_frame(self, seed):
+        array = random_array(seed, 5)
+        position, moment = random_source(seed)
+        shift = np.array([3.0, -2.0, 1.0])
+        other = replace(
+            array, sensors=tuple(replace(s, position_m=s.position_m + shift) for s in reversed(array.sensors))
+        )
+        before, after = bounds_of(array, position, moment), bounds_of(other, position + shift, moment)
+        assert_allclose(after.covariance, before.covariance, rtol=1e-6, atol=1e-6 * np.min(before.sigma) ** 2)
+        assert_allclose(after.sigma_range_m, before.sigma_range_m, rtol=1e-9)
+        assert_allclose(after.sigma_bearing_rad, before.sigma_bearing_rad, rtol=1e-9)
+
+    def test_sign_of_the_moment_for_vector_sensors(self):
+        position, moment = random_source(0)
+        assert_allclose(bounds_of(TETRAHEDRON, position, moment).sigma, bounds_of(TETRAHEDRON, position, -moment).sigma)
+
+
+class TestScaling:
+    def test_noise_moment_and_size(self):
+        position, moment = random_source(1)
+        reference = bounds_of(TETRAHEDRON, position, moment)
+        noisy = bounds_of(tetrahedron(1.5, noise_T=3e-9), position, moment)
+        strong = bounds_of(TETRAHEDRON, position, 2.0 * moment)
+        large = bounds_of(tetrahedron(3.0, noise_T=1e-9), 2.0 * position, moment)
+        powers = np.repeat([4, 3], 3)  # the field is as m/r³, its derivative with p as m/r⁴
+        assert_allclose(noisy.sigma, 3.0 * reference.sigma, rtol=1e-10)
+        assert_allclose(strong.sigma, reference.sigma / np.repeat([2.0, 1.0], 3), rtol=1e-10)
+        assert_allclose(large.sigma, 2.0**powers * reference.sigma, rtol=1e-10)
+
+    def test_far_away_range_follows_the_sixth_power_and_bearing_the_fourth(self):
+        # Differences fall as 1/r⁴; the bearing is in them at once, the range only in terms of relative size 1/r.
+        position, moment = random_source(2)
+        near, far = (bounds_of(TETRAHEDRON, r * position, moment) for r in (200.0, 400.0))
+        assert_allclose(far.sigma_range_m / near.sigma_range_m, 2.0**6, rtol=0.01)
+        assert_allclose(far.sigma_bearing_rad / near.sigma_bearing_rad, 2.0**4, rtol=0.01)
+
+    @given(SEEDS)
+    @settings(max_examples=10, deadline=None)
+    def test_a_further_sensor_never_harms(self, seed):
+        array = random_array(seed, 6)
+        position, moment = random_source(seed)
+        fewer = bounds_of(array.subset(array.ids[:5]), position, moment)
+        assert np.linalg.eigvalsh(fewer.covariance - bounds_of(array, position, moment).covariance).min() >= -1e-9 * (
+            np.abs(fewer.covariance).max()
+        )
+
+    def test_position_is_range_and_bearing_together(self):
+        array = random_array(7, 5)
+        position, moment = random_source(7)
+        bounds = bounds_of(array, position, moment)
+        together = bounds.sigma_range_m**2 + (bounds.range_m * bounds.sigma_bearing_rad) ** 2
+        assert_allclose(bounds.sigma_position_m**2, together, rtol=1e-12)
+        assert_allclose(bounds.sigma_position_m**2, np.sum(bounds.sigma[:3] ** 2), rtol=1e-12)
+        n = (position - array.centroid) / bounds.range_m
+        assert_allclose(bounds.sigma_range_m**2, n @ bounds.covariance[:3, :3] @ n, rtol=1e-9)
+
+
+class TestNuisances:
+    def test_a_wide_prior_of_the_common_field_is_no_knowledge_and_a_narrow_one_helps(self):
+        position, moment = random_source(3)
+        sigmas = [
+            bounds_of(replace(TETRAHEDRON, common_field_T=value), position, moment).sigma
+            for value in (1e-12, 1e-9, 1e-7, 1e-3)
+        ]
+        assert np.all(np.diff(sigmas, axis=0) > 0.0)
+        assert_allclose(sigmas[-1], bounds_of(TETRAHEDRON, position, moment).sigma, rtol=1e-6)
+
+    def test_uncertain_axes_cost_in_the_field_of_the_earth_what_noise_of_their_size_would(self):
+        # Turned about axes across the field, a sensor reads an error of angle times field, across the field.
+        position, moment = random_source(4)
+        array = replace(cube(1.0, noise_T=1e-9), ambient_T=AMBIENT)
+        for angle in (1e-5, 1e-4, 1e-3):
+            sensors = tuple(replace(s, misalignment_rad=angle) for s in array.sensors)
+            sigma = bounds_of(replace(array, sensors=sensors), position, moment).sigma
+            noise = np.hypot(1e-9, angle * np.linalg.norm(AMBIENT))
+            upper = bounds_of(replace(cube(1.0, noise_T=noise), ambient_T=AMBIENT), position, moment).sigma
+            assert np.all(sigma < 1.01 * upper)
+            assert np.all(sigma > bounds_of(array, position, moment).sigma)
+
+    def test_an_uncertain_ambient_field_does_not_matter_to_vector_differences(self):
+        position, moment = random_source(5)
+        known = bounds_of(TETRAHEDRON, position, moment).sigma
+        assert_allclose(bounds_of(TETRAHEDRON, position, moment, ambient_uncertainty_T=1e-6).sigma, known, rtol=1e-9)
+
+    def test_noise_that_grows_with_the_field_counts(self):
+        position, moment = random_source(6)
+        sigma = [
+            bounds_of(replace(TETRAHEDRON, noise_fraction=part), position, moment).sigma for part in (0.0, 1e-3, 1e-1)
+        ]
+        assert np.all(np.diff(sigma, axis=0) > 0.0)
+
+
+class TestSingular:
+    def test_too_few_readings_leave_everything_open(self):
+        four = replace(tetrahedron(1.5, kind="scalar", noise_T=1e-10), ambient_T=AMBIENT)
+        two = SensorArray(TETRAHEDRON.sensors[:2])
+        for array in (four, two):
+            bounds = bounds_of(array, SOURCE, (0.0, 0.0, 100.0))
+            assert bounds.rank == 3
+            assert not bounds.is_regular
+            assert np.isinf([bounds.sigma_range_m, bounds.sigma_bearing_rad, bounds.sigma_position_m]).all()
+            assert np.isinf(np.diagonal(bounds.covariance)).sum() >= 4
+
+    def test_one_sensor_tells_nothing_by_differences(self):
+        bounds = bounds_of(SensorArray(TETRAHEDRON.sensors[:1]), SOURCE, (0.0, 0.0, 100.0))
+        assert bounds.rank == 0
+        assert np.isinf(bounds.sigma).all()
+
+    def test_of_a_source_without_moment_the_moment_alone_is_estimable(self):
+        bounds = bounds_of(TETRAHEDRON, SOURCE, np.zeros(3))
+        assert bounds.rank == 3
+        assert np.isinf(bounds.sigma[:3]).all()
+        known_place = np.linalg.inv(fisher_information(TETRAHEDRON, SOURCE, np.zeros(3))[3:, 3:])
+        assert_allclose(bounds.covariance[3:, 3:], known_place, rtol=1e-9, atol=1e-12)
+        assert np.isnan(bounds.covariance[:3, 3:]).all()
+
+    def test_four_vector_sensors_have_isolated_blind_sources_and_eight_have_none(self):
+        # A 9×6 matrix loses rank under four conditions; at a given range, source and moment have four angles.
+        def unit(azimuth, elevation):
+            return [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+
+        def least_singular_value(angles, array):
+            W = whitened_jacobian(array, 4.0 * np.array(unit(*angles[:2])), unit(*angles[2:]))
+            return float(np.linalg.svd(W / np.linalg.norm(W, axis=0), compute_uv=False)[-1])
+
+        starts = np.random.default_rng(1).uniform(-1.5, 1.5, size=(200, 4))
+        least = {}
+        for array in (TETRAHEDRON, cube(1.0, noise_T=1e-9)):
+            values = np.array([least_singular_value(start, array) for start in starts])
+            ends = [
+                minimize(
+                    least_singular_value,
+                    start,
+                    args=(array,),
+                    method="Nelder-Mead",
+                    options={"xatol": 1e-10, "fatol": 1e-12, "maxiter": 1500},
+                )
+                for start in starts[np.argsort(values)[:3]]
+            ]
+            best = min(ends, key=lambda end: end.fun)
+            least[array.n_sensors] = best.fun / np.median(values)
+            if array is TETRAHEDRON:
+                blind = bounds_of(array, 4.0 * np.array(unit(*best.x[:2])), unit(*best.x[2:]))
+        assert least[4] < 1e-9
+        assert least[8] > 0.1
+        assert blind.rank == 5
+        assert np.isinf([blind.sigma_range_m, blind.sigma_bearing_rad, blind.sigma_position_m]).all()
+
+    def test_on_a_sensor_everything_and_in_the_centroid_range_and_bearing_are_not_a_number(self):
+        array = random_array(9, 5)
+        bounds = bounds_of(array, np.stack([array.positions[1], array.centroid, SOURCE]), (0.0, 0.0, 100.0))
+        assert_array_equal(np.isnan(bounds.sigma_range_m), [True, True, False])
+        assert_array_equal(np.isnan(bounds.sigma_bearing_rad), [True, True, False])
+        assert_array_equal(np.isnan(bounds.sigma).all(axis=1), [True, False, False])
+        assert_array_equal(bounds.rank, [0, 6, 6])
+
+
+class TestScatterOfFits:
+    """The bound is reached where the problem is regular (σ_range/range about 1 %): probability 1e-4 to fail each."""
+
+    def test_covariance(self):
+        n = 4000
+        position, moment = np.array([2.0, 1.0, 1.2]), np.array([60.0, 50.0, 60.0])
+        rng = np.random.default_rng(10)
+        readings = predicted_channels(TETRAHEDRON, position, moment) + 1e-9 * rng.standard_normal((n, 12))
+        fixes = Locator(TETRAHEDRON).fit_rows(readings)
+        errors = np.array([[*f.solutions[0].position_m - position, *f.solutions[0].moment_Am2 - moment] for f in fixes])
+        bounds = bounds_of(TETRAHEDRON, position, moment)
+        squares = np.einsum("ni,ij,nj->n", errors, np.linalg.inv(bounds.covariance), errors)
+        low, high = chi2.ppf([5e-5, 1 - 5e-5], 6 * n)
+        assert low < squares.sum() < high
+        away = position - TETRAHEDRON.centroid
+        along = errors[:, :3] @ away / np.linalg.norm(away)
+        low, high = chi2.ppf([5e-5, 1 - 5e-5], n)
+        assert low < np.sum((along / bounds.sigma_range_m) ** 2) < high
+
+
+class TestBatches:
+    def test_leading_axes_broadcast(self):
+        positions = np.array([[3.0, 1.0, 0.5], [5.0, 0.0, 0.3]])
+        moments = np.array([[0.0, 0.0, 100.0], [100.0, 0.0, 0.0], [60.0, 50.0, 60.0]])
+        array = replace(random_array(6, 5, uncertain=True), noise_fraction=1e-3)
+        many = bounds_of(array, positions[:, None], moments)
+        assert many.covariance.shape == (2, 3, 6, 6)
+        assert many.rank.shape == many.is_regular.shape == (2, 3)
+        for i, j in np.ndindex(2, 3):
+            one = bounds_of(array, positions[i], moments[j])
+            assert_allclose(many.covariance[i, j], one.covariance, rtol=1e-9)
+            assert_allclose(many.sigma_range_m[i, j], one.sigma_range_m, rtol=1e-9)
+
+    @pytest.mark.parametrize(
+        ("position", "moment", "uncertainty", "text"),
+        [
+            ([1.0, 2.0], [0.0, 0.0, 1.0], 0.0, "Input position_m must have shape"),
+            ([1.0, 2.0, 3.0], 4.0, 0.0, "Input moment_Am2 must have shape"),
+            ([1.0, 2.0, 3.0], [0.0, 0.0, 1.0], -1.0, "Input ambient_uncertainty_T must be finite and not negative"),
+            ([1.0, 2.0, 3.0], [0.0, 0.0, 1.0], np.inf, "Input ambient_uncertainty_T must be finite and not negative"),
+        ],
+    )
+    def test_wrong_input(self, position, moment, uncertainty, text):
+        with pytest.raises(ValueError, match=text):
+            bounds_of(TETRAHEDRON, position, moment, ambient_uncertainty_T=uncertainty)
+
+
+ARRAYS = {
+    "tetrahedron": TETRAHEDRON,
+    "any vector sensors": random_array(11, 6),
+    "common field of 30 nT": random_array(12, 5, common_field_T=30e-9),
+    "planar": square(1.0, noise_T=1e-9),
+    "scalar": SCALARS,
+    "mixed": replace(random_array(13, 9, kinds=("vector", "scalar")), ambient_T=AMBIENT),
+    "noise that depends on the readings": replace(random_array(14, 5), noise_fraction=1e-2),
+    "uncertain calibration": replace(
+        random_array(15, 9, kinds=("vector", "scalar"), uncertain=True, common_field_T=50e-9),
+        ambient_T=AMBIENT,
+        noise_fraction=1e-2,
+    ),
+}
+each_array = pytest.mark.parametrize("array", ARRAYS.values(), ids=ARRAYS.keys())
+
+
+def places(array, n=40):
+    directions = sphere_directions(n)
+    return array.centroid + directions * np.geomspace(1.3 * array.circumradius, 30.0 * array.circumradius, n)[:, None]
+
+
+class TestTable:
+    """Compiled tables are bounds_of, and spreads those of the table."""
+
+    @each_array
+    def test_equals_its_twin(self, array):
+        positions, moments = places(array), 100.0 * moment_directions(array, 9)
+        twin = bounds_of(array, positions[:, None], moments)
+        for name, values in sigma_table(array, positions, moments)._asdict().items():
+            expected = {"range_m": twin.sigma_range_m, "bearing_rad": twin.sigma_bearing_rad}.get(
+                name, twin.sigma_position_m
+            )
+            assert_allclose(values, expected, rtol=1e-10, err_msg=name)
+
+    def test_equals_its_twin_with_an_uncertain_ambient_field(self):
+        array = ARRAYS["mixed"]
+        positions, moments = places(array), 100.0 * moment_directions(array, 5)
+        twin = bounds_of(array, positions[:, None], moments, ambient_uncertainty_T=3e-8)
+        table = sigma_table(array, positions, moments, ambient_uncertainty_T=3e-8)
+        assert_allclose(table.range_m, twin.sigma_range_m, rtol=1e-10)
+        assert_allclose(table.bearing_rad, twin.sigma_bearing_rad, rtol=1e-10)
+
+    def test_singular_and_undefined_ones_too(self):
+        array = replace(hexagon(1.0, kind="scalar", noise_T=1e-10), ambient_T=AMBIENT)  # five differences
+        positions = np.stack([np.array([3.0, 1.0, 2.0]), array.positions[0], array.centroid])
+        table = sigma_table(array, positions, np.eye(3))
+        assert np.isinf(table.range_m[0]).all()
+        assert np.isinf(table.bearing_rad[0]).all()
+        assert np.isnan(np.array(table)[:, 1]).all()
+        nothing = sigma_table(TETRAHEDRON, positions[:1], np.zeros((1, 3)))
+        assert np.isinf(np.array(nothing)).all()
+
+    @each_array
+    def test_spreads_are_those_of_the_table(self, array):
+        positions, moments = places(array, 12), 100.0 * moment_directions(array, 21)
+        table = sigma_table(array, positions, moments)
+        for sigma, spread in zip(table, bounds_over_moments(array, positions, moments), strict=True):
+            assert_allclose(spread.mean, sigma.mean(axis=1), rtol=1e-12)
+            assert_allclose(spread.median, np.quantile(sigma, 0.5, axis=1, method="inverted_cdf"), rtol=1e-12)
+            assert_allclose(spread.q95, np.quantile(sigma, 0.95, axis=1, method="inverted_cdf"), rtol=1e-12)
+            assert_allclose(spread.worst, sigma.max(axis=1), rtol=1e-12)
+
+    @each_array
+    @pytest.mark.parametrize("n_moments", [65, 130])
+    def test_many_moments_are_those_of_a_few_at_a_time(self, array, n_moments):
+        # These are more than a block has lanes, and leave some of the last block idle.
+        positions, moments = places(array, 3), 100.0 * moment_directions(array, n_moments)
+        together = np.array(sigma_table(array, positions, moments))
+        parts = [sigma_table(array, positions, part) for part in (moments[:1], *np.array_split(moments[1:], 4))]
+        assert_allclose(together, np.concatenate(parts, axis=-1), rtol=1e-10)
+
+    @each_array
+    def test_table_and_spreads_are_those_of_the_two(self, array):
+        positions, moments = places(array, 4), 100.0 * moment_directions(array, 23)
+        table, spreads = table_and_spreads(array, positions, moments[:3], moments[3:])
+        for values, expected in zip(table, sigma_table(array, positions, moments[:3]), strict=True):
+            assert_allclose(values, expected, rtol=1e-10)
+        for values, expected in zip(spreads, bounds_over_moments(array, positions, moments[3:]), strict=True):
+            assert_allclose(np.array(values), np.array(expected), rtol=1e-10)
+
+    def test_a_modulus_of_no_field_has_no_bound_and_leaves_the_others_theirs(self):
+        array = cube(1.5, kind="scalar", noise_T=1e-11)
+        positions, moments = places(array, 3), np.array([[0.0, 0.0, 0.0], [60.0, 50.0, 60.0]])
+        range_m = sigma_table(array, positions, moments).range_m
+        assert np.isnan(range_m[:, 0]).all()
+        assert_allclose(range_m, bounds_of(array, positions[:, None], moments).sigma_range_m, rtol=1e-9)
+
+    @pytest.mark.parametrize("array", [TETRAHEDRON, ARRAYS["uncertain calibration"]], ids=["constant", "varying"])
+    def test_does_not_depend_on_the_number_of_threads(self, array):
+        positions, moments = places(array, 101), 100.0 * moment_directions(array, 7)
+        before = numba.get_num_threads()
+        results = []
+        try:
+            for threads in (1, before):
+                numba.set_num_threads(threads)
+                results.append((sigma_table(array, positions, moments), bounds_over_moments(array, positions, moments)))
+        finally:
+            numba.set_num_threads(before)
+        for one, other in zip(*results, strict=True):
+            assert_array_equal(np.array(one), np.array(other))
+
+    @pytest.mark.parametrize("shape", [(3,), (0, 3), (2, 2), (2, 2, 3)])
+    def test_wrong_shapes(self, shape):
+        with pytest.raises(ValueError, match="Input positions_m must have shape"):
+            sigma_table(TETRAHEDRON, np.ones(shape), np.eye(3))
+        with pytest.raises(ValueError, match="Input moments_Am2 must have shape"):
+            bounds_over_moments(TETRAHEDRON, np.eye(3), np.ones(shape))
+
+    @pytest.mark.parametrize("shape", [(3,), (2, 2)])
+    def test_wrong_shape_of_moments_alone(self, shape):
+        with pytest.raises(ValueError, match="Input alone_Am2 must have shape"):
+            table_and_spreads(TETRAHEDRON, np.eye(3), np.ones(shape), np.eye(3))
+
+
+class TestSpread:
+    def test_infinite_values_spoil_only_what_they_reach(self):
+        spread = spread_over([[1.0, 2.0, 3.0, np.inf], [4.0, 3.0, 2.0, 1.0], [np.nan, 1.0, 2.0, 3.0]])
+        assert_array_equal(spread.median, [2.0, 2.0, np.nan])
+        assert_array_equal(spread.q95, [np.inf, 4.0, np.nan])
+        assert_array_equal(spread.worst, [np.inf, 4.0, np.nan])
+        assert_array_equal(spread.mean, [np.inf, 2.5, np.nan])
+
+
+class TestDirections:
+    @pytest.mark.parametrize("n", [1, 26, 400])
+    def test_are_unit_vectors(self, n):
+        for directions in (sphere_directions(n), moment_directions(TETRAHEDRON, n)):
+            assert_allclose(np.linalg.norm(directions, axis=1), 1.0, rtol=1e-12)
+
+    def test_are_even(self):
+        sphere = sphere_directions(1000)
+        half = moment_directions(TETRAHEDRON, 1000)
+        # Moments of inertia of the sphere, and of its half, are those of a ball's surface: 1/3 each.
+        for directions in (sphere, half):
+            assert_allclose(directions.T @ directions / 1000, np.eye(3) / 3, atol=2e-3)
+        assert half[:, 2].min() > 0.0
+        assert_array_equal(moment_directions(SCALARS, 1000), sphere)
+
+    def test_none_are_refused(self):
+        with pytest.raises(ValueError, match="Input n must be at least 1"):
+            moment_directions(TETRAHEDRON, 0)

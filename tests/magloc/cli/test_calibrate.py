@@ -1,0 +1,384 @@
+"""The command line: what ``magloc calibrate`` writes and prints, and how it refuses bad input."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from arrays.array import SensorArray
+from arrays.array_file import read_array, read_sensors, write_array
+from arrays.sensor import Calibration, Sensor
+from magloc.calibration import array as calibration
+from magloc.readings import Readings, write_readings
+from tests.command_line import Outcome, Run, assert_refused
+from tests.oracles import magpylib_field
+
+FloatArray = NDArray[np.float64]
+NOISE_T = 1e-9
+MOMENT = np.array([0.5, -0.3, 0.8])
+PLACES = 0.1 * np.array([[1, 0, 0], [-1, 0, 0.2], [0, 1, -0.1], [0.1, -1, 0], [0, 0.2, 1], [0.2, 0.1, -1]])
+
+
+@dataclass(frozen=True)
+class Files:
+    """A nominal array and readings of the true one."""
+
+    folder: Path
+    true: SensorArray
+    position_m: FloatArray
+    origin_m: FloatArray
+    world_from_array: FloatArray
+
+    @property
+    def array(self) -> Path:
+        return self.folder / "array.toml"
+
+    @property
+    def readings(self) -> Path:
+        return self.folder / "readings.csv"
+
+    @property
+    def out(self) -> Path:
+        return self.folder / "out.toml"
+
+    def truth(self, columns: str = "xyz", *, moment: bool = False, shift_s: float = 0.0) -> Path:
+        """A truth file in the world frame, last row first."""
+        path = self.folder / "truth.csv"
+        world = self.origin_m + np.einsum("tab,tb->ta", self.world_from_array, self.position_m)
+        names = ["time_s", *(f"{axis}_m" for axis in columns), *(["mx_Am2", "my_Am2", "mz_Am2"] if moment else [])]
+        lines = [",".join(names)]
+        for time, place in reversed(list(enumerate(world))):
+            numbers = [time + shift_s, *place["xyz".index(columns[0]) :][: len(columns)], *(MOMENT if moment else [])]
+            lines.append(",".join(repr(float(number)) for number in numbers))
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        return path
+
+
+def made(folder: Path, *, n: int = 40, posed: bool = False) -> Files:
+    rng = np.random.default_rng(1)
+    true = SensorArray(
+        tuple(
+            Sensor(
+                id=f"s{i}",
+                kind="vector",
+                position_m=tuple(place.tolist()),
+                noise_T=NOISE_T,
+                calibration=Calibration.of("vector", np.eye(3) + rng.normal(0, 0.02, (3, 3)), rng.normal(0, 1e-6, 3)),
+            )
+            for i, place in enumerate(PLACES, start=1)
+        ),
+        common_field_T=1e-12,
+    )
+    nominal = replace(
+        true,
+        sensors=tuple(
+            replace(s, position_m=np.array(s.position_m) + rng.normal(0, 1e-3, 3), calibration=None)
+            for s in true.sensors
+        ),
+    )
+    direction = rng.normal(size=(n, 3))
+    position = direction / np.linalg.norm(direction, axis=1, keepdims=True) * rng.uniform(0.2, 0.3, (n, 1))
+    rotation = Rotation.random(n, rng=rng) if posed else Rotation.from_quat(np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)))
+    attitude = rotation.as_matrix()
+    origin = rng.normal(size=(n, 3)) if posed else np.zeros((n, 3))
+    moments = np.swapaxes(attitude, -1, -2) @ MOMENT
+    fields = np.stack([magpylib_field(true.positions, p, m) for p, m in zip(position, moments, strict=True)])
+    values = true.readings_of(fields) + NOISE_T * rng.normal(size=(n, true.n_channels))
+    files = Files(folder, true, position, origin, attitude)
+    write_array(nominal, files.array)
+    pose = {"array_position_m": origin, "array_rotation_xyzw": rotation.as_quat()} if posed else {}
+    write_readings(files.readings, Readings(np.arange(n, dtype=float), values, np.arange(2, n + 2), **pose), nominal)
+    return files
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Files:
+    return made(tmp_path)
+
+
+def assert_recovered(files: Files, *, but_gain: bool = False, within_m: float = 2e-5) -> None:
+    """Within a few standard deviations; an unknown moment leaves a common factor of the gains."""
+    found, true = read_array(files.out), files.true
+    np.testing.assert_allclose(found.positions, true.positions, rtol=0, atol=within_m)
+    np.testing.assert_allclose(found.channel_offset_T, true.channel_offset_T, rtol=0, atol=2e-8)
+    factor = np.vdot(found.channel_gain, true.channel_gain) / np.vdot(true.channel_gain, true.channel_gain)
+    assert abs(factor - 1.0) < (0.1 if but_gain else 1e-3)
+    np.testing.assert_allclose(found.channel_gain / factor, true.channel_gain, rtol=0, atol=2e-3)
+
+
+def assert_nothing_written(outcome: Outcome, files: Files, *fragments: str) -> None:
+    """Refused, and no array file nor a part of one."""
+    assert_refused(outcome, *fragments)
+    assert {path.name for path in files.folder.iterdir()} <= {"array.toml", "readings.csv", "truth.csv"}
+
+
+class TestArrayFile:
+    def test_known_path(self, run: Run, files: Files) -> None:
+        outcome = run("calibrate", files.readings, "--array", files.array, "--truth", files.truth(), "--out", files.out)
+        assert outcome.status == 0, outcome.err
+        assert_recovered(files, but_gain=True)
+        assert outcome.out.splitlines()[0].split()[:2] == ["sensor", "position"]
+        assert len(outcome.out.splitlines()) == 7
+        assert "40 of 40 rows used" in outcome.err
+        assert "not told by the readings" in outcome.err
+        assert "common gain against the moment" in outcome.err
+
+    def test_known_moment(self, run: Run, files: Files) -> None:
+        truth = files.truth(moment=True)
+        outcome = run("calibrate", files.readings, "--array", files.array, "--truth", truth, "--out", files.out)
+        assert outcome.status == 0, outcome.err
+        assert_recovered(files)
+        assert "not told" not in outcome.err
+
+    def test_moving_array(self, run: Run, tmp_path: Path) -> None:
+        files = made(tmp_path, posed=True)
+        truth = files.truth(moment=True)
+        outcome = run("calibrate", files.readings, "--array", files.array, "--truth", truth, "--out", files.out)
+        assert outcome.status == 0, outcome.err
+        assert_recovered(files)
+
+    def test_self_calibration_with_trusted_sensors(self, run: Run, files: Files) -> None:
+        nominal = read_array(files.array)
+        trusted = ("s1", "s2", "s3")
+        sensors = [
+            replace(
+                s,
+                position_m=t.position_m if t.id in trusted else s.position_m,
+                calibration=t.calibration if t.id == "s4" else s.calibration,
+            )
+            for s, t in zip(nominal.sensors, files.true.sensors, strict=True)
+        ]
+        write_array(replace(nominal, sensors=tuple(sensors)), files.array)
+        outcome = run(
+            "calibrate", files.readings, "--array", files.array, "--out", files.out,
+            "--trust-position", ",".join(trusted), "--trust-scale", "s4", "--quiet",
+        )  # fmt: skip
+        assert outcome.status == 0, outcome.err
+        assert outcome.err == ""
+        assert_recovered(files)
+        written = read_array(files.out)
+        assert [s.position_m for s in written.sensors[:3]] == [s.position_m for s in files.true.sensors[:3]]
+        assert written.sensors[3].calibration.scale == files.true.sensors[3].calibration.scale
+
+    def test_rows_are_matched_by_time(self, run: Run, files: Files) -> None:
+        """Rows without truth are left out, in whatever order the truth is."""
+        truth = files.truth()
+        lines = truth.read_text(encoding="utf-8").splitlines()
+        truth.write_text("\n".join([lines[0], *lines[6:], "1000.5,0,0,0", ""]), encoding="utf-8")
+        outcome = run(
+            "calibrate", files.readings, "--array", files.array, "--truth", truth, "--out", files.out, "--json"
+        )
+        assert outcome.status == 0, outcome.err
+        assert json.loads(outcome.out)["rows_used"] == 35
+        assert_recovered(files, but_gain=True)
+
+    def test_height(self, run: Run, files: Files) -> None:
+        """A truth file without z: one unknown height for all rows, or the one that is given."""
+        flat = replace(files, position_m=files.position_m * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.25])
+        rng = np.random.default_rng(2)
+        fields = np.stack([magpylib_field(files.true.positions, p, MOMENT) for p in flat.position_m])
+        values = files.true.readings_of(fields) + NOISE_T * rng.normal(size=(40, 18))
+        write_readings(files.readings, Readings(np.arange(40.0), values, np.arange(2, 42)), files.true)
+        arguments = (
+            "calibrate",
+            files.readings,
+            "--array",
+            files.array,
+            "--truth",
+            flat.truth("xy"),
+            "--out",
+            files.out,
+        )
+        unknown = run(*arguments)
+        assert unknown.status == 0, unknown.err
+        assert "translation along z" in unknown.err
+        given = run(*arguments, "--height-m", "0.25")
+        assert given.status == 0, given.err
+        assert "translation along z" not in given.err
+        assert_recovered(files, but_gain=True, within_m=2e-4)
+
+    def test_estimate(self, run: Run, files: Files) -> None:
+        outcome = run(
+            "calibrate", files.readings, "--array", files.array, "--truth", files.truth(), "--out", files.out,
+            "--estimate", "gains, offsets",
+        )  # fmt: skip
+        assert outcome.status == 0, outcome.err
+        before, after = read_array(files.array), read_array(files.out)
+        np.testing.assert_array_equal(after.positions, before.positions)
+        scales = np.array([sensor.calibration.scale for sensor in after.sensors])
+        np.testing.assert_array_equal(scales, scales * np.eye(3))
+
+
+class TestJson:
+    def refuse_constant(self, name: str) -> None:
+        raise AssertionError(f"{name} is not JSON")
+
+    def test_keys(self, run: Run, files: Files) -> None:
+        outcome = run(
+            "calibrate", files.readings, "--array", files.array, "--truth", files.truth(), "--out", files.out, "--json"
+        )
+        assert outcome.err == ""
+        report: dict[str, Any] = json.loads(outcome.out, parse_constant=self.refuse_constant)
+        assert set(report) == {
+            "out", "rows", "rows_used", "chi2_before", "dof_before", "chi2_after", "dof_after", "iterations",
+            "converged", "moment_Am2", "sensors", "unobservable",
+        }  # fmt: skip
+        assert report["converged"] is True
+        assert report["chi2_before"] > 100 * report["dof_before"]
+        # χ² of 40 rows of 18 readings less what is estimated: its mean ± five standard deviations.
+        assert abs(report["chi2_after"] - report["dof_after"]) < 5 * np.sqrt(2 * report["dof_after"])
+        assert [u["name"] for u in report["unobservable"]] == ["common gain against the moment"]
+        written = read_array(files.out)
+        for sensor, entry in zip(written.sensors, report["sensors"], strict=True):
+            assert set(entry) == {
+                "id", "position_m", "position_sd_m", "scale", "gain_sd", "axes_sd_rad", "offset_nT", "offset_sd_nT",
+                "residual_rms_nT",
+            }  # fmt: skip
+            np.testing.assert_allclose(entry["position_m"], sensor.position_m, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(entry["scale"], sensor.calibration.scale, rtol=1e-9)
+            assert 0.5 < entry["residual_rms_nT"] < 1.5
+
+
+class TestRefusals:
+    def arguments(self, files: Files, **changed: str | Path) -> list[str | Path]:
+        options: dict[str, str | Path] = {"array": files.array, "out": files.out, **changed}
+        return ["calibrate", files.readings, *(x for name, value in options.items() for x in (f"--{name}", value))]
+
+    @pytest.mark.parametrize(
+        ("option", "value", "message"),
+        [
+            ("trust-position", "s1,s7", "--trust-position: found 's7', expected ids of sensors in"),
+            ("trust-scale", "s0", "--trust-scale: found 's0'"),
+            ("estimate", "positions,colour", "--estimate: found 'colour', expected some of positions, gains, axes"),
+            ("estimate", "", "--estimate: found ''"),
+            ("gain-prior", "0", "--gain-prior: found 0, expected a positive number"),
+            ("position-prior-mm", "-1", "--position-prior-mm: found -1"),
+            ("height-m", "0.1", "--height-m: found no --truth"),
+            ("moment", "turning", "turning"),
+        ],
+    )
+    def test_options(self, run: Run, files: Files, option: str, value: str, message: str) -> None:
+        assert_nothing_written(run(*self.arguments(files, **{option: value})), files, message)
+
+    def test_height_twice(self, run: Run, files: Files) -> None:
+        truth = files.truth()
+        outcome = run(*self.arguments(files, truth=truth, **{"height-m": "0.1"}))
+        assert_nothing_written(outcome, files, "--height-m: found z_m in", "expected a truth file without it")
+
+    def test_times_that_do_not_match(self, run: Run, files: Files) -> None:
+        truth = files.truth(shift_s=0.5)
+        outcome = run(*self.arguments(files, truth=truth))
+        assert_nothing_written(outcome, files, "truth.csv: found none of the times of", "0 s to 39 s")
+
+    @pytest.mark.parametrize("with_truth", [False, True])
+    def test_too_few_rows(self, run: Run, tmp_path: Path, with_truth: bool) -> None:
+        files = made(tmp_path, n=4)
+        extra = {"truth": files.truth()} if with_truth else {}
+        assert_nothing_written(
+            run(*self.arguments(files, **extra)), files, "readings.csv", "more readings than unknowns"
+        )
+
+    def test_no_folder(self, run: Run, files: Files) -> None:
+        outcome = run(*self.arguments(files, out=files.folder / "nowhere" / "out.toml"))
+        assert_nothing_written(outcome, files, "nowhere", "found no folder")
+
+    @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+    def test_folder_that_cannot_be_written(self, run: Run, files: Files) -> None:
+        files.folder.chmod(0o500)
+        try:
+            outcome = run(*self.arguments(files))
+        finally:
+            files.folder.chmod(0o700)
+        assert_nothing_written(outcome, files, "out.toml: Permission denied")
+
+    def test_out_is_a_folder(self, run: Run, files: Files, tmp_path_factory: pytest.TempPathFactory) -> None:
+        folder = tmp_path_factory.mktemp("taken")
+        assert_nothing_written(run(*self.arguments(files, truth=files.truth(), out=folder)), files, f"{folder}: ")
+        assert list(folder.iterdir()) == []
+
+    def test_scalar_sensors(self, run: Run, files: Files) -> None:
+        sensors = [Sensor(f"s{i}", "scalar", (float(i), 0.0, 0.0), 1e-9) for i in range(3)]
+        array = SensorArray(tuple(sensors))
+        write_array(array, files.array)
+        write_readings(files.readings, Readings(np.arange(4.0), np.ones((4, 3)), np.arange(2, 6)), array)
+        assert_nothing_written(run(*self.arguments(files)), files, "must have vector sensors only")
+
+    def test_what_does_not_converge_is_not_written(
+        self, run: Run, files: Files, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        honest = calibration.self_calibrate
+        monkeypatch.setattr(
+            calibration, "self_calibrate", lambda *args, **options: replace(honest(*args, **options), converged=False)
+        )
+        assert_nothing_written(
+            run(*self.arguments(files)), files, "the calibration did not converge within", "is not written"
+        )
+
+
+class TestTurnedInAKnownModulus:
+    """--modulus-nT: no source, a sensor turned by hand in a uniform field."""
+
+    SCALE = np.array([[1.05, 0.02, -0.01], [0.0, 0.97, 0.03], [0.0, 0.0, 1.01]])
+    OFFSET_T = np.array([300e-9, -150e-9, 80e-9])
+
+    def write(self, folder: Path, directions: np.ndarray) -> tuple[str, ...]:
+        (folder / "one.toml").write_text(
+            '[[sensor]]\nid = "m"\nkind = "vector"\nposition_m = [0.0, 0.0, 0.0]\nnoise_nT = 5.0\n', encoding="utf-8"
+        )
+        noise = 5e-9 * np.random.default_rng(3).normal(size=(len(directions), 3))
+        values_nT = 1e9 * (48e-6 * directions @ self.SCALE.T + self.OFFSET_T + noise)
+        rows = [",".join(map(repr, [float(i), *row])) for i, row in enumerate(values_nT.tolist())]
+        (folder / "turned.csv").write_text("\n".join(["time_s,m_x_nT,m_y_nT,m_z_nT", *rows, ""]), encoding="utf-8")
+        return (
+            "calibrate", str(folder / "turned.csv"), "--array", str(folder / "one.toml"), "--out",
+            str(folder / "out.toml"), "--modulus-nT", "48000",
+        )  # fmt: skip
+
+    def test_single_sensor(self, run: Run, tmp_path: Path) -> None:
+        directions = np.random.default_rng(1).normal(size=(400, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        outcome = run(*self.write(tmp_path, directions), "--json")
+        assert outcome.status == 0, outcome.err
+        (sensor,) = read_sensors(tmp_path / "out.toml").sensors
+        np.testing.assert_allclose(sensor.calibration.offset_T, self.OFFSET_T, atol=3e-9)
+        scale = np.array(sensor.calibration.scale)
+        # The modulus tells S Sᵀ, not the rotation between S and the field.
+        np.testing.assert_allclose(scale @ scale.T, self.SCALE @ self.SCALE.T, atol=2e-4)
+        (entry,) = json.loads(outcome.out)["sensors"]
+        assert entry["converged"]
+        assert entry["dof"] == 400 - 9
+
+    def test_turned_about_one_axis_only(self, run: Run, tmp_path: Path) -> None:
+        angle = np.linspace(0.0, 6.0, 100)
+        directions = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+        assert_refused(run(*self.write(tmp_path, directions)), "turned.csv", "sensor m", "not written")
+        assert not (tmp_path / "out.toml").exists()
+
+    def test_modulus_in_another_unit(self, run: Run, tmp_path: Path) -> None:
+        directions = np.random.default_rng(1).normal(size=(100, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        command = self.write(tmp_path, directions)
+        assert_refused(run(*command[:-1], "48"), "--modulus-nT", "in nT", "not written")
+        assert not (tmp_path / "out.toml").exists()
+
+    def test_options_of_the_other_calibration(self, run: Run, tmp_path: Path) -> None:
+        assert_refused(run(*self.write(tmp_path, np.eye(3)), "--height-m", "3"), "--modulus-nT")
+        assert_refused(run(*self.write(tmp_path, np.eye(3)), "--estimate", "gains"), "--modulus-nT")
+
+    def test_bad_modulus(self, run: Run, tmp_path: Path) -> None:
+        command = self.write(tmp_path, np.eye(3))
+        assert_refused(run(*command[:-1], "-5"), "--modulus-nT")
+        assert_refused(run(*command, "--truth", tmp_path / "truth.csv"), "--modulus-nT", "--truth")
+
+    def test_other_commands_need_two_sensors(self, run: Run, tmp_path: Path) -> None:
+        self.write(tmp_path, np.eye(3))
+        outcome = run("locate", tmp_path / "turned.csv", "--array", tmp_path / "one.toml")
+        assert_refused(outcome, "one.toml", "at least 2")

@@ -1,0 +1,309 @@
+"""``magloc map`` and scenario files, as a user types them."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from magloc.cli.app import main
+from magloc.convergence.filters import IekfFilter
+from magloc.convergence.over_sources import SourcesScenario
+from magloc.convergence.over_starts import StartsScenario
+from magloc.convergence.scenario_files import built_in_scenarios, read_sources_scenario, read_starts_scenario
+from magloc.grids.store import open_map
+from tests.conftest import REPOSITORY
+
+SOURCE = "[source]\nposition_m = [5, 0, 0.3]\nmoment_Am2 = [100, 0, 0]\n"
+STARTS_KEYS = [
+    "starts",
+    "converged",
+    "fraction",
+    "front_fraction",
+    "back_fraction",
+    "median_iterations",
+    "iterations_total",
+    "seconds",
+    "out",
+]
+ARRAY = '[array]\ngeometry = "tetrahedron"\nedge_m = 1.5\nkind = "vector"\nnoise_nT = 1.0\n'
+
+
+class TestResult:
+    def test_json_is_the_only_thing_on_stdout(self, tmp_path, capsys):
+        assert main(["map", "--grid", "5", "--out", str(tmp_path / "out"), "--json"]) == 0
+        result = json.loads(capsys.readouterr().out)
+        assert set(result) == set(STARTS_KEYS)
+        assert result["starts"] == 125
+        assert result["fraction"] == result["converged"] / 125
+        assert result["out"] == str(tmp_path / "out")
+
+    def test_files(self, tmp_path, capsys):
+        assert (
+            main(["map", "paper", "--method", "iekf", "--grid", "5", "--out", str(tmp_path), "--quiet", "--netcdf"])
+            == 0
+        )
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["convergence.nc", "convergence.png", "map.zarr"]
+        assert (tmp_path / "convergence.png").read_bytes().startswith(b"\x89PNG")
+        with xr.open_dataset(tmp_path / "convergence.nc") as dataset:
+            assert dataset.attrs["method"] == "iekf"
+        out, err = capsys.readouterr()
+        assert re.search(r"\d+ of 125 starts converged", out)
+        assert err == ""
+
+    def test_threads_do_not_matter(self, tmp_path, capsys):
+        results = []
+        for threads in ("1", "2"):
+            main(["map", "--grid", "7", "--threads", threads, "--out", str(tmp_path / threads), "--json"])
+            results.append(json.loads(capsys.readouterr().out))
+        for result in results:
+            del result["seconds"], result["out"]
+        assert results[0] == results[1]
+
+    def test_noise_is_drawn_with_the_seed(self, tmp_path, capsys):
+        optima = []
+        for i, options in enumerate(([], ["--noise"], ["--noise", "--seed", "1"], ["--noise", "--seed", "1"])):
+            assert main(["map", "--grid", "3", "--out", str(tmp_path / str(i)), "--quiet", *options]) == 0
+            with open_map(tmp_path / str(i) / "map.zarr") as dataset:
+                optima.append(tuple(dataset.attrs["optimum_position_m"]))
+        assert len(set(optima)) == 3
+        assert optima[2] == optima[3]
+
+
+class TestDefaultFolder:
+    def test_other_settings_go_to_other_folders(self, tmp_path, capsys, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        sources = ["--over", "sources"]
+        for options in (
+            [],
+            ["--noise"],
+            ["--noise", "--seed", "1"],
+            ["--method", "iekf"],
+            sources,
+            [*sources, "--seed", "1"],
+        ):
+            for grid in ("3", "5"):
+                assert main(["map", "--grid", grid, "--quiet", *options]) == 0
+        assert len(list(tmp_path.iterdir())) == 12
+
+
+class TestOverSources:
+    def test_json(self, tmp_path, capsys):
+        assert main(["map", "--over", "sources", "--grid", "5", "--out", str(tmp_path / "out"), "--json"]) == 0
+        result = json.loads(capsys.readouterr().out)
+        assert list(result) == [*STARTS_KEYS[:-1], "truth_listed", "out"]
+        with open_map(tmp_path / "out/map.zarr") as dataset:
+            assert result["starts"] == (dataset.status != 3).sum()
+            assert result["converged"] == (dataset.status == 0).sum()
+        assert result["fraction"] == result["converged"] / result["starts"]
+        assert result["front_fraction"] is None
+        assert result["back_fraction"] is None
+        assert 0.9 < result["truth_listed"] <= 1.0
+        assert (tmp_path / "out/convergence.png").read_bytes().startswith(b"\x89PNG")
+
+    def test_seed_counts_and_threads_do_not(self, tmp_path, capsys):
+        chi2 = []
+        for i, options in enumerate((["--threads", "1"], ["--threads", "2"], ["--seed", "1"])):
+            out = tmp_path / str(i)
+            assert main(["map", "--over", "sources", "--grid", "7", "--out", str(out), "--quiet", *options]) == 0
+            with open_map(out / "map.zarr") as dataset:
+                chi2.append(dataset.chi2.to_numpy())
+        np.testing.assert_array_equal(chi2[0], chi2[1])
+        assert np.nanmin(abs(chi2[0] - chi2[2])) > 0.0
+
+    def test_sources_of_a_file(self, tmp_path, capsys):
+        path = tmp_path / "mine.toml"
+        path.write_text(ARRAY + "[sources]\nhalf_width_m = 3\nnearest_m = 2\nfarthest_m = 3\nmoment_Am2 = 10\n")
+        scenario = read_sources_scenario(str(path), seed=4)
+        assert (scenario.half_width_m, scenario.nearest_m, scenario.farthest_m) == (3.0, 2.0, 3.0)
+        assert (scenario.moment_Am2, scenario.seed) == (10.0, 4)
+        assert main(["map", str(path), "--over", "sources", "--grid", "3", "--out", str(tmp_path / "out")]) == 0
+        assert "of 6 sources found" in capsys.readouterr().out
+
+    def test_the_paper_file_has_the_defaults(self):
+        default = SourcesScenario()
+        paper = read_sources_scenario("paper")
+        assert replace(paper, array=default.array) == default
+
+    @pytest.mark.parametrize(
+        ("text", "options", "expected"),
+        [
+            (ARRAY + "[sources]\nnearest_m = 13\n", [], "key sources.nearest_m: found 13"),
+            (ARRAY + "[sources]\nmoment_Am2 = 0\n", [], "key sources.moment_Am2: found 0, expected a positive number"),
+            (ARRAY + "[sources]\nradius = 1\n", [], "key sources.radius: found an unknown key"),
+            (ARRAY.replace("vector", "scalar"), [], "vector sensors only"),
+            (ARRAY, ["--method", "iekf"], "--method: found 'iekf', expected global"),
+            (ARRAY, ["--over", "moments"], "--over"),
+        ],
+    )
+    def test_bad_input(self, text, options, expected, tmp_path, capsys):
+        path = tmp_path / "bad.toml"
+        path.write_text(text)
+        out = tmp_path / "out"
+        assert main(["map", str(path), "--over", "sources", "--grid", "3", "--out", str(out), *options]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert expected in line
+        assert not out.exists()
+
+
+class TestInterrupted:
+    """The command as a process of its own, with signals."""
+
+    arguments = ("map", "--grid", "70", "--method", "iekf")  # 27 chunks
+
+    def started(self, out):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "magloc.cli", *self.arguments, "--threads", "1", "--out", str(out)],
+            cwd=REPOSITORY, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        marks = out / "map.zarr/seconds_of_chunk/c"
+        while len([path for path in marks.rglob("*") if path.is_file()]) < 3:
+            assert process.poll() is None
+            time.sleep(0.002)
+        return process
+
+    def resumed(self, out, whole, capsys):
+        """Result of the same command, compared with that of an uninterrupted one, to the last bit."""
+        assert main([*self.arguments, "--out", str(out)]) == 0
+        err = capsys.readouterr().err
+        assert re.search(r"\d+ of 27 chunks were there before", err)
+        assert main([*self.arguments, "--out", str(whole), "--quiet"]) == 0
+        with (
+            open_map(out / "map.zarr") as found,
+            open_map(whole / "map.zarr") as expected,
+        ):
+            xr.testing.assert_equal(found, expected)
+
+    def test_kill_9(self, tmp_path, capsys):
+        process = self.started(tmp_path / "out")
+        process.kill()
+        process.communicate()
+        assert not (tmp_path / "out/convergence.png").exists()
+        self.resumed(tmp_path / "out", tmp_path / "whole", capsys)
+
+    def test_control_c(self, tmp_path, capsys):
+        process = self.started(tmp_path / "out")
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=20)
+        assert process.returncode == 130
+        (line,) = err.splitlines()
+        assert re.fullmatch(
+            r"magloc: interrupted: \d+ of 27 chunks are done, the same command goes on with the others", line
+        )
+        self.resumed(tmp_path / "out", tmp_path / "whole", capsys)
+
+    def test_finished(self, tmp_path, capsys):
+        arguments = ["map", "--grid", "5", "--out", str(tmp_path)]
+        results = []
+        for _ in range(2):
+            assert main([*arguments, "--json"]) == 0
+            results.append(json.loads(capsys.readouterr().out))
+        assert results[0] == results[1]  # the seconds as well
+        assert main(arguments) == 0
+        assert "was complete, nothing was computed again" in capsys.readouterr().err
+
+    def test_another_map_in_the_folder(self, tmp_path, capsys):
+        assert main(["map", "--grid", "5", "--out", str(tmp_path), "--quiet"]) == 0
+        before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+        capsys.readouterr()
+        for options in (["--grid", "6"], ["--grid", "5", "--method", "iekf"], ["--grid", "5", "--over", "sources"]):
+            assert main(["map", *options, "--out", str(tmp_path)]) == 2
+            out, err = capsys.readouterr()
+            assert out == ""
+            assert len(err.splitlines()) == 1
+            assert "found another map, with" in err
+        assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+    def test_what_cannot_be_written(self, tmp_path, capsys):
+        """A limit on the size of files stands for a full disk."""
+        script = (
+            "import resource, sys; from magloc.cli.app import main;"
+            "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000));"
+            f"sys.exit(main(['map', '--grid', '49', '--out', {str(tmp_path)!r}]))"
+        )
+        result = subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, capture_output=True, text=True)
+        assert result.returncode == 2
+        (line,) = result.stderr.splitlines()
+        assert "map.zarr cannot be written (File too large); 0 of 8 chunks are done, the same command goes on" in line
+        assert main(["map", "--grid", "49", "--out", str(tmp_path), "--quiet"]) == 0
+
+
+class TestScenarios:
+    def test_the_paper_is_built_in_and_the_default(self):
+        assert "paper" in built_in_scenarios()
+        paper = read_starts_scenario("paper")
+        default = StartsScenario()
+        assert paper.method == default.method
+        assert paper.array.sensors == default.array.sensors
+        assert (paper.position_m, paper.moment_Am2) == (default.position_m, default.moment_Am2)
+
+    def test_a_file_with_an_array_file_beside_it(self, tmp_path):
+        (tmp_path / "array.toml").write_text(ARRAY.removeprefix("[array]\n"))
+        (tmp_path / "mine.toml").write_text(
+            'array = "array.toml"\nmethod = "iekf"\n' + SOURCE + "[iekf]\nmax_iterations = 7\n"
+        )
+        scenario = read_starts_scenario(str(tmp_path / "mine.toml"))
+        assert scenario.method == IekfFilter(max_iterations=7)
+        assert scenario.array.n_sensors == 4
+
+
+class TestBadInput:
+    @pytest.mark.parametrize(
+        ("text", "expected"),
+        [
+            ("sourse = 1\n", "key sourse: found an unknown key"),
+            (ARRAY, "found no key source"),
+            (SOURCE, "found no key array"),
+            (ARRAY + SOURCE + "[iekf]\nsigma = 3\n", "key iekf.sigma: found an unknown key"),
+            (ARRAY + SOURCE + "[repeated]\nmax_iterations = 1.5\n", "key repeated.max_iterations"),
+            (ARRAY + SOURCE + "[repeated]\nposition_step_m = 0\n", "expected a positive number"),
+            ('method = "newton"\n' + ARRAY + SOURCE, "key method: found 'newton', expected one of repeated, iekf"),
+            (ARRAY.replace("tetrahedron", "ring") + SOURCE, "key geometry: found 'ring'"),
+            (ARRAY + SOURCE.replace("100, 0, 0", "0, 0, 0"), "found zero, expected a moment"),
+            (ARRAY + SOURCE.replace("5, 0, 0.3", "5, 0"), "key source.position_m"),
+            (ARRAY.replace("vector", "scalar") + SOURCE, "vector sensors only"),
+            ('array = "nowhere.toml"\n' + SOURCE, "nowhere.toml does not exist"),
+            ("half_width_m = -1\n" + ARRAY + SOURCE, "key half_width_m: found -1"),
+            ("format_version = 2\n" + ARRAY + SOURCE, "key format_version: found 2, expected 1"),
+            ("[array\n", "line 1"),
+        ],
+    )
+    def test_scenario_files(self, text, expected, tmp_path, capsys):
+        path = tmp_path / "bad.toml"
+        path.write_text(text)
+        out = tmp_path / "out"
+        assert main(["map", str(path), "--grid", "3", "--out", str(out)]) == 2
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1
+        assert expected in lines[0]
+        assert "bad.toml" in lines[0] or "nowhere.toml" in lines[0]
+        assert not out.exists() or not any(out.iterdir())
+
+    @pytest.mark.parametrize(
+        ("arguments", "expected"),
+        [
+            (["nothing"], "nothing does not exist"),
+            (["--grid", "1"], "--grid"),
+            (["--grid", "2.5"], "--grid"),
+            (["--method", "newton"], "--method"),
+        ],
+    )
+    def test_options(self, arguments, expected, tmp_path, capsys):
+        assert main(["map", *arguments]) == 2
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == 1
+        assert expected in lines[0]
+
+    def test_out_is_a_file(self, tmp_path, capsys):
+        (tmp_path / "file").write_text("kept")
+        assert main(["map", "--grid", "3", "--out", str(tmp_path / "file")]) == 2
+        assert "found a file, expected a folder" in capsys.readouterr().err
+        assert (tmp_path / "file").read_text() == "kept"

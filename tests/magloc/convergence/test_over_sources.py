@@ -1,0 +1,142 @@
+"""Maps over sources.
+
+| what | who checks it |
+|---|---|
+| Cramér-Rao bounds | the specification's figures, and the errors of the fixes |
+| found, missed | the χ² of the truth itself, an upper bound of the optimum searched from it |
+| random numbers | boxes of other sizes |
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from arrays.differences import decorrelated_differences
+from arrays.geometries import axial, tetrahedron
+from magloc.convergence.over_sources import SourcesMap, SourcesScenario, SourceStatus, source_map, summary
+from magloc.grids.cube import Box
+from magloc.plots.maps import source_figure
+
+PAPER = SourcesScenario()
+
+
+@pytest.fixture(scope="module")
+def paper_map():
+    return source_map(PAPER, 21)
+
+
+class TestFixes:
+    def test_nearly_all_are_found(self, paper_map):
+        assert summary(paper_map).fraction >= 0.9998
+
+    def test_chi2_decides(self, paper_map):
+        used = paper_map.status.to_numpy() != SourceStatus.LEFT_OUT
+        found = (paper_map.chi2 <= paper_map.chi2_from_truth + 0.05).to_numpy()
+        assert_array_equal(found[used], (paper_map.status == SourceStatus.FOUND).to_numpy()[used])
+
+    def test_chi2_of_the_search_from_the_truth(self, paper_map):
+        """12 readings less the common field and 6 unknowns: about 3 degrees of freedom, where they are observable."""
+        near = (paper_map.sigma_range < 0.05).to_numpy()
+        chi2 = paper_map.chi2_from_truth.to_numpy()[near]
+        # Mean of n chi-square variables with 3 degrees of freedom within 4 sigma: one false alarm in 16,000.
+        assert chi2.mean() == pytest.approx(3.0, abs=4.0 * np.sqrt(6.0 / chi2.size))
+
+    def test_errors_are_as_large_as_their_bounds(self, paper_map):
+        near = (paper_map.sigma_range < 0.05).to_numpy()
+        squares = (paper_map.distance / paper_map.sigma_position).to_numpy()[near] ** 2
+        # E[squares] = 1, and their variance is at most 2 (all of it along one axis): 4 sigma.
+        assert squares.mean() == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / squares.size))
+
+    def test_what_is_close_is_found_where_it_is(self, paper_map):
+        near = (paper_map.sigma_range < 0.05).to_numpy()
+        assert near.sum() > 100
+        assert paper_map.truth_listed.to_numpy()[near].all()
+        assert paper_map.range_observable.to_numpy()[near].all()
+        assert (paper_map.solutions.to_numpy()[near] >= 1).all()
+
+    def test_left_out(self, paper_map):
+        distance = np.sqrt(paper_map.x**2 + paper_map.y**2 + paper_map.z**2).to_numpy()
+        left_out = (distance < 1.0) | (distance > 12.0)
+        assert_array_equal(paper_map.status.to_numpy() == SourceStatus.LEFT_OUT, left_out)
+        for name in ("chi2", "chi2_from_truth", "distance", "sigma_range", "sigma_position"):
+            assert_array_equal(np.isnan(paper_map[name].to_numpy()), left_out)
+        assert (paper_map.truth_listed.to_numpy()[left_out] == -1).all()
+        assert summary(paper_map).starts == (~left_out).sum()
+
+    def test_noise_that_grows_with_the_field(self):
+        array = replace(tetrahedron(1.5, noise_T=1e-9), noise_fraction=0.01)
+        dataset = source_map(replace(PAPER, array=array, farthest_m=4.0, half_width_m=4.0), 5)
+        used = dataset.status.to_numpy() != SourceStatus.LEFT_OUT
+        assert (dataset.status.to_numpy()[used] == SourceStatus.FOUND).mean() > 0.9
+        exact = source_map(replace(PAPER, farthest_m=4.0, half_width_m=4.0), 5)
+        assert (dataset.sigma_range > exact.sigma_range).to_numpy()[used].all()
+
+
+class TestBounds:
+    @pytest.mark.parametrize(
+        ("edge", "moment", "sigma"),
+        [
+            (1.5, (0.0, 0.0, 100.0), (0.289, 0.082, 0.076)),
+            (1.5, (60.0, 50.0, 60.0), (0.169, 0.097, 0.082)),
+            (1.5, (100.0, 0.0, 0.0), (0.134, 0.230, 0.254)),
+            (0.5, (0.0, 0.0, 100.0), (2.74, 0.22, 0.21)),
+        ],
+    )
+    def test_the_specifications_figures(self, edge, moment, sigma):
+        cube = SourcesMap(replace(PAPER, array=tetrahedron(edge, noise_T=1e-9)), 2)
+        position = np.array([[5.0, 0.0, 0.306]])
+        sigma_range, sigma_position = cube._bounds(position, np.array([moment]), np.zeros((1, 12)))
+        assert sigma_position[0] == pytest.approx(np.linalg.norm(sigma), rel=0.01)
+        # The range is along x but for 3.5 degrees.
+        assert sigma_range[0] == pytest.approx(sigma[0], rel=0.02)
+
+
+class TestRandomNumbers:
+    def test_boxes_do_not_matter(self):
+        cube = SourcesMap(replace(PAPER, seed=3), 9)
+        whole = cube.values(Box((0, 0, 0), (slice(0, 9),) * 3))
+        part = (slice(2, 5), slice(0, 9), slice(6, 8))
+        for name, values in cube.values(Box((0, 0, 0), part)).items():
+            assert_array_equal(values, whole[name][part])
+
+    def test_moments_and_noise(self):
+        cube = SourcesMap(PAPER, 17)
+        moment, noise = cube._random(Box((0, 0, 0), (slice(0, 17),) * 3))
+        n = 17**3
+        assert_allclose(np.linalg.norm(moment, axis=1), PAPER.moment_Am2)
+        # Means within 5 sigma, 15 of them: one false alarm in 100,000.
+        assert_allclose(moment.mean(axis=0) / PAPER.moment_Am2, 0.0, atol=5.0 / np.sqrt(3.0 * n))
+        assert_allclose(noise.mean(axis=0), 0.0, atol=5.0 / np.sqrt(n))
+        assert len(np.unique(noise)) == noise.size
+        other, _ = SourcesMap(replace(PAPER, seed=1), 17)._random(Box((0, 0, 0), (slice(0, 17),) * 3))
+        assert not np.isin(other, moment).any()
+
+
+class TestRefused:
+    @pytest.mark.parametrize(
+        ("array", "grid", "expected"),
+        [
+            (PAPER.array, 1, "Input grid must be at least 2"),
+            (tetrahedron(1.5, kind="scalar", noise_T=1e-9), 5, "vector sensors only"),
+            (axial(1.0, noise_T=1e-9), 5, "3 independent differences, 6 are needed"),
+        ],
+    )
+    def test_scenarios(self, array, grid, expected):
+        with pytest.raises(ValueError, match=expected):
+            source_map(replace(PAPER, array=array), grid)
+
+
+def test_three_degrees_of_freedom():
+    assert decorrelated_differences(PAPER.array).variance.size - 6 == 3
+
+
+def test_figure(paper_map):
+    figure = source_figure(paper_map)
+    assert "4168 sources" in figure.get_suptitle()
+    for ax in figure.axes[:6]:
+        assert ax.get_xlabel().endswith("[m]")
+        assert ax.get_ylabel().endswith("[m]")

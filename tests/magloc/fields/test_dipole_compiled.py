@@ -1,0 +1,213 @@
+"""Tests of magloc.fields.dipole_compiled: the compiled functions are their NumPy twins in magloc.fields.dipole.
+
+To rounding.
+
+Physics is tested on the twins (test_dipole.py). What is tested here is what compilation could spoil: the blocks and
+their edges, the threads, the rule on the source, and the layouts of the arrays that go in.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import Any, cast
+
+import numba
+import numpy as np
+import pytest
+from numba import njit
+from numpy.typing import NDArray
+
+from magloc.fields import dipole
+from magloc.fields import dipole_compiled as kernels
+from tests import oracles
+
+Array = NDArray[np.float64]
+EPS = float(np.finfo(np.float64).eps)
+# Each of the twins is within 64 eps of the exact value (test_dipole.py derives it; fused multiply-adds only lower it).
+ROUNDING = 64 * EPS
+BETWEEN_TWINS = 2 * ROUNDING
+BLOCK = kernels.BLOCK
+# No point, one, the blocks' edges, and several blocks of which the last is not full
+SIZES = [0, 1, 7, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 5]
+PAIRS = [
+    pytest.param(kernels.field_at_points, dipole.total_field, dipole.field, id="field"),
+    pytest.param(kernels.gradient_at_points, dipole.total_gradient_tensor, dipole.gradient_tensor, id="gradient"),
+]
+
+
+def points_and_dipoles(n_points: int, n_dipoles: int) -> tuple[Array, Array, Array]:
+    rng = np.random.default_rng([n_points, n_dipoles])
+    return rng.uniform(-5, 5, (n_points, 3)), rng.uniform(-5, 5, (n_dipoles, 3)), rng.normal(size=(n_dipoles, 3))
+
+
+def components_at(d: Array, m: Array) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
+    return (
+        kernels.field_components(d[0], d[1], d[2], m[0], m[1], m[2]),
+        kernels.field_matrix_components(d[0], d[1], d[2]),
+        kernels.gradient_components(d[0], d[1], d[2], m[0], m[1], m[2]),
+    )
+
+
+@pytest.fixture
+def threads() -> Iterator[Callable[[int], None]]:
+    before = numba.get_num_threads()
+    yield numba.set_num_threads
+    numba.set_num_threads(before)
+
+
+class TestTwins:
+    @pytest.mark.parametrize("n_dipoles", [0, 1, 3])
+    @pytest.mark.parametrize("n_points", SIZES)
+    @pytest.mark.parametrize(("kernel", "twin", "of_one"), PAIRS)
+    def test_sums_over_dipoles(
+        self,
+        kernel: Callable[..., Array],
+        twin: Callable[..., Array],
+        of_one: Callable[..., Array],
+        n_points: int,
+        n_dipoles: int,
+    ) -> None:
+        points, sources, moments = points_and_dipoles(n_points, n_dipoles)
+        actual, expected = kernel(points, sources, moments), twin(points, sources, moments)
+        assert actual.shape == expected.shape
+        # The terms of the sum may cancel, so an error is measured against the sum of their norms.
+        axes = tuple(range(1, expected.ndim))
+        size = np.zeros(n_points)
+        for p, m in zip(sources, moments, strict=True):
+            size += np.sqrt(np.sum(of_one(points, p, m) ** 2, axes))
+        assert np.all(np.sqrt(np.sum((actual - expected) ** 2, axes)) <= BETWEEN_TWINS * size)
+
+    @pytest.mark.parametrize("n_points", SIZES)
+    def test_jacobian(self, n_points: int) -> None:
+        points, sources, moments = points_and_dipoles(n_points, 1)
+        actual = kernels.jacobian_at_points(points, sources[0], moments[0])
+        expected = dipole.field_jacobian(points, sources[0], moments[0])
+        assert actual.shape == expected.shape == (n_points, 3, 6)
+        for columns in (slice(0, 3), slice(3, 6)):
+            error = np.linalg.norm((actual - expected)[..., columns], axis=(1, 2))
+            assert np.all(error <= BETWEEN_TWINS * np.linalg.norm(expected[..., columns], axis=(1, 2)))
+
+    def test_symmetric_parts_are_exactly_symmetric(self) -> None:
+        points, sources, moments = points_and_dipoles(BLOCK + 9, 2)
+        gradient = kernels.gradient_at_points(points, sources, moments)
+        jacobian = kernels.jacobian_at_points(points, sources[0], moments[0])
+        for matrix in (gradient, jacobian[..., :3], jacobian[..., 3:]):
+            np.testing.assert_array_equal(matrix, matrix.mT)
+
+
+class TestAccuracy:
+    """Against 120-digit arithmetic, from near to far."""
+
+    @pytest.mark.parametrize("exponent", range(-9, 10, 3))
+    def test_from_near_to_far(self, exponent: int) -> None:
+        rng = np.random.default_rng(exponent + 200)
+        source, moment = rng.normal(size=3), rng.normal(size=3)
+        points = source + 10.0**exponent * rng.normal(size=(10, 3))
+        fields = kernels.field_at_points(points, [source], [moment])
+        gradients = kernels.gradient_at_points(points, [source], [moment])
+        for s, field, gradient in zip(points, fields, gradients, strict=True):
+            exact_field = oracles.decimal_field(s, source, moment)
+            exact_gradient = oracles.decimal_gradient_tensor(s, source, moment)
+            assert np.linalg.norm(field - exact_field) <= ROUNDING * np.linalg.norm(exact_field)
+            assert np.linalg.norm(gradient - exact_gradient) <= ROUNDING * np.linalg.norm(exact_gradient)
+
+    @pytest.mark.parametrize("distance_m", [1e-50, 1e50])
+    def test_neither_overflows_nor_underflows(self, distance_m: float) -> None:
+        point, origin, moment = distance_m * np.array([[0.48, -0.6, 0.64]]), np.zeros(3), np.array([3.0, -5.0, 8.0])
+        # Norms are taken of numbers near one: the squares of these would leave the range themselves.
+        unit = 1e-7 / distance_m / distance_m / distance_m
+        field = kernels.field_at_points(point, [origin], [moment])[0] / unit
+        gradient = kernels.gradient_at_points(point, [origin], [moment])[0] / unit * distance_m
+        exact_field = oracles.decimal_field(point[0], origin, moment) / unit
+        exact_gradient = oracles.decimal_gradient_tensor(point[0], origin, moment) / unit * distance_m
+        assert np.linalg.norm(field - exact_field) <= ROUNDING * np.linalg.norm(exact_field)
+        assert np.linalg.norm(gradient - exact_gradient) <= ROUNDING * np.linalg.norm(exact_gradient)
+
+
+class TestThreads:
+    def test_result_does_not_depend_on_their_number(self, threads: Callable[[int], None]) -> None:
+        points, sources, moments = points_and_dipoles(20 * BLOCK + 3, 4)
+        results = []
+        for number in range(1, numba.get_num_threads() + 1):
+            threads(number)
+            results.append(
+                (
+                    kernels.field_at_points(points, sources, moments),
+                    kernels.gradient_at_points(points, sources, moments),
+                    kernels.jacobian_at_points(points, sources[0], moments[0]),
+                )
+            )
+        for result in results[1:]:
+            for actual, expected in zip(result, results[0], strict=True):
+                np.testing.assert_array_equal(actual, expected)
+
+
+class TestSingularPoint:
+    """On a source the result is NaN for that point only, wherever it lies in a block."""
+
+    @pytest.mark.filterwarnings("error")
+    @pytest.mark.parametrize("index", [0, 5, BLOCK - 1, BLOCK, 2 * BLOCK + 2])
+    def test_is_nan_there_only(self, index: int) -> None:
+        points, sources, moments = points_and_dipoles(2 * BLOCK + 3, 2)
+        points[index] = sources[1]
+        for result in (
+            kernels.field_at_points(points, sources, moments),
+            kernels.gradient_at_points(points, sources, moments),
+            kernels.jacobian_at_points(points, sources[1], moments[1]),
+        ):
+            is_nan = np.isnan(result.reshape(len(points), -1))
+            expected = np.arange(len(points)) == index
+            np.testing.assert_array_equal(is_nan, np.broadcast_to(expected[:, None], is_nan.shape))
+            assert np.all(np.isfinite(result[~expected]))
+
+
+class TestComponents:
+    """The scalar functions, as another kernel calls them."""
+
+    def test_inside_another_kernel(self) -> None:
+        d, m = np.array([1.0, -2.0, 0.5]), np.array([3.0, 4.0, -5.0])
+        # Not cached: numba would not notice a change in the functions that are called.
+        field, matrix, gradient = cast(Callable[..., Any], njit(components_at))(d, m)
+        upper = np.triu_indices(3)
+        for actual, expected in [
+            (field, dipole.field(d, np.zeros(3), m)),
+            (matrix, dipole.field_matrix(d, np.zeros(3))[upper]),
+            (gradient, dipole.gradient_tensor(d, np.zeros(3), m)[upper]),
+        ]:
+            assert np.linalg.norm(actual - expected) <= BETWEEN_TWINS * np.linalg.norm(expected)
+
+
+class TestInputs:
+    points, sources, moments = points_and_dipoles(BLOCK + 4, 2)
+
+    def test_layout_does_not_matter(self) -> None:
+        read_only = self.points.copy()
+        read_only.setflags(write=False)
+        doubled = np.repeat(self.points, 2, axis=0)
+        expected = kernels.field_at_points(self.points, self.sources, self.moments)
+        for points in (np.asfortranarray(self.points), doubled[::2], read_only, self.points.tolist()):
+            np.testing.assert_array_equal(kernels.field_at_points(points, self.sources, self.moments), expected)
+
+    def test_inputs_stay_as_they_were(self) -> None:
+        points, sources, moments = self.points.copy(), self.sources.copy(), self.moments.copy()
+        kernels.field_at_points(points, sources, moments)
+        kernels.gradient_at_points(points, sources, moments)
+        kernels.jacobian_at_points(points, sources[0], moments[0])
+        for now, before in [(points, self.points), (sources, self.sources), (moments, self.moments)]:
+            np.testing.assert_array_equal(now, before)
+            assert now.flags.writeable
+
+    @pytest.mark.parametrize("kernel", [kernels.field_at_points, kernels.gradient_at_points])
+    def test_misuse_of_sums(self, kernel: Callable[..., Array]) -> None:
+        with pytest.raises(ValueError, match=r"Input points must have shape \(N, 3\); instead received shape \(3,\)\."):
+            kernel(self.points[0], self.sources, self.moments)
+        with pytest.raises(ValueError, match=r"Input sources must have shape \(K, 3\)"):
+            kernel(self.points, self.sources[0], self.moments)
+        with pytest.raises(ValueError, match=r"Input moments must have shape \(K, 3\)"):
+            kernel(self.points, self.sources, self.moments[:, :2])
+        with pytest.raises(ValueError, match="same length; instead received 2 and 1"):
+            kernel(self.points, self.sources, self.moments[:1])
+
+    def test_misuse_of_jacobian(self) -> None:
+        with pytest.raises(ValueError, match=r"Input source must have shape \(3,\); instead received shape \(2, 3\)\."):
+            kernels.jacobian_at_points(self.points, self.sources, self.moments[0])
+        with pytest.raises(ValueError, match=r"Input moment must have shape \(3,\); instead received shape \(\)\."):
+            kernels.jacobian_at_points(self.points, self.sources[0], 1.0)

@@ -1,0 +1,151 @@
+"""Maps on a dask cluster: the same values, and what happens when the cluster is not there or goes away."""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from arrays.io.errors import InputError
+from magloc.cli.app import main
+from magloc.convergence.filters import IekfFilter
+from magloc.convergence.over_starts import StartsMap, StartsScenario
+from magloc.grids.cluster import check_address, computed_by
+from magloc.grids.cube import boxes, computed_here, in_memory
+from magloc.grids.store import Sweep, open_map
+from tests.conftest import REPOSITORY
+
+pytest.importorskip("distributed")
+CUBE = StartsMap.of(StartsScenario(method=IekfFilter(max_iterations=5)), 70)  # 27 chunks
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """Address of a scheduler with two workers on this machine, and its process."""
+    dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
+    address_file = tmp_path / "scheduler.json"
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
+    quiet["env"] = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    here = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(address_file)]
+    scheduler = subprocess.Popen([*dask, *here, "--port", "0"], **quiet)
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--no-dashboard", "--nworkers", "2"]
+    worker += ["--nthreads", "1", "--scheduler-file", str(address_file)]
+    workers = subprocess.Popen([*worker, "--host", "127.0.0.1"], **quiet)
+    try:
+        yield wait_for_address(address_file), scheduler
+    finally:
+        scheduler.kill()
+        workers.terminate()
+        workers.wait()
+        scheduler.wait()
+
+
+def wait_for_address(path):
+    for _ in range(1000):
+        try:
+            return json.loads(path.read_text())["address"]
+        except (OSError, ValueError):
+            time.sleep(0.02)
+    raise TimeoutError(f"{path} was not written")
+
+
+class TestCluster:
+    def test_same_values_and_then_death(self, cluster, tmp_path):
+        address, scheduler = cluster
+        path = tmp_path / "map.zarr"
+
+        def until_the_scheduler_dies():
+            for i, chunk in enumerate(computed_by(address, CUBE, sweep.unfinished())):
+                if i == 6:
+                    scheduler.kill()
+                yield chunk
+
+        with Sweep(CUBE, path) as sweep:
+            with pytest.raises(InputError, match=f"--scheduler {address}: the connection to the scheduler was lost"):
+                sweep.write(until_the_scheduler_dies())
+            by_workers = sweep.chunks_done
+        assert 7 <= by_workers < 27
+        marks = marks_of(path)
+        assert len(marks) == by_workers
+        with Sweep(CUBE, path) as sweep:
+            sweep.write(computed_here(CUBE, sweep.unfinished()))
+        assert {mark: written for mark, written in marks_of(path).items() if mark in marks} == marks
+        expected = in_memory(CUBE)
+        with open_map(path) as stored:
+            for name in expected:
+                np.testing.assert_array_equal(stored[name], expected[name])
+
+    def test_command(self, cluster, tmp_path, capsys):
+        address, _ = cluster
+        arguments = ["map", "--over", "sources", "--grid", "7", "--quiet"]
+        assert main([*arguments, "--scheduler", address, "--out", str(tmp_path / "far")]) == 0
+        assert main([*arguments, "--out", str(tmp_path / "here")]) == 0
+        assert capsys.readouterr().err == ""
+        with (
+            open_map(tmp_path / "far/map.zarr") as far,
+            open_map(tmp_path / "here/map.zarr") as here,
+        ):
+            xr.testing.assert_equal(far, here)
+
+    def test_a_worker_that_fails(self, cluster):
+        address, _ = cluster
+        broken = StartsMap(CUBE.scenario, CUBE.grid, None, CUBE.z, CUBE.optimum)
+        with pytest.raises(InputError, match=r"a worker failed \(AttributeError: "):
+            list(computed_by(address, broken, boxes(CUBE)))
+
+
+class TestNoCluster:
+    def test_nobody_there(self, tmp_path):
+        with pytest.raises(InputError, match=r"--scheduler tcp://127\.0\.0\.1:9: found no scheduler there"):
+            list(computed_by("tcp://127.0.0.1:9", CUBE, boxes(CUBE), timeout_s=0.2))
+
+    @pytest.mark.parametrize("address", ["foo", "nonsense:::", "", "http://x", "tcp://x", "x:0", "x:65536", "a b:1"])
+    def test_not_an_address(self, address, tmp_path, capsys):
+        """Refused before anything is written."""
+        out = tmp_path / "map"
+        assert main(["map", "--grid", "3", "--scheduler", address, "--out", str(out)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line == f"magloc: --scheduler: found {address!r}, expected tcp://HOST:PORT or HOST:PORT."
+        assert not out.exists()
+
+    @pytest.mark.parametrize("address", ["127.0.0.1:8786", "tcp://h.example:1", "tls://h:65535", "tcp://[::1]:8786"])
+    def test_addresses(self, address):
+        check_address(address)
+
+    @pytest.mark.parametrize("answer", [b"HTTP/1.0 400 Bad Request\r\n\r\n", b"", None])
+    @pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
+    def test_another_service_there(self, answer):
+        """It answers, hangs up, or says nothing: one error in time, and no client that complains when it is deleted."""
+        with socket.create_server(("127.0.0.1", 0)) as server:
+
+            def serve():
+                connection, _ = server.accept()
+                with connection:
+                    connection.sendall(answer)
+
+            if answer is not None:
+                threading.Thread(target=serve, daemon=True).start()
+            address = "{}:{}".format(*server.getsockname())
+            begin = time.perf_counter()
+            with pytest.raises(InputError, match=f"--scheduler {address}: found (no scheduler|another service) there"):
+                list(computed_by(address, CUBE, boxes(CUBE), timeout_s=0.3))
+            gc.collect()
+        assert time.perf_counter() - begin < 3.0
+
+    def test_not_installed(self, monkeypatch):
+        monkeypatch.setitem(sys.modules, "distributed", None)
+        with pytest.raises(InputError, match=r"pip install 'magloc\[cluster\]'"):
+            list(computed_by("tcp://127.0.0.1:9", CUBE, boxes(CUBE)))
+
+
+def marks_of(path):
+    return {p: p.stat().st_mtime_ns for p in (path / "seconds_of_chunk" / "c").rglob("*") if p.is_file()}

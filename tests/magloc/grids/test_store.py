@@ -1,0 +1,353 @@
+"""Maps streamed to disk: interrupted, damaged, full, resumed, on a cluster.
+
+| what | who checks it |
+|---|---|
+| a stored map | the same map made in memory, to the last bit |
+| nothing is done twice | a log of every box that was computed; the files' times |
+| memory | the peak of a process that makes a map with eight times the points |
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from arrays.io.errors import InputError
+from magloc.convergence.filters import IekfFilter
+from magloc.convergence.over_starts import StartsMap, StartsScenario, convergence_map, summary
+from magloc.grids.cube import Box, MapSummary, Tally, Variable, boxes, computed_here, histogram, in_memory
+from magloc.grids.store import Sweep, open_map
+from tests.conftest import REPOSITORY
+
+
+@dataclass(frozen=True)
+class Waves:
+    """A map that costs nothing, and notes down what it computes."""
+
+    grid: int
+    log: Path
+    edge: int = 32
+    phase: float = 0.0
+    pause_s: float = 0.0
+    point: str = "point"
+
+    @property
+    def axis(self) -> np.ndarray:
+        return np.linspace(-1.0, 1.0, self.grid)
+
+    @property
+    def variables(self) -> dict[str, Variable]:
+        return {
+            "height": Variable(np.float64, {"units": "m"}),
+            "sign": Variable(np.int8, {"flag_values": np.array([-1, 1], np.int8), "flag_meanings": "below above"}),
+        }
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        return {"phase": self.phase, "grid": self.grid, "centroid": np.zeros(3)}
+
+    @property
+    def findings(self) -> dict[str, Any]:
+        return {"found": 1.5}
+
+    def warm_up(self) -> None:
+        pass
+
+    def values(self, box: Box) -> dict[str, np.ndarray]:
+        with self.log.open("a") as log:
+            log.write(f"{box.place}\n")
+        time.sleep(self.pause_s)
+        height = np.sin(box.points(self.axis) @ [3.0, 5.0, 7.0] + self.phase).reshape(box.shape)
+        return {"height": height, "sign": np.where(height < 0.0, -1, 1).astype(np.int8)}
+
+    def tally(self, values: Any) -> Tally:
+        above = values["sign"] == 1
+        return Tally(Counter(points=above.size, above=int(above.sum())), histogram(values["sign"][above]))
+
+    def summary(self, tally: Tally, seconds: float) -> MapSummary:
+        fraction = tally.fraction("above", "points")
+        return MapSummary(tally.counts["points"], tally.counts["above"], fraction, 0.0, 0.0, 0.0, 0, seconds)
+
+
+@pytest.fixture
+def waves(tmp_path):
+    return Waves(40, tmp_path / "log", edge=16)  # 27 chunks, those at the end smaller
+
+
+def run(cube, path):
+    with Sweep(cube, path) as sweep:
+        sweep.write(computed_here(cube, sweep.unfinished()))
+        return sweep
+
+
+def computed_boxes(cube):
+    return cube.log.read_text().splitlines()
+
+
+def assert_same(path, expected):
+    """A stored map has the values and attributes of one in memory, to the last bit."""
+    with open_map(path) as stored:
+        xr.testing.assert_identical(stored.drop_attrs(), expected.drop_attrs())
+        assert set(stored.attrs) == set(expected.attrs)
+        for key in set(expected.attrs) - {"seconds"}:
+            np.testing.assert_array_equal(stored.attrs[key], expected.attrs[key])
+
+
+class TestStore:
+    def test_the_map_in_memory(self, waves, tmp_path):
+        run(waves, tmp_path / "map.zarr")
+        assert_same(tmp_path / "map.zarr", in_memory(waves))
+
+    def test_opens_in_xarray_with_cf_attributes(self, tmp_path):
+        scenario = StartsScenario(method=IekfFilter())
+        run(StartsMap.of(scenario, 5), tmp_path / "map.zarr")
+        dataset = xr.open_zarr(tmp_path / "map.zarr")
+        expected = convergence_map(scenario, 5)
+        assert dataset.attrs["Conventions"] == "CF-1.10"
+        assert float(dataset.seconds_of_chunk.sum()) > 0.0
+        for name, variable in expected.variables.items():
+            stored = dataset[name]
+            np.testing.assert_array_equal(stored.values, variable.values)
+            assert stored.dtype == variable.dtype
+            assert set(stored.attrs) == set(variable.attrs)
+            for key, value in variable.attrs.items():
+                np.testing.assert_array_equal(stored.attrs[key], value)
+
+    def test_summary_is_that_of_the_whole_map(self, tmp_path):
+        cube = StartsMap.of(StartsScenario(), 40)
+        counts = run(cube, tmp_path / "map.zarr").summary
+        with open_map(tmp_path / "map.zarr") as dataset:
+            whole = dataset.load()
+        converged = whole.status.to_numpy() == 0
+        assert counts == summary(whole)
+        assert counts.converged == converged.sum()
+        assert counts.front_fraction == converged[whole.half.to_numpy() == 1].mean()
+        assert counts.median_iterations == np.median(whole.iterations.to_numpy()[converged])
+        assert counts.iterations_total == whole.iterations.to_numpy().sum()
+
+    def test_netcdf_of_a_store(self, waves, tmp_path):
+        run(waves, tmp_path / "map.zarr")
+        with open_map(tmp_path / "map.zarr") as stored:
+            stored.to_netcdf(tmp_path / "map.nc")
+        with xr.open_dataset(tmp_path / "map.nc") as again:
+            np.testing.assert_array_equal(again.height, in_memory(waves).height)
+            assert again.sign.attrs["flag_values"].dtype == np.int8
+
+    def test_boxes_do_not_matter(self, waves):
+        fine = in_memory(waves)
+        coarse = in_memory(Waves(40, waves.log, edge=64))
+        xr.testing.assert_equal(fine, coarse)
+
+    @pytest.mark.parametrize("n", [1, 2, 7, 8])
+    def test_median_of_a_histogram(self, n):
+        iterations = np.random.default_rng(n).integers(1, 9, n)
+        tally = Tally(iterations_of_converged=histogram(iterations[: n // 2])) + Tally(
+            iterations_of_converged=histogram(iterations[n // 2 :])
+        )
+        assert tally.median_iterations() == np.median(iterations)
+
+
+class TestResume:
+    def test_finished_is_finished(self, waves, tmp_path):
+        first = run(waves, tmp_path / "map.zarr")
+        again = run(waves, tmp_path / "map.zarr")
+        assert len(computed_boxes(waves)) == 27
+        assert again.summary == first.summary
+        assert again.chunks_done == again.n_chunks == 27
+
+    def test_after_an_error(self, waves, tmp_path):
+        def broken():
+            yield from list(computed_here(waves, boxes(waves)))[:5]
+            raise KeyboardInterrupt
+
+        with Sweep(waves, tmp_path / "map.zarr") as sweep, pytest.raises(KeyboardInterrupt):
+            sweep.write(broken())
+        waves.log.unlink()
+        with Sweep(waves, tmp_path / "map.zarr") as sweep:
+            assert sweep.points_done == sum(box.size for box in list(boxes(waves))[:5])
+        assert run(waves, tmp_path / "map.zarr").chunks_done == 27
+        assert len(computed_boxes(waves)) == 22
+        assert_same(tmp_path / "map.zarr", in_memory(waves))
+
+    def test_after_kill_9(self, waves, tmp_path):
+        script = (
+            "import sys; from pathlib import Path; from tests.magloc.grids.test_store import Waves, run;"
+            f"run(Waves(40, Path({str(waves.log)!r}), edge=16, pause_s=0.02), {str(tmp_path / 'map.zarr')!r})"
+        )
+        process = subprocess.Popen([sys.executable, "-c", script], cwd=REPOSITORY)
+        marks = tmp_path / "map.zarr" / "seconds_of_chunk" / "c"
+        wait_until(lambda: len(chunk_files(marks)) >= 5)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        done = {path: path.stat().st_mtime_ns for path in chunk_files(marks)}
+        assert 5 <= len(done) < 27
+        for mark in list(done):  # and all that belongs to them
+            for name in waves.variables:
+                path = tmp_path / "map.zarr" / name / mark.relative_to(tmp_path / "map.zarr" / "seconds_of_chunk")
+                done[path] = path.stat().st_mtime_ns
+        before = computed_boxes(waves)
+        with Sweep(waves, tmp_path / "map.zarr") as sweep:
+            assert sweep.chunks_done == len(done) / 3
+            sweep.write(computed_here(waves, sweep.unfinished()))
+        assert {path: path.stat().st_mtime_ns for path in done} == done
+        # The one that was being computed or written is computed again, no other.
+        assert len(computed_boxes(waves)) <= 28
+        assert len(before) - len(done) / 3 <= 1
+        assert set(map(str, (box.place for box in boxes(waves)))) == set(computed_boxes(waves))
+        assert_same(tmp_path / "map.zarr", in_memory(waves))
+
+    def test_written_without_its_mark(self, waves, tmp_path):
+        run(waves, tmp_path / "map.zarr")
+        (tmp_path / "map.zarr/seconds_of_chunk/c/1/1/1").unlink()
+        truncate(tmp_path / "map.zarr/height/c/1/1/1")
+        waves.log.unlink()
+        sweep = run(waves, tmp_path / "map.zarr")
+        assert computed_boxes(waves) == ["(1, 1, 1)"]
+        assert sweep.unreadable == []
+        assert_same(tmp_path / "map.zarr", in_memory(waves))
+
+    @pytest.mark.parametrize("name", ["height", "sign"])
+    @pytest.mark.parametrize("place", [(0, 1, 0), (2, 2, 2)])
+    def test_a_damaged_chunk_is_reported_and_done_again(self, waves, name, place, tmp_path):
+        run(waves, tmp_path / "map.zarr")
+        truncate(tmp_path / "map.zarr" / name / "c" / "/".join(map(str, place)))
+        waves.log.unlink()
+        sweep = run(waves, tmp_path / "map.zarr")
+        assert computed_boxes(waves) == [str(place)]
+        (sentence,) = sweep.unreadable
+        assert f"chunk {place} cannot be read" in sentence
+        assert sweep.tally.counts["points"] == 40**3
+        assert_same(tmp_path / "map.zarr", in_memory(waves))
+
+    def test_a_flipped_bit_is_noticed(self, waves, tmp_path):
+        run(waves, tmp_path / "map.zarr")
+        path = tmp_path / "map.zarr/height/c/0/0/0"
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 1
+        path.write_bytes(data)
+        assert len(run(waves, tmp_path / "map.zarr").unreadable) == 1
+        assert_same(tmp_path / "map.zarr", in_memory(waves))
+
+    def test_a_damaged_mark(self, waves, tmp_path):
+        run(waves, tmp_path / "map.zarr")
+        truncate(tmp_path / "map.zarr/seconds_of_chunk/c/0/0/1")
+        waves.log.unlink()
+        run(waves, tmp_path / "map.zarr")
+        assert computed_boxes(waves) == ["(0, 0, 1)"]
+
+    def test_a_missing_chunk(self, waves, tmp_path):
+        run(waves, tmp_path / "map.zarr")
+        (tmp_path / "map.zarr/sign/c/0/0/0").unlink()
+        assert "sign is missing" in run(waves, tmp_path / "map.zarr").unreadable[0]
+        assert_same(tmp_path / "map.zarr", in_memory(waves))
+
+
+class TestRefused:
+    def test_another_map(self, waves, tmp_path):
+        run(waves, tmp_path / "map.zarr")
+        before = snapshot(tmp_path)
+        with pytest.raises(InputError, match=r"found another map, with phase 0.0 in place of 1.0"):
+            Sweep(Waves(40, waves.log, edge=16, phase=1.0), tmp_path / "map.zarr")
+        with pytest.raises(InputError, match="with grid 40 in place of 41"):
+            Sweep(Waves(41, waves.log, edge=16), tmp_path / "map.zarr")
+        assert snapshot(tmp_path) == before
+
+    @pytest.mark.parametrize("what", ["file", "folder", "group"])
+    def test_something_else(self, waves, what, tmp_path):
+        path = tmp_path / "map.zarr"
+        if what == "file":
+            path.write_text("kept")
+        else:
+            path.mkdir()
+            (path / ("notes.txt" if what == "folder" else "zarr.json")).write_text("{}")
+        before = snapshot(tmp_path)
+        with pytest.raises(InputError, match=r"map\.zarr: found .*, expected a map or nothing"):
+            Sweep(waves, path)
+        assert snapshot(tmp_path) == before
+
+    def test_a_map_of_which_a_part_is_missing(self, waves, tmp_path):
+        run(waves, tmp_path / "map.zarr")
+        (tmp_path / "map.zarr/height/zarr.json").unlink()
+        with pytest.raises(InputError, match="a part is missing"):
+            Sweep(waves, tmp_path / "map.zarr")
+
+    @pytest.mark.skipif(sys.platform == "win32", reason="needs file locks")
+    def test_two_processes_at_once(self, waves, tmp_path):
+        with (
+            Sweep(waves, tmp_path / "map.zarr"),
+            pytest.raises(InputError, match="another process is writing"),
+        ):
+            Sweep(waves, tmp_path / "map.zarr")
+        assert run(waves, tmp_path / "map.zarr").chunks_done == 27
+
+
+class TestFullDisk:
+    def test_keeps_what_was_done(self, waves, tmp_path):
+        disk = tmp_path / "disk"
+        disk.mkdir()
+        mounted = subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", "size=200k", "tmpfs", str(disk)], capture_output=True, text=True
+        )
+        if mounted.returncode:  # only root may
+            pytest.skip(f"cannot mount a small file system: {mounted.stderr.strip()}")
+        try:
+            with Sweep(waves, disk / "map.zarr") as sweep:
+                with pytest.raises(OSError, match="No space left on device"):
+                    sweep.write(computed_here(waves, sweep.unfinished()))
+                done = sweep.chunks_done
+            assert 0 < done < 27
+            subprocess.run(["mount", "-o", "remount,size=20m", str(disk)], check=True)
+            with Sweep(waves, disk / "map.zarr") as sweep:
+                assert sweep.chunks_done == done
+                assert sweep.unreadable == []
+                sweep.write(computed_here(waves, sweep.unfinished()))
+            assert_same(disk / "map.zarr", in_memory(waves))
+        finally:
+            subprocess.run(["umount", str(disk)], check=True)
+
+
+class TestMemory:
+    def test_does_not_grow_with_the_map(self, tmp_path):
+        peaks = [peak_mib(tmp_path, grid) for grid in (64, 128)]
+        # In memory, 128³ points would take 128³ · (8 + 1) bytes = 18 MiB more even without a copy.
+        assert peaks[1] - peaks[0] < 8.0
+
+
+def peak_mib(folder: Path, grid: int) -> float:
+    script = (
+        "import resource; from pathlib import Path; from tests.magloc.grids.test_store import Waves, run;"
+        f"run(Waves({grid}, Path({str(folder / 'log')!r})), {str(folder / f'{grid}.zarr')!r});"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    )
+    result = subprocess.run([sys.executable, "-c", script], cwd=REPOSITORY, check=True, capture_output=True, text=True)
+    return int(result.stdout) / 1024.0
+
+
+def chunk_files(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*") if path.is_file() and path.suffix != ".partial"]
+
+
+def truncate(path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def snapshot(folder: Path) -> dict[Path, tuple[int, bytes]]:
+    return {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def wait_until(condition: Any, at_most_s: float = 30.0) -> None:
+    end = time.monotonic() + at_most_s
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)

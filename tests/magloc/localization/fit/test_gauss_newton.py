@@ -1,0 +1,565 @@
+"""The exact model of any number of dipoles, and its refinement.
+
+| what | who checks it |
+|---|---|
+| predictions, χ² | magpylib; DifferenceMeasurement |
+| Jacobians | scipy.differentiate |
+| the optimum | scipy.optimize.least_squares on magpylib's field |
+| covariance | DifferenceMeasurement.fisher_information; scipy.differentiate on magpylib's field; scatter of the fits |
+| range interval | the compiled Locator |
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.optimize
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2 as chi2_distribution
+
+from arrays.array import SensorArray
+from arrays.differences import decorrelated_differences
+from arrays.geometries import cube, tetrahedron
+from arrays.sensor import Sensor
+from magloc.localization.fit.gauss_newton import JointFits, covariances, fit_moments, refine, refine_moments, tangents
+from magloc.localization.search.single_source import Locator
+from magloc.localization.uncertainty.range_profile import ranges_within
+from magloc.measurement.differences import DifferenceMeasurement
+from magloc.measurement.rows import joint_problem, whitenings_of
+from tests import oracles
+from tests.arrays.test_differences import random_array
+
+SEEDS = st.integers(0, 2**32 - 1)
+AMBIENT = (2e-5, -1e-6, 4.5e-5)
+KINDS = ["vector", "scalar", "scalar in ambient", "mixed", "mixed in ambient"]
+
+
+def array_of(kind, seed=0, n=14):
+    """Turned, unequal and offset sensors within a metre or two of the origin."""
+    kinds = {"vector": ("vector",), "scalar": ("scalar",), "mixed": ("vector", "scalar")}[kind.split(" ")[0]]
+    array = random_array(seed, n, kinds=kinds)
+    return replace(array, ambient_T=AMBIENT) if "ambient" in kind else array
+
+
+def scalar_cloud(seed, ambient_T=AMBIENT):
+    """Twelve scalar sensors of 0.01 nT anywhere within 1.5 m along every axis."""
+    places = np.random.default_rng(seed).uniform(-1.5, 1.5, (12, 3))
+    return SensorArray(
+        tuple(Sensor(f"s{i}", "scalar", tuple(place), 1e-11) for i, place in enumerate(places)), ambient_T=ambient_T
+    )
+
+
+def random_sources(rng, n_rows, n_sources, nearest=3.0, farthest=5.0, moment=300.0):
+    """Positions and moments (n, K, 3), every source in a sector of its own around z so that all are told apart."""
+    sector = 2.0 * np.pi / n_sources
+    angle = sector * (np.arange(n_sources) + rng.uniform(-0.25, 0.25, (n_rows, n_sources)))
+    height = rng.uniform(-0.5, 0.5, (n_rows, n_sources))
+    flat = np.sqrt(1.0 - height**2)
+    direction = np.stack([flat * np.cos(angle), flat * np.sin(angle), height], axis=-1)
+    m = rng.normal(size=(n_rows, n_sources, 3))
+    m *= moment / np.linalg.norm(m, axis=-1, keepdims=True)
+    return direction * rng.uniform(nearest, farthest, (n_rows, n_sources, 1)), m
+
+
+def magpylib_readings(array, positions, moments):
+    """Noise-free raw readings (C,) of dipoles (K, 3), their field by magpylib."""
+    fields = np.array(array.ambient_fields)
+    for position, moment in zip(positions, moments, strict=True):
+        fields = fields + oracles.magpylib_field(array.positions, position, moment)
+    return array.readings_of(fields)
+
+
+def noisy_readings(array, positions, moments, rng):
+    """Noisy readings (n, C) of sources (n, K, 3)."""
+    clean = np.stack([magpylib_readings(array, p, m) for p, m in zip(positions, moments, strict=True)])
+    return clean + rng.normal(size=clean.shape) * array.channel_noise_T
+
+
+def problem_of(array, readings, ambient=None):
+    """Joint problem and whitened readings of rows (n, C) that miss the same channels."""
+    mask = np.isfinite(readings[0])
+    problem, raw = joint_problem(array, mask, readings, whitenings_of(array, mask, readings), ambient)
+    return problem, problem.whitened(raw)
+
+
+def whitened_residuals(array, readings, positions, moments):
+    """Decorrelated differences of one row minus those of magpylib's dipoles, over their standard deviations."""
+    differences = decorrelated_differences(array, np.isfinite(readings))
+    residual = np.nan_to_num(readings - magpylib_readings(array, positions, moments))
+    return differences.transform @ residual / np.sqrt(differences.variance)
+
+
+def chi2_by_magpylib(array, readings, positions, moments):
+    return float(np.sum(whitened_residuals(array, readings, positions, moments) ** 2))
+
+
+def scipy_optimum(array, readings, positions, moments):
+    """χ², positions and moments of scipy's local optimum from a start, the field by magpylib."""
+    size = np.linalg.norm(moments)
+
+    def residual(x):
+        p, m = x.reshape(2, -1, 3)
+        return whitened_residuals(array, readings, p, size * m)
+
+    start = np.concatenate([positions.ravel(), moments.ravel() / size])
+    found = scipy.optimize.least_squares(
+        residual, start, jac="3-point", method="lm", x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12
+    )
+    p, m = found.x.reshape(2, -1, 3)
+    return 2.0 * found.cost, p, size * m
+
+
+def refined_from(problem, y, positions, moments, **options):
+    """Refinement from positions and moments (n, K, 3) in SI units."""
+    q = problem.homogeneous(positions)
+    return refine(problem, y, q, problem.scaled_moment(q, moments), **options)
+
+
+def chi2_at(problem, y, q, mu):
+    return np.sum((y - problem.predicted(problem.source_fields(q, mu))) ** 2, axis=-1)
+
+
+class TestPredictions:
+    """χ² is that of the decorrelated differences, whatever the sensors and however many the sources."""
+
+    @given(SEEDS, st.sampled_from(KINDS), st.integers(1, 3))
+    @settings(max_examples=30, deadline=None)
+    def test_chi2_of_magpylib_fields(self, seed, kind, n_sources):
+        array = array_of(kind, seed)
+        rng = np.random.default_rng(seed)
+        p, m = random_sources(rng, 1, n_sources)
+        readings = noisy_readings(array, p, m, rng) + 1e-8 * rng.normal(size=array.n_channels)
+        problem, y = problem_of(array, readings)
+        q = problem.homogeneous(p)
+        chi2 = chi2_at(problem, y, q, problem.scaled_moment(q, m))
+        # Moduli of 50 µT with a noise of 0.3 nT cancel to 1e-10 of the noise, squared against some 1e3.
+        assert_allclose(chi2[0], chi2_by_magpylib(array, readings[0], p[0], m[0]), rtol=1e-7)
+
+    @given(SEEDS, st.sampled_from(KINDS))
+    @settings(max_examples=20, deadline=None)
+    def test_one_source_is_the_measurement_model(self, seed, kind):
+        array = array_of(kind, seed)
+        rng = np.random.default_rng(seed)
+        p, m = random_sources(rng, 1, 1)
+        readings = noisy_readings(array, p, m, rng)
+        problem, y = problem_of(array, readings)
+        q = problem.homogeneous(p)
+        measurement = DifferenceMeasurement.of(array)
+        residual = measurement.measured(readings[0]) - measurement.predicted(p[0, 0], m[0, 0])
+        expected = np.sum(residual**2 / measurement.variance)
+        assert_allclose(chi2_at(problem, y, q, problem.scaled_moment(q, m))[0], expected, rtol=1e-7)
+
+    def test_a_prior_of_the_common_field(self):
+        array = replace(array_of("vector", 3), common_field_T=3e-9)
+        rng = np.random.default_rng(3)
+        p, m = random_sources(rng, 1, 2)
+        readings = noisy_readings(array, p, m, rng)
+        problem, y = problem_of(array, readings)
+        q = problem.homogeneous(p)
+        chi2 = chi2_at(problem, y, q, problem.scaled_moment(q, m))[0]
+        assert_allclose(chi2, chi2_by_magpylib(array, readings[0], p[0], m[0]), rtol=1e-9)
+
+    def test_missing_channels_count_nothing(self):
+        array = array_of("mixed in ambient", 5)
+        rng = np.random.default_rng(5)
+        p, m = random_sources(rng, 2, 2)
+        readings = noisy_readings(array, p, m, rng)
+        readings[:, [0, 3, 8]] = np.nan
+        problem, y = problem_of(array, readings)
+        q = problem.homogeneous(p)
+        expected = [chi2_by_magpylib(array, *row) for row in zip(readings, p, m, strict=True)]
+        assert_allclose(chi2_at(problem, y, q, problem.scaled_moment(q, m)), expected, rtol=1e-7)
+
+    def test_ambient_field_of_every_row(self):
+        array = array_of("scalar", 6)
+        rng = np.random.default_rng(6)
+        p, m = random_sources(rng, 4, 2)
+        ambient = 3e-5 * rng.normal(size=(4, 3))
+        rows = [replace(array, ambient_T=tuple(field)) for field in ambient]
+        readings = np.concatenate([noisy_readings(row, p[i : i + 1], m[i : i + 1], rng) for i, row in enumerate(rows)])
+        problem, y = problem_of(array, readings, ambient)
+        q = problem.homogeneous(p)
+        expected = [chi2_by_magpylib(*row) for row in zip(rows, readings, p, m, strict=True)]
+        assert_allclose(chi2_at(problem, y, q, problem.scaled_moment(q, m)), expected, rtol=1e-6)
+
+
+class TestCoordinates:
+    @given(SEEDS)
+    @settings(max_examples=20, deadline=None)
+    def test_positions_and_moments_come_back(self, seed):
+        array = array_of("mixed", seed)
+        p, m = random_sources(np.random.default_rng(seed), 3, 2)
+        problem, _ = problem_of(array, np.zeros((3, array.n_channels)))
+        q = problem.homogeneous(p)
+        assert_allclose(np.linalg.norm(q, axis=-1), 1.0, rtol=1e-15)
+        for same in (q, -q):
+            assert_allclose(problem.position(same), p, rtol=1e-12)
+            assert_allclose(problem.moment(same, problem.scaled_moment(q, m)), m, rtol=1e-12)
+
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_q_and_minus_q_are_the_same_source(self, kind):
+        array = array_of(kind, 7)
+        rng = np.random.default_rng(7)
+        p, m = random_sources(rng, 3, 2)
+        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        q = problem.homogeneous(p)
+        mu = problem.scaled_moment(q, m)
+        assert_allclose(problem.source_fields(-q, mu), problem.source_fields(q, mu), rtol=1e-12)
+        start = problem.homogeneous(1.05 * p)
+        one, other = refine(problem, y, start, mu), refine(problem, y, -start, mu)
+        assert_allclose(other.chi2, one.chi2, rtol=1e-6)
+        assert_allclose(problem.position(other.q), problem.position(one.q), rtol=1e-6)
+
+    @given(SEEDS)
+    @settings(max_examples=20, deadline=None)
+    def test_tangents_are_orthonormal_and_the_third_changes_the_range_alone(self, seed):
+        q = np.random.default_rng(seed).normal(size=(5, 4))
+        q /= np.linalg.norm(q, axis=-1, keepdims=True)
+        frame = np.concatenate([q[..., None], tangents(q)], axis=-1)
+        assert_allclose(frame.swapaxes(-1, -2) @ frame, np.broadcast_to(np.eye(4), (5, 4, 4)), atol=1e-14)
+        along = tangents(q)[:, :3, 2]
+        assert_allclose(np.cross(along, q[:, :3]), np.zeros((5, 3)), atol=1e-14)
+
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_infinity_is_an_ordinary_point(self, kind):
+        """A source infinitely far away has a uniform field: predicted as nothing but its share in the moduli."""
+        array = array_of(kind, 8)
+        rng = np.random.default_rng(8)
+        p, m = random_sources(rng, 2, 1)
+        problem, _ = problem_of(array, noisy_readings(array, p, m, rng))
+        mu = problem.scaled_moment(problem.homogeneous(p), m)
+        fields = []
+        for s in (0.0, 1e-9):
+            q = np.concatenate([p, np.full((2, 1, 1), s)], axis=-1) / np.linalg.norm(p, axis=-1, keepdims=True)
+            fields.append(problem.source_fields(q, mu))
+        assert_allclose(fields[0], np.broadcast_to(fields[0][:, :1], fields[0].shape), rtol=1e-12)
+        assert_allclose(fields[1], fields[0], rtol=1e-6)
+
+    def test_a_start_far_away_comes_back(self):
+        array = array_of("vector", 8)
+        rng = np.random.default_rng(8)
+        p, m = random_sources(rng, 5, 1)
+        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        far = problem.homogeneous(30.0 * p)
+        fits = refine(problem, y, far, fit_moments(problem, y, far))
+        best = refined_from(problem, y, p, m)
+        assert_allclose(fits.chi2, best.chi2, rtol=1e-6)
+
+
+class TestJacobians:
+    """Derivatives of the predictions, by scipy's differences of order 8."""
+
+    @pytest.mark.parametrize("kind", KINDS)
+    @pytest.mark.parametrize("n_sources", [1, 2])
+    def test_along_tangents_and_moments(self, kind, n_sources):
+        array = array_of(kind, 11)
+        rng = np.random.default_rng(11)
+        p, m = random_sources(rng, 1, n_sources)
+        problem, _ = problem_of(array, noisy_readings(array, p, m, rng))
+        q = problem.homogeneous(p)
+        mu = problem.scaled_moment(q, m)
+        tangent = tangents(q)
+
+        def predicted(x):
+            flat = x.reshape(-1, 2, n_sources, 3)
+            moved = q + (tangent @ flat[:, 0, ..., None])[..., 0]
+            moments = mu + np.linalg.norm(mu) * flat[:, 1]
+            at = problem.rows(np.zeros(len(flat), dtype=np.intp))
+            return at.predicted(at.source_fields(moved, moments)).reshape(*x.shape[:-1], -1)
+
+        expected = oracles.derivative(predicted, np.zeros(6 * n_sources), 0.05)
+        gain = problem.linear_gain(problem.source_fields(q, mu))
+        by_position = problem.position_jacobian(q, mu, gain, tangent)[0]
+        by_moment = problem.moment_jacobian(q, gain)[0] * np.linalg.norm(mu)
+        scale = np.abs(expected).max(axis=0)
+        assert_allclose(np.concatenate([by_position, by_moment], axis=-1) / scale, expected / scale, atol=1e-7)
+
+
+class TestMoments:
+    """Moments at known places."""
+
+    def test_linear_channels_by_least_squares(self):
+        array = array_of("vector", 12)
+        rng = np.random.default_rng(12)
+        p, m = random_sources(rng, 3, 2)
+        readings = noisy_readings(array, p, m, rng)
+        problem, y = problem_of(array, readings)
+        q = problem.homogeneous(p)
+        moments = problem.moment(q, fit_moments(problem, y, q))
+        for i in range(3):
+            columns = [
+                whitened_residuals(array, array.channel_offset_T, p[i, k : k + 1], -axis[None])
+                for k in range(2)
+                for axis in np.eye(3)
+            ]
+            data = whitened_residuals(array, readings[i], p[i], np.zeros((2, 3)))
+            expected, *_ = np.linalg.lstsq(np.stack(columns, axis=-1), data)
+            assert_allclose(moments[i].ravel(), expected, rtol=1e-6, atol=1e-6 * 300.0)
+
+    @pytest.mark.parametrize("kind", ["scalar", "scalar in ambient", "mixed"])
+    def test_moduli_by_scipy_from_the_same_start(self, kind):
+        array = array_of(kind, 13)
+        rng = np.random.default_rng(13)
+        p, m = random_sources(rng, 4, 1)
+        readings = noisy_readings(array, p, m, rng)
+        problem, y = problem_of(array, readings)
+        q = problem.homogeneous(p)
+        start = m + 30.0 * rng.normal(size=m.shape)
+        fits = refine_moments(problem, y, q, problem.scaled_moment(q, start))
+        found = problem.moment(fits.q, fits.mu)
+        assert_allclose(problem.position(fits.q), p, rtol=1e-12)
+        for i in range(4):
+            best = scipy.optimize.least_squares(
+                lambda x, i=i: whitened_residuals(array, readings[i], p[i], x[None]), start[i, 0], jac="3-point"
+            )
+            assert fits.chi2[i] == pytest.approx(2.0 * best.cost, rel=1e-6, abs=1e-5)
+            covariance = np.linalg.inv(best.jac.T @ best.jac)
+            assert_allclose(found[i, 0], best.x, atol=1e-3 * np.sqrt(np.trace(covariance)))
+
+
+class TestOptimum:
+    """The refinement ends where scipy ends from the same start."""
+
+    @pytest.mark.parametrize("kind", KINDS)
+    @pytest.mark.parametrize("n_sources", [1, 2])
+    def test_scipy_on_magpylib_fields(self, kind, n_sources):
+        array = array_of(kind, 21, 16 if "vector" in kind else 22)
+        rng = np.random.default_rng(21)
+        p, m = random_sources(rng, 3, n_sources)
+        readings = noisy_readings(array, p, m, rng)
+        problem, y = problem_of(array, readings)
+        start_p, start_m = p + 0.05 * rng.normal(size=p.shape), m + 10.0 * rng.normal(size=m.shape)
+        fits = refined_from(problem, y, start_p, start_m)
+        position, moment = problem.position(fits.q), problem.moment(fits.q, fits.mu)
+        assert fits.converged.all()
+        for i in range(3):
+            chi2, found_p, found_m = scipy_optimum(array, readings[i], start_p[i], start_m[i])
+            assert fits.chi2[i] == pytest.approx(chi2, rel=1e-5, abs=1e-4)
+            assert_allclose(position[i], found_p, rtol=1e-3)
+            assert_allclose(moment[i], found_m, atol=1e-3 * 300.0)
+
+    @given(SEEDS, st.sampled_from(KINDS), st.integers(1, 2), st.integers(1, 8))
+    @settings(max_examples=40, deadline=None)
+    def test_chi2_never_rises(self, seed, kind, n_sources, max_iterations):
+        """From anywhere, converged or not."""
+        array = array_of(kind, seed)
+        rng = np.random.default_rng(seed)
+        p, m = random_sources(rng, 6, n_sources)
+        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        q = rng.normal(size=(6, n_sources, 4))
+        q /= np.linalg.norm(q, axis=-1, keepdims=True)
+        mu = problem.scaled_moment(q, 300.0 * rng.normal(size=m.shape))
+        before = chi2_at(problem, y, q, mu)
+        fits = refine(problem, y, q, mu, max_iterations=max_iterations)
+        after = chi2_at(problem, y, fits.q, fits.mu)
+        assert (after <= before * (1.0 + 1e-12)).all()
+        assert_allclose(fits.chi2[fits.converged], after[fits.converged], rtol=1e-7, atol=1e-6)
+
+    def test_iterations_that_run_out_are_no_optimum(self):
+        array = array_of("vector", 22)
+        rng = np.random.default_rng(22)
+        p, m = random_sources(rng, 5, 1)
+        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        fits = refined_from(problem, y, 2.0 * p, m, max_iterations=1)
+        assert np.isinf(fits.chi2).all()
+        assert not fits.converged.any()
+        assert (fits.iterations == 1).all()
+
+    def test_starts_are_left_as_they_are(self):
+        array = array_of("vector", 23)
+        rng = np.random.default_rng(23)
+        p, m = random_sources(rng, 2, 1)
+        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        q = problem.homogeneous(1.2 * p)
+        mu = problem.scaled_moment(q, m)
+        before = q.copy(), mu.copy()
+        refine(problem, y, q, mu)
+        assert np.array_equal(q, before[0])
+        assert np.array_equal(mu, before[1])
+
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_a_batch_gives_what_single_fits_give(self, kind):
+        array = array_of(kind, 24)
+        rng = np.random.default_rng(24)
+        p, m = random_sources(rng, 6, 2)
+        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        start = p + 0.1 * rng.normal(size=p.shape)
+        together = refined_from(problem, y, start, m)
+        for i in range(6):
+            alone = refined_from(problem.rows(np.array([i])), y[i : i + 1], start[i : i + 1], m[i : i + 1])
+            assert_allclose(alone.chi2[0], together.chi2[i], rtol=1e-8)
+            assert_allclose(alone.q[0], together.q[i], atol=1e-7)
+
+    def test_order_of_the_fits_does_not_matter(self):
+        array = array_of("mixed in ambient", 25)
+        rng = np.random.default_rng(25)
+        p, m = random_sources(rng, 6, 2)
+        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        order = rng.permutation(6)
+        one, other = refined_from(problem, y, p, m), refined_from(problem.rows(order), y[order], p[order], m[order])
+        assert_allclose(other.chi2, one.chi2[order], rtol=1e-8)
+
+
+class TestRotation:
+    """Turning the array, the ambient field and the source together changes nothing but the frame."""
+
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_equivariance(self, kind):
+        array = array_of(kind, 31)
+        rng = np.random.default_rng(31)
+        p, m = random_sources(rng, 3, 2)
+        readings = noisy_readings(array, p, m, rng)
+        turn = Rotation.from_rotvec([0.4, -1.1, 2.0])
+        turned = replace(
+            array,
+            sensors=tuple(
+                replace(
+                    s,
+                    position_m=tuple(turn.apply(s.position_m)),
+                    rotation_xyzw=tuple((turn * Rotation.from_quat(s.rotation_xyzw)).as_quat()),
+                )
+                for s in array.sensors
+            ),
+            ambient_T=None if array.ambient_T is None else tuple(turn.apply(array.ambient_T)),
+        )
+        problem, y = problem_of(array, readings)
+        other, other_y = problem_of(turned, readings)
+        fits = refined_from(problem, y, 1.02 * p, m)
+        again = refined_from(other, other_y, p @ turn.as_matrix().T * 1.02, m @ turn.as_matrix().T)
+        assert_allclose(again.chi2, fits.chi2, rtol=1e-5)
+        assert_allclose(other.position(again.q), problem.position(fits.q) @ turn.as_matrix().T, rtol=1e-4, atol=1e-4)
+
+
+class TestHeldRange:
+    @pytest.mark.parametrize("kind", ["vector", "scalar in ambient"])
+    def test_without_the_third_tangent_the_range_stays(self, kind):
+        array = array_of(kind, 41, 16)
+        rng = np.random.default_rng(41)
+        p, m = random_sources(rng, 4, 2)
+        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        free = np.ones((2, 3), dtype=bool)
+        free[0, 2] = False
+        start = 1.05 * p + 0.05 * rng.normal(size=p.shape)
+        held = refined_from(problem, y, start, m, free=free)
+        loose = refined_from(problem, y, start, m)
+        before = np.linalg.norm(start - problem.centroid, axis=-1)
+        after = np.linalg.norm(problem.position(held.q) - problem.centroid, axis=-1)
+        assert_allclose(after[:, 0], before[:, 0], rtol=1e-9)
+        assert (np.abs(after[:, 1] / before[:, 1] - 1.0) > 1e-4).all()
+        assert (held.chi2 > loose.chi2).all()
+
+
+class TestCovariance:
+    @pytest.mark.parametrize("kind", KINDS)
+    def test_one_source_against_the_information_of_the_measurement(self, kind):
+        array = array_of(kind, 51)
+        rng = np.random.default_rng(51)
+        p, m = random_sources(rng, 4, 1)
+        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        fits = refined_from(problem, y, p, m)
+        position, moment = problem.position(fits.q), problem.moment(fits.q, fits.mu)
+        information = DifferenceMeasurement.of(array).fisher_information(position[:, 0], moment[:, 0])
+        for found, expected in zip(covariances(problem, fits), np.linalg.inv(information), strict=True):
+            sigma = np.sqrt(np.diagonal(expected))
+            assert_allclose(found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-5)
+
+    @pytest.mark.parametrize("kind", ["vector", "scalar in ambient"])
+    def test_two_sources_against_differences_of_magpylib_fields(self, kind):
+        array = array_of(kind, 52, 18)
+        rng = np.random.default_rng(52)
+        p, m = random_sources(rng, 1, 2)
+        problem, _ = problem_of(array, noisy_readings(array, p, m, rng))
+        q = problem.homogeneous(p)
+        fits = JointFits(q, problem.scaled_moment(q, m), np.zeros(1), np.zeros(1, dtype=np.int64))
+        unit = np.tile(np.repeat([1.0, 300.0], 3), 2)
+
+        def residual(x):
+            states = (x * unit).reshape(-1, 2, 2, 3)
+            rows = [whitened_residuals(array, np.zeros(array.n_channels), s[:, 0], s[:, 1]) for s in states]
+            return np.reshape(rows, (*x.shape[:-1], -1))
+
+        truth = np.stack([p[0], m[0]], axis=1).ravel() / unit
+        jacobian = oracles.derivative(residual, truth, 0.05)
+        expected = np.linalg.inv(jacobian.T @ jacobian)
+        found = covariances(problem, fits)[0] / np.outer(unit, unit)
+        sigma = np.sqrt(np.diagonal(expected))
+        assert_allclose(found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-4)
+
+    @pytest.mark.parametrize("case", ["one by vector sensors", "two by vector sensors", "one by 12 scalar sensors"])
+    def test_scatter_of_the_fits(self, case):
+        """NEES of 200 fixes of strong sources, two-sided false-alarm rate 1e-4."""
+        array = scalar_cloud(53) if "scalar" in case else cube(2.0, noise_T=1e-10)
+        n_sources = 2 if "two" in case else 1
+        rng = np.random.default_rng(53)
+        p, m = (np.repeat(x, 200, axis=0) for x in random_sources(rng, 1, n_sources, 2.8, 3.5))
+        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        fits = refined_from(problem, y, p, m)
+        assert fits.converged.all()
+        error = np.concatenate([problem.position(fits.q) - p, problem.moment(fits.q, fits.mu) - m], axis=-1).reshape(
+            200, -1
+        )
+        nees = np.einsum("bi,bi->", error, np.linalg.solve(covariances(problem, fits), error[..., None])[..., 0])
+        low, high = chi2_distribution.ppf([0.5e-4, 1 - 0.5e-4], 6 * n_sources * 200)
+        assert low < nees < high
+
+    def test_chi2_of_the_fits(self):
+        """Sum of χ² of 200 fixes of two sources, 9 degrees of freedom each; two-sided false-alarm rate 1e-4."""
+        array = cube(2.0, noise_T=1e-10)
+        rng = np.random.default_rng(54)
+        p, m = random_sources(rng, 200, 2, 2.8, 3.5)
+        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        low, high = chi2_distribution.ppf([0.5e-4, 1 - 0.5e-4], (24 - 3 - 12) * 200)
+        assert low < refined_from(problem, y, p, m).chi2.sum() < high
+
+    def test_moduli_without_ambient_field_of_both_signs(self):
+        """The opposite moment is as good, with the same covariance up to the sign of the moment."""
+        array = scalar_cloud(55, ambient_T=None)
+        rng = np.random.default_rng(55)
+        p, m = random_sources(rng, 2, 1)
+        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        assert problem.is_even
+        both = refined_from(problem, y, p, m).with_opposite_moments(2)
+        assert_allclose(chi2_at(problem.rows(np.array([0, 0, 1, 1])), y[[0, 0, 1, 1]], both.q, both.mu), both.chi2)
+        found = covariances(problem.rows(np.array([0, 0, 1, 1])), both)
+        sign = np.repeat([1.0, -1.0], 3)
+        assert_allclose(found[1::2], found[::2] * np.outer(sign, sign), rtol=1e-6)
+
+    def test_a_source_that_is_not_determined_has_none(self):
+        """Three differences of two sensors do not determine six unknowns."""
+        array = SensorArray(tetrahedron(1.5).sensors[:2])
+        p, m = random_sources(np.random.default_rng(0), 1, 1)
+        problem, _ = problem_of(array, np.zeros((1, 6)))
+        q = problem.homogeneous(p)
+        fits = JointFits(q, problem.scaled_moment(q, m), np.zeros(1), np.zeros(1, dtype=np.int64))
+        assert np.isnan(covariances(problem, fits)).all()
+
+
+class TestLocator:
+    """One source and vector sensors: the same as the compiled search has."""
+
+    @pytest.mark.parametrize("geometry", ["tetrahedron", "cube", "irregular"])
+    def test_same_solution(self, geometry):
+        array = {"tetrahedron": tetrahedron(1.5), "cube": cube(1.0), "irregular": random_array(61, 7)}[geometry]
+        rng = np.random.default_rng(61)
+        p, m = random_sources(rng, 12, 1)
+        readings = noisy_readings(array, p, m, rng)
+        solutions = [fix.solutions[0] for fix in Locator(array).fit_rows(readings)]
+        problem, y = problem_of(array, readings)
+        start = np.stack([s.position_m for s in solutions])[:, None]
+        moment = np.stack([s.moment_Am2 for s in solutions])[:, None]
+        fits = refined_from(problem, y, 1.01 * start, moment)
+        covariance = covariances(problem, fits)
+        ends = ranges_within(problem, y, fits, 0, covariance)
+        for i, s in enumerate(solutions):
+            sigma = np.sqrt(np.diagonal(s.covariance))
+            assert fits.chi2[i] == pytest.approx(s.chi2, rel=1e-6, abs=1e-6)
+            assert (np.abs(problem.position(fits.q)[i, 0] - s.position_m) < 0.01 * sigma[:3]).all()
+            assert (np.abs(problem.moment(fits.q, fits.mu)[i, 0] - s.moment_Am2) < 0.01 * sigma[3:]).all()
+            assert_allclose(covariance[i] / np.outer(sigma, sigma), s.covariance / np.outer(sigma, sigma), atol=0.02)
+            low, high = s.range_interval95_m[0]
+            assert_allclose(ends[i], [low, np.inf if high is None else high], rtol=0.01)

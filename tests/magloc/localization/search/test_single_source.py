@@ -1,0 +1,484 @@
+"""Fixes from one set of readings.
+
+| what | who checks it |
+|---|---|
+| the optimum | scipy.optimize.least_squares from the truth; noise-free readings from magpylib |
+| compiled search | magloc.measurement.whitened, its readable twin |
+| covariance | DifferenceMeasurement.fisher_information; scatter of the fixes |
+| range interval | scipy's minimiser of χ² on spheres |
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.optimize
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.stats import chi2 as chi2_distribution
+
+from arrays.array import SensorArray
+from arrays.differences import decorrelated_differences
+from arrays.geometries import axial, cross, square, tetrahedron
+from arrays.noise import proportional_noise
+from arrays.sensor import Sensor
+from arrays.whitening import whitening
+from magloc.chi_square import RISE_95
+from magloc.localization.fit import variable_projection_compiled
+from magloc.localization.fit.prior import Knowledge
+from magloc.localization.search.candidates import candidate_positions
+from magloc.localization.search.single_source import Locator
+from magloc.measurement import whitened_compiled
+from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
+from magloc.measurement.whitened import SeparableProblem
+from tests import oracles
+from tests.arrays.test_differences import random_array
+
+SEEDS = st.integers(0, 2**32 - 1)
+TETRAHEDRON = tetrahedron(1.5, noise_T=1e-9)
+
+
+def random_sources(rng, n, nearest, farthest, moment=300.0):
+    direction, m = rng.normal(size=(2, n, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    m *= moment / np.linalg.norm(m, axis=1, keepdims=True)
+    return direction * rng.uniform(nearest, farthest, (n, 1)), m
+
+
+def noisy_readings(array, position, moment, rng):
+    clean = predicted_channels(array, position, moment) + array.channel_offset_T
+    return clean + rng.normal(size=clean.shape) * array.channel_noise_T
+
+
+def scipy_chi2(array, readings, position, moment):
+    """χ² of scipy's local optimum from a start."""
+    available = np.isfinite(readings)
+    measurement = DifferenceMeasurement(array, decorrelated_differences(array, available))
+    z, sigma = measurement.measured(readings), np.sqrt(measurement.variance)
+    size = np.linalg.norm(moment)
+
+    def residual(x):
+        return (measurement.predicted(x[:3], size * x[3:]) - z) / sigma
+
+    found = scipy.optimize.least_squares(
+        residual, np.concatenate([position, moment / size]), x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12
+    )
+    return 2.0 * found.cost
+
+
+def refined(problem, q, y, mu, max_iterations=100):
+    """The compiled refinement of q (in place) without known optima: χ², linearisations, how it ended."""
+    common = np.ascontiguousarray(problem.whitening.basis.T)
+    return variable_projection_compiled.refine(
+        q,
+        y,
+        problem.sensors,
+        problem.channel_sensor,
+        problem.gain,
+        common,
+        problem.whitening.shrinkage,
+        3,
+        variable_projection_compiled.OPTIMUM_TOLERANCE,
+        max_iterations,
+        np.empty((1, 4)),
+        np.empty(1),
+        0,
+        mu,
+    )
+
+
+class TestNoiseFreeReadings:
+    """The true source comes back, whatever the array's sensors, poses, gains and offsets."""
+
+    @given(SEEDS, st.integers(4, 12))
+    @settings(max_examples=25, deadline=None)
+    def test_any_array(self, seed, n):
+        array = random_array(seed, n)
+        p, m = random_sources(np.random.default_rng(seed), 1, 3.0, 8.0, moment=1e4)
+        readings = predicted_channels(array, p[0], m[0]) + array.channel_offset_T
+        found = Locator(array).fit(readings).solutions
+        distance = [np.linalg.norm(s.position_m - p[0]) for s in found]
+        best = found[int(np.argmin(distance))]
+        assert_allclose(best.position_m, p[0], atol=1e-4 * np.linalg.norm(p))
+        assert_allclose(best.moment_Am2, m[0], atol=1e-3 * np.linalg.norm(m))
+        assert best.chi2 < 1e-6
+
+    def test_readings_that_magpylib_made(self):
+        p, m = np.array([3.0, -2.0, 1.0]), np.array([100.0, 50.0, -80.0])
+        readings = oracles.magpylib_field(TETRAHEDRON.positions, p, m).ravel()
+        best = Locator(TETRAHEDRON).fit(readings).solutions[0]
+        assert_allclose(best.position_m, p, rtol=1e-6)
+        assert_allclose(best.moment_Am2, m, rtol=1e-6)
+
+    def test_a_uniform_field_adds_nothing(self):
+        p, m = np.array([3.0, -2.0, 1.0]), np.array([100.0, 50.0, -80.0])
+        readings = predicted_channels(TETRAHEDRON, p, m)
+        uniform = np.tile([2e-5, 1e-6, 4.5e-5], 4)
+        fits = Locator(TETRAHEDRON).fit_rows([readings, readings + uniform])
+        assert_allclose(fits[1].solutions[0].position_m, fits[0].solutions[0].position_m, rtol=1e-6)
+
+
+class TestBestFit:
+    """The first solution is the maximum of the likelihood: nothing that scipy finds from the truth is better."""
+
+    @pytest.mark.parametrize("case", ["tetrahedron", "irregular", "square", "common field", "proportional noise"])
+    def test_no_worse_than_scipy_from_the_truth(self, case):
+        array, nearest, farthest = {
+            "tetrahedron": (TETRAHEDRON, 1.2, 10.0),
+            "irregular": (random_array(7, 7), 3.0, 12.0),
+            "square": (square(1.0, noise_T=1e-9), 1.0, 6.0),
+            "common field": (SensorArray(TETRAHEDRON.sensors, common_field_T=2e-9), 1.2, 10.0),
+            "proportional noise": (SensorArray(TETRAHEDRON.sensors, noise_fraction=0.01), 1.2, 10.0),
+        }[case]
+        rng = np.random.default_rng(11)
+        p, m = random_sources(rng, 60, nearest, farthest)
+        readings = noisy_readings(array, p, m, rng)
+        worse = []
+        for i, fix in enumerate(Locator(array).fit_rows(readings)):
+            row = array
+            if case == "proportional noise":  # scipy gets the noise of this row as the sensors' own
+                noise = proportional_noise(array, readings[i])[::3]
+                row = SensorArray(
+                    tuple(
+                        Sensor(id=s.id, kind=s.kind, position_m=s.position_m, noise_T=float(sigma))
+                        for s, sigma in zip(array.sensors, noise, strict=True)
+                    )
+                )
+            if fix.solutions[0].chi2 > scipy_chi2(row, readings[i], p[i], m[i]) + 0.05:
+                worse.append(i)
+        assert worse == []
+
+    def test_chi_square_of_good_fits(self):
+        """Sum of 200 χ² of 3 degrees of freedom at high signal; two-sided false-alarm rate 1e-4."""
+        rng = np.random.default_rng(2)
+        p, m = random_sources(rng, 200, 1.5, 4.0, moment=1000.0)
+        fixes = Locator(TETRAHEDRON).fit_rows(noisy_readings(TETRAHEDRON, p, m, rng))
+        assert {fix.solutions[0].dof for fix in fixes} == {3}
+        low, high = chi2_distribution.ppf([0.5e-4, 1 - 0.5e-4], 3 * 200)
+        assert low < sum(fix.solutions[0].chi2 for fix in fixes) < high
+
+    def test_reported_chi2_is_that_of_the_decorrelated_differences(self):
+        rng = np.random.default_rng(3)
+        array = random_array(8, 6)
+        p, m = random_sources(rng, 1, 4.0, 6.0)
+        readings = noisy_readings(array, p, m, rng)[0]
+        measurement = DifferenceMeasurement.of(array)
+        for s in Locator(array).fit(readings).solutions:
+            residual = measurement.measured(readings) - measurement.predicted(s.position_m, s.moment_Am2)
+            assert s.chi2 == pytest.approx(float(np.sum(residual**2 / measurement.variance)), rel=1e-6)
+
+
+class TestSolutionsAreRanked:
+    def test_best_first_and_within_20(self):
+        rng = np.random.default_rng(4)
+        p, m = random_sources(rng, 40, 6.0, 12.0)
+        fixes = Locator(TETRAHEDRON).fit_rows(noisy_readings(TETRAHEDRON, p, m, rng))
+        several = [[s.chi2 for s in fix.solutions] for fix in fixes if len(fix.solutions) > 1]
+        assert several, "weak signals have more than one solution"
+        for chi2 in several:
+            assert chi2 == sorted(chi2)
+            assert chi2[-1] <= chi2[0] + 20.0
+
+    def test_weak_mirror_solution_is_listed(self):
+        """The truth's own basin is among the solutions even where another one fits better."""
+        rng = np.random.default_rng(5)
+        p, m = random_sources(rng, 100, 8.0, 12.0)
+        readings = noisy_readings(TETRAHEDRON, p, m, rng)
+        mirrored = 0
+        for i, fix in enumerate(Locator(TETRAHEDRON).fit_rows(readings)):
+            local = scipy_chi2(TETRAHEDRON, readings[i], p[i], m[i])
+            assert any(abs(s.chi2 - local) < 0.05 or s.chi2 < local for s in fix.solutions)
+            mirrored += fix.solutions[0].chi2 < local - 0.05
+        assert mirrored < 100
+
+
+class TestUncertainty:
+    def test_covariance_is_the_inverse_information(self):
+        rng = np.random.default_rng(6)
+        p, m = random_sources(rng, 5, 2.0, 6.0)
+        for fix in Locator(TETRAHEDRON).fit_rows(noisy_readings(TETRAHEDRON, p, m, rng)):
+            s = fix.solutions[0]
+            information = DifferenceMeasurement.of(TETRAHEDRON).fisher_information(s.position_m, s.moment_Am2)
+            sigma = np.sqrt(np.diagonal(s.covariance))
+            assert_allclose(
+                np.linalg.inv(information) / np.outer(sigma, sigma), s.covariance / np.outer(sigma, sigma), atol=1e-5
+            )
+
+    def test_scatter_of_fixes(self):
+        """NEES of 300 fixes of one strong source, two-sided false-alarm rate 1e-4."""
+        rng = np.random.default_rng(7)
+        p, m = np.array([2.0, 0.5, 0.3]), np.array([300.0, 200.0, -100.0])
+        readings = noisy_readings(TETRAHEDRON, np.tile(p, (300, 1)), np.tile(m, (300, 1)), rng)
+        nees = 0.0
+        for fix in Locator(TETRAHEDRON).fit_rows(readings):
+            s = fix.solutions[0]
+            error = np.concatenate([s.position_m - p, s.moment_Am2 - m])
+            nees += error @ np.linalg.solve(s.covariance, error)
+        low, high = chi2_distribution.ppf([0.5e-4, 1 - 0.5e-4], 6 * 300)
+        assert low < nees < high
+
+    def test_range_interval_against_scipy_on_spheres(self):
+        rng = np.random.default_rng(8)
+        p, m = random_sources(rng, 4, 3.0, 6.0)
+        readings = noisy_readings(TETRAHEDRON, p, m, rng)
+        problem = SeparableProblem.of(TETRAHEDRON, whitening(TETRAHEDRON))
+        for row, fix in zip(readings, Locator(TETRAHEDRON).fit_rows(readings), strict=True):
+            y = problem.whitening.apply(row)
+            s = fix.solutions[0]
+            radius = np.linalg.norm(s.position_m - problem.centroid)
+            for end in s.range_interval95_m[0]:
+                if end is None:
+                    continue
+
+                def chi2(angles, end=end, y=y):
+                    theta, phi = angles
+                    u = [np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)]
+                    return float(problem.projected_chi2(problem.homogeneous(problem.centroid + end * np.array(u)), y))
+
+                u = (s.position_m - problem.centroid) / radius
+                start = [np.arccos(u[2]), np.arctan2(u[1], u[0])]
+                profile = scipy.optimize.minimize(chi2, start, method="Nelder-Mead", options={"xatol": 1e-7}).fun
+                assert profile - s.chi2 == pytest.approx(RISE_95, abs=0.05)
+
+    def test_far_sources_have_no_observable_range(self):
+        rng = np.random.default_rng(9)
+        p, m = random_sources(rng, 20, 20.0, 30.0, moment=3000.0)
+        for fix in Locator(TETRAHEDRON).fit_rows(noisy_readings(TETRAHEDRON, p, m, rng)):
+            for s in fix.solutions:
+                low, high = s.range_interval95_m[0]
+                assert s.range_observable == (high is not None and low > 0 and high <= 2 * low)
+        assert not any(s.range_observable for s in fix.solutions)
+
+    def test_covariance_scales_with_noise(self):
+        p, m = np.array([3.0, 1.0, 0.5]), np.array([100.0, 200.0, 50.0])
+        covariances = []
+        for noise in (1e-9, 3e-9):
+            array = tetrahedron(1.5, noise_T=noise)
+            covariances.append(Locator(array).fit(predicted_channels(array, p, m)).solutions[0].covariance)
+        assert_allclose(covariances[1], 9.0 * covariances[0], rtol=1e-5)
+
+
+class TestMissingReadings:
+    def test_the_rest_of_the_row_is_used(self):
+        array = random_array(1, 6)
+        rng = np.random.default_rng(10)
+        p, m = random_sources(rng, 3, 3.0, 5.0, moment=1e4)
+        readings = noisy_readings(array, p, m, rng)
+        readings[0, 4] = readings[1, [0, 7, 9]] = np.nan
+        fixes = Locator(array).fit_rows(readings)
+        assert [fix.solutions[0].dof for fix in fixes] == [8, 6, 9]
+        for i in range(3):
+            assert fixes[i].solutions[0].chi2 < scipy_chi2(array, readings[i], p[i], m[i]) + 0.05
+
+    def test_too_few_are_a_reason_and_the_others_still_come_out(self):
+        readings = np.stack([predicted_channels(TETRAHEDRON, [3, 1, 0], [0, 0, 100])] * 2)
+        readings[0, 2:9] = np.nan
+        fixes = Locator(TETRAHEDRON).fit_rows(readings)
+        assert fixes[0].solutions == ()
+        assert "6 are needed" in fixes[0].reason
+        assert fixes[1].solutions
+
+
+class TestWhatCannotBeSolved:
+    def test_no_signal(self):
+        fix = Locator(TETRAHEDRON).fit(np.tile([2e-5, 1e-6, 4.5e-5], 4))
+        assert fix.solutions == ()
+        assert "no signal" in fix.reason
+
+    def test_two_sensors_do_not_determine_a_source(self):
+        array = axial(1.0, noise_T=1e-9)
+        fix = Locator(array).fit(predicted_channels(array, [3, 1, 0], [0, 0, 100]))
+        assert fix.solutions == ()
+        assert "3 independent differences" in fix.reason
+
+    def test_iterations_that_run_out_are_not_a_fix(self):
+        rng = np.random.default_rng(0)
+        p, m = random_sources(rng, 1, 4.0, 6.0)
+        fix = Locator(TETRAHEDRON, max_iterations=1).fit(noisy_readings(TETRAHEDRON, p, m, rng)[0])
+        assert fix.solutions == ()
+        assert fix.failed_starts > 0
+        assert "did not converge" in fix.reason
+
+    def test_scalar_sensors_are_refused(self):
+        with pytest.raises(ValueError, match="vector sensors only"):
+            Locator(tetrahedron(1.5, kind="scalar"))
+
+    def test_wrong_shape_is_named(self):
+        with pytest.raises(ValueError, match=r"shape \(n, 12\)"):
+            Locator(TETRAHEDRON).fit(np.zeros(9))
+
+
+class TestKnowledge:
+    """What is known beforehand removes solutions, and only those that contradict it."""
+
+    rng = np.random.default_rng(14)
+    p, m = random_sources(rng, 60, 6.0, 12.0)
+    readings = noisy_readings(TETRAHEDRON, p, m, rng)
+
+    def test_half_space(self):
+        everything = Locator(TETRAHEDRON).fit_rows(self.readings)
+        above = Locator(TETRAHEDRON, knowledge=Knowledge(low_m=(-np.inf, -np.inf, 0.0))).fit_rows(self.readings)
+        assert any(s.position_m[2] < 0 for fix in everything for s in fix.solutions)
+        assert all(s.position_m[2] >= 0 for fix in above for s in fix.solutions)
+        for free, bound in zip(everything, above, strict=True):
+            for s in (s for s in free.solutions if s.position_m[2] >= 0):
+                assert any(np.allclose(s.position_m, other.position_m, rtol=1e-3) for other in bound.solutions)
+
+    def test_a_worse_solution_comes_up_when_better_ones_are_ruled_out(self):
+        for free, low in zip(self.readings, np.sign(self.p[:, 0]), strict=True):
+            known = Knowledge((0.0, -np.inf, -np.inf)) if low > 0 else Knowledge(high_m=(0.0, np.inf, np.inf))
+            for s in Locator(TETRAHEDRON, knowledge=known).fit(free).solutions:
+                assert s.position_m[0] * low >= 0
+
+    def test_largest_moment(self):
+        fixes = Locator(TETRAHEDRON, knowledge=Knowledge(largest_moment_Am2=400.0)).fit_rows(self.readings)
+        solved = [s for fix in fixes for s in fix.solutions]
+        assert solved
+        assert all(np.linalg.norm(s.moment_Am2) <= 400.0 for s in solved)
+        assert all("known region" in fix.reason for fix in fixes if not fix.solutions)
+
+    def test_bounds_that_leave_nothing(self):
+        with pytest.raises(ValueError, match="low_m must be below high_m"):
+            Knowledge((1.0, 0.0, 0.0), (0.0, 1.0, 1.0))
+        with pytest.raises(ValueError, match="must be positive"):
+            Knowledge(largest_moment_Am2=0.0)
+        with pytest.raises(ValueError, match="leaves nothing"):
+            Locator(TETRAHEDRON, knowledge=Knowledge(low_m=(1e6, 1e6, 1e6)))
+
+
+class TestFitFrom:
+    def test_every_start_leads_to_the_best_fit(self):
+        p, m = np.array([5.0, 0.0, 0.306]), np.array([0.0, 0.0, 100.0])
+        readings = predicted_channels(TETRAHEDRON, p, m)
+        starts = np.random.default_rng(0).uniform(-20, 20, (50, 3))
+        ends = Locator(TETRAHEDRON).fit_from(readings, starts)
+        assert_allclose(ends.position_m, np.tile(p, (50, 1)), atol=1e-4)
+        assert (ends.linearisations > 0).all()
+
+
+class TestIndependence:
+    """Rows, blocks and threads do not see each other."""
+
+    def test_of_other_rows_and_of_threads(self):
+        import numba
+
+        rng = np.random.default_rng(12)
+        p, m = random_sources(rng, 300, 2.0, 10.0)
+        readings = noisy_readings(TETRAHEDRON, p, m, rng)
+        locator = Locator(TETRAHEDRON)
+        together = locator.fit_rows(readings)
+        threads = numba.get_num_threads()
+        numba.set_num_threads(1)
+        try:
+            alone = [locator.fit(row) for row in readings[::50]]
+        finally:
+            numba.set_num_threads(threads)
+        for one, other in zip(together[::50], alone, strict=True):
+            assert len(one.solutions) == len(other.solutions)
+            # BLAS may sum the scores of one row and of many in another order.
+            assert_allclose(one.solutions[0].position_m, other.solutions[0].position_m, rtol=1e-9)
+
+    def test_rotation_of_the_frame(self):
+        rng = np.random.default_rng(13)
+        p, m = random_sources(rng, 1, 3.0, 6.0)
+        R = np.linalg.qr(rng.normal(size=(3, 3))).Q
+        R *= np.linalg.det(R)
+        readings = noisy_readings(TETRAHEDRON, p, m, rng)[0]
+        turned = SensorArray(
+            tuple(
+                Sensor(id=s.id, kind=s.kind, position_m=R @ s.position_m, noise_T=s.noise_T)
+                for s in TETRAHEDRON.sensors
+            )
+        )
+        one = Locator(TETRAHEDRON).fit(readings).solutions[0]
+        other = Locator(turned).fit((readings.reshape(4, 3) @ R.T).ravel()).solutions[0]
+        assert other.chi2 == pytest.approx(one.chi2, rel=1e-6)
+        assert_allclose(other.position_m, R @ one.position_m, rtol=1e-4, atol=1e-4)
+
+
+class TestReadableTwin:
+    """magloc.localization.search.single_source_compiled against magloc.measurement.whitened."""
+
+    problem = SeparableProblem.of(random_array(2, 6), whitening(random_array(2, 6)))
+
+    def common(self):
+        return np.ascontiguousarray(self.problem.whitening.basis.T), self.problem.whitening.shrinkage
+
+    @given(SEEDS)
+    @settings(max_examples=25, deadline=None)
+    def test_basis_and_cost(self, seed):
+        rng = np.random.default_rng(seed)
+        q = rng.normal(size=4)
+        q /= np.linalg.norm(q)
+        y = self.problem.whitening.apply(1e-9 * rng.normal(size=18))
+        basis = np.empty((3, 18))
+        whitened_compiled.unit_basis(
+            q, self.problem.sensors, self.problem.channel_sensor, self.problem.gain, *self.common(), basis
+        )
+        expected = self.problem.unit_basis(q).T
+        assert_allclose(basis, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
+        bases = np.empty((1, 3, 18))
+        whitened_compiled.candidate_bases(
+            0, 1, q[None], self.problem.sensors, self.problem.channel_sensor, self.problem.gain, *self.common(), bases
+        )
+        assert y @ y - np.sum((bases[0] @ y) ** 2) == pytest.approx(
+            float(self.problem.projected_chi2(q, y)), rel=1e-7, abs=1e-9
+        )
+
+    @given(SEEDS)
+    @settings(max_examples=25, deadline=None)
+    def test_homogeneous_jacobian(self, seed):
+        rng = np.random.default_rng(seed)
+        q, mu = rng.normal(size=4), rng.normal(size=3)
+        jacobian = np.empty((4, 18))
+        whitened_compiled.homogeneous_jacobian(
+            q, mu, self.problem.sensors, self.problem.channel_sensor, self.problem.gain, jacobian
+        )
+        free = jacobian.T - (self.problem.whitening.basis @ (self.problem.whitening.basis.T @ jacobian.T))
+        scale = np.abs(self.problem.unit_basis(q) @ mu).max()
+        expected = oracles.derivative(lambda x: self.problem.unit_basis(x) @ mu / scale, q, 1e-2, 1e-9)
+        assert_allclose(free / scale, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
+
+    @given(SEEDS)
+    @settings(max_examples=25, deadline=None)
+    def test_every_refinement_ends_at_a_stationary_point(self, seed):
+        rng = np.random.default_rng(seed)
+        array = random_array(2, 6)
+        p, m = random_sources(rng, 1, 3.0, 6.0, moment=3000.0)
+        y = self.problem.whitening.apply(noisy_readings(array, p, m, rng)[0] - array.channel_offset_T)
+        q = self.problem.homogeneous(p[0] + 0.1 * rng.normal(size=3))
+        before = float(self.problem.projected_chi2(q, y))
+        mu = np.empty(3)
+        chi2, _, end = refined(self.problem, q, y, mu)
+        assert end == variable_projection_compiled.CONVERGED
+        assert chi2 <= before
+        assert chi2 == pytest.approx(float(self.problem.projected_chi2(q, y)), rel=1e-9)
+        assert_allclose(mu, self.problem.best_moment(q, y), rtol=1e-6, atol=1e-9 * np.linalg.norm(mu))
+        for tangent in np.linalg.svd(q[None])[2][1:]:
+            step = 1e-4
+            around = [float(self.problem.projected_chi2(q + s * tangent, y)) for s in (-step, step)]
+            curvature = (sum(around) - 2 * chi2) / step**2
+            gradient = (around[1] - around[0]) / (2 * step)
+            assert abs(gradient) < 1e-3 * max(1.0, abs(curvature)) + 1e-6 * chi2 / step
+
+    def test_homogeneous_coordinates_return(self):
+        p = np.random.default_rng(0).normal(size=(5, 3)) * 10
+        assert_allclose(self.problem.position(self.problem.homogeneous(p)), p, rtol=1e-12)
+
+
+class TestCandidates:
+    def test_scale_with_the_array(self):
+        small, large = candidate_positions(cross(0.03)), candidate_positions(cross(30.0))
+        assert_allclose(1000.0 * small, large, rtol=1e-9, atol=1e-9)
+
+    def test_reach_the_sensors_of_a_large_array(self):
+        positions = np.stack(np.meshgrid(range(5), range(6), [0.0]), axis=-1).reshape(-1, 3) * 0.016
+        array = SensorArray(
+            tuple(Sensor(id=f"s{i}", kind="vector", position_m=p, noise_T=1e-8) for i, p in enumerate(positions))
+        )
+        rng = np.random.default_rng(0)
+        p = np.column_stack([rng.uniform(0, 0.064, 50), rng.uniform(0, 0.08, 50), rng.uniform(0.005, 0.04, 50)])
+        m = rng.normal(size=(50, 3))
+        for source, fix in zip(p, Locator(array).fit_rows(noisy_readings(array, p, m, rng)), strict=True):
+            assert np.linalg.norm(fix.solutions[0].position_m - source) < 1e-3

@@ -1,0 +1,351 @@
+"""Fixes that a bad sensor does not ruin.
+
+| what | who checks it |
+|---|---|
+| breakdown | fixes by the sensors that are left, the bad one being known |
+| false drops | binomial distribution |
+| weighted problem | whitening of an array whose sensors have that noise |
+| recordings | positions that the robot reports |
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.stats import binom
+from scipy.stats import chi2 as chi2_distribution
+
+from arrays.array import SensorArray
+from arrays.array_file import read_array
+from arrays.geometries import cube, tetrahedron
+from arrays.sensor import Sensor
+from magloc.fields import dipole
+from magloc.localization.fault_exclusion import robust_fixes, weighted
+from magloc.localization.locator import ExactLocator
+from magloc.localization.search.known_position import MomentLocator
+from magloc.localization.search.multi_source import SeveralLocator
+from magloc.localization.search.single_source import Locator
+from magloc.measurement.rows import joint_problem, whitenings_of
+from magloc.readings import read_readings, read_truth
+
+AMBIENT = np.array([2e-5, 0.0, 4.5e-5])
+NOISE = 1e-9
+CUBE = cube(1.0, "vector", NOISE)
+
+
+def random_sources(rng, n, nearest, farthest, modulus):
+    direction, m = rng.normal(size=(2, n, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    m *= modulus / np.linalg.norm(m, axis=1, keepdims=True)
+    return direction * rng.uniform(nearest, farthest, (n, 1)), m
+
+
+def readings_in_ambient_field(array, position, moment, rng):
+    """Noisy readings (n, C) of sources (n, 3), the ambient field included."""
+    fields = AMBIENT + dipole.field(array.positions, position[:, None], moment[:, None])
+    clean = array.readings_of(fields)
+    return clean + array.channel_noise_T * rng.normal(size=clean.shape)
+
+
+def position_errors(fixes, position):
+    found = [fix.solutions[0].position_m if fix.solutions else np.full(3, np.inf) for fix in fixes]
+    return np.linalg.norm(np.array(found) - position, axis=1)
+
+
+def rms(values):
+    return np.sqrt(np.mean(np.square(values)))
+
+
+def on_cube(n, seed):
+    """Readings (n, 24) of the cube, the sources' positions, and a random sensor for every row."""
+    rng = np.random.default_rng(seed)
+    position, moment = random_sources(rng, n, 1.5, 4.0, 200.0)
+    return readings_in_ambient_field(CUBE, position, moment, rng), position, rng.integers(8, size=n)
+
+
+def robust(array, readings):
+    return robust_fixes(array, Locator(array).fit_rows, readings)
+
+
+def spikes(readings, sigmas, seed=1):
+    return readings + sigmas * NOISE * np.random.default_rng(seed).normal(size=readings.shape)
+
+
+FAULTS = {
+    "dead": np.zeros_like,
+    "stuck": lambda r: np.roll(r, 1, axis=0),
+    "saturated": lambda r: np.full_like(r, 1e-4),
+    **{f"spikes of {k:g} σ": lambda r, k=k: spikes(r, k) for k in (3, 5, 8, 12, 20, 100, 1e3, 1e4, 1e6)},
+    **{f"one axis off by {k:g} σ": lambda r, k=k: r + k * NOISE * (np.arange(24) % 3 == 0) for k in (5, 10, 50, 1e4)},
+}
+GROSS = ("dead", "stuck", "saturated", "spikes of 100 σ", "spikes of 1e+06 σ", "one axis off by 10000 σ")
+WORST = "one axis off by 10 σ"
+
+
+def assert_breakdown(fault, n, seed):
+    clean, position, which = on_cube(n, seed)
+    bad = CUBE.channel_sensor == which[:, None]
+    fixes = robust(CUBE, np.where(bad, FAULTS[fault](clean), clean))
+    error = position_errors(fixes, position)
+    remaining = position_errors(Locator(CUBE).fit_rows(np.where(bad, np.nan, clean)), position)
+    assert np.median(error) <= 1.5 * np.median(remaining)
+    assert rms(error) <= 1.5 * rms(remaining)
+    if fault in GROSS:
+        dropped = np.array([bool(fix.dropped) for fix in fixes])
+        for fix, sensor in zip(fixes, which, strict=True):
+            # A spike that a slightly different dipole explains is no contradiction.
+            best = fix.solutions[0]
+            credible = not fix.dropped and best.chi2 < chi2_distribution.ppf(0.999, best.dof)
+            assert credible or fix.dropped == (CUBE.ids[sensor],)
+        # Measured: one row of 200 with spikes of 100 σ, none with other faults. Its nearest sensor is off by 58 σ, less
+        # than 0.1 % of what it reads; χ² is 28 of 15, and the error 2.2 times that of the remaining seven.
+        assert np.mean(~dropped) <= (0.005 if fault == "spikes of 100 σ" else 0.0)
+        assert_allclose(error[dropped], remaining[dropped], rtol=1e-3, atol=1e-6)
+
+
+class TestBreakdown:
+    """One of eight sensors is arbitrary: the error stays within 1.5 times that of the remaining seven."""
+
+    @pytest.mark.parametrize("fault", ["dead", "stuck", "saturated", "spikes of 1e+06 σ", WORST])
+    def test_one_of_eight(self, fault):
+        assert_breakdown(fault, 20 if fault in GROSS else 300, seed=0)
+
+    @pytest.mark.slow
+    @pytest.mark.parametrize("fault", FAULTS)
+    def test_one_of_eight_in_many_rows(self, fault):
+        assert_breakdown(fault, 200 if fault in GROSS else 1500, seed=1)
+
+    @pytest.mark.parametrize("fault", ["dead", "saturated", "spikes of 1000 σ"])
+    def test_two_of_eight(self, fault):
+        """Gross faults of two sensors at once are both found."""
+        clean, position, first = on_cube(15, seed=2)
+        second = (first + np.random.default_rng(3).integers(1, 8, size=len(first))) % 8
+        owner = CUBE.channel_sensor
+        bad = (owner == first[:, None]) | (owner == second[:, None])
+        fixes = robust(CUBE, np.where(bad, FAULTS[fault](clean), clean))
+        error = position_errors(fixes, position)
+        remaining = position_errors(Locator(CUBE).fit_rows(np.where(bad, np.nan, clean)), position)
+        expected = [{CUBE.ids[a], CUBE.ids[b]} for a, b in zip(first, second, strict=True)]
+        assert [set(fix.dropped) for fix in fixes] == expected
+        assert_allclose(error, remaining, rtol=1e-3, atol=1e-6)
+
+    def test_with_missing_readings(self):
+        """A sensor is silent, another one is wrong."""
+        clean, position, which = on_cube(25, seed=4)
+        owner = CUBE.channel_sensor
+        missing = owner == ((which + 3) % 8)[:, None]
+        missing[::2, 0] = True
+        bad = owner == which[:, None]
+        readings = np.where(missing, np.nan, np.where(bad, 0.0, clean))
+        fixes = robust(CUBE, readings)
+        remaining = position_errors(Locator(CUBE).fit_rows(np.where(bad, np.nan, readings)), position)
+        assert [fix.dropped for fix in fixes] == [(CUBE.ids[sensor],) for sensor in which]
+        assert_allclose(position_errors(fixes, position), remaining, rtol=1e-3, atol=1e-6)
+
+
+class TestGoodSensors:
+    """Nothing happens where no sensor contradicts the others."""
+
+    @pytest.mark.parametrize("n", [3000, pytest.param(30_000, marks=pytest.mark.slow)])
+    def test_rows_without_a_bad_sensor_are_those_of_the_plain_fit(self, n):
+        """Sensors are dropped from at most a thousandth of the rows; a false alarm in a thousand seeds."""
+        clean, _, _ = on_cube(n, seed=5)
+        plain = Locator(CUBE).fit_rows(clean)
+        fixes = robust_fixes(CUBE, lambda readings, ambient: plain if len(readings) == n else alone(readings), clean)
+        dropped = [bool(fix.dropped) for fix in fixes]
+        assert sum(dropped) <= binom.ppf(0.999, n, 1e-3)
+        assert all(fix is same for fix, same, out in zip(fixes, plain, dropped, strict=True) if not out)
+
+    @pytest.mark.parametrize("n", [40, pytest.param(400, marks=pytest.mark.slow)])
+    def test_too_small_noise_is_no_bad_sensor(self, n):
+        """Everything fits badly if the noise is five times what is stated: one row in thirty loses a sensor."""
+        rng = np.random.default_rng(6)
+        position, moment = random_sources(rng, n, 1.5, 4.0, 200.0)
+        readings = readings_in_ambient_field(cube(1.0, "vector", 5 * NOISE), position, moment, rng)
+        fixes = robust(CUBE, readings)
+        assert np.mean([bool(fix.dropped) for fix in fixes]) <= 0.05
+        plain = position_errors(Locator(CUBE).fit_rows(readings), position)
+        assert rms(position_errors(fixes, position)) <= 1.1 * rms(plain)
+
+    def test_too_few_sensors_to_tell(self):
+        """Three vector sensors are exactly determined: whatever they read, nothing contradicts."""
+        array = CUBE.subset(["s1", "s4", "s7"])
+        rng = np.random.default_rng(7)
+        position, moment = random_sources(rng, 10, 1.5, 4.0, 200.0)
+        readings = readings_in_ambient_field(array, position, moment, rng)
+        readings[:, :3] = 0.0
+        assert not any(fix.dropped for fix in robust(array, readings))
+
+    def test_four_sensors_keep_three(self):
+        """Any three of four vector sensors fit exactly: none of the four can be named."""
+        array = tetrahedron(1.5, "vector", NOISE)
+        rng = np.random.default_rng(8)
+        position, moment = random_sources(rng, 10, 2.0, 4.0, 300.0)
+        readings = readings_in_ambient_field(array, position, moment, rng)
+        readings[:, 3:6] = 0.0
+        for fix in robust(array, readings):
+            assert not fix.dropped
+
+    def test_no_signal(self):
+        (fix,) = robust(CUBE, np.tile(AMBIENT, 8)[None])
+        assert not fix.solutions
+        assert not fix.dropped
+        assert "no signal" in fix.reason
+
+    def test_progress_counts_all_rows(self):
+        counts: list[int] = []
+        clean, _, _ = on_cube(9, seed=9)
+        robust_fixes(CUBE, Locator(CUBE).fit_rows, clean, progress=counts.append)
+        assert sum(counts) == 9
+
+
+def alone(readings):
+    return Locator(CUBE).fit_rows(readings)
+
+
+def scattered_scalars(rng):
+    """Twelve scalar sensors within 1.5 m of the origin along every axis."""
+    places = rng.uniform(-1.5, 1.5, (12, 3))
+    sensors = [Sensor(f"t{i}", "scalar", tuple(place), 1e-11) for i, place in enumerate(places.tolist())]
+    return SensorArray(tuple(sensors), ambient_T=tuple(AMBIENT.tolist()))
+
+
+class TestOtherLocators:
+    """Whatever fixes the rows, a bad sensor is found."""
+
+    @pytest.mark.parametrize("reading_T", [0.0, 6e-5])
+    @pytest.mark.parametrize("n", [1, pytest.param(12, marks=pytest.mark.slow)])
+    def test_one_of_twelve_scalar_sensors(self, n, reading_T):
+        rng = np.random.default_rng(10)
+        array = scattered_scalars(rng)
+        position, moment = random_sources(rng, n, 2.8, 5.0, 300.0)
+        readings = readings_in_ambient_field(array, position, moment, rng)
+        which = rng.integers(12, size=n)
+        readings[np.arange(n), which] = reading_T
+        fixes = robust_fixes(array, ExactLocator(array).fit_rows, readings)
+        assert [fix.dropped for fix in fixes] == [(array.ids[sensor],) for sensor in which]
+        assert np.median(position_errors(fixes, position)) <= 1e-3
+        assert position_errors(fixes, position).max() <= 1e-2
+
+    def test_the_ambient_field_of_every_row_is_used(self):
+        rng = np.random.default_rng(11)
+        array = scattered_scalars(rng)
+        position, moment = random_sources(rng, 1, 2.8, 5.0, 300.0)
+        readings = readings_in_ambient_field(array, position, moment, rng)
+        readings[:, 5] = 0.0
+        fixes = robust_fixes(replace(array, ambient_T=None), ExactLocator(array).fit_rows, readings, AMBIENT[None])
+        assert [fix.dropped for fix in fixes] == [("t5",)]
+        assert position_errors(fixes, position).max() <= 1e-2
+
+    @pytest.mark.parametrize("fault", ["dead", pytest.param("spikes of 1000 σ", marks=pytest.mark.slow)])
+    def test_two_dipoles_and_one_of_sixteen_sensors(self, fault):
+        rng = np.random.default_rng(12)
+        grid = np.stack(np.meshgrid(*2 * [np.linspace(-1.0, 1.0, 4)]), axis=-1).reshape(-1, 2)
+        sensors = [Sensor(f"s{i:02d}", "vector", (x, y, 0.0), 5e-10) for i, (x, y) in enumerate(grid.tolist())]
+        array = SensorArray(tuple(sensors))
+        position = np.array([[-0.6, 0.1, -1.0], [0.7, -0.3, -1.3]])
+        moment = random_sources(rng, 2, 1.0, 1.0, 15.0)[1]
+        fields = AMBIENT + dipole.total_field(array.positions, position, moment)
+        clean = array.readings_of(fields) + 5e-10 * rng.normal(size=(2, 48))
+        which = rng.integers(16, size=2)
+        bad = array.channel_sensor == which[:, None]
+        arbitrary = np.zeros_like(clean) if fault == "dead" else spikes(clean, 1000.0)
+        fixes = robust_fixes(array, SeveralLocator(array).fit_rows, np.where(bad, arbitrary, clean))
+        assert [fix.dropped for fix in fixes] == [(array.ids[sensor],) for sensor in which]
+        for fix in fixes:
+            found = np.array([source.position_m for source in fix.solutions[0].sources])
+            assert len(found) == 2
+            assert np.linalg.norm(found[:, None] - position, axis=-1).min(axis=0).max() <= 0.02
+
+    def test_a_moment_at_a_known_place(self):
+        array = replace(cube(1.0, "scalar", 1e-11), ambient_T=tuple(AMBIENT.tolist()))
+        rng = np.random.default_rng(13)
+        place = np.array([3.0, 1.0, -0.5])
+        moment = random_sources(rng, 10, 1.0, 1.0, 300.0)[1]
+        readings = readings_in_ambient_field(array, np.tile(place, (10, 1)), moment, rng)
+        which = rng.integers(8, size=10)
+        readings[np.arange(10), which] += 1e-8
+        fixes = robust_fixes(array, MomentLocator(array, place).fit_rows, readings, free_position=False)
+        assert [fix.dropped for fix in fixes] == [(array.ids[sensor],) for sensor in which]
+        error = [np.linalg.norm(fix.solutions[0].moment_Am2 - m) for fix, m in zip(fixes, moment, strict=True)]
+        assert max(error) <= 1.0
+
+
+class TestWeightedProblem:
+    """A weight divides the variance: χ² is that of an array whose sensors are as noisy as that."""
+
+    @pytest.mark.parametrize("common_field_T", [None, 3e-9, 1e-6])
+    @pytest.mark.parametrize("kinds", ["vector", "scalar", "mixed"])
+    def test_chi2(self, kinds, common_field_T):
+        rng = np.random.default_rng(14)
+        every = {kind: cube(1.0, kind, NOISE).sensors for kind in ("vector", "scalar")}
+        vector, scalar = every["vector"], tuple(replace(s, id=f"t{s.id}") for s in every["scalar"])
+        sensors = {"vector": vector, "scalar": scalar, "mixed": vector[:5] + scalar[5:]}[kinds]
+        array = SensorArray(sensors, ambient_T=tuple(AMBIENT.tolist()), common_field_T=common_field_T)
+        weight = rng.uniform(0.01, 1.0, array.n_sensors)
+        noisier = replace(
+            array,
+            sensors=tuple(
+                replace(s, noise_T=s.noise_T / np.sqrt(w)) for s, w in zip(array.sensors, weight, strict=True)
+            ),
+        )
+        fields = AMBIENT + 1e-8 * rng.normal(size=(4, array.n_sensors, 3))
+        readings = array.readings_of(fields)
+        mask = np.ones(array.n_channels, dtype=bool)
+        problem, raw = joint_problem(array, mask, readings, whitenings_of(array, mask, readings), None)
+        per_channel = np.broadcast_to(weight[array.channel_sensor], raw.shape)
+        lighter, lighter_raw = weighted(problem, raw, per_channel)
+        other, other_raw = joint_problem(noisier, mask, readings, whitenings_of(noisier, mask, readings), None)
+        q = problem.homogeneous(np.array([[[2.0, 1.0, 0.5]]] * 4))
+        mu = problem.scaled_moment(q, rng.normal(size=(4, 1, 3)))
+        chi2 = [
+            np.sum((p.whitened(y) - p.predicted(p.source_fields(q, mu))) ** 2, axis=1)
+            for p, y in ((lighter, lighter_raw), (other, other_raw))
+        ]
+        assert_allclose(chi2[0], chi2[1], rtol=1e-6)
+
+    def test_weights_of_one_change_nothing(self):
+        array = replace(CUBE, common_field_T=1e-8)
+        clean, _, _ = on_cube(2, seed=15)
+        mask = np.ones(24, dtype=bool)
+        problem, raw = joint_problem(array, mask, clean, whitenings_of(array, mask, clean), None)
+        same, same_raw = weighted(problem, raw, np.ones_like(raw))
+        assert_allclose(same.whitened(same_raw), problem.whitened(raw), rtol=1e-9, atol=1e-9)
+
+
+class TestRecording:
+    """A magnet over thirty sensors."""
+
+    @pytest.fixture
+    def recording(self, data_folder):
+        """Array with the noise of these readings, every thirtieth set of readings, and where the magnet was in x-y."""
+        folder = data_folder / "magnet-array"
+        array = read_array(folder / "array.toml")
+        sensors = tuple(replace(s, noise_T=2e-6) for s in array.sensors)
+        array = replace(array, sensors=sensors, noise_fraction=0.03)
+        readings = read_readings(folder / "readings.csv", array, sensors=array.ids).values_T[::30]
+        return array, readings, read_truth(folder / "truth.csv").position_m[::30, :2]
+
+    def test_no_sensor_is_dropped(self, recording):
+        array, readings, _ = recording
+        plain = Locator(array).fit_rows(readings)
+        fixes = robust(array, readings)
+        assert not any(fix.dropped for fix in fixes)
+        for fix, same in zip(fixes, plain, strict=True):
+            assert_allclose(fix.solutions[0].position_m, same.solutions[0].position_m, rtol=1e-12)
+
+    @pytest.mark.parametrize("reading_T", [0.0, 1e-3, pytest.param(-5e-5, marks=pytest.mark.slow)])
+    @pytest.mark.parametrize("sensor", [7, pytest.param(19, marks=pytest.mark.slow)])
+    def test_one_sensor_that_reads_a_constant(self, recording, sensor, reading_T):
+        array, readings, truth = recording
+        readings = readings.copy()
+        readings[:, 3 * sensor : 3 * sensor + 3] = reading_T
+        error = [
+            np.linalg.norm(fix.solutions[0].position_m[:2] - of_row)
+            for fix, of_row in zip(robust(array, readings), truth, strict=True)
+        ]
+        assert np.median(error) <= 0.25e-3
+        assert np.max(error) <= 1.5e-3

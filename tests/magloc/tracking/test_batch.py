@@ -1,0 +1,168 @@
+"""The compiled steps against the readable ones: the same points, and the same steps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+import sims
+from arrays import geometries
+from arrays.array import SensorArray
+from magloc.tracking.batch import track_record
+from magloc.tracking.motion import MotionModel, UnknownMotion, WanderingMotion
+from magloc.tracking.results import Row, TrackPoint, rows_of
+from magloc.tracking.smoother import smoothed
+from magloc.tracking.tracker import Tracker
+from tests.oracles import magpylib_field
+from tests.passing_source import (
+    ARRAY,
+    NOISE_T,
+    SLOW,
+    followed,
+    moving_source,
+    positions,
+    readings_of,
+    rows_from,
+    statuses,
+)
+
+FloatArray = NDArray[np.float64]
+
+
+def assert_same_points(some: list[TrackPoint], others: list[TrackPoint]) -> None:
+    """To 1e-9 m and 1e-9 of the moment; and what is not a number is the same."""
+    assert statuses(some) == statuses(others)
+    for a, b in zip(some, others, strict=True):
+        assert (a.time_s, a.nis_dof) == (b.time_s, b.nis_dof)
+        np.testing.assert_allclose(a.nis, b.nis, rtol=1e-5, atol=1e-6)
+        assert (a.position_m is None) == (b.position_m is None)
+        if a.position_m is None or b.position_m is None or a.moment_Am2 is None or b.moment_Am2 is None:
+            continue
+        np.testing.assert_allclose(a.position_m, b.position_m, rtol=0.0, atol=1e-9)
+        np.testing.assert_allclose(
+            a.moment_Am2, b.moment_Am2, rtol=0.0, atol=1e-9 * float(np.linalg.norm(b.moment_Am2))
+        )
+        assert a.covariance is not None
+        assert b.covariance is not None
+        assert a.estimability is not None
+        assert b.estimability is not None
+        scale = np.sqrt(np.diagonal(b.covariance))
+        np.testing.assert_allclose(
+            a.covariance / np.outer(scale, scale), b.covariance / np.outer(scale, scale), atol=1e-7
+        )
+        np.testing.assert_allclose(a.estimability, b.estimability, atol=1e-7)
+
+
+class TestCompiledRecord:
+    """The compiled steps and the readable ones: the same points to 1e-9, and the same steps."""
+
+    def both(self, array: SensorArray, motion: MotionModel, rows: list[Row]) -> list[TrackPoint]:
+        readable, compiled = Tracker(array, motion, keep_steps=True), Tracker(array, motion, keep_steps=True)
+        expected, points = followed(readable, rows), track_record(compiled, rows)
+        assert_same_points(points, expected)
+        assert [step.row for step in compiled.steps] == [step.row for step in readable.steps]
+        for a, b in zip(smoothed(points, compiled.steps), smoothed(expected, readable.steps), strict=True):
+            if a.position_m is not None and b.position_m is not None:
+                np.testing.assert_allclose(a.position_m, b.position_m, rtol=0.0, atol=1e-8)
+        return points
+
+    def test_gaps_missing_channels_and_spikes(self) -> None:
+        n = 120
+        rng = np.random.default_rng(8)
+        time_s, p, m = moving_source(n)
+        time_s = time_s + rng.uniform(0.0, 0.4, n)
+        p[90:] += [-5.0, 0.0, 0.0]
+        readings = readings_of(ARRAY, p, m)
+        readings[rng.random(readings.shape) < 0.05] = np.nan
+        readings[30:36] = np.nan
+        readings[[20, 50, 51], [3, 7, 1]] += 1e-6
+        points = self.both(ARRAY, SLOW, rows_from(time_s, readings))
+        assert {"acquired", "tracked", "predicted", "outlier"} <= set(statuses(points))
+        assert statuses(points).count("acquired") >= 2
+
+    def test_scalar_sensors_in_an_ambient_field_of_every_row(self) -> None:
+        n = 60
+        array = geometries.cube(1.5, "scalar", NOISE_T)
+        time_s, p, m = moving_source(n)
+        ambient = np.array([1e-5, -2e-5, 4.5e-5]) + 1e-6 * np.random.default_rng(2).normal(size=(n, 3))
+        noise = NOISE_T * np.random.default_rng(0).normal(size=(n, 8))
+        fields = np.stack([magpylib_field(array.positions, *source) for source in zip(p, m, strict=True)])
+        readings = np.linalg.norm(fields + ambient[:, None], axis=-1) + noise
+        rows = list(rows_of(time_s, readings, ambient_T=ambient))
+        points = self.both(array, SLOW, rows)
+        assert statuses(points).count("tracked") > 50
+        assert np.nanmax(np.linalg.norm(positions(points) - p, axis=1)) < 0.3
+
+    def test_a_moving_array(self) -> None:
+        n = 60
+        time_s, p, m = moving_source(n)
+        origin = np.outer(time_s, [-0.05, 0.05, 0.0]) + np.array([10.0, -4.0, 2.0])
+        rotation = Rotation.from_rotvec(np.outer(time_s, [0.02, 0.01, -0.05]))
+        world_p = p + np.array([10.0, -4.0, 2.0])
+        in_array = rotation.inv().apply(world_p - origin)
+        readings = readings_of(ARRAY, in_array, rotation.inv().apply(m))
+        rows = list(rows_of(time_s, readings, origin, rotation.as_quat()))
+        points = self.both(ARRAY, SLOW, rows)
+        assert statuses(points) == ["acquired"] + ["tracked"] * (n - 1)
+        assert np.linalg.norm(positions(points) - world_p, axis=1).max() < 0.2
+
+    def test_noise_that_depends_on_the_reading(self) -> None:
+        time_s, p, m = moving_source(40)
+        array = replace(ARRAY, noise_fraction=1e-3)
+        points = self.both(array, SLOW, rows_from(time_s, readings_of(array, p, m)))
+        assert statuses(points).count("tracked") > 30
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_a_source_at_rest_that_is_known_along_a_curve(self, seed: int) -> None:
+        """The paper's scenario, where a prior that bends changes the track by several σ: see test_row_measurement."""
+        readings = sims.simulate(sims.read_scenario("paper"), seed).readings
+        array = geometries.tetrahedron(1.5, "vector", 1e-9)
+        points = self.both(array, UnknownMotion(1e-6, 1e-6), rows_from(readings.time_s, readings.values_T))
+        assert statuses(points).count("tracked") >= 50
+
+    def test_rows_that_have_no_coordinates_of_their_own(self) -> None:
+        """Five differences: the prediction is taken as Gaussian in position and moment there."""
+        time_s, p, m = moving_source(40)
+        readings = readings_of(ARRAY, p, m)
+        readings[10:30:2, 3:7] = np.nan
+        points = self.both(ARRAY, SLOW, rows_from(time_s, readings))
+        assert [point.nis_dof for point in points[10:14]] == [5, 9, 5, 9]
+        assert set(statuses(points[1:])) == {"tracked"}
+
+    def test_steps_that_swing(self) -> None:
+        """A source that is weak and far: the iterations that shrink do so in both, and their number is the same."""
+        array = geometries.tetrahedron(1.5, "vector", 1e-9)
+        rng = np.random.default_rng(9)
+        n = 80
+        p, m = np.tile([5.0, 0.0, 0.306], (n, 1)), np.tile([100.0, 0.0, 0.0], (n, 1))
+        rows = rows_from(np.arange(float(n)), readings_of(array, p, m, seed=int(rng.integers(1000))))
+        motion = UnknownMotion(0.02, 0.01)
+        readable, compiled = followed(Tracker(array, motion), rows), track_record(Tracker(array, motion), rows)
+        assert_same_points(compiled, readable)
+        assert [point.iterations for point in compiled] == [point.iterations for point in readable]
+        assert max(point.iterations for point in readable) > 5
+
+    def test_sensors_with_lasting_errors_take_the_readable_path(self) -> None:
+        time_s, p, m = moving_source(20)
+        sensors = tuple(replace(sensor, offset_uncertainty_T=1e-9) for sensor in ARRAY.sensors)
+        array = replace(ARRAY, sensors=sensors)
+        points = self.both(array, SLOW, rows_from(time_s, readings_of(ARRAY, p, m)))
+        assert statuses(points).count("tracked") == 19
+
+    def test_other_motions_take_the_readable_path(self) -> None:
+        time_s, p, m = moving_source(20)
+        points = self.both(ARRAY, WanderingMotion(0.1, 0.02), rows_from(time_s, readings_of(ARRAY, p, m)))
+        assert statuses(points).count("tracked") == 19
+
+    def test_no_rows(self) -> None:
+        assert track_record(Tracker(ARRAY, SLOW), []) == []
+
+    def test_progress_counts_every_row_once(self) -> None:
+        time_s, p, m = moving_source(25)
+        finished: list[int] = []
+        track_record(Tracker(ARRAY, SLOW), rows_from(time_s, readings_of(ARRAY, p, m)), finished.append)
+        assert sum(finished) == 25

@@ -1,0 +1,360 @@
+"""A track played through time, and readings plotted beside it. No browser: scene nodes and panels are read directly."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+import viser
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from arrays.array import SensorArray
+from arrays.geometries import tetrahedron
+from arrays.sensor import Sensor
+from magloc.readings import Readings
+from magloc.tracking.results import TrackPoint
+from magloc.viewer.pages.dipole_editor import direction_of
+from magloc.viewer.pages.track_player import TrackPlayer
+from magloc.viewer.panels.inputs import set_value
+from magloc.viewer.panels.readings_plot import (
+    DIFFERENCES,
+    ReadingsPlot,
+    differences_from_mean,
+    span_of,
+    thinned,
+    with_mark,
+)
+from magloc.viewer.scene.glyphs import ArrayGlyphs
+from magloc.viewer.server import free_port, opened
+
+ARRAY = tetrahedron(0.3)
+WAIT_S = 20.0
+N = 100
+STEP_S = 0.1
+GAP = range(40, 50)
+RNG = np.random.default_rng(5)
+
+
+def positions() -> np.ndarray:
+    t = STEP_S * np.arange(N)
+    return np.stack([np.cos(t), np.sin(t), 0.1 * t], axis=1)
+
+
+def covariance(i: int) -> np.ndarray:
+    spread = np.diag([1.0, 2.0, 3.0, 9.0, 9.0, 9.0])
+    return (1e-4 * (1.0 + i)) * spread
+
+
+def track(start_s: float = 1000.0) -> list[TrackPoint]:
+    """A track from row 0 to 99 that is lost from 40 to 49."""
+    return [
+        TrackPoint(start_s + STEP_S * i, status="lost: the range is no longer known")
+        if i in GAP
+        else TrackPoint(
+            start_s + STEP_S * i,
+            place,
+            np.array([0.0, 3.0, 4.0]),
+            covariance(i),
+            nis=8.0,
+            nis_dof=9,
+            status="tracked",
+        )
+        for i, place in enumerate(positions())
+    ]
+
+
+def readings(n: int = N, start_s: float = 1000.0) -> Readings:
+    values = 1e-9 * RNG.standard_normal((n, ARRAY.n_channels))
+    return Readings(start_s + STEP_S * np.arange(n), values, np.arange(n) + 2)
+
+
+@pytest.fixture
+def server() -> Iterator[viser.ViserServer]:
+    before = set(threading.enumerate())
+    with opened(free_port(0), "test") as server:
+        yield server
+    wait_for(lambda: set(threading.enumerate()) <= before)
+
+
+@pytest.fixture
+def player(server) -> Iterator[TrackPlayer]:
+    player = TrackPlayer(server, track(), 0.5)
+    yield player
+    player.close()
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.005)
+
+
+def node(server: viser.ViserServer, name: str) -> viser.SceneNodeHandle:
+    handle = server.scene.get_handle_by_name(name)
+    assert handle is not None
+    return handle
+
+
+class TestTrackPlayer:
+    def test_point_arrow_ellipsoid_and_tail_follow_the_time(self, server, player):
+        set_value(player.tail_slider, 1.0)
+        set_value(player.time_slider, 3.0)
+        assert player.index == 30
+        place = positions()[30]
+        np.testing.assert_allclose(node(server, "/track/tail/mark").position, place)
+        arrow = node(server, "/track/moment")
+        np.testing.assert_allclose(arrow.position, place)
+        np.testing.assert_allclose(direction_of(arrow.wxyz), [0.0, 0.6, 0.8], atol=1e-12)
+        offset = np.asarray(node(server, "/track/tail/region-now").vertices, dtype=np.float64) - place
+        squared = np.einsum("ni,ij,nj->n", offset, np.linalg.inv(covariance(30)[:3, :3]), offset)
+        np.testing.assert_allclose(squared, chi2.ppf(0.95, 3), rtol=1e-4)
+        line = np.asarray(node(server, "/track/tail/line").points)
+        expected = positions()[20:31]
+        np.testing.assert_allclose(line, np.stack([expected[:-1], expected[1:]], axis=1), atol=1e-6)
+        assert "row 31 of 100, time 1003.000 s" in player.row_panel.content
+        assert "NIS/dof 8/9" in player.row_panel.content
+
+    def test_no_tail_is_no_line_and_the_whole_track_may_be_hidden(self, server, player):
+        set_value(player.tail_slider, 0.0)
+        player.show_row(20)
+        assert not node(server, "/track/tail/line").visible
+        whole = node(server, "/track/whole")
+        # 39 intervals before the gap, 49 after it, none across it.
+        assert whole.visible
+        assert len(whole.points) == 39 + 49
+        set_value(player.whole_checkbox, False)
+        assert not whole.visible
+
+    def test_a_gap_shows_nothing_and_says_why(self, server, player):
+        player.show_row(45)
+        assert not node(server, "/track/moment").visible
+        assert not node(server, "/track/tail/mark").visible
+        assert not node(server, "/track/tail/region-now").visible
+        assert "<b>not tracked</b>: lost: the range is no longer known" in player.row_panel.content
+        # The strip of times has a part for each of the hundred rows.
+        assert player.strip_panel.content.count("#d5d9de") == len(GAP)
+        assert "tracked in 90 of 100 rows" in player.strip_panel.content
+        player.show_row(50)
+        assert node(server, "/track/moment").visible
+        assert node(server, "/track/tail/mark").visible
+
+    def test_the_row_is_the_last_one_before_the_time(self, player):
+        set_value(player.time_slider, 3.04)
+        assert player.index == 30
+        set_value(player.time_slider, 3.1)
+        assert player.index == 31
+        player.show_row(10**6)
+        assert player.index == N - 1
+        player.show_row(-5)
+        assert player.index == 0
+        assert player.time_slider.value == 0.0
+
+    def test_it_starts_at_the_last_row_that_is_tracked(self, server):
+        points = track()[:45]
+        player = TrackPlayer(server, points, 0.5)
+        assert player.index == 39
+
+    def test_buttons_step_from_row_to_row(self, player):
+        player.show_row(10)
+        set_value(player.row_buttons, "next")
+        assert player.index == 11
+        set_value(player.row_buttons, "previous")
+        set_value(player.row_buttons, "previous")
+        assert player.index == 9
+
+    def test_array_and_followers_get_pose_and_row(self, server):
+        glyphs = ArrayGlyphs(server.scene, ARRAY)
+        place = RNG.standard_normal((N, 3))
+        turn = Rotation.random(N, random_state=1).as_quat()
+        rows: list[int] = []
+        player = TrackPlayer(
+            server, track(), 0.5, array_poses=(place, turn), on_pose=glyphs.set_pose, on_row=[rows.append]
+        )
+        player.show_row(45)  # the array moves where the source is not tracked, too
+        np.testing.assert_allclose(glyphs.frame.position, place[45])
+        np.testing.assert_allclose(glyphs.frame.wxyz, np.roll(turn[45], 1))
+        assert rows[-1] == 45
+
+    def test_play_runs_to_the_end_with_its_speed_and_stops(self, player):
+        seen: list[int] = []
+        player._on_row = [seen.append]
+        player.show_row(0)
+        set_value(player.speed_dropdown, "10 ×")
+        begin = time.monotonic()
+        set_value(player.play_button, True)
+        assert player.play_button.label == "Pause"
+        wait_for(lambda: not player.is_playing)
+        # 9.9 s at ten times the speed; a loaded machine may be late, but time never runs faster.
+        assert time.monotonic() - begin > 0.9
+        assert player.index == N - 1
+        assert player.play_button.label == "Play"
+        assert seen == sorted(seen)
+        assert len(set(seen)) > 3
+        wait_for(lambda: not any(thread.name == "magloc-track-player" for thread in threading.enumerate()))
+
+    def test_play_at_the_end_begins_anew_and_pause_holds(self, player):
+        player.show_row(N - 1)
+        set_value(player.speed_dropdown, "1 ×")
+        player.play()
+        player.play()  # a second time changes nothing
+        assert sum(thread.name == "magloc-track-player" for thread in threading.enumerate()) == 1
+        wait_for(lambda: 0 < player.index < N // 2)
+        set_value(player.play_button, True)
+        held = player.index
+        assert not player.is_playing
+        time.sleep(0.3)
+        assert player.index == held
+        assert not any(thread.name == "magloc-track-player" for thread in threading.enumerate())
+
+    def test_a_time_that_the_user_chooses_while_it_plays_counts(self, player):
+        player.show_row(0)
+        set_value(player.speed_dropdown, "0.1 ×")
+        player.play()
+        set_value(player.time_slider, 8.0)
+        wait_for(lambda: player.index >= 80)
+        player.pause()
+        assert player.index < 90
+
+    def test_a_truth_has_no_ellipsoids_and_one_row_does_not_play(self, server):
+        truth = [TrackPoint(5.0, np.array([1.0, 2.0, 0.0]), status="truth")]
+        player = TrackPlayer(server, truth, 0.5)
+        player.play()
+        assert not player.is_playing
+        assert player.time_slider.disabled
+        np.testing.assert_allclose(node(server, "/track/tail/mark").position, [1.0, 2.0, 0.0])
+        assert not node(server, "/track/moment").visible
+        assert "truth at (1.000, 2.000, 0.000) m" in player.row_panel.content
+
+    def test_a_track_without_any_position_is_shown_as_such(self, server):
+        player = TrackPlayer(server, [TrackPoint(float(i), status="silent") for i in range(3)], 0.5)
+        assert player.index == 0
+        assert "<b>not tracked</b>: silent" in player.row_panel.content
+
+
+class TestReadingsPlot:
+    def test_lines_are_the_readings_in_nT_and_the_mark_is_at_the_row(self, server):
+        rows = readings()
+        plot = ReadingsPlot(server, rows, ARRAY)
+        plot.show_row(25)
+        time_s, *lines, mark = plot.plot.data
+        kept = np.delete(np.arange(N + 3), [26, 27, 28])  # the three points of the mark stand after those of the row
+        np.testing.assert_allclose(time_s[kept], STEP_S * np.arange(N), atol=1e-9)
+        np.testing.assert_allclose(np.array(lines)[:, kept], 1e9 * rows.values_T.T)
+        np.testing.assert_allclose(np.array(lines)[:, 26:29], 1e9 * rows.values_T[25][:, None] * np.ones(3))
+        assert np.flatnonzero(mark).tolist() == [27]
+        np.testing.assert_allclose(time_s[26:29], 2.5, atol=1e-9)
+        labels = [series.get("label") for series in plot.plot.series]
+        assert labels == ["time [s]", *ARRAY.channel_names, "now"]
+
+    def test_chosen_sensors_and_axes_are_shown(self, server):
+        plot = ReadingsPlot(server, readings(), ARRAY)
+        set_value(plot.sensor_checkboxes["s2"], False)
+        set_value(plot.axis_checkboxes["y"], False)
+        labels = [series.get("label") for series in plot.plot.series]
+        assert labels == ["time [s]", "s1_x", "s1_z", "s3_x", "s3_z", "s4_x", "s4_z", "now"]
+        assert len(plot.plot.data) == len(labels)
+        for checkbox in plot.sensor_checkboxes.values():
+            set_value(checkbox, False)
+        assert len(plot.plot.data) == 2
+
+    def test_differences_are_free_of_the_common_field(self, server):
+        rows = readings()
+        common = 5e-5 * np.sin(rows.time_s)[:, None]
+        plot = ReadingsPlot(server, Readings(rows.time_s, rows.values_T + common, rows.line_numbers), ARRAY)
+        assert plot.plot.scales["y"]["range"][1] > 1e4
+        set_value(plot.kind_dropdown, DIFFERENCES)
+        lines = np.array(plot.plot.data[1:-1])
+        assert np.abs(lines).max() < 10.0
+        np.testing.assert_allclose(lines.reshape(4, 3, -1).sum(axis=0), 0.0, atol=1e-6)
+        assert plot.plot.scales["y"]["range"][1] < 10.0
+
+    def test_missing_readings_break_no_line_but_make_it_points(self, server):
+        rows = readings()
+        rows.values_T[30:35, 4] = np.nan
+        plot = ReadingsPlot(server, rows, ARRAY)
+        assert [series.get("width") for series in plot.plot.series[1:-1]] == [1.2] * 4 + [0.0] + [1.2] * 7
+        assert plot.plot.series[5]["points"]["show"] is True
+        assert np.isfinite(plot.plot.scales["y"]["range"]).all()
+
+    def test_rows_out_of_order_are_put_in_order_and_marked_by_their_row(self, server):
+        rows = readings()
+        shuffled = np.random.default_rng(2).permutation(N)
+        plot = ReadingsPlot(server, Readings(rows.time_s[shuffled], rows.values_T[shuffled], rows.line_numbers), ARRAY)
+        assert np.all(np.diff(plot.plot.data[0]) >= 0.0)
+        plot.show_row(7)
+        marked = float(plot.plot.data[0][plot.plot.data[-1] == 1.0][0])
+        assert marked == pytest.approx(STEP_S * shuffled[7], abs=1e-9)
+
+    def test_a_long_record_is_thinned(self, server):
+        rows = readings(20_000)
+        rows.values_T[12_345, 2] = 1e-6  # a single outlier must stay in sight
+        plot = ReadingsPlot(server, rows, ARRAY)
+        assert all(len(line) <= 403 for line in plot.plot.data)
+        assert np.max(plot.plot.data[3]) == pytest.approx(1e3)
+
+
+class TestThinning:
+    @given(
+        arrays(
+            np.float64,
+            st.tuples(st.integers(1, 300), st.integers(1, 3)),
+            elements=st.floats(-1e5, 1e5) | st.just(np.nan),
+        ),
+        st.sampled_from([10, 50, 100]),
+    )
+    def test_extremes_stay_and_time_goes_on(self, values, most):
+        time_s = np.arange(len(values)) * 0.5
+        kept_s, kept = thinned(time_s, values, most)
+        assert len(kept_s) == len(kept) <= max(most, 1)
+        assert np.all(np.diff(kept_s) >= 0.0)
+        assert kept_s[0] == time_s[0]
+        assert kept_s[-1] == time_s[-1]
+        for column in range(values.shape[1]):
+            known = values[np.isfinite(values[:, column]), column]
+            if known.size:
+                assert np.nanmin(kept[:, column]) == known.min()
+                assert np.nanmax(kept[:, column]) == known.max()
+            else:
+                assert np.isnan(kept[:, column]).all()
+
+    @given(st.floats(0.0, 9.0))
+    def test_the_mark_is_at_its_time_and_time_stays_in_order(self, at_s):
+        time_s, values, mark = with_mark(np.arange(10.0), np.zeros((10, 2)), at_s, np.ones(2))
+        assert np.all(np.diff(time_s) >= 0.0)
+        assert time_s[mark == 1.0].tolist() == [at_s]
+        assert np.flatnonzero(values[:, 0]).size == 3
+
+    def test_span_of_nothing_and_of_one_value(self):
+        assert span_of(np.full((3, 2), np.nan))[0] < span_of(np.full((3, 2), np.nan))[1]
+        low, high = span_of(np.array([[5.0, 5.0]]))
+        assert low < 5.0 < high
+
+
+class TestDifferences:
+    def test_vector_and_scalar_sensors_have_means_of_their_own(self):
+        sensors = (
+            *ARRAY.sensors,
+            Sensor("m1", "scalar", (1.0, 0.0, 0.0), 1e-11),
+            Sensor("m2", "scalar", (0.0, 1.0, 0.0), 1e-11),
+        )
+        array = SensorArray(sensors)
+        values = RNG.standard_normal((5, array.n_channels))
+        result = differences_from_mean(array, values)
+        np.testing.assert_allclose(result[:, 12], 0.5 * (values[:, 12] - values[:, 13]))
+        vectors = values[:, :12].reshape(5, 4, 3)
+        expected = vectors - vectors.mean(axis=1, keepdims=True)
+        np.testing.assert_allclose(result[:, :12], expected.reshape(5, 12))
+
+    def test_a_sensor_that_misses_a_reading_is_left_out_of_the_mean(self):
+        values = RNG.standard_normal((1, 12))
+        values[0, 1] = np.nan
+        result = differences_from_mean(ARRAY, values)
+        assert np.isnan(result[0, :3]).all()
+        others = values[0, 3:].reshape(3, 3)
+        np.testing.assert_allclose(result[0, 3:], (others - others.mean(axis=0)).ravel())

@@ -1,0 +1,235 @@
+"""Tests of sims.attitude: one class per property."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from adcs import quaternion
+from adcs.satellite import dynamics
+from adcs.satellite.sensors import Gyro, Magnetometer, StarTracker
+from sims.attitude.scenario import ANY_START, AttitudeScenario, StartConditions, tabletsat
+from sims.attitude.simulation import AttitudeRuns, advance, prepare, sense, simulate, start_estimates
+
+Array = NDArray[np.float64]
+SEEDS = range(12)
+
+
+@pytest.fixture(scope="module")
+def scenario() -> AttitudeScenario:
+    return replace(tabletsat(), gyro_bias_rad_s=np.radians(0.027), field_bias_T=500e-9)
+
+
+@pytest.fixture(scope="module")
+def runs(scenario: AttitudeScenario) -> AttitudeRuns:
+    return simulate(scenario, SEEDS)
+
+
+class TestTruth:
+    def test_shapes(self, runs: AttitudeRuns) -> None:
+        assert runs.time_s.shape == (201,)
+        assert runs.q.shape == runs.readings.star.shape == (12, 201, 4)
+        for values in (runs.w, runs.momentum_Nms, runs.wheel_torque_Nm, runs.readings.sun, runs.acceleration_s2):
+            assert values.shape == (12, 201, 3)
+
+    def test_compiled_run_agrees_with_the_readable_steps(self, runs: AttitudeRuns) -> None:
+        prepared, scenario = runs.prepared, runs.scenario
+        state = (prepared.q, prepared.w, prepared.momentum_Nms)
+        for row in range(200):
+            rate = prepared.environment.orbital_rate_rad_s[:, row]
+            torque = dynamics.commanded_torque(scenario.body, scenario.control, *state, quaternion.IDENTITY, rate, 1.0)
+            np.testing.assert_allclose(runs.wheel_torque_Nm[:, row], torque, rtol=0, atol=1e-15)
+            state = advance(prepared, state, torque, row)
+        for compiled, readable in zip((runs.q, runs.w, runs.momentum_Nms), state, strict=True):
+            np.testing.assert_allclose(compiled[:, 200], readable, rtol=0, atol=1e-13)
+
+    def test_holds_the_orbital_frame(self, runs: AttitudeRuns) -> None:
+        angle = quaternion.angle_between(runs.q, quaternion.IDENTITY)
+        assert np.degrees(angle[:, 0]).max() > 0.5
+        assert np.degrees(angle[:, 150:]).max() < 0.5
+
+    def test_disturbance(self, runs: AttitudeRuns) -> None:
+        np.testing.assert_allclose(np.linalg.norm(runs.prepared.torque_Nm, axis=-1), 8e-7, rtol=1e-12)
+        d = runs.acceleration_s2[3, 0]
+        np.testing.assert_allclose(runs.scenario.body.inertia_kgm2 @ d, runs.prepared.torque_Nm[3, 0], rtol=1e-12)
+        slow = prepare(replace(runs.scenario, torque_period_s=400.0), [3]).torque_Nm[0]
+        np.testing.assert_allclose(slow[200], -slow[0], rtol=1e-12)
+        np.testing.assert_allclose(slow[100], 0.0, rtol=0, atol=1e-20)
+
+    def test_over_rate_start_is_damped(self) -> None:
+        fast = replace(tabletsat(), start_rate_rad_s=np.radians(2.5))
+        tumbling = simulate(fast, SEEDS)
+        has_star = tumbling.readings.has_star
+        above = np.linalg.norm(tumbling.w, axis=-1) > fast.star_tracker.rate_limit_rad_s
+        assert above[:, 0].any()
+        assert not (has_star & above).any()
+        assert has_star[:, -1].all()
+
+
+class TestReadings:
+    def test_are_the_truth_with_noise_of_the_given_size(self, runs: AttitudeRuns) -> None:
+        readings, around, prepared = runs.readings, runs.environment, runs.prepared
+        # 7236 numbers each: five standard deviations of their rms are 4 %.
+        star = quaternion.error_vector(runs.q, readings.star) / runs.scenario.star_tracker.sigma_rad
+        gyro = (readings.gyro_rad_s - runs.w - prepared.gyro_bias_rad_s) / runs.scenario.gyro.sigma_rad_s
+        b_body = quaternion.rotate_back(runs.q, around.b_orbital_T)
+        field = (readings.field_T - b_body - prepared.field_bias_T) / runs.scenario.magnetometer.sigma_T
+        for residual in (star, gyro, field):
+            assert np.sqrt(np.mean(residual**2)) == pytest.approx(1.0, abs=0.042)
+        # Two of three components are noise.
+        sun = readings.sun - quaternion.rotate_back(runs.q, around.sun_orbital)
+        assert np.sqrt(np.mean(np.sum(sun**2, axis=-1)) / 2.0) == pytest.approx(np.radians(0.1), rel=0.05)
+
+    def test_biases(self, runs: AttitudeRuns) -> None:
+        np.testing.assert_allclose(
+            np.linalg.norm(runs.prepared.gyro_bias_rad_s, axis=-1), np.radians(0.027), rtol=1e-12
+        )
+        np.testing.assert_allclose(np.linalg.norm(runs.prepared.field_bias_T, axis=-1), 500e-9, rtol=1e-12)
+
+    def test_nothing_is_missing_in_the_sunlight(self, runs: AttitudeRuns) -> None:
+        r = runs.readings
+        assert r.has_star.all()
+        assert r.has_gyro.all()
+        assert r.has_field.all()
+        assert r.has_sun.all()
+
+    def test_instant_by_instant(self, runs: AttitudeRuns) -> None:
+        row = slice(57, 58)
+        one = sense(runs.prepared, runs.q[:, row], runs.w[:, row], row)
+        for name in ("star", "gyro_rad_s", "field_T", "sun"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(runs.readings, name)[:, row])
+
+    def test_error_of_the_field_model(self, scenario: AttitudeScenario) -> None:
+        wrong = prepare(replace(scenario, field_error_T=400e-9), SEEDS)
+        difference = wrong.true_field_orbital_T - wrong.environment.b_orbital_T
+        np.testing.assert_allclose(np.linalg.norm(difference, axis=-1), 400e-9, rtol=1e-6)
+        np.testing.assert_array_equal(wrong.environment.b_orbital_T, prepare(scenario, SEEDS).environment.b_orbital_T)
+
+
+class TestStarts:
+    def test_conditions_hold_throughout(self, runs: AttitudeRuns) -> None:
+        around = runs.environment
+        assert around.sunlit.all()
+        assert np.degrees(around.separation_rad).min() >= 45.0 - 0.7  # the field turns by 0.07° a second at most
+        assert np.linalg.norm(around.b_orbital_T, axis=-1).min() >= 24.9e-6
+
+    def test_differ_between_seeds(self, runs: AttitudeRuns) -> None:
+        assert len(set(runs.environment.utc[:, 0].tolist())) == len(SEEDS)
+
+    def test_eclipse_begins_when_told(self) -> None:
+        night = StartConditions(sunlit=False, least_separation_rad=0.0, least_field_T=0.0, eclipse_after_s=300.0)
+        dark = simulate(replace(tabletsat(2500.0), conditions=night), range(4))
+        lit = dark.environment.sunlit
+        assert lit[:, :290].all()
+        assert not lit[:, 301:2000].any()
+        assert lit[:, -200:].all()
+        assert not (dark.readings.has_sun & ~lit).any()
+
+    def test_collinear(self) -> None:
+        line = replace(ANY_START, sunlit=True, most_separation_rad=np.radians(12.0))
+        around = prepare(replace(tabletsat(local_time_h=13.0), conditions=line), range(4)).environment
+        assert np.degrees(around.separation_rad.min(axis=-1)).max() <= 12.0
+
+    def test_afternoon_orbit_is_never_collinear(self) -> None:
+        line = replace(ANY_START, sunlit=True, most_separation_rad=np.radians(30.0))
+        with pytest.raises(ValueError, match=r"Input conditions must hold"):
+            prepare(replace(tabletsat(), conditions=line), [0])
+
+    def test_none(self) -> None:
+        never = replace(tabletsat(), conditions=StartConditions(least_field_T=1.0))
+        with pytest.raises(
+            ValueError, match=r"Input conditions must hold for 200 s somewhere in the 24 hours from 2014"
+        ):
+            simulate(never, [0])
+
+    def test_start_estimates(self, scenario: AttitudeScenario) -> None:
+        prepared = prepare(scenario, range(300))
+        q, w = start_estimates(prepared, 0.02, 0.001)
+        # 900 numbers: five standard deviations of their rms are 12 %.
+        assert np.sqrt(np.mean((2 * quaternion.error_vector(q, prepared.q)) ** 2)) == pytest.approx(0.02, rel=0.12)
+        assert np.sqrt(np.mean((w - prepared.w) ** 2)) == pytest.approx(0.001, rel=0.12)
+
+
+class TestSeeds:
+    def test_a_run_depends_on_its_seed_alone(self, scenario: AttitudeScenario, runs: AttitudeRuns) -> None:
+        alone = simulate(scenario, [7])
+        np.testing.assert_array_equal(alone.q[0], runs.q[7])
+        np.testing.assert_array_equal(alone.readings.field_T[0], runs.readings.field_T[7])
+
+    def test_a_longer_run_begins_alike(self, scenario: AttitudeScenario) -> None:
+        # Both starts allow any instant, so that the draw is the same.
+        short, long = (
+            prepare(replace(scenario, conditions=ANY_START, duration_s=duration), [1]) for duration in (100.0, 200.0)
+        )
+        np.testing.assert_array_equal(short.environment.utc[0], long.environment.utc[0, :101])
+        np.testing.assert_array_equal(short.noise["gyro"][0], long.noise["gyro"][0, :101])
+
+    def test_sensors_have_their_own_streams(self, scenario: AttitudeScenario, runs: AttitudeRuns) -> None:
+        other = replace(scenario, gyro=Gyro(sigma_rad_s=1.0), star_tracker=StarTracker(sigma_rad=0.1))
+        np.testing.assert_array_equal(simulate(other, SEEDS).readings.sun, runs.readings.sun)
+
+    def test_walks(self, scenario: AttitudeScenario) -> None:
+        walking = replace(
+            scenario, gyro=Gyro(bias_walk_rad_s=1e-5), magnetometer=Magnetometer(bias_walk_T=1e-9), gyro_bias_rad_s=0.0
+        )
+        prepared = prepare(walking, range(100))
+        # 300 numbers: five standard deviations of their rms are 20 %.
+        assert np.sqrt(np.mean(prepared.gyro_bias_rad_s[:, 200] ** 2)) == pytest.approx(1e-5 * np.sqrt(200.0), rel=0.2)
+
+    def test_no_seeds(self, scenario: AttitudeScenario) -> None:
+        with pytest.raises(ValueError, match=r"Input seeds must hold one seed at least; instead received none\."):
+            simulate(scenario, [])
+
+
+class TestScenario:
+    @pytest.mark.parametrize(
+        "bad", [{"dt_s": 0.0}, {"duration_s": 0.5}, {"torque_Nm": -1.0}, {"field_error_T": np.inf}]
+    )
+    def test_bad_numbers(self, bad: dict[str, float]) -> None:
+        with pytest.raises(ValueError, match=rf"Input {next(iter(bad))} must be .*; instead received"):
+            replace(tabletsat(), **bad)
+
+    def test_dates_outside_of_the_field_model(self) -> None:
+        late = replace(tabletsat(), day=np.datetime64("2035-01-01", "us"))
+        with pytest.raises(ValueError, match=r"Input date must lie within the validity of IGRF-14"):
+            simulate(late, [0])
+
+
+class TestSpeed:
+    def test_steps_per_second(self, scenario: AttitudeScenario, runs: AttitudeRuns) -> None:
+        assert len(runs.q)  # they have compiled the kernel
+        # A step costs some 0.5 µs; a machine that is busy otherwise may take several times that.
+        from adcs.satellite import dynamics_compiled as rigid_body
+
+        n = 100_000
+        q, vectors = np.empty((1, n, 4)), np.zeros((5, 1, n, 3))
+        q[0, 0] = quaternion.IDENTITY
+        body, control = scenario.body, scenario.control
+        w, k, u, torque, field = vectors
+        begin = time.perf_counter()
+        rigid_body.run(
+            0,
+            1,
+            q,
+            w,
+            k,
+            u,
+            body.inertia_kgm2,
+            body.inverse,
+            body.residual_dipole_Am2,
+            control.attitude_gain_Nm,
+            control.rate_gain_Nms,
+            control.torque_limit_Nm,
+            control.momentum_limit_Nms,
+            quaternion.IDENTITY,
+            torque,
+            np.full((1, n), 1e-3),
+            np.full((1, n), 1e-6),
+            field,
+            1.0,
+        )
+        assert n / (time.perf_counter() - begin) > 200e3
