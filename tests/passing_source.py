@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from arrays import geometries
 from arrays.array import SensorArray
 from magloc.measurement.differences import predicted_channels
-from magloc.tracking.motion import UnknownMotion
+from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
 from magloc.tracking.tracker import Tracker
 
@@ -20,7 +20,7 @@ EDGE_M, NOISE_T = 1.5, 2e-10
 POSITION = np.array([3.0, 1.5, 0.8])
 MOMENT = np.array([120.0, -150.0, 160.0])
 ARRAY = geometries.tetrahedron(EDGE_M, "vector", NOISE_T)
-SLOW = UnknownMotion(0.1, math.radians(1.2))
+SLOW = RandomWalk(0.1, math.radians(1.2))
 
 
 def moving_source(n: int, dt_s: float = 0.5) -> tuple[FloatArray, FloatArray, FloatArray]:

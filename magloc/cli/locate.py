@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from arrays.array import SensorArray
-    from magloc.localization.fit.prior import Knowledge
+    from magloc.localization.fit.prior import SourcePrior
     from magloc.readings import Readings
 from magloc.localization.fit.results import AnyFix
 from magloc.localization.uncertainty.covariance import is_misfit
@@ -237,9 +237,9 @@ def _advice(sentence: str, array: SensorArray) -> str:
     return ""
 
 
-def knowledge_of(region: str | None, largest_moment: float | None) -> Knowledge:
+def knowledge_of(region: str | None, largest_moment: float | None) -> SourcePrior:
     """What the options say of the source."""
-    from magloc.localization.fit.prior import Knowledge
+    from magloc.localization.fit.prior import SourcePrior
 
     low, high = [-math.inf] * 3, [math.inf] * 3
     for part in [] if region is None else region.split(","):
@@ -257,7 +257,7 @@ def knowledge_of(region: str | None, largest_moment: float | None) -> Knowledge:
             )
     if largest_moment is not None and not largest_moment > 0.0:
         raise InputError(f"--max-moment-Am2: found {largest_moment:g}, expected a positive number.")
-    return Knowledge(
+    return SourcePrior(
         (low[0], low[1], low[2]),
         (high[0], high[1], high[2]),
         math.inf if largest_moment is None else largest_moment,

@@ -238,7 +238,7 @@ def track(
 
 
 def _motion(options: MotionOptions, *, smooth: bool) -> MotionModel:
-    from magloc.tracking.motion import ConstantTurn, UnknownMotion, WanderingMotion
+    from magloc.tracking.motion import CoordinatedTurn, OrnsteinUhlenbeck, RandomWalk
 
     for name in ("speed_m_s", "turn_deg_s", "correlation_s"):
         value = getattr(options, name)
@@ -247,10 +247,10 @@ def _motion(options: MotionOptions, *, smooth: bool) -> MotionModel:
     turn = math.radians(options.turn_deg_s)
     name = options.motion or ("wandering" if smooth else "unknown")
     if name == "unknown":
-        return UnknownMotion(options.speed_m_s, turn)
+        return RandomWalk(options.speed_m_s, turn)
     if name == "wandering":
-        return WanderingMotion(options.speed_m_s, turn, options.correlation_s)
-    return ConstantTurn(options.speed_m_s, turn)
+        return OrnsteinUhlenbeck(options.speed_m_s, turn, options.correlation_s)
+    return CoordinatedTurn(options.speed_m_s, turn)
 
 
 def _check_time(rows: Readings, path: Path) -> None:

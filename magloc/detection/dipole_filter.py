@@ -31,7 +31,7 @@ from magloc.compilation import over_rows
 from magloc.fields import dipole
 from magloc.localization.search.candidates import SingleArray, candidate_positions, linear_bases, linear_scores
 from magloc.localization.search.single_source_compiled import search_rows
-from magloc.measurement.whitened import JointProblem
+from magloc.measurement.whitened import WhitenedModel
 
 # As Locator searches: starts of every refinement, least angle between them, linearisations at most.
 _N_STARTS, _APART_RAD, _MOST_ITERATIONS = 6, 0.3, 100
@@ -56,7 +56,7 @@ class DipoleFilter:
         self.array = array
         self.whitening: Whitening = whitening(array)
         check_differences(self.whitening.n_differences, 3, "the three components of a moment")
-        self._problem = JointProblem.of(array, [self.whitening], array.ambient_fields[None])
+        self._problem = WhitenedModel.of(array, [self.whitening], array.ambient_fields[None])
         self._gain: FloatArray = self._problem.linear_gain(np.zeros((1, array.n_sensors, 3)))[0]
         if not np.any(self._gain[array.channel_is_scalar]) and array.channel_is_scalar.any():
             raise ValueError("Input array must have an ambient field for its scalar sensors; instead it has none.")

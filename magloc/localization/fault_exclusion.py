@@ -21,8 +21,8 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray, IntArray
 from magloc.localization.fit.gauss_newton import refine
 from magloc.localization.fit.results import Fix, JointFix, JointSolution, Solution
-from magloc.measurement.rows import NO_SIGNAL, joint_problem, rows_of_equal_mask, whitenings_of
-from magloc.measurement.whitened import JointProblem
+from magloc.measurement.rows import NO_SIGNAL, rows_of_equal_mask, whitened_model, whitenings_of
+from magloc.measurement.whitened import WhitenedModel
 
 AnyFix = TypeVar("AnyFix", bound=Fix | JointFix)
 DEGREES_OF_FREEDOM = 4.0
@@ -156,7 +156,7 @@ class _Examination(Generic[AnyFix]):
         self.array, self.readings, self.ambient = array, readings, ambient
         self.fit: Fitter[AnyFix] = fit
         self.free_position = free_position
-        self.problem, self.raw = joint_problem(array, mask, readings, whitenings_of(array, mask, readings), ambient)
+        self.problem, self.raw = whitened_model(array, mask, readings, whitenings_of(array, mask, readings), ambient)
         self.count = np.bincount(array.channel_sensor[mask], minlength=array.n_sensors)
         level = 1.0 - _SENSOR_FALSE_ALARM / array.n_sensors
         self.limits = np.array(chdtri(np.maximum(self.count, 1), 1.0 - level), dtype=np.float64)
@@ -348,7 +348,7 @@ class _Examination(Generic[AnyFix]):
         return misfit, scale2
 
 
-def weighted(problem: JointProblem, raw: FloatArray, weight: FloatArray) -> tuple[JointProblem, FloatArray]:
+def weighted(problem: WhitenedModel, raw: FloatArray, weight: FloatArray) -> tuple[WhitenedModel, FloatArray]:
     """A problem and its raw readings (b, C) with the variance of every channel divided by a weight (b, C)."""
     root = np.sqrt(weight)
     flat = problem.shrinkage >= 1.0

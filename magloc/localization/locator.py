@@ -14,7 +14,7 @@ from scipy.special import chdtrc
 from arrays.array import SensorArray
 from arrays.typing import FloatArray, Vector
 from magloc.localization.fault_exclusion import robust_fixes
-from magloc.localization.fit.prior import NOTHING_KNOWN, Knowledge
+from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import Fix, JointFix, Solution
 from magloc.localization.search.known_position import MomentLocator
 from magloc.localization.search.multi_source import SeveralLocator, in_stable_order
@@ -35,7 +35,7 @@ class RowFixes:
         array: SensorArray,
         rows: Readings,
         ambient_T: FloatArray | None,
-        knowledge: Knowledge,
+        knowledge: SourcePrior,
         n_sources: int | Literal["auto"] | None,
         position: Vector | None,
         keep_sensors: bool,
@@ -124,7 +124,7 @@ class ExactLocator:
     ----------
     array : SensorArray
         At least seven scalar sensors, or as many differences from sensors of both kinds.
-    knowledge : Knowledge
+    knowledge : SourcePrior
         Bounds of the source's position and moment.
 
     Raises
@@ -133,7 +133,7 @@ class ExactLocator:
         The array has fewer than six independent differences.
     """
 
-    def __init__(self, array: SensorArray, *, knowledge: Knowledge = NOTHING_KNOWN) -> None:
+    def __init__(self, array: SensorArray, *, knowledge: SourcePrior = NOTHING_KNOWN) -> None:
         self.array = array
         self._several = SeveralLocator(array, n_sources=1, knowledge=knowledge)
 

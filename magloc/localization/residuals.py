@@ -11,7 +11,7 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.fields import dipole
 from magloc.localization.fit.results import Fix, JointFix, Solution, Source
-from magloc.measurement.rows import checked_rows, joint_problem, rows_of_equal_mask, whitenings_of
+from magloc.measurement.rows import checked_rows, rows_of_equal_mask, whitened_model, whitenings_of
 
 _ROWS_AT_ONCE = 256
 
@@ -56,7 +56,7 @@ def fix_residuals(
             block = rows[begin : begin + _ROWS_AT_ONCE]
             ambient = None if ambient_T is None else ambient_T[block]
             whitened = whitenings_of(array, mask, readings[block])
-            problem, raw = joint_problem(array, mask, readings[block], whitened, ambient)
+            problem, raw = whitened_model(array, mask, readings[block], whitened, ambient)
             fields = np.stack([_fields(array, fixes[row]) for row in block])
             residual = problem.whitened(raw) - problem.predicted(fields)
             result[np.ix_(block, np.flatnonzero(mask))] = residual[:, mask]

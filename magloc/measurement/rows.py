@@ -11,7 +11,7 @@ from arrays.array import SensorArray
 from arrays.noise import reading_covariance
 from arrays.typing import FloatArray
 from arrays.whitening import Whitening, whitening, whitenings
-from magloc.measurement.whitened import JointProblem
+from magloc.measurement.whitened import WhitenedModel
 
 NO_SIGNAL = "the sensors' readings do not differ: no signal"
 
@@ -55,13 +55,13 @@ def ambient_fields(array: SensorArray, n_rows: int, ambient_T: FloatArray | None
     return fields - uniform + ambient_T[:, None]
 
 
-def joint_problem(
+def whitened_model(
     array: SensorArray,
     mask: NDArray[np.bool_],
     readings_T: FloatArray,
     whitenings: list[Whitening],
     ambient_T: FloatArray | None,
-) -> tuple[JointProblem, FloatArray]:
+) -> tuple[WhitenedModel, FloatArray]:
     """Exact model and whitened readings of rows that miss the same channels.
 
     Parameters
@@ -78,14 +78,14 @@ def joint_problem(
 
     Returns
     -------
-    problem : JointProblem
+    problem : WhitenedModel
     raw : ndarray, shape (n, C)
         What vector channels read above the ambient field, and all that scalar channels read, divided by the noise;
-        :meth:`JointProblem.whitened` frees it from the common field.
+        :meth:`WhitenedModel.whitened` frees it from the common field.
     """
     fields = ambient_fields(array, len(readings_T), ambient_T)
     vector = ~array.channel_is_scalar
     ambient = np.einsum("ncj,cj->nc", fields[:, array.channel_sensor], array.channel_gain) * vector
     channels = np.where(mask, readings_T - array.channel_offset_T - ambient, 0.0)
     raw = np.stack([w.root @ row for w, row in zip(whitenings, channels, strict=True)])
-    return JointProblem.of(array, whitenings, fields), raw
+    return WhitenedModel.of(array, whitenings, fields), raw

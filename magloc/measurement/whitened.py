@@ -129,7 +129,7 @@ class SeparableProblem(ScaledSensors):
 
 
 @dataclass(frozen=True, eq=False)
-class JointProblem(ScaledSensors):
+class WhitenedModel(ScaledSensors):
     """Geometry and whitening of b sets of readings of one array, scaled by the array's size.
 
     Attributes
@@ -151,7 +151,7 @@ class JointProblem(ScaledSensors):
     shrinkage: FloatArray
 
     @classmethod
-    def of(cls, array: SensorArray, whitenings: list[Whitening], ambient_T: FloatArray) -> JointProblem:
+    def of(cls, array: SensorArray, whitenings: list[Whitening], ambient_T: FloatArray) -> WhitenedModel:
         """Problem of b sets of readings, each with its whitening and its ambient field (b, N, 3)."""
         return cls(
             centroid=array.centroid,
@@ -168,7 +168,7 @@ class JointProblem(ScaledSensors):
     def __len__(self) -> int:
         return len(self.gain)
 
-    def rows(self, index: NDArray[np.intp]) -> JointProblem:
+    def rows(self, index: NDArray[np.intp]) -> WhitenedModel:
         """Problem of some of the readings, repeated at will."""
         return replace(
             self,
@@ -183,7 +183,7 @@ class JointProblem(ScaledSensors):
         """Whether moments m and -m give the same readings: moduli without an ambient field, and nothing else."""
         return bool(self.channel_is_scalar.all()) and not np.any(self.ambient)
 
-    def without_ambient(self) -> JointProblem:
+    def without_ambient(self) -> WhitenedModel:
         """The same without an ambient field."""
         return replace(self, ambient=np.zeros_like(self.ambient))
 

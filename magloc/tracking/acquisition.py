@@ -13,7 +13,7 @@ from scipy.special import chdtri
 from arrays.array import SensorArray
 from arrays.differences import decorrelated_differences
 from arrays.typing import FloatArray
-from magloc.localization.fit.prior import Knowledge
+from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.fit.results import Fix, Solution
 from magloc.localization.locator import ExactLocator
 from magloc.localization.search.moving_array import stacked_fix
@@ -71,7 +71,7 @@ class Acquisition:
     Parameters
     ----------
     array : SensorArray
-    knowledge : Knowledge
+    knowledge : SourcePrior
         Bounds for the fix of one row, in the array's frame.
     speed_m_s : float
         Characteristic speed of the source.
@@ -82,7 +82,7 @@ class Acquisition:
         What the last row says on its own, in the world frame.
     """
 
-    def __init__(self, array: SensorArray, knowledge: Knowledge, speed_m_s: float) -> None:
+    def __init__(self, array: SensorArray, knowledge: SourcePrior, speed_m_s: float) -> None:
         self.array = array
         self.speed_m_s = speed_m_s
         self.of_last_row = Fix(())

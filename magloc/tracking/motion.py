@@ -5,7 +5,7 @@ moment come first, whatever follows. With the array's pose known the state is in
 :func:`array_axes_transition` is the source paper's model (17) in the axes of an array whose motion is known.
 
 =============  =============================================================
-MotionMT       :func:`array_axes_transition`, :class:`UnknownMotion`
+MotionMT       :func:`array_axes_transition`, :class:`RandomWalk`
 MotionMV       :func:`array_axes_transition`, its rows of the moment, (29)
 =============  =============================================================
 """
@@ -121,7 +121,7 @@ def _without_rest(source: FloatArray, S: FloatArray, rest_sigma: FloatArray) -> 
 
 
 @dataclass(frozen=True)
-class UnknownMotion:
+class RandomWalk:
     """Position and moment as random walks of the characteristic speed and turn rate: the paper's S_q.
 
     ``S_q = diag(V Δt, V Δt, V Δt, |m| W Δt, …)``: every step is as long as the object may have moved in that time.
@@ -158,7 +158,7 @@ class UnknownMotion:
 
 
 @dataclass(frozen=True)
-class WanderingMotion:
+class OrnsteinUhlenbeck:
     r"""Position, and a moment that turns: speed and turn rate wander about zero, and are forgotten in time.
 
     State (p, m, v, ω), with
@@ -262,7 +262,7 @@ def _wandering_step(correlation_s: float, dt_s: float) -> tuple[float, float, Fl
 
 
 @dataclass(frozen=True)
-class ConstantTurn:
+class CoordinatedTurn:
     r"""A vehicle on a steady turn about the vertical: velocity and moment turn with one rate, which wanders.
 
     State (p, m, v, ω): :math:`\dot p = v`, :math:`\dot v = ω e_z × v`, :math:`\dot m = ω e_z × m`.

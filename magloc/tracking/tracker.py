@@ -30,7 +30,7 @@ from magloc.kalman import (
     predict_square_root,
     symmetric_square_root,
 )
-from magloc.localization.fit.prior import NOTHING_KNOWN, Knowledge
+from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import Solution
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
@@ -78,7 +78,7 @@ class Tracker:
     ----------
     array : SensorArray
     motion : MotionModel
-    knowledge : Knowledge
+    knowledge : SourcePrior
         Bounds for the fixes that start a track, in the array's frame.
 
     Attributes
@@ -94,7 +94,7 @@ class Tracker:
         array: SensorArray,
         motion: MotionModel,
         *,
-        knowledge: Knowledge = NOTHING_KNOWN,
+        knowledge: SourcePrior = NOTHING_KNOWN,
         keep_steps: bool = False,
     ) -> None:
         self.array = array

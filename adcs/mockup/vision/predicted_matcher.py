@@ -176,8 +176,8 @@ class LightTracker:
         blurred = P + np.diag([(CENTROID_PX * s) ** 2, (CENTROID_PX * s) ** 2, (CENTROID_PX / 100.0) ** 2])
         factor = np.linalg.cholesky(blurred)
         whitened = np.linalg.solve(factor, error)
-        log_volume = 1.5 * math.log(2.0 * math.pi) + float(np.log(np.diagonal(factor)).sum())
-        density: FloatArray = -0.5 * (whitened**2).sum(axis=0) - log_volume + 2.0 * math.log(s)
+        log_evidence_volume = 1.5 * math.log(2.0 * math.pi) + float(np.log(np.diagonal(factor)).sum())
+        density: FloatArray = -0.5 * (whitened**2).sum(axis=0) - log_evidence_volume + 2.0 * math.log(s)
         return density
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
 from magloc.fields.dipole import MU0_OVER_4PI
-from magloc.measurement.whitened import JointProblem
+from magloc.measurement.whitened import WhitenedModel
 
 # A refinement has converged where the linearised model promises to lower χ² by less than this, absolute and relative.
 PROMISE_ABSOLUTE = 1e-8
@@ -86,7 +86,7 @@ def tangents(q: FloatArray) -> FloatArray:
     return np.stack(columns, axis=-1)
 
 
-def fit_moments(problem: JointProblem, y: FloatArray, q: FloatArray) -> FloatArray:
+def fit_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> FloatArray:
     """Scaled moments (b, K, 3) that fit y (b, C) best at q, the channels linearised about the ambient field alone."""
     gain = problem.linear_gain(np.zeros_like(problem.ambient))
     return _moment_step(problem.moment_jacobian(q, gain), y - problem.predicted(np.zeros_like(problem.ambient)))
@@ -127,13 +127,13 @@ class _NormalEquations:
 
 
 def refine_moments(
-    problem: JointProblem, y: FloatArray, q: FloatArray, mu: FloatArray, *, max_iterations: int = 60
+    problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray, *, max_iterations: int = 60
 ) -> JointFits:
     """Moments of sources at known places, from starts: a damped Gauss-Newton iteration.
 
     Parameters
     ----------
-    problem : JointProblem
+    problem : WhitenedModel
     y : ndarray, shape (b, C)
         Whitened readings.
     q, mu : ndarray, shapes (b, K, 4) and (b, K, 3)
@@ -149,7 +149,7 @@ def refine_moments(
 
 
 def refine(
-    problem: JointProblem,
+    problem: WhitenedModel,
     y: FloatArray,
     q: FloatArray,
     mu: FloatArray,
@@ -161,7 +161,7 @@ def refine(
 
     Parameters
     ----------
-    problem : JointProblem
+    problem : WhitenedModel
     y : ndarray, shape (b, C)
         Whitened readings.
     q, mu : ndarray, shapes (b, K, 4) and (b, K, 3)
@@ -180,7 +180,7 @@ def refine(
 
 
 def _descend(
-    problem: JointProblem,
+    problem: WhitenedModel,
     y: FloatArray,
     q: FloatArray,
     mu: FloatArray,
@@ -290,7 +290,7 @@ def _moved(
     return moved / norm, new_mu / norm**3, share
 
 
-def covariances(problem: JointProblem, fits: JointFits) -> FloatArray:
+def covariances(problem: WhitenedModel, fits: JointFits) -> FloatArray:
     """Inverse information of (p₁, m₁, p₂, m₂, …) of every fit: (b, 6 K, 6 K) [m, A·m²], NaN where it is singular."""
     n_fits, n_sources = fits.q.shape[:2]
     if not n_fits:

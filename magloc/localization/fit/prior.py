@@ -12,7 +12,7 @@ from arrays.typing import FloatArray
 
 
 @dataclass(frozen=True)
-class Knowledge:
+class SourcePrior:
     """What is known of the source beforehand; solutions that contradict it are left out.
 
     Attributes
@@ -49,4 +49,4 @@ class Knowledge:
         return np.linalg.norm(moment_Am2, axis=-1) <= self.largest_moment_Am2
 
 
-NOTHING_KNOWN = Knowledge()
+NOTHING_KNOWN = SourcePrior()

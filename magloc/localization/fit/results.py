@@ -52,7 +52,7 @@ class Solution:
         Whether the covariance describes the uncertainty: the range is observable in one interval, no other solution has
         a weight to speak of, the standard deviations of position and moment are small against the range and the moment
         (:data:`magloc.localization.uncertainty.ambiguity.LARGEST_GAUSSIAN_SIGMA`), and χ² is one of noise and rises as
-        that of a Gaussian does (:func:`magloc.localization.uncertainty.covariance.is_described`).
+        that of a Gaussian does (:func:`magloc.localization.uncertainty.covariance.covariance_is_valid`).
     """
 
     position_m: FloatArray

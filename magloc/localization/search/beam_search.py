@@ -1,6 +1,6 @@
 """Search for several dipoles at once: beams of the best distinct fits, one more source at a time, and random restarts.
 
-Everything works on b sets of readings of one :class:`magloc.measurement.whitened.JointProblem` at once.
+Everything works on b sets of readings of one :class:`magloc.measurement.whitened.WhitenedModel` at once.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from magloc.localization.search.candidates import (
     modulus_templates,
     rows_of_equal_gain,
 )
-from magloc.measurement.whitened import JointProblem
+from magloc.measurement.whitened import WhitenedModel
 
 Allowed = Callable[[FloatArray, FloatArray], NDArray[np.bool_]]
 _SAME_RAD = 0.02
@@ -156,7 +156,7 @@ class Search:
     n_starts: int = 6
     apart_rad: float = 0.25
 
-    def first(self, problem: JointProblem, y: FloatArray) -> Beam:
+    def first(self, problem: WhitenedModel, y: FloatArray) -> Beam:
         """One source, from the candidates that explain most."""
         silent = np.zeros_like(problem.ambient)
         gain = problem.linear_gain(silent)
@@ -177,7 +177,7 @@ class Search:
             fits = fits.with_opposite_moments(len(y))
         return best_distinct(self._known(fits), len(y), self.width)
 
-    def _needs_templates(self, problem: JointProblem, y: FloatArray) -> bool:
+    def _needs_templates(self, problem: WhitenedModel, y: FloatArray) -> bool:
         """Whether some moduli are far from linear: their source's field is not small against the ambient field."""
         scalar = problem.channel_is_scalar
         if not scalar.any():
@@ -186,7 +186,7 @@ class Search:
         signal = np.abs(y[:, scalar])
         return bool(np.any(signal > 0.2 * ambient * np.abs(problem.gain[:, scalar, 0])))
 
-    def _template_starts(self, problem: JointProblem, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _template_starts(self, problem: WhitenedModel, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         directions = hemisphere(_N_TEMPLATE_DIRECTIONS)
         if not problem.channel_is_scalar.all():
             directions = np.concatenate([directions, -directions])
@@ -207,19 +207,19 @@ class Search:
         length = np.sum(unit * y[row], axis=-1) / np.maximum(np.sum(unit * unit, axis=-1), 1e-300)
         return q, direction * np.maximum(length, 1e-30).reshape(len(y), n_starts, 1)
 
-    def _linear_starts(self, problem: JointProblem, gain: FloatArray, residual: FloatArray) -> NDArray[np.intp]:
+    def _linear_starts(self, problem: WhitenedModel, gain: FloatArray, residual: FloatArray) -> NDArray[np.intp]:
         return distinct_best(
             self._linear_scores(problem, gain, residual), self.candidates, self.n_starts, self.apart_rad
         )
 
-    def _linear_scores(self, problem: JointProblem, gain: FloatArray, residual: FloatArray) -> FloatArray:
+    def _linear_scores(self, problem: WhitenedModel, gain: FloatArray, residual: FloatArray) -> FloatArray:
         scores = np.empty((len(residual), len(self.candidates)))
         for rows in rows_of_equal_gain(gain):
             bases = self._bases(problem, gain[rows[0]], int(rows[0]))
             scores[rows] = linear_scores(bases, residual[rows])
         return scores
 
-    def _bases(self, problem: JointProblem, gain: FloatArray, row: int) -> SingleArray:
+    def _bases(self, problem: WhitenedModel, gain: FloatArray, row: int) -> SingleArray:
         return linear_bases(problem, gain, row, self.candidates)
 
     def _known(self, fits: JointFits) -> JointFits:
@@ -227,7 +227,7 @@ class Search:
         allowed = np.all(self.allowed(fits.q, fits.mu), axis=1)
         return JointFits(fits.q, fits.mu, np.where(allowed, fits.chi2, np.inf), fits.iterations)
 
-    def one_more(self, problem: JointProblem, y: FloatArray, beam: Beam) -> Beam:
+    def one_more(self, problem: WhitenedModel, y: FloatArray, beam: Beam) -> Beam:
         """Beam with another source: every fit is extended by the candidates that explain most of what it leaves."""
         width = beam.chi2.shape[1]
         row = np.repeat(np.arange(len(y)), width)
@@ -241,14 +241,14 @@ class Search:
         fits = self._extended(problem, y, np.repeat(row, self.n_starts), q, mu, chosen)
         return best_distinct(fits, len(y), self.width)
 
-    def left_scores(self, problem: JointProblem, y: FloatArray, q: FloatArray, mu: FloatArray) -> FloatArray:
+    def left_scores(self, problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray) -> FloatArray:
         """Energy that every candidate explains of what the sources (b, K, …) leave: (b, n)."""
         fields = problem.source_fields(q, mu)
         return self._linear_scores(problem, problem.linear_gain(fields), y - problem.predicted(fields))
 
     def _extended(
         self,
-        problem: JointProblem,
+        problem: WhitenedModel,
         y: FloatArray,
         row: NDArray[np.intp],
         q: FloatArray,
@@ -269,7 +269,7 @@ class Search:
         fits = refine(at, y_each, np.concatenate([q[each], new], axis=1), np.concatenate([mu[each], new_mu], axis=1))
         return self._known(fits)
 
-    def one_less(self, problem: JointProblem, y: FloatArray, beam: Beam) -> Beam:
+    def one_less(self, problem: WhitenedModel, y: FloatArray, beam: Beam) -> Beam:
         """Beam without one source: every source of the best fits is left out in turn."""
         n_sources, width = beam.n_sources, beam.chi2.shape[1]
         q, mu = _filled(beam)
@@ -279,7 +279,7 @@ class Search:
         row = np.repeat(np.arange(len(y)), width * n_sources)
         return best_distinct(self._known(refine(problem.rows(row), y[row], q, mu)), len(y), self.width)
 
-    def restarted(self, problem: JointProblem, y: FloatArray, beam: Beam, rng: np.random.Generator) -> Beam:
+    def restarted(self, problem: WhitenedModel, y: FloatArray, beam: Beam, rng: np.random.Generator) -> Beam:
         """Beam after a random source of random fits is replaced by a random one of the best candidates."""
         n_rows, width = beam.chi2.shape
         n_sources, n_tries = beam.n_sources, self.n_starts * self.width

@@ -17,7 +17,7 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.compilation import over_rows
 from magloc.directions import fibonacci_directions
-from magloc.measurement.whitened import JointProblem
+from magloc.measurement.whitened import WhitenedModel
 from magloc.measurement.whitened_compiled import candidate_bases
 
 SingleArray = NDArray[np.float32]
@@ -25,12 +25,12 @@ _SAME_GAIN = 0.02
 _CANDIDATES_AT_ONCE = 512
 
 
-def linear_bases(problem: JointProblem, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
+def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
     """Orthonormal whitened bases of the three unit moments at candidates (n, 4), linear channels: (C, 3 n).
 
     Parameters
     ----------
-    problem : JointProblem
+    problem : WhitenedModel
     gain : ndarray, shape (C, 3)
         What every channel reads of a small field, divided by its noise.
     row : int
@@ -78,7 +78,7 @@ def rows_of_equal_gain(gain: FloatArray) -> Iterator[NDArray[np.intp]]:
         yield np.flatnonzero(of_row.ravel() == i)
 
 
-def modulus_templates(problem: JointProblem, row: int, candidates: FloatArray, directions: FloatArray) -> SingleArray:
+def modulus_templates(problem: WhitenedModel, row: int, candidates: FloatArray, directions: FloatArray) -> SingleArray:
     """Whitened readings of unit length of moments along directions (d, 3) at candidates (n, 4): (n, d, C).
 
     Without ambient field all channels, moduli too, are proportional to the length of the moment.

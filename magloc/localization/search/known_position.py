@@ -16,13 +16,13 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.directions import fibonacci_directions
 from magloc.localization.fit.gauss_newton import JointFits, fit_moments, refine_moments
-from magloc.localization.fit.prior import NOTHING_KNOWN, Knowledge
+from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN, SILENT, Fix, Solution
 from magloc.localization.search.beam_search import Beam
-from magloc.localization.uncertainty.ambiguity import LARGEST_GAUSSIAN_SIGMA, log_volume, weights
+from magloc.localization.uncertainty.ambiguity import LARGEST_GAUSSIAN_SIGMA, log_evidence_volume, weights
 from magloc.localization.uncertainty.range_interval import is_detected
-from magloc.measurement.rows import NO_SIGNAL, checked_rows, joint_problem, rows_of_equal_mask, whitenings_of
-from magloc.measurement.whitened import JointProblem
+from magloc.measurement.rows import NO_SIGNAL, checked_rows, rows_of_equal_mask, whitened_model, whitenings_of
+from magloc.measurement.whitened import WhitenedModel
 
 N_UNKNOWNS = 3
 _N_DIRECTIONS = 60
@@ -42,7 +42,7 @@ class MomentLocator:
     array : SensorArray
     position_m : array_like, shape (3,)
         The source in the array's frame [m].
-    knowledge : Knowledge
+    knowledge : SourcePrior
         Of which only the bound of the moment is used.
 
     Raises
@@ -51,7 +51,7 @@ class MomentLocator:
         The position is not three finite numbers, or is that of a sensor.
     """
 
-    def __init__(self, array: SensorArray, position_m: ArrayLike, *, knowledge: Knowledge = NOTHING_KNOWN) -> None:
+    def __init__(self, array: SensorArray, position_m: ArrayLike, *, knowledge: SourcePrior = NOTHING_KNOWN) -> None:
         position = np.asarray(position_m, dtype=np.float64)
         if position.shape != (3,) or not np.isfinite(position).all():
             raise ValueError(f"Input position_m must be three finite numbers; instead received {position.tolist()}.")
@@ -113,7 +113,7 @@ class MomentLocator:
         if n_differences < N_UNKNOWNS:
             reason = f"{int(mask.sum())} readings give {n_differences} independent differences, {N_UNKNOWNS} are needed"
             return [Fix((), reason, detected=False)] * len(readings)
-        problem, raw = joint_problem(self.array, mask, readings, whitenings, ambient)
+        problem, raw = whitened_model(self.array, mask, readings, whitenings, ambient)
         y = problem.whitened(raw)
         q = problem.homogeneous(positions)[:, None]
         beam = _all_moments(problem, y, q)
@@ -130,7 +130,7 @@ class MomentLocator:
         energy = np.sum((y - problem.predicted(np.zeros_like(problem.ambient))) ** 2, axis=1)
         told, volume = np.full(chi2.shape, np.inf), np.zeros(chi2.shape)
         told[of_row, of_fit] = np.where(determined, fits.chi2, np.inf)
-        volume[of_row, of_fit] = log_volume(covariance, moment[of_row, of_fit][:, None])
+        volume[of_row, of_fit] = log_evidence_volume(covariance, moment[of_row, of_fit][:, None])
         weight, detected = weights(told, volume), is_detected(energy, n_differences).tolist()
         # The readings of vector sensors are linear in the moment, those of moduli only over a small part of it.
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -164,7 +164,7 @@ class MomentLocator:
         ]
 
 
-def _all_moments(problem: JointProblem, y: FloatArray, q: FloatArray) -> Beam:
+def _all_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> Beam:
     """Every distinct optimum of the moment at q (b, 1, 4), from the linear solution and from moments all around."""
     n = len(y)
     starts = [fit_moments(problem, y, q)]
@@ -183,7 +183,7 @@ def _all_moments(problem: JointProblem, y: FloatArray, q: FloatArray) -> Beam:
     return _distinct(problem, y, q, fits)
 
 
-def _distinct(problem: JointProblem, y: FloatArray, q: FloatArray, fits: JointFits) -> Beam:
+def _distinct(problem: WhitenedModel, y: FloatArray, q: FloatArray, fits: JointFits) -> Beam:
     """The best optima of every row that χ² rises between, and their opposites where χ² is even in the moment."""
     n = len(y)
     mu, chi2 = fits.mu.reshape(n, -1, 3), fits.chi2.reshape(n, -1).copy()
@@ -214,7 +214,7 @@ def _distinct(problem: JointProblem, y: FloatArray, q: FloatArray, fits: JointFi
     )
 
 
-def _is_even(problem: JointProblem) -> NDArray[np.bool_]:
+def _is_even(problem: WhitenedModel) -> NDArray[np.bool_]:
     """Whether the readings (b,) stay as they are if the moment is reversed: moduli alone, without an ambient field."""
     silent = ~np.any(problem.gain, axis=-1)
     lone = problem.channel_is_scalar & ~np.any(problem.ambient, axis=-1)[:, problem.channel_sensor]
@@ -222,7 +222,7 @@ def _is_even(problem: JointProblem) -> NDArray[np.bool_]:
     return even
 
 
-def _covariances(problem: JointProblem, y: FloatArray, fits: JointFits) -> FloatArray:
+def _covariances(problem: WhitenedModel, y: FloatArray, fits: JointFits) -> FloatArray:
     """Inverse of half the second derivative of χ² (b, 3, 3) [A·m²], NaN where it is not positive.
 
     Where two exact solutions are about to meet, the first derivative of the readings alone would say nothing.

@@ -14,13 +14,13 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.directions import fibonacci_directions
 from magloc.localization.fit.gauss_newton import covariances
-from magloc.localization.fit.prior import NOTHING_KNOWN, Knowledge
+from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN, Fix, Solution
 from magloc.localization.search.beam_search import Search
 from magloc.localization.uncertainty.covariance import fit_uncertainty
 from magloc.localization.uncertainty.range_interval import is_detected, is_observable_set
 from magloc.measurement.rows import NO_SIGNAL, ambient_fields, whitenings_of
-from magloc.measurement.whitened import JointProblem
+from magloc.measurement.whitened import WhitenedModel
 
 N_UNKNOWNS = 6
 _N_DIRECTIONS = 200
@@ -35,7 +35,7 @@ def stacked_fix(
     R_world_from_array: FloatArray,
     ambient_T: FloatArray | None = None,
     *,
-    knowledge: Knowledge = NOTHING_KNOWN,
+    knowledge: SourcePrior = NOTHING_KNOWN,
 ) -> Fix:
     """Fix of a source at rest, in the world frame, from rows of an array whose pose is known.
 
@@ -48,7 +48,7 @@ def stacked_fix(
         Pose of the array in every row.
     ambient_T : ndarray, shape (n, 3), optional
         Ambient field of every row in the array's frame [T], in place of the array's own.
-    knowledge : Knowledge
+    knowledge : SourcePrior
         Bounds of the position in the world frame, and of the moment.
 
     Returns
@@ -106,7 +106,7 @@ def _problem(
     origins: FloatArray,
     rotations: FloatArray,
     ambient_T: FloatArray | None,
-) -> tuple[JointProblem, FloatArray, int]:
+) -> tuple[WhitenedModel, FloatArray, int]:
     """All rows as one set in the world frame: the problem, whitened readings (1, n C), number of differences."""
     n = len(readings)
     whitenings = [whitenings_of(array, np.isfinite(row), row[None])[0] for row in readings]
@@ -124,7 +124,7 @@ def _problem(
     centroid = places.mean(axis=0)
     radius = float(np.linalg.norm(places - centroid, axis=1).max())
     sensor = array.channel_sensor.astype(np.intp)
-    problem = JointProblem(
+    problem = WhitenedModel(
         centroid=centroid,
         radius=radius,
         sensors=(places - centroid) / radius,
@@ -138,7 +138,7 @@ def _problem(
     return problem, problem.whitened(raw[None]), sum(w.n_differences for w in whitenings)
 
 
-def _candidates(problem: JointProblem) -> FloatArray:
+def _candidates(problem: WhitenedModel) -> FloatArray:
     """Positions around the track of the array: along directions from the centroid, and near every place of it."""
     ranges = problem.radius * np.geomspace(0.3, 20.0, _N_RANGES)
     outer = problem.centroid + (ranges[:, None, None] * fibonacci_directions(_N_DIRECTIONS)).reshape(-1, 3)

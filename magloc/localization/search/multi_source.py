@@ -22,14 +22,14 @@ from scipy.special import chdtri
 from arrays.array import SensorArray
 from arrays.typing import FloatArray, IntArray
 from magloc.localization.fit.gauss_newton import JointFits, covariances, refine
-from magloc.localization.fit.prior import NOTHING_KNOWN, Knowledge
+from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN, SILENT, JointFix, JointSolution, Source
 from magloc.localization.search.beam_search import Beam, Search, best_distinct, merged
 from magloc.localization.search.candidates import candidate_positions, linear_bases, linear_scores
 from magloc.localization.uncertainty.covariance import fit_uncertainty
 from magloc.localization.uncertainty.range_interval import is_detected, is_observable_set
-from magloc.measurement.rows import NO_SIGNAL, checked_rows, joint_problem, rows_of_equal_mask, whitenings_of
-from magloc.measurement.whitened import JointProblem
+from magloc.measurement.rows import NO_SIGNAL, checked_rows, rows_of_equal_mask, whitened_model, whitenings_of
+from magloc.measurement.whitened import WhitenedModel
 
 N_UNKNOWNS = 6
 # A fit whose χ² is above this quantile is no optimum worth the name yet; above the lower one another source is tried.
@@ -58,7 +58,7 @@ class SeveralLocator:
     array : SensorArray
     n_sources : int, optional
         Number of sources; by default it is chosen, up to five.
-    knowledge : Knowledge
+    knowledge : SourcePrior
         Bounds that hold for every source.
     seed : int
         Of random restarts and of the draws for the threshold.
@@ -74,7 +74,7 @@ class SeveralLocator:
         array: SensorArray,
         *,
         n_sources: int | None = None,
-        knowledge: Knowledge = NOTHING_KNOWN,
+        knowledge: SourcePrior = NOTHING_KNOWN,
         seed: int = 0,
     ) -> None:
         whitening = whitenings_of(array, np.ones(array.n_channels, dtype=bool), np.zeros((1, array.n_channels)))[0]
@@ -152,7 +152,7 @@ class SeveralLocator:
         if n_differences < fewest:
             reason = f"{int(mask.sum())} readings give {n_differences} independent differences, {fewest} are needed"
             return [JointFix((), reason, detected=False)] * len(readings)
-        problem, raw = joint_problem(self.array, mask, readings, whitenings, ambient)
+        problem, raw = whitened_model(self.array, mask, readings, whitenings, ambient)
         y = problem.whitened(raw)
         loud = np.flatnonzero(np.sum(y * y, axis=1) >= SILENT * n_differences)
         fixes = [JointFix((), NO_SIGNAL, detected=False)] * len(readings)
@@ -167,7 +167,7 @@ class SeveralLocator:
 class _Levels:
     """The search over numbers of sources for one block of rows."""
 
-    def __init__(self, locator: SeveralLocator, problem: JointProblem, y: FloatArray, n_differences: int) -> None:
+    def __init__(self, locator: SeveralLocator, problem: WhitenedModel, y: FloatArray, n_differences: int) -> None:
         self.locator, self.problem, self.y, self.n_differences = locator, problem, y, n_differences
         self.asked = locator.n_sources
         self.most = min(locator.most, max(1, most_sources(n_differences)))
@@ -413,7 +413,7 @@ def _squared_ratio(values: FloatArray, covariance: FloatArray) -> FloatArray:
 
 
 def _marked_as_merged(
-    fix: JointFix, problem: JointProblem, more: Beam, row: int, asked: int | None, *, certain: bool
+    fix: JointFix, problem: WhitenedModel, more: Beam, row: int, asked: int | None, *, certain: bool
 ) -> JointFix:
     """A fix with fewer sources than asked for: the source that stands for the closest pair of the larger fit."""
     best = fix.solutions[0]

@@ -21,17 +21,17 @@ from arrays.typing import FloatArray
 from arrays.whitening import Whitening, whitening, whitenings
 from magloc.compilation import over_rows
 from magloc.fields.dipole import MU0_OVER_4PI
-from magloc.localization.fit.prior import NOTHING_KNOWN, Knowledge
+from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN, SILENT, Fix, Solution
 from magloc.localization.search import single_source_compiled as kernels
 from magloc.localization.search.candidates import candidate_positions
 from magloc.localization.uncertainty import covariance_compiled, range_profile_compiled
 from magloc.localization.uncertainty.ambiguity import Rivals
-from magloc.localization.uncertainty.covariance import is_described
+from magloc.localization.uncertainty.covariance import covariance_is_valid
 from magloc.localization.uncertainty.range_interval import is_detected
 from magloc.measurement import whitened_compiled
 from magloc.measurement.rows import NO_SIGNAL, ambient_fields, checked_rows, rows_of_equal_mask
-from magloc.measurement.whitened import JointProblem, SeparableProblem
+from magloc.measurement.whitened import SeparableProblem, WhitenedModel
 
 N_UNKNOWNS = 6
 _ROWS_AT_ONCE = 256
@@ -90,7 +90,7 @@ class Locator:
         Least distance of two candidates, as an angle of their homogeneous coordinates.
     max_iterations : int
         Linearisations of one refinement at most; a refinement that needs more did not converge.
-    knowledge : Knowledge
+    knowledge : SourcePrior
         Bounds of the source's position and moment.
 
     Raises
@@ -106,7 +106,7 @@ class Locator:
         n_starts: int = 6,
         apart_rad: float = 0.3,
         max_iterations: int = 100,
-        knowledge: Knowledge = NOTHING_KNOWN,
+        knowledge: SourcePrior = NOTHING_KNOWN,
     ) -> None:
         if array.channel_is_scalar.any():
             raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
@@ -363,8 +363,8 @@ class Locator:
         gaussian, claimed = ranges.gaussian.copy(), np.nonzero(ranges.gaussian)
         if claimed[0].size:
             without_ambient = np.zeros((len(of_rows), self.array.n_sensors, 3))
-            same = JointProblem.of(self.array, of_rows, without_ambient).rows(found.model[-1][claimed[0]])
-            gaussian[claimed] = is_described(
+            same = WhitenedModel.of(self.array, of_rows, without_ambient).rows(found.model[-1][claimed[0]])
+            gaussian[claimed] = covariance_is_valid(
                 same,
                 y[claimed[0]],
                 position[claimed][:, None],

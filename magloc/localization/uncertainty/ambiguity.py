@@ -30,7 +30,7 @@ MISFIT = 1e-6
 """Probability of χ² under noise below which the model does not hold, or the search missed the best solution."""
 
 
-def log_volume(covariance: FloatArray, moment: FloatArray, offset_m: FloatArray | None = None) -> FloatArray:
+def log_evidence_volume(covariance: FloatArray, moment: FloatArray, offset_m: FloatArray | None = None) -> FloatArray:
     r"""Logarithm of how much of what may be thought of beforehand a solution stands for, up to a constant.
 
     Nothing is known beforehand of the scale: direction, orientation and the logarithms of range and moment are uniform,
@@ -73,7 +73,7 @@ def weights(chi2: ArrayLike, volume: ArrayLike) -> FloatArray:
     chi2 : array_like, shape (..., n)
         Infinite where there is no solution.
     volume : array_like, shape (..., n)
-        :func:`log_volume`.
+        :func:`log_evidence_volume`.
 
     Returns
     -------
@@ -200,7 +200,7 @@ class Rivals:
         """From solutions, best first, and the energy (b,) of the rows' differences as they are without a source."""
         determined = np.isfinite(covariance).all(axis=(-2, -1))
         listed = np.where(determined, chi2, np.inf)
-        weight = weights(listed, log_volume(covariance, moment[..., None, :], offset_m[..., None, :]))
+        weight = weights(listed, log_evidence_volume(covariance, moment[..., None, :], offset_m[..., None, :]))
         raised = rise(energy, chi2[:, 0], n_differences, levels(listed, weight))
         return cls(listed, covariance, offset_m, moment, weight, raised)
 

@@ -21,7 +21,7 @@ from magloc.localization.uncertainty.ambiguity import (
     LARGEST_GAUSSIAN_SIGMA,
     MISFIT,
     Rivals,
-    log_volume,
+    log_evidence_volume,
     longest_axes,
     relative_sigma,
     weights,
@@ -37,7 +37,7 @@ from magloc.localization.uncertainty.range_interval import (
     union,
 )
 from magloc.localization.uncertainty.range_profile import profile_stretches, ranges_within
-from magloc.measurement.whitened import JointProblem
+from magloc.measurement.whitened import WhitenedModel
 
 # By how much the rise of χ² at one standard deviation may differ from one where errors are Gaussian.
 _BEND = 0.5
@@ -66,7 +66,7 @@ class FitUncertainty:
 
 
 def fit_uncertainty(
-    problem: JointProblem,
+    problem: WhitenedModel,
     y: FloatArray,
     fits: JointFits,
     covariance: FloatArray,
@@ -78,7 +78,7 @@ def fit_uncertainty(
 
     Parameters
     ----------
-    problem : JointProblem
+    problem : WhitenedModel
         Of f fits.
     y : ndarray, shape (f, C)
         Whitened readings.
@@ -101,8 +101,8 @@ def fit_uncertainty(
     return _of_several(problem, y, fits, covariance, of_row, is_detected(energy, n_differences), n_differences)
 
 
-def is_described(
-    problem: JointProblem,
+def covariance_is_valid(
+    problem: WhitenedModel,
     y: FloatArray,
     position_m: FloatArray,
     moment_Am2: FloatArray,
@@ -117,7 +117,7 @@ def is_described(
 
     Parameters
     ----------
-    problem : JointProblem
+    problem : WhitenedModel
         Of f fits.
     y : ndarray, shape (f, C)
         Whitened readings.
@@ -143,7 +143,7 @@ def is_described(
 
 
 def _of_one(
-    problem: JointProblem,
+    problem: WhitenedModel,
     y: FloatArray,
     fits: JointFits,
     covariance: FloatArray,
@@ -181,17 +181,17 @@ def _of_one(
 
 
 def _described(
-    problem: JointProblem,
+    problem: WhitenedModel,
     y: FloatArray,
     fits: JointFits,
     covariance: FloatArray,
     n_differences: int,
     which: NDArray[np.intp],
 ) -> NDArray[np.bool_]:
-    """:func:`is_described` of some of the fits."""
+    """:func:`covariance_is_valid` of some of the fits."""
     q, mu = fits.q[which], fits.mu[which]
     dof = n_differences - 6 * q.shape[1]
-    return is_described(
+    return covariance_is_valid(
         problem.rows(which),
         y[which],
         problem.position(q),
@@ -203,7 +203,7 @@ def _described(
 
 
 def _of_several(
-    problem: JointProblem,
+    problem: WhitenedModel,
     y: FloatArray,
     fits: JointFits,
     covariance: FloatArray,
@@ -228,7 +228,7 @@ def _of_several(
         for of_fit, intervals in zip(sets, of_source, strict=True):
             of_fit.append(intervals)
     chi2 = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2, np.inf)
-    volume, weight = log_volume(covariance, moment, offset), np.zeros(n_fits)
+    volume, weight = log_evidence_volume(covariance, moment, offset), np.zeros(n_fits)
     for row in np.unique(of_row):
         weight[of_row == row] = weights(chi2[of_row == row], volume[of_row == row])
     gaussian &= (weight >= CERTAIN_WEIGHT)[:, None]

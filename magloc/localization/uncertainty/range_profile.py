@@ -13,7 +13,7 @@ from arrays.typing import FloatArray
 from magloc.chi_square import RISE_95
 from magloc.localization.fit.gauss_newton import JointFits, refine
 from magloc.localization.uncertainty.range_interval import ranges_of, relative_range_sigma
-from magloc.measurement.whitened import JointProblem
+from magloc.measurement.whitened import WhitenedModel
 
 _SMALLEST_ALPHA = 1e-6
 # Steps outwards in standard deviations of a Gaussian profile, about the one where it would have risen enough.
@@ -22,7 +22,7 @@ _ROUNDS = 3
 
 
 def profile_stretches(
-    problem: JointProblem,
+    problem: WhitenedModel,
     y: FloatArray,
     fits: JointFits,
     source: int,
@@ -33,7 +33,7 @@ def profile_stretches(
 
     Parameters
     ----------
-    problem : JointProblem
+    problem : WhitenedModel
     y : ndarray, shape (b, C)
         Whitened readings.
     fits : JointFits
@@ -88,7 +88,7 @@ def profile_stretches(
 
 
 def ranges_within(
-    problem: JointProblem,
+    problem: WhitenedModel,
     y: FloatArray,
     fits: JointFits,
     source: int,
@@ -106,7 +106,7 @@ def ranges_within(
 
 
 def _rises(
-    problem: JointProblem, y: FloatArray, fits: JointFits, source: int, rows: NDArray[np.intp], alpha: FloatArray
+    problem: WhitenedModel, y: FloatArray, fits: JointFits, source: int, rows: NDArray[np.intp], alpha: FloatArray
 ) -> FloatArray:
     """Rise of χ² above the optima of rows (r,) at ranges (r, g), everything else fitted anew from the optimum."""
     n, n_grid = alpha.shape

@@ -21,7 +21,7 @@ from arrays import geometries
 from arrays.array_file import read_array
 from magloc.readings import Readings, Truth, read_readings, truth_of_rows
 from magloc.tracking.batch import track_record
-from magloc.tracking.motion import UnknownMotion, WanderingMotion
+from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import rows_of
 from magloc.tracking.smoother import smoothed
@@ -138,7 +138,7 @@ class TestJson:
 
     def test_are_the_librarys(self, run: Run, array: Path, readings: Path) -> None:
         results = results_of(run("track", readings, "--array", array, "--json", *MOTION))
-        tracker = Tracker(read_array(array), UnknownMotion(0.1, float(np.deg2rad(1.2))))
+        tracker = Tracker(read_array(array), RandomWalk(0.1, float(np.deg2rad(1.2))))
         table = read_readings(readings, tracker.array)
         points = track_record(tracker, list(rows_of(table.time_s, table.values_T)))
         for entry, point in zip(results, points, strict=True):
@@ -202,7 +202,7 @@ class TestTable:
 class TestSmooth:
     def test_is_the_librarys_smoother_of_a_wandering_motion(self, run: Run, array: Path, readings: Path) -> None:
         results = results_of(run("track", readings, "--array", array, "--json", "--smooth", *MOTION))
-        tracker = Tracker(read_array(array), WanderingMotion(0.1, float(np.deg2rad(1.2))), keep_steps=True)
+        tracker = Tracker(read_array(array), OrnsteinUhlenbeck(0.1, float(np.deg2rad(1.2))), keep_steps=True)
         table = read_readings(readings, tracker.array)
         points = track_record(tracker, list(rows_of(table.time_s, table.values_T)))
         for entry, point in zip(results, smoothed(points, tracker.steps), strict=True):
@@ -247,7 +247,7 @@ class TestTruth:
         """Later rows make less error possible: a filter's bound would be beaten."""
         outcome = run("track", readings, "--array", array, "--truth", truth, "--json", "--smooth", *MOTION)
         found = json.loads(outcome.out)["consistency"]["position_bound_m"]
-        tracker = Tracker(read_array(array), WanderingMotion(0.1, float(np.deg2rad(1.2))))
+        tracker = Tracker(read_array(array), OrnsteinUhlenbeck(0.1, float(np.deg2rad(1.2))))
         table, (_, p, m) = read_readings(readings, tracker.array), source()
         rows = list(rows_of(table.time_s, table.values_T))
         of_smoother, of_filter = (

@@ -28,7 +28,7 @@ from magloc.localization.locator import ExactLocator
 from magloc.localization.search.known_position import MomentLocator
 from magloc.localization.search.multi_source import SeveralLocator
 from magloc.localization.search.single_source import Locator
-from magloc.measurement.rows import joint_problem, whitenings_of
+from magloc.measurement.rows import whitened_model, whitenings_of
 from magloc.readings import read_readings, read_truth
 
 AMBIENT = np.array([2e-5, 0.0, 4.5e-5])
@@ -295,10 +295,10 @@ class TestWeightedProblem:
         fields = AMBIENT + 1e-8 * rng.normal(size=(4, array.n_sensors, 3))
         readings = array.readings_of(fields)
         mask = np.ones(array.n_channels, dtype=bool)
-        problem, raw = joint_problem(array, mask, readings, whitenings_of(array, mask, readings), None)
+        problem, raw = whitened_model(array, mask, readings, whitenings_of(array, mask, readings), None)
         per_channel = np.broadcast_to(weight[array.channel_sensor], raw.shape)
         lighter, lighter_raw = weighted(problem, raw, per_channel)
-        other, other_raw = joint_problem(noisier, mask, readings, whitenings_of(noisier, mask, readings), None)
+        other, other_raw = whitened_model(noisier, mask, readings, whitenings_of(noisier, mask, readings), None)
         q = problem.homogeneous(np.array([[[2.0, 1.0, 0.5]]] * 4))
         mu = problem.scaled_moment(q, rng.normal(size=(4, 1, 3)))
         chi2 = [
@@ -311,7 +311,7 @@ class TestWeightedProblem:
         array = replace(CUBE, common_field_T=1e-8)
         clean, _, _ = on_cube(2, seed=15)
         mask = np.ones(24, dtype=bool)
-        problem, raw = joint_problem(array, mask, clean, whitenings_of(array, mask, clean), None)
+        problem, raw = whitened_model(array, mask, clean, whitenings_of(array, mask, clean), None)
         same, same_raw = weighted(problem, raw, np.ones_like(raw))
         assert_allclose(same.whitened(same_raw), problem.whitened(raw), rtol=1e-9, atol=1e-9)
 

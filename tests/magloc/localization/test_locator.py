@@ -14,7 +14,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from arrays.array import SensorArray
 from arrays.geometries import cube, tetrahedron
-from magloc.localization.fit.prior import Knowledge
+from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.locator import ExactLocator
 from magloc.localization.search.single_source import Locator
 from tests.magloc.localization.fit.test_gauss_newton import (
@@ -224,7 +224,7 @@ class TestRows:
         array = scalar_cloud(13, None)
         rng = np.random.default_rng(13)
         p, m = sources_anywhere(rng, 10)
-        known = Knowledge(low_m=(-np.inf, -np.inf, 0.0), largest_moment_Am2=400.0)
+        known = SourcePrior(low_m=(-np.inf, -np.inf, 0.0), largest_moment_Am2=400.0)
         fixes = ExactLocator(array, knowledge=known).fit_rows(noisy_readings(array, p, m, rng))
         listed = [s for fix in fixes for s in fix.solutions]
         assert all(s.position_m[2] >= 0.0 and np.linalg.norm(s.moment_Am2) <= 400.0 for s in listed)

@@ -27,7 +27,7 @@ from magloc.kalman import iterated_update, predict_square_root
 from magloc.measurement.differences import predicted_channels
 from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
 from magloc.tracking.batch import track_record
-from magloc.tracking.motion import UnknownMotion, WanderingMotion
+from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, rows_of
 from magloc.tracking.tracker import MOST_ITERATIONS, SHRINK, TOLERANCE, Tracker
 from sims.magnetics.paths import Attitude, Steered
@@ -220,7 +220,7 @@ class TestEffect:
 class TestWithoutLastingErrors:
     def test_the_track_is_that_of_the_motion_alone(self) -> None:
         """To the last bit: the state, its square root and the NIS of a filter that knows nothing of sensor errors."""
-        array, motion = geometries.tetrahedron(1.5, "vector", 2e-10), UnknownMotion(1e-4, 1e-5)
+        array, motion = geometries.tetrahedron(1.5, "vector", 2e-10), RandomWalk(1e-4, 1e-5)
         t = 0.5 * np.arange(30.0)
         readings = np.tile(predicted_channels(array, SOURCE[:3], SOURCE[3:]), (30, 1))
         readings += 2e-10 * np.random.default_rng(6).normal(size=readings.shape)
@@ -269,7 +269,7 @@ class TestStart:
         _, true = uncalibrated(array, rng)
         readings = predicted_channels(true, SOURCE[:3], SOURCE[3:]) + 2e-10 * rng.normal(size=(6, 12))
         rows = list(rows_of(np.arange(6.0), readings))
-        tracker = Tracker(array, UnknownMotion(1e-6, 1e-6))
+        tracker = Tracker(array, RandomWalk(1e-6, 1e-6))
         measurements = [tracker.measurement(row) for row in rows]
         scale = np.concatenate([UNIT, tracker.errors.sigma])
 
@@ -299,7 +299,7 @@ class TestStart:
         readings, truth = simulation.readings, simulation.truth
         pose = (readings.array_position_m, readings.array_rotation_xyzw)
         rows = list(rows_of(readings.time_s, readings.values_T, *pose, readings.ambient_T))[79::4]
-        tracker = Tracker(simulation.array, UnknownMotion(1e-6, 1e-6))
+        tracker = Tracker(simulation.array, RandomWalk(1e-6, 1e-6))
         source = np.array([1.259, 0.109, -0.234, 6.0, 3.0, -4.0])
         covariance = np.diag([0.18, 0.47, 0.46, 3.0, 3.0, 3.0]) ** 2
         found = tracker.start(source, covariance, rows)
@@ -315,7 +315,7 @@ class TestStart:
 
     def test_without_errors_is_the_fix(self) -> None:
         covariance = np.diag((0.1 * UNIT) ** 2)
-        tracker = Tracker(geometries.tetrahedron(1.5), WanderingMotion(0.1, 0.02))
+        tracker = Tracker(geometries.tetrahedron(1.5), OrnsteinUhlenbeck(0.1, 0.02))
         found = tracker.start(SOURCE, covariance, [Row(0.0, np.zeros(12))])
         assert found is not None
         x, S = found.x, found.S
@@ -364,7 +364,7 @@ class TestErrorsAreFound:
                     readings.ambient_T,
                 )
             )
-            tracker = Tracker(simulation.array, UnknownMotion(1e-7, 1e-7))
+            tracker = Tracker(simulation.array, RandomWalk(1e-7, 1e-7))
             points = track_record(tracker, rows)
             assert points[-1].status == "tracked"
             x, S, _ = tracker.state()

@@ -13,7 +13,7 @@ import sims
 from arrays import geometries
 from arrays.array import SensorArray
 from magloc.tracking.batch import track_record
-from magloc.tracking.motion import MotionModel, UnknownMotion, WanderingMotion
+from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
 from magloc.tracking.smoother import smoothed
 from magloc.tracking.tracker import Tracker
@@ -121,7 +121,7 @@ class TestCompiledRecord:
         """The paper's scenario, where a prior that bends changes the track by several σ: see test_row_measurement."""
         readings = sims.simulate(sims.read_scenario("paper"), seed).readings
         array = geometries.tetrahedron(1.5, "vector", 1e-9)
-        points = self.both(array, UnknownMotion(1e-6, 1e-6), rows_from(readings.time_s, readings.values_T))
+        points = self.both(array, RandomWalk(1e-6, 1e-6), rows_from(readings.time_s, readings.values_T))
         assert statuses(points).count("tracked") >= 50
 
     def test_rows_that_have_no_coordinates_of_their_own(self) -> None:
@@ -140,7 +140,7 @@ class TestCompiledRecord:
         n = 80
         p, m = np.tile([5.0, 0.0, 0.306], (n, 1)), np.tile([100.0, 0.0, 0.0], (n, 1))
         rows = rows_from(np.arange(float(n)), readings_of(array, p, m, seed=int(rng.integers(1000))))
-        motion = UnknownMotion(0.02, 0.01)
+        motion = RandomWalk(0.02, 0.01)
         readable, compiled = followed(Tracker(array, motion), rows), track_record(Tracker(array, motion), rows)
         assert_same_points(compiled, readable)
         assert [point.iterations for point in compiled] == [point.iterations for point in readable]
@@ -155,7 +155,7 @@ class TestCompiledRecord:
 
     def test_other_motions_take_the_readable_path(self) -> None:
         time_s, p, m = moving_source(20)
-        points = self.both(ARRAY, WanderingMotion(0.1, 0.02), rows_from(time_s, readings_of(ARRAY, p, m)))
+        points = self.both(ARRAY, OrnsteinUhlenbeck(0.1, 0.02), rows_from(time_s, readings_of(ARRAY, p, m)))
         assert statuses(points).count("tracked") == 19
 
     def test_no_rows(self) -> None:

@@ -16,7 +16,7 @@ from arrays.differences import contrasts, difference_covariance
 from magloc.chi_square import mean_bounds
 from magloc.tracking.consistency import consistency, nees_of
 from magloc.tracking.measurement import RowMeasurement
-from magloc.tracking.motion import UnknownMotion, WanderingMotion
+from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import Row, TrackPoint, rows_of
 from magloc.tracking.tracker import Tracker
@@ -37,7 +37,7 @@ def blank_rows(n: int) -> list[Row]:
     return list(rows_of(np.arange(float(n)), np.full((n, 12), np.nan)))
 
 
-TRACKER = Tracker(ARRAY, UnknownMotion(0.1, 0.1))
+TRACKER = Tracker(ARRAY, RandomWalk(0.1, 0.1))
 
 
 class TestMeanBounds:
@@ -102,7 +102,7 @@ class TestNeesOfACurvedEstimate:
         """To rounding, for 200 draws of a noise that leaves the range known to 5 %; the Cartesian one is far off."""
         rng = np.random.default_rng(3)
         array = replace(self.THREE, sensors=tuple(replace(s, noise_T=6e-9) for s in self.THREE.sensors))
-        tracker = Tracker(array, UnknownMotion(0.1, 0.1))
+        tracker = Tracker(array, RandomWalk(0.1, 0.1))
         measurement = tracker.measurement(Row(0.0, np.zeros(9)))
         expected, found, cartesian = [], [], []
         for _ in range(200):
@@ -132,7 +132,7 @@ class TestNeesOfACurvedEstimate:
         return np.asarray(fit.x * self.UNIT) if np.abs(fit.fun).max() < 1e-7 else None
 
     def test_what_is_known_in_part_is_counted_in_cartesian_coordinates(self) -> None:
-        measurement = Tracker(ARRAY, UnknownMotion(0.1, 0.1)).measurement(Row(0.0, np.zeros(12)))
+        measurement = Tracker(ARRAY, RandomWalk(0.1, 0.1)).measurement(Row(0.0, np.zeros(12)))
         truth = self.TRUTH.copy()
         truth[2] = np.nan
         square, dof = nees_of(measurement, self.TRUTH + 0.1 * self.UNIT, np.diag(self.UNIT**2), truth)
@@ -220,7 +220,7 @@ class TestPosteriorBound(MovingArray):
         """J' = D22 - D21 (J + D11)⁻¹ D12 with D11 = F⊤Q⁻¹F, D12 = -F⊤Q⁻¹, D22 = Q⁻¹ + H⊤R⁻¹H."""
         t, p, m = self.truth()
         rows, rotations, origin = self.rows(t)
-        motion = UnknownMotion(0.2, 0.05)
+        motion = RandomWalk(0.2, 0.05)
         bounds = posterior_bound(Tracker(ARRAY, motion), rows, p, m)
         expected = []
         J = np.zeros((6, 6))
@@ -242,14 +242,14 @@ class TestPosteriorBound(MovingArray):
         array = geometries.tetrahedron(1.5, "vector", 1e-9)
         row = Row(0.0, np.zeros(12))
         p, m = np.array([[5.0, 0.0, 0.306]]), np.array([[0.0, 0.0, 100.0]])
-        (bound,) = posterior_bound(Tracker(array, UnknownMotion(0.1, 0.1)), [row], p, m)
+        (bound,) = posterior_bound(Tracker(array, RandomWalk(0.1, 0.1)), [row], p, m)
         assert bound == pytest.approx(math.sqrt(0.289**2 + 0.082**2 + 0.076**2), rel=0.01)
 
     def test_of_rest_falls_with_the_root_of_the_rows(self) -> None:
         t, p, m = self.truth()
         rows = list(rows_of(t, np.zeros((self.N_ROWS, 12))))
         still_p, still_m = np.tile(p[0], (self.N_ROWS, 1)), m
-        bounds = posterior_bound(Tracker(ARRAY, UnknownMotion(1e-9, 1e-9)), rows, still_p, still_m)
+        bounds = posterior_bound(Tracker(ARRAY, RandomWalk(1e-9, 1e-9)), rows, still_p, still_m)
         np.testing.assert_allclose(bounds, bounds[0] / np.sqrt(np.arange(1.0, self.N_ROWS + 1.0)), rtol=1e-6)
 
     def test_counts_lasting_errors_as_unknowns_of_their_own(self) -> None:
@@ -258,7 +258,7 @@ class TestPosteriorBound(MovingArray):
         fields = replace(ARRAY, sensors=tuple(replace(s, offset_uncertainty_T=5e-10) for s in ARRAY.sensors))
         rows, rotations, origin = self.rows(t)
         still_p = np.tile(p[0], (self.N_ROWS, 1))
-        bounds = posterior_bound(Tracker(fields, UnknownMotion(1e-9, 1e-9)), rows, still_p, m)
+        bounds = posterior_bound(Tracker(fields, RandomWalk(1e-9, 1e-9)), rows, still_p, m)
         D, R = np.kron(contrasts(4), np.eye(3)), np.kron(difference_covariance(np.full(4, 2e-10)), np.eye(3))
         J = np.diag(np.repeat([0.0, 1.0 / 5e-10**2], [6, 12]))
         expected = []
@@ -274,7 +274,7 @@ class TestPosteriorBound(MovingArray):
         readings[0] = np.nan
         readings[1, 6:] = np.nan  # three differences
         readings[4] = np.nan
-        bounds = posterior_bound(Tracker(ARRAY, WanderingMotion(0.2, 0.05)), list(rows_of(t, readings)), p, m)
+        bounds = posterior_bound(Tracker(ARRAY, OrnsteinUhlenbeck(0.2, 0.05)), list(rows_of(t, readings)), p, m)
         assert np.isinf(bounds[:2]).all()
         assert np.isfinite(bounds[2:]).all()
         assert bounds[4] > bounds[3]
@@ -286,7 +286,7 @@ class TestSmoothingBound(MovingArray):
     def test_of_unknown_motion(self) -> None:
         t, p, m = self.truth()
         rows, rotations, origin = self.rows(t)
-        bounds = smoothing_bound(Tracker(ARRAY, UnknownMotion(0.2, 0.05)), rows, p, m)
+        bounds = smoothing_bound(Tracker(ARRAY, RandomWalk(0.2, 0.05)), rows, p, m)
         unit = np.repeat([1.0, 100.0], 3)
         J = np.zeros((6 * self.N_ROWS,) * 2)
         for i in range(self.N_ROWS):
@@ -304,7 +304,7 @@ class TestSmoothingBound(MovingArray):
         readings = np.zeros((self.N_ROWS, 12))
         readings[3] = np.nan
         rows = list(rows_of(t, readings))
-        motion = WanderingMotion(0.2, 0.05)
+        motion = OrnsteinUhlenbeck(0.2, 0.05)
         tracker = Tracker(ARRAY, motion)
         bounds = smoothing_bound(tracker, rows, p, m)
         velocity, rest = np.array([-0.2, 0.1, 0.0]), np.zeros(3)
@@ -324,7 +324,7 @@ class TestSmoothingBound(MovingArray):
         t, p, m = self.truth()
         readings = np.zeros((self.N_ROWS, 12))
         readings[0, 6:] = np.nan  # three differences: no source yet
-        rows, tracker = list(rows_of(t, readings)), Tracker(ARRAY, WanderingMotion(0.2, 0.05))
+        rows, tracker = list(rows_of(t, readings)), Tracker(ARRAY, OrnsteinUhlenbeck(0.2, 0.05))
         filtered, with_later_rows = posterior_bound(tracker, rows, p, m), smoothing_bound(tracker, rows, p, m)
         assert np.isinf(with_later_rows[0])
         assert np.all(with_later_rows[1:-1] < filtered[1:-1])

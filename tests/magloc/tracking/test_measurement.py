@@ -23,7 +23,7 @@ from arrays.differences import decorrelated_differences
 from magloc.kalman import iterated_update
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 from magloc.tracking.measurement import RowMeasurement
-from magloc.tracking.motion import UnknownMotion
+from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import Row, rows_of
 from magloc.tracking.tracker import TOLERANCE, Tracker
 from tests.oracles import derivative, magpylib_field
@@ -32,7 +32,7 @@ FloatArray = NDArray[np.float64]
 ARRAY = geometries.tetrahedron(1.5, "vector", 2e-10)
 SOURCE = np.array([3.0, 1.5, 0.8, 120.0, -150.0, 160.0])
 UNIT = np.repeat([1.0, 100.0], 3)
-REST = UnknownMotion(1e-9, 1e-9)
+REST = RandomWalk(1e-9, 1e-9)
 
 
 def measurement_of(readings_T: FloatArray, array: SensorArray = ARRAY) -> RowMeasurement:

@@ -17,11 +17,11 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from magloc.tracking.motion import (
-    ConstantTurn,
+    CoordinatedTurn,
     LinearMotion,
     MotionModel,
-    UnknownMotion,
-    WanderingMotion,
+    OrnsteinUhlenbeck,
+    RandomWalk,
     array_axes_transition,
     cross_matrix,
     induced_and_permanent_moment,
@@ -32,10 +32,10 @@ from tests.oracles import derivative
 FloatArray = NDArray[np.float64]
 VECTORS = npst.arrays(np.float64, (3,), elements=st.floats(-10.0, 10.0))
 MODELS: list[MotionModel] = [
-    UnknownMotion(0.1, 0.02),
-    WanderingMotion(0.1, 0.02),
-    WanderingMotion(0.5, 0.3, correlation_s=4.0),
-    ConstantTurn(0.5, 0.1),
+    RandomWalk(0.1, 0.02),
+    OrnsteinUhlenbeck(0.1, 0.02),
+    OrnsteinUhlenbeck(0.5, 0.3, correlation_s=4.0),
+    CoordinatedTurn(0.5, 0.1),
 ]
 
 
@@ -151,7 +151,7 @@ class TestJacobian:
     @pytest.mark.parametrize("angle", [0.0, 1e-6, 0.0199, 0.0201])
     def test_of_a_slowly_wandering_turn(self, angle: float) -> None:
         """At rest, and on both sides of the angle below which the series stands for the quotient."""
-        motion = WanderingMotion(0.5, 0.3, correlation_s=1e9)
+        motion = OrnsteinUhlenbeck(0.5, 0.3, correlation_s=1e9)
         x = state_of(motion, 3)
         x[9:] = np.array([2.0, -1.0, 2.0]) / 3.0 * angle
         _, F, _ = motion.step(x, 0.5)
@@ -160,7 +160,7 @@ class TestJacobian:
     @pytest.mark.parametrize("angle", [0.9e-4, 1.1e-4])
     def test_of_a_slow_turn(self, angle: float) -> None:
         """On both sides of the angle below which the series stands for the quotient."""
-        motion = ConstantTurn(0.5, 0.1)
+        motion = CoordinatedTurn(0.5, 0.1)
         x = np.array([1.0, 2.0, 3.0, 60.0, -50.0, 40.0, 0.5, -0.3, 0.2, angle])
         _, F, _ = motion.step(x, 1.0)
         np.testing.assert_allclose(F, step_derivative(motion, x, 1.0), atol=1e-7)
@@ -177,7 +177,7 @@ class TestTwoHalfSteps:
     @pytest.mark.parametrize("motion", MODELS)
     def test_mean(self, motion: MotionModel) -> None:
         """In the mean: at a rate that lasts for the turn, whose forgetting is taken once a step."""
-        if isinstance(motion, WanderingMotion):
+        if isinstance(motion, OrnsteinUhlenbeck):
             motion = replace(motion, correlation_s=1e6)
         x = state_of(motion, 5)
         whole, _, _ = motion.step(x, 2.0)
@@ -186,7 +186,7 @@ class TestTwoHalfSteps:
 
     def test_mean_of_a_wandering_turn_that_forgets(self) -> None:
         """The angle of a turn about a fixed axis adds up exactly."""
-        motion = WanderingMotion(0.1, 0.02, correlation_s=3.0)
+        motion = OrnsteinUhlenbeck(0.1, 0.02, correlation_s=3.0)
         x = state_of(motion, 5)
         whole, _, _ = motion.step(x, 2.0)
         halves, _, _ = motion.step(motion.step(x, 1.0)[0], 1.0)
@@ -194,7 +194,7 @@ class TestTwoHalfSteps:
 
     def test_covariance_of_a_wandering_position(self) -> None:
         """Position and speed are linear: Q(2h) = F Q(h) F⊤ + Q(h)."""
-        motion = WanderingMotion(0.1, 0.02, correlation_s=3.0)
+        motion = OrnsteinUhlenbeck(0.1, 0.02, correlation_s=3.0)
         x = state_of(motion, 5)
         _, F, S_q = motion.step(x, 1.0)
         part = np.ix_([0, 1, 2, 6, 7, 8], [0, 1, 2, 6, 7, 8])
@@ -203,7 +203,7 @@ class TestTwoHalfSteps:
 
     def test_a_random_walk_by_the_step_grows_with_the_rows(self) -> None:
         """S_q = V Δt is not the square root of a rate of diffusion: two half steps have half of the variance."""
-        motion = UnknownMotion(0.1, 0.02)
+        motion = RandomWalk(0.1, 0.02)
         x = state_of(motion, 5)
         np.testing.assert_allclose(2.0 * noise_of(motion, x, 1.0), 0.5 * noise_of(motion, x, 2.0), rtol=1e-14)
 
@@ -212,7 +212,7 @@ class TestUnknownMotion:
     """The paper's S_q: what the object may move and turn by in one row."""
 
     def test_square_root(self) -> None:
-        motion = UnknownMotion(0.1, math.radians(1.2))
+        motion = RandomWalk(0.1, math.radians(1.2))
         x = np.array([4.0, 1.0, -2.0, 60.0, -50.0, 60.0])
         moved, F, S_q = motion.step(x, 0.5)
         strength = math.sqrt(60.0**2 + 50.0**2 + 60.0**2)
@@ -222,7 +222,7 @@ class TestUnknownMotion:
         np.testing.assert_array_equal(moved, x)
 
     def test_parts_of_the_linear_step(self) -> None:
-        motion = UnknownMotion(0.3, 0.1)
+        motion = RandomWalk(0.3, 0.1)
         assert isinstance(motion, LinearMotion)
         x = state_of(motion, 2)
         F, A, B = motion.linear_step(0.25)
@@ -232,7 +232,7 @@ class TestUnknownMotion:
 
     def test_start_is_a_copy(self) -> None:
         source, S = np.arange(6.0), np.eye(6)
-        x, root = UnknownMotion(0.1, 0.1).start(source, S)
+        x, root = RandomWalk(0.1, 0.1).start(source, S)
         x[0], root[0, 0] = 9.0, 9.0
         assert source[0] == 0.0
         assert S[0, 0] == 1.0
@@ -245,7 +245,7 @@ class TestWanderingMotion:
         F, Q = van_loan_discretization(
             np.array([[0.0, 1.0], [0.0, -1.0 / tau]]), np.array([[0.0], [V * math.sqrt(2.0 / tau)]]), dt_s
         )
-        motion = WanderingMotion(V, 0.1, correlation_s=tau)
+        motion = OrnsteinUhlenbeck(V, 0.1, correlation_s=tau)
         x = state_of(motion, 1)
         _, F_model, S_q = motion.step(x, dt_s)
         Q_model = S_q @ S_q.T
@@ -256,7 +256,7 @@ class TestWanderingMotion:
 
     @pytest.mark.parametrize("dt_s", [0.01, 0.5, 30.0])
     def test_speed_and_rate_keep_their_variance(self, dt_s: float) -> None:
-        motion = WanderingMotion(0.4, 0.1, correlation_s=7.0)
+        motion = OrnsteinUhlenbeck(0.4, 0.1, correlation_s=7.0)
         x = state_of(motion, 1)
         _, F, S_q = motion.step(x, dt_s)
         P = np.diag(np.repeat([0.16, 0.01], 3))
@@ -264,7 +264,7 @@ class TestWanderingMotion:
 
     def test_starts_with_these_variances(self) -> None:
         source, S = np.arange(6.0), np.tril(np.ones((6, 6)))
-        x, root = WanderingMotion(0.4, 0.1).start(source, S)
+        x, root = OrnsteinUhlenbeck(0.4, 0.1).start(source, S)
         np.testing.assert_array_equal(x, [*source, *np.zeros(6)])
         P = root @ root.T
         np.testing.assert_array_equal(P[:6, :6], S @ S.T)
@@ -275,12 +275,12 @@ class TestWanderingMotion:
     @settings(max_examples=50)
     def test_turning_keeps_the_modulus(self, m: FloatArray, rate: FloatArray, dt_s: float) -> None:
         x = np.concatenate([np.zeros(3), m, np.zeros(3), rate])
-        moved, _, _ = WanderingMotion(0.1, 0.02).step(x, dt_s)
+        moved, _, _ = OrnsteinUhlenbeck(0.1, 0.02).step(x, dt_s)
         assert np.linalg.norm(moved[3:6]) == pytest.approx(np.linalg.norm(m), rel=1e-12, abs=1e-12)
 
     def test_solves_the_differential_equation(self) -> None:
         """Speed and rate that fade: the moment turns about a fixed axis by the integral of the rate."""
-        motion = WanderingMotion(0.5, 0.3, correlation_s=4.0)
+        motion = OrnsteinUhlenbeck(0.5, 0.3, correlation_s=4.0)
         x = state_of(motion, 11)
 
         def slope(_: float, y: FloatArray) -> FloatArray:
@@ -291,12 +291,12 @@ class TestWanderingMotion:
 
     def test_towards_a_constant_velocity(self) -> None:
         """As τ grows, F of position and speed tends to exp of the free motion's generator."""
-        _, F, _ = WanderingMotion(0.5, 0.3, correlation_s=1e7).step(np.ones(12), 2.0)
+        _, F, _ = OrnsteinUhlenbeck(0.5, 0.3, correlation_s=1e7).step(np.ones(12), 2.0)
         np.testing.assert_allclose(F[np.ix_([0, 6], [0, 6])], expm(np.array([[0.0, 2.0], [0.0, 0.0]])), atol=1e-6)
 
     def test_noise_of_the_moment_is_across_it(self) -> None:
         """Along the moment only what changes its strength is left; across it the turn comes in as well."""
-        motion = WanderingMotion(0.1, 0.2, correlation_s=5.0)
+        motion = OrnsteinUhlenbeck(0.1, 0.2, correlation_s=5.0)
         x = np.zeros(12)
         x[3:6] = [0.0, 0.0, 100.0]
         Q = noise_of(motion, x, 0.5)
@@ -306,7 +306,7 @@ class TestWanderingMotion:
         assert Q[3, 3] == pytest.approx(along + 100.0**2 * Q_angle, rel=1e-9)
 
     def test_nothing_happens_in_no_time(self) -> None:
-        motion = WanderingMotion(0.1, 0.2)
+        motion = OrnsteinUhlenbeck(0.1, 0.2)
         x = state_of(motion, 1)
         moved, F, S_q = motion.step(x, 0.0)
         np.testing.assert_array_equal(moved, x)
@@ -317,7 +317,7 @@ class TestWanderingMotion:
     @pytest.mark.parametrize("dt_s", [0.05, 0.4999, 0.5001, 6.999, 7.001, 60.0, 3600.0, 1e5])
     def test_position_spreads_as_ornstein_and_uhlenbeck_say(self, tau: float, dt_s: float) -> None:
         """Variance 2 V² τ (Δt - τ (1 - exp(-Δt/τ))) of the position of a source whose speed is stationary."""
-        motion = WanderingMotion(0.4, 0.1, correlation_s=tau)
+        motion = OrnsteinUhlenbeck(0.4, 0.1, correlation_s=tau)
         _, F, S_q = motion.step(state_of(motion, 1), dt_s)
         P = F[[0, 6]][:, [0, 6]] @ np.diag([0.0, 0.16]) @ F[[0, 6]][:, [0, 6]].T + (S_q @ S_q.T)[[0, 6]][:, [0, 6]]
         assert P[0, 0] == pytest.approx(2.0 * 0.16 * tau * (dt_s + tau * math.expm1(-dt_s / tau)), rel=1e-9)
@@ -326,7 +326,7 @@ class TestWanderingMotion:
 
     @pytest.mark.parametrize("dt_s", [1e-6, 1e-3, 1e4])
     def test_noise_is_regular_at_any_step(self, dt_s: float) -> None:
-        motion = WanderingMotion(0.1, 0.02)
+        motion = OrnsteinUhlenbeck(0.1, 0.02)
         _, _, S_q = motion.step(state_of(motion, 1), dt_s)
         Q = S_q @ S_q.T
         assert np.isfinite(Q).all()
@@ -336,7 +336,7 @@ class TestWanderingMotion:
 class TestConstantTurn:
     @pytest.mark.parametrize("rate", [0.0, 1e-6, 0.05, -0.7, 3.0])
     def test_solves_the_differential_equation(self, rate: float) -> None:
-        motion = ConstantTurn(0.5, 0.1)
+        motion = CoordinatedTurn(0.5, 0.1)
         x = np.array([1.0, 2.0, 3.0, 60.0, -50.0, 40.0, 0.5, -0.3, 0.2, rate])
         up = np.array([0.0, 0.0, 1.0])
 
@@ -348,14 +348,14 @@ class TestConstantTurn:
 
     def test_straight_ahead_without_a_turn(self) -> None:
         x = np.array([1.0, 2.0, 3.0, 60.0, -50.0, 40.0, 0.5, -0.3, 0.2, 0.0])
-        moved, _, _ = ConstantTurn(0.5, 0.1).step(x, 2.0)
+        moved, _, _ = CoordinatedTurn(0.5, 0.1).step(x, 2.0)
         np.testing.assert_allclose(moved[:3], [2.0, 1.4, 3.4], rtol=1e-14)
         np.testing.assert_array_equal(moved[3:], x[3:])
 
     @pytest.mark.parametrize("sign", [-1.0, 1.0])
     def test_series_and_quotient_meet(self, sign: float) -> None:
         """On both sides of the angle where one replaces the other the step and F are the same, but for the angle."""
-        motion = ConstantTurn(0.5, 0.1)
+        motion = CoordinatedTurn(0.5, 0.1)
         x = np.array([1.0, 2.0, 3.0, 60.0, -50.0, 40.0, 0.5, -0.3, 0.2, 0.0])
         low, high = x.copy(), x.copy()
         low[9], high[9] = sign * 0.99999999e-4, sign * 1.00000001e-4
@@ -366,18 +366,18 @@ class TestConstantTurn:
     @settings(max_examples=50)
     def test_keeps_speed_and_moment(self, rate: float, dt_s: float) -> None:
         x = np.array([1.0, 2.0, 3.0, 60.0, -50.0, 40.0, 0.5, -0.3, 0.2, rate])
-        moved, _, _ = ConstantTurn(0.5, 0.1).step(x, dt_s)
+        moved, _, _ = CoordinatedTurn(0.5, 0.1).step(x, dt_s)
         assert np.linalg.norm(moved[3:6]) == pytest.approx(np.linalg.norm(x[3:6]), rel=1e-12)
         assert np.linalg.norm(moved[6:9]) == pytest.approx(np.linalg.norm(x[6:9]), rel=1e-12)
 
     def test_starts_with_the_given_deviations(self) -> None:
-        x, root = ConstantTurn(0.5, 0.1).start(np.arange(6.0), np.eye(6))
+        x, root = CoordinatedTurn(0.5, 0.1).start(np.arange(6.0), np.eye(6))
         np.testing.assert_array_equal(x, [*np.arange(6.0), 0.0, 0.0, 0.0, 0.0])
         np.testing.assert_array_equal(root, np.diag([1.0] * 6 + [0.5] * 3 + [0.1]))
 
     def test_noise(self) -> None:
         """Over one step: an acceleration that is constant in it, and walks of the rate and the moment."""
-        motion = ConstantTurn(0.5, 0.1, acceleration_m_s2=0.02, turn_change_rad_s=0.003, moment_change=0.004)
+        motion = CoordinatedTurn(0.5, 0.1, acceleration_m_s2=0.02, turn_change_rad_s=0.003, moment_change=0.004)
         x = np.array([1.0, 2.0, 3.0, 0.0, 30.0, 40.0, 0.5, -0.3, 0.2, 0.1])
         dt_s = 0.25
         Q = noise_of(motion, x, dt_s)

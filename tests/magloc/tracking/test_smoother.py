@@ -6,7 +6,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from magloc.tracking.batch import track_record
-from magloc.tracking.motion import WanderingMotion
+from magloc.tracking.motion import OrnsteinUhlenbeck
 from magloc.tracking.results import Prediction, Step, TrackPoint
 from magloc.tracking.smoother import smoothed
 from magloc.tracking.tracker import Tracker
@@ -59,7 +59,7 @@ class TestSmoother:
 
     def test_never_claims_to_know_less(self) -> None:
         time_s, p, m = moving_source(40)
-        tracker = Tracker(ARRAY, WanderingMotion(0.1, 0.02), keep_steps=True)
+        tracker = Tracker(ARRAY, OrnsteinUhlenbeck(0.1, 0.02), keep_steps=True)
         points = track_record(tracker, rows_from(time_s, readings_of(ARRAY, p, m)))
         for before, after in zip(points, smoothed(points, tracker.steps), strict=True):
             assert before.covariance is not None

@@ -18,7 +18,7 @@ from arrays.sensor import Sensor
 from magloc.measurement.differences import predicted_channels
 from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import consistency
-from magloc.tracking.motion import ConstantTurn, MotionModel, UnknownMotion, WanderingMotion
+from magloc.tracking.motion import CoordinatedTurn, MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
 from magloc.tracking.smoother import smoothed
 from magloc.tracking.tracker import Tracker
@@ -48,7 +48,7 @@ class TestStationarySource:
         sigma = ARRAY.channel_noise_T[0]
         fields = magpylib_field(ARRAY.positions, POSITION, MOMENT).ravel()
         readings = fields + sigma * np.random.default_rng(1).normal(size=(n, 12))
-        points = track_record(Tracker(ARRAY, UnknownMotion(1e-9, 1e-9)), rows_from(np.arange(float(n)), readings))
+        points = track_record(Tracker(ARRAY, RandomWalk(1e-9, 1e-9)), rows_from(np.arange(float(n)), readings))
         assert statuses(points) == ["acquired"] + ["tracked"] * (n - 1)
         mean = readings.mean(axis=0).reshape(4, 3)
         centred = (mean - mean.mean(axis=0)) / sigma * math.sqrt(n)
@@ -100,9 +100,9 @@ def drawn_run(
 
 
 MATCHED = [
-    pytest.param(UnknownMotion(0.02, 0.005), 200, id="unknown"),
-    pytest.param(WanderingMotion(0.05, 0.005, correlation_s=20.0), 60, id="wandering"),
-    pytest.param(ConstantTurn(0.05, 0.005), 60, id="turn"),
+    pytest.param(RandomWalk(0.02, 0.005), 200, id="unknown"),
+    pytest.param(OrnsteinUhlenbeck(0.05, 0.005, correlation_s=20.0), 60, id="wandering"),
+    pytest.param(CoordinatedTurn(0.05, 0.005), 60, id="turn"),
 ]
 
 
@@ -172,7 +172,7 @@ class TestWeavingTarget:
     def test_motion_in_the_state(self) -> None:
         """Speed and turn rate in the state: 0.029 m filtered, 0.020 m smoothed."""
         filtered, finished, nees, _ = zip(
-            *(weaving_errors(lambda: WanderingMotion(SPEED_M_S, TURN_RAD_S), seed) for seed in SEEDS), strict=True
+            *(weaving_errors(lambda: OrnsteinUhlenbeck(SPEED_M_S, TURN_RAD_S), seed) for seed in SEEDS), strict=True
         )
         assert rms(list(filtered)) <= 0.05
         assert rms(list(finished)) <= 0.03
@@ -182,13 +182,13 @@ class TestWeavingTarget:
     def test_random_walk(self) -> None:
         """The paper's S_q: consistent. Its rms is 0.051 m, and so not held to the 0.05 m of a motion in the state."""
         filtered, _, nees, _ = zip(
-            *(weaving_errors(lambda: UnknownMotion(SPEED_M_S, TURN_RAD_S), seed) for seed in SEEDS), strict=True
+            *(weaving_errors(lambda: RandomWalk(SPEED_M_S, TURN_RAD_S), seed) for seed in SEEDS), strict=True
         )
         assert rms(list(filtered)) < 0.16  # what single rows alone give
         assert 0.6 <= float(np.mean(nees)) <= 1.4
 
     @pytest.mark.parametrize("absent", [True, False])
-    @pytest.mark.parametrize("motion", [UnknownMotion(SPEED_M_S, TURN_RAD_S), WanderingMotion(SPEED_M_S, TURN_RAD_S)])
+    @pytest.mark.parametrize("motion", [RandomWalk(SPEED_M_S, TURN_RAD_S), OrnsteinUhlenbeck(SPEED_M_S, TURN_RAD_S)])
     def test_is_found_again_after_a_gap(self, motion: MotionModel, absent: bool) -> None:
         """Within 10 rows after 60 s without readings, whether the rows are absent or empty."""
         for seed in (0, 1):
@@ -216,7 +216,7 @@ class TestWeavingTarget:
         simulation = sims.simulate(WEAVING, 0)
         time_s, readings = simulation.readings.time_s, simulation.readings.values_T
         common = np.tile(np.random.default_rng(3).normal(0.0, 5e-8, (len(time_s), 3)), (1, 4))
-        motion = UnknownMotion(SPEED_M_S, TURN_RAD_S)
+        motion = RandomWalk(SPEED_M_S, TURN_RAD_S)
         quiet = track_record(Tracker(simulation.array, motion), rows_from(time_s, readings))
         stormy = track_record(Tracker(simulation.array, motion), rows_from(time_s, readings + common))
         assert statuses(quiet) == statuses(stormy)
@@ -300,7 +300,7 @@ class TestLossOfTrack:
         away = 200.0 * np.square(np.sin(np.pi * time_s / time_s[-1]))
         p = POSITION * (1.0 + away / np.linalg.norm(POSITION))[:, None]
         points = track_record(
-            Tracker(ARRAY, UnknownMotion(4.0, 0.02)), rows_from(time_s, readings_of(ARRAY, p, np.tile(MOMENT, (n, 1))))
+            Tracker(ARRAY, RandomWalk(4.0, 0.02)), rows_from(time_s, readings_of(ARRAY, p, np.tile(MOMENT, (n, 1))))
         )
         far = away > 100.0
         assert all(point.position_m is None for point, is_far in zip(points, far, strict=True) if is_far)

@@ -25,7 +25,7 @@ from scipy.stats import chi2
 from magloc.chi_square import mean_bounds
 from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import consistency, nees_of
-from magloc.tracking.motion import MotionModel, UnknownMotion, WanderingMotion
+from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.posterior_bound import posterior_bound
 from magloc.tracking.results import rows_of
 from magloc.tracking.tracker import Tracker
@@ -45,10 +45,10 @@ A linear filter about the truth has 1.13 over 180 runs (seeds 0 to 179, standard
 ones without pulsations: 3 nT across 49 µT turn the ambient field by 6e-5, so that a modulus has up to 0.005 nT more or
 less of the source's 90 nT, at a noise of 0.007 nT, as long as the drone passes.
 """
-REST = UnknownMotion(1e-6, 1e-6)
-WEAVING = WanderingMotion(0.1, math.radians(1.2))
-SHIP = WanderingMotion(1.5, math.radians(5.0), correlation_s=10.0)
-HAND = WanderingMotion(0.03, math.radians(20.0), correlation_s=0.5)
+REST = RandomWalk(1e-6, 1e-6)
+WEAVING = OrnsteinUhlenbeck(0.1, math.radians(1.2))
+SHIP = OrnsteinUhlenbeck(1.5, math.radians(5.0), correlation_s=10.0)
+HAND = OrnsteinUhlenbeck(0.03, math.radians(20.0), correlation_s=0.5)
 
 
 def track_statistics(simulation: Simulation, motion: MotionModel) -> dict[str, Any]:

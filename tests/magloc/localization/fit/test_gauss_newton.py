@@ -30,7 +30,7 @@ from magloc.localization.fit.gauss_newton import JointFits, covariances, fit_mom
 from magloc.localization.search.single_source import Locator
 from magloc.localization.uncertainty.range_profile import ranges_within
 from magloc.measurement.differences import DifferenceMeasurement
-from magloc.measurement.rows import joint_problem, whitenings_of
+from magloc.measurement.rows import whitened_model, whitenings_of
 from tests import oracles
 from tests.arrays.test_differences import random_array
 
@@ -83,7 +83,7 @@ def noisy_readings(array, positions, moments, rng):
 def problem_of(array, readings, ambient=None):
     """Joint problem and whitened readings of rows (n, C) that miss the same channels."""
     mask = np.isfinite(readings[0])
-    problem, raw = joint_problem(array, mask, readings, whitenings_of(array, mask, readings), ambient)
+    problem, raw = whitened_model(array, mask, readings, whitenings_of(array, mask, readings), ambient)
     return problem, problem.whitened(raw)
 
 

@@ -24,7 +24,7 @@ from arrays.array import SensorArray
 from arrays.differences import decorrelated_differences
 from arrays.geometries import cube, tetrahedron
 from magloc.fields import dipole
-from magloc.localization.fit.prior import Knowledge
+from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.search.known_position import MomentLocator
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 from tests.arrays.test_differences import random_array
@@ -307,7 +307,7 @@ class TestKnowledge:
         array, rng = scalar_tetrahedron(1e-11), np.random.default_rng(10)
         readings = predicted_channels(array, PLACE, random_moments(rng, 30))
         free = MomentLocator(array, PLACE).fit_rows(readings)
-        bounded = MomentLocator(array, PLACE, knowledge=Knowledge(largest_moment_Am2=301.0)).fit_rows(readings)
+        bounded = MomentLocator(array, PLACE, knowledge=SourcePrior(largest_moment_Am2=301.0)).fit_rows(readings)
         left_out = 0
         for every, fix in zip(free, bounded, strict=True):
             small = [m for m in moments_of(every) if np.linalg.norm(m) <= 301.0]
@@ -317,7 +317,7 @@ class TestKnowledge:
 
     def test_none_that_is_small_enough(self):
         array = scalar_tetrahedron(1e-11, AMBIENT)
-        locator = MomentLocator(array, PLACE, knowledge=Knowledge(largest_moment_Am2=10.0))
+        locator = MomentLocator(array, PLACE, knowledge=SourcePrior(largest_moment_Am2=10.0))
         (fix,) = locator.fit_rows(predicted_channels(array, PLACE, [[100.0, 0.0, 0.0]]))
         assert not fix.solutions
         assert "small enough" in fix.reason

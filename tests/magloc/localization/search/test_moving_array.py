@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from arrays import geometries
 from arrays.array import SensorArray
-from magloc.localization.fit.prior import Knowledge
+from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.search.moving_array import stacked_fix
 from tests.oracles import magpylib_field
 
@@ -108,10 +108,10 @@ class TestRefusal:
     def test_what_is_known_bounds_the_source(self) -> None:
         """A half-space that the source is not in, and a moment that is too small for it."""
         readings, *poses = passing(SQUARE)
-        fix = stacked_fix(SQUARE, readings, *poses, knowledge=Knowledge(low_m=(2.0, -math.inf, -math.inf)))
+        fix = stacked_fix(SQUARE, readings, *poses, knowledge=SourcePrior(low_m=(2.0, -math.inf, -math.inf)))
         assert all(solution.position_m[0] >= 2.0 for solution in fix.solutions)
         assert all(solution.chi2 > 1e3 for solution in fix.solutions)
-        fix = stacked_fix(SQUARE, readings, *poses, knowledge=Knowledge(largest_moment_Am2=1.0))
+        fix = stacked_fix(SQUARE, readings, *poses, knowledge=SourcePrior(largest_moment_Am2=1.0))
         assert all(np.linalg.norm(solution.moment_Am2) <= 1.0 for solution in fix.solutions)
         assert all(solution.chi2 > 1e3 for solution in fix.solutions)
 

@@ -20,7 +20,7 @@ from arrays.array import SensorArray
 from arrays.geometries import cube, tetrahedron
 from arrays.sensor import Sensor
 from magloc.chi_square import RISE_95
-from magloc.localization.fit.prior import Knowledge
+from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.fit.results import JointFix, JointSolution, Source
 from magloc.localization.search.multi_source import FALSE_ALARM, SeveralLocator, in_stable_order, most_sources
 from tests.magloc.localization.fit.test_gauss_newton import (
@@ -444,7 +444,7 @@ class TestKnowledge:
         rng = np.random.default_rng(115)
         p, m = sources_below(rng, 6, 2)
         readings = noisy_readings(PLATE, p, m, rng)
-        known = Knowledge(low_m=(-1.5, -1.5, -2.5), high_m=(1.5, 1.5, -0.5), largest_moment_Am2=40.0)
+        known = SourcePrior(low_m=(-1.5, -1.5, -2.5), high_m=(1.5, 1.5, -0.5), largest_moment_Am2=40.0)
         for fix, truth in zip(SeveralLocator(PLATE, n_sources=2, knowledge=known).fit_rows(readings), p, strict=True):
             assert errors_of(fix, truth).max() < 0.1
             for source in (source for solution in fix.solutions for source in solution.sources):
@@ -455,7 +455,7 @@ class TestKnowledge:
         """A region on the wrong side leaves nothing that contradicts it."""
         rng = np.random.default_rng(116)
         p, m = sources_below(rng, 3, 1)
-        known = Knowledge(low_m=(-np.inf, -np.inf, 0.0))
+        known = SourcePrior(low_m=(-np.inf, -np.inf, 0.0))
         fixes = SeveralLocator(PLATE, n_sources=1, knowledge=known).fit_rows(noisy_readings(PLATE, p, m, rng))
         assert all(source.position_m[2] >= 0.0 for fix in fixes for s in fix.solutions for source in s.sources)
         for fix in (fix for fix in fixes if not fix.solutions):
@@ -463,4 +463,4 @@ class TestKnowledge:
 
     def test_nothing_left_of_the_space_around(self):
         with pytest.raises(ValueError, match="leaves nothing"):
-            SeveralLocator(PLATE, knowledge=Knowledge(low_m=(1e6, 1e6, 1e6)))
+            SeveralLocator(PLATE, knowledge=SourcePrior(low_m=(1e6, 1e6, 1e6)))

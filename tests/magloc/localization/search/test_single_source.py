@@ -26,7 +26,7 @@ from arrays.sensor import Sensor
 from arrays.whitening import whitening
 from magloc.chi_square import RISE_95
 from magloc.localization.fit import variable_projection_compiled
-from magloc.localization.fit.prior import Knowledge
+from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.search.candidates import candidate_positions
 from magloc.localization.search.single_source import Locator
 from magloc.measurement import whitened_compiled
@@ -318,7 +318,7 @@ class TestKnowledge:
 
     def test_half_space(self):
         everything = Locator(TETRAHEDRON).fit_rows(self.readings)
-        above = Locator(TETRAHEDRON, knowledge=Knowledge(low_m=(-np.inf, -np.inf, 0.0))).fit_rows(self.readings)
+        above = Locator(TETRAHEDRON, knowledge=SourcePrior(low_m=(-np.inf, -np.inf, 0.0))).fit_rows(self.readings)
         assert any(s.position_m[2] < 0 for fix in everything for s in fix.solutions)
         assert all(s.position_m[2] >= 0 for fix in above for s in fix.solutions)
         for free, bound in zip(everything, above, strict=True):
@@ -327,12 +327,12 @@ class TestKnowledge:
 
     def test_a_worse_solution_comes_up_when_better_ones_are_ruled_out(self):
         for free, low in zip(self.readings, np.sign(self.p[:, 0]), strict=True):
-            known = Knowledge((0.0, -np.inf, -np.inf)) if low > 0 else Knowledge(high_m=(0.0, np.inf, np.inf))
+            known = SourcePrior((0.0, -np.inf, -np.inf)) if low > 0 else SourcePrior(high_m=(0.0, np.inf, np.inf))
             for s in Locator(TETRAHEDRON, knowledge=known).fit(free).solutions:
                 assert s.position_m[0] * low >= 0
 
     def test_largest_moment(self):
-        fixes = Locator(TETRAHEDRON, knowledge=Knowledge(largest_moment_Am2=400.0)).fit_rows(self.readings)
+        fixes = Locator(TETRAHEDRON, knowledge=SourcePrior(largest_moment_Am2=400.0)).fit_rows(self.readings)
         solved = [s for fix in fixes for s in fix.solutions]
         assert solved
         assert all(np.linalg.norm(s.moment_Am2) <= 400.0 for s in solved)
@@ -340,11 +340,11 @@ class TestKnowledge:
 
     def test_bounds_that_leave_nothing(self):
         with pytest.raises(ValueError, match="low_m must be below high_m"):
-            Knowledge((1.0, 0.0, 0.0), (0.0, 1.0, 1.0))
+            SourcePrior((1.0, 0.0, 0.0), (0.0, 1.0, 1.0))
         with pytest.raises(ValueError, match="must be positive"):
-            Knowledge(largest_moment_Am2=0.0)
+            SourcePrior(largest_moment_Am2=0.0)
         with pytest.raises(ValueError, match="leaves nothing"):
-            Locator(TETRAHEDRON, knowledge=Knowledge(low_m=(1e6, 1e6, 1e6)))
+            Locator(TETRAHEDRON, knowledge=SourcePrior(low_m=(1e6, 1e6, 1e6)))
 
 
 class TestFitFrom:

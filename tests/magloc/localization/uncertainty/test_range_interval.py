@@ -45,7 +45,7 @@ from magloc.localization.uncertainty.range_interval import (
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 from magloc.measurement.whitened import SeparableProblem
 from magloc.tracking.batch import track_record
-from magloc.tracking.motion import UnknownMotion
+from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import Row, TrackPoint
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import ARRAY, MOMENT, POSITION, readings_of
@@ -655,7 +655,7 @@ class TestTrack:
     def points(self, n: int, distance: float) -> tuple[Tracker, list[TrackPoint]]:
         position = distance * POSITION / np.linalg.norm(POSITION)
         readings = readings_of(ARRAY, np.tile(position, (n, 1)), np.tile(MOMENT, (n, 1)), 0)
-        tracker = Tracker(ARRAY, UnknownMotion(0.01, 0.01))
+        tracker = Tracker(ARRAY, RandomWalk(0.01, 0.01))
         return tracker, track_record(tracker, [Row(0.5 * i, values) for i, values in enumerate(readings)])
 
     def test_of_a_track_it_is_that_of_its_covariance(self) -> None:
@@ -690,7 +690,7 @@ class TestTrack:
             assert point.range_observable == fix.solutions[0].range_observable
 
     def test_rows_that_say_nothing_allow_every_range(self) -> None:
-        (point,) = Tracker(ARRAY, UnknownMotion(0.1, 0.1)).run([Row(0.0, np.full(ARRAY.n_channels, np.nan))])
+        (point,) = Tracker(ARRAY, RandomWalk(0.1, 0.1)).run([Row(0.0, np.full(ARRAY.n_channels, np.nan))])
         assert point.range_interval95_m == EVERYWHERE
         assert not point.range_observable
 
