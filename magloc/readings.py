@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
 from arrays.io.errors import InputError
@@ -101,6 +102,13 @@ class Readings:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    @property
+    def pose(self) -> tuple[FloatArray, Rotation] | None:
+        """Origin (n, 3) [m] and rotation of the array's frame in the world frame, if they are known."""
+        if self.array_position_m is None or self.array_rotation_xyzw is None:
+            return None
+        return self.array_position_m, Rotation.from_quat(self.array_rotation_xyzw)
 
 
 @dataclass(frozen=True, eq=False)

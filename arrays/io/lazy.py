@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from typing import Any
 
 
 def lazy_names(
@@ -30,3 +31,10 @@ def lazy_names(
 
     public = sorted(modules)
     return getattr_, lambda: public, public
+
+
+def by_name(where: str) -> Callable[..., Any]:
+    """A function named as ``module:function``: for what stands on a higher floor, such as the figure of a result."""
+    module, _, name = where.partition(":")
+    function: Callable[..., Any] = getattr(import_module(module), name)
+    return function

@@ -24,7 +24,7 @@ from magloc.calibration import model as moving_source
 from magloc.calibration.least_squares import Optimum
 from magloc.calibration.model import AXES, GAINS, OFFSET, PER_SENSOR, POSITION, MomentModel, Problem
 from magloc.calibration.observability import Unobservable, unobservable
-from magloc.localization.search.single_source import Locator
+from magloc.localization.locator import Locator
 
 Quantity = Literal["positions", "gains", "axes", "offsets"]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
@@ -243,15 +243,15 @@ def self_calibrate(
     problem = _problem(array, readings, attitude, prior, True, False, moment)
     nowhere = np.zeros((len(readings), 3))
     doubtful = calibration_steps.with_doubted_fields(problem, calibration_steps.untouched(problem, nowhere, nowhere))
-    fixes = Locator(doubtful).fit_rows(readings)
-    rows = np.array([bool(fix.solutions) for fix in fixes]) & _usable(problem)
+    fixes = Locator(doubtful, exclude_faulty=False).fit_rows(readings)
+    rows = fixes.solved & _usable(problem)
     if not rows.any():
         raise ValueError(
             "Input readings_T must have rows that can be located with the nominal array; instead none can."
         )
     problem = _of_rows(problem, rows)
     _check_counts(problem)
-    start = calibration_steps.located(problem, [fix for fix, used in zip(fixes, rows, strict=True) if used])
+    start = calibration_steps.located(problem, [fixes[row] for row in np.flatnonzero(rows).tolist()])
     # Rows whose sources each have a moment of their own are independent and find their optimum from rough fixes.
     start = calibration_steps.approached(replace(problem, moment="free"), start, calibration_steps.SHARES[:1])
     if moment == "constant":

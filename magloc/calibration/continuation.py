@@ -20,7 +20,7 @@ from magloc.calibration import model as moving_source
 from magloc.calibration.least_squares import Optimum
 from magloc.calibration.model import GAINS, OFFSET, POSITION, Problem, State
 from magloc.localization.fit.results import Fix
-from magloc.localization.search.single_source import Locator
+from magloc.localization.locator import Locator
 
 SHARES = (1.0, 0.3, 0.1, 0.03)
 """Of what the prior leaves open, by which the noise is raised in turn."""
@@ -95,7 +95,8 @@ def looked_for_again(problem: Problem, state: State, rows: BoolArray, share: flo
     """A state with some rows at that solution of a new fix whose moment is nearest to the median moment."""
     median = np.median(state.moment_Am2, axis=0)
     position, moment = state.position_m.copy(), state.moment_Am2.copy()
-    fixes = Locator(with_doubted_fields(problem, state, share)).fit_rows(problem.readings_T[rows])
+    locator = Locator(with_doubted_fields(problem, state, share), exclude_faulty=False)
+    fixes = locator.fit_rows(problem.readings_T[rows])
     for t, fix in zip(np.flatnonzero(rows), fixes, strict=True):
         if fix.solutions:
             moments = np.stack([problem.world_from_array[t] @ solution.moment_Am2 for solution in fix.solutions])

@@ -23,6 +23,7 @@ DONE = 0
 BAD_INPUT = 2
 INTERRUPTED = 130
 BROKEN_PIPE = 141
+_PACKAGES = ("arrays", "magloc", "adcs", "sims")
 
 
 @Parameter(name="*", group="Common options")
@@ -42,7 +43,10 @@ class QuietOptions:
     quiet: Flag = False
 
     def apply(self) -> None:
-        """Limit the threads of compiled code."""
+        """Limit the threads of compiled code, and what is said."""
+        if self.quiet:
+            for name in _PACKAGES:
+                logging.getLogger(name).setLevel(logging.WARNING)
         if self.threads is not None:
             import numba
 
@@ -147,7 +151,7 @@ class _Notes(logging.Handler):
 def _notes_of_the_library(program: str) -> Iterator[None]:
     """Show what the packages log, one line each."""
     handler = _Notes(program)
-    loggers = [logging.getLogger(name) for name in ("arrays", "magloc", "adcs", "sims")]
+    loggers = [logging.getLogger(name) for name in _PACKAGES]
     for logger in loggers:
         logger.addHandler(handler)
         logger.setLevel(logging.INFO)

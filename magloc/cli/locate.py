@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from arrays.array import SensorArray
     from magloc.localization.fit.prior import SourcePrior
     from magloc.readings import Readings
-from magloc.localization.fit.results import AnyFix
-from magloc.localization.uncertainty.covariance import is_misfit
+from magloc.localization.fit.fixes import Fixes
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _BOUNDS = re.compile(rf"(?:(?P<below>{_NUMBER})<(?=[xyz]<))?(?P<axis>[xyz])(?P<sign>[<>])(?P<bound>{_NUMBER})")
@@ -117,15 +116,15 @@ def locate(
     from arrays.io.outputs import refuse_file
     from magloc.ambient import with_ambient_field
     from magloc.cli.options import place_of_options
-    from magloc.cli.tables import fix_table
-    from magloc.localization.files import json_entry
-    from magloc.localization.fit.results import in_world
-    from magloc.localization.locator import RowFixes
-    from magloc.readings import read_readings, saturated_channels, without_saturated
+    from magloc.localization.files import json_of_fixes
+    from magloc.localization.fit.table import lines_of_fixes
+    from magloc.localization.locator import locate as fixes_of
+    from magloc.localization.locator import used_rows
+    from magloc.readings import read_readings
 
     ids = None if sensors is None else [name.strip() for name in sensors.split(",")]
     where = place_of_options(place, date, geomagnetic_model)
-    knowledge, n_sources = knowledge_of(region, max_moment_Am2), _n_sources(sources)
+    prior, n_sources = prior_of(region, max_moment_Am2), _n_sources(sources)
     if body_length_m is not None and not body_length_m > 0.0:
         raise InputError(f"--body-length-m: found {body_length_m:g}, expected a positive length.")
     if position is not None and (sources is not None or region is not None):
@@ -136,46 +135,52 @@ def locate(
     if out is not None:
         refuse_file(out, "--out")
     used = subset_of(read_array(array), ids, array)
-    measured = read_readings(readings, used, sensors=ids)
-    rows = without_saturated(measured, used)
-    if average:
-        rows, used = _averaged(rows, used, readings, quiet=common.quiet)
+    rows = read_readings(readings, used, sensors=ids)
     if position is not None:
         _refuse_farther(position, rows)
     used, ambient_T = with_ambient_field(used, rows, where, gradient=ambient_gradient)
-    true_position_m = None if truth is None else _true_position(rows, truth)
     try:
-        task = RowFixes(used, rows, ambient_T, knowledge, n_sources, position, keep_sensors, common.seed)
+        pictured, noisy, _ = used_rows(rows, used, average=average)
+        true_position_m = None if truth is None else _true_position(pictured, truth)
+        with progress(len(rows), "rows", quiet=common.quiet) as advance:
+            fixes = fixes_of(
+                used,
+                rows,
+                sources=n_sources,
+                position_m=position,
+                prior=prior,
+                ambient_T=ambient_T,
+                body_length_m=body_length_m,
+                exclude_faulty=not keep_sensors,
+                average=average,
+                seed=common.seed,
+                progress=advance,
+            )
+    except InputError as error:
+        raise InputError(f"{readings}: {error}") from None
     except ValueError as error:
         sentence = str(error).removeprefix("Input ")
         option = "" if sentence.startswith("array") else _option_of(sentence, region, sources)
         raise InputError(f"{option or array}: {sentence}{_advice(sentence, used)}") from None
-    with progress(len(rows), "rows", quiet=common.quiet) as advance:
-        fixes = task.fixes(advance)
-    near = task.too_near(fixes, body_length_m)
-    in_array = fixes
-    fixes = [in_world(fix, rows, i) for i, fix in enumerate(fixes)]
 
-    times = rows.time_s.tolist()
-    saturated = saturated_channels(measured, rows, used) if not average else [()] * len(rows)
     if json:
-        entries = (json_entry(*of_row) for of_row in zip(times, fixes, saturated, near, strict=True))
-        print_json({"results": list(entries)})
+        print_json(json_of_fixes(fixes, joint=sources is not None))
     else:
-        print("\n".join(fix_table(times, fixes, near)))
-    reasons = counted_reasons(fix.reason for fix in fixes if not fix.solutions)
-    solved = sum(bool(fix.solutions) for fix in fixes)
-    if not solved:
+        print("\n".join(lines_of_fixes(fixes, joint=sources is not None)))
+    reasons = counted_reasons(reason for reason, solved in zip(fixes.reason, fixes.solved, strict=True) if not solved)
+    n_solved = int(fixes.solved.sum())
+    if not n_solved:
         raise InputError(f"{readings}: found no row that can be solved ({reasons}).")
     if out is not None:
-        from magloc.localization.residuals import fix_residuals
         from magloc.plots.fixes import write_pictures
 
-        residuals = fix_residuals(used, rows.values_T, in_array, ambient_T)
-        write_pictures(rows, used, fixes, residuals, true_position_m, out, quiet=common.quiet)
-    if not (json or common.quiet):
-        print_note(f"{solved} of {len(fixes)} rows solved" + (f"; not solved: {reasons}" if reasons else ""))
-    warn_of(fixes, saturated, near, quiet=common.quiet)
+        write_pictures(pictured, noisy, fixes, ambient_T, true_position_m, out, quiet=common.quiet)
+    if common.quiet:
+        return
+    if not json:
+        print_note(f"{n_solved} of {len(fixes)} rows solved" + (f"; not solved: {reasons}" if reasons else ""))
+    for note in _notes(fixes):
+        print_note(note)
 
 
 def subset_of(array: SensorArray, ids: Sequence[str] | None, path: Path) -> SensorArray:
@@ -210,10 +215,10 @@ def _true_position(rows: Readings, path: Path) -> NDArray[np.float64]:
     return position_m
 
 
-def _n_sources(option: str | None) -> int | Literal["auto"] | None:
-    """The number of sources that is asked for; None for the plain fix of one."""
+def _n_sources(option: str | None) -> int | Literal["auto"]:
+    """The number of sources that is asked for."""
     if option is None:
-        return None
+        return 1
     if option == "auto":
         return "auto"
     try:
@@ -224,11 +229,11 @@ def _n_sources(option: str | None) -> int | Literal["auto"] | None:
 
 def _option_of(sentence: str, region: str | None, sources: str | None) -> str:
     """The option that an error of the library is about."""
-    if sentence.startswith("n_sources"):
+    if sentence.startswith(("n_sources", "sources")):
         return f"--sources {sources}"
     if sentence.startswith("position_m"):
         return "--position"
-    return f"--region {region}" if sentence.startswith("knowledge") and region is not None else ""
+    return f"--region {region}" if sentence.startswith("prior") and region is not None else ""
 
 
 def _advice(sentence: str, array: SensorArray) -> str:
@@ -237,7 +242,7 @@ def _advice(sentence: str, array: SensorArray) -> str:
     return ""
 
 
-def knowledge_of(region: str | None, largest_moment: float | None) -> SourcePrior:
+def prior_of(region: str | None, largest_moment: float | None) -> SourcePrior:
     """What the options say of the source."""
     from magloc.localization.fit.prior import SourcePrior
 
@@ -264,50 +269,33 @@ def knowledge_of(region: str | None, largest_moment: float | None) -> SourcePrio
     )
 
 
-def _averaged(readings: Readings, array: SensorArray, path: Path, *, quiet: bool) -> tuple[Readings, SensorArray]:
-    from magloc.readings import average, averaging_array, complete_rows
-
-    n_complete = int(complete_rows(readings).sum())
-    if 0 < n_complete < len(readings) and not quiet:
-        print_note(f"note: {n_complete} of {len(readings)} rows are averaged, the others miss some readings")
-
-    try:
-        return average(readings), averaging_array(array, readings)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-
-
-def warn_of(
-    fixes: Sequence[AnyFix], saturated: Sequence[tuple[str, ...]], near: Sequence[bool], *, quiet: bool
-) -> None:
-    """Name what is wrong with the sensors and with the source, on stderr."""
-    if quiet:
-        return
-    dropped = Counter(name for fix in fixes for name in fix.dropped)
+def _notes(fixes: Fixes) -> Iterator[str]:
+    """What is wrong with the sensors and with the sources."""
+    n = len(fixes)
+    dropped = Counter(name for names in fixes.dropped_sensors for name in names)
     if dropped:
-        print_note(f"warning: sensors that contradict all others are not used: {_rows_of(dropped)}")
-    fewer = Counter(fix.reason for fix in fixes if fix.solutions and fix.reason)
-    for reason, n in fewer.most_common():
-        print_note(f"note: in {n} of {len(fixes)} rows {reason}")
-    misfits = sum(is_misfit(fix) for fix in fixes)
-    if misfits:
-        print_note(
-            f"warning: in {misfits} of {len(fixes)} rows χ² is far beyond noise: the noise is understated, or the model"
-            " does not hold, and the standard deviations say too little"
+        yield f"warning: sensors that contradict all others are not used: {_rows_of(dropped)}"
+    fewer = Counter(reason for reason, solved in zip(fixes.reason, fixes.solved, strict=True) if solved and reason)
+    for reason, count in fewer.most_common():
+        yield f"note: in {count} of {n} rows {reason}"
+    if fixes.misfit.any():
+        yield (
+            f"warning: in {fixes.misfit.sum()} of {n} rows χ² is far beyond noise: the noise is understated, or the"
+            " model does not hold, and the standard deviations say too little"
         )
-    weak = sum(bool(fix.solutions) and not fix.detected for fix in fixes)
-    if weak:
-        print_note(
-            f"note: in {weak} of {len(fixes)} rows nothing stands out of the noise: their solutions are fits of noise,"
+    weak = fixes.solved & ~fixes.detected
+    if weak.any():
+        yield (
+            f"note: in {weak.sum()} of {n} rows nothing stands out of the noise: their solutions are fits of noise,"
             " and a source may be at any range"
         )
-    lost = Counter(name for names in saturated for name in names)
+    lost = Counter(name for names in fixes.saturated_channels for name in names)
     if lost:
-        print_note(f"warning: saturated readings are not used: {_rows_of(lost)}")
-    if any(near):
-        print_note(
-            f"warning: in {sum(near)} of {len(near)} rows the source is too near, or too large, for a dipole: what is"
-            " left has the pattern of an extended source, or it is nearer than three body lengths"
+        yield f"warning: saturated readings are not used: {_rows_of(lost)}"
+    if fixes.too_near.any():
+        yield (
+            f"warning: in {fixes.too_near.sum()} of {n} rows the source is too near, or too large, for a dipole: what"
+            " is left has the pattern of an extended source, or it is nearer than three body lengths"
         )
 
 

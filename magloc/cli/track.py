@@ -148,7 +148,7 @@ def track(
 
     from arrays.array_file import read_array
     from arrays.io.outputs import refuse_file, refuse_one_for_two, refuse_unwritable
-    from magloc.cli.locate import knowledge_of, subset_of
+    from magloc.cli.locate import prior_of, subset_of
     from magloc.cli.options import place_of_options
     from magloc.cli.tables import report
     from magloc.readings import read_readings, read_truth, truth_of_rows, without_saturated
@@ -173,19 +173,19 @@ def track(
     ids = None if sensors is None else [name.strip() for name in sensors.split(",")]
     used = subset_of(read_array(array), ids, array)
     model = _motion(motion, smooth=smooth)
-    knowledge = knowledge_of(region, max_moment_Am2)
+    prior = prior_of(region, max_moment_Am2)
     if str(readings) == STREAM:
         whole = smooth or json or any(option is not None for option in (truth, out, geojson))
         if whole or conditioning != ConditioningOptions():
             raise InputError("READINGS -: found an option that needs the whole record, expected a stream of --jsonl.")
-        _stream(used, ids, model, knowledge, where)
+        _stream(used, ids, model, prior, where)
         return
     rows = without_saturated(read_readings(readings, used, sensors=ids), used)
     _check_time(rows, readings)
     rows, used = _conditioned(rows, used, conditioning, readings)
     used, ambient_T = _ambient(used, rows, where)
     try:
-        tracker = Tracker(used, model, knowledge=knowledge, keep_steps=smooth)
+        tracker = Tracker(used, model, prior=prior, keep_steps=smooth)
     except ValueError as error:
         raise InputError(f"{array}: {str(error).removeprefix('Input ')}") from None
     records = list(rows_of(rows.time_s, rows.values_T, rows.array_position_m, rows.array_rotation_xyzw, ambient_T))
@@ -322,9 +322,7 @@ def _print_line(point: TrackPoint) -> None:
     sys.stdout.flush()
 
 
-def _stream(
-    array: SensorArray, ids: list[str] | None, model: MotionModel, knowledge: object, where: Place | None
-) -> None:
+def _stream(array: SensorArray, ids: list[str] | None, model: MotionModel, prior: object, where: Place | None) -> None:
     """Answer every row of standard input by one line; none that is tracked is an InputError at its end."""
     from magloc.readings import readings_of_text, without_saturated
     from magloc.tracking.results import rows_of
@@ -353,7 +351,7 @@ def _stream(
         last = time
         array_here, ambient = _ambient(array, rows, where)
         if tracker is None:
-            tracker = Tracker(array_here, model, knowledge=knowledge)  # type: ignore[arg-type]
+            tracker = Tracker(array_here, model, prior=prior)  # type: ignore[arg-type]
         (row,) = rows_of(rows.time_s, rows.values_T, rows.array_position_m, rows.array_rotation_xyzw, ambient)
         point = tracker.advance(row)
         _print_line(point)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import viser
 
     from arrays.array import SensorArray
-    from magloc.localization.fit.results import Fix
+    from magloc.localization.fit.fixes import Fixes
     from magloc.readings import Readings
     from magloc.viewer.pages.open_result import ReadingsResult, Result
     from magloc.viewer.pages.pages import Page
@@ -130,28 +130,23 @@ def _with_track(
     return rows.array, rows.readings
 
 
-def _fixes(result: ReadingsResult, *, quiet: bool) -> tuple[list[Fix], Readings]:
+def _fixes(result: ReadingsResult, *, quiet: bool) -> tuple[Fixes, Readings]:
     """Fixes of the rows as ``magloc locate`` finds them, in its frame; of 2000 rows at most, evenly."""
     from magloc.ambient import with_ambient_field
-    from magloc.localization.fit.prior import NOTHING_KNOWN
-    from magloc.localization.fit.results import Fix, in_world
-    from magloc.localization.locator import RowFixes
-    from magloc.readings import without_saturated
+    from magloc.localization.fit.fixes import Fixes
+    from magloc.localization.locator import locate
 
     step = -(-len(result.readings) // _MOST_ROWS)
     if step > 1 and not quiet:
         print_note(f"note: every {step}th of {len(result.readings)} rows is fixed and shown")
-    rows = _every(without_saturated(result.readings, result.array), step)
+    rows = _every(result.readings, step)
     used, ambient_T = with_ambient_field(result.array, rows, None, gradient=False)
-    try:
-        task = RowFixes(used, rows, ambient_T, NOTHING_KNOWN, None, None, False, 0)
-    except ValueError as error:
-        # Readings can be looked at although nothing can be located.
-        reason = str(error).removeprefix("Input ")
-        return [Fix((), reason)] * len(rows), rows
     with progress(len(rows), "rows", quiet=quiet) as advance:
-        fixes = [in_world(fix, rows, i) for i, fix in enumerate(task.fixes(advance))]
-    return [fix for fix in fixes if isinstance(fix, Fix)], rows
+        try:
+            return locate(used, rows, ambient_T=ambient_T, progress=advance), rows
+        except ValueError as error:
+            # Readings can be looked at although nothing can be located.
+            return Fixes.unsolved(rows.time_s, str(error).removeprefix("Input ")), rows
 
 
 def _every(rows: Readings, step: int) -> Readings:
@@ -165,7 +160,7 @@ def _filled(
     server: viser.ViserServer,
     result: Result,
     with_track: tuple[SensorArray | None, Readings | None],
-    fixes: tuple[list[Fix], Readings] | None,
+    fixes: tuple[Fixes, Readings] | None,
     *,
     live: bool,
 ) -> Page:

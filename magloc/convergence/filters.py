@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magloc.convergence import filters_compiled as lanes
 from magloc.convergence.relinearised_compiled import relinearised_map
 from magloc.kalman import IteratedUpdate, iterated_update, predict_square_root, scalar_update, sequential_update
-from magloc.localization.search.single_source import Locator
+from magloc.localization.search.single_source import SingleSourceSearch
 from magloc.measurement.differences import DifferenceMeasurement
 
 if TYPE_CHECKING:
@@ -303,7 +303,7 @@ class DampedFilter:
 
 @dataclass(frozen=True)
 class GlobalFilter:
-    """The start-free search of :class:`magloc.localization.search.single_source.Locator`.
+    """The start-free search of :class:`magloc.localization.search.single_source.SingleSourceSearch`.
 
     With the map's start refined before its candidates.
 
@@ -328,7 +328,7 @@ class GlobalFilter:
         array = measurement.array
         # Any readings with these differences have the same likelihood.
         readings = np.linalg.lstsq(measurement.differences.transform, z, rcond=None)[0] + array.channel_offset_T
-        ends = Locator(array, max_iterations=self.max_iterations).fit_from(readings, starts[:, :3])
+        ends = SingleSourceSearch(array, max_iterations=self.max_iterations).optima_from(readings, starts[:, :3])
         return Ends(
             states=np.concatenate([ends.position_m, ends.moment_Am2], axis=1),
             chi2=ends.chi2,

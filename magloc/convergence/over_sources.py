@@ -19,14 +19,16 @@ import numpy as np
 
 from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
-from arrays.noise import reading_covariance, reading_errors
+from arrays.noise import reading_errors
 from arrays.typing import FloatArray
-from arrays.whitening import whitening
+from arrays.whitening import Whitening, whitening
 from magloc.grids.cube import Box, MapSummary, Tally, Values, Variable, histogram, in_memory
 from magloc.localization.fit.results import Fix
-from magloc.localization.search.single_source import N_UNKNOWNS, Locator
+from magloc.localization.locator import Locator
+from magloc.localization.search.single_source import N_UNKNOWNS
 from magloc.measurement.differences import channel_jacobian, predicted_channels
-from magloc.measurement.whitened import SeparableProblem
+from magloc.measurement.rows import whitenings_of
+from magloc.measurement.whitened import WhitenedModel
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -91,7 +93,7 @@ class SourcesMap:
             raise ValueError(f"Input grid must be at least 2; instead received {self.grid}.")
         if self.scenario.array.channel_is_scalar.any():
             raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
-        n_differences = self._problem.whitening.n_differences
+        n_differences = whitening(self.scenario.array).n_differences
         if n_differences < N_UNKNOWNS:
             raise ValueError(f"The array gives {n_differences} independent differences, {N_UNKNOWNS} are needed.")
 
@@ -100,11 +102,12 @@ class SourcesMap:
 
     @cached_property
     def _locator(self) -> Locator:
-        return Locator(self.scenario.array)
+        return Locator(self.scenario.array, exclude_faulty=False)
 
     @cached_property
-    def _problem(self) -> SeparableProblem:
-        return SeparableProblem.of(self.scenario.array, whitening(self.scenario.array))
+    def _model(self) -> WhitenedModel:
+        array = self.scenario.array
+        return WhitenedModel.of(array, [whitening(array)], array.ambient_fields[None])
 
     @property
     def edge(self) -> int:
@@ -222,13 +225,10 @@ class SourcesMap:
         exact = predicted_channels(array, position, moment) + array.channel_offset_T
         return exact + reading_errors(array, exact, noise)
 
-    def _problems(self, readings: FloatArray) -> list[SeparableProblem]:
-        """Problem of every row, with the whitening of its fix."""
+    def _whitenings(self, readings: FloatArray) -> list[Whitening]:
+        """Whitening of every row, as of its fix."""
         array = self.scenario.array
-        if not array.noise_depends_on_reading:
-            return [self._problem] * len(readings)
-        covariances = (reading_covariance(array, row) for row in readings)
-        return [SeparableProblem.of(array, whitening(array, covariance_T2=covariance)) for covariance in covariances]
+        return whitenings_of(array, np.ones(array.n_channels, dtype=bool), readings)
 
     def _searched_from(self, truth: FloatArray, readings: FloatArray) -> list[tuple[FloatArray, float]]:
         """Ends q (4,) and χ² of the refinements that start at the truth (n, 3).
@@ -239,15 +239,15 @@ class SourcesMap:
         array = self.scenario.array
         without_source = array.readings_of(array.ambient_fields)
         ends = []
-        for position, row, problem in zip(truth, readings, self._problems(readings), strict=True):
-            white = problem.whitening
-            q = problem.homogeneous(position)
+        model = self._model
+        for position, row, white in zip(truth, readings, self._whitenings(readings), strict=True):
+            q = model.homogeneous(position)
             chi2, _, _ = variable_projection_compiled.refine(
                 q,
                 white.apply(row - without_source),
-                problem.sensors,
-                problem.channel_sensor,
-                problem.gain,
+                model.sensors,
+                model.channel_sensor,
+                white.root @ array.channel_gain,
                 np.ascontiguousarray(white.basis.T),
                 white.shrinkage,
                 3,
@@ -265,7 +265,7 @@ class SourcesMap:
         """Whether a solution is the optimum that the search from the truth ended at."""
         return any(
             variable_projection_compiled.same_optimum(
-                self._problem.homogeneous(solution.position_m), solution.chi2, q, chi2
+                self._model.homogeneous(solution.position_m), solution.chi2, q, chi2
             )
             for solution in fix.solutions
         )
@@ -275,8 +275,8 @@ class SourcesMap:
         array = self.scenario.array
         columns = np.swapaxes(channel_jacobian(array, position, moment), -1, -2)
         rows = np.empty_like(columns)
-        for i, problem in enumerate(self._problems(readings)):
-            rows[i] = problem.whitening.apply(columns[i])
+        for i, white in enumerate(self._whitenings(readings)):
+            rows[i] = white.apply(columns[i])
         covariance = _covariance(rows)[:, :3, :3]
         u = position - array.centroid
         u = u / np.linalg.norm(u, axis=1, keepdims=True)

@@ -31,7 +31,7 @@ from arrays.geometries import tetrahedron
 from arrays.noise import reading_covariance, reading_errors
 from magloc.grids.cube import Box, MapSummary, Tally, Values, Variable, histogram, in_memory
 from magloc.localization.fit.results import Solution
-from magloc.localization.search.single_source import Locator
+from magloc.localization.locator import Locator
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 
 if TYPE_CHECKING:
@@ -129,7 +129,7 @@ class StartsMap:
         """Map of a scenario; the arguments and errors of :func:`convergence_map`."""
         if grid < 2:
             raise ValueError(f"Input grid must be at least 2; instead received {grid}.")
-        locator = Locator(scenario.array)
+        locator = Locator(scenario.array, exclude_faulty=False)
         readings, measurement, z = simulated_measurement(scenario)
         fix = locator.fit(readings)
         if not fix.solutions:

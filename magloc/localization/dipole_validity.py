@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import chdtrc
 from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import f as f_distribution
 
@@ -17,12 +18,15 @@ from arrays.noise import reading_covariance
 from arrays.typing import BoolArray, FloatArray
 from magloc.fields import dipole
 from magloc.fields.multipole import multipole_field_matrix
+from magloc.localization.fit.fixes import Fixes
 from magloc.measurement.differences import DifferenceMeasurement, channel_jacobian
 
 BODY_LENGTHS = 3.0
 _ORDERS = (2, 3)
 _NAMES = {2: "a quadrupole", 3: "an octupole"}
 _NO_OTHER_MISFIT = 0.05
+# Probability of a χ² under noise below which what is left is looked at.
+_MISFIT = 1e-3
 # Columns whose part outside the earlier ones is smaller than this are not seen by the array.
 _UNSEEN_RTOL = 1e-6
 
@@ -229,3 +233,32 @@ def _orthonormal(columns: FloatArray, known: FloatArray) -> FloatArray:
     basis, size, _ = np.linalg.svd(new, full_matrices=False)
     result: FloatArray = basis[:, size > _UNSEEN_RTOL]
     return result
+
+
+def too_near(
+    array: SensorArray,
+    fixes: Fixes,
+    readings_T: FloatArray,
+    ambient_T: FloatArray | None = None,
+    body_length_m: float | None = None,
+) -> BoolArray:
+    """Whether the single source of each row (n,) is too near for a dipole: by its length, or by what is left.
+
+    `fixes` are in the array's frame, `ambient_T` (n, 3) stands in place of the array's ambient field.
+    """
+    near = np.zeros(len(fixes), dtype=bool)
+    solutions, first = fixes.solutions, fixes.first
+    for row in np.flatnonzero(fixes.solved).tolist():
+        best = int(first[row])
+        if solutions.n_sources[best] > 1:
+            continue
+        place, moment = solutions.position_m[best, 0], solutions.moment_Am2[best, 0]
+        if body_length_m is not None:
+            nearest = np.linalg.norm(array.positions - place, axis=1).min()
+            near[row] = not dipole_validity(nearest, body_length_m)
+        dof = int(solutions.dof[best])
+        if not near[row] and dof > 0 and chdtrc(dof, solutions.chi2[best]) < _MISFIT:
+            used = ~np.isin(array.ids, fixes.dropped_sensors[row])[array.channel_sensor]
+            of_row = array if ambient_T is None else replace(array, ambient_T=tuple(ambient_T[row].tolist()))
+            near[row] = nearness_test(of_row, place, moment, np.where(used, readings_T[row], np.nan)).extended
+    return near

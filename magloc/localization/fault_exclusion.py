@@ -8,23 +8,28 @@ without them; what is returned is a plain least-squares fix, with the χ² and t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Generic, Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri, fdtri
 
 from arrays.array import SensorArray
-from arrays.typing import FloatArray, IntArray
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.gauss_newton import refine
-from magloc.localization.fit.results import Fix, JointFix, JointSolution, Solution
-from magloc.measurement.rows import NO_SIGNAL, rows_of_equal_mask, whitened_model, whitenings_of
+from magloc.localization.fit.results import Fix
+from magloc.measurement.rows import (
+    NO_SIGNAL,
+    channels_above_ambient,
+    rows_of_equal_mask,
+    whitened_model,
+    whitenings_of,
+)
 from magloc.measurement.whitened import WhitenedModel
 
-AnyFix = TypeVar("AnyFix", bound=Fix | JointFix)
 DEGREES_OF_FREEDOM = 4.0
 # Rows above this quantile of χ² are examined, and sensors above the other one, shared among them all, are dropped.
 _CREDIBLE = 0.999
@@ -47,79 +52,80 @@ _MEDIAN_RATIO = 0.789
 _ROWS_AT_ONCE = 64
 
 
-class Fitter(Protocol[AnyFix]):
-    """Anything that fixes rows of readings, NaN where missing."""
+class Refit(Protocol):
+    """Fixes some rows anew."""
 
-    def __call__(self, readings_T: FloatArray, ambient_T: FloatArray | None, /) -> list[AnyFix]:
-        """Fixes of readings (n, C), with the ambient field (n, 3) of every row if it differs from the array's."""
+    def __call__(self, rows: IntArray, readings_T: FloatArray, /) -> Sequence[Fix]:
+        """Fixes of rows of these indices with other readings (n, C), NaN where missing."""
 
 
-def robust_fixes(
+def without_faulty_sensors(
     array: SensorArray,
-    fit: Fitter[AnyFix],
+    fixes: Fixes,
+    refit: Refit,
     readings_T: FloatArray,
     ambient_T: FloatArray | None = None,
     *,
     free_position: bool = True,
-    progress: Callable[[int], None] | None = None,
-) -> list[AnyFix]:
+) -> Fixes:
     """Fixes without the sensors that contradict all others.
 
     Parameters
     ----------
     array : SensorArray
-    fit : callable
-        Fixes rows of readings, missing ones being NaN.
+    fixes : Fixes
+        Of all rows with all sensors.
+    refit : callable
+        Fixes rows anew from other readings.
     readings_T : ndarray, shape (n, C)
-        Raw readings [T].
+        Raw readings [T], NaN where missing.
     ambient_T : ndarray, shape (n, 3), optional
         Ambient field of every row [T], in place of the array's.
     free_position : bool
-        False where `fit` knows the place of the source.
-    progress : callable, optional
-        Called with the number of rows finished since the last call.
+        False where the place of the source is known.
 
     Returns
     -------
-    list of Fix or JointFix
-        As `fit` returns them; `dropped` names the sensors that were left out. No sensor is dropped from a row whose χ²
-        is credible, nor where too few would be left to tell which of them is wrong.
+    Fixes
+        `dropped_sensors` names the sensors that were left out. No sensor is dropped from a row whose χ² is credible,
+        nor where too few would be left to tell which of them is wrong.
     """
-    fixes = list(fit(readings_T, ambient_T))
-    if progress is not None:
-        progress(len(fixes))
+    doubtful = _doubtful(fixes)
+    examined, found = [], []
     for mask, rows in rows_of_equal_mask(np.isfinite(readings_T)):
-        doubtful = np.array([row for row in rows if _is_doubtful(fixes[row])], dtype=np.intp)
-        for start in range(0, doubtful.size, _ROWS_AT_ONCE):
-            block = doubtful[start : start + _ROWS_AT_ONCE]
+        of_mask = rows[doubtful[rows]]
+        for start in range(0, of_mask.size, _ROWS_AT_ONCE):
+            block = of_mask[start : start + _ROWS_AT_ONCE]
             ambient = None if ambient_T is None else ambient_T[block]
-            examined = _Examination(array, fit, mask, readings_T[block], ambient, free_position)
-            plain = examined.without_lonely_sources([fixes[row] for row in block])
-            for row, fix in zip(block, examined.fixes(plain), strict=True):
-                fixes[row] = fix
-    return fixes
+            examination = _Examination(array, refit, mask, block, readings_T[block], ambient, free_position)
+            found += examination.fixes(examination.without_lonely_sources([fixes[row] for row in block]))
+            examined.append(block)
+    if not examined:
+        return fixes
+    return fixes.replaced(np.concatenate(examined), found)
 
 
-def _is_doubtful(fix: Fix | JointFix) -> bool:
-    if not fix.solutions:
-        return fix.reason != NO_SIGNAL
-    best = fix.solutions[0]
-    if isinstance(best, JointSolution) and len(best.sources) > 1:
-        return True
-    return not _is_credible(fix)
+def _doubtful(fixes: Fixes) -> BoolArray:
+    """Rows (n,) to be looked at: those whose χ² is not credible, that have several sources, or no solution."""
+    result = ~fixes.solved & np.array([reason != NO_SIGNAL for reason in fixes.reason], dtype=bool)
+    solutions, first = fixes.solutions, fixes.first[fixes.solved]
+    dof = solutions.dof[first]
+    incredible = (dof > 0) & (solutions.chi2[first] > chdtri(np.maximum(dof, 1), 1.0 - _CREDIBLE))
+    result[fixes.solved] = incredible | (solutions.n_sources[first] > 1)
+    return result
 
 
-def _explains(fix: Fix | JointFix) -> bool:
+def _explains(fix: Fix) -> bool:
     """Whether a fix is credible and might have been incredible."""
     return bool(fix.solutions) and fix.solutions[0].dof > 0 and _is_credible(fix)
 
 
-def _is_credible(fix: Fix | JointFix) -> bool:
+def _is_credible(fix: Fix) -> bool:
     best = fix.solutions[0]
     return best.dof <= 0 or bool(best.chi2 <= chdtri(best.dof, 1.0 - _CREDIBLE))
 
 
-def _is_worth_dropping_for(fix: Fix | JointFix, plain: Fix | JointFix) -> bool:
+def _is_worth_dropping_for(fix: Fix, plain: Fix) -> bool:
     """Whether a fix without some sensors explains all others, or all but incomparably better than with them.
 
     Where it does not, it is the model, or what is known of the source, that is wrong.
@@ -134,34 +140,40 @@ def _is_worth_dropping_for(fix: Fix | JointFix, plain: Fix | JointFix) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class _Start(Generic[AnyFix]):
+class _Start:
     """A fix to reweight from, and the sensors that it was made without."""
 
-    fix: AnyFix
+    fix: Fix
     without: frozenset[int]
 
 
-class _Examination(Generic[AnyFix]):
+class _Examination:
     """Rows that miss the same channels and have a doubtful fix."""
 
     def __init__(
         self,
         array: SensorArray,
-        fit: Fitter[AnyFix],
-        mask: NDArray[np.bool_],
+        refit: Refit,
+        mask: BoolArray,
+        rows: IntArray,
         readings: FloatArray,
         ambient: FloatArray | None,
         free_position: bool,
     ) -> None:
         self.array, self.readings, self.ambient = array, readings, ambient
-        self.fit: Fitter[AnyFix] = fit
+        self.refit, self.of_all = refit, rows
         self.free_position = free_position
-        self.problem, self.raw = whitened_model(array, mask, readings, whitenings_of(array, mask, readings), ambient)
+        self.problem, self.raw = whitened_model(
+            array,
+            channels_above_ambient(array, mask, readings, ambient),
+            whitenings_of(array, mask, readings),
+            ambient,
+        )
         self.count = np.bincount(array.channel_sensor[mask], minlength=array.n_sensors)
         level = 1.0 - _SENSOR_FALSE_ALARM / array.n_sensors
         self.limits = np.array(chdtri(np.maximum(self.count, 1), 1.0 - level), dtype=np.float64)
 
-    def without_lonely_sources(self, plain: Sequence[AnyFix]) -> list[AnyFix]:
+    def without_lonely_sources(self, plain: Sequence[Fix]) -> list[Fix]:
         """Fixes without sources that a single sensor sees: nothing tells such a source from a fault of the sensor."""
         found = list(plain)
         for row, fix in enumerate(plain):
@@ -172,10 +184,10 @@ class _Examination(Generic[AnyFix]):
                 continue
             (other,) = self._without(sensors, np.array([row]))
             if other.solutions and _is_credible(other) and len(self._scaled(other)[0]) < len(self._scaled(fix)[0]):
-                found[row] = replace(other, dropped=tuple(self.array.ids[sensor] for sensor in sorted(sensors)))
+                found[row] = replace(other, dropped_sensors=tuple(self.array.ids[sensor] for sensor in sorted(sensors)))
         return found
 
-    def _seers_of_lonely_sources(self, row: int, fix: AnyFix) -> frozenset[int]:
+    def _seers_of_lonely_sources(self, row: int, fix: Fix) -> frozenset[int]:
         q, mu = self._scaled(fix)
         problem = self.problem.rows(np.full(len(q), row))
         seen = problem.predicted(problem.source_fields(q[:, None], mu[:, None]))
@@ -184,7 +196,7 @@ class _Examination(Generic[AnyFix]):
         lonely = energy.max(axis=1) > _LONELY * energy.sum(axis=1)
         return frozenset(np.argmax(energy[lonely], axis=1).tolist())
 
-    def fixes(self, plain: Sequence[AnyFix]) -> list[AnyFix]:
+    def fixes(self, plain: Sequence[Fix]) -> list[Fix]:
         """The plain fix, or that without the sensors that stand out."""
         found = list(plain)
         suspected = self._suspected(plain)
@@ -204,10 +216,10 @@ class _Examination(Generic[AnyFix]):
             names = tuple(self.array.ids[sensor] for sensor in sorted(dropped))
             for row, fix in zip(rows, self._without(dropped, rows), strict=True):
                 if _is_worth_dropping_for(fix, plain[row]):
-                    found[row] = replace(fix, dropped=names)
+                    found[row] = replace(fix, dropped_sensors=names)
         return found
 
-    def _suspected(self, plain: Sequence[AnyFix]) -> IntArray:
+    def _suspected(self, plain: Sequence[Fix]) -> IntArray:
         """Rows where a sensor may stand out: it does so from the plain fix, or nothing fits and the fit is spoilt."""
         solved = np.array([bool(fix.solutions) for fix in plain])
         credible = np.array([bool(fix.solutions) and _is_credible(fix) for fix in plain])
@@ -224,7 +236,7 @@ class _Examination(Generic[AnyFix]):
             )
         return np.flatnonzero(spoilt & ~credible)
 
-    def _by_count(self, fixes: Sequence[tuple[int, AnyFix]]) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+    def _by_count(self, fixes: Sequence[tuple[int, Fix]]) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
         """Rows, and best solutions (f, K, …), of fixes of equally many sources."""
         scaled = [(row, *self._scaled(fix)) for row, fix in fixes if fix.solutions]
         for count in sorted({len(q) for _, q, _ in scaled}):
@@ -232,7 +244,7 @@ class _Examination(Generic[AnyFix]):
             rows, q, mu = zip(*alike, strict=True)
             yield np.array(rows, dtype=np.intp), np.stack(q), np.stack(mu)
 
-    def _left_out(self, plain: Sequence[AnyFix], rows: IntArray) -> list[tuple[int, IntArray]]:
+    def _left_out(self, plain: Sequence[Fix], rows: IntArray) -> list[tuple[int, IntArray]]:
         """Sensors to leave out in turn, and in which rows: those that fit worst, and the nearest to the source."""
         standing = np.flatnonzero(self.count)
         if standing.size <= _MOST_LEFT_OUT:
@@ -261,18 +273,17 @@ class _Examination(Generic[AnyFix]):
             return singles
         return singles + [frozenset(pair) for pair in combinations(standing, 2)]
 
-    def _start_without(self, starts: dict[int, list[_Start[AnyFix]]], sensors: frozenset[int], rows: IntArray) -> None:
+    def _start_without(self, starts: dict[int, list[_Start]], sensors: frozenset[int], rows: IntArray) -> None:
         for row, fix in zip(rows.tolist(), self._without(sensors, rows), strict=True):
             starts[row].append(_Start(fix, sensors))
 
-    def _without(self, sensors: set[int] | frozenset[int], rows: IntArray) -> list[AnyFix]:
+    def _without(self, sensors: set[int] | frozenset[int], rows: IntArray) -> list[Fix]:
         readings = self.readings[rows].copy()
         readings[:, np.isin(self.array.channel_sensor, list(sensors))] = np.nan
-        return list(self.fit(readings, None if self.ambient is None else self.ambient[rows]))
+        return list(self.refit(self.of_all[rows], readings))
 
-    def _scaled(self, fix: Fix | JointFix) -> tuple[FloatArray, FloatArray]:
-        best = fix.solutions[0]
-        sources = (best,) if isinstance(best, Solution) else best.sources
+    def _scaled(self, fix: Fix) -> tuple[FloatArray, FloatArray]:
+        sources = fix.solutions[0].sources
         q = self.problem.homogeneous(np.stack([source.position_m for source in sources]))
         return q, self.problem.scaled_moment(q, np.stack([source.moment_Am2 for source in sources]))
 
@@ -293,7 +304,7 @@ class _Examination(Generic[AnyFix]):
         ratio = np.median(misfit[:, standing] / self.count[standing], axis=1) / _MEDIAN_RATIO
         return np.maximum(1.0, ratio)
 
-    def _standing_out(self, starts: dict[int, list[_Start[AnyFix]]]) -> dict[int, frozenset[int]]:
+    def _standing_out(self, starts: dict[int, list[_Start]]) -> dict[int, frozenset[int]]:
         """Sensors of every row that stand out from the best of its robust fits."""
         best = dict.fromkeys(starts, np.inf)
         found = dict.fromkeys(starts, frozenset[int]())

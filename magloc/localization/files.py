@@ -1,57 +1,52 @@
-"""What a fix looks like in JSON, in the world frame, and what has to be said of all of them on stderr."""
+"""What fixes look like in JSON."""
 
 from __future__ import annotations
 
-from magloc.localization.fit.results import AnyFix, Fix
-from magloc.localization.uncertainty.covariance import is_misfit
-
-_JSON_KEYS = (
-    "position_m",
-    "moment_Am2",
-    "covariance",
-    "chi2",
-    "dof",
-    "iterations",
-    "converged",
-    "range_observable",
-    "range_interval95_m",
-    "gaussian",
-    "weight",
-)
-_SOURCE_KEYS = (
-    "position_m",
-    "moment_Am2",
-    "covariance",
-    "range_observable",
-    "range_interval95_m",
-    "gaussian",
-    "merged",
-)
-_JOINT_KEYS = ("covariance", "chi2", "dof", "iterations", "converged", "weight")
+from magloc.localization.fit.fixes import Fixes
+from magloc.localization.fit.results import Fix, Solution, Source
 
 
-def json_entry(time_s: float, fix: AnyFix, saturated: tuple[str, ...], near: bool) -> dict[str, object]:
-    """What ``--json`` prints of one row."""
-    solutions: list[dict[str, object]]
-    if isinstance(fix, Fix):
-        solutions = [{key: getattr(solution, key) for key in _JSON_KEYS} for solution in fix.solutions]
-    else:
-        solutions = [
-            {
-                "sources": [{key: getattr(source, key) for key in _SOURCE_KEYS} for source in solution.sources],
-                **{key: getattr(solution, key) for key in _JOINT_KEYS},
-            }
-            for solution in fix.solutions
-        ]
-    entry: dict[str, object] = {"time_s": time_s, "detected": fix.detected, "solutions": solutions}
-    if fix.reason:
-        entry["reason"] = fix.reason
-    if fix.dropped:
-        entry["dropped_sensors"] = fix.dropped
-    if saturated:
-        entry["saturated_channels"] = saturated
-    if near:
-        entry["too_near"] = True
-    if is_misfit(fix):
-        entry["misfit"] = True
-    return entry
+def json_of_fixes(fixes: Fixes, *, joint: bool) -> dict[str, object]:
+    """What ``magloc locate --json`` prints; `joint`: every solution has a list of its sources, also for one."""
+    return {"results": [_entry(fix, joint) for fix in fixes]}
+
+
+def _entry(fix: Fix, joint: bool) -> dict[str, object]:
+    entry: dict[str, object] = {
+        "time_s": fix.time_s,
+        "detected": fix.detected,
+        "solutions": [_of_solution(solution, joint) for solution in fix.solutions],
+    }
+    flags = {
+        "reason": fix.reason,
+        "dropped_sensors": fix.dropped_sensors,
+        "saturated_channels": fix.saturated_channels,
+        "too_near": fix.too_near,
+        "misfit": fix.misfit,
+    }
+    return entry | {name: value for name, value in flags.items() if value}
+
+
+def _of_solution(solution: Solution, joint: bool) -> dict[str, object]:
+    whole: dict[str, object] = {
+        "chi2": solution.chi2,
+        "dof": solution.dof,
+        "iterations": solution.iterations,
+        "converged": True,
+        "weight": solution.weight,
+    }
+    if not joint:
+        return _of_source(solution.source) | whole
+    sources = [_of_source(source) | {"merged": source.merged} for source in solution.sources]
+    return {"sources": sources, "covariance": solution.covariance} | whole
+
+
+def _of_source(source: Source) -> dict[str, object]:
+    return {
+        "position_m": source.position_m,
+        "moment_Am2": source.moment_Am2,
+        "covariance": source.covariance,
+        "range_observable": source.range_observable,
+        "range_interval95_m": source.range_interval_m,
+        "gaussian": source.gaussian,
+    }

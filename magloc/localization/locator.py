@@ -1,141 +1,101 @@
-"""Fixes of the rows of readings, whatever is asked for, and whether their source is near enough to matter."""
+"""The one door to a fix, and the only place that knows the order of what makes one.
+
+Detection → search → uncertainty → exclusion of faulty sensors → validity of the dipole → result.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
-from scipy.special import chdtrc
 
 from arrays.array import SensorArray
-from arrays.typing import FloatArray, Vector
-from magloc.localization.fault_exclusion import robust_fixes
+from arrays.typing import FloatArray, IntArray
+from magloc.localization.dipole_validity import too_near
+from magloc.localization.fault_exclusion import without_faulty_sensors
+from magloc.localization.fit.columns import Solutions, in_stable_order
+from magloc.localization.fit.fixes import Fixes
+from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
-from magloc.localization.fit.results import Fix, JointFix, Solution
-from magloc.localization.search.known_position import MomentLocator
-from magloc.localization.search.multi_source import SeveralLocator, in_stable_order
-from magloc.localization.search.single_source import Locator
-from magloc.readings import Readings
+from magloc.localization.fit.results import Fix
+from magloc.localization.search.known_position import MomentSearch
+from magloc.localization.search.moving_array import optima_at_rest, stacked_rows
+from magloc.localization.search.multi_source import NOISE_ALONE, MultiSourceSearch
+from magloc.localization.search.single_source import N_UNKNOWNS, SingleSourceSearch
+from magloc.localization.uncertainty.covariance import solutions_of
+from magloc.localization.uncertainty.range_interval import is_detected
+from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, checked_rows, whitened_rows
+from magloc.readings import (
+    Readings,
+    averaging_array,
+    complete_rows,
+    saturated_channels,
+    without_saturated,
+)
+from magloc.readings import average as averaged
 
-AnyFix = Fix | JointFix
+_LOG = logging.getLogger(__name__)
 _ROWS_AT_ONCE = 256
-# Probability of a χ² under noise below which what is left is looked at.
-_MISFIT = 1e-3
+# A search for several sources, or by moduli, takes its rows in smaller blocks.
+_ROWS_OF_SEVERAL = 64
 
 
-class RowFixes:
-    """The fixes of all rows, whatever is asked for."""
-
-    def __init__(
-        self,
-        array: SensorArray,
-        rows: Readings,
-        ambient_T: FloatArray | None,
-        knowledge: SourcePrior,
-        n_sources: int | Literal["auto"] | None,
-        position: Vector | None,
-        keep_sensors: bool,
-        seed: int,
-    ) -> None:
-        self.array, self.rows, self.ambient_T, self.keep_sensors = array, rows, ambient_T, keep_sensors
-        self.position_known = position is not None
-        self.at_once = _ROWS_AT_ONCE
-        self.fit_rows: list[Callable[..., list[Any]]]
-        if position is not None:
-            places = _in_array_frame(position, rows)
-            if len(places) > 1:
-                # The known place moves in the frame of an array that moves.
-                self.at_once = 1
-            self.fit_rows = [MomentLocator(array, place, knowledge=knowledge).fit_rows for place in places]
-            return
-        if n_sources is not None:
-            number = None if n_sources == "auto" else n_sources
-            self.fit_rows = [SeveralLocator(array, n_sources=number, knowledge=knowledge, seed=seed).fit_rows]
-        elif array.channel_is_scalar.any():
-            self.fit_rows = [ExactLocator(array, knowledge=knowledge).fit_rows]
-        else:
-            self.fit_rows = [Locator(array, knowledge=knowledge).fit_rows]
-
-    def fixes(self, advance: Callable[[int], None]) -> list[AnyFix]:
-        """Fixes of all rows, without the sensors that contradict all others."""
-        fixes: list[Any] = []
-        for begin in range(0, len(self.rows), self.at_once):
-            fit = self.fit_rows[min(begin, len(self.fit_rows) - 1)]
-            readings = self.rows.values_T[begin : begin + self.at_once]
-            ambient = None if self.ambient_T is None else self.ambient_T[begin : begin + self.at_once]
-            if self.keep_sensors:
-                fixes += fit(readings, ambient)
-            else:
-                fixes += robust_fixes(self.array, fit, readings, ambient, free_position=not self.position_known)
-            advance(len(readings))
-        if any(isinstance(fix, JointFix) for fix in fixes):
-            fixes = list(in_stable_order(fixes))
-        return fixes
-
-    def too_near(self, fixes: Sequence[AnyFix], body_length_m: float | None) -> list[bool]:
-        """Whether the source of each row is too near for a dipole: by its length, or by the pattern of what is left."""
-        from magloc.localization.dipole_validity import (
-            dipole_validity,
-            nearness_test,
-        )  # trimesh takes a while to import
-
-        near = []
-        for i, fix in enumerate(fixes):
-            if not isinstance(fix, Fix) or not fix.solutions:
-                near.append(False)
-                continue
-            best = fix.solutions[0]
-            found = False
-            if body_length_m is not None:
-                nearest = np.linalg.norm(self.array.positions - best.position_m, axis=1).min()
-                found = not dipole_validity(nearest, body_length_m)
-            if not found and best.dof > 0 and chdtrc(best.dof, best.chi2) < _MISFIT:
-                readings = self.rows.values_T[i].copy()
-                left_out = [self.array.ids[sensor] in fix.dropped for sensor in self.array.channel_sensor]
-                readings[left_out] = np.nan
-                array = self.array
-                if self.ambient_T is not None:
-                    array = replace(array, ambient_T=tuple(self.ambient_T[i].tolist()))
-                test = nearness_test(array, best.position_m, best.moment_Am2, readings)
-                found = test.extended
-            near.append(found)
-        return near
-
-
-def _in_array_frame(position: Vector, readings: Readings) -> FloatArray:
-    """A place in the frame of the results in that of the array: one for all rows (1, 3), or one for each (n, 3)."""
-    if readings.array_position_m is None or readings.array_rotation_xyzw is None:
-        return np.array([position])
-    array_from_world = Rotation.from_quat(readings.array_rotation_xyzw).inv()
-    place: FloatArray = array_from_world.apply(np.array(position) - readings.array_position_m)
-    return place
-
-
-class ExactLocator:
-    """Start-free fixes of one dipole with vector sensors, scalar sensors or both.
-
-    For vector sensors alone :class:`magloc.localization.search.single_source.Locator` gives the same, much faster.
+class Locator:
+    """Start-free fixes with one array of any sensors.
 
     Parameters
     ----------
     array : SensorArray
-        At least seven scalar sensors, or as many differences from sensors of both kinds.
-    knowledge : SourcePrior
-        Bounds of the source's position and moment.
+    sources : int or "auto"
+        How many sources there are in every row; "auto": as many as the readings support, five at most.
+    position_m : array_like, shape (3,) or (n, 3), optional
+        Where the source is, in the array's frame [m], in all rows or in every one: only its moment is looked for.
+    prior : SourcePrior
+        Bounds of position and moment that hold for every source; solutions that contradict them are left out.
+    body_length_m : float, optional
+        Length of the object: fixes nearer than three lengths are flagged `too_near`, where it is no dipole.
+    exclude_faulty : bool
+        Leave out, and name, sensors that contradict all others.
+    seed : int
+        Of random restarts and of the draws for the threshold of another source.
 
     Raises
     ------
     ValueError
-        The array has fewer than six independent differences.
+        The array cannot tell that many sources, the prior leaves nothing, or the position is no place for a source.
     """
 
-    def __init__(self, array: SensorArray, *, knowledge: SourcePrior = NOTHING_KNOWN) -> None:
+    def __init__(
+        self,
+        array: SensorArray,
+        *,
+        sources: int | Literal["auto"] = 1,
+        position_m: ArrayLike | None = None,
+        prior: SourcePrior = NOTHING_KNOWN,
+        body_length_m: float | None = None,
+        exclude_faulty: bool = True,
+        seed: int = 0,
+    ) -> None:
+        if body_length_m is not None and not body_length_m > 0.0:
+            raise ValueError(f"Input body_length_m must be positive; instead received {body_length_m:g}.")
+        if position_m is not None and sources != 1:
+            raise ValueError(f"Input sources must be 1 where position_m is known; instead received {sources}.")
         self.array = array
-        self._several = SeveralLocator(array, n_sources=1, knowledge=knowledge)
+        self.body_length_m = body_length_m
+        self.exclude_faulty = exclude_faulty
+        self._search: SingleSourceSearch | MultiSourceSearch | MomentSearch
+        if position_m is not None:
+            self._search, self._fewest = MomentSearch(array, position_m, prior=prior), 3
+        elif sources == 1 and not array.channel_is_scalar.any():
+            self._search, self._fewest = SingleSourceSearch(array, prior=prior), 6
+        else:
+            number = None if sources == "auto" else int(sources)
+            self._search = MultiSourceSearch(array, n_sources=number, prior=prior, seed=seed)
+            self._fewest = 6 * (number or 1)
 
     def fit(self, readings_T: ArrayLike, ambient_T: ArrayLike | None = None) -> Fix:
         """Fix from one set of readings (C,) [T], NaN where missing, and the ambient field (3,) [T]."""
@@ -146,33 +106,218 @@ class ExactLocator:
         self,
         readings_T: ArrayLike,
         ambient_T: ArrayLike | None = None,
+        *,
+        time_s: FloatArray | None = None,
         progress: Callable[[int], None] | None = None,
-    ) -> list[Fix]:
-        """Fixes of many sets of readings, as :meth:`magloc.localization.search.multi_source.SeveralLocator.fit_rows`.
+    ) -> Fixes:
+        """Fixes of many sets of readings, each on its own.
+
+        Parameters
+        ----------
+        readings_T : array_like, shape (n, C)
+            Raw readings in channel order [T]; NaN where missing.
+        ambient_T : array_like, shape (n, 3), optional
+            Ambient field of every row in the array's frame [T], in place of the array's own.
+        time_s : ndarray, shape (n,), optional
+            Of the rows; 0, 1, 2 … by default.
+        progress : callable, optional
+            Called with the number of rows finished since the last call.
 
         Returns
         -------
-        list of Fix
-            Every distinct solution of every row; for moduli without an ambient field those of opposite moments too.
+        Fixes
+            In the order of the rows, in the array's frame. Several sources keep their number from row to row where
+            they can be followed, at first the strongest comes first.
         """
-        return [_of_one(fix) for fix in self._several.fit_rows(readings_T, ambient_T, progress)]
+        readings = checked_rows(self.array, readings_T)
+        ambient = None if ambient_T is None else np.asarray(ambient_T, dtype=np.float64)
+        times = np.arange(len(readings), dtype=np.float64) if time_s is None else time_s
+        parts = []
+        for begin in range(0, len(readings), _ROWS_AT_ONCE):
+            index = np.arange(begin, min(begin + _ROWS_AT_ONCE, len(readings)))
+            parts.append(self._credible(index, readings[index], None if ambient is None else ambient[index]))
+            if progress is not None:
+                progress(len(index))
+        fixes = replace(Fixes.joined(parts), time_s=times)
+        if (fixes.solutions.n_sources > 1).any():
+            fixes = replace(fixes, solutions=in_stable_order(fixes.solutions))
+        near = too_near(self.array, fixes, readings, ambient, self.body_length_m)
+        return replace(fixes, too_near=near)
+
+    def _credible(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
+        """Fixes of some of the rows, without the sensors that contradict all others."""
+
+        def refit(rows: IntArray, other: FloatArray) -> Fixes:
+            return self._plain(index[rows], other, None if ambient is None else ambient[rows])
+
+        fixes = self._plain(index, readings, ambient)
+        if not self.exclude_faulty:
+            return fixes
+        free = not isinstance(self._search, MomentSearch)
+        return without_faulty_sensors(self.array, fixes, refit, readings, ambient, free_position=free)
+
+    def _plain(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
+        """Fixes of some of the rows with all sensors: detection, search, uncertainty."""
+        search = self._search
+        if isinstance(search, MomentSearch):
+            search = search.of_rows(index)
+        at_once = _ROWS_AT_ONCE if isinstance(search, SingleSourceSearch) else _ROWS_OF_SEVERAL
+        found = _Rows(len(readings))
+        for rows in whitened_rows(self.array, readings, ambient, at_once):
+            if rows.n_differences < self._fewest:
+                found.refuse(
+                    rows.index,
+                    f"{int(rows.mask.sum())} readings give {rows.n_differences} independent differences,"
+                    f" {self._fewest} are needed",
+                )
+            else:
+                found.fill(rows, search.optima)
+        return found.fixes()
 
 
-def _of_one(fix: JointFix) -> Fix:
-    solutions = tuple(
-        Solution(
-            position_m=solution.sources[0].position_m,
-            moment_Am2=solution.sources[0].moment_Am2,
-            covariance=solution.covariance,
-            chi2=solution.chi2,
-            dof=solution.dof,
-            iterations=solution.iterations,
-            converged=solution.converged,
-            range_observable=solution.sources[0].range_observable,
-            range_interval95_m=solution.sources[0].range_interval95_m,
-            weight=solution.weight,
-            gaussian=solution.sources[0].gaussian,
+class _Rows:
+    """Collects what is found of n rows, block by block."""
+
+    def __init__(self, n: int) -> None:
+        self.detected = np.zeros(n, dtype=bool)
+        self.reason = [""] * n
+        self.failed_starts = np.zeros(n, dtype=np.intp)
+        self.parts: list[Solutions] = []
+
+    def refuse(self, rows: IntArray, reason: str) -> None:
+        """Say why some rows have no solution."""
+        for row in rows.tolist():
+            self.reason[row] = reason
+
+    def fill(self, rows: WhitenedRows, search: Callable[[WhitenedRows], list[Optima]]) -> None:
+        """Detection, search and uncertainty of a block."""
+        silent = rows.silent
+        self.refuse(rows.index[silent], NO_SIGNAL)
+        loud = rows.chosen(~silent) if silent.any() else rows
+        if not len(loud):
+            return
+        energy = np.zeros(len(self.reason))
+        energy[loud.index] = loud.energy
+        self.detected[loud.index] = is_detected(energy[loud.index], loud.n_differences)
+        for optima in search(loud):
+            of_all = optima.rows.index
+            found = solutions_of(optima, energy[of_all], self.detected[of_all])
+            solved = np.bincount(found.of_row, minlength=len(of_all)) > 0
+            for row, reason, has in zip(of_all.tolist(), optima.reason, solved.tolist(), strict=True):
+                self.reason[row] = reason or ("" if has else optima.undetermined)
+                self.detected[row] &= reason != NOISE_ALONE
+            self.failed_starts[of_all] = optima.failed_starts
+            self.parts.append(replace(found, of_row=of_all[found.of_row]))
+
+    def fixes(self) -> Fixes:
+        """All of it."""
+        n = len(self.reason)
+        solutions = Solutions.joined(self.parts)
+        return Fixes(
+            solutions, np.arange(n, dtype=np.float64), self.detected, self.reason, self.failed_starts, [()] * n
         )
-        for solution in fix.solutions
+
+
+def fit_at_rest(
+    array: SensorArray,
+    readings_T: FloatArray,
+    origins_m: FloatArray,
+    R_world_from_array: FloatArray,
+    ambient_T: FloatArray | None = None,
+) -> Fix:
+    """Fix of one source at rest from several rows of an array that moves, all together, in the world frame.
+
+    A few scalar sensors do not locate a source in one row, but they do while they pass it. Every row keeps a common
+    field of its own. Parameters are those of :func:`magloc.localization.search.moving_array.stacked_rows`.
+    """
+    rows = stacked_rows(array, readings_T, origins_m, R_world_from_array, ambient_T)
+    found = _Rows(1)
+    if rows.n_differences < N_UNKNOWNS:
+        reason = f"{len(readings_T)} rows give {rows.n_differences} independent differences, {N_UNKNOWNS} are needed"
+        found.refuse(rows.index, reason)
+    else:
+        found.fill(rows, lambda loud: [optima_at_rest(loud)])
+    return found.fixes()[0]
+
+
+def locate(
+    array: SensorArray,
+    readings: Readings | ArrayLike,
+    *,
+    sources: int | Literal["auto"] = 1,
+    position_m: ArrayLike | None = None,
+    prior: SourcePrior = NOTHING_KNOWN,
+    ambient_T: ArrayLike | None = None,
+    body_length_m: float | None = None,
+    exclude_faulty: bool = True,
+    average: bool = False,
+    seed: int = 0,
+    progress: Callable[[int], None] | None = None,
+) -> Fixes:
+    """Find the sources in every row of readings, each row on its own.
+
+    Parameters
+    ----------
+    array : SensorArray
+    readings : Readings or array_like, shape (n, C) or (C,)
+        Raw readings [T], NaN where missing. Those that saturate are not used, and named.
+    sources, prior, body_length_m, exclude_faulty, seed
+        As in :class:`Locator`.
+    position_m : array_like, shape (3,), optional
+        Where the source is [m], in the frame of the results: only its moment is looked for.
+    ambient_T : array_like, shape (n, 3) or (3,), optional
+        Ambient field in the array's frame [T], in place of the readings' and the array's own.
+    average : bool
+        Average all rows to one fix. The array and the source must stand still.
+    progress : callable, optional
+        Called with the number of rows finished since the last call.
+
+    Returns
+    -------
+    Fixes
+        In the world frame where the readings have the array's pose, else in the array's.
+
+    Raises
+    ------
+    InputError
+        Rows that cannot be averaged.
+    ValueError
+        As of :class:`Locator`.
+    """
+    measured = readings if isinstance(readings, Readings) else _as_readings(readings)
+    n_complete = int(complete_rows(without_saturated(measured, array)).sum()) if average else 0
+    if 0 < n_complete < len(measured):
+        _LOG.info(f"note: {n_complete} of {len(measured)} rows are averaged, the others miss some readings")
+    rows, array, saturated = used_rows(measured, array, average=average)
+    ambient = rows.ambient_T if ambient_T is None else np.broadcast_to(np.asarray(ambient_T, float), (len(rows), 3))
+    place = position_m
+    pose = rows.pose
+    if position_m is not None and pose is not None:
+        place = pose[1].inv().apply(np.asarray(position_m, dtype=np.float64) - pose[0])
+    locator = Locator(
+        array,
+        sources=sources,
+        position_m=place,
+        prior=prior,
+        body_length_m=body_length_m,
+        exclude_faulty=exclude_faulty,
+        seed=seed,
     )
-    return Fix(solutions, "" if solutions else fix.reason, detected=fix.detected)
+    fixes = locator.fit_rows(rows.values_T, ambient, time_s=rows.time_s, progress=progress)
+    fixes = replace(fixes, saturated_channels=saturated)
+    return fixes if pose is None else fixes.moved(*pose, frame="world")
+
+
+def _as_readings(values_T: ArrayLike) -> Readings:
+    values = np.atleast_2d(np.asarray(values_T, dtype=np.float64))
+    return Readings(np.arange(len(values), dtype=np.float64), values, np.arange(1, len(values) + 1))
+
+
+def used_rows(
+    readings: Readings, array: SensorArray, *, average: bool = False
+) -> tuple[Readings, SensorArray, list[tuple[str, ...]]]:
+    """Rows that fixes are made of, with the array of their noise, and names of the channels that saturate in each."""
+    rows = without_saturated(readings, array)
+    if not average:
+        return rows, array, saturated_channels(readings, rows, array)
+    return averaged(rows), averaging_array(array, rows), [()]

@@ -3,17 +3,89 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from arrays.array import SensorArray
 from arrays.noise import reading_covariance
-from arrays.typing import FloatArray
+from arrays.typing import BoolArray, FloatArray, IntArray
 from arrays.whitening import Whitening, whitening, whitenings
 from magloc.measurement.whitened import WhitenedModel
 
 NO_SIGNAL = "the sensors' readings do not differ: no signal"
+# Mean square of whitened differences below which they are rounding errors rather than noise.
+_SILENT = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class WhitenedRows:
+    """Rows of readings that miss the same channels, whitened together.
+
+    Attributes
+    ----------
+    index : ndarray of int, shape (b,)
+        Which rows of the readings they are.
+    mask : ndarray of bool, shape (C,)
+        Channels that have a reading.
+    readings_T : ndarray, shape (b, C)
+    channels_T : ndarray, shape (b, C)
+        What vector channels read above the ambient field, and all that scalar channels read; 0 where missing.
+    model : WhitenedModel
+    y : ndarray, shape (b, C)
+        Of unit noise, free of the common field.
+    n_differences : int
+    """
+
+    index: IntArray
+    mask: BoolArray
+    readings_T: FloatArray
+    channels_T: FloatArray
+    model: WhitenedModel
+    y: FloatArray
+    n_differences: int
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def chosen(self, rows: IntArray | BoolArray) -> WhitenedRows:
+        """Some of the rows."""
+        at = np.arange(len(self))[rows]
+        return replace(
+            self,
+            index=self.index[at],
+            readings_T=self.readings_T[at],
+            channels_T=self.channels_T[at],
+            model=self.model.rows(at),
+            y=self.y[at],
+        )
+
+    @property
+    def silent(self) -> BoolArray:
+        """Whether the differences (b,) are rounding errors."""
+        return np.asarray(np.einsum("bc,bc->b", self.y, self.y) < _SILENT * self.n_differences)
+
+    @property
+    def energy(self) -> FloatArray:
+        """Sums of squared differences (b,), as they are without a source."""
+        without = self.y - self.model.predicted(np.zeros((len(self), *self.model.ambient.shape[1:])))
+        energy: FloatArray = np.einsum("bc,bc->b", without, without)
+        return energy
+
+
+def whitened_rows(
+    array: SensorArray, readings_T: FloatArray, ambient_T: FloatArray | None, at_once: int
+) -> Iterator[WhitenedRows]:
+    """All rows of readings (n, C), those together that miss the same channels, `at_once` of them at most."""
+    for mask, rows in rows_of_equal_mask(np.isfinite(readings_T)):
+        for begin in range(0, rows.size, at_once):
+            index = rows[begin : begin + at_once]
+            readings, ambient = readings_T[index], None if ambient_T is None else ambient_T[index]
+            of_rows = whitenings_of(array, mask, readings)
+            channels = channels_above_ambient(array, mask, readings, ambient)
+            model, raw = whitened_model(array, channels, of_rows, ambient)
+            yield WhitenedRows(index, mask, readings, channels, model, model.whitened(raw), of_rows[0].n_differences)
 
 
 def checked_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
@@ -55,37 +127,27 @@ def ambient_fields(array: SensorArray, n_rows: int, ambient_T: FloatArray | None
     return fields - uniform + ambient_T[:, None]
 
 
-def whitened_model(
-    array: SensorArray,
-    mask: NDArray[np.bool_],
-    readings_T: FloatArray,
-    whitenings: list[Whitening],
-    ambient_T: FloatArray | None,
-) -> tuple[WhitenedModel, FloatArray]:
-    """Exact model and whitened readings of rows that miss the same channels.
-
-    Parameters
-    ----------
-    array : SensorArray
-    mask : ndarray of bool, shape (C,)
-        Channels that have a reading.
-    readings_T : ndarray, shape (n, C)
-        Raw readings [T].
-    whitenings : list of Whitening
-        One for every row.
-    ambient_T : ndarray, shape (n, 3), optional
-        Ambient field of every row [T], in place of the array's.
-
-    Returns
-    -------
-    problem : WhitenedModel
-    raw : ndarray, shape (n, C)
-        What vector channels read above the ambient field, and all that scalar channels read, divided by the noise;
-        :meth:`WhitenedModel.whitened` frees it from the common field.
-    """
+def channels_above_ambient(
+    array: SensorArray, mask: BoolArray, readings_T: FloatArray, ambient_T: FloatArray | None
+) -> FloatArray:
+    """What vector channels (n, C) read above the ambient field, and all that scalar channels read; 0 off the mask."""
     fields = ambient_fields(array, len(readings_T), ambient_T)
     vector = ~array.channel_is_scalar
     ambient = np.einsum("ncj,cj->nc", fields[:, array.channel_sensor], array.channel_gain) * vector
-    channels = np.where(mask, readings_T - array.channel_offset_T - ambient, 0.0)
-    raw = np.stack([w.root @ row for w, row in zip(whitenings, channels, strict=True)])
-    return WhitenedModel.of(array, whitenings, fields), raw
+    channels: FloatArray = np.where(mask, readings_T - array.channel_offset_T - ambient, 0.0)
+    return channels
+
+
+def whitened_model(
+    array: SensorArray, channels_T: FloatArray, whitenings: list[Whitening], ambient_T: FloatArray | None
+) -> tuple[WhitenedModel, FloatArray]:
+    """Exact model of rows, and their channels (n, C) divided by the noise.
+
+    :meth:`WhitenedModel.whitened` frees these from the common field. `channels_T` are those of
+    :func:`channels_above_ambient`, `whitenings` one for every row, `ambient_T` (n, 3) stands in place of the array's.
+    """
+    if all(w is whitenings[0] for w in whitenings):
+        raw = channels_T @ whitenings[0].root.T
+    else:
+        raw = np.stack([w.root @ row for w, row in zip(whitenings, channels_T, strict=True)])
+    return WhitenedModel.of(array, whitenings, ambient_fields(array, len(channels_T), ambient_T)), raw

@@ -1,7 +1,6 @@
-r"""One dipole as a separable least-squares problem: the search is over the position alone.
+r"""Whitened model: dipoles in homogeneous coordinates, and what an array reads of them with unit noise.
 
-For a source at p the field is linear in the moment, so the best moment of every p is a 3-column least-squares problem
-and what remains is a function of three unknowns (variable projection). They are written as homogeneous coordinates
+For a source at p the field is linear in the moment. Positions are written as homogeneous coordinates
 :math:`q = (u, s)` on the unit sphere of :math:`R^4`,
 
 .. math:: p = c + \rho_0 \, u / s,
@@ -12,8 +11,7 @@ with the sensors' centroid c and circumradius :math:`\rho_0`. With the sensors s
 smoothly, where (p, m) turns into (-p, -m): the two fit alike to first order, and only the finite size of the array
 tells them apart.
 
-This module is the readable form, and the reference that tests hold
-:mod:`magloc.localization.search.single_source_compiled` against.
+The readable twin of :mod:`magloc.measurement.whitened_compiled`.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from arrays.array import SensorArray
-from arrays.typing import FloatArray
+from arrays.typing import FloatArray, IntArray
 from arrays.whitening import Whitening
 from magloc.fields.dipole import MU0_OVER_4PI
 
@@ -76,59 +74,6 @@ class ScaledSensors:
 
 
 @dataclass(frozen=True, eq=False)
-class SeparableProblem(ScaledSensors):
-    """Geometry and noise of one set of channels, scaled for the search.
-
-    Attributes
-    ----------
-    whitening : Whitening
-    gain : ndarray, shape (C, 3)
-        Channel gains in channels of unit noise; zero rows where readings are missing.
-    """
-
-    whitening: Whitening
-    gain: FloatArray
-
-    @classmethod
-    def of(cls, array: SensorArray, whitening: Whitening) -> SeparableProblem:
-        """Problem of an array of vector sensors under a whitening of its channels."""
-        return cls(
-            centroid=array.centroid,
-            radius=array.circumradius,
-            sensors=(array.positions - array.centroid) / array.circumradius,
-            channel_sensor=array.channel_sensor.astype(np.intp),
-            whitening=whitening,
-            gain=whitening.root @ array.channel_gain,
-        )
-
-    def unit_basis(self, q: FloatArray) -> FloatArray:
-        """Whitened readings of the three unit scaled moments at q (..., 4): shape (..., C, 3)."""
-        v = q[..., None, 3:] * self.sensors - q[..., None, :3]
-        r = np.linalg.norm(v, axis=-1, keepdims=True)
-        n = (v / r)[..., self.channel_sensor, :]
-        along = np.sum(n * self.gain, axis=-1, keepdims=True)
-        rows = (3.0 * along * n - self.gain) / r[..., self.channel_sensor, :] ** 3
-        return self._free_of_common_field(rows)
-
-    def _free_of_common_field(self, rows: FloatArray) -> FloatArray:
-        common = self.whitening.basis
-        free: FloatArray = rows - (common * self.whitening.shrinkage) @ (common.T @ rows)
-        return free
-
-    def projected_chi2(self, q: FloatArray, y: FloatArray) -> FloatArray:
-        """χ² of whitened readings y (..., C) with the best moment at q (..., 4)."""
-        orthonormal = np.linalg.qr(self.unit_basis(q)).Q
-        residual: FloatArray = y - np.einsum("...cj,...c,...dj->...d", orthonormal, y, orthonormal)
-        chi2: FloatArray = np.einsum("...c,...c->...", residual, residual)
-        return chi2
-
-    def best_moment(self, q: FloatArray, y: FloatArray) -> FloatArray:
-        """Scaled moment (3,) that fits whitened readings y (C,) best at q (4,)."""
-        mu: FloatArray = np.asarray(np.linalg.lstsq(self.unit_basis(q), y, rcond=None)[0], dtype=np.float64)
-        return mu
-
-
-@dataclass(frozen=True, eq=False)
 class WhitenedModel(ScaledSensors):
     """Geometry and whitening of b sets of readings of one array, scaled by the array's size.
 
@@ -152,30 +97,65 @@ class WhitenedModel(ScaledSensors):
 
     @classmethod
     def of(cls, array: SensorArray, whitenings: list[Whitening], ambient_T: FloatArray) -> WhitenedModel:
-        """Problem of b sets of readings, each with its whitening and its ambient field (b, N, 3)."""
+        """Model of b sets of readings, each with its whitening and its ambient field (b, N, 3)."""
+        # One whitening for all rows, as where the noise is constant, is kept once.
+        shared = all(w is whitenings[0] for w in whitenings)
+        distinct = whitenings[:1] if shared else whitenings
+
+        def of_rows(values: list[FloatArray]) -> FloatArray:
+            stacked = np.stack(values)
+            return np.broadcast_to(stacked, (len(whitenings), *stacked.shape[1:])) if shared else stacked
+
         return cls(
             centroid=array.centroid,
             radius=array.circumradius,
             sensors=(array.positions - array.centroid) / array.circumradius,
             channel_sensor=array.channel_sensor.astype(np.intp),
             channel_is_scalar=array.channel_is_scalar,
-            gain=np.stack([w.root @ array.channel_gain for w in whitenings]),
+            gain=of_rows([w.root @ array.channel_gain for w in distinct]),
             ambient=np.asarray(ambient_T, dtype=np.float64),
-            basis=np.stack([w.basis for w in whitenings]),
-            shrinkage=np.stack([w.shrinkage for w in whitenings]),
+            basis=of_rows([w.basis for w in distinct]),
+            shrinkage=of_rows([w.shrinkage for w in distinct]),
         )
 
     def __len__(self) -> int:
         return len(self.gain)
 
+    @property
+    def shares_whitening(self) -> bool:
+        """Whether all rows have one whitening, kept once."""
+        return len(self) == 1 or self.gain.strides[0] == 0
+
     def rows(self, index: NDArray[np.intp]) -> WhitenedModel:
-        """Problem of some of the readings, repeated at will."""
+        """Model of some of the readings, repeated at will."""
+
+        def chosen(values: FloatArray) -> FloatArray:
+            if values.strides[0] == 0:
+                return np.broadcast_to(values[:1], (len(index), *values.shape[1:]))
+            return values[index]
+
         return replace(
             self,
-            gain=self.gain[index],
-            ambient=self.ambient[index],
-            basis=self.basis[index],
-            shrinkage=self.shrinkage[index],
+            gain=chosen(self.gain),
+            ambient=chosen(self.ambient),
+            basis=chosen(self.basis),
+            shrinkage=chosen(self.shrinkage),
+        )
+
+    def compiled(self) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, FloatArray, IntArray]:
+        """Arguments of compiled loops: sensors, channel_sensor, and gain, common, shrinkage of every set; set of a row.
+
+        The common field is transposed, (sets, c, C), so that inner loops run over contiguous channels.
+        """
+        n = len(self)
+        sets = slice(0, 1) if self.shares_whitening else slice(None)
+        return (
+            self.sensors,
+            self.channel_sensor,
+            np.ascontiguousarray(self.gain[sets]),
+            np.ascontiguousarray(self.basis[sets].transpose(0, 2, 1)),
+            np.ascontiguousarray(self.shrinkage[sets]),
+            np.zeros(n, dtype=np.intp) if self.shares_whitening else np.arange(n, dtype=np.intp),
         )
 
     @property
@@ -210,7 +190,7 @@ class WhitenedModel(ScaledSensors):
 
     def predicted(self, source_fields: FloatArray) -> FloatArray:
         """Whitened predictions (b, C) of the fields of the sources at the sensors (b, N, 3)."""
-        channels = np.sum(source_fields[:, self.channel_sensor] * self.gain, axis=-1)
+        channels = np.ascontiguousarray(np.sum(source_fields[:, self.channel_sensor] * self.gain, axis=-1))
         scalar = self.channel_is_scalar
         if scalar.any():
             owner = self.channel_sensor[scalar]

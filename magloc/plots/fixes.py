@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
 from arrays.io.csv import Column, write_columns
 from arrays.io.outputs import make_folder
-from magloc.localization.fit.results import Fix, JointFix, Solution, Source
+from magloc.localization.fit.fixes import Fixes
+from magloc.localization.fit.results import is_observable, span
+from magloc.localization.residuals import fix_residuals
 from magloc.plots import style
 from magloc.plots.style import bounds99, save
 from magloc.readings import Readings
@@ -34,8 +34,8 @@ _NAMES = ("x_m", "y_m", "z_m", "mx_Am2", "my_Am2", "mz_Am2")
 def write_pictures(
     rows: Readings,
     array: SensorArray,
-    fixes: Sequence[Fix | JointFix],
-    residuals: FloatArray,
+    fixes: Fixes,
+    ambient_T: FloatArray | None,
     truth_m: FloatArray | None,
     folder: Path,
     *,
@@ -46,11 +46,11 @@ def write_pictures(
     Parameters
     ----------
     rows : Readings
+        That the fixes were made of (:func:`magloc.localization.locator.used_rows`).
     array : SensorArray
-    fixes : sequence of Fix or JointFix
-        Of every row, in the world frame if the array's pose is known.
-    residuals : ndarray, shape (n, C)
-        Of their best solutions, in standard deviations of the noise.
+    fixes : Fixes
+    ambient_T : ndarray, shape (n, 3), optional
+        Ambient field of every row in the array's frame [T], in place of the array's.
     truth_m : ndarray, shape (n, 3), optional
         True positions in the frame of the fixes [m], NaN where they are not known.
     folder : Path
@@ -64,7 +64,12 @@ def write_pictures(
         The folder cannot be written.
     """
     make_folder(folder, "--out")
-    found = fix_columns(rows.time_s.tolist(), fixes)
+    in_array, pose = fixes, rows.pose
+    if fixes.frame == "world" and pose is not None:
+        back = pose[1].inv()
+        in_array = fixes.moved(-back.apply(pose[0]), back, frame="array")
+    residuals = fix_residuals(array, rows.values_T, in_array, ambient_T)
+    found = fix_columns(fixes)
     state = np.concatenate([found.position_m, found.moment_Am2], axis=1)
     sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
     columns: dict[str, Column] = {"time_s": found.time_s, "source": found.source}
@@ -77,8 +82,8 @@ def write_pictures(
     if truth_m is not None:
         columns |= dict(zip((f"true_{name}" for name in _NAMES), truth_m[found.row].T, strict=False))
         columns["error_m"] = distances_from_truth(found, truth_m)
-    columns["dropped_sensors"] = [" ".join(fixes[row].dropped) for row in found.row]
-    columns["reason"] = [fixes[row].reason for row in found.row]
+    columns["dropped_sensors"] = [" ".join(fixes.dropped_sensors[row]) for row in found.row]
+    columns["reason"] = [fixes.reason[row] for row in found.row]
     write_columns(columns, folder / "fixes.csv")
     names = (f"{name}_residual_sigmas" for name in array.channel_names)
     write_columns({"time_s": rows.time_s, **dict(zip(names, residuals.T, strict=True))}, folder / "residuals.csv")
@@ -91,12 +96,17 @@ def write_pictures(
         _LOG.info(f"wrote fixes.png, fixes.csv, residuals.png and residuals.csv into {folder}/")
 
 
+def figure_of_fixes(fixes: Fixes) -> Figure:
+    """:meth:`magloc.localization.fit.fixes.Fixes.plot`."""
+    return fix_figure(fix_columns(fixes), np.zeros((len(fixes), 0, 3)))
+
+
 def sensors_of_rows(rows: Readings, array: SensorArray) -> FloatArray:
     """Sensors in every row (n, N, 3) [m]: in the world frame if the array's pose is known, else in the array's."""
-    if rows.array_position_m is None or rows.array_rotation_xyzw is None:
+    pose = rows.pose
+    if pose is None:
         return np.broadcast_to(array.positions, (len(rows), *array.positions.shape))
-    R = Rotation.from_quat(rows.array_rotation_xyzw).as_matrix()
-    result: FloatArray = np.einsum("nab,sb->nsa", R, array.positions) + rows.array_position_m[:, None]
+    result: FloatArray = np.einsum("nab,sb->nsa", pose[1].as_matrix(), array.positions) + pose[0][:, None]
     return result
 
 
@@ -147,52 +157,36 @@ class FixColumns:
         return self.source <= 1
 
 
-def fix_columns(times_s: Sequence[float], fixes: Sequence[Fix | JointFix]) -> FixColumns:
-    """Columns of the best solutions.
-
-    Parameters
-    ----------
-    times_s : sequence of float
-    fixes : sequence of Fix or JointFix
-
-    Returns
-    -------
-    FixColumns
-    """
-    entries: list[tuple[int, int, Solution | Source | None]] = []
-    for i, fix in enumerate(fixes):
-        if not fix.solutions:
-            entries.append((i, 0, None))
-            continue
-        best = fix.solutions[0]
-        sources: tuple[Solution | Source, ...] = (best,) if isinstance(best, Solution) else best.sources
-        entries += [(i, number, source) for number, source in enumerate(sources, start=1)]
-    n = len(entries)
-    position, moment, intervals = np.full((3, n, 3), np.nan)
+def fix_columns(fixes: Fixes) -> FixColumns:
+    """Sources of the best solutions of all rows."""
+    columns, best = fixes.solutions, fixes.best
+    number = np.where(fixes.solved, columns.n_sources[best] if len(columns) else 0, 1)
+    row = np.repeat(np.arange(len(fixes)), number)
+    solved = fixes.solved[row]
+    place = np.arange(len(row)) - np.repeat(np.cumsum(number) - number, number)
+    at = best[row][solved], place[solved]
+    n = len(row)
+    position, moment, intervals = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full((n, 2), np.nan)
     covariance = np.full((n, 6, 6), np.nan)
-    for k, (_, _, source) in enumerate(entries):
-        if source is None:
-            continue
-        position[k], moment[k] = source.position_m, source.moment_Am2
-        size = len(source.covariance)
-        covariance[k] = 0.0
-        covariance[k, 6 - size :, 6 - size :] = source.covariance
-        if source.range_interval95_m:
-            highest = source.range_interval95_m[-1][1]
-            intervals[k, :2] = source.range_interval95_m[0][0], math.inf if highest is None else highest
-    rows = np.array([row for row, _, _ in entries], dtype=np.intp)
-    solved = [fixes[row].solutions for row in rows]
+    position[solved], moment[solved] = columns.position_m[at], columns.moment_Am2[at]
+    if columns.covariance.shape[1] == 3:
+        covariance[solved] = 0.0
+        covariance[solved, 3:, 3:] = columns.covariance[at[0]]
+    else:
+        of_state = 6 * at[1][:, None] + np.arange(6)
+        covariance[solved] = columns.covariance[at[0][:, None, None], of_state[:, :, None], of_state[:, None]]
+    intervals[solved] = np.array([span(columns.ranges[i][k]) for i, k in zip(*at, strict=True)]).reshape(-1, 2)
     return FixColumns(
-        row=rows,
-        source=np.array([number for _, number, _ in entries], dtype=np.intp),
-        time_s=np.asarray(times_s, dtype=np.float64)[rows],
-        chi2=np.array([solutions[0].chi2 if solutions else math.nan for solutions in solved]),
-        dof=np.array([solutions[0].dof if solutions else 0 for solutions in solved]),
+        row=row,
+        source=np.where(solved, place + 1, 0),
+        time_s=fixes.time_s[row],
+        chi2=fixes.chi2[row],
+        dof=fixes.dof[row],
         position_m=position,
         moment_Am2=moment,
         covariance=covariance,
-        range_observable=np.array([source is not None and source.range_observable for _, _, source in entries]),
-        range95_m=intervals[:, :2],
+        range_observable=np.array([is_observable(low, high) for low, high in intervals], dtype=bool),
+        range95_m=intervals,
     )
 
 

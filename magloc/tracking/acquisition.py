@@ -15,9 +15,7 @@ from arrays.differences import decorrelated_differences
 from arrays.typing import FloatArray
 from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.fit.results import Fix, Solution
-from magloc.localization.locator import ExactLocator
-from magloc.localization.search.moving_array import stacked_fix
-from magloc.localization.search.single_source import Locator
+from magloc.localization.locator import Locator, fit_at_rest
 from magloc.localization.uncertainty.ambiguity import weights
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row
@@ -71,7 +69,7 @@ class Acquisition:
     Parameters
     ----------
     array : SensorArray
-    knowledge : SourcePrior
+    prior : SourcePrior
         Bounds for the fix of one row, in the array's frame.
     speed_m_s : float
         Characteristic speed of the source.
@@ -82,14 +80,13 @@ class Acquisition:
         What the last row says on its own, in the world frame.
     """
 
-    def __init__(self, array: SensorArray, knowledge: SourcePrior, speed_m_s: float) -> None:
+    def __init__(self, array: SensorArray, prior: SourcePrior, speed_m_s: float) -> None:
         self.array = array
         self.speed_m_s = speed_m_s
         self.of_last_row = Fix(())
-        self._locator: Locator | ExactLocator | None = None
+        self._locator: Locator | None = None
         if decorrelated_differences(array).n_differences >= N_SOURCE:
-            scalar = bool(array.channel_is_scalar.any())
-            self._locator = ExactLocator(array, knowledge=knowledge) if scalar else Locator(array, knowledge=knowledge)
+            self._locator = Locator(array, prior=prior, exclude_faulty=False)
         self.forget()
 
     def forget(self) -> None:
@@ -117,8 +114,7 @@ class Acquisition:
         reason, fix = "not acquired: one row does not determine the source", Fix(())
         self.of_last_row = fix
         if self._locator is not None:
-            ambient = None if row.ambient_T is None else row.ambient_T[None]
-            (fix,) = self._locator.fit_rows(row.readings_T[None], ambient)
+            fix = self._locator.fit(row.readings_T, row.ambient_T)
             centroid = row.origin_m + row.R_world_from_array @ self.array.centroid
             last, self._confirmable = self._confirmable, None
             limit = START_RANGE_ERROR if last is None else CONFIRMED_RANGE_ERROR
@@ -156,7 +152,7 @@ class Acquisition:
             return None
         chosen = recent[:: -max(1, len(recent) // _STACKED_ROWS)]
         known = [earlier.ambient_T for earlier in chosen if earlier.ambient_T is not None]
-        fix = stacked_fix(
+        fix = fit_at_rest(
             self.array,
             np.stack([earlier.readings_T for earlier in chosen]),
             np.stack([earlier.origin_m for earlier in chosen]),
@@ -173,15 +169,16 @@ class Acquisition:
 def _in_world(fix: Fix, row: Row) -> Fix:
     """A fix of one row in the world frame."""
     R, R6 = row.R_world_from_array, np.kron(np.eye(2), row.R_world_from_array)
-    solutions = (
-        replace(
-            solution,
+    solutions = []
+    for solution in fix.solutions:
+        covariance = R6 @ solution.covariance @ R6.T
+        source = replace(
+            solution.source,
             position_m=row.origin_m + R @ solution.position_m,
             moment_Am2=R @ solution.moment_Am2,
-            covariance=R6 @ solution.covariance @ R6.T,
+            covariance=covariance,
         )
-        for solution in fix.solutions
-    )
+        solutions.append(replace(solution, sources=(source,), covariance=covariance))
     return replace(fix, solutions=tuple(solutions))
 
 

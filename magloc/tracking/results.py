@@ -10,15 +10,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from arrays.typing import FloatArray
-from magloc.localization.fit.results import Solution
+from magloc.localization.fit.results import EVERYWHERE, Intervals, Solution, is_observable_set
 from magloc.localization.uncertainty.ambiguity import LARGEST_GAUSSIAN_SIGMA, relative_sigma
-from magloc.localization.uncertainty.range_interval import (
-    EVERYWHERE,
-    Intervals,
-    gaussian_ranges,
-    is_observable_set,
-    union,
-)
+from magloc.localization.uncertainty.range_interval import gaussian_ranges, union
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +89,7 @@ class TrackPoint:
         without one it is that of the row alone, or every range where the row says nothing.
         """
         if self.position_m is None or self.covariance is None:
-            return self.rivals[0].range_interval95_m if self.rivals else EVERYWHERE
+            return self.rivals[0].range_interval_m if self.rivals else EVERYWHERE
         if self.centroid_m is None:
             return None
         ends = gaussian_ranges(self.covariance, self.position_m - self.centroid_m, self.radius_m)

@@ -78,7 +78,7 @@ class Tracker:
     ----------
     array : SensorArray
     motion : MotionModel
-    knowledge : SourcePrior
+    prior : SourcePrior
         Bounds for the fixes that start a track, in the array's frame.
 
     Attributes
@@ -94,7 +94,7 @@ class Tracker:
         array: SensorArray,
         motion: MotionModel,
         *,
-        knowledge: SourcePrior = NOTHING_KNOWN,
+        prior: SourcePrior = NOTHING_KNOWN,
         keep_steps: bool = False,
     ) -> None:
         self.array = array
@@ -103,7 +103,7 @@ class Tracker:
         self.keep_steps = keep_steps
         self.steps: list[Step] = []
         self._noisy_array = without_lasting_errors(array)
-        self._acquisition = Acquisition(array, knowledge, motion.speed_m_s)
+        self._acquisition = Acquisition(array, prior, motion.speed_m_s)
         self._differences: dict[bytes, Differences] = {}
         self._x: FloatArray | None = None
         self._S: FloatArray = np.zeros((0, 0))

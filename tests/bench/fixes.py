@@ -9,10 +9,10 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from arrays.geometries import tetrahedron
-from magloc.localization.search.single_source import Locator
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
+from tests.plain_locator import plain_locator
 
 TITLE = "fix: tetrahedron of 1.5 m, 1 nT, source of 300 A·m² at 2-8 m, no start given"
 MOMENT_AM2 = 300.0
@@ -26,7 +26,7 @@ def rows(size: Size) -> Iterator[Row]:
     The peer has our measurement model and its analytic Jacobian, in NumPy, and MINPACK's Levenberg-Marquardt iteration.
     """
     measurement = DifferenceMeasurement.of(tetrahedron(1.5, noise_T=1e-9))
-    locator = Locator(measurement.array)
+    locator = plain_locator(measurement.array)
     truths, readings = simulated(measurement, size.rows, np.random.default_rng(2))
     few = range(min(size.problems, size.rows))
     z = measurement.measured(readings)

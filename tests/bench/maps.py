@@ -10,12 +10,12 @@ import numpy as np
 
 from magloc.convergence.filters import Ends, IekfFilter, RepeatedFilter
 from magloc.convergence.over_starts import StartsScenario, simulated_measurement
-from magloc.localization.search.single_source import Locator
 from magloc.measurement.differences import DifferenceMeasurement
 from tests.bench.filters import TIME, functions, stonesoup_update
 from tests.bench.fixes import best_fit
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, installed, interleaved
+from tests.plain_locator import plain_locator
 
 TITLE = (
     "map: one start of a cube of 40 m around a tetrahedron, source at 5 m; peers on a sample; iekf is chaotic far away"
@@ -40,7 +40,7 @@ def rows_of(
     """One filter, against its twin, its peers (package and loop by name) and scipy."""
     scenario = StartsScenario()
     readings, measurement, z = simulated_measurement(scenario)
-    optimum = Locator(scenario.array).fit(readings).solutions[0]
+    optimum = plain_locator(scenario.array).fit(readings).solutions[0]
     starts = starts_of(scenario, size.grid)
     sampled = np.random.default_rng(6).permutation(len(starts))[: size.sample]
     threads = numba.get_num_threads()

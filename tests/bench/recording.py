@@ -9,10 +9,10 @@ from pathlib import Path
 import numba
 
 from arrays.array_file import read_array
-from magloc.localization.search.single_source import Locator
 from magloc.readings import read_readings
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
+from tests.plain_locator import plain_locator
 
 TITLE = "recording: fixes of a magnet over 30 vector sensors"
 
@@ -25,7 +25,7 @@ def rows(size: Size) -> Iterator[Row]:
         return
     array = read_array(folder / "array.toml")
     readings = read_readings(folder / "readings.csv", array).values_T[: size.rows]
-    locator = Locator(array)
+    locator = plain_locator(array)
     threads = numba.get_num_threads()
     contestants = {n: Contestant(lambda: locator.fit_rows(readings), n, len(readings)) for n in {1, threads}}
     for n, timing in sorted(interleaved(contestants, size.rounds).items()):

@@ -9,12 +9,11 @@ from scipy.optimize import least_squares
 
 from arrays.array import SensorArray
 from arrays.sensor import Sensor
-from magloc.localization.locator import ExactLocator
-from magloc.localization.search.multi_source import SeveralLocator
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 from tests.bench.fixes import REACHED, best_fit, multi_start, random_directions
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
+from tests.plain_locator import plain_locator
 
 TITLE = "several sources and scalar sensors, no start given, 1 thread"
 
@@ -49,7 +48,7 @@ def scalar_sensors(size: Size) -> Row:
     def peer() -> None:
         found[:] = [2.0 * multi_start(measurement, row, starts).cost for row in z]
 
-    locator = ExactLocator(array)
+    locator = plain_locator(array)
     ours = [fix.solutions[0].chi2 if fix.solutions else np.inf for fix in locator.fit_rows(readings)]
     timings = interleaved(
         {"ours": Contestant(lambda: locator.fit_rows(readings), 1, n), "scipy": Contestant(peer, 1, n)}, size.rounds
@@ -102,7 +101,7 @@ def two_sources(size: Size) -> Row:
     def peer() -> None:
         found[:] = [min(fit(row, start_at(row, pair)) for pair in pairs) for row in z]
 
-    locator = SeveralLocator(array, n_sources=2)
+    locator = plain_locator(array, sources=2)
     ours = [fix.solutions[0].chi2 if fix.solutions else np.inf for fix in locator.fit_rows(readings)]
     timings = interleaved(
         {"ours": Contestant(lambda: locator.fit_rows(readings), 1, n), "scipy": Contestant(peer, 1, n)}, size.rounds

@@ -1,175 +1,195 @@
-"""What a fix is: the solutions of one set of readings, and what is known of the source beforehand."""
+"""What a fix is: its solutions, and their sources."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from numpy.typing import ArrayLike
+from scipy.special import chdtrc
 
 from arrays.typing import FloatArray
-from magloc.readings import Readings
 
+Intervals = tuple[tuple[float, float | None], ...]
+EVERYWHERE: Intervals = ((0.0, None),)
+"""The set of ranges of a row that says nothing."""
+# Δχ² within which another optimum is a solution too.
 DISTINCT_WITHIN = 20.0
-# Mean square of whitened differences below which they are rounding errors rather than noise.
-SILENT = 1e-9
+MISFIT = 1e-6
+"""Probability of χ² under noise below which the model does not hold, or the search missed the best solution."""
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """One optimum of the likelihood.
+@dataclass(frozen=True, eq=False, repr=False)
+class Source:
+    """A magnetic dipole, and how well it is known.
 
     Attributes
     ----------
     position_m : ndarray, shape (3,)
-        Source in the array's frame [m].
+        In the frame of its fix [m].
     moment_Am2 : ndarray, shape (3,)
-        Its moment [A·m²].
-    covariance : ndarray, shape (6, 6)
-        Of (position, moment): the inverse information at the solution. Where the range is not observable it is widened
-        along the range until it is as long as `range_interval95_m`
-        (:func:`magloc.localization.uncertainty.ambiguity.widened`).
-    chi2 : float
-        Sum of squared residuals of the decorrelated differences over their variances.
-    dof : int
-        Differences minus unknowns.
-    iterations : int
-        Linearisations that led here.
-    converged : bool
-        Whether the iteration ended at an optimum; no other solutions are listed.
-    range_observable : bool
-        Whether a source is detected, the 95 % set of ranges is closed, and its ends differ by a factor of two at most.
-    range_interval95_m : tuple of (low, high)
-        The 95 % set of the distance from the sensors' centroid [m], all solutions together: it is a property of the
-        readings, and the same for all their solutions (:mod:`magloc.localization.uncertainty.range_interval`). In
-        ascending order; high is None where it is open.
-    weight : float
-        How likely the solution is among those of the fix; they add up to one
-        (:func:`magloc.localization.uncertainty.ambiguity.weights`).
+        [A·m²].
+    covariance : ndarray, shape (6, 6), optional
+        Of (position, moment), all other sources being unknown too; (3, 3) of the moment where the place is known. None
+        for a source that is not the result of a fix. Where the range is not observable it is widened along the range
+        until it is as long as `range_interval_m`.
+    range_interval_m : tuple of (low, high)
+        95 % set of the distance from the sensors' centroid [m], in ascending order; high is None where it is open. With
+        one source it belongs to the readings, all solutions together; of several sources each has its own, where the
+        profile χ² over its range stays within 3.84 of the solution.
     gaussian : bool
         Whether the covariance describes the uncertainty: the range is observable in one interval, no other solution has
-        a weight to speak of, the standard deviations of position and moment are small against the range and the moment
-        (:data:`magloc.localization.uncertainty.ambiguity.LARGEST_GAUSSIAN_SIGMA`), and χ² is one of noise and rises as
-        that of a Gaussian does (:func:`magloc.localization.uncertainty.covariance.covariance_is_valid`).
-    """
-
-    position_m: FloatArray
-    moment_Am2: FloatArray
-    covariance: FloatArray
-    chi2: float
-    dof: int
-    iterations: int
-    converged: bool
-    range_observable: bool
-    range_interval95_m: tuple[tuple[float, float | None], ...]
-    weight: float = 1.0
-    gaussian: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Fix:
-    """Every distinct solution of one set of readings, best χ² first.
-
-    Attributes
-    ----------
-    solutions : tuple of Solution
-        Empty if the readings cannot be solved.
-    reason : str
-        Why there is no solution; empty if there is one.
-    failed_starts : int
-        Starts of the search that ended without an optimum.
-    dropped : tuple of str
-        Ids of sensors that contradict all others, and were left out.
-    detected : bool
-        Whether the readings stand out of noise, which alone makes them do so in one of a thousand rows. Where they do
-        not, or cannot be tested, the solutions are fits of noise and nothing is known of the range.
-    """
-
-    solutions: tuple[Solution, ...]
-    reason: str = ""
-    failed_starts: int = 0
-    dropped: tuple[str, ...] = ()
-    detected: bool = True
-
-
-@dataclass(frozen=True, eq=False)
-class Source:
-    """One of several sources of a :class:`JointSolution`.
-
-    Attributes
-    ----------
-    position_m, moment_Am2 : ndarray, shape (3,)
-        [m], array's frame; [A·m²].
-    covariance : ndarray, shape (6, 6)
-        Of its position and moment, all other sources being unknown too.
-    range_observable : bool
-    range_interval95_m : tuple of (low, high)
-        As in :class:`Solution` for a single source. Of several sources each has its own: where the profile χ² over its
-        range, all else fitted anew, stays within 3.84 of this solution.
-    gaussian : bool
-        As in :class:`Solution`.
+        a weight to speak of, σ of position and moment are small, and χ² is one of noise and rises as a Gaussian's.
     merged : bool
         Whether it stands for two sources that the array does not tell apart.
     """
 
     position_m: FloatArray
     moment_Am2: FloatArray
-    covariance: FloatArray
-    range_observable: bool
-    range_interval95_m: tuple[tuple[float, float | None], ...]
-    merged: bool = False
+    covariance: FloatArray | None = None
+    range_interval_m: Intervals = EVERYWHERE
     gaussian: bool = False
+    merged: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("position_m", "moment_Am2"):
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape != (3,):
+                raise ValueError(f"Input {name} must have shape (3,); instead received {value.tolist()}.")
+            object.__setattr__(self, name, value)
+
+    @property
+    def range_observable(self) -> bool:
+        """Whether the 95 % set of ranges is closed, and its ends differ by a factor of two at most."""
+        return is_observable_set(self.range_interval_m)
+
+    def __repr__(self) -> str:
+        position, moment = (
+            np.array2string(value, precision=4, separator=", ") for value in (self.position_m, self.moment_Am2)
+        )
+        return f"Source(position_m={position}, moment_Am2={moment})"
 
 
-@dataclass(frozen=True, eq=False)
-class JointSolution:
-    """Several sources that together explain the readings.
+@dataclass(frozen=True, eq=False, repr=False)
+class Solution:
+    """One optimum of the likelihood: sources that together explain the readings.
 
     Attributes
     ----------
     sources : tuple of Source
     covariance : ndarray, shape (6 K, 6 K)
-        Of (position, moment) of the first source, then of the second, and so on.
-    chi2, dof, iterations, converged, weight
-        As in :class:`Solution`.
+        Of (position, moment) of the first source, then of the second, and so on; (3, 3) where the place is known.
+    chi2 : float
+        Sum of squared residuals of the decorrelated differences over their variances.
+    dof : int
+        Differences minus unknowns.
+    weight : float
+        How likely the solution is among those of the fix; they add up to one.
+    iterations : int
+        Linearisations that led here.
     """
 
     sources: tuple[Source, ...]
     covariance: FloatArray
     chi2: float
     dof: int
-    iterations: int
-    converged: bool = True
     weight: float = 1.0
+    iterations: int = 0
+
+    @property
+    def source(self) -> Source:
+        """The only source; a ValueError where there are several."""
+        if len(self.sources) != 1:
+            raise ValueError(f"The solution has {len(self.sources)} sources: see its attribute sources.")
+        return self.sources[0]
+
+    @property
+    def position_m(self) -> FloatArray:
+        """Position (3,) of the only source [m]."""
+        return self.source.position_m
+
+    @property
+    def moment_Am2(self) -> FloatArray:
+        """Moment (3,) of the only source [A·m²]."""
+        return self.source.moment_Am2
+
+    @property
+    def range_interval_m(self) -> Intervals:
+        """95 % set of the range of the only source [m]."""
+        return self.source.range_interval_m
+
+    @property
+    def range_observable(self) -> bool:
+        """Whether the range of the only source is known."""
+        return self.source.range_observable
+
+    @property
+    def gaussian(self) -> bool:
+        """Whether the covariance of the only source describes its uncertainty."""
+        return self.source.gaussian
+
+    def __repr__(self) -> str:
+        return f"Solution({list(self.sources)}, chi2/dof={self.chi2:.3g}/{self.dof}, weight={self.weight:.2f})"
 
 
-@dataclass(frozen=True, eq=False)
-class JointFix:
-    """Every distinct solution with the chosen number of sources, best χ² first.
+@dataclass(frozen=True, eq=False, repr=False)
+class Fix:
+    """Every distinct solution of one set of readings.
 
     Attributes
     ----------
-    solutions : tuple of JointSolution
-        Empty if the readings cannot be solved.
+    solutions : tuple of Solution
+        Best χ² first; empty if the readings cannot be solved.
     reason : str
         Why there is no solution, or why it has fewer sources than were asked for; empty otherwise.
-    dropped : tuple of str
-        Ids of sensors that contradict all others, and were left out.
     detected : bool
-        As in :class:`Fix`.
+        Whether the readings stand out of noise, which alone makes them do so in one of a thousand rows. Where they do
+        not, or cannot be tested, the solutions are fits of noise and nothing is known of the range.
+    dropped_sensors : tuple of str
+        Ids of sensors that contradict all others, and were left out.
+    saturated_channels : tuple of str
+        Names of the channels whose reading is none because it saturates.
+    too_near : bool
+        Whether the source is too near, or too large, for a dipole.
+    failed_starts : int
+        Starts of the search that ended without an optimum.
+    time_s : float
     """
 
-    solutions: tuple[JointSolution, ...]
+    solutions: tuple[Solution, ...]
     reason: str = ""
-    dropped: tuple[str, ...] = ()
     detected: bool = True
+    dropped_sensors: tuple[str, ...] = ()
+    saturated_channels: tuple[str, ...] = ()
+    too_near: bool = False
+    failed_starts: int = 0
+    time_s: float = math.nan
+
+    @property
+    def best(self) -> Solution:
+        """The solution of the largest weight; a ValueError with the reason where there is none."""
+        if not self.solutions:
+            raise ValueError(f"The readings have no solution: {self.reason}.")
+        return max(self.solutions, key=lambda solution: solution.weight)
+
+    @property
+    def misfit(self) -> bool:
+        """Whether χ² is far beyond noise: then neither the position nor its standard deviations are to be trusted."""
+        return bool(self.solutions) and is_misfit(self.solutions[0].chi2, self.solutions[0].dof)
+
+    def __repr__(self) -> str:
+        if not self.solutions:
+            return f"Fix(no solution: {self.reason})"
+        others = len(self.solutions) - 1
+        more = f" and {others} other solution{'s' if others > 1 else ''}" if others else ""
+        return f"Fix({self.best!r}{more}{'' if self.detected else ', not detected'})"
 
 
-def open_ended(low: float, high: float) -> tuple[float, float | None]:
-    """An interval whose upper end may be open."""
-    return low, high if math.isfinite(high) else None
+def is_misfit(chi2: ArrayLike, dof: ArrayLike) -> Any:
+    """Whether χ² (...) is far beyond noise."""
+    return (np.asarray(dof) > 0) & (chdtrc(np.maximum(dof, 1), chi2) < MISFIT)
 
 
 def is_observable(low: float, high: float) -> bool:
@@ -177,36 +197,19 @@ def is_observable(low: float, high: float) -> bool:
     return low > 0.0 and high <= 2.0 * low
 
 
-AnyFix = Fix | JointFix
-AnySource = TypeVar("AnySource", Solution, Source)
+def open_ended(low: float, high: float) -> tuple[float, float | None]:
+    """An interval whose upper end may be open."""
+    return low, high if math.isfinite(high) else None
 
 
-def in_world(fix: AnyFix, readings: Readings, row: int) -> AnyFix:
-    """A fix in the world frame if the array's pose is known."""
-    if readings.array_position_m is None or readings.array_rotation_xyzw is None:
-        return fix
-    origin, R = readings.array_position_m[row], Rotation.from_quat(readings.array_rotation_xyzw[row]).as_matrix()
+def span(intervals: Intervals) -> tuple[float, float]:
+    """Least and largest range of a set; NaN if it is empty."""
+    if not intervals:
+        return math.nan, math.nan
+    high = intervals[-1][1]
+    return intervals[0][0], math.inf if high is None else high
 
-    def turned(covariance: FloatArray) -> FloatArray:
-        R_all = np.kron(np.eye(len(covariance) // 3), R)
-        return R_all @ covariance @ R_all.T
 
-    def moved(found: AnySource) -> AnySource:
-        return replace(
-            found,
-            position_m=origin + R @ found.position_m,
-            moment_Am2=R @ found.moment_Am2,
-            covariance=turned(found.covariance),
-        )
-
-    if isinstance(fix, Fix):
-        return replace(fix, solutions=tuple(moved(solution) for solution in fix.solutions))
-    solutions = (
-        replace(
-            solution,
-            sources=tuple(moved(source) for source in solution.sources),
-            covariance=turned(solution.covariance),
-        )
-        for solution in fix.solutions
-    )
-    return replace(fix, solutions=tuple(solutions))
+def is_observable_set(intervals: Intervals) -> bool:
+    """Whether a set of ranges is closed, and its ends differ by a factor of two at most."""
+    return is_observable(*span(intervals))

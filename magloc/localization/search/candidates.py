@@ -17,6 +17,7 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.compilation import over_rows
 from magloc.directions import fibonacci_directions
+from magloc.localization.fit.prior import SourcePrior
 from magloc.measurement.whitened import WhitenedModel
 from magloc.measurement.whitened_compiled import candidate_bases
 
@@ -172,3 +173,12 @@ def candidate_positions(
     offsets = shells[:, :, None, None] * fibonacci_directions(n_near_directions)
     near = (array.positions[:, None, None] + offsets).reshape(-1, 3)
     return np.concatenate([outer, near])
+
+
+def allowed_positions(array: SensorArray, prior: SourcePrior) -> FloatArray:
+    """Those of :func:`candidate_positions` that a prior allows; a ValueError if there is none."""
+    candidates = candidate_positions(array)
+    allowed: FloatArray = candidates[prior.allows_position(candidates)]
+    if not len(allowed):
+        raise ValueError("Input prior must leave some of the space around the array; instead it leaves nothing.")
+    return allowed

@@ -7,21 +7,18 @@ in the moment, and the solution unique, equations (20) to (30).
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from arrays.array import SensorArray
-from arrays.typing import FloatArray
+from arrays.typing import FloatArray, IntArray
 from magloc.directions import fibonacci_directions
 from magloc.localization.fit.gauss_newton import JointFits, fit_moments, refine_moments
+from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
-from magloc.localization.fit.results import DISTINCT_WITHIN, SILENT, Fix, Solution
+from magloc.localization.fit.results import DISTINCT_WITHIN
 from magloc.localization.search.beam_search import Beam
-from magloc.localization.uncertainty.ambiguity import LARGEST_GAUSSIAN_SIGMA, log_evidence_volume, weights
-from magloc.localization.uncertainty.range_interval import is_detected
-from magloc.measurement.rows import NO_SIGNAL, checked_rows, rows_of_equal_mask, whitened_model, whitenings_of
+from magloc.measurement.rows import WhitenedRows
 from magloc.measurement.whitened import WhitenedModel
 
 N_UNKNOWNS = 3
@@ -30,19 +27,18 @@ _N_DIRECTIONS = 60
 _MOST_SOLUTIONS = 8
 # By how much χ² must rise halfway between two optima for them to count as two.
 _BARRIER = 0.01
-_LEAST_EIGENVALUE = 1e-13
-_ROWS_AT_ONCE = 64
+_TOO_LARGE = "the differences between the sensors do not determine a moment that is small enough"
 
 
-class MomentLocator:
-    """Moments of a dipole at a known place.
+class MomentSearch:
+    """Optima of the moment of a source at known places.
 
     Parameters
     ----------
     array : SensorArray
-    position_m : array_like, shape (3,)
-        The source in the array's frame [m].
-    knowledge : SourcePrior
+    position_m : array_like, shape (3,) or (n, 3)
+        The source in the array's frame [m]: in all rows, or in every one of an array that moves.
+    prior : SourcePrior
         Of which only the bound of the moment is used.
 
     Raises
@@ -51,117 +47,42 @@ class MomentLocator:
         The position is not three finite numbers, or is that of a sensor.
     """
 
-    def __init__(self, array: SensorArray, position_m: ArrayLike, *, knowledge: SourcePrior = NOTHING_KNOWN) -> None:
+    def __init__(self, array: SensorArray, position_m: ArrayLike, *, prior: SourcePrior = NOTHING_KNOWN) -> None:
         position = np.asarray(position_m, dtype=np.float64)
-        if position.shape != (3,) or not np.isfinite(position).all():
+        if position.ndim not in (1, 2) or position.shape[-1] != 3 or not np.isfinite(position).all():
             raise ValueError(f"Input position_m must be three finite numbers; instead received {position.tolist()}.")
-        if np.min(np.linalg.norm(array.positions - position, axis=1)) <= 1e-9 * array.circumradius:
+        offsets = np.linalg.norm(array.positions - position.reshape(-1, 1, 3), axis=-1)
+        if np.min(offsets, initial=np.inf) <= 1e-9 * array.circumradius:
             raise ValueError(f"Input position_m must not be that of a sensor; instead received {position.tolist()}.")
         self.array = array
         self.position_m = position
-        self.knowledge = knowledge
+        self.prior = prior
 
-    def fit_rows(
-        self,
-        readings_T: ArrayLike,
-        ambient_T: ArrayLike | None = None,
-        progress: Callable[[int], None] | None = None,
-        *,
-        position_m: ArrayLike | None = None,
-    ) -> list[Fix]:
-        """Moments of many sets of readings, each on its own.
+    def of_rows(self, index: IntArray) -> MomentSearch:
+        """The search in some of the rows."""
+        if self.position_m.ndim == 1:
+            return self
+        return MomentSearch(self.array, self.position_m[index], prior=self.prior)
 
-        Parameters
-        ----------
-        readings_T : array_like, shape (n, C)
-            Raw readings in channel order [T]; NaN where missing.
-        ambient_T : array_like, shape (n, 3), optional
-            Ambient field of every row in the array's frame [T], in place of the array's own.
-        progress : callable, optional
-            Called with the number of rows finished since the last call.
-        position_m : array_like, shape (n, 3), optional
-            Place of the source in every row, in place of one for all: for an array that moves.
-
-        Returns
-        -------
-        list of Fix
-            Every distinct solution, with the covariance (3, 3) of the moment. The range is that of the known place.
-        """
-        readings = checked_rows(self.array, readings_T)
-        positions = np.broadcast_to(
-            self.position_m if position_m is None else np.asarray(position_m, dtype=np.float64), (len(readings), 3)
-        )
-        ambient = None if ambient_T is None else np.asarray(ambient_T, dtype=np.float64)
-        fixes: list[Fix] = [Fix(())] * len(readings)
-        for mask, rows in rows_of_equal_mask(np.isfinite(readings)):
-            for start in range(0, rows.size, _ROWS_AT_ONCE):
-                block = rows[start : start + _ROWS_AT_ONCE]
-                found = self._fit_block(
-                    mask, readings[block], None if ambient is None else ambient[block], positions[block]
-                )
-                for row, fix in zip(block, found, strict=True):
-                    fixes[row] = fix
-                if progress is not None:
-                    progress(block.size)
-        return fixes
-
-    def _fit_block(
-        self, mask: NDArray[np.bool_], readings: FloatArray, ambient: FloatArray | None, positions: FloatArray
-    ) -> list[Fix]:
-        whitenings = whitenings_of(self.array, mask, readings)
-        n_differences = whitenings[0].n_differences
-        if n_differences < N_UNKNOWNS:
-            reason = f"{int(mask.sum())} readings give {n_differences} independent differences, {N_UNKNOWNS} are needed"
-            return [Fix((), reason, detected=False)] * len(readings)
-        problem, raw = whitened_model(self.array, mask, readings, whitenings, ambient)
-        y = problem.whitened(raw)
-        q = problem.homogeneous(positions)[:, None]
-        beam = _all_moments(problem, y, q)
-        moment = problem.moment(beam.q[:, :, 0], beam.mu[:, :, 0])
+    def optima(self, rows: WhitenedRows) -> list[Optima]:
+        """Every distinct optimum of every row."""
+        model, place = rows.model, self.position_m if self.position_m.ndim == 1 else self.position_m[rows.index]
+        position = np.broadcast_to(place, (len(rows), 3))
+        q = model.homogeneous(position)[:, None]
+        beam = _all_moments(model, rows.y, q)
+        moment = model.moment(beam.q[:, :, 0], beam.mu[:, :, 0])
         with np.errstate(invalid="ignore"):
-            chi2 = np.where(self.knowledge.allows_moment(moment), beam.chi2, np.inf)
+            chi2 = np.where(self.prior.allows_moment(moment), beam.chi2, np.inf)
         listed = np.isfinite(chi2) & (chi2 <= chi2.min(axis=1, keepdims=True) + DISTINCT_WITHIN)
         of_row, of_fit = np.nonzero(listed)
         fits = JointFits(
             beam.q[of_row, of_fit], beam.mu[of_row, of_fit], chi2[of_row, of_fit], beam.iterations[of_row, of_fit]
         )
-        covariance = _covariances(problem.rows(of_row), y[of_row], fits)
-        determined = np.isfinite(covariance).all(axis=(1, 2))
-        energy = np.sum((y - problem.predicted(np.zeros_like(problem.ambient))) ** 2, axis=1)
-        told, volume = np.full(chi2.shape, np.inf), np.zeros(chi2.shape)
-        told[of_row, of_fit] = np.where(determined, fits.chi2, np.inf)
-        volume[of_row, of_fit] = log_evidence_volume(covariance, moment[of_row, of_fit][:, None])
-        weight, detected = weights(told, volume), is_detected(energy, n_differences).tolist()
-        # The readings of vector sensors are linear in the moment, those of moduli only over a small part of it.
-        with np.errstate(invalid="ignore", divide="ignore"):
-            sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2)) / np.linalg.norm(moment[of_row, of_fit], axis=1)
-        gaussian = (sigma <= LARGEST_GAUSSIAN_SIGMA) | (not self.array.channel_is_scalar.any())
-        distance = np.linalg.norm(positions - self.array.centroid, axis=-1)
-        solutions: list[list[Solution]] = [[] for _ in readings]
-        for i in np.flatnonzero(determined):
-            row = int(of_row[i])
-            solutions[row].append(
-                Solution(
-                    position_m=positions[row].copy(),
-                    moment_Am2=moment[row, of_fit[i]],
-                    covariance=covariance[i],
-                    chi2=float(fits.chi2[i]),
-                    dof=n_differences - N_UNKNOWNS,
-                    iterations=int(fits.iterations[i]),
-                    converged=True,
-                    range_observable=True,
-                    range_interval95_m=((float(distance[row]), float(distance[row])),),
-                    weight=float(weight[row, of_fit[i]]),
-                    gaussian=bool(gaussian[i]),
-                )
-            )
-        silent = np.sum(y * y, axis=1) < SILENT * n_differences
-        return [
-            Fix((), NO_SIGNAL, detected=False)
-            if silent[i]
-            else Fix(tuple(found), "" if found else _why_unsolved(beam, i), detected=detected[i])
-            for i, found in enumerate(solutions)
-        ]
+        converged = np.asarray(np.isfinite(beam.chi2).any(axis=1))
+        reason = ["" if found else "the search did not converge from any of its starts" for found in converged]
+        merged = np.zeros((len(of_row), 1), dtype=bool)
+        failed = np.zeros(len(rows), dtype=np.intp)
+        return [Optima(rows, fits, of_row, reason, merged, failed, position, _TOO_LARGE)]
 
 
 def _all_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> Beam:
@@ -220,49 +141,3 @@ def _is_even(problem: WhitenedModel) -> NDArray[np.bool_]:
     lone = problem.channel_is_scalar & ~np.any(problem.ambient, axis=-1)[:, problem.channel_sensor]
     even: NDArray[np.bool_] = np.all(silent | lone, axis=-1)
     return even
-
-
-def _covariances(problem: WhitenedModel, y: FloatArray, fits: JointFits) -> FloatArray:
-    """Inverse of half the second derivative of χ² (b, 3, 3) [A·m²], NaN where it is not positive.
-
-    Where two exact solutions are about to meet, the first derivative of the readings alone would say nothing.
-    """
-    if not len(problem):
-        return np.empty((0, N_UNKNOWNS, N_UNKNOWNS))
-    fields = problem.source_fields(fits.q, fits.mu)
-    jacobian = problem.moment_jacobian(fits.q, problem.linear_gain(fields))
-    information = jacobian.transpose(0, 2, 1) @ jacobian
-    scalar = problem.channel_is_scalar
-    if scalar.any():
-        owner = problem.channel_sensor[scalar]
-        residual = problem.whitened(y - problem.predicted(fields))[:, scalar]
-        total = (fields + problem.ambient)[:, owner]
-        modulus = np.linalg.norm(total, axis=-1, keepdims=True)
-        matrix = np.stack(
-            [problem.source_fields(fits.q, np.broadcast_to(axis, fits.mu.shape)) for axis in np.eye(3)], axis=-1
-        )[:, owner]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            direction = total / modulus
-            across = matrix - direction[..., None] * (direction[..., None, :] @ matrix)
-            weight = residual * problem.gain[:, scalar, 0] / modulus[..., 0]
-            information = information - np.einsum("bc,bcji,bcjk->bik", weight, across, across)
-    length = np.sqrt(np.abs(np.diagonal(information, axis1=1, axis2=2)))
-    scale = length[:, :, None] * length[:, None]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        unit = information / scale
-    positive = np.isfinite(unit).all(axis=(1, 2))
-    values, vectors = np.linalg.eigh(np.where(positive[:, None, None], unit, np.eye(3)))
-    positive &= values[:, 0] > _LEAST_EIGENVALUE
-    safe = np.where(positive[:, None], values, 1.0)
-    inverse = (vectors / safe[:, None]) @ vectors.transpose(0, 2, 1)
-    size = problem.moment(fits.q[:, 0], np.ones((len(y), 3)))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        covariance: FloatArray = inverse / scale * size[:, :, None] * size[:, None]
-    covariance[~positive] = np.nan
-    return covariance
-
-
-def _why_unsolved(beam: Beam, row: int) -> str:
-    if not np.isfinite(beam.chi2[row]).any():
-        return "the search did not converge from any of its starts"
-    return "the differences between the sensors do not determine a moment that is small enough"

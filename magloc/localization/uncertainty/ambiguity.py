@@ -10,24 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from arrays.typing import FloatArray
 from magloc.chi_square import RISE_95
-from magloc.localization.uncertainty.range_interval import (
-    EVERYWHERE,
-    Intervals,
-    is_observable_set,
-    levels,
-    ranges_of,
-    relative_range_sigma,
-    rise,
-    span,
-    union,
-)
+from magloc.localization.fit.results import EVERYWHERE, Intervals, is_observable_set, span
+from magloc.localization.uncertainty.range_interval import levels, ranges_of, relative_range_sigma, rise, union
 
 LARGEST_GAUSSIAN_SIGMA = 0.04
 """Standard deviations of position and moment, over range and moment, up to which their errors are Gaussian."""
 CERTAIN_WEIGHT = 0.99
 """Weight from which on a solution is as good as the only one."""
-MISFIT = 1e-6
-"""Probability of χ² under noise below which the model does not hold, or the search missed the best solution."""
 
 
 def log_evidence_volume(covariance: FloatArray, moment: FloatArray, offset_m: FloatArray | None = None) -> FloatArray:

@@ -1,4 +1,4 @@
-"""What is known of the sources of joint fits: sets of ranges, weights of the solutions, and covariances that fit them.
+"""How well the sources of optima are known: covariances, sets of ranges, and weights of the solutions.
 
 Of a single source all solutions of a row are taken together (:mod:`magloc.localization.uncertainty.range_interval`).
 Several sources have no common range: each has its own ranges in each solution, where the profile of χ² stays within
@@ -10,16 +10,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from arrays.typing import FloatArray
-from magloc.localization.fit.gauss_newton import JointFits
-from magloc.localization.fit.results import AnyFix
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.compilation import over_rows
+from magloc.fields.dipole import MU0_OVER_4PI
+from magloc.localization.fit.columns import Solutions
+from magloc.localization.fit.gauss_newton import covariances
+from magloc.localization.fit.optima import Optima
+from magloc.localization.fit.results import EVERYWHERE, MISFIT, Intervals, is_observable_set, span
 from magloc.localization.uncertainty.ambiguity import (
     CERTAIN_WEIGHT,
     LARGEST_GAUSSIAN_SIGMA,
-    MISFIT,
     Rivals,
     log_evidence_volume,
     longest_axes,
@@ -27,16 +29,11 @@ from magloc.localization.uncertainty.ambiguity import (
     weights,
     widened,
 )
-from magloc.localization.uncertainty.range_interval import (
-    EVERYWHERE,
-    Intervals,
-    is_detected,
-    is_observable_set,
-    relative_range_sigma,
-    span,
-    union,
-)
+from magloc.localization.uncertainty.covariance_compiled import covariance_rows
+from magloc.localization.uncertainty.moment_covariance import moment_covariances
+from magloc.localization.uncertainty.range_interval import relative_range_sigma, union
 from magloc.localization.uncertainty.range_profile import profile_stretches, ranges_within
+from magloc.localization.uncertainty.range_profile_compiled import profile_rows
 from magloc.measurement.whitened import WhitenedModel
 
 # By how much the rise of χ² at one standard deviation may differ from one where errors are Gaussian.
@@ -44,61 +41,52 @@ _BEND = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class FitUncertainty:
-    """What is known of f fits of K sources.
+class _Known:
+    """What is known of f fits of K sources: the columns of :class:`Solutions` of these names."""
 
-    Attributes
-    ----------
-    sets : list of list of tuple of (low, high)
-        95 % sets of the ranges [m] of every source of every fit.
-    covariance : ndarray, shape (f, 6 K, 6 K)
-        Widened where ranges are not observable.
-    gaussian : ndarray of bool, shape (f, K)
-        Whether a source's part of it describes the uncertainty.
-    weight : ndarray, shape (f,)
-        How likely a fit is among those of its row.
-    """
-
-    sets: list[list[Intervals]]
+    ranges: list[tuple[Intervals, ...]]
     covariance: FloatArray
-    gaussian: NDArray[np.bool_]
+    gaussian: BoolArray
     weight: FloatArray
 
 
-def fit_uncertainty(
-    problem: WhitenedModel,
-    y: FloatArray,
-    fits: JointFits,
-    covariance: FloatArray,
-    of_row: NDArray[np.intp],
-    energy: FloatArray,
-    n_differences: int,
-) -> FitUncertainty:
-    """What is known of the sources of all solutions of b rows.
+def solutions_of(optima: Optima, energy: FloatArray, detected: BoolArray) -> Solutions:
+    """Solutions of b rows: the optima whose covariance is finite, with what is known of them.
 
     Parameters
     ----------
-    problem : WhitenedModel
-        Of f fits.
-    y : ndarray, shape (f, C)
-        Whitened readings.
-    fits : JointFits
-        Row after row, and of every row best first.
-    covariance : ndarray, shape (f, 6 K, 6 K)
-        Inverse information, as of :func:`magloc.localization.fit.gauss_newton.covariances`.
-    of_row : ndarray of int, shape (f,)
-        Row of every fit.
+    optima : Optima
     energy : ndarray, shape (b,)
-        Sums of squared differences of the rows, as they are without a source.
-    n_differences : int
-
-    Returns
-    -------
-    FitUncertainty
+        Sums of squared differences, as they are without a source.
+    detected : ndarray of bool, shape (b,)
+        Whether they stand out of noise.
     """
-    if fits.q.shape[1] == 1:
-        return _of_one(problem, y, fits, covariance, of_row, energy, n_differences)
-    return _of_several(problem, y, fits, covariance, of_row, is_detected(energy, n_differences), n_differences)
+    model, fits, of_row = optima.rows.model, optima.fits, optima.of_row
+    position, moment = model.position(fits.q), model.moment(fits.q, fits.mu)
+    n_fits, n_sources = position.shape[:2]
+    if optima.position_m is not None:
+        position = optima.position_m[of_row][:, None]
+        known = _of_known_position(optima, optima.position_m, moment)
+    elif n_sources == 1:
+        known = _of_one(optima, energy)
+    else:
+        known = _of_several(optima, detected)
+    every = Solutions(
+        of_row=of_row,
+        n_sources=np.full(n_fits, n_sources),
+        position_m=position,
+        moment_Am2=moment,
+        covariance=known.covariance,
+        chi2=fits.chi2,
+        dof=np.full(n_fits, optima.rows.n_differences - optima.n_unknowns),
+        weight=known.weight,
+        iterations=fits.iterations,
+        ranges=known.ranges,
+        gaussian=known.gaussian,
+        merged=optima.merged,
+    )
+    determined = np.asarray(np.isfinite(known.covariance).all(axis=(1, 2)))
+    return every if determined.all() else every.chosen(determined)
 
 
 def covariance_is_valid(
@@ -109,7 +97,7 @@ def covariance_is_valid(
     chi2: FloatArray,
     dof: int,
     covariance: FloatArray,
-) -> NDArray[np.bool_]:
+) -> BoolArray:
     """Whether covariances describe the errors of f fits of K sources, as far as the model near the fits tells.
 
     They do where χ² is one of noise, and rises by one, give or take a half, at one standard deviation along the longest
@@ -142,82 +130,73 @@ def covariance_is_valid(
     return np.asarray(described)
 
 
-def _of_one(
-    problem: WhitenedModel,
-    y: FloatArray,
-    fits: JointFits,
-    covariance: FloatArray,
-    of_row: NDArray[np.intp],
-    energy: FloatArray,
-    n_differences: int,
-) -> FitUncertainty:
-    place = np.arange(len(of_row)) - np.searchsorted(of_row, of_row)
-    shape = len(energy), int(place.max(initial=0)) + 1
-    at = of_row, place
+def _valid(optima: Optima, covariance: FloatArray, which: IntArray) -> BoolArray:
+    """:func:`covariance_is_valid` of some of the fits."""
+    model, fits, of_row = optima.rows.model, optima.fits.rows(which), optima.of_row[which]
+    return covariance_is_valid(
+        model.rows(of_row),
+        optima.rows.y[of_row],
+        model.position(fits.q),
+        model.moment(fits.q, fits.mu),
+        fits.chi2,
+        optima.rows.n_differences - optima.n_unknowns,
+        covariance[which],
+    )
+
+
+def _of_one(optima: Optima, energy: FloatArray) -> _Known:
+    """What is known of single sources, all solutions of a row together."""
+    rows, fits, of_row = optima.rows, optima.fits, optima.of_row
+    model, n_rows = rows.model, len(rows)
+    shape, at = _places(of_row, n_rows)
 
     def table(values: FloatArray, empty: float) -> FloatArray:
         full = np.full((*shape, *values.shape[1:]), empty)
         full[at] = values
         return full
 
-    offset = problem.position(fits.q)[:, 0] - problem.centroid
-    moment, chi2 = problem.moment(fits.q, fits.mu)[:, 0], table(fits.chi2, np.inf)
-    rivals = Rivals.of(
-        chi2, table(covariance, np.nan), table(offset, np.nan), table(moment, np.nan), energy, n_differences
-    )
-    left = rivals.rise[of_row] - (fits.chi2 - chi2[of_row, 0])
-    inside = np.flatnonzero((left > 0.0) & np.isfinite(left))
-    alpha = np.full((len(left), 2), np.nan)
-    sigma = relative_range_sigma(covariance, offset)
-    alpha[inside] = profile_stretches(
-        problem.rows(inside), y[inside], fits.rows(inside), 0, sigma[inside], left[inside]
-    )
-    ranges = rivals.ranges(table(alpha, np.nan), problem.radius)
+    q, mu, chi2 = table(fits.q[:, 0], np.nan), table(fits.mu[:, 0], np.nan), table(fits.chi2, np.inf)
+    offset, moment = model.position(q) - model.centroid, model.moment(q, mu)
+    compiled = not model.channel_is_scalar.any()
+    if compiled:
+        counts = np.bincount(of_row, minlength=n_rows)[:, None]
+        scaled = np.full((*shape, 6, 6), np.nan)
+        over_rows(covariance_rows, n_rows, *model.compiled(), q, mu, counts, scaled)
+        unit = np.repeat([model.radius, model.radius**3 / MU0_OVER_4PI], 3)
+        covariance = scaled * np.outer(unit, unit)
+    else:
+        covariance = table(covariances(model.rows(of_row), fits), np.nan)
+    rivals = Rivals.of(chi2, covariance, offset, moment, energy, rows.n_differences)
+    alpha = np.full((*shape, 2), np.nan)
+    if compiled:
+        over_rows(profile_rows, n_rows, rows.y, rivals.rise, *model.compiled(), q, chi2, counts, scaled, alpha)
+    else:
+        left = rivals.rise[of_row] - (fits.chi2 - chi2[of_row, 0])
+        inside = np.flatnonzero((left > 0.0) & np.isfinite(left))
+        sigma = relative_range_sigma(covariance[at], offset[at])
+        alpha[of_row[inside], at[1][inside]] = profile_stretches(
+            model.rows(of_row[inside]), rows.y[of_row[inside]], fits.rows(inside), 0, sigma[inside], left[inside]
+        )
+    ranges = rivals.ranges(alpha, model.radius)
     gaussian = ranges.gaussian[at]
-    gaussian[gaussian] = _described(problem, y, fits, covariance, n_differences, np.flatnonzero(gaussian))
-    return FitUncertainty(
-        [[ranges.sets[row]] for row in of_row], ranges.covariance[at], gaussian[:, None], rivals.weight[at]
-    )
+    claimed = np.flatnonzero(gaussian)
+    if claimed.size:
+        gaussian[claimed] = _valid(optima, covariance[at], claimed)
+    return _Known([(ranges.sets[row],) for row in of_row], ranges.covariance[at], gaussian[:, None], rivals.weight[at])
 
 
-def _described(
-    problem: WhitenedModel,
-    y: FloatArray,
-    fits: JointFits,
-    covariance: FloatArray,
-    n_differences: int,
-    which: NDArray[np.intp],
-) -> NDArray[np.bool_]:
-    """:func:`covariance_is_valid` of some of the fits."""
-    q, mu = fits.q[which], fits.mu[which]
-    dof = n_differences - 6 * q.shape[1]
-    return covariance_is_valid(
-        problem.rows(which),
-        y[which],
-        problem.position(q),
-        problem.moment(q, mu),
-        fits.chi2[which],
-        dof,
-        covariance[which],
-    )
-
-
-def _of_several(
-    problem: WhitenedModel,
-    y: FloatArray,
-    fits: JointFits,
-    covariance: FloatArray,
-    of_row: NDArray[np.intp],
-    detected: NDArray[np.bool_],
-    n_differences: int,
-) -> FitUncertainty:
-    offset, moment = problem.position(fits.q) - problem.centroid, problem.moment(fits.q, fits.mu)
+def _of_several(optima: Optima, detected: BoolArray) -> _Known:
+    """What is known of several sources: every one has a range of its own in every solution."""
+    rows, fits, of_row = optima.rows, optima.fits, optima.of_row
+    model, y = rows.model.rows(of_row), rows.y[of_row]
+    covariance = covariances(model, fits)
+    offset, moment = model.position(fits.q) - model.centroid, model.moment(fits.q, fits.mu)
     n_fits, n_sources = offset.shape[:2]
     wide = covariance.copy()
     sets: list[list[Intervals]] = [[] for _ in range(n_fits)]
     gaussian = np.zeros((n_fits, n_sources), dtype=bool)
     for k in range(n_sources):
-        ends = ranges_within(problem, y, fits, k, covariance).tolist()
+        ends = ranges_within(model, y, fits, k, covariance).tolist()
         of_source = [union([pair]) if seen else EVERYWHERE for pair, seen in zip(ends, detected[of_row], strict=True)]
         low, high = np.array([span(intervals) for intervals in of_source]).reshape(-1, 2).T
         observable = np.array([is_observable_set(intervals) for intervals in of_source], dtype=bool)
@@ -228,17 +207,38 @@ def _of_several(
         for of_fit, intervals in zip(sets, of_source, strict=True):
             of_fit.append(intervals)
     chi2 = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2, np.inf)
-    volume, weight = log_evidence_volume(covariance, moment, offset), np.zeros(n_fits)
-    for row in np.unique(of_row):
-        weight[of_row == row] = weights(chi2[of_row == row], volume[of_row == row])
+    weight = _weights_of_rows(of_row, chi2, log_evidence_volume(covariance, moment, offset))
     gaussian &= (weight >= CERTAIN_WEIGHT)[:, None]
     claimed = np.flatnonzero(gaussian.any(axis=1))
-    gaussian[claimed] &= _described(problem, y, fits, covariance, n_differences, claimed)[:, None]
-    return FitUncertainty(sets, wide, gaussian, weight)
+    gaussian[claimed] &= _valid(optima, covariance, claimed)[:, None]
+    return _Known([tuple(of_fit) for of_fit in sets], wide, gaussian, weight)
 
 
-def is_misfit(fix: AnyFix) -> bool:
-    """Whether χ² is far beyond noise: then neither the position nor its standard deviations are to be trusted."""
-    if not fix.solutions or fix.solutions[0].dof <= 0:
-        return False
-    return bool(chdtrc(fix.solutions[0].dof, fix.solutions[0].chi2) < MISFIT)
+def _of_known_position(optima: Optima, position_m: FloatArray, moment: FloatArray) -> _Known:
+    """What is known of moments at known places; the range is that of the place."""
+    rows, fits, of_row = optima.rows, optima.fits, optima.of_row
+    model = rows.model
+    covariance = moment_covariances(model.rows(of_row), rows.y[of_row], fits)
+    told = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2, np.inf)
+    weight = _weights_of_rows(of_row, told, log_evidence_volume(covariance, moment))
+    # The readings of vector sensors are linear in the moment, those of moduli only over a small part of it.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2)) / np.linalg.norm(moment[:, 0], axis=1)
+    gaussian = (sigma <= LARGEST_GAUSSIAN_SIGMA) | (not model.channel_is_scalar.any())
+    distance = np.linalg.norm(position_m - model.centroid, axis=-1)[of_row].tolist()
+    return _Known([(((r, r),),) for r in distance], covariance, gaussian[:, None], weight)
+
+
+def _places(of_row: IntArray, n_rows: int) -> tuple[tuple[int, int], tuple[IntArray, IntArray]]:
+    """Shape of a table of the fits of every row, and the places of the fits in it."""
+    place = np.arange(len(of_row)) - np.searchsorted(of_row, of_row)
+    return (n_rows, int(place.max(initial=0)) + 1), (of_row, place)
+
+
+def _weights_of_rows(of_row: IntArray, chi2: FloatArray, volume: FloatArray) -> FloatArray:
+    """:func:`weights` (f,) among the fits of every row."""
+    shape, at = _places(of_row, int(of_row.max(initial=-1)) + 1)
+    of_table, volumes = np.full(shape, np.inf), np.zeros(shape)
+    of_table[at], volumes[at] = chi2, volume
+    weight: FloatArray = weights(of_table, volumes)[at]
+    return weight

@@ -42,11 +42,8 @@ from scipy.special import chndtr, erfc
 
 from arrays.typing import FloatArray
 from magloc.chi_square import RISE_95, energy_threshold
-from magloc.localization.fit.results import is_observable
+from magloc.localization.fit.results import Intervals
 
-Intervals = tuple[tuple[float, float | None], ...]
-EVERYWHERE: Intervals = ((0.0, None),)
-"""The set of ranges of a row that says nothing."""
 # Signals so many standard deviations above the root of the threshold are seen for certain.
 _CERTAIN = 8.0
 _N_STRENGTHS = 1200
@@ -214,20 +211,6 @@ def union(ends: Sequence[Sequence[float]]) -> Intervals:
         else:
             merged.append([low, high])
     return tuple((low, high if high < np.inf else None) for low, high in merged)
-
-
-def is_observable_set(intervals: Intervals) -> bool:
-    """Whether a set of ranges is closed, and its ends differ by a factor of two at most."""
-    low, high = span(intervals)
-    return is_observable(low, high)
-
-
-def span(intervals: Intervals) -> tuple[float, float]:
-    """Least and largest range of a set; NaN if it is empty."""
-    if not intervals:
-        return math.nan, math.nan
-    high = intervals[-1][1]
-    return intervals[0][0], math.inf if high is None else high
 
 
 def relative_range_sigma(covariance: FloatArray, offset_m: FloatArray) -> FloatArray:

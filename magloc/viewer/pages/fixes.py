@@ -111,7 +111,7 @@ class FixView:
                 best.covariance,
                 self._centroids[row],
                 range_observable=best.range_observable,
-                range_interval95_m=best.range_interval95_m,
+                range_interval95_m=best.range_interval_m,
                 farthest_m=_FARTHEST_OF_RANGE * float(np.linalg.norm(best.position_m - self._centroids[row])),
             )
         self.region.show(surface)
@@ -150,7 +150,7 @@ class FixView:
             f"{time}, {words.place(best.position_m)}",
             f"moment {np.linalg.norm(best.moment_Am2):.3g} A·m²",
             f"χ² {best.chi2:.3g}, {best.dof} degrees of freedom",
-            *(words.range_words(ends, observable=best.range_observable) for ends in best.range_interval95_m),
+            *(words.range_words(ends, observable=best.range_observable) for ends in best.range_interval_m),
         ]
         others = len(fix.solutions) - 1
         if others:

@@ -15,8 +15,8 @@ from arrays.typing import FloatArray
 from magloc.chi_square import RISE_95
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.localization.fit.results import Fix, Solution, is_observable, open_ended
-from magloc.localization.locator import ExactLocator
-from magloc.localization.search.single_source import N_UNKNOWNS, Locator
+from magloc.localization.locator import Locator
+from magloc.localization.search.single_source import N_UNKNOWNS
 from magloc.localization.uncertainty.range_interval import gaussian_ranges
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 
@@ -75,10 +75,10 @@ class LiveFit:
         self.array = array
         self._without_source = array.readings_of(array.ambient_fields)
         self._differences = decorrelated_differences(array)
-        self._locator: Locator | ExactLocator | None = None
+        self._locator: Locator | None = None
         self._reason = ""
         try:
-            self._locator = ExactLocator(array) if array.channel_is_scalar.any() else Locator(array)
+            self._locator = Locator(array, exclude_faulty=False)
         except ValueError as error:
             self._reason = str(error).removeprefix("Input ").rstrip(".")
 

@@ -91,14 +91,12 @@ def fix_words(fix: Fix, forecast: Forecast, of_best: Difference | None) -> list[
     lines = []
     if not forecast.detectable:
         lines.append("<b>this is a fit of noise</b>: the signal is too weak to be detected")
-    if not best.converged:
-        lines.append("<b>the fit did not converge</b>")
     lines.append(f"found at {place(best.position_m)}")
     error = f"error {length_text(of_best.position_m)}"
     if of_best.in_sigma is not None:
         error += f", {_plain(of_best.in_sigma, 2)} × the least rms error that is possible"
     lines += [error, f"error of the moment {_plain(100.0 * of_best.moment, 2)} %", _chi2_words(best)]
-    lines += [range_words(interval, observable=best.range_observable) for interval in best.range_interval95_m]
+    lines += [range_words(interval, observable=best.range_observable) for interval in best.range_interval_m]
     others = len(fix.solutions) - 1
     if others:
         lines.append(f"<b>{others} other solution{'s fit' if others > 1 else ' fits'}</b> almost as well")

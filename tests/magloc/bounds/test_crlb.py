@@ -36,10 +36,10 @@ from magloc.bounds.over_moments import (
     table_and_spreads,
 )
 from magloc.directions import sphere_directions
-from magloc.localization.search.single_source import Locator
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 from tests.arrays.test_differences import random_array
 from tests.magloc.bounds.hyper_dual import Model
+from tests.plain_locator import plain_locator
 
 SOURCE = np.array([5.0, 0.0, 0.306])
 AMBIENT = (2e-5, 1e-6, 4.5e-5)
@@ -328,7 +328,7 @@ class TestScatterOfFits:
         position, moment = np.array([2.0, 1.0, 1.2]), np.array([60.0, 50.0, 60.0])
         rng = np.random.default_rng(10)
         readings = predicted_channels(TETRAHEDRON, position, moment) + 1e-9 * rng.standard_normal((n, 12))
-        fixes = Locator(TETRAHEDRON).fit_rows(readings)
+        fixes = plain_locator(TETRAHEDRON).fit_rows(readings)
         errors = np.array([[*f.solutions[0].position_m - position, *f.solutions[0].moment_Am2 - moment] for f in fixes])
         bounds = bounds_of(TETRAHEDRON, position, moment)
         squares = np.einsum("ni,ij,nj->n", errors, np.linalg.inv(bounds.covariance), errors)

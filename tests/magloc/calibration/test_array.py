@@ -23,9 +23,9 @@ from magloc.calibration.array import CalibrationResult, Prior, calibrate_on_path
 from magloc.calibration.continuation import calibrated_array
 from magloc.calibration.model import AXES, GAINS, OFFSET, POSITION, Problem, State
 from magloc.calibration.observability import gauge_vectors
-from magloc.localization.search.single_source import Locator
 from magloc.readings import read_readings, read_truth
 from tests.oracles import magpylib_field
+from tests.plain_locator import plain_locator
 
 FloatArray = NDArray[np.float64]
 COMMON_OFFSETS = {f"common offset along {axis}" for axis in "xyz"}
@@ -580,7 +580,7 @@ class TestRecording:
 
     @staticmethod
     def fixes(array: SensorArray, readings: FloatArray) -> tuple[FloatArray, float]:
-        best = [fix.solutions[0] for fix in Locator(array).fit_rows(readings)]
+        best = [fix.solutions[0] for fix in plain_locator(array).fit_rows(readings)]
         return np.array([solution.position_m[:2] for solution in best]), sum(solution.chi2 for solution in best)
 
     def test_perturbed(self, recording):

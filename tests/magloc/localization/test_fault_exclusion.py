@@ -24,12 +24,9 @@ from arrays.geometries import cube, tetrahedron
 from arrays.sensor import Sensor
 from magloc.fields import dipole
 from magloc.localization.fault_exclusion import robust_fixes, weighted
-from magloc.localization.locator import ExactLocator
-from magloc.localization.search.known_position import MomentLocator
-from magloc.localization.search.multi_source import SeveralLocator
-from magloc.localization.search.single_source import Locator
 from magloc.measurement.rows import whitened_model, whitenings_of
 from magloc.readings import read_readings, read_truth
+from tests.plain_locator import plain_locator
 
 AMBIENT = np.array([2e-5, 0.0, 4.5e-5])
 NOISE = 1e-9
@@ -67,7 +64,7 @@ def on_cube(n, seed):
 
 
 def robust(array, readings):
-    return robust_fixes(array, Locator(array).fit_rows, readings)
+    return robust_fixes(array, plain_locator(array).fit_rows, readings)
 
 
 def spikes(readings, sigmas, seed=1):
@@ -90,16 +87,16 @@ def assert_breakdown(fault, n, seed):
     bad = CUBE.channel_sensor == which[:, None]
     fixes = robust(CUBE, np.where(bad, FAULTS[fault](clean), clean))
     error = position_errors(fixes, position)
-    remaining = position_errors(Locator(CUBE).fit_rows(np.where(bad, np.nan, clean)), position)
+    remaining = position_errors(plain_locator(CUBE).fit_rows(np.where(bad, np.nan, clean)), position)
     assert np.median(error) <= 1.5 * np.median(remaining)
     assert rms(error) <= 1.5 * rms(remaining)
     if fault in GROSS:
-        dropped = np.array([bool(fix.dropped) for fix in fixes])
+        dropped = np.array([bool(fix.dropped_sensors) for fix in fixes])
         for fix, sensor in zip(fixes, which, strict=True):
             # A spike that a slightly different dipole explains is no contradiction.
             best = fix.solutions[0]
-            credible = not fix.dropped and best.chi2 < chi2_distribution.ppf(0.999, best.dof)
-            assert credible or fix.dropped == (CUBE.ids[sensor],)
+            credible = not fix.dropped_sensors and best.chi2 < chi2_distribution.ppf(0.999, best.dof)
+            assert credible or fix.dropped_sensors == (CUBE.ids[sensor],)
         # Measured: one row of 200 with spikes of 100 σ, none with other faults. Its nearest sensor is off by 58 σ, less
         # than 0.1 % of what it reads; χ² is 28 of 15, and the error 2.2 times that of the remaining seven.
         assert np.mean(~dropped) <= (0.005 if fault == "spikes of 100 σ" else 0.0)
@@ -127,9 +124,9 @@ class TestBreakdown:
         bad = (owner == first[:, None]) | (owner == second[:, None])
         fixes = robust(CUBE, np.where(bad, FAULTS[fault](clean), clean))
         error = position_errors(fixes, position)
-        remaining = position_errors(Locator(CUBE).fit_rows(np.where(bad, np.nan, clean)), position)
+        remaining = position_errors(plain_locator(CUBE).fit_rows(np.where(bad, np.nan, clean)), position)
         expected = [{CUBE.ids[a], CUBE.ids[b]} for a, b in zip(first, second, strict=True)]
-        assert [set(fix.dropped) for fix in fixes] == expected
+        assert [set(fix.dropped_sensors) for fix in fixes] == expected
         assert_allclose(error, remaining, rtol=1e-3, atol=1e-6)
 
     def test_with_missing_readings(self):
@@ -141,8 +138,8 @@ class TestBreakdown:
         bad = owner == which[:, None]
         readings = np.where(missing, np.nan, np.where(bad, 0.0, clean))
         fixes = robust(CUBE, readings)
-        remaining = position_errors(Locator(CUBE).fit_rows(np.where(bad, np.nan, readings)), position)
-        assert [fix.dropped for fix in fixes] == [(CUBE.ids[sensor],) for sensor in which]
+        remaining = position_errors(plain_locator(CUBE).fit_rows(np.where(bad, np.nan, readings)), position)
+        assert [fix.dropped_sensors for fix in fixes] == [(CUBE.ids[sensor],) for sensor in which]
         assert_allclose(position_errors(fixes, position), remaining, rtol=1e-3, atol=1e-6)
 
 
@@ -153,9 +150,9 @@ class TestGoodSensors:
     def test_rows_without_a_bad_sensor_are_those_of_the_plain_fit(self, n):
         """Sensors are dropped from at most a thousandth of the rows; a false alarm in a thousand seeds."""
         clean, _, _ = on_cube(n, seed=5)
-        plain = Locator(CUBE).fit_rows(clean)
+        plain = plain_locator(CUBE).fit_rows(clean)
         fixes = robust_fixes(CUBE, lambda readings, ambient: plain if len(readings) == n else alone(readings), clean)
-        dropped = [bool(fix.dropped) for fix in fixes]
+        dropped = [bool(fix.dropped_sensors) for fix in fixes]
         assert sum(dropped) <= binom.ppf(0.999, n, 1e-3)
         assert all(fix is same for fix, same, out in zip(fixes, plain, dropped, strict=True) if not out)
 
@@ -166,8 +163,8 @@ class TestGoodSensors:
         position, moment = random_sources(rng, n, 1.5, 4.0, 200.0)
         readings = readings_in_ambient_field(cube(1.0, "vector", 5 * NOISE), position, moment, rng)
         fixes = robust(CUBE, readings)
-        assert np.mean([bool(fix.dropped) for fix in fixes]) <= 0.05
-        plain = position_errors(Locator(CUBE).fit_rows(readings), position)
+        assert np.mean([bool(fix.dropped_sensors) for fix in fixes]) <= 0.05
+        plain = position_errors(plain_locator(CUBE).fit_rows(readings), position)
         assert rms(position_errors(fixes, position)) <= 1.1 * rms(plain)
 
     def test_too_few_sensors_to_tell(self):
@@ -177,7 +174,7 @@ class TestGoodSensors:
         position, moment = random_sources(rng, 10, 1.5, 4.0, 200.0)
         readings = readings_in_ambient_field(array, position, moment, rng)
         readings[:, :3] = 0.0
-        assert not any(fix.dropped for fix in robust(array, readings))
+        assert not any(fix.dropped_sensors for fix in robust(array, readings))
 
     def test_four_sensors_keep_three(self):
         """Any three of four vector sensors fit exactly: none of the four can be named."""
@@ -187,23 +184,23 @@ class TestGoodSensors:
         readings = readings_in_ambient_field(array, position, moment, rng)
         readings[:, 3:6] = 0.0
         for fix in robust(array, readings):
-            assert not fix.dropped
+            assert not fix.dropped_sensors
 
     def test_no_signal(self):
         (fix,) = robust(CUBE, np.tile(AMBIENT, 8)[None])
         assert not fix.solutions
-        assert not fix.dropped
+        assert not fix.dropped_sensors
         assert "no signal" in fix.reason
 
     def test_progress_counts_all_rows(self):
         counts: list[int] = []
         clean, _, _ = on_cube(9, seed=9)
-        robust_fixes(CUBE, Locator(CUBE).fit_rows, clean, progress=counts.append)
+        robust_fixes(CUBE, plain_locator(CUBE).fit_rows, clean, progress=counts.append)
         assert sum(counts) == 9
 
 
 def alone(readings):
-    return Locator(CUBE).fit_rows(readings)
+    return plain_locator(CUBE).fit_rows(readings)
 
 
 def scattered_scalars(rng):
@@ -225,8 +222,8 @@ class TestOtherLocators:
         readings = readings_in_ambient_field(array, position, moment, rng)
         which = rng.integers(12, size=n)
         readings[np.arange(n), which] = reading_T
-        fixes = robust_fixes(array, ExactLocator(array).fit_rows, readings)
-        assert [fix.dropped for fix in fixes] == [(array.ids[sensor],) for sensor in which]
+        fixes = robust_fixes(array, plain_locator(array).fit_rows, readings)
+        assert [fix.dropped_sensors for fix in fixes] == [(array.ids[sensor],) for sensor in which]
         assert np.median(position_errors(fixes, position)) <= 1e-3
         assert position_errors(fixes, position).max() <= 1e-2
 
@@ -236,8 +233,8 @@ class TestOtherLocators:
         position, moment = random_sources(rng, 1, 2.8, 5.0, 300.0)
         readings = readings_in_ambient_field(array, position, moment, rng)
         readings[:, 5] = 0.0
-        fixes = robust_fixes(replace(array, ambient_T=None), ExactLocator(array).fit_rows, readings, AMBIENT[None])
-        assert [fix.dropped for fix in fixes] == [("t5",)]
+        fixes = robust_fixes(replace(array, ambient_T=None), plain_locator(array).fit_rows, readings, AMBIENT[None])
+        assert [fix.dropped_sensors for fix in fixes] == [("t5",)]
         assert position_errors(fixes, position).max() <= 1e-2
 
     @pytest.mark.parametrize("fault", ["dead", pytest.param("spikes of 1000 σ", marks=pytest.mark.slow)])
@@ -253,8 +250,8 @@ class TestOtherLocators:
         which = rng.integers(16, size=2)
         bad = array.channel_sensor == which[:, None]
         arbitrary = np.zeros_like(clean) if fault == "dead" else spikes(clean, 1000.0)
-        fixes = robust_fixes(array, SeveralLocator(array).fit_rows, np.where(bad, arbitrary, clean))
-        assert [fix.dropped for fix in fixes] == [(array.ids[sensor],) for sensor in which]
+        fixes = robust_fixes(array, plain_locator(array, sources="auto").fit_rows, np.where(bad, arbitrary, clean))
+        assert [fix.dropped_sensors for fix in fixes] == [(array.ids[sensor],) for sensor in which]
         for fix in fixes:
             found = np.array([source.position_m for source in fix.solutions[0].sources])
             assert len(found) == 2
@@ -268,8 +265,8 @@ class TestOtherLocators:
         readings = readings_in_ambient_field(array, np.tile(place, (10, 1)), moment, rng)
         which = rng.integers(8, size=10)
         readings[np.arange(10), which] += 1e-8
-        fixes = robust_fixes(array, MomentLocator(array, place).fit_rows, readings, free_position=False)
-        assert [fix.dropped for fix in fixes] == [(array.ids[sensor],) for sensor in which]
+        fixes = robust_fixes(array, plain_locator(array, position_m=place).fit_rows, readings, free_position=False)
+        assert [fix.dropped_sensors for fix in fixes] == [(array.ids[sensor],) for sensor in which]
         error = [np.linalg.norm(fix.solutions[0].moment_Am2 - m) for fix, m in zip(fixes, moment, strict=True)]
         assert max(error) <= 1.0
 
@@ -331,9 +328,9 @@ class TestRecording:
 
     def test_no_sensor_is_dropped(self, recording):
         array, readings, _ = recording
-        plain = Locator(array).fit_rows(readings)
+        plain = plain_locator(array).fit_rows(readings)
         fixes = robust(array, readings)
-        assert not any(fix.dropped for fix in fixes)
+        assert not any(fix.dropped_sensors for fix in fixes)
         for fix, same in zip(fixes, plain, strict=True):
             assert_allclose(fix.solutions[0].position_m, same.solutions[0].position_m, rtol=1e-12)
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from arrays.array import SensorArray
 from arrays.array_file import read_array
 from arrays.sensor import Sensor
-from magloc.localization.search.single_source import Locator
 from magloc.readings import read_readings, read_truth
+from tests.plain_locator import plain_locator
 
 FOUR = ("s08", "s11", "s20", "s23")
 
@@ -37,7 +37,7 @@ def errors_m(folder: Path, array: SensorArray) -> NDArray[np.float64]:
     """Error in x-y of the best solution of every row."""
     readings = read_readings(folder / "readings.csv", array, sensors=array.ids)
     truth = read_truth(folder / "truth.csv")
-    fixes = Locator(array).fit_rows(readings.values_T)
+    fixes = plain_locator(array).fit_rows(readings.values_T)
     found = np.array([fix.solutions[0].position_m[:2] for fix in fixes])
     return np.linalg.norm(found - truth.position_m[:, :2], axis=1)
 

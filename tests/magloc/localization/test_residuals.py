@@ -11,11 +11,9 @@ from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.sensor import Sensor
 from magloc.localization.fit.results import Fix
-from magloc.localization.locator import ExactLocator
 from magloc.localization.residuals import fix_residuals
-from magloc.localization.search.multi_source import SeveralLocator
-from magloc.localization.search.single_source import Locator
 from tests.oracles import magpylib_field
+from tests.plain_locator import plain_locator
 
 NOISE_T = 1e-10
 ARRAY = tetrahedron(1.5, noise_T=NOISE_T)
@@ -40,13 +38,13 @@ def assert_squares_are_chi2(residuals: np.ndarray, fixes: list, rtol: float = 1e
 class TestSquares:
     def test_of_vector_sensors(self) -> None:
         rows = readings(ARRAY, 10)
-        fixes = Locator(ARRAY).fit_rows(rows)
+        fixes = plain_locator(ARRAY).fit_rows(rows)
         assert_squares_are_chi2(fix_residuals(ARRAY, rows, fixes), fixes)
 
     def test_of_missing_readings(self) -> None:
         rows = readings(ARRAY, 3)
         rows[1, 4] = np.nan
-        fixes = Locator(ARRAY).fit_rows(rows)
+        fixes = plain_locator(ARRAY).fit_rows(rows)
         residuals = fix_residuals(ARRAY, rows, fixes)
         np.testing.assert_array_equal(np.isnan(residuals), np.isnan(rows))
         assert_squares_are_chi2(residuals, fixes)
@@ -55,7 +53,7 @@ class TestSquares:
         sensors = tuple(replace(s, noise_T=NOISE_T * (1 + i)) for i, s in enumerate(ARRAY.sensors))
         array = replace(ARRAY, sensors=sensors, noise_fraction=1e-5)
         rows = readings(array, 5)
-        fixes = Locator(array).fit_rows(rows)
+        fixes = plain_locator(array).fit_rows(rows)
         assert_squares_are_chi2(fix_residuals(array, rows, fixes), fixes)
 
     def test_of_two_sources(self) -> None:
@@ -64,7 +62,7 @@ class TestSquares:
             tuple(Sensor(f"s{i}", "vector", tuple(place.tolist()), NOISE_T) for i, place in enumerate(places))
         )
         rows = readings(array, 2, sources=2)
-        fixes = SeveralLocator(array, n_sources=2).fit_rows(rows)
+        fixes = plain_locator(array, sources=2).fit_rows(rows)
         assert len(fixes[0].solutions[0].sources) == 2
         assert_squares_are_chi2(fix_residuals(array, rows, fixes), fixes)
 
@@ -75,7 +73,7 @@ class TestSquares:
             ambient_T=(1e-5, 1e-5, 1e-5),
         )
         rows, ambient = readings(array, 2), np.tile(AMBIENT_T, (2, 1))
-        fixes = ExactLocator(array).fit_rows(rows, ambient)
+        fixes = plain_locator(array).fit_rows(rows, ambient)
         assert_squares_are_chi2(fix_residuals(array, rows, fixes, ambient), fixes)
 
 
@@ -85,7 +83,7 @@ class TestRows:
 
     def test_a_dropped_sensor_has_none(self) -> None:
         rows = readings(ARRAY, 1)
-        (fix,) = Locator(ARRAY).fit_rows(rows)
+        (fix,) = plain_locator(ARRAY).fit_rows(rows)
         name = ARRAY.ids[1]
         residuals = fix_residuals(ARRAY, rows, [replace(fix, dropped=(name,))])
         np.testing.assert_array_equal(np.isnan(residuals[0]), ARRAY.channel_sensor == 1)

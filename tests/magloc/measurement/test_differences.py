@@ -28,10 +28,10 @@ from magloc.convergence.filters import DampedFilter, IekfFilter, RepeatedFilter
 from magloc.convergence.over_sources import SourcesMap, SourcesScenario
 from magloc.convergence.over_starts import StartsScenario, simulated_measurement
 from magloc.grids.cube import Box
-from magloc.localization.search.single_source import Locator
 from magloc.measurement.differences import DifferenceMeasurement, channel_jacobian, predicted_channels
 from tests import oracles
 from tests.arrays.test_differences import random_array
+from tests.plain_locator import plain_locator
 
 SOURCE = np.array([5.0, 0.0, 0.306])
 MOMENT = np.array([60.0, 50.0, 60.0])
@@ -113,18 +113,18 @@ class TestGradientOfTheAmbientField:
         array = tetrahedron(1.5)
         p, m = np.array([3.0, -2.0, 1.0]), np.array([100.0, 50.0, -80.0])
         noise = 1e-9 * np.random.default_rng(4).normal(size=12)
-        quiet = Locator(array).fit(predicted_channels(array, p, m) + noise).solutions[0]
+        quiet = plain_locator(array).fit(predicted_channels(array, p, m) + noise).solutions[0]
         graded = with_gradient(array)
         readings = predicted_channels(graded, p, m) + noise
-        found = Locator(graded).fit(readings).solutions[0]
+        found = plain_locator(graded).fit(readings).solutions[0]
         assert_allclose(found.position_m, quiet.position_m, rtol=1e-6)
         assert found.chi2 == pytest.approx(quiet.chi2, rel=1e-6)
-        assert np.linalg.norm(Locator(array).fit(readings).solutions[0].position_m - p) > 0.1
+        assert np.linalg.norm(plain_locator(array).fit(readings).solutions[0].position_m - p) > 0.1
 
     def test_a_prior_of_the_common_field_is_about_the_ambient_field(self):
         array = replace(with_gradient(tetrahedron(1.5)), common_field_T=2e-9)
         p, m = np.array([3.0, -2.0, 1.0]), np.array([100.0, 50.0, -80.0])
-        best = Locator(array).fit(predicted_channels(array, p, m)).solutions[0]
+        best = plain_locator(array).fit(predicted_channels(array, p, m)).solutions[0]
         assert_allclose(best.position_m, p, rtol=1e-6)
 
     @pytest.mark.parametrize("method", [RepeatedFilter(), IekfFilter(), DampedFilter()], ids=lambda m: m.name)
@@ -166,11 +166,11 @@ class TestErrorsOfTheCalibration:
         in_field = replace(array, ambient_T=AMBIENT)
         exact = predicted_channels(in_field, p, m) + array.channel_offset_T
         readings = exact + reading_errors(array, exact, rng.normal(size=exact.shape))
-        fixes = Locator(array).fit_rows(readings)
+        fixes = plain_locator(array).fit_rows(readings)
         assert {fix.solutions[0].dof for fix in fixes} == {9}
         low, high = chi2_distribution.ppf([0.5e-4, 1 - 0.5e-4], 9 * 200)
         assert low < sum(fix.solutions[0].chi2 for fix in fixes) < high
-        white = [fix.solutions[0].chi2 for fix in Locator(random_array(12, 6, equal=True)).fit_rows(readings)]
+        white = [fix.solutions[0].chi2 for fix in plain_locator(random_array(12, 6, equal=True)).fit_rows(readings)]
         assert sum(white) > 10 * high
 
     def test_reported_chi2_is_that_of_the_decorrelated_differences(self):
@@ -178,7 +178,7 @@ class TestErrorsOfTheCalibration:
         readings = array.readings_of(AMBIENT + oracles.magpylib_field(array.positions, SOURCE, 100 * MOMENT))
         readings += 1e-8 * np.random.default_rng(8).normal(size=18)
         readings[7] = np.nan
-        best = Locator(array).fit(readings).solutions[0]
+        best = plain_locator(array).fit(readings).solutions[0]
         assert best.dof == 17 - 3 - 6
         differences = decorrelated_differences(
             array, np.isfinite(readings), covariance_T2=reading_covariance(array, readings)

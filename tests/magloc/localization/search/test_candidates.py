@@ -15,9 +15,9 @@ from arrays.geometries import square, tetrahedron
 from arrays.sensor import Sensor
 from arrays.whitening import whitening
 from magloc.localization.fit import variable_projection_compiled
-from magloc.localization.search.single_source import Locator
-from magloc.measurement.whitened import SeparableProblem
+from magloc.measurement.whitened import WhitenedModel
 from tests.magloc.localization.search.test_single_source import noisy_readings, refined
+from tests.plain_locator import plain_locator
 
 
 def seven_irregular_sensors():
@@ -74,9 +74,9 @@ def failures(case, n, seed):
     rng = np.random.default_rng(seed)
     array, p, m = random_problems(case, n, rng)
     readings = noisy_readings(array, p, m, rng)
-    problem = SeparableProblem.of(array, whitening(array))
+    problem = WhitenedModel.of(array, [whitening(array)], array.ambient_fields[None])
     failed = []
-    for i, fix in enumerate(Locator(array).fit_rows(readings)):
+    for i, fix in enumerate(plain_locator(array).fit_rows(readings)):
         y = problem.whitening.apply(readings[i])
         chi2, _, end = refined(problem, problem.homogeneous(p[i]), y, np.empty(3), 300)
         if end == variable_projection_compiled.CONVERGED and not (

@@ -22,7 +22,7 @@ from arrays.sensor import Sensor
 from magloc.chi_square import RISE_95
 from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.fit.results import JointFix, JointSolution, Source
-from magloc.localization.search.multi_source import FALSE_ALARM, SeveralLocator, in_stable_order, most_sources
+from magloc.localization.search.multi_source import FALSE_ALARM, in_stable_order, most_sources
 from tests.magloc.localization.fit.test_gauss_newton import (
     AMBIENT,
     array_of,
@@ -33,6 +33,7 @@ from tests.magloc.localization.fit.test_gauss_newton import (
     scipy_optimum,
     whitened_residuals,
 )
+from tests.plain_locator import plain_locator
 
 
 def plate(noise_T=5e-10):
@@ -43,7 +44,7 @@ def plate(noise_T=5e-10):
 
 
 PLATE = plate()
-BY_ITSELF = SeveralLocator(PLATE)
+BY_ITSELF = plain_locator(PLATE, sources="auto")
 
 
 def sources_below(rng, n_rows, n_sources):
@@ -122,7 +123,7 @@ class TestFalseAlarms:
     @pytest.mark.parametrize("n_rows", [40, pytest.param(2000, marks=pytest.mark.slow)])
     def test_no_source(self, n_rows):
         noise = np.random.default_rng(104).normal(size=(n_rows, 48)) * 5e-10
-        fixes = SeveralLocator(PLATE).fit_rows(noise)
+        fixes = plain_locator(PLATE, sources="auto").fit_rows(noise)
         assert sum(bool(fix.solutions) for fix in fixes) <= binom.ppf(0.9999, n_rows, FALSE_ALARM)
         assert {fix.reason for fix in fixes if not fix.solutions} == {
             "noise alone explains the readings: no source stands out of it"
@@ -143,7 +144,7 @@ class TestNumberAsked:
     def test_as_many_as_asked_for(self, n_sources):
         rng = np.random.default_rng(105)
         p, m = sources_below(rng, 5, n_sources)
-        fixes = SeveralLocator(PLATE, n_sources=n_sources).fit_rows(noisy_readings(PLATE, p, m, rng))
+        fixes = plain_locator(PLATE, sources=n_sources).fit_rows(noisy_readings(PLATE, p, m, rng))
         for fix, truth in zip(fixes, p, strict=True):
             assert {len(solution.sources) for solution in fix.solutions} == {n_sources}
             assert errors_of(fix, truth).max() < 0.1
@@ -157,7 +158,7 @@ class TestNumberAsked:
         with pytest.raises(
             ValueError, match=rf"n_sources must be (between 1 and )?{most}, .*; instead received {n_sources}"
         ):
-            SeveralLocator(array, n_sources=n_sources)
+            plain_locator(array, sources=n_sources)
 
     def test_a_degree_of_freedom_is_left(self):
         for n_differences in range(7, 60):
@@ -166,7 +167,7 @@ class TestNumberAsked:
 
     def test_too_small_an_array(self):
         with pytest.raises(ValueError, match=r"must give 6 independent differences .* instead it gives 3"):
-            SeveralLocator(SensorArray(PLATE.sensors[:2]))
+            plain_locator(SensorArray(PLATE.sensors[:2]), sources="auto")
 
 
 class TestMergedSources:
@@ -178,7 +179,7 @@ class TestMergedSources:
     def fix(self, distance, n_sources=2, seed=0):
         p = self.middle + 0.5 * distance * np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
         readings = noisy_readings(PLATE, p[None], self.m[None], np.random.default_rng(seed))
-        return p, SeveralLocator(PLATE, n_sources=n_sources).fit_rows(readings)[0]
+        return p, plain_locator(PLATE, sources=n_sources).fit_rows(readings)[0]
 
     @pytest.mark.parametrize("seed", range(3))
     def test_two_asked_for(self, seed):
@@ -195,7 +196,7 @@ class TestMergedSources:
         p = np.array([[0.6, 0.5, -1.2], [0.604, 0.5, -1.2], [-0.7, -0.6, -1.1]])
         m = np.array([*self.m, [10.0, 2.0, -3.0]])
         readings = noisy_readings(PLATE, p[None], m[None], np.random.default_rng(1))
-        fix = SeveralLocator(PLATE, n_sources=3).fit_rows(readings)[0]
+        fix = plain_locator(PLATE, sources=3).fit_rows(readings)[0]
         first, second = fix.solutions[0].sources
         assert_allclose(first.position_m, p[0], atol=0.02)
         assert_allclose(second.position_m, p[2], atol=0.02)
@@ -237,7 +238,7 @@ class TestMergedSources:
 
     def test_a_single_source_is_not_called_merged(self):
         readings = noisy_readings(PLATE, self.middle[None, None], self.m[None, :1], np.random.default_rng(3))
-        (source,) = SeveralLocator(PLATE).fit_rows(readings)[0].solutions[0].sources
+        (source,) = plain_locator(PLATE, sources="auto").fit_rows(readings)[0].solutions[0].sources
         assert not source.merged
 
 
@@ -245,7 +246,7 @@ class TestUncertainty:
     rng = np.random.default_rng(106)
     p, m = sources_below(rng, 25, 2)
     readings = noisy_readings(PLATE, p, m, rng)
-    fixes = SeveralLocator(PLATE, n_sources=2).fit_rows(readings)
+    fixes = plain_locator(PLATE, sources=2).fit_rows(readings)
 
     def test_blocks_of_the_joint_covariance_are_the_sources(self):
         for fix in self.fixes:
@@ -277,7 +278,7 @@ class TestUncertainty:
             offset = position[k] - PLATE.centroid
             # Two directions of tan of the angle turn the held source, on a sphere.
             aside = np.linalg.svd(offset[None])[2][1:]
-            for end in best.sources[k].range_interval95_m[0]:
+            for end in best.sources[k].range_interval_m[0]:
 
                 def states(x, k=k, offset=offset, aside=aside, end=end):
                     p, m = position.copy(), size * x[5:].reshape(2, 3)
@@ -295,7 +296,7 @@ class TestUncertainty:
 
     def test_an_observable_range_is_a_closed_interval(self):
         for source in (source for fix in self.fixes for source in fix.solutions[0].sources):
-            low, high = source.range_interval95_m[0]
+            low, high = source.range_interval_m[0]
             distance = np.linalg.norm(source.position_m - PLATE.centroid)
             assert low < distance < (np.inf if high is None else high)
             assert source.range_observable == (high is not None and low > 0.0 and high <= 2.0 * low)
@@ -346,7 +347,7 @@ class TestRows:
     rng = np.random.default_rng(109)
     p, m = sources_below(rng, 8, 2)
     readings = noisy_readings(PLATE, p, m, rng)
-    together = SeveralLocator(PLATE).fit_rows(readings)
+    together = plain_locator(PLATE, sources="auto").fit_rows(readings)
 
     @staticmethod
     def sorted_positions(fix):
@@ -354,18 +355,18 @@ class TestRows:
 
     def test_alone_or_together(self):
         for i, fix in enumerate(self.together[:3]):
-            alone = SeveralLocator(PLATE).fit_rows(self.readings[i : i + 1])[0]
+            alone = plain_locator(PLATE, sources="auto").fit_rows(self.readings[i : i + 1])[0]
             assert_allclose(self.sorted_positions(alone), self.sorted_positions(fix), rtol=1e-4)
             assert alone.solutions[0].chi2 == pytest.approx(fix.solutions[0].chi2, rel=1e-6)
 
     def test_in_any_order(self):
         order = np.random.default_rng(0).permutation(8)
-        for fix, i in zip(SeveralLocator(PLATE).fit_rows(self.readings[order]), order, strict=True):
+        for fix, i in zip(plain_locator(PLATE, sources="auto").fit_rows(self.readings[order]), order, strict=True):
             assert_allclose(self.sorted_positions(fix), self.sorted_positions(self.together[i]), rtol=1e-4)
 
     def test_in_any_number_at_once(self, monkeypatch):
         monkeypatch.setattr("magloc.localization.search.multi_source._ROWS_AT_ONCE", 3)
-        for fix, whole in zip(SeveralLocator(PLATE).fit_rows(self.readings), self.together, strict=True):
+        for fix, whole in zip(plain_locator(PLATE, sources="auto").fit_rows(self.readings), self.together, strict=True):
             assert_allclose(self.sorted_positions(fix), self.sorted_positions(whole), rtol=1e-4)
 
     def test_progress_counts_every_row(self):
@@ -389,7 +390,7 @@ class TestRows:
     def test_too_few_readings_for_the_number_asked_for(self):
         readings = self.readings[:1].copy()
         readings[0, 14:] = np.nan
-        fix = SeveralLocator(PLATE, n_sources=2).fit_rows(readings)[0]
+        fix = plain_locator(PLATE, sources=2).fit_rows(readings)[0]
         assert fix.solutions == ()
         assert fix.reason == "14 readings give 11 independent differences, 12 are needed"
 
@@ -412,7 +413,11 @@ class TestMixedSensors:
 
     def test_two_sources(self):
         for row, fix, *truth in zip(
-            self.readings, SeveralLocator(self.array, n_sources=2).fit_rows(self.readings), self.p, self.m, strict=True
+            self.readings,
+            plain_locator(self.array, sources=2).fit_rows(self.readings),
+            self.p,
+            self.m,
+            strict=True,
         ):
             assert fix.solutions[0].chi2 < scipy_optimum(self.array, row, *truth)[0] + 0.01
 
@@ -422,7 +427,7 @@ class TestMixedSensors:
             tuple(Sensor(f"s{i}", "scalar", tuple(place), 1e-11) for i, place in enumerate(places)), ambient_T=AMBIENT
         )
         readings = noisy_readings(array, self.p, self.m, np.random.default_rng(113))
-        for fix, truth in zip(SeveralLocator(array, n_sources=2).fit_rows(readings), self.p, strict=True):
+        for fix, truth in zip(plain_locator(array, sources=2).fit_rows(readings), self.p, strict=True):
             assert errors_of(fix, truth).max() < 0.02
 
     def test_ambient_field_of_every_row(self):
@@ -433,7 +438,7 @@ class TestMixedSensors:
                 for field, p, m in zip(ambient, self.p, self.m, strict=True)
             ]
         )
-        for fix, truth in zip(SeveralLocator(self.array, n_sources=2).fit_rows(readings, ambient), self.p, strict=True):
+        for fix, truth in zip(plain_locator(self.array, sources=2).fit_rows(readings, ambient), self.p, strict=True):
             assert errors_of(fix, truth).max() < 1e-3
 
 
@@ -445,7 +450,7 @@ class TestKnowledge:
         p, m = sources_below(rng, 6, 2)
         readings = noisy_readings(PLATE, p, m, rng)
         known = SourcePrior(low_m=(-1.5, -1.5, -2.5), high_m=(1.5, 1.5, -0.5), largest_moment_Am2=40.0)
-        for fix, truth in zip(SeveralLocator(PLATE, n_sources=2, knowledge=known).fit_rows(readings), p, strict=True):
+        for fix, truth in zip(plain_locator(PLATE, sources=2, prior=known).fit_rows(readings), p, strict=True):
             assert errors_of(fix, truth).max() < 0.1
             for source in (source for solution in fix.solutions for source in solution.sources):
                 assert known.allows_position(source.position_m)
@@ -456,11 +461,11 @@ class TestKnowledge:
         rng = np.random.default_rng(116)
         p, m = sources_below(rng, 3, 1)
         known = SourcePrior(low_m=(-np.inf, -np.inf, 0.0))
-        fixes = SeveralLocator(PLATE, n_sources=1, knowledge=known).fit_rows(noisy_readings(PLATE, p, m, rng))
+        fixes = plain_locator(PLATE, sources=1, prior=known).fit_rows(noisy_readings(PLATE, p, m, rng))
         assert all(source.position_m[2] >= 0.0 for fix in fixes for s in fix.solutions for source in s.sources)
         for fix in (fix for fix in fixes if not fix.solutions):
             assert "within the known region" in fix.reason
 
     def test_nothing_left_of_the_space_around(self):
         with pytest.raises(ValueError, match="leaves nothing"):
-            SeveralLocator(PLATE, knowledge=SourcePrior(low_m=(1e6, 1e6, 1e6)))
+            plain_locator(PLATE, prior=SourcePrior(low_m=(1e6, 1e6, 1e6)), sources="auto")

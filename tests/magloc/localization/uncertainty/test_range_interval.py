@@ -26,10 +26,7 @@ from arrays.whitening import whitening
 from magloc.chi_square import RISE_95
 from magloc.directions import fibonacci_directions
 from magloc.localization.fit.results import Fix, Solution
-from magloc.localization.locator import ExactLocator
-from magloc.localization.search.known_position import MomentLocator
-from magloc.localization.search.multi_source import SeveralLocator
-from magloc.localization.search.single_source import Locator
+from magloc.localization.fit.variable_projection import projected_chi2
 from magloc.localization.uncertainty.ambiguity import weights
 from magloc.localization.uncertainty.range_interval import (
     EVERYWHERE,
@@ -43,12 +40,13 @@ from magloc.localization.uncertainty.range_interval import (
     union,
 )
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
-from magloc.measurement.whitened import SeparableProblem
+from magloc.measurement.whitened import WhitenedModel
 from magloc.tracking.batch import track_record
 from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import Row, TrackPoint
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import ARRAY, MOMENT, POSITION, readings_of
+from tests.plain_locator import plain_locator
 
 FloatArray = NDArray[np.float64]
 TETRAHEDRON = tetrahedron(1.5, noise_T=1e-9)
@@ -102,7 +100,7 @@ class Problems:
         position = array.centroid + direction * rng.uniform(nearest, farthest, (n, 1))
         clean = predicted_channels(array, position, moment)
         readings = clean + rng.normal(size=clean.shape) * array.channel_noise_T
-        return cls(array, position, moment, readings, Locator(array).fit_rows(readings))
+        return cls(array, position, moment, readings, plain_locator(array).fit_rows(readings))
 
     @property
     def ranges_m(self) -> FloatArray:
@@ -121,7 +119,7 @@ class Problems:
 
     @property
     def covered(self) -> NDArray[np.bool_]:
-        sets = [fix.solutions[0].range_interval95_m if fix.solutions else () for fix in self.fixes]
+        sets = [fix.solutions[0].range_interval_m if fix.solutions else () for fix in self.fixes]
         return np.array([holds(intervals, r) for intervals, r in zip(sets, self.ranges_m, strict=True)])
 
 
@@ -130,21 +128,23 @@ def holds(intervals: Intervals, range_m: float) -> bool:
 
 
 def ends_of(told: Solution | TrackPoint) -> list[float]:
-    return [np.inf if end is None else end for pair in told.range_interval95_m or () for end in pair]
+    return [np.inf if end is None else end for pair in told.range_interval_m or () for end in pair]
 
 
 class Sphere:
     """Least χ² of sources at one range, of all directions."""
 
     def __init__(self, array: SensorArray, n_directions: int = 250) -> None:
-        self.problem = SeparableProblem.of(array, whitening(array))
+        self.problem = WhitenedModel.of(array, [whitening(array)], array.ambient_fields[None])
         self.directions = fibonacci_directions(n_directions)
 
     def chi2(self, readings_T: FloatArray, range_m: float) -> float:
         y = self.problem.whitening.apply(readings_T)
 
         def of(direction: FloatArray) -> FloatArray:
-            return self.problem.projected_chi2(self.problem.homogeneous(self.problem.centroid + range_m * direction), y)
+            return projected_chi2(
+                self.problem, self.problem.homogeneous(self.problem.centroid + range_m * direction), y
+            )
 
         def of_angles(angles: FloatArray) -> float:
             theta, phi = angles
@@ -191,9 +191,9 @@ class TestCoverage:
         assert not (claimed & ~detected).any()
         for fix, seen in zip(problems.fixes, detected, strict=True):
             for solution in fix.solutions:
-                assert solution.range_observable == is_observable_set(solution.range_interval95_m)
+                assert solution.range_observable == is_observable_set(solution.range_interval_m)
                 if not seen:
-                    assert solution.range_interval95_m == EVERYWHERE
+                    assert solution.range_interval_m == EVERYWHERE
         # Outside the 99.7 % set there are only rows outside the 95 % set.
         sphere, false = Sphere(problems.array), 0
         for i in np.flatnonzero(claimed & ~covered):
@@ -228,32 +228,32 @@ class TestUndetected:
     def test_noise_is_detected_once_in_a_thousand(self) -> None:
         """4,000 rows; false-alarm rate 2e-4."""
         readings = 1e-9 * np.random.default_rng(1).normal(size=(4000, 12))
-        fixes = Locator(TETRAHEDRON).fit_rows(readings)
+        fixes = plain_locator(TETRAHEDRON).fit_rows(readings)
         n = sum(fix.detected for fix in fixes)
         assert scipy.stats.binom.ppf(1e-4, 4000, FALSE_ALARM) <= n <= scipy.stats.binom.isf(1e-4, 4000, FALSE_ALARM)
         for fix in fixes:
             if not fix.detected:
-                assert all(s.range_interval95_m == EVERYWHERE for s in fix.solutions)
+                assert all(s.range_interval_m == EVERYWHERE for s in fix.solutions)
                 assert not any(s.range_observable or s.gaussian for s in fix.solutions)
 
     def test_readings_without_any_difference(self) -> None:
-        assert not Locator(TETRAHEDRON).fit(np.full(12, 5e-5)).detected
+        assert not plain_locator(TETRAHEDRON).fit(np.full(12, 5e-5)).detected
 
     def test_several_sources_and_moduli_say_so_too(self) -> None:
         rng = np.random.default_rng(2)
         array = irregular(6, 3)
-        (joint,) = SeveralLocator(array, n_sources=2).fit_rows(1e-9 * rng.normal(size=(1, 18)))
+        (joint,) = plain_locator(array, sources=2).fit_rows(1e-9 * rng.normal(size=(1, 18)))
         assert not joint.detected
-        assert all(s.range_interval95_m == EVERYWHERE for solution in joint.solutions for s in solution.sources)
+        assert all(s.range_interval_m == EVERYWHERE for solution in joint.solutions for s in solution.sources)
         ambient = (2e-5, 0.0, 4.5e-5)
         scalar = scalar_array(ambient)
         readings = float(np.linalg.norm(ambient)) + 1e-9 * rng.normal(size=(3, 9))
-        fixes = ExactLocator(scalar).fit_rows(readings)
+        fixes = plain_locator(scalar).fit_rows(readings)
         assert not any(fix.detected for fix in fixes)
-        assert all(s.range_interval95_m == EVERYWHERE for fix in fixes for s in fix.solutions)
+        assert all(s.range_interval_m == EVERYWHERE for fix in fixes for s in fix.solutions)
 
     def test_a_known_place_stays_known(self) -> None:
-        (fix,) = MomentLocator(TETRAHEDRON, [3.0, 0.0, 0.0]).fit_rows(
+        (fix,) = plain_locator(TETRAHEDRON, position_m=[3.0, 0.0, 0.0]).fit_rows(
             1e-9 * np.random.default_rng(3).normal(size=(1, 12))
         )
         assert not fix.detected
@@ -271,11 +271,11 @@ class TestSetOfRanges:
         for i in weak[:9]:
             best = problems.fixes[i].solutions[0]
             allowed = expected_rise(problems.fixes[i], problems.readings_T[i], problems.array)
-            n_several += len(best.range_interval95_m) > 1 or len(problems.fixes[i].solutions) > 1
+            n_several += len(best.range_interval_m) > 1 or len(problems.fixes[i].solutions) > 1
             for range_m in np.exp(rng.uniform(np.log(0.5), np.log(80.0), 5)):
                 risen = sphere.chi2(problems.readings_T[i], range_m) - best.chi2
                 if abs(risen - allowed) > 0.1:
-                    assert (risen < allowed) == holds(best.range_interval95_m, range_m)
+                    assert (risen < allowed) == holds(best.range_interval_m, range_m)
                     n_compared += 1
         assert n_compared > 30
         assert n_several > 2
@@ -286,10 +286,10 @@ class TestSetOfRanges:
         p = np.array([25.0, 5.0, -10.0])
         readings = predicted_channels(TETRAHEDRON, p, [2e4, 5e3, 1.5e4]) + 1e-9 * rng.normal(size=(20, 12))
         ends = []
-        for fix in Locator(TETRAHEDRON).fit_rows(readings):
+        for fix in plain_locator(TETRAHEDRON).fit_rows(readings):
             assert fix.detected
             assert not fix.solutions[0].range_observable
-            ends.append((fix.solutions[0].range_interval95_m[0][0], fix.solutions[0].range_interval95_m[-1][1]))
+            ends.append((fix.solutions[0].range_interval_m[0][0], fix.solutions[0].range_interval_m[-1][1]))
         assert all(low > 1.0 for low, _ in ends)
         assert sum(high is None for _, high in ends) >= 10
 
@@ -322,16 +322,14 @@ class TestSetOfRanges:
         readings = (problems.readings_T.reshape(40, 7, 3)[:, order] @ R.T).reshape(40, 21)
         # Candidates stand along other directions of the turned array: rarely one more or less of the worst is found.
         same = 0
-        for one, other in zip(problems.fixes, Locator(turned).fit_rows(readings), strict=True):
+        for one, other in zip(problems.fixes, plain_locator(turned).fit_rows(readings), strict=True):
             assert one.detected == other.detected
             a, b = one.solutions[0], other.solutions[0]
             chi2 = [[s.chi2 for s in fix.solutions] for fix in (one, other)]
             if len(chi2[0]) == len(chi2[1]) and np.allclose(chi2[0], chi2[1], atol=1e-3):
                 same += 1
-                assert len(a.range_interval95_m) == len(b.range_interval95_m)
-                ends = [
-                    [np.inf if end is None else end for pair in s.range_interval95_m for end in pair] for s in (a, b)
-                ]
+                assert len(a.range_interval_m) == len(b.range_interval_m)
+                ends = [[np.inf if end is None else end for pair in s.range_interval_m for end in pair] for s in (a, b)]
                 assert_allclose(ends[0], ends[1], rtol=0.01)
                 assert [s.weight for s in other.solutions] == pytest.approx([s.weight for s in one.solutions], abs=0.01)
         assert same > 30
@@ -392,10 +390,10 @@ class TestWeights:
     def test_opposite_moments_of_moduli_are_equally_likely(self) -> None:
         scalar = scalar_array()
         p, m = np.array([3.0, 1.0, 2.0]), np.array([4000.0, 2000.0, 1000.0])
-        (fix,) = ExactLocator(scalar).fit_rows(predicted_channels(scalar, p, m)[None])
+        (fix,) = plain_locator(scalar).fit_rows(predicted_channels(scalar, p, m)[None])
         assert len(fix.solutions) == 2
         assert [s.weight for s in fix.solutions] == pytest.approx([0.5, 0.5], rel=1e-6)
-        moments = MomentLocator(scalar, p).fit_rows(predicted_channels(scalar, p, m)[None])[0]
+        moments = plain_locator(scalar, position_m=p).fit_rows(predicted_channels(scalar, p, m)[None])[0]
         assert sum(s.weight for s in moments.solutions) == pytest.approx(1.0)
         assert moments.solutions[0].weight == pytest.approx(moments.solutions[1].weight, rel=1e-6)
 
@@ -403,7 +401,7 @@ class TestWeights:
         array = irregular(9, 6)
         p = np.array([[4.0, 1.0, 0.0], [-2.0, 3.0, 4.0]])
         readings = predicted_channels(array, p, np.full((2, 3), 3000.0)).sum(axis=0)
-        (fix,) = SeveralLocator(array, n_sources=2).fit_rows(readings[None])
+        (fix,) = plain_locator(array, sources=2).fit_rows(readings[None])
         assert fix.detected
         assert sum(s.weight for s in fix.solutions) == pytest.approx(1.0)
         assert all(source.range_observable and source.gaussian for source in fix.solutions[0].sources)
@@ -484,7 +482,7 @@ class TestCovariance:
                 offset = s.position_m - centroid
                 distance = float(np.linalg.norm(offset))
                 sigma = float(np.sqrt(offset @ s.covariance[:3, :3] @ offset)) / distance
-                low, high = s.range_interval95_m[0][0], s.range_interval95_m[-1][1]
+                low, high = s.range_interval_m[0][0], s.range_interval_m[-1][1]
                 if high is None:
                     assert sigma >= 0.999 * distance
                     n_open += 1
@@ -583,7 +581,7 @@ class TestBentErrors:
             jacobian = measurement.jacobian(s.position_m, s.moment_Am2) * unit / np.sqrt(measurement.variance)[:, None]
             _, w, Vt = np.linalg.svd(jacobian)
             sigma = [np.sqrt(np.sum((Vt.T[part] / w) ** 2)) for part in (slice(3), slice(3, 6))]
-            if max(sigma) > 0.04 or s.weight < 0.99 or len(s.range_interval95_m) > 1 or not s.range_observable:
+            if max(sigma) > 0.04 or s.weight < 0.99 or len(s.range_interval_m) > 1 or not s.range_observable:
                 assert not s.gaussian
                 continue
             rises = []
@@ -609,7 +607,7 @@ class TestBentErrors:
         problems = self.problems()
         wrong = problems.readings_T + 100.0 * self.ARRAY.channel_noise_T * (np.arange(15) == 4)
         misfits = 0
-        for fix in Locator(self.ARRAY).fit_rows(wrong):
+        for fix in plain_locator(self.ARRAY).fit_rows(wrong):
             s = fix.solutions[0]
             if scipy.stats.chi2.sf(s.chi2, s.dof) < 1e-6:
                 misfits += 1
@@ -620,7 +618,9 @@ class TestBentErrors:
         problems = self.problems()
         rows = slice(0, 60)
         for one, other in zip(
-            ExactLocator(self.ARRAY).fit_rows(problems.readings_T[rows]), problems.fixes[rows], strict=True
+            plain_locator(self.ARRAY).fit_rows(problems.readings_T[rows]),
+            problems.fixes[rows],
+            strict=True,
         ):
             a, b = one.solutions[0], other.solutions[0]
             if abs(a.chi2 - b.chi2) < 1e-6 and len(one.solutions) == len(other.solutions):
@@ -633,7 +633,7 @@ class TestOtherLocators:
     def test_same_sets_and_weights(self) -> None:
         problems = Problems.of("tetrahedron 1.5 m", 60, 17)
         rows = np.flatnonzero(problems.detected)[:20]
-        exact = ExactLocator(problems.array).fit_rows(problems.readings_T[rows])
+        exact = plain_locator(problems.array).fit_rows(problems.readings_T[rows])
         same = 0
         for row, ours in zip(rows, exact, strict=True):
             other = problems.fixes[row]
@@ -675,7 +675,7 @@ class TestTrack:
 
     def test_without_one_it_is_that_of_the_row(self) -> None:
         _, points = self.points(8, 14.0)
-        locator = Locator(ARRAY)
+        locator = plain_locator(ARRAY)
         position = 14.0 * POSITION / np.linalg.norm(POSITION)
         readings = readings_of(ARRAY, np.tile(position, (8, 1)), np.tile(MOMENT, (8, 1)), 0)
         assert any(point.position_m is None for point in points)
@@ -685,13 +685,13 @@ class TestTrack:
             assert np.isnan(point.weight)
             assert not point.gaussian
             assert sum(s.weight for s in point.rivals) == pytest.approx(1.0)
-            assert point.range_interval95_m is not None
+            assert point.range_interval_m is not None
             assert_allclose(ends_of(point), ends_of(fix.solutions[0]), rtol=1e-6)
             assert point.range_observable == fix.solutions[0].range_observable
 
     def test_rows_that_say_nothing_allow_every_range(self) -> None:
         (point,) = Tracker(ARRAY, RandomWalk(0.1, 0.1)).run([Row(0.0, np.full(ARRAY.n_channels, np.nan))])
-        assert point.range_interval95_m == EVERYWHERE
+        assert point.range_interval_m == EVERYWHERE
         assert not point.range_observable
 
     def test_gaussian_ranges_open_where_the_source_is_far(self) -> None:

@@ -27,7 +27,6 @@ from arrays.array_file import read_array, write_array
 from arrays.geometries import axial, cube, square, tetrahedron
 from arrays.sensor import Calibration
 from magloc.localization.fit.results import Fix
-from magloc.localization.search.single_source import Locator
 from magloc.viewer.pages.array_editor import ArrayEditor, fault_of_path, moved
 from magloc.viewer.pages.dipole_editor import DipoleEditor, angles_of, direction_of, sensible_step, turned_to
 from magloc.viewer.pages.live_fit import LiveFit, range_interval, suitable_dipole
@@ -36,6 +35,7 @@ from magloc.viewer.panels.inputs import set_value
 from magloc.viewer.panels.latest import Latest
 from magloc.viewer.server import free_port, opened
 from tests.oracles import derivative, magpylib_field
+from tests.plain_locator import plain_locator
 
 SMALL, LARGE = tetrahedron(0.03), cube(30.0)
 WAIT_S = 20.0
@@ -141,11 +141,11 @@ class TestForecast:
         position, moment = suitable_dipole(array)
         live = LiveFit(array)
         forecast = live.forecast(position, moment)
-        (profile,) = live.fix(forecast.readings_T).solutions[0].range_interval95_m
+        (profile,) = live.fix(forecast.readings_T).solutions[0].range_interval_m
         assert forecast.range_observable
         # The width is that of a Gaussian: third order terms of a well known range are below a twentieth of it.
         width = profile[1] - profile[0]
-        np.testing.assert_allclose(forecast.range_interval95_m, profile, atol=0.05 * width)
+        np.testing.assert_allclose(forecast.range_interval_m, profile, atol=0.05 * width)
 
     def test_range_opens_with_the_distance_and_the_words_follow(self):
         position, moment = suitable_dipole(SMALL)
@@ -153,7 +153,7 @@ class TestForecast:
         near, far = live.forecast(position, moment), live.forecast(4.0 * position, moment)
         assert near.range_observable
         assert not far.range_observable
-        assert far.range_interval95_m[1] is None
+        assert far.range_interval_m[1] is None
         assert live.fix(far.readings_T).solutions[0].range_observable is False
 
     @given(st.floats(0.05, 20.0), st.floats(1e-4, 1.0))
@@ -504,4 +504,4 @@ class TestArrayEditor:
         array = replace(SMALL, sensors=(*SMALL.sensors, scalar))
         at_one_place = moved(array, "m1", SMALL.positions[0])
         np.testing.assert_array_equal(at_one_place.positions[4], SMALL.positions[0])
-        assert Locator(SMALL).fit(LiveFit(SMALL).forecast(*suitable_dipole(SMALL)).readings_T).solutions
+        assert plain_locator(SMALL).fit(LiveFit(SMALL).forecast(*suitable_dipole(SMALL)).readings_T).solutions

@@ -1,0 +1,169 @@
+"""Solutions of many rows as columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.localization.fit.results import Intervals, Solution, Source
+
+
+@dataclass(frozen=True, eq=False)
+class Solutions:
+    """Solutions of many rows as columns: f of them, row after row, of every row best χ² first.
+
+    Attributes
+    ----------
+    of_row, n_sources, dof, iterations : ndarray of int, shape (f,)
+    position_m, moment_Am2 : ndarray, shape (f, K, 3)
+        NaN beyond the sources of a solution.
+    covariance : ndarray, shape (f, 6 K, 6 K) or (f, 3, 3)
+    chi2, weight : ndarray, shape (f,)
+    ranges : list of tuple of Intervals
+        Of every source of every solution.
+    gaussian, merged : ndarray of bool, shape (f, K)
+    """
+
+    of_row: IntArray
+    n_sources: IntArray
+    position_m: FloatArray
+    moment_Am2: FloatArray
+    covariance: FloatArray
+    chi2: FloatArray
+    dof: IntArray
+    weight: FloatArray
+    iterations: IntArray
+    ranges: list[tuple[Intervals, ...]]
+    gaussian: BoolArray
+    merged: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.of_row)
+
+    @classmethod
+    def none(cls) -> Solutions:
+        """No solution of any row."""
+        whole, number = np.zeros(0, dtype=np.intp), np.zeros(0)
+        flags, vectors = np.zeros((0, 1), dtype=bool), np.zeros((0, 1, 3))
+        return cls(whole, whole, vectors, vectors, np.zeros((0, 6, 6)), number, whole, number, whole, [], flags, flags)
+
+    @classmethod
+    def of(cls, solutions: Sequence[tuple[int, Solution]]) -> Solutions:
+        """From solutions and their rows."""
+        return cls.joined([cls._of_one(row, solution) for row, solution in solutions])
+
+    @classmethod
+    def _of_one(cls, row: int, solution: Solution) -> Solutions:
+        sources = solution.sources
+        return cls(
+            of_row=np.array([row]),
+            n_sources=np.array([len(sources)]),
+            position_m=np.array([[source.position_m for source in sources]]),
+            moment_Am2=np.array([[source.moment_Am2 for source in sources]]),
+            covariance=solution.covariance[None],
+            chi2=np.array([solution.chi2]),
+            dof=np.array([solution.dof]),
+            weight=np.array([solution.weight]),
+            iterations=np.array([solution.iterations]),
+            ranges=[tuple(source.range_interval_m for source in sources)],
+            gaussian=np.array([[source.gaussian for source in sources]]),
+            merged=np.array([[source.merged for source in sources]]),
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Solutions]) -> Solutions:
+        """All solutions of parts with different rows, in the order of their rows."""
+        filled = [part for part in parts if len(part)]
+        if len(filled) <= 1:
+            return filled[0] if filled else cls.none()
+        order = np.argsort(np.concatenate([part.of_row for part in filled]), kind="stable")
+        most = max(part.position_m.shape[1] for part in filled)
+        size = max(part.covariance.shape[1] for part in filled)
+
+        def stacked(name: str, shape: tuple[int, ...], empty: float) -> Any:
+            values = [getattr(part, name) for part in filled]
+            result = np.full((sum(map(len, filled)), *shape), empty, dtype=values[0].dtype)
+            begin = 0
+            for value in values:
+                result[(slice(begin, begin + len(value)), *map(slice, value.shape[1:]))] = value
+                begin += len(value)
+            return result[order]
+
+        ranges = [intervals for part in filled for intervals in part.ranges]
+        return cls(
+            **{name: stacked(name, (), 0) for name in ("of_row", "n_sources", "chi2", "dof", "weight", "iterations")},
+            **{name: stacked(name, (most, 3), np.nan) for name in ("position_m", "moment_Am2")},
+            **{name: stacked(name, (most,), False) for name in ("gaussian", "merged")},
+            covariance=stacked("covariance", (size, size), np.nan),
+            ranges=[ranges[i] for i in order],
+        )
+
+    def chosen(self, index: IntArray | BoolArray, of_row: IntArray | None = None) -> Solutions:
+        """Some of the solutions, of other rows if these are named."""
+        at = np.arange(len(self))[index]
+        values = {name: value[at] for name, value in vars(self).items() if name != "ranges"}
+        values["ranges"] = [self.ranges[i] for i in at]
+        return Solutions(**(values if of_row is None else values | {"of_row": of_row}))
+
+    def solution(self, i: int) -> Solution:
+        """One of them as an object."""
+        n, size = int(self.n_sources[i]), self.covariance.shape[1]
+        known = size == 3
+        sources = tuple(
+            Source(
+                self.position_m[i, k],
+                self.moment_Am2[i, k],
+                self.covariance[i] if known else self.covariance[i, 6 * k : 6 * k + 6, 6 * k : 6 * k + 6],
+                self.ranges[i][k],
+                bool(self.gaussian[i, k]),
+                bool(self.merged[i, k]),
+            )
+            for k in range(n)
+        )
+        covariance = self.covariance[i] if known else self.covariance[i, : 6 * n, : 6 * n]
+        return Solution(
+            sources, covariance, float(self.chi2[i]), int(self.dof[i]), float(self.weight[i]), int(self.iterations[i])
+        )
+
+
+def in_stable_order(solutions: Solutions) -> Solutions:
+    """Solutions whose sources are numbered as in the row before; at first the strongest comes first."""
+    order = np.tile(np.arange(solutions.position_m.shape[1]), (len(solutions), 1))
+    before: FloatArray | None = None
+    last = -1
+    for i, n in enumerate(solutions.n_sources.tolist()):
+        position, moment = solutions.position_m[i, :n], solutions.moment_Am2[i, :n]
+        if solutions.of_row[i] != last:
+            known = before
+        order[i, :n] = _order(position, moment, known)
+        if solutions.of_row[i] != last:
+            last, before = int(solutions.of_row[i]), position[order[i, :n]]
+    of_state = (6 * order[:, :, None] + np.arange(6)).reshape(len(order), -1)
+    every = np.arange(len(order))[:, None]
+    return replace(
+        solutions,
+        **{
+            name: np.take_along_axis(values, order.reshape(*order.shape, *[1] * (values.ndim - 2)), axis=1)
+            for name in ("position_m", "moment_Am2", "gaussian", "merged")
+            for values in (getattr(solutions, name),)
+        },
+        covariance=solutions.covariance[every[..., None], of_state[:, :, None], of_state[:, None]],
+        ranges=[
+            tuple(of_fit[k] for k in of_row[: len(of_fit)])
+            for of_fit, of_row in zip(solutions.ranges, order, strict=True)
+        ],
+    )
+
+
+def _order(position: FloatArray, moment: FloatArray, before: FloatArray | None) -> list[int]:
+    strongest = np.argsort(-np.linalg.norm(moment, axis=-1), kind="stable").tolist()
+    if before is None:
+        return strongest
+    known, found = linear_sum_assignment(np.linalg.norm(before[:, None] - position, axis=-1))
+    followed = [int(k) for _, k in sorted(zip(known.tolist(), found.tolist(), strict=True))]
+    return followed + [k for k in strongest if k not in followed]

@@ -1,0 +1,249 @@
+"""The fixes of many rows: columns first."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from html import escape
+from typing import TYPE_CHECKING, Any, Literal, overload
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from arrays.io.lazy import by_name
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.localization.fit.columns import Solutions
+from magloc.localization.fit.results import EVERYWHERE, Fix, Intervals, is_misfit
+from magloc.localization.fit.table import lines_of_fixes
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Fixes(Sequence[Fix]):
+    """The fixes of many rows: columns first, a :class:`Fix` where one row is asked for.
+
+    Attributes
+    ----------
+    solutions : Solutions
+        Of all rows.
+    time_s : ndarray, shape (n,)
+    frame : {"array", "world"}
+        Of positions, moments and covariances.
+    detected, too_near : ndarray of bool, shape (n,)
+    reason : list of str
+    dropped_sensors, saturated_channels : list of tuple of str
+    failed_starts : ndarray of int, shape (n,)
+    """
+
+    solutions: Solutions
+    time_s: FloatArray
+    detected: BoolArray
+    reason: list[str]
+    failed_starts: IntArray
+    dropped_sensors: list[tuple[str, ...]]
+    saturated_channels: list[tuple[str, ...]] = field(default_factory=list)
+    too_near: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    frame: Literal["array", "world"] = "array"
+
+    def __post_init__(self) -> None:
+        if not len(self.too_near):
+            object.__setattr__(self, "too_near", np.zeros(len(self), dtype=bool))
+        if not self.saturated_channels:
+            object.__setattr__(self, "saturated_channels", [()] * len(self))
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @overload
+    def __getitem__(self, row: int) -> Fix: ...
+    @overload
+    def __getitem__(self, row: slice) -> list[Fix]: ...
+    def __getitem__(self, row: int | slice) -> Fix | list[Fix]:
+        if isinstance(row, slice):
+            return [self[i] for i in range(*row.indices(len(self)))]
+        i = range(len(self))[row]
+        begin, end = self._edges[i : i + 2].tolist()
+        return Fix(
+            tuple(self.solutions.solution(j) for j in range(begin, end)),
+            self.reason[i],
+            bool(self.detected[i]),
+            self.dropped_sensors[i],
+            self.saturated_channels[i],
+            bool(self.too_near[i]),
+            int(self.failed_starts[i]),
+            float(self.time_s[i]),
+        )
+
+    @cached_property
+    def _edges(self) -> IntArray:
+        """First solution of every row (n + 1,)."""
+        return np.searchsorted(self.solutions.of_row, np.arange(len(self) + 1))
+
+    @cached_property
+    def best(self) -> IntArray:
+        """Index (n,) of the heaviest solution of every row in `solutions`; -1 where there is none."""
+        result = np.full(len(self), -1, dtype=np.intp)
+        order = np.lexsort((-np.arange(len(self.solutions)), self.solutions.weight, self.solutions.of_row))
+        result[self.solutions.of_row[order]] = order
+        return result
+
+    def _column(self, values: Any, empty: Any) -> Any:
+        """Values of the best solutions (n, ...), `empty` where there is none."""
+        if not len(self.solutions):
+            return np.full((len(self), *values.shape[1:]), empty)
+        solved = (self.best >= 0).reshape(-1, *[1] * (values.ndim - 1))
+        return np.where(solved, values[self.best], empty)
+
+    def _of_one(self, values: Any) -> Any:
+        if (self.solutions.n_sources[self.best[self.solved]] > 1).any():
+            raise ValueError("Some rows have several sources: see fixes[row].best.sources, or to_xarray().")
+        return values
+
+    @property
+    def solved(self) -> BoolArray:
+        """Whether a row has a solution (n,)."""
+        return self.best >= 0
+
+    @property
+    def position_m(self) -> FloatArray:
+        """Positions (n, 3) of the best solutions of one source [m]; NaN where there is none."""
+        column: FloatArray = self._column(self._of_one(self.solutions.position_m[:, 0]), np.nan)
+        return column
+
+    @property
+    def moment_Am2(self) -> FloatArray:
+        """Moments (n, 3) of the best solutions of one source [A·m²]."""
+        column: FloatArray = self._column(self._of_one(self.solutions.moment_Am2[:, 0]), np.nan)
+        return column
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariances (n, 6, 6) of the best solutions of one source; (n, 3, 3) of moments where the place is known."""
+        column: FloatArray = self._column(self._of_one(self.solutions.covariance[:, :6, :6]), np.nan)
+        return column
+
+    @property
+    def chi2(self) -> FloatArray:
+        """χ² (n,) of the best solutions."""
+        column: FloatArray = self._column(self.solutions.chi2, np.nan)
+        return column
+
+    @property
+    def dof(self) -> IntArray:
+        """Degrees of freedom (n,) of the best solutions."""
+        column: IntArray = self._column(self.solutions.dof, 0)
+        return column
+
+    @property
+    def weight(self) -> FloatArray:
+        """Weights (n,) of the best solutions."""
+        column: FloatArray = self._column(self.solutions.weight, np.nan)
+        return column
+
+    @property
+    def range_interval_m(self) -> list[Intervals]:
+        """95 % sets of the range of every row with one source [m]."""
+        self._of_one(None)
+        return [self.solutions.ranges[i][0] if i >= 0 else EVERYWHERE for i in self.best]
+
+    @property
+    def misfit(self) -> BoolArray:
+        """Whether χ² is far beyond noise (n,)."""
+        result = np.zeros(len(self), dtype=bool)
+        begin = self._edges[:-1][self.solved]
+        result[self.solved] = is_misfit(self.solutions.chi2[begin], self.solutions.dof[begin])
+        return result
+
+    @classmethod
+    def unsolved(cls, time_s: FloatArray, reason: str) -> Fixes:
+        """Rows without a solution, all for one reason."""
+        n = len(time_s)
+        nothing = np.zeros(n, dtype=bool)
+        return cls(Solutions.none(), time_s, nothing, [reason] * n, np.zeros(n, dtype=np.intp), [()] * n)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Fixes]) -> Fixes:
+        """The fixes of parts, row after row."""
+        begins = np.cumsum([0, *map(len, parts)])
+        solutions = [
+            part.solutions.chosen(np.arange(len(part.solutions)), begin + part.solutions.of_row)
+            for begin, part in zip(begins, parts, strict=False)
+        ]
+        return cls(
+            Solutions.joined(solutions),
+            np.concatenate([np.zeros(0), *(part.time_s for part in parts)]),
+            np.concatenate([np.zeros(0, dtype=bool), *(part.detected for part in parts)]),
+            [reason for part in parts for reason in part.reason],
+            np.concatenate([np.zeros(0, dtype=np.intp), *(part.failed_starts for part in parts)]),
+            [names for part in parts for names in part.dropped_sensors],
+        )
+
+    def moved(self, position_m: FloatArray, rotation: Rotation, *, frame: Literal["array", "world"]) -> Fixes:
+        """The same in another frame: places are turned and moved by the pose (n, 3) of every row, moments turned."""
+        row, columns = self.solutions.of_row, self.solutions
+        R = rotation.as_matrix()[row]
+        n = columns.covariance.shape[1] // 3
+        blocks = columns.covariance.reshape(-1, n, 3, n, 3)
+        turned = np.einsum("fab,fibjc,fdc->fiajd", R, blocks, R, optimize=True)
+        moved = replace(
+            columns,
+            position_m=position_m[row][:, None] + np.einsum("fab,fkb->fka", R, columns.position_m),
+            moment_Am2=np.einsum("fab,fkb->fka", R, columns.moment_Am2),
+            covariance=turned.reshape(columns.covariance.shape),
+        )
+        return replace(self, solutions=moved, frame=frame)
+
+    @property
+    def first(self) -> IntArray:
+        """Index (n,) of the solution of the smallest χ² of every row in `solutions`, where it is solved."""
+        return self._edges[:-1]
+
+    def replaced(self, rows: IntArray, fixes: Sequence[Fix]) -> Fixes:
+        """With the fixes of some rows replaced by others."""
+        kept = self.solutions.chosen(~np.isin(self.solutions.of_row, rows))
+        come = Solutions.of(
+            [(int(row), solution) for row, fix in zip(rows, fixes, strict=True) for solution in fix.solutions]
+        )
+        columns: dict[str, Any] = {}
+        for name in ("detected", "failed_starts", "reason", "dropped_sensors"):
+            columns[name] = getattr(self, name).copy()
+            for row, fix in zip(rows, fixes, strict=True):
+                columns[name][row] = getattr(fix, name)
+        return replace(self, solutions=Solutions.joined([kept, come]), **columns)
+
+    def table(self) -> str:
+        """The table that ``magloc locate`` prints."""
+        return "\n".join(lines_of_fixes(self))
+
+    def plot(self) -> Figure:
+        """Fixes in three planes with 95 % ellipses, their standard deviations and their χ²."""
+        figure: Figure = by_name("magloc.plots.fixes:figure_of_fixes")(self)
+        return figure
+
+    def to_xarray(self, which: Literal["best", "all"] = "best") -> xr.Dataset:
+        """Columns with units and names, along `row`, for "all" also along `solution`, and along `source`.
+
+        Parameters
+        ----------
+        which : {"best", "all"}
+            The heaviest solution of every row, or all of them, padded with NaN.
+        """
+        from magloc.localization.fit.export import dataset_of_fixes
+
+        return dataset_of_fixes(self, which)
+
+    def to_geojson(self) -> dict[str, Any]:
+        """The best solutions as points, a FeatureCollection in the frame of the fixes: x, y, z in metres."""
+        from magloc.localization.fit.export import geojson_of_fixes
+
+        return geojson_of_fixes(self)
+
+    def __repr__(self) -> str:
+        return "\n".join(lines_of_fixes(self, most=10))
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"

@@ -1,0 +1,47 @@
+"""Optima of the likelihood: what every search returns, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.localization.fit.gauss_newton import JointFits
+from magloc.measurement.rows import WhitenedRows
+
+UNDETERMINED = "the differences between the sensors do not determine the source: no signal, or a degenerate array"
+
+
+@dataclass(frozen=True, eq=False)
+class Optima:
+    """Optima of b rows: f fits of K sources, row after row, of every row best χ² first.
+
+    Attributes
+    ----------
+    rows : WhitenedRows
+    fits : JointFits
+    of_row : ndarray of int, shape (f,)
+        Place of a fit's row among the b rows.
+    reason : list of str
+        Of every row: why it has no optimum, or fewer sources than were asked for; empty otherwise.
+    merged : ndarray of bool, shape (f, K)
+        Whether a source stands for two that the array does not tell apart.
+    failed_starts : ndarray of int, shape (b,)
+    position_m : ndarray, shape (b, 3), optional
+        Places of the sources where they are known: then the unknowns are the moments alone.
+    undetermined : str
+        Why a row has no solution if its optima have no finite covariance.
+    """
+
+    rows: WhitenedRows
+    fits: JointFits
+    of_row: IntArray
+    reason: list[str]
+    merged: BoolArray
+    failed_starts: IntArray
+    position_m: FloatArray | None = None
+    undetermined: str = UNDETERMINED
+
+    @property
+    def n_unknowns(self) -> int:
+        """Unknowns of a fit."""
+        return 3 if self.position_m is not None else 6 * self.fits.q.shape[1]

@@ -1,0 +1,51 @@
+"""Covariances of moments at known places."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from arrays.typing import FloatArray
+from magloc.localization.fit.gauss_newton import JointFits
+from magloc.measurement.whitened import WhitenedModel
+
+_LEAST_EIGENVALUE = 1e-13
+
+
+def moment_covariances(problem: WhitenedModel, y: FloatArray, fits: JointFits) -> FloatArray:
+    """Inverse of half the second derivative of χ² (b, 3, 3) [A·m²], NaN where it is not positive.
+
+    Where two exact solutions are about to meet, the first derivative of the readings alone would say nothing.
+    """
+    if not len(problem):
+        return np.empty((0, 3, 3))
+    fields = problem.source_fields(fits.q, fits.mu)
+    jacobian = problem.moment_jacobian(fits.q, problem.linear_gain(fields))
+    information = jacobian.transpose(0, 2, 1) @ jacobian
+    scalar = problem.channel_is_scalar
+    if scalar.any():
+        owner = problem.channel_sensor[scalar]
+        residual = problem.whitened(y - problem.predicted(fields))[:, scalar]
+        total = (fields + problem.ambient)[:, owner]
+        modulus = np.linalg.norm(total, axis=-1, keepdims=True)
+        matrix = np.stack(
+            [problem.source_fields(fits.q, np.broadcast_to(axis, fits.mu.shape)) for axis in np.eye(3)], axis=-1
+        )[:, owner]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            direction = total / modulus
+            across = matrix - direction[..., None] * (direction[..., None, :] @ matrix)
+            weight = residual * problem.gain[:, scalar, 0] / modulus[..., 0]
+            information = information - np.einsum("bc,bcji,bcjk->bik", weight, across, across)
+    length = np.sqrt(np.abs(np.diagonal(information, axis1=1, axis2=2)))
+    scale = length[:, :, None] * length[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        unit = information / scale
+    positive = np.isfinite(unit).all(axis=(1, 2))
+    values, vectors = np.linalg.eigh(np.where(positive[:, None, None], unit, np.eye(3)))
+    positive &= values[:, 0] > _LEAST_EIGENVALUE
+    safe = np.where(positive[:, None], values, 1.0)
+    inverse = (vectors / safe[:, None]) @ vectors.transpose(0, 2, 1)
+    size = problem.moment(fits.q[:, 0], np.ones((len(y), 3)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        covariance: FloatArray = inverse / scale * size[:, :, None] * size[:, None]
+    covariance[~positive] = np.nan
+    return covariance
