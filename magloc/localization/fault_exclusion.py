@@ -23,7 +23,6 @@ from magloc.localization.fit.gauss_newton import refine
 from magloc.localization.fit.results import Fix
 from magloc.measurement.rows import (
     NO_SIGNAL,
-    channels_above_ambient,
     rows_of_equal_mask,
     whitened_model,
     whitenings_of,
@@ -163,12 +162,7 @@ class _Examination:
         self.array, self.readings, self.ambient = array, readings, ambient
         self.refit, self.of_all = refit, rows
         self.free_position = free_position
-        self.problem, self.raw = whitened_model(
-            array,
-            channels_above_ambient(array, mask, readings, ambient),
-            whitenings_of(array, mask, readings),
-            ambient,
-        )
+        self.problem, self.raw = whitened_model(array, mask, readings, whitenings_of(array, mask, readings), ambient)
         self.count = np.bincount(array.channel_sensor[mask], minlength=array.n_sensors)
         level = 1.0 - _SENSOR_FALSE_ALARM / array.n_sensors
         self.limits = np.array(chdtri(np.maximum(self.count, 1), 1.0 - level), dtype=np.float64)

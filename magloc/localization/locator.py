@@ -224,11 +224,14 @@ def fit_at_rest(
     origins_m: FloatArray,
     R_world_from_array: FloatArray,
     ambient_T: FloatArray | None = None,
+    *,
+    prior: SourcePrior = NOTHING_KNOWN,
 ) -> Fix:
     """Fix of one source at rest from several rows of an array that moves, all together, in the world frame.
 
     A few scalar sensors do not locate a source in one row, but they do while they pass it. Every row keeps a common
-    field of its own. Parameters are those of :func:`magloc.localization.search.moving_array.stacked_rows`.
+    field of its own. Parameters are those of :func:`magloc.localization.search.moving_array.stacked_rows`, and a prior
+    in the world frame.
     """
     rows = stacked_rows(array, readings_T, origins_m, R_world_from_array, ambient_T)
     found = _Rows(1)
@@ -236,7 +239,7 @@ def fit_at_rest(
         reason = f"{len(readings_T)} rows give {rows.n_differences} independent differences, {N_UNKNOWNS} are needed"
         found.refuse(rows.index, reason)
     else:
-        found.fill(rows, lambda loud: [optima_at_rest(loud)])
+        found.fill(rows, lambda loud: [optima_at_rest(loud, prior)])
     return found.fixes()[0]
 
 

@@ -30,8 +30,6 @@ class WhitenedRows:
     mask : ndarray of bool, shape (C,)
         Channels that have a reading.
     readings_T : ndarray, shape (b, C)
-    channels_T : ndarray, shape (b, C)
-        What vector channels read above the ambient field, and all that scalar channels read; 0 where missing.
     model : WhitenedModel
     y : ndarray, shape (b, C)
         Of unit noise, free of the common field.
@@ -41,7 +39,6 @@ class WhitenedRows:
     index: IntArray
     mask: BoolArray
     readings_T: FloatArray
-    channels_T: FloatArray
     model: WhitenedModel
     y: FloatArray
     n_differences: int
@@ -56,7 +53,6 @@ class WhitenedRows:
             self,
             index=self.index[at],
             readings_T=self.readings_T[at],
-            channels_T=self.channels_T[at],
             model=self.model.rows(at),
             y=self.y[at],
         )
@@ -83,9 +79,8 @@ def whitened_rows(
             index = rows[begin : begin + at_once]
             readings, ambient = readings_T[index], None if ambient_T is None else ambient_T[index]
             of_rows = whitenings_of(array, mask, readings)
-            channels = channels_above_ambient(array, mask, readings, ambient)
-            model, raw = whitened_model(array, channels, of_rows, ambient)
-            yield WhitenedRows(index, mask, readings, channels, model, model.whitened(raw), of_rows[0].n_differences)
+            model, raw = whitened_model(array, mask, readings, of_rows, ambient)
+            yield WhitenedRows(index, mask, readings, model, model.whitened(raw), of_rows[0].n_differences)
 
 
 def checked_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
@@ -128,26 +123,34 @@ def ambient_fields(array: SensorArray, n_rows: int, ambient_T: FloatArray | None
 
 
 def channels_above_ambient(
-    array: SensorArray, mask: BoolArray, readings_T: FloatArray, ambient_T: FloatArray | None
+    array: SensorArray, mask: BoolArray, readings_T: FloatArray, ambient_T: FloatArray
 ) -> FloatArray:
-    """What vector channels (n, C) read above the ambient field, and all that scalar channels read; 0 off the mask."""
-    fields = ambient_fields(array, len(readings_T), ambient_T)
+    """What vector channels (n, C) read above the ambient field at the sensors (n, N, 3), and all that scalars read.
+
+    Zero where the mask (n, C) or (C,) has no reading.
+    """
     vector = ~array.channel_is_scalar
-    ambient = np.einsum("ncj,cj->nc", fields[:, array.channel_sensor], array.channel_gain) * vector
+    ambient = np.einsum("ncj,cj->nc", ambient_T[:, array.channel_sensor], array.channel_gain) * vector
     channels: FloatArray = np.where(mask, readings_T - array.channel_offset_T - ambient, 0.0)
     return channels
 
 
 def whitened_model(
-    array: SensorArray, channels_T: FloatArray, whitenings: list[Whitening], ambient_T: FloatArray | None
+    array: SensorArray,
+    mask: BoolArray,
+    readings_T: FloatArray,
+    whitenings: list[Whitening],
+    ambient_T: FloatArray | None,
 ) -> tuple[WhitenedModel, FloatArray]:
-    """Exact model of rows, and their channels (n, C) divided by the noise.
+    """Exact model of rows of readings (n, C), and their channels (n, C) divided by the noise.
 
-    :meth:`WhitenedModel.whitened` frees these from the common field. `channels_T` are those of
-    :func:`channels_above_ambient`, `whitenings` one for every row, `ambient_T` (n, 3) stands in place of the array's.
+    :meth:`WhitenedModel.whitened` frees these from the common field. There is one whitening for every row, and
+    `ambient_T` (n, 3) stands in place of the array's ambient field.
     """
+    fields = ambient_fields(array, len(readings_T), ambient_T)
+    channels = channels_above_ambient(array, mask, readings_T, fields)
     if all(w is whitenings[0] for w in whitenings):
-        raw = channels_T @ whitenings[0].root.T
+        raw = channels @ whitenings[0].root.T
     else:
-        raw = np.stack([w.root @ row for w, row in zip(whitenings, channels_T, strict=True)])
-    return WhitenedModel.of(array, whitenings, ambient_fields(array, len(channels_T), ambient_T)), raw
+        raw = np.stack([w.root @ row for w, row in zip(whitenings, channels, strict=True)])
+    return WhitenedModel.of(array, whitenings, fields), raw

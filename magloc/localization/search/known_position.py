@@ -62,6 +62,10 @@ class MomentSearch:
         """The search in some of the rows."""
         if self.position_m.ndim == 1:
             return self
+        if len(self.position_m) <= index.max(initial=-1):
+            raise ValueError(
+                f"Input position_m must have a place for every row; instead received {len(self.position_m)}."
+            )
         return MomentSearch(self.array, self.position_m[index], prior=self.prior)
 
     def optima(self, rows: WhitenedRows) -> list[Optima]:

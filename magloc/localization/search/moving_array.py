@@ -64,7 +64,7 @@ def stacked_rows(
     n, available = len(readings_T), np.isfinite(readings_T)
     whitenings = [whitenings_of(array, mask, row[None])[0] for mask, row in zip(available, readings_T, strict=True)]
     fields = ambient_fields(array, n, ambient_T)
-    channels = channels_above_ambient(array, available, readings_T, ambient_T)
+    channels = channels_above_ambient(array, available, readings_T, fields)
     raw = np.concatenate([w.root @ row for w, row in zip(whitenings, channels, strict=True)])
     # A vector channel reads a · Rᵀ B of the world's field B; a modulus does not see the turn.
     turned = np.where(
@@ -92,7 +92,6 @@ def stacked_rows(
         np.zeros(1, dtype=np.intp),
         available.ravel(),
         readings_T.reshape(1, -1),
-        channels.reshape(1, -1),
         model,
         model.whitened(raw[None]),
         sum(w.n_differences for w in whitenings),

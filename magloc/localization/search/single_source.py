@@ -23,7 +23,7 @@ from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
 from magloc.localization.search import single_source_compiled as kernels
 from magloc.localization.search.candidates import SingleArray, allowed_positions, linear_bases
-from magloc.measurement.rows import WhitenedRows, whitened_rows
+from magloc.measurement.rows import WhitenedRows, channels_above_ambient, whitened_rows
 from magloc.measurement.whitened import WhitenedModel
 
 N_UNKNOWNS = 6
@@ -170,7 +170,10 @@ class SingleSourceSearch:
     def _search(self, rows: WhitenedRows, reading_of_row: IntArray, first: FloatArray, keep_within: float) -> _Found:
         """Optima of some of the rows, starts of their own refined before the best candidates."""
         ranking, model = self._ranking(rows.mask), rows.model
-        ranked = ranking.whitening.apply(rows.channels_T) if self.array.noise_depends_on_reading else rows.y
+        ranked = rows.y
+        if self.array.noise_depends_on_reading:
+            channels = channels_above_ambient(self.array, rows.mask, rows.readings_T, model.ambient)
+            ranked = ranking.whitening.apply(channels)
         shape = (len(reading_of_row), self.n_starts + first.shape[1])
         found = _Found(
             q=np.full((*shape, 4), np.nan),

@@ -417,7 +417,7 @@ class TestProcess:
         def interrupt(*_: object) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("magloc.localization.search.single_source.Locator.fit_rows", interrupt)
+        monkeypatch.setattr("magloc.localization.locator.Locator.fit_rows", interrupt)
         outcome = run("locate", readings, "--array", array)
         assert outcome.status == 130
         assert outcome.err == "magloc: interrupted\n"

@@ -13,7 +13,7 @@ from arrays.sensor import Sensor
 from magloc.localization.fit.results import Fix
 from magloc.localization.residuals import fix_residuals
 from tests.oracles import magpylib_field
-from tests.plain_locator import plain_locator
+from tests.plain_locator import columns_of, plain_locator
 
 NOISE_T = 1e-10
 ARRAY = tetrahedron(1.5, noise_T=NOISE_T)
@@ -79,15 +79,15 @@ class TestSquares:
 
 class TestRows:
     def test_a_row_without_a_solution_has_none(self) -> None:
-        assert np.isnan(fix_residuals(ARRAY, readings(ARRAY, 1), [Fix((), "no signal")])).all()
+        assert np.isnan(fix_residuals(ARRAY, readings(ARRAY, 1), columns_of([Fix((), "no signal")]))).all()
 
     def test_a_dropped_sensor_has_none(self) -> None:
         rows = readings(ARRAY, 1)
         (fix,) = plain_locator(ARRAY).fit_rows(rows)
         name = ARRAY.ids[1]
-        residuals = fix_residuals(ARRAY, rows, [replace(fix, dropped=(name,))])
+        residuals = fix_residuals(ARRAY, rows, columns_of([replace(fix, dropped_sensors=(name,))]))
         np.testing.assert_array_equal(np.isnan(residuals[0]), ARRAY.channel_sensor == 1)
 
     def test_refuses_other_shapes(self) -> None:
         with pytest.raises(ValueError, match="readings_T must have shape"):
-            fix_residuals(ARRAY, np.zeros((1, 5)), [Fix(())])
+            fix_residuals(ARRAY, np.zeros((1, 5)), columns_of([Fix(())]))

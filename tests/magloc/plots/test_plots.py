@@ -36,6 +36,7 @@ from magloc.plots.maps import _SOURCE_ENDS, convergence_figure
 from magloc.plots.style import save
 from magloc.plots.tracks import consistency_figure, track_figure
 from magloc.tracking.results import TrackPoint
+from tests.plain_locator import columns_of, one_source
 
 FloatArray = NDArray[np.float64]
 # Linear RGB as seen without one of the three kinds of cones, severity 1.
@@ -67,8 +68,8 @@ def track(n: int = 12, lost: tuple[int, ...] = (0, 5, 6)) -> list[TrackPoint]:
 
 
 def solution(position: FloatArray, *, observable: bool = True, high: float | None = None) -> Solution:
-    interval = ((0.5, high if high is not None or not observable else 6.0),)
-    return Solution(position, np.array([1.0, 2.0, 3.0]), COVARIANCE, 4.0, 6, 3, True, observable, interval)
+    interval = ((3.5 if observable else 0.5, high if high is not None or not observable else 6.0),)
+    return one_source(position, [1.0, 2.0, 3.0], COVARIANCE, chi2=4.0, dof=6, range_interval_m=interval)
 
 
 def line(ax: Axes, label: str) -> Line2D:
@@ -330,7 +331,7 @@ class TestFixes:
 
     def figure(self, fixes: list[Fix], truth_m: FloatArray | None = None) -> Figure:
         n = len(fixes)
-        columns = fix_columns(list(np.arange(float(n))), fixes)
+        columns = fix_columns(columns_of(fixes))
         return fix_figure(columns, np.broadcast_to(self.SENSORS, (n, 4, 3)), truth_m)
 
     def test_planes_show_fixes_sensors_and_ellipses_to_one_scale(self) -> None:
@@ -370,13 +371,13 @@ class TestFixes:
         assert "of 1 rows" in panel(figure, "χ² / degrees of freedom [1]").get_title(loc="left")
 
     def test_a_known_place_shows_the_moment(self) -> None:
-        known = Solution(np.ones(3), np.array([0.0, 3.0, 4.0]), np.eye(3), 4.0, 9, 1, True, True, ())
+        known = one_source(np.ones(3), [0.0, 3.0, 4.0], np.eye(3), chi2=4.0, dof=9, range_interval_m=())
         ax = panel(self.figure([Fix((known,))]), "moment [A·m²]")
         (bars,) = [artist for artist in ax.collections if isinstance(artist, LineCollection)]
         np.testing.assert_allclose(bars.get_segments()[0][:, 1], 5.0 + norm.ppf([0.025, 0.975]))
 
     def test_distance_counts_known_coordinates_only(self) -> None:
-        columns = fix_columns([0.0], [Fix((solution(np.array([3.0, 4.0, 9.0])),))])
+        columns = fix_columns(columns_of([Fix((solution(np.array([3.0, 4.0, 9.0])),))]))
         assert distances_from_truth(columns, np.array([[0.0, 0.0, np.nan]])) == pytest.approx(5.0)
         assert np.isnan(distances_from_truth(columns, np.full((1, 3), np.nan)))
 

@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from magloc.localization.fit.prior import NOTHING_KNOWN
-from magloc.localization.fit.results import Fix, Solution
+from magloc.localization.fit.results import Fix
 from magloc.tracking import acquisition as acquisition_module
 from magloc.tracking.acquisition import Acquisition, Start
 from magloc.tracking.results import Row
 from tests.magloc.localization.search.test_moving_array import N_ROWS, SOURCE, SQUARE, passing
 from tests.passing_source import ARRAY, MOMENT, POSITION, readings_of
+from tests.plain_locator import one_source
 
 FloatArray = NDArray[np.float64]
 
@@ -119,23 +120,17 @@ class TestTwoProposalsMustAgree:
         """Rows (of square_rows, counted from one) after which a track starts, for given proposals."""
 
         def started(heights: list[float], **changes: object) -> list[int]:
-            solution = Solution(
-                position_m=np.zeros(3),
-                moment_Am2=np.ones(3),
-                covariance=1e-6 * np.eye(6),
-                chi2=30.0,
-                dof=30,
-                iterations=3,
-                converged=True,
-                range_observable=True,
-                range_interval95_m=((1.0, 1.1),),
-            )
+            interval = changes.pop("range_interval_m", ((1.0, 1.1),))
+            covariance = changes.pop("covariance", 1e-6 * np.eye(6))
+            values = {"chi2": 30.0, "dof": 30, **changes}
+
             proposals = iter(heights)
 
             def fix(*_: object, **__: object) -> Fix:
-                return Fix((replace(solution, position_m=np.array([0.0, 0.0, -next(proposals)]), **changes),))  # type: ignore[arg-type]
+                place = [0.0, 0.0, -next(proposals)]
+                return Fix((one_source(place, np.ones(3), covariance, range_interval_m=interval, **values),))
 
-            monkeypatch.setattr(acquisition_module, "stacked_fix", fix)
+            monkeypatch.setattr(acquisition_module, "fit_at_rest", fix)
             acquisition = Acquisition(SQUARE, NOTHING_KNOWN, 1e-6)
             starts = [acquisition.start(row)[0] for row in square_rows(4 * len(heights))]
             return [i + 1 for i, start in enumerate(starts) if start is not None]

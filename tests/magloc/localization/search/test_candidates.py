@@ -77,7 +77,7 @@ def failures(case, n, seed):
     problem = WhitenedModel.of(array, [whitening(array)], array.ambient_fields[None])
     failed = []
     for i, fix in enumerate(plain_locator(array).fit_rows(readings)):
-        y = problem.whitening.apply(readings[i])
+        y = whitening(array).apply(readings[i])
         chi2, _, end = refined(problem, problem.homogeneous(p[i]), y, np.empty(3), 300)
         if end == variable_projection_compiled.CONVERGED and not (
             fix.solutions and fix.solutions[0].chi2 <= chi2 + 0.05

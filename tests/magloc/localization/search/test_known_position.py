@@ -267,7 +267,7 @@ class TestRows:
         places = PLACE + rng.normal(size=(6, 3))
         moment = random_moments(rng, 6)
         readings = noisy_readings(array, places, moment, rng)
-        fixes = plain_locator(array, position_m=PLACE).fit_rows(readings, position_m=places)
+        fixes = plain_locator(array, position_m=places).fit_rows(readings)
         for place, row, fix in zip(places, readings, fixes, strict=True):
             (alone,) = plain_locator(array, position_m=place).fit_rows(row[None])
             assert_allclose(moments_of(fix), moments_of(alone), rtol=1e-9)
@@ -330,7 +330,7 @@ class TestKnowledge:
 
 
 class TestBadInput:
-    @pytest.mark.parametrize("place", [[1.0, 2.0], [1.0, np.nan, 2.0], [[1.0, 2.0, 3.0]]])
+    @pytest.mark.parametrize("place", [[1.0, 2.0], [1.0, np.nan, 2.0], [[1.0, 2.0]], [[[1.0, 2.0, 3.0]]]])
     def test_place(self, place):
         with pytest.raises(ValueError, match="Input position_m must be three finite numbers"):
             plain_locator(scalar_tetrahedron(1e-10), position_m=place)

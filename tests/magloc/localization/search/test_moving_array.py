@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from arrays import geometries
 from arrays.array import SensorArray
 from magloc.localization.fit.prior import SourcePrior
-from magloc.localization.search.moving_array import stacked_fix
+from magloc.localization.locator import fit_at_rest
 from tests.oracles import magpylib_field
 
 FloatArray = NDArray[np.float64]
@@ -43,7 +43,7 @@ def passing(array: SensorArray, n: int = N_ROWS) -> Rows:
 class TestExact:
     def test_a_moving_array_of_scalar_sensors(self) -> None:
         """Three differences in a row do not determine a source, 36 do: to 1e-6 m and 1e-6 of the moment."""
-        (best, *_) = stacked_fix(SQUARE, *passing(SQUARE)).solutions
+        (best, *_) = fit_at_rest(SQUARE, *passing(SQUARE)).solutions
         np.testing.assert_allclose(best.position_m, SOURCE[:3], rtol=0.0, atol=1e-6)
         np.testing.assert_allclose(best.moment_Am2, SOURCE[3:], rtol=0.0, atol=1e-6 * np.linalg.norm(SOURCE[3:]))
         assert best.dof == 3 * N_ROWS - 6
@@ -51,14 +51,14 @@ class TestExact:
 
     def test_a_moving_pair_of_vector_sensors(self) -> None:
         pair = geometries.tetrahedron(1.5, "vector", 1e-11).subset(["s1", "s2"])
-        (best, *_) = stacked_fix(pair, *passing(pair)).solutions
+        (best, *_) = fit_at_rest(pair, *passing(pair)).solutions
         np.testing.assert_allclose(best.position_m, SOURCE[:3], rtol=0.0, atol=1e-6)
         np.testing.assert_allclose(best.moment_Am2, SOURCE[3:], rtol=0.0, atol=1e-6 * np.linalg.norm(SOURCE[3:]))
 
     def test_missing_readings_leave_the_others(self) -> None:
         readings, *poses = passing(SQUARE)
         readings[3, 1], readings[7] = np.nan, np.nan
-        (best, *_) = stacked_fix(SQUARE, readings, *poses).solutions
+        (best, *_) = fit_at_rest(SQUARE, readings, *poses).solutions
         np.testing.assert_allclose(best.position_m, SOURCE[:3], rtol=0.0, atol=1e-6)
         assert best.dof == 3 * N_ROWS - 6 - 1 - 3
 
@@ -66,7 +66,7 @@ class TestExact:
         """Whatever is common to the sensors of a row drops out."""
         pair = geometries.tetrahedron(1.5, "vector", 1e-11).subset(["s1", "s2"])
         readings, origins, R, _ = passing(pair)
-        (best, *_) = stacked_fix(pair, readings, origins, R).solutions
+        (best, *_) = fit_at_rest(pair, readings, origins, R).solutions
         np.testing.assert_allclose(best.position_m, SOURCE[:3], rtol=0.0, atol=1e-6)
 
 
@@ -81,7 +81,7 @@ class TestNoise:
         misfit, error, dof = 0.0, 0.0, 0
         n_fits = 25
         for _ in range(n_fits):
-            (best, *_) = stacked_fix(SQUARE, readings + 1e-11 * rng.normal(size=readings.shape), *poses).solutions
+            (best, *_) = fit_at_rest(SQUARE, readings + 1e-11 * rng.normal(size=readings.shape), *poses).solutions
             misfit, dof = misfit + best.chi2, dof + best.dof
             off = np.concatenate([best.position_m, best.moment_Am2]) - SOURCE
             error += float(off @ np.linalg.solve(best.covariance, off))
@@ -94,24 +94,24 @@ class TestRefusal:
     def test_too_few_rows(self) -> None:
         readings, *poses = passing(SQUARE)
         readings[5, 3] = np.nan
-        fix = stacked_fix(SQUARE, readings[4:6], *(pose[4:6] for pose in poses))
+        fix = fit_at_rest(SQUARE, readings[4:6], *(pose[4:6] for pose in poses))
         assert fix.solutions == ()
         assert fix.reason == "2 rows give 5 independent differences, 6 are needed"
 
     def test_no_signal(self) -> None:
         _, origins, R, ambient = passing(SQUARE)
         readings = SQUARE.readings_of(np.repeat(ambient[:, None], 4, axis=1))
-        fix = stacked_fix(SQUARE, readings, origins, R, ambient)
+        fix = fit_at_rest(SQUARE, readings, origins, R, ambient)
         assert fix.solutions == ()
         assert fix.reason
 
     def test_what_is_known_bounds_the_source(self) -> None:
         """A half-space that the source is not in, and a moment that is too small for it."""
         readings, *poses = passing(SQUARE)
-        fix = stacked_fix(SQUARE, readings, *poses, knowledge=SourcePrior(low_m=(2.0, -math.inf, -math.inf)))
+        fix = fit_at_rest(SQUARE, readings, *poses, prior=SourcePrior(low_m=(2.0, -math.inf, -math.inf)))
         assert all(solution.position_m[0] >= 2.0 for solution in fix.solutions)
         assert all(solution.chi2 > 1e3 for solution in fix.solutions)
-        fix = stacked_fix(SQUARE, readings, *poses, knowledge=SourcePrior(largest_moment_Am2=1.0))
+        fix = fit_at_rest(SQUARE, readings, *poses, prior=SourcePrior(largest_moment_Am2=1.0))
         assert all(np.linalg.norm(solution.moment_Am2) <= 1.0 for solution in fix.solutions)
         assert all(solution.chi2 > 1e3 for solution in fix.solutions)
 
@@ -120,5 +120,5 @@ class TestRefusal:
 def test_the_fix_moves_with_the_world(shift: FloatArray) -> None:
     """Also in coordinates of hundreds of kilometres, as those of a map."""
     readings, origins, R, ambient = passing(SQUARE)
-    (best, *_) = stacked_fix(SQUARE, readings, origins + shift, R, ambient).solutions
+    (best, *_) = fit_at_rest(SQUARE, readings, origins + shift, R, ambient).solutions
     np.testing.assert_allclose(best.position_m - shift, SOURCE[:3], rtol=0.0, atol=1e-5)

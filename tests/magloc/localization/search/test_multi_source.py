@@ -20,9 +20,10 @@ from arrays.array import SensorArray
 from arrays.geometries import cube, tetrahedron
 from arrays.sensor import Sensor
 from magloc.chi_square import RISE_95
+from magloc.localization.fit.columns import in_stable_order
 from magloc.localization.fit.prior import SourcePrior
-from magloc.localization.fit.results import JointFix, JointSolution, Source
-from magloc.localization.search.multi_source import FALSE_ALARM, in_stable_order, most_sources
+from magloc.localization.fit.results import Fix, Solution, Source
+from magloc.localization.search.multi_source import FALSE_ALARM, most_sources
 from tests.magloc.localization.fit.test_gauss_newton import (
     AMBIENT,
     array_of,
@@ -33,7 +34,7 @@ from tests.magloc.localization.fit.test_gauss_newton import (
     scipy_optimum,
     whitened_residuals,
 )
-from tests.plain_locator import plain_locator
+from tests.plain_locator import columns_of, plain_locator
 
 
 def plate(noise_T=5e-10):
@@ -326,13 +327,13 @@ class TestLabels:
     def test_covariances_move_with_their_sources(self):
         def fix(*xs):
             sources = tuple(
-                Source(np.array([x, 0.0, 0.0]), np.array([0.0, 0.0, abs(x)]), x * np.eye(6), True, ((1.0, 2.0),))
-                for x in xs
+                Source(np.array([x, 0.0, 0.0]), np.array([0.0, 0.0, abs(x)]), x * np.eye(6), ((1.0, 2.0),)) for x in xs
             )
             covariance = np.diag(np.repeat(xs, 6))
-            return JointFix((JointSolution(sources, covariance, 1.0, 5, 1),))
+            return Fix((Solution(sources, covariance, 1.0, 5),))
 
-        ordered = in_stable_order([fix(1.0, 4.0), JointFix((), "none"), fix(1.1, 4.1), fix(4.2, 1.2)])
+        fixes = columns_of([fix(1.0, 4.0), Fix((), "none"), fix(1.1, 4.1), fix(4.2, 1.2)])
+        ordered = replace(fixes, solutions=in_stable_order(fixes.solutions))
         assert ordered[1].reason == "none"
         for found, expected in zip(
             (ordered[0], ordered[2], ordered[3]), ([4.0, 1.0], [4.1, 1.1], [4.2, 1.2]), strict=True
@@ -365,7 +366,7 @@ class TestRows:
             assert_allclose(self.sorted_positions(fix), self.sorted_positions(self.together[i]), rtol=1e-4)
 
     def test_in_any_number_at_once(self, monkeypatch):
-        monkeypatch.setattr("magloc.localization.search.multi_source._ROWS_AT_ONCE", 3)
+        monkeypatch.setattr("magloc.localization.locator._ROWS_OF_SEVERAL", 3)
         for fix, whole in zip(plain_locator(PLATE, sources="auto").fit_rows(self.readings), self.together, strict=True):
             assert_allclose(self.sorted_positions(fix), self.sorted_positions(whole), rtol=1e-4)
 

@@ -29,6 +29,7 @@ from magloc.localization.fit import variable_projection_compiled
 from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.fit.variable_projection import best_moment, projected_chi2, unit_basis
 from magloc.localization.search.candidates import candidate_positions
+from magloc.localization.search.single_source import SingleSourceSearch
 from magloc.measurement import whitened_compiled
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 from magloc.measurement.whitened import WhitenedModel
@@ -70,15 +71,15 @@ def scipy_chi2(array, readings, position, moment):
 
 def refined(problem, q, y, mu, max_iterations=100):
     """The compiled refinement of q (in place) without known optima: χ², linearisations, how it ended."""
-    common = np.ascontiguousarray(problem.whitening.basis.T)
+    common = np.ascontiguousarray(problem.basis[0].T)
     return variable_projection_compiled.refine(
         q,
         y,
         problem.sensors,
         problem.channel_sensor,
-        problem.gain,
+        problem.gain[0],
         common,
-        problem.whitening.shrinkage,
+        problem.shrinkage[0],
         3,
         variable_projection_compiled.OPTIMUM_TOLERANCE,
         max_iterations,
@@ -225,7 +226,7 @@ class TestUncertainty:
         readings = noisy_readings(TETRAHEDRON, p, m, rng)
         problem = WhitenedModel.of(TETRAHEDRON, [whitening(TETRAHEDRON)], TETRAHEDRON.ambient_fields[None])
         for row, fix in zip(readings, plain_locator(TETRAHEDRON).fit_rows(readings), strict=True):
-            y = problem.whitening.apply(row)
+            y = whitening(TETRAHEDRON).apply(row)
             s = fix.solutions[0]
             radius = np.linalg.norm(s.position_m - problem.centroid)
             for end in s.range_interval_m[0]:
@@ -296,14 +297,16 @@ class TestWhatCannotBeSolved:
     def test_iterations_that_run_out_are_not_a_fix(self):
         rng = np.random.default_rng(0)
         p, m = random_sources(rng, 1, 4.0, 6.0)
-        fix = plain_locator(TETRAHEDRON, max_iterations=1).fit(noisy_readings(TETRAHEDRON, p, m, rng)[0])
+        hasty = plain_locator(TETRAHEDRON)
+        hasty._search = SingleSourceSearch(TETRAHEDRON, max_iterations=1)
+        fix = hasty.fit(noisy_readings(TETRAHEDRON, p, m, rng)[0])
         assert fix.solutions == ()
         assert fix.failed_starts > 0
         assert "did not converge" in fix.reason
 
     def test_scalar_sensors_are_refused(self):
         with pytest.raises(ValueError, match="vector sensors only"):
-            plain_locator(tetrahedron(1.5, kind="scalar"))
+            SingleSourceSearch(tetrahedron(1.5, kind="scalar"))
 
     def test_wrong_shape_is_named(self):
         with pytest.raises(ValueError, match=r"shape \(n, 12\)"):
@@ -353,7 +356,7 @@ class TestFitFrom:
         p, m = np.array([5.0, 0.0, 0.306]), np.array([0.0, 0.0, 100.0])
         readings = predicted_channels(TETRAHEDRON, p, m)
         starts = np.random.default_rng(0).uniform(-20, 20, (50, 3))
-        ends = plain_locator(TETRAHEDRON).fit_from(readings, starts)
+        ends = SingleSourceSearch(TETRAHEDRON).optima_from(readings, starts)
         assert_allclose(ends.position_m, np.tile(p, (50, 1)), atol=1e-4)
         assert (ends.linearisations > 0).all()
 
@@ -405,8 +408,10 @@ class TestReadableTwin:
         random_array(2, 6), [whitening(random_array(2, 6))], random_array(2, 6).ambient_fields[None]
     )
 
+    white = whitening(random_array(2, 6))
+
     def common(self):
-        return np.ascontiguousarray(self.problem.whitening.basis.T), self.problem.whitening.shrinkage
+        return np.ascontiguousarray(self.white.basis.T), self.white.shrinkage
 
     @given(SEEDS)
     @settings(max_examples=25, deadline=None)
@@ -414,16 +419,23 @@ class TestReadableTwin:
         rng = np.random.default_rng(seed)
         q = rng.normal(size=4)
         q /= np.linalg.norm(q)
-        y = self.problem.whitening.apply(1e-9 * rng.normal(size=18))
+        y = self.white.apply(1e-9 * rng.normal(size=18))
         basis = np.empty((3, 18))
         whitened_compiled.unit_basis(
-            q, self.problem.sensors, self.problem.channel_sensor, self.problem.gain, *self.common(), basis
+            q, self.problem.sensors, self.problem.channel_sensor, self.problem.gain[0], *self.common(), basis
         )
         expected = unit_basis(self.problem, q).T
         assert_allclose(basis, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
         bases = np.empty((1, 3, 18))
         whitened_compiled.candidate_bases(
-            0, 1, q[None], self.problem.sensors, self.problem.channel_sensor, self.problem.gain, *self.common(), bases
+            0,
+            1,
+            q[None],
+            self.problem.sensors,
+            self.problem.channel_sensor,
+            self.problem.gain[0],
+            *self.common(),
+            bases,
         )
         assert y @ y - np.sum((bases[0] @ y) ** 2) == pytest.approx(
             float(projected_chi2(self.problem, q, y)), rel=1e-7, abs=1e-9
@@ -436,9 +448,9 @@ class TestReadableTwin:
         q, mu = rng.normal(size=4), rng.normal(size=3)
         jacobian = np.empty((4, 18))
         whitened_compiled.homogeneous_jacobian(
-            q, mu, self.problem.sensors, self.problem.channel_sensor, self.problem.gain, jacobian
+            q, mu, self.problem.sensors, self.problem.channel_sensor, self.problem.gain[0], jacobian
         )
-        free = jacobian.T - (self.problem.whitening.basis @ (self.problem.whitening.basis.T @ jacobian.T))
+        free = jacobian.T - (self.white.basis @ (self.white.basis.T @ jacobian.T))
         scale = np.abs(unit_basis(self.problem, q) @ mu).max()
         expected = oracles.derivative(lambda x: unit_basis(self.problem, x) @ mu / scale, q, 1e-2, 1e-9)
         assert_allclose(free / scale, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
@@ -449,7 +461,7 @@ class TestReadableTwin:
         rng = np.random.default_rng(seed)
         array = random_array(2, 6)
         p, m = random_sources(rng, 1, 3.0, 6.0, moment=3000.0)
-        y = self.problem.whitening.apply(noisy_readings(array, p, m, rng)[0] - array.channel_offset_T)
+        y = self.white.apply(noisy_readings(array, p, m, rng)[0] - array.channel_offset_T)
         q = self.problem.homogeneous(p[0] + 0.1 * rng.normal(size=3))
         before = float(projected_chi2(self.problem, q, y))
         mu = np.empty(3)

@@ -25,15 +25,12 @@ from arrays.sensor import Sensor
 from arrays.whitening import whitening
 from magloc.chi_square import RISE_95
 from magloc.directions import fibonacci_directions
-from magloc.localization.fit.results import Fix, Solution
+from magloc.localization.fit.results import EVERYWHERE, Fix, Intervals, Solution, Source, is_observable_set
 from magloc.localization.fit.variable_projection import projected_chi2
 from magloc.localization.uncertainty.ambiguity import weights
 from magloc.localization.uncertainty.range_interval import (
-    EVERYWHERE,
-    Intervals,
     gaussian_ranges,
     is_detected,
-    is_observable_set,
     levels,
     ranges_of,
     rise,
@@ -706,6 +703,6 @@ class TestTrack:
 
 def test_solutions_say_what_they_are() -> None:
     """Defaults of a solution that somebody else makes: the only one, and not known to be Gaussian."""
-    solution = Solution(np.zeros(3), np.ones(3), np.eye(6), 0.0, 3, 1, True, True, ((1.0, 2.0),))
+    solution = Solution((Source(np.zeros(3), np.ones(3), np.eye(6), ((1.0, 2.0),)),), np.eye(6), 0.0, 3)
     assert solution.weight == 1.0
     assert not solution.gaussian

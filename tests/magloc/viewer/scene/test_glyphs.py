@@ -29,6 +29,7 @@ from magloc.viewer.scene import framing, shapes
 from magloc.viewer.scene import glyphs as scene
 from magloc.viewer.scene.legend import ColourScale, Swatch, legend_html, with_legend
 from magloc.viewer.server import opened
+from tests.plain_locator import one_source
 
 FloatArray = NDArray[np.float64]
 
@@ -64,7 +65,7 @@ def map_result(n: int = 9) -> MapResult:
 def solution(position: FloatArray, *, observable: bool = True) -> Solution:
     covariance = np.diag([0.25, 0.01, 0.01, 1.0, 1.0, 1.0])
     interval = (4.0, 6.0) if observable else (2.0, None)
-    return Solution(position, np.array([0.0, 0.0, 7.0]), covariance, 3.0, 3, 5, True, observable, (interval,))
+    return one_source(position, [0.0, 0.0, 7.0], covariance, chi2=3.0, dof=3, range_interval_m=(interval,))
 
 
 def time_of(action: Callable[[], object], repeats: int = 5) -> float:
