@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats.mstats import hdquantiles
 
 from arrays.geometries import cube, tetrahedron
-from magloc.bounds.crlb import bounds_of
+from magloc.bounds.crlb import cramer_rao_bounds
 from magloc.design.descent import Sample, descend, feasible, is_spaced
 from magloc.design.evaluation import references, worst_case
 from magloc.design.optimise import DesignSearch, design, random_sample, sobol_sample, starts_of
@@ -61,7 +61,7 @@ class TestRangeDeviation:
     def test_equals_the_bounds(self, task, shape):
         sensors = shape + rng(1).normal(0.0, 0.1, shape.shape)
         sample = random_sample(task, 500, rng(2))
-        expected = bounds_of(task.array(sensors), sample.positions, sample.moments).sigma_range_m
+        expected = cramer_rao_bounds(task.array(sensors), sample.positions, sample.moments).sigma_range_m
         np.testing.assert_allclose(sample.deviations(task, sensors), expected, rtol=1e-7)
 
     @pytest.mark.parametrize(("task", "shape"), [(TASK, TETRAHEDRON), (SCALAR, CUBE)])

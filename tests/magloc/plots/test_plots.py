@@ -27,12 +27,11 @@ from scipy.stats import chi2, norm
 from skimage.color import rgb2lab
 
 from magloc.convergence.over_starts import Status
-from magloc.grids.cube import MapSummary
 from magloc.localization.fit.results import Fix, Solution
 from magloc.plots import style
 from magloc.plots.calibration import calibration_figure, turning_figure
 from magloc.plots.fixes import distances_from_truth, fix_columns, fix_figure, residual_figure
-from magloc.plots.maps import _SOURCE_ENDS, convergence_figure
+from magloc.plots.maps import _SOURCE_ENDS, convergence
 from magloc.plots.style import save
 from magloc.plots.tracks import consistency_figure, track_figure
 from magloc.tracking.results import TrackPoint
@@ -211,18 +210,23 @@ class TestMaps:
         status[:, 0, 1] = Status.OTHER_OPTIMUM, Status.NOT_STOPPED, Status.DIVERGED
         passes[2, 2, 1] = 40
         return xr.Dataset(
-            {"status": (("x", "y", "z"), status), "iterations": (("x", "y", "z"), passes)},
+            {
+                "status": (("x", "y", "z"), status),
+                "iterations": (("x", "y", "z"), passes),
+                "half": (("x", "y", "z"), np.ones((3, 3, 3), dtype=np.int8)),
+            },
             {"x": axis, "y": axis, "z": axis},
             {
                 "position_m": [0.0, 0.0, 0.0],
                 "centroid_m": [-1.0, 0.0, 0.0],
                 "moment_Am2": [100.0, 0.0, 0.0],
                 "method": "repeated",
+                "seconds": 1.0,
             },
         )
 
     def figure(self) -> Figure:
-        return convergence_figure(self.dataset(), MapSummary(27, 24, 0.8, 0.9, 0.5, 12.0, 300, 1.0))
+        return convergence(self.dataset())
 
     def test_values_are_shown_where_the_start_converged(self) -> None:
         figure = self.figure()

@@ -1,0 +1,13 @@
+from magloc import plots as plots
+from magloc.bounds.crlb import Bounds as Bounds
+from magloc.bounds.crlb import cramer_rao_bounds as cramer_rao_bounds
+from magloc.bounds.maps import bound_map as bound_map
+from magloc.convergence.over_sources import source_map as source_map
+from magloc.convergence.over_starts import convergence_map as convergence_map
+from magloc.design.task import DesignTask as DesignTask
+from magloc.detection.detection_range import detection_range as detection_range
+from magloc.detection.matched_filter import MatchedFilterDetector as MatchedFilterDetector
+from magloc.directions import moments_on_sphere as moments_on_sphere
+from magloc.fields import dipole as dipole
+from magloc.fields import geomagnetic as geomagnetic
+from magloc.fields.body import equivalent_dipole as equivalent_dipole
