@@ -6,11 +6,13 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "Bounds": "magloc.bounds.crlb",
+        "Design": "magloc.design.optimise",
         "DesignTask": "magloc.design.task",
         "MatchedFilterDetector": "magloc.detection.matched_filter",
         "bound_map": "magloc.bounds.maps",
         "convergence_map": "magloc.convergence.over_starts",
         "cramer_rao_bounds": "magloc.bounds.crlb",
+        "design_array": "magloc.design.optimise",
         "detection_range": "magloc.detection.detection_range",
         "dipole": ":magloc.fields.dipole",
         "equivalent_dipole": "magloc.fields.body",

@@ -4,6 +4,8 @@ from magloc.bounds.crlb import cramer_rao_bounds as cramer_rao_bounds
 from magloc.bounds.maps import bound_map as bound_map
 from magloc.convergence.over_sources import source_map as source_map
 from magloc.convergence.over_starts import convergence_map as convergence_map
+from magloc.design.optimise import Design as Design
+from magloc.design.optimise import design_array as design_array
 from magloc.design.task import DesignTask as DesignTask
 from magloc.detection.detection_range import detection_range as detection_range
 from magloc.detection.matched_filter import MatchedFilterDetector as MatchedFilterDetector
