@@ -6,10 +6,13 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "Bounds": "magloc.bounds.crlb",
+        "Calibration": "magloc.calibration.results",
+        "CalibrationPrior": "magloc.calibration.array",
         "Design": "magloc.design.optimise",
         "DesignTask": "magloc.design.task",
         "MatchedFilterDetector": "magloc.detection.matched_filter",
         "bound_map": "magloc.bounds.maps",
+        "calibrate": "magloc.calibration.calibrate",
         "convergence_map": "magloc.convergence.over_starts",
         "cramer_rao_bounds": "magloc.bounds.crlb",
         "design_array": "magloc.design.optimise",

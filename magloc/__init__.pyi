@@ -2,6 +2,9 @@ from magloc import plots as plots
 from magloc.bounds.crlb import Bounds as Bounds
 from magloc.bounds.crlb import cramer_rao_bounds as cramer_rao_bounds
 from magloc.bounds.maps import bound_map as bound_map
+from magloc.calibration.array import CalibrationPrior as CalibrationPrior
+from magloc.calibration.calibrate import calibrate as calibrate
+from magloc.calibration.results import Calibration as Calibration
 from magloc.convergence.over_sources import source_map as source_map
 from magloc.convergence.over_starts import convergence_map as convergence_map
 from magloc.design.optimise import Design as Design
