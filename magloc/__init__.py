@@ -11,6 +11,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "Design": "magloc.design.optimise",
         "DesignTask": "magloc.design.task",
         "MatchedFilterDetector": "magloc.detection.matched_filter",
+        "Source": "magloc.localization.fit.results",
         "bound_map": "magloc.bounds.maps",
         "calibrate": "magloc.calibration.calibrate",
         "convergence_map": "magloc.convergence.over_starts",

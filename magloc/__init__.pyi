@@ -16,3 +16,4 @@ from magloc.directions import moments_on_sphere as moments_on_sphere
 from magloc.fields import dipole as dipole
 from magloc.fields import geomagnetic as geomagnetic
 from magloc.fields.body import equivalent_dipole as equivalent_dipole
+from magloc.localization.fit.results import Source as Source

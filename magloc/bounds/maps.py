@@ -231,10 +231,6 @@ class BoundsSummary:
     fraction: float
     seconds: float
 
-    def lines(self) -> list[str]:
-        """The counts in words."""
-        return [f"{self.accurate} of {self.points} sources known as well as required ({self.fraction:.1%})"]
-
 
 def bound_map(
     array: SensorArray,

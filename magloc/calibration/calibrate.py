@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
@@ -94,8 +93,8 @@ def _by_source(
     position = truth.position_m[in_truth].copy()
     unknown = np.isnan(position[:, 2])
     position[unknown, 2] = 0.0
-    if rows.array_position_m is not None:
-        position = np.einsum("tba,tb->ta", attitude[in_readings], position - rows.array_position_m[in_readings])
+    if rows.pose is not None:
+        position = np.einsum("tba,tb->ta", attitude[in_readings], position - rows.pose[0][in_readings])
     return calibrate_on_path(
         array,
         rows.values_T[in_readings],
@@ -110,9 +109,9 @@ def _by_source(
 
 def _world_from_array(readings: Readings) -> FloatArray:
     """Attitude of the array in every row (n, 3, 3); without a pose its axes are the world's."""
-    if readings.array_rotation_xyzw is None:
+    if readings.pose is None:
         return np.broadcast_to(np.eye(3), (len(readings), 3, 3))
-    return Rotation.from_quat(readings.array_rotation_xyzw).as_matrix()
+    return readings.pose[1].as_matrix()
 
 
 def _turned(nominal: SensorArray, rows: Readings, modulus_T: FloatArray) -> TurningCalibration:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from magloc.convergence.over_sources import SourcesSummary
     from magloc.convergence.over_starts import StartsSummary
+    from magloc.grids.cube import Summary
 
 
 Over = Literal["starts", "sources"]
@@ -111,14 +112,17 @@ _KEYS = dict.fromkeys(
 
 def _over_starts(scenario: str, method: str | None, noise_seed: int | None) -> tuple[str, Callable[..., xr.Dataset]]:
     """Name of the method, and the map without the arguments that all maps have."""
+    import numpy as np
+
     from magloc.convergence.filters import FILTERS
     from magloc.convergence.scenario_files import read_starts_scenario
 
     if method is not None and method not in FILTERS:
         raise InputError(f"--method: found {method!r}, expected one of {', '.join(FILTERS)}.")
     task = read_starts_scenario(scenario, method=method, noise_seed=noise_seed)
+    source = magloc.Source(np.asarray(task.position_m), np.asarray(task.moment_Am2))
     options: dict[str, Any] = {"method": task.method, "edge_m": 2.0 * task.half_width_m, "noise_seed": noise_seed}
-    return task.method.name, partial(magloc.convergence_map, task.array, task, **options)
+    return task.method.name, partial(magloc.convergence_map, task.array, source, **options)
 
 
 def _over_sources(scenario: str, method: str | None, seed: int) -> Callable[..., xr.Dataset]:
@@ -144,7 +148,7 @@ def _summary(dataset: xr.Dataset) -> StartsSummary | SourcesSummary:
     return over_starts.summary(dataset) if "half" in dataset else over_sources.summary(dataset)
 
 
-def _how_done(before: int, n_chunks: int, counts: StartsSummary | SourcesSummary, folder: Path) -> str:
+def _how_done(before: int, n_chunks: int, counts: Summary, folder: Path) -> str:
     per_iteration_us = 1e6 * counts.seconds / max(1, counts.iterations_total)
     text = f"{counts.iterations_total} iterations in {counts.seconds:.2f} s ({per_iteration_us:.3g} µs each)"
     if before == n_chunks:

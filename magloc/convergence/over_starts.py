@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from importlib.metadata import version
 from os import PathLike
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ from arrays.geometries import tetrahedron
 from arrays.noise import reading_covariance, reading_errors
 from magloc.grids.computed import computed_map
 from magloc.grids.cube import Box, Tally, Values, Variable, check_half_width, histogram, tallied
-from magloc.localization.fit.results import Solution
+from magloc.localization.fit.results import Solution, Source
 from magloc.localization.locator import Locator
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 
@@ -266,21 +266,9 @@ def _tally(values: Values) -> Tally:
     )
 
 
-class _Dipole(Protocol):
-    """What a map needs of a source."""
-
-    @property
-    def position_m(self) -> Any:
-        """Three numbers [m], in the array's frame."""
-
-    @property
-    def moment_Am2(self) -> Any:
-        """Three numbers [A·m²]."""
-
-
 def convergence_map(
     array: SensorArray,
-    source: _Dipole,
+    source: Source,
     *,
     method: str | Filter = "repeated",
     edge_m: float = 40.0,
@@ -326,7 +314,7 @@ def convergence_map(
     """
     if isinstance(method, str) and method not in FILTERS:
         raise ValueError(f"Input method must be one of {', '.join(FILTERS)}; instead received {method!r}.")
-    (x, y, z), (mx, my, mz) = (np.asarray(v, float).tolist() for v in (source.position_m, source.moment_Am2))
+    (x, y, z), (mx, my, mz) = source.position_m.tolist(), source.moment_Am2.tolist()
     chosen = FILTERS[method] if isinstance(method, str) else method
     scenario = StartsScenario(array, (x, y, z), (mx, my, mz), check_half_width(edge_m), chosen, noise_seed)
     return computed_map(StartsMap.of(scenario, n), out, scheduler, progress)

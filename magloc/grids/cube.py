@@ -112,6 +112,14 @@ def histogram(iterations: NDArray[Any]) -> Counter[int]:
 class Summary(Protocol):
     """Counts of a whole map."""
 
+    @property
+    def iterations_total(self) -> int:
+        """Of all points."""
+
+    @property
+    def seconds(self) -> float:
+        """Duration of the computation alone; that of all machines together."""
+
     def lines(self) -> list[str]:
         """The counts in words."""
 

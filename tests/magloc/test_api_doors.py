@@ -13,7 +13,6 @@ maps                                  the same map streamed to a folder, resumed
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,7 +29,7 @@ from magloc.readings import Readings, Truth
 
 ARRAY = arrays.tetrahedron(1.5, noise_T=1e-9)
 MOMENT = np.array([0.3, -0.2, 0.5])
-SOURCE = SimpleNamespace(position_m=[5, 0, 0.306], moment_Am2=[100, 0, 0])
+SOURCE = magloc.Source([5, 0, 0.306], [100, 0, 0])
 
 
 class Passage:
