@@ -131,6 +131,8 @@ class StartsMap:
         """Map of a scenario; the errors of :func:`convergence_map`."""
         if grid < 2:
             raise ValueError(f"Input grid must be at least 2; instead received {grid}.")
+        if scenario.array.channel_is_scalar.any():
+            raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
         locator = Locator(scenario.array, exclude_faulty=False)
         readings, measurement, z = simulated_measurement(scenario)
         fix = locator.fit(readings)
