@@ -143,6 +143,31 @@ def axial(baseline_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9)
     return _array("axial", half * np.array([[0, 0, 1], [0, 0, -1]]), kind, noise_T)
 
 
+def grid(nx: int, ny: int, pitch_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9) -> SensorArray:
+    """Sensors on a flat board: a grid in the x-y plane with rows along x; x changes fastest.
+
+    Parameters
+    ----------
+    nx, ny : int
+        Sensors along x and y, at least 1 and together at least 2.
+    pitch_m : float
+        Distance between neighbours [m].
+    kind : {"vector", "scalar"}
+        Kind of the sensors.
+    noise_T : float
+        Standard deviation of a reading [T].
+
+    Returns
+    -------
+    SensorArray
+    """
+    if min(nx, ny) < 1 or nx * ny < 2:
+        raise ValueError(f"Inputs nx and ny must be at least 1, together at least 2; instead received {nx} and {ny}.")
+    pitch = _size("pitch_m", pitch_m)
+    y, x = np.meshgrid(np.arange(ny) - 0.5 * (ny - 1), np.arange(nx) - 0.5 * (nx - 1), indexing="ij")
+    return _array("grid", pitch * np.stack([x.ravel(), y.ravel(), np.zeros(nx * ny)], axis=1), kind, noise_T)
+
+
 class _Maker(Protocol):
     def __call__(self, size_m: float, /, kind: SensorKind = ..., noise_T: float = ...) -> SensorArray: ...
 

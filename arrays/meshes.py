@@ -62,7 +62,7 @@ def sensor_mesh(sensor: Sensor, size_m: float) -> trimesh.Trimesh:
     return glyph
 
 
-def array_mesh(array: SensorArray, size_m: float | None = None) -> trimesh.Trimesh:
+def mesh_of(array: SensorArray, size_m: float | None = None) -> trimesh.Trimesh:
     """All sensors of an array as one mesh.
 
     Parameters

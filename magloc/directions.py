@@ -22,6 +22,33 @@ def _fibonacci(n: int, lowest: float) -> FloatArray:
     return np.stack([radius * np.cos(_GOLDEN_ANGLE * i), radius * np.sin(_GOLDEN_ANGLE * i), z], axis=-1)
 
 
+def moments_on_sphere(moment_Am2: float, n: int = 50, *, half: bool = False) -> FloatArray:
+    """Moments of one size in evenly spread directions: a Fibonacci lattice.
+
+    Parameters
+    ----------
+    moment_Am2 : float
+        Their size [A·m²].
+    n : int
+        At least 1.
+    half : bool
+        Cover half of the sphere, which is enough for bounds of vector sensors: they are the same for m and -m.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        [A·m²]
+
+    Raises
+    ------
+    ValueError
+        n is less than 1.
+    """
+    if n < 1:
+        raise ValueError(f"Input n must be at least 1; instead received {n}.")
+    return moment_Am2 * _fibonacci(n, 0.0 if half else -1.0)
+
+
 def fibonacci_directions(n: int) -> FloatArray:
     """Nearly uniform unit vectors, shape (n, 3), on a Fibonacci spiral."""
     i = np.arange(n) + 0.5

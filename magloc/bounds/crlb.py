@@ -142,7 +142,7 @@ def fisher_information(
     return W.mT @ W
 
 
-def bounds_of(
+def cramer_rao_bounds(
     array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, *, ambient_uncertainty_T: float = 0.0
 ) -> Bounds:
     """Cramér-Rao bounds of a source, or of many over leading axes.

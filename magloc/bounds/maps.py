@@ -5,18 +5,19 @@ bound comes as four variables, ``sigma_range`` for the given moment, and over th
 ``_q95`` that 95 % of them stay below, and the ``_worst`` of those sampled (that of all may be infinite: see
 :mod:`magloc.bounds.crlb`).
 
-Three maps: a cube around the array (:class:`BoundMap`, box by box, so that its memory does not grow with it), planes
-through its centroid, and spheres about it with the reach in every direction.
+Two maps: a cube around the array (:class:`BoundMap`, box by box, so that its memory does not grow with it), and planes
+through its centroid. Spheres about it: :mod:`magloc.bounds.spheres`.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
 from importlib.metadata import version
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,8 +26,10 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.typing import FloatArray
-from magloc.bounds.over_moments import moment_directions, table_and_spreads
-from magloc.grids.cube import Box, MapSummary, Tally, Values, Variable, in_memory
+from magloc.bounds.over_moments import table_and_spreads
+from magloc.directions import moments_on_sphere
+from magloc.grids.computed import computed_map
+from magloc.grids.cube import Box, Tally, Values, Variable, check_half_width, tallied
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -41,16 +44,9 @@ CASES_IN_WORDS = {
 """What each ending of the variables stands for."""
 CASES = tuple(CASES_IN_WORDS)
 """Endings of the variables: the given moment, and the statistics over the directions of the moment."""
-ANGLES = ("elevation", "azimuth")
-"""Dimensions of a sphere."""
 PLANES = ("xy", "xz", "yz")
 _UNITS = {"range": "m", "bearing": "rad", "position": "m"}
 _EDGE = 32
-# Distances, in circumradii, at which the reach is looked for before it is refined, and their ratio.
-_NEAREST, _STEP = 1.1, 1.12
-_FARTHEST = 1e6
-_REFINEMENTS = 2
-_ALL_DONE = 8  # distances without a single direction in reach, after which no farther ones are tried
 
 
 class Reached(IntEnum):
@@ -80,7 +76,7 @@ class BoundScenario:
     n_moments : int
         Directions of the moment.
     ambient_uncertainty_T : float
-        See :func:`magloc.bounds.crlb.bounds_of`.
+        See :func:`magloc.bounds.crlb.cramer_rao_bounds`.
 
     Raises
     ------
@@ -107,7 +103,8 @@ class BoundScenario:
     @cached_property
     def moments_Am2(self) -> FloatArray:
         """Moments of the given size in every direction, shape (n_moments, 3)."""
-        return float(np.linalg.norm(self.moment_Am2)) * moment_directions(self.array, self.n_moments)
+        size, half = float(np.linalg.norm(self.moment_Am2)), not self.array.channel_is_scalar.any()
+        return moments_on_sphere(size, self.n_moments, half=half)
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -156,14 +153,6 @@ def bounds_at(scenario: BoundScenario, positions_m: ArrayLike) -> dict[str, Floa
     return values
 
 
-@dataclass(frozen=True)
-class BoundMapSummary(MapSummary):
-    """Counts of a cube, which knows neither halves nor iterations.
-
-    ``starts`` are the points that have a bound, ``converged`` those with the required accuracy for 95 % of the moments.
-    """
-
-
 @dataclass(frozen=True, eq=False)
 class BoundMap:
     """Bounds over a cube of sources, as :class:`magloc.grids.cube.CubeMap`.
@@ -199,7 +188,7 @@ class BoundMap:
     @property
     def variables(self) -> Mapping[str, Variable]:
         """Variables over the cube."""
-        return _VARIABLES
+        return VARIABLES
 
     @property
     def attributes(self) -> Mapping[str, Any]:
@@ -220,38 +209,62 @@ class BoundMap:
         """Bounds of the sources of a box."""
         sigma = bounds_at(self.scenario, self.scenario.array.centroid + box.points(self.axis))
         values = {**sigma, "reached": _reached(sigma, self.scenario.accuracy_m)}
-        return {name: values[name].reshape(box.shape).astype(_VARIABLES[name].dtype) for name in _VARIABLES}
-
-    def tally(self, values: Values) -> Tally:
-        """Counts of a part's values."""
-        reached = values["reached"]
-        counts = {"points": reached != Reached.UNDEFINED, "accurate": reached >= Reached.MOST}
-        return Tally(Counter({name: int(mask.sum()) for name, mask in counts.items()}))
-
-    def summary(self, tally: Tally, seconds: float) -> BoundMapSummary:
-        """Summary of the whole cube."""
-        return BoundMapSummary(
-            starts=tally.counts["points"],
-            converged=tally.counts["accurate"],
-            fraction=tally.fraction("accurate", "points"),
-            front_fraction=float("nan"),
-            back_fraction=float("nan"),
-            median_iterations=float("nan"),
-            iterations_total=0,
-            seconds=seconds,
-        )
+        return {name: values[name].reshape(box.shape).astype(VARIABLES[name].dtype) for name in VARIABLES}
 
 
-def bound_map(scenario: BoundScenario, grid: int = 41, progress: Callable[[int], None] | None = None) -> xr.Dataset:
-    """Bounds of sources in a cube around the array.
+@dataclass(frozen=True)
+class BoundsSummary:
+    """Counts of a cube of bounds.
+
+    Attributes
+    ----------
+    points, accurate : int
+        Points that have a bound, and those of them with the required accuracy for 95 % of the moments.
+    fraction : float
+        Of the latter.
+    seconds : float
+        Duration of the computation alone; that of all machines together.
+    """
+
+    points: int
+    accurate: int
+    fraction: float
+    seconds: float
+
+
+def bound_map(
+    array: SensorArray,
+    moment_Am2: tuple[float, float, float],
+    *,
+    edge_m: float = 2.0 * BoundScenario.half_width_m,
+    n: int = 41,
+    accuracy_m: float = BoundScenario.accuracy_m,
+    n_moments: int = BoundScenario.n_moments,
+    ambient_uncertainty_T: float = 0.0,
+    out: str | PathLike[str] | None = None,
+    scheduler: str | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> xr.Dataset:
+    """Cramér-Rao bounds of sources in a cube around an array: where can it know a source how well?
 
     Parameters
     ----------
-    scenario : BoundScenario
-    grid : int
-        Sources along every axis, at least 2. For maps that do not fit into memory see :mod:`magloc.grids.store`.
-    progress : callable, optional
-        Called with the number of sources finished since the last call.
+    array : SensorArray
+    moment_Am2 : tuple of 3 floats
+        Moment of the source; its size is that of the moments of other directions, too [A·m²].
+    edge_m : float
+        Edge of the cube, which is centred on the array's centroid [m].
+    n : int
+        Sources along every axis, at least 2.
+    accuracy_m : float
+        Required standard deviation of the range [m].
+    n_moments : int
+        Directions of the moment.
+    ambient_uncertainty_T : float
+        See :func:`magloc.bounds.crlb.cramer_rao_bounds`.
+    out, scheduler, progress
+        See :func:`magloc.grids.computed.computed_map`: a zarr folder that streams and resumes, the address of a dask
+        scheduler, and a call with the number of sources finished.
 
     Returns
     -------
@@ -262,9 +275,25 @@ def bound_map(scenario: BoundScenario, grid: int = 41, progress: Callable[[int],
     Raises
     ------
     ValueError
-        The grid is less than 2.
+        An input is out of range.
     """
-    return in_memory(BoundMap(scenario, grid), progress)
+    mx, my, mz = np.asarray(moment_Am2, dtype=np.float64).tolist()
+    half_width_m = check_half_width(edge_m)
+    scenario = BoundScenario(array, (mx, my, mz), half_width_m, accuracy_m, n_moments, ambient_uncertainty_T)
+    return computed_map(BoundMap(scenario, n), out, scheduler, progress)
+
+
+def summary(dataset: xr.Dataset) -> BoundsSummary:
+    """Counts of a map made by :func:`bound_map`, which need not fit into memory."""
+    tally = tallied(dataset, ("reached",), _tally)
+    accurate, points = tally.counts["accurate"], tally.counts["points"]
+    return BoundsSummary(points, accurate, tally.fraction("accurate", "points"), float(dataset.attrs["seconds"]))
+
+
+def _tally(values: Values) -> Tally:
+    reached = values["reached"]
+    counts = {"points": reached != Reached.UNDEFINED, "accurate": reached >= Reached.MOST}
+    return Tally(Counter({name: int(mask.sum()) for name, mask in counts.items()}))
 
 
 def bound_slices(scenario: BoundScenario, grid: int = 121) -> xr.Dataset:
@@ -299,7 +328,7 @@ def bound_slices(scenario: BoundScenario, grid: int = 121) -> xr.Dataset:
     values = bounds_at(scenario, scenario.array.centroid + places)
     dimensions = ("plane", "up", "across")
     return xr.Dataset(
-        {name: (dimensions, sigma, dict(_VARIABLES[name].attributes)) for name, sigma in values.items()},
+        {name: (dimensions, sigma, dict(VARIABLES[name].attributes)) for name, sigma in values.items()},
         coords={
             "plane": ("plane", list(PLANES), {"long_name": "axes of the plane, across and up"}),
             "across": ("across", axis, {"long_name": "first axis, from the centroid", "units": "m"}),
@@ -309,132 +338,13 @@ def bound_slices(scenario: BoundScenario, grid: int = 121) -> xr.Dataset:
     )
 
 
-def bound_spheres(scenario: BoundScenario, ranges_m: Sequence[float], step_deg: float = 5.0) -> xr.Dataset:
-    """Bounds on spheres about the array's centroid, and the reach in every direction.
-
-    Parameters
-    ----------
-    scenario : BoundScenario
-    ranges_m : sequence of float
-        Radii of the spheres [m].
-    step_deg : float
-        Between directions along either angle, a part of 90.
-
-    Returns
-    -------
-    xarray.Dataset
-        Over (range, elevation, azimuth) the variables of :func:`bounds_at`; over (elevation, azimuth) the reach
-        ``accuracy_range`` with each of :data:`CASES`, see :func:`accuracy_ranges`. Azimuth counts from +x to +y,
-        elevation from the x-y plane to +z.
-
-    Raises
-    ------
-    ValueError
-        A range is not positive, or 90 is no multiple of the step.
-    """
-    import xarray as xr
-
-    ranges = np.asarray(ranges_m, dtype=np.float64)
-    if ranges.ndim != 1 or not np.all((ranges > 0.0) & np.isfinite(ranges)):
-        raise ValueError(f"Input ranges_m must be positive numbers; instead received {list(ranges_m)}.")
-    n = round(90.0 / step_deg) if step_deg > 0.0 else 0
-    if n < 1 or abs(n * step_deg - 90.0) > 1e-9:
-        raise ValueError(f"Input step_deg must divide 90; instead received {step_deg}.")
-    elevation, azimuth = np.linspace(-90.0, 90.0, 2 * n + 1), np.linspace(-180.0, 180.0, 4 * n + 1)
-    directions = sphere_grid(elevation, azimuth)
-    sphere = bounds_at(scenario, scenario.array.centroid + ranges[:, None, None, None] * directions)
-    reach = accuracy_ranges(scenario, directions.reshape(-1, 3))
-    return xr.Dataset(
-        {name: (("range", *ANGLES), sigma, dict(_VARIABLES[name].attributes)) for name, sigma in sphere.items()}
-        | {
-            f"accuracy_range{case}": (ANGLES, reach[:, i].reshape(directions.shape[:-1]), _reach_attributes(case))
-            for i, case in enumerate(CASES)
-        },
-        coords={
-            "range": ("range", ranges, {"long_name": "distance from the centroid", "units": "m"}),
-            "elevation": ("elevation", elevation, {"long_name": "from the x-y plane to +z", "units": "degree"}),
-            "azimuth": ("azimuth", azimuth, {"long_name": "from +x to +y", "units": "degree"}),
-        },
-        attrs={**scenario.attributes, "centroid_m": scenario.array.centroid},
-    )
-
-
-def accuracy_ranges(scenario: BoundScenario, directions: ArrayLike) -> FloatArray:
-    """Reach in some directions: the largest distance at which σ of the range is as small as required.
-
-    It is looked for at distances from 1.1 circumradii on, each 12 % more than the one before, and interpolated to a
-    part in 10⁴; what happens between two of them that are both in reach is not seen.
-
-    Parameters
-    ----------
-    scenario : BoundScenario
-    directions : array_like, shape (D, 3)
-        Unit vectors from the centroid.
-
-    Returns
-    -------
-    ndarray, shape (D, 4)
-        For each of :data:`CASES` [m]; 0 where no distance will do.
-    """
-    directions = np.asarray(directions, dtype=np.float64)
-    centroid, nearest = scenario.array.centroid, _NEAREST * scenario.array.circumradius
-
-    def excess(distance_m: FloatArray) -> FloatArray:
-        """Logarithm of σ over what is required, shape (D, 4): far away straight over that of the distance."""
-        sigma = bounds_at(scenario, centroid + distance_m[:, None] * directions)
-        of_cases = np.stack([sigma[f"sigma_range{case}"] for case in CASES], axis=-1)
-        return np.log(of_cases / scenario.accuracy_m)
-
-    shape = (len(directions), len(CASES))
-    low, at_low, high, at_high = np.zeros(shape), np.zeros(shape), np.full(shape, nearest), np.full(shape, np.inf)
-    distance, before, misses = nearest, np.zeros(shape, dtype=np.bool_), 0
-    while misses < _ALL_DONE and distance < _FARTHEST * nearest:
-        value = excess(np.full(len(directions), distance))
-        inside = value <= 0.0
-        leaves = before & ~inside
-        low, at_low = np.where(inside, distance, low), np.where(inside, value, at_low)
-        high, at_high = np.where(leaves, distance, high), np.where(leaves, value, at_high)
-        misses = 0 if inside.any() else misses + 1
-        before, distance = inside, distance * _STEP
-    for _ in range(_REFINEMENTS):
-        middle = _crossing(low, at_low, high, at_high)
-        value = np.stack([excess(np.maximum(middle[:, i], nearest))[:, i] for i in range(len(CASES))], axis=-1)
-        inside = value <= 0.0
-        low, at_low = np.where(inside, middle, low), np.where(inside, value, at_low)
-        high, at_high = np.where(inside, high, middle), np.where(inside, at_high, value)
-    return _crossing(low, at_low, high, at_high)
-
-
-def _crossing(low: FloatArray, at_low: FloatArray, high: FloatArray, at_high: FloatArray) -> FloatArray:
-    """Where a line through both ends, over the logarithm of the distance, is zero; zero where low is."""
-    present = low > 0.0
-    rise = np.where(present, at_high - at_low, 1.0)
-    share = np.where(np.isfinite(rise) & (rise > 0.0), -at_low / np.where(rise > 0.0, rise, 1.0), 0.0)
-    ratio = np.where(present, high, 1.0) / np.where(present, low, 1.0)
-    result: FloatArray = low * ratio ** np.clip(share, 0.0, 1.0)
-    return result
-
-
-def sphere_grid(elevation_deg: FloatArray, azimuth_deg: FloatArray) -> FloatArray:
-    """Unit vectors (elevations, azimuths, 3) of angles [°]."""
-    e, a = np.meshgrid(np.radians(elevation_deg), np.radians(azimuth_deg), indexing="ij")
-    return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
-
-
 def _reached(sigma: Mapping[str, FloatArray], accuracy_m: float) -> Any:
     undefined = np.isnan(sigma["sigma_range"])
     count = sum((sigma[f"sigma_range{case}"] <= accuracy_m).astype(np.int8) for case in CASES[1:])
     return np.where(undefined, Reached.UNDEFINED, count)
 
 
-def _reach_attributes(case: str) -> dict[str, str]:
-    return {
-        "long_name": f"largest distance with the required accuracy of the range, {CASES_IN_WORDS[case]}",
-        "units": "m",
-    }
-
-
-_VARIABLES: dict[str, Variable] = {
+VARIABLES: dict[str, Variable] = {
     f"sigma_{name}{case}": Variable(
         np.float64,
         {"long_name": f"Cramer-Rao bound of the {name}, standard deviation, {CASES_IN_WORDS[case]}", "units": unit},

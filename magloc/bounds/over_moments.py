@@ -1,7 +1,7 @@
 """Cramér-Rao bounds of many sources, each with many moments: tables, and statistics over the directions of the moment.
 
-Compiled and parallel; the readable twin of every entry is :func:`magloc.bounds.crlb.bounds_of`, which says what the
-bounds mean and when they are infinite.
+Compiled and parallel; the readable twin of every entry is :func:`magloc.bounds.crlb.cramer_rao_bounds`, which says
+what the bounds mean and when they are infinite.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.bounds.crlb import check_uncertainty
-from magloc.directions import _fibonacci, sphere_directions
 
 QUANTILES = (0.5, 0.95)
 """Quantiles over the directions of the moment: the smallest σ that is not exceeded by this share of the directions."""
@@ -45,31 +44,6 @@ class SigmaTable(NamedTuple):
     position_m: FloatArray
 
 
-def moment_directions(array: SensorArray, n: int = 50) -> FloatArray:
-    """Evenly spread directions of a moment: a Fibonacci lattice.
-
-    Parameters
-    ----------
-    array : SensorArray
-        Bounds of vector sensors are the same for m and -m, so theirs cover half of the sphere.
-    n : int
-        At least 1.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        Unit vectors.
-
-    Raises
-    ------
-    ValueError
-        n is less than 1.
-    """
-    if n < 1:
-        raise ValueError(f"Input n must be at least 1; instead received {n}.")
-    return sphere_directions(n) if array.channel_is_scalar.any() else _fibonacci(n, 0.0)
-
-
 def bounds_over_moments(
     array: SensorArray,
     positions_m: ArrayLike,
@@ -85,9 +59,9 @@ def bounds_over_moments(
     positions_m : array_like, shape (P, 3)
         Sources in the array's frame [m].
     moments_Am2 : array_like, shape (M, 3)
-        Moments that each of them may have [A·m²]: a size times :func:`moment_directions`.
+        Moments that each of them may have [A·m²]: :func:`magloc.directions.moments_on_sphere`.
     ambient_uncertainty_T : float
-        As for :func:`magloc.bounds.crlb.bounds_of`.
+        As for :func:`magloc.bounds.crlb.cramer_rao_bounds`.
 
     Returns
     -------
@@ -124,7 +98,7 @@ def table_and_spreads(
     moments_Am2 : array_like, shape (M, 3)
         Moments of the spreads [A·m²].
     ambient_uncertainty_T : float
-        As for :func:`magloc.bounds.crlb.bounds_of`.
+        As for :func:`magloc.bounds.crlb.cramer_rao_bounds`.
 
     Returns
     -------
@@ -154,7 +128,7 @@ def sigma_table(
 ) -> SigmaTable:
     """Bounds of range, bearing and position for every pair of a position and a moment.
 
-    Compiled and parallel; its readable twin is :func:`magloc.bounds.crlb.bounds_of`.
+    Compiled and parallel; its readable twin is :func:`magloc.bounds.crlb.cramer_rao_bounds`.
 
     Parameters
     ----------
@@ -164,7 +138,7 @@ def sigma_table(
     moments_Am2 : array_like, shape (M, 3)
         Moments that each of them may have [A·m²].
     ambient_uncertainty_T : float
-        As for :func:`magloc.bounds.crlb.bounds_of`.
+        As for :func:`magloc.bounds.crlb.cramer_rao_bounds`.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-r"""Compiled Cramér-Rao bounds of range and bearing; the readable twin is :func:`magloc.bounds.crlb.bounds_of`.
+r"""Compiled Cramér-Rao bounds of range and bearing; the readable twin is :func:`magloc.bounds.crlb.cramer_rao_bounds`.
 
 A channel with the axis a reads a·B. Its derivatives follow from the field and the gradient tensor of a dipole of
 "moment" a, for both are symmetric: with d from the source to the sensor

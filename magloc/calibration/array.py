@@ -23,7 +23,8 @@ from magloc.calibration import least_squares as source_fit
 from magloc.calibration import model as moving_source
 from magloc.calibration.least_squares import Optimum
 from magloc.calibration.model import AXES, GAINS, OFFSET, PER_SENSOR, POSITION, MomentModel, Problem
-from magloc.calibration.observability import Unobservable, unobservable
+from magloc.calibration.observability import unobservable
+from magloc.calibration.results import SourceCalibration
 from magloc.localization.locator import Locator
 
 Quantity = Literal["positions", "gains", "axes", "offsets"]
@@ -34,7 +35,7 @@ _PLACES = {"positions": POSITION, "gains": GAINS, "axes": AXES, "offsets": OFFSE
 
 
 @dataclass(frozen=True)
-class Prior:
+class CalibrationPrior:
     """How well the nominal array is known, and what of it is estimated.
 
     Attributes
@@ -93,60 +94,6 @@ class Prior:
         return free
 
 
-@dataclass(frozen=True, eq=False)
-class CalibrationResult:
-    """A calibrated array, and how far it can be trusted.
-
-    Attributes
-    ----------
-    array : SensorArray
-        With the estimated positions, scale matrices and offsets; all else as in the nominal array.
-    converged : bool
-        Whether the iteration ended at an optimum; else nothing here is a result.
-    iterations : int
-        Linearisations of the last and finest fit.
-    rows : ndarray of bool, shape (n,)
-        Rows that were used.
-    chi2_before, chi2_after : float
-        Σ ((reading - prediction)/noise)² over the rows, with the nominal and the calibrated sensors, the source fitted
-        to either; with ``common_field_T`` and its prior's term. Both with the noise of the calibrated array.
-    dof_before, dof_after : float
-        Readings minus unknowns, where an unknown of a sensor counts by how much of it the readings tell and not the
-        prior.
-    residual_rms_T : ndarray, shape (N,)
-        Root mean square of the calibrated array's residuals, of every sensor [T].
-    change, standard_deviation : ndarray, shape (N, 15)
-        What the estimate adds to the nominal array, and its posterior standard deviation: position x y z [m], relative
-        gain of channel x y z, axes [rad] (x towards y, x towards z, y towards x, …), offset x y z [T]. The standard
-        deviation is 0 where nothing is estimated.
-    estimated : ndarray of bool, shape (N, 15)
-        Which of them were estimated.
-    covariance : ndarray, shape (F, F)
-        Posterior covariance of ``change[estimated]``.
-    unobservable : tuple of Unobservable
-        Directions that only the prior determines.
-    position_m, moment_Am2 : ndarray, shape (T, 3)
-        The source in the rows that were used: in the array's frame, and in the world frame.
-    """
-
-    array: SensorArray
-    converged: bool
-    iterations: int
-    rows: BoolArray
-    chi2_before: float
-    chi2_after: float
-    dof_before: float
-    dof_after: float
-    residual_rms_T: FloatArray
-    change: FloatArray
-    standard_deviation: FloatArray
-    estimated: BoolArray
-    covariance: FloatArray
-    unobservable: tuple[Unobservable, ...]
-    position_m: FloatArray
-    moment_Am2: FloatArray
-
-
 def calibrate_on_path(
     array: SensorArray,
     readings_T: ArrayLike,
@@ -155,38 +102,12 @@ def calibrate_on_path(
     moment_Am2: ArrayLike | None = None,
     moment: Literal["constant", "free"] = "constant",
     unknown_height: bool = False,
-    prior: Prior = Prior(),
+    prior: CalibrationPrior = CalibrationPrior(),
     world_from_array: ArrayLike | None = None,
-) -> CalibrationResult:
-    """Calibrate an array by a source whose path is known.
+) -> SourceCalibration:
+    """Calibrate an array by a source at positions (n, 3) in the array's frame, of a known moment in the world or none.
 
-    Parameters
-    ----------
-    array : SensorArray
-        Nominal array of vector sensors; its noise weights the readings.
-    readings_T : array_like, shape (n, C)
-        Raw readings in channel order [T]; NaN where missing.
-    position_m : array_like, shape (n, 3)
-        Source in the array's frame [m].
-    moment_Am2 : array_like, shape (n, 3), optional
-        Its moment in the world frame [A·m²], where it is known; `moment` is not used then.
-    moment : {"constant", "free"}
-        Whether the unknown moment is one vector in the world frame, of a source that does not turn, or one for every
-        row.
-    unknown_height : bool
-        Whether a constant is to be added to all positions along the world's z, and estimated.
-    prior : Prior
-    world_from_array : array_like, shape (n, 3, 3), optional
-        Attitude of the array in every row; by default its axes are the world's.
-
-    Returns
-    -------
-    CalibrationResult
-
-    Raises
-    ------
-    ValueError
-        The shapes do not agree, the array has scalar sensors, or there are fewer readings than unknowns.
+    With `unknown_height` a constant is added to all positions along the world's z, and estimated.
     """
     readings, attitude = _checked(array, readings_T, world_from_array)
     position = _rows_of_3("position_m", position_m, len(readings))
@@ -207,38 +128,10 @@ def self_calibrate(
     readings_T: ArrayLike,
     *,
     moment: Literal["constant", "free"] = "constant",
-    prior: Prior = Prior(),
+    prior: CalibrationPrior = CalibrationPrior(),
     world_from_array: ArrayLike | None = None,
-) -> CalibrationResult:
-    """Calibrate an array by a source whose path is unknown.
-
-    The path is found with the sensors, starting from fixes with the nominal array. The array as a whole can be moved,
-    turned and scaled without any effect on the readings: there the prior decides, or the trusted sensors do. A mirror
-    image, all sensors and the path inverted through one point, fits equally well too; the nominal array tells which of
-    the two it is.
-
-    Parameters
-    ----------
-    array : SensorArray
-        Nominal array of vector sensors; its noise weights the readings.
-    readings_T : array_like, shape (n, C)
-        Raw readings in channel order [T]; NaN where missing.
-    moment : {"constant", "free"}
-        Whether the moment is one vector in the world frame, of a source that does not turn, or one for each row.
-    prior : Prior
-    world_from_array : array_like, shape (n, 3, 3), optional
-        Attitude of the array in every row; by default its axes are the world's.
-
-    Returns
-    -------
-    CalibrationResult
-
-    Raises
-    ------
-    ValueError
-        The shapes do not agree, the array has scalar sensors, no row can be located with the nominal array, or there
-        are fewer readings than unknowns.
-    """
+) -> SourceCalibration:
+    """Calibrate an array by a source whose path is found as well, starting from fixes with the nominal array."""
     readings, attitude = _checked(array, readings_T, world_from_array)
     problem = _problem(array, readings, attitude, prior, True, False, moment)
     nowhere = np.zeros((len(readings), 3))
@@ -289,7 +182,7 @@ def _problem(
     array: SensorArray,
     readings: FloatArray,
     attitude: FloatArray,
-    prior: Prior,
+    prior: CalibrationPrior,
     unknown_position: bool,
     unknown_height: bool,
     moment: MomentModel,
@@ -337,7 +230,7 @@ def _check_counts(problem: Problem) -> None:
         )
 
 
-def _result(problem: Problem, fitted: tuple[Problem, Optimum], rows: BoolArray) -> CalibrationResult:
+def _result(problem: Problem, fitted: tuple[Problem, Optimum], rows: BoolArray) -> SourceCalibration:
     problem, optimum = fitted
     state = optimum.state
     nominal = replace(problem, free=np.zeros_like(problem.free))
@@ -355,21 +248,24 @@ def _result(problem: Problem, fitted: tuple[Problem, Optimum], rows: BoolArray) 
     squares = (residual**2).reshape(len(residual), -1, 3)
     counts = np.isfinite(problem.readings_T).reshape(squares.shape).sum(axis=(0, 2))
     array_from_world = np.swapaxes(problem.world_from_array, -1, -2)
-    return CalibrationResult(
+    return SourceCalibration(
+        nominal=problem.array,
         array=calibration_steps.calibrated_array(problem.array, state.sensors),
         converged=optimum.converged,
         iterations=optimum.iterations,
         rows=rows,
         chi2_before=moving_source.chi2(nominal, before.state),
-        chi2_after=after,
+        chi2=after,
         dof_before=_n_readings(problem) - problem.n_globals,
-        dof_after=_n_readings(problem) - problem.n_globals - told_numbers,
+        dof=_n_readings(problem) - problem.n_globals - told_numbers,
         residual_rms_T=np.sqrt(squares.sum(axis=(0, 2)) / np.maximum(counts, 1)),
         change=state.sensors,
-        standard_deviation=deviation,
+        sigma=deviation,
         estimated=problem.free,
         covariance=covariance,
         unobservable=unobservable(problem, state, told),
         position_m=state.position_m + state.height_m * array_from_world[..., 2],
         moment_Am2=np.array(state.moment_Am2),
+        readings_T=problem.readings_T,
+        world_from_array=problem.world_from_array,
     )

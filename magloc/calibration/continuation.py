@@ -38,7 +38,7 @@ def calibrated_array(array: SensorArray, change: FloatArray) -> SensorArray:
     ----------
     array : SensorArray
     change : ndarray, shape (N, 15)
-        Of position [m], gains, axes [rad] and offset [T] of every sensor, as in :class:`CalibrationResult`.
+        Of position [m], gains, axes [rad] and offset [T] of every sensor, as in :mod:`magloc.calibration.model`.
 
     Returns
     -------

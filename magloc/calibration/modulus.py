@@ -259,7 +259,7 @@ def _starts(problem: _Problem) -> list[tuple[FloatArray, FloatArray]]:
 
     def algebraic(c: float) -> tuple[FloatArray, FloatArray, float] | None:
         x = of_modulus - c * of_one
-        value, vector = np.linalg.eigh(_symmetric(x[:6]))
+        value, vector = np.linalg.eigh(symmetric(x[:6]))
         if value[0] <= 0.0:
             return None
         offset = (vector / value) @ vector.T @ x[6:]
@@ -294,7 +294,7 @@ def _minimised(problem: _Problem, offset: FloatArray, scale: FloatArray) -> tupl
         while True:
             # By orthogonal transformations, because normal equations would square the condition of a poor coverage.
             step = -np.linalg.lstsq(np.concatenate([triangle, np.sqrt(damping) * weights]), right, rcond=None)[0]
-            trial = _linearised(problem, fit.offset + step[:3], fit.scale + _symmetric(step[3:]))
+            trial = _linearised(problem, fit.offset + step[:3], fit.scale + symmetric(step[3:]))
             settled = float(np.linalg.norm(fit.jacobian @ step)) <= max(_SETTLED, rounding)
             if trial.chi2 <= fit.chi2 or settled or damping > _LARGEST_DAMPING:
                 break
@@ -375,13 +375,13 @@ def _root_covariance(problem: _Problem, fit: _Fit) -> FloatArray | None:
     for deviations in (-2.0, 2.0):
         # χ² must rise by four there, or the uncertainty is bent and no covariance describes it.
         step = deviations * root[:, -1]
-        rise = _linearised(problem, fit.offset + step[:3], fit.scale + _symmetric(step[3:])).chi2 - fit.chi2
+        rise = _linearised(problem, fit.offset + step[:3], fit.scale + symmetric(step[3:])).chi2 - fit.chi2
         if not 4.0 / _LARGEST_BEND < rise < 4.0 * _LARGEST_BEND:
             return None
     return root
 
 
-def _symmetric(entries: FloatArray) -> FloatArray:
+def symmetric(entries: FloatArray) -> FloatArray:
     """Symmetric matrix of its entries xx yy zz xy xz yz."""
     matrix = np.zeros((3, 3))
     matrix[_ROW, _COLUMN] = matrix[_COLUMN, _ROW] = entries

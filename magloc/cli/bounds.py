@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import partial
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+import arrays
+import magloc
 from arrays.io.arguments import Flag, whole_number
-from arrays.io.errors import InputError
+from arrays.io.errors import InputError, naming
+from arrays.io.outputs import refuse_file
+from arrays.io.text import replace_file
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, print_json, progress
-from magloc.cli.options import Grid, complete, print_note
+from magloc.cli.options import Grid, print_note
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -22,10 +26,9 @@ if TYPE_CHECKING:
     from arrays.array import SensorArray
     from arrays.typing import FloatArray
     from magloc.bounds.crlb import Bounds
-    from magloc.bounds.maps import BoundScenario
+    from magloc.bounds.maps import BoundScenario, BoundsSummary
     from magloc.bounds.over_moments import MomentBounds
     from magloc.detection.matched_filter import MatchedFilterDetector
-    from magloc.grids.store import Sweep
 
 
 Directions = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1, lte=10_000))]
@@ -39,21 +42,67 @@ _FRAMES = 24
 _COMPONENTS = "xyz"
 
 
+@Parameter(name="*", group="Array and source")
+@dataclass(frozen=True)
+class SourceOptions:
+    """What stands in place of the scenario's.
+
+    Parameters
+    ----------
+    array : Path
+        Array file (TOML), in place of the scenario's array.
+    position : tuple of 3 floats
+        Where the source is [m], in the array's frame, in place of the scenario's position.
+    moment_Am2 : tuple of 3 floats
+        Its moment [A·m²], in place of the scenario's.
+    ambient_uncertainty_nT : float
+        Standard deviation per axis of the ambient field that the array file states, for scalar sensors [nT].
+    """
+
+    array: Path | None = None
+    position: Vector | None = None
+    moment_Am2: Annotated[Vector | None, Parameter(name="--moment-Am2")] = None
+    ambient_uncertainty_nT: Annotated[float, Parameter(name="--ambient-uncertainty-nT")] = 0.0
+
+
+@Parameter(name="*", group="What is required, and where")
+@dataclass(frozen=True)
+class TaskOptions:
+    """What the maps are to show.
+
+    Parameters
+    ----------
+    range_m : float
+        Distance from the sensors' centroid [m] for the picture of a sphere; by default that of the source.
+    accuracy_m : float
+        Required standard deviation of the range [m].
+    half_width_m : float
+        The cube and the slices reach so far from the centroid [m]; by default twice the range.
+    probability : float
+        Of detection, for the distances at which a source is found.
+    false_alarm_rate : float
+        Share of the rows without a source in which one may be found, 0.0001 or more.
+    moments : int
+        Directions of the moment, 10,000 at most.
+    grid : int
+        Points along every axis of the cube, 2,000 at most.
+    """
+
+    range_m: float | None = None
+    accuracy_m: float = 0.5
+    half_width_m: float | None = None
+    probability: float = 0.9
+    false_alarm_rate: float = 1e-3
+    moments: Directions = 50
+    grid: Grid = 41
+
+
 def bounds(
     scenario: str = "paper",
     /,
     *,
-    array: Path | None = None,
-    position: Vector | None = None,
-    moment_Am2: Annotated[Vector | None, Parameter(name="--moment-Am2")] = None,
-    range_m: float | None = None,
-    accuracy_m: float = 0.5,
-    half_width_m: float | None = None,
-    ambient_uncertainty_nT: Annotated[float, Parameter(name="--ambient-uncertainty-nT")] = 0.0,
-    probability: float = 0.9,
-    false_alarm_rate: float = 1e-3,
-    moments: Directions = 50,
-    grid: Grid = 41,
+    of: SourceOptions = SourceOptions(),
+    task: TaskOptions = TaskOptions(),
     gif: Flag = False,
     out: Path | None = None,
     json: Flag = False,
@@ -71,28 +120,10 @@ def bounds(
     scenario : str
         Built-in scenario or scenario file (TOML) of magloc map, for its array and source. "paper" is the source
         paper's.
-    array : Path
-        Array file (TOML), in place of the scenario's array.
-    position : tuple of 3 floats
-        Where the source is [m], in the array's frame, in place of the scenario's position.
-    moment_Am2 : tuple of 3 floats
-        Its moment [A·m²], in place of the scenario's.
-    range_m : float
-        Distance from the sensors' centroid [m] for the picture of a sphere; by default that of the source.
-    accuracy_m : float
-        Required standard deviation of the range [m].
-    half_width_m : float
-        The cube and the slices reach so far from the centroid [m]; by default twice the range.
-    ambient_uncertainty_nT : float
-        Standard deviation per axis of the ambient field that the array file states, for scalar sensors [nT].
-    probability : float
-        Of detection, for the distances at which a source is found.
-    false_alarm_rate : float
-        Share of the rows without a source in which one may be found, 0.0001 or more.
-    moments : int
-        Directions of the moment, 10,000 at most.
-    grid : int
-        Points along every axis of the cube, 2,000 at most.
+    of : SourceOptions
+        Array and source.
+    task : TaskOptions
+        What is required, and where.
     gif : bool
         Write bounds.gif as well: the sphere, from half to twice the range.
     out : Path
@@ -111,68 +142,73 @@ def bounds(
     """
     import numpy as np
 
-    from arrays.io.outputs import make_folder
-    from magloc.bounds.crlb import bounds_of
     from magloc.bounds.over_moments import bounds_over_moments
     from magloc.convergence.scenario_files import read_starts_scenario
 
     source = read_starts_scenario(scenario)
-    used = source.array if array is None else _array_of(array)
-    place = np.asarray(source.position_m if position is None else position)
-    distance = float(np.linalg.norm(place - used.centroid))
-    for option, value in (("--range-m", range_m), ("--half-width-m", half_width_m), ("--accuracy-m", accuracy_m)):
-        if value is not None and not 0.0 < value < np.inf:
-            raise InputError(f"{option}: found {value:g}, expected a positive length.")
-    if not 1e-4 <= false_alarm_rate < 0.5:
-        raise InputError(f"--false-alarm-rate: found {false_alarm_rate:g}, expected 0.0001 or more, and less than 0.5.")
-    if not false_alarm_rate < probability < 1.0:
-        raise InputError(f"--probability: found {probability:g}, expected it between the false-alarm rate and 1.")
-    if not 0.0 <= ambient_uncertainty_nT < np.inf:
-        raise InputError(f"--ambient-uncertainty-nT: found {ambient_uncertainty_nT:g}, expected zero or more.")
-    _check_place(used, place)
-    radius = distance if range_m is None else range_m
-    nearest_m, farthest_m = (factor * used.circumradius for factor in _REACH)
-    if not nearest_m <= radius <= farthest_m:
-        raise InputError(
-            f"--range-m: found {radius:g}, expected {nearest_m:.3g} to {farthest_m:.3g} m, by the size of the array."
-        )
-    if moment_Am2 is not None and not 0.0 < max(map(abs, moment_Am2)) <= _LARGEST_AM2:
-        raise InputError(
-            f"--moment-Am2: found {_plain(moment_Am2)}, expected three finite numbers, not all zero, up to "
-            f"{_LARGEST_AM2:g} A·m²."
-        )
-    task = _scenario(
-        used,
-        source.moment_Am2 if moment_Am2 is None else moment_Am2,
-        half_width_m=2.0 * radius if half_width_m is None else half_width_m,
-        accuracy_m=accuracy_m,
-        n_moments=moments,
-        ambient_uncertainty_T=1e-9 * ambient_uncertainty_nT,
-    )
-    if used.channel_is_scalar.any() and used.ambient_T is None:
+    array = source.array if of.array is None else _array_of(of.array)
+    place = np.asarray(source.position_m if of.position is None else of.position)
+    radius = _checked(array, place, of, task)
+    wanted = _scenario(array, source.moment_Am2 if of.moment_Am2 is None else of.moment_Am2, radius, of, task)
+    if array.channel_is_scalar.any() and array.ambient_T is None:
         print_note("warning: the array has scalar sensors and no ambient_nT, the ambient field is taken to be zero")
-    options = {"ambient_uncertainty_T": task.ambient_uncertainty_T}
-    of_source = bounds_of(used, place, task.moment_Am2, **options)
-    over_moments = bounds_over_moments(used, place[None], task.moments_Am2, **options)
-    folder = Path(f"bounds-{Path(scenario).stem if array is None else array.stem}-{grid}") if out is None else out
-    make_folder(folder, "--out")
-    detector = _detector(used, false_alarm_rate, common.seed)
-    sweep = _cube(task, grid, folder, quiet=common.quiet)
-    spheres = _pictures(task, detector, probability, radius, folder, gif=gif, quiet=common.quiet)
+    ambient = {"ambient_uncertainty_T": wanted.ambient_uncertainty_T}
+    of_source = magloc.cramer_rao_bounds(array, place, wanted.moment_Am2, **ambient)
+    over_moments = bounds_over_moments(array, place[None], wanted.moments_Am2, **ambient)
+    name = Path(scenario).stem if of.array is None else of.array.stem
+    folder = Path(f"bounds-{name}-{task.grid}") if out is None else out
+    refuse_file(folder, "--out")
+    detector = _detector(array, task.false_alarm_rate, common.seed)
+    counts = _cube(wanted, task.grid, folder, quiet=common.quiet)
+    spheres = _pictures(wanted, detector, task.probability, radius, folder, gif=gif, quiet=common.quiet)
     if json:
         print_json(
             {
-                **_json(of_source, over_moments, spheres, task),
-                **_detection_json(detector, probability, spheres),
-                **_cube_json(sweep, moments),
+                **_json(of_source, over_moments, spheres, wanted),
+                **_detection_json(detector, task.probability, spheres),
+                "grid": task.grid,
+                "moments": task.moments,
+                "points": counts.points,
+                "accurate_fraction": counts.fraction,
+                "seconds": counts.seconds,
                 "out": str(folder),
             }
         )
         return
-    print(_table(of_source, over_moments, spheres, task))
+    print(_table(of_source, over_moments, spheres, wanted))
     if not common.quiet:
-        counts = sweep.summary
-        print_note(f"{counts.starts} sources × {moments + 1} moments in {counts.seconds:.2f} s; wrote {folder}/")
+        print_note(f"{counts.points} sources × {task.moments + 1} moments in {counts.seconds:.2f} s; wrote {folder}/")
+
+
+def _checked(array: SensorArray, place: FloatArray, of: SourceOptions, task: TaskOptions) -> float:
+    """Radius of the sphere, once the options are known to be in bounds."""
+    import numpy as np
+
+    lengths = (("--range-m", task.range_m), ("--half-width-m", task.half_width_m), ("--accuracy-m", task.accuracy_m))
+    for option, value in lengths:
+        if value is not None and not 0.0 < value < math.inf:
+            raise InputError(f"{option}: found {value:g}, expected a positive length.")
+    if not 1e-4 <= task.false_alarm_rate < 0.5:
+        raise InputError(
+            f"--false-alarm-rate: found {task.false_alarm_rate:g}, expected 0.0001 or more, and less than 0.5."
+        )
+    if not task.false_alarm_rate < task.probability < 1.0:
+        raise InputError(f"--probability: found {task.probability:g}, expected it between the false-alarm rate and 1.")
+    if not 0.0 <= of.ambient_uncertainty_nT < math.inf:
+        raise InputError(f"--ambient-uncertainty-nT: found {of.ambient_uncertainty_nT:g}, expected zero or more.")
+    _check_place(array, place)
+    radius = float(np.linalg.norm(place - array.centroid)) if task.range_m is None else task.range_m
+    nearest_m, farthest_m = (factor * array.circumradius for factor in _REACH)
+    if not nearest_m <= radius <= farthest_m:
+        raise InputError(
+            f"--range-m: found {radius:g}, expected {nearest_m:.3g} to {farthest_m:.3g} m, by the size of the array."
+        )
+    if of.moment_Am2 is not None and not 0.0 < max(map(abs, of.moment_Am2)) <= _LARGEST_AM2:
+        raise InputError(
+            f"--moment-Am2: found {_plain(of.moment_Am2)}, expected three finite numbers, not all zero, up to "
+            f"{_LARGEST_AM2:g} A·m²."
+        )
+    return radius
 
 
 def _check_place(array: SensorArray, place: FloatArray) -> None:
@@ -195,45 +231,56 @@ def _check_place(array: SensorArray, place: FloatArray) -> None:
 
 
 def _array_of(path: Path) -> SensorArray:
-    from arrays.array_file import read_array
-
-    array = read_array(path)
+    array = arrays.read_array(path)
     # A figure calls an array by its name; one without is called after its file.
     return array if array.name else replace(array, name=path.stem)
 
 
-def _scenario(array: SensorArray, moment_Am2: Vector, **options: Any) -> BoundScenario:
+def _scenario(
+    array: SensorArray, moment_Am2: Vector, radius: float, of: SourceOptions, task: TaskOptions
+) -> BoundScenario:
     from magloc.bounds.maps import BoundScenario
 
-    try:
-        return BoundScenario(array, moment_Am2, **options)
-    except ValueError as error:
-        raise InputError(f"--moment-Am2: {error}") from None
+    with naming("--moment-Am2"):
+        return BoundScenario(
+            array,
+            moment_Am2,
+            half_width_m=2.0 * radius if task.half_width_m is None else task.half_width_m,
+            accuracy_m=task.accuracy_m,
+            n_moments=task.moments,
+            ambient_uncertainty_T=1e-9 * of.ambient_uncertainty_nT,
+        )
 
 
 def _detector(array: SensorArray, false_alarm_rate: float, seed: int) -> MatchedFilterDetector | None:
     """Matched filter of the array; None, with a note, where it has none."""
-    from magloc.detection.matched_filter import MatchedFilterDetector
-
     try:
-        return MatchedFilterDetector.of(array, false_alarm_rate, n_draws=round(100 / false_alarm_rate), seed=seed)
+        return magloc.MatchedFilterDetector.of(
+            array, false_alarm_rate, n_draws=round(100 / false_alarm_rate), seed=seed
+        )
     except ValueError as error:
         print_note(f"how far a source is found is left out: {error}")
         return None
 
 
-def _cube(task: BoundScenario, grid: int, folder: Path, *, quiet: bool) -> Sweep:
-    """The cube, computed as far as it is not done; closed."""
-    from magloc.bounds.maps import BoundMap
-    from magloc.grids.cube import computed_here
-    from magloc.grids.store import Sweep
+def _cube(task: BoundScenario, grid: int, folder: Path, *, quiet: bool) -> BoundsSummary:
+    """Counts of the cube, computed as far as it is not done."""
+    from magloc.bounds.maps import summary
 
-    cube = BoundMap(task, grid)
-    with Sweep(cube, folder / "map.zarr") as sweep:
-        for sentence in sweep.unreadable:
-            print_note(sentence)
-        complete(sweep, computed_here(cube, sweep.unfinished()), quiet=quiet)
-    return sweep
+    with progress(grid**3, "sources", quiet=quiet) as advance:
+        cube = magloc.bound_map(
+            task.array,
+            task.moment_Am2,
+            edge_m=2.0 * task.half_width_m,
+            n=grid,
+            accuracy_m=task.accuracy_m,
+            n_moments=task.n_moments,
+            ambient_uncertainty_T=task.ambient_uncertainty_T,
+            out=folder / "map.zarr",
+            progress=advance,
+        )
+    with cube:
+        return summary(cube)
 
 
 def _pictures(
@@ -249,11 +296,9 @@ def _pictures(
     """Slices and spheres, as data and as figures; returns the spheres."""
     import numpy as np
 
-    from arrays.io.text import replace_file
-    from magloc.bounds.detection_map import with_detection_ranges
-    from magloc.bounds.maps import bound_slices, bound_spheres
+    from magloc.bounds.maps import bound_slices
+    from magloc.bounds.spheres import bound_spheres, with_detection_ranges
     from magloc.plots.bounds import bound_slices_figure, bound_sphere_figure, reach_figure, write_bound_animation
-    from magloc.plots.style import save
 
     nearest = min(max(0.5 * range_m, 1.1 * task.array.circumradius), range_m)
     ranges = np.geomspace(nearest, 2.0 * range_m, _FRAMES) if gif else np.empty(0)
@@ -269,7 +314,7 @@ def _pictures(
         "bounds-reach.png": reach_figure(spheres, task),
     }
     for name, figure in figures.items():
-        replace_file(folder / name, partial(save, figure))
+        magloc.plots.write(figure, folder / name)
     if gif:
         frames = spheres.sel(range=ranges)
         with progress(_FRAMES, "pictures", quiet=quiet) as advance:
@@ -316,17 +361,6 @@ def _detection_json(detector: MatchedFilterDetector | None, probability: float, 
 
 
 _SPREAD = ("mean", "median", "q95", "worst_sampled")
-
-
-def _cube_json(sweep: Sweep, moments: int) -> dict[str, Any]:
-    counts = sweep.summary
-    return {
-        "grid": sweep.cube.grid,
-        "moments": moments,
-        "points": counts.starts,
-        "accurate_fraction": counts.fraction,
-        "seconds": counts.seconds,
-    }
 
 
 def _reach(spheres: xr.Dataset, variable: str) -> dict[str, dict[str, float]]:

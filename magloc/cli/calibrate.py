@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+import arrays
+import magloc
 from arrays.io.arguments import Flag
-from arrays.io.errors import InputError
+from arrays.io.errors import InputError, naming
+from arrays.io.outputs import make_folder, refuse_file, refuse_unwritable
 from magloc.cli.framework import CommonOptions, print_json
 from magloc.cli.options import print_note
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from arrays.array import SensorArray
-    from magloc.calibration.array import CalibrationResult, Prior
+    from magloc.calibration.array import CalibrationPrior
+    from magloc.calibration.results import SourceCalibration, TurningCalibration
     from magloc.readings import Readings, Truth
-
-    FloatArray = NDArray[np.float64]
 
 
 # Gains beyond this many standard deviations of the prior are named.
@@ -114,13 +113,9 @@ def calibrate(
     common : CommonOptions
         Common options.
     """
-    import numpy as np
-
-    from arrays.array_file import read_array, read_sensors, write_array
-    from arrays.io.outputs import refuse_file, refuse_unwritable
-    from magloc.calibration.array import calibrate_on_path, self_calibrate
-    from magloc.cli.calibrate_by_turning import calibrate_by_turning
-    from magloc.readings import read_readings, read_truth, without_saturated
+    from magloc.calibration.results import TurningCalibration
+    from magloc.cli import calibrate_by_turning as turning
+    from magloc.readings import read_readings
 
     refuse_unwritable(out, "--out")
     if figures is not None:
@@ -130,71 +125,58 @@ def calibrate(
             raise InputError("--modulus-nT: found it together with --truth, expected one of them.")
         if known != PriorOptions() or height_m is not None or moment is not None:
             raise InputError("--modulus-nT: found it together with an option for a moving source, expected none.")
-        calibrate_by_turning(readings, array, modulus_nT, out, json=json, quiet=common.quiet)
-        if figures is not None:
-            from magloc.plots.calibration import write_turning_pictures
+        turning.check_modulus(modulus_nT)
+        nominal = arrays.read_sensors(array)
+        rows = read_readings(readings, nominal)
+        with naming(str(array)):
+            result = magloc.calibrate(nominal, rows, modulus_T=1e-9 * modulus_nT)
+    else:
+        nominal = arrays.read_array(array)
+        prior = _prior(known, nominal, array)
+        rows = read_readings(readings, nominal)
+        path = _path(rows, truth, height_m, readings)
+        with naming(str(readings)):
+            result = magloc.calibrate(nominal, rows, truth=path, moment=moment, prior=prior)
+    if isinstance(result, TurningCalibration):
+        turning.check(result, readings, array, out)
+        report, lines, notes = turning.report(result, out), turning.lines(result), turning.NOTES
+    else:
+        _check_converged(result, readings, out)
+        report, lines, notes = _report(result, len(rows), out), _table(result), _notes(result, len(rows), prior)
+    arrays.write_array(result.array, out)
+    if json:
+        print_json(report)
+    else:
+        print("\n".join(lines))
+    if figures is not None:
+        _draw(result, figures, quiet=common.quiet)
+    if not (json or common.quiet):
+        for note in notes:
+            print_note(note)
 
-            nominal = read_sensors(array)
-            rows = without_saturated(read_readings(readings, nominal), nominal)
-            write_turning_pictures(nominal, read_sensors(out), rows, 1e-9 * modulus_nT, figures, quiet=common.quiet)
-        return
-    nominal = read_array(array)
-    prior = _prior(known, nominal, array)
-    rows = without_saturated(read_readings(readings, nominal), nominal)
-    if truth is None and height_m is not None:
-        raise InputError("--height-m: found no --truth, expected it because the height is that of its path.")
-    attitude, readings_T = _world_from_array(rows), rows.values_T
-    try:
-        if truth is None:
-            result = self_calibrate(
-                nominal, readings_T, moment=moment or "constant", prior=prior, world_from_array=attitude
-            )
-        else:
-            path = read_truth(truth)
-            in_readings, in_truth = _matched(rows, path, readings, truth)
-            unknown_height = not _has_height(path) and height_m is None
-            attitude, readings_T = attitude[in_readings], readings_T[in_readings]
-            result = calibrate_on_path(
-                nominal,
-                readings_T,
-                _in_array_frame(rows, in_readings, path.position_m[in_truth], height_m, truth),
-                moment_Am2=None if path.moment_Am2 is None or moment is not None else path.moment_Am2[in_truth],
-                moment=moment or "constant",
-                unknown_height=unknown_height,
-                prior=prior,
-                world_from_array=attitude,
-            )
-    except InputError:
-        raise
-    except np.linalg.LinAlgError:
-        raise InputError(
-            f"{readings}: found a source that the model cannot place (on a sensor, or at infinity), expected one that"
-            " passes the sensors at a distance."
-        ) from None
-    except ValueError as error:
-        raise InputError(f"{readings}: {str(error).removeprefix('Input ')}") from None
+
+def _check_converged(result: SourceCalibration, readings: Path, out: Path) -> None:
     if not result.converged:
         raise InputError(
             f"{readings}: the calibration did not converge within {result.iterations} iterations "
-            f"(χ² {result.chi2_after:.4g}), expected readings that the array file, its noise and its priors describe; "
+            f"(χ² {result.chi2:.4g}), expected readings that the array file, its noise and its priors describe; "
             f"{out} is not written."
         )
-    write_array(result.array, out)
-    if json:
-        print_json(_report(result, len(rows), out))
-    else:
-        print("\n".join(_table(result)))
-    if figures is not None:
-        from magloc.plots.calibration import write_calibration_pictures
-
-        write_calibration_pictures(nominal, readings_T, attitude, result, figures, quiet=common.quiet)
-    if not (json or common.quiet):
-        _print_summary(result, len(rows))
-        _warn_of_strangers(result, prior)
 
 
-def _prior(options: PriorOptions, array: SensorArray, path: Path) -> Prior:
-    from magloc.calibration.array import QUANTITIES, Prior
+def _draw(result: SourceCalibration | TurningCalibration, folder: Path, *, quiet: bool) -> None:
+    from magloc.calibration.results import TurningCalibration
+    from magloc.plots.calibration import columns_of_calibration
+
+    make_folder(folder, "--figures")
+    name = "turning" if isinstance(result, TurningCalibration) else "calibration"
+    magloc.plots.write(result.plot(), folder / f"{name}.png", columns_of_calibration(result))
+    if not quiet:
+        print_note(f"wrote {name}.png and {name}.csv into {folder}/")
+
+
+def _prior(options: PriorOptions, array: SensorArray, path: Path) -> CalibrationPrior:
+    from magloc.calibration.array import QUANTITIES
 
     quantities = _listed(options.estimate)
     for name in quantities or [""]:
@@ -210,7 +192,7 @@ def _prior(options: PriorOptions, array: SensorArray, path: Path) -> Prior:
         value = getattr(options, name)
         if not 0.0 < value < math.inf:
             raise InputError(f"--{name.replace('_', '-')}: found {value:g}, expected a positive number.")
-    return Prior(
+    return magloc.CalibrationPrior(
         position_m=options.position_prior_mm * 1e-3,
         gain=options.gain_prior,
         axes_rad=math.radians(options.axes_prior_deg),
@@ -225,56 +207,31 @@ def _listed(text: str) -> list[str]:
     return [name.strip() for name in text.split(",")] if text else []
 
 
-def _world_from_array(readings: Readings) -> FloatArray:
-    """Attitude of the array in every row (n, 3, 3); without a pose its axes are the world's."""
+def _path(readings: Readings, path: Path | None, height_m: float | None, readings_path: Path) -> Truth | None:
+    """The source's path, with a missing z set to the height if that is given."""
     import numpy as np
-    from scipy.spatial.transform import Rotation
 
-    if readings.array_rotation_xyzw is None:
-        return np.broadcast_to(np.eye(3), (len(readings), 3, 3))
-    return Rotation.from_quat(readings.array_rotation_xyzw).as_matrix()
+    from magloc.readings import read_truth, rows_of_same_time
 
-
-def _matched(
-    readings: Readings, truth: Truth, readings_path: Path, truth_path: Path
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of the readings and of the truth that have the same time."""
-    from magloc.readings import rows_of_same_time
-
-    in_readings, in_truth = rows_of_same_time(readings, truth)
-    if not in_readings.size:
+    if path is None:
+        if height_m is not None:
+            raise InputError("--height-m: found no --truth, expected it because the height is that of its path.")
+        return None
+    truth = read_truth(path)
+    if not rows_of_same_time(readings, truth)[0].size:
         raise InputError(
-            f"{truth_path}: found none of the times of {readings_path} ({readings.time_s.min():.15g} s to "
+            f"{path}: found none of the times of {readings_path} ({readings.time_s.min():.15g} s to "
             f"{readings.time_s.max():.15g} s), expected rows with the same time_s."
         )
-    return in_readings, in_truth
+    if height_m is None:
+        return truth
+    missing = np.isnan(truth.position_m)
+    if not missing.any():
+        raise InputError(f"--height-m: found z_m in {path}, expected a truth file without it.")
+    return replace(truth, position_m=np.where(missing, height_m, truth.position_m))
 
 
-def _has_height(truth: Truth) -> bool:
-    import numpy as np
-
-    return bool(np.isfinite(truth.position_m[:, 2]).all())
-
-
-def _in_array_frame(
-    readings: Readings, rows: NDArray[np.intp], position_m: FloatArray, height_m: float | None, truth_path: Path
-) -> FloatArray:
-    """True positions in the array's frame, with a missing z set to the height, or to 0 if that is unknown."""
-    import numpy as np
-
-    position = position_m.copy()
-    missing = np.isnan(position[:, 2])
-    if height_m is not None and not missing.any():
-        raise InputError(f"--height-m: found z_m in {truth_path}, expected a truth file without it.")
-    position[missing, 2] = 0.0 if height_m is None else height_m
-    if readings.array_position_m is None:
-        return position
-    world_from_array = _world_from_array(readings)[rows]
-    result: FloatArray = np.einsum("tba,tb->ta", world_from_array, position - readings.array_position_m[rows])
-    return result
-
-
-def _report(result: CalibrationResult, n_rows: int, out: Path) -> dict[str, Any]:
+def _report(result: SourceCalibration, n_rows: int, out: Path) -> dict[str, Any]:
     """What ``--json`` prints."""
     from magloc.calibration.model import AXES, GAINS, OFFSET, POSITION
 
@@ -290,9 +247,7 @@ def _report(result: CalibrationResult, n_rows: int, out: Path) -> dict[str, Any]
             "offset_sd_nT": 1e9 * sd[OFFSET],
             "residual_rms_nT": 1e9 * rms,
         }
-        for sensor, sd, rms in zip(
-            result.array.sensors, result.standard_deviation, result.residual_rms_T.tolist(), strict=True
-        )
+        for sensor, sd, rms in zip(result.array.sensors, result.sigma, result.residual_rms_T.tolist(), strict=True)
     ]
     constant = bool((result.moment_Am2 == result.moment_Am2[0]).all())
     return {
@@ -301,8 +256,8 @@ def _report(result: CalibrationResult, n_rows: int, out: Path) -> dict[str, Any]
         "rows_used": int(result.rows.sum()),
         "chi2_before": result.chi2_before,
         "dof_before": result.dof_before,
-        "chi2_after": result.chi2_after,
-        "dof_after": result.dof_after,
+        "chi2_after": result.chi2,
+        "dof_after": result.dof,
         "iterations": result.iterations,
         "converged": result.converged,
         "moment_Am2": result.moment_Am2[0] if constant else None,
@@ -311,7 +266,7 @@ def _report(result: CalibrationResult, n_rows: int, out: Path) -> dict[str, Any]
     }
 
 
-def _table(result: CalibrationResult) -> list[str]:
+def _table(result: SourceCalibration) -> list[str]:
     """What the calibration adds to every sensor, with the largest standard deviation of each group."""
     import numpy as np
 
@@ -323,7 +278,7 @@ def _table(result: CalibrationResult) -> list[str]:
         f"  {'offset µT':>26} {'s':>7}  {'rms nT':>10}"
     ]
     for sensor, change, sd, rms in zip(
-        result.array.ids, result.change, result.standard_deviation, result.residual_rms_T, strict=True
+        result.array.ids, result.change, result.sigma, result.residual_rms_T, strict=True
     ):
         position = " ".join(f"{1e3 * value:7.3f}" for value in change[POSITION])
         gains = " ".join(f"{100 * value:6.2f}" for value in change[GAINS])
@@ -337,23 +292,21 @@ def _table(result: CalibrationResult) -> list[str]:
     return lines
 
 
-def _warn_of_strangers(result: CalibrationResult, prior: Prior) -> None:
-    """Name the sensors whose gain is far from what the array file could be wrong by: dead, or of another kind."""
+def _notes(result: SourceCalibration, n_rows: int, prior: CalibrationPrior) -> list[str]:
+    """Rows and χ², what is not told, and sensors whose gain is farther off than an array file could be: dead ones."""
     import numpy as np
 
     from magloc.calibration.model import GAINS
 
-    far = np.max(np.abs(result.change[:, GAINS]), axis=1) > _STRANGE * prior.gain
-    names = [sensor for sensor, strange in zip(result.array.ids, far.tolist(), strict=True) if strange]
-    if names:
-        print_note(f"warning: gains far beyond --gain-prior, a dead or wrong sensor: {', '.join(names)}")
-
-
-def _print_summary(result: CalibrationResult, n_rows: int) -> None:
-    print_note(
+    notes = [
         f"{int(result.rows.sum())} of {n_rows} rows used; χ² {result.chi2_before:.4g} with {result.dof_before:.0f} "
-        f"degrees of freedom before, {result.chi2_after:.4g} with {result.dof_after:.0f} after"
-    )
+        f"degrees of freedom before, {result.chi2:.4g} with {result.dof:.0f} after"
+    ]
     if result.unobservable:
         names = "; ".join(direction.name for direction in result.unobservable)
-        print_note(f"not told by the readings, as in the array file: {names}")
+        notes.append(f"not told by the readings, as in the array file: {names}")
+    far = np.max(np.abs(result.change[:, GAINS]), axis=1) > _STRANGE * prior.gain
+    strangers = [sensor for sensor, strange in zip(result.array.ids, far.tolist(), strict=True) if strange]
+    if strangers:
+        notes.append(f"warning: gains far beyond --gain-prior, a dead or wrong sensor: {', '.join(strangers)}")
+    return notes

@@ -7,51 +7,48 @@ from typing import Any
 
 import numpy as np
 
-from arrays.array_file import read_sensors, write_array
 from arrays.io.errors import InputError
-from magloc.calibration.modulus import EllipsoidCalibration, calibrated_in_modulus
-from magloc.cli.framework import print_json
-from magloc.cli.options import print_note
-from magloc.readings import read_readings, without_saturated
+from magloc.calibration.modulus import EllipsoidCalibration
+from magloc.calibration.results import TurningCalibration
 
 # Of a gain from the array file: beyond it the modulus is in another unit.
 _LARGEST_CHANGE = 3.0
 
 
-def calibrate_by_turning(readings: Path, array: Path, modulus_nT: float, out: Path, *, json: bool, quiet: bool) -> None:
-    """Calibrate every vector sensor of an array file, or its only one, and write the array file.
+NOTES = ["the modulus does not tell how a sensor is mounted: its rotation stays as in the array file"]
 
-    Raises
-    ------
-    InputError
-        The readings do not determine a sensor; nothing is written.
-    """
+
+def check_modulus(modulus_nT: float) -> None:
+    """Refuse what is no modulus."""
     if not 0.0 < modulus_nT < np.inf:
         raise InputError(f"--modulus-nT: found {modulus_nT:g}, expected a positive number.")
-    nominal = read_sensors(array)
-    rows = without_saturated(read_readings(readings, nominal), nominal)
-    try:
-        calibrated, results = calibrated_in_modulus(nominal, rows.values_T, 1e-9 * modulus_nT)
-    except ValueError as error:
-        raise InputError(f"{array}: {str(error).removeprefix('Input ')}") from None
-    for name, result in results.items():
-        if not result.converged:
-            raise InputError(f"{readings}: sensor {name} cannot be calibrated: {result.reason}; {out} is not written.")
-    for before, sensor in zip(nominal.sensors, calibrated.sensors, strict=True):
+
+
+def check(result: TurningCalibration, readings: Path, array: Path, out: Path) -> None:
+    """Refuse readings that do not determine a sensor, and a modulus that is in another unit."""
+    for name, fit in result.fits.items():
+        if not fit.converged:
+            raise InputError(f"{readings}: sensor {name} cannot be calibrated: {fit.reason}; {out} is not written.")
+    for before, sensor in zip(result.nominal.sensors, result.array.sensors, strict=True):
         volumes = np.linalg.det([sensor.calibration.scale, before.calibration.scale])
         ratio = float(np.cbrt(volumes[0] / volumes[1]))
         if not 1.0 / _LARGEST_CHANGE < ratio < _LARGEST_CHANGE:
             raise InputError(
-                f"--modulus-nT: found {modulus_nT:g}, which makes the gains of sensor {sensor.id} {ratio:.3g} times"
-                f" those of {array}, expected the modulus in nT, or an array file with its gains; {out} is not written."
+                f"--modulus-nT: found {1e9 * float(result.modulus_T):g}, which makes the gains of sensor {sensor.id}"
+                f" {ratio:.3g} times those of {array}, expected the modulus in nT, or an array file with its gains;"
+                f" {out} is not written."
             )
-    write_array(calibrated, out)
-    if json:
-        print_json({"out": str(out), "rows": len(rows), "sensors": [_entry(*item) for item in results.items()]})
-    else:
-        print("\n".join(_line(*item) for item in results.items()))
-    if not (json or quiet):
-        print_note("the modulus does not tell how a sensor is mounted: its rotation stays as in the array file")
+
+
+def report(result: TurningCalibration, out: Path) -> dict[str, Any]:
+    """What ``--json`` prints."""
+    sensors = [_entry(*item) for item in result.fits.items()]
+    return {"out": str(out), "rows": len(result.time_s), "sensors": sensors}
+
+
+def lines(result: TurningCalibration) -> list[str]:
+    """One line for every sensor."""
+    return [_line(*item) for item in result.fits.items()]
 
 
 def _deviations(result: EllipsoidCalibration) -> tuple[Any, Any]:

@@ -7,8 +7,11 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import arrays
+import magloc
 from arrays.io.arguments import Flag
-from arrays.io.errors import InputError
+from arrays.io.errors import naming
+from arrays.io.outputs import refuse_one_for_two, refuse_unwritable
 from magloc.cli.framework import CommonOptions, print_json, progress
 from magloc.cli.options import print_note
 
@@ -46,13 +49,8 @@ def design(
     common : CommonOptions
         Common options.
     """
-    from arrays.array_file import write_array
-    from arrays.io.outputs import refuse_one_for_two, refuse_unwritable
-    from magloc.design.optimise import design as designed
-    from magloc.design.task_files import read_task
-
-    file = read_task(task)
-    target = Path(f"design-{file.task.name}.toml") if out is None else out
+    wanted = magloc.DesignTask.read(task)
+    target = Path(f"design-{wanted.name}.toml") if out is None else out
     refuse_one_for_two({"--out": target, "--png": png})
     refuse_unwritable(target, "--out")
     if png is not None:
@@ -60,19 +58,17 @@ def design(
     best: list[SensorArray] = []
     begin = time.perf_counter()
     try:
-        with progress(file.search.n_steps, "steps", quiet=common.quiet) as advance:
-            result = designed(file.task, search=file.search, seed=common.seed, progress=advance, better=best.append)
+        with progress(wanted.search.n_steps, "steps", quiet=common.quiet) as advance, naming(task):
+            result = magloc.design_array(wanted, seed=common.seed, progress=advance, better=best.append)
     except KeyboardInterrupt:
         if not best:
             raise KeyboardInterrupt("interrupted: nothing is written, no start had been judged") from None
-        write_array(best[-1], target)
+        arrays.write_array(best[-1], target)
         raise KeyboardInterrupt(f"interrupted: the best array so far is in {target}") from None
-    except ValueError as error:
-        raise InputError(f"{task}: {str(error).removeprefix('Input ')}") from None
     seconds = time.perf_counter() - begin
-    write_array(result.array, target)
+    arrays.write_array(result.array, target)
     if png is not None:
-        _draw(result, common.seed, png)
+        magloc.plots.save(result.plot(common.seed), png)
     if json:
         print_json(_report(result, target, png, seconds))
         return
@@ -83,13 +79,6 @@ def design(
             f"{result.n_converged} of {result.n_descents} refined starts converged, {seconds:.1f} s; wrote"
             f" {target}{drawn}"
         )
-
-
-def _draw(result: Design, seed: int, path: Path) -> None:
-    from magloc.plots.design import design_figure
-    from magloc.plots.style import save
-
-    save(design_figure(result, seed), path)
 
 
 def _report(result: Design, out: Path, png: Path | None, seconds: float) -> dict[str, Any]:

@@ -178,7 +178,7 @@ def print_note(text: str, program: str) -> None:
 
 
 @contextmanager
-def progress(total: int, unit: str, *, quiet: bool, initial: int = 0) -> Iterator[Callable[[int], None]]:
+def progress(total: int, unit: str, *, quiet: bool) -> Iterator[Callable[[int], None]]:
     """Count up to a total on a terminal's stderr.
 
     Parameters
@@ -187,8 +187,6 @@ def progress(total: int, unit: str, *, quiet: bool, initial: int = 0) -> Iterato
     unit : str
         What is counted.
     quiet : bool
-    initial : int
-        Finished before; does not count in the estimate of the time left.
 
     Yields
     ------
@@ -198,7 +196,7 @@ def progress(total: int, unit: str, *, quiet: bool, initial: int = 0) -> Iterato
     from tqdm import tqdm
 
     hidden = quiet or not sys.stderr.isatty()
-    with tqdm(total=total, initial=initial, unit=f" {unit}", disable=hidden, leave=False) as bar:
+    with tqdm(total=total, unit=f" {unit}", disable=hidden, leave=False) as bar:
 
         def advance(finished: int) -> None:
             bar.update(finished)

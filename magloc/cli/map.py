@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+import magloc
 from arrays.io.arguments import Flag
-from arrays.io.errors import InputError
-from arrays.io.outputs import make_folder
+from arrays.io.errors import InputError, naming
+from arrays.io.outputs import refuse_file
 from arrays.io.text import replace_file
-from magloc.cli.framework import CommonOptions, print_json
-from magloc.cli.options import Grid, complete, print_note
+from magloc.cli.framework import CommonOptions, print_json, progress
+from magloc.cli.options import Grid, naming_scheduler, print_note
 
 if TYPE_CHECKING:
-    from magloc.grids.cube import CubeMap, MapSummary
-    from magloc.grids.store import Sweep
+    from collections.abc import Callable
+
+    import xarray as xr
+
+    from magloc.convergence.over_sources import SourcesSummary
+    from magloc.convergence.over_starts import StartsSummary
+    from magloc.grids.cube import Summary
 
 
 Over = Literal["starts", "sources"]
@@ -63,113 +71,86 @@ def map_(
     common : CommonOptions
         Common options.
     """
-    from dataclasses import asdict
+    from magloc.grids.store import chunk_seconds
 
-    from magloc.grids.store import Sweep
-
+    n = (41 if over == "starts" else 21) if grid is None else grid
     if over == "starts":
-        cube = _starts_map(scenario, method, 41 if grid is None else grid, common.seed if noise else None)
+        name, compute = _over_starts(scenario, method, common.seed if noise else None)
     else:
-        cube = _sources_map(scenario, method, 21 if grid is None else grid, common.seed)
-    name = cube.attributes["method"] if over == "starts" else over
+        name, compute = over, _over_sources(scenario, method, common.seed)
     drawn = f"-seed{common.seed}" if noise or (over == "sources" and common.seed) else ""
-    folder = Path(f"map-{Path(scenario).stem}-{name}-{cube.grid}{drawn}") if out is None else out
-    if scheduler is not None:
-        from magloc.grids.cluster import check_address
-
-        check_address(scheduler)
-    make_folder(folder, "--out")
-    with Sweep(cube, folder / "map.zarr") as sweep:
-        for sentence in sweep.unreadable:
-            print_note(sentence)
-        before = sweep.chunks_done
-        if before < sweep.n_chunks:
-            _run(sweep, scheduler, quiet=common.quiet)
-        counts = sweep.summary
-    _export(folder, counts, netcdf=netcdf)
+    folder = Path(f"map-{Path(scenario).stem}-{name}-{n}{drawn}") if out is None else out
+    store = folder / "map.zarr"
+    refuse_file(folder, "--out")
+    before = chunk_seconds(store)
+    with (
+        naming(scenario),
+        naming_scheduler(),
+        progress(n**3, over, quiet=common.quiet) as advance,
+    ):
+        dataset = compute(n=n, out=store, scheduler=scheduler, progress=advance)
+    done = chunk_seconds(store)
+    with dataset:
+        counts = _summary(dataset)
+        draw = magloc.plots.convergence if over == "starts" else magloc.plots.sources
+        magloc.plots.write(draw(dataset), folder / "convergence.png")
+        if netcdf:
+            replace_file(folder / "convergence.nc", lambda path: dataset.to_netcdf(path))
     if json:
-        print_json({**asdict(counts), "out": str(folder)})
+        print_json({**_KEYS, **asdict(counts), "out": str(folder)})
     else:
-        print(_in_words(counts))
+        print("\n".join(counts.lines()))
     if not (json or common.quiet):
-        print_note(_how_done(before, counts, sweep, folder))
+        print_note(_how_done(int((before == done).sum()) if before.size else 0, done.size, counts, folder))
 
 
-def _starts_map(scenario: str, method: str | None, grid: int, noise_seed: int | None) -> CubeMap:
+# Keys of every map, in this order; null where a map has no such number.
+_KEYS = dict.fromkeys(
+    ("starts", "converged", "fraction", "front_fraction", "back_fraction", "median_iterations", "iterations_total")
+)
+
+
+def _over_starts(scenario: str, method: str | None, noise_seed: int | None) -> tuple[str, Callable[..., xr.Dataset]]:
+    """Name of the method, and the map without the arguments that all maps have."""
+    import numpy as np
+
     from magloc.convergence.filters import FILTERS
-    from magloc.convergence.over_starts import StartsMap
     from magloc.convergence.scenario_files import read_starts_scenario
 
     if method is not None and method not in FILTERS:
         raise InputError(f"--method: found {method!r}, expected one of {', '.join(FILTERS)}.")
-    problem = read_starts_scenario(scenario, method=method, noise_seed=noise_seed)
-    try:
-        return StartsMap.of(problem, grid)
-    except ValueError as error:
-        raise InputError(f"{scenario}: {error}") from None
+    task = read_starts_scenario(scenario, method=method, noise_seed=noise_seed)
+    source = magloc.Source(np.asarray(task.position_m), np.asarray(task.moment_Am2))
+    options: dict[str, Any] = {"method": task.method, "edge_m": 2.0 * task.half_width_m, "noise_seed": noise_seed}
+    return task.method.name, partial(magloc.convergence_map, task.array, source, **options)
 
 
-def _sources_map(scenario: str, method: str | None, grid: int, seed: int) -> CubeMap:
-    from magloc.convergence.over_sources import SourcesMap
+def _over_sources(scenario: str, method: str | None, seed: int) -> Callable[..., xr.Dataset]:
     from magloc.convergence.scenario_files import read_sources_scenario
 
     if method not in (None, "global"):
         raise InputError(f"--method: found {method!r}, expected global or none: sources are fixed without a start.")
-    problem = read_sources_scenario(scenario, seed=seed)
-    try:
-        return SourcesMap(problem, grid)
-    except ValueError as error:
-        raise InputError(f"{scenario}: {error}") from None
+    task = read_sources_scenario(scenario, seed=seed)
+    return partial(
+        magloc.source_map,
+        task.array,
+        task.moment_Am2,
+        edge_m=2.0 * task.half_width_m,
+        nearest_m=task.nearest_m,
+        farthest_m=task.farthest_m,
+        seed=seed,
+    )
 
 
-def _run(sweep: Sweep, scheduler: str | None, *, quiet: bool) -> None:
-    """Compute what is not done yet."""
-    from magloc.grids.cube import computed_here
+def _summary(dataset: xr.Dataset) -> StartsSummary | SourcesSummary:
+    from magloc.convergence import over_sources, over_starts
 
-    if scheduler is None:
-        chunks = computed_here(sweep.cube, sweep.unfinished())
-    else:
-        from magloc.grids.cluster import computed_by
-
-        chunks = computed_by(scheduler, sweep.cube, sweep.unfinished())
-    complete(sweep, chunks, quiet=quiet)
+    return over_starts.summary(dataset) if "half" in dataset else over_sources.summary(dataset)
 
 
-def _export(folder: Path, counts: MapSummary, *, netcdf: bool) -> None:
-    """Figure of a finished map, and all of it as netCDF if wanted."""
-    from magloc.convergence.over_sources import SourceMapSummary
-    from magloc.grids.store import open_map
-    from magloc.plots.maps import convergence_figure, source_figure
-    from magloc.plots.style import save
-
-    with open_map(folder / "map.zarr") as dataset:
-        if isinstance(counts, SourceMapSummary):
-            figure = source_figure(dataset, counts)
-        else:
-            figure = convergence_figure(dataset, counts)
-        if netcdf:
-            replace_file(folder / "convergence.nc", lambda path: dataset.to_netcdf(path))
-    replace_file(folder / "convergence.png", lambda path: save(figure, path))
-
-
-def _how_done(before: int, counts: MapSummary, sweep: Sweep, folder: Path) -> str:
+def _how_done(before: int, n_chunks: int, counts: Summary, folder: Path) -> str:
     per_iteration_us = 1e6 * counts.seconds / max(1, counts.iterations_total)
     text = f"{counts.iterations_total} iterations in {counts.seconds:.2f} s ({per_iteration_us:.3g} µs each)"
-    if before == sweep.n_chunks:
+    if before == n_chunks:
         return f"{folder}/ was complete, nothing was computed again; {text}"
-    return f"{text}; wrote {folder}/" + (f", {before} of {sweep.n_chunks} chunks were there before" if before else "")
-
-
-def _in_words(counts: MapSummary) -> str:
-    from magloc.convergence.over_sources import SourceMapSummary
-
-    if isinstance(counts, SourceMapSummary):
-        return (
-            f"{counts.converged} of {counts.starts} sources found ({counts.fraction:.2%}), "
-            f"truth listed {counts.truth_listed:.2%}, median {counts.median_iterations:.0f} iterations"
-        )
-    return (
-        f"{counts.converged} of {counts.starts} starts converged ({counts.fraction:.1%}): "
-        f"front half {counts.front_fraction:.1%}, back half {counts.back_fraction:.1%}, "
-        f"median {counts.median_iterations:.0f} passes"
-    )
+    return f"{text}; wrote {folder}/" + (f", {before} of {n_chunks} chunks were there before" if before else "")

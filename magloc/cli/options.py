@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from arrays.io.arguments import whole_number
 from arrays.io.errors import InputError
-from magloc.cli import framework
-from magloc.cli.framework import progress
-
-if TYPE_CHECKING:
-    from magloc.grids.cube import Chunk
-    from magloc.grids.store import Sweep
 from magloc.ambient import Place
+from magloc.cli import framework
 
 
 def print_note(text: str) -> None:
@@ -29,38 +25,15 @@ Grid = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=2, 
 """Points along an axis: 2000 are 8,000,000,000 points, more than a day of work."""
 
 
-def complete(sweep: Sweep, chunks: Iterable[Chunk], *, quiet: bool) -> None:
-    """Write chunks as they are computed; however that ends, say how to go on.
+@contextmanager
+def naming_scheduler() -> Iterator[None]:
+    """Let errors of a scheduler speak of the option."""
+    from magloc.grids.cluster import SchedulerError
 
-    Parameters
-    ----------
-    sweep : Sweep
-    chunks : iterable
-        Computed chunks that are not written yet.
-    quiet : bool
-        No progress.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        With what is done.
-    InputError
-        The file cannot be written, or a chunk cannot be computed; the text says what is done.
-    """
-    cube = sweep.cube
-
-    def kept() -> str:
-        return f"{sweep.chunks_done} of {sweep.n_chunks} chunks are done, the same command goes on with the others"
-
-    with progress(cube.grid**3, f"{cube.point}s", quiet=quiet, initial=sweep.points_done) as advance:
-        try:
-            sweep.write(chunks, advance)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"interrupted: {kept()}") from None
-        except InputError as error:
-            raise InputError(f"{str(error).rstrip('.')}; {kept()}.") from None
-        except OSError as error:
-            raise InputError(f"{sweep.path} cannot be written ({error.strerror or error}); {kept()}.") from None
+    try:
+        yield
+    except SchedulerError as error:
+        raise InputError(f"--{error}") from None
 
 
 _DATE = re.compile(r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}(:\d{2}(\.\d+)?)?)?")

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from arrays.typing import FloatArray
 from magloc.convergence import filters_compiled as lanes
 from magloc.convergence.relinearised_compiled import relinearised_map
 from magloc.kalman import IteratedUpdate, iterated_update, predict_square_root, scalar_update, sequential_update
 from magloc.localization.search.single_source import SingleSourceSearch
 from magloc.measurement.differences import DifferenceMeasurement
-
-if TYPE_CHECKING:
-    pass
-from arrays.typing import FloatArray
 
 # χ² above the maximum-likelihood χ² within which a stop counts as having reached it.
 CHI2_REACHED = 0.05
@@ -59,8 +56,34 @@ class Filter(Protocol):
         """Which of the ends are the maximum-likelihood optimum."""
 
 
+class _LikelihoodFilter:
+    """A filter that ends where the likelihood is largest."""
+
+    def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
+        """Stopped with the χ² of the maximum-likelihood optimum."""
+        return ends.stopped & (ends.chi2 < chi2_optimum + CHI2_REACHED)
+
+
 @dataclass(frozen=True)
-class RepeatedFilter:
+class _PriorFilter:
+    """A filter with the start as the mean of its prior, of these standard deviations per axis."""
+
+    position_sigma_m: float = 3.0
+    moment_sigma_Am2: float = 300.0
+
+    @property
+    def s_0(self) -> FloatArray:
+        """Diagonal of the square root of the prior covariance, shape (6,)."""
+        return np.repeat([self.position_sigma_m, self.moment_sigma_Am2], 3)
+
+    def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
+        """Stopped at the prior's own optimum, near the maximum-likelihood position (the prior pulls, so χ² differs)."""
+        distance = np.linalg.norm(ends.states[:, :3] - position_optimum, axis=1)
+        return ends.stopped & (distance < PRIOR_REACHED_M)
+
+
+@dataclass(frozen=True)
+class RepeatedFilter(_LikelihoodFilter):
     r"""Extended Kalman filter that processes the same readings again and again.
 
     Attributes
@@ -77,17 +100,13 @@ class RepeatedFilter:
         Passes at most.
     """
 
+    name: ClassVar[str] = "repeated"
     position_step_m: float = 0.1
     moment_step_Am2: float = 100.0
     noise_inflation: float = 1.0
     relinearise_every_scalar: bool = False
     tolerance_T: float = 1e-12
     max_iterations: int = 200
-
-    @property
-    def name(self) -> str:
-        """Name on the command line."""
-        return "repeated"
 
     @property
     def s_q(self) -> FloatArray:
@@ -99,11 +118,7 @@ class RepeatedFilter:
         run_all = relinearised_map if self.relinearise_every_scalar else lanes.repeated_map
         return Ends(
             *run_all(
-                starts,
-                _of_source(measurement, z),
-                measurement.variance,
-                measurement.array.positions,
-                field_weights(measurement),
+                *_inputs(measurement, z, starts),
                 self.noise_inflation,
                 self.position_step_m,
                 self.moment_step_Am2,
@@ -132,13 +147,9 @@ class RepeatedFilter:
                 return IteratedUpdate(x, S, iteration, change < self.tolerance_T, innovation, np.nan)
         return IteratedUpdate(x, S, self.max_iterations, False, innovation, np.nan)
 
-    def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
-        """Stopped with the χ² of the maximum-likelihood optimum."""
-        return ends.stopped & (ends.chi2 < chi2_optimum + CHI2_REACHED)
-
 
 @dataclass(frozen=True)
-class IekfFilter:
+class IekfFilter(_PriorFilter):
     """Iterated extended Kalman filter with the start as the mean of its prior.
 
     Attributes
@@ -151,30 +162,15 @@ class IekfFilter:
         Linearisations at most.
     """
 
-    position_sigma_m: float = 3.0
-    moment_sigma_Am2: float = 300.0
+    name: ClassVar[str] = "iekf"
     tolerance_T: float = 1e-12
     max_iterations: int = 200
-
-    @property
-    def name(self) -> str:
-        """Name on the command line."""
-        return "iekf"
-
-    @property
-    def s_0(self) -> FloatArray:
-        """Diagonal of the square root of the prior covariance, shape (6,)."""
-        return np.repeat([self.position_sigma_m, self.moment_sigma_Am2], 3)
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
         return Ends(
             *lanes.iekf_map(
-                starts,
-                _of_source(measurement, z),
-                measurement.variance,
-                measurement.array.positions,
-                field_weights(measurement),
+                *_inputs(measurement, z, starts),
                 self.position_sigma_m,
                 self.moment_sigma_Am2,
                 self.tolerance_T,
@@ -195,14 +191,9 @@ class IekfFilter:
             max_iterations=self.max_iterations,
         )
 
-    def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
-        """Stopped at the prior's own optimum, near the maximum-likelihood position (the prior pulls, so χ² differs)."""
-        distance = np.linalg.norm(ends.states[:, :3] - position_optimum, axis=1)
-        return ends.stopped & (distance < PRIOR_REACHED_M)
-
 
 @dataclass(frozen=True)
-class DampedFilter:
+class DampedFilter(_PriorFilter):
     r"""Levenberg-Marquardt iteration on the cost of :class:`IekfFilter`: no accepted step raises it.
 
     A step solves :math:`(M + \lambda\,\mathrm{diag} M)\,\delta = -\nabla` with :math:`M = H^T R^{-1} H + P_0^{-1}` and
@@ -227,31 +218,16 @@ class DampedFilter:
     D. W. Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", J. SIAM 11 (1963).
     """
 
-    position_sigma_m: float = 3.0
-    moment_sigma_Am2: float = 300.0
+    name: ClassVar[str] = "damped"
     first_damping: float = 1.0
     tolerance_T: float = 1e-12
     max_iterations: int = 200
-
-    @property
-    def name(self) -> str:
-        """Name on the command line."""
-        return "damped"
-
-    @property
-    def s_0(self) -> FloatArray:
-        """Diagonal of the square root of the prior covariance, shape (6,)."""
-        return np.repeat([self.position_sigma_m, self.moment_sigma_Am2], 3)
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
         return Ends(
             *lanes.damped_map(
-                starts,
-                _of_source(measurement, z),
-                measurement.variance,
-                measurement.array.positions,
-                field_weights(measurement),
+                *_inputs(measurement, z, starts),
                 self.position_sigma_m,
                 self.moment_sigma_Am2,
                 self.first_damping,
@@ -295,14 +271,9 @@ class DampedFilter:
         S: FloatArray = self.s_0[:, None] * np.linalg.inv(np.linalg.qr(J, mode="r"))
         return IteratedUpdate(x, S, iteration, stopped, innovation, np.nan)
 
-    def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
-        """As :meth:`IekfFilter.reached`."""
-        distance = np.linalg.norm(ends.states[:, :3] - position_optimum, axis=1)
-        return ends.stopped & (distance < PRIOR_REACHED_M)
-
 
 @dataclass(frozen=True)
-class GlobalFilter:
+class GlobalFilter(_LikelihoodFilter):
     """The start-free search of :class:`magloc.localization.search.single_source.SingleSourceSearch`.
 
     With the map's start refined before its candidates.
@@ -313,12 +284,8 @@ class GlobalFilter:
         Linearisations of one refinement at most. The map counts those of all refinements of a start together.
     """
 
+    name: ClassVar[str] = "global"
     max_iterations: int = 100
-
-    @property
-    def name(self) -> str:
-        """Name on the command line."""
-        return "global"
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """Best end of every start (n, 6), compiled.
@@ -336,10 +303,6 @@ class GlobalFilter:
             stopped=np.isfinite(ends.chi2),
         )
 
-    def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
-        """Stopped with the χ² of the maximum-likelihood optimum."""
-        return ends.stopped & (ends.chi2 < chi2_optimum + CHI2_REACHED)
-
 
 # Every method of a map by its name, with its default settings; scenario files and the command line take them from here.
 FILTERS: dict[str, Filter] = {
@@ -347,10 +310,14 @@ FILTERS: dict[str, Filter] = {
 }
 
 
-def _of_source(measurement: DifferenceMeasurement, z: FloatArray) -> FloatArray:
-    """Differences (k,) without those of the known ambient field, which the compiled filters do not model."""
+_Inputs = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+
+
+def _inputs(measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> _Inputs:
+    """What every compiled filter is given first; the known ambient field, which none models, is taken out of z."""
     array = measurement.array
-    return z - measurement.measured(array.readings_of(array.ambient_fields))
+    of_source = z - measurement.measured(array.readings_of(array.ambient_fields))
+    return starts, of_source, measurement.variance, array.positions, field_weights(measurement)
 
 
 def field_weights(measurement: DifferenceMeasurement) -> FloatArray:

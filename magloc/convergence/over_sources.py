@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
 from importlib.metadata import version
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,11 +23,13 @@ from arrays.geometries import tetrahedron
 from arrays.noise import reading_errors
 from arrays.typing import FloatArray
 from arrays.whitening import Whitening, whitening
-from magloc.grids.cube import Box, MapSummary, Tally, Values, Variable, histogram, in_memory
+from magloc.bounds.crlb import cramer_rao_bounds
+from magloc.grids.computed import computed_map
+from magloc.grids.cube import Box, Tally, Values, Variable, check_half_width, histogram, tallied
 from magloc.localization.fit.results import Fix
 from magloc.localization.locator import Locator
 from magloc.localization.search.single_source import N_UNKNOWNS
-from magloc.measurement.differences import channel_jacobian, predicted_channels
+from magloc.measurement.differences import predicted_channels
 from magloc.measurement.rows import whitenings_of
 from magloc.measurement.whitened import WhitenedModel
 
@@ -73,6 +76,12 @@ class SourcesScenario:
     farthest_m: float = 12.0
     moment_Am2: float = 300.0
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.nearest_m < self.farthest_m:
+            raise ValueError(f"Input nearest_m must be between 0 and farthest_m; instead received {self.nearest_m}.")
+        if not 0.0 < self.moment_Am2 < np.inf:
+            raise ValueError(f"Input moment_Am2 must be positive and finite; instead received {self.moment_Am2}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +184,7 @@ class SourcesMap:
         reference = np.array([chi2 for _, chi2 in from_truth])
         chi2 = np.array([fix.solutions[0].chi2 if fix.solutions else np.nan for fix in fixes])
         found = np.where(chi2 <= reference + CHI2_FOUND, SourceStatus.FOUND, SourceStatus.MISSED)
-        sigma_range, sigma_position = self._bounds(position, moment, readings)
+        bounds = cramer_rao_bounds(self.scenario.array, position, moment)
         of_used: dict[str, Any] = {
             "status": np.where(np.isnan(chi2), SourceStatus.UNSOLVED, found),
             "iterations": [fix.solutions[0].iterations if fix.solutions else 0 for fix in fixes],
@@ -185,8 +194,8 @@ class SourcesMap:
             "solutions": [len(fix.solutions) for fix in fixes],
             "truth_listed": [self._lists(fix, *end) for fix, end in zip(fixes, from_truth, strict=True)],
             "range_observable": [bool(fix.solutions) and fix.solutions[0].range_observable for fix in fixes],
-            "sigma_range": sigma_range,
-            "sigma_position": sigma_position,
+            "sigma_range": bounds.sigma_range_m,
+            "sigma_position": bounds.sigma_position_m,
         }
         values = {}
         for name, variable in _VARIABLES.items():
@@ -194,14 +203,6 @@ class SourcesMap:
             of_all[used] = of_used[name]
             values[name] = of_all.reshape(box.shape)
         return values
-
-    def tally(self, values: Values) -> Tally:
-        """Counts of a part's values."""
-        return sources_tally(values)
-
-    def summary(self, tally: Tally, seconds: float) -> SourceMapSummary:
-        """Summary of the whole cube."""
-        return sources_summary(tally, seconds)
 
     def _random(self, box: Box) -> tuple[FloatArray, FloatArray]:
         """Moments (n, 3) [A·m²] and standard normal noise (n, C) of a box's sources.
@@ -270,32 +271,6 @@ class SourcesMap:
             for solution in fix.solutions
         )
 
-    def _bounds(self, position: FloatArray, moment: FloatArray, readings: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Cramér-Rao bounds (n,) of the range's and the position's standard deviation [m]."""
-        array = self.scenario.array
-        columns = np.swapaxes(channel_jacobian(array, position, moment), -1, -2)
-        rows = np.empty_like(columns)
-        for i, white in enumerate(self._whitenings(readings)):
-            rows[i] = white.apply(columns[i])
-        covariance = _covariance(rows)[:, :3, :3]
-        u = position - array.centroid
-        u = u / np.linalg.norm(u, axis=1, keepdims=True)
-        return (
-            np.sqrt(np.einsum("ni,nij,nj->n", u, covariance, u)),
-            np.sqrt(np.trace(covariance, axis1=1, axis2=2)),
-        )
-
-
-def _covariance(rows: FloatArray) -> FloatArray:
-    """Inverse (n, 6, 6) of the information ``rows rowsᵀ`` of whitened rows (n, 6, C); infinite where singular."""
-    scale = np.linalg.norm(rows, axis=-1)
-    unit = rows / scale[..., None]
-    eigenvalues, vectors = np.linalg.eigh(unit @ np.swapaxes(unit, -1, -2))
-    singular = eigenvalues[:, :1] <= 1e-15 * eigenvalues[:, -1:]
-    part = vectors / np.sqrt(np.where(singular, 1.0, eigenvalues))[:, None, :] / scale[..., None]
-    covariance: FloatArray = np.where(singular[..., None], np.inf, part @ np.swapaxes(part, -1, -2))
-    return covariance
-
 
 def _error(fix: Fix, truth: FloatArray) -> float:
     return float(np.linalg.norm(fix.solutions[0].position_m - truth)) if fix.solutions else np.nan
@@ -341,19 +316,41 @@ _VARIABLES = {
 
 
 @dataclass(frozen=True)
-class SourceMapSummary(MapSummary):
-    """Counts of a map over sources: ``starts`` are the sources that were fixed, ``converged`` those that were found.
+class SourcesSummary:
+    """Counts of a map over sources.
 
     Attributes
     ----------
+    starts, converged : int
+        Sources that were fixed, and those of them that were found.
+    fraction : float
+        Of the latter.
+    median_iterations : float
+        Over the sources that were found; NaN if there are none.
+    iterations_total : int
+    seconds : float
+        Duration of the computation alone; that of all machines together.
     truth_listed : float
-        Fraction of them whose solutions have the optimum that the search from the truth ended at.
+        Fraction of the sources whose solutions have the optimum that the search from the truth ended at.
     """
 
+    starts: int
+    converged: int
+    fraction: float
+    median_iterations: float
+    iterations_total: int
+    seconds: float
     truth_listed: float
 
+    def lines(self) -> list[str]:
+        """The counts in words."""
+        return [
+            f"{self.converged} of {self.starts} sources found ({self.fraction:.2%}), "
+            f"truth listed {self.truth_listed:.2%}, median {self.median_iterations:.0f} iterations"
+        ]
 
-def sources_tally(values: Values) -> Tally:
+
+def _tally(values: Values) -> Tally:
     """Counts of ``status``, ``truth_listed`` and ``iterations`` of a part of a map over sources."""
     found = values["status"] == SourceStatus.FOUND
     counts = {
@@ -365,31 +362,38 @@ def sources_tally(values: Values) -> Tally:
     return Tally(Counter({name: int(count) for name, count in counts.items()}), histogram(values["iterations"][found]))
 
 
-def sources_summary(tally: Tally, seconds: float) -> SourceMapSummary:
-    """Summary of a map over sources from its tally."""
-    return SourceMapSummary(
-        starts=tally.counts["sources"],
-        converged=tally.counts["found"],
-        fraction=tally.fraction("found", "sources"),
-        front_fraction=float("nan"),
-        back_fraction=float("nan"),
-        median_iterations=tally.median_iterations(),
-        iterations_total=tally.counts["iterations"],
-        seconds=seconds,
-        truth_listed=tally.fraction("truth listed", "sources"),
-    )
-
-
-def source_map(scenario: SourcesScenario, grid: int = 21, progress: Callable[[int], None] | None = None) -> xr.Dataset:
-    r"""Fix every source of a cube once.
+def source_map(
+    array: SensorArray,
+    moment_Am2: float = SourcesScenario.moment_Am2,
+    *,
+    edge_m: float = 2.0 * SourcesScenario.half_width_m,
+    n: int = 21,
+    nearest_m: float = SourcesScenario.nearest_m,
+    farthest_m: float = SourcesScenario.farthest_m,
+    seed: int = 0,
+    out: str | PathLike[str] | None = None,
+    scheduler: str | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> xr.Dataset:
+    r"""Fix every source of a cube once, with a random moment and noise: which of them does a fix find?
 
     Parameters
     ----------
-    scenario : SourcesScenario
-    grid : int
-        Sources along every axis, at least 2. For maps that do not fit into memory see :mod:`magloc.grids.store`.
-    progress : callable, optional
-        Called with the number of sources finished since the last call.
+    array : SensorArray
+        Vector sensors.
+    moment_Am2 : float
+        Size of every source's moment [A·m²].
+    edge_m : float
+        Edge of the cube, which is centred on the array's centroid [m].
+    n : int
+        Sources along every axis, at least 2.
+    nearest_m, farthest_m : float
+        Sources nearer to the centroid, or farther from it, are left out [m].
+    seed : int
+        Of the moments' directions and the noise.
+    out, scheduler, progress
+        See :func:`magloc.grids.computed.computed_map`: a zarr folder that streams and resumes, the address of a dask
+        scheduler, and a call with the number of sources finished.
 
     Returns
     -------
@@ -403,12 +407,21 @@ def source_map(scenario: SourcesScenario, grid: int = 21, progress: Callable[[in
     Raises
     ------
     ValueError
-        The array has scalar sensors or too few of them.
+        The array has scalar sensors or too few of them, or an input is out of range.
     """
-    return in_memory(SourcesMap(scenario, grid), progress)
+    scenario = SourcesScenario(array, check_half_width(edge_m), nearest_m, farthest_m, moment_Am2, seed)
+    return computed_map(SourcesMap(scenario, n), out, scheduler, progress)
 
 
-def summary(dataset: xr.Dataset) -> SourceMapSummary:
-    """Counts of a map made by :func:`source_map`."""
-    values = {name: dataset[name].to_numpy() for name in ("status", "truth_listed", "iterations")}
-    return sources_summary(sources_tally(values), float(dataset.attrs["seconds"]))
+def summary(dataset: xr.Dataset) -> SourcesSummary:
+    """Counts of a map made by :func:`source_map`, which need not fit into memory."""
+    tally = tallied(dataset, ("status", "truth_listed", "iterations"), _tally)
+    return SourcesSummary(
+        starts=tally.counts["sources"],
+        converged=tally.counts["found"],
+        fraction=tally.fraction("found", "sources"),
+        median_iterations=tally.median_iterations(),
+        iterations_total=tally.counts["iterations"],
+        seconds=float(dataset.attrs["seconds"]),
+        truth_listed=tally.fraction("truth listed", "sources"),
+    )

@@ -20,6 +20,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from importlib.metadata import version
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,15 +30,16 @@ from arrays.array import SensorArray
 from arrays.differences import decorrelated_differences
 from arrays.geometries import tetrahedron
 from arrays.noise import reading_covariance, reading_errors
-from magloc.grids.cube import Box, MapSummary, Tally, Values, Variable, histogram, in_memory
-from magloc.localization.fit.results import Solution
+from magloc.grids.computed import computed_map
+from magloc.grids.cube import Box, Tally, Values, Variable, check_half_width, histogram, tallied
+from magloc.localization.fit.results import Solution, Source
 from magloc.localization.locator import Locator
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 
 if TYPE_CHECKING:
     import xarray as xr
 from arrays.typing import FloatArray
-from magloc.convergence.filters import Ends, Filter, RepeatedFilter
+from magloc.convergence.filters import FILTERS, Ends, Filter, RepeatedFilter
 
 
 class Status(IntEnum):
@@ -126,9 +128,11 @@ class StartsMap:
 
     @classmethod
     def of(cls, scenario: StartsScenario, grid: int) -> StartsMap:
-        """Map of a scenario; the arguments and errors of :func:`convergence_map`."""
+        """Map of a scenario; the errors of :func:`convergence_map`."""
         if grid < 2:
             raise ValueError(f"Input grid must be at least 2; instead received {grid}.")
+        if scenario.array.channel_is_scalar.any():
+            raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
         locator = Locator(scenario.array, exclude_faulty=False)
         readings, measurement, z = simulated_measurement(scenario)
         fix = locator.fit(readings)
@@ -210,16 +214,43 @@ class StartsMap:
         }
         return {name: values[name].reshape(box.shape).astype(_VARIABLES[name].dtype) for name in _VARIABLES}
 
-    def tally(self, values: Values) -> Tally:
-        """Counts of a part's values."""
-        return starts_tally(values)
 
-    def summary(self, tally: Tally, seconds: float) -> MapSummary:
-        """Summary of the whole cube."""
-        return starts_summary(tally, seconds)
+@dataclass(frozen=True)
+class StartsSummary:
+    """Counts of a map over starts.
+
+    Attributes
+    ----------
+    starts, converged : int
+    fraction, front_fraction, back_fraction : float
+        Converged starts over all starts, over those in front of the plane and over those behind it.
+    median_iterations : float
+        Over the converged starts; NaN if there are none.
+    iterations_total : int
+        Of all starts.
+    seconds : float
+        Duration of the computation alone; that of all machines together.
+    """
+
+    starts: int
+    converged: int
+    fraction: float
+    front_fraction: float
+    back_fraction: float
+    median_iterations: float
+    iterations_total: int
+    seconds: float
+
+    def lines(self) -> list[str]:
+        """The counts in words."""
+        return [
+            f"{self.converged} of {self.starts} starts converged ({self.fraction:.1%}): "
+            f"front half {self.front_fraction:.1%}, back half {self.back_fraction:.1%}, "
+            f"median {self.median_iterations:.0f} passes"
+        ]
 
 
-def starts_tally(values: Values) -> Tally:
+def _tally(values: Values) -> Tally:
     """Counts of ``status``, ``half`` and ``iterations`` of a part of a map over starts."""
     converged = values["status"] == Status.CONVERGED
     front, back = values["half"] == 1, values["half"] == -1
@@ -237,32 +268,38 @@ def starts_tally(values: Values) -> Tally:
     )
 
 
-def starts_summary(tally: Tally, seconds: float) -> MapSummary:
-    """Summary of a map over starts from its tally."""
-    return MapSummary(
-        starts=tally.counts["starts"],
-        converged=tally.counts["converged"],
-        fraction=tally.fraction("converged", "starts"),
-        front_fraction=tally.fraction("converged front", "front"),
-        back_fraction=tally.fraction("converged back", "back"),
-        median_iterations=tally.median_iterations(),
-        iterations_total=tally.counts["iterations"],
-        seconds=seconds,
-    )
-
-
 def convergence_map(
-    scenario: StartsScenario, grid: int = 41, progress: Callable[[int], None] | None = None
+    array: SensorArray,
+    source: Source,
+    *,
+    method: str | Filter = "repeated",
+    edge_m: float = 40.0,
+    n: int = 41,
+    noise_seed: int | None = None,
+    out: str | PathLike[str] | None = None,
+    scheduler: str | None = None,
+    progress: Callable[[int], None] | None = None,
 ) -> xr.Dataset:
-    """Run the filter from every start of a cube.
+    """Run a filter from every start of a cube: from where does it find the source?
 
     Parameters
     ----------
-    scenario : StartsScenario
-    grid : int
-        Starts along every axis, at least 2. For maps that do not fit into memory see :mod:`magloc.grids.store`.
-    progress : callable, optional
-        Called with the number of starts finished since the last call.
+    array : SensorArray
+        Vector sensors.
+    source : Source
+        Its position and moment count.
+    method : str or Filter
+        "repeated", "iekf", "damped" or "global" with their default settings, or a filter of
+        :mod:`magloc.convergence.filters`.
+    edge_m : float
+        Edge of the cube, which is centred on the origin of the array's frame [m].
+    n : int
+        Starts along every axis, at least 2. The moment always starts at zero.
+    noise_seed : int, optional
+        Of one realisation of the sensors' noise that all starts share; noise-free readings without it.
+    out, scheduler, progress
+        See :func:`magloc.grids.computed.computed_map`: a zarr folder that streams and resumes, the address of a dask
+        scheduler, and a call with the number of starts finished.
 
     Returns
     -------
@@ -274,9 +311,15 @@ def convergence_map(
     Raises
     ------
     ValueError
-        The array has scalar sensors or too few of them, or its readings have no unique best fit.
+        The array has scalar sensors or too few of them, its readings have no unique best fit, or an input is out of
+        range.
     """
-    return in_memory(StartsMap.of(scenario, grid), progress)
+    if isinstance(method, str) and method not in FILTERS:
+        raise ValueError(f"Input method must be one of {', '.join(FILTERS)}; instead received {method!r}.")
+    (x, y, z), (mx, my, mz) = source.position_m.tolist(), source.moment_Am2.tolist()
+    chosen = FILTERS[method] if isinstance(method, str) else method
+    scenario = StartsScenario(array, (x, y, z), (mx, my, mz), check_half_width(edge_m), chosen, noise_seed)
+    return computed_map(StartsMap.of(scenario, n), out, scheduler, progress)
 
 
 def _status(ends: Ends, reached: NDArray[np.bool_]) -> NDArray[np.int8]:
@@ -312,7 +355,16 @@ def _attribute(value: Any) -> Any:
     return int(value) if isinstance(value, bool) else value  # netCDF has no booleans
 
 
-def summary(dataset: xr.Dataset) -> MapSummary:
-    """Counts of a map made by :func:`convergence_map`."""
-    values = {name: dataset[name].to_numpy() for name in ("status", "half", "iterations")}
-    return starts_summary(starts_tally(values), float(dataset.attrs["seconds"]))
+def summary(dataset: xr.Dataset) -> StartsSummary:
+    """Counts of a map made by :func:`convergence_map`, which need not fit into memory."""
+    tally = tallied(dataset, ("status", "half", "iterations"), _tally)
+    return StartsSummary(
+        starts=tally.counts["starts"],
+        converged=tally.counts["converged"],
+        fraction=tally.fraction("converged", "starts"),
+        front_fraction=tally.fraction("converged front", "front"),
+        back_fraction=tally.fraction("converged back", "back"),
+        median_iterations=tally.median_iterations(),
+        iterations_total=tally.counts["iterations"],
+        seconds=float(dataset.attrs["seconds"]),
+    )

@@ -13,18 +13,23 @@ no accident of the sample that it was fitted to.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.stats import qmc
 
 from arrays.array import SensorArray
 from arrays.geometries import GEOMETRIES
+from arrays.io.lazy import by_name
 from arrays.typing import FloatArray
 from magloc.design.descent import Descent, Sample, descend, feasible, is_spaced
 from magloc.design.evaluation import Judgement, fits, judged, random_rotation, references, unit_shape, worst_case
 from magloc.design.task import N_DRAWN, DesignTask
 from magloc.directions import fibonacci_directions
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 BEST_START = "best start"
 NEAR_OPTIMAL = 0.1
@@ -33,41 +38,9 @@ NEAR_OPTIMAL = 0.1
 _UNBOUNDED = 1e3
 
 
-@dataclass(frozen=True)
-class DesignSearch:
-    """How hard to search.
-
-    Attributes
-    ----------
-    n_starts : int
-        Shapes and random places to start from.
-    n_refined : int
-        Best of them, which descend again on the large sample.
-    log2_small, log2_large : int
-        Sizes of the samples, as powers of two: scrambled Sobol points.
-    small_iterations, large_iterations : int
-        Steps of a descent at most.
-    n_judged : int
-        Independent sources that everything is judged on.
-    """
-
-    n_starts: int = 16
-    n_refined: int = 4
-    log2_small: int = 11
-    log2_large: int = 14
-    small_iterations: int = 84
-    large_iterations: int = 250
-    n_judged: int = 40_000
-
-    @property
-    def n_steps(self) -> int:
-        """Steps of all descents together, at most."""
-        return self.n_starts * self.small_iterations + self.n_refined * self.large_iterations
-
-
 @dataclass(frozen=True, eq=False)
 class Design:
-    """Result of :func:`design`.
+    """Result of :func:`design_array`.
 
     Attributes
     ----------
@@ -96,6 +69,11 @@ class Design:
     worst_m: float
 
     @property
+    def gain(self) -> float:
+        """Share by which its criterion is below that of the best reference: tetrahedron, cube, cross of its span."""
+        return min(other.gain for other in self.judged[2:])
+
+    @property
     def worst_is_bounded(self) -> bool:
         """Whether the worst case that was found is of the size of the others, not a loss of rank."""
         return self.worst_m < _UNBOUNDED * self.judged[0].criterion_m
@@ -109,25 +87,31 @@ class Design:
             if other.fits and other.array.n_sensors <= self.array.n_sensors and other.gain < NEAR_OPTIMAL
         )
 
+    def plot(self, seed: int = 0) -> Figure:
+        """The sensors in their volume, and the range's σ over the distance; `seed` of the sources it is drawn from."""
+        figure: Figure = by_name("magloc.plots.design:design_figure")(self, seed)
+        return figure
 
-def design(
+
+def design_array(
     task: DesignTask,
     *,
-    search: DesignSearch = DesignSearch(),
+    starts: int | None = None,
     seed: int = 0,
-    progress: Callable[[int], None] = lambda _: None,
+    progress: Callable[[int], None] | None = None,
     better: Callable[[SensorArray], None] = lambda _: None,
 ) -> Design:
-    """Design an array for a task.
+    """Design an array: place its sensors for the sources that it is to locate.
 
     Parameters
     ----------
     task : DesignTask
-    search : DesignSearch
+    starts : int, optional
+        Shapes and random places to start from, in place of those of ``task.search``.
     seed : int
         Of the starts and of all samples; the same seed gives the same array, whatever the number of threads.
     progress : callable, optional
-        Called with steps done, of ``search.n_steps``.
+        Called with steps done, of ``task.search.n_steps``.
     better : callable, optional
         Called with every array that is better, on the large sample, than all before.
 
@@ -140,36 +124,38 @@ def design(
     ValueError
         No start leaves the sensors their least spacing, or determines the range of the sources.
     """
+    search = task.search if starts is None else replace(task.search, n_starts=starts)
+    step_done = progress or (lambda _: None)
     of_starts, of_small, of_large, of_references, of_judge = np.random.SeedSequence(seed).spawn(5)
     small = sobol_sample(task, search.log2_small, np.random.default_rng(of_small))
     large = sobol_sample(task, search.log2_large, np.random.default_rng(of_large))
     known = references(task, large, np.random.default_rng(of_references))
     buildable = [array.positions for array in known if array.n_sensors == task.n_sensors and fits(task, array)]
     shapes = starts_of(task, search.n_starts, np.random.default_rng(of_starts))
-    starts = [feasible(task, start) for start in [*buildable, *shapes][: search.n_starts]]
-    starts = [start for start in starts if is_spaced(task, start) and np.isfinite(small.value(task, start))]
-    if not starts:
+    places = [feasible(task, start) for start in [*buildable, *shapes][: search.n_starts]]
+    places = [start for start in places if is_spaced(task, start) and np.isfinite(small.value(task, start))]
+    if not places:
         raise ValueError(
             "Input task must leave room for its sensors, least_spacing_m apart, where they determine the range of its"
             " sources; instead no start does."
         )
-    values = [large.value(task, start) for start in starts]
+    values = [large.value(task, start) for start in places]
     first = int(np.argmin(values))
-    best = Descent(starts[first], values[first], 0, False)
+    best = Descent(places[first], values[first], 0, False)
     better(task.array(best.sensors))
 
     def descended(sample: Sample, start: FloatArray, max_iterations: int) -> Descent:
         """A descent; its end is kept if it is the best one on the large sample so far."""
         nonlocal best
-        end = descend(task, sample, start, max_iterations=max_iterations, step_done=progress)
+        end = descend(task, sample, start, max_iterations=max_iterations, step_done=step_done)
         value = large.value(task, end.sensors)
         if value <= best.value:
             best = Descent(end.sensors, value, end.iterations, end.converged and sample is large)
             better(task.array(best.sensors))
         return end
 
-    rough = [descended(small, start, search.small_iterations) for start in starts]
-    progress((search.n_starts - len(starts)) * search.small_iterations)
+    rough = [descended(small, start, search.small_iterations) for start in places]
+    step_done((search.n_starts - len(places)) * search.small_iterations)
     chosen = sorted(rough, key=lambda end: end.value)[: search.n_refined]
     fine = [descended(large, end.sensors, search.large_iterations) for end in chosen]
     array = task.array(best.sensors)
@@ -183,7 +169,7 @@ def design(
         n_descents=len(fine),
         judged=judged(
             task,
-            (array, task.array(starts[first], BEST_START), *known),
+            (array, task.array(places[first], BEST_START), *known),
             random_sample(task, search.n_judged, np.random.default_rng(of_judge)),
             np.random.default_rng(of_judge.spawn(1)[0]),
         ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from os import PathLike
 from typing import Protocol
 
 import numpy as np
@@ -127,9 +128,41 @@ class Mean:
         return "mean"
 
 
+@dataclass(frozen=True)
+class DesignSearch:
+    """How hard to search.
+
+    Attributes
+    ----------
+    n_starts : int
+        Shapes and random places to start from.
+    n_refined : int
+        Best of them, which descend again on the large sample.
+    log2_small, log2_large : int
+        Sizes of the samples, as powers of two: scrambled Sobol points.
+    small_iterations, large_iterations : int
+        Steps of a descent at most.
+    n_judged : int
+        Independent sources that everything is judged on.
+    """
+
+    n_starts: int = 16
+    n_refined: int = 4
+    log2_small: int = 11
+    log2_large: int = 14
+    small_iterations: int = 84
+    large_iterations: int = 250
+    n_judged: int = 40_000
+
+    @property
+    def n_steps(self) -> int:
+        """Steps of all descents together, at most."""
+        return self.n_starts * self.small_iterations + self.n_refined * self.large_iterations
+
+
 @dataclass(frozen=True, eq=False)
 class DesignTask:
-    """A task for :func:`magloc.design.optimise.design`.
+    """What an array is designed for.
 
     Attributes
     ----------
@@ -151,6 +184,8 @@ class DesignTask:
         Uniform ambient field [T].
     least_spacing_m : float
         Least distance of two sensors.
+    search : DesignSearch
+        How hard to search.
 
     Raises
     ------
@@ -168,6 +203,7 @@ class DesignTask:
     criterion: Criterion
     ambient_T: tuple[float, float, float] | None = None
     least_spacing_m: float = 0.0
+    search: DesignSearch = DesignSearch()
 
     def __post_init__(self) -> None:
         n_differences = (self.n_sensors - 1) * (3 if self.kind == "vector" else 1)
@@ -179,6 +215,19 @@ class DesignTask:
             )
         if self.kind == "scalar" and self.ambient_T is None:
             raise ValueError("Input ambient_T must be given for scalar sensors; instead received None.")
+
+    @classmethod
+    def read(cls, name_or_path: str | PathLike[str]) -> DesignTask:
+        """Task of a built-in name, such as "half-space-2m", or a TOML file (:mod:`magloc.design.task_files`).
+
+        Raises
+        ------
+        InputError
+            The file cannot be read or does not describe a task; the text says where and why.
+        """
+        from magloc.design.task_files import read_task
+
+        return read_task(str(name_or_path))
 
     def array(self, positions: FloatArray, name: str | None = None) -> SensorArray:
         """Array of the task's sensors at positions (n, 3) [m]."""

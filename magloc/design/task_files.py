@@ -44,7 +44,6 @@ A task file (TOML)::
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib import resources
 from math import pi, radians
 from pathlib import Path
@@ -56,8 +55,7 @@ import numpy as np
 from arrays.io.errors import InputError
 from arrays.io.toml import Table, check_keys, converted, read_toml, section_of
 from arrays.sensor import SensorKind
-from magloc.design.optimise import DesignSearch
-from magloc.design.task import Block, Cap, Criterion, DesignTask, Mean, Quantile, Region
+from magloc.design.task import Block, Cap, Criterion, DesignSearch, DesignTask, Mean, Quantile, Region
 from magloc.design.volumes import Ball, Box, Cylinder, Volume, read_surface
 
 FORMAT_VERSION = 1
@@ -166,42 +164,14 @@ _VOLUMES: dict[str, type[Table]] = {"ball": _Ball, "box": _Box, "cylinder": _Cyl
 _REGIONS: dict[str, type[Table]] = {"shell": _Shell, "half-space": _HalfSpace, "cap": _Cap, "box": _Block}
 
 
-@dataclass(frozen=True, eq=False)
-class TaskFile:
-    """What a task file holds.
-
-    Attributes
-    ----------
-    task : DesignTask
-    search : DesignSearch
-    """
-
-    task: DesignTask
-    search: DesignSearch
-
-
 def built_in_tasks() -> tuple[str, ...]:
     """Names of the tasks that come with the package."""
     files = (resources.files("magloc.design") / "tasks").iterdir()
     return tuple(sorted(Path(file.name).stem for file in files if file.name.endswith(".toml")))
 
 
-def read_task(name_or_path: str) -> TaskFile:
-    """Task of a built-in name or a TOML file; the head of this module documents every key.
-
-    Parameters
-    ----------
-    name_or_path : str
-
-    Returns
-    -------
-    TaskFile
-
-    Raises
-    ------
-    InputError
-        The file cannot be read or does not describe a task; the text says where and why.
-    """
+def read_task(name_or_path: str) -> DesignTask:
+    """Task of a built-in name or a TOML file: :meth:`magloc.design.task.DesignTask.read`."""
     path = name_or_path
     if name_or_path in built_in_tasks():
         path = str(resources.files("magloc.design") / "tasks" / f"{name_or_path}.toml")
@@ -213,7 +183,7 @@ def read_task(name_or_path: str) -> TaskFile:
     sensors = _sensors(f"{path}, table sensors", file.sensors)
     region, moment = _region(f"{path}, table sources", file.sources)
     ambient = sensors.ambient_nT
-    task = DesignTask(
+    return DesignTask(
         name=file.name or Path(path).stem,
         n_sensors=sensors.count,
         kind=cast(SensorKind, sensors.kind),
@@ -224,8 +194,8 @@ def read_task(name_or_path: str) -> TaskFile:
         criterion=_criterion(f"{path}, table criterion", file.criterion),
         ambient_T=None if ambient is None else (ambient[0] / 1e9, ambient[1] / 1e9, ambient[2] / 1e9),
         least_spacing_m=sensors.least_spacing_m,
+        search=_search(f"{path}, table search", file.search),
     )
-    return TaskFile(task, _search(f"{path}, table search", file.search))
 
 
 def _sensors(place: str, table: dict[str, Any]) -> _Sensors:

@@ -7,8 +7,10 @@ from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
-from magloc.chi_square import Detector
+from magloc.chi_square import FALSE_ALARM, Detector
 from magloc.detection.dipole_filter import DipoleFilter
+from magloc.detection.matched_filter import MatchedFilterDetector
+from magloc.directions import moments_on_sphere, sphere_directions
 
 # Ratio of neighbouring distances of the search: the energy is a power of the distance to 1e-5 between two of them.
 _STEP = 1.03
@@ -16,9 +18,56 @@ _STEP = 1.03
 _NEAREST = 1.1
 _DIRECTIONS_AT_ONCE = 32
 _FARTHEST_M = 1e6
+_N_DIRECTIONS, _N_MOMENTS = 100, 50
+# They know the threshold to 2 %, and the range, which falls with its eighth root, to a quarter of a per cent.
+_EXCEEDANCES = 20
 
 
 def detection_range(
+    array: SensorArray,
+    moment_Am2: float,
+    *,
+    probability: float = 0.9,
+    false_alarm_rate: float = FALSE_ALARM,
+    share: float = 0.5,
+    seed: int = 0,
+) -> float:
+    """Distance up to which the matched filter finds a source, over directions of the source and of its moment.
+
+    Parameters
+    ----------
+    array : SensorArray
+    moment_Am2 : float
+        Size of the moment [A·m²].
+    probability : float
+        Of detection.
+    false_alarm_rate : float
+        Share of the rows without a source in which one is found.
+    share : float
+        Of the directions for which that distance suffices: 0.5 gives the median, 0.95 what is nearly sure.
+    seed : int
+        Of the noise that sets the threshold.
+
+    Returns
+    -------
+    float
+        From the sensors' centroid [m]; 0 where a source is not even found beside the array.
+
+    Raises
+    ------
+    ValueError
+        The array gives fewer than six differences or has scalar sensors without an ambient field, or an input is out of
+        range.
+    """
+    detector = MatchedFilterDetector.of(
+        array, false_alarm_rate, n_draws=round(_EXCEEDANCES / false_alarm_rate), seed=seed
+    )
+    moments = moments_on_sphere(moment_Am2, _N_MOMENTS)
+    ranges = detection_ranges(array, sphere_directions(_N_DIRECTIONS), moments, detector, probability=probability)
+    return float(np.quantile(ranges, 1.0 - share, method="inverted_cdf"))
+
+
+def detection_ranges(
     array: SensorArray,
     directions: ArrayLike,
     moments_Am2: ArrayLike,
@@ -34,7 +83,7 @@ def detection_range(
     directions : array_like, shape (d, 3)
         From the sensors' centroid, array frame, of any length.
     moments_Am2 : array_like, shape (n, 3)
-        Moments that the source may have [A·m²]: a size times :func:`magloc.bounds.crlb.moment_directions`, say.
+        Moments that the source may have [A·m²]: :func:`magloc.directions.moments_on_sphere`, say.
     detector : Detector
         With its false-alarm rate: :class:`magloc.chi_square.ChiSquareDetector` or
         :class:`magloc.detection.matched_filter.MatchedFilterDetector`.

@@ -27,11 +27,15 @@ _LARGEST_PORT = 65535
 _one_chunk = threading.Lock()
 
 
+class SchedulerError(InputError):
+    """A scheduler that cannot be used; the text begins with the name of the argument."""
+
+
 def check_address(scheduler: str) -> None:
-    """Refuse what cannot be the address of a scheduler, with an :class:`arrays.io.errors.InputError`."""
+    """Refuse what cannot be the address of a scheduler."""
     address = _ADDRESS.fullmatch(scheduler)
     if address is None or not 0 < int(address["port"]) <= _LARGEST_PORT:
-        raise InputError(f"--scheduler: found {scheduler!r}, expected tcp://HOST:PORT or HOST:PORT.")
+        raise SchedulerError(f"scheduler: found {scheduler!r}, expected tcp://HOST:PORT or HOST:PORT.")
 
 
 def computed_by(scheduler: str, cube: CubeMap, wanted: Iterable[Box], timeout_s: float = 10.0) -> Iterator[Chunk]:
@@ -54,15 +58,15 @@ def computed_by(scheduler: str, cube: CubeMap, wanted: Iterable[Box], timeout_s:
 
     Raises
     ------
-    InputError
+    SchedulerError
         There is no scheduler, it has no workers, it went away, or a worker failed.
     """
     check_address(scheduler)
     try:
         from distributed import as_completed
     except ImportError:
-        raise InputError(
-            "--scheduler needs the package distributed, which is not installed: pip install 'magloc[cluster]'."
+        raise SchedulerError(
+            "scheduler needs the package distributed, which is not installed: pip install 'magloc[cluster]'."
         ) from None
     waiting = iter(wanted)
     with _client(scheduler, timeout_s) as client:
@@ -75,9 +79,9 @@ def computed_by(scheduler: str, cube: CubeMap, wanted: Iterable[Box], timeout_s:
                     return
                 yield next(running).result()
         except (CancelledError, OSError):
-            raise InputError(f"--scheduler {scheduler}: the connection to the scheduler was lost.") from None
+            raise SchedulerError(f"scheduler {scheduler}: the connection to the scheduler was lost.") from None
         except Exception as error:
-            raise InputError(f"--scheduler {scheduler}: a worker failed ({type(error).__name__}: {error}).") from None
+            raise SchedulerError(f"scheduler {scheduler}: a worker failed ({type(error).__name__}: {error}).") from None
 
 
 def _computed_by_worker(cube: CubeMap, box: Box) -> Chunk:
@@ -102,12 +106,12 @@ def _client(scheduler: str, timeout_s: float) -> Iterator[Any]:
         try:
             client = Client(scheduler, timeout=timeout_s, set_as_default=False)
         except (OSError, ValueError) as error:
-            raise InputError(f"--scheduler {scheduler}: found no scheduler there ({error}).") from None
+            raise SchedulerError(f"scheduler {scheduler}: found no scheduler there ({error}).") from None
         with client:
             try:
                 client.wait_for_workers(1, timeout=timeout_s)
             except TimeoutError:
-                raise InputError(f"--scheduler {scheduler}: found no workers there within {timeout_s:g} s.") from None
+                raise SchedulerError(f"scheduler {scheduler}: found no workers there within {timeout_s:g} s.") from None
             yield client
     finally:
         logger.setLevel(level)
@@ -130,12 +134,12 @@ def _check_answer(scheduler: str, timeout_s: float) -> None:
     try:
         found = asyncio.run(answer_in_time())
     except TimeoutError:
-        raise InputError(
-            f"--scheduler {scheduler}: found no scheduler there (no answer within {timeout_s:g} s)."
+        raise SchedulerError(
+            f"scheduler {scheduler}: found no scheduler there (no answer within {timeout_s:g} s)."
         ) from None
     except OSError as error:
-        raise InputError(f"--scheduler {scheduler}: found no scheduler there ({error}).") from None
+        raise SchedulerError(f"scheduler {scheduler}: found no scheduler there ({error}).") from None
     except Exception:  # what another service says may mean anything to dask
-        raise InputError(f"--scheduler {scheduler}: found another service there, expected a scheduler.") from None
+        raise SchedulerError(f"scheduler {scheduler}: found another service there, expected a scheduler.") from None
     if found != "Scheduler":
-        raise InputError(f"--scheduler {scheduler}: found a {found} of dask there, expected a scheduler.")
+        raise SchedulerError(f"scheduler {scheduler}: found a {found} of dask there, expected a scheduler.")

@@ -11,7 +11,7 @@ import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -25,6 +25,7 @@ from arrays.typing import FloatArray
 
 Values = Mapping[str, NDArray[Any]]
 DIMENSIONS = ("x", "y", "z")
+_PART = 64  # points along the edges of the parts that are counted at once
 
 
 class Box(NamedTuple):
@@ -108,32 +109,19 @@ def histogram(iterations: NDArray[Any]) -> Counter[int]:
     return Counter(dict(zip(values.tolist(), counts.tolist(), strict=True)))
 
 
-@dataclass(frozen=True)
-class MapSummary:
-    """Counts of a map.
+class Summary(Protocol):
+    """Counts of a whole map."""
 
-    Attributes
-    ----------
-    starts, converged : int
-    fraction, front_fraction, back_fraction : float
-        Converged starts over all starts, over those in front of the plane and over those behind it; NaN where the map
-        has no such plane.
-    median_iterations : float
-        Over the converged starts; NaN if there are none.
-    iterations_total : int
-        Of all starts.
-    seconds : float
-        Duration of the computation alone; that of all machines together.
-    """
+    @property
+    def iterations_total(self) -> int:
+        """Of all points."""
 
-    starts: int
-    converged: int
-    fraction: float
-    front_fraction: float
-    back_fraction: float
-    median_iterations: float
-    iterations_total: int
-    seconds: float
+    @property
+    def seconds(self) -> float:
+        """Duration of the computation alone; that of all machines together."""
+
+    def lines(self) -> list[str]:
+        """The counts in words."""
 
 
 class CubeMap(Protocol):
@@ -173,12 +161,6 @@ class CubeMap(Protocol):
     def values(self, box: Box) -> Values:
         """Values of every variable, of the box's shape. They depend neither on the box nor on the number of threads."""
 
-    def tally(self, values: Values) -> Tally:
-        """Counts of a part's values."""
-
-    def summary(self, tally: Tally, seconds: float) -> MapSummary:
-        """Summary of the whole cube from its tally."""
-
 
 class Chunk(NamedTuple):
     """Values of one box, and how long they took."""
@@ -190,7 +172,11 @@ class Chunk(NamedTuple):
 
 def boxes(cube: CubeMap) -> Iterator[Box]:
     """Boxes that tile a cube."""
-    parts = [slice(i, min(i + cube.edge, cube.grid)) for i in range(0, cube.grid, cube.edge)]
+    return _tiles(cube.grid, cube.edge)
+
+
+def _tiles(grid: int, edge: int) -> Iterator[Box]:
+    parts = [slice(i, min(i + edge, grid)) for i in range(0, grid, edge)]
     n = len(parts)
     for i, j, k in np.ndindex(n, n, n):
         yield Box((i, j, k), (parts[i], parts[j], parts[k]))
@@ -236,7 +222,25 @@ def coordinates(cube: CubeMap) -> dict[str, tuple[FloatArray, dict[str, str]]]:
     }
 
 
-def in_memory(cube: CubeMap, progress: Callable[[int], None] | None = None) -> xr.Dataset:
+def check_half_width(edge_m: float) -> float:
+    """Half of a cube's edge."""
+    if not 0.0 < edge_m < np.inf:
+        raise ValueError(f"Input edge_m must be positive and finite; instead received {edge_m}.")
+    return 0.5 * edge_m
+
+
+def tallied(dataset: xr.Dataset, names: Sequence[str], tally: Callable[[Values], Tally]) -> Tally:
+    """Tally of some variables of a map, part by part: the map need not fit into memory."""
+    total = Tally()
+    for box in _tiles(dataset.sizes[DIMENSIONS[0]], _PART):
+        part = dataset[list(names)].isel(dict(zip(DIMENSIONS, box.region, strict=True)))
+        total += tally({name: part[name].to_numpy() for name in names})
+    return total
+
+
+def in_memory(
+    cube: CubeMap, progress: Callable[[int], None] | None = None, chunks: Iterable[Chunk] | None = None
+) -> xr.Dataset:
     """All values of a map.
 
     Parameters
@@ -244,6 +248,8 @@ def in_memory(cube: CubeMap, progress: Callable[[int], None] | None = None) -> x
     cube : CubeMap
     progress : callable, optional
         Called with the number of points finished since the last call.
+    chunks : iterable of Chunk, optional
+        Of all boxes; by default computed here.
 
     Returns
     -------
@@ -255,7 +261,7 @@ def in_memory(cube: CubeMap, progress: Callable[[int], None] | None = None) -> x
     shape = (cube.grid,) * 3
     whole = {name: np.full(shape, variable.not_done, variable.dtype) for name, variable in cube.variables.items()}
     seconds = 0.0
-    for chunk in computed_here(cube, boxes(cube)):
+    for chunk in computed_here(cube, boxes(cube)) if chunks is None else chunks:
         for name, values in chunk.values.items():
             whole[name][chunk.box.region] = values
         seconds += chunk.seconds

@@ -27,8 +27,6 @@ from magloc.grids.cube import (
     Box,
     Chunk,
     CubeMap,
-    MapSummary,
-    Tally,
     Values,
     boxes,
     coordinates,
@@ -57,8 +55,6 @@ class Sweep:
 
     Attributes
     ----------
-    tally : Tally
-        Of the chunks that are done.
     points_done, chunks_done, n_chunks : int
     unreadable : list of str
         One sentence for every chunk that was done but cannot be read; it is computed again.
@@ -74,7 +70,6 @@ class Sweep:
     def __init__(self, cube: CubeMap, path: str | os.PathLike[str]) -> None:
         self.cube = cube
         self.path = Path(path)
-        self.tally = Tally()
         self.points_done = 0
         self.unreadable: list[str] = []
         if not self.path.exists():
@@ -116,11 +111,6 @@ class Sweep:
         """Chunks that will not be computed again."""
         return int(np.isfinite(self._seconds).sum())
 
-    @property
-    def summary(self) -> MapSummary:
-        """Summary of what is done."""
-        return self.cube.summary(self.tally, float(np.nansum(self._seconds)))
-
     def unfinished(self) -> Iterator[Box]:
         """Boxes that are not done."""
         return (box for box in boxes(self.cube) if np.isnan(self._seconds[box.place]))
@@ -145,13 +135,12 @@ class Sweep:
                 for name, array in self._arrays.items():
                     array[chunk.box.region] = chunk.values[name]
                 self._marks[chunk.box.place] = chunk.seconds
-                self._count(chunk.box, chunk.values, chunk.seconds)
+                self._count(chunk.box, chunk.seconds)
             if progress is not None:
                 progress(chunk.box.size)
 
-    def _count(self, box: Box, values: Values, seconds: float) -> None:
+    def _count(self, box: Box, seconds: float) -> None:
         self._seconds[box.place] = seconds
-        self.tally += self.cube.tally(values)
         self.points_done += box.size
 
     def _count_done(self) -> None:
@@ -165,7 +154,7 @@ class Sweep:
                 self.unreadable.append(f"{self.path}: chunk {box.place} cannot be read ({error}) and is computed again")
                 self._marks[box.place] = self._seconds[box.place] = np.nan
             else:
-                self._count(box, values, self._seconds[box.place])
+                self._count(box, self._seconds[box.place])
 
     def _check_complete(self, values: Values) -> None:
         for name, variable in self.cube.variables.items():
@@ -195,6 +184,14 @@ def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
         if "flag_values" in variable.attrs:  # JSON knows no types, netCDF and CF want that of the variable
             variable.attrs["flag_values"] = np.asarray(variable.attrs["flag_values"], dtype=variable.dtype)
     return dataset
+
+
+def chunk_seconds(path: str | os.PathLike[str]) -> FloatArray:
+    """Duration of every chunk of a store, NaN where it is not done; empty where there is no map."""
+    try:
+        return _readable_marks(_opened(Path(path))[SECONDS_OF_CHUNK])
+    except (KeyError, OSError, ValueError):
+        return np.empty(0)
 
 
 def _as_json(attributes: Mapping[str, Any]) -> dict[str, Any]:

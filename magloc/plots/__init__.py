@@ -2,18 +2,19 @@
 
 from magloc.plots.calibration import calibration_figure, turning_figure
 from magloc.plots.fixes import fix_figure, residual_figure
-from magloc.plots.maps import convergence_figure, source_figure
-from magloc.plots.style import save
+from magloc.plots.maps import convergence, sources
+from magloc.plots.style import save, write
 from magloc.plots.tracks import consistency_figure, track_figure
 
 __all__ = [
     "calibration_figure",
     "consistency_figure",
-    "convergence_figure",
+    "convergence",
     "fix_figure",
     "residual_figure",
     "save",
-    "source_figure",
+    "sources",
     "track_figure",
     "turning_figure",
+    "write",
 ]

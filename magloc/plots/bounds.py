@@ -85,7 +85,7 @@ def bound_sphere_figure(dataset: xr.Dataset, scenario: BoundScenario, range_m: f
     Parameters
     ----------
     dataset : xarray.Dataset
-        Made by :func:`magloc.bounds.maps.bound_spheres`.
+        Made by :func:`magloc.bounds.spheres.bound_spheres`.
     scenario : BoundScenario
         That it was made for.
     range_m : float
@@ -127,8 +127,8 @@ def reach_figure(dataset: xr.Dataset, scenario: BoundScenario) -> Figure:
     Parameters
     ----------
     dataset : xarray.Dataset
-        Made by :func:`magloc.bounds.maps.bound_spheres`; with the detection ranges of
-        :func:`magloc.bounds.detection_map.with_detection_ranges`, or without.
+        Made by :func:`magloc.bounds.spheres.bound_spheres`; with the detection ranges of
+        :func:`magloc.bounds.spheres.with_detection_ranges`, or without.
     scenario : BoundScenario
         That it was made for.
 
@@ -198,7 +198,7 @@ def write_bound_animation(
     Parameters
     ----------
     dataset : xarray.Dataset
-        Made by :func:`magloc.bounds.maps.bound_spheres`.
+        Made by :func:`magloc.bounds.spheres.bound_spheres`.
     scenario : BoundScenario
         That it was made for.
     path : Path

@@ -10,10 +10,9 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from magloc.convergence.over_sources import SourceMapSummary, SourceStatus
+from magloc.convergence.over_sources import SourceStatus
 from magloc.convergence.over_sources import summary as source_summary
 from magloc.convergence.over_starts import Status, summary
-from magloc.grids.cube import MapSummary
 from magloc.plots import style
 
 if TYPE_CHECKING:
@@ -39,16 +38,14 @@ _SOURCE_ENDS = {
 _SOURCES_COLOURS = ListedColormap([colour for colour, _, _ in _SOURCE_ENDS.values()])
 
 
-def convergence_figure(dataset: xr.Dataset, counts: MapSummary | None = None) -> Figure:
+def convergence(dataset: xr.Dataset) -> Figure:
     """Iterations to convergence on three slices through the source, as in the source paper.
 
     Parameters
     ----------
     dataset : xarray.Dataset
         A map made by :func:`magloc.convergence.over_starts.convergence_map`, or one opened by
-        :func:`magloc.grids.store.open_map`, of which only the slices are loaded.
-    counts : MapSummary, optional
-        Its summary, where that is known; without it the whole map is loaded to count.
+        :func:`magloc.grids.store.open_map`: only its slices are in memory at once.
 
     Returns
     -------
@@ -56,7 +53,7 @@ def convergence_figure(dataset: xr.Dataset, counts: MapSummary | None = None) ->
         Starts that did not converge are white and hatched; the dashed line is the plane through the array, orthogonal
         to the direction of the source.
     """
-    counts = summary(dataset) if counts is None else counts
+    counts = summary(dataset)
     source = np.atleast_1d(dataset.attrs["position_m"])
     centroid = np.atleast_1d(dataset.attrs["centroid_m"])
     moment = np.atleast_1d(dataset.attrs["moment_Am2"])
@@ -87,22 +84,20 @@ def convergence_figure(dataset: xr.Dataset, counts: MapSummary | None = None) ->
     return figure
 
 
-def source_figure(dataset: xr.Dataset, counts: SourceMapSummary | None = None) -> Figure:
+def sources(dataset: xr.Dataset) -> Figure:
     """How fixes ended, over the Cramér-Rao bound of the range, on three slices through the array.
 
     Parameters
     ----------
     dataset : xarray.Dataset
         A map made by :func:`magloc.convergence.over_sources.source_map`, or one opened by
-        :func:`magloc.grids.store.open_map`, of which only the slices are loaded.
-    counts : SourceMapSummary, optional
-        Its summary, where that is known; without it the whole map is loaded to count.
+        :func:`magloc.grids.store.open_map`: only its slices are in memory at once.
 
     Returns
     -------
     matplotlib.figure.Figure
     """
-    counts = source_summary(dataset) if counts is None else counts
+    counts = source_summary(dataset)
     figure = style.new_figure(4.9, layout="compressed")
     axes = figure.subplots(2, 3)
     parts = _slices(dataset[["status", "sigma_range"]], np.zeros(3))

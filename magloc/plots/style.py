@@ -7,7 +7,7 @@ or more in CIE lightness, and by its marker or line as well.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +16,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
+
+from arrays.io.csv import Column, write_columns
+from arrays.io.text import replace_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,6 +50,13 @@ def new_figure(height_in: float, *, layout: str | None = "constrained") -> Figur
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, fine enough for print."""
     figure.savefig(path, format="png", dpi=DPI, pil_kwargs={"compress_level": 3})
+
+
+def write(figure: Figure, path: Path, columns: Mapping[str, Column] | None = None) -> None:
+    """Write a figure as PNG, whole or not at all, and the data behind it beside it as CSV."""
+    replace_file(path, lambda place: save(figure, place))
+    if columns is not None:
+        write_columns(columns, path.with_suffix(".csv"))
 
 
 def dress(ax: Axes, across: str, up: str, title: str = "") -> None:

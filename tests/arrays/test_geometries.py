@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.distance import pdist, squareform
 
-from arrays.geometries import GEOMETRIES, axial, cross, cube, hexagon, square, tetrahedron
+from arrays.geometries import GEOMETRIES, axial, cross, cube, grid, hexagon, square, tetrahedron
 
 NAMES = list(GEOMETRIES)
 
@@ -109,3 +109,19 @@ class TestSolidAndAxial:
 
     def test_axial(self) -> None:
         assert_array_equal(axial(1.5).positions, [[0, 0, 0.75], [0, 0, -0.75]])
+
+
+class TestGrid:
+    def test_stands_flat_and_centred_with_equal_spacing(self):
+        board = grid(3, 2, 0.04, noise_T=2e-9)
+        assert board.n_sensors == 6
+        assert_allclose(board.centroid, 0.0, atol=1e-15)
+        assert_allclose(board.positions[:3], [[-0.04, -0.02, 0.0], [0.0, -0.02, 0.0], [0.04, -0.02, 0.0]])
+        assert_allclose(board.positions[3:, 1], 0.02)
+        assert {sensor.noise_T for sensor in board.sensors} == {2e-9}
+
+    def test_bad_input(self):
+        with pytest.raises(ValueError, match="nx and ny must be at least 1"):
+            grid(1, 1, 0.1)
+        with pytest.raises(ValueError, match="Input pitch_m must be a positive finite number"):
+            grid(2, 2, 0.0)

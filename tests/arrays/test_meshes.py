@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
 from arrays.geometries import GEOMETRIES, cube, tetrahedron
-from arrays.meshes import AXIS_COLOURS, array_mesh, array_scene, glyph_size, sensor_mesh
+from arrays.meshes import AXIS_COLOURS, array_scene, glyph_size, mesh_of, sensor_mesh
 from arrays.sensor import Sensor
 
 BODIES = {"vector": 4, "scalar": 1}  # a cube and three rods, or a sphere
@@ -54,7 +54,7 @@ class TestSize:
 
     @pytest.mark.parametrize("edge", [0.03, 1.5, 30.0])
     def test_proportion(self, edge: float) -> None:
-        assert_allclose(array_mesh(tetrahedron(edge)).bounds, edge * array_mesh(tetrahedron(1.0)).bounds, rtol=1e-12)
+        assert_allclose(mesh_of(tetrahedron(edge)).bounds, edge * mesh_of(tetrahedron(1.0)).bounds, rtol=1e-12)
 
     @pytest.mark.parametrize("name", GEOMETRIES)
     def test_glyphs_do_not_touch(self, name: str) -> None:
@@ -73,7 +73,7 @@ class TestArray:
     @pytest.mark.parametrize("kind", ["vector", "scalar"])
     @pytest.mark.parametrize("edge", [0.03, 30.0])
     def test_mesh_is_watertight(self, kind: str, edge: float) -> None:
-        mesh = array_mesh(cube(edge, kind))
+        mesh = mesh_of(cube(edge, kind))
         assert mesh.is_watertight
         assert mesh.is_winding_consistent
         assert mesh.volume > 0.0
@@ -97,4 +97,4 @@ class TestArray:
 
     def test_scene_and_mesh_show_the_same(self) -> None:
         array = tetrahedron(1.5)
-        assert_allclose(array_scene(array, 0.1).bounds, array_mesh(array, 0.1).bounds, rtol=1e-12)
+        assert_allclose(array_scene(array, 0.1).bounds, mesh_of(array, 0.1).bounds, rtol=1e-12)

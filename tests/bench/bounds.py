@@ -10,8 +10,9 @@ import numpy as np
 
 from arrays.array import SensorArray
 from arrays.geometries import cube, tetrahedron
-from magloc.bounds.crlb import bounds_of
-from magloc.bounds.over_moments import moment_directions, sigma_table
+from magloc.bounds.crlb import cramer_rao_bounds
+from magloc.bounds.over_moments import sigma_table
+from magloc.directions import moments_on_sphere
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
 
@@ -35,14 +36,14 @@ def rows(size: Size) -> Iterator[Row]:
     threads = numba.get_num_threads()
     for name, array in arrays().items():
         positions = np.random.default_rng(8).uniform(-20.0, 20.0, (size.rows, 3))
-        moments = 100.0 * moment_directions(array, N_MOMENTS)
+        moments = moments_on_sphere(100.0, N_MOMENTS, half=not array.channel_is_scalar.any())
         sample = positions[: size.sample]
 
         def ours(array=array, positions=positions, moments=moments):
             return sigma_table(array, positions, moments)
 
         def twin(array=array, sample=sample, moments=moments):
-            return bounds_of(array, sample[:, None], moments)
+            return cramer_rao_bounds(array, sample[:, None], moments)
 
         timings = interleaved(
             {

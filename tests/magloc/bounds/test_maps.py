@@ -2,8 +2,8 @@
 
 | what | who checks it |
 |---|---|
-| values of every map | magloc.bounds.crlb.bounds_of at the points' own coordinates, NumPy's quantiles |
-| reach | the root of magloc.bounds.crlb.bounds_of by SciPy; a scan over distances |
+| values of every map | magloc.bounds.crlb.cramer_rao_bounds at the points' own coordinates, NumPy's quantiles |
+| reach | the root of magloc.bounds.crlb.cramer_rao_bounds by SciPy; a scan over distances |
 | a map in boxes, on disk | the same in memory |
 """
 
@@ -19,19 +19,19 @@ from scipy.optimize import brentq
 
 from arrays.array import SensorArray
 from arrays.geometries import cube, tetrahedron
-from magloc.bounds.crlb import bounds_of
+from magloc.bounds.crlb import cramer_rao_bounds
 from magloc.bounds.maps import (
     CASES,
     BoundMap,
     BoundScenario,
     Reached,
-    accuracy_ranges,
-    bound_map,
     bound_slices,
-    bound_spheres,
     bounds_at,
+    summary,
 )
+from magloc.bounds.spheres import accuracy_ranges, bound_spheres
 from magloc.directions import sphere_directions
+from magloc.grids.computed import computed_map
 from magloc.grids.cube import boxes, computed_here
 from magloc.grids.store import Sweep, open_map
 
@@ -46,9 +46,9 @@ QUANTITIES = {"range": "sigma_range_m", "bearing": "sigma_bearing_rad", "positio
 
 
 def direct(scenario, position):
-    """All values at one position, by bounds_of and NumPy."""
-    one = bounds_of(scenario.array, position, scenario.moment_Am2)
-    many = bounds_of(scenario.array, position, scenario.moments_Am2)
+    """All values at one position, by cramer_rao_bounds and NumPy."""
+    one = cramer_rao_bounds(scenario.array, position, scenario.moment_Am2)
+    many = cramer_rao_bounds(scenario.array, position, scenario.moments_Am2)
     values = {}
     for name, attribute in QUANTITIES.items():
         sigmas = getattr(many, attribute)
@@ -65,7 +65,7 @@ def assert_same(values, expected):
 
 class TestCube:
     def test_values_are_the_bounds_at_its_points(self):
-        dataset = bound_map(MOVED, 4)
+        dataset = computed_map(BoundMap(MOVED, 4))
         assert_array_equal(dataset.attrs["centroid_m"], MOVED.array.centroid)
         for x, y, z in ((0, 0, 0), (1, 2, 3), (3, 1, 2)):
             point = dataset.isel(x=x, y=y, z=z)
@@ -73,7 +73,7 @@ class TestCube:
             assert_same(point, direct(MOVED, place))
 
     def test_reached_counts_the_moments_that_are_accurate_enough(self):
-        dataset = bound_map(SCENARIO, 9)
+        dataset = computed_map(BoundMap(SCENARIO, 9))
         ranks = [(dataset[f"sigma_range{case}"] <= SCENARIO.accuracy_m).astype(int) for case in CASES[1:]]
         defined = dataset.reached != Reached.UNDEFINED
         assert_array_equal(dataset.reached.to_numpy()[defined], sum(ranks).to_numpy()[defined])
@@ -87,18 +87,18 @@ class TestCube:
         assert len(list(boxes(cube_map))) == 8
         with Sweep(cube_map, tmp_path / "map.zarr") as sweep:
             sweep.write(computed_here(cube_map, sweep.unfinished()))
-            counts = sweep.summary
         with open_map(tmp_path / "map.zarr") as stored:
             # All at once, without boxes.
             places = np.stack(np.meshgrid(*3 * [cube_map.axis], indexing="ij"), axis=-1)
             whole = bounds_at(small, small.array.centroid + places)
             for name, values in whole.items():
                 assert_array_equal(stored[name], values)
-            assert counts.starts == 40**3
+            counts = summary(stored)
+            assert counts.points == 40**3
             assert counts.fraction == (stored.reached >= Reached.MOST).mean()
 
     def test_describes_itself(self):
-        dataset = bound_map(SCENARIO, 2)
+        dataset = computed_map(BoundMap(SCENARIO, 2))
         for variable in (*dataset.data_vars.values(), *dataset.coords.values()):
             assert variable.attrs["long_name"]
             assert "units" in variable.attrs or "flag_values" in variable.attrs
@@ -106,7 +106,7 @@ class TestCube:
             assert key in dataset.attrs
 
     def test_survives_netcdf(self, tmp_path):
-        dataset = bound_map(SCENARIO, 3)
+        dataset = computed_map(BoundMap(SCENARIO, 3))
         dataset.to_netcdf(tmp_path / "cube.nc")
         with xr.open_dataset(tmp_path / "cube.nc") as again:
             xr.testing.assert_equal(again, dataset)
@@ -208,7 +208,7 @@ class TestScenario:
 
     def test_a_grid_has_two_points_at_least(self):
         with pytest.raises(ValueError, match="Input grid must be at least 2"):
-            bound_map(SCENARIO, 1)
+            computed_map(BoundMap(SCENARIO, 1))
         with pytest.raises(ValueError, match="Input grid must be at least 2"):
             bound_slices(SCENARIO, 1)
 

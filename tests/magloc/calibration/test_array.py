@@ -19,10 +19,11 @@ from arrays.geometries import tetrahedron
 from arrays.sensor import Calibration, Sensor
 from magloc.calibration import least_squares as source_fit
 from magloc.calibration import model as moving_source
-from magloc.calibration.array import CalibrationResult, Prior, calibrate_on_path, self_calibrate
+from magloc.calibration.array import CalibrationPrior, calibrate_on_path, self_calibrate
 from magloc.calibration.continuation import calibrated_array
 from magloc.calibration.model import AXES, GAINS, OFFSET, POSITION, Problem, State
 from magloc.calibration.observability import gauge_vectors
+from magloc.calibration.results import SourceCalibration
 from magloc.readings import read_readings, read_truth
 from tests.oracles import magpylib_field
 from tests.plain_locator import plain_locator
@@ -33,7 +34,7 @@ GAIN = {"common gain against the moment"}
 SIZE = {"size of the array against the moment"}
 TRANSLATIONS = {f"translation along {axis}" for axis in "xyz"}
 ROTATIONS = {f"rotation about {axis}" for axis in "xyz"}
-PRIOR = Prior(position_m=2e-3, gain=0.05, axes_rad=0.02, offset_T=1e-6)
+PRIOR = CalibrationPrior(position_m=2e-3, gain=0.05, axes_rad=0.02, offset_T=1e-6)
 MOMENT = np.array([0.5, -0.3, 0.8])
 
 
@@ -85,7 +86,7 @@ def passage(
     path: FloatArray | None = None,
     attitude: FloatArray | None = None,
     moment: FloatArray = MOMENT,
-    prior: Prior = PRIOR,
+    prior: CalibrationPrior = PRIOR,
 ) -> Passage:
     """Readings by magpylib of an array whose errors are drawn from the prior."""
     rng = np.random.default_rng(seed)
@@ -110,11 +111,11 @@ def passage(
     )
 
 
-def unseen(result: CalibrationResult) -> set[str]:
+def unseen(result: SourceCalibration) -> set[str]:
     return {direction.name for direction in result.unobservable}
 
 
-def assert_recovered(result: CalibrationResult, case: Passage, *, within: float) -> None:
+def assert_recovered(result: SourceCalibration, case: Passage, *, within: float) -> None:
     """Every unknown within a fraction of its prior standard deviation."""
     wrong = (result.change - case.change) / PRIOR.deviations(case.array.n_sensors)
     np.testing.assert_allclose(wrong, 0.0, rtol=0, atol=within)
@@ -128,7 +129,7 @@ def problem_of(
         readings_T=case.readings_T,
         noise_T=np.full(case.readings_T.shape, 1e-8),
         prior=PRIOR.deviations(case.array.n_sensors),
-        free=Prior(trusted_positions=("s2",), trusted_scales=("s3",)).free(case.array),
+        free=CalibrationPrior(trusted_positions=("s2",), trusted_scales=("s3",)).free(case.array),
         world_from_array=case.world_from_array,
         unknown_position=unknown_position,
         unknown_height=unknown_height,
@@ -246,7 +247,7 @@ class TestKnownPath:
         assert result.converged
         assert unseen(result) == set()
         assert_recovered(result, case, within=1e-6)
-        assert result.chi2_after < 1e-2
+        assert result.chi2 < 1e-2
         assert result.chi2_before > 1e6
 
     @pytest.mark.parametrize("moment", ["constant", "free"])
@@ -268,7 +269,7 @@ class TestKnownPath:
         result = calibrate_on_path(case.array, case.readings_T, case.position_m, prior=prior)
         assert unseen(result) == set()
         assert_recovered(result, case, within=1e-5)
-        np.testing.assert_array_equal(result.standard_deviation[3, GAINS], 0.0)
+        np.testing.assert_array_equal(result.sigma[3, GAINS], 0.0)
 
     def test_an_unknown_common_field_hides_a_common_offset(self):
         case = passage(5)
@@ -332,7 +333,7 @@ class TestSelfCalibration:
         result = self_calibrate(case.array, case.readings_T, prior=PRIOR)
         assert result.converged
         assert unseen(result) == TRANSLATIONS | ROTATIONS | SIZE | GAIN | COMMON_OFFSETS
-        assert result.chi2_after < 1e-2
+        assert result.chi2 < 1e-2
 
     def test_a_trusted_position_holds_the_array_there(self):
         """It may still be turned and scaled about that sensor."""
@@ -420,8 +421,8 @@ class TestMovingArray:
         np.testing.assert_allclose(result.moment_Am2[0] / np.linalg.norm(result.moment_Am2[0]),
                                    MOMENT / np.linalg.norm(MOMENT), rtol=0, atol=1e-7)  # fmt: skip
         ignored = calibrate_on_path(case.array, case.readings_T, case.position_m, prior=PRIOR)
-        assert result.chi2_after < 1e-2
-        assert ignored.chi2_after > 1e6
+        assert result.chi2 < 1e-2
+        assert ignored.chi2 > 1e6
 
 
 class TestUncertainty:
@@ -434,7 +435,7 @@ class TestUncertainty:
 
     RUNS = 12
 
-    def check(self, run: Callable[[int], tuple[Passage, CalibrationResult]]) -> None:
+    def check(self, run: Callable[[int], tuple[Passage, SourceCalibration]]) -> None:
         total, dof, fit, fit_dof = 0.0, 0, 0.0, 0.0
         for seed in range(self.RUNS):
             case, result = run(seed)
@@ -443,9 +444,9 @@ class TestUncertainty:
             scale = np.sqrt(np.diagonal(result.covariance))
             total += (error / scale) @ np.linalg.solve(result.covariance / np.outer(scale, scale), error / scale)
             dof += error.size
-            fit += result.chi2_after
-            fit_dof += result.dof_after
-            np.testing.assert_allclose(result.standard_deviation[result.estimated], scale)
+            fit += result.chi2
+            fit_dof += result.dof
+            np.testing.assert_allclose(result.sigma[result.estimated], scale)
         low, high = chi2.ppf([0.0005, 0.9995], dof)
         assert low < total < high, (total, dof)
         # The effective number of unknowns makes χ² of the readings their degrees of freedom on average.
@@ -453,7 +454,7 @@ class TestUncertainty:
         assert low < fit < high, (fit, fit_dof)
 
     def test_known_path(self):
-        def run(seed: int) -> tuple[Passage, CalibrationResult]:
+        def run(seed: int) -> tuple[Passage, SourceCalibration]:
             case = passage(100 + seed, noise_T=1e-8, noisy=True, n=30)
             return case, calibrate_on_path(case.array, case.readings_T, case.position_m, prior=PRIOR)
 
@@ -462,7 +463,7 @@ class TestUncertainty:
     def test_self_calibration(self):
         prior = replace(TestSelfCalibration.TRUSTED, position_m=5e-4, gain=0.01, axes_rad=5e-3)
 
-        def run(seed: int) -> tuple[Passage, CalibrationResult]:
+        def run(seed: int) -> tuple[Passage, SourceCalibration]:
             case = passage(200 + seed, noise_T=1e-8, noisy=True, n=30, prior=prior, common_field_T=1e-6)
             return case, self_calibrate(case.array, case.readings_T, prior=prior)
 
@@ -500,7 +501,10 @@ class TestBadInput:
             ({"readings_T": np.zeros((60, 4))}, r"readings_T must have shape \(n, 18\); instead received \(60, 4\)"),
             ({"world_from_array": np.zeros((2, 3, 3))}, r"world_from_array must have shape \(60, 3, 3\)"),
             ({"moment_Am2": np.zeros(3)}, r"moment_Am2 must be finite and have shape \(60, 3\)"),
-            ({"prior": Prior(trusted_scales=("s9",))}, r"prior must trust ids of sensors of the array; .* 's9'"),
+            (
+                {"prior": CalibrationPrior(trusted_scales=("s9",))},
+                r"prior must trust ids of sensors of the array; .* 's9'",
+            ),
             ({"array": tetrahedron(1.0, kind="scalar", noise_T=1e-9)}, "must have vector sensors only"),
         ],
     )
@@ -522,7 +526,7 @@ class TestBadInput:
     )
     def test_prior(self, arguments: dict[str, Any], message: str):
         with pytest.raises(ValueError, match=message):
-            Prior(**arguments)
+            CalibrationPrior(**arguments)
 
     def test_readings_without_a_source(self, case):
         with pytest.raises(ValueError, match="rows that can be located with the nominal array; instead none can"):

@@ -12,7 +12,7 @@ import xarray as xr
 from PIL import Image
 
 from arrays.geometries import tetrahedron
-from magloc.bounds.crlb import bounds_of
+from magloc.bounds.crlb import cramer_rao_bounds
 from magloc.cli.app import main
 from magloc.grids.store import Sweep, open_map
 from magloc.plots import style
@@ -78,7 +78,7 @@ class TestResult:
         assert list(result) == KEYS
         assert np.round(result["sigma_position_m"], 3).tolist() == [0.289, 0.082, 0.076]
         assert np.round(result["sigma_moment_Am2"], 1).tolist()[1:] == [1.7, 23.6]
-        direct = bounds_of(tetrahedron(1.5), (5.0, 0.0, 0.306), (0.0, 0.0, 100.0))
+        direct = cramer_rao_bounds(tetrahedron(1.5), (5.0, 0.0, 0.306), (0.0, 0.0, 100.0))
         assert result["sigma_range_m"] == pytest.approx(float(direct.sigma_range_m))
         assert result["sigma_bearing_deg"] == pytest.approx(float(np.degrees(direct.sigma_bearing_rad)))
         assert result["rank"] == 6

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from arrays.array import SensorArray
 from arrays.array_file import read_array, read_sensors, write_array
 from arrays.sensor import Calibration, Sensor
-from magloc.calibration import array as calibration
+from magloc.calibration import calibrate as calibration
 from magloc.readings import Readings, write_readings
 from tests.command_line import Outcome, Run, assert_refused
 from tests.oracles import magpylib_field

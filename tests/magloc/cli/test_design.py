@@ -12,8 +12,7 @@ import trimesh
 
 from arrays.array_file import read_array
 from arrays.io.errors import InputError
-from magloc.design.optimise import DesignSearch
-from magloc.design.task import Block, Cap, Mean, Quantile
+from magloc.design.task import Block, Cap, DesignSearch, Mean, Quantile
 from magloc.design.task_files import built_in_tasks, read_task
 from magloc.design.volumes import Ball, Box, Cylinder
 from tests.command_line import Run, assert_refused
@@ -109,11 +108,11 @@ class TestBuiltInTasks:
     def test_all_can_be_read(self):
         assert set(built_in_tasks()) == {"half-space-2m", "half-space-4m", "half-space-8m", "hull", "plate-scalar"}
         for name in built_in_tasks():
-            assert read_task(name).task.name == name
+            assert read_task(name).name == name
             assert read_task(name).search == DesignSearch()
 
     def test_half_space(self):
-        task = read_task("half-space-2m").task
+        task = read_task("half-space-2m")
         assert task.volume == Ball((0.0, 0.0, 0.0), 0.92)
         assert task.region == Cap(2.0, 2.0, (1.0, 0.0, 0.0), 0.5 * np.pi)
         assert (task.n_sensors, task.kind, task.noise_T, task.moment_Am2) == (4, "vector", 1e-9, 100.0)
@@ -129,7 +128,7 @@ class TestTaskFile:
         ],
     )
     def test_volumes(self, tmp_path, text, volume):
-        assert read_task(str(write(tmp_path, SENSORS, "[volume]", text, SOURCES))).task.volume == volume
+        assert read_task(str(write(tmp_path, SENSORS, "[volume]", text, SOURCES))).volume == volume
 
     @pytest.mark.parametrize(
         ("text", "region"),
@@ -143,13 +142,11 @@ class TestTaskFile:
         ],
     )
     def test_regions(self, tmp_path, text, region):
-        assert (
-            read_task(str(write(tmp_path, SENSORS, VOLUME, "[sources]", text, "moment_Am2 = 1"))).task.region == region
-        )
+        assert read_task(str(write(tmp_path, SENSORS, VOLUME, "[sources]", text, "moment_Am2 = 1"))).region == region
 
     def test_criterion_and_search(self, tmp_path):
         file = read_task(str(write(tmp_path, SENSORS, VOLUME, SOURCES, '[criterion]\nquantity = "mean"\n', QUICK)))
-        assert file.task.criterion == Mean()
+        assert file.criterion == Mean()
         assert file.search == DesignSearch(3, 1, 5, 8, 4, 12, 2000)
 
 

@@ -17,16 +17,17 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from arrays.differences import decorrelated_differences
 from arrays.geometries import axial, tetrahedron
-from magloc.convergence.over_sources import SourcesMap, SourcesScenario, SourceStatus, source_map, summary
+from magloc.convergence.over_sources import SourcesMap, SourcesScenario, SourceStatus, summary
+from magloc.grids.computed import computed_map
 from magloc.grids.cube import Box
-from magloc.plots.maps import source_figure
+from magloc.plots.maps import sources
 
 PAPER = SourcesScenario()
 
 
 @pytest.fixture(scope="module")
 def paper_map():
-    return source_map(PAPER, 21)
+    return computed_map(SourcesMap(PAPER, 21))
 
 
 class TestFixes:
@@ -69,30 +70,11 @@ class TestFixes:
 
     def test_noise_that_grows_with_the_field(self):
         array = replace(tetrahedron(1.5, noise_T=1e-9), noise_fraction=0.01)
-        dataset = source_map(replace(PAPER, array=array, farthest_m=4.0, half_width_m=4.0), 5)
+        dataset = computed_map(SourcesMap(replace(PAPER, array=array, farthest_m=4.0, half_width_m=4.0), 5))
         used = dataset.status.to_numpy() != SourceStatus.LEFT_OUT
         assert (dataset.status.to_numpy()[used] == SourceStatus.FOUND).mean() > 0.9
-        exact = source_map(replace(PAPER, farthest_m=4.0, half_width_m=4.0), 5)
+        exact = computed_map(SourcesMap(replace(PAPER, farthest_m=4.0, half_width_m=4.0), 5))
         assert (dataset.sigma_range > exact.sigma_range).to_numpy()[used].all()
-
-
-class TestBounds:
-    @pytest.mark.parametrize(
-        ("edge", "moment", "sigma"),
-        [
-            (1.5, (0.0, 0.0, 100.0), (0.289, 0.082, 0.076)),
-            (1.5, (60.0, 50.0, 60.0), (0.169, 0.097, 0.082)),
-            (1.5, (100.0, 0.0, 0.0), (0.134, 0.230, 0.254)),
-            (0.5, (0.0, 0.0, 100.0), (2.74, 0.22, 0.21)),
-        ],
-    )
-    def test_the_specifications_figures(self, edge, moment, sigma):
-        cube = SourcesMap(replace(PAPER, array=tetrahedron(edge, noise_T=1e-9)), 2)
-        position = np.array([[5.0, 0.0, 0.306]])
-        sigma_range, sigma_position = cube._bounds(position, np.array([moment]), np.zeros((1, 12)))
-        assert sigma_position[0] == pytest.approx(np.linalg.norm(sigma), rel=0.01)
-        # The range is along x but for 3.5 degrees.
-        assert sigma_range[0] == pytest.approx(sigma[0], rel=0.02)
 
 
 class TestRandomNumbers:
@@ -127,7 +109,7 @@ class TestRefused:
     )
     def test_scenarios(self, array, grid, expected):
         with pytest.raises(ValueError, match=expected):
-            source_map(replace(PAPER, array=array), grid)
+            computed_map(SourcesMap(replace(PAPER, array=array), grid))
 
 
 def test_three_degrees_of_freedom():
@@ -135,7 +117,7 @@ def test_three_degrees_of_freedom():
 
 
 def test_figure(paper_map):
-    figure = source_figure(paper_map)
+    figure = sources(paper_map)
     assert "4168 sources" in figure.get_suptitle()
     for ax in figure.axes[:6]:
         assert ax.get_xlabel().endswith("[m]")

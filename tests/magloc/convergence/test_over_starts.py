@@ -19,9 +19,10 @@ from numpy.testing import assert_allclose
 from arrays.array import SensorArray
 from arrays.geometries import axial, tetrahedron
 from magloc.convergence.filters import GlobalFilter, IekfFilter, RepeatedFilter, field_weights
-from magloc.convergence.over_starts import StartsScenario, Status, convergence_map, simulated_measurement, summary
+from magloc.convergence.over_starts import StartsMap, StartsScenario, Status, simulated_measurement, summary
+from magloc.grids.computed import computed_map
 from magloc.measurement.differences import DifferenceMeasurement
-from magloc.plots.maps import convergence_figure
+from magloc.plots.maps import convergence
 from tests.arrays.test_differences import random_array
 
 PAPER = StartsScenario()
@@ -29,12 +30,12 @@ PAPER = StartsScenario()
 
 @pytest.fixture(scope="module")
 def paper_map():
-    return convergence_map(PAPER, 21)
+    return computed_map(StartsMap.of(PAPER, 21))
 
 
 def fractions(scenario):
     """Front, front within 15 m, back, median, of a 21³ map."""
-    dataset = convergence_map(scenario, 21)
+    dataset = computed_map(StartsMap.of(scenario, 21))
     counts = summary(dataset)
     near = np.sqrt(dataset.x**2 + dataset.y**2 + dataset.z**2) <= 15.0
     converged = dataset.status == Status.CONVERGED
@@ -65,7 +66,7 @@ class TestThePapersFigure:
         assert bool((paper_map.iterations.where(not_stopped) == PAPER.method.max_iterations).where(not_stopped).all())
 
     def test_with_noise_the_same(self):
-        counts = summary(convergence_map(replace(PAPER, noise_seed=0), 11))
+        counts = summary(computed_map(StartsMap.of(replace(PAPER, noise_seed=0), 11)))
         assert counts.front_fraction >= 0.95
         assert counts.back_fraction <= 0.12
 
@@ -73,7 +74,7 @@ class TestThePapersFigure:
 class TestProportionalNoise:
     def test_filters_and_optimum_use_the_same_noise(self):
         array = SensorArray(PAPER.array.sensors, noise_fraction=0.02)
-        counts = summary(convergence_map(replace(PAPER, array=array, noise_seed=3), 7))
+        counts = summary(computed_map(StartsMap.of(replace(PAPER, array=array, noise_seed=3), 7)))
         assert counts.front_fraction > 0.5
 
 
@@ -82,7 +83,7 @@ class TestStartFree:
 
     @pytest.mark.parametrize("noise_seed", [None, 0])
     def test_every_start_reaches_the_optimum(self, noise_seed):
-        dataset = convergence_map(replace(PAPER, method=GlobalFilter(), noise_seed=noise_seed), 11)
+        dataset = computed_map(StartsMap.of(replace(PAPER, method=GlobalFilter(), noise_seed=noise_seed), 11))
         assert summary(dataset).converged == 11**3
 
 
@@ -179,7 +180,7 @@ class TestDataset:
         (tmp_path / "array.toml").write_text(paper_map.attrs["array"])
         array = read_array(tmp_path / "array.toml")
         assert array.sensors == PAPER.array.sensors
-        again = convergence_map(replace(PAPER, array=array), 5)
+        again = computed_map(StartsMap.of(replace(PAPER, array=array), 5))
         xr.testing.assert_equal(again.status, paper_map.status[::5, ::5, ::5].assign_coords(again.coords))
 
     def test_halves(self, paper_map):
@@ -189,19 +190,19 @@ class TestDataset:
 
     def test_progress_counts_every_start(self):
         counted = []
-        convergence_map(PAPER, 5, counted.append)
+        computed_map(StartsMap.of(PAPER, 5), progress=counted.append)
         assert sum(counted) == 125
 
     def test_scenarios_that_cannot_be(self):
         with pytest.raises(ValueError, match="Input grid must be at least 2"):
-            convergence_map(PAPER, 1)
+            computed_map(StartsMap.of(PAPER, 1))
         with pytest.raises(ValueError, match="no maximum-likelihood solution"):
-            convergence_map(replace(PAPER, array=axial(1.0, noise_T=1e-9)), 3)
+            computed_map(StartsMap.of(replace(PAPER, array=axial(1.0, noise_T=1e-9)), 3))
 
 
 class TestFigure:
     def test_fractions_in_the_title_and_units_on_the_axes(self, paper_map):
-        figure = convergence_figure(paper_map)
+        figure = convergence(paper_map)
         counts = summary(paper_map)
         title = figure.get_suptitle()
         assert f"front half {100 * counts.front_fraction:.1f} %" in title

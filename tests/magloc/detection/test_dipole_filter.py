@@ -28,7 +28,7 @@ from arrays.array import SensorArray
 from arrays.differences import decorrelated_differences
 from arrays.geometries import cube, hexagon, square, tetrahedron
 from magloc.chi_square import ChiSquareDetector, energy_threshold, receiver_operating_characteristic
-from magloc.detection.detection_range import detection_range
+from magloc.detection.detection_range import detection_ranges
 from magloc.detection.dipole_filter import DipoleFilter
 from magloc.detection.matched_filter import MatchedFilterDetector
 from magloc.directions import fibonacci_directions
@@ -253,7 +253,7 @@ class TestDetectionRange:
     def test_brentq_finds_the_same(self, array):
         detector = ChiSquareDetector(3)
         moments = 100.0 * fibonacci_directions(7)
-        found = detection_range(array, self.DIRECTIONS, moments, detector)
+        found = detection_ranges(array, self.DIRECTIONS, moments, detector)
         matched = DipoleFilter(array)
         required = stats.chi2.isf(1e-3, 3)
         for i, direction in enumerate(self.DIRECTIONS):
@@ -269,21 +269,21 @@ class TestDetectionRange:
     def test_far_field_law(self):
         """Differences fall as r⁻⁴, but for terms of the order radius/r = 0.01: 16 times the moment, twice as far."""
         near, far = (
-            detection_range(ARRAY, self.DIRECTIONS, size * fibonacci_directions(200), ChiSquareDetector(9))
+            detection_ranges(ARRAY, self.DIRECTIONS, size * fibonacci_directions(200), ChiSquareDetector(9))
             for size in (1e6, 16e6)
         )
         np.testing.assert_allclose(far / near, 2.0, rtol=2e-3)
 
     def test_detectors_are_in_order(self, detector):
         ranges = [
-            np.median(detection_range(ARRAY, self.DIRECTIONS, 100.0 * fibonacci_directions(50), one))
+            np.median(detection_ranges(ARRAY, self.DIRECTIONS, 100.0 * fibonacci_directions(50), one))
             for one in (ChiSquareDetector(9, 2e-2), detector, ChiSquareDetector(3, 2e-2))
         ]
         assert ranges[0] < 1.005 * ranges[1]
         assert ranges[1] < ranges[2]
 
     def test_moment_too_weak(self):
-        assert np.all(detection_range(ARRAY, self.DIRECTIONS, 1e-6 * np.eye(3), ChiSquareDetector(9)) == 0.0)
+        assert np.all(detection_ranges(ARRAY, self.DIRECTIONS, 1e-6 * np.eye(3), ChiSquareDetector(9)) == 0.0)
 
     @pytest.mark.parametrize(
         ("directions", "moments", "probability", "name"),
@@ -297,7 +297,7 @@ class TestDetectionRange:
     )
     def test_misuse(self, directions, moments, probability, name):
         with pytest.raises(ValueError, match=f"Input {name} must be"):
-            detection_range(ARRAY, directions, moments, ChiSquareDetector(9), probability=probability)
+            detection_ranges(ARRAY, directions, moments, ChiSquareDetector(9), probability=probability)
 
 
 class TestMisuse:
@@ -305,7 +305,7 @@ class TestMisuse:
         few = replace(square(1.0, "scalar"), ambient_T=(0.0, 0.0, 5e-5))
         with pytest.raises(ValueError, match="6 independent differences"):
             MatchedFilterDetector.of(few)
-        assert detection_range(few, [[0.0, 0.0, 1.0]], 100.0 * np.eye(3), ChiSquareDetector(3)).shape == (1, 3)
+        assert detection_ranges(few, [[0.0, 0.0, 1.0]], 100.0 * np.eye(3), ChiSquareDetector(3)).shape == (1, 3)
         with pytest.raises(ValueError, match="3 independent differences"):
             DipoleFilter(replace(few, sensors=few.sensors[:3]))
 

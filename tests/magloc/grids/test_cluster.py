@@ -70,7 +70,7 @@ class TestCluster:
                 yield chunk
 
         with Sweep(CUBE, path) as sweep:
-            with pytest.raises(InputError, match=f"--scheduler {address}: the connection to the scheduler was lost"):
+            with pytest.raises(InputError, match=f"scheduler {address}: the connection to the scheduler was lost"):
                 sweep.write(until_the_scheduler_dies())
             by_workers = sweep.chunks_done
         assert 7 <= by_workers < 27
@@ -105,7 +105,7 @@ class TestCluster:
 
 class TestNoCluster:
     def test_nobody_there(self, tmp_path):
-        with pytest.raises(InputError, match=r"--scheduler tcp://127\.0\.0\.1:9: found no scheduler there"):
+        with pytest.raises(InputError, match=r"scheduler tcp://127\.0\.0\.1:9: found no scheduler there"):
             list(computed_by("tcp://127.0.0.1:9", CUBE, boxes(CUBE), timeout_s=0.2))
 
     @pytest.mark.parametrize("address", ["foo", "nonsense:::", "", "http://x", "tcp://x", "x:0", "x:65536", "a b:1"])
@@ -136,7 +136,7 @@ class TestNoCluster:
                 threading.Thread(target=serve, daemon=True).start()
             address = "{}:{}".format(*server.getsockname())
             begin = time.perf_counter()
-            with pytest.raises(InputError, match=f"--scheduler {address}: found (no scheduler|another service) there"):
+            with pytest.raises(InputError, match=f"scheduler {address}: found (no scheduler|another service) there"):
                 list(computed_by(address, CUBE, boxes(CUBE), timeout_s=0.3))
             gc.collect()
         assert time.perf_counter() - begin < 3.0

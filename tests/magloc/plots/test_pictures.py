@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 from arrays.io.csv import write_columns
-from magloc.plots.calibration import residual_rms
+from magloc.calibration.results import residual_rms
 from magloc.plots.tracks import write_picture
 from magloc.tracking.results import TrackPoint
 from tests.command_line import Run, assert_refused, results_of

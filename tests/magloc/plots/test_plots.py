@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from itertools import combinations
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,13 +28,14 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 from skimage.color import rgb2lab
 
+from arrays.geometries import tetrahedron
+from arrays.sensor import Calibration
 from magloc.convergence.over_starts import Status
-from magloc.grids.cube import MapSummary
 from magloc.localization.fit.results import Fix, Solution
 from magloc.plots import style
 from magloc.plots.calibration import calibration_figure, turning_figure
 from magloc.plots.fixes import distances_from_truth, fix_columns, fix_figure, residual_figure
-from magloc.plots.maps import _SOURCE_ENDS, convergence_figure
+from magloc.plots.maps import _SOURCE_ENDS, convergence
 from magloc.plots.style import save
 from magloc.plots.tracks import consistency_figure, track_figure
 from magloc.tracking.results import TrackPoint
@@ -212,18 +215,23 @@ class TestMaps:
         status[:, 0, 1] = Status.OTHER_OPTIMUM, Status.NOT_STOPPED, Status.DIVERGED
         passes[2, 2, 1] = 40
         return xr.Dataset(
-            {"status": (("x", "y", "z"), status), "iterations": (("x", "y", "z"), passes)},
+            {
+                "status": (("x", "y", "z"), status),
+                "iterations": (("x", "y", "z"), passes),
+                "half": (("x", "y", "z"), np.ones((3, 3, 3), dtype=np.int8)),
+            },
             {"x": axis, "y": axis, "z": axis},
             {
                 "position_m": [0.0, 0.0, 0.0],
                 "centroid_m": [-1.0, 0.0, 0.0],
                 "moment_Am2": [100.0, 0.0, 0.0],
                 "method": "repeated",
+                "seconds": 1.0,
             },
         )
 
     def figure(self) -> Figure:
-        return convergence_figure(self.dataset(), MapSummary(27, 24, 0.8, 0.9, 0.5, 12.0, 300, 1.0))
+        return convergence(self.dataset())
 
     def test_values_are_shown_where_the_start_converged(self) -> None:
         figure = self.figure()
@@ -409,8 +417,12 @@ class TestCalibration:
         deviation, estimated = np.full((2, 15), 2e-4), np.ones((2, 15), dtype=bool)
         return change, deviation, estimated
 
+    def result(self, change: Any, sigma: Any, estimated: Any, before: Any, after: Any) -> Any:
+        ids = SimpleNamespace(ids=("a", "b"))
+        return SimpleNamespace(array=ids, change=change, sigma=sigma, estimated=estimated, rms_T=(before, after))
+
     def test_changes_with_their_intervals(self) -> None:
-        figure = calibration_figure(("a", "b"), np.array([1e-6, 2e-6]), np.array([1e-8, 2e-8]), *self.arguments())
+        figure = calibration_figure(self.result(*self.arguments(), np.array([1e-6, 2e-6]), np.array([1e-8, 2e-8])))
         assert_units(figure)
         top = panel(figure, "residual rms [nT]")
         np.testing.assert_allclose(line(top, "before").get_ydata(), [1000.0, 2000.0])
@@ -426,11 +438,20 @@ class TestCalibration:
     def test_what_is_not_estimated_has_no_panel(self) -> None:
         change, deviation, estimated = self.arguments()
         estimated[:, :3] = estimated[:, 6:] = False
-        figure = calibration_figure(("a", "b"), np.ones(2), np.ones(2), change, deviation, estimated)
+        figure = calibration_figure(self.result(change, deviation, estimated, np.ones(2), np.ones(2)))
         assert [ax.get_ylabel() for ax in figure.axes] == ["residual rms [nT]", "change of\ngain [%]"]
 
     def test_turning(self) -> None:
-        figure = turning_figure(("a", "b"), np.full(2, 1e-6), np.full(2, 5e-9), np.full((2, 3), 0.01), np.zeros((2, 3)))
+        nominal, calibrated = (tetrahedron(1.0).subset(("s1", "s2")) for _ in range(2))
+        scaled = (replace(s, calibration=Calibration.of("vector", 1.01, 0.0)) for s in calibrated.sensors)
+        fits = dict.fromkeys(nominal.ids)
+        moduli = (np.full((3, 2), 49e-6), np.full((3, 2), 48.005e-6))
+        figure = turning_figure(
+            SimpleNamespace(
+                nominal=nominal, array=replace(calibrated, sensors=tuple(scaled)), fits=fits, time_s=np.arange(3.0),
+                modulus_T=48e-6, moduli_T=moduli,
+            )
+        )  # fmt: skip
         assert_units(figure)
         np.testing.assert_allclose(line(figure.axes[0], "after").get_ydata(), 5.0)
         np.testing.assert_allclose(figure.axes[1].containers[0].lines[0].get_ydata(), 1.0)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from arrays.geometries import tetrahedron
-from magloc.bounds.detection_map import with_detection_ranges
-from magloc.bounds.maps import CASES, BoundScenario, bound_spheres, sphere_grid
+from magloc.bounds.maps import CASES, BoundScenario
+from magloc.bounds.spheres import bound_spheres, sphere_grid, with_detection_ranges
 from magloc.chi_square import ChiSquareDetector
 from magloc.detection.dipole_filter import DipoleFilter
 

@@ -1,0 +1,158 @@
+"""The door of calibration: by a source on a known path or an unknown one, or by turning in a field of known modulus."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from arrays.array import SensorArray
+from arrays.typing import FloatArray
+from magloc.calibration.array import CalibrationPrior, calibrate_on_path, self_calibrate
+from magloc.calibration.model import AXES, AXIS_PAIRS, GAINS, OFFSET, PER_SENSOR
+from magloc.calibration.modulus import EllipsoidCalibration, calibrated_in_modulus, symmetric
+from magloc.calibration.observability import Unobservable
+from magloc.calibration.results import SourceCalibration, TurningCalibration
+from magloc.readings import Readings, Truth, rows_of_same_time, without_saturated
+
+
+def calibrate(
+    array: SensorArray,
+    readings: Readings,
+    *,
+    truth: Truth | None = None,
+    modulus_T: ArrayLike | None = None,
+    moment: Literal["constant", "free"] | None = None,
+    prior: CalibrationPrior = CalibrationPrior(),
+) -> SourceCalibration | TurningCalibration:
+    """Calibrate vector sensors by a source that moves past them, or by turning them in a field of known modulus.
+
+    With `truth` the path of the source is known. Without it the path is found with the sensors; the array as a whole
+    can then be moved, turned and scaled without any effect on the readings: there the prior decides, or the trusted
+    sensors do. A mirror image, all sensors and the path inverted through one point, fits equally well too; the nominal
+    array tells which of the two it is. With `modulus_T` there is no source: every sensor was turned in a uniform field,
+    which tells its gains, the angles between its axes and its offsets, not how it is mounted.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Nominal array; its noise weights the readings.
+    readings : Readings
+        Readings that saturate do not count.
+    truth : Truth, optional
+        Path of the source in the readings' frame; rows of the same time are used. A missing z is one unknown height for
+        all rows. Moments, where it has them, are taken as known.
+    modulus_T : array_like, shape () or (n,), optional
+        Modulus of the field that the sensors were turned in [T].
+    moment : {"constant", "free"}, optional
+        Whether the unknown moment of the source is one vector in the world frame, of a source that does not turn, or
+        free in every row; moments of the truth are not used then. Constant by default.
+    prior : CalibrationPrior
+        How well the nominal array is known; not used with `modulus_T`.
+
+    Returns
+    -------
+    SourceCalibration or TurningCalibration
+        The latter with `modulus_T`. Not converged where nothing in it counts.
+
+    Raises
+    ------
+    ValueError
+        The shapes do not agree, the array has scalar sensors (with `modulus_T`: no vector sensor), no time of the truth
+        is one of the readings, no row can be located with the nominal array, or there are fewer readings than unknowns.
+    """
+    rows = without_saturated(readings, array)
+    if modulus_T is not None:
+        if truth is not None or moment is not None:
+            raise ValueError("Input modulus_T must come without truth and moment: there is no source.")
+        return _turned(array, rows, np.asarray(modulus_T, dtype=np.float64))
+    try:
+        return _by_source(array, rows, truth, moment, prior)
+    except np.linalg.LinAlgError:
+        raise ValueError(
+            "Input readings must be those of a source that passes the sensors at a distance; instead the model cannot"
+            " place it (on a sensor, or at infinity)."
+        ) from None
+
+
+def _by_source(
+    array: SensorArray,
+    rows: Readings,
+    truth: Truth | None,
+    moment: Literal["constant", "free"] | None,
+    prior: CalibrationPrior,
+) -> SourceCalibration:
+    model = moment or "constant"
+    attitude = _world_from_array(rows)
+    if truth is None:
+        return self_calibrate(array, rows.values_T, moment=model, prior=prior, world_from_array=attitude)
+    in_readings, in_truth = rows_of_same_time(rows, truth)
+    if not in_readings.size:
+        raise ValueError("Input truth must have times of the readings; instead it has none of them.")
+    position = truth.position_m[in_truth].copy()
+    unknown = np.isnan(position[:, 2])
+    position[unknown, 2] = 0.0
+    if rows.pose is not None:
+        position = np.einsum("tba,tb->ta", attitude[in_readings], position - rows.pose[0][in_readings])
+    return calibrate_on_path(
+        array,
+        rows.values_T[in_readings],
+        position,
+        moment_Am2=None if truth.moment_Am2 is None or moment is not None else truth.moment_Am2[in_truth],
+        moment=model,
+        unknown_height=bool(np.isnan(truth.position_m[:, 2]).any()),
+        prior=prior,
+        world_from_array=attitude[in_readings],
+    )
+
+
+def _world_from_array(readings: Readings) -> FloatArray:
+    """Attitude of the array in every row (n, 3, 3); without a pose its axes are the world's."""
+    if readings.pose is None:
+        return np.broadcast_to(np.eye(3), (len(readings), 3, 3))
+    return readings.pose[1].as_matrix()
+
+
+def _turned(nominal: SensorArray, rows: Readings, modulus_T: FloatArray) -> TurningCalibration:
+    array, fits = calibrated_in_modulus(nominal, rows.values_T, modulus_T)
+    change, sigma = np.zeros((2, nominal.n_sensors, PER_SENSOR))
+    for i, (before, after) in enumerate(zip(nominal.sensors, array.sensors, strict=True)):
+        if before.id not in fits:
+            continue
+        if fits[before.id].converged:
+            old, new = (np.asarray(sensor.calibration.scale) for sensor in (before, after))
+            offsets = np.subtract(after.calibration.offset_T, before.calibration.offset_T)
+            change[i] = _unknowns(new @ np.linalg.inv(old) - np.eye(3), offsets)
+            sigma[i] = _sigma(fits[before.id], old, new)
+        else:
+            sigma[i, GAINS.start :] = np.inf
+    return TurningCalibration(
+        nominal=nominal,
+        array=array,
+        converged=all(fit.converged for fit in fits.values()),
+        change=change,
+        sigma=sigma,
+        chi2=sum(fit.chi2 for fit in fits.values()),
+        dof=sum(fit.dof for fit in fits.values()),
+        unobservable=tuple(Unobservable(f"rotation of sensor {name}", 0.0) for name in fits),
+        fits=fits,
+        time_s=rows.time_s,
+        readings_T=rows.values_T,
+        modulus_T=modulus_T,
+    )
+
+
+def _sigma(fit: EllipsoidCalibration, old: FloatArray, new: FloatArray) -> FloatArray:
+    """Standard deviations (15,): with S = P R the change E = S S₀⁻¹ - 1 moves by dP R S₀⁻¹."""
+    by_entry = np.stack([symmetric(unit) for unit in np.eye(6)]) @ (np.linalg.inv(fit.scale) @ new @ np.linalg.inv(old))
+    variance = np.einsum("eab,ef,fab->ab", by_entry, fit.covariance[3:, 3:], by_entry)
+    return _unknowns(np.sqrt(variance), np.sqrt(np.diagonal(fit.covariance)[:3]))
+
+
+def _unknowns(response: FloatArray, offset: FloatArray) -> FloatArray:
+    """The 15 unknowns of a sensor, of the change of its response (3, 3) and its offset (3,)."""
+    row = np.zeros(PER_SENSOR)
+    row[GAINS], row[OFFSET] = np.diagonal(response), offset
+    row[AXES] = [response[channel, component] for channel, component in AXIS_PAIRS]
+    return row

@@ -1,0 +1,151 @@
+"""What a calibration finds, and how far it can be trusted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from arrays.array import SensorArray
+from arrays.io.lazy import by_name
+from arrays.typing import BoolArray, FloatArray
+from magloc.calibration.modulus import EllipsoidCalibration
+from magloc.calibration.observability import Unobservable
+from magloc.fields import dipole
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Calibration:
+    """A calibrated array, and how far it can be trusted.
+
+    Attributes
+    ----------
+    nominal, array : SensorArray
+        Before and after: with the estimated positions, scale matrices and offsets; all else as in the nominal array.
+    converged : bool
+        Whether the iteration ended at an optimum; else nothing here is a result.
+    change, sigma : ndarray, shape (N, 15)
+        What the estimate adds to the nominal array, and its posterior standard deviation: position x y z [m], relative
+        gain of channel x y z, axes [rad] (x towards y, x towards z, y towards x, …), offset x y z [T]. The standard
+        deviation is 0 where nothing is estimated, infinite where the readings do not determine a sensor.
+    chi2, dof : float
+        Σ ((reading - prediction)/noise)² with the calibrated sensors, and the readings minus the unknowns that they
+        tell.
+    unobservable : tuple of Unobservable
+        What the readings do not tell: there the nominal array speaks alone.
+    """
+
+    nominal: SensorArray
+    array: SensorArray
+    converged: bool
+    change: FloatArray
+    sigma: FloatArray
+    chi2: float
+    dof: float
+    unobservable: tuple[Unobservable, ...]
+
+    def plot(self) -> Figure:
+        """What is left of the readings before and after, and what the calibration changes."""
+        figure: Figure = by_name("magloc.plots.calibration:figure_of_calibration")(self)
+        return figure
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SourceCalibration(Calibration):
+    """A calibration by a source that moves past the array.
+
+    Attributes
+    ----------
+    iterations : int
+        Linearisations of the last and finest fit.
+    rows : ndarray of bool, shape (n,)
+        Rows that were used.
+    chi2_before, dof_before : float
+        With the nominal sensors, the source fitted to them; with the noise of the calibrated array. With
+        ``common_field_T`` and its prior's term, as `chi2`. In `dof` an unknown of a sensor counts by how much of it the
+        readings tell and not the prior.
+    residual_rms_T : ndarray, shape (N,)
+        Root mean square of the calibrated array's residuals, of every sensor [T].
+    estimated : ndarray of bool, shape (N, 15)
+        Which of the unknowns were estimated.
+    covariance : ndarray, shape (F, F)
+        Posterior covariance of ``change[estimated]``.
+    position_m, moment_Am2 : ndarray, shape (T, 3)
+        The source in the rows that were used: in the array's frame, and in the world frame.
+    readings_T, world_from_array : ndarray, shape (T, C), (T, 3, 3)
+        Readings of these rows [T], and the array's attitude.
+    """
+
+    iterations: int
+    rows: BoolArray
+    chi2_before: float
+    dof_before: float
+    residual_rms_T: FloatArray
+    estimated: BoolArray
+    covariance: FloatArray
+    position_m: FloatArray
+    moment_Am2: FloatArray
+    readings_T: FloatArray
+    world_from_array: FloatArray
+
+    @cached_property
+    def rms_T(self) -> tuple[FloatArray, FloatArray]:
+        """What the source and the best common field leave of every sensor's readings, (N,) before and after [T]."""
+        attitude = self.world_from_array
+        moment = np.einsum("tba,tb->ta", attitude, np.broadcast_to(self.moment_Am2, (len(attitude), 3)))
+        before, after = (
+            residual_rms(array, self.readings_T, self.position_m, moment) for array in (self.nominal, self.array)
+        )
+        return before, after
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TurningCalibration(Calibration):
+    """A calibration of sensors that were turned in a field of known modulus.
+
+    Attributes
+    ----------
+    fits : dict
+        The fit of every vector sensor, by its id.
+    time_s, readings_T : ndarray, shape (n,), (n, C)
+        The rows.
+    modulus_T : float or ndarray, shape (n,)
+        Of the field.
+    """
+
+    fits: dict[str, EllipsoidCalibration]
+    time_s: FloatArray
+    readings_T: FloatArray
+    modulus_T: float | FloatArray
+
+    @cached_property
+    def moduli_T(self) -> tuple[FloatArray, FloatArray]:
+        """Modulus that every vector sensor reads, shape (n, V) before and after [T]."""
+        vector = [i for i, sensor in enumerate(self.nominal.sensors) if sensor.kind == "vector"]
+        before, after = (
+            np.linalg.norm(array.calibrated_field(self.readings_T)[:, vector], axis=-1)
+            for array in (self.nominal, self.array)
+        )
+        return before, after
+
+
+def residual_rms(
+    array: SensorArray, readings_T: FloatArray, position_m: FloatArray, moment_Am2: FloatArray
+) -> FloatArray:
+    """Root mean square (N,) [T] of what a known source and the best common field leave of every sensor's readings."""
+    fields = dipole.field(array.positions, position_m[:, None], moment_Am2[:, None])
+    residual = readings_T - array.readings_of(fields)
+    noise, gain = array.channel_noise_T, array.channel_gain
+    for i, of_row in enumerate(residual):
+        known = np.isfinite(of_row)
+        common, *_ = np.linalg.lstsq(gain[known] / noise[known, None], of_row[known] / noise[known], rcond=None)
+        residual[i] = of_row - gain @ common
+    squares = (residual**2).reshape(len(residual), -1, 3)
+    counts = np.isfinite(squares).sum(axis=(0, 2))
+    result: FloatArray = np.sqrt(np.nansum(squares, axis=(0, 2)) / np.maximum(counts, 1))
+    return result
