@@ -414,7 +414,7 @@ class TestProcess:
             assert process.wait(timeout=120) == 128 + signal.SIGPIPE
 
     def test_interrupted(self, run: Run, array: Path, readings: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        def interrupt(*_: object) -> None:
+        def interrupt(*_: object, **__: object) -> None:
             raise KeyboardInterrupt
 
         monkeypatch.setattr("magloc.localization.locator.Locator.fit_rows", interrupt)
