@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
     from arrays.array import SensorArray
     from magloc.calibration.array import CalibrationResult, Prior
-    from magloc.readings import Readings, Truth
+    from magloc.readings import Readings
+    from magloc.truth import Truth
 
     FloatArray = NDArray[np.float64]
 
@@ -120,7 +121,8 @@ def calibrate(
     from arrays.io.outputs import refuse_file, refuse_unwritable
     from magloc.calibration.array import calibrate_on_path, self_calibrate
     from magloc.cli.calibrate_by_turning import calibrate_by_turning
-    from magloc.readings import read_readings, read_truth, without_saturated
+    from magloc.readings import read_readings, without_saturated
+    from magloc.truth import read_truth
 
     refuse_unwritable(out, "--out")
     if figures is not None:
@@ -228,18 +230,17 @@ def _listed(text: str) -> list[str]:
 def _world_from_array(readings: Readings) -> FloatArray:
     """Attitude of the array in every row (n, 3, 3); without a pose its axes are the world's."""
     import numpy as np
-    from scipy.spatial.transform import Rotation
 
-    if readings.array_rotation_xyzw is None:
+    if readings.array_rotation is None:
         return np.broadcast_to(np.eye(3), (len(readings), 3, 3))
-    return Rotation.from_quat(readings.array_rotation_xyzw).as_matrix()
+    return readings.array_rotation.as_matrix()
 
 
 def _matched(
     readings: Readings, truth: Truth, readings_path: Path, truth_path: Path
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of the readings and of the truth that have the same time."""
-    from magloc.readings import rows_of_same_time
+    from magloc.truth import rows_of_same_time
 
     in_readings, in_truth = rows_of_same_time(readings, truth)
     if not in_readings.size:
