@@ -8,6 +8,7 @@ read as Decimal, so that whoever converts a unit can do it without rounding.
 
 from __future__ import annotations
 
+import datetime
 import difflib
 import math
 import re
@@ -37,6 +38,20 @@ class Rule:
     holds: Callable[[Any], bool]
     expected: str
     may_be_infinite: bool = False
+    is_date: bool = False
+
+
+def date_such_as(example: str) -> Rule:
+    """A date, in quotation marks or not; it is read as text."""
+    return Rule(_is_date, example, is_date=True)
+
+
+def _is_date(text: str) -> bool:
+    try:
+        datetime.datetime.fromisoformat(text)
+    except ValueError:
+        return False
+    return True
 
 
 def one_of(names: Collection[str], expected: str = "") -> Rule:
@@ -187,6 +202,9 @@ def section_of(place: str, table: dict[str, Any], struct: type[AnyTable]) -> Any
     fields = _fields(struct)
     check_keys(place, table, fields)
     read = {key: _with_tables(place, struct, key, value, fields[key][1]) for key, value in table.items()}
+    for key, value in table.items():
+        if isinstance(value, datetime.date) and any(rule.is_date for rule in fields[key][0]):
+            read[key] = value.isoformat()
     result = _converted(place, read, struct)
     for key, (rules, _) in fields.items():
         for value in _values(getattr(result, key)):
