@@ -17,7 +17,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from functools import cache
-from importlib import resources
 from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
@@ -103,12 +102,16 @@ class BuiltIn:
 
     def names(self) -> tuple[str, ...]:
         """Of the files."""
-        files = (resources.files(self.package) / self.folder).iterdir()
-        return tuple(sorted(Path(file.name).stem for file in files if file.name.endswith(".toml")))
+        return tuple(sorted(path.stem for path in self._folder().glob("*.toml")))
 
     def path(self, name: str) -> Path:
         """Of the file of a name."""
-        return Path(str(resources.files(self.package) / self.folder / f"{name}.toml"))
+        return self._folder() / f"{name}.toml"
+
+    def _folder(self) -> Path:
+        from importlib import resources  # of some milliseconds, which an array's file does not need
+
+        return Path(str(resources.files(self.package) / self.folder))
 
     def read(self, name_or_path: str) -> tuple[str, dict[str, Any]]:
         """Path and table of a built-in file or one of the user's."""
@@ -229,13 +232,16 @@ def named_section(place: str, table: dict[str, Any], key: str, structs: Mapping[
 
 
 def _check_value(where: str, value: Any, rules: tuple[Rule, ...]) -> None:
-    is_text = isinstance(value, str)
-    infinite = any(rule.may_be_infinite for rule in rules)
-    if not (isinstance(value, int | str) or math.isfinite(value) or (infinite and value == math.inf)):
+    # A Decimal may be finite and beyond every float: its unit is not what it will have.
+    is_finite = (
+        value.is_finite() if isinstance(value, Decimal) else isinstance(value, int | str) or math.isfinite(value)
+    )
+    if not is_finite and not (value == math.inf and any(rule.may_be_infinite for rule in rules)):
         raise InputError(f"{where}: found {value}, expected a finite number.")
     for rule in rules:
         if not rule.holds(value):
-            raise InputError(f"{where}: found {repr(value) if is_text else f'{value:g}'}, expected {rule.expected}.")
+            found = repr(value) if isinstance(value, str) else f"{value:g}"
+            raise InputError(f"{where}: found {found}, expected {rule.expected}.")
 
 
 def _values(value: Any) -> Iterator[float | str | Decimal]:
@@ -258,7 +264,7 @@ def _found(hint: Any, kind: type[_Any]) -> Iterator[_Any]:
     """What stands beside a type, or one of its alternatives."""
     if get_origin(hint) is Annotated:
         yield from (extra for extra in hint.__metadata__ if isinstance(extra, kind))
-    elif get_origin(hint) not in (list, dict, tuple):
+    elif get_origin(hint) is not dict:
         for argument in get_args(hint):
             yield from _found(argument, kind)
 
