@@ -198,20 +198,11 @@ def array_toml(array: SensorArray) -> str:
         lines.append(f"position_m = {list(sensor.position_m)}")
         if sensor.rotation_xyzw != (0.0, 0.0, 0.0, 1.0):
             lines.append(f"rotation_xyzw = {list(sensor.rotation_xyzw)}")
-        lines.append(f"noise_nT = {_nanotesla(sensor.noise_T)}")
-        if sensor.saturation_T is not None:
-            lines.append(f"saturation_nT = {_nanotesla(sensor.saturation_T)}")
-        if sensor.misalignment_rad:
-            lines.append(f"misalignment_mrad = {_shifted(sensor.misalignment_rad, 3)}")
-        if sensor.gain_uncertainty:
-            lines.append(f"gain_uncertainty = {sensor.gain_uncertainty!r}")
-        for key, value in (
-            ("offset_uncertainty_nT", sensor.offset_uncertainty_T),
-            ("flicker_nT", sensor.flicker_T),
-            ("drift_nT_rth", sensor.drift_T_rth),
-        ):
+        for key in _keys(_Quality):
+            name, exponent = _of_sensor(key)
+            value = getattr(sensor, name)
             if value:
-                lines.append(f"{key} = {_nanotesla(value)}")
+                lines.append(f"{key} = {_shifted(value, exponent) if exponent else repr(value)}")
         if sensor.calibration != Calibration.of(sensor.kind):
             offsets = sensor.calibration.offset_T
             offset = _nanotesla_list(offsets) if sensor.kind == "vector" else _nanotesla(offsets[0])
@@ -295,14 +286,18 @@ def _with_header(path: str, array: SensorArray, header: _Header) -> SensorArray:
 
 def _quality(place: str, table: _Quality) -> dict[str, Any]:
     """How good a sensor is, as arguments of Sensor."""
-    nanotesla = {key: getattr(table, key) for key in _keys(_Quality) if "nT" in key}
-    return {
-        "misalignment_rad": _scaled(f"{place}, key misalignment_mrad", table.misalignment_mrad, -3),
-        "gain_uncertainty": table.gain_uncertainty,
-    } | {
-        key.replace("nT", "T"): None if value is None else _tesla(f"{place}, key {key}", value)
-        for key, value in nanotesla.items()
-    }
+    result = {}
+    for key in _keys(_Quality):
+        name, exponent = _of_sensor(key)
+        value = getattr(table, key)
+        result[name] = _scaled(f"{place}, key {key}", value, -exponent) if exponent and value is not None else value
+    return result
+
+
+def _of_sensor(key: str) -> tuple[str, int]:
+    """What a key of a sensor's table is called in SI, and by which power of ten it is larger there."""
+    exponent = 9 if "nT" in key else 3 if "mrad" in key else 0
+    return key.replace("nT", "T").replace("mrad", "rad"), exponent
 
 
 def _tesla(place: str, nanotesla: _Number) -> float:
