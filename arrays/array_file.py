@@ -58,6 +58,7 @@ from arrays.io.toml import (
     Rule,
     Table,
     check_keys,
+    in_si,
     item_place,
     read_toml,
     section_of,
@@ -199,7 +200,7 @@ def array_toml(array: SensorArray) -> str:
         if sensor.rotation_xyzw != (0.0, 0.0, 0.0, 1.0):
             lines.append(f"rotation_xyzw = {list(sensor.rotation_xyzw)}")
         for key in _keys(_Quality):
-            name, exponent = _of_sensor(key)
+            name, exponent = in_si(key)
             value = getattr(sensor, name)
             if value:
                 lines.append(f"{key} = {_shifted(value, exponent) if exponent else repr(value)}")
@@ -288,16 +289,10 @@ def _quality(place: str, table: _Quality) -> dict[str, Any]:
     """How good a sensor is, as arguments of Sensor."""
     result = {}
     for key in _keys(_Quality):
-        name, exponent = _of_sensor(key)
+        name, exponent = in_si(key)
         value = getattr(table, key)
         result[name] = _scaled(f"{place}, key {key}", value, -exponent) if exponent and value is not None else value
     return result
-
-
-def _of_sensor(key: str) -> tuple[str, int]:
-    """What a key of a sensor's table is called in SI, and by which power of ten it is larger there."""
-    exponent = 9 if "nT" in key else 3 if "mrad" in key else 0
-    return key.replace("nT", "T").replace("mrad", "rad"), exponent
 
 
 def _tesla(place: str, nanotesla: _Number) -> float:

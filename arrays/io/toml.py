@@ -152,6 +152,12 @@ def read_toml(path: str | PathLike[str], expected: str) -> dict[str, Any]:
         raise InputError(f"{path}: found lists nested too deeply, expected a list of lists at most.") from None
 
 
+def in_si(key: str) -> tuple[str, int]:
+    """What a key is called in SI, and by which power of ten its number is larger than there: nT and mrad."""
+    exponent = 9 if "nT" in key else 3 if "mrad" in key else 0
+    return key.replace("nT", "T").replace("mrad", "rad"), exponent
+
+
 def check_keys(place: str, table: Mapping[str, Any], known: Collection[str]) -> None:
     """Refuse a table with a key that is not known, naming the nearest one that is."""
     for key in table:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +11,7 @@ import msgspec
 from arrays.array import SensorArray
 from arrays.array_file import array_of_table, read_array
 from arrays.io.errors import InputError
-from arrays.io.toml import POSITIVE, BuiltIn, File, RefusalError, Rule, Table, one_of, section_of
+from arrays.io.toml import POSITIVE, BuiltIn, File, RefusalError, Rule, Table, in_si, one_of, section_of
 from arrays.typing import Vector
 from magloc.convergence.filters import FILTERS, Filter
 from magloc.convergence.over_sources import SourcesScenario
@@ -151,10 +151,10 @@ def _read(name_or_path: str) -> tuple[str, dict[str, Any], Any]:
 def _filter(default: Filter, table: Any, given: dict[str, Any]) -> Filter:
     """A filter with the settings that its table gives."""
     values = {}
-    for name in (field.name for field in fields(default)):  # type: ignore[arg-type]
-        if _key(name) in given:
-            value = getattr(table, _key(name))
-            values[name] = value / 1e9 if name.endswith("_T") else value
+    for key in given:
+        name, exponent = in_si(key)
+        value = getattr(table, key)
+        values[name] = value / 10.0**exponent if exponent else value
     return replace(default, **values)  # type: ignore[type-var]
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from arrays.array import SensorArray
 from arrays.array_file import array_of_table, read_array
 from arrays.io.errors import InputError, naming
-from arrays.io.toml import BuiltIn, named_section, section_of
+from arrays.io.toml import BuiltIn, in_si, named_section, section_of
 from sims.magnetics.paths import Attitude, Path, Steered, Vector
 from sims.magnetics.scenario import Carrier, Matrix, Missing, Platform, Pulsation, Scenario, Source
 from sims.magnetics.scenario_tables import (
@@ -133,25 +133,12 @@ def _completed(
     return {**table, "sensor": filled} if one_by_one else filled[0]
 
 
-_OVERRIDES: dict[str, tuple[str, float]] = {
-    "noise_nT_rtHz": ("noise_T_rtHz", 1e9),
-    "corner_Hz": ("corner_Hz", 1.0),
-    "bandwidth_Hz": ("bandwidth_Hz", 1.0),
-    "range_nT": ("range_T", 1e9),
-    "resolution_nT": ("resolution_T", 1e9),
-    "misalignment_mrad": ("misalignment_rad", 1e3),
-    "gain_error": ("gain_error", 1.0),
-    "drift_nT_rth": ("drift_T_rth", 1e9),
-    "offset_error_nT": ("offset_error_T", 1e9),
-}
-
-
 def _overridden(model: SensorModel, settings: SensorsTable, rate_Hz: float) -> SensorModel:
-    values = {
-        name: getattr(settings, key) / unit
-        for key, (name, unit) in _OVERRIDES.items()
-        if getattr(settings, key) is not None
-    }
+    values = {}
+    for key in SensorsTable.__struct_fields__:
+        name, exponent = in_si(key)
+        if getattr(settings, key) is not None and name in SensorModel.__dataclass_fields__:
+            values[name] = getattr(settings, key) / 10.0**exponent
     changed = replace(model, **values)
     return changed if settings.noise_nT is None else changed.with_sigma(settings.noise_nT / 1e9, rate_Hz)
 
