@@ -38,48 +38,62 @@ Both may have ``noise_fraction``, ``common_field_nT``, ``ambient_nT = [x, y, z]`
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import replace
 from decimal import Context, Decimal
 from os import PathLike
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import msgspec
 
 from arrays.array import SensorArray
 from arrays.geometries import GEOMETRIES
-from arrays.io.errors import InputError
+from arrays.io.errors import InputError, naming
 from arrays.io.text import write_text
-from arrays.io.toml import check_keys, converted, place_of, read_toml
+from arrays.io.toml import (
+    FORMAT_VERSION,
+    NOT_NEGATIVE,
+    POSITIVE,
+    File,
+    Rule,
+    Table,
+    check_keys,
+    in_si,
+    item_place,
+    read_toml,
+    section_of,
+)
 from arrays.sensor import Calibration, Sensor
+from arrays.typing import Vector
 
-FORMAT_VERSION = 1
 # Units are converted, nT to T and mrad to rad, by shifting the decimal point of what is written, never by a
 # multiplication: 1.0 nT is the number 1e-9 to the last digit, and every float survives the way to a file and back.
 _SHIFT = Context(prec=1000, traps=[])
 _Number = int | Decimal
-_Vector = tuple[float, float, float]
+_NotNegative = Annotated[_Number, NOT_NEGATIVE]
 _NumberVector = tuple[_Number, _Number, _Number]
 
 
-class _Header(msgspec.Struct, kw_only=True):
-    format_version: int = FORMAT_VERSION
+class _Header(File, kw_only=True):
+    floats_may_be_infinite: ClassVar[bool] = True
+
     name: str | None = None
     noise_fraction: float = 0.0
-    common_field_nT: _Number | None = None
+    common_field_nT: _NotNegative | None = None
     ambient_nT: _NumberVector | None = None
     ambient_gradient_nT_m: tuple[_NumberVector, _NumberVector, _NumberVector] | None = None
 
 
-class _Quality(msgspec.Struct, kw_only=True):
-    noise_nT: _Number
-    saturation_nT: _Number | None = None
-    misalignment_mrad: _Number = 0
+class _Quality(Table, kw_only=True):
+    floats_may_be_infinite: ClassVar[bool] = True
+
+    noise_nT: Annotated[_Number, POSITIVE]
+    saturation_nT: Annotated[_Number, POSITIVE] | None = None
+    misalignment_mrad: Annotated[_Number, Rule(lambda value: 0 <= value < 1000, "a number from 0 to below 1000")] = 0
     gain_uncertainty: float = 0.0
-    offset_uncertainty_nT: _Number = 0
-    flicker_nT: _Number = 0
-    drift_nT_rth: _Number = 0
+    offset_uncertainty_nT: _NotNegative = 0
+    flicker_nT: _NotNegative = 0
+    drift_nT_rth: _NotNegative = 0
 
 
 class _GeometryFile(_Header, kw_only=True):
@@ -87,7 +101,10 @@ class _GeometryFile(_Header, kw_only=True):
     kind: str
 
 
-class _CalibrationTable(msgspec.Struct, kw_only=True):
+class _CalibrationTable(Table, kw_only=True):
+    is_inline: ClassVar[bool] = True
+    floats_may_be_infinite: ClassVar[bool] = True
+
     scale: float | list[float | list[float]] = 1.0
     offset_nT: _Number | list[_Number] | None = None
 
@@ -95,7 +112,7 @@ class _CalibrationTable(msgspec.Struct, kw_only=True):
 class _SensorTable(_Quality, kw_only=True):
     id: str
     kind: str
-    position_m: _Vector
+    position_m: Vector
     rotation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
     calibration: _CalibrationTable = msgspec.field(default_factory=_CalibrationTable)
 
@@ -133,24 +150,7 @@ def read_sensors(path: str | PathLike[str]) -> SensorArray:
 
 
 def array_of_table(place: str, table: dict[str, Any]) -> SensorArray:
-    """Array from the keys of an array file, which another file may hold as a table of its own.
-
-    Parameters
-    ----------
-    place : str
-        Name of the file, and of the table within it, for errors.
-    table : dict
-        As :func:`read_toml` returns it, with decimal numbers.
-
-    Returns
-    -------
-    SensorArray
-
-    Raises
-    ------
-    InputError
-        The table does not describe an array; the text says where and why.
-    """
+    """Array from the keys of an array file, which another file may hold as a table; `place` is for errors."""
     if not table:
         raise InputError(f"{place} is empty, expected an array: a geometry with its size, or [[sensor]] tables.")
     if "geometry" in table and "sensor" in table:
@@ -181,16 +181,7 @@ def write_array(array: SensorArray, path: str | PathLike[str]) -> None:
 
 
 def array_toml(array: SensorArray) -> str:
-    """Text of an array's TOML file, sensor by sensor.
-
-    Parameters
-    ----------
-    array : SensorArray
-
-    Returns
-    -------
-    str
-    """
+    """Text of an array's TOML file, sensor by sensor."""
     lines = [f"format_version = {FORMAT_VERSION}"]
     if array.name:
         lines.append(f"name = {_quoted(array.name)}")
@@ -208,20 +199,11 @@ def array_toml(array: SensorArray) -> str:
         lines.append(f"position_m = {list(sensor.position_m)}")
         if sensor.rotation_xyzw != (0.0, 0.0, 0.0, 1.0):
             lines.append(f"rotation_xyzw = {list(sensor.rotation_xyzw)}")
-        lines.append(f"noise_nT = {_nanotesla(sensor.noise_T)}")
-        if sensor.saturation_T is not None:
-            lines.append(f"saturation_nT = {_nanotesla(sensor.saturation_T)}")
-        if sensor.misalignment_rad:
-            lines.append(f"misalignment_mrad = {_shifted(sensor.misalignment_rad, 3)}")
-        if sensor.gain_uncertainty:
-            lines.append(f"gain_uncertainty = {sensor.gain_uncertainty!r}")
-        for key, value in (
-            ("offset_uncertainty_nT", sensor.offset_uncertainty_T),
-            ("flicker_nT", sensor.flicker_T),
-            ("drift_nT_rth", sensor.drift_T_rth),
-        ):
+        for key in _keys(_Quality):
+            name, exponent = in_si(key)
+            value = getattr(sensor, name)
             if value:
-                lines.append(f"{key} = {_nanotesla(value)}")
+                lines.append(f"{key} = {_shifted(value, exponent) if exponent else repr(value)}")
         if sensor.calibration != Calibration.of(sensor.kind):
             offsets = sensor.calibration.offset_T
             offset = _nanotesla_list(offsets) if sensor.kind == "vector" else _nanotesla(offsets[0])
@@ -241,11 +223,12 @@ def _array_of_geometry(path: str, table: dict[str, Any]) -> SensorArray:
     check_keys(path, table, {*_keys(_GeometryFile), *_keys(_Quality), size_key})
     if size_key not in table:
         raise InputError(f"{path}: found no key {size_key}, expected the size of the {name}.")
-    file = converted(path, table, _GeometryFile)
-    size = getattr(converted(path, table, msgspec.defstruct("_Size", [(size_key, float)])), size_key)
-    quality = _quality(path, converted(path, table, _Quality))
-    with _naming(path):
-        array = make(size, file.kind, quality["noise_T"])  # type: ignore[arg-type]  # the kind is checked there
+    sized: Any = msgspec.defstruct("_Sized", [(size_key, float)], bases=(_GeometryFile,), kw_only=True)
+    of_sensors = {key: value for key, value in table.items() if key in _keys(_Quality)}
+    file = section_of(path, {key: value for key, value in table.items() if key not in of_sensors}, sized)
+    quality = _quality(path, section_of(path, of_sensors, _Quality))
+    with naming(path):
+        array = make(getattr(file, size_key), file.kind, quality["noise_T"])
         array = replace(array, sensors=tuple(replace(sensor, **quality) for sensor in array.sensors))
     return _with_header(path, array, file)
 
@@ -254,22 +237,19 @@ def _array_of_sensors(path: str, table: dict[str, Any]) -> SensorArray:
     misplaced = next((key for key in ("kind", *_keys(_Quality)) if key in table), None)
     if misplaced is not None:
         raise InputError(f"{path}, key {misplaced}: found at the top, expected in each [[sensor]] table.")
-    check_keys(path, table, _keys(_SensorsFile))
-    for i, sensor in _tables(table["sensor"]):
-        place = place_of(path, table, f"sensor[{i}]")
-        check_keys(place, sensor, _keys(_SensorTable))
-        if isinstance(sensor.get("calibration"), dict):
-            check_keys(place, sensor["calibration"], _keys(_CalibrationTable), within="calibration.")
-    file = converted(path, table, _SensorsFile)
-    sensors = tuple(_sensor(place_of(path, table, f"sensor[{i}]"), sensor) for i, sensor in enumerate(file.sensor))
-    with _naming(path):
+    file = section_of(path, table, _SensorsFile)
+    tables = zip(table["sensor"], file.sensor, strict=True)
+    sensors = tuple(
+        _sensor(item_place(path, "sensor", i, raw, _SensorTable), sensor) for i, (raw, sensor) in enumerate(tables)
+    )
+    with naming(path):
         array = SensorArray(sensors)
     return _with_header(path, array, file)
 
 
 def _sensor(place: str, table: _SensorTable) -> Sensor:
     quality = _quality(place, table)
-    with _naming(place):
+    with naming(place):
         sensor = Sensor(
             id=table.id,
             kind=table.kind,  # type: ignore[arg-type]  # checked there
@@ -286,54 +266,33 @@ def _sensor(place: str, table: _SensorTable) -> Sensor:
         raise InputError(
             f"{key}: found {_count(len(offset_nT))}, expected {_count(sensor.n_channels)} for a {sensor.kind} sensor."
         )
-    with _naming(place):
+    with naming(place):
         calibration = Calibration.of(sensor.kind, table.calibration.scale, [_tesla(key, x) for x in offset_nT])
     return replace(sensor, calibration=calibration)
 
 
 def _with_header(path: str, array: SensorArray, header: _Header) -> SensorArray:
-    if header.format_version != FORMAT_VERSION:
-        raise InputError(f"{path}, key format_version: found {header.format_version}, expected {FORMAT_VERSION}.")
     common_T = ambient_T = gradient_T_m = None
     if header.common_field_nT is not None:
         common_T = _tesla(f"{path}, key common_field_nT", header.common_field_nT)
-        if common_T < 0.0:
-            raise InputError(
-                f"{path}, key common_field_nT: found {header.common_field_nT}, expected a number that is not negative."
-            )
     if header.ambient_nT is not None:
         ambient_T = _tesla_vector(f"{path}, key ambient_nT", header.ambient_nT)
     if header.ambient_gradient_nT_m is not None:
         place = f"{path}, key ambient_gradient_nT_m"
         gradient_T_m = tuple(_tesla_vector(place, row) for row in header.ambient_gradient_nT_m)
     name = array.name if header.name is None else header.name
-    with _naming(path):
+    with naming(path):
         return SensorArray(array.sensors, name, header.noise_fraction, common_T, ambient_T, gradient_T_m)
 
 
 def _quality(place: str, table: _Quality) -> dict[str, Any]:
     """How good a sensor is, as arguments of Sensor."""
-    for key in ("noise_nT", "saturation_nT"):
+    result = {}
+    for key in _keys(_Quality):
+        name, exponent = in_si(key)
         value = getattr(table, key)
-        if value is not None and _tesla(f"{place}, key {key}", value) <= 0.0:
-            raise InputError(f"{place}, key {key}: found {value}, expected a positive number.")
-    key = f"{place}, key misalignment_mrad"
-    misalignment_rad = _scaled(key, table.misalignment_mrad, -3)
-    if not 0.0 <= misalignment_rad < 1.0:
-        raise InputError(f"{key}: found {table.misalignment_mrad}, expected a number from 0 to below 1000.")
-    lasting = {}
-    for name in ("offset_uncertainty_nT", "flicker_nT", "drift_nT_rth"):
-        value = getattr(table, name)
-        lasting[name.replace("nT", "T")] = _tesla(f"{place}, key {name}", value)
-        if value < 0:
-            raise InputError(f"{place}, key {name}: found {value}, expected a number that is not negative.")
-    return {
-        "noise_T": _tesla(place, table.noise_nT),
-        "saturation_T": None if table.saturation_nT is None else _tesla(place, table.saturation_nT),
-        "misalignment_rad": misalignment_rad,
-        "gain_uncertainty": table.gain_uncertainty,
-        **lasting,
-    }
+        result[name] = _scaled(f"{place}, key {key}", value, -exponent) if exponent and value is not None else value
+    return result
 
 
 def _tesla(place: str, nanotesla: _Number) -> float:
@@ -341,7 +300,7 @@ def _tesla(place: str, nanotesla: _Number) -> float:
     return _scaled(place, nanotesla, -9)
 
 
-def _tesla_vector(place: str, nanotesla: _NumberVector) -> _Vector:
+def _tesla_vector(place: str, nanotesla: _NumberVector) -> Vector:
     x, y, z = (_tesla(place, component) for component in nanotesla)
     return (x, y, z)
 
@@ -390,23 +349,6 @@ def _keys(struct: type[msgspec.Struct]) -> tuple[str, ...]:
 
 def _size_keys() -> set[str]:
     return {geometry.size_key for geometry in GEOMETRIES.values()}
-
-
-def _tables(value: object) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Those members of a list that are tables; anything else is the type check's to refuse."""
-    if isinstance(value, list):
-        yield from ((i, item) for i, item in enumerate(value) if isinstance(item, dict))
-
-
-@contextmanager
-def _naming(place: str) -> Iterator[None]:
-    """Turn what the sensors and arrays say of their inputs into errors of a place in the file."""
-    try:
-        yield
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(f"{place}: {str(error).removeprefix('Input ')}") from None
 
 
 def _count(n: int) -> str:

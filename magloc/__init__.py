@@ -24,5 +24,9 @@ __getattr__, __dir__, __all__ = lazy_names(
         "moments_on_sphere": "magloc.directions",
         "plots": ":magloc.plots",
         "source_map": "magloc.convergence.over_sources",
+        "Readings": "magloc.readings",
+        "Truth": "magloc.truth",
+        "read_readings": "magloc.readings",
+        "read_truth": "magloc.truth",
     },
 )

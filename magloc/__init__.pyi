@@ -17,3 +17,7 @@ from magloc.fields import dipole as dipole
 from magloc.fields import geomagnetic as geomagnetic
 from magloc.fields.body import equivalent_dipole as equivalent_dipole
 from magloc.localization.fit.results import Source as Source
+from magloc.readings import Readings as Readings
+from magloc.readings import read_readings as read_readings
+from magloc.truth import Truth as Truth
+from magloc.truth import read_truth as read_truth

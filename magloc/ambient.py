@@ -52,7 +52,7 @@ def with_ambient_field(
     if gradient:
         if gradient_T_m is None:
             raise InputError("--ambient-gradient: found no --place, expected --place LAT LON ALT_M and --date with it.")
-        if readings.array_rotation_xyzw is not None:
+        if readings.array_rotation is not None:
             raise InputError("--ambient-gradient: found an array with a pose, expected one that stands east-north-up.")
         rows = [(float(x), float(y), float(z)) for x, y, z in gradient_T_m]
         array = replace(array, ambient_gradient_T_m=tuple(rows))
@@ -81,17 +81,17 @@ def with_ambient_field(
         return array, None
     if scalar:
         _LOG.info("note: the geomagnetic model is taken as exact; crust and storms make it wrong by some 100 nT")
-    if readings.array_rotation_xyzw is None:
+    if readings.array_rotation is None:
         return replace(array, ambient_T=tuple(model_T.tolist())), None
-    from scipy.spatial.transform import Rotation
-
-    return array, Rotation.from_quat(readings.array_rotation_xyzw).inv().apply(model_T)
+    return array, readings.array_rotation.inv().apply(model_T)
 
 
 def _turns(readings: Readings) -> bool:
     """Whether the array turns between the rows, by more than a milliradian."""
-    rotations = readings.array_rotation_xyzw
-    return rotations is not None and bool((abs(rotations @ rotations[0]) < 1.0 - 1e-7).any())
+    if readings.array_rotation is None:
+        return False
+    rotations = readings.array_rotation.as_quat()
+    return bool((abs(rotations @ rotations[0]) < 1.0 - 1e-7).any())
 
 
 def _of_model(place: Place) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

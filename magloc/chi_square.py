@@ -11,20 +11,16 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri, chndtr, chndtrinc
 
 from arrays.typing import FloatArray
+from magloc.levels import CONSISTENCY, DELTA_CHI2_95, FALSE_ALARM
 
-_LEVEL = 0.99
 
-
-def mean_bounds(degrees_of_freedom: int, level: float = _LEVEL) -> tuple[float, float]:
+def mean_bounds(degrees_of_freedom: int, level: float = CONSISTENCY) -> tuple[float, float]:
     """Two-sided bounds of a χ² over its degrees of freedom."""
     if degrees_of_freedom <= 0:
         return math.nan, math.nan
     tail = 0.5 * (1.0 - level)
     low, high = chdtri(degrees_of_freedom, 1.0 - tail), chdtri(degrees_of_freedom, tail)
     return float(low) / degrees_of_freedom, float(high) / degrees_of_freedom
-
-
-FALSE_ALARM = 1e-3
 
 
 class Detector(Protocol):
@@ -163,4 +159,4 @@ def check_probability(probability: float, false_alarm_rate: float) -> None:
 
 
 # Δχ² of a 95 % interval of one parameter, and within which another optimum is a solution too.
-RISE_95 = 3.841458820694124
+RISE_95 = DELTA_CHI2_95

@@ -10,10 +10,7 @@ from __future__ import annotations
 import datetime
 import json
 import math
-import re
-from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -21,30 +18,25 @@ import numpy as np
 
 from adcs.environment.orbit import CircularOrbit, Orbit, Sgp4Orbit, node_of_local_time
 from adcs.io.scenario_tables import (
-    FORMAT_VERSION,
     SENSOR_TABLES,
     DisturbanceTable,
     EstimateTable,
     FileTable,
-    GyroTable,
-    MagnetometerTable,
     OrbitTable,
     ProcessNoiseTable,
     SatelliteTable,
-    StarTrackerTable,
     StartTable,
-    SunSensorTable,
 )
 from adcs.kalman.bank import FILTERS, NOISES, STARTS, Estimate
 from adcs.kalman.error_state import FilterSettings, ProcessNoise, SensorSet, paper_noise, sensor_set, tuned_noise
 from adcs.satellite.dynamics import RigidBody, WheelControl, wheel_control
 from adcs.satellite.sensors import Gyro, Magnetometer, StarTracker, SunSensor
 from arrays.io.errors import InputError, naming
-from arrays.io.toml import read_toml, section_of
-from magloc.fields.geomagnetic import MODELS, Model
+from arrays.io.toml import BuiltIn, section_of
+from magloc.fields.geomagnetic import Model
 
-MOST_STEPS = 200_000
-"""Of a run: its covariances are held together, 230 MB of them."""
+_FILES = BuiltIn("adcs", "scenarios", "scenario")
+built_in_scenarios = _FILES.names
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,15 +90,9 @@ class AttitudeFile:
         return self.step_s
 
 
-def built_in_scenarios() -> tuple[str, ...]:
-    """Names of the scenarios that come with the package."""
-    files = (resources.files("adcs") / "scenarios").iterdir()
-    return tuple(sorted(Path(file.name).stem for file in files if file.name.endswith(".toml")))
-
-
 def built_in_text(name: str) -> str:
     """Text of a built-in scenario's file."""
-    return (resources.files("adcs") / "scenarios" / f"{name}.toml").read_text(encoding="utf-8")
+    return _FILES.path(name).read_text(encoding="utf-8")
 
 
 def read_scenario(name_or_path: str) -> AttitudeFile:
@@ -117,20 +103,12 @@ def read_scenario(name_or_path: str) -> AttitudeFile:
     name_or_path : str
         A built-in scenario's name, or a TOML file; ``scenarios/tabletsat.toml`` beside this module documents the keys.
 
-    Returns
-    -------
-    AttitudeFile
-
     Raises
     ------
     InputError
         The file cannot be read or does not describe a scenario; the text says where and why.
     """
-    path = name_or_path
-    if name_or_path in built_in_scenarios():
-        path = str(resources.files("adcs") / "scenarios" / f"{name_or_path}.toml")
-    expected = f"a scenario file, or one of the built-in scenarios {', '.join(built_in_scenarios())}"
-    return scenario_of(path, _with_dates(read_toml(path, expected)))
+    return scenario_of(*_FILES.read(name_or_path))
 
 
 def changed(file: AttitudeFile, changes: dict[str, Any]) -> AttitudeFile:
@@ -163,6 +141,8 @@ def _table_lines(name: str, table: dict[str, Any]) -> list[str]:
 def _toml(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, datetime.date):
+        value = value.isoformat()
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False)
     if isinstance(value, list | tuple):
@@ -171,48 +151,21 @@ def _toml(value: Any) -> str:
 
 
 def scenario_of(path: str, tables: dict[str, Any]) -> AttitudeFile:
-    """Scenario of the tables of a file.
-
-    Parameters
-    ----------
-    path : str
-        Of the file, for errors.
-    tables : dict
-        As :func:`arrays.io.toml.read_toml` returns them.
-
-    Returns
-    -------
-    AttitudeFile
-
-    Raises
-    ------
-    InputError
-        They do not describe a scenario; the text says where and why.
-    """
+    """Scenario of the tables of a file, as :func:`arrays.io.toml.read_toml` returns them."""
     file = section_of(path, tables, FileTable)
-    if file.format_version != FORMAT_VERSION:
-        raise InputError(f"{path}, key format_version: found {file.format_version}, expected {FORMAT_VERSION}.")
     body, control = _satellite(f"{path}, table satellite", file.satellite)
     orbit, start_utc, model = _orbit(f"{path}, table orbit", file.orbit)
-    if not 1.0 <= file.duration_s / file.step_s <= MOST_STEPS:
-        raise InputError(
-            f"{path}, key duration_s: found {file.duration_s:g} s, expected 1 to {MOST_STEPS} steps of "
-            f"{file.step_s:g} s."
-        )
-    if file.name is not None and not re.fullmatch(r"[\w.-]+", file.name):
-        raise InputError(f"{path}, key name: found {file.name!r}, expected letters, digits, dots and dashes.")
     for name in file.sensors:
         if name not in SENSOR_TABLES:
             raise InputError(
                 f"{path}, table sensors: found the unknown sensor {name!r}, expected one of {', '.join(SENSOR_TABLES)}."
             )
-    sensors = {
-        name: make(f"{path}, table sensors.{name}", file.sensors.get(name, {})) for name, make in _MAKERS.items()
-    }
-    start = section_of(f"{path}, table start", file.start, StartTable)
-    for key in ("least_separation_deg", "most_separation_deg"):
-        if not 0.0 <= getattr(start, key) <= 90.0:
-            raise InputError(f"{path}, table start, key {key}: found {getattr(start, key):g}, expected 0 to 90.")
+    sensors = {}
+    for name, struct in SENSOR_TABLES.items():
+        place = f"{path}, table sensors.{name}"
+        table = section_of(place, file.sensors.get(name, {}), struct)
+        with naming(place):
+            sensors[name] = table.sensor()
     return AttitudeFile(
         name=Path(path).stem if file.name is None else file.name,
         path=path,
@@ -225,9 +178,9 @@ def scenario_of(path: str, tables: dict[str, Any]) -> AttitudeFile:
         duration_s=file.duration_s,
         step_s=file.step_s,
         **sensors,
-        start=start,
-        disturbance=section_of(f"{path}, table disturbance", file.disturbance, DisturbanceTable),
-        estimate=section_of(f"{path}, table estimate", file.estimate, EstimateTable),
+        start=file.start,
+        disturbance=file.disturbance,
+        estimate=file.estimate,
     )
 
 
@@ -297,8 +250,7 @@ def _process_noise(place: str, wanted: str | dict[str, Any], used: SensorSet) ->
     )
 
 
-def _satellite(place: str, table: dict[str, Any]) -> tuple[RigidBody, WheelControl]:
-    section = section_of(place, table, SatelliteTable)
+def _satellite(place: str, section: SatelliteTable) -> tuple[RigidBody, WheelControl]:
     with naming(place):
         body = RigidBody(np.array(section.inertia_kgm2), np.array(section.residual_dipole_Am2))
         gains = wheel_control(body, section.control_rad_s, section.control_damping)
@@ -308,31 +260,19 @@ def _satellite(place: str, table: dict[str, Any]) -> tuple[RigidBody, WheelContr
     return body, control
 
 
-def _orbit(place: str, table: dict[str, Any]) -> tuple[Orbit, np.datetime64, Model]:
-    section = section_of(place, table, OrbitTable)
-    if section.field_model not in MODELS:
-        raise InputError(f"{place}, key field_model: found {section.field_model!r}, expected one of {_listed(MODELS)}.")
-    start = _instant(f"{place}, key start", section.start)
-    circle = {key: getattr(section, key) for key in ("altitude_km", "inclination_deg")}
+def _orbit(place: str, section: OrbitTable) -> tuple[Orbit, np.datetime64, Model]:
+    start = _instant(section.start)
     if section.elements is not None:
-        if any(value is not None for value in (*circle.values(), section.local_time_h, section.node_deg)):
-            raise InputError(f"{place}: found elements and a circle, expected one of them.")
         with naming(f"{place}, key elements"):
             return Sgp4Orbit(*section.elements), start, section.field_model
-    for key, value in circle.items():
-        if value is None:
-            raise InputError(f"{place}: found no key {key}, expected one, or two-line elements.")
-    if (section.local_time_h is None) == (section.node_deg is None):
-        found = "neither local_time_h nor node_deg" if section.node_deg is None else "both local_time_h and node_deg"
-        raise InputError(f"{place}: found {found}, expected one of them.")
     if section.local_time_h is not None:
         node = node_of_local_time(section.local_time_h, start)
     else:
         node = math.radians(section.node_deg or 0.0)
     with naming(place):
         orbit = CircularOrbit(
-            1e3 * circle["altitude_km"],
-            math.radians(circle["inclination_deg"]),
+            1e3 * (section.altitude_km or 0.0),
+            math.radians(section.inclination_deg or 0.0),
             node,
             start,
             math.radians(section.latitude_argument_deg),
@@ -340,77 +280,8 @@ def _orbit(place: str, table: dict[str, Any]) -> tuple[Orbit, np.datetime64, Mod
     return orbit, start, section.field_model
 
 
-def _with_dates(table: dict[str, Any]) -> dict[str, Any]:
-    """TOML has dates of its own; here they are text, so that both are allowed."""
-    orbit = table.get("orbit")
-    if isinstance(orbit, dict) and isinstance(orbit.get("start"), datetime.date):
-        return {**table, "orbit": {**orbit, "start": orbit["start"].isoformat()}}
-    return table
-
-
-def _instant(place: str, text: str) -> np.datetime64:
-    try:
-        date = datetime.datetime.fromisoformat(text)
-    except ValueError:
-        raise InputError(f"{place}: found {text!r}, expected an instant such as 2014-09-01T12:00:00 (UTC).") from None
+def _instant(text: str) -> np.datetime64:
+    date = datetime.datetime.fromisoformat(text)
     if date.tzinfo is not None:
         date = date.astimezone(datetime.UTC).replace(tzinfo=None)
     return np.datetime64(date, "us")
-
-
-def _star_tracker(place: str, table: dict[str, Any]) -> StarTracker:
-    section = section_of(place, table, StarTrackerTable)
-    with naming(place):
-        return StarTracker(
-            sigma_rad=0.5 * math.radians(section.noise_deg),
-            rate_limit_rad_s=math.radians(section.rate_limit_deg_s),
-            boresight_body=np.array(section.boresight),
-            sun_exclusion_rad=math.radians(section.sun_exclusion_deg),
-            earth_exclusion_rad=math.radians(section.earth_exclusion_deg),
-            misalignment_rad=np.radians(section.misalignment_deg),
-        )
-
-
-def _gyro(place: str, table: dict[str, Any]) -> Gyro:
-    section = section_of(place, table, GyroTable)
-    with naming(place):
-        return Gyro(
-            sigma_rad_s=math.radians(section.noise_deg_s),
-            range_rad_s=math.radians(section.range_deg_s),
-            bias_walk_rad_s=math.radians(section.bias_walk_deg_s_rts),
-            misalignment_rad=np.radians(section.misalignment_deg),
-        )
-
-
-def _magnetometer(place: str, table: dict[str, Any]) -> Magnetometer:
-    section = section_of(place, table, MagnetometerTable)
-    with naming(place):
-        return Magnetometer(
-            sigma_T=1e-9 * section.noise_nT,
-            range_T=1e-9 * section.range_nT,
-            bias_walk_T=1e-9 * section.bias_walk_nT_rts,
-            misalignment_rad=np.radians(section.misalignment_deg),
-        )
-
-
-def _sun_sensor(place: str, table: dict[str, Any]) -> SunSensor:
-    section = section_of(place, table, SunSensorTable)
-    with naming(place):
-        return SunSensor(
-            sigma_rad=math.radians(section.noise_deg),
-            heads_body=np.array(section.heads, dtype=np.float64),
-            half_field_rad=math.radians(section.half_field_deg),
-            misalignment_rad=np.radians(section.misalignment_deg),
-        )
-
-
-_MAKERS: dict[str, Callable[[str, dict[str, Any]], Any]] = {
-    "star_tracker": _star_tracker,
-    "gyro": _gyro,
-    "magnetometer": _magnetometer,
-    "sun_sensor": _sun_sensor,
-}
-
-
-def _listed(names: Any) -> str:
-    return ", ".join(map(str, names))

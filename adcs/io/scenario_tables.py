@@ -3,159 +3,183 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+import re
+from typing import Annotated, Any
 
 import msgspec
+import numpy as np
 
-from adcs.satellite.sensors import FIVE_HEADS
-from arrays.io.toml import Table
+from adcs.satellite.sensors import FIVE_HEADS, Gyro, Magnetometer, StarTracker, SunSensor
+from arrays.io.toml import (
+    MAY_BE_INFINITE,
+    File,
+    NotNegative,
+    Positive,
+    RefusalError,
+    Rule,
+    Table,
+    date_such_as,
+    one_of,
+)
+from arrays.typing import Vector
+from magloc.fields.geomagnetic import MODELS
 
-FORMAT_VERSION = 1
-Vector = tuple[float, float, float]
+MOST_STEPS = 200_000
+"""Of a run: its covariances are held together, 230 MB of them."""
 _ZERO: Vector = (0.0, 0.0, 0.0)
-
-
-class FileTable(Table, kw_only=True):
-    """The whole file."""
-
-    positive = frozenset({"duration_s", "step_s"})
-
-    satellite: dict[str, Any]
-    orbit: dict[str, Any]
-    format_version: int = FORMAT_VERSION
-    name: str | None = None
-    duration_s: float = 200.0
-    step_s: float = 1.0
-    start: dict[str, Any] = msgspec.field(default_factory=dict)
-    disturbance: dict[str, Any] = msgspec.field(default_factory=dict)
-    sensors: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
-    estimate: dict[str, Any] = msgspec.field(default_factory=dict)
+_RIGHT_ANGLE = Rule(lambda value: 0.0 <= value <= 90.0, "0 to 90")
+_NAME = Rule(lambda value: bool(re.fullmatch(r"[\w.-]+", value)), "letters, digits, dots and dashes")
 
 
 class SatelliteTable(Table, kw_only=True):
     """The body and its wheels."""
 
-    positive = frozenset({"torque_limit_Nm", "momentum_limit_Nms", "control_rad_s", "control_damping"})
-
     inertia_kgm2: tuple[Vector, Vector, Vector]
     residual_dipole_Am2: Vector = _ZERO
-    control_rad_s: float = 0.03
-    control_damping: float = 0.8
-    torque_limit_Nm: float = 5e-3
-    momentum_limit_Nms: float = 0.17
+    control_rad_s: Positive = 0.03
+    control_damping: Positive = 0.8
+    torque_limit_Nm: Positive = 5e-3
+    momentum_limit_Nms: Positive = 0.17
 
 
 class OrbitTable(Table, kw_only=True):
     """A circle, or two-line elements; the day; the model of the field."""
 
-    positive = frozenset({"altitude_km"})
-
-    start: str
-    altitude_km: float | None = None
+    start: Annotated[str, date_such_as("an instant such as 2014-09-01T12:00:00 (UTC)")]
+    altitude_km: Positive | None = None
     inclination_deg: float | None = None
     local_time_h: float | None = None
     node_deg: float | None = None
     latitude_argument_deg: float = 0.0
     elements: tuple[str, str] | None = None
-    field_model: str = "IGRF-14"
+    field_model: Annotated[str, one_of(MODELS)] = "IGRF-14"
+
+    def check(self) -> None:
+        """Refuse anything but one orbit."""
+        circle = ("altitude_km", "inclination_deg", "local_time_h", "node_deg")
+        missing = [key for key in circle if getattr(self, key) is None]
+        if self.elements is not None:
+            if len(missing) < len(circle):
+                raise RefusalError("", "found elements and a circle, expected one of them")
+        elif missing and missing[0] in circle[:2]:
+            raise RefusalError("", f"found no key {missing[0]}, expected one, or two-line elements")
+        elif len(missing) != 1:
+            found = "neither local_time_h nor node_deg" if missing else "both local_time_h and node_deg"
+            raise RefusalError("", f"found {found}, expected one of them")
 
 
 class StartTable(Table, kw_only=True):
     """When runs start and what holds throughout, and how the satellite moves then."""
 
-    not_negative = frozenset({"least_field_nT", "attitude_deg", "rate_deg_s", "eclipse_after_s"})
-
     sunlit: bool = True
-    least_separation_deg: float = 45.0
-    most_separation_deg: float = 90.0
-    least_field_nT: float = 25_000.0
-    eclipse_after_s: float | None = None
-    attitude_deg: float = 1.0
-    rate_deg_s: float = 0.01
+    least_separation_deg: Annotated[float, _RIGHT_ANGLE] = 45.0
+    most_separation_deg: Annotated[float, _RIGHT_ANGLE] = 90.0
+    least_field_nT: NotNegative = 25_000.0
+    eclipse_after_s: NotNegative | None = None
+    attitude_deg: NotNegative = 1.0
+    rate_deg_s: NotNegative = 0.01
 
 
 class DisturbanceTable(Table, kw_only=True):
     """What the filters are not told."""
 
-    positive = frozenset({"torque_period_s"})
-    not_negative = frozenset({"torque_Nm", "gyro_bias_deg_s", "field_bias_nT", "field_error_nT"})
-    may_be_infinite = frozenset({"torque_period_s"})
-
-    torque_Nm: float = 8e-7
-    torque_period_s: float = math.inf
-    gyro_bias_deg_s: float = 0.0
-    field_bias_nT: float = 0.0
-    field_error_nT: float = 0.0
+    torque_Nm: NotNegative = 8e-7
+    torque_period_s: Annotated[Positive, MAY_BE_INFINITE] = math.inf
+    gyro_bias_deg_s: NotNegative = 0.0
+    field_bias_nT: NotNegative = 0.0
+    field_error_nT: NotNegative = 0.0
 
 
 class StarTrackerTable(Table, kw_only=True):
     """Noise is that of the angle about each axis."""
 
-    positive = frozenset({"noise_deg", "rate_limit_deg_s"})
-    not_negative = frozenset({"sun_exclusion_deg", "earth_exclusion_deg"})
-
-    noise_deg: float = 0.001
-    rate_limit_deg_s: float = 2.0
+    noise_deg: Positive = 0.001
+    rate_limit_deg_s: Positive = 2.0
     boresight: Vector = (0.0, 0.0, 1.0)
-    sun_exclusion_deg: float = 0.0
-    earth_exclusion_deg: float = 0.0
+    sun_exclusion_deg: NotNegative = 0.0
+    earth_exclusion_deg: NotNegative = 0.0
     misalignment_deg: Vector = _ZERO
+
+    def sensor(self) -> StarTracker:
+        """What the table describes."""
+        return StarTracker(
+            sigma_rad=0.5 * math.radians(self.noise_deg),
+            rate_limit_rad_s=math.radians(self.rate_limit_deg_s),
+            boresight_body=np.array(self.boresight),
+            sun_exclusion_rad=math.radians(self.sun_exclusion_deg),
+            earth_exclusion_rad=math.radians(self.earth_exclusion_deg),
+            misalignment_rad=np.radians(self.misalignment_deg),
+        )
 
 
 class GyroTable(Table, kw_only=True):
     """Noise of one reading of one axis."""
 
-    positive = frozenset({"noise_deg_s", "range_deg_s"})
-    not_negative = frozenset({"bias_walk_deg_s_rts"})
-
-    noise_deg_s: float = 0.005
-    range_deg_s: float = 250.0
-    bias_walk_deg_s_rts: float = 0.0
+    noise_deg_s: Positive = 0.005
+    range_deg_s: Positive = 250.0
+    bias_walk_deg_s_rts: NotNegative = 0.0
     misalignment_deg: Vector = _ZERO
+
+    def sensor(self) -> Gyro:
+        """What the table describes."""
+        return Gyro(
+            sigma_rad_s=math.radians(self.noise_deg_s),
+            range_rad_s=math.radians(self.range_deg_s),
+            bias_walk_rad_s=math.radians(self.bias_walk_deg_s_rts),
+            misalignment_rad=np.radians(self.misalignment_deg),
+        )
 
 
 class MagnetometerTable(Table, kw_only=True):
     """Noise of one reading of one axis."""
 
-    positive = frozenset({"noise_nT", "range_nT"})
-    not_negative = frozenset({"bias_walk_nT_rts"})
-
-    noise_nT: float = 250.0
-    range_nT: float = 200_000.0
-    bias_walk_nT_rts: float = 0.0
+    noise_nT: Positive = 250.0
+    range_nT: Positive = 200_000.0
+    bias_walk_nT_rts: NotNegative = 0.0
     misalignment_deg: Vector = _ZERO
+
+    def sensor(self) -> Magnetometer:
+        """What the table describes."""
+        return Magnetometer(
+            sigma_T=1e-9 * self.noise_nT,
+            range_T=1e-9 * self.range_nT,
+            bias_walk_T=1e-9 * self.bias_walk_nT_rts,
+            misalignment_rad=np.radians(self.misalignment_deg),
+        )
 
 
 class SunSensorTable(Table, kw_only=True):
     """Noise of the direction along each of two axes across it."""
 
-    positive = frozenset({"noise_deg", "half_field_deg"})
-
-    noise_deg: float = 0.1
-    half_field_deg: float = 45.0
+    noise_deg: Positive = 0.1
+    half_field_deg: Positive = 45.0
     heads: list[Vector] = msgspec.field(default_factory=FIVE_HEADS.tolist)
     misalignment_deg: Vector = _ZERO
+
+    def sensor(self) -> SunSensor:
+        """What the table describes."""
+        return SunSensor(
+            sigma_rad=math.radians(self.noise_deg),
+            heads_body=np.array(self.heads, dtype=np.float64),
+            half_field_rad=math.radians(self.half_field_deg),
+            misalignment_rad=np.radians(self.misalignment_deg),
+        )
 
 
 class EstimateTable(Table, kw_only=True):
     """The filter."""
 
-    not_negative = frozenset({"field_model_error_nT"})
-    positive = frozenset(
-        {"start_error_deg", "start_rate_error_deg_s", "gyro_bias_deg_s", "field_bias_nT", "disturbance_s2"}
-    )
-
     sensors: str = "st+gyro+mag+sun"
     states: list[str] = msgspec.field(default_factory=list)
     filter: str = "mekf"
     process_noise: str | dict[str, Any] = "tuned"
-    field_model_error_nT: float = 0.0
+    field_model_error_nT: NotNegative = 0.0
     start: str = "near"
-    start_error_deg: float = 5.0
-    start_rate_error_deg_s: float = 0.1
-    gyro_bias_deg_s: float = 0.06
-    field_bias_nT: float = 1000.0
-    disturbance_s2: float = 2e-6
+    start_error_deg: Positive = 5.0
+    start_rate_error_deg_s: Positive = 0.1
+    gyro_bias_deg_s: Positive = 0.06
+    field_bias_nT: Positive = 1000.0
+    disturbance_s2: Positive = 2e-6
     forgetting: float = 0.99
     closed_loop_F: bool = False
 
@@ -166,18 +190,36 @@ class ProcessNoiseTable(Table, kw_only=True):
     See :class:`adcs.kalman.error_state.ProcessNoise`.
     """
 
-    not_negative = frozenset({"half_angle_rad", "rate_rad_s", "field_bias_nT", "gyro_bias_rad_s", "disturbance_s2"})
-
-    half_angle_rad: float | None = None
-    rate_rad_s: float | None = None
-    field_bias_nT: float | None = None
-    gyro_bias_rad_s: float | None = None
-    disturbance_s2: float | None = None
+    half_angle_rad: NotNegative | None = None
+    rate_rad_s: NotNegative | None = None
+    field_bias_nT: NotNegative | None = None
+    gyro_bias_rad_s: NotNegative | None = None
+    disturbance_s2: NotNegative | None = None
 
 
-SENSOR_TABLES: dict[str, type[Table]] = {
+SENSOR_TABLES: dict[str, Any] = {
     "star_tracker": StarTrackerTable,
     "gyro": GyroTable,
     "magnetometer": MagnetometerTable,
     "sun_sensor": SunSensorTable,
 }
+
+
+class FileTable(File, kw_only=True):
+    """The whole file."""
+
+    satellite: SatelliteTable
+    orbit: OrbitTable
+    name: Annotated[str, _NAME] | None = None
+    duration_s: Positive = 200.0
+    step_s: Positive = 1.0
+    start: StartTable = msgspec.field(default_factory=StartTable)
+    disturbance: DisturbanceTable = msgspec.field(default_factory=DisturbanceTable)
+    sensors: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
+    estimate: EstimateTable = msgspec.field(default_factory=EstimateTable)
+
+    def check(self) -> None:
+        """Refuse no step at all, and too many."""
+        if not 1.0 <= self.duration_s / self.step_s <= MOST_STEPS:
+            expected = f"1 to {MOST_STEPS} steps of {self.step_s:g} s"
+            raise RefusalError("duration_s", f"found {self.duration_s:g} s, expected {expected}")

@@ -178,7 +178,7 @@ def _instants(table: Table, step_s: float) -> NDArray[np.int64]:
     table.refuse(back, [TIME], "found a time that is not after the one before, expected times that ascend")
     if rows[-1] >= _MOST_INSTANTS:
         raise InputError(
-            f"{table.place(int(table.line_numbers[-1]), TIME)}: found {rows[-1]} steps after the first row, expected "
+            f"{table.place(-1, TIME)}: found {rows[-1]} steps after the first row, expected "
             f"fewer than {_MOST_INSTANTS}."
         )
     return rows

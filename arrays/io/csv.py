@@ -6,12 +6,6 @@ any line ends, blank lines and spaces around cells are tolerated.
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 import csv
 import difflib
 import io
@@ -20,48 +14,54 @@ from array import array as packed
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from arrays.io.errors import InputError
 from arrays.io.text import read_text, write_text
-from arrays.typing import FloatArray
+from arrays.typing import FloatArray, IntArray
 
-IntArray = NDArray[np.int64]
 _SHOWN_CHARACTERS = 40
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """A CSV file of numbers.
+    """A table of numbers, from a CSV file or from columns in memory.
 
     Attributes
     ----------
     path : str
     header : tuple of str
         Names of the columns, each once.
-    header_line : int
-        Line that they stand on.
+    header_line : int, optional
+        Line that they stand on, of a file.
     values : ndarray, shape (n, columns)
         NaN where a cell is empty.
     line_numbers : ndarray of int, shape (n,)
-        Line of every row as an editor counts it.
+        Line of every row as an editor counts it; of columns the row, counted from one.
     """
 
     path: str
     header: tuple[str, ...]
-    header_line: int
+    header_line: int | None
     values: FloatArray
     line_numbers: IntArray
 
-    def place(self, line: int, column: str) -> str:
+    def row_place(self, row: int) -> str:
+        """Where a row, counted from zero, is, for the start of an error's sentence."""
+        return f"{self.path}, {'row' if self.header_line is None else 'line'} {self.line_numbers[row]}"
+
+    def place(self, row: int, column: str) -> str:
         """Where a cell is, for the start of an error's sentence."""
-        return f"{self.path}, line {line}, column {column}"
+        return f"{self.row_place(row)}, column {column}"
 
     def header_place(self, column: str) -> str:
         """Where a column's name is, or should be, for the start of an error's sentence."""
-        return self.place(self.header_line, column)
+        line = "" if self.header_line is None else f", line {self.header_line}"
+        return f"{self.path}{line}, column {column}"
 
     def require(self, column: str, known: Sequence[str]) -> None:
         """Raise an InputError if a column is missing, with the nearest name in the file that is not a known one."""
@@ -103,8 +103,8 @@ class Table:
             second = repeated.min()
             first = np.flatnonzero(values == values[second])[0]
             raise InputError(
-                f"{self.place(self.line_numbers[second], column)}: found {values[second]:.15g} "
-                f"as on line {self.line_numbers[first]}, expected every value once."
+                f"{self.place(second, column)}: found {values[second]:.15g} "
+                f"as on {self.row_place(first).removeprefix(self.path + ', ')}, expected every value once."
             )
         return values
 
@@ -112,7 +112,15 @@ class Table:
         """Raise an InputError with the place of the first bad cell (n, k) of some columns, and the fault in words."""
         if bad.any():
             row, column = np.argwhere(bad)[0]
-            raise InputError(f"{self.place(self.line_numbers[row], columns[column])}: {fault}.")
+            raise InputError(f"{self.place(row, columns[column])}: {fault}.")
+
+    def refuse_back(self, column: str, bad: NDArray[np.bool_], expected: str, shown: str = "{:.6g} s") -> None:
+        """Raise an InputError for the first pair (n − 1) of successive rows whose values are in a bad order."""
+        if bad.any():
+            row = int(np.argmax(bad)) + 1
+            before, found = self.values[row - 1 : row + 1, self.header.index(column)]
+            pair = f"found {shown.format(found)} after {shown.format(before)}"
+            raise InputError(f"{self.place(row, column)}: {pair}, expected {expected}.")
 
 
 def read_table(path: str | PathLike[str], expected_header: str) -> Table:
@@ -135,6 +143,31 @@ def read_table(path: str | PathLike[str], expected_header: str) -> Table:
         The file cannot be read or is not such a table.
     """
     return table_of_text(read_text(path, "a CSV file"), str(path), expected_header)
+
+
+class Columns(Protocol):
+    """A mapping from names to columns, or a data frame."""
+
+    def __iter__(self) -> Iterator[Any]:
+        """Names of the columns."""
+
+    def __getitem__(self, name: Any, /) -> Any:
+        """A column."""
+
+
+def table_of_columns(columns: Columns, name: str) -> Table:
+    """Table as of :func:`read_table`, from columns in memory; `name` is what they are called in errors."""
+    header = tuple(map(str, columns))
+    values = []
+    for column in columns:
+        try:
+            values.append(np.asarray(columns[column], dtype=np.float64))
+        except (TypeError, ValueError):
+            raise InputError(f"{name}, column {column}: found what is not a number, expected numbers.") from None
+    shapes = {column.shape for column in values}
+    if len(shapes) != 1 or len(*shapes) != 1 or shapes == {(0,)}:
+        raise InputError(f"{name}: found columns of the shapes {sorted(shapes)}, expected one length, 1 or more.")
+    return Table(name, header, None, np.stack(values, axis=1), np.arange(1, len(values[0]) + 1))
 
 
 def table_of_text(text: str, name: str, expected_header: str, *, first_line: int | None = None) -> Table:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import secrets
 from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
@@ -65,7 +64,7 @@ def write_text(text: str, path: str | PathLike[str]) -> None:
     in_place = target.exists() and not target.is_file()  # a pipe or a terminal cannot be replaced
     if not in_place:
         target = Path(os.path.realpath(path))
-    written = target if in_place else target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    written = target if in_place else target.with_name(f".{target.name}.{os.urandom(4).hex()}.tmp")
     try:
         try:
             written.write_text(text, encoding="utf-8", newline="\n")

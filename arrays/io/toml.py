@@ -1,25 +1,123 @@
-"""TOML files: strict reading as typed structs, writing in one step, and errors that name the place.
+"""TOML files: one strict reader that makes typed structs of them, with errors that name the file, table and key.
 
-Numbers with a fraction are read as Decimal, so that whoever converts a unit can do it without rounding.
+A kind of file is a :class:`File` with a field for every key, units in the names, and in it fields that are a
+:class:`Table`, a list or a dict of them. What a type cannot say of a value stands beside it (``radius_m: Positive``,
+``kind: Annotated[str, one_of(KINDS)]``), what holds between keys in :meth:`Table.check`. Numbers with a fraction are
+read as Decimal, so that whoever converts a unit can do it without rounding.
 """
 
 from __future__ import annotations
 
+import datetime
 import difflib
 import math
 import re
 import tomllib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
 from decimal import Decimal
+from functools import cache
 from os import PathLike
-from typing import Any, ClassVar, TypeVar
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 
 from arrays.io.errors import InputError
 from arrays.io.text import read_text
 
+FORMAT_VERSION = 1
 _Any = TypeVar("_Any")
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a text, or every number of a value, must be; numbers are finite unless the rule lets them be infinite."""
+
+    holds: Callable[[Any], bool]
+    expected: str
+    may_be_infinite: bool = False
+    is_date: bool = False
+
+
+def date_such_as(example: str) -> Rule:
+    """A date, in quotation marks or not; it is read as text."""
+    return Rule(_is_date, example, is_date=True)
+
+
+def _is_date(text: str) -> bool:
+    try:
+        datetime.datetime.fromisoformat(text)
+    except ValueError:
+        return False
+    return True
+
+
+def one_of(names: Collection[str], expected: str = "") -> Rule:
+    """A text must be one of some names."""
+    return Rule(lambda value: value in names, expected or f"one of {', '.join(names)}")
+
+
+POSITIVE = Rule(lambda value: value > 0, "a positive number")
+NOT_NEGATIVE = Rule(lambda value: value >= 0, "a number that is not negative")
+MAY_BE_INFINITE = Rule(lambda _: True, "", may_be_infinite=True)
+_VERSION = Rule(lambda value: value == FORMAT_VERSION, str(FORMAT_VERSION))
+Positive = Annotated[float, POSITIVE]
+NotNegative = Annotated[float, NOT_NEGATIVE]
+
+
+class RefusalError(ValueError):
+    """Something is wrong with the value of a key, or with a table: the key or "", what was found and expected."""
+
+
+class Table(msgspec.Struct, kw_only=True):
+    """A table of a file."""
+
+    is_inline: ClassVar[bool] = False
+    """Whether errors name its keys ``table.key``, as of the file that it stands in."""
+
+    floats_may_be_infinite: ClassVar[bool] = False
+    """Whether whoever uses the floats refuses those that are not finite."""
+
+    def check(self) -> None:
+        """Raise a :class:`RefusalError` if its values do not fit each other."""
+
+
+class File(Table, kw_only=True):
+    """A whole file."""
+
+    format_version: Annotated[int, _VERSION] = FORMAT_VERSION
+
+
+AnyTable = TypeVar("AnyTable", bound=Table)
+
+
+@dataclass(frozen=True)
+class BuiltIn:
+    """TOML files of one kind that come with a package, in a folder of it."""
+
+    package: str
+    folder: str
+    called: str
+
+    def names(self) -> tuple[str, ...]:
+        """Of the files."""
+        return tuple(sorted(path.stem for path in self._folder().glob("*.toml")))
+
+    def path(self, name: str) -> Path:
+        """Of the file of a name."""
+        return self._folder() / f"{name}.toml"
+
+    def _folder(self) -> Path:
+        from importlib import resources  # of some milliseconds, which an array's file does not need
+
+        return Path(str(resources.files(self.package) / self.folder))
+
+    def read(self, name_or_path: str) -> tuple[str, dict[str, Any]]:
+        """Path and table of a built-in file or one of the user's."""
+        names = self.names()
+        path = str(self.path(name_or_path)) if name_or_path in names else name_or_path
+        return path, read_toml(path, f"a {self.called} file, or one of the built-in {self.called}s {', '.join(names)}")
 
 
 def read_toml(path: str | PathLike[str], expected: str) -> dict[str, Any]:
@@ -54,32 +152,20 @@ def read_toml(path: str | PathLike[str], expected: str) -> dict[str, Any]:
         raise InputError(f"{path}: found lists nested too deeply, expected a list of lists at most.") from None
 
 
-def check_keys(place: str, table: Mapping[str, Any], known: Collection[str], within: str = "") -> None:
-    """Refuse a table with a key that is not known, naming the nearest one that is.
+def in_si(key: str) -> tuple[str, int]:
+    """What a key is called in SI, and by which power of ten its number is larger than there: nT and mrad."""
+    exponent = 9 if "nT" in key else 3 if "mrad" in key else 0
+    return key.replace("nT", "T").replace("mrad", "rad"), exponent
 
-    Parameters
-    ----------
-    place : str
-        Name of the file, and of the table within it, for errors.
-    table : mapping
-    known : collection of str
-        Keys that the table may have.
-    within : str
-        What the keys are shown with in front, such as ``"calibration."``.
 
-    Raises
-    ------
-    InputError
-        For the first unknown key.
-    """
+def check_keys(place: str, table: Mapping[str, Any], known: Collection[str]) -> None:
+    """Refuse a table with a key that is not known, naming the nearest one that is."""
     for key in table:
         if key not in known:
             nearest = difflib.get_close_matches(key, sorted(known), n=1, cutoff=0.0)[0]
             shown = key if key and key.isprintable() else repr(key)
-            raise InputError(
-                f"{place}, key {within}{shown}: found an unknown key, expected a known one "
-                f"(the nearest is {within}{nearest})."
-            )
+            where, within = key_place(place, shown), _within(place)
+            raise InputError(f"{where}: found an unknown key, expected a known one (the nearest is {within}{nearest}).")
 
 
 _TYPE_ERROR = re.compile(r"Expected `(?P<expected>[^`]+)`(?P<length> of length \d+)?, got `?(?P<found>[^`]+)`?")
@@ -96,36 +182,144 @@ _TYPES = {
 }
 
 
-def converted(path: str, table: dict[str, Any], type_: type[_Any]) -> _Any:
-    """A table as a struct of the right types.
+def key_place(place: str, key: str) -> str:
+    """Where a key is: of a place that ends with a stop, as of an inline table, in one word with it."""
+    return f"{place}{key}" if place.endswith(".") else f"{place}, key {key}"
+
+
+def _within(place: str) -> str:
+    return place.rpartition("key ")[2] if place.endswith(".") else ""
+
+
+def section_of(place: str, table: dict[str, Any], struct: type[AnyTable]) -> AnyTable:
+    """A table, and those in it, with known keys of the right types and values as they must be.
 
     Parameters
     ----------
-    path : str
-        Name of the file, for errors.
+    place : str
+        Name of the file, and of the table within it, for errors.
     table : dict
-        As :func:`read_toml` returns it, with decimal numbers.
-    type_ : type
-        The struct. Fields of type float take any number.
-
-    Returns
-    -------
-    object
-        Of that type.
+        As :func:`read_toml` returns it.
+    struct : type
+        What it should be.
 
     Raises
     ------
     InputError
-        A key is missing, or its value has another type; the text names the key.
+        It is not; the text says where and why.
     """
+    fields = _fields(struct)
+    check_keys(place, table, fields)
+    read = {key: _with_tables(place, struct, key, value, fields[key][1]) for key, value in table.items()}
+    for key, value in table.items():
+        if isinstance(value, datetime.date) and any(rule.is_date for rule in fields[key][0]):
+            read[key] = value.isoformat()
+    result = _converted(place, read, struct)
+    for key, (rules, _) in fields.items():
+        for value in _values(getattr(result, key)):
+            if not (struct.floats_may_be_infinite and isinstance(value, float)):
+                _check_value(key_place(place, key), value, rules)
+    try:
+        result.check()
+    except RefusalError as refusal:
+        key, sentence = refusal.args
+        raise InputError(f"{key_place(place, key) if key else place}: {sentence}.") from None
+    return result
+
+
+def named_section(place: str, table: dict[str, Any], key: str, structs: Mapping[str, type[AnyTable]]) -> AnyTable:
+    """A table as the struct that it names under a key."""
+    if key not in table:
+        raise InputError(f"{place}: found no key {key}, expected one of {', '.join(structs)}.")
+    name = table[key]
+    if not isinstance(name, str) or name not in structs:
+        raise InputError(f"{place}, key {key}: found {name!r}, expected one of {', '.join(structs)}.")
+    return section_of(place, table, structs[name])
+
+
+def _check_value(where: str, value: Any, rules: tuple[Rule, ...]) -> None:
+    # A Decimal may be finite and beyond every float: its unit is not what it will have.
+    is_finite = (
+        value.is_finite() if isinstance(value, Decimal) else isinstance(value, int | str) or math.isfinite(value)
+    )
+    if not is_finite and not (value == math.inf and any(rule.may_be_infinite for rule in rules)):
+        raise InputError(f"{where}: found {value}, expected a finite number.")
+    for rule in rules:
+        if not rule.holds(value):
+            found = repr(value) if isinstance(value, str) else f"{value:g}"
+            raise InputError(f"{where}: found {found}, expected {rule.expected}.")
+
+
+def _values(value: Any) -> Iterator[float | str | Decimal]:
+    """The texts and numbers of a value."""
+    if isinstance(value, int | float | str | Decimal):
+        yield value
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from _values(item)
+
+
+@cache
+def _fields(struct: type[Table]) -> dict[str, tuple[tuple[Rule, ...], Any]]:
+    """Rules of every key, and the type of its value if there are tables in it."""
+    hints = get_type_hints(struct, include_extras=True)
+    return {key: (tuple(_found(hints[key], Rule)), _with_tables_in(hints[key])) for key in struct.__struct_fields__}
+
+
+def _found(hint: Any, kind: type[_Any]) -> Iterator[_Any]:
+    """What stands beside a type, or one of its alternatives."""
+    if get_origin(hint) is Annotated:
+        yield from (extra for extra in hint.__metadata__ if isinstance(extra, kind))
+    elif get_origin(hint) is not dict:
+        for argument in get_args(hint):
+            yield from _found(argument, kind)
+
+
+def _with_tables_in(hint: Any) -> Any:
+    """A kind of table, or a list or dict of one, among the alternatives of a type."""
+    if (isinstance(hint, type) and issubclass(hint, Table)) or get_origin(hint) in (list, dict):
+        return hint if get_origin(hint) is None or _with_tables_in(get_args(hint)[-1]) else None
+    return next(filter(None, map(_with_tables_in, get_args(hint))), None)
+
+
+def _with_tables(place: str, struct: type[Table], key: str, value: Any, type_: Any) -> Any:
+    """A value with structs in place of the tables in it; one of another type is the type check's to refuse."""
+    container = get_origin(type_) or type_
+    if container is list and isinstance(value, list):
+        (table,) = get_args(type_)
+        return [_item(item_place(place, key, i, item, table), item, table) for i, item in enumerate(value)]
+    if type_ is None or container is list or not isinstance(value, dict):
+        return value
+    inside = f"{place}, table {key}" if issubclass(struct, File) else f"{place}.{key}"
+    if container is dict:
+        return {name: _item(f"{inside}.{name}", item, get_args(type_)[1]) for name, item in value.items()}
+    return section_of(f"{key_place(place, key)}." if type_.is_inline else inside, value, type_)
+
+
+def _item(place: str, item: Any, table: type[AnyTable]) -> AnyTable:
+    return section_of(place, _converted(place, item, dict), table)
+
+
+def item_place(place: str, key: str, i: int, item: Any, table: type[Table]) -> str:
+    """Where a table of a list is: by its number, or by its id if it has one that can be shown."""
+    if "id" not in table.__struct_fields__:
+        return f"{place}, {key} {i + 1}"
+    name = item.get("id") if isinstance(item, dict) else None
+    usable = isinstance(name, str) and name.isprintable() and name.strip()
+    return f"{place}, {key} {name}" if usable else f"{place}, {key} number {i + 1}"
+
+
+def _converted(place: str, table: Any, type_: type[_Any]) -> _Any:
+    """A table as a struct of the right types."""
     try:
         return msgspec.convert(table, type_, builtin_types=(Decimal,))
     except msgspec.ValidationError as error:
         text, _, where = str(error).partition(" - at `$.")
-        place = place_of(path, table, where.rstrip("`"))
     missing = _MISSING_ERROR.fullmatch(text)
     if missing:
-        raise InputError(f"{place}: found no key {missing['key']}, expected one.")
+        raise InputError(f"{place.removesuffix('.')}: found no key {missing['key']}, expected one.")
+    if where:
+        place = key_place(place, where.rstrip("`"))
     wrong = _TYPE_ERROR.fullmatch(text)
     if not wrong:
         raise InputError(f"{place}: {_lower_first(text)}.")
@@ -140,71 +334,5 @@ def _type_in_words(types: str) -> str:
     return " or ".join(_TYPES.get(name, name) for name in sorted(names, reverse=True))
 
 
-def place_of(path: str, table: Mapping[str, Any], where: str) -> str:
-    """Where ``sensor[1].noise_nT`` is, in words: the sensor by its id, or by its number if that cannot be shown."""
-    sensor = re.fullmatch(r"sensor\[(\d+)\]\.?(.*)", where)
-    if sensor:
-        index, where = int(sensor[1]), sensor[2]
-        item = table["sensor"][index]
-        name = item.get("id") if isinstance(item, dict) else None
-        usable = isinstance(name, str) and name.isprintable() and name.strip()
-        path = f"{path}, sensor {name}" if usable else f"{path}, sensor number {index + 1}"
-    return f"{path}, key {where}" if where else path
-
-
 def _lower_first(text: str) -> str:
     return text[:1].lower() + text[1:]
-
-
-class Table(msgspec.Struct, kw_only=True):
-    """A table of a file; numbers are finite unless they are named here."""
-
-    positive: ClassVar[frozenset[str]] = frozenset()
-    not_negative: ClassVar[frozenset[str]] = frozenset()
-    may_be_infinite: ClassVar[frozenset[str]] = frozenset()
-
-
-AnyTable = TypeVar("AnyTable", bound=Table)
-
-
-def section_of(place: str, table: dict[str, Any], struct: type[AnyTable]) -> AnyTable:
-    """A table of the file with known keys of the right types and numbers within their bounds.
-
-    Parameters
-    ----------
-    place : str
-        Name of the file, and of the table within it, for errors.
-    table : dict
-        As :func:`arrays.io.toml.read_toml` returns it.
-    struct : type
-        What it should be.
-
-    Returns
-    -------
-    Table
-        Of that type.
-
-    Raises
-    ------
-    InputError
-        It is not; the text says where and why.
-    """
-    check_keys(place, table, struct.__struct_fields__)
-    result = converted(place, table, struct)
-    for key in struct.__struct_fields__:
-        for number in _numbers(getattr(result, key)):
-            if not (math.isfinite(number) or (number == math.inf and key in struct.may_be_infinite)):
-                raise InputError(f"{place}, key {key}: found {number}, expected a finite number.")
-            if key in struct.positive and not number > 0.0:
-                raise InputError(f"{place}, key {key}: found {number:g}, expected a positive number.")
-            if key in struct.not_negative and not number >= 0.0:
-                raise InputError(f"{place}, key {key}: found {number:g}, expected a number that is not negative.")
-    return result
-
-
-def _numbers(value: Any) -> Iterator[float]:
-    if isinstance(value, int | float):
-        yield value
-    elif isinstance(value, list | tuple):
-        for item in value:
-            yield from _numbers(item)

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.bounds.crlb import check_uncertainty
+from magloc.levels import TYPICAL_AND_BAD
 
-QUANTILES = (0.5, 0.95)
 """Quantiles over the directions of the moment: the smallest σ that is not exceeded by this share of the directions."""
 
 
@@ -119,7 +119,7 @@ def table_and_spreads(
         raise ValueError(f"Input alone_Am2 must have shape (n, 3); instead received {alone.shape}.")
     check_uncertainty(ambient_uncertainty_T)
     model = BoundModel.of(array, ambient_uncertainty_T)
-    table, spreads = bounds.table_and_spreads(model, positions, alone, moments, np.array(QUANTILES))
+    table, spreads = bounds.table_and_spreads(model, positions, alone, moments, np.array(TYPICAL_AND_BAD))
     return SigmaTable(*table), MomentBounds(*(Spread(*spreads[:, i].T) for i in range(3)))
 
 
@@ -174,7 +174,7 @@ def spread_over(sigma: ArrayLike) -> Spread:
     """
     ordered = np.sort(np.asarray(sigma, dtype=np.float64), axis=-1)
     n = ordered.shape[-1]
-    median, q95 = (ordered[..., int(np.ceil(q * n)) - 1] for q in QUANTILES)
+    median, q95 = (ordered[..., int(np.ceil(q * n)) - 1] for q in TYPICAL_AND_BAD)
     blank = np.where(np.isnan(ordered[..., -1]), np.nan, 0.0)
     return Spread(ordered.mean(axis=-1), median + blank, q95 + blank, ordered[..., -1])
 

@@ -14,7 +14,8 @@ from magloc.calibration.model import AXES, AXIS_PAIRS, GAINS, OFFSET, PER_SENSOR
 from magloc.calibration.modulus import EllipsoidCalibration, calibrated_in_modulus, symmetric
 from magloc.calibration.observability import Unobservable
 from magloc.calibration.results import SourceCalibration, TurningCalibration
-from magloc.readings import Readings, Truth, rows_of_same_time, without_saturated
+from magloc.readings import Readings, without_saturated
+from magloc.truth import Truth, rows_of_same_time
 
 
 def calibrate(

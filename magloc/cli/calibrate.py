@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from arrays.array import SensorArray
     from magloc.calibration.array import CalibrationPrior
     from magloc.calibration.results import SourceCalibration, TurningCalibration
-    from magloc.readings import Readings, Truth
+    from magloc.readings import Readings
+    from magloc.truth import Truth
 
 
 # Gains beyond this many standard deviations of the prior are named.
@@ -211,7 +212,7 @@ def _path(readings: Readings, path: Path | None, height_m: float | None, reading
     """The source's path, with a missing z set to the height if that is given."""
     import numpy as np
 
-    from magloc.readings import read_truth, rows_of_same_time
+    from magloc.truth import read_truth, rows_of_same_time
 
     if path is None:
         if height_m is not None:

@@ -135,7 +135,7 @@ def locate(
     if out is not None:
         refuse_file(out, "--out")
     used = subset_of(read_array(array), ids, array)
-    rows = read_readings(readings, used, sensors=ids)
+    rows = read_readings(readings, used, sensors=ids, still=average)
     if position is not None:
         _refuse_farther(position, rows)
     used, ambient_T = with_ambient_field(used, rows, where, gradient=ambient_gradient)
@@ -209,7 +209,7 @@ def _refuse_farther(position: Vector, rows: Readings) -> None:
 
 
 def _true_position(rows: Readings, path: Path) -> NDArray[np.float64]:
-    from magloc.readings import read_truth, truth_of_rows
+    from magloc.truth import read_truth, truth_of_rows
 
     position_m, _ = truth_of_rows(rows, read_truth(path), path)
     return position_m

@@ -151,7 +151,7 @@ def track(
     from magloc.cli.locate import prior_of, subset_of
     from magloc.cli.options import place_of_options
     from magloc.cli.tables import report
-    from magloc.readings import read_readings, read_truth, truth_of_rows, without_saturated
+    from magloc.readings import read_readings, without_saturated
     from magloc.tracking.batch import track_record
     from magloc.tracking.consistency import consistency, nees_of_rows
     from magloc.tracking.files import geojson_text
@@ -159,6 +159,7 @@ def track(
     from magloc.tracking.results import rows_of
     from magloc.tracking.smoother import smoothed
     from magloc.tracking.tracker import Tracker
+    from magloc.truth import read_truth, truth_of_rows
 
     if json and jsonl:
         raise InputError("--json: found it together with --jsonl, expected one of them.")
@@ -180,15 +181,14 @@ def track(
             raise InputError("READINGS -: found an option that needs the whole record, expected a stream of --jsonl.")
         _stream(used, ids, model, prior, where)
         return
-    rows = without_saturated(read_readings(readings, used, sensors=ids), used)
-    _check_time(rows, readings)
+    rows = without_saturated(read_readings(readings, used, sensors=ids, ordered=True), used)
     rows, used = _conditioned(rows, used, conditioning, readings)
     used, ambient_T = _ambient(used, rows, where)
     try:
         tracker = Tracker(used, model, prior=prior, keep_steps=smooth)
     except ValueError as error:
         raise InputError(f"{array}: {str(error).removeprefix('Input ')}") from None
-    records = list(rows_of(rows.time_s, rows.values_T, rows.array_position_m, rows.array_rotation_xyzw, ambient_T))
+    records = list(rows_of(rows.time_s, rows.values_T, rows.array_position_m, rows.array_rotation, ambient_T))
     points: list[TrackPoint] = []
     with progress(len(records), "rows", quiet=common.quiet) as advance:
         if jsonl and not smooth:
@@ -253,37 +253,25 @@ def _motion(options: MotionOptions, *, smooth: bool) -> MotionModel:
     return CoordinatedTurn(options.speed_m_s, turn)
 
 
-def _check_time(rows: Readings, path: Path) -> None:
-    import numpy as np
-
-    backwards = np.flatnonzero(np.diff(rows.time_s) <= 0.0)
-    if backwards.size:
-        i = int(backwards[0]) + 1
-        raise InputError(
-            f"{path}, line {rows.line_numbers[i]}, column time_s: found {rows.time_s[i]:.15g} after "
-            f"{rows.time_s[i - 1]:.15g}, expected time to increase from row to row."
-        )
-
-
 def _conditioned(
     rows: Readings, array: SensorArray, options: ConditioningOptions, path: Path
 ) -> tuple[Readings, SensorArray]:
-    from magloc import conditioning
+    from magloc.averages import window_averages, window_averaging_array
 
     if options.window_s is not None and not 0.0 < options.window_s < math.inf:
         raise InputError(f"--window-s: found {options.window_s:g}, expected a positive number.")
     try:
         if options.detrend:
-            rows = conditioning.detrended(rows)
+            rows = rows.detrended()
         if options.high_pass_hz is not None:
-            rows = conditioning.high_passed(rows, options.high_pass_hz)
+            rows = rows.high_passed(options.high_pass_hz)
         if options.mains_hz is not None:
-            rows = conditioning.without_hum(rows, options.mains_hz)
+            rows = rows.without_hum(options.mains_hz)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     if options.window_s is not None:
-        averaged = conditioning.window_averages(rows, options.window_s)
-        return averaged, conditioning.window_averaging_array(array, rows, options.window_s)
+        averaged = window_averages(rows, options.window_s)
+        return averaged, window_averaging_array(array, rows, options.window_s)
     return rows, array
 
 
@@ -352,7 +340,7 @@ def _stream(array: SensorArray, ids: list[str] | None, model: MotionModel, prior
         array_here, ambient = _ambient(array, rows, where)
         if tracker is None:
             tracker = Tracker(array_here, model, prior=prior)  # type: ignore[arg-type]
-        (row,) = rows_of(rows.time_s, rows.values_T, rows.array_position_m, rows.array_rotation_xyzw, ambient)
+        (row,) = rows_of(rows.time_s, rows.values_T, rows.array_position_m, rows.array_rotation, ambient)
         point = tracker.advance(row)
         _print_line(point)
         statuses.add(point.status)

@@ -16,9 +16,9 @@ from arrays.typing import FloatArray
 from magloc.bounds.over_moments import sigma_table
 from magloc.design.descent import Sample
 from magloc.design.task import DesignTask
+from magloc.levels import TYPICAL_AND_BAD
 
 REFERENCES = ("tetrahedron", "cube", "cross")
-_LEVELS = (0.5, 0.95)
 _N_ATTITUDES = 24
 _N_RESAMPLES = 200
 _N_BEARINGS, _N_BEARING_MOMENTS = 1000, 16
@@ -191,7 +191,7 @@ def range_spread(task: DesignTask, array: SensorArray, sources: Sample, distance
     spreads = []
     for distance in distance_m:
         deviations = Sample(_at(sources, distance), sources.moments).deviations(task, array.positions)
-        quantiles = np.quantile(deviations, _LEVELS, method="inverted_cdf")
+        quantiles = np.quantile(deviations, TYPICAL_AND_BAD, method="inverted_cdf")
         spreads.append([*quantiles, np.mean(deviations)])
     return RangeSpread(*np.array(spreads).T)
 

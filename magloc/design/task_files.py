@@ -44,262 +44,230 @@ A task file (TOML)::
 
 from __future__ import annotations
 
-from importlib import resources
 from math import pi, radians
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import Annotated, Any, cast
 
 import msgspec
 import numpy as np
 
 from arrays.io.errors import InputError
-from arrays.io.toml import Table, check_keys, converted, read_toml, section_of
+from arrays.io.toml import (
+    NOT_NEGATIVE,
+    BuiltIn,
+    File,
+    NotNegative,
+    Positive,
+    RefusalError,
+    Rule,
+    Table,
+    named_section,
+    one_of,
+    section_of,
+)
 from arrays.sensor import SensorKind
-from magloc.design.task import Block, Cap, Criterion, DesignSearch, DesignTask, Mean, Quantile, Region
+from arrays.typing import Vector
+from magloc.design.task import Block, Cap, DesignSearch, DesignTask, Mean, Quantile, Region
 from magloc.design.volumes import Ball, Box, Cylinder, Volume, read_surface
 
-FORMAT_VERSION = 1
-_Vector = tuple[float, float, float]
 _ORIGIN = (0.0, 0.0, 0.0)
 _LEAST = {"vector": 3, "scalar": 7}
 _MOST_SENSORS = 64
 _LARGEST = 1e9
 _LEAST_LOG2, _MOST_LOG2 = 8, 20
 _MOST_OF_ANYTHING = 10_000_000
+_FILES = BuiltIn("magloc.design", "tasks", "task")
+built_in_tasks = _FILES.names
 
 
 class _Sensors(Table, kw_only=True):
-    positive: ClassVar[frozenset[str]] = frozenset({"noise_nT"})
-    not_negative: ClassVar[frozenset[str]] = frozenset({"least_spacing_m"})
-
     count: int
-    kind: str = "vector"
-    noise_nT: float = 1.0
-    ambient_nT: _Vector | None = None
-    least_spacing_m: float = 0.0
+    kind: Annotated[str, one_of(_LEAST)] = "vector"
+    noise_nT: Positive = 1.0
+    ambient_nT: Vector | None = None
+    least_spacing_m: NotNegative = 0.0
+
+    def check(self) -> None:
+        least = _LEAST[self.kind]
+        if not least <= self.count <= _MOST_SENSORS:
+            raise RefusalError(
+                "count",
+                f"found {self.count}, expected {least} to {_MOST_SENSORS} {self.kind} sensors,"
+                " which give the six differences that a position and a moment take",
+            )
+        if self.kind == "scalar" and not any(self.ambient_nT or ()):
+            raise RefusalError("ambient_nT", "found none, expected the ambient field of scalar sensors")
 
 
 class _Ball(Table, kw_only=True):
-    positive: ClassVar[frozenset[str]] = frozenset({"radius_m"})
-
     shape: str
-    radius_m: float
-    centre_m: _Vector = _ORIGIN
+    radius_m: Positive
+    centre_m: Vector = _ORIGIN
+
+    def volume(self, folder: Path) -> Volume:
+        return Ball(self.centre_m, self.radius_m)
 
 
 class _Box(Table, kw_only=True):
-    not_negative: ClassVar[frozenset[str]] = frozenset({"size_m"})
-
     shape: str
-    size_m: _Vector
-    centre_m: _Vector = _ORIGIN
+    size_m: Annotated[Vector, NOT_NEGATIVE]
+    centre_m: Vector = _ORIGIN
+
+    def volume(self, folder: Path) -> Volume:
+        return Box(self.centre_m, self.size_m)
 
 
 class _Cylinder(Table, kw_only=True):
-    not_negative: ClassVar[frozenset[str]] = frozenset({"radius_m", "height_m"})
-
     shape: str
-    radius_m: float
-    height_m: float
-    centre_m: _Vector = _ORIGIN
+    radius_m: NotNegative
+    height_m: NotNegative
+    centre_m: Vector = _ORIGIN
+
+    def volume(self, folder: Path) -> Volume:
+        return Cylinder(self.centre_m, self.radius_m, self.height_m)
 
 
 class _Surface(Table, kw_only=True):
     shape: str
     file: str
 
+    def volume(self, folder: Path) -> Volume:
+        return read_surface(folder / self.file)
+
 
 class _Shell(Table, kw_only=True):
-    positive: ClassVar[frozenset[str]] = frozenset({"nearest_m", "farthest_m", "moment_Am2"})
-
     region: str
-    nearest_m: float
-    farthest_m: float
-    moment_Am2: float
+    moment_Am2: Positive
+    nearest_m: Positive
+    farthest_m: Positive
+
+    def check(self) -> None:
+        if not self.nearest_m <= self.farthest_m < _LARGEST:
+            expected = f"nearest_m = {self.nearest_m:g} or more"
+            raise RefusalError("farthest_m", f"found {self.farthest_m:g}, expected {expected}")
+
+    def sources(self) -> Region:
+        return Cap(self.nearest_m, self.farthest_m)
 
 
 class _HalfSpace(_Shell, kw_only=True):
-    towards: _Vector
+    towards: Vector
+
+    def check(self) -> None:
+        super().check()
+        if not any(self.towards):
+            raise RefusalError("towards", "found zero, expected a direction")
+
+    def sources(self) -> Region:
+        return Cap(self.nearest_m, self.farthest_m, self.towards, 0.5 * pi)
 
 
 class _Cap(_HalfSpace, kw_only=True):
-    positive: ClassVar[frozenset[str]] = _Shell.positive | {"half_angle_deg"}
+    half_angle_deg: Annotated[Positive, Rule(lambda value: value <= 180.0, "180 or less")]
 
-    half_angle_deg: float
+    def sources(self) -> Region:
+        return Cap(self.nearest_m, self.farthest_m, self.towards, radians(self.half_angle_deg))
 
 
 class _Block(Table, kw_only=True):
-    positive: ClassVar[frozenset[str]] = frozenset({"moment_Am2"})
-
     region: str
-    low_m: _Vector
-    high_m: _Vector
-    moment_Am2: float
+    moment_Am2: Positive
+    low_m: Vector
+    high_m: Vector
+
+    def check(self) -> None:
+        if not all(low <= high for low, high in zip(self.low_m, self.high_m, strict=True)):
+            raise RefusalError("high_m", "found a number below that of low_m, expected a box")
+
+    def sources(self) -> Region:
+        return Block(self.low_m, self.high_m)
+
+
+_BELOW_ONE = Rule(
+    lambda value: 0.0 < value < 1.0,
+    "a number between 0 and 1; the worst case, 1, is infinite for four vector sensors",
+)
 
 
 class _Criterion(Table, kw_only=True):
-    quantity: str = "quantile"
-    level: float = 0.95
+    quantity: Annotated[str, one_of(("quantile", "mean"), "quantile or mean")] = "quantile"
+    level: Annotated[float, _BELOW_ONE] = 0.95
+
+
+def _up_to(least: int) -> Rule:
+    return Rule(lambda value: least <= value <= _MOST_OF_ANYTHING, f"{least} to {_MOST_OF_ANYTHING}")
 
 
 class _Search(Table, kw_only=True):
     starts: int = DesignSearch.n_starts
     refined: int = DesignSearch.n_refined
     sources: int = 2**DesignSearch.log2_large
-    iterations: int = DesignSearch.large_iterations
-    judged: int = DesignSearch.n_judged
+    iterations: Annotated[int, _up_to(1)] = DesignSearch.large_iterations
+    judged: Annotated[int, _up_to(1000)] = DesignSearch.n_judged
+
+    def check(self) -> None:
+        if not 1 <= self.refined <= self.starts <= 10_000:
+            raise RefusalError(
+                "",
+                f"found {self.refined} refined of {self.starts} starts, expected 1 or more refined, and no more than"
+                " starts",
+            )
+        if not (_LEAST_LOG2 <= self.log2 <= _MOST_LOG2 and self.sources == 1 << self.log2):
+            expected = f"a power of two from {1 << _LEAST_LOG2} to {1 << _MOST_LOG2}"
+            raise RefusalError("sources", f"found {self.sources}, expected {expected}")
+
+    @property
+    def log2(self) -> int:
+        """Of the number of sources."""
+        return self.sources.bit_length() - 1
 
 
-class _File(msgspec.Struct, kw_only=True):
-    sensors: dict[str, Any]
+class _File(File, kw_only=True):
+    sensors: _Sensors
     volume: dict[str, Any]
     sources: dict[str, Any]
-    criterion: dict[str, Any] = msgspec.field(default_factory=dict)
-    search: dict[str, Any] = msgspec.field(default_factory=dict)
+    criterion: _Criterion = msgspec.field(default_factory=_Criterion)
+    search: _Search = msgspec.field(default_factory=_Search)
     name: str | None = None
-    format_version: int = FORMAT_VERSION
 
 
-_VOLUMES: dict[str, type[Table]] = {"ball": _Ball, "box": _Box, "cylinder": _Cylinder, "surface": _Surface}
-_REGIONS: dict[str, type[Table]] = {"shell": _Shell, "half-space": _HalfSpace, "cap": _Cap, "box": _Block}
-
-
-def built_in_tasks() -> tuple[str, ...]:
-    """Names of the tasks that come with the package."""
-    files = (resources.files("magloc.design") / "tasks").iterdir()
-    return tuple(sorted(Path(file.name).stem for file in files if file.name.endswith(".toml")))
+_VOLUMES: dict[str, Any] = {"ball": _Ball, "box": _Box, "cylinder": _Cylinder, "surface": _Surface}
+_REGIONS: dict[str, Any] = {"shell": _Shell, "half-space": _HalfSpace, "cap": _Cap, "box": _Block}
 
 
 def read_task(name_or_path: str) -> DesignTask:
     """Task of a built-in name or a TOML file: :meth:`magloc.design.task.DesignTask.read`."""
-    path = name_or_path
-    if name_or_path in built_in_tasks():
-        path = str(resources.files("magloc.design") / "tasks" / f"{name_or_path}.toml")
-    table = read_toml(path, f"a task file, or one of the built-in tasks {', '.join(built_in_tasks())}")
-    check_keys(path, table, _File.__struct_fields__)
-    file = converted(path, table, _File)
-    if file.format_version != FORMAT_VERSION:
-        raise InputError(f"{path}, key format_version: found {file.format_version}, expected {FORMAT_VERSION}.")
-    sensors = _sensors(f"{path}, table sensors", file.sensors)
-    region, moment = _region(f"{path}, table sources", file.sources)
+    path, table = _FILES.read(name_or_path)
+    file = section_of(path, table, _File)
+    sensors, search = file.sensors, file.search
     ambient = sensors.ambient_nT
+    sources = named_section(f"{path}, table sources", file.sources, "region", _REGIONS)
     return DesignTask(
         name=file.name or Path(path).stem,
         n_sensors=sensors.count,
         kind=cast(SensorKind, sensors.kind),
         noise_T=sensors.noise_nT / 1e9,
         volume=_volume(f"{path}, table volume", file.volume, Path(path).parent),
-        region=region,
-        moment_Am2=moment,
-        criterion=_criterion(f"{path}, table criterion", file.criterion),
+        region=sources.sources(),
+        moment_Am2=sources.moment_Am2,
+        criterion=Mean() if file.criterion.quantity == "mean" else Quantile(file.criterion.level),
         ambient_T=None if ambient is None else (ambient[0] / 1e9, ambient[1] / 1e9, ambient[2] / 1e9),
         least_spacing_m=sensors.least_spacing_m,
-        search=_search(f"{path}, table search", file.search),
+        search=DesignSearch(
+            n_starts=search.starts,
+            n_refined=search.refined,
+            log2_small=search.log2 - 3,
+            log2_large=search.log2,
+            small_iterations=-(-search.iterations // 3),
+            large_iterations=search.iterations,
+            n_judged=search.judged,
+        ),
     )
 
 
-def _sensors(place: str, table: dict[str, Any]) -> _Sensors:
-    sensors = section_of(place, table, _Sensors)
-    if sensors.kind not in _LEAST:
-        raise InputError(f"{place}, key kind: found {sensors.kind!r}, expected one of {', '.join(_LEAST)}.")
-    least = _LEAST[sensors.kind]
-    if not least <= sensors.count <= _MOST_SENSORS:
-        raise InputError(
-            f"{place}, key count: found {sensors.count}, expected {least} to {_MOST_SENSORS} {sensors.kind} sensors,"
-            " which give the six differences that a position and a moment take."
-        )
-    if sensors.kind == "scalar" and not any(sensors.ambient_nT or ()):
-        raise InputError(f"{place}, key ambient_nT: found none, expected the ambient field of scalar sensors.")
-    return sensors
-
-
 def _volume(place: str, table: dict[str, Any], folder: Path) -> Volume:
-    shape = section_of(place, table, _named(place, table, "shape", _VOLUMES))
-    volume: Volume
-    if isinstance(shape, _Ball):
-        volume = Ball(shape.centre_m, shape.radius_m)
-    elif isinstance(shape, _Box):
-        volume = Box(shape.centre_m, shape.size_m)
-    elif isinstance(shape, _Cylinder):
-        volume = Cylinder(shape.centre_m, shape.radius_m, shape.height_m)
-    else:
-        volume = read_surface(folder / cast(_Surface, shape).file)
+    volume: Volume = named_section(place, table, "shape", _VOLUMES).volume(folder)
     reach = float(np.abs(volume.centre).max()) + volume.radius
     if not (volume.radius > 0.0 and reach < _LARGEST):
         raise InputError(f"{place}: found a volume that holds one point only or is too large, expected room to design.")
     return volume
-
-
-def _region(place: str, table: dict[str, Any]) -> tuple[Region, float]:
-    """Region of the sources, and the modulus of their moments [A·m²]."""
-    region = section_of(place, table, _named(place, table, "region", _REGIONS))
-    if isinstance(region, _Block):
-        if not all(low <= high for low, high in zip(region.low_m, region.high_m, strict=True)):
-            raise InputError(f"{place}, key high_m: found a number below that of low_m, expected a box.")
-        return Block(region.low_m, region.high_m), region.moment_Am2
-    shell = cast(_Shell, region)
-    if not shell.nearest_m <= shell.farthest_m < _LARGEST:
-        raise InputError(
-            f"{place}, key farthest_m: found {shell.farthest_m:g}, expected nearest_m = {shell.nearest_m:g} or more."
-        )
-    if not isinstance(shell, _HalfSpace):
-        return Cap(shell.nearest_m, shell.farthest_m), shell.moment_Am2
-    if not any(shell.towards):
-        raise InputError(f"{place}, key towards: found zero, expected a direction.")
-    half_angle = 0.5 * pi
-    if isinstance(shell, _Cap):
-        if shell.half_angle_deg > 180.0:
-            raise InputError(f"{place}, key half_angle_deg: found {shell.half_angle_deg:g}, expected 180 or less.")
-        half_angle = radians(shell.half_angle_deg)
-    return Cap(shell.nearest_m, shell.farthest_m, shell.towards, half_angle), shell.moment_Am2
-
-
-def _criterion(place: str, table: dict[str, Any]) -> Criterion:
-    criterion = section_of(place, table, _Criterion)
-    if criterion.quantity not in ("quantile", "mean"):
-        raise InputError(f"{place}, key quantity: found {criterion.quantity!r}, expected quantile or mean.")
-    if not 0.0 < criterion.level < 1.0:
-        raise InputError(
-            f"{place}, key level: found {criterion.level:g}, expected a number between 0 and 1; the worst case, 1, is"
-            " infinite for four vector sensors."
-        )
-    return Mean() if criterion.quantity == "mean" else Quantile(criterion.level)
-
-
-def _search(place: str, table: dict[str, Any]) -> DesignSearch:
-    search = section_of(place, table, _Search)
-    if not 1 <= search.refined <= search.starts <= 10_000:
-        raise InputError(
-            f"{place}: found {search.refined} refined of {search.starts} starts, expected 1 or more refined, and no"
-            " more than starts."
-        )
-    log2 = search.sources.bit_length() - 1
-    if not (_LEAST_LOG2 <= log2 <= _MOST_LOG2 and search.sources == 1 << log2):
-        raise InputError(
-            f"{place}, key sources: found {search.sources}, expected a power of two from {1 << _LEAST_LOG2} to"
-            f" {1 << _MOST_LOG2}."
-        )
-    for key, least in (("iterations", 1), ("judged", 1000)):
-        if not least <= getattr(search, key) <= _MOST_OF_ANYTHING:
-            raise InputError(
-                f"{place}, key {key}: found {getattr(search, key)}, expected {least} to {_MOST_OF_ANYTHING}."
-            )
-    return DesignSearch(
-        n_starts=search.starts,
-        n_refined=search.refined,
-        log2_small=log2 - 3,
-        log2_large=log2,
-        small_iterations=-(-search.iterations // 3),
-        large_iterations=search.iterations,
-        n_judged=search.judged,
-    )
-
-
-def _named(place: str, table: dict[str, Any], key: str, structs: dict[str, type[Table]]) -> type[Table]:
-    """The struct that a table names under a key."""
-    if key not in table:
-        raise InputError(f"{place}: found no key {key}, expected one of {', '.join(structs)}.")
-    name = table[key]
-    if not isinstance(name, str) or name not in structs:
-        raise InputError(f"{place}, key {key}: found {name!r}, expected one of {', '.join(structs)}.")
-    return structs[name]

@@ -14,9 +14,10 @@ from scipy.optimize import brentq
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
-from magloc.chi_square import FALSE_ALARM, ChiSquareDetector, check_differences, check_probability, check_share
+from magloc.chi_square import ChiSquareDetector, check_differences, check_probability, check_share
 from magloc.detection.dipole_filter import DipoleFilter
 from magloc.directions import fibonacci_directions
+from magloc.levels import FALSE_ALARM
 
 N_UNKNOWNS = 6
 # Noise that may reach the threshold is among this many times as many of the draws that candidates explain most of.

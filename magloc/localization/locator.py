@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray, IntArray
+from magloc.averages import average as averaged
+from magloc.averages import averaging_array, complete_rows
 from magloc.localization.dipole_validity import too_near
 from magloc.localization.fault_exclusion import without_faulty_sensors
 from magloc.localization.fit.columns import Solutions, in_stable_order
@@ -29,14 +31,7 @@ from magloc.localization.search.single_source import N_UNKNOWNS, SingleSourceSea
 from magloc.localization.uncertainty.covariance import solutions_of
 from magloc.localization.uncertainty.range_interval import is_detected
 from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, checked_rows, whitened_rows
-from magloc.readings import (
-    Readings,
-    averaging_array,
-    complete_rows,
-    saturated_channels,
-    without_saturated,
-)
-from magloc.readings import average as averaged
+from magloc.readings import Readings, saturated_channels, without_saturated
 
 _LOG = logging.getLogger(__name__)
 _ROWS_AT_ONCE = 256
@@ -313,7 +308,7 @@ def locate(
 
 def _as_readings(values_T: ArrayLike) -> Readings:
     values = np.atleast_2d(np.asarray(values_T, dtype=np.float64))
-    return Readings(np.arange(len(values), dtype=np.float64), values, np.arange(1, len(values) + 1))
+    return Readings(values)
 
 
 def used_rows(

@@ -23,6 +23,8 @@ from arrays.io.text import replace_file
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 from arrays.typing import FloatArray
+from magloc.levels import INTERVAL
+from magloc.levels import SIGMAS_95 as SIGMAS_95
 
 WIDTH_IN = 7.1
 DPI = 200
@@ -33,8 +35,6 @@ GREY, PALE_GREY, LIGHT_GREY = "#7f7f7f", "#adadad", "#d9d9d9"
 ESTIMATE, TRUTH, BOUND = BLUE, BLACK, ORANGE
 COMPONENTS = (("x", BLACK, "o", "-"), ("y", BLUE, "s", "--"), ("z", ORANGE, "^", ":"))
 """Name, colour, marker and line of the components of a vector."""
-LEVEL = 0.95
-SIGMAS_95 = 1.959963984540054
 _MILLIMETRES_BELOW_M = 1.0
 _MOST_ELLIPSES = 24
 # Ratios of the limits below which some, many, or all numbers between the powers of ten are written.
@@ -136,7 +136,7 @@ def draw_truth(ax: Axes, across: FloatArray, up: FloatArray) -> None:
 def ellipse95(centre: FloatArray, covariance: FloatArray, **options: Any) -> Ellipse:
     """95 % ellipse of two numbers: where their χ² of two degrees of freedom is within its 0.95 quantile."""
     values, vectors = np.linalg.eigh(covariance)
-    width, height = 2.0 * np.sqrt(np.clip(values, 0.0, None) * chdtri(2, 1.0 - LEVEL))
+    width, height = 2.0 * np.sqrt(np.clip(values, 0.0, None) * chdtri(2, 1.0 - INTERVAL))
     angle = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
     chosen = {"fill": False, "edgecolor": BOUND, "linewidth": 0.6, "alpha": 0.8, "zorder": 2.3, **options}
     return Ellipse((float(centre[0]), float(centre[1])), float(width), float(height), angle=angle, **chosen)

@@ -142,11 +142,11 @@ def rows_of(
     time_s: FloatArray,
     readings_T: FloatArray,
     array_position_m: FloatArray | None = None,
-    array_rotation_xyzw: FloatArray | None = None,
+    array_rotation: Rotation | None = None,
     ambient_T: FloatArray | None = None,
 ) -> Iterator[Row]:
     """Rows of readings for a tracker, from columns as :class:`magloc.readings.Readings` has them."""
-    rotations = None if array_rotation_xyzw is None else Rotation.from_quat(array_rotation_xyzw).as_matrix()
+    rotations = None if array_rotation is None else array_rotation.as_matrix()
     for i, time in enumerate(time_s.tolist()):
         row = Row(time, readings_T[i], ambient_T=None if ambient_T is None else ambient_T[i])
         if array_position_m is not None and rotations is not None:

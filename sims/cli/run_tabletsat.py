@@ -11,7 +11,8 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from adcs.cli.options import ScenarioOptions, print_note
-from adcs.io.scenario_files import MOST_STEPS, AttitudeFile, built_in_scenarios, changed, estimate_of, read_scenario
+from adcs.io.scenario_files import AttitudeFile, built_in_scenarios, changed, estimate_of, read_scenario
+from adcs.io.scenario_tables import MOST_STEPS
 from adcs.kalman.bank import Estimate
 from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import InputError

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adcs.mockup.navigation.delayed_ekf import DelayedFilter, StartSigma
 from adcs.mockup.navigation.fixes import FixRecord, Fused, Fusion, Outcome, counts_in_words, fuse, unused_counts
@@ -178,13 +177,13 @@ def read_samples(path: Path) -> ImuRecord:
     time_s = table.complete(["time_s"])[:, 0]
     if len(time_s) < 2:
         raise InputError(f"{path}: found one row, expected two samples at least.")
-    _refuse_back(table, "time_s", time_s, ~(np.diff(time_s) > 0.0), "times that increase")
+    table.refuse_back("time_s", ~(np.diff(time_s) > 0.0), "times that increase")
     usual_s = float(np.median(np.diff(time_s)))
     far = np.append(False, np.diff(time_s) > _LONGEST_GAP * usual_s)
     if far.any():
         row = int(np.argmax(far))
         raise InputError(
-            f"{table.place(int(table.line_numbers[row]), 'time_s')}: found {time_s[row]:.10g} s after "
+            f"{table.place(row, 'time_s')}: found {time_s[row]:.10g} s after "
             f"{time_s[row - 1]:.10g} s, expected the next sample within {_LONGEST_GAP * usual_s:.4g} s, "
             f"{_LONGEST_GAP} usual intervals."
         )
@@ -228,12 +227,12 @@ def read_fixes(path: Path) -> FixRecord:
     table.refuse(
         np.abs(values[:, 4:]) > _MOST_DEG, FIX_COLUMNS[4:], f"found more than {_MOST_DEG:g}°, expected a heading"
     )
-    _refuse_back(table, "arrival_s", values[:, 1], np.diff(values[:, 1]) < 0.0, "arrivals that do not go back")
+    table.refuse_back("arrival_s", np.diff(values[:, 1]) < 0.0, "arrivals that do not go back")
     early = np.flatnonzero(values[:, 1] < values[:, 0])
     if early.size:
         exposure_s, arrival_s = values[early[0], :2]
         raise InputError(
-            f"{table.place(int(table.line_numbers[early[0]]), 'arrival_s')}: found {arrival_s:.6g} s for an exposure "
+            f"{table.place(int(early[0]), 'arrival_s')}: found {arrival_s:.6g} s for an exposure "
             f"at {exposure_s:.6g} s, expected an arrival after the exposure."
         )
     return FixRecord(values[:, 0], values[:, 1], values[:, 2:4], np.radians(values[:, 4]))
@@ -244,15 +243,6 @@ def _table_with(path: Path, columns: tuple[str, ...]) -> Table:
     for column in columns:
         table.require(column, columns)
     return table
-
-
-def _refuse_back(table: Table, column: str, time_s: FloatArray, bad: NDArray[np.bool_], expected: str) -> None:
-    if bad.any():
-        row = int(np.argmax(bad)) + 1
-        raise InputError(
-            f"{table.place(int(table.line_numbers[row]), column)}: found {time_s[row]:.6g} s after "
-            f"{time_s[row - 1]:.6g} s, expected {expected}."
-        )
 
 
 def record_lines(run: RecordRun) -> list[str]:

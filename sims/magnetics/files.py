@@ -13,7 +13,8 @@ import numpy as np
 from arrays.array_file import write_array
 from arrays.io.errors import InputError
 from arrays.io.text import write_text
-from magloc.readings import TRUE_MOMENT_COLUMNS, TRUE_POSITION_COLUMNS, Truth, write_readings
+from magloc.readings import write_readings
+from magloc.truth import TRUE_MOMENT_COLUMNS, TRUE_POSITION_COLUMNS, Truth
 from sims.magnetics.simulation import Simulation
 
 

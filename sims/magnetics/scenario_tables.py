@@ -4,81 +4,77 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 
-from arrays.io.toml import Table
+from arrays.io.toml import (
+    MAY_BE_INFINITE,
+    NOT_NEGATIVE,
+    POSITIVE,
+    File,
+    NotNegative,
+    Positive,
+    RefusalError,
+    Rule,
+    Table,
+    date_such_as,
+    one_of,
+)
 from sims.magnetics.paths import Lawnmower, Path, Steered, Vector, Waypoints, circle
+from sims.magnetics.sensors import SENSOR_KINDS
 
-FORMAT_VERSION = 1
-Quaternion = tuple[float, float, float, float]
-
-
-class FileTable(Table, kw_only=True):
-    """The whole file."""
-
-    positive = frozenset({"duration_s", "rate_Hz"})
-
-    duration_s: float
-    rate_Hz: float
-    array: dict[str, Any] | str
-    format_version: int = FORMAT_VERSION
-    name: str | None = None
-    sensors: dict[str, Any] = msgspec.field(default_factory=dict)
-    carrier: dict[str, Any] = msgspec.field(default_factory=dict)
-    source: list[dict[str, Any]] = msgspec.field(default_factory=list)
-    ambient: dict[str, Any] | None = None
-    pulsation: list[dict[str, Any]] = msgspec.field(default_factory=list)
-    platform: dict[str, Any] = msgspec.field(default_factory=dict)
-    missing: dict[str, Any] = msgspec.field(default_factory=dict)
+_ORIGIN: Vector = (0.0, 0.0, 0.0)
+_UNIT_QUATERNION_ATOL = 1e-6
+_BELOW_1 = Rule(lambda value: value < 1.0, "a number below 1")
+_BELOW_1000 = Rule(lambda value: value < 1000.0, "a number below 1000")
 
 
 class SensorsTable(Table, kw_only=True):
     """What is known of all sensors, or of one."""
 
-    positive = frozenset({"noise_nT", "noise_nT_rtHz", "bandwidth_Hz", "range_nT"})
-    not_negative = frozenset(
-        {"corner_Hz", "resolution_nT", "misalignment_mrad", "gain_error", "drift_nT_rth", "offset_error_nT"}
-    )
-    may_be_infinite = frozenset({"bandwidth_Hz", "range_nT"})
+    kind: Annotated[str, one_of(SENSOR_KINDS)] | None = None
+    noise_nT: Positive | None = None
+    noise_nT_rtHz: Positive | None = None
+    corner_Hz: NotNegative | None = None
+    bandwidth_Hz: Annotated[Positive, MAY_BE_INFINITE] | None = None
+    range_nT: Annotated[Positive, MAY_BE_INFINITE] | None = None
+    resolution_nT: NotNegative | None = None
+    misalignment_mrad: Annotated[NotNegative, _BELOW_1000] | None = None
+    gain_error: Annotated[NotNegative, _BELOW_1] | None = None
+    drift_nT_rth: NotNegative | None = None
+    offset_error_nT: NotNegative | None = None
+    of: dict[str, SensorsTable] = msgspec.field(default_factory=dict)
 
-    kind: str | None = None
-    noise_nT: float | None = None
-    noise_nT_rtHz: float | None = None
-    corner_Hz: float | None = None
-    bandwidth_Hz: float | None = None
-    range_nT: float | None = None
-    resolution_nT: float | None = None
-    misalignment_mrad: float | None = None
-    gain_error: float | None = None
-    drift_nT_rth: float | None = None
-    offset_error_nT: float | None = None
-    of: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
+    def check(self) -> None:
+        """Refuse two noises."""
+        if self.noise_nT is not None and self.noise_nT_rtHz is not None:
+            raise RefusalError("noise_nT and noise_nT_rtHz", "found both, expected one of them")
 
 
 class CarrierTable(Table, kw_only=True):
     """How the array moves."""
 
-    positive = frozenset({"wobble_period_s"})
-    not_negative = frozenset({"wobble_deg"})
-
     path: dict[str, Any] = msgspec.field(default_factory=dict)
-    attitude: str = "fixed"
-    rotation_xyzw: Quaternion = (0.0, 0.0, 0.0, 1.0)
-    rate_deg_s: Vector = (0.0, 0.0, 0.0)
-    wobble_deg: Vector = (0.0, 0.0, 0.0)
-    wobble_period_s: float | Vector = 4.0
+    attitude: Annotated[str, one_of(("fixed", "course"), "fixed or course")] = "fixed"
+    rotation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    rate_deg_s: Vector = _ORIGIN
+    wobble_deg: Annotated[Vector, NOT_NEGATIVE] = _ORIGIN
+    wobble_period_s: Annotated[float | Vector, POSITIVE] = 4.0
+
+    def check(self) -> None:
+        """Refuse what is no rotation."""
+        norm = math.hypot(*self.rotation_xyzw)
+        if abs(norm - 1.0) > _UNIT_QUATERNION_ATOL:
+            raise RefusalError("rotation_xyzw", f"found a quaternion of norm {norm:.6g}, expected norm 1")
 
 
 class SourceTable(CarrierTable, kw_only=True):
     """A source, and how it moves."""
 
-    not_negative = frozenset({"wobble_deg", "radius_m"})
-
-    moment_Am2: Vector = (0.0, 0.0, 0.0)
+    moment_Am2: Vector = _ORIGIN
     polarisability_m3: float | list[float | list[float]] = 0.0
-    radius_m: float = 0.0
+    radius_m: NotNegative = 0.0
 
 
 class AmbientTable(Table, kw_only=True):
@@ -86,39 +82,67 @@ class AmbientTable(Table, kw_only=True):
 
     field_nT: Vector | None = None
     place: Vector | None = None
-    date: str | None = None
+    date: Annotated[str, date_such_as("a date such as 2026-11-21")] | None = None
     model: str = "IGRF-14"
+
+    def check(self) -> None:
+        """Refuse a place without its date, and anything but one field."""
+        if (self.field_nT is None) == (self.place is None):
+            found = "neither field_nT nor place" if self.place is None else "both field_nT and place"
+            raise RefusalError("", f"found {found}, expected one of them")
+        if self.place is not None and self.date is None:
+            raise RefusalError("", "found no key date, expected one because there is a place")
 
 
 class PulsationTable(Table, kw_only=True):
     """A sinusoid in the ambient field."""
 
-    positive = frozenset({"period_s"})
-    not_negative = frozenset({"amplitude_nT"})
-
-    amplitude_nT: float
-    period_s: float
+    amplitude_nT: NotNegative
+    period_s: Positive
     direction: Vector
+
+    def check(self) -> None:
+        """Refuse a direction that is none."""
+        if not any(self.direction):
+            raise RefusalError("direction", "found zero, expected a direction")
 
 
 class PlatformTable(Table, kw_only=True):
     """Noise of what carries the array."""
 
-    not_negative = frozenset({"frequency_Hz", "noise_nT"})
-
-    position_m: Vector = (0.0, 0.0, 0.0)
-    moment_Am2: Vector = (0.0, 0.0, 0.0)
-    frequency_Hz: float = 0.0
-    noise_nT: float = 0.0
+    position_m: Vector = _ORIGIN
+    moment_Am2: Vector = _ORIGIN
+    frequency_Hz: NotNegative = 0.0
+    noise_nT: NotNegative = 0.0
 
 
 class MissingTable(Table, kw_only=True):
     """Readings that are not there."""
 
-    not_negative = frozenset({"dropout"})
-
-    dropout: float = 0.0
+    dropout: Annotated[NotNegative, Rule(lambda value: value < 1.0, "a probability below 1")] = 0.0
     gaps_s: list[tuple[float, float]] = msgspec.field(default_factory=list)
+
+    def check(self) -> None:
+        """Refuse a gap that ends before it starts."""
+        for start, end in self.gaps_s:
+            if not start < end:
+                raise RefusalError("gaps_s", f"found [{start:g}, {end:g}], expected an end after its start")
+
+
+class FileTable(File, kw_only=True):
+    """The whole file."""
+
+    duration_s: Positive
+    rate_Hz: Positive
+    array: dict[str, Any] | str
+    name: str | None = None
+    sensors: SensorsTable = msgspec.field(default_factory=SensorsTable)
+    carrier: CarrierTable = msgspec.field(default_factory=CarrierTable)
+    source: list[SourceTable] = msgspec.field(default_factory=list)
+    ambient: AmbientTable | None = None
+    pulsation: list[PulsationTable] = msgspec.field(default_factory=list)
+    platform: PlatformTable = msgspec.field(default_factory=PlatformTable)
+    missing: MissingTable = msgspec.field(default_factory=MissingTable)
 
 
 class PathTable(Table, kw_only=True):
@@ -130,7 +154,7 @@ class PathTable(Table, kw_only=True):
 class FixedPath(PathTable, kw_only=True):
     """At rest."""
 
-    position_m: Vector = (0.0, 0.0, 0.0)
+    position_m: Vector = _ORIGIN
 
     def path(self) -> Path:
         """The path that the table describes."""
@@ -140,11 +164,9 @@ class FixedPath(PathTable, kw_only=True):
 class LinePath(PathTable, kw_only=True):
     """Constant speed and course."""
 
-    not_negative = frozenset({"speed_m_s"})
-
     start_m: Vector
     course_deg: float
-    speed_m_s: float
+    speed_m_s: NotNegative
     climb_m_s: float = 0.0
 
     def path(self) -> Steered:
@@ -165,10 +187,8 @@ class CoursePath(LinePath, kw_only=True):
 class WeavingPath(LinePath, kw_only=True):
     """Constant speed, and a course that swings."""
 
-    positive = frozenset({"weave_period_s"})
-
     weave_deg: float
-    weave_period_s: float
+    weave_period_s: Positive
     turn_deg_s: float = 0.0
 
     def path(self) -> Steered:
@@ -184,12 +204,9 @@ class WeavingPath(LinePath, kw_only=True):
 class CirclePath(PathTable, kw_only=True):
     """A horizontal circle."""
 
-    positive = frozenset({"radius_m"})
-    not_negative = frozenset({"speed_m_s"})
-
     centre_m: Vector
-    radius_m: float
-    speed_m_s: float
+    radius_m: Positive
+    speed_m_s: NotNegative
     start_deg: float = 0.0
     clockwise: bool = True
 
@@ -203,10 +220,8 @@ class CirclePath(PathTable, kw_only=True):
 class WaypointsPath(PathTable, kw_only=True):
     """Straight from point to point."""
 
-    positive = frozenset({"speed_m_s"})
-
     points_m: list[Vector]
-    speed_m_s: float
+    speed_m_s: Positive
 
     def path(self) -> Path:
         """The path that the table describes."""
@@ -216,14 +231,12 @@ class WaypointsPath(PathTable, kw_only=True):
 class LawnmowerPath(PathTable, kw_only=True):
     """Parallel lines joined by half circles."""
 
-    positive = frozenset({"length_m", "spacing_m", "lines", "speed_m_s"})
-
     start_m: Vector
     course_deg: float
-    length_m: float
-    spacing_m: float
-    lines: int
-    speed_m_s: float
+    length_m: Positive
+    spacing_m: Positive
+    lines: Annotated[int, POSITIVE]
+    speed_m_s: Positive
 
     def path(self) -> Path:
         """The path that the table describes."""

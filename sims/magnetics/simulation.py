@@ -13,7 +13,8 @@ from arrays.array import SensorArray
 from arrays.sensor import Calibration
 from arrays.typing import FloatArray
 from magloc.fields.dipole import MU0_OVER_4PI, field
-from magloc.readings import Readings, Truth
+from magloc.readings import Readings
+from magloc.truth import Truth
 from sims.magnetics.scenario import Carrier, Scenario, Source
 from sims.magnetics.sensors import SensorModel
 from sims.noise import coloured_noise, low_passed, random_walk, stream
@@ -21,7 +22,6 @@ from sims.noise import coloured_noise, low_passed, random_walk, stream
 MU0 = 4.0 * math.pi * MU0_OVER_4PI
 NEAREST_M = 1e-3
 """No sensor may come nearer to a source, whatever its size."""
-_HEADER_LINES = 2  # the first row of a readings file stands on its second line
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,11 +118,10 @@ def simulate(scenario: Scenario, seed: int) -> Simulation:
         raise ValueError("Input scenario must leave some rows; instead received gaps_s that leave none.")
     posed = not scenario.carrier.is_world
     readings = Readings(
+        values_T[present],
         time_s=time_s[present],
-        values_T=values_T[present],
-        line_numbers=np.arange(int(present.sum())) + _HEADER_LINES,
         array_position_m=array_pose.position_m[present] if posed else None,
-        array_rotation_xyzw=array_pose.rotation.as_quat()[present] if posed else None,
+        array_rotation=array_pose.rotation[present] if posed else None,
         ambient_T=None if scenario.ambient_T is None else array_pose.rotation.inv().apply(ambient_T)[present],
     )
     kept = tuple(Truth(t.time_s[present], t.position_m[present], _rows(t.moment_Am2, present)) for t in truths)

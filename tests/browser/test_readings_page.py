@@ -29,7 +29,7 @@ ORANGE = hue_of(DIPOLE_COLOUR)
 @pytest.fixture(scope="module")
 def server(screen: Screen, tmp_path_factory: pytest.TempPathFactory) -> Iterator[viser.ViserServer]:
     values = np.array([predicted_channels(ARRAY, position, MOMENT) for position in POSITIONS])
-    rows = Readings(0.5 * np.arange(9.0), values, np.arange(2, 11))
+    rows = Readings(values, time_s=0.5 * np.arange(9.0))
     fit = LiveFit(ARRAY)
     fixes = [fit.fix(reading) for reading in values]
     with opened(0, "readings") as server:

@@ -40,7 +40,7 @@ def server(screen: Screen) -> Iterator[viser.ViserServer]:
     )
     values = np.array([predicted_channels(ARRAY, position, MOMENT) for position in POSITIONS])
     with opened(0, "track") as server:
-        page = track_page(server, TrackResult(points, is_truth=False), ARRAY, Readings(TIMES, values, np.arange(2, 43)))
+        page = track_page(server, TrackResult(points, is_truth=False), ARRAY, Readings(values, time_s=TIMES))
         screen.open_server(server)
         yield server
         screen.leave()

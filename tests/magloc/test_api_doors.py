@@ -25,7 +25,8 @@ from magloc.cli.app import main
 from magloc.detection.detection_range import detection_ranges
 from magloc.directions import sphere_directions
 from magloc.fields import dipole
-from magloc.readings import Readings, Truth
+from magloc.readings import Readings
+from magloc.truth import Truth
 
 ARRAY = arrays.tetrahedron(1.5, noise_T=1e-9)
 MOMENT = np.array([0.3, -0.2, 0.5])

@@ -9,19 +9,16 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import butter, detrend, freqz_sos
 
-from arrays import geometries
-from arrays.array import SensorArray
 from arrays.io.errors import InputError
-from arrays.sensor import Sensor
-from magloc.conditioning import detrended, high_passed, window_averages, window_averaging_array, without_hum
 from magloc.readings import Readings
 
 FloatArray = NDArray[np.float64]
 RATE_HZ = 200.0
+detrended, high_passed, without_hum = Readings.detrended, Readings.high_passed, Readings.without_hum
 
 
 def readings_of(time_s: FloatArray, values_T: FloatArray) -> Readings:
-    return Readings(time_s=time_s, values_T=values_T, line_numbers=np.arange(2, len(time_s) + 2))
+    return Readings(values_T, time_s=time_s)
 
 
 def sinusoid(frequency_Hz: float, n: int = 8000) -> Readings:
@@ -147,53 +144,3 @@ class TestDetrending:
         values[3, 1] = 1e-9
         with pytest.raises(InputError, match="fewer than two readings"):
             detrended(readings_of(np.arange(5.0), values))
-
-
-class TestWindows:
-    def test_are_exact_means(self) -> None:
-        values = np.random.default_rng(2).normal(size=(20, 3))
-        averaged = window_averages(readings_of(0.1 * np.arange(20.0), values), 0.5)
-        np.testing.assert_allclose(averaged.values_T, values.reshape(4, 5, 3).mean(axis=1), rtol=1e-12)
-        np.testing.assert_allclose(averaged.time_s, [0.2, 0.7, 1.2, 1.7], rtol=1e-12)
-
-    def test_leave_out_missing_readings_and_empty_windows(self) -> None:
-        t = np.array([0.0, 0.1, 0.2, 5.0, 5.1])
-        values = np.array([[1.0, np.nan], [np.nan, np.nan], [3.0, np.nan], [4.0, 1.0], [6.0, np.nan]])
-        averaged = window_averages(readings_of(t, values), 1.0)
-        np.testing.assert_array_equal(averaged.values_T, [[2.0, np.nan], [5.0, 1.0]])
-        np.testing.assert_allclose(averaged.time_s, [0.1, 5.05])
-        np.testing.assert_array_equal(averaged.line_numbers, [3, 6])
-
-    def test_keep_the_pose_of_the_middle_and_the_mean_ambient_field(self) -> None:
-        n = 6
-        position = np.arange(3.0 * n).reshape(n, 3)
-        rotation = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
-        readings = Readings(
-            np.arange(float(n)), np.zeros((n, 3)), np.arange(n) + 2, position, rotation, 1e-6 * position
-        )
-        averaged = window_averages(readings, 3.0)
-        np.testing.assert_array_equal(averaged.array_position_m, position[[1, 4]])
-        assert averaged.ambient_T is not None
-        np.testing.assert_allclose(averaged.ambient_T, 1e-6 * position[[1, 4]], rtol=1e-12)
-
-    def test_noise_of_the_averages(self) -> None:
-        """White noise falls with the root of the window's rows: 2,000 windows of 4, false-alarm rate 1e-4."""
-        array = SensorArray(
-            tuple(
-                Sensor(f"s{i}", kind="vector", position_m=(float(i), 0.0, 0.0), noise_T=1e-9 * (i + 1))
-                for i in range(3)
-            )
-        )
-        n = 8000
-        noise = array.channel_noise_T * np.random.default_rng(3).normal(size=(n, 9))
-        readings = readings_of(0.25 * np.arange(float(n)), noise)
-        averaged, quieter = window_averages(readings, 1.0), window_averaging_array(array, readings, 1.0)
-        np.testing.assert_allclose(quieter.channel_noise_T, array.channel_noise_T / 2.0, rtol=1e-12)
-        ratio = averaged.values_T.std(axis=0) / quieter.channel_noise_T
-        np.testing.assert_allclose(ratio, 1.0, atol=4.4 / math.sqrt(2 * 2000))
-
-    def test_of_one_row_change_nothing(self) -> None:
-        array = geometries.tetrahedron(1.0)
-        readings = readings_of(np.arange(5.0), np.random.default_rng(4).normal(size=(5, 12)))
-        np.testing.assert_array_equal(window_averages(readings, 1.0).values_T, readings.values_T)
-        assert window_averaging_array(array, readings, 1.0) == array

@@ -12,20 +12,15 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+import magloc
 from arrays.array import SensorArray
 from arrays.array_file import read_array
 from arrays.io.errors import InputError
 from arrays.sensor import Sensor
-from magloc.readings import (
-    Readings,
-    average,
-    averaging_array,
-    read_readings,
-    read_truth,
-    without_saturated,
-    write_readings,
-)
+from magloc.readings import Readings, read_readings, without_saturated, write_readings
 
 HEADER = "time_s,s1_x_nT,s1_y_nT,s1_z_nT,s2_x_nT,s2_y_nT,s2_z_nT,s3_nT"
 ROW = "0,1,2,3,4,5,6,7"
@@ -84,10 +79,10 @@ class TestValues:
         half = math.sqrt(0.5)
         readings = read_readings(write(f"{header}\n{ROW},10,20,30,0,0,0.7071,0.7071,100,200,300\n"), array)
         assert readings.array_position_m is not None
-        assert readings.array_rotation_xyzw is not None
+        assert readings.array_rotation is not None
         assert readings.ambient_T is not None
         np.testing.assert_array_equal(readings.array_position_m, [[10.0, 20.0, 30.0]])
-        np.testing.assert_allclose(readings.array_rotation_xyzw, [[0.0, 0.0, half, half]], rtol=1e-15)
+        np.testing.assert_allclose(readings.array_rotation.as_quat(), [[0.0, 0.0, half, half]], rtol=1e-15)
         np.testing.assert_allclose(readings.ambient_T, [[100e-9, 200e-9, 300e-9]], rtol=1e-15)
 
     def test_subset_ignores_columns_of_other_sensors(self, array: SensorArray, write: WriteFile) -> None:
@@ -149,8 +144,16 @@ class TestTolerance:
         np.testing.assert_allclose(readings.values_T, np.arange(1.0, 8.0)[None] * 1e-9, rtol=1e-15)
 
     def test_line_numbers_are_those_of_an_editor(self, array: SensorArray, write: WriteFile) -> None:
-        readings = read_readings(write(f"\r\n{HEADER}\r\n{ROW}\r\n\r\n1{ROW[1:]}\r\n"), array)
-        np.testing.assert_array_equal(readings.line_numbers, [3, 5])
+        path = write(f"\r\n{HEADER}\r\n1{ROW[1:]}\r\n\r\n{ROW}\r\n")
+        assert len(read_readings(path, array)) == 2
+        with pytest.raises(InputError, match=r"line 5, column time_s: found 0 after 1, expected time to increase"):
+            read_readings(path, array, ordered=True)
+
+    def test_rows_that_are_to_stand_still(self, array: SensorArray, write: WriteFile) -> None:
+        path = write(f"{HEADER},{POSE}\n{ROW},1,2,3,0,0,0,1\n\n1{ROW[1:]},1,2,4,0,0,0,1\n")
+        assert len(read_readings(path, array)) == 2
+        with pytest.raises(InputError, match=r"readings\.csv: found the array moved between lines 2 and 4, expected"):
+            read_readings(path, array, still=True)
 
 
 BAD_FILES = {
@@ -254,18 +257,19 @@ class TestWriting:
         )
         n = len(readings_nT)
         written = Readings(
+            np.array(readings_nT) * 1e-9,
             time_s=np.linspace(0.0, scale, n),
-            values_T=np.array(readings_nT) * 1e-9,
-            line_numbers=np.arange(n) + 2,
             array_position_m=np.full((n, 3), scale / 3.0),
-            array_rotation_xyzw=np.full((n, 4), 0.5),
+            array_rotation=Rotation.from_quat(np.full((n, 4), 0.5)),
             ambient_T=np.full((n, 3), scale * 1e-9),
         )
         path = tmp_path_factory.mktemp("round") / "readings.csv"
         write_readings(path, written, array)
         read = read_readings(path, array)
         np.testing.assert_array_equal(read.time_s, written.time_s)
-        np.testing.assert_array_equal(read.line_numbers, written.line_numbers)
+        assert read.array_rotation is not None
+        assert written.array_rotation is not None
+        np.testing.assert_array_equal(read.array_rotation.as_quat(), written.array_rotation.as_quat())
         np.testing.assert_allclose(read.values_T, written.values_T, rtol=HALF_OF_DIGIT_15, atol=0.0)
         assert read.array_position_m is not None
         assert read.ambient_T is not None
@@ -290,66 +294,16 @@ class TestReadingsShapes:
 
     def test_shapes(self) -> None:
         with pytest.raises(ValueError, match=r"ambient_T must have shape \(2, 3\)"):
-            Readings(np.arange(2.0), np.zeros((2, 6)), np.arange(2), ambient_T=np.zeros(3))
+            Readings(np.zeros((2, 6)), ambient_T=np.zeros(3))
         with pytest.raises(ValueError, match=r"values_T must have shape \(n, C\)"):
-            Readings(np.arange(2.0), np.zeros(2), np.arange(2))
+            Readings(np.zeros(2))
+        with pytest.raises(ValueError, match=r"time_s must have shape \(2,\); instead received \(3,\)"):
+            Readings(np.zeros((2, 6)), time_s=np.arange(3.0))
         with pytest.raises(ValueError, match="must come together"):
-            Readings(np.arange(2.0), np.zeros((2, 6)), np.arange(2), array_position_m=np.zeros((2, 3)))
-
-
-class TestAverage:
-    """The mean of all rows, and its noise."""
-
-    @staticmethod
-    def readings(values_T: list[list[float]], **columns: object) -> Readings:
-        n = len(values_T)
-        return Readings(np.arange(float(n)), np.array(values_T), np.arange(n) + 2, **columns)  # type: ignore[arg-type]
-
-    def test_rows_with_less_than_the_others_are_left_out(self) -> None:
-        rows = self.readings([[1.0, math.nan, 3.0], [3.0, math.nan, math.nan], [5.0, math.nan, 4.0]])
-        mean = average(rows)
-        np.testing.assert_array_equal(mean.values_T, [[3.0, math.nan, 3.5]])
-        np.testing.assert_array_equal(mean.time_s, [1.0])
-        np.testing.assert_array_equal(mean.line_numbers, [2])
-
-    def test_a_common_field_that_drifts_still_cancels(self) -> None:
-        drift = np.linspace(0.0, 1.0, 6)[:, None] * np.ones(4)
-        values = drift + np.arange(4.0)
-        values[3:, 0] = math.nan
-        np.testing.assert_allclose(np.diff(average(self.readings(values.tolist())).values_T[0]), 1.0, rtol=1e-12)
-
-    def test_no_complete_row(self) -> None:
-        with pytest.raises(InputError, match="no row with all channels"):
-            average(self.readings([[1.0, math.nan], [math.nan, 2.0]]))
-
-    def test_noise_falls_with_the_root_of_the_rows(self, array: SensorArray) -> None:
-        values = np.ones((5, 7))
-        values[4, 2] = math.nan  # this row is left out
-        values[:, 6] = math.nan  # a channel that no row has
-        averaged = averaging_array(array, self.readings(values.tolist()))
-        before = [sensor.noise_T for sensor in array.sensors]
-        np.testing.assert_allclose([sensor.noise_T for sensor in averaged.sensors], np.divide(before, 2.0), rtol=1e-15)
-
-    def test_errors_of_the_calibration_do_not_average_out(self, array: SensorArray) -> None:
-        uncertain = replace(
-            array,
-            sensors=tuple(
-                replace(sensor, misalignment_rad=1e-3 * (sensor.kind == "vector"), gain_uncertainty=2e-3)
-                for sensor in array.sensors
-            ),
-            noise_fraction=0.01,
-        )
-        averaged = averaging_array(uncertain, self.readings([[1.0] * 7] * 4))
-        assert averaged.noise_fraction == 0.005
-        for before, after in zip(uncertain.sensors, averaged.sensors, strict=True):
-            assert after == replace(before, noise_T=before.noise_T / 2.0)
-
-    def test_array_that_moves(self) -> None:
-        position = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.1, 0.0]])
-        rotation = np.array([[0.0, 0.0, 0.0, 1.0]] * 3)
-        rows = self.readings([[1.0]] * 3, array_position_m=position, array_rotation_xyzw=rotation)
-        with pytest.raises(InputError, match="between lines 2 and 4"):
-            average(rows)
+            Readings(np.zeros((2, 6)), array_position_m=np.zeros((2, 3)))
+        for turn, received in ((Rotation.identity(3), 3), (Rotation.identity(), 1)):
+            with pytest.raises(ValueError, match=f"array_rotation must have 2 rotations; instead received {received}"):
+                Readings(np.zeros((2, 6)), array_position_m=np.zeros((2, 3)), array_rotation=turn)
 
 
 class TestSaturation:
@@ -373,7 +327,7 @@ class TestSaturation:
     def test_everything_else_stays(self, limited: SensorArray, write: WriteFile) -> None:
         readings = read_readings(write(f"{HEADER},{POSE}\n{ROW},1,2,3,0,0,0,1\n"), limited)
         after = without_saturated(readings, limited)
-        for name in ("time_s", "line_numbers", "array_position_m", "array_rotation_xyzw", "ambient_T"):
+        for name in ("time_s", "array_position_m", "array_rotation", "ambient_T"):
             assert getattr(after, name) is getattr(readings, name)
 
     def test_no_limit(self, array: SensorArray, write: WriteFile) -> None:
@@ -386,30 +340,66 @@ class TestSaturation:
             without_saturated(readings, array.subset(["s1", "s2"]))
 
 
-class TestTruth:
-    """Truth files have positions, and moments where they are known."""
+class TestFromMemory:
+    """My data frame, my arrays: nothing is converted by hand."""
 
-    def test_plane(self, write: WriteFile) -> None:
-        truth = read_truth(write("time_s,x_m,y_m\n0,1,2\n1,3,4\n"))
-        np.testing.assert_array_equal(truth.position_m, [[1.0, 2.0, math.nan], [3.0, 4.0, math.nan]])
-        assert truth.moment_Am2 is None
+    @staticmethod
+    def columns(n: int = 3) -> dict[str, NDArray[np.float64]]:
+        names = [*HEADER.split(","), *POSE.split(",")]
+        columns = dict(zip(names, np.random.default_rng(1).normal(size=(len(names), n)), strict=True))
+        turns = Rotation.random(n, rng=np.random.default_rng(2)).as_quat()
+        return columns | {"time_s": np.arange(n) / 4.0} | dict(zip(POSE.split(",")[3:], turns.T, strict=True))
 
-    def test_space_and_moment(self, write: WriteFile) -> None:
-        truth = read_truth(write("time_s,x_m,y_m,z_m,mx_Am2,my_Am2,mz_Am2\n0,1,2,3,4,5,6\n"))
-        np.testing.assert_array_equal(truth.position_m, [[1.0, 2.0, 3.0]])
-        assert truth.moment_Am2 is not None
-        np.testing.assert_array_equal(truth.moment_Am2, [[4.0, 5.0, 6.0]])
+    def test_story(self, array: SensorArray) -> None:
+        columns = self.columns()
+        frame = pd.DataFrame(columns)
+        readings = magloc.Readings.from_columns(frame, array)
+        values_T = np.stack([columns[name] for name in HEADER.split(",")[1:]], axis=1) / 1e9
+        t, p, q = columns["time_s"], frame[POSE.split(",")[:3]].to_numpy(), frame[POSE.split(",")[3:]].to_numpy()
+        same = magloc.Readings(values_T, time_s=t, array_position_m=p, array_rotation=Rotation.from_quat(q))
+        for name in ("time_s", "values_T", "array_position_m"):
+            np.testing.assert_array_equal(getattr(readings, name), getattr(same, name))
+        assert readings.array_rotation is not None
+        assert same.array_rotation is not None
+        np.testing.assert_allclose(readings.array_rotation.as_quat(), same.array_rotation.as_quat(), rtol=1e-14)
+
+    def test_a_mapping_is_read_as_its_file(self, array: SensorArray, write: WriteFile) -> None:
+        columns = self.columns()
+        path = write(pd.DataFrame(columns).to_csv(index=False))
+        read, made = read_readings(path, array), Readings.from_columns(columns, array)
+        for name in ("time_s", "values_T", "array_position_m"):
+            np.testing.assert_array_equal(getattr(read, name), getattr(made, name))
+
+    def test_time_is_one_row_a_second(self) -> None:
+        np.testing.assert_array_equal(Readings(np.zeros((3, 6))).time_s, [0.0, 1.0, 2.0])
+
+    def test_rows(self, array: SensorArray) -> None:
+        readings = Readings.from_columns(self.columns(), array)
+        rows = list(readings)
+        assert [len(row) for row in rows] == [1, 1, 1]
+        np.testing.assert_array_equal(np.concatenate([row.values_T for row in rows]), readings.values_T)
+        np.testing.assert_array_equal([row.time_s[0] for row in rows], readings.time_s)
+        last = readings[-1].array_rotation
+        assert last is not None
+        assert readings.array_rotation is not None
+        np.testing.assert_array_equal(last.as_quat(), readings.array_rotation.as_quat()[2:])
+        with pytest.raises(IndexError):
+            readings[3]
 
     @pytest.mark.parametrize(
-        ("content", "fragment"),
+        ("change", "sentence"),
         [
-            ("time_s,x_m\n0,1\n", "column y_m"),
-            ("time_s,x_m,y_m,mx_Am2\n0,1,2,3\n", "column my_Am2"),
-            ("time_s,x_m,y_m,speed\n0,1,2,3\n", "column speed"),
-            ("time_s,x_m,y_m\n0,1,\n", "line 2, column y_m"),
-            ("time_s,x_m,y_m\n0,1,2\n0,3,4\n", "line 3, column time_s"),
+            ({"time_s": [0.0, 1.0, 1.0]}, "the readings, row 3, column time_s: found 1 as on row 2, expected every"),
+            ({"s1_x_nT": [0.0, np.inf, 1.0]}, "the readings, row 2, column s1_x_nT: found an infinite number"),
+            (
+                {"s1_x_nT": [0.0, 1.0]},
+                r"the readings: found columns of the shapes \[\(2,\), \(3,\)\], expected one length",
+            ),
+            ({"s1_x_nT": ["a", "b", "c"]}, "the readings, column s1_x_nT: found what is not a number"),
+            ({"s9_nT": [1.0, 2.0, 3.0]}, "the readings, column s9_nT: found a column of sensor s9"),
+            ({"array_qw": [1.0, 2.0, 3.0]}, "the readings, row 1, columns array_qx to array_qw: found a quaternion"),
         ],
     )
-    def test_bad_file(self, write: WriteFile, content: str, fragment: str) -> None:
-        with pytest.raises(InputError, match=fragment):
-            read_truth(write(content))
+    def test_faults(self, array: SensorArray, change: dict[str, list[object]], sentence: str) -> None:
+        with pytest.raises(InputError, match=f"^{sentence}"):
+            Readings.from_columns({**self.columns(), **change}, array)

@@ -18,17 +18,15 @@ import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
-from typing import ClassVar
 
 import numpy as np
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
-from arrays.io.errors import InputError
+from arrays.io.errors import naming
 from arrays.io.text import write_text
-from arrays.io.toml import Table, read_toml, section_of
+from arrays.io.toml import FORMAT_VERSION, File, read_toml, section_of
 from arrays.typing import FloatArray, IntArray
 
-FORMAT_VERSION = 1
 FEWEST_LIGHTS = 4
 """Two triangles that agree need as many."""
 SKY_SIZE_M = (3.0, 2.4)
@@ -218,10 +216,7 @@ def _border(half: FloatArray, rng: np.random.Generator) -> FloatArray:
     return curved
 
 
-class _SkyFile(Table, kw_only=True):
-    positive: ClassVar[frozenset[str]] = frozenset()
-
-    format_version: int = FORMAT_VERSION
+class _SkyFile(File, kw_only=True):
     name: str = "sky"
     positions_m: list[tuple[float, float]]
 
@@ -243,18 +238,8 @@ def read_sky(path: str | PathLike[str]) -> LedSky:
         The file cannot be read, or is no sky; the text names the key.
     """
     table = section_of(str(path), read_toml(path, "the TOML file of a sky"), _SkyFile)
-    if table.format_version != FORMAT_VERSION:
-        raise InputError(
-            f"{path}, key format_version: found {table.format_version}, expected {FORMAT_VERSION} or no such key."
-        )
-    try:
+    with naming(f"{path}, key positions_m"):
         return LedSky(np.array(table.positions_m, dtype=np.float64).reshape(-1, 2), table.name)
-    except ValueError as error:
-        raise InputError(f"{path}, key positions_m: {_without_input(error)}") from None
-
-
-def _without_input(error: ValueError) -> str:
-    return str(error).removeprefix("Input positions_m ")
 
 
 def write_sky(sky: LedSky, path: str | PathLike[str]) -> None:

@@ -20,9 +20,10 @@ from arrays.array_file import array_of_table, read_sensors
 from arrays.io.csv import read_table
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
-from magloc.readings import Readings, Truth, read_readings, read_truth
+from magloc.readings import Readings, read_readings
 from magloc.tracking.files import _read_track
 from magloc.tracking.results import TrackPoint, TrackResult
+from magloc.truth import Truth, read_truth
 
 KINDS = (
     "an array (.toml), readings or a truth (.csv), a track of `magloc track` (.json, .jsonl), or the folder of a map"

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import viser
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
@@ -132,8 +131,8 @@ def readings_page(server: viser.ViserServer, result: ReadingsResult, fixes: Sequ
     view = FixView(server, rows.time_s, fixes, centroids, size_m=size, reach_m=1.4 * size, dot_m=dot)
 
     def move_array(row: int) -> None:
-        if rows.array_position_m is not None and rows.array_rotation_xyzw is not None:
-            glyphs.set_pose(rows.array_position_m[row], rows.array_rotation_xyzw[row])
+        if rows.array_position_m is not None and rows.array_rotation is not None:
+            glyphs.set_pose(rows.array_position_m[row], rows.array_rotation[row].as_quat())
 
     move_array(view.row)
     # The plot stands below the choice of the row, which has to move its mark.
@@ -181,9 +180,9 @@ def track_page(
     if array is not None:
         glyphs = ArrayGlyphs(server.scene, array)
         on_pose = glyphs.set_pose
-        if rows is not None and rows.array_position_m is not None and rows.array_rotation_xyzw is not None:
+        if rows is not None and rows.array_position_m is not None and rows.array_rotation is not None:
             of_point = _nearest_rows(rows, points)
-            poses = (rows.array_position_m[of_point], rows.array_rotation_xyzw[of_point])
+            poses = (rows.array_position_m[of_point], rows.array_rotation[of_point].as_quat())
             seen.append(poses[0])
         else:
             seen.append(array.positions)
@@ -285,11 +284,9 @@ def _sensors_entry(array: SensorArray) -> Swatch:
 
 def _centroids(array: SensorArray, rows: Readings) -> FloatArray:
     """Mean position of the sensors at every row, in the frame of the fixes (n, 3)."""
-    if rows.array_position_m is None or rows.array_rotation_xyzw is None:
+    if rows.array_position_m is None or rows.array_rotation is None:
         return np.tile(array.centroid, (len(rows), 1))
-    turned: FloatArray = Rotation.from_quat(rows.array_rotation_xyzw).apply(
-        array.centroid.copy()
-    )  # scipy takes no read-only array
+    turned: FloatArray = rows.array_rotation.apply(array.centroid.copy())  # scipy takes no read-only array
     return rows.array_position_m + turned
 
 

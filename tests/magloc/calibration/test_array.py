@@ -24,7 +24,8 @@ from magloc.calibration.continuation import calibrated_array
 from magloc.calibration.model import AXES, GAINS, OFFSET, POSITION, Problem, State
 from magloc.calibration.observability import gauge_vectors
 from magloc.calibration.results import SourceCalibration
-from magloc.readings import read_readings, read_truth
+from magloc.readings import read_readings
+from magloc.truth import read_truth
 from tests.oracles import magpylib_field
 from tests.plain_locator import plain_locator
 

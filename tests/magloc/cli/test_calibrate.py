@@ -94,8 +94,8 @@ def made(folder: Path, *, n: int = 40, posed: bool = False) -> Files:
     values = true.readings_of(fields) + NOISE_T * rng.normal(size=(n, true.n_channels))
     files = Files(folder, true, position, origin, attitude)
     write_array(nominal, files.array)
-    pose = {"array_position_m": origin, "array_rotation_xyzw": rotation.as_quat()} if posed else {}
-    write_readings(files.readings, Readings(np.arange(n, dtype=float), values, np.arange(2, n + 2), **pose), nominal)
+    pose = {"array_position_m": origin, "array_rotation": rotation} if posed else {}
+    write_readings(files.readings, Readings(values, **pose), nominal)
     return files
 
 
@@ -186,7 +186,7 @@ class TestArrayFile:
         rng = np.random.default_rng(2)
         fields = np.stack([magpylib_field(files.true.positions, p, MOMENT) for p in flat.position_m])
         values = files.true.readings_of(fields) + NOISE_T * rng.normal(size=(40, 18))
-        write_readings(files.readings, Readings(np.arange(40.0), values, np.arange(2, 42)), files.true)
+        write_readings(files.readings, Readings(values), files.true)
         arguments = (
             "calibrate",
             files.readings,
@@ -308,7 +308,7 @@ class TestRefusals:
         sensors = [Sensor(f"s{i}", "scalar", (float(i), 0.0, 0.0), 1e-9) for i in range(3)]
         array = SensorArray(tuple(sensors))
         write_array(array, files.array)
-        write_readings(files.readings, Readings(np.arange(4.0), np.ones((4, 3)), np.arange(2, 6)), array)
+        write_readings(files.readings, Readings(np.ones((4, 3))), array)
         assert_nothing_written(run(*self.arguments(files)), files, "must have vector sensors only")
 
     def test_what_does_not_converge_is_not_written(

@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from magloc.readings import read_truth
+from magloc.truth import read_truth
 from tests.command_line import Outcome, Run, assert_refused, refuse_constant, results_of
 from tests.oracles import magpylib_field
 

@@ -63,14 +63,13 @@ class Files:
         values: FloatArray,
         *,
         ambient: FloatArray | None = None,
-        pose: tuple[FloatArray, FloatArray] | None = None,
+        pose: tuple[FloatArray, Rotation] | None = None,
     ) -> tuple[str, ...]:
-        n = len(values)
         origin, rotation = pose or (None, None)
         write_array(array, self.array)
         write_readings(
             self.readings,
-            Readings(np.arange(float(n)), values, np.arange(n) + 2, origin, rotation, ambient),
+            Readings(values, array_position_m=origin, array_rotation=rotation, ambient_T=ambient),
             array,
         )
         return "locate", str(self.readings), "--array", str(self.array)
@@ -130,7 +129,7 @@ class TestKnownPlace:
             )[0]
             for turn, origin in zip(turns, origins, strict=True)
         ]
-        command = files.write(self.ARRAY, np.stack(values), pose=(origins, turns.as_quat()))
+        command = files.write(self.ARRAY, np.stack(values), pose=(origins, turns))
         where = ("--place", "-33.9", "18.4", "10", "--date", "2026-11-21")
         for row in results_of(run(*command, *AT_PLACE, *where, "--json")):
             (solution,) = row["solutions"]
@@ -317,7 +316,7 @@ class TestAverage:
 class TestTurningArray:
     def test_constant_ambient_field_in_its_axes(self, run: Run, files: Files) -> None:
         array = replace(scalar_cloud(), ambient_T=tuple(AMBIENT))
-        turns = Rotation.from_rotvec(np.radians([[0.0, 0.0, angle] for angle in (0.0, 40.0, 80.0)])).as_quat()
+        turns = Rotation.from_rotvec(np.radians([[0.0, 0.0, angle] for angle in (0.0, 40.0, 80.0)]))
         values = readings_of(array, [(PLACE * 0.7, MOMENT)], ambient=AMBIENT)
         command = files.write(array, values, pose=(np.zeros((3, 3)), turns))
         assert_refused(run(*command), "ambient_nT", "turns")

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from arrays.array_file import read_array
-from magloc.readings import read_readings, read_truth
+from magloc.readings import read_readings
+from magloc.truth import read_truth
 from sims.magnetics.scenario_files import read_scenario
 from sims.magnetics.simulation import simulate
 from tests.command_line import Run, assert_refused

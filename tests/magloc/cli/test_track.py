@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 
 from arrays import geometries
 from arrays.array_file import read_array
-from magloc.readings import Readings, Truth, read_readings, truth_of_rows
+from magloc.readings import Readings, read_readings
 from magloc.tracking.batch import track_record
 from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import rows_of
 from magloc.tracking.smoother import smoothed
 from magloc.tracking.tracker import Tracker
+from magloc.truth import Truth, truth_of_rows
 from tests.command_line import Outcome, Run, assert_refused, refuse_constant, results_of
 from tests.oracles import magpylib_field
 
@@ -280,7 +281,7 @@ class TestTruthBetweenItsRows:
     def test_is_interpolated_but_not_over_a_gap(self) -> None:
         truth = Truth(np.array([0.0, 1.0, 2.0, 10.0, 11.0]), np.arange(15.0).reshape(5, 3), None)
         time = np.array([0.0, 0.5, 2.0, 5.0, 10.25, 12.0])
-        position, moment = truth_of_rows(Readings(time, np.zeros((6, 1)), np.arange(6)), truth, Path("truth.csv"))
+        position, moment = truth_of_rows(Readings(np.zeros((6, 1)), time_s=time), truth, Path("truth.csv"))
         assert moment is None
         np.testing.assert_allclose(position[:, 0], [0.0, 1.5, 6.0, np.nan, 9.75, np.nan])
 

@@ -76,7 +76,7 @@ def readings_file(tmp_path: Path) -> Path:
     positions = np.stack([x, np.full(5, 3.0), np.full(5, 0.5)], axis=-1)
     values = np.array([predicted_channels(array, p, [0.0, 80.0, 30.0]) for p in positions])
     path = tmp_path / "readings.csv"
-    write_readings(path, Readings(np.arange(5.0), values, np.arange(2, 7)), array)
+    write_readings(path, Readings(values), array)
     return path
 
 

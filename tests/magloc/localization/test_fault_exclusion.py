@@ -26,7 +26,8 @@ from magloc.fields import dipole
 from magloc.localization.fault_exclusion import weighted
 from magloc.localization.locator import Locator
 from magloc.measurement.rows import whitened_model, whitenings_of
-from magloc.readings import read_readings, read_truth
+from magloc.readings import read_readings
+from magloc.truth import read_truth
 from tests.plain_locator import plain_locator
 
 AMBIENT = np.array([2e-5, 0.0, 4.5e-5])

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from arrays.array import SensorArray
 from arrays.array_file import read_array
 from arrays.sensor import Sensor
-from magloc.readings import read_readings, read_truth
+from magloc.readings import read_readings
+from magloc.truth import read_truth
 from tests.plain_locator import plain_locator
 
 FOUR = ("s08", "s11", "s20", "s23")

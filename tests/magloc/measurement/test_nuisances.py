@@ -297,7 +297,7 @@ class TestStart:
         """
         simulation = sims.simulate(replace(sims.read_scenario("drone"), duration_s=14.0), 1010)
         readings, truth = simulation.readings, simulation.truth
-        pose = (readings.array_position_m, readings.array_rotation_xyzw)
+        pose = (readings.array_position_m, readings.array_rotation)
         rows = list(rows_of(readings.time_s, readings.values_T, *pose, readings.ambient_T))[79::4]
         tracker = Tracker(simulation.array, RandomWalk(1e-6, 1e-6))
         source = np.array([1.259, 0.109, -0.234, 6.0, 3.0, -4.0])
@@ -360,7 +360,7 @@ class TestErrorsAreFound:
                     readings.time_s,
                     readings.values_T,
                     readings.array_position_m,
-                    readings.array_rotation_xyzw,
+                    readings.array_rotation,
                     readings.ambient_T,
                 )
             )

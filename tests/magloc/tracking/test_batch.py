@@ -105,7 +105,7 @@ class TestCompiledRecord:
         world_p = p + np.array([10.0, -4.0, 2.0])
         in_array = rotation.inv().apply(world_p - origin)
         readings = readings_of(ARRAY, in_array, rotation.inv().apply(m))
-        rows = list(rows_of(time_s, readings, origin, rotation.as_quat()))
+        rows = list(rows_of(time_s, readings, origin, rotation))
         points = self.both(ARRAY, SLOW, rows)
         assert statuses(points) == ["acquired"] + ["tracked"] * (n - 1)
         assert np.linalg.norm(positions(points) - world_p, axis=1).max() < 0.2

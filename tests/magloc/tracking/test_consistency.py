@@ -211,7 +211,7 @@ class MovingArray:
 
         origin = np.outer(t, [0.1, -0.1, 0.0])
         rotation = Rotation.from_rotvec(np.outer(t, [0.1, 0.0, -0.2]))
-        rows = list(rows_of(t, np.zeros((self.N_ROWS, 12)), origin, rotation.as_quat()))
+        rows = list(rows_of(t, np.zeros((self.N_ROWS, 12)), origin, rotation))
         return rows, rotation.as_matrix(), origin
 
 

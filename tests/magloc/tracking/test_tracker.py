@@ -394,7 +394,7 @@ class TestFrames:
         readings = readings_of(ARRAY, p, m)
         rotation, origin = Rotation.from_rotvec([0.4, -1.1, 0.7]), np.array([100.0, -40.0, 7.0])
         here = track_record(Tracker(ARRAY, SLOW), rows_from(time_s, readings))
-        pose = (np.tile(origin, (30, 1)), np.tile(rotation.as_quat(), (30, 1)))
+        pose = (np.tile(origin, (30, 1)), Rotation.from_quat(np.tile(rotation.as_quat(), (30, 1))))
         there = track_record(Tracker(ARRAY, SLOW), list(rows_of(time_s, readings, *pose)))
         np.testing.assert_allclose(positions(there), rotation.apply(positions(here)) + origin, atol=1e-8)
         R6 = np.kron(np.eye(2), rotation.as_matrix())

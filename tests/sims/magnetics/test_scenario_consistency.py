@@ -58,7 +58,7 @@ def track_statistics(simulation: Simulation, motion: MotionModel) -> dict[str, A
     truth, in m² and in σ at the end; the sum of all NIS and its degrees of freedom.
     """
     readings, truth = simulation.readings, simulation.truth
-    pose = (readings.array_position_m, readings.array_rotation_xyzw)
+    pose = (readings.array_position_m, readings.array_rotation)
     rows = list(rows_of(readings.time_s, readings.values_T, *pose, readings.ambient_T))
     tracker = Tracker(simulation.array, motion)
     points = track_record(tracker, rows)
@@ -196,7 +196,7 @@ def linear_filter(simulation: Simulation) -> dict[str, Any]:
     A linear filter is consistent at once if the array states its errors as they are, and seldom if it does not.
     """
     readings, truth = simulation.readings, simulation.truth
-    pose = (readings.array_position_m, readings.array_rotation_xyzw)
+    pose = (readings.array_position_m, readings.array_rotation)
     tracker = Tracker(simulation.array, REST)
     rows = rows_of(readings.time_s, readings.values_T, *pose, readings.ambient_T)
     measurements = [tracker.measurement(row) for row in rows]

@@ -14,7 +14,8 @@ from arrays.array_file import read_array
 from arrays.geometries import tetrahedron
 from arrays.io.errors import InputError
 from magloc.fields.geomagnetic import field_enu
-from magloc.readings import read_readings, read_truth
+from magloc.readings import read_readings
+from magloc.truth import read_truth
 from sims.magnetics import scenario_tables as tables
 from sims.magnetics.files import files_beside, write_simulation
 from sims.magnetics.paths import Lawnmower, Steered, Waypoints, circle
@@ -70,8 +71,10 @@ class TestBuiltIn:
         readings = read_readings(files.readings, array)
         np.testing.assert_array_equal(readings.time_s, simulation.readings.time_s)
         np.testing.assert_allclose(readings.values_T, simulation.readings.values_T, rtol=1e-14)
-        for attribute in ("array_position_m", "array_rotation_xyzw", "ambient_T", "line_numbers"):
+        for attribute in ("array_position_m", "array_rotation", "ambient_T"):
             found, expected = getattr(readings, attribute), getattr(simulation.readings, attribute)
+            if attribute == "array_rotation" and expected is not None:
+                found, expected = found.as_quat(), expected.as_quat()
             assert (found is None) == (expected is None)
             if expected is not None:
                 np.testing.assert_allclose(found, expected, rtol=1e-13)

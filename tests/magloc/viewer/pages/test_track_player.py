@@ -3,6 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -70,7 +71,7 @@ def track(start_s: float = 1000.0) -> list[TrackPoint]:
 
 def readings(n: int = N, start_s: float = 1000.0) -> Readings:
     values = 1e-9 * RNG.standard_normal((n, ARRAY.n_channels))
-    return Readings(start_s + STEP_S * np.arange(n), values, np.arange(n) + 2)
+    return Readings(values, time_s=start_s + STEP_S * np.arange(n))
 
 
 @pytest.fixture
@@ -266,7 +267,7 @@ class TestReadingsPlot:
     def test_differences_are_free_of_the_common_field(self, server):
         rows = readings()
         common = 5e-5 * np.sin(rows.time_s)[:, None]
-        plot = ReadingsPlot(server, Readings(rows.time_s, rows.values_T + common, rows.line_numbers), ARRAY)
+        plot = ReadingsPlot(server, replace(rows, values_T=rows.values_T + common), ARRAY)
         assert plot.plot.scales["y"]["range"][1] > 1e4
         set_value(plot.kind_dropdown, DIFFERENCES)
         lines = np.array(plot.plot.data[1:-1])
@@ -285,7 +286,7 @@ class TestReadingsPlot:
     def test_rows_out_of_order_are_put_in_order_and_marked_by_their_row(self, server):
         rows = readings()
         shuffled = np.random.default_rng(2).permutation(N)
-        plot = ReadingsPlot(server, Readings(rows.time_s[shuffled], rows.values_T[shuffled], rows.line_numbers), ARRAY)
+        plot = ReadingsPlot(server, rows[shuffled], ARRAY)
         assert np.all(np.diff(plot.plot.data[0]) >= 0.0)
         plot.show_row(7)
         marked = float(plot.plot.data[0][plot.plot.data[-1] == 1.0][0])

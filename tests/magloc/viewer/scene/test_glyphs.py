@@ -442,8 +442,8 @@ class TestFixes:
     def test_page_of_an_array_that_moves(self, server: viser.ViserServer) -> None:
         array = tetrahedron_of(1.0)
         pose = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0]])
-        turn = np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))
-        rows = Readings(np.arange(2.0), np.zeros((2, 12)), np.array([2, 3]), pose, turn)
+        turn = Rotation.identity(2)
+        rows = Readings(np.zeros((2, 12)), array_position_m=pose, array_rotation=turn)
         fixes = [Fix((solution(np.array([5.0, 0.0, 0.0])),)), Fix((solution(np.array([15.0, 0.0, 0.0])),))]
         page = pages.readings_page(server, ReadingsResult(rows, array, Path("array.toml")), fixes, rows)
         assert any("95 %" in getattr(entry, "text", "") for entry in page.entries)

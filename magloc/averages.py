@@ -1,0 +1,118 @@
+"""Rows of readings averaged: all of a record to one, or those of successive windows of time."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.array import SensorArray
+from arrays.io.errors import InputError
+from magloc.readings import Readings, change_between_rows
+
+
+def average(readings: Readings) -> Readings:
+    """All complete rows averaged to one.
+
+    Complete are the rows with every channel that any row has. Rows with less are left out: the field common to all
+    sensors changes from row to row, and cancels only between channels that are averaged over the same rows.
+
+    Parameters
+    ----------
+    readings : Readings
+        Of an array that does not move.
+
+    Returns
+    -------
+    Readings
+        One row, at the mean time. A channel that no row has stays missing.
+
+    Raises
+    ------
+    InputError
+        The array moves, or the ambient field changes, between the rows, or no row is complete.
+    """
+    change = change_between_rows(readings)
+    if change is not None:
+        what, row, expected = change
+        raise InputError(f"found {what} between rows 1 and {row + 1}, expected {expected}.")
+    complete = complete_rows(readings)
+    if not complete.any():
+        raise InputError("found no row with all channels, expected at least one for an average.")
+    ambient_T = readings.ambient_T
+    return replace(
+        readings[:1],
+        time_s=readings.time_s[complete].mean(keepdims=True),
+        values_T=readings.values_T[complete].mean(axis=0, keepdims=True),
+        ambient_T=None if ambient_T is None else ambient_T[complete].mean(axis=0, keepdims=True),
+    )
+
+
+def complete_rows(readings: Readings) -> NDArray[np.bool_]:
+    """Rows with every channel that any row has."""
+    present = np.isfinite(readings.values_T)
+    return np.asarray((present == present.any(axis=0)).all(axis=1))
+
+
+def averaging_array(array: SensorArray, readings: Readings) -> SensorArray:
+    r"""The array with the noise of :func:`average`'s row in place of that of a single row.
+
+    White noise, and the proportional noise with it, falls by :math:`\sqrt n` with n complete rows. Misalignments and
+    errors of the gains stay as they are: they are the same in every row, and no average removes them.
+
+    Parameters
+    ----------
+    array : SensorArray
+    readings : Readings
+        The rows that are averaged.
+
+    Returns
+    -------
+    SensorArray
+    """
+    return _less_noisy(array, math.sqrt(max(1, int(complete_rows(readings).sum()))))
+
+
+def window_averages(readings: Readings, window_s: float) -> Readings:
+    """Means of successive windows of time; the pose is that of the row in the middle.
+
+    Parameters
+    ----------
+    readings : Readings
+    window_s : float
+        Length of a window [s].
+
+    Returns
+    -------
+    Readings
+        One row for each window that has one. A channel is missing where it is missing in the whole window.
+    """
+    window = np.floor((readings.time_s - readings.time_s[0]) / window_s + 1e-9).astype(np.intp)
+    _, first, count = np.unique(window, return_index=True, return_counts=True)
+    middle = first + count // 2
+    known = np.isfinite(readings.values_T)
+    total = np.add.reduceat(np.where(known, readings.values_T, 0.0), first)
+    n_known = np.add.reduceat(known.astype(np.intp), first)
+    with np.errstate(invalid="ignore"):
+        values = total / n_known
+    ambient = readings.ambient_T
+    return replace(
+        readings[middle],
+        time_s=np.add.reduceat(readings.time_s, first) / count,
+        values_T=values,
+        ambient_T=None if ambient is None else np.add.reduceat(ambient, first) / count[:, None],
+    )
+
+
+def window_averaging_array(array: SensorArray, readings: Readings, window_s: float) -> SensorArray:
+    """The array with the white noise of :func:`window_averages`' rows, by the median number of readings in one."""
+    window = np.floor((readings.time_s - readings.time_s[0]) / window_s + 1e-9)
+    return _less_noisy(array, float(np.sqrt(np.median(np.unique(window, return_counts=True)[1]))))
+
+
+def _less_noisy(array: SensorArray, root: float) -> SensorArray:
+    """The array with its white and proportional noise divided by the root of a number of rows."""
+    sensors = tuple(replace(sensor, noise_T=sensor.noise_T / root) for sensor in array.sensors)
+    return replace(array, sensors=sensors, noise_fraction=array.noise_fraction / root)

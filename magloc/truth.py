@@ -1,0 +1,122 @@
+"""Where a source truly was: files of it, and the rows of readings that they belong to.
+
+A truth file is CSV with ``time_s, x_m, y_m[, z_m][, mx_Am2, my_Am2, mz_Am2]``, one row per instant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from arrays.io.csv import read_table
+from arrays.io.errors import InputError
+from arrays.typing import FloatArray, IntArray
+from magloc.readings import Readings
+
+TRUE_POSITION_COLUMNS = ("x_m", "y_m", "z_m")
+TRUE_MOMENT_COLUMNS = ("mx_Am2", "my_Am2", "mz_Am2")
+SAME_TIME_S = 1e-6
+# Of the truth's usual interval: over a longer one it is not interpolated.
+_LONGEST_STEP = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Where the source truly was at n instants.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n,)
+        Instants [s].
+    position_m : ndarray, shape (n, 3)
+        Position of the source [m]; z is NaN where the file does not give it.
+    moment_Am2 : ndarray, shape (n, 3), optional
+        Moment of the source [A·m²].
+    """
+
+    time_s: FloatArray
+    position_m: FloatArray
+    moment_Am2: FloatArray | None = None
+
+
+def read_truth(path: str | PathLike[str]) -> Truth:
+    """True positions, and moments where they are known, from a CSV file.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    Truth
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or is not a truth file.
+    """
+    table = read_table(path, "a header with time_s, x_m and y_m")
+    known = ("time_s", *TRUE_POSITION_COLUMNS, *TRUE_MOMENT_COLUMNS)
+    for name in ("time_s", "x_m", "y_m"):
+        table.require(name, known)
+    for name in table.header:
+        if name not in known:
+            raise InputError(
+                f"{table.header_place(name)}: found an unknown column, expected one of {', '.join(known)}."
+            )
+    time_s = table.complete_and_distinct("time_s")
+    position_m = np.full((len(time_s), 3), np.nan)
+    columns = TRUE_POSITION_COLUMNS if "z_m" in table.header else TRUE_POSITION_COLUMNS[:2]
+    position_m[:, : len(columns)] = table.complete(columns)
+    moment_Am2 = table.complete(TRUE_MOMENT_COLUMNS) if table.has_group(TRUE_MOMENT_COLUMNS) else None
+    return Truth(time_s, position_m, moment_Am2)
+
+
+def rows_of_same_time(readings: Readings, truth: Truth) -> tuple[IntArray, IntArray]:
+    """Rows of readings and of a truth that have the same time, to a microsecond.
+
+    Parameters
+    ----------
+    readings : Readings
+    truth : Truth
+
+    Returns
+    -------
+    in_readings, in_truth : ndarray of int, shape (k,)
+        In the order of the readings; empty where no time agrees.
+    """
+    order = np.argsort(truth.time_s, kind="stable")
+    times = truth.time_s[order]
+    after = np.clip(np.searchsorted(times, readings.time_s), 1, max(1, len(times) - 1))
+    before, after = after - 1, np.minimum(after, len(times) - 1)
+    nearest = np.where(np.abs(times[before] - readings.time_s) <= np.abs(times[after] - readings.time_s), before, after)
+    same = np.abs(times[nearest] - readings.time_s) <= SAME_TIME_S
+    return np.flatnonzero(same), order[nearest[same]]
+
+
+def truth_of_rows(readings: Readings, truth: Truth, path: Path) -> tuple[FloatArray, FloatArray | None]:
+    """True position, and moment if it is known, of every row (n, 3); NaN where the truth says nothing of that time.
+
+    Between two rows of the truth, as the mean time of a window may be, it is interpolated, but not over a gap.
+    """
+    order = np.argsort(truth.time_s, kind="stable")
+    times, wanted = truth.time_s[order], readings.time_s
+    after = np.clip(np.searchsorted(times, wanted - SAME_TIME_S), 0, len(times) - 1)
+    exact = np.abs(times[after] - wanted) <= SAME_TIME_S
+    before = np.where(exact, after, np.maximum(after - 1, 0))
+    length = times[after] - times[before]
+    longest = _LONGEST_STEP * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    known = exact | ((times[before] <= wanted) & (wanted <= times[after]) & (length <= longest))
+    if not known.any():
+        raise InputError(f"{path}: found none of the times of the readings, expected rows with the same time_s.")
+    share = np.divide(wanted - times[before], length, out=np.zeros_like(wanted), where=length > 0.0)[:, None]
+
+    def of_rows(values: FloatArray) -> FloatArray:
+        values = values[order]
+        between = values[before] + share * (values[after] - values[before])
+        return np.asarray(np.where(known[:, None], between, np.nan))
+
+    return of_rows(truth.position_m), None if truth.moment_Am2 is None else of_rows(truth.moment_Am2)

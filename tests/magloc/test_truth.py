@@ -1,0 +1,54 @@
+"""Truth files: what is read and what is refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from arrays.io.errors import InputError
+from magloc.truth import read_truth
+
+WriteFile = Callable[[str], Path]
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> WriteFile:
+    def write_file(content: str) -> Path:
+        path = tmp_path / "truth.csv"
+        path.write_text(content, encoding="utf-8")
+        return path
+
+    return write_file
+
+
+class TestTruth:
+    """Truth files have positions, and moments where they are known."""
+
+    def test_plane(self, write: WriteFile) -> None:
+        truth = read_truth(write("time_s,x_m,y_m\n0,1,2\n1,3,4\n"))
+        np.testing.assert_array_equal(truth.position_m, [[1.0, 2.0, math.nan], [3.0, 4.0, math.nan]])
+        assert truth.moment_Am2 is None
+
+    def test_space_and_moment(self, write: WriteFile) -> None:
+        truth = read_truth(write("time_s,x_m,y_m,z_m,mx_Am2,my_Am2,mz_Am2\n0,1,2,3,4,5,6\n"))
+        np.testing.assert_array_equal(truth.position_m, [[1.0, 2.0, 3.0]])
+        assert truth.moment_Am2 is not None
+        np.testing.assert_array_equal(truth.moment_Am2, [[4.0, 5.0, 6.0]])
+
+    @pytest.mark.parametrize(
+        ("content", "fragment"),
+        [
+            ("time_s,x_m\n0,1\n", "column y_m"),
+            ("time_s,x_m,y_m,mx_Am2\n0,1,2,3\n", "column my_Am2"),
+            ("time_s,x_m,y_m,speed\n0,1,2,3\n", "column speed"),
+            ("time_s,x_m,y_m\n0,1,\n", "line 2, column y_m"),
+            ("time_s,x_m,y_m\n0,1,2\n0,3,4\n", "line 3, column time_s"),
+        ],
+    )
+    def test_bad_file(self, write: WriteFile, content: str, fragment: str) -> None:
+        with pytest.raises(InputError, match=fragment):
+            read_truth(write(content))
