@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from adcs.kalman.bank import Filter, Noise, StartKind
+from adcs.kalman.names import Filter, Noise, StartKind
 from arrays.io.arguments import Flag
 from magloc.cli import framework
 
@@ -30,7 +30,35 @@ _ECLIPSE_NOISE = {"rate_rad_s": 1e-8, "gyro_bias_rad_s": 1e-9, "disturbance_s2":
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class ScenarioOptions:
+class EstimateOptions:
+    """What replaces keys of the scenario file; by default nothing does.
+
+    Parameters
+    ----------
+    sensors : str
+        Sensors in use: any of st, gyro, mag and sun that observe attitude, in any order.
+    states : str
+        What is estimated besides attitude and rate: any of gyro-bias, field-bias and disturbance with commas, or none.
+    filter : str
+        As of `adcs run tabletsat`.
+    """
+
+    sensors: str | None = None
+    states: str | None = None
+    filter: Filter | None = None
+
+    @property
+    def estimate(self) -> dict[str, Any]:
+        """Keys of the table ``estimate``, and what replaces them."""
+        given = {"sensors": self.sensors, "states": _names(self.states), "filter": self.filter}
+        if self.sensors is not None and self.states is None:
+            given["states"] = []  # those of the file belong to its sensors
+        return {key: value for key, value in given.items() if value is not None}
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ScenarioOptions(EstimateOptions):
     """What replaces keys of the scenario file; by default nothing does.
 
     Parameters
@@ -60,9 +88,6 @@ class ScenarioOptions:
         The Jacobian of the paper, which takes the feedback of the control for dynamics.
     """
 
-    sensors: str | None = None
-    states: str | None = None
-    filter: Filter | None = None
     process_noise: Noise | None = None
     star_noise: Literal["angle", "paper"] | None = None
     field_error_nT: Annotated[float | None, Parameter(name="--field-error-nT")] = None
@@ -73,25 +98,20 @@ class ScenarioOptions:
 
     def changes(self, duration_s: float | None) -> dict[str, Any]:
         """Keys of the scenario file, and what replaces them."""
-        changes: dict[str, Any] = {}
-        states = None if self.states is None else _names(self.states)
         estimate = {
-            "sensors": self.sensors,
-            "states": states,
-            "filter": self.filter,
             "process_noise": self.process_noise,
             "start": self.start,
             "start_error_deg": self.start_error_deg,
             "closed_loop_F": self.closed_loop_F or None,
         }
-        if self.sensors is not None and self.states is None:
-            estimate["states"] = []  # those of the file belong to its sensors
-        changes["estimate"] = {key: value for key, value in estimate.items() if value is not None}
+        changes: dict[str, Any] = {
+            "estimate": self.estimate | {key: value for key, value in estimate.items() if value is not None}
+        }
         if self.field_error_nT is not None:
             changes["disturbance"] = {"field_error_nT": self.field_error_nT}
         if self.eclipse:
             changes["start"] = _ECLIPSE
-            if self.process_noise is None and "disturbance" in (states or []):
+            if self.process_noise is None and "disturbance" in (_names(self.states) or []):
                 changes["estimate"]["process_noise"] = _ECLIPSE_NOISE
             changes["duration_s"] = _ECLIPSE_DURATION_S
         if duration_s is not None:
@@ -99,6 +119,8 @@ class ScenarioOptions:
         return changes
 
 
-def _names(text: str) -> list[str]:
+def _names(text: str | None) -> list[str] | None:
+    if text is None:
+        return None
     names = [name.strip() for name in text.replace("+", ",").split(",")]
     return [name for name in names if name and name != "none"]

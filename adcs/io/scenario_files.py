@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from adcs.environment.orbit import CircularOrbit, Orbit, Sgp4Orbit, node_of_local_time
+from adcs.environment.orbit import Orbit, Sgp4Orbit, circular_orbit
 from adcs.io.scenario_tables import (
     FORMAT_VERSION,
     SENSOR_TABLES,
@@ -35,9 +35,11 @@ from adcs.io.scenario_tables import (
     StartTable,
     SunSensorTable,
 )
-from adcs.kalman.bank import FILTERS, NOISES, STARTS, Estimate
+from adcs.kalman.bank import IMPLIED_STATES, EstimatorSettings
 from adcs.kalman.error_state import FilterSettings, ProcessNoise, SensorSet, paper_noise, sensor_set, tuned_noise
+from adcs.kalman.names import FILTERS, NOISES, STARTS
 from adcs.satellite.dynamics import RigidBody, WheelControl, wheel_control
+from adcs.satellite.satellite import Satellite
 from adcs.satellite.sensors import Gyro, Magnetometer, StarTracker, SunSensor
 from arrays.io.errors import InputError, naming
 from arrays.io.toml import read_toml, section_of
@@ -58,17 +60,9 @@ class AttitudeFile:
         Of the file, for errors.
     tables : dict
         As read.
-    body : RigidBody
-    control : WheelControl
-    orbit : Orbit
-    start_utc : datetime64
-        Runs start within the 24 hours from here; a telemetry's ``time_s`` counts from here.
-    field_model : str
+    satellite : Satellite
+        Runs start within the 24 hours from its start.
     duration_s, step_s : float
-    star_tracker : StarTracker
-    gyro : Gyro
-    magnetometer : Magnetometer
-    sun_sensor : SunSensor
     start : StartTable
     disturbance : DisturbanceTable
     estimate : EstimateTable
@@ -77,25 +71,23 @@ class AttitudeFile:
     name: str
     path: str
     tables: dict[str, Any]
-    body: RigidBody
-    control: WheelControl
-    orbit: Orbit
-    start_utc: np.datetime64
-    field_model: Model
+    satellite: Satellite
     duration_s: float
     step_s: float
-    star_tracker: StarTracker
-    gyro: Gyro
-    magnetometer: Magnetometer
-    sun_sensor: SunSensor
     start: StartTable
     disturbance: DisturbanceTable
     estimate: EstimateTable
 
-    @property
-    def dt_s(self) -> float:
-        """Time between instants, as :class:`adcs.satellite.telemetry.Satellite` names it."""
-        return self.step_s
+    def changed(self, changes: dict[str, Any]) -> AttitudeFile:
+        """The scenario with some keys replaced; keys of a table in a table of the changes."""
+        tables = dict(self.tables)
+        for key, value in changes.items():
+            tables[key] = {**tables.get(key, {}), **value} if isinstance(value, dict) else value
+        return scenario_of(self.path, tables)
+
+    def estimator(self, place: str = "") -> EstimatorSettings:
+        """What the table ``estimate`` orders, checked; errors name a place, or the file."""
+        return _estimator(place or self.path, self.estimate)
 
 
 def built_in_scenarios() -> tuple[str, ...]:
@@ -131,14 +123,6 @@ def read_scenario(name_or_path: str) -> AttitudeFile:
         path = str(resources.files("adcs") / "scenarios" / f"{name_or_path}.toml")
     expected = f"a scenario file, or one of the built-in scenarios {', '.join(built_in_scenarios())}"
     return scenario_of(path, _with_dates(read_toml(path, expected)))
-
-
-def changed(file: AttitudeFile, changes: dict[str, Any]) -> AttitudeFile:
-    """The scenario with some keys replaced; keys of a table in a table of the changes."""
-    tables = dict(file.tables)
-    for key, value in changes.items():
-        tables[key] = {**tables.get(key, {}), **value} if isinstance(value, dict) else value
-    return scenario_of(file.path, tables)
 
 
 def scenario_text(file: AttitudeFile) -> str:
@@ -217,38 +201,24 @@ def scenario_of(path: str, tables: dict[str, Any]) -> AttitudeFile:
         name=Path(path).stem if file.name is None else file.name,
         path=path,
         tables=tables,
-        body=body,
-        control=control,
-        orbit=orbit,
-        start_utc=start_utc,
-        field_model=model,
+        satellite=Satellite(
+            inertia_kgm2=body.inertia_kgm2,
+            residual_dipole_Am2=body.residual_dipole_Am2,
+            control=control,
+            orbit=orbit,
+            start=start_utc,
+            field_model=model,
+            **sensors,
+        ),
         duration_s=file.duration_s,
         step_s=file.step_s,
-        **sensors,
         start=start,
         disturbance=section_of(f"{path}, table disturbance", file.disturbance, DisturbanceTable),
         estimate=section_of(f"{path}, table estimate", file.estimate, EstimateTable),
     )
 
 
-def estimate_of(place: str, table: EstimateTable) -> Estimate:
-    """What a table orders, checked.
-
-    Parameters
-    ----------
-    place : str
-        Where it stands, for errors.
-    table : EstimateTable
-
-    Returns
-    -------
-    Estimate
-
-    Raises
-    ------
-    InputError
-        A name is unknown, the sensors cannot observe attitude, or the paper has no noise for them.
-    """
+def _estimator(place: str, table: EstimateTable) -> EstimatorSettings:
     for key, known in (("filter", FILTERS), ("start", STARTS)):
         if getattr(table, key) not in known:
             raise InputError(f"{place}, {key}: found {getattr(table, key)!r}, expected one of {', '.join(known)}.")
@@ -256,11 +226,10 @@ def estimate_of(place: str, table: EstimateTable) -> Estimate:
         raise InputError(f"{place}, forgetting: found {table.forgetting:g}, expected more than 0 and at most 1.")
     if table.closed_loop_F and table.filter != "mekf":
         raise InputError(f"{place}, closed_loop_F: found the filter {table.filter}, expected mekf.")
-    implied = {"parallel-disturbance": ["disturbance"], "reduced": ["gyro-bias"]}.get(table.filter, [])
-    states = [*table.states, *(state for state in implied if state not in table.states)]
+    states = [*table.states, *(state for state in IMPLIED_STATES.get(table.filter, ()) if state not in table.states)]
     with naming(place):
         used = sensor_set(table.sensors, states)
-        return Estimate(
+        return EstimatorSettings(
             settings=FilterSettings(
                 used,
                 _process_noise(place, table.process_noise, used),
@@ -325,17 +294,14 @@ def _orbit(place: str, table: dict[str, Any]) -> tuple[Orbit, np.datetime64, Mod
     if (section.local_time_h is None) == (section.node_deg is None):
         found = "neither local_time_h nor node_deg" if section.node_deg is None else "both local_time_h and node_deg"
         raise InputError(f"{place}: found {found}, expected one of them.")
-    if section.local_time_h is not None:
-        node = node_of_local_time(section.local_time_h, start)
-    else:
-        node = math.radians(section.node_deg or 0.0)
     with naming(place):
-        orbit = CircularOrbit(
-            1e3 * circle["altitude_km"],
-            math.radians(circle["inclination_deg"]),
-            node,
-            start,
-            math.radians(section.latitude_argument_deg),
+        orbit = circular_orbit(
+            altitude_m=1e3 * circle["altitude_km"],
+            inclination_deg=circle["inclination_deg"],
+            epoch=start,
+            node_deg=section.node_deg,
+            local_time_h=section.local_time_h,
+            latitude_argument_deg=section.latitude_argument_deg,
         )
     return orbit, start, section.field_model
 

@@ -18,6 +18,7 @@ of the sky towards the camera (east is to the left of north).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -392,6 +393,37 @@ class StarMatcher:
         # Of at least `matched` - 3: the survival function counts what is more than its argument.
         chance = float(binom.logsf(matched - 4, max(stars - 3, 0), min(covered, 1.0)))
         return (chance + math.log(hypotheses)) / math.log(10.0)
+
+
+def identify_stars(
+    catalogue: StarCatalogue,
+    camera: StarCamera,
+    frames: Iterable[tuple[ArrayLike, ArrayLike]],
+    *,
+    noise_px: float = 1.0,
+    progress: Callable[[int], None] | None = None,
+) -> list[StarFix | NoFix]:
+    """Attitude and stars of images, without knowing where the camera looked.
+
+    Parameters
+    ----------
+    catalogue : StarCatalogue
+        At the date of the images, of :func:`adcs.stars.files.read_star_catalogue` or :meth:`StarCatalogue.of`.
+    camera : StarCamera
+    frames : iterable of (array_like, array_like)
+        Points (f, 2), y up, and magnitudes (f,) of each image; see :meth:`StarMatcher.identify`.
+    noise_px : float
+        Standard deviation of a star's place, per axis.
+    progress : callable, optional
+        Called with 1 after every image.
+    """
+    matcher = StarMatcher.of(catalogue, camera, noise_px)
+    fixes = []
+    for points_px, magnitudes in frames:
+        fixes.append(matcher.identify(points_px, magnitudes))
+        if progress is not None:
+            progress(1)
+    return fixes
 
 
 def rotation_between(seen: FloatArray, there: FloatArray) -> FloatArray:

@@ -12,7 +12,8 @@ from cyclopts import Parameter
 
 from adcs.cli.options import ScenarioOptions, print_note
 from adcs.io.scenario_files import AttitudeFile
-from adcs.kalman.bank import FILTERS, Estimate
+from adcs.kalman.bank import EstimatorSettings
+from adcs.kalman.names import FILTERS
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
 from magloc.cli.framework import QuietOptions, print_json, progress
@@ -66,12 +67,12 @@ class Row:
     Attributes
     ----------
     file : AttitudeFile
-    estimate : Estimate
+    estimate : EstimatorSettings
     outcome : Outcome
     """
 
     file: AttitudeFile
-    estimate: Estimate
+    estimate: EstimatorSettings
     outcome: Outcome
 
     def report(self) -> dict[str, Any]:

@@ -11,8 +11,8 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from adcs.cli.options import ScenarioOptions, print_note
-from adcs.io.scenario_files import MOST_STEPS, AttitudeFile, built_in_scenarios, changed, estimate_of, read_scenario
-from adcs.kalman.bank import Estimate
+from adcs.io.scenario_files import MOST_STEPS, AttitudeFile, built_in_scenarios, read_scenario
+from adcs.kalman.bank import EstimatorSettings
 from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import InputError
 from magloc.cli.framework import QuietOptions, print_json, progress
@@ -46,7 +46,7 @@ class RunOptions:
         return range(self.seed, self.seed + self.seeds)
 
 
-def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) -> tuple[AttitudeFile, Estimate]:
+def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) -> tuple[AttitudeFile, EstimatorSettings]:
     """The scenario with the options in it, and its filter.
 
     Parameters
@@ -58,7 +58,7 @@ def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) ->
 
     Returns
     -------
-    AttitudeFile, Estimate
+    AttitudeFile, EstimatorSettings
 
     Raises
     ------
@@ -74,13 +74,13 @@ def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) ->
         raise InputError(f"--start-error-deg: found {options.start_error_deg:g}, expected more than 0 and at most 180.")
     if options.field_error_nT is not None and not 0.0 <= options.field_error_nT <= 1e9:
         raise InputError(f"--field-error-nT: found {options.field_error_nT:g}, expected 0 to 1e9.")
-    file = changed(file, changes)
+    file = file.changed(changes)
     if options.star_noise is not None:
         tables = {**file.tables.get("sensors", {})}
         tables["star_tracker"] = {**tables.get("star_tracker", {}), "noise_deg": _STAR_NOISE_DEG[options.star_noise]}
-        file = changed(file, {"sensors": tables})
+        file = file.changed({"sensors": tables})
     given = [f"--{key}" for key in ("sensors", "states", "filter") if getattr(options, key) is not None]
-    return file, estimate_of(" and ".join(given) or file.path, file.estimate)
+    return file, file.estimator(" and ".join(given) or file.path)
 
 
 def run_attitude(
@@ -161,13 +161,13 @@ _ROWS = (
 )
 
 
-def summary_lines(file: AttitudeFile, estimate: Estimate, numbers: dict[str, Any]) -> Sequence[str]:
+def summary_lines(file: AttitudeFile, estimate: EstimatorSettings, numbers: dict[str, Any]) -> Sequence[str]:
     """The result as text.
 
     Parameters
     ----------
     file : AttitudeFile
-    estimate : Estimate
+    estimate : EstimatorSettings
     numbers : dict
         What ``--json`` prints.
 

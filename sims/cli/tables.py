@@ -10,7 +10,7 @@ import numpy as np
 from cyclopts import Parameter
 
 from adcs.cli.options import print_note
-from adcs.io.scenario_files import AttitudeFile, changed, estimate_of, read_scenario
+from adcs.io.scenario_files import AttitudeFile, read_scenario
 from arrays.io.arguments import Count, Flag, Seed
 from magloc.cli.framework import QuietOptions, print_json, progress
 from sims.experiments.paper_tables import PAPER_ROWS, UNITS, PaperRow, Quantity
@@ -140,7 +140,7 @@ def comparisons(file: AttitudeFile, row: PaperRow, options: TableOptions) -> lis
     -------
     list of Comparison
     """
-    from adcs.kalman.results import sigma_in_units
+    from adcs.kalman.results import in_units, sigma_by_state
     from sims.experiments.attitude import run_scenario
 
     sensors = dict(file.tables["sensors"])
@@ -152,14 +152,14 @@ def comparisons(file: AttitudeFile, row: PaperRow, options: TableOptions) -> lis
         "process_noise": "paper",
     }
     duration_s = row.duration_s if options.duration is None else options.duration
-    file = changed(file, {"duration_s": duration_s, "sensors": sensors, "estimate": estimate})
+    file = file.changed({"duration_s": duration_s, "sensors": sensors, "estimate": estimate})
     last: list[np.ndarray] = []
 
     def look(part: Part) -> None:
-        last.append(sigma_in_units(part.estimates)[:, -1])
+        last.append(in_units(sigma_by_state(part.estimates))[:, -1])
 
     seeds = range(options.seed, options.seed + options.seeds)
-    outcome = run_scenario(file, estimate_of(file.path, file.estimate), seeds, look=look)
+    outcome = run_scenario(file, file.estimator(file.path), seeds, look=look)
     sigma = np.concatenate(last).reshape(-1, 5, 3).max(axis=2).mean(axis=0)
     rms = outcome.axis_rms.mean(axis=0).reshape(5, 3).max(axis=1)
     found = []

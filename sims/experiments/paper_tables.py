@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from adcs.kalman.bank import Filter
+from adcs.kalman.names import Filter
 
 Quantity = Literal["attitude", "rate", "gyro bias", "field bias", "disturbance"]
 UNITS: dict[Quantity, str] = {
