@@ -24,8 +24,7 @@ from os import PathLike
 
 import numpy as np
 
-from adcs import quaternion
-from adcs.satellite.telemetry import MOST_INSTANTS, Record, Telemetry, orbital_from_eci, steps_of
+from adcs.satellite.telemetry import MOST_INSTANTS, Telemetry, steps_of
 from arrays.io.csv import Table, read_table
 from arrays.io.errors import InputError, naming
 from arrays.io.toml import check_keys
@@ -94,19 +93,16 @@ def _refuse_times(table: Table, time_s: FloatArray, step_s: float) -> None:
         )
 
 
-def telemetry_columns(record: Record, start: np.datetime64, run: int = 0) -> dict[str, FloatArray]:
-    """Columns (n,) of the log that a run would have written, times from ``start`` on; none of a sensor unread."""
-    around, readings = record.environment, record.readings
-    eci_from_orbital = quaternion.conjugate(orbital_from_eci(around)[run])
+def telemetry_columns(telemetry: Telemetry) -> dict[str, FloatArray]:
+    """Columns (n,) of a log's file; there are none of a sensor without any reading."""
     groups = (
-        (STAR, quaternion.multiply(eci_from_orbital, readings.star[run])),
-        (GYRO, np.degrees(readings.gyro_rad_s[run])),
-        (FIELD, 1e9 * readings.field_T[run]),
-        (SUN, readings.sun[run]),
-        (WHEELS, record.momentum_Nms[run]),
+        (STAR, np.roll(telemetry.star, 1, axis=1)),
+        (GYRO, np.degrees(telemetry.gyro_rad_s)),
+        (FIELD, 1e9 * telemetry.field_T),
+        (SUN, telemetry.sun),
+        (WHEELS, telemetry.wheels_Nms),
     )
-    seconds = (around.utc[run] - start).astype(np.float64) / 1e6
-    columns = {TIME: seconds}
+    columns = {TIME: telemetry.time_s}
     for names, values in groups:
         if not np.isnan(values).all():
             columns |= dict(zip(names, values.T, strict=True))

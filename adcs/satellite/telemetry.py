@@ -265,6 +265,21 @@ class Telemetry:
         for name, value in ({"time_s": times, "step_s": step_s} | checked).items():
             object.__setattr__(self, name, value)
 
+    @classmethod
+    def of(cls, record: Record, start: np.datetime64, run: int = 0) -> Telemetry:
+        """Log that a run of a record would have written, its time counted from ``start``."""
+        around, readings = record.environment, record.readings
+        eci_from_orbital = quaternion.conjugate(orbital_from_eci(around)[run])
+        return cls(
+            (around.utc[run] - start).astype(np.float64) / 1e6,
+            star=quaternion.multiply(eci_from_orbital, readings.star[run])[:, [1, 2, 3, 0]],
+            gyro_rad_s=readings.gyro_rad_s[run],
+            field_T=readings.field_T[run],
+            sun=readings.sun[run],
+            wheels_Nms=record.momentum_Nms[run],
+            step_s=record.dt_s,
+        )
+
     @property
     def rows(self) -> NDArray[np.int64]:
         """Instant of every row, counted in steps from the first."""

@@ -17,7 +17,8 @@ from adcs import quaternion
 from adcs.environment.environment import Environment, environment
 from adcs.environment.orbit import EARTH_RADIUS_M
 from adcs.satellite import dynamics, sensors
-from adcs.satellite.telemetry import Readings
+from adcs.satellite.attitude_track import AttitudeTrack
+from adcs.satellite.telemetry import Readings, orbital_from_eci
 from arrays.typing import FloatArray
 from sims.attitude.scenario import AttitudeScenario
 from sims.attitude.starts import starts
@@ -89,6 +90,14 @@ class AttitudeRuns:
     def scenario(self) -> AttitudeScenario:
         """What was simulated."""
         return self.prepared.scenario
+
+    def error_deg(self, track: AttitudeTrack) -> FloatArray:
+        """Angle between the first run's truth and a track of its log, shape (n,) [°]; NaN before the track begins."""
+        eci_from_orbital = quaternion.conjugate(orbital_from_eci(self.environment)[0])
+        true = quaternion.multiply(eci_from_orbital, self.q[0])[-len(track) :]
+        error = np.full(self.q.shape[1], np.nan)
+        error[-len(track) :] = np.degrees(quaternion.angle_between(track.q, true))
+        return error
 
     @property
     def satellite(self) -> AttitudeScenario:

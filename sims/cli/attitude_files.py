@@ -12,6 +12,7 @@ from adcs.io.scenario_files import AttitudeFile, scenario_text
 from adcs.io.telemetry_files import telemetry_columns
 from adcs.kalman.bank import EstimatorSettings
 from adcs.satellite.sensors import SENSORS
+from adcs.satellite.telemetry import Telemetry
 from arrays.io.csv import write_columns
 from arrays.io.text import write_text
 from sims.experiments.attitude import Outcome, Part, errors_in_units
@@ -71,8 +72,9 @@ def write_attitude_files(
     write_columns(columns, out / f"{name}.csv")
     write_columns(_runs_table(outcome), out / f"{name}-runs.csv")
     dataset_of(parts, estimate, title).to_netcdf(out / f"{name}.nc")
-    write_columns(telemetry_columns(first.runs, file.satellite.start), out / "telemetry.csv")
-    write_columns(_truth_columns(first, file), out / "truth.csv")
+    log = Telemetry.of(first.runs, file.satellite.start)
+    write_columns(telemetry_columns(log), out / "telemetry.csv")
+    write_columns(_truth_columns(first, log.time_s), out / "truth.csv")
     write_text(scenario_text(file), out / "scenario.toml")
     return [
         *(f"{name}{ending}" for ending in ("-errors.png", "-consistency.png", ".csv", "-runs.csv", ".nc")),
@@ -94,10 +96,10 @@ def _runs_table(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def _truth_columns(part: Part, file: AttitudeFile) -> dict[str, Any]:
+def _truth_columns(part: Part, time_s: FloatArray) -> dict[str, Any]:
     """What the estimates of the telemetry may be compared with."""
     runs = part.runs
-    columns: dict[str, Any] = {"time_s": telemetry_columns(runs, file.satellite.start)["time_s"]}
+    columns: dict[str, Any] = {"time_s": time_s}
     groups = (
         (["qw", "qx", "qy", "qz"], runs.q[0]),
         ([f"rate_{axis}_deg_s" for axis in "xyz"], np.degrees(runs.w[0])),

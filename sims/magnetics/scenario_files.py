@@ -22,7 +22,7 @@ from arrays.array_file import array_of_table, read_array
 from arrays.io.errors import InputError
 from arrays.io.toml import read_toml, section_of
 from sims.magnetics.paths import Attitude, Path, Steered, Vector
-from sims.magnetics.scenario import Carrier, Matrix, Missing, Platform, Pulsation, Scenario, Source
+from sims.magnetics.scenario import Carrier, MagneticScenario, Matrix, Missing, Platform, Pulsation, Source
 from sims.magnetics.scenario_tables import (
     FORMAT_VERSION,
     PATH_TABLES,
@@ -48,7 +48,7 @@ def built_in_scenarios() -> tuple[str, ...]:
     return tuple(sorted(FilePath(file.name).stem for file in files if file.name.endswith(".toml")))
 
 
-def read_scenario(name_or_path: str) -> Scenario:
+def read_scenario(name_or_path: str) -> MagneticScenario:
     """Scenario of a simulation.
 
     Parameters
@@ -58,7 +58,7 @@ def read_scenario(name_or_path: str) -> Scenario:
 
     Returns
     -------
-    Scenario
+    MagneticScenario
 
     Raises
     ------
@@ -74,7 +74,7 @@ def read_scenario(name_or_path: str) -> Scenario:
         raise InputError(f"{path}, key format_version: found {file.format_version}, expected {FORMAT_VERSION}.")
     array, models = _array_and_models(path, file)
     with _naming(path):
-        return Scenario(
+        return MagneticScenario(
             array=array,
             models=models,
             duration_s=file.duration_s,

@@ -8,7 +8,7 @@ import pytest
 from adcs import quaternion
 from adcs.io.scenario_files import read_scenario
 from adcs.io.telemetry_files import FIELD, GROUPS, GYRO, STAR, SUN, TIME, WHEELS, read_telemetry, telemetry_columns
-from adcs.satellite.telemetry import part
+from adcs.satellite.telemetry import Telemetry, part
 from arrays.io.csv import write_columns
 from arrays.io.errors import InputError
 from sims.attitude.files import simulation_of
@@ -38,7 +38,7 @@ def written(tmp_path):
 
 class TestRoundTrip:
     def test_readings_and_wheels(self, runs, written):
-        record = written(telemetry_columns(runs, START)).record(SCENARIO.satellite)
+        record = written(telemetry_columns(Telemetry.of(runs, START))).record(SCENARIO.satellite)
         for name in ("gyro_rad_s", "field_T", "sun"):
             np.testing.assert_allclose(getattr(record.readings, name), getattr(runs.readings, name), rtol=1e-12)
         np.testing.assert_allclose(record.momentum_Nms, runs.momentum_Nms, rtol=1e-12)
@@ -47,7 +47,7 @@ class TestRoundTrip:
 
     def test_star_tracker_through_the_inertial_frame(self, runs, written):
         """The file has the attitude against inertial space: the rotation of the orbital frame cancels."""
-        columns = telemetry_columns(runs, START)
+        columns = telemetry_columns(Telemetry.of(runs, START))
         record = written(columns).record(SCENARIO.satellite)
         angle = quaternion.angle_between(record.readings.star, runs.readings.star)
         assert angle.max() < 1e-7
@@ -57,14 +57,14 @@ class TestRoundTrip:
         assert np.degrees(to_first[-1]) == pytest.approx(20.0 * 0.062, abs=0.3)
 
     def test_surroundings(self, runs, written):
-        record = written(telemetry_columns(runs, START)).record(SCENARIO.satellite)
+        record = written(telemetry_columns(Telemetry.of(runs, START))).record(SCENARIO.satellite)
         np.testing.assert_allclose(record.environment.b_orbital_T, runs.environment.b_orbital_T, atol=1e-12)
         assert record.environment.utc[0, 0] == runs.environment.utc[0, 0]
 
 
 class TestGaps:
     def test_rows_and_cells(self, runs, written):
-        columns = {name: values.copy() for name, values in telemetry_columns(runs, START).items()}
+        columns = {name: values.copy() for name, values in telemetry_columns(Telemetry.of(runs, START)).items()}
         columns[SUN[1]][4] = np.nan
         kept = np.delete(np.arange(21), [7, 8])
         telemetry = written({name: values[kept] for name, values in columns.items()})
@@ -77,21 +77,21 @@ class TestGaps:
         assert np.isfinite(record.momentum_Nms).all()
 
     def test_absent_sensors(self, runs, written):
-        columns = telemetry_columns(runs, START)
+        columns = telemetry_columns(Telemetry.of(runs, START))
         record = written({name: columns[name] for name in (TIME, *FIELD)}).record(SCENARIO.satellite)
         assert [name for name, seen in record.readings.seen.items() if seen.any()] == ["mag"]
         assert np.isnan(record.readings.star).all()
         assert not record.momentum_Nms.any()
 
     def test_later_part(self, runs, written):
-        record = written(telemetry_columns(runs, START)).record(SCENARIO.satellite)
+        record = written(telemetry_columns(Telemetry.of(runs, START))).record(SCENARIO.satellite)
         later = part(record, np.array([0]), slice(5, None))
         assert later.environment.time_s[0] == record.environment.time_s[5]
         np.testing.assert_array_equal(later.readings.sun, record.readings.sun[:, 5:])
         np.testing.assert_array_equal(later.environment.b_orbital_T, record.environment.b_orbital_T[:, 5:])
 
     def test_any_length_of_directions(self, runs, written):
-        columns = telemetry_columns(runs, START)
+        columns = telemetry_columns(Telemetry.of(runs, START))
         for name in (*SUN, *STAR):
             columns[name] = 7.0 * columns[name]
         record = written(columns).record(SCENARIO.satellite)
