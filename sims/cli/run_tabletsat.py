@@ -6,16 +6,22 @@ import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
+import adcs
+import sims.experiments
 from adcs.cli.options import ScenarioOptions, print_note
-from adcs.io.scenario_files import MOST_STEPS, AttitudeFile, built_in_scenarios, read_scenario
-from adcs.kalman.bank import EstimatorSettings
 from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import InputError
+from arrays.io.outputs import make_folder, refuse_file
 from magloc.cli.framework import QuietOptions, print_json, progress
+
+if TYPE_CHECKING:
+    from adcs.io.scenario_files import AttitudeFile
+    from adcs.kalman.bank import EstimatorSettings
+    from sims.experiments.attitude import Part
 
 _OTHERS = ("complementary", "ellipsoid", "mockup")
 _STAR_NOISE_DEG = {"angle": 0.001, "paper": 0.002}
@@ -65,7 +71,9 @@ def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) ->
     InputError
         The file or an option cannot be used.
     """
-    file = read_scenario(scenario)
+    from adcs.io.scenario_files import MOST_STEPS
+
+    file = adcs.read_scenario(scenario)
     changes = options.changes(duration_s)
     if duration_s is not None and not 1.0 <= duration_s / file.step_s <= MOST_STEPS:
         longest_s = MOST_STEPS * file.step_s
@@ -115,8 +123,7 @@ def run_attitude(
     common : QuietOptions
         Common options.
     """
-    from arrays.io.outputs import make_folder, refuse_file
-    from sims.experiments.attitude import Part, run_scenario
+    from adcs.io.scenario_files import built_in_scenarios
 
     if scenario in _OTHERS:
         raise InputError(f"adcs run: found options before {scenario}, expected its name right after run.")
@@ -132,7 +139,7 @@ def run_attitude(
         refuse_file(out, "--out")
     parts: list[Part] = []
     with progress(runs.seeds, "runs", quiet=common.quiet) as advance:
-        outcome = run_scenario(
+        outcome = sims.experiments.run_scenario(
             file, estimate, runs.numbers, look=None if out is None else parts.append, advance=advance
         )
     if not common.quiet:

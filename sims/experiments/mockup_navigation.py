@@ -9,12 +9,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from adcs.mockup.navigation.strapdown import PlanarTrack, strapdown, wrapped
 from arrays.io.errors import InputError
+from sims.experiments.mockup_settings import METHODS, SETTLED_S, UNKNOWNS, Method, Unknowns
 
 if TYPE_CHECKING:
     from adcs.mockup.navigation.fixes import Fused, Fusion
@@ -22,12 +23,6 @@ if TYPE_CHECKING:
     from sims.mockup.table_run import TableRun, TableScenario
 from arrays.typing import FloatArray
 
-Method = Literal["paper", "velocity-corrected", "ekf", "camera", "imu"]
-METHODS: tuple[Method, ...] = get_args(Method)
-Unknowns = Literal["two", "six", "drift"]
-UNKNOWNS: tuple[Unknowns, ...] = get_args(Unknowns)
-SETTLED_S = 10.0
-"""Errors count after it."""
 SHORT_S = 20.0
 """Runs of zeros up to it are the one with two firings, longer ones drive around the table."""
 ZERO_M_S2 = (0.005, -0.004)

@@ -16,7 +16,8 @@ from adcs.mockup.navigation.delayed_ekf import DelayedFilter, FilterSettings, Fi
 from adcs.mockup.navigation.fixes import Outcome, fuse
 from adcs.mockup.navigation.strapdown import PlanarTrack
 from arrays.io.errors import InputError
-from sims.experiments.mockup_navigation import METHODS, fused_runs, fusion_run, track_errors, zeros_run
+from sims.experiments.mockup_navigation import fused_runs, fusion_run, track_errors, zeros_run
+from sims.experiments.mockup_settings import METHODS
 from sims.mockup.table_run import CameraErrors, ImuErrors, TableScenario, table_run
 
 
