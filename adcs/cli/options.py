@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -9,12 +12,27 @@ from cyclopts import Parameter
 
 from adcs.kalman.names import Filter, Noise, StartKind
 from arrays.io.arguments import Flag
+from arrays.io.errors import InputError
 from magloc.cli import framework
 
 
 def print_note(text: str) -> None:
     """Print one line on stderr, whatever the text."""
     framework.print_note(text, "adcs")
+
+
+@contextmanager
+def naming_options() -> Iterator[None]:
+    """Say of an option what the library says of the argument of that name."""
+    try:
+        yield
+    except InputError:
+        raise
+    except ValueError as error:
+        said = re.fullmatch(r"Input (\w+) must be (.*); instead received (.*)\.", str(error))
+        if said is None:
+            raise
+        raise InputError(f"--{said[1].replace('_', '-')}: found {said[3]}, expected {said[2]}.") from None
 
 
 _ECLIPSE: dict[str, Any] = {

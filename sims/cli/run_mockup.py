@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import sims.experiments
-from adcs.cli.options import print_note
+from adcs.cli.options import naming_options, print_note
 from arrays.io.arguments import Flag
 from arrays.io.outputs import make_folder, refuse_file
 from magloc.cli.framework import QuietOptions, print_json, progress
@@ -287,7 +287,7 @@ def _sky(options: MockupOptions, out: Path | None, *, quiet: bool) -> Told:
 
 def _zeros(options: MockupOptions, out: Path | None, *, quiet: bool) -> Told:
     seeds = options.runs(6)
-    with progress(len(seeds), "runs", quiet=quiet) as advance:
+    with progress(len(seeds), "runs", quiet=quiet) as advance, naming_options():
         runs = sims.experiments.zeros_run(
             value_or(options.unknowns, "six"),
             len(seeds),
