@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
+import adcs
 from adcs.kalman.names import Filter, Noise, StartKind
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
@@ -33,17 +34,6 @@ def naming_options() -> Iterator[None]:
         if said is None:
             raise
         raise InputError(f"--{said[1].replace('_', '-')}: found {said[3]}, expected {said[2]}.") from None
-
-
-_ECLIPSE: dict[str, Any] = {
-    "sunlit": False,
-    "least_separation_deg": 0.0,
-    "least_field_nT": 0.0,
-    "eclipse_after_s": 600.0,
-}
-_ECLIPSE_DURATION_S = 3000.0
-# As in eclipse.toml: what is learnt in the Sun must last half an hour. Too small without the torque in the state.
-_ECLIPSE_NOISE = {"rate_rad_s": 1e-8, "gyro_bias_rad_s": 1e-9, "disturbance_s2": 1e-10}
 
 
 @Parameter(name="*")
@@ -128,10 +118,11 @@ class ScenarioOptions(EstimateOptions):
         if self.field_error_nT is not None:
             changes["disturbance"] = {"field_error_nT": self.field_error_nT}
         if self.eclipse:
-            changes["start"] = _ECLIPSE
+            eclipse = adcs.read_scenario("eclipse").tables
+            changes |= {key: eclipse[key] for key in ("start", "duration_s")}
+            # The noise of that file is too small without the torque in the state.
             if self.process_noise is None and "disturbance" in (_names(self.states) or []):
-                changes["estimate"]["process_noise"] = _ECLIPSE_NOISE
-            changes["duration_s"] = _ECLIPSE_DURATION_S
+                changes["estimate"]["process_noise"] = eclipse["estimate"]["process_noise"]
         if duration_s is not None:
             changes["duration_s"] = duration_s
         return changes

@@ -7,6 +7,7 @@ import json
 
 import pytest
 
+import sims.experiments
 from adcs.io.scenario_files import read_scenario
 from sims.experiments.paper_tables import PAPER_ROWS, printed
 from tests.adcs.refusals import assert_refused
@@ -74,9 +75,7 @@ class TestCommand:
         assert float(row["rms"]) == pytest.approx(float(row["ours"]), rel=0.4)
 
     def test_json_and_text(self, adcs, monkeypatch):
-        from sims.cli import tables
-
-        monkeypatch.setattr(tables, "PAPER_ROWS", PAPER_ROWS[-2:])
+        monkeypatch.setattr(sims.experiments, "PAPER_ROWS", PAPER_ROWS[-2:])
         outcome = adcs("tables", "--seeds", "1", "--duration", "60", "--json")
         assert outcome.status == 0
         rows = json.loads(outcome.out, parse_constant=refuse_constant)["rows"]
