@@ -408,7 +408,7 @@ def identify_stars(
     Parameters
     ----------
     catalogue : StarCatalogue
-        At the date of the images, of :func:`adcs.stars.files.read_star_catalogue` or :meth:`StarCatalogue.of`.
+        At the date of the images.
     camera : StarCamera
     frames : iterable of (array_like, array_like)
         Points (f, 2), y up, and magnitudes (f,) of each image; see :meth:`StarMatcher.identify`.
@@ -427,17 +427,7 @@ def identify_stars(
 
 
 def rotation_between(seen: FloatArray, there: FloatArray) -> FloatArray:
-    """Rotations of least squares with there ≈ R seen, by the singular values of Σ there seenᵀ (Kabsch).
-
-    Parameters
-    ----------
-    seen, there : ndarray, shape (..., k, 3)
-        Unit vectors, k ≥ 2.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-    """
+    """Rotations (..., 3, 3) of least squares of k ≥ 2 unit vectors (..., k, 3): there ≈ R seen, by SVD (Kabsch)."""
     U, _, Vt = np.linalg.svd(np.swapaxes(there, -1, -2) @ seen)
     sign = np.ones(U.shape[:-1])
     sign[..., 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
