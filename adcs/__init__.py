@@ -1,1 +1,23 @@
-"""Satellite attitude determination on the magnetic models of :mod:`magloc`."""
+"""Attitude of satellites and of anything else that turns: error-state Kalman, complementary and set-valued filters."""
+
+from arrays.io.lazy import lazy_names
+
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "AttitudeTrack": "adcs.satellite.attitude_track",
+        "Ellipsoid": "adcs.ellipsoids.ellipsoid",
+        "EllipsoidObserver": "adcs.ellipsoids.observer",
+        "EstimatorSettings": "adcs.kalman.bank",
+        "Satellite": "adcs.satellite.satellite",
+        "Telemetry": "adcs.satellite.telemetry",
+        "circular_orbit": "adcs.environment.orbit",
+        "complementary_filter": "adcs.complementary.filters",
+        "estimate": "adcs.kalman.bank",
+        "frames": ":adcs.frames",
+        "identify_stars": "adcs.stars.identification",
+        "mockup": ":adcs.mockup",
+        "read_scenario": "adcs.io.scenario_files",
+        "read_telemetry": "adcs.io.telemetry_files",
+    },
+)

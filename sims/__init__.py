@@ -1,15 +1,16 @@
-"""Truth and readings for :mod:`magloc` and :mod:`adcs`: uses their models, never their estimators."""
+"""Truth and readings for :mod:`magloc` and :mod:`adcs`, and estimators run on many of them."""
 
 from arrays.io.lazy import lazy_names
 
 __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
-        "Scenario": "sims.magnetics.scenario",
-        "Simulation": "sims.magnetics.simulation",
-        "built_in_scenarios": "sims.magnetics.scenario_files",
-        "read_scenario": "sims.magnetics.scenario_files",
-        "simulate": "sims.magnetics.simulation",
+        "AttitudeScenario": "sims.attitude.scenario",
+        "MagneticScenario": "sims.magnetics.scenario",
+        "experiments": ":sims.experiments",
+        "read_scenario": "sims.scenarios",
+        "run_many": "sims.montecarlo",
+        "simulate": "sims.scenarios",
         "write_simulation": "sims.magnetics.files",
     },
 )

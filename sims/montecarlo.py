@@ -9,6 +9,7 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
+from functools import partial
 from importlib.metadata import version
 from multiprocessing import get_context
 from typing import Any
@@ -16,21 +17,29 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from adcs.satellite.telemetry import Telemetry
 from arrays.typing import FloatArray
-from sims.magnetics.scenario import Scenario
-from sims.magnetics.simulation import Simulation, simulate
+from sims.attitude.scenario import AttitudeScenario
+from sims.attitude.simulation import AttitudeRuns
+from sims.magnetics.scenario import MagneticScenario
+from sims.magnetics.simulation import Simulation
+from sims.scenarios import simulate
 
-Result = Mapping[str, Any]
-Estimator = Callable[[Simulation], Result]
+Estimator = Callable[[Any, Any], Any]
+"""Of an array and its readings, or of a log and its satellite."""
+Judge = Callable[[Any, Any], Mapping[str, Any]]
+"""Of a simulation and what the estimator makes of its readings."""
 _RESERVED = ("seed", "error")
 _Outcome = dict[str, FloatArray] | str
+_Work = Callable[[int], _Outcome]
 
 
-def run(
-    scenario: Scenario,
+def run_many(
+    scenario: MagneticScenario | AttitudeScenario,
     estimator: Estimator,
-    seeds: Sequence[int],
     *,
+    seeds: Sequence[int],
+    judge: Judge | None = None,
     processes: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> xr.Dataset:
@@ -40,16 +49,19 @@ def run(
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : MagneticScenario or AttitudeScenario
     estimator : callable
-        Takes a :class:`sims.magnetics.simulation.Simulation` and returns a mapping of names to numbers, or to arrays of
-        numbers of the same shape for all seeds. With more than one process it must be a function of a module, or
-        something else that can be pickled.
+        Takes an array and its readings, or a :class:`adcs.Telemetry` and its :class:`adcs.Satellite`. What it returns
+        is kept as ``judge`` says.
     seeds : sequence of int
         Each once.
+    judge : callable, optional
+        Takes the simulation and what the estimator returned, and gives a mapping of names to numbers, or to arrays of
+        numbers of the same shape for all seeds. By default a mapping is kept as it is, of an attitude the angle from
+        the truth (``error_deg``), and of all else the numbers of ``result.consistency(truth)``, such as ``nees``.
     processes : int, optional
-        By default as many as there are processors, but no more than seeds. The result does not depend on it. One runs
-        in the calling process.
+        By default as many as there are processors, but no more than seeds, and one for what cannot be pickled, such as
+        a lambda. The result does not depend on it. One runs in the calling process.
     progress : callable, optional
         Called with 1 after every seed.
 
@@ -65,42 +77,46 @@ def run(
         There are no seeds or one comes twice, ``processes`` is not positive, or the estimator cannot be pickled.
     """
     numbers = [int(seed) for seed in seeds]
+    work = partial(_one, scenario, estimator, judge or against_truth)
     if not numbers or len(set(numbers)) < len(numbers):
         raise ValueError(f"Input seeds must be different numbers, one at least; instead received {numbers}.")
     if processes is None:
-        processes = min(os.cpu_count() or 1, len(numbers))
+        processes = min(os.cpu_count() or 1, len(numbers)) if _refusal_to_pickle(work) is None else 1
     if processes < 1:
         raise ValueError(f"Input processes must be positive; instead received {processes}.")
     finished = _in_turn if processes == 1 else _in_parallel
     outcomes: dict[int, _Outcome] = {}
-    with closing(finished(scenario, estimator, numbers, processes)) as pairs:
+    with closing(finished(work, numbers, processes)) as pairs:
         for seed, outcome in pairs:
             outcomes[seed] = outcome
             if progress is not None:
                 progress(1)
-    return _dataset(scenario, numbers, outcomes)
+    return _dataset(getattr(scenario, "name", "of a satellite"), numbers, outcomes)
 
 
-def _in_turn(
-    scenario: Scenario, estimator: Estimator, seeds: Sequence[int], processes: int
-) -> Generator[tuple[int, _Outcome], None, None]:
-    for seed in seeds:
-        yield seed, _one(scenario, estimator, seed)
-
-
-def _in_parallel(
-    scenario: Scenario, estimator: Estimator, seeds: Sequence[int], processes: int
-) -> Generator[tuple[int, _Outcome], None, None]:
+def _refusal_to_pickle(work: _Work) -> str | None:
     try:
-        pickle.dumps(estimator)
+        pickle.dumps(work)
     except (pickle.PicklingError, AttributeError, TypeError) as error:
+        return str(error)
+    return None
+
+
+def _in_turn(work: _Work, seeds: Sequence[int], processes: int) -> Generator[tuple[int, _Outcome], None, None]:
+    for seed in seeds:
+        yield seed, work(seed)
+
+
+def _in_parallel(work: _Work, seeds: Sequence[int], processes: int) -> Generator[tuple[int, _Outcome], None, None]:
+    refusal = _refusal_to_pickle(work)
+    if refusal is not None:
         raise ValueError(
-            f"Input estimator must be one that can be pickled, for more than one process; instead received {error}."
-        ) from None
+            f"Input estimator must be one that can be pickled, for more than one process; instead received {refusal}."
+        )
     # New interpreters: a fork of a process with threads, such as those of compiled code, may never come back.
     pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_prepare)
     try:
-        futures: dict[Future[_Outcome], int] = {pool.submit(_one, scenario, estimator, seed): seed for seed in seeds}
+        futures: dict[Future[_Outcome], int] = {pool.submit(work, seed): seed for seed in seeds}
         for future in as_completed(futures):
             try:
                 outcome = future.result()
@@ -121,10 +137,28 @@ def _prepare() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def _one(scenario: Scenario, estimator: Estimator, seed: int) -> _Outcome:
+def against_truth(simulation: Simulation | AttitudeRuns, result: Any) -> Mapping[str, Any]:
+    """What is kept of a result unless something else is asked for."""
+    if isinstance(result, Mapping):
+        return result
+    if isinstance(simulation, AttitudeRuns):
+        return {"error_deg": simulation.error_deg(result)}
+    found = result.consistency(simulation.truth)
+    names = [name for name in dir(found) if not name.startswith("_")]
+    values = {name: getattr(found, name) for name in names}
+    return {name: value for name, value in values.items() if isinstance(value, int | float | tuple | np.ndarray)}
+
+
+def _one(scenario: MagneticScenario | AttitudeScenario, estimator: Estimator, judge: Judge, seed: int) -> _Outcome:
     """Result of one seed, or why there is none."""
     try:
-        result = estimator(simulate(scenario, seed))
+        simulation = simulate(scenario, seed)
+        if isinstance(simulation, AttitudeRuns):
+            satellite = simulation.scenario.satellite
+            estimated = estimator(Telemetry.of(simulation, satellite.start), satellite)
+        else:
+            estimated = estimator(simulation.array, simulation.readings)
+        result = judge(simulation, estimated)
         values = {str(name): np.asarray(value, dtype=np.float64) for name, value in result.items()}
         for name in _RESERVED:
             if name in values:
@@ -134,7 +168,7 @@ def _one(scenario: Scenario, estimator: Estimator, seed: int) -> _Outcome:
     return values
 
 
-def _dataset(scenario: Scenario, seeds: Sequence[int], outcomes: Mapping[int, _Outcome]) -> xr.Dataset:
+def _dataset(name: str, seeds: Sequence[int], outcomes: Mapping[int, _Outcome]) -> xr.Dataset:
     shapes: dict[str, tuple[int, ...]] = {}
     errors = []
     for seed in seeds:
@@ -147,16 +181,16 @@ def _dataset(scenario: Scenario, seeds: Sequence[int], outcomes: Mapping[int, _O
         errors.append("" if found == shapes else f"ValueError: expected results of shapes {shapes}, found {found}")
     attributes = {
         "Conventions": "CF-1.10",
-        "title": f"Monte-Carlo runs of the scenario {scenario.name}",
+        "title": f"Monte-Carlo runs of the scenario {name}",
         "source": f"magloc {version('magloc')}",
-        "scenario": scenario.name,
+        "scenario": name,
     }
     variables: dict[str, Any] = {"error": ("seed", np.array(errors, dtype=np.str_), {"long_name": "what went wrong"})}
-    for name, shape in shapes.items():
+    for variable, shape in shapes.items():
         values = np.full((len(seeds), *shape), np.nan)
         for i, seed in enumerate(seeds):
             outcome = outcomes[seed]
             if not errors[i] and not isinstance(outcome, str):
-                values[i] = outcome[name]
-        variables[name] = (("seed", *(f"{name}_{axis}" for axis in range(len(shape)))), values)
+                values[i] = outcome[variable]
+        variables[variable] = (("seed", *(f"{variable}_{axis}" for axis in range(len(shape)))), values)
     return xr.Dataset(variables, coords={"seed": list(seeds)}, attrs=attributes)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from adcs.kalman.bank import Filter, Noise, StartKind
+import adcs
+from adcs.kalman.names import Filter, Noise, StartKind
 from arrays.io.arguments import Flag
+from arrays.io.errors import InputError
 from magloc.cli import framework
 
 
@@ -17,20 +22,51 @@ def print_note(text: str) -> None:
     framework.print_note(text, "adcs")
 
 
-_ECLIPSE: dict[str, Any] = {
-    "sunlit": False,
-    "least_separation_deg": 0.0,
-    "least_field_nT": 0.0,
-    "eclipse_after_s": 600.0,
-}
-_ECLIPSE_DURATION_S = 3000.0
-# As in eclipse.toml: what is learnt in the Sun must last half an hour. Too small without the torque in the state.
-_ECLIPSE_NOISE = {"rate_rad_s": 1e-8, "gyro_bias_rad_s": 1e-9, "disturbance_s2": 1e-10}
+@contextmanager
+def naming_options() -> Iterator[None]:
+    """Say of an option what the library says of the argument of that name."""
+    try:
+        yield
+    except InputError:
+        raise
+    except ValueError as error:
+        said = re.fullmatch(r"Input (\w+) must be (.*); instead received (.*)\.", str(error))
+        if said is None:
+            raise
+        raise InputError(f"--{said[1].replace('_', '-')}: found {said[3]}, expected {said[2]}.") from None
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
-class ScenarioOptions:
+class EstimateOptions:
+    """What replaces keys of the scenario file; by default nothing does.
+
+    Parameters
+    ----------
+    sensors : str
+        Sensors in use: any of st, gyro, mag and sun that observe attitude, in any order.
+    states : str
+        What is estimated besides attitude and rate: any of gyro-bias, field-bias and disturbance with commas, or none.
+    filter : str
+        As of `adcs run tabletsat`.
+    """
+
+    sensors: str | None = None
+    states: str | None = None
+    filter: Filter | None = None
+
+    @property
+    def estimate(self) -> dict[str, Any]:
+        """Keys of the table ``estimate``, and what replaces them."""
+        given = {"sensors": self.sensors, "states": _names(self.states), "filter": self.filter}
+        if self.sensors is not None and self.states is None:
+            given["states"] = []  # those of the file belong to its sensors
+        return {key: value for key, value in given.items() if value is not None}
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ScenarioOptions(EstimateOptions):
     """What replaces keys of the scenario file; by default nothing does.
 
     Parameters
@@ -60,9 +96,6 @@ class ScenarioOptions:
         The Jacobian of the paper, which takes the feedback of the control for dynamics.
     """
 
-    sensors: str | None = None
-    states: str | None = None
-    filter: Filter | None = None
     process_noise: Noise | None = None
     star_noise: Literal["angle", "paper"] | None = None
     field_error_nT: Annotated[float | None, Parameter(name="--field-error-nT")] = None
@@ -73,32 +106,30 @@ class ScenarioOptions:
 
     def changes(self, duration_s: float | None) -> dict[str, Any]:
         """Keys of the scenario file, and what replaces them."""
-        changes: dict[str, Any] = {}
-        states = None if self.states is None else _names(self.states)
         estimate = {
-            "sensors": self.sensors,
-            "states": states,
-            "filter": self.filter,
             "process_noise": self.process_noise,
             "start": self.start,
             "start_error_deg": self.start_error_deg,
             "closed_loop_F": self.closed_loop_F or None,
         }
-        if self.sensors is not None and self.states is None:
-            estimate["states"] = []  # those of the file belong to its sensors
-        changes["estimate"] = {key: value for key, value in estimate.items() if value is not None}
+        changes: dict[str, Any] = {
+            "estimate": self.estimate | {key: value for key, value in estimate.items() if value is not None}
+        }
         if self.field_error_nT is not None:
             changes["disturbance"] = {"field_error_nT": self.field_error_nT}
         if self.eclipse:
-            changes["start"] = _ECLIPSE
-            if self.process_noise is None and "disturbance" in (states or []):
-                changes["estimate"]["process_noise"] = _ECLIPSE_NOISE
-            changes["duration_s"] = _ECLIPSE_DURATION_S
+            eclipse = adcs.read_scenario("eclipse").tables
+            changes |= {key: eclipse[key] for key in ("start", "duration_s")}
+            # The noise of that file is too small without the torque in the state.
+            if self.process_noise is None and "disturbance" in (_names(self.states) or []):
+                changes["estimate"]["process_noise"] = eclipse["estimate"]["process_noise"]
         if duration_s is not None:
             changes["duration_s"] = duration_s
         return changes
 
 
-def _names(text: str) -> list[str]:
+def _names(text: str | None) -> list[str] | None:
+    if text is None:
+        return None
     names = [name.strip() for name in text.replace("+", ",").split(",")]
     return [name for name in names if name and name != "none"]

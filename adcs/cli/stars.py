@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+import adcs
 from arrays.io.arguments import Flag
+from arrays.io.errors import InputError
 from magloc.cli.framework import QuietOptions, print_json, progress
 
 if TYPE_CHECKING:
@@ -45,11 +50,7 @@ def stars(
     common : QuietOptions
         Common options.
     """
-    import math
-
     from adcs.stars.files import read_star_catalogue, read_star_frames
-    from adcs.stars.identification import StarMatcher
-    from arrays.io.errors import InputError
 
     if not 0.0 < noise_px < math.inf:
         raise InputError(f"--noise-px: found {noise_px:g}, expected a positive number.")
@@ -61,12 +62,9 @@ def stars(
             "beyond it, stars cannot be told apart."
         )
     known = read_star_catalogue(catalogue)
-    matcher = StarMatcher.of(known, camera, noise_px)
-    fixes: list[StarFix | NoFix] = []
+    frames_of = [(image.points_px, image.magnitudes) for image in images]
     with progress(len(images), "frames", quiet=common.quiet) as advance:
-        for image in images:
-            fixes.append(matcher.identify(image.points_px, image.magnitudes))
-            advance(1)
+        fixes = adcs.identify_stars(known, camera, frames_of, noise_px=noise_px, progress=advance)
     rows = [_row(known, image, fix) for image, fix in zip(images, fixes, strict=True)]
     totals = _totals(known, images, rows)
     if json:
@@ -79,8 +77,6 @@ def stars(
 
 def _row(catalogue: StarCatalogue, image: StarFrame, fix: StarFix | NoFix) -> dict[str, Any]:
     """What was found in one frame."""
-    import numpy as np
-
     from adcs.stars.files import NO_STAR
     from adcs.stars.identification import NoFix
 
@@ -101,8 +97,6 @@ def _row(catalogue: StarCatalogue, image: StarFrame, fix: StarFix | NoFix) -> di
 
 def _totals(catalogue: StarCatalogue, images: list[StarFrame], rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Counts over all frames, and rates where the true numbers are known."""
-    import numpy as np
-
     found = np.concatenate([row["hip"] for row in rows])
     totals: dict[str, Any] = {
         "fixes": sum(not row["reason"] for row in rows),

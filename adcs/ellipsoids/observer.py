@@ -4,7 +4,7 @@ r"""Guaranteed observer of a linear system whose disturbances and reading errors
 
 with known inputs u, disturbances w in an ellipsoid (or a segment, see :func:`adcs.ellipsoids.ellipsoid.segment_shape`)
 around zero, and :math:`|\xi_i| \le c_i`. :func:`predict` and :func:`correct` carry the ellipsoid that contains the
-state for certain, one run at a time; :class:`EllipsoidBatch` does the same for many runs, compiled.
+state for certain, one run at a time; :class:`EllipsoidObserver` does the same for many runs, compiled.
 
 A reading that contradicts the set shows that a bound was too small. Then the bound grows to the larger one of \|ν\| and
 1.5 times itself, and is kept; the set may be enlarged too. That repairs the compatibility, not the guarantee: a state
@@ -170,7 +170,7 @@ def correct(
     return Correction(ellipsoid, bounds, resets)
 
 
-class EllipsoidBatch:
+class EllipsoidObserver:
     """Observers of many runs of one system, compiled; :func:`predict` and :func:`correct` for every run.
 
     Parameters
@@ -179,6 +179,7 @@ class EllipsoidBatch:
     start : Ellipsoid
         Set of the first state.
     n_runs : int
+        By default one.
     rule : {'optimal', 'tightened', 'lemma'}
     reinflation : array_like, shape (n, n), optional
         See :func:`correct`.
@@ -202,7 +203,7 @@ class EllipsoidBatch:
         self,
         system: BoundedSystem,
         start: Ellipsoid,
-        n_runs: int,
+        n_runs: int = 1,
         *,
         rule: StepRule = "optimal",
         reinflation: ArrayLike | None = None,

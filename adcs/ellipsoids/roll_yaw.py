@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adcs.ellipsoids.ellipsoid import Ellipsoid, positive_bound, quadratic_form, segment_shape
-from adcs.ellipsoids.observer import BoundedSystem, EllipsoidBatch
+from adcs.ellipsoids.observer import BoundedSystem, EllipsoidObserver
 from adcs.ellipsoids.strip import StepRule
 from arrays.typing import FloatArray
 from magloc.kalman import predict_square_root, scalar_update
@@ -126,7 +126,7 @@ def constant_shift_system(noise_rad: float, drift_rad_s: float) -> tuple[Bounded
 
 def roll_yaw_observer(
     system: BoundedSystem, n_runs: int, rule: StepRule = "tightened", *, reinflation_rad: float | None = None
-) -> EllipsoidBatch:
+) -> EllipsoidObserver:
     """Observers of many runs.
 
     Parameters
@@ -142,11 +142,11 @@ def roll_yaw_observer(
 
     Returns
     -------
-    EllipsoidBatch
+    EllipsoidObserver
     """
     c = float(system.bounds[0])
     radius = 4.0 * c if reinflation_rad is None else reinflation_rad
-    return EllipsoidBatch(system, first_set(c), n_runs, rule=rule, reinflation=radius**2 * np.eye(2))
+    return EllipsoidObserver(system, first_set(c), n_runs, rule=rule, reinflation=radius**2 * np.eye(2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +179,7 @@ class SetTrack:
 class Recorder:
     """Keeps the sets of an observer, step by step."""
 
-    def __init__(self, observer: EllipsoidBatch, n_steps: int) -> None:
+    def __init__(self, observer: EllipsoidObserver, n_steps: int) -> None:
         n, shape = observer.system.n, (len(observer), n_steps + 1)
         self._observer, self._next = observer, 0
         self.track = SetTrack(
@@ -197,12 +197,12 @@ class Recorder:
         self._next = step + 1
 
 
-def observe(observer: EllipsoidBatch, readings_rad: FloatArray) -> SetTrack:
+def observe(observer: EllipsoidObserver, readings_rad: FloatArray) -> SetTrack:
     """Sets of many runs without known inputs: the dynamics of the error alone.
 
     Parameters
     ----------
-    observer : EllipsoidBatch
+    observer : EllipsoidObserver
         At its start; goes on to the end.
     readings_rad : ndarray, shape (n_runs, n_steps)
         Roll readings after every step, NaN where missing.
@@ -227,7 +227,7 @@ class AttitudeLoop:
 
     Parameters
     ----------
-    observer : EllipsoidBatch
+    observer : EllipsoidObserver
     n_steps : int
         Cycles at most.
     orbital_rate : float
@@ -241,7 +241,7 @@ class AttitudeLoop:
     KP = 0.0025
     KD = 0.07
 
-    def __init__(self, observer: EllipsoidBatch, n_steps: int, *, orbital_rate: float = ORBITAL_RATE) -> None:
+    def __init__(self, observer: EllipsoidObserver, n_steps: int, *, orbital_rate: float = ORBITAL_RATE) -> None:
         self._observer, self._rate = observer, orbital_rate
         self._input = input_matrix(orbital_rate)
         self.recorder = Recorder(observer, n_steps)

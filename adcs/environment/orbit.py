@@ -26,6 +26,11 @@ class Orbit(Protocol):
 
     def __hash__(self) -> int: ...
 
+    @property
+    def epoch(self) -> np.datetime64:
+        """UTC of the elements."""
+        ...
+
     def position_velocity_eci(self, utc: Instants) -> tuple[FloatArray, FloatArray]:
         """Position [m] and velocity [m/s] in eci, two arrays (..., 3), at instants of any shape (...)."""
         ...
@@ -93,6 +98,41 @@ class CircularOrbit:
         position = self.radius_m * (cosine * to_node + sine * across)
         velocity = self.radius_m * self.rate_rad_s * (cosine * across - sine * to_node)
         return position, velocity
+
+
+def circular_orbit(
+    *,
+    altitude_m: float,
+    inclination_deg: float,
+    epoch: Dates,
+    node_deg: float | None = None,
+    local_time_h: float | None = None,
+    latitude_argument_deg: float = 0.0,
+) -> CircularOrbit:
+    """Orbit on a circle around a point mass.
+
+    Parameters
+    ----------
+    altitude_m : float
+        Above the equatorial radius, 6378.137 km.
+    inclination_deg : float
+        To the equator of J2000.
+    epoch : datetime, datetime64 or str
+        UTC at which the satellite is at ``latitude_argument_deg`` from the ascending node.
+    node_deg, local_time_h : float, optional
+        Right ascension of the ascending node, by default 0; or mean solar time there at the epoch.
+    latitude_argument_deg : float
+
+    Raises
+    ------
+    ValueError
+        The node is given twice, the altitude is not positive, or a number is not finite.
+    """
+    if node_deg is not None and local_time_h is not None:
+        raise ValueError("Inputs node_deg and local_time_h must not both be given; instead received both.")
+    start: np.datetime64 = instants(epoch)[()]  # type: ignore[assignment]
+    node = math.radians(node_deg or 0.0) if local_time_h is None else node_of_local_time(local_time_h, start)
+    return CircularOrbit(altitude_m, math.radians(inclination_deg), node, start, math.radians(latitude_argument_deg))
 
 
 def node_of_local_time(local_time_h: float, date: Dates) -> float:

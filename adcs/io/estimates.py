@@ -1,63 +1,59 @@
-"""What is written of an estimate: columns with units."""
+"""What is written and printed of an attitude track: columns with units, and a summary."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from adcs.io.telemetry_files import TelemetryRecord
-    from adcs.kalman.error_state import Estimates
+from adcs.kalman.results import UNITS
+from adcs.satellite.attitude_track import AttitudeTrack
+
+_NAMES = {"st": ("star", 3), "gyro": ("gyro", 3), "mag": ("field", 3), "sun": ("sun", 2)}
+"""What files call a sensor's innovations, and how many numbers they have."""
+_WORDS = {
+    "attitude": ("attitude, 1σ", "°"),
+    "rate": ("rate", "°/s"),
+    "gyro-bias": ("bias of the gyro", "°/s"),
+    "field-bias": ("bias of the magnetometer", "nT"),
+    "disturbance": ("disturbing acceleration", "1/s²"),
+}
 
 
-def estimate_columns(record: TelemetryRecord, estimates: Estimates) -> dict[str, Any]:
-    """Columns of estimates.csv, at all instants.
-
-    Parameters
-    ----------
-    record : TelemetryRecord
-    estimates : Estimates
-
-    Returns
-    -------
-    dict of str to ndarray, shape (n,)
-        ``qw`` to ``qz`` is the attitude, orbital from body, ``eci_qw`` to ``eci_qz`` inertial from body.
-    """
-    from adcs import quaternion
-    from adcs.io.telemetry_files import orbital_from_eci
-    from adcs.kalman.results import STATE_COLUMNS, sigma_in_units
-
-    used = estimates.settings.sensors
-    q = estimates.q[0]
-    inertial = quaternion.multiply(quaternion.conjugate(orbital_from_eci(record.environment)[0]), q)
-    columns: dict[str, Any] = {"time_s": record.time_s}
-    columns |= dict(zip(("qw", "qx", "qy", "qz"), q.T, strict=True))
-    columns |= dict(zip(("eci_qw", "eci_qx", "eci_qy", "eci_qz"), inertial.T, strict=True))
-    values = values_in_units(estimates)[0].T
-    sigma = sigma_in_units(estimates)[0].T
-    there = [True, True, *(state in used.states for state in ("gyro-bias", "field-bias", "disturbance"))]
-    for i, name in enumerate(STATE_COLUMNS):
-        if there[i // 3]:
-            if i >= 3:
-                columns[name] = values[i]
-            columns[f"sigma_{name}"] = sigma[i]
-    for name, nis in zip(("star", "gyro", "field", "sun"), estimates.nis[0].T, strict=True):
+def estimate_columns(track: AttitudeTrack) -> dict[str, Any]:
+    """Columns (n,) of estimates.csv at the log's rows: ``qw`` is orbital from body, ``eci_qw`` inertial from body."""
+    columns: dict[str, Any] = {"time_s": track.time_s}
+    for prefix, q in (("", track.q_orbital), ("eci_", track.q)):
+        if q is not None:
+            columns |= dict(zip((f"{prefix}q{part}" for part in "wxyz"), q.T, strict=True))
+    for state, (column, scale) in UNITS.items():
+        for i, axis in enumerate("xyz"):
+            for prefix, values in (("", track.states), ("sigma_", track.sigma)):
+                if state in values:
+                    columns[prefix + column.format(axis)] = scale * values[state][:, i]
+    for sensor, nis in track.nis.items():
         if not np.isnan(nis).all():
-            columns[f"nis_{name}"] = nis
-    return columns
+            columns[f"nis_{_NAMES[sensor][0]}"] = nis
+    return {name: values[track.rows] for name, values in columns.items()}
 
 
-def values_in_units(estimates: Estimates) -> Any:
-    """Estimates (1, n, 15): attitude as rotation vector from the orbital frame [°], and the states in files' units."""
-    from adcs import quaternion
-
-    used = estimates.settings.sensors
-    parts = [
-        np.degrees(quaternion.log(estimates.q)),
-        np.degrees(estimates.w),
-        np.degrees(estimates.gyro_bias_rad_s) if used.gyro_bias else np.full_like(estimates.w, np.nan),
-        1e9 * estimates.field_bias_T if used.field_bias else np.full_like(estimates.w, np.nan),
-        estimates.disturbance_s2 if used.disturbance else np.full_like(estimates.w, np.nan),
-    ]
-    return np.concatenate(parts, axis=-1)
+def summary_lines(track: AttitudeTrack, columns: dict[str, Any]) -> list[str]:
+    """The result as text, of a track and its :func:`estimate_columns`: what is known at the end, how readings fit."""
+    lines = [f"{len(track.rows)} rows from {track.time_s[0]:g} to {track.time_s[-1]:g} s; {track.title}"]
+    q = ", ".join(f"{columns[name][-1]:.6f}" for name in ("qw", "qx", "qy", "qz"))
+    lines.append(f"attitude at the end, orbital from body (w, x, y, z)   {q}")
+    for state, (what, unit) in _WORDS.items():
+        names = [UNITS[state][0].format(axis) for axis in "xyz"]
+        if state not in track.sigma:
+            continue
+        sigma = max(float(columns[f"sigma_{name}"][-1]) for name in names)
+        if state in track.states:
+            values = ", ".join(f"{columns[name][-1]:.3g}" for name in names)
+            lines.append(f"{what:27s}{values} {unit} (1σ {sigma:.2g})")
+        else:
+            lines.append(f"{what:27s}{sigma:.2g} {unit}")
+    for name, numbers in _NAMES.values():
+        if f"nis_{name}" in columns:
+            nis = float(np.nanmean(columns[f"nis_{name}"])) / numbers
+            lines.append(f"NIS of {name} / {numbers} (1 is consistent){'':3s}{nis:.3g}")
+    return lines

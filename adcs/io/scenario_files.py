@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from adcs.environment.orbit import CircularOrbit, Orbit, Sgp4Orbit, node_of_local_time
+from adcs.environment.orbit import Orbit, Sgp4Orbit, circular_orbit
 from adcs.io.scenario_tables import (
     SENSOR_TABLES,
     DisturbanceTable,
@@ -27,10 +27,11 @@ from adcs.io.scenario_tables import (
     SatelliteTable,
     StartTable,
 )
-from adcs.kalman.bank import FILTERS, NOISES, STARTS, Estimate
+from adcs.kalman.bank import IMPLIED_STATES, EstimatorSettings
 from adcs.kalman.error_state import FilterSettings, ProcessNoise, SensorSet, paper_noise, sensor_set, tuned_noise
+from adcs.kalman.names import FILTERS, NOISES, STARTS
 from adcs.satellite.dynamics import RigidBody, WheelControl, wheel_control
-from adcs.satellite.sensors import Gyro, Magnetometer, StarTracker, SunSensor
+from adcs.satellite.satellite import Satellite
 from arrays.io.errors import InputError, naming
 from arrays.io.toml import BuiltIn, section_of
 from magloc.fields.geomagnetic import Model
@@ -50,17 +51,9 @@ class AttitudeFile:
         Of the file, for errors.
     tables : dict
         As read.
-    body : RigidBody
-    control : WheelControl
-    orbit : Orbit
-    start_utc : datetime64
-        Runs start within the 24 hours from here; a telemetry's ``time_s`` counts from here.
-    field_model : str
+    satellite : Satellite
+        Runs start within the 24 hours from its start.
     duration_s, step_s : float
-    star_tracker : StarTracker
-    gyro : Gyro
-    magnetometer : Magnetometer
-    sun_sensor : SunSensor
     start : StartTable
     disturbance : DisturbanceTable
     estimate : EstimateTable
@@ -69,25 +62,23 @@ class AttitudeFile:
     name: str
     path: str
     tables: dict[str, Any]
-    body: RigidBody
-    control: WheelControl
-    orbit: Orbit
-    start_utc: np.datetime64
-    field_model: Model
+    satellite: Satellite
     duration_s: float
     step_s: float
-    star_tracker: StarTracker
-    gyro: Gyro
-    magnetometer: Magnetometer
-    sun_sensor: SunSensor
     start: StartTable
     disturbance: DisturbanceTable
     estimate: EstimateTable
 
-    @property
-    def dt_s(self) -> float:
-        """Time between instants, as :class:`adcs.satellite.telemetry.Satellite` names it."""
-        return self.step_s
+    def changed(self, changes: dict[str, Any]) -> AttitudeFile:
+        """The scenario with some keys replaced; keys of a table in a table of the changes."""
+        tables = dict(self.tables)
+        for key, value in changes.items():
+            tables[key] = {**tables.get(key, {}), **value} if isinstance(value, dict) else value
+        return scenario_of(self.path, tables)
+
+    def estimator(self, place: str = "") -> EstimatorSettings:
+        """What the table ``estimate`` orders, checked; errors name a place, or the file."""
+        return _estimator(place or self.path, self.estimate)
 
 
 def built_in_text(name: str) -> str:
@@ -109,14 +100,6 @@ def read_scenario(name_or_path: str) -> AttitudeFile:
         The file cannot be read or does not describe a scenario; the text says where and why.
     """
     return scenario_of(*_FILES.read(name_or_path))
-
-
-def changed(file: AttitudeFile, changes: dict[str, Any]) -> AttitudeFile:
-    """The scenario with some keys replaced; keys of a table in a table of the changes."""
-    tables = dict(file.tables)
-    for key, value in changes.items():
-        tables[key] = {**tables.get(key, {}), **value} if isinstance(value, dict) else value
-    return scenario_of(file.path, tables)
 
 
 def scenario_text(file: AttitudeFile) -> str:
@@ -170,38 +153,24 @@ def scenario_of(path: str, tables: dict[str, Any]) -> AttitudeFile:
         name=Path(path).stem if file.name is None else file.name,
         path=path,
         tables=tables,
-        body=body,
-        control=control,
-        orbit=orbit,
-        start_utc=start_utc,
-        field_model=model,
+        satellite=Satellite(
+            inertia_kgm2=body.inertia_kgm2,
+            residual_dipole_Am2=body.residual_dipole_Am2,
+            control=control,
+            orbit=orbit,
+            start=start_utc,
+            field_model=model,
+            **sensors,
+        ),
         duration_s=file.duration_s,
         step_s=file.step_s,
-        **sensors,
         start=file.start,
         disturbance=file.disturbance,
         estimate=file.estimate,
     )
 
 
-def estimate_of(place: str, table: EstimateTable) -> Estimate:
-    """What a table orders, checked.
-
-    Parameters
-    ----------
-    place : str
-        Where it stands, for errors.
-    table : EstimateTable
-
-    Returns
-    -------
-    Estimate
-
-    Raises
-    ------
-    InputError
-        A name is unknown, the sensors cannot observe attitude, or the paper has no noise for them.
-    """
+def _estimator(place: str, table: EstimateTable) -> EstimatorSettings:
     for key, known in (("filter", FILTERS), ("start", STARTS)):
         if getattr(table, key) not in known:
             raise InputError(f"{place}, {key}: found {getattr(table, key)!r}, expected one of {', '.join(known)}.")
@@ -209,11 +178,10 @@ def estimate_of(place: str, table: EstimateTable) -> Estimate:
         raise InputError(f"{place}, forgetting: found {table.forgetting:g}, expected more than 0 and at most 1.")
     if table.closed_loop_F and table.filter != "mekf":
         raise InputError(f"{place}, closed_loop_F: found the filter {table.filter}, expected mekf.")
-    implied = {"parallel-disturbance": ["disturbance"], "reduced": ["gyro-bias"]}.get(table.filter, [])
-    states = [*table.states, *(state for state in implied if state not in table.states)]
+    states = [*table.states, *(state for state in IMPLIED_STATES.get(table.filter, ()) if state not in table.states)]
     with naming(place):
         used = sensor_set(table.sensors, states)
-        return Estimate(
+        return EstimatorSettings(
             settings=FilterSettings(
                 used,
                 _process_noise(place, table.process_noise, used),
@@ -265,17 +233,14 @@ def _orbit(place: str, section: OrbitTable) -> tuple[Orbit, np.datetime64, Model
     if section.elements is not None:
         with naming(f"{place}, key elements"):
             return Sgp4Orbit(*section.elements), start, section.field_model
-    if section.local_time_h is not None:
-        node = node_of_local_time(section.local_time_h, start)
-    else:
-        node = math.radians(section.node_deg or 0.0)
     with naming(place):
-        orbit = CircularOrbit(
-            1e3 * (section.altitude_km or 0.0),
-            math.radians(section.inclination_deg or 0.0),
-            node,
-            start,
-            math.radians(section.latitude_argument_deg),
+        orbit = circular_orbit(
+            altitude_m=1e3 * (section.altitude_km or 0.0),
+            inclination_deg=section.inclination_deg or 0.0,
+            epoch=start,
+            node_deg=section.node_deg,
+            local_time_h=section.local_time_h,
+            latitude_argument_deg=section.latitude_argument_deg,
         )
     return orbit, start, section.field_model
 

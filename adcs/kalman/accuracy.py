@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from adcs import quaternion
-from adcs.kalman.error_state import Estimates
+from adcs.kalman.error_state import AttitudeTracks
 from adcs.satellite.telemetry import TrueRecord
 from arrays.typing import FloatArray
 
@@ -15,7 +15,7 @@ DIVERGED_RAD = np.radians(10.0)
 """A run whose attitude is farther off than this in the last minute has diverged."""
 
 
-def errors(record: TrueRecord, estimates: Estimates) -> FloatArray:
+def errors(record: TrueRecord, estimates: AttitudeTracks) -> FloatArray:
     """Error state of truth against estimate, shape (runs, n, N)."""
     true = {
         "field-bias": (record.prepared.field_bias_T, estimates.field_bias_T),
@@ -27,7 +27,7 @@ def errors(record: TrueRecord, estimates: Estimates) -> FloatArray:
     return np.concatenate(parts, axis=-1)
 
 
-def normalised_error_squared(record: TrueRecord, estimates: Estimates) -> FloatArray:
+def normalised_error_squared(record: TrueRecord, estimates: AttitudeTracks) -> FloatArray:
     """NEES, shape (runs, n): χ² of N numbers where the filter is consistent."""
     error = errors(record, estimates)
     # States of mixed units: solve with the correlations.
@@ -37,18 +37,18 @@ def normalised_error_squared(record: TrueRecord, estimates: Estimates) -> FloatA
     return np.sum(scaled * np.linalg.solve(correlation, scaled[..., None])[..., 0], axis=-1)
 
 
-def axis_rms(record: TrueRecord, estimates: Estimates) -> FloatArray:
+def axis_rms(record: TrueRecord, estimates: AttitudeTracks) -> FloatArray:
     """Rms of every component of the error state over the last minute, shape (runs, N); δq is half of the angle."""
     return np.sqrt(np.mean(errors(record, estimates)[:, last_rows(record)] ** 2, axis=1))
 
 
-def evaluate(record: TrueRecord, estimates: Estimates) -> dict[str, float | int | None]:
+def evaluate(record: TrueRecord, estimates: AttitudeTracks) -> dict[str, float | int | None]:
     """Accuracy over the last minute: every axis' rms, its mean over the runs, and of these the worst axis.
 
     Parameters
     ----------
     record : TrueRecord
-    estimates : Estimates
+    estimates : AttitudeTracks
 
     Returns
     -------
@@ -78,9 +78,9 @@ def evaluate(record: TrueRecord, estimates: Estimates) -> dict[str, float | int 
 
 def last_rows(record: TrueRecord) -> slice:
     """Instants of the last minute."""
-    return slice(-max(1, round(LAST_S / record.scenario.dt_s)), None)
+    return slice(-max(1, round(LAST_S / record.dt_s)), None)
 
 
-def error_norm_deg(record: TrueRecord, estimates: Estimates) -> FloatArray:
+def error_norm_deg(record: TrueRecord, estimates: AttitudeTracks) -> FloatArray:
     """Length of the error's rotation vector, shape (runs, n) [°]."""
     return np.degrees(quaternion.angle_between(estimates.q, record.q))

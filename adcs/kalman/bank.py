@@ -2,76 +2,36 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from adcs.kalman.error_state import Estimates, Start
+from adcs import quaternion
+from adcs.kalman.constant_gain import run_constant_gain
+from adcs.kalman.diagnostics import warnings_of
+from adcs.kalman.error_state import AttitudeTracks, FilterSettings, Start, sensor_set, tuned_noise
+from adcs.kalman.gyro_driven import run_reduced
+from adcs.kalman.initialisation import any_start, first_told, vector_start
 from adcs.kalman.mekf import closed_loop_jacobian, run_filter, run_readable
-from adcs.satellite.telemetry import Record
+from adcs.kalman.names import FILTERS, Filter, StartKind
+from adcs.kalman.results import sigma_by_state
+from adcs.kalman.separate_bias import run_parallel
+from adcs.kalman.smoother import smoothed
+from adcs.satellite.attitude_track import AttitudeTrack
+from adcs.satellite.satellite import Satellite
+from adcs.satellite.sensors import SENSORS
+from adcs.satellite.telemetry import FilterRecord, Record, Telemetry, orbital_from_eci, part
 from arrays.io.errors import InputError, naming
 
-if TYPE_CHECKING:
-    pass
-from typing import Literal, get_args
-
-from adcs.kalman.error_state import FilterSettings
-
-
-def start_of(record: Record, estimate: Estimate) -> Start:
-    """Where the filter starts when it is told nothing: from the readings."""
-    from adcs.kalman.initialisation import any_start, vector_start
-
-    if estimate.start == "vectors":
-        return vector_start(record, estimate.settings)
-    return any_start(record, estimate.settings)
-
-
-def estimated(record: Record, estimate: Estimate, start: Start) -> Estimates:
-    """Estimates of the filter that is wanted.
-
-    Raises
-    ------
-    InputError
-        It cannot estimate from this record.
-    """
-    try:
-        with naming(f"filter {estimate.filter}"):
-            return _estimated(record, estimate, start)
-    except np.linalg.LinAlgError:
-        raise InputError(
-            f"filter {estimate.filter}: found a covariance that grows without end, expected a shorter duration or "
-            "another filter: a constant gain holds only near the geometry that it was computed for."
-        ) from None
-
-
-def _estimated(record: Record, estimate: Estimate, start: Start) -> Estimates:
-    settings = estimate.settings
-    if estimate.filter == "constant-gain":
-        from adcs.kalman.constant_gain import run_constant_gain
-
-        return run_constant_gain(record, settings, start)
-    if estimate.filter == "parallel-disturbance":
-        from adcs.kalman.separate_bias import run_parallel
-
-        return run_parallel(record, settings, start, forgetting=estimate.forgetting)
-    if estimate.filter == "reduced":
-        from adcs.kalman.gyro_driven import run_reduced
-
-        return run_reduced(record, settings, start)
-    if estimate.closed_loop_F:
-        return run_readable(record, settings, start, jacobian=closed_loop_jacobian)
-    estimates = run_filter(record, settings, start)
-    if estimate.filter == "smoother":
-        from adcs.kalman.smoother import smoothed
-
-        return smoothed(record, estimates)
-    return estimates
+IMPLIED_STATES = {"parallel-disturbance": ("disturbance",), "reduced": ("gyro-bias",)}
+"""What a filter estimates whether it is asked to or not."""
+_WORDS = dict(zip(SENSORS, ("star tracker", "gyro", "magnetometer", "Sun sensor"), strict=True))
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class EstimatorSettings:
     """What is estimated, from what, and how.
 
     Attributes
@@ -79,9 +39,9 @@ class Estimate:
     settings : FilterSettings
         Sensors, states and what the filter believes of their noise.
     filter : str
-        One of :data:`adcs.kalman.bank.FILTERS`.
+        One of :data:`adcs.kalman.names.FILTERS`.
     start : str
-        One of :data:`adcs.kalman.bank.STARTS`.
+        One of :data:`adcs.kalman.names.STARTS`, for simulations; :func:`estimate` starts from any attitude.
     start_attitude_rad, start_rate_rad_s : float
         Standard deviations per axis of what it starts from.
     forgetting : float
@@ -91,12 +51,20 @@ class Estimate:
     """
 
     settings: FilterSettings
-    filter: Filter
-    start: StartKind
-    start_attitude_rad: float
-    start_rate_rad_s: float
-    forgetting: float
-    closed_loop_F: bool
+    filter: Filter = "mekf"
+    start: StartKind = "any"
+    start_attitude_rad: float = math.radians(5.0)
+    start_rate_rad_s: float = math.radians(0.1)
+    forgetting: float = 0.99
+    closed_loop_F: bool = False
+
+    @classmethod
+    def of(cls, sensors: str, states: Iterable[str] = (), filter: Filter = "mekf") -> EstimatorSettings:
+        """Settings by names, with the process noise that we found."""
+        if filter not in FILTERS:
+            raise ValueError(f"Input filter must be one of {', '.join(FILTERS)}; instead received {filter!r}.")
+        used = sensor_set(sensors, dict.fromkeys((*states, *IMPLIED_STATES.get(filter, ()))))
+        return cls(FilterSettings(used, tuned_noise(used)), filter)
 
     @property
     def in_words(self) -> str:
@@ -106,9 +74,119 @@ class Estimate:
         return f"{used.sensors}{states}; filter {self.filter}"
 
 
-Filter = Literal["mekf", "constant-gain", "parallel-disturbance", "reduced", "smoother"]
-Noise = Literal["tuned", "paper"]
-FILTERS: tuple[str, ...] = get_args(Filter)
-NOISES: tuple[str, ...] = get_args(Noise)
-StartKind = Literal["near", "vectors", "any"]
-STARTS: tuple[str, ...] = get_args(StartKind)
+def estimate(
+    telemetry: Telemetry,
+    satellite: Satellite,
+    *,
+    sensors: str | EstimatorSettings,
+    states: Iterable[str] = (),
+    filter: Filter = "mekf",
+) -> AttitudeTrack:
+    """Attitude and rate of a satellite from its log, by an error-state Kalman filter.
+
+    Field and Sun are computed along the orbit. The filter starts from the first readings; where they leave a turn
+    open, from the turn that fits the readings of five minutes.
+
+    Parameters
+    ----------
+    telemetry : Telemetry
+    satellite : Satellite
+    sensors : str or EstimatorSettings
+        Sensors in use, ``st``, ``gyro``, ``mag`` and ``sun`` with + between them, such as ``"mag+sun+gyro"``; or
+        everything that a filter may be told, in place of states and filter too.
+    states : iterable of str
+        What is estimated besides attitude and rate: ``gyro-bias``, ``field-bias``, ``disturbance``.
+    filter : str
+        ``mekf``; with its converged gain (``constant-gain``); with a filter of the disturbance beside it
+        (``parallel-disturbance``); of attitude and gyro bias alone (``reduced``); with a smoother after it
+        (``smoother``).
+
+    Returns
+    -------
+    AttitudeTrack
+        Inertial from body.
+
+    Raises
+    ------
+    ValueError
+        The sensors cannot observe attitude or have no reading, a date is outside of the model of the field, or the
+        filter fails.
+    """
+    chosen = EstimatorSettings.of(sensors, states, filter) if isinstance(sensors, str) else sensors
+    used = chosen.settings.sensors
+    record = telemetry.record(satellite)
+    for name in used.sensors.split("+"):
+        if not record.readings.seen[name].any():
+            raise ValueError(
+                f"Input found no reading of the {_WORDS[name]}, expected some because the sensors in use are "
+                f"{used.sensors}."
+            )
+    first = first_told(record, used, with_gyro=chosen.filter == "reduced")
+    record = part(record, np.array([0]), slice(first, None))
+    tracks = estimated(record, chosen, any_start(record, chosen.settings))
+    if not np.isfinite(tracks.q).all():
+        raise ValueError("Input found readings that no attitude explains: the filter has failed.")
+    return _track(telemetry, first, record, chosen, tracks)
+
+
+def _track(
+    telemetry: Telemetry, first: int, record: FilterRecord, chosen: EstimatorSettings, tracks: AttitudeTracks
+) -> AttitudeTrack:
+    """The only run of some tracks, from an instant of its log on."""
+    used, q = chosen.settings.sensors, tracks.q[0]
+    optional = {
+        "gyro-bias": tracks.gyro_bias_rad_s,
+        "field-bias": tracks.field_bias_T,
+        "disturbance": tracks.disturbance_s2,
+    }
+    return AttitudeTrack(
+        title=chosen.in_words,
+        time_s=telemetry.instants_s[first:],
+        rows=telemetry.rows[telemetry.rows >= first] - first,
+        q=quaternion.multiply(quaternion.conjugate(orbital_from_eci(record.environment)[0]), q),
+        states={"rate": tracks.w[0]} | {state: optional[state][0] for state in used.states},
+        used=tuple(used.sensors.split("+")),
+        seen={name: seen[0] for name, seen in record.readings.seen.items()},
+        sigma={state: sigma[0] for state, sigma in sigma_by_state(tracks).items()},
+        nis=dict(zip(SENSORS, tracks.nis[0].T, strict=True)),
+        q_orbital=q,
+        warnings=warnings_of(record, tracks)[0],
+    )
+
+
+def start_of(record: Record, chosen: EstimatorSettings) -> Start:
+    """Where the filter starts when it is told nothing: from the readings."""
+    start = vector_start if chosen.start == "vectors" else any_start
+    return start(record, chosen.settings)
+
+
+def estimated(record: Record, chosen: EstimatorSettings, start: Start) -> AttitudeTracks:
+    """Tracks of the filter that is wanted.
+
+    Raises
+    ------
+    InputError
+        It cannot estimate from this record.
+    """
+    try:
+        with naming(f"filter {chosen.filter}"):
+            return _estimated(record, chosen, start)
+    except np.linalg.LinAlgError:
+        raise InputError(
+            f"filter {chosen.filter}: found a covariance that grows without end, expected a shorter duration or "
+            "another filter: a constant gain holds only near the geometry that it was computed for."
+        ) from None
+
+
+def _estimated(record: Record, chosen: EstimatorSettings, start: Start) -> AttitudeTracks:
+    settings = chosen.settings
+    if chosen.filter == "constant-gain":
+        return run_constant_gain(record, settings, start)
+    if chosen.filter == "parallel-disturbance":
+        return run_parallel(record, settings, start, forgetting=chosen.forgetting)
+    if chosen.filter == "reduced":
+        return run_reduced(record, settings, start)
+    if chosen.closed_loop_F:
+        return run_readable(record, settings, start, jacobian=closed_loop_jacobian)
+    tracks = run_filter(record, settings, start)
+    return smoothed(record, tracks) if chosen.filter == "smoother" else tracks

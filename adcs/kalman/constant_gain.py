@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from adcs.kalman.error_state import Estimates, FilterSettings, Start
+from adcs.kalman.error_state import AttitudeTracks, FilterSettings, Start
 from adcs.kalman.mekf import (
     check_start,
     collected,
@@ -54,7 +54,7 @@ def converged_gain(record: Record, settings: FilterSettings, start: Start, row: 
 
 def run_constant_gain(
     record: Record, settings: FilterSettings, start: Start, gain: FloatArray | None = None
-) -> Estimates:
+) -> AttitudeTracks:
     """Filter of whole runs with one gain.
 
     Parameters
@@ -67,7 +67,7 @@ def run_constant_gain(
 
     Returns
     -------
-    Estimates
+    AttitudeTracks
 
     Raises
     ------

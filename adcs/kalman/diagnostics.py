@@ -12,8 +12,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from adcs.environment.environment import Environment
-from adcs.kalman.error_state import SENSORS, Estimates, SensorSet
+from adcs.kalman.error_state import AttitudeTracks, SensorSet
 from adcs.kalman.mekf import deviations
+from adcs.satellite.sensors import SENSORS
 from adcs.satellite.telemetry import Record, is_read
 from arrays.typing import BoolArray
 
@@ -23,7 +24,7 @@ FALSE_ALARM = 1e-6
 """Probability with which readings that fit their model are called wrong."""
 
 
-def warnings_of(record: Record, estimates: Estimates) -> tuple[tuple[str, ...], ...]:
+def warnings_of(record: Record, estimates: AttitudeTracks) -> tuple[tuple[str, ...], ...]:
     """Sentences about every run, in the order of the list below; none where nothing is wrong.
 
     - eclipse, no star tracker reading (over-rate or blinded),
@@ -35,7 +36,7 @@ def warnings_of(record: Record, estimates: Estimates) -> tuple[tuple[str, ...], 
     Parameters
     ----------
     record : Record
-    estimates : Estimates
+    estimates : AttitudeTracks
 
     Returns
     -------
@@ -66,11 +67,11 @@ def _lost_sun(record: Record, used: SensorSet, run: int) -> list[str]:
     return sentences
 
 
-def _lost_stars(record: Record, estimates: Estimates, run: int) -> list[str]:
+def _lost_stars(record: Record, estimates: AttitudeTracks, run: int) -> list[str]:
     if not estimates.settings.sensors.star:
         return []
     missing = ~is_read(record.readings.star[run])
-    limit = record.scenario.star_tracker.rate_limit_rad_s
+    limit = record.satellite.star_tracker.rate_limit_rad_s
     fast = missing & (np.linalg.norm(estimates.w[run], axis=-1) > limit)
     sentences = []
     if fast.any():
@@ -109,7 +110,7 @@ def _one_vector(record: Record, used: SensorSet, run: int) -> list[str]:
     return [f"one direction and a gyro for {_seconds(alone, record)}: {cannot}, the error accumulates"]
 
 
-def _field_model(record: Record, estimates: Estimates, run: int) -> list[str]:
+def _field_model(record: Record, estimates: AttitudeTracks, run: int) -> list[str]:
     """Compare what does not depend on the attitude: the field's modulus, and its angle with the Sun."""
     settings = estimates.settings
     used = settings.sensors
@@ -141,7 +142,7 @@ def _field_model(record: Record, estimates: Estimates, run: int) -> list[str]:
     ]
 
 
-def _innovations(estimates: Estimates, run: int) -> list[str]:
+def _innovations(estimates: AttitudeTracks, run: int) -> list[str]:
     """Compare the sum of NIS over the second half of the run, after the start, with its χ²."""
     nis = estimates.nis[run, estimates.nis.shape[1] // 2 :]
     # Noise of the direction to the Sun has two components.
@@ -154,4 +155,4 @@ def _innovations(estimates: Estimates, run: int) -> list[str]:
 
 
 def _seconds(rows: BoolArray, record: Record) -> str:
-    return f"{rows.sum() * record.scenario.dt_s:.0f} s"
+    return f"{rows.sum() * record.dt_s:.0f} s"

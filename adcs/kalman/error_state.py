@@ -31,9 +31,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from adcs.satellite.sensors import SENSORS
 from arrays.typing import FloatArray
 
-SENSORS = ("st", "gyro", "mag", "sun")
 STATES = ("field-bias", "gyro-bias", "disturbance")
 """Optional states in the order of the error state."""
 ALWAYS = 6
@@ -372,7 +372,7 @@ class State:
 
 
 @dataclass(frozen=True, eq=False)
-class Estimates:
+class AttitudeTracks:
     """Estimates at the n instants of some runs.
 
     Attributes

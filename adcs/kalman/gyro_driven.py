@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from adcs import quaternion
-from adcs.kalman.error_state import Estimates, FilterSettings, Start, State
+from adcs.kalman.error_state import AttitudeTracks, FilterSettings, Start, State
 from adcs.kalman.mekf import check_start, collected, joseph_update, nis_of, stacked_residuals
 from adcs.quaternion import cross_matrix
 from adcs.satellite.dynamics import relative_rate
@@ -26,7 +26,7 @@ from adcs.satellite.telemetry import Record, is_read
 from arrays.typing import FloatArray
 
 
-def run_reduced(record: Record, settings: FilterSettings, start: Start) -> Estimates:
+def run_reduced(record: Record, settings: FilterSettings, start: Start) -> AttitudeTracks:
     """Reduced filter of whole runs.
 
     Parameters
@@ -40,7 +40,7 @@ def run_reduced(record: Record, settings: FilterSettings, start: Start) -> Estim
 
     Returns
     -------
-    Estimates
+    AttitudeTracks
         Of the set (δq, δω, δΔω): δω is minus the error of the bias, with the gyro's noise.
 
     Raises
@@ -56,7 +56,7 @@ def run_reduced(record: Record, settings: FilterSettings, start: Start) -> Estim
         )
     check_start(record, start)
     rates = _filled(record.readings.gyro_rad_s)
-    h, gyro_rad_s = record.scenario.dt_s, record.scenario.gyro.sigma_rad_s
+    h, gyro_rad_s = record.dt_s, record.satellite.gyro.sigma_rad_s
     runs, n = rates.shape[:2]
     Q = np.diag(
         np.repeat([settings.noise.attitude**2 + (0.5 * gyro_rad_s * h) ** 2, settings.noise.gyro_bias_rad_s**2], 3)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adcs import quaternion
-from adcs.kalman.error_state import FilterSettings, Start
+from adcs.kalman.error_state import FilterSettings, SensorSet, Start
 from adcs.kalman.mekf import deviations, run_filter
 from adcs.quaternion import cross_matrix, rotate_back
 from adcs.satellite.dynamics import absolute_rate
@@ -87,6 +87,16 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
     return Start(quaternion.normalised(q), w, covariance)
 
 
+def first_told(record: Record, used: SensorSet, *, with_gyro: bool) -> int:
+    """First instant of a record's first run that tells something of the attitude; with a reading of the gyro or not."""
+    seen = {name: there[0] for name, there in record.readings.seen.items()}
+    told = np.any([seen[name] for name in used.sensors.split("+") if name != "gyro"], axis=0)
+    rows = np.flatnonzero(told & seen["gyro"] if with_gyro else told)
+    if not rows.size:
+        raise ValueError(f"Input found no reading that tells the attitude, expected one of {used.sensors}.")
+    return int(rows[0])
+
+
 def largest_deviation_rad(start: Start) -> FloatArray:
     """Largest standard deviation of an axis of every start's attitude, as an angle, shape (runs,)."""
     return 2.0 * np.sqrt(np.linalg.eigvalsh(start.covariance[:, :3, :3])[:, -1])
@@ -130,7 +140,7 @@ def any_start(
     variances, axes = np.linalg.eigh(start.covariance[open_runs, :3, :3])
     if (2.0 * np.sqrt(variances[:, 1]) > KNOWN_RAD).any():
         raise ValueError("Input record must have a direction at the first instant of every run; one has none.")
-    n = 1 + round(min(window_s / record.scenario.dt_s, record.momentum_Nms.shape[1] - 1))
+    n = 1 + round(min(window_s / record.dt_s, record.momentum_Nms.shape[1] - 1))
     spacing = 2.0 * math.pi / turns
     angles = spacing * np.arange(turns)
     repeated = np.repeat(open_runs, turns)

@@ -6,14 +6,14 @@ Use::
     settings = FilterSettings(used, tuned_noise(used))
     q, w = start_estimates(runs.prepared, math.radians(5), math.radians(0.1))   # sims, or adcs.kalman.initialisation
     start = start_near(q, w, math.radians(5), math.radians(0.1))
-    estimates = run_filter(runs, settings, start)                   # Estimates: compiled, all runs at once
+    estimates = run_filter(runs, settings, start)                   # AttitudeTracks: compiled, all runs at once
     numbers = evaluate(runs, estimates)                             # adcs.kalman.accuracy: the keys of `adcs run
     --json`
 
     run_readable(record, settings, start, jacobian=..., update=...) # adcs.kalman.mekf: the reference twin
-    smoothed(record, estimates)                                     # adcs.kalman.smoother -> Estimates
-    run_constant_gain(record, settings, start)                      # adcs.kalman.constant_gain -> Estimates
-    run_parallel(record, settings, start, forgetting=0.99)          # adcs.kalman.separate_bias -> Estimates
+    smoothed(record, estimates)                                     # adcs.kalman.smoother -> AttitudeTracks
+    run_constant_gain(record, settings, start)                      # adcs.kalman.constant_gain -> AttitudeTracks
+    run_parallel(record, settings, start, forgetting=0.99)          # adcs.kalman.separate_bias -> AttitudeTracks
     vector_start(record, settings), any_start(record, settings)     # adcs.kalman.initialisation -> Start
     warnings_of(record, estimates)                                  # adcs.kalman.diagnostics -> tuple of str for every
     run
@@ -55,9 +55,10 @@ from dataclasses import replace
 import numpy as np
 
 from adcs import quaternion
-from adcs.kalman.error_state import ALWAYS, SENSORS, Estimates, FilterSettings, SensorSet, Start, State
+from adcs.kalman.error_state import ALWAYS, AttitudeTracks, FilterSettings, SensorSet, Start, State
 from adcs.quaternion import cross_matrix, rotate_back
 from adcs.satellite import dynamics
+from adcs.satellite.sensors import SENSORS
 from adcs.satellite.telemetry import Record, is_read
 from arrays.typing import FloatArray
 from magloc.kalman import sequential_update, symmetric_square_root
@@ -85,7 +86,7 @@ def known_torque_jacobian(record: Record, row: int, q: FloatArray, w: FloatArray
     """
     around = record.environment
     return dynamics.error_jacobian(
-        record.scenario.body, q, w, record.momentum_Nms[:, row], around.gravity_s2[:, row], around.b_orbital_T[:, row]
+        record.satellite.body, q, w, record.momentum_Nms[:, row], around.gravity_s2[:, row], around.b_orbital_T[:, row]
     )
 
 
@@ -94,9 +95,9 @@ def closed_loop_jacobian(record: Record, row: int, q: FloatArray, w: FloatArray)
 
     See :func:`adcs.satellite.dynamics.closed_loop_error_jacobian`.
     """
-    scenario = record.scenario
+    satellite = record.satellite
     return dynamics.closed_loop_error_jacobian(
-        scenario.body, scenario.control, q, w, quaternion.IDENTITY, record.environment.gravity_s2[:, row]
+        satellite.body, satellite.control, q, w, quaternion.IDENTITY, record.environment.gravity_s2[:, row]
     )
 
 
@@ -114,18 +115,18 @@ def transition(F: FloatArray, used: SensorSet, dt_s: float) -> FloatArray:
 
 def moved(record: Record, row: int, state: State) -> tuple[FloatArray, FloatArray]:
     """Attitude and rate (runs, 4), (runs, 3) one step after instant ``row``, by the equations of motion."""
-    scenario, around = record.scenario, record.environment
+    satellite, around = record.satellite, record.environment
     q, w, _ = dynamics.step(
-        scenario.body,
+        satellite.body,
         state.q,
         state.w,
         record.momentum_Nms[:, row],
         record.wheel_torque_Nm[:, row],
-        state.disturbance_s2 @ scenario.body.inertia_kgm2,
+        state.disturbance_s2 @ satellite.body.inertia_kgm2,
         around.orbital_rate_rad_s[:, row],
         around.gravity_s2[:, row],
         around.b_orbital_T[:, row],
-        scenario.dt_s,
+        record.dt_s,
     )
     return q, w
 
@@ -136,14 +137,14 @@ def predicted(
     """State one step after instant ``row`` before its readings, and Φ (runs, N, N)."""
     q, w = moved(record, row, state)
     F = 0.5 * (jacobian(record, row, state.q, state.w) + jacobian(record, row + 1, q, w))
-    Phi = transition(F, settings.sensors, record.scenario.dt_s)
+    Phi = transition(F, settings.sensors, record.dt_s)
     P = Phi @ state.P @ Phi.mT + np.diag(settings.process_variance)
     return replace(state, q=q, w=w, P=0.5 * (P + P.mT)), Phi
 
 
 def deviations(record: Record, settings: FilterSettings) -> FloatArray:
     """Noise of one component of the readings of star tracker, gyro, magnetometer and Sun sensor, shape (4,)."""
-    satellite = record.scenario
+    satellite = record.satellite
     return np.array(
         [
             satellite.star_tracker.sigma_rad,
@@ -283,7 +284,7 @@ def run_readable(
     start: Start,
     jacobian: Jacobian = known_torque_jacobian,
     update: Update = joseph_update,
-) -> Estimates:
+) -> AttitudeTracks:
     """Filter of whole runs in NumPy, the reference of :func:`run_filter`.
 
     Parameters
@@ -298,7 +299,7 @@ def run_readable(
 
     Returns
     -------
-    Estimates
+    AttitudeTracks
     """
     check_start(record, start)
     state, nis = corrected(record, 0, first_state(settings, start), settings, update)
@@ -311,13 +312,13 @@ def run_readable(
     return collected(settings, states, np.stack(innovations, axis=1))
 
 
-def collected(settings: FilterSettings, states: list[State], nis: FloatArray) -> Estimates:
+def collected(settings: FilterSettings, states: list[State], nis: FloatArray) -> AttitudeTracks:
     """Estimates of the states of all instants."""
 
     def all_of(values: Callable[[State], FloatArray]) -> FloatArray:
         return np.stack([values(state) for state in states], axis=1)
 
-    return Estimates(
+    return AttitudeTracks(
         settings,
         all_of(lambda state: state.q),
         all_of(lambda state: state.w),
@@ -338,7 +339,7 @@ def check_start(record: Record, start: Start) -> None:
             raise ValueError(f"Input start.{name} must be finite with shape {shape}; instead received {values.shape}.")
 
 
-def run_filter(record: Record, settings: FilterSettings, start: Start) -> Estimates:
+def run_filter(record: Record, settings: FilterSettings, start: Start) -> AttitudeTracks:
     """Filter of whole runs, compiled; runs are shared out among the threads of numba.
 
     Parameters
@@ -351,7 +352,7 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Estima
 
     Returns
     -------
-    Estimates
+    AttitudeTracks
 
     Raises
     ------
@@ -362,7 +363,8 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Estima
     from magloc.compilation import over_rows
 
     check_start(record, start)
-    used, first, around, body = settings.sensors, first_state(settings, start), record.environment, record.scenario.body
+    used, first = settings.sensors, first_state(settings, start)
+    around, body = record.environment, record.satellite.body
     runs, n = record.momentum_Nms.shape[:2]
     q, w, optional = np.empty((runs, n, 4)), np.empty((runs, n, 3)), np.zeros((3, runs, n, 3))
     covariance, nis = np.empty((runs, n, used.size, used.size)), np.full((runs, n, len(SENSORS)), np.nan)
@@ -399,6 +401,6 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Estima
         deviations(record, settings),
         np.array([used.first_of("field-bias"), used.first_of("gyro-bias"), used.first_of("disturbance")]),
         settings.process_variance,
-        record.scenario.dt_s,
+        record.dt_s,
     )
-    return Estimates(settings, q, w, optional[0], optional[1], optional[2], covariance, nis)
+    return AttitudeTracks(settings, q, w, optional[0], optional[1], optional[2], covariance, nis)

@@ -2,49 +2,32 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
-from adcs.kalman.error_state import SENSORS, Estimates, SensorSet
-from adcs.satellite.telemetry import Record
-
-if TYPE_CHECKING:
-    pass
+from adcs.kalman.error_state import AttitudeTracks
 from arrays.typing import FloatArray
 
-STATE_COLUMNS = tuple(
-    f"{name}_{axis}_{unit}"
-    for name, unit in (
-        ("attitude", "deg"),
-        ("rate", "deg_s"),
-        ("gyro_bias", "deg_s"),
-        ("field_bias", "nT"),
-        ("disturbance", "s2"),
-    )
-    for axis in "xyz"
-)
-_SENSOR_WORDS = dict(zip(SENSORS, ("no star tracker", "no gyro", "no magnetometer", "no Sun sensor"), strict=True))
+UNITS = {
+    "attitude": ("attitude_{}_deg", np.degrees(1.0)),
+    "rate": ("rate_{}_deg_s", np.degrees(1.0)),
+    "gyro-bias": ("gyro_bias_{}_deg_s", np.degrees(1.0)),
+    "field-bias": ("field_bias_{}_nT", 1e9),
+    "disturbance": ("disturbance_{}_s2", 1.0),
+}
+"""Column of each state, with its axis left open, and what makes its unit of the SI's."""
+STATE_COLUMNS = tuple(column.format(axis) for column, _ in UNITS.values() for axis in "xyz")
 
 
-def sigma_in_units(estimates: Estimates) -> FloatArray:
-    """Standard deviations (runs, n, 15) in the units of :data:`STATE_COLUMNS`; NaN of a state that is not there."""
-    sigma, used = estimates.sigma, estimates.settings.sensors
-    values = np.full((*sigma.shape[:2], 15), np.nan)
-    values[..., :3] = np.degrees(2.0 * sigma[..., :3])
-    values[..., 3:6] = np.degrees(sigma[..., 3:6])
-    scales = {"gyro-bias": np.degrees(1.0), "field-bias": 1e9, "disturbance": 1.0}
-    for place, (state, scale) in enumerate(scales.items(), start=2):
-        first = used.first_of(state)
-        if first >= 0:
-            values[..., 3 * place : 3 * place + 3] = scale * sigma[..., first : first + 3]
-    return values
+def sigma_by_state(tracks: AttitudeTracks) -> dict[str, FloatArray]:
+    """Standard deviations (runs, n, 3) of the states that there are; that of the attitude is of the angle."""
+    sigma, used = tracks.sigma, tracks.settings.sensors
+    first = {"attitude": 0, "rate": 3} | {state: used.first_of(state) for state in used.states}
+    return {state: (2.0 if i == 0 else 1.0) * sigma[..., i : i + 3] for state, i in first.items()}
 
 
-def sensor_gaps(record: Record, used: SensorSet, run: int = 0) -> list[tuple[str, NDArray[np.bool_]]]:
-    """Sensors in use that have no reading at times, in words, and where they have."""
-    readings = record.readings
-    values = dict(zip(SENSORS, (readings.star, readings.gyro_rad_s, readings.field_T, readings.sun), strict=True))
-    there = {name: ~np.isnan(values[name][run, :, 0]) for name in used.sensors.split("+")}
-    return [(_SENSOR_WORDS[name], seen) for name, seen in there.items() if not seen.all()]
+def in_units(states: Mapping[str, FloatArray]) -> FloatArray:
+    """States (..., 3) as (..., 15) in the order and units of :data:`STATE_COLUMNS`; NaN of one that is not there."""
+    missing = np.full_like(next(iter(states.values())), np.nan)
+    return np.concatenate([scale * states.get(state, missing) for state, (_, scale) in UNITS.items()], axis=-1)

@@ -27,7 +27,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from adcs.kalman.error_state import Estimates, FilterSettings, Start
+from adcs.kalman.error_state import AttitudeTracks, FilterSettings, Start
 from adcs.kalman.mekf import check_start, collected, first_state, nis_of, predicted, stacked_residuals, with_error
 from adcs.satellite.telemetry import Record
 from arrays.typing import FloatArray
@@ -51,7 +51,7 @@ def run_parallel(
     start: Start,
     forgetting: float = 0.99,
     correction: Correction = by_sensitivity,
-) -> Estimates:
+) -> AttitudeTracks:
     """Filter of whole runs with a parallel filter of the disturbance.
 
     Parameters
@@ -67,7 +67,7 @@ def run_parallel(
 
     Returns
     -------
-    Estimates
+    AttitudeTracks
         Of the set with the disturbance; its covariance is that of the whole.
 
     Raises
@@ -83,7 +83,7 @@ def run_parallel(
     inner = replace(settings, sensors=replace(settings.sensors, disturbance=False))
     state = first_state(inner, start)
     runs, n = record.momentum_Nms.shape[:2]
-    size, h = inner.sensors.size, record.scenario.dt_s
+    size, h = inner.sensors.size, record.dt_s
     B = np.concatenate([h * h / 4.0 * np.eye(3), h * np.eye(3), np.zeros((size - 6, 3))])
     S = np.zeros((runs, size, 3))
     P_d = np.tile(settings.disturbance_sigma_s2**2 * np.eye(3), (runs, 1, 1))

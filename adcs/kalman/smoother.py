@@ -17,26 +17,26 @@ from dataclasses import replace
 import numpy as np
 
 from adcs import quaternion
-from adcs.kalman.error_state import Estimates, SensorSet, State
+from adcs.kalman.error_state import AttitudeTracks, SensorSet, State
 from adcs.kalman.mekf import Jacobian, collected, known_torque_jacobian, predicted, with_error
 from adcs.satellite.telemetry import Record
 from arrays.typing import FloatArray
 
 
-def smoothed(record: Record, estimates: Estimates, jacobian: Jacobian = known_torque_jacobian) -> Estimates:
+def smoothed(record: Record, estimates: AttitudeTracks, jacobian: Jacobian = known_torque_jacobian) -> AttitudeTracks:
     """Smoothed estimates of whole runs.
 
     Parameters
     ----------
     record : Record
-    estimates : Estimates
+    estimates : AttitudeTracks
         Of :func:`adcs.kalman.mekf.run_filter`, or of its readable twin.
     jacobian : callable
         That of the filter.
 
     Returns
     -------
-    Estimates
+    AttitudeTracks
         ``nis`` is that of the filter.
     """
     settings, n = estimates.settings, estimates.q.shape[1]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,11 +11,15 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy.special import chdtri
 
+from adcs import quaternion
+from adcs.kalman.results import in_units
+from adcs.satellite.attitude_track import AttitudeTrack
+from adcs.satellite.sensors import SENSORS
+from arrays.typing import BoolArray, FloatArray
 from magloc.plots import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-from arrays.typing import BoolArray, FloatArray
 
 GROUPS = (
     ("attitude", "°"),
@@ -56,6 +60,24 @@ class StatesPicture:
     sigma: FloatArray
     are_errors: bool
     gaps: Sequence[tuple[str, BoolArray]] = ()
+
+
+_MISSING = dict(zip(SENSORS, ("no star tracker", "no gyro", "no magnetometer", "no Sun sensor"), strict=True))
+
+
+def sensor_gaps(seen: Mapping[str, BoolArray], used: Iterable[str]) -> list[tuple[str, BoolArray]]:
+    """Sensors in use that have no reading at times, in words, and where they have."""
+    return [(_MISSING.get(name, f"no {name}"), seen[name]) for name in used if not seen[name].all()]
+
+
+def track_figure(track: AttitudeTrack, name: str = "") -> Figure:
+    """States of a track; the attitude is a rotation vector from the orbital frame, or from that of its vectors."""
+    attitude = quaternion.log(track.q if track.q_orbital is None else track.q_orbital)
+    values = in_units({"attitude": attitude} | dict(track.states))
+    sigma = in_units(track.sigma) if track.sigma else np.full_like(values, np.nan)
+    gaps = sensor_gaps(track.seen, track.used)
+    title = f"{name}: {track.title}" if name else track.title
+    return states_figure(StatesPicture(title, track.time_s, values, sigma, are_errors=False, gaps=gaps))
 
 
 def states_figure(picture: StatesPicture) -> Figure:
@@ -181,6 +203,12 @@ def consistency_figure(picture: ConsistencyPicture) -> Figure:
             ax.set_xlabel("")
     style.headline(figure, picture.title)
     return figure
+
+
+def nis_figure(track: AttitudeTrack, name: str) -> Figure:
+    """Innovations of every sensor of a track."""
+    nis = np.stack(list(track.nis.values()), axis=-1)[None]
+    return consistency_figure(ConsistencyPicture(f"{name}: {track.title}", track.time_s, None, None, None, 0, nis))
 
 
 def _errors(ax: Axes, time_s: FloatArray, error_deg: FloatArray, sigma_deg: FloatArray | None) -> None:

@@ -39,6 +39,9 @@ FIVE_HEADS: FloatArray = np.array(
 )
 """Axes of Sun heads on ±x, ±y and z, which points to the zenith in the orbital frame."""
 
+SENSORS = ("st", "gyro", "mag", "sun")
+"""Names of star tracker, gyro, magnetometer and Sun sensor, in the order in which filters take them."""
+
 
 def _aligned() -> FloatArray:
     return np.zeros(3)

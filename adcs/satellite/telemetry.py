@@ -1,49 +1,62 @@
 """What the filters of attitude are given: readings, wheels and surroundings of some runs at once.
 
-These are protocols: :class:`sims.attitude.simulation.AttitudeRuns` is a :class:`TrueRecord`, and a log of telemetry is
-a :class:`Record` without the truth. The leading axis of all arrays is the run, the second the instant.
+:class:`sims.attitude.simulation.AttitudeRuns` is a :class:`TrueRecord`, and a log, :class:`Telemetry`, gives a
+:class:`Record` without the truth. The leading axis of all arrays is the run, the second the instant.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol
+import math
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from adcs.environment.environment import Environment
+from adcs import quaternion
+from adcs.environment.environment import Environment, environment
 from adcs.satellite.dynamics import RigidBody, WheelControl
-from adcs.satellite.sensors import Gyro, Magnetometer, StarTracker, SunSensor
+from adcs.satellite.satellite import Satellite
+from adcs.satellite.sensors import SENSORS, Gyro, Magnetometer, StarTracker, SunSensor
 from arrays.typing import BoolArray, FloatArray
 
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
-class Readings(Protocol):
-    """What the sensors report, in body axes; NaN where there is no reading."""
+_STEP_TOLERANCE = 1e-3
+MOST_INSTANTS = 500_000
+"""Of a log, with those of its gaps."""
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """What the sensors report at the instants of some runs, in body axes; NaN where there is no reading.
+
+    Attributes
+    ----------
+    star : ndarray, shape (runs, n, 4)
+        Attitude, orbital from body, scalar first; sign as it comes.
+    gyro_rad_s : ndarray, shape (runs, n, 3)
+        Rate against inertial space.
+    field_T : ndarray, shape (runs, n, 3)
+    sun : ndarray, shape (runs, n, 3)
+        Unit vector to the Sun.
+    """
+
+    star: FloatArray
+    gyro_rad_s: FloatArray
+    field_T: FloatArray
+    sun: FloatArray
 
     @property
-    def star(self) -> FloatArray:
-        """Attitude, orbital from body, shape (runs, n, 4)."""
-        ...
-
-    @property
-    def gyro_rad_s(self) -> FloatArray:
-        """Rate against inertial space, shape (runs, n, 3)."""
-        ...
-
-    @property
-    def field_T(self) -> FloatArray:
-        """Field, shape (runs, n, 3)."""
-        ...
-
-    @property
-    def sun(self) -> FloatArray:
-        """Unit vector to the Sun, shape (runs, n, 3)."""
-        ...
+    def seen(self) -> dict[str, BoolArray]:
+        """Whether there is a reading, shape (runs, n), by the sensor's name: st, gyro, mag, sun."""
+        values = (self.star, self.gyro_rad_s, self.field_T, self.sun)
+        return dict(zip(SENSORS, map(is_read, values), strict=True))
 
 
-class Satellite(Protocol):
-    """The satellite and its sensors, as its user believes them to be, and the time between its instants."""
+class KnownSatellite(Protocol):
+    """The satellite and its sensors, as its user believes them to be."""
 
     @property
     def body(self) -> RigidBody:
@@ -53,11 +66,6 @@ class Satellite(Protocol):
     @property
     def control(self) -> WheelControl:
         """Wheel control, which only the F of the source paper needs."""
-        ...
-
-    @property
-    def dt_s(self) -> float:
-        """Time between instants."""
         ...
 
     @property
@@ -88,8 +96,13 @@ class Record(Protocol):
     """
 
     @property
-    def scenario(self) -> Satellite:
+    def satellite(self) -> KnownSatellite:
         """Satellite and sensors."""
+        ...
+
+    @property
+    def dt_s(self) -> float:
+        """Time between instants."""
         ...
 
     @property
@@ -157,59 +170,187 @@ def is_read(values: FloatArray) -> BoolArray:
 
 
 @dataclass(frozen=True, eq=False)
-class PartReadings:
-    """Readings of a part of a record, see :class:`Readings`."""
+class FilterRecord:
+    """A log, or some runs and instants of a record; see :class:`Record`."""
 
-    star: FloatArray
-    gyro_rad_s: FloatArray
-    field_T: FloatArray
-    sun: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """Some runs and instants of a record, see :class:`Record`."""
-
-    scenario: Satellite
+    satellite: KnownSatellite
+    dt_s: float
     environment: Environment
-    readings: PartReadings
+    readings: Readings
     momentum_Nms: FloatArray
     wheel_torque_Nm: FloatArray
 
 
-def part(record: Record, runs: NDArray[np.intp], rows: slice = slice(None)) -> Part:
-    """Some runs of a record, each as often as its index comes, and instants that follow one another.
-
-    Parameters
-    ----------
-    record : Record
-    runs : ndarray of int, shape (m,)
-    rows : slice
-        All instants, unless given.
-
-    Returns
-    -------
-    Part
-        Of m runs.
-    """
+def part(record: Record, runs: NDArray[np.intp], rows: slice = slice(None)) -> FilterRecord:
+    """Some runs of a record, each as often as its index comes, and instants that follow one another."""
     around, readings = record.environment, record.readings
     of_runs = {
-        name: getattr(around, name)[runs, rows]
-        for name in (
-            "utc",
-            "position_eci_m",
-            "velocity_eci_m_s",
-            "b_orbital_T",
-            "sun_orbital",
-            "illuminated",
-            "orbital_rate_rad_s",
-            "gravity_s2",
-        )
+        field.name: getattr(around, field.name)[runs, rows] for field in fields(around) if field.name != "time_s"
     }
-    return Part(
-        record.scenario,
+    return FilterRecord(
+        record.satellite,
+        record.dt_s,
         Environment(time_s=around.time_s[rows], **of_runs),
-        PartReadings(*(getattr(readings, name)[runs, rows] for name in ("star", "gyro_rad_s", "field_T", "sun"))),
+        Readings(*(getattr(readings, field.name)[runs, rows] for field in fields(readings))),
         record.momentum_Nms[runs, rows],
         record.wheel_torque_Nm[runs, rows],
     )
+
+
+@dataclass(frozen=True, eq=False, init=False)
+class Telemetry:
+    """Log of a satellite's attitude sensors, in body axes; a value that is missing is NaN, a sensor None.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n,)
+        Since :attr:`adcs.Satellite.start`, ascending in whole multiples of the step; rows may be missing.
+    star : Rotation, or ndarray, shape (n, 4)
+        Star tracker: inertial (J2000) from body. As quaternions with the scalar last where some are missing.
+    gyro_rad_s : ndarray, shape (n, 3)
+        Rate against inertial space.
+    field_T : ndarray, shape (n, 3)
+        Magnetometer.
+    sun : ndarray, shape (n, 3)
+        Direction to the Sun, of any length.
+    wheels_Nms : ndarray, shape (n, 3)
+        Momentum of all wheels together; straight lines go through what is missing.
+    step_s : float
+        Time between instants; by default the shortest between two rows.
+
+    Raises
+    ------
+    ValueError
+        A shape does not match, a direction has no length, or the times are no ascending multiples of the step.
+    """
+
+    time_s: FloatArray
+    star: FloatArray
+    gyro_rad_s: FloatArray
+    field_T: FloatArray
+    sun: FloatArray
+    wheels_Nms: FloatArray
+    step_s: float
+
+    def __init__(
+        self,
+        time_s: ArrayLike,
+        *,
+        star: Rotation | ArrayLike | None = None,
+        gyro_rad_s: ArrayLike | None = None,
+        field_T: ArrayLike | None = None,
+        sun: ArrayLike | None = None,
+        wheels_Nms: ArrayLike | None = None,
+        step_s: float | None = None,
+    ) -> None:
+        times = np.array(time_s, dtype=np.float64)
+        if times.ndim != 1 or not times.size or not np.isfinite(times).all():
+            raise ValueError(f"Input time_s must be finite with shape (n,); instead received shape {times.shape}.")
+        if step_s is None:
+            step_s = float(np.diff(times).min()) if len(times) > 1 else 1.0
+        if not 0.0 < step_s < math.inf:
+            raise ValueError(f"Input step_s must be positive and finite; instead received {step_s}.")
+        rows, off, back = steps_of(times, step_s)
+        if (off | back).any():
+            raise ValueError(
+                f"Input time_s must ascend in multiples of step_s = {step_s:g} s; instead received "
+                f"{times[off | back][0]:g}."
+            )
+        if rows[-1] >= MOST_INSTANTS:
+            raise ValueError(f"Input time_s must have fewer than {MOST_INSTANTS} steps; instead received {rows[-1]}.")
+        quaternions = star if star is None or not hasattr(star, "as_quat") else np.atleast_2d(star.as_quat())
+        given = {"star": quaternions, "gyro_rad_s": gyro_rad_s, "field_T": field_T, "sun": sun}
+        checked = {name: _columns(name, values, len(times)) for name, values in given.items()}
+        checked["wheels_Nms"] = _columns("wheels_Nms", wheels_Nms, len(times))
+        for name, value in ({"time_s": times, "step_s": step_s} | checked).items():
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def of(cls, record: Record, start: np.datetime64, run: int = 0) -> Telemetry:
+        """Log that a run of a record would have written, its time counted from ``start``."""
+        around, readings = record.environment, record.readings
+        eci_from_orbital = quaternion.conjugate(orbital_from_eci(around)[run])
+        return cls(
+            (around.utc[run] - start).astype(np.float64) / 1e6,
+            star=quaternion.multiply(eci_from_orbital, readings.star[run])[:, [1, 2, 3, 0]],
+            gyro_rad_s=readings.gyro_rad_s[run],
+            field_T=readings.field_T[run],
+            sun=readings.sun[run],
+            wheels_Nms=record.momentum_Nms[run],
+            step_s=record.dt_s,
+        )
+
+    @property
+    def rows(self) -> NDArray[np.int64]:
+        """Instant of every row, counted in steps from the first."""
+        return steps_of(self.time_s, self.step_s)[0]
+
+    def record(self, satellite: Satellite) -> FilterRecord:
+        """What the filters are given: readings at every instant, field and Sun along the satellite's orbit."""
+        rows, step_s = self.rows, self.step_s
+        n = int(rows[-1]) + 1
+        start_s = self.time_s[0]
+
+        def spread(values: FloatArray) -> FloatArray:
+            """Values at all instants, NaN in gaps."""
+            all_of = np.full((n, values.shape[1]), np.nan)
+            all_of[rows] = values
+            return all_of
+
+        around = environment(
+            satellite.orbit,
+            np.array([satellite.start + np.timedelta64(round(1e6 * start_s), "us")]),
+            self.instants_s - start_s,
+            model=satellite.field_model,
+        )
+        momentum = _through_gaps(spread(self.wheels_Nms))
+        torque = np.zeros_like(momentum)
+        torque[:-1] = np.diff(momentum, axis=0) / step_s
+        star, sun = spread(self.star[:, [3, 0, 1, 2]]), spread(self.sun)
+        readings = Readings(
+            star=quaternion.multiply(orbital_from_eci(around)[0], quaternion.normalised(star))[None],
+            gyro_rad_s=spread(self.gyro_rad_s)[None],
+            field_T=spread(self.field_T)[None],
+            sun=(sun / np.linalg.norm(sun, axis=1, keepdims=True))[None],
+        )
+        return FilterRecord(satellite, step_s, around, readings, momentum[None], torque[None])
+
+    @property
+    def instants_s(self) -> FloatArray:
+        """Time of every instant, with those of missing rows."""
+        return self.time_s[0] + self.step_s * np.arange(int(self.rows[-1]) + 1)
+
+
+def _columns(name: str, given: ArrayLike | None, n: int) -> FloatArray:
+    """Readings of a sensor, NaN where one of their numbers is missing."""
+    shape = (n, 4 if name == "star" else 3)
+    values = np.full(shape, np.nan) if given is None else np.array(given, dtype=np.float64)
+    if values.shape != shape or np.isinf(values).any():
+        raise ValueError(f"Input {name} must have shape {shape} and no infinity; instead received {values.shape}.")
+    if name in ("star", "sun") and (values == 0.0).all(axis=1).any():
+        raise ValueError(f"Input {name} must have a direction; instead received a reading of length 0.")
+    return np.where(np.isnan(values).any(axis=1, keepdims=True), np.nan, values)
+
+
+def steps_of(time_s: FloatArray, step_s: float) -> tuple[NDArray[np.int64], BoolArray, BoolArray]:
+    """Steps (n,) since the first time, which times are no multiple of the step, and which do not ascend."""
+    steps = (time_s - time_s[0]) / step_s
+    rows = np.round(steps).astype(np.int64)
+    return rows, np.abs(steps - rows) > _STEP_TOLERANCE, np.diff(rows, prepend=-1) <= 0
+
+
+def _through_gaps(momentum: FloatArray) -> FloatArray:
+    """Momentum at all instants: straight lines through gaps, zero where there is none at all."""
+    known = np.flatnonzero(~np.isnan(momentum[:, 0]))
+    if not known.size:
+        return np.zeros_like(momentum)
+    return np.stack([np.interp(np.arange(len(momentum)), known, column[known]) for column in momentum.T], axis=1)
+
+
+def orbital_from_eci(around: Environment) -> FloatArray:
+    """Attitude of the inertial frame in the orbital one, shape (runs, n, 4)."""
+    from scipy.spatial.transform import Rotation
+
+    matrices = around.R_orbital_from_eci
+    rotations = Rotation.from_matrix(matrices.reshape(-1, 3, 3))
+    return quaternion.from_rotation(rotations).reshape(*matrices.shape[:-2], 4)

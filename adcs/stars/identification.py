@@ -18,6 +18,7 @@ of the sky towards the camera (east is to the left of north).
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -394,18 +395,39 @@ class StarMatcher:
         return (chance + math.log(hypotheses)) / math.log(10.0)
 
 
-def rotation_between(seen: FloatArray, there: FloatArray) -> FloatArray:
-    """Rotations of least squares with there ≈ R seen, by the singular values of Σ there seenᵀ (Kabsch).
+def identify_stars(
+    catalogue: StarCatalogue,
+    camera: StarCamera,
+    frames: Iterable[tuple[ArrayLike, ArrayLike]],
+    *,
+    noise_px: float = 1.0,
+    progress: Callable[[int], None] | None = None,
+) -> list[StarFix | NoFix]:
+    """Attitude and stars of images, without knowing where the camera looked.
 
     Parameters
     ----------
-    seen, there : ndarray, shape (..., k, 3)
-        Unit vectors, k ≥ 2.
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
+    catalogue : StarCatalogue
+        At the date of the images.
+    camera : StarCamera
+    frames : iterable of (array_like, array_like)
+        Points (f, 2), y up, and magnitudes (f,) of each image; see :meth:`StarMatcher.identify`.
+    noise_px : float
+        Standard deviation of a star's place, per axis.
+    progress : callable, optional
+        Called with 1 after every image.
     """
+    matcher = StarMatcher.of(catalogue, camera, noise_px)
+    fixes = []
+    for points_px, magnitudes in frames:
+        fixes.append(matcher.identify(points_px, magnitudes))
+        if progress is not None:
+            progress(1)
+    return fixes
+
+
+def rotation_between(seen: FloatArray, there: FloatArray) -> FloatArray:
+    """Rotations (..., 3, 3) of least squares of k ≥ 2 unit vectors (..., k, 3): there ≈ R seen, by SVD (Kabsch)."""
     U, _, Vt = np.linalg.svd(np.swapaxes(there, -1, -2) @ seen)
     sign = np.ones(U.shape[:-1])
     sign[..., 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))

@@ -7,10 +7,11 @@ from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
-from magloc.chi_square import FALSE_ALARM, Detector
+from magloc.chi_square import Detector
 from magloc.detection.dipole_filter import DipoleFilter
 from magloc.detection.matched_filter import MatchedFilterDetector
 from magloc.directions import moments_on_sphere, sphere_directions
+from magloc.levels import FALSE_ALARM
 
 # Ratio of neighbouring distances of the search: the energy is a power of the distance to 1e-5 between two of them.
 _STEP = 1.03

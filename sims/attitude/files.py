@@ -26,13 +26,13 @@ def simulation_of(file: AttitudeFile) -> AttitudeScenario:
     InputError
         The file describes what cannot be simulated.
     """
-    start, disturbance = file.start, file.disturbance
+    satellite, start, disturbance = file.satellite, file.start, file.disturbance
     with naming(file.path):
         return AttitudeScenario(
-            body=file.body,
-            control=file.control,
-            orbit=file.orbit,
-            day=file.start_utc,
+            body=satellite.body,
+            control=satellite.control,
+            orbit=satellite.orbit,
+            day=satellite.start,
             conditions=StartConditions(
                 sunlit=start.sunlit,
                 least_separation_rad=math.radians(start.least_separation_deg),
@@ -42,10 +42,10 @@ def simulation_of(file: AttitudeFile) -> AttitudeScenario:
             ),
             duration_s=file.duration_s,
             dt_s=file.step_s,
-            star_tracker=file.star_tracker,
-            gyro=file.gyro,
-            magnetometer=file.magnetometer,
-            sun_sensor=file.sun_sensor,
+            star_tracker=satellite.star_tracker,
+            gyro=satellite.gyro,
+            magnetometer=satellite.magnetometer,
+            sun_sensor=satellite.sun_sensor,
             torque_Nm=disturbance.torque_Nm,
             torque_period_s=disturbance.torque_period_s,
             gyro_bias_rad_s=math.radians(disturbance.gyro_bias_deg_s),
@@ -53,5 +53,5 @@ def simulation_of(file: AttitudeFile) -> AttitudeScenario:
             field_error_T=1e-9 * disturbance.field_error_nT,
             start_attitude_rad=math.radians(start.attitude_deg),
             start_rate_rad_s=math.radians(start.rate_deg_s),
-            field_model=file.field_model,
+            field_model=satellite.field_model,
         )

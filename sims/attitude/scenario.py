@@ -9,6 +9,7 @@ import numpy as np
 
 from adcs.environment.orbit import CircularOrbit, Orbit, node_of_local_time
 from adcs.satellite.dynamics import RigidBody, WheelControl, wheel_control
+from adcs.satellite.satellite import Satellite
 from adcs.satellite.sensors import Gyro, Magnetometer, StarTracker, SunSensor
 from magloc.fields.geomagnetic import Model
 
@@ -114,6 +115,22 @@ class AttitudeScenario:
         ):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"Input {name} must be 0 or more and finite; instead received {getattr(self, name)}.")
+
+    @property
+    def satellite(self) -> Satellite:
+        """What its user knows of it; a log's time counts from the day on."""
+        return Satellite(
+            inertia_kgm2=self.body.inertia_kgm2,
+            residual_dipole_Am2=self.body.residual_dipole_Am2,
+            orbit=self.orbit,
+            star_tracker=self.star_tracker,
+            gyro=self.gyro,
+            magnetometer=self.magnetometer,
+            sun_sensor=self.sun_sensor,
+            control=self.control,
+            start=self.day,
+            field_model=self.field_model,
+        )
 
     @property
     def n_instants(self) -> int:

@@ -17,52 +17,14 @@ from adcs import quaternion
 from adcs.environment.environment import Environment, environment
 from adcs.environment.orbit import EARTH_RADIUS_M
 from adcs.satellite import dynamics, sensors
-from arrays.typing import BoolArray, FloatArray
+from adcs.satellite.attitude_track import AttitudeTrack
+from adcs.satellite.telemetry import Readings, orbital_from_eci
+from arrays.typing import FloatArray
 from sims.attitude.scenario import AttitudeScenario
 from sims.attitude.starts import starts
 from sims.noise import stream
 
 State = tuple[FloatArray, FloatArray, FloatArray]
-
-
-@dataclass(frozen=True, eq=False)
-class Readings:
-    """What the sensors report at the instants of some runs, in body axes; NaN where there is no reading.
-
-    Attributes
-    ----------
-    star : ndarray, shape (runs, n, 4)
-        Attitude, orbital from body, scalar first; sign as it comes.
-    gyro_rad_s : ndarray, shape (runs, n, 3)
-    field_T : ndarray, shape (runs, n, 3)
-    sun : ndarray, shape (runs, n, 3)
-        Unit vector.
-    """
-
-    star: FloatArray
-    gyro_rad_s: FloatArray
-    field_T: FloatArray
-    sun: FloatArray
-
-    @property
-    def has_star(self) -> BoolArray:
-        """Whether there is an attitude, shape (runs, n)."""
-        return ~np.isnan(self.star[..., 0])
-
-    @property
-    def has_gyro(self) -> BoolArray:
-        """Whether there is a rate, shape (runs, n)."""
-        return ~np.isnan(self.gyro_rad_s[..., 0])
-
-    @property
-    def has_field(self) -> BoolArray:
-        """Whether there is a field, shape (runs, n)."""
-        return ~np.isnan(self.field_T[..., 0])
-
-    @property
-    def has_sun(self) -> BoolArray:
-        """Whether there is a direction to the Sun, shape (runs, n)."""
-        return ~np.isnan(self.sun[..., 0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,6 +90,24 @@ class AttitudeRuns:
     def scenario(self) -> AttitudeScenario:
         """What was simulated."""
         return self.prepared.scenario
+
+    def error_deg(self, track: AttitudeTrack) -> FloatArray:
+        """Angle between the first run's truth and a track of its log, shape (n,) [°]; NaN before the track begins."""
+        eci_from_orbital = quaternion.conjugate(orbital_from_eci(self.environment)[0])
+        true = quaternion.multiply(eci_from_orbital, self.q[0])[-len(track) :]
+        error = np.full(self.q.shape[1], np.nan)
+        error[-len(track) :] = np.degrees(quaternion.angle_between(track.q, true))
+        return error
+
+    @property
+    def satellite(self) -> AttitudeScenario:
+        """The satellite and its sensors, as the filters know them."""
+        return self.prepared.scenario
+
+    @property
+    def dt_s(self) -> float:
+        """Between instants."""
+        return self.prepared.scenario.dt_s
 
     @property
     def environment(self) -> Environment:

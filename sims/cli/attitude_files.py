@@ -10,20 +10,21 @@ import numpy as np
 
 from adcs.io.scenario_files import AttitudeFile, scenario_text
 from adcs.io.telemetry_files import telemetry_columns
-from adcs.kalman.bank import Estimate
-from adcs.kalman.error_state import SENSORS
+from adcs.kalman.bank import EstimatorSettings
+from adcs.satellite.sensors import SENSORS
+from adcs.satellite.telemetry import Telemetry
 from arrays.io.csv import write_columns
 from arrays.io.text import write_text
 from sims.experiments.attitude import Outcome, Part, errors_in_units
 
 if TYPE_CHECKING:
     import xarray as xr
-from adcs.kalman.results import STATE_COLUMNS, sensor_gaps, sigma_in_units
+from adcs.kalman.results import STATE_COLUMNS, in_units, sigma_by_state
 from arrays.typing import FloatArray
 
 
 def write_attitude_files(
-    out: Path, file: AttitudeFile, estimate: Estimate, parts: Sequence[Part], outcome: Outcome
+    out: Path, file: AttitudeFile, estimate: EstimatorSettings, parts: Sequence[Part], outcome: Outcome
 ) -> list[str]:
     """Write everything of some runs into a folder.
 
@@ -32,7 +33,7 @@ def write_attitude_files(
     out : Path
         The folder.
     file : AttitudeFile
-    estimate : Estimate
+    estimate : EstimatorSettings
     parts : sequence of Part
         All runs.
     outcome : Outcome
@@ -42,16 +43,17 @@ def write_attitude_files(
     list of str
         Names of the files.
     """
-    from adcs.plots.attitude import ConsistencyPicture, StatesPicture, consistency_figure, states_figure
+    from adcs.plots.attitude import ConsistencyPicture, StatesPicture, consistency_figure, sensor_gaps, states_figure
     from magloc.plots import style
 
     first = parts[0]
     time_s, name = first.runs.time_s, file.name
     # Truth minus estimate is what the filter's state is; an error is estimate minus truth.
     errors = -errors_in_units(first)[0]
-    sigma = sigma_in_units(first.estimates)[0]
+    sigma = in_units(sigma_by_state(first.estimates))[0]
     title = f"{name}: {estimate.in_words}"
-    gaps = sensor_gaps(first.runs, estimate.settings.sensors)
+    seen = {name: there[0] for name, there in first.runs.readings.seen.items()}
+    gaps = sensor_gaps(seen, estimate.settings.sensors.sensors.split("+"))
     seed = int(outcome.seeds[0])
     picture = StatesPicture(f"{title}; seed {seed}", time_s, errors, sigma, are_errors=True, gaps=gaps)
     style.save(states_figure(picture), out / f"{name}-errors.png")
@@ -70,8 +72,9 @@ def write_attitude_files(
     write_columns(columns, out / f"{name}.csv")
     write_columns(_runs_table(outcome), out / f"{name}-runs.csv")
     dataset_of(parts, estimate, title).to_netcdf(out / f"{name}.nc")
-    write_columns(telemetry_columns(first.runs, file), out / "telemetry.csv")
-    write_columns(_truth_columns(first, file), out / "truth.csv")
+    log = Telemetry.of(first.runs, file.satellite.start)
+    write_columns(telemetry_columns(log), out / "telemetry.csv")
+    write_columns(_truth_columns(first, log.time_s), out / "truth.csv")
     write_text(scenario_text(file), out / "scenario.toml")
     return [
         *(f"{name}{ending}" for ending in ("-errors.png", "-consistency.png", ".csv", "-runs.csv", ".nc")),
@@ -93,10 +96,10 @@ def _runs_table(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def _truth_columns(part: Part, file: AttitudeFile) -> dict[str, Any]:
+def _truth_columns(part: Part, time_s: FloatArray) -> dict[str, Any]:
     """What the estimates of the telemetry may be compared with."""
     runs = part.runs
-    columns: dict[str, Any] = {"time_s": telemetry_columns(runs, file)["time_s"]}
+    columns: dict[str, Any] = {"time_s": time_s}
     groups = (
         (["qw", "qx", "qy", "qz"], runs.q[0]),
         ([f"rate_{axis}_deg_s" for axis in "xyz"], np.degrees(runs.w[0])),
@@ -109,13 +112,13 @@ def _truth_columns(part: Part, file: AttitudeFile) -> dict[str, Any]:
     return columns
 
 
-def dataset_of(parts: Sequence[Part], estimate: Estimate, title: str) -> xr.Dataset:
+def dataset_of(parts: Sequence[Part], estimate: EstimatorSettings, title: str) -> xr.Dataset:
     """Truth and estimates of all runs.
 
     Parameters
     ----------
     parts : sequence of Part
-    estimate : Estimate
+    estimate : EstimatorSettings
     title : str
 
     Returns

@@ -10,15 +10,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from cyclopts import Parameter
 
+import sims.experiments
 from adcs.cli.options import ScenarioOptions, print_note
-from adcs.io.scenario_files import AttitudeFile
-from adcs.kalman.bank import FILTERS, Estimate
+from adcs.kalman.names import FILTERS
 from arrays.io.arguments import Flag
+from arrays.io.csv import write_columns
 from arrays.io.errors import InputError
+from arrays.io.outputs import make_folder, refuse_file
 from magloc.cli.framework import QuietOptions, print_json, progress
 from sims.cli.run_tabletsat import RunOptions, wanted
 
 if TYPE_CHECKING:
+    from adcs.io.scenario_files import AttitudeFile
+    from adcs.kalman.bank import EstimatorSettings
     from sims.experiments.attitude import Outcome
 from arrays.typing import FloatArray
 
@@ -66,12 +70,12 @@ class Row:
     Attributes
     ----------
     file : AttitudeFile
-    estimate : Estimate
+    estimate : EstimatorSettings
     outcome : Outcome
     """
 
     file: AttitudeFile
-    estimate: Estimate
+    estimate: EstimatorSettings
     outcome: Outcome
 
     def report(self) -> dict[str, Any]:
@@ -112,9 +116,6 @@ def compare(
     common : QuietOptions
         Common options.
     """
-    from arrays.io.outputs import make_folder, refuse_file
-    from sims.experiments.attitude import run_scenario
-
     if not scenarios:
         raise InputError("adcs compare: found no scenario, expected one or more, such as tabletsat eclipse.")
     if out is not None:
@@ -123,7 +124,9 @@ def compare(
     rows = []
     with progress(len(pairs) * runs.seeds, "runs", quiet=common.quiet) as advance:
         for file, estimate in pairs:
-            rows.append(Row(file, estimate, run_scenario(file, estimate, runs.numbers, advance=advance)))
+            rows.append(
+                Row(file, estimate, sims.experiments.run_scenario(file, estimate, runs.numbers, advance=advance))
+            )
     reports = [row.report() for row in rows]
     if out is not None:
         make_folder(out, "--out")
@@ -180,7 +183,6 @@ def label_of(report: dict[str, Any]) -> str:
 
 def _write(out: Path, rows: list[Row], reports: list[dict[str, Any]]) -> None:
     from adcs.plots.attitude import compare_figure
-    from arrays.io.csv import write_columns
     from magloc.plots import style
 
     columns: dict[str, Any] = {"row": [label_of(report) for report in reports]}

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from adcs.io.frame_files import read_frame, write_frame
 from adcs.mockup.navigation.delayed_ekf import FilterTrack
 from adcs.mockup.navigation.fixes import Outcome
 from adcs.mockup.vision.camera import Camera, Pose
-from adcs.mockup.vision.frame_files import read_frame, write_frame
 from adcs.mockup.vision.paper_matcher import CameraFix
 from adcs.mockup.vision.sky import LedSky, write_sky
 from arrays.io.csv import Column, write_columns, write_table
 from magloc.plots import style
-from sims.experiments.mockup_navigation import SETTLED_S, FusionResult, FusionRuns, ZerosResult, ZerosRuns
-from sims.experiments.mockup_settings import MockupOptions, value_or
+from sims.experiments.mockup_navigation import FusionResult, FusionRuns, ZerosResult, ZerosRuns
+from sims.experiments.mockup_settings import METHOD_WORDS, SETTLED_S, MockupOptions, value_or
 from sims.experiments.mockup_vision import FrameResult, SkyRun, frame_result, random_frame
 
 if TYPE_CHECKING:
@@ -32,13 +32,6 @@ _DRIVE_S, _DRIVE_STEP_S = 150.0, 1.8
 _REST_FRAMES, _REST_STEP_S = 40, 0.6
 _REST_M, _REST_RAD = (-1.2228, 0.3), 0.5
 """About where the source's figure 10 is."""
-METHOD_WORDS = {
-    "paper": "integration again from each exposure",
-    "velocity-corrected": "integration again, velocity corrected",
-    "ekf": "delayed filter",
-    "camera": "camera alone",
-    "imu": "samples alone",
-}
 
 
 def write_sky_run(options: MockupOptions, run: SkyRun, out: Path) -> list[str]:

@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from cyclopts import Parameter
 
+from adcs.cli.options import print_note
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
-
-if TYPE_CHECKING:
-    pass
-from collections.abc import Callable
-from typing import TYPE_CHECKING
-
-import numpy as np
-
-from adcs.cli.options import print_note
 from arrays.io.outputs import refuse_unwritable
-from sims.cli.mockup_files import METHOD_WORDS
-from sims.experiments.mockup_navigation import FusionResult, FusionRuns
+from sims.experiments.mockup_settings import METHOD_WORDS, MockupOptions, Port
 
 if TYPE_CHECKING:
     from adcs.viewer.drive import Drive, SeenFrame
-from sims.experiments.mockup_settings import MockupOptions, Port
+    from sims.experiments.mockup_navigation import FusionResult, FusionRuns
 
 
 def check_places(replay: ReplayOptions) -> None:

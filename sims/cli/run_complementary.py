@@ -12,9 +12,7 @@ import numpy as np
 from cyclopts import Parameter
 
 from adcs.cli.options import print_note
-from adcs.complementary.explicit import Gains
-from adcs.complementary.outage import Rule, Substitution
-from adcs.satellite.vector_record import VectorRecord
+from adcs.complementary.outage import Rule
 from arrays.io.arguments import Flag
 from arrays.io.csv import write_table
 from arrays.io.errors import InputError
@@ -22,14 +20,13 @@ from arrays.io.outputs import refuse_file
 from magloc.cli.framework import QuietOptions, print_json, progress
 
 if TYPE_CHECKING:
+    from adcs.complementary.explicit import Gains
     from sims.attitude.complementary import SatelliteRuns, SatelliteScenario
 from arrays.typing import FloatArray
 
 Filter = Literal["explicit", "gauss-newton", "adaptive"]
 STEP_ORBITS, OUTAGE_STEP_ORBITS, OUTAGE_ORBITS = 1.7, 0.3, 1.5
 ORBITS, ORBITS_WITH_OUTAGE = 3.5, 4.0
-RMS_ORBITS = (0.5, 3.0)
-OUTAGE_MAX_FROM_ORBITS = 2.0
 _ALONE_KP_PER_S, _OUTAGE_KP_PER_S = 0.02, 0.005
 _LONGEST_ORBITS = 20.0
 _RUNS_AT_ONCE = 20  # 250 MB of the adaptive filter
@@ -90,6 +87,7 @@ class ComplementaryOptions:
         if self.seeds < 1:
             raise InputError(f"--seeds: found {self.seeds}, expected a positive number.")
         from sims.attitude.complementary import ORBIT
+        from sims.experiments.complementary import OUTAGE_MAX_FROM_ORBITS, RMS_ORBITS
 
         least = (RMS_ORBITS[0] if self.outage is None else OUTAGE_MAX_FROM_ORBITS) * ORBIT.period_s
         most = _LONGEST_ORBITS * ORBIT.period_s
@@ -116,6 +114,8 @@ class ComplementaryOptions:
     @property
     def gains(self) -> Gains:
         """With their defaults."""
+        from adcs.complementary.explicit import Gains
+
         kp = (_ALONE_KP_PER_S if self.outage is None else _OUTAGE_KP_PER_S) if self.kp is None else self.kp
         ki = max(kp * kp / 4.0, 2e-6) if self.ki is None else self.ki
         return Gains(kp, ki)
@@ -178,8 +178,8 @@ def run_complementary(
     OSError
         A file cannot be written.
     """
-    # The command line stands on top of all packages; nothing that it imports imports it.
     from sims.attitude.complementary import satellite_runs
+    from sims.experiments.complementary import RUN_COLUMNS, errors_deg, row_of_each
 
     options.check()
     if out is not None:
@@ -189,7 +189,7 @@ def run_complementary(
     for begin in range(options.seed, last, _RUNS_AT_ONCE):
         seeds = range(begin, min(begin + _RUNS_AT_ONCE, last))
         runs = satellite_runs(options.scenario, seeds)
-        rows.append(_row_of_each(options, runs.scenario.orbits, errors_deg(options, options.filter, runs)))
+        rows.append(row_of_each(runs.scenario, errors_deg(runs, options.filter, options.gains, options.outage)))
         if out is not None and begin == options.seed:
             out.mkdir(parents=True, exist_ok=True)
             _write_picture(options, runs, out)
@@ -198,7 +198,7 @@ def run_complementary(
     table = np.concatenate(rows)
     if out is not None:
         numbers = np.arange(options.seed, last)
-        write_table(out / "complementary-runs.csv", ("seed", *_RUN_COLUMNS), np.column_stack([numbers, table]))
+        write_table(out / "complementary-runs.csv", ("seed", *RUN_COLUMNS), np.column_stack([numbers, table]))
     means = [float(value) for value in table[:, :3].mean(axis=0)]
     return {
         "rms_deg": means[0],
@@ -208,67 +208,12 @@ def run_complementary(
     }
 
 
-def errors_deg(options: ComplementaryOptions, name: Filter, runs: SatelliteRuns) -> FloatArray:
-    """Errors of roll, pitch and yaw, in body axes, of one of the filters: shape (R, n, 3).
-
-    Parameters
-    ----------
-    options : ComplementaryOptions
-        Gains, noise and what stands in for the Sun.
-    name : {'explicit', 'gauss-newton', 'adaptive'}
-    runs : SatelliteRuns
-    """
-    from adcs import quaternion
-
-    q = _estimates(options, name, runs.record)
-    return np.degrees(2.0 * quaternion.error_vector(q, runs.q))
-
-
-def _estimates(options: ComplementaryOptions, name: Filter, record: VectorRecord) -> FloatArray:
-    from adcs.complementary.adaptive import AdaptiveTuning, adaptive_track
-    from adcs.complementary.explicit import explicit_track
-    from adcs.complementary.gauss_newton import gauss_newton_track
-
-    if name == "adaptive":
-        return adaptive_track(record, AdaptiveTuning(first_sigma=1e-9 * options.sigma_nT)).q
-    substitution = Substitution(options.outage or "magnetometer-only")
-    track = explicit_track if name == "explicit" else gauss_newton_track
-    return track(record, options.gains, substitution=substitution).q
-
-
-_RUN_COLUMNS = (
-    "rms_deg",
-    "steady_rms_deg",
-    "peak_deg",
-    "outage_max_roll_deg",
-    "outage_max_pitch_deg",
-    "outage_max_yaw_deg",
-)
-
-
-def _row_of_each(options: ComplementaryOptions, orbits: FloatArray, errors: FloatArray) -> FloatArray:
-    """Columns of _RUN_COLUMNS, NaN where a run has none."""
-    outage = options.outage is not None
-    step = options.scenario.step_orbits
-    steady = (orbits >= 1.0) & (orbits < OUTAGE_ORBITS) if outage else (orbits >= RMS_ORBITS[0]) & (orbits < step)
-    after = (orbits >= step) & (orbits < (OUTAGE_ORBITS if outage else math.inf))
-    rows = np.full((len(errors), len(_RUN_COLUMNS)), np.nan)
-    for row, error in zip(rows, errors, strict=True):
-        pooled = error[(orbits >= RMS_ORBITS[0]) & (orbits < RMS_ORBITS[1])]
-        row[0] = math.sqrt(np.mean(pooled**2))
-        row[1] = math.sqrt(np.mean(error[steady] ** 2))
-        if after.any():
-            row[2] = np.abs(error[after]).max()
-        if outage:
-            row[3:] = np.abs(error[orbits >= OUTAGE_MAX_FROM_ORBITS]).max(axis=0)
-    return rows
-
-
 def _write_picture(options: ComplementaryOptions, runs: SatelliteRuns, out: Path) -> None:
     from adcs.plots.complementary import ComplementaryPicture, complementary_figure
+    from sims.experiments.complementary import errors_deg
 
     names: tuple[Filter, ...] = ("gauss-newton", "explicit", "adaptive")
-    errors: dict[str, FloatArray] = {name: errors_deg(options, name, runs)[0] for name in names}
+    errors: dict[str, FloatArray] = {name: errors_deg(runs, name, options.gains, options.outage)[0] for name in names}
     orbits = runs.scenario.orbits
     picture = ComplementaryPicture(
         f"{options.gains_text}; {options.surroundings}",

@@ -6,13 +6,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from cyclopts import Parameter
 
 from adcs.cli.options import print_note
-from adcs.ellipsoids.roll_yaw import STEP_S, YAW, SetTrack
+from adcs.ellipsoids.roll_yaw import STEP_S
 from adcs.ellipsoids.strip import StepRule
 from arrays.io.arguments import Flag
 from arrays.io.csv import write_table
@@ -20,6 +20,9 @@ from arrays.io.errors import InputError
 from arrays.io.outputs import refuse_file
 from arrays.typing import FloatArray
 from magloc.cli.framework import QuietOptions, print_json, progress
+
+if TYPE_CHECKING:
+    from sims.experiments.ellipsoid import EllipsoidRuns, EllipsoidSettings
 
 JUMP_S = 2000.0
 _RUNS_AT_ONCE = 500  # 90 MB of an orbit
@@ -79,16 +82,19 @@ class EllipsoidOptions:
         """Steps of 2 s."""
         return int(self.duration / STEP_S)
 
+    @property
+    def settings(self) -> EllipsoidSettings:
+        """What is simulated and observed."""
+        from sims.experiments.ellipsoid import EllipsoidSettings
 
-@dataclass(frozen=True, eq=False)
-class _Runs:
-    """Truth and sets of some runs."""
-
-    seeds: range
-    states_rad: FloatArray
-    track: SetTrack
-    roll_readings_rad: FloatArray
-    increments_rad: FloatArray | None
+        return EllipsoidSettings(
+            math.radians(self.noise_deg),
+            math.radians(self.drift_deg_s),
+            self.n_steps,
+            self.step,
+            JUMP_S if self.jump else None,
+            self.closed_loop,
+        )
 
 
 def run_ellipsoid(
@@ -119,14 +125,16 @@ def run_ellipsoid(
     OSError
         A file cannot be written.
     """
+    from sims.experiments.ellipsoid import RUN_COLUMNS, ellipsoid_runs, row_of_each
+
     options.check()
     if out is not None:
         refuse_file(out, "--out")
     rows: list[FloatArray] = []
     last = options.seed + options.seeds
     for begin in range(options.seed, last, _RUNS_AT_ONCE):
-        runs = _run(options, range(begin, min(begin + _RUNS_AT_ONCE, last)))
-        rows.append(_row_of_each(runs))
+        runs = ellipsoid_runs(options.settings, range(begin, min(begin + _RUNS_AT_ONCE, last)))
+        rows.append(row_of_each(runs))
         if out is not None and begin == options.seed:
             out.mkdir(parents=True, exist_ok=True)
             _write_picture(options, runs, out)
@@ -134,7 +142,7 @@ def run_ellipsoid(
             progress(len(runs.seeds))
     table = np.concatenate(rows)
     if out is not None:
-        write_table(out / "ellipsoid-runs.csv", _RUN_COLUMNS, table)
+        write_table(out / "ellipsoid-runs.csv", RUN_COLUMNS, table)
     error, half_width, resets, outside = table[:, 1], table[:, 2], table[:, 4], table[:, 5]
     return {
         "final_error_mean_deg": float(error.mean()),
@@ -147,46 +155,7 @@ def run_ellipsoid(
     }
 
 
-def _run(options: EllipsoidOptions, seeds: range) -> _Runs:
-    # The command line stands on top of all packages; nothing that it imports imports it.
-    from adcs.ellipsoids.roll_yaw import AttitudeLoop, observe, roll_yaw_observer, roll_yaw_system
-    from sims.attitude.roll_yaw import ErrorScenario, LoopScenario, error_runs, fly
-
-    noise, drift, n_steps = math.radians(options.noise_deg), math.radians(options.drift_deg_s), options.n_steps
-    jump_s = JUMP_S if options.jump else None
-    observer = roll_yaw_observer(roll_yaw_system(noise, drift), len(seeds), options.step)
-    if options.closed_loop:
-        loop = AttitudeLoop(observer, n_steps)
-        scenario = LoopScenario(noise, drift, n_steps, first_yaw_rad=2.0 * noise, jump_s=jump_s)
-        flown = fly(scenario, loop, seeds)
-        states = flown.angles_rad[..., [0, 2]]
-        return _Runs(seeds, states, loop.recorder.track, flown.roll_readings_rad, flown.increments_rad)
-    runs = error_runs(ErrorScenario(noise, drift, n_steps, jump_s=jump_s), seeds)
-    return _Runs(seeds, runs.states_rad, observe(observer, runs.readings_rad), runs.readings_rad, None)
-
-
-_RUN_COLUMNS = ("seed", "final_error_deg", "half_width_deg", "bound_deg", "resets", "violations", "yaw_max_1000s_deg")
-
-
-def _row_of_each(runs: _Runs) -> FloatArray:
-    """Columns of _RUN_COLUMNS; the last one is the largest yaw after 1000 s, NaN of a shorter run."""
-    from adcs.ellipsoids.roll_yaw import violations
-
-    track, yaw = runs.track, runs.states_rad[..., YAW]
-    late = np.abs(yaw[:, int(1000.0 / STEP_S) :])
-    columns = [
-        np.array(runs.seeds),
-        np.degrees(np.abs(track.centres[:, -1, YAW] - yaw[:, -1])),
-        np.degrees(track.yaw_half_widths[:, -1]),
-        np.degrees(track.bounds[:, -1]),
-        track.resets[:, -1],
-        violations(track, runs.states_rad),
-        np.degrees(late.max(axis=1)) if late.size else np.full(len(yaw), np.nan),
-    ]
-    return np.stack(columns, axis=1)
-
-
-def _write_picture(options: EllipsoidOptions, runs: _Runs, out: Path) -> None:
+def _write_picture(options: EllipsoidOptions, runs: EllipsoidRuns, out: Path) -> None:
     from adcs.ellipsoids.roll_yaw import kalman_track, roll_yaw_system
     from adcs.plots.ellipsoids import RollYawPicture, roll_yaw_figure
 

@@ -7,79 +7,20 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from adcs.cli.options import print_note
+import sims.experiments
+from adcs.cli.options import naming_options, print_note
 from arrays.io.arguments import Flag
 from arrays.io.outputs import make_folder, refuse_file
 from magloc.cli.framework import QuietOptions, print_json, progress
 from sims.cli.mockup_replay import ReplayOptions
-from sims.experiments.mockup_navigation import METHODS, SETTLED_S, FusionRuns, Method, ZerosRuns, fused_runs, zeros_run
-from sims.experiments.mockup_settings import MockupOptions, value_or
+from sims.experiments.mockup_settings import METHODS, SETTLED_S, Method, MockupOptions, value_or
 
 if TYPE_CHECKING:
-    from sims.experiments.mockup_vision import FrameResult, SkyRun
+    from sims.experiments.mockup_navigation import FusionRuns, ZerosRuns
+    from sims.experiments.mockup_vision import FrameResult
 
 
 Advance = Callable[[int], None]
-
-
-def sky_runs(options: MockupOptions, advance: Advance | None = None) -> SkyRun:
-    """Frames of all seeds, identified.
-
-    Parameters
-    ----------
-    options : MockupOptions
-    advance : callable, optional
-        Called with the number of frames finished since the last call.
-
-    Returns
-    -------
-    SkyRun
-        One seed after the other.
-
-    Raises
-    ------
-    InputError
-        The file of the sky is none, or the lens folds the image.
-    """
-    from sims.experiments.mockup_vision import sky_run
-
-    sky, setup = options.led_sky, options.sky_setup()
-    matcher = options.matcher_of(sky)
-    return joined([sky_run(sky, matcher, setup, seed, advance, options.finder()) for seed in options.runs(1)])
-
-
-def joined(runs: Sequence[SkyRun]) -> SkyRun:
-    """Runs as one, row after row."""
-    arrays = {name: np.concatenate([getattr(run, name) for run in runs]) for name in vars(runs[0]) if name != "reasons"}
-    return type(runs[0])(**arrays, reasons=tuple(reason for run in runs for reason in run.reasons))
-
-
-def frames_identified(options: MockupOptions) -> dict[Path, FrameResult]:
-    """Frames of files, identified.
-
-    Parameters
-    ----------
-    options : MockupOptions
-        With frames and sky.
-
-    Returns
-    -------
-    dict
-        From path to result.
-
-    Raises
-    ------
-    InputError
-        A file is no frame or no sky.
-    """
-    from adcs.mockup.vision.frame_files import frame_paths
-    from sims.experiments.mockup_vision import identified_files
-
-    sky = options.led_sky
-    paths = frame_paths(options.frames) if options.frames is not None else []
-    return identified_files(paths, options.camera(), options.matcher_of(sky), options.finder())
 
 
 def frame_entries(results: dict[Path, FrameResult]) -> list[dict[str, Any]]:
@@ -88,7 +29,7 @@ def frame_entries(results: dict[Path, FrameResult]) -> list[dict[str, Any]]:
     Parameters
     ----------
     results : dict
-        Of :func:`frames_identified`.
+        Of :func:`sims.experiments.mockup_vision.frames_identified`.
 
     Returns
     -------
@@ -303,7 +244,7 @@ Told = tuple[dict[str, Any], list[str], list[str]]
 
 
 def _frames(options: MockupOptions, out: Path | None) -> Told:
-    results = frames_identified(options)
+    results = sims.experiments.frames_identified(options)
     entries = frame_entries(results)
     fixed = sum(entry["position_m"] is not None for entry in entries)
     written = []
@@ -333,7 +274,7 @@ def _recording(samples: Path, fixes: Path, options: MockupOptions, out: Path | N
 def _sky(options: MockupOptions, out: Path | None, *, quiet: bool) -> Told:
     setup, seeds = options.sky_setup(), options.runs(1)
     with progress(setup.poses * len(seeds), "frames", quiet=quiet) as advance:
-        run = sky_runs(options, advance)
+        run = sims.experiments.sky_runs(options, advance)
     result = run.summary()
     written = []
     if out is not None:
@@ -346,8 +287,8 @@ def _sky(options: MockupOptions, out: Path | None, *, quiet: bool) -> Told:
 
 def _zeros(options: MockupOptions, out: Path | None, *, quiet: bool) -> Told:
     seeds = options.runs(6)
-    with progress(len(seeds), "runs", quiet=quiet) as advance:
-        runs = zeros_run(
+    with progress(len(seeds), "runs", quiet=quiet) as advance, naming_options():
+        runs = sims.experiments.zeros_run(
             value_or(options.unknowns, "six"),
             len(seeds),
             options.duration_s,
@@ -373,7 +314,7 @@ def _drives(options: MockupOptions, replay: ReplayOptions, out: Path | None, *, 
     wanted = value_or(options.fusion, "ekf")
     methods: tuple[Method, ...] = METHODS if wanted == "all" else (wanted,)
     with progress(len(seeds) * len(methods), "runs", quiet=quiet) as advance:
-        every = [fused_runs(method, scenario, seeds, advance) for method in methods]
+        every = [sims.experiments.fused_runs(method, scenario, seeds, advance) for method in methods]
     runs, written = every[0], []
     if out is not None:
         from sims.cli.mockup_files import write_fusion, write_methods

@@ -6,17 +6,22 @@ import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
+import adcs
+import sims.experiments
 from adcs.cli.options import ScenarioOptions, print_note
-from adcs.io.scenario_files import AttitudeFile, built_in_scenarios, changed, estimate_of, read_scenario
-from adcs.io.scenario_tables import MOST_STEPS
-from adcs.kalman.bank import Estimate
 from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import InputError
+from arrays.io.outputs import make_folder, refuse_file
 from magloc.cli.framework import QuietOptions, print_json, progress
+
+if TYPE_CHECKING:
+    from adcs.io.scenario_files import AttitudeFile
+    from adcs.kalman.bank import EstimatorSettings
+    from sims.experiments.attitude import Part
 
 _OTHERS = ("complementary", "ellipsoid", "mockup")
 _STAR_NOISE_DEG = {"angle": 0.001, "paper": 0.002}
@@ -47,7 +52,7 @@ class RunOptions:
         return range(self.seed, self.seed + self.seeds)
 
 
-def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) -> tuple[AttitudeFile, Estimate]:
+def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) -> tuple[AttitudeFile, EstimatorSettings]:
     """The scenario with the options in it, and its filter.
 
     Parameters
@@ -59,14 +64,16 @@ def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) ->
 
     Returns
     -------
-    AttitudeFile, Estimate
+    AttitudeFile, EstimatorSettings
 
     Raises
     ------
     InputError
         The file or an option cannot be used.
     """
-    file = read_scenario(scenario)
+    from adcs.io.scenario_tables import MOST_STEPS
+
+    file = adcs.read_scenario(scenario)
     changes = options.changes(duration_s)
     if duration_s is not None and not 1.0 <= duration_s / file.step_s <= MOST_STEPS:
         longest_s = MOST_STEPS * file.step_s
@@ -75,13 +82,13 @@ def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) ->
         raise InputError(f"--start-error-deg: found {options.start_error_deg:g}, expected more than 0 and at most 180.")
     if options.field_error_nT is not None and not 0.0 <= options.field_error_nT <= 1e9:
         raise InputError(f"--field-error-nT: found {options.field_error_nT:g}, expected 0 to 1e9.")
-    file = changed(file, changes)
+    file = file.changed(changes)
     if options.star_noise is not None:
         tables = {**file.tables.get("sensors", {})}
         tables["star_tracker"] = {**tables.get("star_tracker", {}), "noise_deg": _STAR_NOISE_DEG[options.star_noise]}
-        file = changed(file, {"sensors": tables})
+        file = file.changed({"sensors": tables})
     given = [f"--{key}" for key in ("sensors", "states", "filter") if getattr(options, key) is not None]
-    return file, estimate_of(" and ".join(given) or file.path, file.estimate)
+    return file, file.estimator(" and ".join(given) or file.path)
 
 
 def run_attitude(
@@ -116,8 +123,7 @@ def run_attitude(
     common : QuietOptions
         Common options.
     """
-    from arrays.io.outputs import make_folder, refuse_file
-    from sims.experiments.attitude import Part, run_scenario
+    from adcs.io.scenario_files import built_in_scenarios
 
     if scenario in _OTHERS:
         raise InputError(f"adcs run: found options before {scenario}, expected its name right after run.")
@@ -133,7 +139,7 @@ def run_attitude(
         refuse_file(out, "--out")
     parts: list[Part] = []
     with progress(runs.seeds, "runs", quiet=common.quiet) as advance:
-        outcome = run_scenario(
+        outcome = sims.experiments.run_scenario(
             file, estimate, runs.numbers, look=None if out is None else parts.append, advance=advance
         )
     if not common.quiet:
@@ -162,13 +168,13 @@ _ROWS = (
 )
 
 
-def summary_lines(file: AttitudeFile, estimate: Estimate, numbers: dict[str, Any]) -> Sequence[str]:
+def summary_lines(file: AttitudeFile, estimate: EstimatorSettings, numbers: dict[str, Any]) -> Sequence[str]:
     """The result as text.
 
     Parameters
     ----------
     file : AttitudeFile
-    estimate : Estimate
+    estimate : EstimatorSettings
     numbers : dict
         What ``--json`` prints.
 

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from adcs import quaternion
 from adcs.io.scenario_files import AttitudeFile
 from adcs.kalman import accuracy
-from adcs.kalman.bank import Estimate
-from adcs.kalman.error_state import Estimates, start_near
+from adcs.kalman.bank import EstimatorSettings
+from adcs.kalman.error_state import AttitudeTracks, start_near
+from adcs.kalman.results import in_units
 from arrays.io.errors import InputError
 
 if TYPE_CHECKING:
@@ -35,11 +36,11 @@ class Part:
     Attributes
     ----------
     runs : AttitudeRuns
-    estimates : Estimates
+    estimates : AttitudeTracks
     """
 
     runs: AttitudeRuns
-    estimates: Estimates
+    estimates: AttitudeTracks
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,13 +102,13 @@ class Outcome:
         }
 
 
-def parts_of(file: AttitudeFile, estimate: Estimate, seeds: Sequence[int]) -> Iterator[Part]:
+def parts_of(file: AttitudeFile, estimate: EstimatorSettings, seeds: Sequence[int]) -> Iterator[Part]:
     """All runs, as many at once as fit into memory.
 
     Parameters
     ----------
     file : AttitudeFile
-    estimate : Estimate
+    estimate : EstimatorSettings
     seeds : sequence of int
 
     Yields
@@ -143,8 +144,9 @@ def _simulated(file: AttitudeFile, scenario: AttitudeScenario, seeds: Sequence[i
     except ValueError as error:
         text = str(error).removeprefix("Input ")
         if text.startswith("conditions"):
+            day = file.satellite.start.astype("datetime64[s]")
             text = (
-                f"found no time within 24 hours from {file.start_utc.astype('datetime64[s]')} at which the conditions "
+                f"found no time within 24 hours from {day} at which the conditions "
                 f"of the table start hold for {file.duration_s:g} s, expected weaker ones, or a shorter duration."
             )
         raise InputError(f"{file.path}: {text}") from None
@@ -152,7 +154,7 @@ def _simulated(file: AttitudeFile, scenario: AttitudeScenario, seeds: Sequence[i
 
 def run_scenario(
     file: AttitudeFile,
-    estimate: Estimate,
+    estimate: EstimatorSettings,
     seeds: Sequence[int],
     *,
     look: Callable[[Part], None] | None = None,
@@ -163,7 +165,7 @@ def run_scenario(
     Parameters
     ----------
     file : AttitudeFile
-    estimate : Estimate
+    estimate : EstimatorSettings
     seeds : sequence of int
     look : callable, optional
         Called with every part of the runs.
@@ -207,16 +209,14 @@ def errors_in_units(part: Part) -> FloatArray:
     """Truth minus estimate, shape (runs, n, 15), in the order and units of :attr:`Outcome.axis_rms`."""
     runs, estimates = part.runs, part.estimates
     states = estimates.settings.sensors.states
-    values = np.full((*estimates.w.shape[:2], 15), np.nan)
-    values[..., :3] = np.degrees(2.0 * quaternion.error_vector(estimates.q, runs.q))
-    values[..., 3:6] = np.degrees(runs.w - estimates.w)
-    if "gyro-bias" in states:
-        values[..., 6:9] = np.degrees(runs.prepared.gyro_bias_rad_s - estimates.gyro_bias_rad_s)
-    if "field-bias" in states:
-        values[..., 9:12] = 1e9 * (runs.prepared.field_bias_T - estimates.field_bias_T)
-    if "disturbance" in states:
-        values[..., 12:] = runs.acceleration_s2 - estimates.disturbance_s2
-    return values
+    errors = {
+        "attitude": 2.0 * quaternion.error_vector(estimates.q, runs.q),
+        "rate": runs.w - estimates.w,
+        "gyro-bias": runs.prepared.gyro_bias_rad_s - estimates.gyro_bias_rad_s,
+        "field-bias": runs.prepared.field_bias_T - estimates.field_bias_T,
+        "disturbance": runs.acceleration_s2 - estimates.disturbance_s2,
+    }
+    return in_units({state: errors[state] for state in ("attitude", "rate", *states)})
 
 
 def _outcome(part: Part) -> Outcome:

@@ -9,12 +9,12 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from adcs.mockup.navigation.strapdown import PlanarTrack, strapdown, wrapped
-from arrays.io.errors import InputError
+from sims.experiments.mockup_settings import METHODS, SETTLED_S, UNKNOWNS, Method, Unknowns
 
 if TYPE_CHECKING:
     from adcs.mockup.navigation.fixes import Fused, Fusion
@@ -22,12 +22,6 @@ if TYPE_CHECKING:
     from sims.mockup.table_run import TableRun, TableScenario
 from arrays.typing import FloatArray
 
-Method = Literal["paper", "velocity-corrected", "ekf", "camera", "imu"]
-METHODS: tuple[Method, ...] = get_args(Method)
-Unknowns = Literal["two", "six", "drift"]
-UNKNOWNS: tuple[Unknowns, ...] = get_args(Unknowns)
-SETTLED_S = 10.0
-"""Errors count after it."""
 SHORT_S = 20.0
 """Runs of zeros up to it are the one with two firings, longer ones drive around the table."""
 ZERO_M_S2 = (0.005, -0.004)
@@ -163,16 +157,16 @@ def fusion_run(
 
     Raises
     ------
-    InputError
-        An option is out of range.
+    ValueError
+        An argument is out of range.
     """
     from sims.mockup.table_run import CameraErrors, TableScenario
 
     if method not in METHODS:
-        raise InputError(f"--fusion: found {method!r}, expected one of {', '.join(METHODS)}.")
+        raise ValueError(f"Input method must be one of {', '.join(METHODS)}; instead received {method!r}.")
     _check(seeds, seed, duration_s, lowest_s=SETTLED_S)
     if not 0.0 <= false_fixes <= 1.0:
-        raise InputError(f"--false-fixes: found {false_fixes:g}, expected a fraction between 0 and 1.")
+        raise ValueError(f"Input false_fixes must be a fraction between 0 and 1; instead received {false_fixes:g}.")
     scenario = TableScenario(duration_s=duration_s, camera=CameraErrors(false=false_fixes))
     return fused_runs(method, scenario, range(seed, seed + seeds), progress)
 
@@ -323,13 +317,13 @@ def zeros_run(
 
     Raises
     ------
-    InputError
-        An option is out of range.
+    ValueError
+        An argument is out of range.
     """
     from sims.mockup.table_run import ImuErrors, TableScenario
 
     if unknowns not in UNKNOWNS:
-        raise InputError(f"--unknowns: found {unknowns!r}, expected one of {', '.join(UNKNOWNS)}.")
+        raise ValueError(f"Input unknowns must be one of {', '.join(UNKNOWNS)}; instead received {unknowns!r}.")
     _check(seeds, seed, duration_s, lowest_s=SETTLED_S)
     drift = (_DRIFT_M_S3[0] * duration_s, _DRIFT_M_S3[1] * duration_s)
     scenario = TableScenario(
@@ -350,9 +344,9 @@ def _zeros_result(unknowns: Unknowns, start_fixes: int, seed: int, run: TableRun
 
     fixes = run.fixes.in_time_order()
     if unknowns == "two" and not 2 <= start_fixes < len(fixes):
-        raise InputError(
-            f"--start-fixes: found {start_fixes}, expected 2 to {len(fixes) - 1}, less than the {len(fixes)} fixes of "
-            f"the run with seed {seed}."
+        raise ValueError(
+            f"Input start_fixes must be 2 to {len(fixes) - 1}, less than the {len(fixes)} fixes of the run with seed "
+            f"{seed}; instead received {start_fixes}."
         )
     heading, gyro_zero = heading_from_fixes(run.imu, fixes)
     imu = run.imu.less(0.0, gyro_zero)
@@ -380,8 +374,10 @@ def _rms(values: FloatArray) -> float:
 
 def _check(seeds: int, seed: int, duration_s: float, lowest_s: float) -> None:
     if seeds < 1:
-        raise InputError(f"--seeds: found {seeds}, expected a positive number.")
+        raise ValueError(f"Input seeds must be a positive number; instead received {seeds}.")
     if seed < 0:
-        raise InputError(f"--seed: found {seed}, expected 0 or more.")
+        raise ValueError(f"Input seed must be 0 or more; instead received {seed}.")
     if not lowest_s < duration_s <= 1e4 or math.isnan(duration_s):
-        raise InputError(f"--duration: found {duration_s:g} s, expected more than {lowest_s:g} and up to 10000 s.")
+        raise ValueError(
+            f"Input duration_s must be more than {lowest_s:g} and up to 10000 s; instead received {duration_s:g} s."
+        )

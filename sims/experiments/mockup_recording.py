@@ -22,7 +22,7 @@ from adcs.mockup.navigation.strapdown import Gate, ImuRecord, PlanarState, wrapp
 from arrays.io.csv import Table, read_table
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
-from sims.experiments.mockup_navigation import SETTLED_S, Method
+from sims.experiments.mockup_settings import SETTLED_S, Method
 
 SAMPLE_COLUMNS = ("time_s", "acceleration_x_m_s2", "acceleration_y_m_s2", "rate_deg_s")
 FIX_COLUMNS = ("exposure_s", "arrival_s", "x_m", "y_m", "heading_deg")

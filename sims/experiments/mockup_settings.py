@@ -6,14 +6,13 @@ import math
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from arrays.io.arguments import Count, Seed, whole_number
 from arrays.io.errors import InputError, naming
-from sims.experiments.mockup_navigation import SETTLED_S, Method, Unknowns
 
 if TYPE_CHECKING:
     from adcs.mockup.vision.camera import Camera
@@ -23,6 +22,19 @@ if TYPE_CHECKING:
     from sims.mockup.table_run import TableScenario
 
 
+Method = Literal["paper", "velocity-corrected", "ekf", "camera", "imu"]
+METHODS: tuple[Method, ...] = get_args(Method)
+METHOD_WORDS = {
+    "paper": "integration again from each exposure",
+    "velocity-corrected": "integration again, velocity corrected",
+    "ekf": "delayed filter",
+    "camera": "camera alone",
+    "imu": "samples alone",
+}
+Unknowns = Literal["two", "six", "drift"]
+UNKNOWNS: tuple[Unknowns, ...] = get_args(Unknowns)
+SETTLED_S = 10.0
+"""Errors count after it."""
 Part = Literal["sky", "fusion", "zeros"]
 MatcherName = Literal["paper", "robust", "odds"]
 StarFinder = Literal["bright", "faint", "level"]

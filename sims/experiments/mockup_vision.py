@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from adcs.io.frame_files import frame_paths, read_frame
 from adcs.mockup.vision.camera import Camera, Pose, camera_of_footprint, undistorted
 from adcs.mockup.vision.centroids import NoLightsError, Stars, find_stars
-from adcs.mockup.vision.frame_files import read_frame
 from adcs.mockup.vision.paper_matcher import CameraFix, Matcher
 from adcs.mockup.vision.sky import LedSky
 from adcs.stars.identification import NoFix
 
 if TYPE_CHECKING:
+    from sims.experiments.mockup_settings import MockupOptions
     from sims.mockup.frames import Frame, FrameQuality
 from arrays.typing import BoolArray, ByteArray, FloatArray
 
@@ -336,3 +337,23 @@ def identified_files(
         A file is no frame of this camera.
     """
     return {path: frame_result(read_frame(path, camera), camera, matcher, finder) for path in paths}
+
+
+def sky_runs(options: MockupOptions, advance: Callable[[int], None] | None = None) -> SkyRun:
+    """Frames of all seeds, identified, one seed after the other; ``advance`` is told how many more are finished."""
+    sky, setup = options.led_sky, options.sky_setup()
+    matcher = options.matcher_of(sky)
+    return _joined([sky_run(sky, matcher, setup, seed, advance, options.finder()) for seed in options.runs(1)])
+
+
+def _joined(runs: Sequence[SkyRun]) -> SkyRun:
+    """Runs as one, row after row."""
+    arrays = {name: np.concatenate([getattr(run, name) for run in runs]) for name in vars(runs[0]) if name != "reasons"}
+    return SkyRun(**arrays, reasons=tuple(reason for run in runs for reason in run.reasons))
+
+
+def frames_identified(options: MockupOptions) -> dict[Path, FrameResult]:
+    """Frames of files, identified, by their path."""
+    sky = options.led_sky
+    paths = frame_paths(options.frames) if options.frames is not None else []
+    return identified_files(paths, options.camera(), options.matcher_of(sky), options.finder())

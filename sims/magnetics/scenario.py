@@ -110,7 +110,7 @@ class Missing:
 
 
 @dataclass(frozen=True)
-class Scenario:
+class MagneticScenario:
     """Everything that a simulation needs except its seed.
 
     Attributes
@@ -184,7 +184,7 @@ class Scenario:
         """The array as its user knows it."""
         return nominal_array(self.array, self.models, self.rate_Hz)
 
-    def with_white_noise_only(self) -> Scenario:
+    def with_white_noise_only(self) -> MagneticScenario:
         """The same without anything that an array file with white noise does not describe.
 
         No 1/f noise, bandwidth, rounding, misalignment, error of gain, drift and noise of the platform; saturation,

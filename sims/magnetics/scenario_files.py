@@ -20,7 +20,7 @@ from arrays.array_file import array_of_table, read_array
 from arrays.io.errors import InputError, naming
 from arrays.io.toml import BuiltIn, in_si, named_section, section_of
 from sims.magnetics.paths import Attitude, Path, Steered, Vector
-from sims.magnetics.scenario import Carrier, Matrix, Missing, Platform, Pulsation, Scenario, Source
+from sims.magnetics.scenario import Carrier, MagneticScenario, Matrix, Missing, Platform, Pulsation, Source
 from sims.magnetics.scenario_tables import (
     PATH_TABLES,
     AmbientTable,
@@ -39,7 +39,7 @@ _FILES = BuiltIn("sims.magnetics", "scenarios", "scenario")
 built_in_scenarios = _FILES.names
 
 
-def read_scenario(name_or_path: str) -> Scenario:
+def read_scenario(name_or_path: str) -> MagneticScenario:
     """Scenario of a simulation.
 
     Parameters
@@ -56,7 +56,7 @@ def read_scenario(name_or_path: str) -> Scenario:
     file = section_of(path, table, FileTable)
     array, models = _array_and_models(path, file)
     with naming(path):
-        return Scenario(
+        return MagneticScenario(
             array=array,
             models=models,
             duration_s=file.duration_s,

@@ -15,7 +15,7 @@ from arrays.typing import FloatArray
 from magloc.fields.dipole import MU0_OVER_4PI, field
 from magloc.readings import Readings
 from magloc.truth import Truth
-from sims.magnetics.scenario import Carrier, Scenario, Source
+from sims.magnetics.scenario import Carrier, MagneticScenario, Source
 from sims.magnetics.sensors import SensorModel
 from sims.noise import coloured_noise, low_passed, random_walk, stream
 
@@ -30,7 +30,7 @@ class Simulation:
 
     Attributes
     ----------
-    scenario : Scenario
+    scenario : MagneticScenario
     seed : int
     array : SensorArray
         As its user knows it.
@@ -42,7 +42,7 @@ class Simulation:
         The array with its true calibration: misalignments and errors of the gains are part of it.
     """
 
-    scenario: Scenario
+    scenario: MagneticScenario
     seed: int
     array: SensorArray
     readings: Readings
@@ -71,7 +71,7 @@ class _Pose:
     rotation: Rotation
 
 
-def simulate(scenario: Scenario, seed: int) -> Simulation:
+def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
     """One realisation of a scenario.
 
     The field at every sensor is that of the ambient field with its pulsations, of the platform and of all sources at
@@ -80,7 +80,7 @@ def simulate(scenario: Scenario, seed: int) -> Simulation:
 
     Parameters
     ----------
-    scenario : Scenario
+    scenario : MagneticScenario
     seed : int
         The same seed gives the same numbers. Every feature of every sensor, by its id, has its own stream: leaving out
         one changes no other.
@@ -142,7 +142,7 @@ def _moments(source: Source, rotation: Rotation, ambient_T: FloatArray) -> Float
     return moments
 
 
-def _refuse_contact(scenario: Scenario, number: int, time_s: FloatArray, offset_m: FloatArray) -> None:
+def _refuse_contact(scenario: MagneticScenario, number: int, time_s: FloatArray, offset_m: FloatArray) -> None:
     """Raise if a sensor is inside a source; offset (n, N, 3)."""
     distance = np.linalg.norm(offset_m, axis=-1)
     row, sensor = np.unravel_index(int(distance.argmin()), distance.shape)
@@ -155,7 +155,7 @@ def _refuse_contact(scenario: Scenario, number: int, time_s: FloatArray, offset_
         )
 
 
-def _pulsations(scenario: Scenario, time_s: FloatArray, seed: int) -> FloatArray:
+def _pulsations(scenario: MagneticScenario, time_s: FloatArray, seed: int) -> FloatArray:
     """Variations of the ambient field (n, 3), world frame."""
     total = np.zeros((len(time_s), 3))
     for number, pulsation in enumerate(scenario.pulsations, start=1):
@@ -165,7 +165,7 @@ def _pulsations(scenario: Scenario, time_s: FloatArray, seed: int) -> FloatArray
     return total
 
 
-def _platform_fields(scenario: Scenario, time_s: FloatArray, seed: int) -> FloatArray:
+def _platform_fields(scenario: MagneticScenario, time_s: FloatArray, seed: int) -> FloatArray:
     """Fields of the carrier at the sensors (n, N, 3), array frame."""
     platform, array = scenario.platform, scenario.array
     total = np.zeros((len(time_s), array.n_sensors, 3))
@@ -188,7 +188,7 @@ def _platform_fields(scenario: Scenario, time_s: FloatArray, seed: int) -> Float
     return total
 
 
-def _stray_fields(scenario: Scenario, seed: int) -> FloatArray:
+def _stray_fields(scenario: MagneticScenario, seed: int) -> FloatArray:
     """Constant fields at the sensors (N, 3) that are fixed to the array."""
     return np.stack(
         [
@@ -198,7 +198,7 @@ def _stray_fields(scenario: Scenario, seed: int) -> FloatArray:
     )
 
 
-def _true_array(scenario: Scenario, seed: int) -> SensorArray:
+def _true_array(scenario: MagneticScenario, seed: int) -> SensorArray:
     """The array with the calibration that its sensors really have.
 
     A vector sensor of nominal scale S reads S diag(1 + g) R b: R is a random rotation, g a random error of the gains.
@@ -215,7 +215,7 @@ def _true_array(scenario: Scenario, seed: int) -> SensorArray:
     return replace(scenario.array, sensors=tuple(sensors))
 
 
-def _sensed(scenario: Scenario, clean_T: FloatArray, seed: int) -> FloatArray:
+def _sensed(scenario: MagneticScenario, clean_T: FloatArray, seed: int) -> FloatArray:
     """What the sensors make of their clean readings (n, C); NaN where a sensor misses a sample."""
     values = np.empty_like(clean_T)
     for i, (name, model) in enumerate(zip(scenario.array.ids, scenario.models, strict=True)):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adcs.ellipsoids.ellipsoid import Ellipsoid, quadratic_form, segment_shape
-from adcs.ellipsoids.observer import BoundedSystem, EllipsoidBatch
+from adcs.ellipsoids.observer import BoundedSystem, EllipsoidObserver
 
 
 class Containment(NamedTuple):
@@ -63,7 +63,7 @@ def containment(system, rule, n_runs, n_steps, seed):
     keep = eigenvalue > 1e-12 * max(eigenvalue.max(), 1e-300)
     root = eigenvector[:, keep] * np.sqrt(eigenvalue[keep])  # disturbances are root @ v, |v| <= 1
     radius = 3.0 * float(system.bounds.max())
-    observer = EllipsoidBatch(system, Ellipsoid(np.zeros(n), radius**2 * np.eye(n)), n_runs, rule=rule)
+    observer = EllipsoidObserver(system, Ellipsoid(np.zeros(n), radius**2 * np.eye(n)), n_runs, rule=rule)
     inner = np.where(np.arange(n_runs) % 2, 1.0, rng.random(n_runs) ** (1.0 / n))
     x = radius * inner[:, None] * _directions(rng, n_runs, n)
     kind = np.arange(n_runs) % 5

@@ -265,9 +265,7 @@ class DelayedFilter:
     Attributes
     ----------
     x, P : ndarray, shape (10,), (10, 10)
-        Estimate and covariance at the last sample.
-    state : PlanarState
-        The same without the zeros and drifts.
+        Estimate and covariance at the last sample; ``state`` is the same without zeros and drifts.
     nis : list of float
         Normalised innovation squared of every fix that came and could be taken, when it was first taken.
     """
@@ -316,10 +314,6 @@ class DelayedFilter:
         imu : ImuRecord
             One run; begins where the last samples ended.
 
-        Returns
-        -------
-        FilterTrack
-
         Raises
         ------
         ValueError
@@ -358,10 +352,6 @@ class DelayedFilter:
         Parameters
         ----------
         fix : Fix
-
-        Returns
-        -------
-        Outcome
         """
         now = float(self._time_s[self._n - 1])
         if fix.time_s > now:

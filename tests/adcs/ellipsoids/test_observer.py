@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from adcs.ellipsoids.ellipsoid import Ellipsoid
-from adcs.ellipsoids.observer import BoundedSystem, EllipsoidBatch, correct, predict
+from adcs.ellipsoids.observer import BoundedSystem, EllipsoidObserver, correct, predict
 from adcs.ellipsoids.strip import STEP_RULES
 from tests.adcs.bounded_noise import containment, random_system, satellite, three_states
 
@@ -72,7 +72,7 @@ class TestTwins:
         start = Ellipsoid(rng.standard_normal(n), np.diag(rng.uniform(0.5, 2.0, n)))
         reinflation = 0.3 * np.eye(n)
         n_runs = 6
-        batch = EllipsoidBatch(system, start, n_runs, rule=rule, reinflation=reinflation)
+        batch = EllipsoidObserver(system, start, n_runs, rule=rule, reinflation=reinflation)
         sets, bounds = [start] * n_runs, [system.bounds] * n_runs
         resets = np.zeros(n_runs, dtype=np.int64)
         x = start.centre + 0.1 * rng.standard_normal((n_runs, n))
@@ -102,7 +102,7 @@ class TestTwins:
         system = satellite()
         readings = np.random.default_rng(5).uniform(-1.0, 1.0, (8000, 1))
         start = Ellipsoid(np.zeros(2), 9.0 * np.eye(2))
-        together, alone = EllipsoidBatch(system, start, 8000), EllipsoidBatch(system, start, 1)
+        together, alone = EllipsoidObserver(system, start, 8000), EllipsoidObserver(system, start, 1)
         for batch, values in ((together, readings), (alone, readings[777:778])):
             batch.predict()
             batch.correct(values)
@@ -176,10 +176,10 @@ class TestBadInput:
     def test_of_a_batch(self):
         start = Ellipsoid(np.zeros(2), np.eye(2))
         with pytest.raises(ValueError, match="Input start must have 2 dimensions"):
-            EllipsoidBatch(satellite(), Ellipsoid(np.zeros(3), np.eye(3)), 1)
+            EllipsoidObserver(satellite(), Ellipsoid(np.zeros(3), np.eye(3)), 1)
         with pytest.raises(ValueError, match="Input rule must be one of lemma, optimal, tightened"):
-            EllipsoidBatch(satellite(), start, 1, rule="best")
+            EllipsoidObserver(satellite(), start, 1, rule="best")
         with pytest.raises(ValueError, match="Input reinflation must be positive semidefinite"):
-            EllipsoidBatch(satellite(), start, 1, reinflation=-np.eye(2))
+            EllipsoidObserver(satellite(), start, 1, reinflation=-np.eye(2))
         with pytest.raises(ValueError, match="Input readings must have shape"):
-            EllipsoidBatch(satellite(), start, 3).correct(np.zeros((2, 1)))
+            EllipsoidObserver(satellite(), start, 3).correct(np.zeros((2, 1)))

@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 
 from adcs.ellipsoids import roll_yaw
 from adcs.ellipsoids.ellipsoid import quadratic_form
-from adcs.ellipsoids.observer import EllipsoidBatch, correct, predict
+from adcs.ellipsoids.observer import EllipsoidObserver, correct, predict
 from adcs.ellipsoids.roll_yaw import (
     ORBITAL_RATE,
     YAW,
@@ -310,7 +310,7 @@ class TestConstantShift:
         noise, drift = math.radians(noise), math.radians(0.02)
         truth = error_runs(ErrorScenario(noise, drift, ORBIT), range(50))
         system, first = constant_shift_system(noise, drift)
-        observer = EllipsoidBatch(system, first, 50, rule="tightened")
+        observer = EllipsoidObserver(system, first, 50, rule="tightened")
         for step, readings in enumerate(truth.readings_rad.T, start=1):
             observer.predict()
             observer.correct(readings[:, None])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from adcs.environment.orbit import CircularOrbit, Sgp4Orbit
-from adcs.io.scenario_files import built_in_scenarios, built_in_text, changed, estimate_of, read_scenario, scenario_text
+from adcs.io.scenario_files import built_in_scenarios, built_in_text, read_scenario, scenario_text
 from adcs.kalman.error_state import ProcessNoise, paper_noise, tuned_noise
 from arrays.io.errors import InputError
 from sims.attitude.files import simulation_of
@@ -59,7 +59,7 @@ class TestBuiltIn:
     def test_each_can_be_read(self, name):
         file = read_scenario(name)
         assert file.name == name
-        assert estimate_of(file.path, file.estimate).settings.sensors.sensors
+        assert file.estimator(file.path).settings.sensors.sensors
 
     def test_tabletsat_is_that_of_the_simulation(self):
         """Every number of the file against the scenario that sims builds."""
@@ -95,8 +95,8 @@ class TestBuiltIn:
         assert short.disturbance == long.disturbance
         assert short.estimate == long.estimate
         for name in ("star_tracker", "gyro", "magnetometer", "sun_sensor"):
-            for key, value in vars(getattr(long, name)).items():
-                np.testing.assert_allclose(getattr(getattr(short, name), key), value, err_msg=f"{name}.{key}")
+            for key, value in vars(getattr(long.satellite, name)).items():
+                np.testing.assert_allclose(getattr(getattr(short.satellite, name), key), value, err_msg=f"{name}.{key}")
 
     def test_tabletsat_documents_every_key(self):
         from adcs.io import scenario_tables as module
@@ -121,33 +121,34 @@ class TestBuiltIn:
 
 class TestChanges:
     def test_text_and_back(self, file):
-        wanted = changed(read_scenario("eclipse"), {"duration_s": 77.0, "estimate": {"sensors": "st", "states": []}})
+        wanted = read_scenario("eclipse").changed({"duration_s": 77.0, "estimate": {"sensors": "st", "states": []}})
         again = read_scenario(file(scenario_text(wanted)))
         assert (again.duration_s, again.start, again.estimate) == (77.0, wanted.start, wanted.estimate)
 
     def test_infinite_and_nested(self, file):
         again = read_scenario(file(scenario_text(read_scenario("tabletsat"))))
         assert again.disturbance.torque_period_s == math.inf
-        np.testing.assert_allclose(again.sun_sensor.heads_body, read_scenario("tabletsat").sun_sensor.heads_body)
+        default = read_scenario("tabletsat").satellite
+        np.testing.assert_allclose(again.satellite.sun_sensor.heads_body, default.sun_sensor.heads_body)
 
 
 class TestOrbit:
     def test_elements(self, file):
         text = MINIMAL[: MINIMAL.index("altitude_km")]
         text += f'elements = ["{ISS[0]}", "{ISS[1]}"]\n'
-        orbit = read_scenario(file(text)).orbit
+        orbit = read_scenario(file(text)).satellite.orbit
         assert isinstance(orbit, Sgp4Orbit)
         assert orbit.epoch == np.datetime64("2008-09-20T12:25:40.104192")
 
     @pytest.mark.parametrize("start", ["2014-09-01", '"2014-09-01T00:00:00"', '"2014-09-01T02:00:00+02:00"'])
     def test_start(self, file, start):
         text = MINIMAL.replace('"2014-09-01"', start)
-        assert read_scenario(file(text)).start_utc == np.datetime64("2014-09-01T00:00:00")
+        assert read_scenario(file(text)).satellite.start == np.datetime64("2014-09-01T00:00:00")
 
 
 class TestNoise:
     def estimate(self, **keys):
-        return estimate_of("x", changed(read_scenario("tabletsat"), {"estimate": keys}).estimate).settings
+        return read_scenario("tabletsat").changed({"estimate": keys}).estimator("x").settings
 
     def test_tuned_and_paper(self):
         tuned = self.estimate(sensors="mag+sun")
@@ -219,7 +220,7 @@ def test_bad_files(file, old, new, fragments):
 )
 def test_bad_estimates(keys, fragments):
     with pytest.raises(InputError) as refused:
-        estimate_of("here", changed(read_scenario("tabletsat"), {"estimate": keys}).estimate)
+        read_scenario("tabletsat").changed({"estimate": keys}).estimator("here")
     assert str(refused.value).startswith("here")
     for fragment in fragments:
         assert fragment in str(refused.value)

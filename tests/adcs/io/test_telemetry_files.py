@@ -6,14 +6,17 @@ import numpy as np
 import pytest
 
 from adcs import quaternion
-from adcs.io.scenario_files import changed, read_scenario
+from adcs.io.scenario_files import read_scenario
 from adcs.io.telemetry_files import FIELD, GROUPS, GYRO, STAR, SUN, TIME, WHEELS, read_telemetry, telemetry_columns
+from adcs.satellite.telemetry import Telemetry, part
 from arrays.io.csv import write_columns
 from arrays.io.errors import InputError
 from sims.attitude.files import simulation_of
 from sims.attitude.simulation import simulate
 
-SCENARIO = changed(read_scenario("tabletsat"), {"duration_s": 20.0, "disturbance": {"gyro_bias_deg_s": 0.02}})
+SCENARIO = read_scenario("tabletsat").changed({"duration_s": 20.0, "disturbance": {"gyro_bias_deg_s": 0.02}})
+
+START = SCENARIO.satellite.start
 
 
 @pytest.fixture(scope="module")
@@ -28,24 +31,24 @@ def written(tmp_path):
     def write_and_read(columns, scenario=SCENARIO):
         path = tmp_path / "log.csv"
         write_columns(columns, path)
-        return read_telemetry(path, scenario)
+        return read_telemetry(path, scenario.step_s)
 
     return write_and_read
 
 
 class TestRoundTrip:
     def test_readings_and_wheels(self, runs, written):
-        record = written(telemetry_columns(runs, SCENARIO))
+        record = written(telemetry_columns(Telemetry.of(runs, START))).record(SCENARIO.satellite)
         for name in ("gyro_rad_s", "field_T", "sun"):
             np.testing.assert_allclose(getattr(record.readings, name), getattr(runs.readings, name), rtol=1e-12)
         np.testing.assert_allclose(record.momentum_Nms, runs.momentum_Nms, rtol=1e-12)
         np.testing.assert_allclose(record.wheel_torque_Nm[:, :-1], runs.wheel_torque_Nm[:, :-1], atol=1e-14)
-        assert record.sensors == ("st", "gyro", "mag", "sun")
+        assert all(seen.all() for seen in record.readings.seen.values())
 
     def test_star_tracker_through_the_inertial_frame(self, runs, written):
         """The file has the attitude against inertial space: the rotation of the orbital frame cancels."""
-        columns = telemetry_columns(runs, SCENARIO)
-        record = written(columns)
+        columns = telemetry_columns(Telemetry.of(runs, START))
+        record = written(columns).record(SCENARIO.satellite)
         angle = quaternion.angle_between(record.readings.star, runs.readings.star)
         assert angle.max() < 1e-7
         in_file = np.stack([columns[name] for name in STAR], axis=1)
@@ -54,44 +57,44 @@ class TestRoundTrip:
         assert np.degrees(to_first[-1]) == pytest.approx(20.0 * 0.062, abs=0.3)
 
     def test_surroundings(self, runs, written):
-        record = written(telemetry_columns(runs, SCENARIO))
+        record = written(telemetry_columns(Telemetry.of(runs, START))).record(SCENARIO.satellite)
         np.testing.assert_allclose(record.environment.b_orbital_T, runs.environment.b_orbital_T, atol=1e-12)
         assert record.environment.utc[0, 0] == runs.environment.utc[0, 0]
 
 
 class TestGaps:
     def test_rows_and_cells(self, runs, written):
-        columns = {name: values.copy() for name, values in telemetry_columns(runs, SCENARIO).items()}
+        columns = {name: values.copy() for name, values in telemetry_columns(Telemetry.of(runs, START)).items()}
         columns[SUN[1]][4] = np.nan
         kept = np.delete(np.arange(21), [7, 8])
-        record = written({name: values[kept] for name, values in columns.items()})
-        assert record.time_s.tolist() == columns[TIME].tolist()
-        assert record.rows.tolist() == kept.tolist()
+        telemetry = written({name: values[kept] for name, values in columns.items()})
+        assert telemetry.instants_s.tolist() == columns[TIME].tolist()
+        assert telemetry.rows.tolist() == kept.tolist()
+        record = telemetry.record(SCENARIO.satellite)
         missing = np.isnan(record.readings.sun[0]).all(axis=-1)
         assert np.flatnonzero(missing).tolist() == [4, 7, 8]
         assert np.isnan(record.readings.gyro_rad_s[0, 7:9]).all()
         assert np.isfinite(record.momentum_Nms).all()
 
     def test_absent_sensors(self, runs, written):
-        columns = telemetry_columns(runs, SCENARIO)
-        record = written({name: columns[name] for name in (TIME, *FIELD)})
-        assert record.sensors == ("mag",)
+        columns = telemetry_columns(Telemetry.of(runs, START))
+        record = written({name: columns[name] for name in (TIME, *FIELD)}).record(SCENARIO.satellite)
+        assert [name for name, seen in record.readings.seen.items() if seen.any()] == ["mag"]
         assert np.isnan(record.readings.star).all()
         assert not record.momentum_Nms.any()
 
     def test_later_part(self, runs, written):
-        record = written(telemetry_columns(runs, SCENARIO))
-        later = record.since(5)
-        assert later.time_s[0] == record.time_s[5]
+        record = written(telemetry_columns(Telemetry.of(runs, START))).record(SCENARIO.satellite)
+        later = part(record, np.array([0]), slice(5, None))
+        assert later.environment.time_s[0] == record.environment.time_s[5]
         np.testing.assert_array_equal(later.readings.sun, record.readings.sun[:, 5:])
-        assert later.rows.tolist() == list(range(16))
-        assert record.since(0) is record
+        np.testing.assert_array_equal(later.environment.b_orbital_T, record.environment.b_orbital_T[:, 5:])
 
     def test_any_length_of_directions(self, runs, written):
-        columns = telemetry_columns(runs, SCENARIO)
+        columns = telemetry_columns(Telemetry.of(runs, START))
         for name in (*SUN, *STAR):
             columns[name] = 7.0 * columns[name]
-        record = written(columns)
+        record = written(columns).record(SCENARIO.satellite)
         np.testing.assert_allclose(np.linalg.norm(record.readings.sun, axis=-1), 1.0)
         np.testing.assert_allclose(np.linalg.norm(record.readings.star, axis=-1), 1.0)
 
@@ -109,7 +112,6 @@ class TestGaps:
         (f"time_s,{','.join(SUN)}", ["0,1,2,3", "1,0,0,0"], ["line 3", "sun_x", "length 0"]),
         (f"time_s,{','.join(STAR)}", ["0,0,0,0,0"], ["line 2", "star_qw", "length 0"]),
         (f"time_s,{','.join(WHEELS)}", ["0,1,2,inf"], ["line 2", "wheels_z_Nms", "infinite"]),
-        (f"time_s,{','.join(FIELD)}", ["1e9,1,2,3"], ["2046", "2030"]),
         ("time_s", [], ["without rows"]),
     ],
 )
@@ -117,10 +119,17 @@ def test_bad_files(tmp_path, header, rows, fragments):
     path = tmp_path / "log.csv"
     path.write_text("\n".join([header, *rows, ""]))
     with pytest.raises(InputError) as refused:
-        read_telemetry(path, SCENARIO)
+        read_telemetry(path, SCENARIO.step_s)
     assert str(refused.value).startswith(str(path))
     for fragment in fragments:
         assert fragment in str(refused.value)
+
+
+def test_a_date_that_no_field_model_has(tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text(f"time_s,{','.join(FIELD)}\n1e9,1,2,3\n")
+    with pytest.raises(ValueError, match=r"2046.*2030|2030.*2046"):
+        read_telemetry(path, SCENARIO.step_s).record(SCENARIO.satellite)
 
 
 def test_every_column_says_its_unit_or_has_none():

@@ -80,7 +80,7 @@ class TestAnyStart:
     def test_uniform_true_attitudes(self, sensors: str, tumbling: AttitudeRuns) -> None:
         """At some of them no head sees the Sun at first, or the Earth blinds the star tracker."""
         runs, chosen = tumbling, settings(sensors)
-        seen = runs.readings.has_star if chosen.sensors.star else runs.readings.has_sun
+        seen = runs.readings.seen["st"] if chosen.sensors.star else runs.readings.seen["sun"]
         assert not seen[:, 0].all()
         estimates = run_filter(runs, chosen, any_start(runs, chosen))
         converged = error_norm_deg(runs, estimates)[:, -60:].max(axis=-1) < 1.0
@@ -95,7 +95,7 @@ class TestAnyStart:
             chosen = settings(sensors)
             norm = error_norm_deg(runs, run_filter(runs, chosen, any_start(runs, chosen)))
             # A filter without gyro loses degrees in eclipse: it counts where the Sun has been seen for five minutes.
-            lit = np.lib.stride_tricks.sliding_window_view(runs.readings.has_sun, 300, axis=1).all(axis=-1)
+            lit = np.lib.stride_tricks.sliding_window_view(runs.readings.seen["sun"], 300, axis=1).all(axis=-1)
             last = [299 + np.flatnonzero(one)[-1] for one in lit]
             assert np.mean(norm[np.arange(100), last] < 1.0) >= 0.99
 

@@ -22,7 +22,7 @@ from adcs import quaternion
 from adcs.kalman import mekf as multiplicative
 from adcs.kalman.accuracy import axis_rms, error_norm_deg, evaluate, last_rows, normalised_error_squared
 from adcs.kalman.diagnostics import warnings_of
-from adcs.kalman.error_state import Estimates, FilterSettings, ProcessNoise, Start, State, paper_noise, sensor_set
+from adcs.kalman.error_state import AttitudeTracks, FilterSettings, ProcessNoise, Start, State, paper_noise, sensor_set
 from adcs.kalman.mekf import (
     closed_loop_jacobian,
     collected,
@@ -51,7 +51,7 @@ Array = NDArray[np.float64]
 ALL = ("st+gyro+mag+sun", ("field-bias", "gyro-bias", "disturbance"))
 
 
-def filtered(sensors: str, states: tuple[str, ...], duration_s: float) -> tuple[AttitudeRuns, Estimates]:
+def filtered(sensors: str, states: tuple[str, ...], duration_s: float) -> tuple[AttitudeRuns, AttitudeTracks]:
     chosen = settings(sensors, states)
     runs, start = runs_for(chosen.sensors, duration_s)
     return runs, run_filter(runs, chosen, start)
@@ -457,7 +457,7 @@ class TestProblems:
         sentences = warnings_of(runs, estimates)
         assert any("star tracker over-rate: above 2°/s" in " ".join(one) for one in sentences)
         assert any("star tracker blinded" in " ".join(one) for one in sentences)
-        missing = ~runs.readings.has_star.all(axis=-1)
+        missing = ~runs.readings.seen["st"].all(axis=-1)
         assert [any("star tracker" in sentence for sentence in one) for one in sentences] == missing.tolist()
 
     def test_wrong_torque(self) -> None:
@@ -475,7 +475,7 @@ class TestAccuracy:
         q = quaternion.multiply(runs.q, quaternion.conjugate(quaternion.from_error_vector(error)))
         zero = np.zeros_like(runs.w)
         covariance = np.tile(np.diag(np.repeat([1e-6, 1e-8, 1e-8], 3)), (3, 101, 1, 1))
-        estimates = Estimates(
+        estimates = AttitudeTracks(
             chosen, q, runs.w - 1e-4, zero, runs.prepared.gyro_bias_rad_s, zero, covariance, np.zeros((3, 101, 4))
         )
         reached = evaluate(runs, estimates)

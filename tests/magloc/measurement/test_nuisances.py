@@ -31,7 +31,7 @@ from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, rows_of
 from magloc.tracking.tracker import MOST_ITERATIONS, SHRINK, TOLERANCE, Tracker
 from sims.magnetics.paths import Attitude, Steered
-from sims.magnetics.scenario import Carrier, Scenario, Source
+from sims.magnetics.scenario import Carrier, MagneticScenario, Source
 from sims.magnetics.sensors import SensorModel
 
 FloatArray = NDArray[np.float64]
@@ -329,12 +329,12 @@ class TestErrorsAreFound:
     MODEL = SensorModel("vector", 2e-10, misalignment_rad=1e-4).with_sigma(2e-10, 2.0)
     N_RUNS = 5
 
-    def scenario(self) -> Scenario:
+    def scenario(self) -> MagneticScenario:
         array = geometries.tetrahedron(1.5)
         wobble = Attitude(wobble_rad=(0.2, 0.2, 0.3), wobble_period_s=(9.0, 13.0, 17.0))
         carrier = Carrier(Steered((-3.0, -3.0, 0.0), math.pi / 2, 0.1), wobble)
         source = Source(Carrier(Steered((0.0, 0.5, 0.0))), moment_Am2=(150.0, -120.0, 90.0))
-        return Scenario(
+        return MagneticScenario(
             array,
             (self.MODEL,) * 4,
             duration_s=30.0,

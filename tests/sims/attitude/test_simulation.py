@@ -63,7 +63,7 @@ class TestTruth:
     def test_over_rate_start_is_damped(self) -> None:
         fast = replace(tabletsat(), start_rate_rad_s=np.radians(2.5))
         tumbling = simulate(fast, SEEDS)
-        has_star = tumbling.readings.has_star
+        has_star = tumbling.readings.seen["st"]
         above = np.linalg.norm(tumbling.w, axis=-1) > fast.star_tracker.rate_limit_rad_s
         assert above[:, 0].any()
         assert not (has_star & above).any()
@@ -92,10 +92,10 @@ class TestReadings:
 
     def test_nothing_is_missing_in_the_sunlight(self, runs: AttitudeRuns) -> None:
         r = runs.readings
-        assert r.has_star.all()
-        assert r.has_gyro.all()
-        assert r.has_field.all()
-        assert r.has_sun.all()
+        assert r.seen["st"].all()
+        assert r.seen["gyro"].all()
+        assert r.seen["mag"].all()
+        assert r.seen["sun"].all()
 
     def test_instant_by_instant(self, runs: AttitudeRuns) -> None:
         row = slice(57, 58)
@@ -127,7 +127,7 @@ class TestStarts:
         assert lit[:, :290].all()
         assert not lit[:, 301:2000].any()
         assert lit[:, -200:].all()
-        assert not (dark.readings.has_sun & ~lit).any()
+        assert not (dark.readings.seen["sun"] & ~lit).any()
 
     def test_collinear(self) -> None:
         line = replace(ANY_START, sunlit=True, most_separation_rad=np.radians(12.0))

@@ -24,7 +24,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from adcs.mockup.vision.frame_files import write_frame
+from adcs.io.frame_files import write_frame
 from adcs.mockup.vision.sky import led_sky, write_sky
 from sims.experiments.mockup_vision import SkySetup, random_frame
 from tests.adcs.refusals import assert_refused

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 from matplotlib import image
 
-from adcs.io.scenario_files import changed, estimate_of, read_scenario, scenario_text
+from adcs.io.scenario_files import read_scenario, scenario_text
 from adcs.kalman import accuracy
 from sims.experiments.attitude import parts_of, run_scenario
 from tests.adcs.refusals import assert_refused
@@ -106,8 +106,8 @@ class TestNumbers:
 
     def test_agree_with_the_library(self):
         """What is put together from parts of the runs is what the library says of all of them."""
-        file = changed(read_scenario("tabletsat"), {"estimate": {"sensors": "st+gyro", "states": ["gyro-bias"]}})
-        estimate = estimate_of("x", file.estimate)
+        file = read_scenario("tabletsat").changed({"estimate": {"sensors": "st+gyro", "states": ["gyro-bias"]}})
+        estimate = file.estimator("x")
         (part,) = parts_of(file, estimate, range(3))
         expected = accuracy.evaluate(part.runs, part.estimates)
         found = run_scenario(file, estimate, range(3)).numbers()
@@ -119,7 +119,7 @@ class TestNumbers:
         from sims.experiments import attitude as attitude_runs
 
         file = read_scenario("field-error")
-        estimate = estimate_of("x", file.estimate)
+        estimate = file.estimator("x")
         whole = run_scenario(file, estimate, range(3))
         monkeypatch.setattr(attitude_runs, "_NUMBERS_AT_ONCE", 1)
         finished = []
@@ -171,7 +171,7 @@ class TestNamedProblems:
         arguments = ("--sensors", "mag+sun+gyro", "--states", "gyro-bias,disturbance", "--eclipse")
         assert numbers(adcs("run", "tabletsat", "--json", "--quiet", *arguments))["angle_rms_deg"] < 0.06
         file = read_scenario("eclipse")
-        outcome = run_scenario(file, estimate_of("x", file.estimate), range(10))
+        outcome = run_scenario(file, file.estimator("x"), range(10))
         assert np.median(outcome.error_deg[:, 600:].max(axis=1)) < 0.25
         assert np.median(outcome.error_deg[:, 2690:].max(axis=1)) < 0.06
 
@@ -237,7 +237,7 @@ class TestOwnScenario:
     def test_file(self, adcs, tmp_path):
         path = tmp_path / "mine.toml"
         changes = {"name": "mine", "satellite": {"inertia_kgm2": [[2.0, 0, 0], [0, 3.0, 0], [0, 0, 4.0]]}}
-        path.write_text(scenario_text(changed(read_scenario("tabletsat"), changes)))
+        path.write_text(scenario_text(read_scenario("tabletsat").changed(changes)))
         outcome = adcs("run", path, "--seeds", "2")
         assert outcome.status == 0
         assert outcome.out.startswith("mine: 2 runs of 200 s; st+gyro+mag+sun; filter mekf")

@@ -7,7 +7,8 @@ import json
 
 import pytest
 
-from adcs.io.scenario_files import changed, estimate_of, read_scenario
+import sims.experiments
+from adcs.io.scenario_files import read_scenario
 from sims.experiments.paper_tables import PAPER_ROWS, printed
 from tests.adcs.refusals import assert_refused
 from tests.command_line import refuse_constant
@@ -41,8 +42,8 @@ class TestPaper:
         """All sets observe attitude, and the paper's noise is known of all of them."""
         for row in PAPER_ROWS:
             estimate = {"sensors": row.sensors, "states": list(row.states), "filter": row.filter}
-            file = changed(read_scenario("tabletsat"), {"estimate": {**estimate, "process_noise": "paper"}})
-            settings = estimate_of("x", file.estimate).settings
+            file = read_scenario("tabletsat").changed({"estimate": {**estimate, "process_noise": "paper"}})
+            settings = file.estimator("x").settings
             assert settings.sensors.states == tuple(
                 state for state in ("field-bias", "gyro-bias", "disturbance") if state in row.states
             )
@@ -74,9 +75,7 @@ class TestCommand:
         assert float(row["rms"]) == pytest.approx(float(row["ours"]), rel=0.4)
 
     def test_json_and_text(self, adcs, monkeypatch):
-        from sims.cli import tables
-
-        monkeypatch.setattr(tables, "PAPER_ROWS", PAPER_ROWS[-2:])
+        monkeypatch.setattr(sims.experiments, "PAPER_ROWS", PAPER_ROWS[-2:])
         outcome = adcs("tables", "--seeds", "1", "--duration", "60", "--json")
         assert outcome.status == 0
         rows = json.loads(outcome.out, parse_constant=refuse_constant)["rows"]

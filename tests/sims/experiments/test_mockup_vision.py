@@ -17,9 +17,9 @@ from functools import cache, lru_cache
 import numpy as np
 import pytest
 
+from adcs.io.frame_files import write_frame
 from adcs.mockup.vision.camera import Camera, Pose
 from adcs.mockup.vision.centroids import find_faint_stars
-from adcs.mockup.vision.frame_files import write_frame
 from adcs.mockup.vision.paper_matcher import CameraFix, PaperMatcher
 from adcs.mockup.vision.robust_matcher import RobustMatcher
 from adcs.mockup.vision.sky import led_sky

@@ -29,10 +29,10 @@ from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.posterior_bound import posterior_bound
 from magloc.tracking.results import rows_of
 from magloc.tracking.tracker import Tracker
-from sims import montecarlo
-from sims.magnetics.scenario import Scenario
+from sims.magnetics.scenario import MagneticScenario
 from sims.magnetics.scenario_files import read_scenario
 from sims.magnetics.simulation import Simulation
+from sims.montecarlo import run_many
 
 FloatArray = NDArray[np.float64]
 FAR = chi2.isf(math.erfc(5.0 / math.sqrt(2.0)), 3)
@@ -85,12 +85,12 @@ def track_statistics(simulation: Simulation, motion: MotionModel) -> dict[str, A
     }
 
 
-def at_rest(simulation: Simulation) -> dict[str, Any]:
+def at_rest(simulation: Simulation, _: None) -> dict[str, Any]:
     """Of a source at rest."""
     return track_statistics(simulation, REST)
 
 
-def at_rest_with_bound(simulation: Simulation) -> dict[str, Any]:
+def at_rest_with_bound(simulation: Simulation, _: None) -> dict[str, Any]:
     """Of a source at rest; and mean squares of errors and of their posterior bound over the rows of the track.
 
     The bound is that of the rows from the track's first one on: what the start drops is not held against the filter.
@@ -109,26 +109,30 @@ def at_rest_with_bound(simulation: Simulation) -> dict[str, Any]:
     return {**track_statistics(simulation, REST), **squares}
 
 
-def weaving(simulation: Simulation) -> dict[str, Any]:
+def weaving(simulation: Simulation, _: None) -> dict[str, Any]:
     """Of the weaving target."""
     return track_statistics(simulation, WEAVING)
 
 
-def ship(simulation: Simulation) -> dict[str, Any]:
+def ship(simulation: Simulation, _: None) -> dict[str, Any]:
     """Of the ship."""
     return track_statistics(simulation, SHIP)
 
 
-def hand(simulation: Simulation) -> dict[str, Any]:
+def hand(simulation: Simulation, _: None) -> dict[str, Any]:
     """Of the magnet in a hand."""
     return track_statistics(simulation, HAND)
 
 
-Estimator = Callable[[Simulation], dict[str, Any]]
+Estimator = Callable[[Simulation, None], dict[str, Any]]
 
 
-def found(scenario: Scenario, estimator: Estimator, n_runs: int) -> xr.Dataset:
-    result = montecarlo.run(scenario, estimator, range(n_runs), processes=1)
+def unjudged(array: object, readings: object) -> None:
+    """Leave everything to the judge, which knows the truth."""
+
+
+def found(scenario: MagneticScenario, estimator: Estimator, n_runs: int) -> xr.Dataset:
+    result = run_many(scenario, unjudged, seeds=range(n_runs), judge=estimator, processes=1)
     assert (result.error == "").all(), result.error.values
     return result
 

@@ -19,7 +19,7 @@ from arrays.geometries import tetrahedron
 from arrays.sensor import Calibration, Sensor
 from sims.magnetics import simulation as simulation_module
 from sims.magnetics.paths import Attitude, Lawnmower, Steered
-from sims.magnetics.scenario import Carrier, Missing, Platform, Pulsation, Scenario, Source
+from sims.magnetics.scenario import Carrier, MagneticScenario, Missing, Platform, Pulsation, Source
 from sims.magnetics.sensors import SensorModel
 from sims.magnetics.simulation import MU0, Simulation, simulate
 from sims.noise import stream
@@ -40,9 +40,9 @@ TARGET = Source(
 )
 
 
-def scenario(model: SensorModel = SILENT, array: SensorArray | None = None, **changes: object) -> Scenario:
+def scenario(model: SensorModel = SILENT, array: SensorArray | None = None, **changes: object) -> MagneticScenario:
     array = tetrahedron(1.5) if array is None else array
-    base = Scenario(array, (model,) * array.n_sensors, duration_s=20.0, rate_Hz=10.0, sources=(TARGET,))
+    base = MagneticScenario(array, (model,) * array.n_sensors, duration_s=20.0, rate_Hz=10.0, sources=(TARGET,))
     return replace(base, **changes)  # type: ignore[arg-type]
 
 

@@ -1,4 +1,4 @@
-"""Tests of adcs.mockup.vision.frame_files: what was written is read.
+"""Tests of adcs.io.frame_files: what was written is read.
 
 And one sentence says what is wrong with a file.
 """
@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from adcs.io.frame_files import frame_paths, read_frame, write_frame
 from adcs.mockup.vision.camera import Camera, Pose
-from adcs.mockup.vision.frame_files import frame_paths, read_frame, write_frame
 from adcs.mockup.vision.sky import led_sky
 from arrays.io.errors import InputError
 from sims.mockup.frames import rendered_frame

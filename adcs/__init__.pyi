@@ -1,0 +1,14 @@
+from adcs import frames as frames
+from adcs import mockup as mockup
+from adcs.complementary.filters import complementary_filter as complementary_filter
+from adcs.ellipsoids.ellipsoid import Ellipsoid as Ellipsoid
+from adcs.ellipsoids.observer import EllipsoidObserver as EllipsoidObserver
+from adcs.environment.orbit import circular_orbit as circular_orbit
+from adcs.io.scenario_files import read_scenario as read_scenario
+from adcs.io.telemetry_files import read_telemetry as read_telemetry
+from adcs.kalman.bank import EstimatorSettings as EstimatorSettings
+from adcs.kalman.bank import estimate as estimate
+from adcs.satellite.attitude_track import AttitudeTrack as AttitudeTrack
+from adcs.satellite.satellite import Satellite as Satellite
+from adcs.satellite.telemetry import Telemetry as Telemetry
+from adcs.stars.identification import identify_stars as identify_stars

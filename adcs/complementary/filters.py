@@ -1,0 +1,124 @@
+"""The door to the complementary filters: attitude of any record of a gyro and two vectors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, TypeVar, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adcs import quaternion
+from adcs.complementary.adaptive import AdaptiveTuning, adaptive_track
+from adcs.complementary.explicit import BEST_GAINS, Gains, explicit_track
+from adcs.complementary.gauss_newton import gauss_newton_track
+from adcs.satellite.attitude_track import AttitudeTrack
+from adcs.satellite.telemetry import is_read
+from adcs.satellite.vector_record import VectorRecord
+from arrays.typing import FloatArray
+
+Method = Literal["explicit", "gauss-newton", "adaptive"]
+METHODS: tuple[Method, ...] = get_args(Method)
+_STEP_TOLERANCE = 1e-2
+_NAMES = ("first vector", "second vector")
+
+
+def complementary_filter(
+    time_s: ArrayLike,
+    gyro_rad_s: ArrayLike,
+    body_vectors: Sequence[ArrayLike],
+    frame_vectors: Sequence[ArrayLike],
+    *,
+    method: Method = "explicit",
+    settings: Gains | AdaptiveTuning | None = None,
+) -> AttitudeTrack:
+    """Attitude from a gyro and two vectors, such as those of an IMU, in a frame that does not turn.
+
+    It starts where the first readings of both vectors put it.
+
+    Parameters
+    ----------
+    time_s : array_like, shape (n,)
+        In equal steps.
+    gyro_rad_s : array_like, shape (n, 3)
+        Rate, body axes.
+    body_vectors : two array_like, shape (n, 3)
+        What is measured, of any length, such as acceleration and field; NaN where missing.
+    frame_vectors : two array_like, shape (3,) or (n, 3)
+        The same in the frame, such as up and the local field.
+    method : str
+        ``explicit`` and ``gauss-newton`` (of a measured quaternion) have fixed gains; ``adaptive`` is a Kalman filter
+        that lets the bias change where its innovations grow: its first vector is to be a field in tesla.
+    settings : Gains or AdaptiveTuning, optional
+        By default those of a satellite with a magnetometer of 1000 nT, which forget the start in a minute.
+
+    Returns
+    -------
+    AttitudeTrack
+        Frame from body; with gains, the estimate before the readings of each instant.
+
+    Raises
+    ------
+    ValueError
+        A shape does not match, the steps differ, a vector is zero, or the filter would be unstable.
+    """
+    if method not in METHODS:
+        raise ValueError(f"Input method must be one of {', '.join(METHODS)}; instead received {method!r}.")
+    times = np.asarray(time_s, dtype=np.float64)
+    steps = np.diff(times)
+    if times.ndim != 1 or len(times) < 2 or not np.ptp(steps) <= _STEP_TOLERANCE * steps.mean():
+        raise ValueError("Input time_s must ascend in equal steps; instead received others.")
+    for name, vectors in (("body_vectors", body_vectors), ("frame_vectors", frame_vectors)):
+        if len(vectors) != 2:
+            raise ValueError(f"Input {name} must be two vectors; instead received {len(vectors)}.")
+    rate = np.asarray(gyro_rad_s, dtype=np.float64)
+    body = [np.asarray(v, dtype=np.float64) for v in body_vectors]
+    frame = [np.broadcast_to(np.asarray(v, dtype=np.float64), (len(times), 3)) for v in frame_vectors]
+    vectors = body[0], body[1], frame[0], frame[1]
+    record = VectorRecord(float(steps.mean()), rate, *vectors, np.zeros_like(rate))
+    start = _first_attitude(body, frame)
+    sigma: dict[str, FloatArray] = {}
+    if method == "adaptive":
+        adapted = adaptive_track(record, _of_kind(settings, AdaptiveTuning()), q_start=start)
+        q, bias = adapted.q[0], adapted.bias_rad_s[0]
+        deviations = np.sqrt(np.diagonal(adapted.covariance[0], axis1=-2, axis2=-1))
+        sigma = {"attitude": deviations[:, :3], "gyro-bias": deviations[:, 3:]}
+    else:
+        run = explicit_track if method == "explicit" else gauss_newton_track
+        found = run(record, _of_kind(settings, BEST_GAINS), q_start=start)
+        q, bias = found.q[0], -found.integral_rad_s[0]
+    return AttitudeTrack(
+        title=f"complementary filter, {method}",
+        time_s=times,
+        rows=np.arange(len(times)),
+        q=q,
+        states={"rate": rate - bias, "gyro-bias": bias},
+        used=_NAMES,
+        seen=dict(zip(_NAMES, map(is_read, body), strict=True)),
+        sigma=sigma,
+    )
+
+
+_Settings = TypeVar("_Settings", Gains, AdaptiveTuning)
+
+
+def _of_kind(settings: Gains | AdaptiveTuning | None, default: _Settings) -> _Settings:
+    """Settings of the filter that is asked for."""
+    if settings is None:
+        return default
+    if not isinstance(settings, type(default)):
+        raise ValueError(
+            f"Input settings must be {type(default).__name__} for this method; instead received {settings!r}."
+        )
+    return settings
+
+
+def _first_attitude(body: list[FloatArray], frame: list[FloatArray]) -> FloatArray:
+    """Quaternion (4,) of the first instant that has both vectors; the identity without one."""
+    from scipy.spatial.transform import Rotation
+
+    both = np.flatnonzero(is_read(body[0]) & is_read(body[1]))
+    if not both.size:
+        return quaternion.IDENTITY
+    seen, there = (np.stack([v[both[0]] / np.linalg.norm(v[both[0]]) for v in pair]) for pair in (body, frame))
+    return quaternion.from_rotation(Rotation.align_vectors(there, seen)[0])

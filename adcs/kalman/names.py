@@ -1,0 +1,12 @@
+"""Words by which a filter, its noise and its start are chosen."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+Filter = Literal["mekf", "constant-gain", "parallel-disturbance", "reduced", "smoother"]
+Noise = Literal["tuned", "paper"]
+StartKind = Literal["near", "vectors", "any"]
+FILTERS: tuple[str, ...] = get_args(Filter)
+NOISES: tuple[str, ...] = get_args(Noise)
+STARTS: tuple[str, ...] = get_args(StartKind)

@@ -1,0 +1,85 @@
+"""Attitude through time, as a filter makes it of one log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adcs import quaternion
+from arrays.io.lazy import by_name
+from arrays.typing import BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from scipy.spatial.transform import Rotation
+
+
+@dataclass(frozen=True, eq=False)
+class AttitudeTrack:
+    """Attitude and what else a filter estimates, at n instants.
+
+    Attributes
+    ----------
+    title : str
+        Sensors, states and filter in words.
+    time_s : ndarray, shape (n,)
+        Of every instant, those of missing rows too; it begins where a reading first tells something of the attitude.
+    rows : ndarray of int
+        Instants that the log has.
+    q : ndarray, shape (n, 4)
+        Reference frame from body, scalar first; :attr:`rotation` is scipy's.
+    states : mapping of str to ndarray, shape (n, 3)
+        ``rate`` against inertial space [rad/s], and of what is estimated ``gyro-bias`` [rad/s], ``field-bias`` [T] and
+        ``disturbance`` [1/s²], body axes.
+    used : tuple of str
+        Sensors in use.
+    seen : mapping of str to ndarray of bool, shape (n,)
+        Where each sensor has a reading.
+    sigma : mapping of str to ndarray, shape (n, 3)
+        Standard deviations of the states and of ``attitude`` [rad]; empty for a filter without a covariance.
+    nis : mapping of str to ndarray, shape (n,)
+        Normalised innovation squared of each sensor, NaN without a reading: χ² of 3 numbers, of 2 for the Sun sensor.
+    q_orbital : ndarray, shape (n, 4), optional
+        Orbital frame from body.
+    warnings : tuple of str
+        What is degraded or cannot be observed, and for how long.
+    """
+
+    title: str
+    time_s: FloatArray
+    rows: NDArray[np.int64]
+    q: FloatArray
+    states: Mapping[str, FloatArray]
+    used: tuple[str, ...]
+    seen: Mapping[str, BoolArray]
+    sigma: Mapping[str, FloatArray] = field(default_factory=dict)
+    nis: Mapping[str, FloatArray] = field(default_factory=dict)
+    q_orbital: FloatArray | None = None
+    warnings: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        """Return the number of instants."""
+        return len(self.time_s)
+
+    @property
+    def rotation(self) -> Rotation:
+        """Reference frame from body: the inertial one (J2000) of :func:`adcs.estimate`, else that of its vectors."""
+        return quaternion.to_rotation(self.q)
+
+    @property
+    def sigma_deg(self) -> FloatArray:
+        """Standard deviation of the attitude about each body axis [°], shape (n, 3); NaN if the filter has none."""
+        return np.degrees(self.sigma.get("attitude", np.full((len(self), 3), np.nan)))
+
+    @property
+    def rejected(self) -> dict[str, BoolArray]:
+        """Readings that were not used, by sensor, shape (n,): no filter has a gate, so all of sensors not in use."""
+        return {name: seen & (name not in self.used) for name, seen in self.seen.items()}
+
+    def plot(self) -> Figure:
+        """Every state's three axes side by side, with the filter's ±3σ, and the gaps of its sensors."""
+        return by_name("adcs.plots.attitude:track_figure")(self)

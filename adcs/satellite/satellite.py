@@ -1,0 +1,66 @@
+"""A satellite as its user knows it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from adcs.environment.orbit import Orbit
+from adcs.frames import instants
+from adcs.satellite.dynamics import RigidBody, WheelControl, wheel_control
+from adcs.satellite.sensors import Gyro, Magnetometer, StarTracker, SunSensor
+from magloc.fields.geomagnetic import Model
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Satellite:
+    """A satellite, its orbit and its sensors.
+
+    Attributes
+    ----------
+    inertia_kgm2 : ndarray, shape (3, 3)
+        Wheels included, body axes.
+    orbit : Orbit
+        Of :func:`adcs.circular_orbit`, or :class:`adcs.environment.orbit.Sgp4Orbit`.
+    residual_dipole_Am2 : ndarray, shape (3,)
+        Magnetic moment that stays with the satellite, body axes.
+    star_tracker : StarTracker
+    gyro : Gyro
+    magnetometer : Magnetometer
+    sun_sensor : SunSensor
+        Their noise is what the filters believe; by default that of TabletSat-Aurora.
+    control : WheelControl
+        Only of use to a simulation, and to the Jacobian of the closed loop.
+    start : datetime64
+        UTC from which a telemetry's time counts; by default the orbit's epoch.
+    field_model : str or Coefficients
+        Of the geomagnetic field: "IGRF-14" (1900 to 2030) or "WMM2025".
+    body : RigidBody
+        Inertia and dipole, checked.
+
+    Raises
+    ------
+    ValueError
+        No body has this inertia.
+    """
+
+    inertia_kgm2: ArrayLike
+    orbit: Orbit
+    residual_dipole_Am2: ArrayLike = (0.0, 0.0, 0.0)
+    star_tracker: StarTracker = field(default_factory=StarTracker)
+    gyro: Gyro = field(default_factory=Gyro)
+    magnetometer: Magnetometer = field(default_factory=Magnetometer)
+    sun_sensor: SunSensor = field(default_factory=SunSensor)
+    control: WheelControl = None  # type: ignore[assignment]  # filled in from the body
+    start: np.datetime64 = None  # type: ignore[assignment]  # the orbit's epoch
+    field_model: Model = "IGRF-14"
+    body: RigidBody = field(init=False)
+
+    def __post_init__(self) -> None:
+        body = RigidBody(np.asarray(self.inertia_kgm2, dtype=np.float64), np.asarray(self.residual_dipole_Am2))
+        object.__setattr__(self, "body", body)
+        if self.control is None:
+            object.__setattr__(self, "control", wheel_control(body))
+        object.__setattr__(self, "start", instants(self.orbit.epoch if self.start is None else self.start)[()])

@@ -1,0 +1,91 @@
+"""Runs of yaw in guaranteed ellipsoids: ``adcs run ellipsoid``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adcs.ellipsoids.roll_yaw import (
+    STEP_S,
+    YAW,
+    AttitudeLoop,
+    SetTrack,
+    observe,
+    roll_yaw_observer,
+    roll_yaw_system,
+    violations,
+)
+from adcs.ellipsoids.strip import StepRule
+from arrays.typing import FloatArray
+from sims.attitude.roll_yaw import ErrorScenario, LoopScenario, error_runs, fly
+
+
+@dataclass(frozen=True)
+class EllipsoidSettings:
+    """What is simulated and observed.
+
+    Attributes
+    ----------
+    noise_rad, drift_rad_s : float
+        Bounds of the horizon sensor's errors and of the yaw gyro's zero shift.
+    n_steps : int
+        Of 2 s.
+    step : str
+        Rule by which a set shrinks to a reading.
+    jump_s : float or None
+        When the readings become four times as bad as their bound.
+    closed_loop : bool
+        The satellite in its attitude loop in place of the dynamics of the error alone.
+    """
+
+    noise_rad: float
+    drift_rad_s: float
+    n_steps: int
+    step: StepRule = "tightened"
+    jump_s: float | None = None
+    closed_loop: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class EllipsoidRuns:
+    """Truth and sets of some runs."""
+
+    seeds: range
+    states_rad: FloatArray
+    track: SetTrack
+    roll_readings_rad: FloatArray
+    increments_rad: FloatArray | None
+
+
+def ellipsoid_runs(settings: EllipsoidSettings, seeds: range) -> EllipsoidRuns:
+    """Runs of some seeds, all at once."""
+    noise, drift, n_steps = settings.noise_rad, settings.drift_rad_s, settings.n_steps
+    observer = roll_yaw_observer(roll_yaw_system(noise, drift), len(seeds), settings.step)
+    if settings.closed_loop:
+        loop = AttitudeLoop(observer, n_steps)
+        scenario = LoopScenario(noise, drift, n_steps, first_yaw_rad=2.0 * noise, jump_s=settings.jump_s)
+        flown = fly(scenario, loop, seeds)
+        states = flown.angles_rad[..., [0, 2]]
+        return EllipsoidRuns(seeds, states, loop.recorder.track, flown.roll_readings_rad, flown.increments_rad)
+    runs = error_runs(ErrorScenario(noise, drift, n_steps, jump_s=settings.jump_s), seeds)
+    return EllipsoidRuns(seeds, runs.states_rad, observe(observer, runs.readings_rad), runs.readings_rad, None)
+
+
+RUN_COLUMNS = ("seed", "final_error_deg", "half_width_deg", "bound_deg", "resets", "violations", "yaw_max_1000s_deg")
+
+
+def row_of_each(runs: EllipsoidRuns) -> FloatArray:
+    """Columns of RUN_COLUMNS; the last one is the largest yaw after 1000 s, NaN of a shorter run."""
+    track, yaw = runs.track, runs.states_rad[..., YAW]
+    late = np.abs(yaw[:, int(1000.0 / STEP_S) :])
+    columns = [
+        np.array(runs.seeds),
+        np.degrees(np.abs(track.centres[:, -1, YAW] - yaw[:, -1])),
+        np.degrees(track.yaw_half_widths[:, -1]),
+        np.degrees(track.bounds[:, -1]),
+        track.resets[:, -1],
+        violations(track, runs.states_rad),
+        np.degrees(late.max(axis=1)) if late.size else np.full(len(yaw), np.nan),
+    ]
+    return np.stack(columns, axis=1)

@@ -1,0 +1,73 @@
+"""Scenarios of either kind: an array of magnetometers, or a satellite that turns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import overload
+
+from adcs.io.scenario_files import built_in_scenarios as built_in_satellites
+from adcs.io.scenario_files import read_scenario as read_satellite
+from arrays.io.errors import InputError
+from arrays.io.toml import read_toml
+from sims.attitude.files import simulation_of
+from sims.attitude.scenario import AttitudeScenario
+from sims.attitude.simulation import AttitudeRuns
+from sims.attitude.simulation import simulate as simulate_attitude
+from sims.magnetics.scenario import MagneticScenario
+from sims.magnetics.scenario_files import built_in_scenarios
+from sims.magnetics.scenario_files import read_scenario as read_magnetic
+from sims.magnetics.simulation import Simulation
+from sims.magnetics.simulation import simulate as simulate_magnetic
+
+
+def read_scenario(name_or_path: str) -> MagneticScenario | AttitudeScenario:
+    """Scenario of a simulation.
+
+    Parameters
+    ----------
+    name_or_path : str
+        Name of a built-in scenario of ``magloc simulate`` or ``adcs run``, or a TOML file of either: with a table
+        ``satellite`` it is of a satellite.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or does not describe a scenario; the text says where and why.
+    """
+    if name_or_path not in built_in_scenarios() and _is_of_a_satellite(name_or_path):
+        return simulation_of(read_satellite(name_or_path))
+    return read_magnetic(name_or_path)
+
+
+def _is_of_a_satellite(name_or_path: str) -> bool:
+    if name_or_path in built_in_satellites():
+        return True
+    try:
+        return "satellite" in read_toml(name_or_path, "")
+    except InputError:
+        return False  # the reader of the other kind says what is wrong
+
+
+@overload
+def simulate(scenario: MagneticScenario, seed: int) -> Simulation: ...
+@overload
+def simulate(scenario: AttitudeScenario, seed: int | Sequence[int]) -> AttitudeRuns: ...
+def simulate(scenario: MagneticScenario | AttitudeScenario, seed: int | Sequence[int]) -> Simulation | AttitudeRuns:
+    """Readings of a scenario, and the truth behind them.
+
+    Parameters
+    ----------
+    scenario : MagneticScenario or AttitudeScenario
+    seed : int
+        Of all random numbers; of a satellite also several, one for every run.
+
+    Raises
+    ------
+    ValueError
+        A sensor comes too near to a source, or a satellite's start conditions hold at no time.
+    """
+    if isinstance(scenario, AttitudeScenario):
+        return simulate_attitude(scenario, [seed] if isinstance(seed, int) else seed)
+    if not isinstance(seed, int):
+        raise ValueError(f"Input seed must be one number for an array; instead received {seed}.")
+    return simulate_magnetic(scenario, seed)
