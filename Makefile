@@ -16,7 +16,7 @@ test: lint chromium
 	$(BIN)/python -m pytest -q -n 2 --dist loadgroup -m "not slow"
 
 test-full: lint chromium
-	$(BIN)/python -m pytest -q -n 2 --dist loadgroup
+	HYPOTHESIS_PROFILE=random $(BIN)/python -m pytest -q -n 2 --dist loadgroup
 
 lint: .venv/installed
 	$(BIN)/ruff check

@@ -6,12 +6,20 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from adcs.cli.app import main as adcs_main
 from magloc.cli.app import main
 from tests.command_line import Outcome, Run
 
 REPOSITORY = Path(__file__).parents[1]
+
+# The same examples in every run of `make test`, new ones in every run of `make test-full`. Neither asks the clock.
+for profile, derandomize in (("fixed", True), ("random", False)):
+    settings.register_profile(
+        profile, derandomize=derandomize, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    )
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 
 
 @pytest.fixture(scope="session")

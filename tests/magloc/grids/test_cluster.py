@@ -25,6 +25,7 @@ from magloc.grids.store import Sweep, open_map
 from tests.conftest import REPOSITORY
 
 pytest.importorskip("distributed")
+dask = pytest.importorskip("dask")
 CUBE = StartsMap.of(StartsScenario(method=IekfFilter(max_iterations=5)), 70)  # 27 chunks
 
 
@@ -124,7 +125,7 @@ class TestNoCluster:
     @pytest.mark.parametrize("answer", [b"HTTP/1.0 400 Bad Request\r\n\r\n", b"", None])
     @pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
     def test_another_service_there(self, answer):
-        """It answers, hangs up, or says nothing: one error in time, and no client that complains when it is deleted."""
+        """It answers, hangs up, or says nothing: one error, and no client that complains when it is deleted."""
         with socket.create_server(("127.0.0.1", 0)) as server:
 
             def serve():
@@ -135,11 +136,13 @@ class TestNoCluster:
             if answer is not None:
                 threading.Thread(target=serve, daemon=True).start()
             address = "{}:{}".format(*server.getsockname())
-            begin = time.perf_counter()
-            with pytest.raises(InputError, match=f"--scheduler {address}: found (no scheduler|another service) there"):
+            # Dask's own patience is without end: what ends the wait is the time that was given.
+            with (
+                dask.config.set({f"distributed.comm.timeouts.{name}": "1 day" for name in ("connect", "tcp")}),
+                pytest.raises(InputError, match=f"--scheduler {address}: found (no scheduler|another service) there"),
+            ):
                 list(computed_by(address, CUBE, boxes(CUBE), timeout_s=0.3))
             gc.collect()
-        assert time.perf_counter() - begin < 3.0
 
     def test_not_installed(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "distributed", None)
