@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,6 +30,12 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 
 # The notebooks that `make test` executes; all others take more than some seconds and are left to `make test-full`.
 QUICK_NOTEBOOKS = {"01-first-fix", "04-scalar-sign", "ellipsoid"}
+
+
+def pytest_configure() -> None:
+    """Let Ctrl-C reach the commands that tests start, even where these tests run in the background of a shell."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -29,9 +29,10 @@ dask = pytest.importorskip("dask")
 CUBE = StartsMap.of(StartsScenario(method=IekfFilter(max_iterations=5)), 70)  # 27 chunks
 
 
-@pytest.fixture
-def cluster(tmp_path):
-    """Address of a scheduler with two workers on this machine, and its process."""
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory):
+    """Address of a scheduler with two workers on this machine, and its process; one for all tests."""
+    tmp_path = tmp_path_factory.mktemp("cluster")
     dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
     address_file = tmp_path / "scheduler.json"
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "cwd": tmp_path}
@@ -60,7 +61,26 @@ def wait_for_address(path):
 
 
 class TestCluster:
+    def test_command(self, cluster, tmp_path, capsys):
+        address, _ = cluster
+        arguments = ["map", "--over", "sources", "--grid", "7", "--quiet"]
+        assert main([*arguments, "--scheduler", address, "--out", str(tmp_path / "far")]) == 0
+        assert main([*arguments, "--out", str(tmp_path / "here")]) == 0
+        assert capsys.readouterr().err == ""
+        with (
+            open_map(tmp_path / "far/map.zarr") as far,
+            open_map(tmp_path / "here/map.zarr") as here,
+        ):
+            xr.testing.assert_equal(far, here)
+
+    def test_a_worker_that_fails(self, cluster):
+        address, _ = cluster
+        broken = StartsMap(CUBE.scenario, CUBE.grid, None, CUBE.z, CUBE.optimum)
+        with pytest.raises(InputError, match=r"a worker failed \(AttributeError: "):
+            list(computed_by(address, broken, boxes(CUBE)))
+
     def test_same_values_and_then_death(self, cluster, tmp_path):
+        """The last one: it ends the scheduler."""
         address, scheduler = cluster
         path = tmp_path / "map.zarr"
 
@@ -84,24 +104,6 @@ class TestCluster:
         with open_map(path) as stored:
             for name in expected:
                 np.testing.assert_array_equal(stored[name], expected[name])
-
-    def test_command(self, cluster, tmp_path, capsys):
-        address, _ = cluster
-        arguments = ["map", "--over", "sources", "--grid", "7", "--quiet"]
-        assert main([*arguments, "--scheduler", address, "--out", str(tmp_path / "far")]) == 0
-        assert main([*arguments, "--out", str(tmp_path / "here")]) == 0
-        assert capsys.readouterr().err == ""
-        with (
-            open_map(tmp_path / "far/map.zarr") as far,
-            open_map(tmp_path / "here/map.zarr") as here,
-        ):
-            xr.testing.assert_equal(far, here)
-
-    def test_a_worker_that_fails(self, cluster):
-        address, _ = cluster
-        broken = StartsMap(CUBE.scenario, CUBE.grid, None, CUBE.z, CUBE.optimum)
-        with pytest.raises(InputError, match=r"a worker failed \(AttributeError: "):
-            list(computed_by(address, broken, boxes(CUBE)))
 
 
 class TestNoCluster:

@@ -79,7 +79,7 @@ def errors_of(fix, positions):
 class TestSixteenVectorSensors:
     """The plate of the figures: right number in 99 %, median position error 3.2 mm, 95 % within 20 mm, no start."""
 
-    @pytest.mark.parametrize("n_rows", [20, pytest.param(200, marks=pytest.mark.slow)])
+    @pytest.mark.parametrize("n_rows", [8, pytest.param(200, marks=pytest.mark.slow)])
     def test_number_and_positions(self, n_rows):
         rng = np.random.default_rng(101)
         right, errors = [], []
@@ -95,7 +95,7 @@ class TestSixteenVectorSensors:
 
     def test_none_is_worse_than_scipy_from_the_truth(self):
         rng = np.random.default_rng(102)
-        p, m = sources_below(rng, 6, 2)
+        p, m = sources_below(rng, 3, 2)
         readings = noisy_readings(PLATE, p, m, rng)
         for row, fix, *truth in zip(readings, BY_ITSELF.fit_rows(readings), p, m, strict=True):
             best = fix.solutions[0]
@@ -345,7 +345,7 @@ class TestRows:
     """Every row on its own, whatever rows are beside it."""
 
     rng = np.random.default_rng(109)
-    p, m = sources_below(rng, 8, 2)
+    p, m = sources_below(rng, 4, 2)
     readings = noisy_readings(PLATE, p, m, rng)
     together = plain_locator(PLATE, sources="auto").fit_rows(readings)
 
@@ -354,13 +354,13 @@ class TestRows:
         return np.array(sorted(found_positions(fix).tolist()))
 
     def test_alone_or_together(self):
-        for i, fix in enumerate(self.together[:3]):
+        for i, fix in enumerate(self.together[:2]):
             alone = plain_locator(PLATE, sources="auto").fit_rows(self.readings[i : i + 1])[0]
             assert_allclose(self.sorted_positions(alone), self.sorted_positions(fix), rtol=1e-4)
             assert alone.solutions[0].chi2 == pytest.approx(fix.solutions[0].chi2, rel=1e-6)
 
     def test_in_any_order(self):
-        order = np.random.default_rng(0).permutation(8)
+        order = np.random.default_rng(0).permutation(4)
         for fix, i in zip(plain_locator(PLATE, sources="auto").fit_rows(self.readings[order]), order, strict=True):
             assert_allclose(self.sorted_positions(fix), self.sorted_positions(self.together[i]), rtol=1e-4)
 
@@ -372,7 +372,7 @@ class TestRows:
     def test_progress_counts_every_row(self):
         counts = []
         BY_ITSELF.fit_rows(self.readings, progress=counts.append)
-        assert sum(counts) == 8
+        assert sum(counts) == 4
 
     def test_missing_readings(self):
         readings = self.readings[:4].copy()
