@@ -155,14 +155,23 @@ class TestOverSources:
         assert not out.exists()
 
 
+CHUNKED = ("map", "--grid", "70", "--method", "iekf")  # 27 chunks
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """What the uninterrupted command makes."""
+    out = tmp_path_factory.mktemp("whole")
+    assert main([*CHUNKED, "--out", str(out), "--quiet"]) == 0
+    return out
+
+
 class TestInterrupted:
     """The command as a process of its own, with signals."""
 
-    arguments = ("map", "--grid", "70", "--method", "iekf")  # 27 chunks
-
     def started(self, out):
         process = subprocess.Popen(
-            [sys.executable, "-m", "magloc.cli", *self.arguments, "--threads", "1", "--out", str(out)],
+            [sys.executable, "-m", "magloc.cli", *CHUNKED, "--threads", "1", "--out", str(out)],
             cwd=REPOSITORY, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
         marks = out / "map.zarr/seconds_of_chunk/c"
@@ -171,16 +180,9 @@ class TestInterrupted:
             time.sleep(0.002)
         return process
 
-    @pytest.fixture(scope="class")
-    def whole(self, tmp_path_factory):
-        """What the uninterrupted command makes."""
-        out = tmp_path_factory.mktemp("whole")
-        assert main([*self.arguments, "--out", str(out), "--quiet"]) == 0
-        return out
-
     def resumed(self, out, whole, capsys):
         """Result of the same command, compared with that of an uninterrupted one, to the last bit."""
-        assert main([*self.arguments, "--out", str(out)]) == 0
+        assert main([*CHUNKED, "--out", str(out)]) == 0
         err = capsys.readouterr().err
         assert re.search(r"\d+ of 27 chunks were there before", err)
         with (
