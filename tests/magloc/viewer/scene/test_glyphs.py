@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from time import perf_counter, sleep
 
 import numpy as np
 import pytest
@@ -29,6 +28,7 @@ from magloc.viewer.scene import glyphs as scene
 from magloc.viewer.scene.legend import ColourScale, Swatch, legend_html, with_legend
 from magloc.viewer.server import opened
 from tests.calls import calls_of
+from tests.waiting import wait_for
 
 FloatArray = NDArray[np.float64]
 
@@ -65,14 +65,6 @@ def solution(position: FloatArray, *, observable: bool = True) -> Solution:
     covariance = np.diag([0.25, 0.01, 0.01, 1.0, 1.0, 1.0])
     interval = (4.0, 6.0) if observable else (2.0, None)
     return Solution(position, np.array([0.0, 0.0, 7.0]), covariance, 3.0, 3, 5, True, observable, (interval,))
-
-
-def wait_until(condition: Callable[[], bool], seconds: float = 10.0) -> None:
-    """Callbacks of the GUI run in threads of their own."""
-    deadline = perf_counter() + seconds
-    while not condition():
-        assert perf_counter() < deadline, "the scene did not follow"
-        sleep(0.01)
 
 
 class TestFirstCamera:
@@ -349,18 +341,18 @@ class TestMap:
         view = MapView(server, map_result())
         controls = MapControls(server, view)
         set_value(controls.places[1], 2.0)
-        wait_until(lambda: view.cloud.points[:, 1].min() == 2.0)
+        wait_for(lambda: view.cloud.points[:, 1].min() == 2.0)
         set_value(controls.places[0], 3.0)
-        wait_until(lambda: view.slices[0].visible and view.slices[0].position[0] == 3.0)
+        wait_for(lambda: view.slices[0].visible and view.slices[0].position[0] == 3.0)
         set_value(controls.level, 45.0)
-        wait_until(lambda: view.surface.mesh is not None and bool(view.surface.mesh.visible))
+        wait_for(lambda: view.surface.mesh is not None and bool(view.surface.mesh.visible))
         assert controls.surface.value
         assert view.level == 45.0
         set_value(controls.surface, False)
-        wait_until(lambda: view.surface.mesh is not None and not view.surface.mesh.visible)
+        wait_for(lambda: view.surface.mesh is not None and not view.surface.mesh.visible)
         set_value(controls.points, False)
         set_value(controls.cut, False)
-        wait_until(lambda: not view.cloud.visible and len(view.cloud.points) == 9**3 - 4**3)
+        wait_for(lambda: not view.cloud.visible and len(view.cloud.points) == 9**3 - 4**3)
 
     def test_levels_of_a_logarithmic_map_are_logarithms(self, server: viser.ViserServer) -> None:
         linear = map_result()
@@ -368,7 +360,7 @@ class TestMap:
         view = MapView(server, result)
         controls = MapControls(server, view)
         set_value(controls.level, 2.0)
-        wait_until(lambda: view.level == pytest.approx(100.0))
+        wait_for(lambda: view.level == pytest.approx(100.0))
 
     def test_page_has_units_and_a_scale(self, server: viser.ViserServer) -> None:
         page = pages.map_page(server, map_result())
@@ -420,7 +412,7 @@ class TestFixes:
         rows: list[int] = []
         view.add_controls([rows.append])
         set_value(view.slider, 1)
-        wait_until(lambda: rows == [1])
+        wait_for(lambda: rows == [1])
         assert view.best.frame.position == pytest.approx([6.0, 0.0, 0.0])
 
     def test_no_fix_at_all(self, server: viser.ViserServer) -> None:
