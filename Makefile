@@ -1,5 +1,6 @@
 # Every target does its whole set-up: a virtual environment of its own in .venv, with the versions of constraints.txt.
-# `make map` and `make test` are what a new user needs; `make test-full` adds the slow Monte-Carlo sizes.
+# `make map` and `make test` are what a new user needs; `make test-full` adds the slow Monte-Carlo sizes, the
+# longer notebooks, and examples that are new in every run.
 
 PYTHON ?= python3
 BIN := .venv/bin
