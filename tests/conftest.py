@@ -69,7 +69,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadSco
 def forgetful(request: pytest.FixtureRequest) -> Iterator[None]:
     """What a file keeps for its own tests in caches goes with it."""
     yield
-    for kept in vars(request.module).values() if request.module else ():
+    for kept in vars(request.module).values():
         if hasattr(kept, "cache_clear") and kept.__module__ == request.module.__name__:
             kept.cache_clear()
 
