@@ -1,5 +1,6 @@
 # Every target does its whole set-up: a virtual environment of its own in .venv, with the versions of constraints.txt.
-# `make map` and `make test` are what a new user needs; `make test-full` adds the slow Monte-Carlo sizes.
+# `make map` and `make test` are what a new user needs; `make test-full` adds the slow Monte-Carlo sizes, the
+# longer notebooks, and examples that are new in every run.
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -13,10 +14,10 @@ map: .venv/installed
 	$(BIN)/magloc map
 
 test: lint chromium
-	$(BIN)/python -m pytest -q -n 2 --dist loadgroup -m "not slow"
+	$(BIN)/python -m pytest -q -n 2 -m "not slow"
 
 test-full: lint chromium
-	$(BIN)/python -m pytest -q -n 2 --dist loadgroup
+	HYPOTHESIS_PROFILE=random $(BIN)/python -m pytest -q -n 2
 
 lint: .venv/installed
 	$(BIN)/ruff check
@@ -46,7 +47,7 @@ notebooks: .venv/installed
 
 # The lower bounds of pyproject.toml, installed exactly.
 test-oldest: .venv-oldest/installed chromium
-	.venv-oldest/bin/python -m pytest -q -n 2 --dist loadgroup -m "not slow"
+	.venv-oldest/bin/python -m pytest -q -n 2 -m "not slow"
 
 .venv/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("magloc needs Python 3.11 or newer, found " + sys.version.split()[0]) if sys.version_info < (3, 11) else None'

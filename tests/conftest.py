@@ -3,15 +3,75 @@
 from __future__ import annotations
 
 import os
+import signal
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from adcs.cli.app import main as adcs_main
 from magloc.cli.app import main
 from tests.command_line import Outcome, Run
 
+if TYPE_CHECKING:
+    from xdist.remote import Producer
+    from xdist.scheduler import LoadScopeScheduling
+
 REPOSITORY = Path(__file__).parents[1]
+
+# The same examples in every run of `make test`, new ones in every run of `make test-full`. Neither asks the clock.
+for profile, derandomize in (("fixed", True), ("random", False)):
+    settings.register_profile(
+        profile, derandomize=derandomize, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    )
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
+
+# The notebooks that `make test` executes; all others take more than some seconds and are left to `make test-full`.
+QUICK_NOTEBOOKS = {"01-first-fix", "04-scalar-sign", "ellipsoid"}
+
+
+def pytest_configure() -> None:
+    """Let Ctrl-C reach the commands that tests start, even where these tests run in the background of a shell."""
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the longer notebooks as slow, and take first what takes longest: parallel processes then end together."""
+
+    def rank(item: pytest.Item) -> int:
+        return 0 if "browser" in item.path.parts else 1 if item.path.suffix == ".ipynb" else 2
+
+    for item in items:
+        if item.path.suffix == ".ipynb" and item.path.stem not in QUICK_NOTEBOOKS:
+            item.add_marker(pytest.mark.slow)
+    items.sort(key=rank)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LoadScopeScheduling:
+    """Give all tests of a file to one process, which sets up once what they share; one browser serves its folder."""
+    from xdist.scheduler import LoadScopeScheduling
+
+    class ByFile(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.partition("::")[0]
+            return "tests/browser" if file.startswith("tests/browser/") else file
+
+    config.option.loadscopereorder = False
+    return ByFile(config, log)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forgetful(request: pytest.FixtureRequest) -> Iterator[None]:
+    """What a file keeps for its own tests in caches goes with it."""
+    yield
+    for kept in vars(request.module).values():
+        if hasattr(kept, "cache_clear") and kept.__module__ == request.module.__name__:
+            kept.cache_clear()
 
 
 @pytest.fixture(scope="session")

@@ -88,8 +88,7 @@ def _refuse_times(table: Table, time_s: FloatArray, step_s: float) -> None:
     table.refuse(back[:, None], [TIME], "found a time that is not after the one before, expected times that ascend")
     if rows[-1] >= MOST_INSTANTS:
         raise InputError(
-            f"{table.place(-1, TIME)}: found {rows[-1]} steps after the first row, expected "
-            f"fewer than {MOST_INSTANTS}."
+            f"{table.place(-1, TIME)}: found {rows[-1]} steps after the first row, expected fewer than {MOST_INSTANTS}."
         )
 
 

@@ -5,7 +5,19 @@ from __future__ import annotations
 import argparse
 import sys
 
-from tests.bench import bounds, complementary, fields, filters, fixes, machine, maps, mockup, recording, sources
+from tests.bench import (
+    attitude,
+    bounds,
+    complementary,
+    fields,
+    filters,
+    fixes,
+    machine,
+    maps,
+    mockup,
+    recording,
+    sources,
+)
 from tests.bench.table import header, table
 from tests.bench.timing import FULL, QUICK, Size
 
@@ -15,6 +27,7 @@ GROUPS = {
     "sources": sources,
     "filters": filters,
     "complementary": complementary,
+    "attitude": attitude,
     "maps": maps,
     "bounds": bounds,
     "mockup": mockup,

@@ -14,8 +14,9 @@ from tests.conftest import REPOSITORY
 ARTEFACTS = REPOSITORY / ".artefacts" / "browser"
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")
 def screen() -> Iterator[Screen]:
+    """Closed after this folder: its connection draws from `random` in a thread, which hypothesis elsewhere refuses."""
     try:
         find_chromium()
     except InputError:

@@ -21,7 +21,8 @@ from magloc.viewer.chromium import Chromium
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 Look = Callable[[FloatArray], BoolArray]
-PATIENCE_S = 40.0
+PATIENCE_S = 300.0
+_REOPENED_AFTER_S = 20.0
 # viser's page sends at most one change of an input in this time; of several, to whatever inputs, only the last.
 _BETWEEN_CHANGES_S = 0.06
 _TOLD_S = 5.0
@@ -142,7 +143,7 @@ class Screen:
             return "; ".join([str(error), *(str(sight) for sight in missed), *self.browser.errors])
 
         try:
-            self.until(seen, "the scene shows", 0.5 * PATIENCE_S if self._server else PATIENCE_S)
+            self.until(seen, "the scene shows", _REOPENED_AFTER_S if self._server else PATIENCE_S)
             return
         except AssertionError as error:
             first = fault(error)

@@ -19,8 +19,6 @@ from magloc.viewer.scene.shapes import field_lines
 from magloc.viewer.server import opened
 from tests.browser.screen import Camera, Screen, Sight, dark_grey, hue_of
 
-# All in one process of a parallel run: one browser is enough.
-pytestmark = pytest.mark.xdist_group("browser")
 FloatArray = NDArray[np.float64]
 ARRAY = tetrahedron(30.0)  # the static page is of one of 3 cm
 START_M, START_AM2 = suitable_dipole(ARRAY)

@@ -14,8 +14,6 @@ from arrays.geometries import tetrahedron
 from tests.browser.screen import Screen
 from tests.command_line import viewer_started
 
-# All in one process of a parallel run: one browser is enough.
-pytestmark = pytest.mark.xdist_group("browser")
 ARRAY = tetrahedron(1.5)
 
 

@@ -18,8 +18,6 @@ from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, REGION_COLOUR
 from magloc.viewer.server import opened
 from tests.browser.screen import Camera, Screen, Sight, close_to, dark_grey, hue_of
 
-# All in one process of a parallel run: one browser is enough.
-pytestmark = pytest.mark.xdist_group("browser")
 FloatArray = NDArray[np.float64]
 AXIS = np.linspace(-4.0, 4.0, 17)
 SOURCE = np.array([2.0, 0.0, 0.0])

@@ -24,8 +24,6 @@ from sims.experiments.mockup_navigation import fused_runs
 from sims.mockup.table_run import TableScenario
 from tests.browser.screen import Camera, Screen, Sight, dark_grey, hue_of
 
-# All in one process of a parallel run: one browser is enough.
-pytestmark = pytest.mark.xdist_group("browser")
 FloatArray = NDArray[np.float64]
 DURATION_S = 20.0
 

@@ -18,8 +18,6 @@ from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, FIT_COLOUR
 from magloc.viewer.server import opened
 from tests.browser.screen import Screen, Sight, dark_grey, hue_of
 
-# All in one process of a parallel run: one browser is enough.
-pytestmark = pytest.mark.xdist_group("browser")
 ARRAY = tetrahedron(1.5)
 POSITIONS = np.stack([np.linspace(-2.0, 2.0, 9), np.full(9, 2.0), np.full(9, 0.5)], axis=-1)
 MOMENT = np.array([0.0, 0.0, 80.0])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from arrays.array_file import write_array
 from arrays.geometries import tetrahedron
@@ -17,8 +16,6 @@ from tests.browser.screen import Screen, Sight, dark_grey, hue_of
 from tests.browser.test_map_page import DIPOLE, RESULT, sights
 from tests.command_line import Run
 
-# All in one process of a parallel run: one browser is enough.
-pytestmark = pytest.mark.xdist_group("browser")
 LARGEST = 15_000_000
 
 

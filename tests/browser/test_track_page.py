@@ -19,8 +19,6 @@ from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, TRACK_COLOUR
 from magloc.viewer.server import opened
 from tests.browser.screen import Screen, Sight, dark_grey, hue_of
 
-# All in one process of a parallel run: one browser is enough.
-pytestmark = pytest.mark.xdist_group("browser")
 FloatArray = NDArray[np.float64]
 ARRAY = tetrahedron(1.5)
 TIMES = 0.5 * np.arange(41)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 import adcs
 import sims
 from arrays import SensorArray
-from magloc.readings import Readings, Truth
+from magloc.readings import Readings
+from magloc.truth import Truth
 from sims.attitude.simulation import AttitudeRuns
 
 

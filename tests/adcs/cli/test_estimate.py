@@ -35,15 +35,21 @@ def errors_deg(columns, truth):
     return np.degrees(quaternion.angle_between(q, true))
 
 
+def estimated(adcs, example, *options):
+    """Columns of the estimates, without the files and pictures of ``--out``."""
+    files = (example / "telemetry.csv", "--config", example / "scenario.toml")
+    outcome = adcs("estimate", *files, *options, "--json")
+    assert outcome.status == 0, outcome.err
+    rows = json.loads(outcome.out, parse_constant=refuse_constant)["results"]
+    return {name: np.array([row[name] for row in rows], dtype=np.float64) for name in rows[0]}
+
+
 class TestExample:
     @pytest.mark.parametrize("sensors", ["mag+sun+gyro", "st", "st+gyro", "mag+sun"])
-    def test_finds_the_truth_from_nowhere(self, adcs, example, tmp_path, sensors):
+    def test_finds_the_truth_from_nowhere(self, adcs, example, sensors):
         """The acceptance limits of 200 s, as length of the error's vector: √3 times those of an axis."""
         states = ("--states", "gyro-bias") if "gyro" in sensors else ("--states", "none")
-        files = (example / "telemetry.csv", "--config", example / "scenario.toml")
-        outcome = adcs("estimate", *files, "--sensors", sensors, *states, "--out", tmp_path)
-        assert outcome.status == 0, outcome.err
-        error = errors_deg(table(tmp_path / "estimates.csv"), table(example / "truth.csv"))
+        error = errors_deg(estimated(adcs, example, "--sensors", sensors, *states), table(example / "truth.csv"))
         limit = {"mag+sun+gyro": 4e-2, "st": 9e-4, "st+gyro": 9e-4, "mag+sun": 0.14}[sensors]
         assert np.sqrt(np.mean(error[-60:] ** 2)) < 3**0.5 * limit
 
@@ -55,10 +61,8 @@ class TestExample:
         stars = np.stack([log[f"star_q{part}"] for part in "wxyz"], axis=1)
         assert np.degrees(quaternion.angle_between(ours, stars))[-60:].max() < 0.15
 
-    def test_gyro_bias(self, adcs, example, tmp_path):
-        files = (example / "telemetry.csv", "--config", example / "scenario.toml")
-        assert adcs("estimate", *files, "--out", tmp_path, "--quiet").status == 0
-        columns, truth = table(tmp_path / "estimates.csv"), table(example / "truth.csv")
+    def test_gyro_bias(self, adcs, example):
+        columns, truth = estimated(adcs, example), table(example / "truth.csv")
         for axis in "xyz":
             name = f"gyro_bias_{axis}_deg_s"
             assert abs(columns[name][-1] - truth[name][-1]) < 4.0 * columns[f"sigma_{name}"][-1]
@@ -81,11 +85,9 @@ class TestExample:
         )
 
     @pytest.mark.parametrize("name", ["constant-gain", "parallel-disturbance", "reduced", "smoother"])
-    def test_every_filter(self, adcs, example, tmp_path, name):
-        files = (example / "telemetry.csv", "--config", example / "scenario.toml")
-        outcome = adcs("estimate", *files, "--sensors", "st+gyro", "--filter", name, "--out", tmp_path)
-        assert outcome.status == 0, outcome.err
-        error = errors_deg(table(tmp_path / "estimates.csv"), table(example / "truth.csv"))
+    def test_every_filter(self, adcs, example, name):
+        columns = estimated(adcs, example, "--sensors", "st+gyro", "--filter", name)
+        error = errors_deg(columns, table(example / "truth.csv"))
         assert error[-60:].max() < 0.01
 
 

@@ -9,7 +9,6 @@ a prototype of its own reached, and χ² for runs whose truth does exactly what 
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -46,6 +45,7 @@ from sims.attitude.scenario import ANY_START, StartConditions, tabletsat
 from sims.attitude.simulation import AttitudeRuns, advance, prepare, sense, simulate
 from tests.adcs.filter_runs import GYRO_BIAS_RAD_S, SEEDS, believed_runs, followed, runs_for, settings, start_of
 from tests.adcs.kalman.test_error_state import TABLE_3
+from tests.calls import calls_of
 
 Array = NDArray[np.float64]
 ALL = ("st+gyro+mag+sun", ("field-bias", "gyro-bias", "disturbance"))
@@ -250,26 +250,23 @@ class TestClosedLoop:
         np.testing.assert_allclose(run_filter(runs, chosen, start).q, estimates.q, rtol=0, atol=1e-13)
 
 
-@pytest.mark.slow
 class TestSpeed:
-    """Steps a second with warm caches, best of three."""
-
-    def best(self, runs: AttitudeRuns, chosen: FilterSettings) -> float:
-        start = start_of(runs)
-        seconds = []
-        for _ in range(4):
-            begin = time.perf_counter()
-            run_filter(runs, chosen, start)
-            seconds.append(time.perf_counter() - begin)
-        return runs.q.shape[0] * runs.q.shape[1] / min(seconds[1:])
+    """Steps and runs are compiled: more of them make no more interpreted calls, but for the start of the threads."""
 
     def test_single_record(self) -> None:
-        runs = simulate(replace(tabletsat(50_000.0), conditions=ANY_START), [0])
-        assert self.best(runs, settings("mag+sun+gyro")) >= 100e3
+        chosen = settings("mag+sun+gyro")
+        short, long = (simulate(replace(tabletsat(s), conditions=ANY_START), [0]) for s in (100.0, 10_000.0))
+        assert self.calls(long, chosen) == self.calls(short, chosen)
 
     def test_monte_carlo(self) -> None:
-        runs = simulate(tabletsat(), range(400))
-        assert self.best(runs, settings("mag+sun+gyro")) >= 200e3
+        few, many = (simulate(tabletsat(), range(n)) for n in (10, 400))
+        chosen = settings("mag+sun+gyro")
+        assert self.calls(many, chosen) < 1.5 * self.calls(few, chosen)
+
+    @staticmethod
+    def calls(runs: AttitudeRuns, chosen: FilterSettings) -> int:
+        start = start_of(runs)
+        return calls_of(lambda: run_filter(runs, chosen, start))
 
 
 class TestAcceptance:

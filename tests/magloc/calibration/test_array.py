@@ -591,6 +591,7 @@ class TestRecording:
     def test_perturbed(self, recording):
         self.check(recording, 0, removed=False, proportional=True)
 
+    @pytest.mark.slow
     def test_removed(self, recording):
         self.check(recording, 0, removed=True, proportional=False)
 

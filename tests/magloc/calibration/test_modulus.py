@@ -127,16 +127,20 @@ class TestWithoutNoise:
 
 
 class TestConsistency:
-    """Two-sided bounds of a false-alarm rate of 1e-3 for each test; the seeds are the first ones."""
+    """Two-sided bounds of a false-alarm rate of 1e-3 for each test and size; the seeds are the first ones."""
+
+    @pytest.fixture(params=[40, pytest.param(200, marks=pytest.mark.slow)])
+    def n_sensors(self, request):
+        return request.param
 
     @pytest.mark.parametrize(
         ("noise", "n", "modulus"),
         [(1e-9, 30, (5e-5, 5e-5)), (5e-7, 60, (5e-5, 5e-5)), (1e-6, 200, (5e-5, 5e-5)), (2e-7, 100, (2e-5, 5e-5))],
     )
-    def test_errors_and_residuals_are_as_large_as_stated(self, noise, n, modulus):
+    def test_errors_and_residuals_are_as_large_as_stated(self, noise, n, modulus, n_sensors):
         rng = np.random.default_rng(0)
         errors, residuals, dof = [], [], 0
-        for _ in range(200):
+        for _ in range(n_sensors):
             scale, offset = random_scale(rng, 0.2), 3e-5 * rng.normal(size=3)
             moduli = rng.uniform(*modulus, n)
             result = ellipsoid_calibration(readings_of(rng, scale, offset, moduli, n, noise), moduli, noise)
@@ -150,21 +154,21 @@ class TestConsistency:
         assert low < np.sum(residuals) < high
 
     @pytest.mark.parametrize(
-        ("noise", "n", "cap", "at_least"), [(1e-9, 9, np.pi, 150), (1e-9, 300, 0.5, 150), (1e-8, 300, 0.7, 100)]
+        ("noise", "n", "cap", "at_least"), [(1e-9, 9, np.pi, 0.75), (1e-9, 300, 0.5, 0.75), (1e-8, 300, 0.7, 0.5)]
     )
-    def test_what_is_not_refused_of_a_poor_coverage_is_consistent(self, noise, n, cap, at_least):
+    def test_what_is_not_refused_of_a_poor_coverage_is_consistent(self, noise, n, cap, at_least, n_sensors):
         """Nine readings, or all of them within a cap about one direction: refused, or with a covariance that holds."""
         rng = np.random.default_rng(0)
         errors = []
-        for _ in range(200):
+        for _ in range(n_sensors):
             scale, offset = random_scale(rng, 0.2), 3e-5 * rng.normal(size=3)
-            u = directions(rng, 200 * n)
+            u = directions(rng, 30 * n)  # the smaller cap has 6 % of the sphere
             u = u[u[:, 2] > np.cos(cap)][:n]
             readings = MODULUS * u @ scale + offset + noise * rng.normal(size=u.shape)
             result = ellipsoid_calibration(readings, MODULUS, noise)
             if result.converged:
                 errors.append(nees(result, offset, scale))
-        assert len(errors) >= at_least
+        assert len(errors) >= at_least * n_sensors
         low, high = chi2.ppf([5e-4, 1 - 5e-4], 9 * len(errors))
         assert low < np.sum(errors) < high
 
@@ -179,9 +183,9 @@ class TestConsistency:
                 offset,
                 scale,
             )
-            for _ in range(10)
+            for _ in range(4)
         ]
-        low, high = chi2.ppf([5e-4, 1 - 5e-4], 90)
+        low, high = chi2.ppf([5e-4, 1 - 5e-4], 36)
         assert low < np.sum(errors) < high
 
 
@@ -209,7 +213,7 @@ class TestAgainstOtherFits:
 
     def test_uneven_sensors_with_strong_noise_more_accurate_than_both(self):
         """Many readings, so that the others' bias of the second order in noise over modulus is what remains."""
-        ours, twostep, plain = self.errors([np.diag([0.5, 1.0, 1.5])] * 6, noise=1e-6, n=20000)
+        ours, twostep, plain = self.errors([np.diag([0.5, 1.0, 1.5])] * 3, noise=1e-6, n=20000)
         assert ours < 0.5 * twostep
         assert ours < 0.5 * plain
 

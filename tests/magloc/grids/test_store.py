@@ -28,6 +28,7 @@ from magloc.convergence.over_starts import StartsMap, StartsScenario, summary
 from magloc.grids.cube import Box, Tally, Variable, boxes, computed_here, histogram, in_memory
 from magloc.grids.store import Sweep, chunk_seconds, open_map
 from tests.conftest import REPOSITORY
+from tests.waiting import wait_for
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ class TestResume:
         )
         process = subprocess.Popen([sys.executable, "-c", script], cwd=REPOSITORY)
         marks = tmp_path / "map.zarr" / "seconds_of_chunk" / "c"
-        wait_until(lambda: len(chunk_files(marks)) >= 5)
+        wait_for(lambda: len(chunk_files(marks)) >= 5)
         process.send_signal(signal.SIGKILL)
         process.wait()
         done = {path: path.stat().st_mtime_ns for path in chunk_files(marks)}
@@ -337,10 +338,3 @@ def truncate(path: Path) -> None:
 
 def snapshot(folder: Path) -> dict[Path, tuple[int, bytes]]:
     return {p: (p.stat().st_mtime_ns, p.read_bytes()) for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
-def wait_until(condition: Any, at_most_s: float = 30.0) -> None:
-    end = time.monotonic() + at_most_s
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.005)

@@ -75,7 +75,7 @@ class TestLoopField:
 
 
 class TestSimulatedLines:
-    @pytest.mark.parametrize("seed", range(4))
+    @pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(3))])
     def test_dipole(self, seed):
         line = random_line(seed, 0.0)
         found = fit_line(STAGE[::2], line.field(STAGE[::2]), 1e-12, noise_fraction=0.01)
@@ -88,7 +88,7 @@ class TestSimulatedLines:
         assert_allclose(distance, STAGE[1::2], atol=1e-5)
         assert np.all(np.diff(deviation) > 0.0)
 
-    @pytest.mark.parametrize("seed", range(3))
+    @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
     def test_coil(self, seed):
         line = random_line(seed, 0.08)
         found = fit_coil_line(STAGE, line.field(STAGE), 1e-12, noise_fraction=0.001)

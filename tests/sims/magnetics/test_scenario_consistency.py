@@ -233,7 +233,7 @@ class TestStatedErrors:
 class TestDiver:
     """A buried object at rest, and a moving array: turned axes, wrong gains, drift, 1/f noise, a field of its own."""
 
-    @pytest.mark.parametrize("n_runs", [1, pytest.param(20, marks=SLOW)])
+    @pytest.mark.parametrize("n_runs", [pytest.param(20, marks=SLOW)])
     def test_is_consistent(self, n_runs: int) -> None:
         """False-alarm rate 1 % for NEES and for NIS, 1.2e-5 for 20 runs that end within 5 σ.
 
@@ -276,7 +276,7 @@ class TestUnmatchedPaths:
         assert 0.6 < nees_of_the_last(result, 5) < 1.4
         assert_none_is_far(result)
 
-    @pytest.mark.parametrize("n_runs", [2, pytest.param(60, marks=SLOW)])
+    @pytest.mark.parametrize("n_runs", [1, pytest.param(60, marks=SLOW)])
     def test_ship(self, n_runs: int) -> None:
         """The last 30 s, when it has passed: measured 0.9 to 1.1 over 40 runs (seeds 1000 to 1039).
 

@@ -5,7 +5,6 @@ from the rates measured over 1,500 other frames.
 """
 
 import math
-import time
 
 import numpy as np
 import pytest
@@ -32,6 +31,7 @@ from tests.adcs.mockup.stars_of_poses import (
     rendered_set,
     score,
 )
+from tests.calls import calls_of
 
 CLEAN = Field()
 M_PER_PX = CLEAN.camera.m_per_px
@@ -128,15 +128,9 @@ class TestEveryMatcher:
         assert result.position_rms_m <= (0.2e-3 if make is PaperMatcher else 0.1e-3)
         assert result.heading_rms_rad <= math.radians(0.02)
 
-    def test_takes_no_time(self, matcher):
-        """Median at most 30 ms (2 ms alone on a machine), never above 0.6 s; in processor time, as others may run."""
-        seconds = []
-        for _, points in rendered_set(SkySetup()):
-            begin = time.thread_time()
-            matcher.identify(points)
-            seconds.append(time.thread_time() - begin)
-        assert np.median(seconds) <= 0.03
-        assert max(seconds) <= 0.6
+    def test_candidates_are_worked_through_in_arrays(self, matcher):
+        """No frame makes many interpreted calls: 420 of the paper's matcher, 1,100 of the others at most."""
+        assert max(calls_of(lambda p=points: matcher.identify(p)) for _, points in rendered_set(SkySetup())) <= 2000
 
 
 @pytest.mark.slow

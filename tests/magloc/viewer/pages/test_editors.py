@@ -8,7 +8,7 @@ three unknowns more, while the project takes differences.
 import asyncio
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,9 +36,9 @@ from magloc.viewer.panels.latest import Latest
 from magloc.viewer.server import free_port, opened
 from tests.oracles import derivative, magpylib_field
 from tests.plain_locator import plain_locator
+from tests.waiting import WAIT_S, wait_for
 
 SMALL, LARGE = tetrahedron(0.03), cube(30.0)
-WAIT_S = 20.0
 
 
 @pytest.fixture
@@ -47,13 +47,6 @@ def server() -> Iterator[viser.ViserServer]:
     with opened(free_port(0), "test") as server:
         yield server
     wait_for(lambda: set(threading.enumerate()) <= before)
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < end, "it did not happen in time"
-        time.sleep(0.005)
 
 
 def drag(server: viser.ViserServer, control: viser.TransformControlsHandle, position_m, wxyz=None) -> None:

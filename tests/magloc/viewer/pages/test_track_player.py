@@ -1,8 +1,9 @@
 """A track played through time, and readings plotted beside it. No browser: scene nodes and panels are read directly."""
 
+import itertools
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -32,9 +33,9 @@ from magloc.viewer.panels.readings_plot import (
 )
 from magloc.viewer.scene.glyphs import ArrayGlyphs
 from magloc.viewer.server import free_port, opened
+from tests.waiting import wait_for
 
 ARRAY = tetrahedron(0.3)
-WAIT_S = 20.0
 N = 100
 STEP_S = 0.1
 GAP = range(40, 50)
@@ -87,13 +88,6 @@ def player(server) -> Iterator[TrackPlayer]:
     player = TrackPlayer(server, track(), 0.5)
     yield player
     player.close()
-
-
-def wait_for(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < end, "it did not happen in time"
-        time.sleep(0.005)
 
 
 def node(server: viser.ViserServer, name: str) -> viser.SceneNodeHandle:
@@ -182,24 +176,27 @@ class TestTrackPlayer:
         np.testing.assert_allclose(glyphs.frame.wxyz, np.roll(turn[45], 1))
         assert rows[-1] == 45
 
-    def test_play_runs_to_the_end_with_its_speed_and_stops(self, player):
+    def test_play_runs_to_the_end_with_its_speed_and_stops(self, player, monkeypatch):
+        tenths = itertools.count()  # the clock's: at ten times the speed, a second of the track for every frame
+        monkeypatch.setattr("magloc.viewer.panels.played_time.perf_counter", lambda: 0.1 * next(tenths))
         seen: list[int] = []
         player._on_row = [seen.append]
         player.show_row(0)
         set_value(player.speed_dropdown, "10 ×")
-        begin = time.monotonic()
         set_value(player.play_button, True)
         assert player.play_button.label == "Pause"
         wait_for(lambda: not player.is_playing)
-        # 9.9 s at ten times the speed; a loaded machine may be late, but time never runs faster.
-        assert time.monotonic() - begin > 0.9
+        # 9.9 s of the track after ten frames, and the clock is asked once before the first.
+        assert next(tenths) == 11
         assert player.index == N - 1
         assert player.play_button.label == "Play"
         assert seen == sorted(seen)
         assert len(set(seen)) > 3
         wait_for(lambda: not any(thread.name == "magloc-track-player" for thread in threading.enumerate()))
 
-    def test_play_at_the_end_begins_anew_and_pause_holds(self, player):
+    def test_play_at_the_end_begins_anew_and_pause_holds(self, player, monkeypatch):
+        tenths = iter(range(20))  # the clock stands still before half of the time is over
+        monkeypatch.setattr("magloc.viewer.panels.played_time.perf_counter", lambda: 0.1 * next(tenths, 20))
         player.show_row(N - 1)
         set_value(player.speed_dropdown, "1 ×")
         player.play()
@@ -213,14 +210,15 @@ class TestTrackPlayer:
         assert player.index == held
         assert not any(thread.name == "magloc-track-player" for thread in threading.enumerate())
 
-    def test_a_time_that_the_user_chooses_while_it_plays_counts(self, player):
+    def test_a_time_that_the_user_chooses_while_it_plays_counts(self, player, monkeypatch):
+        monkeypatch.setattr("magloc.viewer.panels.played_time.perf_counter", lambda: 0.0)
         player.show_row(0)
         set_value(player.speed_dropdown, "0.1 ×")
         player.play()
         set_value(player.time_slider, 8.0)
         wait_for(lambda: player.index >= 80)
         player.pause()
-        assert player.index < 90
+        assert player.index == 80
 
     def test_a_truth_has_no_ellipsoids_and_one_row_does_not_play(self, server):
         truth = [TrackPoint(5.0, np.array([1.0, 2.0, 0.0]), status="truth")]
