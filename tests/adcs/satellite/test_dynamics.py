@@ -339,9 +339,7 @@ class TestKernels:
         expected = dynamics.step(MAGNETIC, q, w, k, u, torque, RATE, GRAVITY, B, 1.0)
         for i in range(20):
             compiled = rigid_body.step(
-                J,
-                MAGNETIC.inverse,
-                tuple(MAGNETIC.residual_dipole_Am2),
+                rigid_body.Body.of(MAGNETIC),
                 *(tuple(one[i]) for one in (q, w, k, u, torque)),
                 RATE,
                 GRAVITY,
@@ -361,11 +359,8 @@ class TestKernels:
         for i in range(20):
             compiled = rigid_body.commanded_torque(
                 J,
-                tuple(control.attitude_gain_Nm),
-                tuple(control.rate_gain_Nms),
-                *limits,
+                rigid_body.Control.of(control, reference),
                 *(tuple(one[i]) for one in (q, w, k)),
-                tuple(reference),
                 RATE,
                 1.0,
             )
@@ -377,9 +372,7 @@ class TestKernels:
         F = np.full((6, 6), np.nan)
         for i in range(20):
             rigid_body.error_jacobian(
-                J,
-                MAGNETIC.inverse,
-                tuple(MAGNETIC.residual_dipole_Am2),
+                rigid_body.Body.of(MAGNETIC),
                 *(tuple(one[i]) for one in (q, w, k)),
                 GRAVITY,
                 tuple(B),

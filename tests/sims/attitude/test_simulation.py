@@ -208,28 +208,16 @@ class TestSpeed:
         n = 100_000
         q, vectors = np.empty((1, n, 4)), np.zeros((5, 1, n, 3))
         q[0, 0] = quaternion.IDENTITY
-        body, control = scenario.body, scenario.control
         w, k, u, torque, field = vectors
         begin = time.perf_counter()
         rigid_body.run(
             0,
             1,
-            q,
-            w,
-            k,
-            u,
-            body.inertia_kgm2,
-            body.inverse,
-            body.residual_dipole_Am2,
-            control.attitude_gain_Nm,
-            control.rate_gain_Nms,
-            control.torque_limit_Nm,
-            control.momentum_limit_Nms,
-            quaternion.IDENTITY,
+            rigid_body.Motion(q, w, k, u),
+            rigid_body.Body.of(scenario.body),
+            rigid_body.Control.of(scenario.control, quaternion.IDENTITY),
             torque,
-            np.full((1, n), 1e-3),
-            np.full((1, n), 1e-6),
-            field,
+            rigid_body.Surroundings(np.full((1, n), 1e-3), np.full((1, n), 1e-6), field),
             1.0,
         )
         assert n / (time.perf_counter() - begin) > 200e3
