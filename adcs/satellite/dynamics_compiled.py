@@ -2,7 +2,7 @@
 
 :mod:`adcs.satellite.dynamics` is the readable twin and has the formulas.
 
-Vectors and quaternions are tuples of scalars, which the compiler keeps in registers; matrices are arrays (3, 3). The
+Vectors, quaternions and matrices are tuples of scalars, which the compiler keeps in registers. The
 functions of this module are made to be called by other kernels; :func:`run` follows whole runs, one row each.
 """
 
@@ -19,19 +19,20 @@ from magloc.compilation import compiled
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
+Matrix = tuple[Vector, Vector, Vector]
 
 
 class Body(NamedTuple):
     """A satellite: its inertia, the inverse of it, and its residual dipole."""
 
-    J: Array
-    J_inverse: Array
+    J: Matrix
+    J_inverse: Matrix
     dipole: Vector
 
     @classmethod
     def of(cls, body: RigidBody) -> Body:
         """In the layout of the compiled code."""
-        return cls(body.inertia_kgm2, body.inverse, vector_at(body.residual_dipole_Am2))
+        return cls(matrix_at(body.inertia_kgm2), matrix_at(body.inverse), vector_at(body.residual_dipole_Am2))
 
 
 class Control(NamedTuple):
@@ -74,6 +75,12 @@ def vector_at(values: Array) -> Vector:
 
 
 @compiled
+def matrix_at(values: Array) -> Matrix:
+    """Tuple of the rows of a matrix (3, 3)."""
+    return vector_at(values[0]), vector_at(values[1]), vector_at(values[2])
+
+
+@compiled
 def quaternion_at(values: Array) -> Quaternion:
     """Tuple of a row (4,)."""
     return values[0], values[1], values[2], values[3]
@@ -92,12 +99,12 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 @compiled
-def applied(M: Array, v: Vector) -> Vector:
+def applied(M: Matrix, v: Vector) -> Vector:
     """Vector M v of a matrix (3, 3)."""
     return (
-        M[0, 0] * v[0] + M[0, 1] * v[1] + M[0, 2] * v[2],
-        M[1, 0] * v[0] + M[1, 1] * v[1] + M[1, 2] * v[2],
-        M[2, 0] * v[0] + M[2, 1] * v[1] + M[2, 2] * v[2],
+        M[0][0] * v[0] + M[0][1] * v[1] + M[0][2] * v[2],
+        M[1][0] * v[0] + M[1][1] * v[1] + M[1][2] * v[2],
+        M[2][0] * v[0] + M[2][1] * v[1] + M[2][2] * v[2],
     )
 
 
@@ -262,7 +269,7 @@ def _clipped(value: float, limit: float) -> float:
 
 @compiled
 def commanded_torque(
-    J: Array,
+    J: Matrix,
     control: Control,
     q: Quaternion,
     w: Vector,

@@ -291,9 +291,12 @@ def follow(
 
     Returns that row, or end, and the number of contradictions so far. Outputs of rows before it are filled.
     """
+    z, n_differences, transforms, transform_of_row, origins, rotations, ambients, ambient_of_row = given
+    F_steps, A_steps, B_steps, step_of_row = steps
+    centroid = array.centroid
     n = x.size
-    k, n_channels = given.transforms.shape[1], array.sensor.size
-    width = n + steps.A.shape[2]
+    k, n_channels = transforms.shape[1], array.sensor.size
+    width = n + A_steps.shape[2]
     rows = np.empty((n, width))
     predicted_x, predicted_S = np.empty(n), np.empty((n, n))
     x_k, S_k, x_next = np.empty(n), np.empty((n, n)), np.empty(n)
@@ -303,35 +306,33 @@ def follow(
     predicted_first, M = np.empty(k), np.empty((6, k))
     A, B, mean, root = np.empty((6, 6)), np.empty((6, 1 + n)), np.empty(n), np.empty((n, n))
     for row in range(begin, end):
-        step, origin, rotation = steps.of_row[row], given.origins[row], given.rotations[row]
+        step, origin, rotation = step_of_row[row], origins[row], rotations[row]
         strength = math.sqrt(x[3] * x[3] + x[4] * x[4] + x[5] * x[5])
         for i in range(n):
             t = 0.0
             for j in range(n):
-                t += steps.F[step, i, j] * x[j]
+                t += F_steps[step, i, j] * x[j]
             predicted_x[i] = t
             for c in range(n):
                 t = 0.0
                 for j in range(n):
-                    t += steps.F[step, i, j] * S[j, c]
+                    t += F_steps[step, i, j] * S[j, c]
                 rows[i, c] = t
-            for c in range(steps.A.shape[2]):
-                rows[i, n + c] = steps.A[step, i, c] + strength * steps.B[step, i, c]
+            for c in range(A_steps.shape[2]):
+                rows[i, n + c] = A_steps[step, i, c] + strength * B_steps[step, i, c]
         triangular_root(rows, predicted_S)
         status = TRACKED
         nis = math.nan
         iterations = 0
-        if given.n_differences[row] == 0:
+        if n_differences[row] == 0:
             status = PREDICTED
         else:
-            if _range_error(predicted_x, predicted_S, origin, rotation, array.centroid) > rules.start_range_error:
+            if _range_error(predicted_x, predicted_S, origin, rotation, centroid) > rules.start_range_error:
                 return row, contradictions
             for i in range(n):
                 x_k[i] = predicted_x[i]
-            w, a = given.transform_of_row[row], given.ambient_of_row[row]
-            _predicted(
-                x_k, origin, rotation, given.ambients[a], array, given.transforms[w], channels, slopes, predicted, H
-            )
+            w, a = transform_of_row[row], ambient_of_row[row]
+            _predicted(x_k, origin, rotation, ambients[a], array, transforms[w], channels, slopes, predicted, H)
             curved = _is_of_readings(S, predicted_S, rules.largest_growth) and _chart(
                 H, predicted_S, rules.least_singular, M
             )
@@ -349,7 +350,7 @@ def follow(
                         M, H, predicted, predicted_first, predicted_x, predicted_S, x_k, A, B, mean, root
                     )  # fmt: skip
                 for j in range(k):
-                    t = given.z[row, j] - predicted[j]
+                    t = z[row, j] - predicted[j]
                     for i in range(6):
                         t -= H[j, i] * (mean[i] - x_k[i])
                     innovation[j] = t
@@ -361,7 +362,7 @@ def follow(
                 for i in range(n):
                     x_next[i] = x_k[i] + length * (x_next[i] - x_k[i])
                 _predicted(
-                    x_next, origin, rotation, given.ambients[a], array, given.transforms[w],
+                    x_next, origin, rotation, ambients[a], array, transforms[w],
                     channels, slopes, predicted_next, H,
                 )  # fmt: skip
                 change = 0.0
@@ -379,7 +380,7 @@ def follow(
                 if change >= change_before:
                     length *= rules.step_shrink
                 change_before = change
-            if not converged or nis > rules.nis_limits[given.n_differences[row]]:
+            if not converged or nis > rules.nis_limits[n_differences[row]]:
                 if contradictions + 1 >= rules.rows_to_lose:
                     return row, contradictions
                 contradictions += 1
@@ -388,7 +389,7 @@ def follow(
             else:
                 contradictions = 0
         used_x, used_S = (x_k, S_k) if status == TRACKED else (predicted_x, predicted_S)
-        if _range_error(used_x, used_S, origin, rotation, array.centroid) > rules.largest_range_error:
+        if _range_error(used_x, used_S, origin, rotation, centroid) > rules.largest_range_error:
             return row, contradictions
         for i in range(n):
             x[i] = used_x[i]

@@ -358,7 +358,7 @@ class TestKernels:
         expected = dynamics.commanded_torque(BODY, control, q, w, k, reference, RATE, 1.0)
         for i in range(20):
             compiled = rigid_body.commanded_torque(
-                J,
+                rigid_body.Body.of(BODY).J,
                 rigid_body.Control.of(control, reference),
                 *(tuple(one[i]) for one in (q, w, k)),
                 RATE,
@@ -389,4 +389,4 @@ class TestKernels:
         np.testing.assert_allclose(
             rigid_body.error_vector(tuple(p), tuple(q)), quaternion.error_vector(p, q), atol=1e-16
         )
-        np.testing.assert_allclose(rigid_body.applied(J, tuple(v)), turned(J, v), atol=1e-16)
+        np.testing.assert_allclose(rigid_body.applied(rigid_body.matrix_at(J), tuple(v)), turned(J, v), atol=1e-16)
