@@ -140,7 +140,7 @@ def adaptive_track(
     ValueError
         The first estimate has no length.
     """
-    from adcs.complementary.filters_compiled import adaptive
+    from adcs.complementary.filters_compiled import Record, adaptive
 
     shape = (record.n_runs, len(record))
     track = AdaptiveTrack(np.empty((*shape, 4)), np.zeros((*shape, 3)), np.empty((*shape, 6, 6)), np.empty(shape))
@@ -151,8 +151,7 @@ def adaptive_track(
     over_rows(
         adaptive,
         record.n_runs,
-        *record.arrays,
-        record.dt_s,
+        Record.of(record),
         np.array([tuning.first_sigma, tuning.second_sigma_rad]),
         np.array([tuning.attitude_noise_rad, tuning.bias_noise_rad_s]),
         np.array([tuning.memory, tuning.threshold, tuning.growth_rad_s]),

@@ -213,7 +213,7 @@ def compiled_track(
 
     See :func:`explicit_track` and :func:`adcs.complementary.gauss_newton.gauss_newton_track`.
     """
-    from adcs.complementary.filters_compiled import complementary
+    from adcs.complementary.filters_compiled import Outage, Record, Weights, complementary
 
     gains.check(record.dt_s)
     shape = (record.n_runs, len(record))
@@ -224,14 +224,14 @@ def compiled_track(
     over_rows(
         complementary,
         record.n_runs,
-        *record.arrays,
-        record.dt_s,
-        np.array([gains.first_weight, gains.second_weight]),
-        np.array([*gains.during(False), *gains.during(True)]),
-        np.array([gains.boost, gains.boost_level_rad, gains.boost_memory]),
+        Record.of(record),
+        Weights(
+            np.array([gains.first_weight, gains.second_weight]),
+            np.array([*gains.during(False), *gains.during(True)]),
+            np.array([gains.boost, gains.boost_level_rad, gains.boost_memory]),
+        ),
         method,
-        substitute_code(substitution),
-        delay_steps(substitution, record.dt_s),
+        Outage(substitute_code(substitution), delay_steps(substitution, record.dt_s)),
         mu,
         q,
         integral,

@@ -2,13 +2,17 @@
 
 :mod:`adcs.complementary.explicit`, :mod:`adcs.complementary.gauss_newton`, :mod:`adcs.complementary.outage` and
 :mod:`adcs.complementary.adaptive` are the readable twins and have the formulas. What all runs share may be given once:
-references and ``frame_turn`` (R or 1, n, 4), what the reference frame turns by from each instant to the next, have one
-row or as many as the runs.
+references and turns of the reference frame have one row or as many as the runs.
 """
+
+from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adcs import quaternion
 from adcs.satellite.dynamics_compiled import (
     Quaternion,
     Vector,
@@ -22,12 +26,53 @@ from adcs.satellite.dynamics_compiled import (
     rotate_back,
     vector_at,
 )
+from adcs.satellite.vector_record import VectorRecord
 from magloc.compilation import compiled
 
 Array = NDArray[np.float64]
 EXPLICIT, GAUSS_NEWTON = 0, 1
 MAGNETOMETER_ONLY, RAW, TRANSPORTED = 0, 1, 2
 _NONE: Vector = (0.0, 0.0, 0.0)
+
+
+class Record(NamedTuple):
+    """Rates, vectors and references (R or 1, n, 3), and what the frame turns by to the next instant (R or 1, n, 4)."""
+
+    rate: Array
+    first: Array
+    second: Array
+    first_reference: Array
+    second_reference: Array
+    frame_turn: Array
+    dt: float
+
+    @classmethod
+    def of(cls, record: VectorRecord) -> Record:
+        """In the layout of the compiled code."""
+        return cls(
+            record.rate_rad_s,
+            record.first_body,
+            record.second_body,
+            record.first_reference,
+            record.second_reference,
+            quaternion.exp(record.frame_rate_rad_s * record.dt_s),
+            record.dt_s,
+        )
+
+
+class Weights(NamedTuple):
+    """Weights of the vectors; (K_P, K_I) with the second vector and in its outage; (factor of K_I, level, memory)."""
+
+    vectors: Array
+    gains: Array
+    boost: Array
+
+
+class Outage(NamedTuple):
+    """What stands in for a second vector that is missing: a rule, and how many instants ago its vector is from."""
+
+    substitute: int
+    delay: int
 
 
 @compiled
@@ -108,19 +153,10 @@ def gauss_newton_step(
 def complementary(
     begin: int,
     end: int,
-    rate: Array,
-    first: Array,
-    second: Array,
-    first_reference: Array,
-    second_reference: Array,
-    frame_turn: Array,
-    dt: float,
-    weights: Array,
-    gains: Array,
-    boost: Array,
+    record: Record,
+    weighting: Weights,
     method: int,
-    substitute: int,
-    delay: int,
+    outage: Outage,
     mu: float,
     q: Array,
     integral: Array,
@@ -128,9 +164,11 @@ def complementary(
 ) -> None:
     """Runs begin to end of a complementary filter, from the first rows of ``q`` (R, n, 4) and ``integral`` (R, n, 3).
 
-    ``gains`` is (K_P, K_I) with the second vector and (K_P, K_I) in its outage; ``boost`` is (factor of K_I, level,
-    memory). ``q_measured`` (R, n, 4) gets the measured quaternions of the filter that has them.
+    ``q_measured`` (R, n, 4) gets the measured quaternions of the filter that has them.
     """
+    rate, first, second, first_reference, second_reference, frame_turn, dt = record
+    weights, gains, boost = weighting
+    substitute, delay = outage
     n = rate.shape[1]
     shared = first_reference.shape[0] == 1
     p_line, c_line = np.empty((delay + 1, 4)), np.empty((delay + 1, 4))
@@ -259,13 +297,7 @@ def _predict(P: Array, w: Vector, dt: float, attitude_variance: float, bias_vari
 def adaptive(
     begin: int,
     end: int,
-    rate: Array,
-    first: Array,
-    second: Array,
-    first_reference: Array,
-    second_reference: Array,
-    frame_turn: Array,
-    dt: float,
+    record: Record,
     sigmas: Array,
     noises: Array,
     adaptation: Array,
@@ -279,6 +311,7 @@ def adaptive(
     ``sigmas`` are those of the first vector (in its unit) and of the unit second one, ``noises`` the growth of attitude
     and bias in a step, ``adaptation`` (memory, threshold, growth of the bias above it).
     """
+    rate, first, second, first_reference, second_reference, frame_turn, dt = record
     n = rate.shape[1]
     shared = first_reference.shape[0] == 1
     P, M, x, h, Ph = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), np.empty(3), np.empty(6)

@@ -360,47 +360,34 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
         The start does not have as many runs as the record.
     """
     from adcs.kalman import mekf_compiled as kernel
+    from adcs.satellite import dynamics_compiled
     from magloc.compilation import over_rows
 
     check_start(record, start)
-    used, first = settings.sensors, first_state(settings, start)
-    around, body = record.environment, record.satellite.body
+    used, first, around = settings.sensors, first_state(settings, start), record.environment
     runs, n = record.momentum_Nms.shape[:2]
     q, w, optional = np.empty((runs, n, 4)), np.empty((runs, n, 3)), np.zeros((3, runs, n, 3))
     covariance, nis = np.empty((runs, n, used.size, used.size)), np.full((runs, n, len(SENSORS)), np.nan)
     readings = record.readings
-    given = (
-        record.momentum_Nms,
-        record.wheel_torque_Nm,
-        readings.star,
-        readings.gyro_rad_s,
-        readings.field_T,
-        readings.sun,
-        around.b_orbital_T,
-        around.sun_orbital,
-        around.orbital_rate_rad_s,
-        around.gravity_s2,
-    )
+    wheels = (record.momentum_Nms, record.wheel_torque_Nm)
+    read = (readings.star, readings.gyro_rad_s, readings.field_T, readings.sun, around.sun_orbital)
+    places = (around.orbital_rate_rad_s, around.gravity_s2, around.b_orbital_T)
+    firsts = [used.first_of("field-bias"), used.first_of("gyro-bias"), used.first_of("disturbance")]
     over_rows(
         kernel.run,
         runs,
-        q,
-        w,
-        optional,
-        covariance,
-        nis,
-        np.ascontiguousarray(first.q),
-        np.ascontiguousarray(first.w),
-        first.P,
-        body.inertia_kgm2,
-        body.inverse,
-        body.residual_dipole_Am2,
+        kernel.Estimated(q, w, optional, covariance, nis),
+        kernel.First(np.ascontiguousarray(first.q), np.ascontiguousarray(first.w), first.P),
+        dynamics_compiled.Body.of(record.satellite.body),
         # One layout in memory, for which the kernel is compiled.
-        *(np.ascontiguousarray(values, dtype=np.float64) for values in given),
-        np.array([used.star, used.gyro, used.magnetometer, used.sun]),
-        deviations(record, settings),
-        np.array([used.first_of("field-bias"), used.first_of("gyro-bias"), used.first_of("disturbance")]),
-        settings.process_variance,
+        kernel.Record(*(np.ascontiguousarray(values, dtype=np.float64) for values in (*wheels, *read))),
+        dynamics_compiled.Surroundings(*(np.ascontiguousarray(values, dtype=np.float64) for values in places)),
+        kernel.Settings(
+            np.array([used.star, used.gyro, used.magnetometer, used.sun]),
+            deviations(record, settings),
+            np.array(firsts),
+            settings.process_variance,
+        ),
         record.dt_s,
     )
     return AttitudeTracks(settings, q, w, optional[0], optional[1], optional[2], covariance, nis)

@@ -4,11 +4,17 @@ Readings are taken one scalar after the other, all linearised at the predicted s
 update of all at once without a matrix to invert. The covariance of a step is in Joseph's form.
 """
 
+from __future__ import annotations
+
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from adcs.satellite.dynamics_compiled import (
+    Body,
     Quaternion,
+    Surroundings,
     Vector,
     applied,
     error_jacobian,
@@ -24,6 +30,48 @@ from magloc.compilation import compiled
 
 Array = NDArray[np.float64]
 _ALWAYS = 6
+
+
+class Estimated(NamedTuple):
+    """Outputs (R, n, …), optional (3, R, n, 3): biases of field and gyro, disturbance; nis (R, n, 4) at readings."""
+
+    q: Array
+    w: Array
+    optional: Array
+    covariance: Array
+    nis: Array
+
+
+class First(NamedTuple):
+    """Attitude (R, 4), rate (R, 3) and covariance (R, N, N) before the first reading."""
+
+    q: Array
+    w: Array
+    P: Array
+
+
+class Record(NamedTuple):
+    """Wheels, readings, and the Sun in the orbital frame: (R, n, 3) or of the star tracker (R, n, 4)."""
+
+    momentum: Array
+    wheel_torque: Array
+    star: Array
+    gyro: Array
+    field: Array
+    sun: Array
+    sun_orbital: Array
+
+
+class Settings(NamedTuple):
+    """Which of star tracker, gyro, magnetometer and Sun sensor are used, and their deviations, (4,) both.
+
+    Biases of field and gyro and the disturbance begin at ``firsts`` in the error state, -1 where there are none.
+    """
+
+    used: NDArray[np.bool_]
+    sigma: Array
+    firsts: NDArray[np.int64]
+    variance: Array
 
 
 @compiled
@@ -170,72 +218,39 @@ def _with_error(q: Quaternion, dx: Array) -> Quaternion:
 def run(
     begin: int,
     end: int,
-    q_out: Array,
-    w_out: Array,
-    optional_out: Array,
-    covariance: Array,
-    nis: Array,
-    q_start: Array,
-    w_start: Array,
-    P_start: Array,
-    J: Array,
-    J_inverse: Array,
-    dipole: Array,
-    momentum: Array,
-    wheel_torque: Array,
-    star: Array,
-    gyro: Array,
-    field: Array,
-    sun: Array,
-    b_orbital: Array,
-    sun_orbital: Array,
-    orbital_rate: Array,
-    gravity: Array,
-    used: NDArray[np.bool_],
-    sigma: Array,
-    firsts: NDArray[np.int64],
-    variance: Array,
+    out: Estimated,
+    first: First,
+    body: Body,
+    record: Record,
+    around: Surroundings,
+    settings: Settings,
     dt: float,
 ) -> None:
-    """Filter runs begin to end.
-
-    Arrays begin with (R, n); ``optional_out`` (3, R, n, 3) has bias of the field, bias of the gyro and disturbance,
-    which begin at ``firsts`` in the error state, -1 where there are none. ``used`` and ``sigma`` (4,) are of star
-    tracker, gyro, magnetometer and Sun sensor. ``nis`` (R, n, 4) is written where there is a reading.
-    """
-    n_rows, N = q_out.shape[1], P_start.shape[1]
+    """Filter runs begin to end."""
+    q_out, w_out, optional_out, covariance, nis = out
+    momentum, wheel_torque, star, gyro, field, sun, sun_orbital = record
+    orbital_rate, gravity, b_orbital = around
+    used, sigma, firsts, variance = settings
+    n_rows, N = q_out.shape[1], first.P.shape[1]
     b_first, g_first, d_first = firsts[0], firsts[1], firsts[2]
     r_star, r_gyro = sigma[0] * sigma[0], sigma[1] * sigma[1]
     r_field, r_sun = sigma[2] * sigma[2], sigma[3] * sigma[3]
-    m = vector_at(dipole)
     P, T = np.empty((N, N)), np.empty((6, N))
     F, F_after, F2, F3, Phi = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
     G, A, dx, u = np.empty((6, 3)), np.empty((N, N)), np.empty(N), np.empty(N)
     for run in range(begin, end):
-        q, w = quaternion_at(q_start[run]), vector_at(w_start[run])
+        q, w = quaternion_at(first.q[run]), vector_at(first.w[run])
         b_bias, g_bias, d = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        P[:] = P_start[run]
+        P[:] = first.P[run]
         for i in range(n_rows):
             if i > 0:
                 k = vector_at(momentum[run, i - 1])
                 b_o = vector_at(b_orbital[run, i - 1])
-                error_jacobian(J, J_inverse, m, q, w, k, gravity[run, i - 1], b_o, F)
-                q, w, _ = step(
-                    J,
-                    J_inverse,
-                    m,
-                    q,
-                    w,
-                    k,
-                    vector_at(wheel_torque[run, i - 1]),
-                    applied(J, d),
-                    orbital_rate[run, i - 1],
-                    gravity[run, i - 1],
-                    b_o,
-                    dt,
-                )
+                error_jacobian(body, q, w, k, gravity[run, i - 1], b_o, F)
+                u_k, torque = vector_at(wheel_torque[run, i - 1]), applied(body.J, d)
+                q, w, _ = step(body, q, w, k, u_k, torque, orbital_rate[run, i - 1], gravity[run, i - 1], b_o, dt)
                 k, b_o = vector_at(momentum[run, i]), vector_at(b_orbital[run, i])
-                error_jacobian(J, J_inverse, m, q, w, k, gravity[run, i], b_o, F_after)
+                error_jacobian(body, q, w, k, gravity[run, i], b_o, F_after)
                 for row in range(6):
                     for column in range(6):
                         F[row, column] = 0.5 * (F[row, column] + F_after[row, column])

@@ -2,24 +2,82 @@
 
 :mod:`adcs.satellite.dynamics` is the readable twin and has the formulas.
 
-Vectors and quaternions are tuples of scalars, which the compiler keeps in registers; matrices are arrays (3, 3). The
+Vectors, quaternions and matrices are tuples of scalars, which the compiler keeps in registers. The
 functions of this module are made to be called by other kernels; :func:`run` follows whole runs, one row each.
 """
+
+from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adcs.satellite.dynamics import RigidBody, WheelControl
 from magloc.compilation import compiled
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
+Matrix = tuple[Vector, Vector, Vector]
+
+
+class Body(NamedTuple):
+    """A satellite: its inertia, the inverse of it, and its residual dipole."""
+
+    J: Matrix
+    J_inverse: Matrix
+    dipole: Vector
+
+    @classmethod
+    def of(cls, body: RigidBody) -> Body:
+        """In the layout of the compiled code."""
+        return cls(matrix_at(body.inertia_kgm2), matrix_at(body.inverse), vector_at(body.residual_dipole_Am2))
+
+
+class Control(NamedTuple):
+    """Proportional-derivative control of the wheels towards a reference attitude."""
+
+    attitude_gain: Vector
+    rate_gain: Vector
+    torque_limit: float
+    momentum_limit: float
+    q_reference: Quaternion
+
+    @classmethod
+    def of(cls, control: WheelControl, q_reference: Array) -> Control:
+        """In the layout of the compiled code."""
+        gains = vector_at(control.attitude_gain_Nm), vector_at(control.rate_gain_Nms)
+        return cls(*gains, control.torque_limit_Nm, control.momentum_limit_Nms, quaternion_at(q_reference))
+
+
+class Surroundings(NamedTuple):
+    """Orbital rate and gravity (R, n), field in the orbital frame (R, n, 3), of all instants of all runs."""
+
+    orbital_rate: Array
+    gravity: Array
+    b_orbital: Array
+
+
+class Motion(NamedTuple):
+    """Attitude (R, n, 4), rate, momentum and torque of the wheels (R, n, 3) of all instants of all runs."""
+
+    q: Array
+    w: Array
+    momentum: Array
+    wheel_torque: Array
 
 
 @compiled
 def vector_at(values: Array) -> Vector:
     """Tuple of a row (3,)."""
     return values[0], values[1], values[2]
+
+
+@compiled
+def matrix_at(values: Array) -> Matrix:
+    """Tuple of the rows of a matrix (3, 3)."""
+    return vector_at(values[0]), vector_at(values[1]), vector_at(values[2])
 
 
 @compiled
@@ -41,12 +99,12 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 @compiled
-def applied(M: Array, v: Vector) -> Vector:
+def applied(M: Matrix, v: Vector) -> Vector:
     """Vector M v of a matrix (3, 3)."""
     return (
-        M[0, 0] * v[0] + M[0, 1] * v[1] + M[0, 2] * v[2],
-        M[1, 0] * v[0] + M[1, 1] * v[1] + M[1, 2] * v[2],
-        M[2, 0] * v[0] + M[2, 1] * v[1] + M[2, 2] * v[2],
+        M[0][0] * v[0] + M[0][1] * v[1] + M[0][2] * v[2],
+        M[1][0] * v[0] + M[1][1] * v[1] + M[1][2] * v[2],
+        M[2][0] * v[0] + M[2][1] * v[1] + M[2][2] * v[2],
     )
 
 
@@ -104,20 +162,18 @@ def relative_rate(q: Quaternion, w: Vector, orbital_rate: float) -> Vector:
 
 
 @compiled
-def environment_torque(J: Array, dipole: Vector, q: Quaternion, gravity: float, b_orbital: Vector) -> Vector:
+def environment_torque(body: Body, q: Quaternion, gravity: float, b_orbital: Vector) -> Vector:
     """Torque of the gravity gradient and of the residual dipole."""
     eta = rotate_back(q, (0.0, 0.0, 1.0))
-    magnetic = cross(dipole, rotate_back(q, b_orbital))
-    return combined(magnetic, 3.0 * gravity, cross(eta, applied(J, eta)))
+    magnetic = cross(body.dipole, rotate_back(q, b_orbital))
+    return combined(magnetic, 3.0 * gravity, cross(eta, applied(body.J, eta)))
 
 
 @compiled
-def angular_acceleration(
-    J: Array, J_inverse: Array, w: Vector, momentum: Vector, wheel_torque: Vector, torque: Vector
-) -> Vector:
+def angular_acceleration(body: Body, w: Vector, momentum: Vector, wheel_torque: Vector, torque: Vector) -> Vector:
     """Acceleration of the body."""
-    gyroscopic = cross(w, combined(momentum, 1.0, applied(J, w)))
-    return applied(J_inverse, combined(combined(torque, -1.0, wheel_torque), -1.0, gyroscopic))
+    gyroscopic = cross(w, combined(momentum, 1.0, applied(body.J, w)))
+    return applied(body.J_inverse, combined(combined(torque, -1.0, wheel_torque), -1.0, gyroscopic))
 
 
 @compiled
@@ -128,9 +184,7 @@ def quaternion_rate(q: Quaternion, w_relative: Vector) -> Quaternion:
 
 @compiled
 def step(
-    J: Array,
-    J_inverse: Array,
-    dipole: Vector,
+    body: Body,
     q: Quaternion,
     w: Vector,
     momentum: Vector,
@@ -147,23 +201,23 @@ def step(
     end = combined(momentum, dt, wheel_torque)
 
     q1 = quaternion_rate(q, relative_rate(q, w, orbital_rate))
-    outside = combined(torque, 1.0, environment_torque(J, dipole, q, gravity, b_orbital))
-    w1 = angular_acceleration(J, J_inverse, w, momentum, wheel_torque, outside)
+    outside = combined(torque, 1.0, environment_torque(body, q, gravity, b_orbital))
+    w1 = angular_acceleration(body, w, momentum, wheel_torque, outside)
 
     q_at, w_at = moved(q, half, q1), combined(w, half, w1)
     q2 = quaternion_rate(q_at, relative_rate(q_at, w_at, orbital_rate))
-    outside = combined(torque, 1.0, environment_torque(J, dipole, q_at, gravity, b_orbital))
-    w2 = angular_acceleration(J, J_inverse, w_at, middle, wheel_torque, outside)
+    outside = combined(torque, 1.0, environment_torque(body, q_at, gravity, b_orbital))
+    w2 = angular_acceleration(body, w_at, middle, wheel_torque, outside)
 
     q_at, w_at = moved(q, half, q2), combined(w, half, w2)
     q3 = quaternion_rate(q_at, relative_rate(q_at, w_at, orbital_rate))
-    outside = combined(torque, 1.0, environment_torque(J, dipole, q_at, gravity, b_orbital))
-    w3 = angular_acceleration(J, J_inverse, w_at, middle, wheel_torque, outside)
+    outside = combined(torque, 1.0, environment_torque(body, q_at, gravity, b_orbital))
+    w3 = angular_acceleration(body, w_at, middle, wheel_torque, outside)
 
     q_at, w_at = moved(q, dt, q3), combined(w, dt, w3)
     q4 = quaternion_rate(q_at, relative_rate(q_at, w_at, orbital_rate))
-    outside = combined(torque, 1.0, environment_torque(J, dipole, q_at, gravity, b_orbital))
-    w4 = angular_acceleration(J, J_inverse, w_at, end, wheel_torque, outside)
+    outside = combined(torque, 1.0, environment_torque(body, q_at, gravity, b_orbital))
+    w4 = angular_acceleration(body, w_at, end, wheel_torque, outside)
 
     sixth = dt / 6.0
     q = moved(moved(moved(moved(q, sixth, q1), 2.0 * sixth, q2), 2.0 * sixth, q3), sixth, q4)
@@ -173,9 +227,7 @@ def step(
 
 @compiled
 def error_jacobian(
-    J: Array,
-    J_inverse: Array,
-    dipole: Vector,
+    body: Body,
     q: Quaternion,
     w: Vector,
     momentum: Vector,
@@ -187,6 +239,7 @@ def error_jacobian(
 
     Its columns are what the linear map makes of the three unit vectors e: with δη = 2 η×e for δq = e, and so for B.
     """
+    J, J_inverse = body.J, body.J_inverse
     eta = rotate_back(q, (0.0, 0.0, 1.0))
     J_eta = applied(J, eta)
     b = rotate_back(q, b_orbital)
@@ -198,7 +251,7 @@ def error_jacobian(
         F[0, 3 + i], F[1, 3 + i], F[2, 3 + i] = 0.5 * e[0], 0.5 * e[1], 0.5 * e[2]
         d_eta = cross(eta, e)
         gradient = combined(cross(d_eta, J_eta), 1.0, cross(eta, applied(J, d_eta)))
-        magnetic = cross(dipole, cross(b, e))
+        magnetic = cross(body.dipole, cross(b, e))
         torque = (
             6.0 * gravity * gradient[0] + 2.0 * magnetic[0],
             6.0 * gravity * gradient[1] + 2.0 * magnetic[1],
@@ -216,20 +269,18 @@ def _clipped(value: float, limit: float) -> float:
 
 @compiled
 def commanded_torque(
-    J: Array,
-    attitude_gain: Vector,
-    rate_gain: Vector,
-    torque_limit: float,
-    momentum_limit: float,
+    J: Matrix,
+    control: Control,
     q: Quaternion,
     w: Vector,
     momentum: Vector,
-    q_reference: Quaternion,
     orbital_rate: float,
     dt: float,
 ) -> Vector:
     """Wheel torque of the proportional-derivative control, within its limits."""
-    angle = error_vector(q_reference, q)
+    attitude_gain, rate_gain = control.attitude_gain, control.rate_gain
+    torque_limit, momentum_limit = control.torque_limit, control.momentum_limit
+    angle = error_vector(control.q_reference, q)
     rate = relative_rate(q, w, orbital_rate)
     gyroscopic = cross(w, combined(momentum, 1.0, applied(J, w)))
     x = _clipped(attitude_gain[0] * angle[0] + rate_gain[0] * rate[0] - gyroscopic[0], torque_limit)
@@ -246,68 +297,33 @@ def commanded_torque(
 def run(
     begin: int,
     end: int,
-    q: Array,
-    w: Array,
-    momentum: Array,
-    wheel_torque: Array,
-    J: Array,
-    J_inverse: Array,
-    dipole: Array,
-    attitude_gain: Array,
-    rate_gain: Array,
-    torque_limit: float,
-    momentum_limit: float,
-    q_reference: Array,
+    motion: Motion,
+    body: Body,
+    control: Control,
     torque: Array,
-    orbital_rate: Array,
-    gravity: Array,
-    b_orbital: Array,
+    around: Surroundings,
     dt: float,
 ) -> None:
     """Runs begin to end under control that sees the true state, from their first rows on.
 
-    ``q`` (R, n, 4), ``w`` and ``momentum`` (R, n, 3) hold the start in their rows 0, and get the rest; ``wheel_torque``
-    (R, n, 3) gets what is held from each instant to the next (the last row: what would be). ``torque`` (R, n, 3) is
-    held likewise; surroundings, (R, n) and (R, n, 3), are those at the start of every step.
+    The first rows of the motion hold the start of attitude, rate and momentum, and the others are filled; the wheels'
+    torque is what is held from each instant to the next (the last row: what would be). ``torque`` (R, n, 3) is held
+    likewise; surroundings are those at the start of every step.
     """
+    q, w, momentum, wheel_torque = motion
     n = q.shape[1]
-    reference = quaternion_at(q_reference)
-    m = vector_at(dipole)
     for r in range(begin, end):
         q_now = quaternion_at(q[r, 0])
         w_now = vector_at(w[r, 0])
         k_now = vector_at(momentum[r, 0])
         for i in range(n):
-            u = commanded_torque(
-                J,
-                vector_at(attitude_gain),
-                vector_at(rate_gain),
-                torque_limit,
-                momentum_limit,
-                q_now,
-                w_now,
-                k_now,
-                reference,
-                orbital_rate[r, i],
-                dt,
-            )
+            rate = around.orbital_rate[r, i]
+            u = commanded_torque(body.J, control, q_now, w_now, k_now, rate, dt)
             q[r, i, 0], q[r, i, 1], q[r, i, 2], q[r, i, 3] = q_now
             w[r, i, 0], w[r, i, 1], w[r, i, 2] = w_now
             momentum[r, i, 0], momentum[r, i, 1], momentum[r, i, 2] = k_now
             wheel_torque[r, i, 0], wheel_torque[r, i, 1], wheel_torque[r, i, 2] = u
             if i == n - 1:
                 break
-            q_now, w_now, k_now = step(
-                J,
-                J_inverse,
-                m,
-                q_now,
-                w_now,
-                k_now,
-                u,
-                vector_at(torque[r, i]),
-                orbital_rate[r, i],
-                gravity[r, i],
-                vector_at(b_orbital[r, i]),
-                dt,
-            )
+            outside, b_orbital = vector_at(torque[r, i]), vector_at(around.b_orbital[r, i])
+            q_now, w_now, k_now = step(body, q_now, w_now, k_now, u, outside, rate, around.gravity[r, i], b_orbital, dt)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from adcs import quaternion
 from arrays.typing import FloatArray
 
 
@@ -73,12 +72,6 @@ class VectorRecord:
     def __len__(self) -> int:
         """Return the number of instants."""
         return self.rate_rad_s.shape[1]
-
-    @property
-    def arrays(self) -> tuple[FloatArray, ...]:
-        """What the compiled filters take of it, in their order."""
-        vectors = (self.first_body, self.second_body, self.first_reference, self.second_reference)
-        return (self.rate_rad_s, *vectors, quaternion.exp(self.frame_rate_rad_s * self.dt_s))
 
 
 _OF_RUNS = ("first_body", "second_body")

@@ -36,6 +36,7 @@ from magloc.measurement.whitened import WhitenedModel
 if TYPE_CHECKING:
     import xarray as xr
 from magloc.localization.fit import variable_projection_compiled
+from magloc.measurement.whitened_compiled import ModelRow
 
 # χ² above that of the optimum searched from the truth within which a fix has found it.
 CHI2_FOUND = 0.05
@@ -246,11 +247,7 @@ class SourcesMap:
             chi2, _, _ = variable_projection_compiled.refine(
                 q,
                 white.apply(row - without_source),
-                model.sensors,
-                model.channel_sensor,
-                white.root @ array.channel_gain,
-                np.ascontiguousarray(white.basis.T),
-                white.shrinkage,
+                ModelRow.of(model, white.root @ array.channel_gain, white.basis, white.shrinkage),
                 3,
                 variable_projection_compiled.OPTIMUM_TOLERANCE,
                 _MAX_ITERATIONS,

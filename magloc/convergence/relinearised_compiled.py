@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from arrays.typing import FloatArray
 from magloc.compilation import compiled, compiled_parallel
 from magloc.fields.dipole import MU0_OVER_4PI
-from magloc.linalg_compiled import orthonormalise
+from magloc.kalman_compiled import scalar_update, triangular_root
 
 
 @compiled
@@ -51,41 +51,14 @@ def _row(x: FloatArray, sensors: FloatArray, weights: FloatArray, j: int, h: Flo
 
 
 @compiled
-def _scalar_update(
-    x: FloatArray, S: FloatArray, h: FloatArray, innovation: float, variance: float, phi: FloatArray, gain: FloatArray
-) -> None:
-    """Potter's update in place, the twin of :func:`magloc.kalman.scalar_update`."""
-    s = variance
-    for c in range(6):
-        t = 0.0
-        for r in range(6):
-            t += S[r, c] * h[r]
-        phi[c] = t
-        s += t * t
-    alpha = 1.0 / s
-    shrink = 1.0 / (1.0 + math.sqrt(alpha * variance))
-    for r in range(6):
-        t = 0.0
-        for c in range(6):
-            t += S[r, c] * phi[c]
-        gain[r] = alpha * t
-        x[r] += gain[r] * innovation
-        for c in range(6):
-            S[r, c] -= gain[r] * phi[c] * shrink
-
-
-@compiled
-def _add_process_noise(S: FloatArray, s_q: FloatArray, wide: FloatArray, triangle: FloatArray) -> None:
+def _add_process_noise(S: FloatArray, s_q: FloatArray, wide: FloatArray) -> None:
     """S becomes a lower triangular square root of ``S Sᵀ + diag(s_q²)``."""
     wide[:] = 0.0
     for r in range(6):
         for c in range(6):
             wide[r, c] = S[r, c]
         wide[r, 6 + r] = s_q[r]
-    orthonormalise(wide, triangle)
-    for r in range(6):
-        for c in range(6):
-            S[r, c] = triangle[c, r] if c <= r else 0.0
+    triangular_root(wide, S)
 
 
 @compiled
@@ -125,15 +98,14 @@ def relinearised_map(
     for i in prange(n):
         x = states[i]
         S = np.diag(s_q)
-        wide, triangle = np.empty((6, 12)), np.zeros((6, 6))
-        phi, gain, h, g = np.empty(6), np.empty(6), np.empty(6), np.empty(k)
+        wide, phi, h, g = np.empty((6, 12)), np.empty(6), np.empty(6), np.empty(k)
         for j in range(k):
             g[j] = _row(x, sensors, weights, j, h)
         for iteration in range(1, max_iterations + 1):
-            _add_process_noise(S, s_q, wide, triangle)
+            _add_process_noise(S, s_q, wide)
             for j in range(k):
                 nu = z[j] - _row(x, sensors, weights, j, h)
-                _scalar_update(x, S, h, nu, inflation * variance[j], phi, gain)
+                scalar_update(x, S, h, nu, inflation * variance[j], phi)
             change = 0.0
             for j in range(k):
                 predicted = _row(x, sensors, weights, j, h)

@@ -18,6 +18,7 @@ that is hard to detect fulfils; they need an ambient field.
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 
 import numpy as np
@@ -30,8 +31,9 @@ from magloc.chi_square import check_differences
 from magloc.compilation import over_rows
 from magloc.fields import dipole
 from magloc.localization.search.candidates import SingleArray, candidate_positions, linear_bases, linear_scores
-from magloc.localization.search.single_source_compiled import search_rows
+from magloc.localization.search.single_source_compiled import Candidates, Ends, search_rows
 from magloc.measurement.whitened import WhitenedModel
+from magloc.measurement.whitened_compiled import ModelRows
 
 # As Locator searches: starts of every refinement, least angle between them, linearisations at most.
 _N_STARTS, _APART_RAD, _MOST_ITERATIONS = 6, 0.3, 100
@@ -167,32 +169,22 @@ class DipoleFilter:
             The generalised likelihood ratio, χ² without a source less χ² of the best source anywhere.
         """
         n = len(whitened)
-        w, problem = self.whitening, self._problem
+        problem = self._problem
         y = np.ascontiguousarray(whitened)
         q, mu, chi2 = np.empty((n, _N_STARTS, 4)), np.empty((n, _N_STARTS, 3)), np.full((n, _N_STARTS), np.inf)
+        rows = ModelRows.of(problem)._replace(gain=self._gain[None], set_of_row=np.zeros(n, dtype=np.intp))
         over_rows(
             search_rows,
             n,
             y,
             y,
             np.arange(n),
-            self._bases,
-            self._candidates,
+            Candidates(self._candidates, self._bases, math.cos(_APART_RAD)),
             np.empty((n, 0, 4)),
-            np.cos(_APART_RAD),
             np.inf,
             _MOST_ITERATIONS,
-            problem.sensors,
-            problem.channel_sensor,
-            self._gain[None],
-            np.ascontiguousarray(w.basis.T)[None],
-            w.shrinkage[None],
-            np.zeros(n, dtype=np.intp),
-            q,
-            mu,
-            chi2,
-            np.empty((n, _N_STARTS), dtype=np.int64),
-            np.zeros((n, 3), dtype=np.int64),
+            rows,
+            Ends(q, mu, chi2, np.empty((n, _N_STARTS), dtype=np.int64), np.zeros((n, 3), dtype=np.int64)),
         )
         # A candidate is a source too, where none of the refinements converged.
         best: FloatArray = np.maximum(self.energy(y) - chi2.min(axis=1), self.candidate_energy(y))

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from arrays.array import SensorArray
-from arrays.typing import FloatArray, IntArray
+from arrays.typing import FloatArray
 from arrays.whitening import Whitening
 from magloc.fields.dipole import MU0_OVER_4PI
 
@@ -140,22 +140,6 @@ class WhitenedModel(ScaledSensors):
             ambient=chosen(self.ambient),
             basis=chosen(self.basis),
             shrinkage=chosen(self.shrinkage),
-        )
-
-    def compiled(self) -> tuple[FloatArray, IntArray, FloatArray, FloatArray, FloatArray, IntArray]:
-        """Arguments of compiled loops: sensors, channel_sensor, and gain, common, shrinkage of every set; set of a row.
-
-        The common field is transposed, (sets, c, C), so that inner loops run over contiguous channels.
-        """
-        n = len(self)
-        sets = slice(0, 1) if self.shares_whitening else slice(None)
-        return (
-            self.sensors,
-            self.channel_sensor,
-            np.ascontiguousarray(self.gain[sets]),
-            np.ascontiguousarray(self.basis[sets].transpose(0, 2, 1)),
-            np.ascontiguousarray(self.shrinkage[sets]),
-            np.zeros(n, dtype=np.intp) if self.shares_whitening else np.arange(n, dtype=np.intp),
         )
 
     @property

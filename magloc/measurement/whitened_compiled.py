@@ -10,6 +10,7 @@ The source is (u, s) on the unit sphere of R⁴: position = centroid + radius ·
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +18,63 @@ from numpy.typing import NDArray
 from arrays.typing import FloatArray
 from magloc.compilation import compiled
 from magloc.linalg_compiled import orthonormalise
+from magloc.measurement.whitened import ScaledSensors, WhitenedModel
 
 # |s| stays above this: below it the differences lose their digits, and no array resolves a range of 10⁵ radii.
 SMALLEST_S = 1e-5
 
 
+class ModelRow(NamedTuple):
+    """Whitened channels of one row: their sensors, gains (c, 3), common field (q, c), shrinkage (q,)."""
+
+    sensors: FloatArray
+    channel_sensor: NDArray[np.intp]
+    gain: FloatArray
+    common: FloatArray
+    shrinkage: FloatArray
+
+    @classmethod
+    def of(cls, scaled: ScaledSensors, gain: FloatArray, basis: FloatArray, shrinkage: FloatArray) -> ModelRow:
+        """From a whitening's basis (c, q) in the order of the twin."""
+        arrays = (np.ascontiguousarray(values) for values in (gain, basis.T, shrinkage))
+        return cls(scaled.sensors, scaled.channel_sensor, *arrays)
+
+
+class ModelRows(NamedTuple):
+    """Whitened channels of many rows: b sets of gains (b, c, 3), common fields and shrinkages, and the set of a row."""
+
+    sensors: FloatArray
+    channel_sensor: NDArray[np.intp]
+    gain: FloatArray
+    common: FloatArray
+    shrinkage: FloatArray
+    set_of_row: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, model: WhitenedModel) -> ModelRows:
+        """All rows of a model; the common field is transposed, so that inner loops run over contiguous channels."""
+        sets = slice(0, 1) if model.shares_whitening else slice(None)
+        return cls(
+            model.sensors,
+            model.channel_sensor,
+            np.ascontiguousarray(model.gain[sets]),
+            np.ascontiguousarray(model.basis[sets].transpose(0, 2, 1)),
+            np.ascontiguousarray(model.shrinkage[sets]),
+            np.zeros(len(model), dtype=np.intp) if model.shares_whitening else np.arange(len(model), dtype=np.intp),
+        )
+
+
 @compiled
-def _project_common(rows: FloatArray, n_rows: int, common: FloatArray, shrinkage: FloatArray) -> None:
+def row_at(rows: ModelRows, i: int) -> ModelRow:
+    """Row i of many."""
+    w = rows.set_of_row[i]
+    return ModelRow(rows.sensors, rows.channel_sensor, rows.gain[w], rows.common[w], rows.shrinkage[w])
+
+
+@compiled
+def _project_common(rows: FloatArray, n_rows: int, row: ModelRow) -> None:
     """Remove the common field from whitened rows (k, c) in place."""
+    common, shrinkage = row.common, row.shrinkage
     for j in range(n_rows):
         for k in range(shrinkage.size):
             t = 0.0
@@ -38,14 +88,11 @@ def _project_common(rows: FloatArray, n_rows: int, common: FloatArray, shrinkage
 @compiled
 def unit_basis(
     q: FloatArray,
-    sensors: FloatArray,
-    channel_sensor: NDArray[np.intp],
-    gain: FloatArray,
-    common: FloatArray,
-    shrinkage: FloatArray,
+    row: ModelRow,
     basis: FloatArray,
 ) -> None:
     """Whitened readings of the three unit moments at q, into basis (3, c)."""
+    sensors, channel_sensor, gain = row.sensors, row.channel_sensor, row.gain
     last = -1
     n0 = n1 = n2 = r3 = 0.0
     for c in range(channel_sensor.size):
@@ -63,19 +110,18 @@ def unit_basis(
         basis[0, c] = (t * n0 - g0) * r3
         basis[1, c] = (t * n1 - g1) * r3
         basis[2, c] = (t * n2 - g2) * r3
-    _project_common(basis, 3, common, shrinkage)
+    _project_common(basis, 3, row)
 
 
 @compiled
 def homogeneous_jacobian(
     q: FloatArray,
     mu: FloatArray,
-    sensors: FloatArray,
-    channel_sensor: NDArray[np.intp],
-    gain: FloatArray,
+    row: ModelRow,
     jacobian: FloatArray,
 ) -> None:
     """Derivative of the readings of the scaled moment mu along (u, s), before the common field is removed: (4, c)."""
+    sensors, channel_sensor, gain = row.sensors, row.channel_sensor, row.gain
     last = -1
     n0 = n1 = n2 = r4 = nm = 0.0
     for c in range(channel_sensor.size):
@@ -107,15 +153,11 @@ def candidate_bases(
     begin: int,
     end: int,
     candidates: FloatArray,
-    sensors: FloatArray,
-    channel_sensor: NDArray[np.intp],
-    gain: FloatArray,
-    common: FloatArray,
-    shrinkage: FloatArray,
+    row: ModelRow,
     bases: FloatArray,
 ) -> None:
     """Orthonormal whitened bases (n, 3, c) of candidate positions q (n, 4), rows begin to end."""
     triangle = np.zeros((3, 3))
     for i in range(begin, end):
-        unit_basis(candidates[i], sensors, channel_sensor, gain, common, shrinkage, bases[i])
+        unit_basis(candidates[i], row, bases[i])
         orthonormalise(bases[i], triangle)

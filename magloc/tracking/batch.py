@@ -73,29 +73,53 @@ class _CompiledSteps:
         distinct = {id(of_row): of_row for of_row in differences}
         index = {key: i for i, key in enumerate(distinct)}
         k = max(1, *(of_row.n_differences for of_row in distinct.values()))
-        self.transforms = np.zeros((len(distinct), k, array.n_channels))
+        transforms = np.zeros((len(distinct), k, array.n_channels))
         for i, of_row in enumerate(distinct.values()):
-            self.transforms[i, : of_row.n_differences] = of_row.transform / np.sqrt(of_row.variance)[:, None]
-        self.transform_of_row = np.array([index[id(of_row)] for of_row in differences])
-        self.n_differences = np.array([of_row.n_differences for of_row in differences])
+            transforms[i, : of_row.n_differences] = of_row.transform / np.sqrt(of_row.variance)[:, None]
+        transform_of_row = np.array([index[id(of_row)] for of_row in differences])
         channels = np.nan_to_num(np.stack([row.readings_T for row in rows]) - array.channel_offset_T)
-        self.z = (self.transforms[self.transform_of_row] @ channels[..., None])[..., 0]
-        self.origins = np.stack([row.origin_m for row in rows])
-        self.rotations = np.stack([row.R_world_from_array for row in rows])
-        self.ambients, self.ambient_of_row = array.ambient_fields[None], np.zeros(len(rows), dtype=np.int64)
+        ambients, ambient_of_row = array.ambient_fields[None], np.zeros(len(rows), dtype=np.int64)
         if any(row.ambient_T is not None for row in rows):
             own = np.zeros(3) if array.ambient_T is None else np.asarray(array.ambient_T)
             of_rows = np.stack([own if row.ambient_T is None else row.ambient_T for row in rows])
-            self.ambients, self.ambient_of_row = ambient_fields(array, len(rows), of_rows), np.arange(len(rows))
-        lengths, self.step_of_row = np.unique(np.diff(self.times, prepend=self.times[0]), return_inverse=True)
+            ambients, ambient_of_row = ambient_fields(array, len(rows), of_rows), np.arange(len(rows))
+        self.given = kernels.Rows(
+            z=(transforms[transform_of_row] @ channels[..., None])[..., 0],
+            n_differences=np.array([of_row.n_differences for of_row in differences]),
+            transforms=transforms,
+            transform_of_row=transform_of_row,
+            origins=np.stack([row.origin_m for row in rows]),
+            rotations=np.stack([row.R_world_from_array for row in rows]),
+            ambients=ambients,
+            ambient_of_row=ambient_of_row,
+        )
+        lengths, step_of_row = np.unique(np.diff(self.times, prepend=self.times[0]), return_inverse=True)
         steps = [motion.linear_step(max(length, 0.0)) for length in lengths.tolist()]
-        self.F, self.A, self.B = (np.stack(part) for part in zip(*steps, strict=True))
-        self.nis_limits = np.asarray(chdtri(np.maximum(np.arange(k + 1), 1), CONTRADICTION), dtype=np.float64)
+        F, A, B = (np.stack(part) for part in zip(*steps, strict=True))
+        self.steps = kernels.Steps(F, A, B, step_of_row)
+        self.channels = kernels.Channels(
+            array.positions, array.centroid, array.channel_sensor, array.channel_is_scalar, array.channel_gain
+        )
+        self.rules = kernels.Rules(
+            nis_limits=np.asarray(chdtri(np.maximum(np.arange(k + 1), 1), CONTRADICTION), dtype=np.float64),
+            tolerance=TOLERANCE,
+            max_iterations=MOST_ITERATIONS,
+            step_shrink=SHRINK,
+            least_singular=LEAST_SINGULAR,
+            largest_growth=LARGEST_GROWTH,
+            rows_to_lose=ROWS_TO_LOSE,
+            start_range_error=REFIX_RANGE_ERROR,
+            largest_range_error=LARGEST_RANGE_ERROR,
+        )
         n = motion.n_states
-        self.x, self.predicted_x = np.empty((2, len(rows), n))
-        self.S, self.predicted_S = np.empty((2, len(rows), n, n))
-        self.nis = np.full(len(rows), np.nan)
-        self.iterations, self.status = np.zeros((2, len(rows)), dtype=np.int64)
+        self.out = kernels.Followed(
+            np.empty((len(rows), n)),
+            np.empty((len(rows), n, n)),
+            np.empty((len(rows), n)),
+            np.empty((len(rows), n, n)),
+            np.full(len(rows), np.nan),
+            *np.zeros((2, len(rows)), dtype=np.int64),
+        )
 
     def follow(self, begin: int) -> list[TrackPoint]:
         """Points from a row to the one before the first that has to be acquired, or that goes back in time."""
@@ -107,67 +131,40 @@ class _CompiledSteps:
             x,
             S,
             contradictions,
-            self.z,
-            self.n_differences,
-            self.transforms,
-            self.transform_of_row,
-            self.origins,
-            self.rotations,
-            self.ambients,
-            self.ambient_of_row,
-            self.F,
-            self.A,
-            self.B,
-            self.step_of_row,
-            array.positions,
-            array.centroid,
-            array.channel_sensor,
-            array.channel_is_scalar,
-            array.channel_gain,
-            self.nis_limits,
-            TOLERANCE,
-            MOST_ITERATIONS,
-            SHRINK,
-            LEAST_SINGULAR,
-            LARGEST_GROWTH,
-            ROWS_TO_LOSE,
-            REFIX_RANGE_ERROR,
-            LARGEST_RANGE_ERROR,
-            self.x,
-            self.S,
-            self.predicted_x,
-            self.predicted_S,
-            self.nis,
-            self.iterations,
-            self.status,
+            self.channels,
+            self.given,
+            self.steps,
+            self.rules,
+            self.out,
         )
         if end == begin:
             return []
+        given, out = self.given, self.out
         steps = [
             Step(
                 i,
-                Prediction(self.predicted_x[i], self.predicted_S[i], self.F[self.step_of_row[i]]),
-                self.x[i],
-                self.S[i],
+                Prediction(out.predicted_x[i], out.predicted_S[i], self.steps.F[self.steps.of_row[i]]),
+                out.x[i],
+                out.S[i],
             )
             for i in range(begin, end)
         ]
         tracker.resume(x, S, times[end - 1], contradictions, steps)
-        roots, predicted = self.S[begin:end], self.predicted_S[begin:end]
+        roots, predicted = out.S[begin:end], out.predicted_S[begin:end]
         covariance = (roots @ roots.swapaxes(-1, -2))[:, :N_SOURCE, :N_SOURCE]
         learned = estimability(roots, predicted)[:, :N_SOURCE]
-        centroids = self.origins[begin:end] + self.rotations[begin:end] @ array.centroid
+        centroids = given.origins[begin:end] + given.rotations[begin:end] @ array.centroid
         return [
             TrackPoint(
                 times[i],
-                self.x[i, :3],
-                self.x[i, 3:6],
+                out.x[i, :3],
+                out.x[i, 3:6],
                 covariance[i - begin],
                 learned[i - begin],
-                int(self.iterations[i]),
-                float(self.nis[i]),
-                int(self.n_differences[i]),
-                _STATUS[int(self.status[i])],
+                int(out.iterations[i]),
+                float(out.nis[i]),
+                int(given.n_differences[i]),
+                _STATUS[int(out.status[i])],
                 weight=tracker.weight,
                 centroid_m=centroids[i - begin],
                 radius_m=array.circumradius,

@@ -7,6 +7,7 @@ two parts, ``S_q = A + |m| B``; its readings are whitened differences, padded to
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,35 +15,69 @@ from numpy.typing import NDArray
 from arrays.typing import FloatArray
 from magloc.compilation import compiled
 from magloc.fields.dipole import MU0_OVER_4PI
+from magloc.kalman_compiled import scalar_update, triangular_root
+from magloc.linalg_compiled import orthonormalise
 
 IntArray = NDArray[np.int64]
 TRACKED, PREDICTED, OUTLIER = 0, 1, 2
 
 
-@compiled
-def _triangularised(rows: FloatArray, out: FloatArray) -> None:
-    """Lower triangular ``L``, ``L Lᵀ = rows rowsᵀ``, by modified Gram-Schmidt on the rows (n, m), which are spoilt."""
-    n, m = rows.shape
-    for i in range(n):
-        for j in range(n):
-            out[i, j] = 0.0
-    for i in range(n):
-        norm = 0.0
-        for c in range(m):
-            norm += rows[i, c] * rows[i, c]
-        norm = math.sqrt(norm)
-        out[i, i] = norm
-        if norm > 0.0:
-            inverse = 1.0 / norm
-            for c in range(m):
-                rows[i, c] *= inverse
-            for j in range(i + 1, n):
-                t = 0.0
-                for c in range(m):
-                    t += rows[j, c] * rows[i, c]
-                out[j, i] = t
-                for c in range(m):
-                    rows[j, c] -= t * rows[i, c]
+class Channels(NamedTuple):
+    """The array: positions of the sensors, and sensor, kind and gain of every channel."""
+
+    positions: FloatArray
+    centroid: FloatArray
+    sensor: NDArray[np.intp]
+    is_scalar: NDArray[np.bool_]
+    gain: FloatArray
+
+
+class Rows(NamedTuple):
+    """Whitened differences of every row, how they are formed, and the array's pose and ambient field."""
+
+    z: FloatArray
+    n_differences: IntArray
+    transforms: FloatArray
+    transform_of_row: IntArray
+    origins: FloatArray
+    rotations: FloatArray
+    ambients: FloatArray
+    ambient_of_row: IntArray
+
+
+class Steps(NamedTuple):
+    """Linear steps of the motion: transition F, noise ``A + |m| B``, and which of them leads to a row."""
+
+    F: FloatArray
+    A: FloatArray
+    B: FloatArray
+    of_row: IntArray
+
+
+class Rules(NamedTuple):
+    """When an update has converged, and when it is believed; see :mod:`magloc.tracking.tracker`."""
+
+    nis_limits: FloatArray
+    tolerance: float
+    max_iterations: int
+    step_shrink: float
+    least_singular: float
+    largest_growth: float
+    rows_to_lose: int
+    start_range_error: float
+    largest_range_error: float
+
+
+class Followed(NamedTuple):
+    """Outputs of every row: the state after and before its readings, and what became of them."""
+
+    x: FloatArray
+    S: FloatArray
+    predicted_x: FloatArray
+    predicted_S: FloatArray
+    nis: FloatArray
+    iterations: IntArray
+    status: IntArray
 
 
 @compiled
@@ -51,10 +86,7 @@ def _predicted(
     origin: FloatArray,
     R: FloatArray,
     ambient: FloatArray,
-    positions: FloatArray,
-    channel_sensor: NDArray[np.intp],
-    channel_is_scalar: NDArray[np.bool_],
-    gain: FloatArray,
+    array: Channels,
     transform: FloatArray,
     channels: FloatArray,
     slopes: FloatArray,
@@ -62,7 +94,8 @@ def _predicted(
     H: FloatArray,
 ) -> None:
     """Whitened differences (k,) of a state, and their Jacobian (k, 6) with respect to position and moment."""
-    n_channels, k = channel_sensor.size, predicted.size
+    positions, gain = array.positions, array.gain
+    n_channels, k = array.sensor.size, predicted.size
     p0 = R[0, 0] * (x[0] - origin[0]) + R[1, 0] * (x[1] - origin[1]) + R[2, 0] * (x[2] - origin[2])
     p1 = R[0, 1] * (x[0] - origin[0]) + R[1, 1] * (x[1] - origin[1]) + R[2, 1] * (x[2] - origin[2])
     p2 = R[0, 2] * (x[0] - origin[0]) + R[1, 2] * (x[1] - origin[1]) + R[2, 2] * (x[2] - origin[2])
@@ -70,7 +103,7 @@ def _predicted(
     m1 = R[0, 1] * x[3] + R[1, 1] * x[4] + R[2, 1] * x[5]
     m2 = R[0, 2] * x[3] + R[1, 2] * x[4] + R[2, 2] * x[5]
     for c in range(n_channels):
-        s = channel_sensor[c]
+        s = array.sensor[c]
         d0, d1, d2 = positions[s, 0] - p0, positions[s, 1] - p1, positions[s, 2] - p2
         r2 = d0 * d0 + d1 * d1 + d2 * d2
         inverse = 1.0 / math.sqrt(r2)
@@ -81,7 +114,7 @@ def _predicted(
         b1 = scale * (3.0 * nm * n1 - m1) + ambient[s, 1]
         b2 = scale * (3.0 * nm * n2 - m2) + ambient[s, 2]
         g0, g1, g2 = gain[c, 0], gain[c, 1], gain[c, 2]
-        if channel_is_scalar[c]:
+        if array.is_scalar[c]:
             modulus = math.sqrt(b0 * b0 + b1 * b1 + b2 * b2)
             channels[c] = g0 * modulus
             t = g0 / modulus if modulus > 0.0 else 0.0
@@ -113,42 +146,17 @@ def _predicted(
 
 
 @compiled
-def _updated(
-    x: FloatArray,
-    S: FloatArray,
-    H: FloatArray,
-    innovation: FloatArray,
-    phi: FloatArray,
-) -> float:
-    """Potter's updates by all scalars of unit variance in turn, in place; the sum of normalised squared innovations."""
-    n, k = x.size, innovation.size
+def _updated(x: FloatArray, S: FloatArray, H: FloatArray, innovation: FloatArray, phi: FloatArray) -> float:
+    """Updates by all scalars of unit variance in turn, in place; the sum of normalised squared innovations."""
     x0 = np.empty(6)
     for i in range(6):
         x0[i] = x[i]
     squares = 0.0
-    for j in range(k):
+    for j in range(innovation.size):
         nu = innovation[j]
         for i in range(6):
             nu -= H[j, i] * (x[i] - x0[i])
-        alpha = 1.0
-        for c in range(n):
-            t = 0.0
-            for i in range(6):
-                t += S[i, c] * H[j, i]
-            phi[c] = t
-            alpha += t * t
-        alpha = 1.0 / alpha
-        squares += nu * nu * alpha
-        shrink = 1.0 / (1.0 + math.sqrt(alpha))
-        for i in range(n):
-            t = 0.0
-            for c in range(n):
-                t += S[i, c] * phi[c]
-            t *= alpha
-            x[i] += t * nu
-            t *= shrink
-            for c in range(n):
-                S[i, c] -= t * phi[c]
+        squares += scalar_update(x, S, H[j], nu, 1.0, phi)
     return squares
 
 
@@ -165,27 +173,10 @@ def _chart(H: FloatArray, predicted_S: FloatArray, least_singular: float, M: Flo
         unit[i] = math.sqrt(t)
         for j in range(k):
             Q[i, j] = H[j, i] * unit[i]
+    orthonormalise(Q, R)
     smallest, largest = math.inf, 0.0
     for i in range(6):
-        # Twice, or the columns lose their right angles to rounding.
-        for _ in range(2):
-            for before in range(i):
-                t = 0.0
-                for j in range(k):
-                    t += Q[before, j] * Q[i, j]
-                R[before, i] += t
-                for j in range(k):
-                    Q[i, j] -= t * Q[before, j]
-        t = 0.0
-        for j in range(k):
-            t += Q[i, j] * Q[i, j]
-        t = math.sqrt(t)
-        R[i, i] = t
-        smallest, largest = min(smallest, t), max(largest, t)
-        if t == 0.0:
-            return False
-        for j in range(k):
-            Q[i, j] /= t
+        smallest, largest = min(smallest, R[i, i]), max(largest, R[i, i])
     if not smallest > least_singular * largest:
         return False
     for i in range(5, -1, -1):
@@ -290,47 +281,21 @@ def follow(
     x: FloatArray,
     S: FloatArray,
     contradictions: int,
-    z: FloatArray,
-    n_differences: IntArray,
-    transforms: FloatArray,
-    transform_of_row: IntArray,
-    origins: FloatArray,
-    rotations: FloatArray,
-    ambients: FloatArray,
-    ambient_of_row: IntArray,
-    F_steps: FloatArray,
-    A_steps: FloatArray,
-    B_steps: FloatArray,
-    step_of_row: IntArray,
-    positions: FloatArray,
-    centroid: FloatArray,
-    channel_sensor: NDArray[np.intp],
-    channel_is_scalar: NDArray[np.bool_],
-    gain: FloatArray,
-    nis_limits: FloatArray,
-    tolerance: float,
-    max_iterations: int,
-    step_shrink: float,
-    least_singular: float,
-    largest_growth: float,
-    rows_to_lose: int,
-    start_range_error: float,
-    largest_range_error: float,
-    out_x: FloatArray,
-    out_S: FloatArray,
-    out_predicted_x: FloatArray,
-    out_predicted_S: FloatArray,
-    out_nis: FloatArray,
-    out_iterations: IntArray,
-    out_status: IntArray,
+    array: Channels,
+    given: Rows,
+    steps: Steps,
+    rules: Rules,
+    out: Followed,
 ) -> tuple[int, int]:
     """Follow a track from the state (x, S) before row begin, which are changed, to the first row that must be acquired.
 
-    Returns that row, or end, and the number of contradictions so far. Outputs of rows before it are filled: the state
-    after and before its readings.
+    Returns that row, or end, and the number of contradictions so far. Outputs of rows before it are filled.
     """
+    z, n_differences, transforms, transform_of_row, origins, rotations, ambients, ambient_of_row = given
+    F_steps, A_steps, B_steps, step_of_row = steps
+    centroid = array.centroid
     n = x.size
-    k, n_channels = transforms.shape[1], channel_sensor.size
+    k, n_channels = transforms.shape[1], array.sensor.size
     width = n + A_steps.shape[2]
     rows = np.empty((n, width))
     predicted_x, predicted_S = np.empty(n), np.empty((n, n))
@@ -341,7 +306,7 @@ def follow(
     predicted_first, M = np.empty(k), np.empty((6, k))
     A, B, mean, root = np.empty((6, 6)), np.empty((6, 1 + n)), np.empty(n), np.empty((n, n))
     for row in range(begin, end):
-        step = step_of_row[row]
+        step, origin, rotation = step_of_row[row], origins[row], rotations[row]
         strength = math.sqrt(x[3] * x[3] + x[4] * x[4] + x[5] * x[5])
         for i in range(n):
             t = 0.0
@@ -355,23 +320,22 @@ def follow(
                 rows[i, c] = t
             for c in range(A_steps.shape[2]):
                 rows[i, n + c] = A_steps[step, i, c] + strength * B_steps[step, i, c]
-        _triangularised(rows, predicted_S)
+        triangular_root(rows, predicted_S)
         status = TRACKED
         nis = math.nan
         iterations = 0
         if n_differences[row] == 0:
             status = PREDICTED
         else:
-            if _range_error(predicted_x, predicted_S, origins[row], rotations[row], centroid) > start_range_error:
+            if _range_error(predicted_x, predicted_S, origin, rotation, centroid) > rules.start_range_error:
                 return row, contradictions
             for i in range(n):
                 x_k[i] = predicted_x[i]
             w, a = transform_of_row[row], ambient_of_row[row]
-            _predicted(
-                x_k, origins[row], rotations[row], ambients[a], positions, channel_sensor, channel_is_scalar, gain,
-                transforms[w], channels, slopes, predicted, H,
-            )  # fmt: skip
-            curved = _is_of_readings(S, predicted_S, largest_growth) and _chart(H, predicted_S, least_singular, M)
+            _predicted(x_k, origin, rotation, ambients[a], array, transforms[w], channels, slopes, predicted, H)
+            curved = _is_of_readings(S, predicted_S, rules.largest_growth) and _chart(
+                H, predicted_S, rules.least_singular, M
+            )
             for j in range(k):
                 predicted_first[j] = predicted[j]
             for i in range(n):
@@ -379,7 +343,7 @@ def follow(
                 for c in range(n):
                     root[i, c] = predicted_S[i, c]
             converged, change_before, length = False, math.inf, 1.0
-            for _ in range(max_iterations):
+            for _ in range(rules.max_iterations):
                 iterations += 1
                 if curved and iterations > 1:
                     _curved_prior(
@@ -398,8 +362,8 @@ def follow(
                 for i in range(n):
                     x_next[i] = x_k[i] + length * (x_next[i] - x_k[i])
                 _predicted(
-                    x_next, origins[row], rotations[row], ambients[a], positions, channel_sensor, channel_is_scalar,
-                    gain, transforms[w], channels, slopes, predicted_next, H,
+                    x_next, origin, rotation, ambients[a], array, transforms[w],
+                    channels, slopes, predicted_next, H,
                 )  # fmt: skip
                 change = 0.0
                 for j in range(k):
@@ -410,14 +374,14 @@ def follow(
                 change = math.sqrt(change) / length
                 if not math.isfinite(change):
                     break
-                if change < tolerance:
+                if change < rules.tolerance:
                     converged = True
                     break
                 if change >= change_before:
-                    length *= step_shrink
+                    length *= rules.step_shrink
                 change_before = change
-            if not converged or nis > nis_limits[n_differences[row]]:
-                if contradictions + 1 >= rows_to_lose:
+            if not converged or nis > rules.nis_limits[n_differences[row]]:
+                if contradictions + 1 >= rules.rows_to_lose:
                     return row, contradictions
                 contradictions += 1
                 status = OUTLIER
@@ -425,15 +389,15 @@ def follow(
             else:
                 contradictions = 0
         used_x, used_S = (x_k, S_k) if status == TRACKED else (predicted_x, predicted_S)
-        if _range_error(used_x, used_S, origins[row], rotations[row], centroid) > largest_range_error:
+        if _range_error(used_x, used_S, origin, rotation, centroid) > rules.largest_range_error:
             return row, contradictions
         for i in range(n):
             x[i] = used_x[i]
-            out_x[row, i], out_predicted_x[row, i] = used_x[i], predicted_x[i]
+            out.x[row, i], out.predicted_x[row, i] = used_x[i], predicted_x[i]
             for c in range(n):
                 S[i, c] = used_S[i, c]
-                out_S[row, i, c], out_predicted_S[row, i, c] = used_S[i, c], predicted_S[i, c]
-        out_nis[row], out_iterations[row], out_status[row] = nis, iterations, status
+                out.S[row, i, c], out.predicted_S[row, i, c] = used_S[i, c], predicted_S[i, c]
+        out.nis[row], out.iterations[row], out.status[row] = nis, iterations, status
     return end, contradictions
 
 

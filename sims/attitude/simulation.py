@@ -203,26 +203,15 @@ def simulate(scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
     runs, n = prepared.torque_Nm.shape[:2]
     q, w, momentum, wheel_torque = np.empty((runs, n, 4)), *np.empty((3, runs, n, 3))
     q[:, 0], w[:, 0], momentum[:, 0] = prepared.q, prepared.w, prepared.momentum_Nms
-    body, control, around = scenario.body, scenario.control, prepared.environment
+    around = prepared.environment
     over_rows(
         rigid_body.run,
         runs,
-        q,
-        w,
-        momentum,
-        wheel_torque,
-        body.inertia_kgm2,
-        body.inverse,
-        body.residual_dipole_Am2,
-        control.attitude_gain_Nm,
-        control.rate_gain_Nms,
-        control.torque_limit_Nm,
-        control.momentum_limit_Nms,
-        quaternion.IDENTITY,
+        rigid_body.Motion(q, w, momentum, wheel_torque),
+        rigid_body.Body.of(scenario.body),
+        rigid_body.Control.of(scenario.control, quaternion.IDENTITY),
         prepared.torque_Nm,
-        around.orbital_rate_rad_s,
-        around.gravity_s2,
-        prepared.true_field_orbital_T,
+        rigid_body.Surroundings(around.orbital_rate_rad_s, around.gravity_s2, prepared.true_field_orbital_T),
         scenario.dt_s,
     )
     return AttitudeRuns(prepared, q, w, momentum, wheel_torque, sense(prepared, q, w))

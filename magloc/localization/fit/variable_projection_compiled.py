@@ -8,12 +8,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
 from magloc.compilation import compiled
 from magloc.linalg_compiled import _directional_tangent, _solve_damped, _tangent, orthonormalise
-from magloc.measurement.whitened_compiled import SMALLEST_S, _project_common, homogeneous_jacobian, unit_basis
+from magloc.measurement.whitened_compiled import (
+    SMALLEST_S,
+    ModelRow,
+    _project_common,
+    homogeneous_jacobian,
+    unit_basis,
+)
 
 # How a refinement ends.
 CONVERGED, KNOWN, FAILED = 0, 1, 2
@@ -25,18 +30,14 @@ OPTIMUM_TOLERANCE = 1e-9
 def _residual(
     q: FloatArray,
     y: FloatArray,
-    sensors: FloatArray,
-    channel_sensor: NDArray[np.intp],
-    gain: FloatArray,
-    common: FloatArray,
-    shrinkage: FloatArray,
+    row: ModelRow,
     basis: FloatArray,
     triangle: FloatArray,
     mu: FloatArray,
     residual: FloatArray,
 ) -> float:
     """Orthonormal basis, best scaled moment mu and residual at q; returns χ²."""
-    unit_basis(q, sensors, channel_sensor, gain, common, shrinkage, basis)
+    unit_basis(q, row, basis)
     orthonormalise(basis, triangle)
     n = y.size
     for c in range(n):
@@ -70,11 +71,7 @@ def same_optimum(q: FloatArray, chi2: float, other_q: FloatArray, other_chi2: fl
 def refine(
     q: FloatArray,
     y: FloatArray,
-    sensors: FloatArray,
-    channel_sensor: NDArray[np.intp],
-    gain: FloatArray,
-    common: FloatArray,
-    shrinkage: FloatArray,
+    row: ModelRow,
     n_free: int,
     tolerance: float,
     max_iterations: int,
@@ -95,7 +92,7 @@ def refine(
     jacobian, rows = np.empty((4, n)), np.empty((n_free, n))
     tangent, new_q, new_mu = np.empty((3, 4)), np.empty(4), np.empty(3)
     a, b, step = np.empty((3, 3)), np.empty(3), np.empty(3)
-    chi2 = _residual(q, y, sensors, channel_sensor, gain, common, shrinkage, basis, triangle, mu, residual)
+    chi2 = _residual(q, y, row, basis, triangle, mu, residual)
     if not math.isfinite(chi2):
         return math.inf, 0, FAILED
     damping = 1e-3
@@ -103,7 +100,7 @@ def refine(
         for j in range(n_known):
             if same_optimum(q, chi2, known_q[j], known_chi2[j]):
                 return chi2, iteration - 1, KNOWN
-        homogeneous_jacobian(q, mu, sensors, channel_sensor, gain, jacobian)
+        homogeneous_jacobian(q, mu, row, jacobian)
         if n_free == 2:
             _directional_tangent(q, tangent)
         else:
@@ -116,7 +113,7 @@ def refine(
                     + tangent[j, 2] * jacobian[2, c]
                     + tangent[j, 3] * jacobian[3, c]
                 )
-        _project_common(rows, n_free, common, shrinkage)
+        _project_common(rows, n_free, row)
         # Kaufman's form of variable projection: the moment's part of every column is taken out.
         for j in range(n_free):
             for k in range(3):
@@ -170,10 +167,7 @@ def refine(
                     new_q[d] *= norm
                 if abs(new_q[3]) < SMALLEST_S:
                     new_q[3] = math.copysign(SMALLEST_S, new_q[3])
-            new_chi2 = _residual(
-                new_q, y, sensors, channel_sensor, gain, common, shrinkage,
-                new_basis, new_triangle, new_mu, new_residual,
-            )  # fmt: skip
+            new_chi2 = _residual(new_q, y, row, new_basis, new_triangle, new_mu, new_residual)
             if new_chi2 < chi2:
                 accepted = True
                 break

@@ -19,7 +19,7 @@ from magloc.compilation import over_rows
 from magloc.directions import fibonacci_directions
 from magloc.localization.fit.prior import SourcePrior
 from magloc.measurement.whitened import WhitenedModel
-from magloc.measurement.whitened_compiled import candidate_bases
+from magloc.measurement.whitened_compiled import ModelRow, candidate_bases
 
 SingleArray = NDArray[np.float32]
 _SAME_GAIN = 0.02
@@ -49,11 +49,7 @@ def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates:
         candidate_bases,
         len(candidates),
         candidates,
-        problem.sensors,
-        problem.channel_sensor,
-        np.ascontiguousarray(gain),
-        np.ascontiguousarray(problem.basis[row].T),
-        np.ascontiguousarray(problem.shrinkage[row]),
+        ModelRow.of(problem, gain, problem.basis[row], problem.shrinkage[row]),
         bases,
     )
     single: SingleArray = bases.transpose(2, 1, 0).astype(np.float32, order="C").reshape(gain.shape[0], -1)

@@ -25,6 +25,7 @@ from magloc.localization.search import single_source_compiled as kernels
 from magloc.localization.search.candidates import SingleArray, allowed_positions, linear_bases
 from magloc.measurement.rows import WhitenedRows, channels_above_ambient, whitened_rows
 from magloc.measurement.whitened import WhitenedModel
+from magloc.measurement.whitened_compiled import ModelRows
 
 N_UNKNOWNS = 6
 
@@ -46,17 +47,6 @@ class BestFits:
     moment_Am2: FloatArray
     chi2: FloatArray
     linearisations: NDArray[np.int64]
-
-
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """Outputs of the compiled search, (rows, starts, ...)."""
-
-    q: FloatArray
-    mu: FloatArray
-    chi2: FloatArray
-    iterations: NDArray[np.int64]
-    counts: NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +157,9 @@ class SingleSourceSearch:
             self._ranking_of[key] = _Ranking(of_mask, bases)
         return self._ranking_of[key]
 
-    def _search(self, rows: WhitenedRows, reading_of_row: IntArray, first: FloatArray, keep_within: float) -> _Found:
+    def _search(
+        self, rows: WhitenedRows, reading_of_row: IntArray, first: FloatArray, keep_within: float
+    ) -> kernels.Ends:
         """Optima of some of the rows, starts of their own refined before the best candidates."""
         ranking, model = self._ranking(rows.mask), rows.model
         ranked = rows.y
@@ -175,41 +167,30 @@ class SingleSourceSearch:
             channels = channels_above_ambient(self.array, rows.mask, rows.readings_T, model.ambient)
             ranked = ranking.whitening.apply(channels)
         shape = (len(reading_of_row), self.n_starts + first.shape[1])
-        found = _Found(
+        found = kernels.Ends(
             q=np.full((*shape, 4), np.nan),
             mu=np.full((*shape, 3), np.nan),
             chi2=np.full(shape, np.nan),
             iterations=np.zeros(shape, dtype=np.int64),
             counts=np.zeros((shape[0], 3), dtype=np.int64),
         )
-        sensors, channel_sensor, gain, common, shrinkage, set_of_row = model.compiled()
+        every = ModelRows.of(model)
         over_rows(
             kernels.search_rows,
             shape[0],
             rows.y,
             ranked,
             reading_of_row,
-            ranking.bases,
-            model.homogeneous(self._candidates),
+            kernels.Candidates(model.homogeneous(self._candidates), ranking.bases, math.cos(self.apart_rad)),
             first,
-            np.cos(self.apart_rad),
             keep_within,
             self.max_iterations,
-            sensors,
-            channel_sensor,
-            gain,
-            common,
-            shrinkage,
-            set_of_row[reading_of_row],
-            found.q,
-            found.mu,
-            found.chi2,
-            found.iterations,
-            found.counts,
+            every._replace(set_of_row=every.set_of_row[reading_of_row]),
+            found,
         )
         return found
 
-    def _known(self, model: WhitenedModel, found: _Found) -> _Found:
+    def _known(self, model: WhitenedModel, found: kernels.Ends) -> kernels.Ends:
         """Optima that agree with what is known, again those within Δχ² of the best of them."""
         position, moment = model.position(found.q), model.moment(found.q, found.mu)
         with np.errstate(invalid="ignore"):
@@ -219,7 +200,7 @@ class SingleSourceSearch:
         chi2 = np.take_along_axis(chi2, order, axis=1)
         counts = found.counts.copy()
         counts[:, 0] = (np.isfinite(chi2) & (chi2 <= chi2[:, :1] + DISTINCT_WITHIN)).sum(axis=1)
-        return _Found(
+        return kernels.Ends(
             np.take_along_axis(found.q, order[..., None], axis=1),
             np.take_along_axis(found.mu, order[..., None], axis=1),
             chi2,

@@ -6,6 +6,7 @@ The readable twin is :mod:`magloc.localization.search.single_source`.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +20,34 @@ from magloc.localization.fit.variable_projection_compiled import (
     refine,
     same_optimum,
 )
+from magloc.measurement.whitened_compiled import ModelRow, ModelRows, row_at
+
+
+class Candidates(NamedTuple):
+    """Candidates q (n, 4), their orthonormal whitened bases (c, 3 n) in single precision, least angle of two starts."""
+
+    q: FloatArray
+    bases: NDArray[np.float32]
+    cos_apart: float
+
+
+class Ends(NamedTuple):
+    """Outputs of the search, (rows, starts, …): q, mu, χ², linearisations; counts (rows, 3).
+
+    These are the optima kept, the starts that did not converge, and all linearisations.
+    """
+
+    q: FloatArray
+    mu: FloatArray
+    chi2: FloatArray
+    iterations: NDArray[np.int64]
+    counts: NDArray[np.int64]
 
 
 @compiled
-def _pick_starts(
-    y: FloatArray, bases: NDArray[np.float32], candidates: FloatArray, cos_apart: float, starts: FloatArray
-) -> int:
+def _pick_starts(y: FloatArray, among: Candidates, starts: FloatArray) -> int:
     """Candidates that explain most of the energy of y, some angle apart on the sphere of homogeneous coordinates."""
+    candidates, bases, cos_apart = among.q, among.bases, among.cos_apart
     n = candidates.shape[0]
     components = np.zeros(3 * n, np.float32)
     for c in range(y.size):
@@ -56,24 +78,17 @@ def _pick_starts(
 def _search_row(
     y: FloatArray,
     ranked: FloatArray,
-    bases: NDArray[np.float32],
-    candidates: FloatArray,
+    candidates: Candidates,
     first: FloatArray,
-    cos_apart: float,
     keep_within: float,
     max_iterations: int,
-    sensors: FloatArray,
-    channel_sensor: NDArray[np.intp],
-    gain: FloatArray,
-    common: FloatArray,
-    shrinkage: FloatArray,
-    out_q: FloatArray,
-    out_mu: FloatArray,
-    out_chi2: FloatArray,
-    out_iterations: NDArray[np.int64],
-    counts: NDArray[np.int64],
+    model: ModelRow,
+    out: Ends,
+    row: int,
 ) -> None:
-    """Distinct optima of one row into the outputs, best first; counts as in :func:`search_rows`."""
+    """Distinct optima of one row into its outputs, best first."""
+    out_q, out_mu, out_chi2 = out.q[row], out.mu[row], out.chi2[row]
+    out_iterations, counts = out.iterations[row], out.counts[row]
     n_starts, n_first = out_chi2.size, first.shape[0]
     starts = np.empty((n_starts, 4))
     moments = np.empty((n_starts, 3))
@@ -82,7 +97,7 @@ def _search_row(
     for k in range(n_first):
         for d in range(4):
             starts[k, d] = first[k, d]
-    n = n_first + _pick_starts(ranked, bases, candidates, cos_apart, starts[n_first:])
+    n = n_first + _pick_starts(ranked, candidates, starts[n_first:])
     found = runtime_int(0)
     counts[1] = counts[2] = 0
     for k in range(n):
@@ -90,8 +105,8 @@ def _search_row(
         for d in range(4):
             starts[found, d] = starts[k, d]
         chi2[found], iterations[found], end = refine(
-            starts[found], y, sensors, channel_sensor, gain, common, shrinkage, runtime_int(3),
-            OPTIMUM_TOLERANCE, max_iterations, starts, chi2, found, moments[found],
+            starts[found], y, model, runtime_int(3), OPTIMUM_TOLERANCE, max_iterations,
+            starts, chi2, found, moments[found],
         )  # fmt: skip
         counts[2] += iterations[found]
         if end == FAILED:
@@ -130,37 +145,20 @@ def search_rows(
     y: FloatArray,
     ranked: FloatArray,
     reading_of_row: NDArray[np.intp],
-    bases: NDArray[np.float32],
-    candidates: FloatArray,
+    candidates: Candidates,
     first: FloatArray,
-    cos_apart: float,
     keep_within: float,
     max_iterations: int,
-    sensors: FloatArray,
-    channel_sensor: NDArray[np.intp],
-    gain: FloatArray,
-    common: FloatArray,
-    shrinkage: FloatArray,
-    set_of_row: NDArray[np.intp],
-    out_q: FloatArray,
-    out_mu: FloatArray,
-    out_chi2: FloatArray,
-    out_iterations: NDArray[np.int64],
-    counts: NDArray[np.int64],
+    rows: ModelRows,
+    out: Ends,
 ) -> None:
     """Distinct optima of rows begin to end, best first; for :func:`magloc.compilation.over_rows`.
 
     y (readings, c) are whitened readings, reading_of_row which of them a row has; ranked (readings, c) the same ones
-    under the whitening of bases (c, 3 · candidates), the candidates' orthonormal bases in single precision, which ranks
-    them as well; first (rows, f, 4) are starts of a row's own, refined before the best candidates; gain (sets, c, 3),
-    common (sets, q, c), shrinkage (sets, q) the whitening, set_of_row which of them a row has. Into the outputs
-    (rows, starts, …): q, mu, χ², linearisations; counts (rows, 3) are the optima kept, the starts that did not
-    converge, and all linearisations.
+    under the whitening of the candidates' bases, which ranks them as well; first (rows, f, 4) are starts of a row's
+    own, refined before the best candidates.
     """
     for row in range(begin, end):
-        w, r = set_of_row[row], reading_of_row[row]
-        _search_row(
-            y[r], ranked[r], bases, candidates, first[row], cos_apart, keep_within, max_iterations,
-            sensors, channel_sensor, gain[w], common[w], shrinkage[w],
-            out_q[row], out_mu[row], out_chi2[row], out_iterations[row], counts[row],
-        )  # fmt: skip
+        r = reading_of_row[row]
+        model = row_at(rows, row)
+        _search_row(y[r], ranked[r], candidates, first[row], keep_within, max_iterations, model, out, row)

@@ -35,6 +35,7 @@ from magloc.localization.uncertainty.range_interval import relative_range_sigma,
 from magloc.localization.uncertainty.range_profile import profile_stretches, ranges_within
 from magloc.localization.uncertainty.range_profile_compiled import profile_rows
 from magloc.measurement.whitened import WhitenedModel
+from magloc.measurement.whitened_compiled import ModelRows
 
 # By how much the rise of χ² at one standard deviation may differ from one where errors are Gaussian.
 _BEND = 0.5
@@ -161,7 +162,7 @@ def _of_one(optima: Optima, energy: FloatArray) -> _Known:
     if compiled:
         counts = np.bincount(of_row, minlength=n_rows)[:, None]
         scaled = np.full((*shape, 6, 6), np.nan)
-        over_rows(covariance_rows, n_rows, *model.compiled(), q, mu, counts, scaled)
+        over_rows(covariance_rows, n_rows, ModelRows.of(model), q, mu, counts, scaled)
         unit = np.repeat([model.radius, model.radius**3 / MU0_OVER_4PI], 3)
         covariance = scaled * np.outer(unit, unit)
     else:
@@ -169,7 +170,7 @@ def _of_one(optima: Optima, energy: FloatArray) -> _Known:
     rivals = Rivals.of(chi2, covariance, offset, moment, energy, rows.n_differences)
     alpha = np.full((*shape, 2), np.nan)
     if compiled:
-        over_rows(profile_rows, n_rows, rows.y, rivals.rise, *model.compiled(), q, chi2, counts, scaled, alpha)
+        over_rows(profile_rows, n_rows, rows.y, rivals.rise, ModelRows.of(model), q, chi2, counts, scaled, alpha)
     else:
         left = rivals.rise[of_row] - (fits.chi2 - chi2[of_row, 0])
         inside = np.flatnonzero((left > 0.0) & np.isfinite(left))

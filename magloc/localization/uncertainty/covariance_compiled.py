@@ -10,22 +10,25 @@ from numpy.typing import NDArray
 from arrays.typing import FloatArray
 from magloc.compilation import compiled
 from magloc.linalg_compiled import orthonormalise
-from magloc.measurement.whitened_compiled import _project_common, homogeneous_jacobian, unit_basis
+from magloc.measurement.whitened_compiled import (
+    ModelRow,
+    ModelRows,
+    _project_common,
+    homogeneous_jacobian,
+    row_at,
+    unit_basis,
+)
 
 
 @compiled
 def _scaled_covariance(
     q: FloatArray,
     mu: FloatArray,
-    sensors: FloatArray,
-    channel_sensor: NDArray[np.intp],
-    gain: FloatArray,
-    common: FloatArray,
-    shrinkage: FloatArray,
+    row: ModelRow,
     covariance: FloatArray,
 ) -> bool:
     """Inverse information of (ρ, μ), ρ = u/s and μ scaled at s = 1, by QR of the whitened Jacobian."""
-    n = channel_sensor.size
+    n = row.channel_sensor.size
     rho, mu1 = np.empty(4), np.empty(3)
     for d in range(4):
         rho[d] = q[d] / q[3]
@@ -33,9 +36,9 @@ def _scaled_covariance(
     for d in range(3):
         mu1[d] = mu[d] * inverse
     rows, basis, jacobian = np.empty((6, n)), np.empty((3, n)), np.empty((4, n))
-    unit_basis(rho, sensors, channel_sensor, gain, common, shrinkage, basis)
-    homogeneous_jacobian(rho, mu1, sensors, channel_sensor, gain, jacobian)
-    _project_common(jacobian, 3, common, shrinkage)
+    unit_basis(rho, row, basis)
+    homogeneous_jacobian(rho, mu1, row, jacobian)
+    _project_common(jacobian, 3, row)
     scale = np.empty(6)
     # Moment first: its three columns are the well-conditioned part.
     for j in range(6):
@@ -73,12 +76,7 @@ def _scaled_covariance(
 def covariance_rows(
     begin: int,
     end: int,
-    sensors: FloatArray,
-    channel_sensor: NDArray[np.intp],
-    gain: FloatArray,
-    common: FloatArray,
-    shrinkage: FloatArray,
-    set_of_row: NDArray[np.intp],
+    rows: ModelRows,
     q: FloatArray,
     mu: FloatArray,
     counts: NDArray[np.int64],
@@ -89,8 +87,6 @@ def covariance_rows(
     They are left as they are where the information is singular.
     """
     for row in range(begin, end):
-        w = set_of_row[row]
+        model = row_at(rows, row)
         for j in range(counts[row, 0]):
-            _scaled_covariance(
-                q[row, j], mu[row, j], sensors, channel_sensor, gain[w], common[w], shrinkage[w], out_covariance[row, j]
-            )
+            _scaled_covariance(q[row, j], mu[row, j], model, out_covariance[row, j])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from arrays.typing import FloatArray
 from magloc.compilation import compiled, runtime_int
 from magloc.localization.fit.variable_projection_compiled import refine
-from magloc.measurement.whitened_compiled import SMALLEST_S
+from magloc.measurement.whitened_compiled import SMALLEST_S, ModelRow, ModelRows, row_at
 
 # The same for the profile over the range, which is read at a rise of 3.84 to 0.01.
 PROFILE_TOLERANCE = 1e-3
@@ -29,11 +29,7 @@ def _profile_end(
     outward: bool,
     first_step: float,
     y: FloatArray,
-    sensors: FloatArray,
-    channel_sensor: NDArray[np.intp],
-    gain: FloatArray,
-    common: FloatArray,
-    shrinkage: FloatArray,
+    row: ModelRow,
 ) -> float:
     """Angle α where the profile χ² has risen by `rise`; π/2 inward or -π/2 outward where it never does.
 
@@ -60,9 +56,7 @@ def _profile_end(
         outside = inside + toward * step
         if toward * (outside - bound) > 0.0:
             outside = bound
-        f_outside = (
-            _profile(best, trial, outside, y, sensors, channel_sensor, gain, common, shrinkage, mu) - chi2 - rise
-        )
+        f_outside = _profile(best, trial, outside, y, row, mu) - chi2 - rise
         if f_outside > 0.0:
             found = True
             break
@@ -80,7 +74,7 @@ def _profile_end(
         t = (math.sqrt(rise) - a) / (b - a) if b > a else 0.5
         t = min(max(t, 0.05), 0.95)
         middle = inside + t * (outside - inside)
-        f = _profile(best, trial, middle, y, sensors, channel_sensor, gain, common, shrinkage, mu) - chi2 - rise
+        f = _profile(best, trial, middle, y, row, mu) - chi2 - rise
         if abs(f) < 0.01 or abs(outside - inside) < 1e-4 * min(abs(inside), abs(outside)):
             return middle
         if f > 0.0:
@@ -98,11 +92,7 @@ def _profile(
     trial: FloatArray,
     alpha: float,
     y: FloatArray,
-    sensors: FloatArray,
-    channel_sensor: NDArray[np.intp],
-    gain: FloatArray,
-    common: FloatArray,
-    shrinkage: FloatArray,
+    row: ModelRow,
     mu: FloatArray,
 ) -> float:
     """Smallest χ² at one α, searched from a direction; trial becomes the best direction (unit u)."""
@@ -113,8 +103,7 @@ def _profile(
         q[d] = direction[d] * math.cos(alpha)
     q[3] = math.sin(alpha)
     chi2, _, _ = refine(
-        q, y, sensors, channel_sensor, gain, common, shrinkage, runtime_int(2), PROFILE_TOLERANCE, runtime_int(30),
-        q.reshape(1, 4), mu, runtime_int(0), mu,
+        q, y, row, runtime_int(2), PROFILE_TOLERANCE, runtime_int(30), q.reshape(1, 4), mu, runtime_int(0), mu
     )  # fmt: skip
     for d in range(3):
         trial[d] = q[d] / math.cos(alpha)
@@ -143,12 +132,7 @@ def profile_rows(
     end: int,
     y: FloatArray,
     rise: FloatArray,
-    sensors: FloatArray,
-    channel_sensor: NDArray[np.intp],
-    gain: FloatArray,
-    common: FloatArray,
-    shrinkage: FloatArray,
-    set_of_row: NDArray[np.intp],
+    rows: ModelRows,
     q: FloatArray,
     chi2: FloatArray,
     counts: NDArray[np.int64],
@@ -162,7 +146,7 @@ def profile_rows(
     the range. The scaled covariances serve for the first steps.
     """
     for row in range(begin, end):
-        w = set_of_row[row]
+        model = row_at(rows, row)
         for j in range(counts[row, 0]):
             left = rise[row] - (chi2[row, j] - chi2[row, 0])
             if not (left > 0.0 and math.isfinite(left)):
@@ -172,6 +156,5 @@ def profile_rows(
                 first_step = 0.05
             for side in range(2):
                 out_alpha[row, j, side] = _profile_end(
-                    q[row, j], chi2[row, j], left, side == 0, first_step, y[row],
-                    sensors, channel_sensor, gain[w], common[w], shrinkage[w],
-                )  # fmt: skip
+                    q[row, j], chi2[row, j], left, side == 0, first_step, y[row], model
+                )

@@ -339,9 +339,7 @@ class TestKernels:
         expected = dynamics.step(MAGNETIC, q, w, k, u, torque, RATE, GRAVITY, B, 1.0)
         for i in range(20):
             compiled = rigid_body.step(
-                J,
-                MAGNETIC.inverse,
-                tuple(MAGNETIC.residual_dipole_Am2),
+                rigid_body.Body.of(MAGNETIC),
                 *(tuple(one[i]) for one in (q, w, k, u, torque)),
                 RATE,
                 GRAVITY,
@@ -360,12 +358,9 @@ class TestKernels:
         expected = dynamics.commanded_torque(BODY, control, q, w, k, reference, RATE, 1.0)
         for i in range(20):
             compiled = rigid_body.commanded_torque(
-                J,
-                tuple(control.attitude_gain_Nm),
-                tuple(control.rate_gain_Nms),
-                *limits,
+                rigid_body.Body.of(BODY).J,
+                rigid_body.Control.of(control, reference),
                 *(tuple(one[i]) for one in (q, w, k)),
-                tuple(reference),
                 RATE,
                 1.0,
             )
@@ -377,9 +372,7 @@ class TestKernels:
         F = np.full((6, 6), np.nan)
         for i in range(20):
             rigid_body.error_jacobian(
-                J,
-                MAGNETIC.inverse,
-                tuple(MAGNETIC.residual_dipole_Am2),
+                rigid_body.Body.of(MAGNETIC),
                 *(tuple(one[i]) for one in (q, w, k)),
                 GRAVITY,
                 tuple(B),
@@ -396,4 +389,4 @@ class TestKernels:
         np.testing.assert_allclose(
             rigid_body.error_vector(tuple(p), tuple(q)), quaternion.error_vector(p, q), atol=1e-16
         )
-        np.testing.assert_allclose(rigid_body.applied(J, tuple(v)), turned(J, v), atol=1e-16)
+        np.testing.assert_allclose(rigid_body.applied(rigid_body.matrix_at(J), tuple(v)), turned(J, v), atol=1e-16)

@@ -32,8 +32,9 @@ from numpy.typing import NDArray
 from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.sensor import Sensor
-from magloc.convergence import filters_compiled as lanes
 from magloc.convergence.filters import DampedFilter, Ends, IekfFilter, RepeatedFilter, field_weights
+from magloc.convergence.linearisation_compiled import Model
+from magloc.convergence.workspace_compiled import LANES
 from magloc.kalman import predict_square_root, sequential_update
 from magloc.measurement.differences import DifferenceMeasurement
 from tests.arrays.test_differences import random_array
@@ -254,9 +255,7 @@ class TestTwoFormsOfTheDifferences:
 
     @staticmethod
     def form(measurement: DifferenceMeasurement, z: Array) -> str:
-        model = lanes._Model.of(
-            z, measurement.variance, measurement.array.positions, field_weights(measurement), 1.0, 1.0
-        )
+        model = Model.of(z, measurement.variance, measurement.array.positions, field_weights(measurement), 1.0, 1.0)
         return "recursive" if model.blend.size else "matrix"
 
 
@@ -404,7 +403,7 @@ class TestLanes:
         self.assert_same(method.run(measurement, z, starts), one)
 
     @each_filter
-    @pytest.mark.parametrize("n", [0, 1, lanes.LANES - 1, lanes.LANES, lanes.LANES + 1])
+    @pytest.mark.parametrize("n", [0, 1, LANES - 1, LANES, LANES + 1])
     def test_any_number_of_starts(self, method: Filter, n: int) -> None:
         starts = starts_of("cube", 100)
         ends = method.run(self.measurement, self.z, starts)

@@ -69,17 +69,17 @@ def scipy_chi2(array, readings, position, moment):
     return 2.0 * found.cost
 
 
+def row_of(problem):
+    """The first row of a model in the layout of the compiled code."""
+    return whitened_compiled.row_at(whitened_compiled.ModelRows.of(problem), 0)
+
+
 def refined(problem, q, y, mu, max_iterations=100):
     """The compiled refinement of q (in place) without known optima: χ², linearisations, how it ended."""
-    common = np.ascontiguousarray(problem.basis[0].T)
     return variable_projection_compiled.refine(
         q,
         y,
-        problem.sensors,
-        problem.channel_sensor,
-        problem.gain[0],
-        common,
-        problem.shrinkage[0],
+        row_of(problem),
         3,
         variable_projection_compiled.OPTIMUM_TOLERANCE,
         max_iterations,
@@ -410,9 +410,6 @@ class TestReadableTwin:
 
     white = whitening(random_array(2, 6))
 
-    def common(self):
-        return np.ascontiguousarray(self.white.basis.T), self.white.shrinkage
-
     @given(SEEDS)
     @settings(max_examples=25, deadline=None)
     def test_basis_and_cost(self, seed):
@@ -421,22 +418,11 @@ class TestReadableTwin:
         q /= np.linalg.norm(q)
         y = self.white.apply(1e-9 * rng.normal(size=18))
         basis = np.empty((3, 18))
-        whitened_compiled.unit_basis(
-            q, self.problem.sensors, self.problem.channel_sensor, self.problem.gain[0], *self.common(), basis
-        )
+        whitened_compiled.unit_basis(q, row_of(self.problem), basis)
         expected = unit_basis(self.problem, q).T
         assert_allclose(basis, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
         bases = np.empty((1, 3, 18))
-        whitened_compiled.candidate_bases(
-            0,
-            1,
-            q[None],
-            self.problem.sensors,
-            self.problem.channel_sensor,
-            self.problem.gain[0],
-            *self.common(),
-            bases,
-        )
+        whitened_compiled.candidate_bases(0, 1, q[None], row_of(self.problem), bases)
         assert y @ y - np.sum((bases[0] @ y) ** 2) == pytest.approx(
             float(projected_chi2(self.problem, q, y)), rel=1e-7, abs=1e-9
         )
@@ -447,9 +433,7 @@ class TestReadableTwin:
         rng = np.random.default_rng(seed)
         q, mu = rng.normal(size=4), rng.normal(size=3)
         jacobian = np.empty((4, 18))
-        whitened_compiled.homogeneous_jacobian(
-            q, mu, self.problem.sensors, self.problem.channel_sensor, self.problem.gain[0], jacobian
-        )
+        whitened_compiled.homogeneous_jacobian(q, mu, row_of(self.problem), jacobian)
         free = jacobian.T - (self.white.basis @ (self.white.basis.T @ jacobian.T))
         scale = np.abs(unit_basis(self.problem, q) @ mu).max()
         expected = oracles.derivative(lambda x: unit_basis(self.problem, x) @ mu / scale, q, 1e-2, 1e-9)

@@ -1,0 +1,67 @@
+"""Compiled steps of a square-root Kalman filter; the readable twin is :mod:`magloc.kalman`."""
+
+from __future__ import annotations
+
+import math
+
+from arrays.typing import FloatArray
+from magloc.compilation import compiled
+
+
+@compiled
+def triangular_root(rows: FloatArray, root: FloatArray) -> None:
+    """Lower triangular root, ``L Lᵀ = rows rowsᵀ``, by modified Gram-Schmidt on the rows (n, m), which are spoilt.
+
+    With rows ``[F S, S_q]`` it is the twin of :func:`magloc.kalman.predict_square_root`.
+    """
+    n, m = rows.shape
+    for i in range(n):
+        for j in range(n):
+            root[i, j] = 0.0
+    for i in range(n):
+        norm = 0.0
+        for c in range(m):
+            norm += rows[i, c] * rows[i, c]
+        norm = math.sqrt(norm)
+        root[i, i] = norm
+        if norm > 0.0:
+            inverse = 1.0 / norm
+            for c in range(m):
+                rows[i, c] *= inverse
+            for j in range(i + 1, n):
+                t = 0.0
+                for c in range(m):
+                    t += rows[j, c] * rows[i, c]
+                root[j, i] = t
+                for c in range(m):
+                    rows[j, c] -= t * rows[i, c]
+
+
+@compiled
+def scalar_update(
+    x: FloatArray, S: FloatArray, h: FloatArray, innovation: float, variance: float, phi: FloatArray
+) -> float:
+    """Potter's update in place by a scalar of the first states, the twin of :func:`magloc.kalman.scalar_update`.
+
+    The states behind the last element of h are not read directly; phi (n,) is for work. Returns the normalised
+    innovation squared.
+    """
+    s = variance
+    for c in range(phi.size):
+        t = 0.0
+        for i in range(h.size):
+            t += S[i, c] * h[i]
+        phi[c] = t
+        s += t * t
+    alpha = 1.0 / s
+    shrink = 1.0 / (1.0 + math.sqrt(alpha * variance))
+    for i in range(phi.size):
+        t = 0.0
+        for c in range(phi.size):
+            t += S[i, c] * phi[c]
+        t *= alpha
+        x[i] += t * innovation
+        t *= shrink
+        for c in range(phi.size):
+            S[i, c] -= t * phi[c]
+    return innovation * innovation * alpha
