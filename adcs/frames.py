@@ -19,10 +19,12 @@ from __future__ import annotations
 
 import datetime
 import warnings
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from arrays.io.errors import of_extra
 from arrays.typing import FloatArray
 
 Instants = NDArray[np.datetime64]
@@ -76,10 +78,16 @@ def julian_dates(utc: Instants) -> tuple[FloatArray, FloatArray]:
     return _JD_J2000 - 0.5 + days, rest / 86_400e6
 
 
+def pyerfa() -> ModuleType:
+    """The standards of astronomy, loaded when they are first used."""
+    with of_extra("satellites", "the rotation of the Earth"):
+        import erfa
+    return erfa
+
+
 def terrestrial_dates(utc: Instants) -> tuple[FloatArray, FloatArray]:
     """Julian dates of Terrestrial Time, which is 69.184 s ahead of UTC since 2017, as :func:`julian_dates`."""
-    import erfa
-
+    erfa = pyerfa()
     with warnings.catch_warnings():
         # Beyond the table of leap seconds, and before UTC began in 1960, the nearest entry is used.
         warnings.simplefilter("ignore", erfa.ErfaWarning)
@@ -90,16 +98,12 @@ def terrestrial_dates(utc: Instants) -> tuple[FloatArray, FloatArray]:
 
 def R_ecef_from_eci(utc: Instants) -> FloatArray:
     """Rotation of the Earth, IAU 2000B precession and nutation, UT1 = UTC. Instants (...) -> (..., 3, 3)."""
-    import erfa
-
-    return np.asarray(erfa.c2t00b(*terrestrial_dates(utc), *julian_dates(utc), 0.0, 0.0), dtype=np.float64)
+    return np.asarray(pyerfa().c2t00b(*terrestrial_dates(utc), *julian_dates(utc), 0.0, 0.0), dtype=np.float64)
 
 
 def R_eci_from_teme(utc: Instants) -> FloatArray:
     """Axes of SGP4's results in eci: TEME is turned to ecef by the mean sidereal time of 1982. (...) -> (..., 3, 3)."""
-    import erfa
-
-    return R_ecef_from_eci(utc).mT @ rotation_about_z(erfa.gmst82(*julian_dates(utc)))
+    return R_ecef_from_eci(utc).mT @ rotation_about_z(pyerfa().gmst82(*julian_dates(utc)))
 
 
 def rotation_about_z(angle_rad: ArrayLike) -> FloatArray:
@@ -143,7 +147,8 @@ def orbital_rate(position_eci_m: ArrayLike, velocity_eci_m_s: ArrayLike) -> Floa
 
 def geodetic_from_ecef(position_ecef_m: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Geodetic latitude and longitude [°] and height above the ellipsoid [m] (WGS-84) of positions (..., 3)."""
-    from pymap3d import ecef2geodetic
+    with of_extra("geo", "a place on the Earth"):
+        from pymap3d import ecef2geodetic
 
     x, y, z = np.moveaxis(np.asarray(position_ecef_m, dtype=np.float64), -1, 0)
     latitude, longitude, height = ecef2geodetic(x, y, z)

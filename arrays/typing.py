@@ -1,13 +1,33 @@
-"""Types that all packages share."""
+"""Types that all packages share; numpy is loaded with the first of them that needs it."""
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.intp]
-ByteArray = NDArray[np.uint8]
-ComplexArray = NDArray[np.complex128]
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    FloatArray = NDArray[np.float64]
+    BoolArray = NDArray[np.bool_]
+    IntArray = NDArray[np.intp]
+    ByteArray = NDArray[np.uint8]
+    ComplexArray = NDArray[np.complex128]
+
 Vector = tuple[float, float, float]
+_SCALARS = {
+    "FloatArray": "float64",
+    "BoolArray": "bool_",
+    "IntArray": "intp",
+    "ByteArray": "uint8",
+    "ComplexArray": "complex128",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _SCALARS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import numpy as np
+    from numpy.typing import NDArray
+
+    return NDArray[getattr(np, _SCALARS[name])]  # type: ignore[misc]

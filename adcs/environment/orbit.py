@@ -12,7 +12,8 @@ from typing import Protocol
 
 import numpy as np
 
-from adcs.frames import Dates, Instants, R_eci_from_teme, instants, julian_dates, turned
+from adcs.frames import Dates, Instants, R_eci_from_teme, instants, julian_dates, pyerfa, turned
+from arrays.io.errors import of_extra
 from arrays.typing import FloatArray
 
 MU_M3_S2 = 3.986004418e14
@@ -151,10 +152,8 @@ def node_of_local_time(local_time_h: float, date: Dates) -> float:
     -------
     float
     """
-    import erfa
-
     day, fraction = julian_dates(instants(date))
-    greenwich = float(erfa.gmst82(day, fraction))
+    greenwich = float(pyerfa().gmst82(day, fraction))
     since_midnight = float(day + 0.5 + fraction) % 1.0
     return (greenwich + 2.0 * math.pi * (local_time_h / 24.0 - since_midnight)) % (2.0 * math.pi)
 
@@ -174,7 +173,8 @@ class Sgp4Orbit:
     """
 
     def __init__(self, line1: str, line2: str) -> None:
-        from sgp4.api import Satrec
+        with of_extra("satellites", "an orbit of two-line elements"):
+            from sgp4.api import Satrec
 
         for number, line in (("1", line1), ("2", line2)):
             if len(line) < 69 or line[0] != number or line[68] != str(_checksum(line)):

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from adcs.environment.orbit import EARTH_RADIUS_M
-from adcs.frames import Instants, terrestrial_dates
+from adcs.frames import Instants, pyerfa, terrestrial_dates
 from arrays.typing import FloatArray
 
 SUN_RADIUS_M = 695_700e3
@@ -27,14 +27,12 @@ def sun_position_eci(utc: Instants) -> FloatArray:
     ndarray, shape (..., 3)
         Good to some arc seconds from 1900 to 2100 (erfa's series of the Earth's orbit; TT stands for TDB).
     """
-    import erfa
-
-    heliocentric, barycentric = erfa.epv00(*terrestrial_dates(utc))
+    heliocentric, barycentric = pyerfa().epv00(*terrestrial_dates(utc))
     distance = np.linalg.norm(heliocentric["p"], axis=-1)
     direction = -heliocentric["p"] / distance[..., None]
     velocity = barycentric["v"] / _SPEED_OF_LIGHT_AU_DAY
     contraction = np.sqrt(1.0 - np.sum(velocity * velocity, axis=-1))
-    apparent: FloatArray = erfa.ab(direction, velocity, distance, contraction)
+    apparent: FloatArray = pyerfa().ab(direction, velocity, distance, contraction)
     return ASTRONOMICAL_UNIT_M * distance[..., None] * apparent
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import ArrayLike
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
-from arrays.typing import FloatArray
+    from arrays.typing import FloatArray
 
 
 class InputError(ValueError):
@@ -30,7 +31,18 @@ def naming(place: str) -> Iterator[None]:
         raise InputError(f"{place}: {str(error).removeprefix('Input ').removeprefix('Inputs ')}") from None
 
 
+@contextmanager
+def of_extra(extra: str, what: str) -> Iterator[None]:
+    """Name the extra that brings what is imported here, for whoever did not install it."""
+    try:
+        yield
+    except ModuleNotFoundError:
+        raise InputError(f'{what} needs the extra "{extra}": pip install "magloc[{extra}]".') from None
+
+
 def _vector(name: str, value: ArrayLike) -> FloatArray:
+    import numpy as np
+
     vector = np.asarray(value, dtype=np.float64)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise ValueError(f"Input {name} must be finite and have shape (3,); instead received {vector.tolist()}.")

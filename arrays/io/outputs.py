@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Mapping
-from importlib import metadata
 from pathlib import Path
 
 from arrays.io.errors import InputError
@@ -101,6 +100,8 @@ def make_folder(folder: Path, option: str) -> None:
 
 def installed_version() -> str:
     """Version of the package that holds the command lines."""
+    from importlib import metadata
+
     try:
         return metadata.version("magloc")
     except metadata.PackageNotFoundError:

@@ -6,8 +6,12 @@ import os
 from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from arrays.io.errors import InputError
+from arrays.io.errors import InputError, of_extra
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 def read_text(path: str | PathLike[str], expected: str) -> str:
@@ -100,3 +104,15 @@ def replace_file(path: Path, write: Callable[[Path], object]) -> None:
         raise InputError(f"{path} cannot be written ({getattr(error, 'strerror', None) or error}).") from None
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def check_netcdf() -> None:
+    """Refuse to go on, before long work, where no netCDF file can be written."""
+    with of_extra("maps", "a netCDF file"):
+        import netCDF4  # noqa: F401
+
+
+def write_netcdf(dataset: xr.Dataset, path: Path) -> None:
+    """Write a netCDF file, whole or not at all."""
+    check_netcdf()
+    replace_file(path, lambda unfinished: dataset.to_netcdf(unfinished))

@@ -15,7 +15,7 @@ import magloc
 from arrays.io.arguments import Flag, whole_number
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file
-from arrays.io.text import replace_file
+from arrays.io.text import replace_file, write_netcdf
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, print_json, progress
 from magloc.cli.options import Grid, print_note
@@ -306,8 +306,8 @@ def _pictures(
     spheres = bound_spheres(task, np.union1d(ranges, [range_m]).tolist(), _STEP_DEG)
     if detector is not None:
         spheres = with_detection_ranges(spheres, task, detector, probability)
-    replace_file(folder / "slices.nc", lambda path: slices.to_netcdf(path))
-    replace_file(folder / "spheres.nc", lambda path: spheres.to_netcdf(path))
+    write_netcdf(slices, folder / "slices.nc")
+    write_netcdf(spheres, folder / "spheres.nc")
     figures = {
         "bounds-slices.png": bound_slices_figure(slices, task),
         "bounds-sphere.png": bound_sphere_figure(spheres, task, range_m),

@@ -6,6 +6,7 @@ whatever is wrong with the input becomes one line on stderr and exit status 2, a
 
 from __future__ import annotations
 
+import difflib
 import logging
 import os
 import sys
@@ -14,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, CycloptsError, Parameter, UnknownCommandError
 
 from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import InputError
@@ -110,12 +111,25 @@ def run(app: App, arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(app: App, tokens: Sequence[str]) -> None:
-    _show_whole_help(app, tokens)
-    command, bound, _ = app.parse_args(tokens, print_error=False, exit_on_error=False)
+    try:
+        _show_whole_help(app, tokens)
+        command, bound, _ = app.parse_args(tokens, print_error=False, exit_on_error=False)
+    except UnknownCommandError as error:
+        raise InputError(_unknown_command(app, error)) from None
+    except ImportError as error:
+        raise InputError(f"the command cannot be loaded ({error.__cause__ or error}).") from None
     for value in bound.arguments.values():
         if isinstance(value, QuietOptions):
             value.apply()
     command(*bound.args, **bound.kwargs)
+
+
+def _unknown_command(app: App, error: UnknownCommandError) -> str:
+    """As cyclopts says it, but it would load every command."""
+    token, *_ = error.unused_tokens or [""]
+    names = [name for name in app if not name.startswith("-")]
+    near = "".join(f' Did you mean "{name}"?' for name in difflib.get_close_matches(token, names, n=1))
+    return f'Unknown command "{token}".{near} Available commands: {", ".join(names)}.'
 
 
 def _show_whole_help(app: App, tokens: Sequence[str]) -> None:

@@ -11,7 +11,7 @@ import magloc
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file
-from arrays.io.text import replace_file
+from arrays.io.text import write_netcdf
 from magloc.cli.framework import CommonOptions, print_json, progress
 from magloc.cli.options import Grid, naming_scheduler, print_note
 
@@ -95,7 +95,7 @@ def map_(
         draw = magloc.plots.convergence if over == "starts" else magloc.plots.sources
         magloc.plots.write(draw(dataset), folder / "convergence.png")
         if netcdf:
-            replace_file(folder / "convergence.nc", lambda path: dataset.to_netcdf(path))
+            write_netcdf(dataset, folder / "convergence.nc")
     if json:
         print_json({**_KEYS, **asdict(counts), "out": str(folder)})
     else:

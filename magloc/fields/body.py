@@ -15,15 +15,18 @@ three, so that only two are left to be seen in a fix.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike
 from scipy.special import elliprd
 
 from arrays.io.errors import _vector
 from arrays.typing import FloatArray
 from magloc.fields.dipole import MU0_OVER_4PI
+
+if TYPE_CHECKING:
+    import trimesh
 
 """Distance in body lengths from which on a body counts as a dipole."""
 _MU0 = 4.0 * np.pi * MU0_OVER_4PI

@@ -8,7 +8,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from arrays.io.errors import of_extra
 from arrays.typing import FloatArray
+
+FIELD = "the Earth's magnetic field"
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +88,8 @@ def coefficients(model: Model) -> Coefficients:
 @cache
 def _igrf14() -> Coefficients:
     # Loaded here because ppigrf brings pandas, which costs more time than all the rest of this package.
-    from ppigrf import ppigrf
+    with of_extra("geo", FIELD):
+        from ppigrf import ppigrf
 
     g, h = ppigrf.read_shc(ppigrf.shc_fn_igrf14)
     degree, order = np.array(list(g.columns), dtype=np.int64).T
@@ -95,7 +99,8 @@ def _igrf14() -> Coefficients:
 
 @cache
 def _wmm2025() -> Coefficients:
-    from wmm import wmm_calc
+    with of_extra("geo", FIELD):
+        from wmm import wmm_calc
 
     table = wmm_calc().load_coeffs()
     if table["model_name"] != "WMM-2025":

@@ -34,8 +34,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from arrays.io.errors import of_extra
 from arrays.typing import FloatArray
 from magloc.fields.dipole import MU0_OVER_4PI
+from magloc.fields.gauss_coefficients import FIELD
 from magloc.fields.gauss_coefficients import MODELS as MODELS
 from magloc.fields.gauss_coefficients import Coefficients as Coefficients
 from magloc.fields.gauss_coefficients import Model as Model
@@ -234,7 +236,8 @@ def _harmonic_sum(
     table: Coefficients, radius_m: FloatArray, latitude_deg: FloatArray, longitude_deg: FloatArray, year: FloatArray
 ) -> FloatArray:
     """Equations (2) to (4) as north, east, down: (N, 3) [T]; all arguments (N,)."""
-    from ppigrf.ppigrf import get_legendre
+    with of_extra("geo", FIELD):
+        from ppigrf.ppigrf import get_legendre
 
     # (4) divides by sin θ. Every P with m > 0 holds that factor, so a tenth of a millimetre off the pole is far enough.
     colatitude = np.clip(90.0 - latitude_deg, _POLE_DEG, 180.0 - _POLE_DEG)
@@ -350,7 +353,8 @@ def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height
     ValueError
         If an input is not finite, or a latitude is beyond ±90°.
     """
-    from pymap3d import geodetic2ecef
+    with of_extra("geo", "a place on the Earth"):
+        from pymap3d import geodetic2ecef
 
     latitude = _latitude("latitude_deg", latitude_deg)
     longitude, height = _finite("longitude_deg", longitude_deg), _finite("height_m", height_m)

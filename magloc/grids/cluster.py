@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from itertools import islice
 from typing import Any
 
-from arrays.io.errors import InputError
+from arrays.io.errors import InputError, of_extra
 from magloc.grids.cube import Box, Chunk, CubeMap, computed
 
 # Boxes sent ahead for every worker: one that it computes, one that it has ready.
@@ -62,12 +62,8 @@ def computed_by(scheduler: str, cube: CubeMap, wanted: Iterable[Box], timeout_s:
         There is no scheduler, it has no workers, it went away, or a worker failed.
     """
     check_address(scheduler)
-    try:
+    with of_extra("cluster", "a scheduler"):
         from distributed import as_completed
-    except ImportError:
-        raise SchedulerError(
-            "scheduler needs the package distributed, which is not installed: pip install 'magloc[cluster]'."
-        ) from None
     waiting = iter(wanted)
     with _client(scheduler, timeout_s) as client:
         try:

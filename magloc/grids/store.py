@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from arrays.io.errors import InputError
+from arrays.io.errors import InputError, of_extra
 from arrays.typing import FloatArray
 from magloc.grids.cube import (
     DIMENSIONS,
@@ -202,8 +202,9 @@ def _as_json(attributes: Mapping[str, Any]) -> dict[str, Any]:
 
 def _make_store(cube: CubeMap, path: Path) -> None:
     """Make an empty store in one step: an interruption leaves no half of one in its place."""
-    import zarr
-    from zarr.codecs import ZstdCodec
+    with of_extra("maps", "a stored map"):
+        import zarr
+        from zarr.codecs import ZstdCodec
 
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -244,7 +245,8 @@ def _make_store(cube: CubeMap, path: Path) -> None:
 
 
 def _opened(path: Path) -> zarr.Group:
-    import zarr
+    with of_extra("maps", "a stored map"):
+        import zarr
 
     try:
         return zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)

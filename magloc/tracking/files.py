@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from arrays.io.errors import InputError
+from arrays.io.errors import InputError, of_extra
 from magloc.tracking.results import TrackPoint
 
 if TYPE_CHECKING:
@@ -65,7 +65,8 @@ def geojson_text(points: Sequence[TrackPoint], origin: Vector) -> str:
     str
         Coordinates are longitude, latitude [deg] and height above the ellipsoid [m], as RFC 7946 has them.
     """
-    from pymap3d import enu2geodetic
+    with of_extra("geo", "a place on the Earth"):
+        from pymap3d import enu2geodetic
 
     features: list[dict[str, object]] = []
     line: list[list[float]] = []

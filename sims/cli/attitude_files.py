@@ -14,7 +14,7 @@ from adcs.kalman.bank import EstimatorSettings
 from adcs.satellite.sensors import SENSORS
 from adcs.satellite.telemetry import Telemetry
 from arrays.io.csv import write_columns
-from arrays.io.text import write_text
+from arrays.io.text import write_netcdf, write_text
 from sims.experiments.attitude import Outcome, Part, errors_in_units
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def write_attitude_files(
     }
     write_columns(columns, out / f"{name}.csv")
     write_columns(_runs_table(outcome), out / f"{name}-runs.csv")
-    dataset_of(parts, estimate, title).to_netcdf(out / f"{name}.nc")
+    write_netcdf(dataset_of(parts, estimate, title), out / f"{name}.nc")
     log = Telemetry.of(first.runs, file.satellite.start)
     write_columns(telemetry_columns(log), out / "telemetry.csv")
     write_columns(_truth_columns(first, log.time_s), out / "truth.csv")

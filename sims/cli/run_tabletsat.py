@@ -124,6 +124,7 @@ def run_attitude(
         Common options.
     """
     from adcs.io.scenario_files import built_in_scenarios
+    from arrays.io.text import check_netcdf
 
     if scenario in _OTHERS:
         raise InputError(f"adcs run: found options before {scenario}, expected its name right after run.")
@@ -137,6 +138,7 @@ def run_attitude(
     file, estimate = wanted(scenario, options, runs.duration)
     if out is not None:
         refuse_file(out, "--out")
+        check_netcdf()
     parts: list[Part] = []
     with progress(runs.seeds, "runs", quiet=common.quiet) as advance:
         outcome = sims.experiments.run_scenario(

@@ -16,6 +16,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.distance import cdist
 
+from arrays.io.errors import of_extra
 from arrays.typing import FloatArray
 
 IntArray = NDArray[np.int64]
@@ -362,7 +363,8 @@ def iso_surface(axis_m: ArrayLike, values: ArrayLike, level: float) -> Surface:
         Half a spacing beyond the points where they are at the border of the cube; :data:`NOTHING` if no value is low
         enough.
     """
-    from skimage.measure import marching_cubes
+    with of_extra("view", "a surface"):
+        from skimage.measure import marching_cubes
 
     axis, cube = np.asarray(axis_m, dtype=np.float64), np.asarray(values, dtype=np.float64)
     inside = cube <= level

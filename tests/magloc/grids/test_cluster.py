@@ -148,7 +148,7 @@ class TestNoCluster:
 
     def test_not_installed(self, monkeypatch):
         monkeypatch.setitem(sys.modules, "distributed", None)
-        with pytest.raises(InputError, match=r"pip install 'magloc\[cluster\]'"):
+        with pytest.raises(InputError, match=r'needs the extra "cluster": pip install "magloc\[cluster\]"'):
             list(computed_by("tcp://127.0.0.1:9", CUBE, boxes(CUBE)))
 
 
