@@ -1,5 +1,5 @@
 # Every target does its whole set-up: a virtual environment of its own in .venv, with the versions of constraints.txt.
-# `make map` and `make test` are what a new user needs; `make test-full` adds the slow Monte-Carlo sizes, the
+# `make map` installs what a map needs, `make test` the rest; `make test-full` adds the slow Monte-Carlo sizes, the
 # longer notebooks, and examples that are new in every run.
 
 PYTHON ?= python3
@@ -19,7 +19,7 @@ test: lint chromium
 test-full: lint chromium
 	HYPOTHESIS_PROFILE=random $(BIN)/python -m pytest -q -n 2
 
-lint: .venv/installed
+lint: .venv/installed-test
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
@@ -42,7 +42,7 @@ chromium:
 	echo "no Chromium: the tests in a browser are skipped (on Debian and Ubuntu: apt-get install chromium)"
 
 # The notebooks executed anew, and the README's pictures of them.
-notebooks: .venv/installed
+notebooks: .venv/installed-test
 	$(BIN)/python -m tests.notebooks
 
 # The lower bounds of pyproject.toml, installed exactly.
@@ -54,10 +54,14 @@ test-oldest: .venv-oldest/installed chromium
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(MAKE_VENV) .venv >/dev/null 2>&1 || \
 		{ $(MAKE_VENV) --without-pip .venv && $(PYTHON) -m pip --python $(BIN)/python install --quiet pip; } >/dev/null 2>&1 || \
 		{ echo "magloc needs Python's venv and pip: on Debian and Ubuntu, apt-get install python3-venv" >&2; exit 1; }
+	$(PIP) install --constraint constraints.txt --editable '.[maps]'
+	@touch $@
+
+.venv/installed-test: .venv/installed
 	$(PIP) install --constraint constraints.txt --editable '.[test]'
 	@touch $@
 
-.venv/installed-bench: .venv/installed
+.venv/installed-bench: .venv/installed-test
 	$(PIP) install --constraint constraints.txt --editable '.[test,bench]'
 	@touch $@
 
