@@ -9,26 +9,22 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
 from cyclopts import Parameter
-from numpy.typing import NDArray
 
-from arrays.array import SensorArray
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, print_json, progress
 from magloc.cli.options import print_note
-from magloc.readings import Readings
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from arrays.array import SensorArray
+    from magloc.localization.fit.fixes import Fixes
     from magloc.localization.fit.prior import SourcePrior
     from magloc.readings import Readings
-from magloc.localization.fit.fixes import Fixes
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _BOUNDS = re.compile(rf"(?:(?P<below>{_NUMBER})<(?=[xyz]<))?(?P<axis>[xyz])(?P<sign>[<>])(?P<bound>{_NUMBER})")

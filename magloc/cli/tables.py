@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from magloc.tracking.consistency import Consistency
-from magloc.tracking.results import TrackPoint
+if TYPE_CHECKING:
+    from magloc.tracking.consistency import Consistency
+    from magloc.tracking.results import TrackPoint
 
 
 def track_table(points: Sequence[TrackPoint]) -> list[str]:

@@ -7,9 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtrc
-from scipy.stats import chi2 as chi2_distribution
-from scipy.stats import f as f_distribution
+from scipy.special import chdtrc, fdtrc
 
 from arrays.array import SensorArray
 from arrays.differences import decorrelated_differences
@@ -183,7 +181,7 @@ def nearness_test(
     rest = max(chi2 - sum(gain for _, gain, _ in steps), 0.0)
     gains = tuple(_tested(order, gain, n, rest, left) for order, gain, n in steps)
     level = false_alarm / 3.0
-    misfit = dof > 0 and bool(chi2_distribution.sf(chi2, dof) < level)
+    misfit = dof > 0 and bool(chdtrc(dof, chi2) < level)
     extended = any(gain.noise_probability < level and gain.misfit_probability < _NO_OTHER_MISFIT for gain in gains)
     return NearnessTest(misfit, extended, chi2, dof, gains, _warning(misfit, extended, chi2, dof, gains))
 
@@ -195,8 +193,8 @@ def _tested(order: int, gain: float, n_parameters: int, rest: float, left: int) 
         order=order,
         gain=gain,
         n_parameters=n_parameters,
-        noise_probability=float(chi2_distribution.sf(gain, n_parameters)),
-        misfit_probability=float(f_distribution.sf(ratio, n_parameters, left)) if comparable else 1.0,
+        noise_probability=float(chdtrc(n_parameters, gain)),
+        misfit_probability=float(fdtrc(n_parameters, left, ratio)) if comparable else 1.0,
     )
 
 

@@ -18,7 +18,6 @@ from functools import lru_cache
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from filterpy.common import van_loan_discretization
 from numpy.typing import ArrayLike
 
 from arrays.typing import FloatArray
@@ -252,6 +251,8 @@ def _wandering_step(correlation_s: float, dt_s: float) -> tuple[float, float, Fl
         Q_pp = correlation_s**2 * (2.0 * dt_s / correlation_s - 3.0 + 4.0 * kept - kept**2)
         root = np.linalg.cholesky(np.array([[Q_pp, Q_pv], [Q_pv, Q_vv]]))
         return correlation_s * (1.0 - kept), kept, root
+    from filterpy.common import van_loan_discretization  # it brings matplotlib and scipy.stats
+
     drift = np.array([[0.0, 1.0], [0.0, -1.0 / correlation_s]])
     noise = np.array([[0.0], [math.sqrt(2.0 / correlation_s)]])
     F, Q = van_loan_discretization(drift, noise, dt_s)
