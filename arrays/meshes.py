@@ -9,13 +9,16 @@ from __future__ import annotations
 from typing import cast
 
 import numpy as np
-import trimesh
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
+from arrays.io.errors import of_extra
 from arrays.sensor import Sensor
 from arrays.typing import FloatArray
+
+with of_extra("view", "the mesh of an array"):
+    import trimesh
 
 BODY_COLOUR = (90, 96, 105, 255)
 AXIS_COLOURS = ((214, 66, 62, 255), (68, 160, 71, 255), (52, 101, 204, 255))

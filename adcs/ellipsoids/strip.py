@@ -20,8 +20,6 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-from scipy.optimize import brentq
-
 StepRule = Literal["lemma", "optimal", "tightened"]
 STEP_RULES: tuple[StepRule, ...] = get_args(StepRule)
 # Floors, all of which enlarge the set. Without the first, cut after cut along a tangent makes the set vanish.
@@ -71,6 +69,8 @@ def optimal_step(mu: float, delta: float, g: float) -> float:
     smallest = 1.0 - LARGEST_STEP
     if cubic(smallest) >= 0.0:
         return LARGEST_STEP
+    from scipy.optimize import brentq
+
     return 1.0 - float(brentq(cubic, smallest, 1.0, xtol=1e-20, rtol=1e-15))
 
 

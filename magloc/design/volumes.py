@@ -6,14 +6,16 @@ from dataclasses import dataclass
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-import trimesh
 from scipy.spatial import cKDTree
 
-from arrays.io.errors import InputError
+from arrays.io.errors import InputError, of_extra
 from arrays.typing import FloatArray
+
+if TYPE_CHECKING:
+    import trimesh
 
 MESH_FORMATS = ("stl", "obj", "ply")
 
@@ -161,7 +163,9 @@ class Surface:
 
     @cached_property
     def _enclosing(self) -> tuple[FloatArray, float]:
-        centre, radius = trimesh.nsphere.minimum_nsphere(self.mesh)  # type: ignore[no-untyped-call]
+        from trimesh import nsphere
+
+        centre, radius = nsphere.minimum_nsphere(self.mesh)  # type: ignore[no-untyped-call]
         return np.asarray(centre, dtype=np.float64), float(radius)
 
     @property
@@ -184,13 +188,15 @@ class Surface:
 
     def nearest(self, points: FloatArray) -> FloatArray:
         """The nearest points of the surface to points (n, 3) [m]."""
+        from trimesh import triangles
+
         corners, tree, largest = self._triangles
         # No triangle whose centroid is farther than the nearest centroid and the largest triangle together is nearest.
         reach = tree.query(points)[0] + largest
         found = np.empty_like(points)
         for i, faces in enumerate(tree.query_ball_point(points, reach * (1.0 + 1e-9))):
             here = np.tile(points[i], (len(faces), 1))
-            on_each = trimesh.triangles.closest_point(corners[faces], here)  # type: ignore[no-untyped-call]
+            on_each = triangles.closest_point(corners[faces], here)  # type: ignore[no-untyped-call]
             found[i] = on_each[np.argmin(np.linalg.norm(on_each - points[i], axis=1))]
         return found
 
@@ -225,8 +231,10 @@ def read_surface(path: str | PathLike[str]) -> Surface:
         raise InputError(f"{path}: found the name of another kind of file, expected {expected}.")
     if not Path(path).is_file():
         raise InputError(f"{path} does not exist, expected {expected}.")
+    with of_extra("view", "the surface of a mesh"):
+        from trimesh import load_mesh
     try:
-        mesh = trimesh.load_mesh(str(path), process=True)
+        mesh = load_mesh(str(path), process=True)
     except Exception as error:  # every reader has errors of its own
         raise InputError(f"{path}: found what is no mesh ({str(error).rstrip('.')}), expected {expected}.") from None
     faces = np.asarray(getattr(mesh, "faces", ()))

@@ -9,6 +9,8 @@ from importlib.metadata import version
 import pytest
 
 from adcs.cli.app import app, main
+from adcs.environment.orbit import Sgp4Orbit
+from arrays.io.errors import InputError
 from magloc.cli import framework
 from sims.cli.run import run as run_app
 from tests.adcs.refusals import assert_refused
@@ -100,3 +102,23 @@ def test_the_process_arguments(monkeypatch, capsys):
     assert main() == 0
     assert capsys.readouterr().out.strip() == version("magloc")
     assert app.name == ("adcs",)
+
+
+class TestMissingExtra:
+    @pytest.mark.parametrize(
+        ("module", "arguments", "sentence"),
+        [
+            ("erfa", [], 'the rotation of the Earth needs the extra "satellites": pip install "magloc[satellites]".'),
+            ("netCDF4", ["--out", "out"], 'a netCDF file needs the extra "maps": pip install "magloc[maps]".'),
+        ],
+    )
+    def test_of_a_run(self, adcs, monkeypatch, tmp_path, module, arguments, sentence):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setitem(sys.modules, module, None)
+        assert_refused(adcs("run", "tabletsat", "--seeds", "1", "--duration", "2", *arguments), sentence)
+        assert not list(tmp_path.iterdir())
+
+    def test_of_two_line_elements(self, monkeypatch):
+        monkeypatch.setitem(sys.modules, "sgp4.api", None)
+        with pytest.raises(InputError, match='two-line elements needs the extra "satellites"'):
+            Sgp4Orbit("1", "2")

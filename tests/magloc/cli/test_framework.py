@@ -1,0 +1,126 @@
+"""What starting a command costs, in modules and not in seconds, and what it says where an extra is missing."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from arrays import read_array
+from arrays.io.errors import InputError
+from tests.command_line import Outcome, Run, assert_refused
+
+COMMANDS = ("calibrate", "locate", "map", "track", "bounds", "design", "simulate", "view")
+HEAVY = {"numpy", "scipy", "numba", "matplotlib", "filterpy", "pandas", "xarray", "zarr", "trimesh", "viser", "msgspec"}
+
+
+def modules_after(program: str) -> set[str]:
+    """Top-level modules that a program has loaded in a process of its own."""
+    code = f"{program}\nimport sys\nprint(*{{name.split('.')[0] for name in sys.modules}}, file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    return set(done.stderr.splitlines()[-1].split())
+
+
+def modules_of(command_line: str, *calls: Sequence[str | Path]) -> set[str]:
+    """Top-level modules that calls of a command line have loaded, one after the other."""
+    texts = [[str(argument) for argument in call] for call in calls]
+    return modules_after(f"from {command_line}.cli.app import main\nfor call in {texts}: main(call)")
+
+
+def without(extra: str, *arguments: str | Path) -> Outcome:
+    """Run ``magloc`` where the modules of an extra are not installed."""
+    hidden = EXTRAS[extra]
+    code = f"import sys\nsys.modules.update(dict.fromkeys({hidden}))\nfrom magloc.cli.app import main\nsys.exit(main())"
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return Outcome(done.returncode, done.stdout, done.stderr)
+
+
+EXTRAS = {
+    "view": ("viser", "trimesh", "skimage", "websockets"),
+    "maps": ("zarr", "netCDF4"),
+    "geo": ("ppigrf", "wmm", "pymap3d"),
+}
+
+
+class TestLoaded:
+    @pytest.mark.parametrize("package", ["arrays", "magloc", "adcs", "sims"])
+    def test_by_an_import(self, package: str) -> None:
+        assert not modules_after(f"import {package}") & HEAVY
+
+    def test_a_heavy_module_is_seen(self) -> None:
+        assert "numpy" in modules_after("import magloc.readings")
+
+    @pytest.mark.parametrize("command_line", ["magloc", "adcs"])
+    @pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["wrong"], ["--wrong"]])
+    def test_by_a_command_line(self, command_line: str, arguments: list[str]) -> None:
+        assert not modules_of(command_line, arguments) & HEAVY
+
+    def test_by_the_help_and_the_refusals_of_commands(self) -> None:
+        calls = [[command, option] for command in COMMANDS for option in ("--help", "--wrong")]
+        assert not modules_of("magloc", *calls) & HEAVY
+
+    def test_by_the_help_of_commands_of_adcs(self) -> None:
+        calls = [[command, "--help"] for command in ("run", "compare", "tables", "estimate", "stars")]
+        assert not modules_of("adcs", *calls) & (HEAVY - {"numpy", "msgspec"})
+
+    def test_by_fixes(self, recording: tuple[Path, Path]) -> None:
+        readings, array = recording
+        loaded = modules_of("magloc", ["locate", readings, "--array", array])
+        assert "numba" in loaded
+        assert not loaded & {"trimesh", "viser", "matplotlib", "zarr", "xarray", "filterpy", "pandas"}
+
+
+class TestWrongCommand:
+    def test_names_the_nearest(self, run: Run) -> None:
+        assert_refused(run("calibrat"), 'Unknown command "calibrat". Did you mean "calibrate"? ', "locate, map")
+
+    def test_names_all(self, run: Run) -> None:
+        assert_refused(run("zzz"), f'Unknown command "zzz". Available commands: {", ".join(COMMANDS)}.')
+
+
+class TestMissingExtra:
+    def test_view(self, recording: tuple[Path, Path]) -> None:
+        assert_refused(without("view", "view", recording[1]), 'the viewer needs the extra "view": pip install "magloc[')
+
+    def test_maps(self, tmp_path: Path) -> None:
+        outcome = without("maps", "map", "--grid", "2", "--out", tmp_path / "map", "--quiet")
+        assert_refused(outcome, 'a stored map needs the extra "maps": pip install "magloc[maps]".')
+
+    def test_geo(self, recording: tuple[Path, Path]) -> None:
+        readings, array = recording
+        place = ("--place", "50", "10", "0", "--date", "2026-11-21")
+        outcome = without("geo", "locate", readings, "--array", array, *place)
+        assert_refused(outcome, '--place: a place on the Earth needs the extra "geo": pip install "magloc[geo]".')
+
+    def test_surface(self, tmp_path: Path) -> None:
+        outcome = without("view", "design", "hull", "--out", tmp_path / "array.toml")
+        assert_refused(outcome, 'the surface of a mesh needs the extra "view": pip install "magloc[view]".')
+
+    def test_mesh(self) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setitem(sys.modules, "trimesh", None)
+            patch.delitem(sys.modules, "arrays.meshes", raising=False)
+            with pytest.raises(InputError, match='the mesh of an array needs the extra "view"'):
+                import_module("arrays.meshes")
+
+    @pytest.mark.parametrize("extra", sorted(EXTRAS))
+    def test_a_fix_needs_none(self, recording: tuple[Path, Path], extra: str) -> None:
+        readings, array = recording
+        assert without(extra, "locate", readings, "--array", array, "--quiet").status == 0
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Readings and array files of one row."""
+    folder = tmp_path_factory.mktemp("recording")
+    file = folder / "array.toml"
+    file.write_text('geometry = "tetrahedron"\nedge_m = 1.5\nkind = "vector"\nnoise_nT = 1.0\n')
+    names = [f"{sensor}_{axis}_nT" for sensor in read_array(file).ids for axis in "xyz"]
+    values = [f"{100.0 / (1 + k):.3f}" for k in range(len(names))]
+    (folder / "readings.csv").write_text(f"time_s,{','.join(names)}\n0,{','.join(values)}\n")
+    return folder / "readings.csv", file
