@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.localization.fit.results import Intervals, Solution, Source
@@ -164,6 +163,8 @@ def _order(position: FloatArray, moment: FloatArray, before: FloatArray | None) 
     strongest = np.argsort(-np.linalg.norm(moment, axis=-1), kind="stable").tolist()
     if before is None:
         return strongest
+    from scipy.optimize import linear_sum_assignment  # it costs as much as a fix
+
     known, found = linear_sum_assignment(np.linalg.norm(before[:, None] - position, axis=-1))
     followed = [int(k) for _, k in sorted(zip(known.tolist(), found.tolist(), strict=True))]
     return followed + [k for k in strongest if k not in followed]

@@ -9,7 +9,6 @@ from html import escape
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from arrays.io.lazy import by_name
 from arrays.typing import BoolArray, FloatArray, IntArray
@@ -20,6 +19,7 @@ from magloc.localization.fit.table import lines_of_fixes
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
+    from scipy.spatial.transform import Rotation
 
 
 @dataclass(frozen=True, eq=False, repr=False)
