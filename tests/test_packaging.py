@@ -16,7 +16,13 @@ PACKAGES = ("arrays", "magloc", "adcs", "sims")
 PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 # Modules that are named otherwise than their distribution.
-DISTRIBUTIONS = {"PIL": "pillow", "erfa": "pyerfa", "skimage": "scikit-image", "wmm": "wmm-calculator"}
+DISTRIBUTIONS = {
+    "PIL": "pillow",
+    "erfa": "pyerfa",
+    "skimage": "scikit-image",
+    "wmm": "wmm-calculator",
+    "xdist": "pytest-xdist",
+}
 
 
 def imported(*folders: str) -> set[str]:

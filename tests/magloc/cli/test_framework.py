@@ -65,7 +65,8 @@ class TestLoaded:
         assert not modules_of("magloc", *calls) & HEAVY
 
     def test_by_the_help_of_commands_of_adcs(self) -> None:
-        calls = [[command, "--help"] for command in ("run", "compare", "tables", "estimate", "stars")]
+        runs = [["run", "complementary"], ["run", "ellipsoid"], ["run", "mockup"]]
+        calls = [[*command, "--help"] for command in (["run"], *runs, ["compare"], ["tables"], ["estimate"], ["stars"])]
         assert not modules_of("adcs", *calls) & (HEAVY - {"numpy", "msgspec"})
 
     def test_by_fixes(self, recording: tuple[Path, Path]) -> None:
