@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from arrays.array import AMBIENT_CHANNELS, SensorArray
 from arrays.io.csv import Columns, Table, read_table, table_of_columns, table_of_text
