@@ -44,7 +44,7 @@ class Passage:
         path = direction / np.linalg.norm(direction, axis=1, keepdims=True) * rng.uniform(0.2, 0.3, (n, 1))
         fields = dipole.field(self.true.positions, path[:, None], MOMENT)
         values = self.true.readings_of(fields) + 2e-9 * rng.normal(size=(n, 18))
-        self.readings = Readings(time_s=np.arange(float(n)), values_T=values, line_numbers=np.arange(n))
+        self.readings = Readings(time_s=np.arange(float(n)), values_T=values)
         self.truth = Truth(np.arange(float(n)), path, np.tile(MOMENT, (n, 1)))
 
     @staticmethod
@@ -108,7 +108,7 @@ class TestCalibrate:
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
         scale = np.array(true.calibration.scale)
         values = 48e-6 * directions @ scale.T + true.calibration.offset_T + 5e-9 * rng.normal(size=(400, 3))
-        readings = Readings(time_s=np.arange(400.0), values_T=values, line_numbers=np.arange(400))
+        readings = Readings(time_s=np.arange(400.0), values_T=values)
         calibration = magloc.calibrate(nominal, readings, modulus_T=48e-6)
         found = calibration.array.sensors[0].calibration
         assert calibration.converged

@@ -1,0 +1,86 @@
+"""Rules of the house that no linter knows: names, roots, sizes."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import pkgutil
+import re
+from collections import Counter
+
+import pytest
+
+from tests.conftest import REPOSITORY
+
+PACKAGES = ("arrays", "magloc", "adcs", "sims")
+FILES = sorted(path for package in PACKAGES for path in (REPOSITORY / package).rglob("*.py"))
+TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
+MOST_PARAMETERS, MOST_LINES, MOST_FILES = 12, 450, 14
+
+
+def test_every_file_is_read() -> None:
+    assert len(FILES) > 250
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+class TestPublicNames:
+    def test_the_stub_has_the_same(self, package: str) -> None:
+        stub = ast.parse((REPOSITORY / package / "__init__.pyi").read_text(encoding="utf-8"))
+        stated = [alias.asname for node in stub.body if isinstance(node, ast.ImportFrom) for alias in node.names]
+        assert sorted(name for name in stated if name is not None) == importlib.import_module(package).__all__
+
+    def test_each_can_be_had(self, package: str) -> None:
+        module = importlib.import_module(package)
+        assert [name for name in module.__all__ if getattr(module, name, None) is None] == []
+
+    def test_none_is_shadowed_by_a_submodule(self, package: str) -> None:
+        """A function of a submodule's name would turn into the module once that is imported."""
+        module = importlib.import_module(package)
+        submodules = {info.name: f"{package}.{info.name}" for info in pkgutil.iter_modules(module.__path__)}
+        for name in set(submodules) & set(module.__all__):
+            assert getattr(module, name) is importlib.import_module(submodules[name])
+
+    def test_each_has_a_user(self, package: str) -> None:
+        """A command, a page or a notebook."""
+        users = [path for other in PACKAGES for path in (REPOSITORY / other / "cli").glob("*.py")]
+        users += [REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md")]
+        users += (REPOSITORY / "notebooks").glob("*.ipynb")
+        words = {word for path in users for word in re.findall(r"\w+", path.read_text(encoding="utf-8"))}
+        assert sorted(set(importlib.import_module(package).__all__) - words) == []
+
+
+def test_only_command_lines_import_the_root_of_their_package() -> None:
+    """A lazy root would hide an upward import from the linter."""
+    found = []
+    for path, tree in TREES.items():
+        package, *rest = path.relative_to(REPOSITORY).parts
+        if rest[0] == "cli":
+            continue
+        modules = {info.name for info in pkgutil.iter_modules([str(REPOSITORY / package)])}
+        for node in ast.walk(tree):
+            whole = isinstance(node, ast.Import) and any(alias.name == package for alias in node.names)
+            name = isinstance(node, ast.ImportFrom) and node.module == package
+            if whole or (name and any(alias.name not in modules for alias in node.names)):
+                found.append(f"{path.relative_to(REPOSITORY)}:{node.lineno}")
+    assert found == []
+
+
+class TestSizes:
+    def test_no_function_has_too_many_parameters(self) -> None:
+        found = []
+        for path, tree in TREES.items():
+            for node in ast.walk(tree):
+                if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+                    names = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+                    count = sum(argument.arg not in ("self", "cls") for argument in names)
+                    if count > MOST_PARAMETERS:
+                        found.append(f"{path.relative_to(REPOSITORY)}: {node.name} has {count}")
+        assert found == []
+
+    def test_no_file_is_too_long(self) -> None:
+        lines = {path.relative_to(REPOSITORY): len(path.read_text(encoding="utf-8").splitlines()) for path in FILES}
+        assert {path: n for path, n in lines.items() if n > MOST_LINES} == {}
+
+    def test_no_folder_is_too_full(self) -> None:
+        files = Counter(path.parent.relative_to(REPOSITORY) for path in FILES)
+        assert {folder: n for folder, n in files.items() if n > MOST_FILES} == {}
