@@ -36,38 +36,15 @@ _LARGEST_NUMBER = 10**15
 
 @dataclass(frozen=True, eq=False)
 class StarFrame:
-    """Stars of one image.
+    """Stars of one image."""
 
-    Attributes
-    ----------
-    points_px : ndarray, shape (f, 2)
-        x to the right, y up.
-    magnitudes : ndarray, shape (f,)
-    numbers : ndarray, shape (f,), optional
-        In the catalogue; -1 where it is no star.
-    """
-
-    points_px: FloatArray
-    magnitudes: FloatArray
-    numbers: IntArray | None
+    points_px: FloatArray  # (f, 2): x to the right, y up
+    magnitudes: FloatArray  # (f,)
+    numbers: IntArray | None  # (f,): in the catalogue; -1 where it is no star
 
 
 def read_star_catalogue(path: str | PathLike[str]) -> StarCatalogue:
-    """Catalogue from a CSV file, see the module.
-
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    StarCatalogue
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, a column is missing, or a number is missing or out of range.
-    """
+    """Catalogue from a CSV file, see the module."""
     table = read_table(path, f"a header with the columns {', '.join(COLUMNS)}")
     for column in COLUMNS:
         table.require(column, COLUMNS)
@@ -87,21 +64,7 @@ def read_star_catalogue(path: str | PathLike[str]) -> StarCatalogue:
 
 
 def read_star_frames(folder: str | PathLike[str]) -> tuple[StarCamera, list[StarFrame]]:
-    """Frames of a folder, see the module.
-
-    Parameters
-    ----------
-    folder : path-like
-
-    Returns
-    -------
-    tuple of StarCamera and list of StarFrame
-
-    Raises
-    ------
-    InputError
-        A file cannot be read, a number is none, or the numbers of a line do not fit.
-    """
+    """Frames of a folder, see the module."""
     camera = _read_camera(Path(folder) / "calibration.txt")
     frames_path, labels_path = Path(folder) / "input.csv", Path(folder) / "result.csv"
     rows = _read_lines(frames_path, "stars of frames")

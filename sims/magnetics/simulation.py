@@ -28,36 +28,20 @@ NEAREST_M = 1e-3
 class Simulation:
     """One realisation of a scenario.
 
-    Attributes
-    ----------
-    scenario : MagneticScenario
-    seed : int
-    array : SensorArray
-        As its user knows it.
-    readings : Readings
-        With the pose of the array unless its frame is the world's, and with the ambient field if there is one.
-    truths : tuple of Truth
-        Position and moment of every source at the times of the readings, world frame.
-    true_array : SensorArray
-        The array with its true calibration: misalignments and errors of the gains are part of it.
+    ``readings``: with the pose of the array unless its frame is the world's, and with the ambient field if there is
+    one.
     """
 
     scenario: MagneticScenario
     seed: int
-    array: SensorArray
+    array: SensorArray  # as its user knows it
     readings: Readings
-    truths: tuple[Truth, ...]
-    true_array: SensorArray
+    truths: tuple[Truth, ...]  # position and moment of every source at the times of the readings, world frame
+    true_array: SensorArray  # the array with its true calibration: misalignments and errors of the gains are part of it
 
     @property
     def truth(self) -> Truth:
-        """Truth of the first source.
-
-        Raises
-        ------
-        ValueError
-            The scenario has no source.
-        """
+        """Truth of the first source."""
         if not self.truths:
             raise ValueError("Input scenario must have a source; instead received one without.")
         return self.truths[0]
@@ -77,23 +61,8 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
     The field at every sensor is that of the ambient field with its pulsations, of the platform and of all sources at
     that instant. Then come calibration with its errors, the sensor's low-pass, noise and drift, rounding, and
     saturation: a reading beyond the range is the range.
-
-    Parameters
-    ----------
-    scenario : MagneticScenario
-    seed : int
-        The same seed gives the same numbers. Every feature of every sensor, by its id, has its own stream: leaving out
-        one changes no other.
-
-    Returns
-    -------
-    Simulation
-
-    Raises
-    ------
-    ValueError
-        At one of the instants a sensor is inside a source, or within a millimetre of one or of the platform's dipole;
-        or no row is left between the gaps.
+    ``seed``: the same seed gives the same numbers. Every feature of every sensor, by its id, has its own stream:
+    leaving out one changes no other.
     """
     time_s = scenario.time_s
     array_pose = _pose(scenario.carrier, time_s, seed, "array")

@@ -21,20 +21,11 @@ from arrays.typing import BoolArray, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Fix:
-    """Position and heading from one image.
+    """Position and heading from one image."""
 
-    Attributes
-    ----------
-    time_s : float
-        Of the exposure.
-    position_m : ndarray, shape (2,)
-    heading_rad : float
-        Counter-clockwise, of any number of turns.
-    """
-
-    time_s: float
-    position_m: FloatArray
-    heading_rad: float
+    time_s: float  # of the exposure
+    position_m: FloatArray  # (2,)
+    heading_rad: float  # counter-clockwise, of any number of turns
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,18 +130,10 @@ class Fusion(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """Estimates as they were known at each sample.
+    """Estimates as they were known at each sample."""
 
-    Attributes
-    ----------
-    track : PlanarTrack
-        At the end of every sample; a fix that arrives just then counts from the next one on.
-    outcomes : tuple of Outcome
-        Of every fix, as it arrived.
-    """
-
-    track: PlanarTrack
-    outcomes: tuple[Outcome, ...]
+    track: PlanarTrack  # at the end of every sample; a fix that arrives just then counts from the next one on
+    outcomes: tuple[Outcome, ...]  # of every fix, as it arrived
 
     @property
     def used(self) -> BoolArray:
@@ -164,14 +147,7 @@ _TAKEN = (Outcome.USED, Outcome.REACQUIRED)
 def unused_counts(outcomes: Sequence[Outcome]) -> dict[str, int]:
     """Number of the fixes that were not used, by the reason; with those that were used they are all.
 
-    Parameters
-    ----------
-    outcomes : sequence of Outcome
-
-    Returns
-    -------
-    dict
-        Every reason in words, also where it has none.
+    Returns: every reason in words, also where it has none.
     """
     return {reason.value: outcomes.count(reason) for reason in Outcome if reason not in _TAKEN}
 
@@ -179,15 +155,7 @@ def unused_counts(outcomes: Sequence[Outcome]) -> dict[str, int]:
 def counts_in_words(used: int, unused: Mapping[str, int]) -> str:
     """Numbers of fixes by what became of them, which add up: "187 used, 75 too old".
 
-    Parameters
-    ----------
-    used : int
-    unused : mapping
-        Of :func:`unused_counts`; reasons without fixes are left out.
-
-    Returns
-    -------
-    str
+    ``unused``: of :func:`unused_counts`; reasons without fixes are left out.
     """
     return ", ".join([f"{used} used", *(f"{count} {reason}" for reason, count in unused.items() if count)])
 

@@ -1,12 +1,6 @@
-r"""Calibration of the camera: scale, distortion and optical centre from frames taken at known poses.
+"""Calibration of the camera: scale, distortion and optical centre from frames taken at known poses.
 
-Each light found in a frame is paired with the light of the sky that the pose predicts nearest to it. The parameters
-:math:`\theta = (s, k_1, c_x, c_y)` are those of least squares of the pairs' distances in the image, each frame weighted
-by :math:`R = \sigma^2 I + J_p P_p J_p^T`: the noise of centroids and what the uncertainty of the pose makes of
-it. :math:`\sigma` is estimated from the residuals that no shift or turn of a frame explains.
-
-Where the optical centre is cannot be told from where the satellite is, but for the lens: it is only as well known as
-the poses are, which its standard deviation says.
+See docs/theory/tabletop-vision.md.
 """
 
 from __future__ import annotations
@@ -37,7 +31,6 @@ class KnownFrame:
 
     Attributes
     ----------
-    pose : Pose
     positions_px : ndarray, shape (n, 2)
         Column and row.
     """
@@ -50,24 +43,14 @@ class KnownFrame:
 class CameraCalibration:
     """A calibrated camera.
 
-    Attributes
-    ----------
-    camera : Camera
-    covariance : ndarray, shape (4, 4)
-        Of :data:`PARAMETERS`, in m/px, 1 and px.
-    noise_px : float
-        Standard deviation of a centroid's coordinate, from the residuals.
-    residual_rms_px : float
-        Root mean square of the coordinates' residuals, what the poses' errors make of them included.
-    n_pairs : int
-        Lights that were used.
+    ``residual_rms_px``: root mean square of the coordinates' residuals, what the poses' errors make of them included.
     """
 
     camera: Camera
-    covariance: FloatArray
-    noise_px: float
+    covariance: FloatArray  # (4, 4): of :data:`PARAMETERS`, in m/px, 1 and px
+    noise_px: float  # standard deviation of a centroid's coordinate, from the residuals
     residual_rms_px: float
-    n_pairs: int
+    n_pairs: int  # lights that were used
 
     @property
     def values(self) -> FloatArray:
@@ -91,16 +74,10 @@ def calibrated_camera(
 
     Parameters
     ----------
-    sky : LedSky
-    frames : sequence of KnownFrame
     camera : Camera
         To start from: the scale to some percent, the lens to some hundredths.
     position_sigma_m, heading_sigma_rad : float
         Standard deviations of X, Y and heading of the poses, independent from frame to frame.
-
-    Returns
-    -------
-    CameraCalibration
 
     Raises
     ------
