@@ -192,12 +192,6 @@ def square_root_update(P: FloatArray, H: FloatArray, residual: FloatArray) -> tu
     return np.array(corrections), np.array(covariances)
 
 
-def information_update(P: FloatArray, H: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The same by adding information, P⁻¹ + HᵀH: for tests, since it loses digits where P is nearly singular."""
-    updated = np.asarray(np.linalg.inv(np.linalg.inv(P) + H.mT @ H), dtype=np.float64)
-    return (updated @ H.mT @ residual[..., None])[..., 0], updated
-
-
 def corrected(
     record: Record, row: int, state: State, settings: FilterSettings, update: Update = joseph_update
 ) -> tuple[State, FloatArray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,9 +18,6 @@ from sims.experiments.mockup_settings import METHODS, SETTLED_S, Method, MockupO
 if TYPE_CHECKING:
     from sims.experiments.mockup_navigation import FusionRuns, ZerosRuns
     from sims.experiments.mockup_vision import FrameResult
-
-
-Advance = Callable[[int], None]
 
 
 def frame_entries(results: dict[Path, FrameResult]) -> list[dict[str, Any]]:

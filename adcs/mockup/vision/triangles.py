@@ -105,11 +105,6 @@ class TriangleCatalogue:
         """Number of lights."""
         return len(self.positions_m)
 
-    @property
-    def n_hull(self) -> int:
-        """Lights on the hull, from T = 2n - 2 - h."""
-        return 2 * self.n_stars - 2 - len(self.triangles)
-
     @cached_property
     def plane(self) -> ComplexArray:
         """Lights as X + iY, shape (n,) [m]."""
