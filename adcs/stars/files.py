@@ -36,15 +36,30 @@ _LARGEST_NUMBER = 10**15
 
 @dataclass(frozen=True, eq=False)
 class StarFrame:
-    """Stars of one image."""
+    """Stars of one image.
 
-    points_px: FloatArray  # (f, 2): x to the right, y up
-    magnitudes: FloatArray  # (f,)
-    numbers: IntArray | None  # (f,): in the catalogue; -1 where it is no star
+    Attributes
+    ----------
+    points_px : ndarray, shape (f, 2)
+        x to the right, y up.
+    magnitudes : ndarray, shape (f,)
+    numbers : ndarray, shape (f,), optional
+        In the catalogue; -1 where it is no star.
+    """
+
+    points_px: FloatArray
+    magnitudes: FloatArray
+    numbers: IntArray | None
 
 
 def read_star_catalogue(path: str | PathLike[str]) -> StarCatalogue:
-    """Catalogue from a CSV file, see the module."""
+    """Catalogue from a CSV file, see the module.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, a column is missing, or a number is missing or out of range.
+    """
     table = read_table(path, f"a header with the columns {', '.join(COLUMNS)}")
     for column in COLUMNS:
         table.require(column, COLUMNS)
@@ -64,7 +79,13 @@ def read_star_catalogue(path: str | PathLike[str]) -> StarCatalogue:
 
 
 def read_star_frames(folder: str | PathLike[str]) -> tuple[StarCamera, list[StarFrame]]:
-    """Frames of a folder, see the module."""
+    """Frames of a folder, see the module.
+
+    Raises
+    ------
+    InputError
+        A file cannot be read, a number is none, or the numbers of a line do not fit.
+    """
     camera = _read_camera(Path(folder) / "calibration.txt")
     frames_path, labels_path = Path(folder) / "input.csv", Path(folder) / "result.csv"
     rows = _read_lines(frames_path, "stars of frames")

@@ -49,13 +49,25 @@ class Prepared:
 
 @dataclass(frozen=True, eq=False)
 class AttitudeRuns:
-    """Truth and readings."""
+    """Truth and readings.
+
+    Attributes
+    ----------
+    q : ndarray, shape (runs, n, 4)
+        Attitude, orbital from body.
+    w : ndarray, shape (runs, n, 3)
+        Rate against inertial space, body axes [rad/s].
+    momentum_Nms : ndarray, shape (runs, n, 3)
+        Of the wheels.
+    wheel_torque_Nm : ndarray, shape (runs, n, 3)
+        Rate of change of the wheels' momentum from each instant to the next.
+    """
 
     prepared: Prepared
-    q: FloatArray  # (runs, n, 4): attitude, orbital from body
-    w: FloatArray  # (runs, n, 3): rate against inertial space, body axes [rad/s]
-    momentum_Nms: FloatArray  # (runs, n, 3): of the wheels
-    wheel_torque_Nm: FloatArray  # (runs, n, 3): rate of change of the wheels' momentum from each instant to the next
+    q: FloatArray
+    w: FloatArray
+    momentum_Nms: FloatArray
+    wheel_torque_Nm: FloatArray
     readings: Readings
 
     @property

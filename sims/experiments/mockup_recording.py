@@ -135,7 +135,16 @@ def _fusion_of(method: Method, start: PlanarState, begin_s: float) -> Fusion:
 def read_samples(path: Path) -> ImuRecord:
     """Samples from a CSV file with the columns of :data:`SAMPLE_COLUMNS`; others are left out.
 
-    ``path``: a time is when the interval of its sample ends; an empty cell is a missing reading.
+    Parameters
+    ----------
+    path : Path
+        A time is when the interval of its sample ends; an empty cell is a missing reading.
+
+    Raises
+    ------
+    InputError
+        It is no such file, has fewer than two rows, its times go back, a gap is too long to go through it in steps, or
+        a column has no reading that is believed.
     """
     table = _table_with(path, SAMPLE_COLUMNS)
     time_s = table.complete(["time_s"])[:, 0]
@@ -166,7 +175,13 @@ def read_samples(path: Path) -> ImuRecord:
 
 
 def read_fixes(path: Path) -> FixRecord:
-    """Fixes from a CSV file with the columns of :data:`FIX_COLUMNS`, in the order of their arrival."""
+    """Fixes from a CSV file with the columns of :data:`FIX_COLUMNS`, in the order of their arrival.
+
+    Raises
+    ------
+    InputError
+        It is no such file, arrivals go back, a fix arrives before its exposure, or is nowhere near the table.
+    """
     table = _table_with(path, FIX_COLUMNS)
     values = table.complete(list(FIX_COLUMNS))
     table.refuse(

@@ -19,11 +19,17 @@ from sims.magnetics.simulation import Simulation
 
 
 class SimulationFiles(NamedTuple):
-    """Paths of the files of a simulation."""
+    """Paths of the files of a simulation.
+
+    Attributes
+    ----------
+    truths : tuple of Path
+        One for each source.
+    """
 
     readings: Path
     array: Path
-    truths: tuple[Path, ...]  # one for each source
+    truths: tuple[Path, ...]
 
     @property
     def all(self) -> tuple[Path, ...]:

@@ -28,20 +28,34 @@ NEAREST_M = 1e-3
 class Simulation:
     """One realisation of a scenario.
 
-    ``readings``: with the pose of the array unless its frame is the world's, and with the ambient field if there is
-    one.
+    Attributes
+    ----------
+    array : SensorArray
+        As its user knows it.
+    readings : Readings
+        With the pose of the array unless its frame is the world's, and with the ambient field if there is one.
+    truths : tuple of Truth
+        Position and moment of every source at the times of the readings, world frame.
+    true_array : SensorArray
+        The array with its true calibration: misalignments and errors of the gains are part of it.
     """
 
     scenario: MagneticScenario
     seed: int
-    array: SensorArray  # as its user knows it
+    array: SensorArray
     readings: Readings
-    truths: tuple[Truth, ...]  # position and moment of every source at the times of the readings, world frame
-    true_array: SensorArray  # the array with its true calibration: misalignments and errors of the gains are part of it
+    truths: tuple[Truth, ...]
+    true_array: SensorArray
 
     @property
     def truth(self) -> Truth:
-        """Truth of the first source."""
+        """Truth of the first source.
+
+        Raises
+        ------
+        ValueError
+            The scenario has no source.
+        """
         if not self.truths:
             raise ValueError("Input scenario must have a source; instead received one without.")
         return self.truths[0]

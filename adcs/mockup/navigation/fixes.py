@@ -21,11 +21,20 @@ from arrays.typing import BoolArray, FloatArray
 
 @dataclass(frozen=True, eq=False)
 class Fix:
-    """Position and heading from one image."""
+    """Position and heading from one image.
 
-    time_s: float  # of the exposure
-    position_m: FloatArray  # (2,)
-    heading_rad: float  # counter-clockwise, of any number of turns
+    Attributes
+    ----------
+    time_s : float
+        Of the exposure.
+    position_m : ndarray, shape (2,)
+    heading_rad : float
+        Counter-clockwise, of any number of turns.
+    """
+
+    time_s: float
+    position_m: FloatArray
+    heading_rad: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,10 +139,18 @@ class Fusion(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """Estimates as they were known at each sample."""
+    """Estimates as they were known at each sample.
 
-    track: PlanarTrack  # at the end of every sample; a fix that arrives just then counts from the next one on
-    outcomes: tuple[Outcome, ...]  # of every fix, as it arrived
+    Attributes
+    ----------
+    track : PlanarTrack
+        At the end of every sample; a fix that arrives just then counts from the next one on.
+    outcomes : tuple of Outcome
+        Of every fix, as it arrived.
+    """
+
+    track: PlanarTrack
+    outcomes: tuple[Outcome, ...]
 
     @property
     def used(self) -> BoolArray:

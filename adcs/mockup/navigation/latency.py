@@ -23,14 +23,28 @@ _LARGEST_SIGMA = 0.1  # of the range that is searched
 
 @dataclass(frozen=True)
 class LatencyEstimate:
-    """Latency of the camera."""
+    """Latency of the camera.
 
-    latency_s: float  # NaN where it is not observable
-    sigma_s: float  # its standard deviation, infinite where it is not observable
-    gyro_zero_rad_s: float  # b, NaN likewise
+    Attributes
+    ----------
+    latency_s : float
+        NaN where it is not observable.
+    sigma_s : float
+        Its standard deviation, infinite where it is not observable.
+    gyro_zero_rad_s : float
+        b, NaN likewise.
+    reason : str
+        Why not; empty where it is.
+    used : int
+        Differences of fixes that it rests on.
+    """
+
+    latency_s: float
+    sigma_s: float
+    gyro_zero_rad_s: float
     observable: bool
-    reason: str  # why not; empty where it is
-    used: int  # differences of fixes that it rests on
+    reason: str
+    used: int
 
 
 def camera_latency(

@@ -215,12 +215,19 @@ class PlanarState:
 
 @dataclass(frozen=True, eq=False)
 class PlanarTrack:
-    """States through time."""
+    """States through time.
 
-    time_s: FloatArray  # (n,)
-    position_m: FloatArray  # (..., n, 2)
-    velocity_m_s: FloatArray  # (..., n, 2)
-    heading_rad: FloatArray  # (..., n)
+    Attributes
+    ----------
+    time_s : ndarray, shape (n,)
+    position_m, velocity_m_s : ndarray, shape (..., n, 2)
+    heading_rad : ndarray, shape (..., n)
+    """
+
+    time_s: FloatArray
+    position_m: FloatArray
+    velocity_m_s: FloatArray
+    heading_rad: FloatArray
 
     def __len__(self) -> int:
         """Return the number of instants."""
@@ -242,10 +249,23 @@ class PlanarTrack:
 
 @dataclass(frozen=True)
 class Gate:
-    """Largest readings that are believed, each of the three channels on its own."""
+    """Largest readings that are believed, each of the three channels on its own.
 
-    acceleration_m_s2: float = 0.5  # of each axis, its zero taken off
-    rate_rad_s: float = math.radians(200.0)  # the source has 50 °/s, which the firings of its own figure 14 exceed
+    Attributes
+    ----------
+    acceleration_m_s2 : float
+        Of each axis, its zero taken off.
+    rate_rad_s : float
+        The source has 50 °/s, which the firings of its own figure 14 exceed.
+
+    Raises
+    ------
+    ValueError
+        A limit is not positive.
+    """
+
+    acceleration_m_s2: float = 0.5
+    rate_rad_s: float = math.radians(200.0)
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

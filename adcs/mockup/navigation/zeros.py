@@ -82,12 +82,24 @@ def heading_from_fixes(imu: ImuRecord, fixes: FixRecord) -> tuple[FloatArray, fl
 
 @dataclass(frozen=True, eq=False)
 class ZeroProblem:
-    """What the fits need, at the exposures of k fixes; table axes as complex numbers."""
+    """What the fits need, at the exposures of k fixes; table axes as complex numbers.
 
-    time_s: FloatArray  # (k,): since the beginning of the record
-    moved: ComplexArray  # (k,): D[a e^{iφ}] of the readings [m]
-    by_zero: ComplexArray  # (m, k): D[s e^{iφ}] for each course s of a zero [s²]; the first one is constant
-    measured: ComplexArray  # (k,): positions of the fixes [m]
+    Attributes
+    ----------
+    time_s : ndarray, shape (k,)
+        Since the beginning of the record.
+    moved : ndarray of complex, shape (k,)
+        D[a e^{iφ}] of the readings [m].
+    by_zero : ndarray of complex, shape (m, k)
+        D[s e^{iφ}] for each course s of a zero [s²]; the first one is constant.
+    measured : ndarray of complex, shape (k,)
+        Positions of the fixes [m].
+    """
+
+    time_s: FloatArray
+    moved: ComplexArray
+    by_zero: ComplexArray
+    measured: ComplexArray
 
 
 def zero_problem(

@@ -43,14 +43,23 @@ class KnownFrame:
 class CameraCalibration:
     """A calibrated camera.
 
-    ``residual_rms_px``: root mean square of the coordinates' residuals, what the poses' errors make of them included.
+    Attributes
+    ----------
+    covariance : ndarray, shape (4, 4)
+        Of :data:`PARAMETERS`, in m/px, 1 and px.
+    noise_px : float
+        Standard deviation of a centroid's coordinate, from the residuals.
+    residual_rms_px : float
+        Root mean square of the coordinates' residuals, what the poses' errors make of them included.
+    n_pairs : int
+        Lights that were used.
     """
 
     camera: Camera
-    covariance: FloatArray  # (4, 4): of :data:`PARAMETERS`, in m/px, 1 and px
-    noise_px: float  # standard deviation of a centroid's coordinate, from the residuals
+    covariance: FloatArray
+    noise_px: float
     residual_rms_px: float
-    n_pairs: int  # lights that were used
+    n_pairs: int
 
     @property
     def values(self) -> FloatArray:

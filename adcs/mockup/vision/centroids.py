@@ -33,13 +33,26 @@ class NoLightsError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Stars:
-    """Lights found in a frame, brightest first."""
+    """Lights found in a frame, brightest first.
 
-    positions_px: FloatArray  # (n, 2): column and row of each centroid
-    intensity_DN: FloatArray  # (n,): sum above the background
-    n_pixels: IntArray  # (n,)
-    background_DN: float  # median of the frame
-    threshold_DN: float  # above the background
+    Attributes
+    ----------
+    positions_px : ndarray, shape (n, 2)
+        Column and row of each centroid.
+    intensity_DN : ndarray, shape (n,)
+        Sum above the background.
+    n_pixels : ndarray of int, shape (n,)
+    background_DN : float
+        Median of the frame.
+    threshold_DN : float
+        Above the background.
+    """
+
+    positions_px: FloatArray
+    intensity_DN: FloatArray
+    n_pixels: IntArray
+    background_DN: float
+    threshold_DN: float
 
     def __len__(self) -> int:
         return len(self.positions_px)
@@ -50,7 +63,17 @@ def find_stars(frame: ArrayLike) -> Stars:
 
     The background is the frame's median, its standard deviation 1.4826 times the median distance from it (MAD). Blobs
     are 8-connected pixels above the threshold; those of fewer than 4 pixels and those at the border are left out.
-    Shape ``frame`` (height, width).
+
+    Parameters
+    ----------
+    frame : array_like of uint8, shape (height, width)
+
+    Raises
+    ------
+    NoLightsError
+        It is black, saturated or of one value throughout.
+    ValueError
+        This is no grey image of bytes.
     """
     image = checked_frame(frame)
     background, sigma = _background(image)

@@ -204,7 +204,13 @@ class _SkyFile(File, kw_only=True):
 
 
 def read_sky(path: str | PathLike[str]) -> LedSky:
-    """Sky from its TOML file."""
+    """Sky from its TOML file.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read, or is no sky; the text names the key.
+    """
     table = section_of(str(path), read_toml(path, "the TOML file of a sky"), _SkyFile)
     with naming(f"{path}, key positions_m"):
         return LedSky(np.array(table.positions_m, dtype=np.float64).reshape(-1, 2), table.name)
