@@ -35,7 +35,7 @@ _JD_J2000 = 2_451_545.0
 
 
 def instants(date: Dates, time_s: ArrayLike = 0.0) -> Instants:
-    """Instants of time, UTC to the microsecond, of dates and seconds after them.
+    """Instants of time, UTC to the microsecond, of dates and seconds after them, shape (...) or (..., n).
 
     Parameters
     ----------
@@ -43,10 +43,6 @@ def instants(date: Dates, time_s: ArrayLike = 0.0) -> Instants:
         A datetime without a time zone is UTC; a string is ISO 8601.
     time_s : array_like, shape (n,), optional
         Seconds after every date; a number keeps the shape of the dates.
-
-    Returns
-    -------
-    ndarray of datetime64[us], shape (...) or (..., n)
 
     Raises
     ------
@@ -117,16 +113,12 @@ def rotation_about_z(angle_rad: ArrayLike) -> FloatArray:
 
 
 def R_orbital_from_eci(position_eci_m: ArrayLike, velocity_eci_m_s: ArrayLike) -> FloatArray:
-    """Rotation matrices whose rows are e1, e2, e3 of the orbital frame in eci.
+    """Rotation matrices whose rows are e1, e2, e3 of the orbital frame in eci, shape (..., 3, 3).
 
     Parameters
     ----------
     position_eci_m : array_like, shape (..., 3)
     velocity_eci_m_s : array_like, shape (..., 3)
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
     """
     position = np.asarray(position_eci_m, dtype=np.float64)
     e3 = position / np.linalg.norm(position, axis=-1, keepdims=True)

@@ -1,15 +1,6 @@
-r"""Unit quaternions of attitude: Hamilton's product, scalar part first.
+"""Unit quaternions of attitude: Hamilton's product, scalar part first.
 
-A quaternion q = (q0, p) of frame "to" from frame "from" turns components of a vector,
-
-.. math:: v_{to} = q \circ v_{from} \circ q^*, \qquad v_{from} = A(q)\, v_{to}
-
-so that ``q_orbital_from_body`` gives orbital components of a body vector, and A(q) is the matrix that the literature of
-attitude writes for the opposite direction. q and -q are the same rotation. The error of an estimate is in its right
-factor, :math:`q = \hat q \circ (\sqrt{1-|\delta|^2}, \delta)`, and turns in body axes by the angle 2δ for small δ.
-
-All functions take leading batch axes. :mod:`scipy.spatial.transform` has the scalar part last: :func:`to_rotation` and
-:func:`from_rotation` are the only place that converts.
+See docs/theory/satellite-dynamics-and-sensors.md.
 """
 
 from __future__ import annotations
@@ -27,16 +18,12 @@ IDENTITY: FloatArray = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def multiply(p: ArrayLike, q: ArrayLike) -> FloatArray:
-    """Hamilton product p∘q: the rotation q, then p.
+    """Hamilton product p∘q: the rotation q, then p, shape (..., 4).
 
     Parameters
     ----------
     p, q : array_like, shape (..., 4)
         Scalar first; they broadcast.
-
-    Returns
-    -------
-    ndarray, shape (..., 4)
     """
     p0, p1, p2, p3 = np.moveaxis(np.asarray(p, dtype=np.float64), -1, 0)
     q0, q1, q2, q3 = np.moveaxis(np.asarray(q, dtype=np.float64), -1, 0)
@@ -64,7 +51,7 @@ def normalised(q: ArrayLike) -> FloatArray:
 
 
 def rotate(q: ArrayLike, v: ArrayLike) -> FloatArray:
-    """Vector q∘v∘q*: for ``q_orbital_from_body``, orbital components of a body vector.
+    """Vector q∘v∘q*: for ``q_orbital_from_body``, orbital components of a body vector, shape (..., 3).
 
     Parameters
     ----------
@@ -72,10 +59,6 @@ def rotate(q: ArrayLike, v: ArrayLike) -> FloatArray:
         Unit quaternion.
     v : array_like, shape (..., 3)
         Broadcasts against q.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
     """
     q = np.asarray(q, dtype=np.float64)
     v = np.asarray(v, dtype=np.float64)
@@ -99,14 +82,7 @@ def matrix(q: ArrayLike) -> FloatArray:
 def exp(rotation_vector: ArrayLike) -> FloatArray:
     """Quaternion (cos θ/2, n sin θ/2) of a rotation vector θn.
 
-    Parameters
-    ----------
-    rotation_vector : array_like, shape (..., 3)
-        [rad]
-
-    Returns
-    -------
-    ndarray, shape (..., 4)
+    ``rotation_vector`` (..., 3) [rad]. Returns shape (..., 4).
     """
     half = 0.5 * np.asarray(rotation_vector, dtype=np.float64)
     angle = np.linalg.norm(half, axis=-1, keepdims=True)
@@ -127,14 +103,8 @@ def log(q: ArrayLike) -> FloatArray:
 def error_vector(q_estimated: ArrayLike, q_true: ArrayLike) -> FloatArray:
     r"""Vector part δ of :math:`\hat q^* \circ q` with the sign that makes its scalar part positive.
 
-    Parameters
-    ----------
-    q_estimated, q_true : array_like, shape (..., 4)
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        Body axes; 2δ is the angle of error for small errors [rad].
+    Shape ``q_estimated``, ``q_true`` (..., 4). Returns (..., 3): body axes; 2δ is the angle of error for small errors
+    [rad].
     """
     error = multiply(conjugate(q_estimated), q_true)
     return np.where(error[..., :1] < 0.0, -error[..., 1:], error[..., 1:])
@@ -157,15 +127,7 @@ def angle_between(p: ArrayLike, q: ArrayLike) -> FloatArray:
 def derivative(q: ArrayLike, w: ArrayLike) -> FloatArray:
     """Rate of change ½ q∘(0, w) for the rate w of the "from" frame against the "to" frame, in "from" axes [rad/s].
 
-    Parameters
-    ----------
-    q : array_like, shape (..., 4)
-    w : array_like, shape (..., 3)
-
-    Returns
-    -------
-    ndarray, shape (..., 4)
-        [1/s]
+    Shapes ``q`` (..., 4), ``w`` (..., 3). Returns (..., 4) [1/s].
     """
     w = np.asarray(w, dtype=np.float64)
     return 0.5 * multiply(q, np.concatenate([np.zeros_like(w[..., :1]), w], axis=-1))

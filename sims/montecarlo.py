@@ -49,7 +49,6 @@ def run_many(
 
     Parameters
     ----------
-    scenario : MagneticScenario or AttitudeScenario
     estimator : callable
         Takes an array and its readings, or a :class:`adcs.Telemetry` and its :class:`adcs.Satellite`. What it returns
         is kept as ``judge`` says.

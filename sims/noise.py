@@ -1,13 +1,6 @@
-r"""Random processes of a simulation, each from a stream of its own.
+"""Random processes of a simulation, each from a stream of its own.
 
-Noise of a sensor has the one-sided spectral density
-
-.. math:: S(f) = N² (1 + f_c/f) / (1 + (f/f_b)²)
-
-white above the corner frequency f_c, 1/f below it, and limited by the sensor's first-order low-pass of bandwidth f_b.
-It is made by shaping the discrete Fourier transform of white normal numbers, of a record twice as long as needed, so
-that its end does not know its beginning. There is nothing at zero frequency, nor below 1/(2·duration): a constant is no
-noise.
+See docs/theory/magnetic-simulation.md.
 """
 
 from __future__ import annotations
@@ -27,19 +20,9 @@ HOUR_S = 3600.0
 def stream(seed: int, feature: str, owner: str = "") -> np.random.Generator:
     """Random numbers of one feature of one sensor, source or carrier.
 
-    Parameters
-    ----------
-    seed : int
-        Of the simulation.
-    feature : str
-        What they are for, such as ``"noise"``.
-    owner : str
-        Whose they are, such as a sensor's id.
-
-    Returns
-    -------
-    numpy.random.Generator
-        Independent of that of any other name: leaving out a feature or a sensor changes no other one.
+    ``seed``: of the simulation. ``feature``: what they are for, such as ``"noise"``. ``owner``: whose they are, such as
+    a sensor's id. Returns: independent of that of any other name: leaving out a feature or a sensor changes no other
+    one.
     """
     key = (zlib.crc32(feature.encode()), zlib.crc32(owner.encode()))
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
@@ -68,7 +51,6 @@ def coloured_noise(
         f_c, where both parts are equal; 0 = none.
     bandwidth_Hz : float
         f_b, infinite = none.
-    rng : numpy.random.Generator
 
     Returns
     -------
@@ -89,16 +71,7 @@ def white_sigma(rate_Hz: float, density: float, bandwidth_Hz: float) -> float:
     r"""Standard deviation of the white part of :func:`coloured_noise` in one sample.
 
     :math:`σ² = N² ∫_0^{f_s/2} df/(1 + (f/f_b)²) = N² f_b \arctan(f_s/(2 f_b))`.
-
-    Parameters
-    ----------
-    rate_Hz, density, bandwidth_Hz : float
-        As there.
-
-    Returns
-    -------
-    float
-        [unit]
+    ``rate_Hz``, ``density``, ``bandwidth_Hz``: as there. Returns [unit].
     """
     nyquist = rate_Hz / 2.0
     band = nyquist if math.isinf(bandwidth_Hz) else bandwidth_Hz * math.atan(nyquist / bandwidth_Hz)
@@ -106,21 +79,10 @@ def white_sigma(rate_Hz: float, density: float, bandwidth_Hz: float) -> float:
 
 
 def flicker_sigma(rate_Hz: float, density: float, corner_Hz: float, bandwidth_Hz: float, lowest_Hz: float) -> float:
-    r"""Standard deviation of the 1/f part of :func:`coloured_noise` above a frequency, in one sample.
+    """Standard deviation of the 1/f part of :func:`coloured_noise` above a frequency, in one sample.
 
     :math:`σ² = N² f_c ∫_{f_1}^{f_s/2} df/(f (1 + (f/f_b)²))`, zero where the rate does not reach that frequency.
-
-    Parameters
-    ----------
-    rate_Hz, density, corner_Hz, bandwidth_Hz : float
-        As there.
-    lowest_Hz : float
-        f_1, positive.
-
-    Returns
-    -------
-    float
-        [unit]
+    ``rate_Hz``, ``density``, ``corner_Hz``, ``bandwidth_Hz``: as there. ``lowest_Hz``: f_1, positive. Returns [unit].
     """
     nyquist = rate_Hz / 2.0
     if nyquist <= lowest_Hz:
@@ -132,20 +94,8 @@ def flicker_sigma(rate_Hz: float, density: float, corner_Hz: float, bandwidth_Hz
 def random_walk(n: int, channels: int, rate_Hz: float, per_root_hour: float, rng: np.random.Generator) -> FloatArray:
     """Drift that starts at zero and whose variance grows by ``per_root_hour²`` in an hour.
 
-    Parameters
-    ----------
-    n, channels : int
-        Samples, and independent channels.
-    rate_Hz : float
-        Sampling rate.
-    per_root_hour : float
-        [unit/√h]
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    ndarray, shape (n, channels)
-        [unit]
+    ``n``, ``channels``: samples, and independent channels. ``rate_Hz``: sampling rate. ``per_root_hour`` [unit/√h].
+    Returns (n, channels) [unit].
     """
     steps = rng.standard_normal((n, channels)) * (per_root_hour / math.sqrt(HOUR_S * rate_Hz))
     steps[0] = 0.0
@@ -155,17 +105,8 @@ def random_walk(n: int, channels: int, rate_Hz: float, per_root_hour: float, rng
 def low_passed(values: FloatArray, rate_Hz: float, bandwidth_Hz: float) -> FloatArray:
     """What a first-order low-pass makes of a signal that is linear between its samples and constant before them.
 
-    Parameters
-    ----------
-    values : ndarray, shape (n, channels)
-    rate_Hz : float
-        Sampling rate.
-    bandwidth_Hz : float
-        Where the amplitude has fallen by 3 dB; infinite = no filter.
-
-    Returns
-    -------
-    ndarray, shape (n, channels)
+    Shapes ``values`` (n, channels) -> (n, channels). ``rate_Hz``: sampling rate. ``bandwidth_Hz``: where the amplitude
+    has fallen by 3 dB; infinite = no filter.
     """
     if math.isinf(bandwidth_Hz):
         return values

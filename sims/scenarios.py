@@ -57,7 +57,6 @@ def simulate(scenario: MagneticScenario | AttitudeScenario, seed: int | Sequence
 
     Parameters
     ----------
-    scenario : MagneticScenario or AttitudeScenario
     seed : int
         Of all random numbers; of a satellite also several, one for every run.
 

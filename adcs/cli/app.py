@@ -43,16 +43,5 @@ for _name, _where, _help in (
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        The command and its arguments; by default those of the process.
-
-    Returns
-    -------
-    int
-        Exit status: 0 done, 2 bad input, 130 interrupted, 141 the reader of the output is gone.
-    """
+    """Run one command."""
     return framework.run(app, arguments)

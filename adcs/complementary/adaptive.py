@@ -1,17 +1,6 @@
-r"""Adaptive error-state filter: field, Sun and gyro, with a bias whose steps it finds by itself.
+"""Adaptive error-state filter: field, Sun and gyro, with a bias whose steps it finds by itself.
 
-The state is the error of attitude and bias: :math:`q = \hat q \circ \exp(\delta\theta)`, :math:`\beta = \hat\beta +
-\delta\beta`, and with the gyro's reading less the bias, ω,
-
-.. math:: \delta\theta_{i+1} = e^{-[\omega h \times]} \delta\theta_i - h\,\delta\beta_i, \qquad
-    v_{body} - A(\hat q) v_{reference} = [A(\hat q) v_{reference} \times]\, \delta\theta + \text{noise}
-
-A measured unit vector has two degrees of freedom, along axes across it. The bias is taken for nearly constant, which
-makes the filter good and slow; when it steps, the innovations grow, and whenever their smoothed normalised square (NIS
-for each degree of freedom) exceeds a threshold, the covariance of the bias grows until they are as small as they
-should be. Estimates at an instant have seen its readings.
-
-A gyro whose reading is missing is not foreseen; a vector that is missing is left out, so that an outage needs nothing.
+See docs/theory/complementary-filters.md.
 """
 
 from __future__ import annotations
@@ -82,33 +71,17 @@ class AdaptiveTuning:
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveTrack:
-    """Estimates of every run at every instant, with its readings.
+    """Estimates of every run at every instant, with its readings."""
 
-    Attributes
-    ----------
-    q : ndarray, shape (R, n, 4)
-        Reference from body.
-    bias_rad_s : ndarray, shape (R, n, 3)
-        Of the gyro.
-    covariance : ndarray, shape (R, n, 6, 6)
-        Of the error angle in body axes and the bias [rad, rad/s].
-    smoothed_nis : ndarray, shape (R, n)
-        For each degree of freedom.
-    """
-
-    q: FloatArray
-    bias_rad_s: FloatArray
-    covariance: FloatArray
-    smoothed_nis: FloatArray
+    q: FloatArray  # (R, n, 4): reference from body
+    bias_rad_s: FloatArray  # (R, n, 3): of the gyro
+    covariance: FloatArray  # (R, n, 6, 6): of the error angle in body axes and the bias [rad, rad/s]
+    smoothed_nis: FloatArray  # (R, n): for each degree of freedom
 
     def nees(self, q_true: ArrayLike, bias_true_rad_s: ArrayLike) -> FloatArray:
         """Squared errors in units of the covariance, 6 on average where it is right, shape (R, n).
 
-        Parameters
-        ----------
-        q_true : array_like, shape (R, n, 4)
-        bias_true_rad_s : array_like
-            Broadcasts to (R, n, 3).
+        Shape ``q_true`` (R, n, 4). ``bias_true_rad_s``: broadcasts to (R, n, 3).
         """
         angle = 2.0 * quaternion.error_vector(self.q, q_true)
         x = np.concatenate([angle, np.broadcast_to(bias_true_rad_s, angle.shape) - self.bias_rad_s], axis=-1)
@@ -126,14 +99,8 @@ def adaptive_track(
 
     Parameters
     ----------
-    record : VectorRecord
-    tuning : AdaptiveTuning
     q_start : array_like, shape (4,) or (R, 4)
         First estimate.
-
-    Returns
-    -------
-    AdaptiveTrack
 
     Raises
     ------
@@ -172,11 +139,7 @@ def adaptive_steps(
 ) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
     """Readable twin of :func:`adaptive_track`: attitude, bias and covariance of one run at every instant.
 
-    Yields
-    ------
-    q : ndarray, shape (4,)
-    bias : ndarray, shape (3,)
-    covariance : ndarray, shape (6, 6)
+    Yields ``q`` (4,), ``bias`` (3,), ``covariance`` (6, 6).
     """
     h = record.dt_s
     shared = 0 if record.first_reference.shape[0] == 1 else run

@@ -1,23 +1,7 @@
-r"""Complementary filters: a gyro's rate, corrected by two measured vectors, such as field and Sun.
+"""Complementary filters: a gyro's rate, corrected by two measured vectors, such as field and Sun.
 
-In one axis an angle of a vector sensor and the gyro's integral are blended by :math:`G_a = k/(s+k)` and
-:math:`G_g = s/(s+k)`, whose sum is 1: what the filter passes of one, it takes away of the other. In three axes
-
-.. math:: \dot{\hat q} = \tfrac12 \hat q \circ (\omega_{gyro} - A(\hat q)\,\omega_{frame} + K_P e + I), \qquad
-    \dot I = K_I e
-
-in steps :math:`\hat q \leftarrow \exp(-\omega_{frame} h) \circ \hat q \circ \exp((\omega_{gyro} + K_P e + I) h)`. Here
-e is the error angle that the vectors show, and I becomes minus the bias of the gyro. The explicit filter has
-:math:`e = \sum v \times A(\hat q) v_{reference}`; that of :mod:`adcs.complementary.gauss_newton` has the angle to a
-measured quaternion. Both are taken of unit vectors.
-
-The reference frame may turn (the orbital frame does) and need not (north, west, up on Earth). When the second vector is
-missing, :mod:`adcs.complementary.outage` may put another one in its place, and the gains of the outage hold: an
-integral that is not frozen then takes the turning of the field for a bias. Estimates at an instant have not seen its
-readings.
-
-Source: a Ukrainian paper on the attitude of a magnetically stabilised satellite, by its equations. Ours: the rate of
-the frame, unit vectors, gains, frozen integral.
+See docs/theory/complementary-filters.md. Source: a Ukrainian paper on the attitude of a magnetically stabilised
+satellite, by its equations. Ours: the rate of the frame, unit vectors, gains, frozen integral.
 """
 
 from __future__ import annotations
@@ -130,21 +114,11 @@ BEST_GAINS = Gains()
 
 @dataclass(frozen=True, eq=False)
 class ComplementaryTrack:
-    """Estimates of every run at every instant, before its readings.
+    """Estimates of every run at every instant, before its readings."""
 
-    Attributes
-    ----------
-    q : ndarray, shape (R, n, 4)
-        Reference from body.
-    integral_rad_s : ndarray, shape (R, n, 3)
-        I; minus the bias of the gyro.
-    q_measured : ndarray, shape (R, n, 4)
-        Measured quaternions, of the instant's readings; NaN of the explicit filter.
-    """
-
-    q: FloatArray
-    integral_rad_s: FloatArray
-    q_measured: FloatArray
+    q: FloatArray  # (R, n, 4): reference from body
+    integral_rad_s: FloatArray  # (R, n, 3): I; minus the bias of the gyro
+    q_measured: FloatArray  # (R, n, 4): measured quaternions, of the instant's readings; NaN of the explicit filter
 
 
 def explicit_error(
@@ -154,18 +128,8 @@ def explicit_error(
 ) -> FloatArray:
     """Error angle e = Σ weight · v × A(q̂) v_reference.
 
-    Parameters
-    ----------
-    q : ndarray, shape (4,)
-        Estimate, reference from body.
-    vectors : list of (body, reference)
-        Unit vectors (3,), NaN where missing.
-    weights : tuple of float
-
-    Returns
-    -------
-    ndarray, shape (3,)
-        Body axes [rad]: for two unit vectors Σ (E - vvᵀ) δθ of a small error δθ.
+    ``q`` (4,): estimate, reference from body. ``vectors``: unit vectors (3,), NaN where missing. Returns (3,): body
+    axes [rad]: for two unit vectors Σ (E - vvᵀ) δθ of a small error δθ.
     """
     e = np.zeros(3)
     for (body, reference), weight in zip(vectors, weights, strict=True):
@@ -185,16 +149,10 @@ def explicit_track(
 
     Parameters
     ----------
-    record : VectorRecord
-    gains : Gains
     q_start : array_like, shape (4,) or (R, 4)
         First estimate.
     substitution : Substitution
         In place of a second vector that is missing.
-
-    Returns
-    -------
-    ComplementaryTrack
 
     Raises
     ------
@@ -262,20 +220,9 @@ def steps(
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Readable twin of the compiled filters: (q̂, I) of one run at every instant.
 
-    Parameters
-    ----------
-    record : VectorRecord
-    correction : callable
-        Error angle e of an estimate and the instant's two unit vectors, such as :func:`explicit_error` or
-        :class:`adcs.complementary.gauss_newton.MeasuredQuaternion`.
-    gains, q_start, substitution
-        As :func:`explicit_track`.
-    run : int
-
-    Yields
-    ------
-    q : ndarray, shape (4,)
-    integral : ndarray, shape (3,)
+    ``correction``: error angle e of an estimate and the instant's two unit vectors, such as :func:`explicit_error` or
+    :class:`adcs.complementary.gauss_newton.MeasuredQuaternion`. ``gains``, ``q_start``, ``substitution``: as
+    :func:`explicit_track`. Yields ``q`` (4,), ``integral`` (3,).
     """
     h = record.dt_s
     shared = 0 if record.first_reference.shape[0] == 1 else run

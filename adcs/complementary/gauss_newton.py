@@ -1,15 +1,7 @@
-r"""Filter with a measured quaternion: Gauss and Newton's method on two measured vectors, one step for each sample.
+"""Filter with a measured quaternion: Gauss and Newton's method on two measured vectors, one step for each sample.
 
-The measured quaternion makes :math:`J = \sum |v_{reference} - R(q) v_{body}|^2` least, where R maps body to reference
-and is written as a homogeneous form, :math:`R(q)v = (q_0^2 - p \cdot p)v + 2p(p \cdot v) + 2q_0\, p \times v`: its
-length is observable, which keeps the normal equations regular while the two vectors are not collinear. For nearly
-collinear ones μE is added to them.
-
-For unit vectors and q = 1∘(1 + η) the step is :math:`\mathrm{vec}\,\eta = \tfrac12 (\sum (E - vv^T))^{-1}
-\sum v \times A(q) v_{reference}`: the error of the explicit filter, with its gain the same in all directions. That is
-why the two filters are equal within a third at equal gains.
-
-Source: as :mod:`adcs.complementary.explicit`; it has R mapping reference to body, which its J contradicts.
+See docs/theory/complementary-filters.md. Source: as :mod:`adcs.complementary.explicit`; it has R mapping reference to
+body, which its J contradicts.
 """
 
 from __future__ import annotations
@@ -51,17 +43,8 @@ def rotation_derivative(q: ArrayLike, v: ArrayLike) -> FloatArray:
 def gauss_newton_step(q: FloatArray, vectors: list[tuple[FloatArray, FloatArray]], mu: float = MU) -> FloatArray:
     """One step q - (AᵀA + μE)⁻¹Aᵀε, normalised.
 
-    Parameters
-    ----------
-    q : ndarray, shape (4,)
-        Unit quaternion, reference from body.
-    vectors : list of (body, reference)
-        Unit vectors (3,); those with NaN are left out. With one vector the turn around it stays as it is.
-    mu : float
-
-    Returns
-    -------
-    ndarray, shape (4,)
+    ``q`` (4,): unit quaternion, reference from body. ``vectors``: unit vectors (3,); those with NaN are left out. With
+    one vector the turn around it stays as it is. Returns shape (4,).
     """
     present = [(body, reference) for body, reference in vectors if np.isfinite(body).all()]
     if not present:
@@ -75,14 +58,8 @@ def gauss_newton_step(q: FloatArray, vectors: list[tuple[FloatArray, FloatArray]
 class MeasuredQuaternion:
     """Error angle to the measured quaternion, e = 2 vec(q̂*∘q_measured); a correction of :func:`complementary.steps`.
 
-    Parameters
-    ----------
-    mu : float
-
-    Attributes
-    ----------
-    q : ndarray, shape (4,), or None
-        The last measured quaternion. The next one starts from it where both vectors are there, from the estimate else.
+    ``q`` (4,): the last measured quaternion. The next one starts from it where both vectors are there, from the
+    estimate else.
     """
 
     def __init__(self, mu: float = MU) -> None:
@@ -109,18 +86,12 @@ def gauss_newton_track(
 
     Parameters
     ----------
-    record : VectorRecord
-    gains : Gains
     q_start : array_like, shape (4,) or (R, 4)
         First estimate, and where the first measured quaternion starts.
     substitution : Substitution
         In place of a second vector that is missing.
     mu : float
         Added to the normal equations.
-
-    Returns
-    -------
-    ComplementaryTrack
 
     Raises
     ------

@@ -1,16 +1,6 @@
-r"""The same filter on Earth: gyro, accelerometer and magnetometer, a drop-in for the field, the Sun and the gyro.
+"""The same filter on Earth: gyro, accelerometer and magnetometer, a drop-in for the field, the Sun and the gyro.
 
-The second vector is the direction up: the accelerometer's reading is turned by the gyro into a frame that does not turn
-with the sensor, low-passed there, where gravity stands and other accelerations average out, and turned back. The first
-one is the horizontal part of the field, so that a disturbed field cannot tilt the estimate. The bias of the gyro is
-what it shows at rest. The reference frame is east, magnetic north, up; the Earth's rotation is left out.
-
-Near a magnet the field is wrong. :func:`undisturbed` leaves out what has the wrong length or dip. A magnet that moves
-with the sensor adds a constant to its readings: :func:`sensor_fixed_field` estimates that, beside the heading, and
-takes steps of it as they come, so that it can be subtracted and the compass goes on. A constant is all that one
-magnetometer sees of such a magnet: its distance and moment stay unknown.
-
-Source of the low-pass: D. Laidig, T. Seel, VQF, Information Fusion 91, 2023.
+See docs/theory/complementary-filters.md. Source of the low-pass: D. Laidig, T. Seel, VQF, Information Fusion 91, 2023.
 """
 
 from __future__ import annotations
@@ -43,7 +33,6 @@ class InertialMagneticRecord:
 
     Attributes
     ----------
-    dt_s : float
     rate_rad_s, acceleration_m_s2, field_T : ndarray, shape (n, 3)
         The acceleration is 9.8 m/s² upwards at rest.
 
@@ -80,10 +69,7 @@ class InertialMagneticRecord:
 def rest_bias(record: InertialMagneticRecord) -> FloatArray:
     """Bias of the gyro at every instant: the mean of the last 20 rests of 1.5 s, the first of them before it.
 
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        Zero where the sensor never rests [rad/s].
+    Returns (n, 3): zero where the sensor never rests [rad/s].
     """
     window = max(2, round(_REST_S / record.dt_s))
     count = len(record) // window
@@ -105,27 +91,16 @@ def rest_bias(record: InertialMagneticRecord) -> FloatArray:
 class Prepared:
     """What the filter needs of a record.
 
-    Attributes
-    ----------
-    dt_s : float
-    rate_rad_s : ndarray, shape (n, 3)
-        Less the bias.
-    up : ndarray, shape (n, 3)
-        Unit vector, body axes.
-    field_T : ndarray, shape (n, 3)
-        Turned by the gyro to where it would be without the magnetometer's lag.
-    q_level : ndarray, shape (n, 4)
-        Attitude of gyro and accelerometer alone: level from body, with a heading that drifts from an unknown start.
-    lag_s : float
-        Of the magnetometer behind the gyro.
+    ``q_level`` (n, 4): attitude of gyro and accelerometer alone: level from body, with a heading that drifts from an
+    unknown start.
     """
 
     dt_s: float
-    rate_rad_s: FloatArray
-    up: FloatArray
-    field_T: FloatArray
+    rate_rad_s: FloatArray  # (n, 3): less the bias
+    up: FloatArray  # (n, 3): unit vector, body axes
+    field_T: FloatArray  # (n, 3): turned by the gyro to where it would be without the magnetometer's lag
     q_level: FloatArray
-    lag_s: float
+    lag_s: float  # of the magnetometer behind the gyro
 
 
 def prepare(record: InertialMagneticRecord) -> Prepared:
@@ -147,21 +122,8 @@ def prepare(record: InertialMagneticRecord) -> Prepared:
 def inertial_magnetic_track(prepared: Prepared, field_T: FloatArray) -> FloatArray:
     """Attitude by the explicit filter.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    field_T : ndarray, shape (n, 3)
-        ``prepared.field_T``, or what is left of it, NaN where it is not used.
-
-    Returns
-    -------
-    ndarray, shape (n, 4)
-        East, north, up from body.
-
-    Raises
-    ------
-    ValueError
-        There is no field in the first second.
+    ``field_T`` (n, 3): ``prepared.field_T``, or what is left of it, NaN where it is not used. Returns (n, 4): east,
+    north, up from body.
     """
     horizontal = field_T - np.sum(field_T * prepared.up, axis=1, keepdims=True) * prepared.up
     first = horizontal[: round(1.0 / prepared.dt_s)]
@@ -176,18 +138,7 @@ def inertial_magnetic_track(prepared: Prepared, field_T: FloatArray) -> FloatArr
 def undisturbed(prepared: Prepared, *, length: float = 0.1, dip_rad: float = math.radians(5.0)) -> FloatArray:
     """Field, NaN where its length or dip is not that of the first second: the usual rejection.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    length : float
-        Largest relative difference.
-    dip_rad : float
-        Largest difference.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        [T]
+    ``length``: largest relative difference. ``dip_rad``: largest difference. Returns (n, 3) [T].
     """
     n_first = round(1.0 / prepared.dt_s)
     lengths = np.linalg.norm(prepared.field_T, axis=1)
@@ -201,31 +152,18 @@ def undisturbed(prepared: Prepared, *, length: float = 0.1, dip_rad: float = mat
 class MagnetTuning:
     """What :func:`sensor_fixed_field` assumes.
 
-    Attributes
-    ----------
-    block : int
-        Readings that are averaged before they are used.
-    sigma_T : float
-        Of a block, mostly what is left of lag and calibration.
-    start_T : float
-        Standard deviation of the sensor's own offset at the start.
-    walk_T : float
-        Growth of the offset's standard deviation in one second.
-    memory, threshold : float
-        Smoothed squared innovation for each axis (1 on average) above which the offset is taken to change.
-    growth_T : float
-        By which the offset's standard deviation then grows in a block.
-    start_heading_rad, heading_rate_rad_s : float
-        Standard deviations of the heading at the start and of its drift.
+    ``memory``, ``threshold``: smoothed squared innovation for each axis (1 on average) above which the offset is taken
+    to change. ``start_heading_rad``, ``heading_rate_rad_s``: standard deviations of the heading at the start and of its
+    drift.
     """
 
-    block: int = 10
-    sigma_T: float = 1e-6
-    start_T: float = 0.5e-6
-    walk_T: float = 0.02e-6
+    block: int = 10  # readings that are averaged before they are used
+    sigma_T: float = 1e-6  # of a block, mostly what is left of lag and calibration
+    start_T: float = 0.5e-6  # standard deviation of the sensor's own offset at the start
+    walk_T: float = 0.02e-6  # growth of the offset's standard deviation in one second
     memory: float = 0.7
     threshold: float = 5.0
-    growth_T: float = 1.8e-6
+    growth_T: float = 1.8e-6  # by which the offset's standard deviation then grows in a block
     start_heading_rad: float = 0.01
     heading_rate_rad_s: float = math.radians(0.05)
 
@@ -236,11 +174,6 @@ def sensor_fixed_field(prepared: Prepared, tuning: MagnetTuning = MagnetTuning()
     The state is (heading ψ of the level frame, its drift, offset o), and a block of readings, turned to the level
     frame, is :math:`f(\psi) + R\,o`, f the field of the first second turned by ψ. A magnet that comes or goes makes the
     innovations grow, and then the covariance of the offset: the heading is kept by the gyro until both are known.
-
-    Parameters
-    ----------
-    prepared : Prepared
-    tuning : MagnetTuning
 
     Returns
     -------

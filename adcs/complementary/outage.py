@@ -1,13 +1,6 @@
-r"""What stands in for the second vector while its sensor is out: an old first vector, as the field turns.
+"""What stands in for the second vector while its sensor is out: an old first vector, as the field turns.
 
-- "magnetometer-only": nothing. The turning field shows all three angles within a fraction of an orbit.
-- "raw": the field M samples ago, in body and reference, as in the source paper. It is wrong by what the body has turned
-  against the reference frame in between.
-- "transported": the same, turned to the present by the gyro, :math:`A(p^*_{n-M} \circ p_n)\,B_b[n-M]`, and by the
-  frame's own rate, :math:`C_n C^T_{n-M} B_o[n-M]`; p and C are integrated from the rates, less the bias found so far.
-
-The outage begins where the second vector is NaN and ends where it is not. The estimate goes on from where it is, so
-that no hand-over makes a jump: the largest step of a correction is K_P·h·\|e\|, \|e\| being 2 at most.
+See docs/theory/complementary-filters.md.
 """
 
 from __future__ import annotations
@@ -34,7 +27,7 @@ class Substitution:
     Attributes
     ----------
     rule : {'magnetometer-only', 'raw', 'transported'}
-        See the module.
+        See docs/theory/complementary-filters.md.
     delay_s : float
         Age of the field that is taken.
 
@@ -70,11 +63,7 @@ def substitute_code(substitution: Substitution) -> int:
 class Substitute:
     """The delay line of one run: measured first vectors, never one that was put in place of another.
 
-    Parameters
-    ----------
-    substitution : Substitution
-    n_steps : int
-        M.
+    ``n_steps``: M.
     """
 
     def __init__(self, substitution: Substitution, n_steps: int) -> None:
@@ -85,10 +74,7 @@ class Substitute:
     def vector(self, first: Pair) -> Pair:
         """(body, reference) in place of the second vector now; NaN where there is none.
 
-        Parameters
-        ----------
-        first : (ndarray, ndarray)
-            Of this instant, the shapes of the answer.
+        ``first``: of this instant, the shapes of the answer.
         """
         missing = np.full_like(first[0], np.nan)
         if self._rule == "magnetometer-only" or len(self._line) < (self._line.maxlen or 0):

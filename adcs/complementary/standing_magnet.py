@@ -26,10 +26,7 @@ _LARGEST_DISTANCE_M = 0.5
 class StandingMagnet:
     """A dipole.
 
-    Attributes
-    ----------
-    position_m, moment_Am2 : ndarray, shape (3,)
-        East, north, up.
+    ``position_m``, ``moment_Am2`` (3,): east, north, up.
     """
 
     position_m: FloatArray
@@ -44,15 +41,10 @@ def locate_standing_magnet(prepared: Prepared, q: FloatArray, position_m: FloatA
 
     Parameters
     ----------
-    prepared : Prepared
     q : ndarray, shape (n, 4)
         East, north, up from body.
     position_m : ndarray, shape (n, 3)
         Of the magnetometer, NaN where unknown.
-
-    Returns
-    -------
-    StandingMagnet
 
     Raises
     ------

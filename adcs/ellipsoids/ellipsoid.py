@@ -1,18 +1,6 @@
-r"""Guaranteed ellipsoids: sets that contain the state for certain, where all that is known of the noise is a bound.
+"""Guaranteed ellipsoids: sets that contain the state for certain, where all that is known of the noise is a bound.
 
-An ellipsoid :math:`E(\tilde x, H)` is :math:`\{x : (x-\tilde x)^T H^{-1} (x-\tilde x) \le 1\}`, and for a singular H
-:math:`\{x : l^T (x-\tilde x) \le \sqrt{l^T H l}` for every l :math:`\}`. The set of all states that readings and bounds
-allow is no ellipsoid; every operation here returns one that contains it, of the smallest trace of H (the sum of the
-squared semi-axes) in a family of one parameter:
-
-* :func:`transformed`, a linear map, exact;
-* :func:`sum_with_segment`, :func:`sum_with_ellipsoid`, what a bounded disturbance adds;
-* :func:`intersect_strip`, what one scalar reading with bounded noise leaves.
-
-They hold for any linear system, see :mod:`adcs.ellipsoids.observer`. The trace adds squares of all state components:
-scale the state so that they are comparable.
-
-Source: Pankratova, Sholokhov, Cybernetics and Systems Analysis 55(1), 2019.
+See docs/theory/guaranteed-ellipsoids.md. Source: Pankratova, Sholokhov, Cybernetics and Systems Analysis 55(1), 2019.
 """
 
 from __future__ import annotations
@@ -114,16 +102,8 @@ class Ellipsoid:
 def quadratic_form(centres: ArrayLike, shapes: ArrayLike, points: ArrayLike) -> FloatArray:
     """(x - x̃)ᵀ (H + 1e-13 tr(H) I)⁻¹ (x - x̃): the addition keeps flat ellipsoids invertible.
 
-    Parameters
-    ----------
-    centres : array_like, shape (..., n)
-    shapes : array_like, shape (..., n, n)
-    points : array_like, shape (..., n)
-
-    Returns
-    -------
-    ndarray, shape (...)
-        Of an ellipsoid that is a point: 0 there and infinite elsewhere.
+    Shapes ``centres`` (..., n), ``shapes`` (..., n, n), ``points`` (..., n). Returns (...): of an ellipsoid that is a
+    point: 0 there and infinite elsewhere.
     """
     shapes = np.asarray(shapes, dtype=np.float64)
     offset = np.asarray(points, dtype=np.float64) - np.asarray(centres, dtype=np.float64)
@@ -140,18 +120,8 @@ def quadratic_form(centres: ArrayLike, shapes: ArrayLike, points: ArrayLike) -> 
 def transformed(ellipsoid: Ellipsoid, A: ArrayLike, offset: ArrayLike = 0.0) -> Ellipsoid:
     """Ellipsoid of all A x + offset.
 
-    Parameters
-    ----------
-    ellipsoid : Ellipsoid
-    A : array_like, shape (m, n)
-        May be singular or map to another dimension.
-    offset : array_like, shape (m,)
-
-    Returns
-    -------
-    Ellipsoid
-        Exact but for an addition of some eps, which covers rounding: a flat or tiny ellipsoid would lose its points to
-        it.
+    Shape ``offset`` (m,). ``A`` (m, n): may be singular or map to another dimension. Returns: exact but for an addition
+    of some eps, which covers rounding: a flat or tiny ellipsoid would lose its points to it.
     """
     A, offset = np.asarray(A, dtype=np.float64), np.asarray(offset, dtype=np.float64)
     # An entry of A H Aᵀ is known to n eps r_i r_j, see the notes of intersect_strip.
@@ -166,15 +136,7 @@ def minimum_trace_sum(H: FloatArray, Q: FloatArray) -> FloatArray:
 
     :math:`(1 + 1/k) Q + (1 + k) H` with :math:`k^2 = \mathrm{tr} Q / \mathrm{tr} H`; its trace is
     :math:`(\sqrt{\mathrm{tr} H} + \sqrt{\mathrm{tr} Q})^2`.
-
-    Parameters
-    ----------
-    H, Q : ndarray, shape (n, n)
-        Positive semidefinite; either may be zero or of low rank.
-
-    Returns
-    -------
-    ndarray, shape (n, n)
+    ``H``, ``Q`` (n, n): positive semidefinite; either may be zero or of low rank. Returns shape (n, n).
     """
     trace_H, trace_Q = float(np.trace(H)), float(np.trace(Q))
     if trace_Q == 0.0:
@@ -189,20 +151,7 @@ def minimum_trace_sum(H: FloatArray, Q: FloatArray) -> FloatArray:
 def sum_with_ellipsoid(ellipsoid: Ellipsoid, Q: ArrayLike) -> Ellipsoid:
     """Ellipsoid of least trace around all x + w with wᵀ Q⁻¹ w ≤ 1.
 
-    Parameters
-    ----------
-    ellipsoid : Ellipsoid
-    Q : array_like, shape (n, n)
-        Positive semidefinite, singular ones as in :class:`Ellipsoid`.
-
-    Returns
-    -------
-    Ellipsoid
-
-    Raises
-    ------
-    ValueError
-        Q is not symmetric positive semidefinite.
+    ``Q`` (n, n): positive semidefinite, singular ones as in :class:`Ellipsoid`.
     """
     added = shape_matrix(Q, ellipsoid.n, "Q")
     return Ellipsoid(ellipsoid.centre, minimum_trace_sum(ellipsoid.shape, added))
@@ -211,22 +160,7 @@ def sum_with_ellipsoid(ellipsoid: Ellipsoid, Q: ArrayLike) -> Ellipsoid:
 def sum_with_segment(ellipsoid: Ellipsoid, direction: ArrayLike, half_length: float) -> Ellipsoid:
     r"""Ellipsoid of least trace around all x + f η with \|η\| ≤ d.
 
-    Parameters
-    ----------
-    ellipsoid : Ellipsoid
-    direction : array_like, shape (n,)
-        f; only its direction counts.
-    half_length : float
-        d, positive.
-
-    Returns
-    -------
-    Ellipsoid
-
-    Raises
-    ------
-    ValueError
-        The direction has no length, or half_length is not positive.
+    ``direction`` (n,): f; only its direction counts. ``half_length``: d, positive.
     """
     return Ellipsoid(
         ellipsoid.centre, minimum_trace_sum(ellipsoid.shape, segment_shape(direction, half_length, ellipsoid.n))
@@ -252,16 +186,12 @@ class Outcome(IntEnum):
 class StripUpdate:
     """Result of a reading.
 
-    Attributes
-    ----------
-    ellipsoid : Ellipsoid
-        Contains what the strip leaves of the ellipsoid before; the same where the outcome is not ``REDUCED``.
-    outcome : Outcome
-        ``INCONSISTENT`` where strip and ellipsoid have no point in common.
+    ``ellipsoid``: contains what the strip leaves of the ellipsoid before; the same where the outcome is not
+    ``REDUCED``.
     """
 
     ellipsoid: Ellipsoid
-    outcome: Outcome
+    outcome: Outcome  # ``INCONSISTENT`` where strip and ellipsoid have no point in common
 
 
 def intersect_strip(
@@ -271,7 +201,6 @@ def intersect_strip(
 
     Parameters
     ----------
-    ellipsoid : Ellipsoid
     direction : array_like, shape (n,)
         h, of any length but zero.
     value : float
@@ -282,10 +211,6 @@ def intersect_strip(
         ``optimal`` has the least trace for the strip as it is; ``tightened`` first narrows the strip to where it
         touches the ellipsoid, which usually gives the smallest set (2 % above the true minimum in the plane, on
         average); ``lemma`` is the source paper's simplified step.
-
-    Returns
-    -------
-    StripUpdate
 
     Raises
     ------
@@ -340,21 +265,7 @@ def intersect_strip(
 def shape_matrix(shape: ArrayLike, n: int, name: str = "shape") -> FloatArray:
     """Symmetric copy of a positive semidefinite matrix, checked.
 
-    Parameters
-    ----------
-    shape : array_like, shape (n, n)
-    n : int
-    name : str
-        What an error calls it.
-
-    Returns
-    -------
-    ndarray, shape (n, n)
-
-    Raises
-    ------
-    ValueError
-        It is not of that size, not finite, not symmetric, or not positive semidefinite.
+    Shapes ``shape`` (n, n) -> (n, n). ``name``: what an error calls it.
     """
     matrix = np.asarray(shape, dtype=np.float64)
     if matrix.shape != (n, n) or not np.isfinite(matrix).all():

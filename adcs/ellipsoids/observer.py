@@ -1,16 +1,7 @@
-r"""Guaranteed observer of a linear system whose disturbances and reading errors are only bounded.
+"""Guaranteed observer of a linear system whose disturbances and reading errors are only bounded.
 
-.. math:: x_{j+1} = A x_j + u_j + w_j, \qquad y_j = H x_j + \xi_j
-
-with known inputs u, disturbances w in an ellipsoid (or a segment, see :func:`adcs.ellipsoids.ellipsoid.segment_shape`)
-around zero, and :math:`|\xi_i| \le c_i`. :func:`predict` and :func:`correct` carry the ellipsoid that contains the
-state for certain, one run at a time; :class:`EllipsoidObserver` does the same for many runs, compiled.
-
-A reading that contradicts the set shows that a bound was too small. Then the bound grows to the larger one of \|ν\| and
-1.5 times itself, and is kept; the set may be enlarged too. That repairs the compatibility, not the guarantee: a state
-that was lost before it showed may be outside of the set.
-
-Source: Pankratova, Sholokhov, Cybernetics and Systems Analysis 55(1), 2019; the factor and the enlargement are ours.
+See docs/theory/guaranteed-ellipsoids.md. Source: Pankratova, Sholokhov, Cybernetics and Systems Analysis 55(1), 2019;
+the factor and the enlargement are ours.
 """
 
 from __future__ import annotations
@@ -94,14 +85,8 @@ def predict(system: BoundedSystem, ellipsoid: Ellipsoid, known_input: ArrayLike 
 
     Parameters
     ----------
-    system : BoundedSystem
-    ellipsoid : Ellipsoid
     known_input : array_like, shape (n,)
         u.
-
-    Returns
-    -------
-    Ellipsoid
     """
     mapped = transformed(ellipsoid, system.A, known_input)
     return Ellipsoid(mapped.centre, minimum_trace_sum(mapped.shape, system.disturbance))
@@ -109,20 +94,11 @@ def predict(system: BoundedSystem, ellipsoid: Ellipsoid, known_input: ArrayLike 
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """Result of the readings of one instant.
-
-    Attributes
-    ----------
-    ellipsoid : Ellipsoid
-    bounds : ndarray, shape (m,)
-        Bounds that the readings do not contradict: to be used from now on.
-    resets : int
-        Channels that contradicted the set.
-    """
+    """Result of the readings of one instant."""
 
     ellipsoid: Ellipsoid
-    bounds: FloatArray
-    resets: int
+    bounds: FloatArray  # (m,): bounds that the readings do not contradict: to be used from now on
+    resets: int  # channels that contradicted the set
 
 
 def correct(
@@ -138,7 +114,6 @@ def correct(
 
     Parameters
     ----------
-    system : BoundedSystem
     ellipsoid : Ellipsoid
         Predicted set.
     readings : array_like, shape (m,)
@@ -149,10 +124,6 @@ def correct(
         See :func:`adcs.ellipsoids.ellipsoid.intersect_strip`.
     reinflation : ndarray, shape (n, n), optional
         Shape of an ellipsoid that is added to the set where a reading contradicts it.
-
-    Returns
-    -------
-    Correction
     """
     bounds, resets = bounds.copy(), 0
     for channel, y in enumerate(np.atleast_1d(np.asarray(readings, dtype=np.float64))):
@@ -175,7 +146,6 @@ class EllipsoidObserver:
 
     Parameters
     ----------
-    system : BoundedSystem
     start : Ellipsoid
         Set of the first state.
     n_runs : int

@@ -1,12 +1,8 @@
-r"""Roll and yaw of a satellite from a horizon sensor and gyros, with guaranteed ellipsoids.
+"""Roll and yaw of a satellite from a horizon sensor and gyros, with guaranteed ellipsoids.
 
-Nothing measures yaw. The orbital motion turns it into roll and back, :math:`\dot\gamma = \omega_x + \omega_0 \psi`,
-:math:`\dot\psi = \omega_z - \omega_0 \gamma`, so that a horizon sensor sees it within a quarter of an orbit. The state
-is (roll γ, yaw ψ) [rad]; gyros give the known input, and the zero shift of the yaw gyro is the disturbance: a number
-within a bound, of which nothing else is known.
-
-Source: Pankratova, Sholokhov, Cybernetics and Systems Analysis 55(1), 2019, section 4. Ours: the increments of the
-gyros as known inputs, which are exact for a constant rate, and the control law of :class:`AttitudeLoop`.
+See docs/theory/guaranteed-ellipsoids.md. Source: Pankratova, Sholokhov, Cybernetics and Systems Analysis 55(1), 2019,
+section 4. Ours: the increments of the gyros as known inputs, which are exact for a constant rate, and the control law
+of :class:`AttitudeLoop`.
 """
 
 from __future__ import annotations
@@ -54,26 +50,10 @@ def roll_yaw_system(
 ) -> BoundedSystem:
     """The system that the observer takes.
 
-    Parameters
-    ----------
-    noise_rad : float
-        c, largest error of the horizon sensor, positive.
-    drift_rad_s : float
-        Largest zero shift of the yaw gyro, positive. It must be that of the gyro in use: with a better gyro and the old
-        bound nothing is gained.
-    orbital_rate : float
-        ω₀ [rad/s]. The source paper takes what the pitch gyro shows, whose zero shift is in no bound: 0.02 °/s are a
-        third of ω₀, and void the guarantee.
-    step_s : float
-
-    Returns
-    -------
-    BoundedSystem
-
-    Raises
-    ------
-    ValueError
-        A bound is not positive.
+    ``noise_rad``: c, largest error of the horizon sensor, positive. ``drift_rad_s``: largest zero shift of the yaw
+    gyro, positive. It must be that of the gyro in use: with a better gyro and the old bound nothing is gained.
+    ``orbital_rate``: ω₀ [rad/s]. The source paper takes what the pitch gyro shows, whose zero shift is in no bound:
+    0.02 °/s are a third of ω₀, and void the guarantee.
     """
     c = positive_bound(noise_rad, "noise_rad")
     drift = positive_bound(drift_rad_s, "drift_rad_s") * step_s * input_matrix(orbital_rate, step_s)[:, YAW]
@@ -95,25 +75,9 @@ def constant_shift_system(noise_rad: float, drift_rad_s: float) -> tuple[Bounded
 
     Ours. Where the shift is known to be constant the set becomes far smaller: after an orbit, with c = 1° and
     0.02 °/s, half a degree in yaw instead of four. A shift that drifts is a disturbance of the third state.
-
-    Parameters
-    ----------
-    noise_rad : float
-        c, positive.
-    drift_rad_s : float
-        Largest shift, positive.
-
-    Returns
-    -------
-    system : BoundedSystem
-        Of (roll, yaw, 3 c · shift / drift_rad_s), so that the states have comparable sizes.
-    first : Ellipsoid
-        Around roll and yaw within 3 c and all shifts within the bound.
-
-    Raises
-    ------
-    ValueError
-        A bound is not positive.
+    ``noise_rad``: c, positive. ``drift_rad_s``: largest shift, positive. Returns ``system`` of (roll, yaw, 3 c · shift
+    / drift_rad_s), so that the states have comparable sizes. Returns ``first`` around roll and yaw within 3 c and all
+    shifts within the bound.
     """
     c, drift = positive_bound(noise_rad, "noise_rad"), positive_bound(drift_rad_s, "drift_rad_s")
     A = np.eye(3)
@@ -129,20 +93,9 @@ def roll_yaw_observer(
 ) -> EllipsoidObserver:
     """Observers of many runs.
 
-    Parameters
-    ----------
-    system : BoundedSystem
-        See :func:`roll_yaw_system`.
-    n_runs : int
-    rule : {'tightened', 'optimal', 'lemma'}
-        The first has the smallest sets of this satellite, and recovers best from a bound that was wrong.
-    reinflation_rad : float, optional
-        Radius of the circle that is added to a set that a reading contradicts, 4 c by default; zero as in the source
-        paper.
-
-    Returns
-    -------
-    EllipsoidObserver
+    ``system``: see :func:`roll_yaw_system`. ``rule``, one of 'tightened', 'optimal', 'lemma': the first has the
+    smallest sets of this satellite, and recovers best from a bound that was wrong. ``reinflation_rad``: radius of the
+    circle that is added to a set that a reading contradicts, 4 c by default; zero as in the source paper.
     """
     c = float(system.bounds[0])
     radius = 4.0 * c if reinflation_rad is None else reinflation_rad
@@ -151,24 +104,12 @@ def roll_yaw_observer(
 
 @dataclass(frozen=True, eq=False)
 class SetTrack:
-    """Sets of many runs through time, the first one of the start.
+    """Sets of many runs through time, the first one of the start."""
 
-    Attributes
-    ----------
-    centres : ndarray, shape (n_runs, n_steps + 1, 2)
-        (roll, yaw) [rad].
-    shapes : ndarray, shape (n_runs, n_steps + 1, 2, 2)
-        [rad²].
-    bounds : ndarray, shape (n_runs, n_steps + 1)
-        Bound of the horizon sensor in force [rad].
-    resets : ndarray of int, shape (n_runs, n_steps + 1)
-        Contradictions until then.
-    """
-
-    centres: FloatArray
-    shapes: FloatArray
-    bounds: FloatArray
-    resets: IntArray
+    centres: FloatArray  # (n_runs, n_steps + 1, 2): (roll, yaw) [rad]
+    shapes: FloatArray  # (n_runs, n_steps + 1, 2, 2): [rad²]
+    bounds: FloatArray  # (n_runs, n_steps + 1): bound of the horizon sensor in force [rad]
+    resets: IntArray  # (n_runs, n_steps + 1): contradictions until then
 
     @property
     def yaw_half_widths(self) -> FloatArray:
@@ -200,16 +141,8 @@ class Recorder:
 def observe(observer: EllipsoidObserver, readings_rad: FloatArray) -> SetTrack:
     """Sets of many runs without known inputs: the dynamics of the error alone.
 
-    Parameters
-    ----------
-    observer : EllipsoidObserver
-        At its start; goes on to the end.
-    readings_rad : ndarray, shape (n_runs, n_steps)
-        Roll readings after every step, NaN where missing.
-
-    Returns
-    -------
-    SetTrack
+    ``observer``: at its start; goes on to the end. ``readings_rad`` (n_runs, n_steps): roll readings after every step,
+    NaN where missing.
     """
     recorder = Recorder(observer, readings_rad.shape[1])
     for readings in readings_rad.T:
@@ -224,18 +157,7 @@ class AttitudeLoop:
 
     The torque is :math:`-J (k_p\,\alpha + k_d\,\omega_{rel})`, J the nominal inertia, α the estimated roll and yaw and
     the measured pitch, ω_rel the gyros' rates relative to the orbital frame.
-
-    Parameters
-    ----------
-    observer : EllipsoidObserver
-    n_steps : int
-        Cycles at most.
-    orbital_rate : float
-        Of the control law [rad/s].
-
-    Attributes
-    ----------
-    recorder : Recorder
+    ``n_steps``: cycles at most. ``orbital_rate``: of the control law [rad/s].
     """
 
     KP = 0.0025
@@ -249,19 +171,9 @@ class AttitudeLoop:
     def __call__(self, horizon_rad: FloatArray, increments_rad: FloatArray, rates_rad_s: FloatArray) -> FloatArray:
         """One cycle: the readings at its end, and the torque to hold during the next one.
 
-        Parameters
-        ----------
-        horizon_rad : ndarray, shape (n_runs, 2)
-            Roll and pitch readings.
-        increments_rad : ndarray, shape (n_runs, 3)
-            Increments of the three gyros in the cycle.
-        rates_rad_s : ndarray, shape (n_runs, 3)
-            Rates of the three gyros at its end.
-
-        Returns
-        -------
-        ndarray, shape (n_runs, 3)
-            Torque in the body frame [N·m].
+        ``horizon_rad`` (n_runs, 2): roll and pitch readings. ``increments_rad`` (n_runs, 3): increments of the three
+        gyros in the cycle. ``rates_rad_s`` (n_runs, 3): rates of the three gyros at its end. Returns (n_runs, 3):
+        torque in the body frame [N·m].
         """
         self._observer.predict(np.einsum("ij,rj->ri", self._input, increments_rad[:, [0, 2]]))
         self._observer.correct(horizon_rad[:, :1])
@@ -274,18 +186,10 @@ class AttitudeLoop:
 
 @dataclass(frozen=True, eq=False)
 class KalmanTrack:
-    """Kalman estimates of one run through time, the first one of the start.
+    """Kalman estimates of one run through time, the first one of the start."""
 
-    Attributes
-    ----------
-    means : ndarray, shape (n_steps + 1, 2)
-        (roll, yaw) [rad].
-    covariances : ndarray, shape (n_steps + 1, 2, 2)
-        [rad²].
-    """
-
-    means: FloatArray
-    covariances: FloatArray
+    means: FloatArray  # (n_steps + 1, 2): (roll, yaw) [rad]
+    covariances: FloatArray  # (n_steps + 1, 2, 2): [rad²]
 
 
 def kalman_track(
@@ -295,19 +199,9 @@ def kalman_track(
 
     Uniform numbers within ±b have the variance b²/3; the first standard deviation is a third of the first set's
     radius, so that both ellipses, this one at 3 σ, start equal.
-
-    Parameters
-    ----------
-    system : BoundedSystem
-        See :func:`roll_yaw_system`.
-    readings_rad : ndarray, shape (n_steps,)
-        Roll readings after every step, NaN where missing.
-    increments_rad : ndarray, shape (n_steps, 3), optional
-        Increments of the gyros in every step; none for the dynamics of the error alone.
-
-    Returns
-    -------
-    KalmanTrack
+    ``system``: see :func:`roll_yaw_system`. ``readings_rad`` (n_steps,): roll readings after every step, NaN where
+    missing. ``increments_rad`` (n_steps, 3): increments of the gyros in every step; none for the dynamics of the error
+    alone.
     """
     noise_rad = float(system.bounds[0])
     eigenvalue, eigenvector = np.linalg.eigh(system.disturbance / 3.0)
@@ -331,16 +225,7 @@ def kalman_track(
 def violations(track: SetTrack, states_rad: FloatArray, tolerance: float = 1e-9) -> IntArray:
     """Instants at which the true state is outside of the set, its form above 1 + tolerance.
 
-    Parameters
-    ----------
-    track : SetTrack
-    states_rad : ndarray, shape (n_runs, n_steps + 1, 2)
-        True (roll, yaw) [rad].
-    tolerance : float
-
-    Returns
-    -------
-    ndarray of int, shape (n_runs,)
+    ``states_rad`` (n_runs, n_steps + 1, 2): true (roll, yaw) [rad]. Returns shape (n_runs,).
     """
     forms = quadratic_form(track.centres, track.shapes, states_rad)
     return np.count_nonzero(forms > 1.0 + tolerance, axis=1).astype(np.int64)

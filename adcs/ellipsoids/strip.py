@@ -1,19 +1,7 @@
-r"""How far an ellipsoid shrinks to a strip: the step λ of the one-parameter family, its optimum and its bounds.
+"""How far an ellipsoid shrinks to a strip: the step λ of the one-parameter family, its optimum and its bounds.
 
-The strip :math:`|y - h^T x| \le c` cuts the ellipsoid of centre x̃ and shape H. Three numbers describe the cut, with
-:math:`e^2 = h^T H h`, the half-width of the ellipsoid along h:
-
-* :math:`\mu = (y - h^T \tilde x)/e`, where the middle of the strip is,
-* :math:`\delta = c/e`, the half-width of the strip,
-* :math:`g = h^T H^2 h / (e^2\,\mathrm{tr} H) \in (0, 1]`, the share of the trace that the cut can take away.
-
-For every λ in [0, 1) the ellipsoid of shape :math:`\beta^2 (H - \lambda e^{-2} H h h^T H)`, centred at
-:math:`\tilde x + \lambda (\mu / e) H h`, contains the intersection (:func:`growth` has β²). Its trace relative to that
-of H is :func:`trace_ratio`, F(λ); :func:`optimal_step` minimises it and :func:`lemma_step` is a simple step that always
-decreases it.
-
-Source: Pankratova, Sholokhov, Cybernetics and Systems Analysis 55(1), 2019. The tightening of the strip, the search of
-the cubic's root and the floors are ours.
+See docs/theory/guaranteed-ellipsoids.md. Source: Pankratova, Sholokhov, Cybernetics and Systems Analysis 55(1), 2019.
+The tightening of the strip, the search of the cubic's root and the floors are ours.
 """
 
 from __future__ import annotations
@@ -86,17 +74,9 @@ def tightened_strip(mu: float, delta: float) -> tuple[float, float]:
 def cut(mu: float, delta: float, g: float, rule: StepRule) -> tuple[float, float, float] | None:
     r"""Middle μ of the strip that is used, step λ and growth β² of an update, floors included.
 
-    Parameters
-    ----------
-    mu, delta, g : float
-        Of a strip that touches the ellipsoid, \|μ\| ≤ 1 + δ.
-    rule : {'lemma', 'optimal', 'tightened'}
-        ``tightened`` is the optimal step of :func:`tightened_strip`.
-
-    Returns
-    -------
-    tuple of float, or None
-        None where the update would not decrease the trace.
+    ``mu``, ``delta``, ``g``: of a strip that touches the ellipsoid, \|μ\| ≤ 1 + δ. ``rule``, one of 'lemma', 'optimal',
+    'tightened': ``tightened`` is the optimal step of :func:`tightened_strip`. Returns: None where the update would not
+    decrease the trace.
     """
     if rule == "tightened":
         mu, delta = tightened_strip(mu, delta)

@@ -23,35 +23,17 @@ KNOTS_S = 30.0
 
 @dataclass(frozen=True, eq=False)
 class Environment:
-    """Surroundings of one or several runs (...) at n instants each.
+    """Surroundings of one or several runs (...) at n instants each."""
 
-    Attributes
-    ----------
-    utc : ndarray of datetime64, shape (..., n)
-    time_s : ndarray, shape (n,)
-        Since the start of the run.
-    position_eci_m, velocity_eci_m_s : ndarray, shape (..., n, 3)
-    b_orbital_T : ndarray, shape (..., n, 3)
-        Geomagnetic field.
-    sun_orbital : ndarray, shape (..., n, 3)
-        Unit vector to the Sun, also in eclipse.
-    illuminated : ndarray, shape (..., n)
-        Part of the Sun's disc that is seen.
-    orbital_rate_rad_s : ndarray, shape (..., n)
-        n, rate of the orbital frame about its e2.
-    gravity_s2 : ndarray, shape (..., n)
-        μ/r³, which is n² on a circle.
-    """
-
-    utc: Instants
-    time_s: FloatArray
-    position_eci_m: FloatArray
-    velocity_eci_m_s: FloatArray
-    b_orbital_T: FloatArray
-    sun_orbital: FloatArray
-    illuminated: FloatArray
-    orbital_rate_rad_s: FloatArray
-    gravity_s2: FloatArray
+    utc: Instants  # (..., n)
+    time_s: FloatArray  # (n,): since the start of the run
+    position_eci_m: FloatArray  # (..., n, 3)
+    velocity_eci_m_s: FloatArray  # (..., n, 3)
+    b_orbital_T: FloatArray  # (..., n, 3): geomagnetic field
+    sun_orbital: FloatArray  # (..., n, 3): unit vector to the Sun, also in eclipse
+    illuminated: FloatArray  # (..., n): part of the Sun's disc that is seen
+    orbital_rate_rad_s: FloatArray  # (..., n): n, rate of the orbital frame about its e2
+    gravity_s2: FloatArray  # (..., n): μ/r³, which is n² on a circle
 
     @property
     def sunlit(self) -> BoolArray:
@@ -71,13 +53,7 @@ class Environment:
 
 
 def field_eci(position_eci_m: ArrayLike, utc: Instants, model: Model = "IGRF-14") -> FloatArray:
-    """Geomagnetic field in eci [T] at positions (..., 3) and instants (...).
-
-    Raises
-    ------
-    ValueError
-        A date is outside the model's validity.
-    """
+    """Geomagnetic field in eci [T] at positions (..., 3) and instants (...)."""
     rotation = R_ecef_from_eci(utc)
     return turned(rotation.mT, field_ecef(turned(rotation, position_eci_m), utc, model))
 
@@ -85,24 +61,8 @@ def field_eci(position_eci_m: ArrayLike, utc: Instants, model: Model = "IGRF-14"
 def environment(orbit: Orbit, start: Dates, time_s: ArrayLike, *, model: Model = "IGRF-14") -> Environment:
     """Surroundings along an orbit.
 
-    Parameters
-    ----------
-    orbit : Orbit
-    start : datetime, datetime64 or str, or an array of them, shape (...)
-        Start of every run, UTC.
-    time_s : array_like, shape (n,)
-        Since the start, ascending.
-    model : str or Coefficients
-        Of the geomagnetic field: "IGRF-14" (1900 to 2030) or "WMM2025".
-
-    Returns
-    -------
-    Environment
-
-    Raises
-    ------
-    ValueError
-        The times do not ascend or an instant is outside the validity of the field model.
+    ``start`` (...): start of every run, UTC. ``time_s`` (n,): since the start, ascending. ``model``: of the geomagnetic
+    field: "IGRF-14" (1900 to 2030) or "WMM2025".
     """
     seconds = np.atleast_1d(np.asarray(time_s, dtype=np.float64))
     if seconds.ndim != 1 or seconds.size == 0 or not np.isfinite(seconds).all() or (np.diff(seconds) <= 0.0).any():

@@ -122,7 +122,6 @@ def circular_orbit(
         UTC at which the satellite is at ``latitude_argument_deg`` from the ascending node.
     node_deg, local_time_h : float, optional
         Right ascension of the ascending node, by default 0; or mean solar time there at the epoch.
-    latitude_argument_deg : float
 
     Raises
     ------
@@ -140,17 +139,7 @@ def node_of_local_time(local_time_h: float, date: Dates) -> float:
     """Right ascension of an ascending node that is crossed at a mean solar time, LTAN, on a date [rad, 0 to 2π].
 
     The mean Sun is 12 h minus UT away from Greenwich, whose right ascension is the mean sidereal time.
-
-    Parameters
-    ----------
-    local_time_h : float
-        Local mean solar time at the node [h].
-    date : datetime, datetime64 or str
-        UTC.
-
-    Returns
-    -------
-    float
+    ``local_time_h``: local mean solar time at the node [h]. ``date``: UTC.
     """
     day, fraction = julian_dates(instants(date))
     greenwich = float(pyerfa().gmst82(day, fraction))

@@ -18,14 +18,8 @@ _SPEED_OF_LIGHT_AU_DAY = 173.144632674
 def sun_position_eci(utc: Instants) -> FloatArray:
     """Apparent position of the Sun from the Earth's centre in eci [m]; the annual aberration is in it.
 
-    Parameters
-    ----------
-    utc : ndarray of datetime64, shape (...)
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        Good to some arc seconds from 1900 to 2100 (erfa's series of the Earth's orbit; TT stands for TDB).
+    Shape ``utc`` (...). Returns (..., 3): good to some arc seconds from 1900 to 2100 (erfa's series of the Earth's
+    orbit; TT stands for TDB).
     """
     heliocentric, barycentric = pyerfa().epv00(*terrestrial_dates(utc))
     distance = np.linalg.norm(heliocentric["p"], axis=-1)
@@ -41,17 +35,8 @@ def illuminated_fraction(position_eci_m: ArrayLike, sun_position_eci_m: ArrayLik
 
     Both are circles on the sky, of angular radii a (Sun) and b (Earth) and c apart; the hidden part is the lens that
     two circles have in common, over :math:`\pi a^2`.
-
-    Parameters
-    ----------
-    position_eci_m : array_like, shape (..., 3)
-        Of the satellite, outside of the Earth.
-    sun_position_eci_m : array_like, shape (..., 3)
-
-    Returns
-    -------
-    ndarray, shape (...)
-        1 in the sunlight, 0 in the umbra, between them in the penumbra.
+    Shape ``sun_position_eci_m`` (..., 3). ``position_eci_m`` (..., 3): of the satellite, outside of the Earth. Returns
+    (...): 1 in the sunlight, 0 in the umbra, between them in the penumbra.
 
     References
     ----------

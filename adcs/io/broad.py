@@ -28,11 +28,7 @@ class OrientationErrors:
 def orientation_errors(q: FloatArray, q_true: FloatArray, counted: BoolArray) -> OrientationErrors:
     """Errors where they are counted and the truth is known: angle, its part around the vertical, and the rest.
 
-    Parameters
-    ----------
-    q, q_true : ndarray, shape (n, 4)
-        East, north, up from body; NaN where the truth is unknown.
-    counted : ndarray of bool, shape (n,)
+    Shape ``counted`` (n,). ``q``, ``q_true`` (n, 4): east, north, up from body; NaN where the truth is unknown.
     """
     known = counted & np.isfinite(q_true).all(axis=1)
     error = quaternion.multiply(q[known], quaternion.conjugate(quaternion.normalised(q_true[known])))
@@ -47,33 +43,16 @@ def orientation_errors(q: FloatArray, q_true: FloatArray, counted: BoolArray) ->
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """A recording with optical truth.
-
-    Attributes
-    ----------
-    record : InertialMagneticRecord
-    q_true : ndarray, shape (n, 4)
-        East, north, up from body, NaN where unknown.
-    position_m : ndarray, shape (n, 3)
-        NaN where unknown.
-    moving : ndarray of bool, shape (n,)
-        Where errors are counted.
-    """
+    """A recording with optical truth."""
 
     record: InertialMagneticRecord
-    q_true: FloatArray
-    position_m: FloatArray
-    moving: BoolArray
+    q_true: FloatArray  # (n, 4): east, north, up from body, NaN where unknown
+    position_m: FloatArray  # (n, 3): NaN where unknown
+    moving: BoolArray  # (n,): where errors are counted
 
 
 def read_broad(path: Path) -> Trial:
-    """Read a trial of the BROAD benchmark, a MAT file.
-
-    Raises
-    ------
-    OSError
-        The file cannot be read.
-    """
+    """Read a trial of the BROAD benchmark, a MAT file."""
     from scipy.io import loadmat
 
     content = loadmat(path)

@@ -25,20 +25,7 @@ _MODES = {"1": "an image of black and white alone", "I;16": "an image of 16 bits
 def read_frame(path: str | PathLike[str], camera: Camera = Camera()) -> ByteArray:  # noqa: B008 - frozen
     """Frame from a PNG file.
 
-    Parameters
-    ----------
-    path : path-like
-    camera : Camera
-        That took it; gives its size.
-
-    Returns
-    -------
-    ndarray of uint8, shape (height_px, width_px)
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, is no PNG image, has colours or another size or depth, or is black or saturated.
+    ``camera``: that took it; gives its size. Returns shape (height_px, width_px).
     """
     try:
         with warnings.catch_warnings():
@@ -78,21 +65,7 @@ def _size_of(camera: Camera) -> str:
 
 
 def frame_paths(path: str | PathLike[str]) -> list[Path]:
-    """Frames that a path stands for: itself, or all PNG files of a folder in the order of their names.
-
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    list of Path
-
-    Raises
-    ------
-    InputError
-        There is no such file, or no PNG file in the folder.
-    """
+    """Frames that a path stands for: itself, or all PNG files of a folder in the order of their names."""
     place = Path(path)
     if not place.is_dir():
         if not place.exists():
@@ -107,16 +80,7 @@ def frame_paths(path: str | PathLike[str]) -> list[Path]:
 def write_frame(frame: ByteArray, path: str | PathLike[str]) -> None:
     """Write a frame as a PNG file, in one step.
 
-    Parameters
-    ----------
-    frame : ndarray of uint8, shape (height, width)
-    path : path-like
-        Replaced if it exists.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
+    Shape ``frame`` (height, width). ``path``: replaced if it exists.
     """
     target = Path(os.path.realpath(path))
     written = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")

@@ -42,27 +42,12 @@ built_in_scenarios = _FILES.names
 
 @dataclass(frozen=True, eq=False)
 class AttitudeFile:
-    """A scenario file.
-
-    Attributes
-    ----------
-    name : str
-    path : str
-        Of the file, for errors.
-    tables : dict
-        As read.
-    satellite : Satellite
-        Runs start within the 24 hours from its start.
-    duration_s, step_s : float
-    start : StartTable
-    disturbance : DisturbanceTable
-    estimate : EstimateTable
-    """
+    """A scenario file."""
 
     name: str
-    path: str
-    tables: dict[str, Any]
-    satellite: Satellite
+    path: str  # of the file, for errors
+    tables: dict[str, Any]  # as read
+    satellite: Satellite  # runs start within the 24 hours from its start
     duration_s: float
     step_s: float
     start: StartTable

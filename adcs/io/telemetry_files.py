@@ -44,7 +44,6 @@ def read_telemetry(path: str | PathLike[str], step_s: float | None = None) -> Te
 
     Parameters
     ----------
-    path : path-like
     step_s : float, optional
         Time between readings, such as that of the scenario file; by default the shortest between two rows.
 

@@ -45,16 +45,9 @@ def axis_rms(record: TrueRecord, estimates: AttitudeTracks) -> FloatArray:
 def evaluate(record: TrueRecord, estimates: AttitudeTracks) -> dict[str, float | int | None]:
     """Accuracy over the last minute: every axis' rms, its mean over the runs, and of these the worst axis.
 
-    Parameters
-    ----------
-    record : TrueRecord
-    estimates : AttitudeTracks
-
-    Returns
-    -------
-    dict
-        ``angle_rms_deg``, ``rate_rms_deg_s``, ``gyro_bias_rms_deg_s``, ``field_bias_rms_nT``, ``disturbance_rms_s2``
-        (None where the filter has no such state), ``nees_per_dimension``, ``diverged_runs``, ``runs``.
+    Returns: ``angle_rms_deg``, ``rate_rms_deg_s``, ``gyro_bias_rms_deg_s``, ``field_bias_rms_nT``,
+    ``disturbance_rms_s2`` (None where the filter has no such state), ``nees_per_dimension``, ``diverged_runs``,
+    ``runs``.
     """
     used = estimates.settings.sensors
     mean = axis_rms(record, estimates).mean(axis=0)

@@ -89,8 +89,6 @@ def estimate(
 
     Parameters
     ----------
-    telemetry : Telemetry
-    satellite : Satellite
     sensors : str or EstimatorSettings
         Sensors in use, ``st``, ``gyro``, ``mag`` and ``sun`` with + between them, such as ``"mag+sun+gyro"``; or
         everything that a filter may be told, in place of states and filter too.
@@ -161,13 +159,7 @@ def start_of(record: Record, chosen: EstimatorSettings) -> Start:
 
 
 def estimated(record: Record, chosen: EstimatorSettings, start: Start) -> AttitudeTracks:
-    """Tracks of the filter that is wanted.
-
-    Raises
-    ------
-    InputError
-        It cannot estimate from this record.
-    """
+    """Tracks of the filter that is wanted."""
     try:
         with naming(f"filter {chosen.filter}"):
             return _estimated(record, chosen, start)

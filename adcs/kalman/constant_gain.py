@@ -1,12 +1,7 @@
 r"""Filters whose gain is not computed on board: :math:`x^+ = x^- + K \tilde z` with one K.
 
-K is that of a filter which has converged in quasi-stationary motion. For directions to Sun and field it holds only as
-long as they stay about where they were: the gain's H is theirs. A state whose process noise is small has a small gain,
-and takes long to find: with the noise of :func:`adcs.kalman.error_state.tuned_noise` a gyro's bias takes hours.
-
-The covariance is still computed, by Joseph's form, which holds for any gain; the estimate does not use it.
-
-Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014, Table 5.
+See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64,
+2014, Table 5.
 """
 
 from __future__ import annotations
@@ -33,18 +28,8 @@ from arrays.typing import FloatArray
 def converged_gain(record: Record, settings: FilterSettings, start: Start, row: int = -1) -> FloatArray:
     """Gain of the filter at an instant, by default the last, in units of the sensors' noise.
 
-    Parameters
-    ----------
-    record : Record
-    settings : FilterSettings
-    start : Start
-    row : int
-
-    Returns
-    -------
-    ndarray, shape (runs, N, k)
-        For the k residuals of :func:`adcs.kalman.mekf.stacked_residuals`; columns of a sensor without a reading at
-        that instant are zero.
+    Returns (runs, N, k): for the k residuals of :func:`adcs.kalman.mekf.stacked_residuals`; columns of a sensor without
+    a reading at that instant are zero.
     """
     state = run_filter(record, settings, start).at(row)
     H, _ = stacked_residuals(record, row, state, settings)
@@ -57,22 +42,7 @@ def run_constant_gain(
 ) -> AttitudeTracks:
     """Filter of whole runs with one gain.
 
-    Parameters
-    ----------
-    record : Record
-    settings : FilterSettings
-    start : Start
-    gain : ndarray, shape (runs, N, k), optional
-        That of :func:`converged_gain` at the last instant, unless given.
-
-    Returns
-    -------
-    AttitudeTracks
-
-    Raises
-    ------
-    ValueError
-        The start does not suit the record.
+    ``gain`` (runs, N, k): that of :func:`converged_gain` at the last instant, unless given.
     """
     check_start(record, start)
     K = converged_gain(record, settings, start) if gain is None else gain

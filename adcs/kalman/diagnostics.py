@@ -32,15 +32,6 @@ def warnings_of(record: Record, estimates: AttitudeTracks) -> tuple[tuple[str, .
     - one direction with a biased gyro,
     - a field that does not fit its model: an error of the model, or the satellite's own field,
     - innovations that the covariance does not explain.
-
-    Parameters
-    ----------
-    record : Record
-    estimates : AttitudeTracks
-
-    Returns
-    -------
-    tuple of tuple of str, one for every run
     """
     used, runs = estimates.settings.sensors, len(estimates.q)
     found: list[list[str]] = [[] for _ in range(runs)]

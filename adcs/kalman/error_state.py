@@ -1,26 +1,8 @@
-r"""Which sensors a filter has, what it estimates besides attitude and rate, and the process noise that suits them.
+"""Which sensors a filter has, what it estimates besides attitude and rate, and the process noise that suits them.
 
-The error state is (δq, δω, Δb, Δω, d): vector part of the quaternion's error, rate, bias of the magnetometer, bias of
-the gyro, disturbing acceleration; the last three where the set has them, always in this order.
-
-==================  ===========================================  =============================================
-set                 optional states                              what the source's tables call it
-==================  ===========================================  =============================================
-st+gyro+mag+sun                                                  ST+G+M+S
-st+gyro+mag                                                      ST+G+M
-st+mag+sun                                                       ST+M+S
-st+mag              field-bias                                   ST+M, Δb
-st+gyro             none, gyro-bias                              ST+G; ST+G, Δω
-st                                                               ST
-mag+sun+gyro        none, gyro-bias, field-bias                  Mag+Sun+G; with Δω; with Δb
-mag+sun                                                          Mag+Sun
-mag+gyro                                                         Mag+G
-==================  ===========================================  =============================================
-
-``disturbance`` may be added to every one of them.
-
-Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014, Tables 3 to 5. Its exponents are lost
-or unsure: those of :func:`paper_noise` are ours, found from what the filter then reaches.
+See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64,
+2014, Tables 3 to 5. Its exponents are lost or unsure: those of :func:`paper_noise` are ours, found from what the filter
+then reaches.
 """
 
 from __future__ import annotations
@@ -44,12 +26,7 @@ ALWAYS = 6
 class SensorSet:
     """Sensors in use and optional states; made by :func:`sensor_set`, which checks them.
 
-    Attributes
-    ----------
-    star, gyro, magnetometer, sun : bool
-        Sensors.
-    field_bias, gyro_bias, disturbance : bool
-        States.
+    ``star``, ``gyro``, ``magnetometer``, ``sun``: sensors. ``field_bias``, ``gyro_bias``, ``disturbance``: states.
     """
 
     star: bool = False
@@ -90,22 +67,8 @@ class SensorSet:
 def sensor_set(sensors: str, states: Iterable[str] = ()) -> SensorSet:
     """Set of sensors and states by their names.
 
-    Parameters
-    ----------
-    sensors : str
-        Names of :data:`SENSORS` in any order with + between them.
-    states : iterable of str
-        Names of :data:`STATES` in any order.
-
-    Returns
-    -------
-    SensorSet
-
-    Raises
-    ------
-    ValueError
-        A name is unknown or comes twice, a state belongs to a sensor that is not there, or the sensors cannot observe
-        attitude; the sentence says what is missing.
+    ``sensors``: names of :data:`SENSORS` in any order with + between them. ``states``: names of :data:`STATES` in any
+    order.
     """
     names = [name.strip().lower() for name in sensors.split("+")]
     optional = [state.strip().lower() for state in states]
@@ -134,14 +97,6 @@ def check_observable(used: SensorSet) -> None:
     A direction leaves the rotation about it open. The field turns along the orbit, and with a gyro that closes the gap;
     the Sun stays where it is, so that no time helps there. A magnetometer alone, with the known motion, finds attitude
     to a degree after a whole orbit; it is refused as well.
-
-    Parameters
-    ----------
-    used : SensorSet
-
-    Raises
-    ------
-    ValueError
     """
     if used.gyro_bias and not used.gyro:
         raise ValueError("Input states must not have gyro-bias without a gyro; add gyro to the sensors.")
@@ -197,16 +152,7 @@ class ProcessNoise:
 
 
 def tuned_noise(used: SensorSet) -> ProcessNoise:
-    """Process noise with which the filter is accurate and its covariance true, for a constant torque of 8e-7 N·m.
-
-    Parameters
-    ----------
-    used : SensorSet
-
-    Returns
-    -------
-    ProcessNoise
-    """
+    """Process noise with which the filter is accurate and its covariance true, for a constant torque of 8e-7 N·m."""
     if used.disturbance:
         # The torque is in the state: what is left for the rate is almost nothing.
         if used.star and not used.gyro_bias:
@@ -241,21 +187,7 @@ PAPER_NOISE: dict[tuple[str, tuple[str, ...]], ProcessNoise] = {
 
 
 def paper_noise(used: SensorSet) -> ProcessNoise:
-    """Process noise of the source's tables.
-
-    Parameters
-    ----------
-    used : SensorSet
-
-    Returns
-    -------
-    ProcessNoise
-
-    Raises
-    ------
-    ValueError
-        The tables do not have this set.
-    """
+    """Process noise of the source's tables."""
     try:
         return PAPER_NOISE[used.sensors, used.states]
     except KeyError:
@@ -271,8 +203,6 @@ class FilterSettings:
 
     Attributes
     ----------
-    sensors : SensorSet
-    noise : ProcessNoise
     field_error_T : float
         Standard deviation of each component of the field model's error, added to the magnetometer's noise.
     field_bias_sigma_T, gyro_bias_sigma_rad_s, disturbance_sigma_s2 : float
@@ -320,32 +250,18 @@ class FilterSettings:
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """Where the filter starts; the optional states start from zero.
+    """Where the filter starts; the optional states start from zero."""
 
-    Attributes
-    ----------
-    q, w : ndarray, shape (runs, 4), (runs, 3)
-    covariance : ndarray, shape (runs, 6, 6)
-        Of (δq, δω): δq is half of the angle.
-    """
-
-    q: FloatArray
-    w: FloatArray
-    covariance: FloatArray
+    q: FloatArray  # (runs, 4)
+    w: FloatArray  # (runs, 3)
+    covariance: FloatArray  # (runs, 6, 6): of (δq, δω): δq is half of the angle
 
 
 def start_near(q: FloatArray, w: FloatArray, attitude_rad: float, rate_rad_s: float) -> Start:
     """Start from estimates with independent errors.
 
-    Parameters
-    ----------
-    q, w : ndarray, shape (runs, 4), (runs, 3)
-    attitude_rad, rate_rad_s : float
-        Standard deviations per axis, of the angle and of the rate.
-
-    Returns
-    -------
-    Start
+    Shapes ``q`` (runs, 4), ``w`` (runs, 3). ``attitude_rad``, ``rate_rad_s``: standard deviations per axis, of the
+    angle and of the rate.
     """
     variance = np.repeat(np.square([0.5 * attitude_rad, rate_rad_s]), 3)
     return Start(np.array(q), np.array(w), np.tile(np.diag(variance), (len(q), 1, 1)))
@@ -355,12 +271,8 @@ def start_near(q: FloatArray, w: FloatArray, attitude_rad: float, rate_rad_s: fl
 class State:
     """Estimate of all runs at one instant.
 
-    Attributes
-    ----------
-    q, w, field_bias_T, gyro_bias_rad_s, disturbance_s2 : ndarray, shape (runs, 4), then (runs, 3)
-        A state that the filter does not have is zero.
-    P : ndarray, shape (runs, N, N)
-        Covariance of the error state.
+    ``q`` (runs, 4), ``w`` (runs, 3), ``field_bias_T`` (runs, 3), ``gyro_bias_rad_s`` (runs, 3), ``disturbance_s2``
+    (runs, 3): a state that the filter does not have is zero.
     """
 
     q: FloatArray
@@ -368,7 +280,7 @@ class State:
     field_bias_T: FloatArray
     gyro_bias_rad_s: FloatArray
     disturbance_s2: FloatArray
-    P: FloatArray
+    P: FloatArray  # (runs, N, N): covariance of the error state
 
 
 @dataclass(frozen=True, eq=False)
@@ -377,7 +289,6 @@ class AttitudeTracks:
 
     Attributes
     ----------
-    settings : FilterSettings
     q, w, field_bias_T, gyro_bias_rad_s, disturbance_s2 : ndarray, shape (runs, n, 4), then (runs, n, 3)
         Attitude (orbital from body), rate against inertial space; a state that the filter does not have is zero.
     covariance : ndarray, shape (runs, n, N, N)

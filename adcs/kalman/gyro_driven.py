@@ -1,14 +1,7 @@
-r"""Filter of attitude and gyro bias alone, (δq, δΔω): the gyro is its input, not a measurement.
+"""Filter of attitude and gyro bias alone, (δq, δΔω): the gyro is its input, not a measurement.
 
-.. math::
-
-    \dot q = \tfrac12\, q\circ(0, \hat\omega - A\omega_o), \quad \hat\omega = \omega_m - \Delta\hat\omega, \qquad
-    F = \begin{pmatrix} -W(\hat\omega) & -\tfrac12 E \\ 0 & 0 \end{pmatrix}
-
-It needs no inertia, no wheels and no torque. The rate over a step is the mean of the readings at its two ends; in
-place of a reading that is missing stands the last one before it. The rate has the noise of the gyro.
-
-Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014, Table 5, row [λ, Δω].
+See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64,
+2014, Table 5, row [λ, Δω].
 """
 
 from __future__ import annotations
@@ -29,24 +22,9 @@ from arrays.typing import FloatArray
 def run_reduced(record: Record, settings: FilterSettings, start: Start) -> AttitudeTracks:
     """Reduced filter of whole runs.
 
-    Parameters
-    ----------
-    record : Record
-    settings : FilterSettings
-        Of a set with a gyro, the state ``gyro-bias`` and no other. Its q_λ and q_g are used, the gyro's noise is added
-        to the attitude.
-    start : Start
-        Its attitude; the rate is the gyro's.
-
-    Returns
-    -------
-    AttitudeTracks
-        Of the set (δq, δω, δΔω): δω is minus the error of the bias, with the gyro's noise.
-
-    Raises
-    ------
-    ValueError
-        The set is another one, a run's first reading of the gyro is missing, or the start does not suit the record.
+    ``settings``: of a set with a gyro, the state ``gyro-bias`` and no other. Its q_λ and q_g are used, the gyro's noise
+    is added to the attitude. ``start``: its attitude; the rate is the gyro's. Returns: of the set (δq, δω, δΔω): δω is
+    minus the error of the bias, with the gyro's noise.
     """
     used = settings.sensors
     if not used.gyro or used.states != ("gyro-bias",):

@@ -36,19 +36,9 @@ _OPEN_RAD = 2.0
 def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = RATE_RAD_S) -> Start:
     """Start from the readings of the first instant alone.
 
-    Parameters
-    ----------
-    record : Record
-    settings : FilterSettings
-    rate_rad_s : float
-        Standard deviation of each component of the rate against the orbital frame; the gyro's reading is used where the
-        set has one.
-
-    Returns
-    -------
-    Start
-        The covariance tells where the readings leave a turn open: standard deviation 2 rad about it. Elsewhere it is
-        wider than the readings by :data:`AGAIN`.
+    ``rate_rad_s``: standard deviation of each component of the rate against the orbital frame; the gyro's reading is
+    used where the set has one. Returns: the covariance tells where the readings leave a turn open: standard deviation 2
+    rad about it. Elsewhere it is wider than the readings by :data:`AGAIN`.
     """
     used, readings, around = settings.sensors, record.readings, record.environment
     sigma = deviations(record, settings)
@@ -111,26 +101,9 @@ def any_start(
 ) -> Start:
     """Start from any attitude: :func:`vector_start`, and where it leaves a turn open the best of several hypotheses.
 
-    Parameters
-    ----------
-    record : Record
-    settings : FilterSettings
-    turns : int
-        Hypotheses, at equal angles about the axis that is left open.
-    window_s : float
-        How much of the record decides between them.
-    rate_rad_s : float
-        As :func:`vector_start`.
-
-    Returns
-    -------
-    Start
-        Where a hypothesis was chosen, the deviation about the open axis is the distance between hypotheses.
-
-    Raises
-    ------
-    ValueError
-        A run has neither attitude nor direction at its first instant, so that there is no axis to turn about.
+    ``turns``: hypotheses, at equal angles about the axis that is left open. ``window_s``: how much of the record
+    decides between them. ``rate_rad_s``: as :func:`vector_start`. Returns: where a hypothesis was chosen, the deviation
+    about the open axis is the distance between hypotheses.
     """
     start = vector_start(record, settings, rate_rad_s)
     open_runs = np.flatnonzero(largest_deviation_rad(start) > KNOWN_RAD)

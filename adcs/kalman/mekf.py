@@ -1,50 +1,7 @@
-r"""Multiplicative (error-state) Kalman filter of attitude and rate, assembled from any sensors and optional states.
+"""Multiplicative (error-state) Kalman filter of attitude and rate, assembled from any sensors and optional states.
 
-Use::
-
-    used = sensor_set("st+gyro", ["gyro-bias"])                     # adcs.kalman.error_state
-    settings = FilterSettings(used, tuned_noise(used))
-    q, w = start_estimates(runs.prepared, math.radians(5), math.radians(0.1))   # sims, or adcs.kalman.initialisation
-    start = start_near(q, w, math.radians(5), math.radians(0.1))
-    estimates = run_filter(runs, settings, start)                   # AttitudeTracks: compiled, all runs at once
-    numbers = evaluate(runs, estimates)                             # adcs.kalman.accuracy: the keys of `adcs run
-    --json`
-
-    run_readable(record, settings, start, jacobian=..., update=...) # adcs.kalman.mekf: the reference twin
-    smoothed(record, estimates)                                     # adcs.kalman.smoother -> AttitudeTracks
-    run_constant_gain(record, settings, start)                      # adcs.kalman.constant_gain -> AttitudeTracks
-    run_parallel(record, settings, start, forgetting=0.99)          # adcs.kalman.separate_bias -> AttitudeTracks
-    vector_start(record, settings), any_start(record, settings)     # adcs.kalman.initialisation -> Start
-    warnings_of(record, estimates)                                  # adcs.kalman.diagnostics -> tuple of str for every
-    run
-
-The state is (q, ω, Δb, Δω, d), its error (δq, δω, δΔb, δΔω, δd) with :math:`q = \hat q \circ (\sqrt{1-|\delta q|^2},
-\delta q)`, which is put into q̂ after every update. A step predicts by the full equations of motion with the torque that
-was given to the wheels, and the covariance with
-
-.. math::
-
-    \Phi = E + Fh + \tfrac12 (Fh)^2 + \tfrac16 (Fh)^3, \qquad P^- = \Phi P \Phi^T + Q
-
-F being the mean over the step; then every sensor with a reading corrects it:
-
-==============  ====================================  ===========================
-sensor          residual                              rows for (δq, δω, Δb, Δω)
-==============  ====================================  ===========================
-star tracker    vec(q̂*∘q_m), sign of positive scalar  E      0   0   0
-gyro            ω_m - ω̂ - Δω̂                          0      E   0   E
-magnetometer    b_m - A b_o - Δb̂                      2W(b̂)  0   E   0
-Sun sensor      s_m - A s_o                           2W(ŝ)  0   0   0
-==============  ====================================  ===========================
-
-The first reading of directions is linearised at the start. From 5° off that costs consistency for minutes, and the set
-with a bias of the field twice the accuracy: start from :func:`adcs.kalman.initialisation.vector_start` where there is
-no reason not to.
-
-Everything here takes all runs at once as leading axis, and :mod:`adcs.kalman.mekf_compiled` is its compiled twin.
-
-Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014, with the corrections of
-:mod:`adcs.satellite.dynamics`; the factors 2 (δq is half an angle) are missing there.
+See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64,
+2014, with the corrections of :mod:`adcs.satellite.dynamics`; the factors 2 (δq is half an angle) are missing there.
 """
 
 from __future__ import annotations
@@ -235,12 +192,6 @@ def square_root_update(P: FloatArray, H: FloatArray, residual: FloatArray) -> tu
     return np.array(corrections), np.array(covariances)
 
 
-def information_update(P: FloatArray, H: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The same by adding information, P⁻¹ + HᵀH: for tests, since it loses digits where P is nearly singular."""
-    updated = np.asarray(np.linalg.inv(np.linalg.inv(P) + H.mT @ H), dtype=np.float64)
-    return (updated @ H.mT @ residual[..., None])[..., 0], updated
-
-
 def corrected(
     record: Record, row: int, state: State, settings: FilterSettings, update: Update = joseph_update
 ) -> tuple[State, FloatArray]:
@@ -287,19 +238,8 @@ def run_readable(
 ) -> AttitudeTracks:
     """Filter of whole runs in NumPy, the reference of :func:`run_filter`.
 
-    Parameters
-    ----------
-    record : Record
-    settings : FilterSettings
-    start : Start
-    jacobian : callable
-        :func:`known_torque_jacobian`, or :func:`closed_loop_jacobian` to reproduce the source paper.
-    update : callable
-        :func:`joseph_update` or :func:`square_root_update`.
-
-    Returns
-    -------
-    AttitudeTracks
+    ``jacobian``: :func:`known_torque_jacobian`, or :func:`closed_loop_jacobian` to reproduce the source paper.
+    ``update``: :func:`joseph_update` or :func:`square_root_update`.
     """
     check_start(record, start)
     state, nis = corrected(record, 0, first_state(settings, start), settings, update)
@@ -346,13 +286,8 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
     ----------
     record : Record
         Of any number of runs, such as :class:`sims.attitude.simulation.AttitudeRuns`.
-    settings : FilterSettings
     start : Start
         One for every run: :func:`start_near`, or :mod:`adcs.kalman.initialisation`.
-
-    Returns
-    -------
-    AttitudeTracks
 
     Raises
     ------

@@ -1,23 +1,7 @@
 r"""Disturbance d (s⁻²) in :math:`\dot\omega = f(x) + d`, estimated by a filter of its own beside that of the state.
 
-The other way, d in the state itself, is the optional state ``disturbance`` of :mod:`adcs.kalman.error_state`. Here a
-filter without it gives H, Φ, its gain K and its innovation z̃, and
-
-.. math::
-
-    S^- &= \Phi S^+ + B, \quad B = (h^2/4\,E; hE), \qquad P_d^- = P_d/\lambda, \qquad H_d = H S^- \\
-    K_d &= P_d^- H_d^T (H_d P_d^- H_d^T + HP^-H^T + R)^{-1}, \qquad d^+ = d^- + K_d \tilde z, \quad
-    P_d^+ = (E - K_d H_d) P_d^- \\
-    S^+ &= (E - KH) S^-, \qquad x^+ = x^- + K\tilde z + S^+ (d^+ - d^-)
-
-with a forgetting factor λ. S is how the filter's state depends on d. The source paper leaves out the recursion of P_d
-and S and the last term; without that term the filter goes on correcting d for errors which its state still has from the
-old d, and oscillates or diverges (:func:`without_correction`).
-
-With that term this is Friedland's separated bias (IEEE Trans. Automatic Control 14, 1969), whose covariance of the
-whole is :math:`P + S P_d S^T`; it is what the estimates report.
-
-Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014, section on the parallel filter.
+See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64,
+2014, section on the parallel filter.
 """
 
 from __future__ import annotations
@@ -54,26 +38,9 @@ def run_parallel(
 ) -> AttitudeTracks:
     """Filter of whole runs with a parallel filter of the disturbance.
 
-    Parameters
-    ----------
-    record : Record
-    settings : FilterSettings
-        Of a set with the state ``disturbance``; its process noise q_d is not used, forgetting takes its place.
-    start : Start
-    forgetting : float
-        λ, above 0 and up to 1.
-    correction : callable
-        :func:`by_sensitivity`, or :func:`without_correction` to see the printed form fail.
-
-    Returns
-    -------
-    AttitudeTracks
-        Of the set with the disturbance; its covariance is that of the whole.
-
-    Raises
-    ------
-    ValueError
-        The set has no disturbance, λ is out of its range, or the start does not suit the record.
+    ``settings``: of a set with the state ``disturbance``; its process noise q_d is not used, forgetting takes its
+    place. ``forgetting``: λ, above 0 and up to 1. ``correction``: :func:`by_sensitivity`, or :func:`without_correction`
+    to see the printed form fail. Returns: of the set with the disturbance; its covariance is that of the whole.
     """
     if not settings.sensors.disturbance:
         raise ValueError("Input settings must have the state disturbance; instead received a set without it.")

@@ -1,13 +1,6 @@
-r"""Estimates of a finished record with what later readings tell as well: a fixed-interval smoother of the error state.
+"""Estimates of a finished record with what later readings tell as well: a fixed-interval smoother of the error state.
 
-Rauch, Tung and Striebel's recursion, backwards from the last instant, with Φ and the prediction of the filter's step:
-
-.. math::
-
-    C = P \Phi^T (P^-)^{-1}, \qquad \delta x = C\,(x^s_{i+1} \ominus x^-_{i+1}), \qquad
-    P^s = P + C (P^s_{i+1} - P^-_{i+1}) C^T
-
-where the difference of two attitudes is the error vector between them, and δx is put into the filter's state.
+See docs/theory/attitude-kalman-filters.md.
 """
 
 from __future__ import annotations
@@ -26,18 +19,8 @@ from arrays.typing import FloatArray
 def smoothed(record: Record, estimates: AttitudeTracks, jacobian: Jacobian = known_torque_jacobian) -> AttitudeTracks:
     """Smoothed estimates of whole runs.
 
-    Parameters
-    ----------
-    record : Record
-    estimates : AttitudeTracks
-        Of :func:`adcs.kalman.mekf.run_filter`, or of its readable twin.
-    jacobian : callable
-        That of the filter.
-
-    Returns
-    -------
-    AttitudeTracks
-        ``nis`` is that of the filter.
+    ``estimates``: of :func:`adcs.kalman.mekf.run_filter`, or of its readable twin. ``jacobian``: that of the filter.
+    Returns: ``nis`` is that of the filter.
     """
     settings, n = estimates.settings, estimates.q.shape[1]
     later = estimates.at(n - 1)

@@ -40,26 +40,16 @@ _SENSOR_LINES = ("-", "--", "-.", ":")
 class StatesPicture:
     """One run through time.
 
-    Attributes
-    ----------
-    title : str
-    time_s : ndarray, shape (n,)
-    values : ndarray, shape (n, 15)
-        Errors (estimate minus truth) or estimates, in the units of ``adcs``' files; NaN of a state that is not there.
-    sigma : ndarray, shape (n, 15)
-        Standard deviations that the filter gives.
-    are_errors : bool
-        Whether values are errors: their band is around zero.
-    gaps : sequence of (str, ndarray of bool, shape (n,))
-        What was missing, and whether it was there.
+    ``values`` (n, 15): errors (estimate minus truth) or estimates, in the units of ``adcs``' files; NaN of a state that
+    is not there.
     """
 
     title: str
-    time_s: FloatArray
+    time_s: FloatArray  # (n,)
     values: FloatArray
-    sigma: FloatArray
-    are_errors: bool
-    gaps: Sequence[tuple[str, BoolArray]] = ()
+    sigma: FloatArray  # (n, 15): standard deviations that the filter gives
+    are_errors: bool  # whether values are errors: their band is around zero
+    gaps: Sequence[tuple[str, BoolArray]] = ()  # (n,): what was missing, and whether it was there
 
 
 _MISSING = dict(zip(SENSORS, ("no star tracker", "no gyro", "no magnetometer", "no Sun sensor"), strict=True))
@@ -81,16 +71,7 @@ def track_figure(track: AttitudeTrack, name: str = "") -> Figure:
 
 
 def states_figure(picture: StatesPicture) -> Figure:
-    """Every state's three axes side by side, with the filter's ±3σ.
-
-    Parameters
-    ----------
-    picture : StatesPicture
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Every state's three axes side by side, with the filter's ±3σ."""
     rows = [row for row in range(len(GROUPS)) if not np.isnan(picture.values[:, 3 * row]).all()]
     figure = style.new_figure(1.25 * len(rows) + 0.75)
     axes = figure.subplots(len(rows), 3, sharex=True, sharey="row", squeeze=False)
@@ -155,41 +136,20 @@ def _percent(part: float) -> str:
 class ConsistencyPicture:
     """All runs through time.
 
-    Attributes
-    ----------
-    title : str
-    time_s : ndarray, shape (n,)
-    error_deg : ndarray, shape (runs, n), optional
-        Angle between truth and estimate.
-    sigma_deg : ndarray, shape (n,), optional
-        What the filter believes of it, root of the sum of squares of the axes, in the first run.
-    nees : ndarray, shape (runs, n), optional
-        Over its numbers.
-    size : int
-        Numbers of the error state.
-    nis : ndarray, shape (runs, n, 4)
+    ``sigma_deg`` (n,): what the filter believes of it, root of the sum of squares of the axes, in the first run.
     """
 
     title: str
-    time_s: FloatArray
-    error_deg: FloatArray | None
+    time_s: FloatArray  # (n,)
+    error_deg: FloatArray | None  # (runs, n): angle between truth and estimate
     sigma_deg: FloatArray | None
-    nees: FloatArray | None
-    size: int
-    nis: FloatArray
+    nees: FloatArray | None  # (runs, n): over its numbers
+    size: int  # numbers of the error state
+    nis: FloatArray  # (runs, n, 4)
 
 
 def consistency_figure(picture: ConsistencyPicture) -> Figure:
-    """Errors of all runs, NEES and NIS with their bounds.
-
-    Parameters
-    ----------
-    picture : ConsistencyPicture
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Errors of all runs, NEES and NIS with their bounds."""
     n_panels = 1 + 2 * (picture.error_deg is not None)
     figure = style.new_figure(1.75 * n_panels + 0.5)
     axes = list(figure.subplots(n_panels, 1, sharex=True, squeeze=False)[:, 0])
@@ -272,17 +232,7 @@ _COMPARE_LINES = ("-", "--", "-.", ":")
 
 
 def compare_figure(lines: Sequence[tuple[str, FloatArray, FloatArray]]) -> Figure:
-    """Attitude errors of several filters through time.
-
-    Parameters
-    ----------
-    lines : sequence of (str, ndarray, ndarray)
-        Name, times [s] and median errors [°].
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Attitude errors of several filters through time."""
     figure = style.new_figure(3.4 + 0.15 * len(lines))
     ax = figure.add_subplot()
     for i, (name, time_s, error_deg) in enumerate(lines):

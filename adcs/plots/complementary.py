@@ -23,37 +23,18 @@ _MOST_POINTS = 3000
 class ComplementaryPicture:
     """What a figure shows.
 
-    Attributes
-    ----------
-    title : str
-    orbits : ndarray, shape (n,)
-        Instants.
-    errors_deg : dict of ndarray, shape (n, 3)
-        Errors of roll, pitch and yaw, by the name of the filter: explicit, gauss-newton, adaptive.
-    step_orbits : float
-        When the bias steps.
-    outage_orbits : float, optional
-        When the Sun sensor fails.
+    ``errors_deg`` (n, 3): errors of roll, pitch and yaw, by the name of the filter: explicit, gauss-newton, adaptive.
     """
 
     title: str
-    orbits: FloatArray
+    orbits: FloatArray  # (n,): instants
     errors_deg: dict[str, FloatArray]
-    step_orbits: float
-    outage_orbits: float | None = None
+    step_orbits: float  # when the bias steps
+    outage_orbits: float | None = None  # when the Sun sensor fails
 
 
 def complementary_figure(picture: ComplementaryPicture) -> Figure:
-    """Errors of the three axes, one below the other, and the length of the error of every filter on a log scale.
-
-    Parameters
-    ----------
-    picture : ComplementaryPicture
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Errors of the three axes, one below the other, and the length of the error of every filter on a log scale."""
     figure = Figure(figsize=(11.0, 9.0), layout="constrained")
     axes = figure.subplots(4, 1, sharex=True)
     for axis, ax, label in zip(range(3), axes, ("roll", "pitch", "yaw"), strict=False):

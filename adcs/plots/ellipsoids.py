@@ -23,45 +23,19 @@ _KALMAN_LABEL = "Kalman filter (white noise), 3σ"
 
 @dataclass(frozen=True, eq=False)
 class RollYawPicture:
-    """What a figure shows.
-
-    Attributes
-    ----------
-    title : str
-    time_s : ndarray, shape (n_steps + 1,)
-    states_rad : ndarray, shape (n_runs, n_steps + 1, 2)
-        True (roll, yaw).
-    track : SetTrack
-        Sets of the same runs.
-    kalman : KalmanTrack
-        Of the first run.
-    in_loop : bool
-        Whether the states are those of a satellite in its attitude loop.
-    jump_s : float, optional
-        When the readings became worse than their bound.
-    """
+    """What a figure shows."""
 
     title: str
-    time_s: FloatArray
-    states_rad: FloatArray
-    track: SetTrack
-    kalman: KalmanTrack
-    in_loop: bool
-    jump_s: float | None = None
+    time_s: FloatArray  # (n_steps + 1,)
+    states_rad: FloatArray  # (n_runs, n_steps + 1, 2): true (roll, yaw)
+    track: SetTrack  # sets of the same runs
+    kalman: KalmanTrack  # of the first run
+    in_loop: bool  # whether the states are those of a satellite in its attitude loop
+    jump_s: float | None = None  # when the readings became worse than their bound
 
 
 def roll_yaw_figure(picture: RollYawPicture) -> Figure:
-    """Sets in the plane of roll and yaw, the yaw error of the first run, those of all runs, and bound or attitude.
-
-    Parameters
-    ----------
-    picture : RollYawPicture
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Everything but the attitude is relative to the truth, which is the zero line.
-    """
+    """Sets in the plane of roll and yaw, the yaw error of the first run, those of all runs, and bound or attitude."""
     figure = Figure(figsize=(13.0, 7.6), layout="constrained")
     grid = figure.add_gridspec(3, 2, width_ratios=[1.0, 1.15])
     plane, error = figure.add_subplot(grid[:, 0]), figure.add_subplot(grid[0, 1])

@@ -41,20 +41,12 @@ _SHARE, _MARGIN = 0.9, 0.6
 class ZerosPicture:
     """One run whose zeros were found.
 
-    Attributes
-    ----------
-    title : str
-    imu : ImuRecord
-        As read.
-    fixes : FixRecord
-    truth, before, after : PlanarTrack
-        True, and integrated without and with the zeros that were found.
-    position_before_mm, position_after_mm : float
-        Distance from the truth, rms.
+    ``truth``, ``before``, ``after``: true, and integrated without and with the zeros that were found.
+    ``position_before_mm``, ``position_after_mm``: distance from the truth, rms.
     """
 
     title: str
-    imu: ImuRecord
+    imu: ImuRecord  # as read
     fixes: FixRecord
     truth: PlanarTrack
     before: PlanarTrack
@@ -64,16 +56,7 @@ class ZerosPicture:
 
 
 def zeros_figure(picture: ZerosPicture) -> Figure:
-    """Readings, heading, velocities, and positions before and after the fit.
-
-    Parameters
-    ----------
-    picture : ZerosPicture
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Readings, heading, velocities, and positions before and after the fit."""
     figure = style.new_figure(6.6)
     axes = figure.subplots(3, 2, sharex=True)
     imu, fixes = picture.imu, picture.fixes
@@ -125,31 +108,16 @@ def _limits_of_positions(picture: ZerosPicture) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class FusionPicture:
-    """One run of one method.
-
-    Attributes
-    ----------
-    title : str
-    truth, track : PlanarTrack
-        At the same instants.
-    fixes : FixRecord
-        Those that arrived within the run.
-    outcomes : tuple of Outcome
-        What became of them.
-    sigma_m, sigma_rad : ndarray, shapes (n, 2) and (n,), optional
-        What the method believes of its errors.
-    begin_s : float
-        What is before it does not count, and is left out of the limits.
-    """
+    """One run of one method."""
 
     title: str
-    truth: PlanarTrack
-    track: PlanarTrack
-    fixes: FixRecord
-    outcomes: tuple[Outcome, ...]
-    sigma_m: FloatArray | None = None
-    sigma_rad: FloatArray | None = None
-    begin_s: float = 10.0
+    truth: PlanarTrack  # at the same instants
+    track: PlanarTrack  # at the same instants
+    fixes: FixRecord  # those that arrived within the run
+    outcomes: tuple[Outcome, ...]  # what became of them
+    sigma_m: FloatArray | None = None  # (n, 2): what the method believes of its errors
+    sigma_rad: FloatArray | None = None  # (n,): what the method believes of its errors
+    begin_s: float = 10.0  # what is before it does not count, and is left out of the limits
 
     @property
     def used(self) -> BoolArray:
@@ -158,16 +126,7 @@ class FusionPicture:
 
 
 def fusion_figure(picture: FusionPicture) -> Figure:
-    """Fused velocity and position, and both less the camera's undelayed ones.
-
-    Parameters
-    ----------
-    picture : FusionPicture
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Fused velocity and position, and both less the camera's undelayed ones."""
     figure = style.new_figure(6.2)
     velocity, position, apart, slower = figure.subplots(4, 1, sharex=True)
     track = picture.track
@@ -193,16 +152,7 @@ def fusion_figure(picture: FusionPicture) -> Figure:
 
 
 def errors_figure(picture: FusionPicture) -> Figure:
-    """The path in the plane, and errors against the truth with what the method believes of them.
-
-    Parameters
-    ----------
-    picture : FusionPicture
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """The path in the plane, and errors against the truth with what the method believes of them."""
     figure = style.new_figure(4.6)
     panels = figure.subplot_mosaic([["path", "x"], ["path", "y"], ["path", "phi"]], width_ratios=[1.1, 1.0])
     _path(panels["path"], picture)
@@ -228,19 +178,7 @@ def errors_figure(picture: FusionPicture) -> Figure:
 
 
 def methods_figure(lines: Sequence[tuple[str, FloatArray, FloatArray]], begin_s: float) -> Figure:
-    """Errors of position of several methods through time.
-
-    Parameters
-    ----------
-    lines : sequence of (str, ndarray, ndarray)
-        Name, times [s] and distances from the truth [mm].
-    begin_s : float
-        What is before it does not count.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Errors of position of several methods through time."""
     figure = style.new_figure(3.9)
     ax = figure.add_subplot()
     shown = []

@@ -32,40 +32,18 @@ _BRIGHT_DN = 120
 
 @dataclass(frozen=True, eq=False)
 class FramePicture:
-    """A frame and its fix.
-
-    Attributes
-    ----------
-    title : str
-    image : ndarray of uint8, shape (height, width)
-    stars_px : ndarray, shape (f, 2)
-        Column and row of the stars that were found.
-    fix : CameraFix or NoFix
-    lights_m : ndarray, shape (n, 2)
-        The sky.
-    camera : Camera
-        As it is believed to be.
-    """
+    """A frame and its fix."""
 
     title: str
-    image: NDArray[np.uint8]
-    stars_px: FloatArray
+    image: NDArray[np.uint8]  # (height, width)
+    stars_px: FloatArray  # (f, 2): column and row of the stars that were found
     fix: CameraFix | NoFix
-    lights_m: FloatArray
-    camera: Camera
+    lights_m: FloatArray  # (n, 2): the sky
+    camera: Camera  # as it is believed to be
 
 
 def frame_figure(picture: FramePicture) -> Figure:
-    """The frame with its stars, and the ceiling with what it shows of it.
-
-    Parameters
-    ----------
-    picture : FramePicture
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """The frame with its stars, and the ceiling with what it shows of it."""
     figure = style.new_figure(3.4)
     frame, ceiling = figure.subplots(1, 2)
     fix = picture.fix
@@ -121,40 +99,20 @@ def draw_footprint(ax: Axes, camera: Camera, fix: CameraFix) -> None:
 class SkyPicture:
     """Many frames.
 
-    Attributes
-    ----------
-    title : str
-    lights_m : ndarray, shape (n, 2)
-    places_m : ndarray, shape (p, 2)
-        True places of the camera.
-    errors_mm : ndarray, shape (p,)
-        NaN without a fix.
-    good, false : ndarray of bool, shape (p,)
-        Fixes near the truth, and others.
-    n_stars : ndarray of int, shape (p,)
-        Found in the frame.
+    ``good``, ``false`` (p,): fixes near the truth, and others.
     """
 
     title: str
-    lights_m: FloatArray
-    places_m: FloatArray
-    errors_mm: FloatArray
+    lights_m: FloatArray  # (n, 2)
+    places_m: FloatArray  # (p, 2): true places of the camera
+    errors_mm: FloatArray  # (p,): NaN without a fix
     good: BoolArray
     false: BoolArray
-    n_stars: IntArray
+    n_stars: IntArray  # (p,): found in the frame
 
 
 def sky_figure(picture: SkyPicture) -> Figure:
-    """Where there are fixes, how good they are, and how both depend on the number of stars.
-
-    Parameters
-    ----------
-    picture : SkyPicture
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """Where there are fixes, how good they are, and how both depend on the number of stars."""
     figure = style.new_figure(3.7)
     panels = figure.subplot_mosaic([["map", "errors"], ["map", "stars"]], width_ratios=[1.35, 1.0])
     _outcomes(panels["map"], picture)
@@ -219,37 +177,20 @@ def _by_stars(ax: Axes, picture: SkyPicture) -> None:
 class DrivePicture:
     """A drive along the perimeter, and a satellite at rest, seen by the camera.
 
-    Attributes
-    ----------
-    title : str
-    lights_m : ndarray, shape (n, 2)
-    truth_m, fixes_m : ndarray, shape (p, 2)
-        Of the frames of the drive; fixes NaN where there is none.
-    rest_s : ndarray, shape (r,)
-        Times of the frames at rest.
-    rest_m, rest_truth_m : ndarray, shapes (r, 2) and (2,)
+    ``truth_m``, ``fixes_m`` (p, 2): of the frames of the drive; fixes NaN where there is none.
     """
 
     title: str
-    lights_m: FloatArray
+    lights_m: FloatArray  # (n, 2)
     truth_m: FloatArray
     fixes_m: FloatArray
-    rest_s: FloatArray
-    rest_m: FloatArray
-    rest_truth_m: FloatArray
+    rest_s: FloatArray  # (r,): times of the frames at rest
+    rest_m: FloatArray  # (r, 2)
+    rest_truth_m: FloatArray  # (2,)
 
 
 def drive_figure(picture: DrivePicture) -> Figure:
-    """The path as the camera sees it, and X and Y at rest.
-
-    Parameters
-    ----------
-    picture : DrivePicture
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-    """
+    """The path as the camera sees it, and X and Y at rest."""
     figure = style.new_figure(3.7)
     panels = figure.subplot_mosaic([["path", "X"], ["path", "Y"]], width_ratios=[1.35, 1.0])
     path = panels["path"]

@@ -1,18 +1,7 @@
-r"""Rotation of a rigid satellite with reaction wheels, its wheel control, and the Jacobians of its error.
+"""Rotation of a rigid satellite with reaction wheels, its wheel control, and the Jacobians of its error.
 
-.. math::
-
-    J \dot\omega = -\dot k + 3\frac{\mu}{r^3}\,\eta\times J\eta + m\times B - \omega\times(J\omega + k) + M, \qquad
-    \dot q = \tfrac12\, q\circ(0, \omega - A\omega_o)
-
-with the rate ω of the body against inertial space, the momentum k of the wheels and their torque :math:`\dot k`, the
-local vertical :math:`\eta = A e_3`, the residual dipole m in the field B, any other torque M, all in body axes, and the
-attitude q of body against the orbital frame, which turns at :math:`\omega_o = (0, n, 0)`.
-
-All functions take leading batch axes; :mod:`adcs.satellite.dynamics_compiled` is the compiled twin.
-
-Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014. The orbital rate in the kinematics,
-missing there, is ours.
+See docs/theory/satellite-dynamics-and-sensors.md. Source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute
+preprint 64, 2014. The orbital rate in the kinematics, missing there, is ours.
 """
 
 from __future__ import annotations
@@ -27,8 +16,6 @@ from adcs.frames import turned
 from adcs.quaternion import cross_matrix, rotate_back
 from arrays.typing import FloatArray
 
-ERROR_STATES = 6
-"""δq (3) and δω (3) [rad/s], of :func:`error_jacobian`."""
 _E2 = np.array([0.0, 1.0, 0.0])
 _E3 = np.array([0.0, 0.0, 1.0])
 
@@ -127,18 +114,8 @@ def wheel_control(body: RigidBody, natural_rad_s: float = 0.03, damping: float =
 def relative_rate(q: ArrayLike, w: ArrayLike, orbital_rate_rad_s: ArrayLike) -> FloatArray:
     """Rate ω - Aω_o of the body against the orbital frame, body axes [rad/s].
 
-    Parameters
-    ----------
-    q : array_like, shape (..., 4)
-        Attitude, orbital from body.
-    w : array_like, shape (..., 3)
-        Rate against inertial space, body axes [rad/s].
-    orbital_rate_rad_s : array_like, shape (...)
-        n.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
+    ``q`` (..., 4): attitude, orbital from body. ``w`` (..., 3): rate against inertial space, body axes [rad/s].
+    ``orbital_rate_rad_s`` (...): n. Returns shape (..., 3).
     """
     return np.asarray(w, dtype=np.float64) - rotate_back(q, np.asarray(orbital_rate_rad_s)[..., None] * _E2)
 
@@ -153,7 +130,6 @@ def environment_torque(body: RigidBody, q: ArrayLike, gravity_s2: ArrayLike, b_o
 
     Parameters
     ----------
-    body : RigidBody
     q : array_like, shape (..., 4)
         Attitude, orbital from body.
     gravity_s2 : array_like, shape (...)
@@ -177,7 +153,6 @@ def angular_acceleration(
 
     Parameters
     ----------
-    body : RigidBody
     w : array_like, shape (..., 3)
         ω [rad/s].
     momentum_Nms, wheel_torque_Nm : array_like, shape (..., 3)
@@ -211,22 +186,10 @@ def step(
 
     Torque, wheel torque and surroundings are held over the step, the momentum of the wheels is linear in time; the
     attitude is normalised after it.
-
-    Parameters
-    ----------
-    body : RigidBody
-    q, w, momentum_Nms : array_like, shape (..., 4), (..., 3), (..., 3)
-        Attitude (orbital from body), rate against inertial space [rad/s], momentum of the wheels, body axes.
-    wheel_torque_Nm, torque_Nm : array_like, shape (..., 3)
-        Rate of change of that momentum, and the torque of the disturbances, body axes.
-    orbital_rate_rad_s, gravity_s2 : array_like, shape (...)
-    b_orbital_T : array_like, shape (..., 3)
-        Field that the residual dipole feels.
-    dt_s : float
-
-    Returns
-    -------
-    q, w, momentum_Nms : ndarray
+    Shape ``orbital_rate_rad_s``, ``gravity_s2`` (...). ``q`` (..., 4), ``w`` (..., 3), ``momentum_Nms`` (..., 3):
+    attitude (orbital from body), rate against inertial space [rad/s], momentum of the wheels, body axes.
+    ``wheel_torque_Nm``, ``torque_Nm`` (..., 3): rate of change of that momentum, and the torque of the disturbances,
+    body axes. ``b_orbital_T`` (..., 3): field that the residual dipole feels.
     """
     q, w, k = (np.asarray(one, dtype=np.float64) for one in (q, w, momentum_Nms))
     k_dot, disturbance = (np.asarray(one, dtype=np.float64) for one in (wheel_torque_Nm, torque_Nm))
@@ -267,8 +230,6 @@ def commanded_torque(
 
     Parameters
     ----------
-    body : RigidBody
-    control : WheelControl
     q, w : array_like, shape (..., 4), (..., 3)
         Attitude and rate as the controller knows them: the estimate.
     momentum_Nms : array_like, shape (..., 3)
@@ -299,7 +260,7 @@ def commanded_torque(
 def error_jacobian(
     body: RigidBody, q: ArrayLike, w: ArrayLike, momentum_Nms: ArrayLike, gravity_s2: ArrayLike, b_orbital_T: ArrayLike
 ) -> FloatArray:
-    r"""F of the error (δq, δω) for a known wheel torque: d/dt (δq, δω) = F (δq, δω).
+    r"""F of the error (δq, δω) for a known wheel torque: d/dt (δq, δω) = F (δq, δω), shape (..., 6, 6).
 
     .. math::
 
@@ -312,14 +273,9 @@ def error_jacobian(
 
     Parameters
     ----------
-    body : RigidBody
     q, w, momentum_Nms : array_like, shape (..., 4), (..., 3), (..., 3)
     gravity_s2 : array_like, shape (...)
     b_orbital_T : array_like, shape (..., 3)
-
-    Returns
-    -------
-    ndarray, shape (..., 6, 6)
     """
     w = np.asarray(w, dtype=np.float64)
     J = body.inertia_kgm2
@@ -348,8 +304,6 @@ def closed_loop_error_jacobian(
 
     Parameters
     ----------
-    body : RigidBody
-    control : WheelControl
     q, w : array_like, shape (..., 4), (..., 3)
     q_reference : array_like, shape (..., 4)
         Wanted attitude, orbital from body.

@@ -26,9 +26,6 @@ class Satellite:
         Of :func:`adcs.circular_orbit`, or :class:`adcs.environment.orbit.Sgp4Orbit`.
     residual_dipole_Am2 : ndarray, shape (3,)
         Magnetic moment that stays with the satellite, body axes.
-    star_tracker : StarTracker
-    gyro : Gyro
-    magnetometer : Magnetometer
     sun_sensor : SunSensor
         Their noise is what the filters believe; by default that of TabletSat-Aurora.
     control : WheelControl

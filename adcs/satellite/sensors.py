@@ -1,22 +1,7 @@
-r"""Models of the attitude sensors: what they read, and when they read nothing.
+"""Models of the attitude sensors: what they read, and when they read nothing.
 
-==============  ==========================  ==================================================================
-sensor          reading                     missing (NaN)
-==============  ==========================  ==================================================================
-star tracker    q∘(error), orbital from     rate above its limit; Sun or Earth in the way of its axis
-                body
-gyro            ω + Δω + noise              an axis beyond the range
-magnetometer    B + Δb + noise              an axis beyond the range
-Sun sensor      unit vector with noise      eclipse; no head has the Sun in its field
-==============  ==========================  ==================================================================
-
-All readings are in body axes. Every sensor may be misaligned: it is then turned against its nominal axes by a small
-rotation vector that its user does not know. Random numbers are an argument: standard normal, of the shape of the
-readings. All functions take leading batch axes.
-
-Defaults are Table 1 of the source: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014. Limits of
-the star tracker's view are ours, and so is the square field of a Sun head: with cones of 45° five heads would leave a
-quarter of the sky unseen.
+See docs/theory/satellite-dynamics-and-sensors.md. Defaults are Table 1 of the source: Ivanov, Ivlev, Karpenko,
+Ovchinnikov, Keldysh Institute preprint 64, 2014.
 """
 
 from __future__ import annotations
@@ -192,25 +177,10 @@ def star_tracker_readings(
 ) -> FloatArray:
     """Attitudes that a star tracker reports, q∘exp of misalignment and noise.
 
-    Parameters
-    ----------
-    tracker : StarTracker
-    q : array_like, shape (..., 4)
-        True attitude, orbital from body.
-    w : array_like, shape (..., 3)
-        True rate [rad/s].
-    sun_orbital : array_like, shape (..., 3)
-        Unit vector to the Sun; it blinds the tracker only where some of it is seen.
-    earth_radius_rad : array_like, shape (...)
-        Angular radius of the Earth, around nadir.
-    illuminated : array_like, shape (...)
-        Part of the Sun that is seen.
-    unit_noise : array_like, shape (..., 3)
-
-    Returns
-    -------
-    ndarray, shape (..., 4)
-        Orbital from body, NaN where there is none.
+    Shape ``unit_noise`` (..., 3). ``q`` (..., 4): true attitude, orbital from body. ``w`` (..., 3): true rate [rad/s].
+    ``sun_orbital`` (..., 3): unit vector to the Sun; it blinds the tracker only where some of it is seen.
+    ``earth_radius_rad`` (...): angular radius of the Earth, around nadir. ``illuminated`` (...): part of the Sun that
+    is seen. Returns (..., 4): orbital from body, NaN where there is none.
     """
     delta = tracker.sigma_rad * np.asarray(unit_noise, dtype=np.float64)
     turned_by = quaternion.multiply(quaternion.exp(tracker.misalignment_rad), quaternion.from_error_vector(delta))
@@ -243,20 +213,8 @@ def sun_readings(sensor: SunSensor, sun_body: ArrayLike, illuminated: ArrayLike,
 
     Noise turns the direction by ``sigma_rad`` along each of two axes across it: three numbers per component are added
     and the sum is normalised, which leaves nothing along it.
-
-    Parameters
-    ----------
-    sensor : SunSensor
-    sun_body : array_like, shape (..., 3)
-        True unit vector.
-    illuminated : array_like, shape (...)
-        Part of the Sun that is seen; at least half is needed.
-    unit_noise : array_like, shape (..., 3)
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        Unit vectors, NaN where no head sees the Sun.
+    Shape ``unit_noise`` (..., 3). ``sun_body`` (..., 3): true unit vector. ``illuminated`` (...): part of the Sun that
+    is seen; at least half is needed. Returns (..., 3): unit vectors, NaN where no head sees the Sun.
     """
     sun = np.asarray(sun_body, dtype=np.float64)
     seen = in_field(sensor, sun).any(axis=-1) & (np.asarray(illuminated) >= 0.5)
@@ -277,19 +235,8 @@ def in_field(sensor: SunSensor, direction_body: ArrayLike) -> BoolArray:
 def bias_walk(start: ArrayLike, walk: float, dt_s: float, unit_noise: ArrayLike) -> FloatArray:
     """Biases whose derivative is white noise.
 
-    Parameters
-    ----------
-    start : array_like, shape (..., 3)
-        First bias.
-    walk : float
-        Growth of the standard deviation in one second [unit/√s].
-    dt_s : float
-        Between readings.
-    unit_noise : array_like, shape (..., n, 3)
-
-    Returns
-    -------
-    ndarray, shape (..., n, 3)
+    Shapes ``unit_noise`` (..., n, 3) -> (..., n, 3). ``start`` (..., 3): first bias. ``walk``: growth of the standard
+    deviation in one second [unit/√s]. ``dt_s``: between readings.
     """
     steps = walk * math.sqrt(dt_s) * np.asarray(unit_noise, dtype=np.float64)
     steps[..., 0, :] = start

@@ -55,14 +55,6 @@ class StarFrame:
 def read_star_catalogue(path: str | PathLike[str]) -> StarCatalogue:
     """Catalogue from a CSV file, see the module.
 
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    StarCatalogue
-
     Raises
     ------
     InputError
@@ -88,14 +80,6 @@ def read_star_catalogue(path: str | PathLike[str]) -> StarCatalogue:
 
 def read_star_frames(folder: str | PathLike[str]) -> tuple[StarCamera, list[StarFrame]]:
     """Frames of a folder, see the module.
-
-    Parameters
-    ----------
-    folder : path-like
-
-    Returns
-    -------
-    tuple of StarCamera and list of StarFrame
 
     Raises
     ------

@@ -1,18 +1,6 @@
-r"""Stars of the real sky in an image: which they are, and where the camera looks, from the image and a catalogue alone.
+"""Stars of the real sky in an image: which they are, and where the camera looks, from the image and a catalogue alone.
 
-The idea is that of the LED sky, on the sphere:
-
-1. Triangles. Delaunay's need the same stars on both sides. Real stars have magnitudes, and these say which are the
-   same: every star makes triangles with its nearest *brighter* neighbours, which are in the catalogue whatever its
-   limit.
-2. The camera's scale is known, and so all three sides are compared, by a k-d tree; in the order of their lengths they
-   pair the corners. The image is not mirrored: the sense in which the corners go round must agree.
-3. A triangle gives an attitude, which all bright stars of the image check.
-4. The best is fitted again to all its stars, and accepted if chance alone would not have matched as many: with the
-   density of catalogued stars around, the expected number of hypotheses that match as well by chance must be tiny.
-
-Directions are unit vectors. The frame's axes are x to the right and y up in the image as one looks at the sky, z out
-of the sky towards the camera (east is to the left of north).
+See docs/theory/star-identification.md.
 """
 
 from __future__ import annotations
@@ -100,7 +88,6 @@ class StarCamera:
 
     Attributes
     ----------
-    width_px, height_px : int
     rad_per_px : float
         Scale at the centre [rad/px].
 
@@ -144,7 +131,7 @@ class StarCamera:
         return self.width_px * self.height_px * self.rad_per_px**2
 
     def directions(self, points_px: ArrayLike) -> FloatArray:
-        """Unit vectors (f, 3) in the frame's axes of points (f, 2), y up; see the module.
+        """Unit vectors (f, 3) in the frame's axes of points (f, 2), y up; see docs/theory/star-identification.md.
 
         Raises
         ------
@@ -186,36 +173,18 @@ class StarFix:
 
 @dataclass(frozen=True, eq=False)
 class StarTriangles:
-    """Triangles of stars: corners ordered by the opposite side, shortest first.
+    """Triangles of stars: corners ordered by the opposite side, shortest first."""
 
-    Attributes
-    ----------
-    corners : ndarray, shape (T, 3)
-    sides : ndarray, shape (T, 3)
-        Chords, ascending.
-    is_counter_clockwise : ndarray, shape (T,)
-        Seen from the centre of the sphere.
-    """
-
-    corners: IntArray
-    sides: FloatArray
-    is_counter_clockwise: BoolArray
+    corners: IntArray  # (T, 3)
+    sides: FloatArray  # (T, 3): chords, ascending
+    is_counter_clockwise: BoolArray  # (T,): seen from the centre of the sphere
 
 
 def star_triangles(directions: FloatArray, longest: float) -> StarTriangles:
     """Triangles of every star with its nearest brighter neighbours.
 
-    Parameters
-    ----------
-    directions : ndarray, shape (n, 3)
-        Unit vectors, brightest first.
-    longest : float
-        Longest side, a chord.
-
-    Returns
-    -------
-    StarTriangles
-        Each triangle once.
+    ``directions`` (n, 3): unit vectors, brightest first. ``longest``: longest side, a chord. Returns: each triangle
+    once.
     """
     n = len(directions)
     k = min(_NEIGHBOURS + 1, n)
@@ -249,8 +218,6 @@ class StarMatcher:
 
     Attributes
     ----------
-    catalogue : StarCatalogue
-    camera : StarCamera
     bright : ndarray
         Rows of the catalogue that make triangles, brightest first.
     triangles : StarTriangles
@@ -279,13 +246,8 @@ class StarMatcher:
         ----------
         catalogue : StarCatalogue
             At the date of the images.
-        camera : StarCamera
         noise_px : float
             Standard deviation of a centroid, per axis [px].
-
-        Returns
-        -------
-        StarMatcher
         """
         per_image = camera.solid_angle_sr / (4.0 * math.pi)
         bright = np.argsort(catalogue.magnitudes, kind="stable")[: math.ceil(_BRIGHT_PER_IMAGE / per_image)]
@@ -307,10 +269,6 @@ class StarMatcher:
             x to the right, y up.
         magnitudes : array_like, shape (f,)
             Only their order counts.
-
-        Returns
-        -------
-        StarFix or NoFix
 
         Raises
         ------
@@ -409,7 +367,6 @@ def identify_stars(
     ----------
     catalogue : StarCatalogue
         At the date of the images.
-    camera : StarCamera
     frames : iterable of (array_like, array_like)
         Points (f, 2), y up, and magnitudes (f,) of each image; see :meth:`StarMatcher.identify`.
     noise_px : float

@@ -31,30 +31,16 @@ ANGLE_PERIODS = np.array([1.0, 0.8, 1.3])
 class SatelliteScenario:
     """Settings of :func:`satellite_runs`.
 
-    Attributes
-    ----------
-    sigma_T : float
-        Noise of the magnetometer, each axis.
-    amplitude_rad : float
-        Of roll, pitch and yaw against the orbital frame, sines of :data:`ANGLE_PERIODS` with random phases.
-    step_orbits : float
-        When the gyro's bias steps from zero.
-    drift_rad_s : float
-        To this, on all three axes.
-    outage_orbits : float or None
-        When the Sun sensor fails for good.
-    outage_end_orbits : float
-        When it comes back.
-    duration_s : float
-    dt_s : float
+    ``amplitude_rad``: of roll, pitch and yaw against the orbital frame, sines of :data:`ANGLE_PERIODS` with random
+    phases.
     """
 
-    sigma_T: float = 1000e-9
+    sigma_T: float = 1000e-9  # noise of the magnetometer, each axis
     amplitude_rad: float = math.radians(5.0)
-    step_orbits: float = 1.7
-    drift_rad_s: float = math.radians(0.02)
-    outage_orbits: float | None = None
-    outage_end_orbits: float = math.inf
+    step_orbits: float = 1.7  # when the gyro's bias steps from zero
+    drift_rad_s: float = math.radians(0.02)  # to this, on all three axes
+    outage_orbits: float | None = None  # when the Sun sensor fails for good
+    outage_end_orbits: float = math.inf  # when it comes back
     duration_s: float = 3.5 * ORBIT.period_s
     dt_s: float = 1.0
 
@@ -71,23 +57,12 @@ class SatelliteScenario:
 
 @dataclass(frozen=True, eq=False)
 class SatelliteRuns:
-    """Truth and readings.
-
-    Attributes
-    ----------
-    scenario : SatelliteScenario
-    q : ndarray, shape (R, n, 4)
-        Orbital from body.
-    bias_rad_s : ndarray, shape (n,)
-        Of each axis of the gyro.
-    record : VectorRecord
-        Field [T] and unit vector to the Sun.
-    """
+    """Truth and readings."""
 
     scenario: SatelliteScenario
-    q: FloatArray
-    bias_rad_s: FloatArray
-    record: VectorRecord
+    q: FloatArray  # (R, n, 4): orbital from body
+    bias_rad_s: FloatArray  # (n,): of each axis of the gyro
+    record: VectorRecord  # field [T] and unit vector to the Sun
 
 
 def satellite_runs(scenario: SatelliteScenario, seeds: Sequence[int]) -> SatelliteRuns:
@@ -95,15 +70,6 @@ def satellite_runs(scenario: SatelliteScenario, seeds: Sequence[int]) -> Satelli
 
     The gyro gives the rate at each instant, plus its bias: filters that hold it to the next one are wrong by what it
     changes in between.
-
-    Parameters
-    ----------
-    scenario : SatelliteScenario
-    seeds : sequence of int
-
-    Returns
-    -------
-    SatelliteRuns
     """
     time_s, h = scenario.time_s, scenario.dt_s
     field_T = _field_orbital(len(time_s), h)
@@ -136,17 +102,7 @@ def satellite_runs(scenario: SatelliteScenario, seeds: Sequence[int]) -> Satelli
 def attitude(phases_rad: ArrayLike, amplitude_rad: float, time_s: ArrayLike) -> FloatArray:
     """Attitude of 3-2-1 Euler angles, amplitude·sin(2πt/(pT) + φ).
 
-    Parameters
-    ----------
-    phases_rad : array_like, shape (R, 3)
-        φ of roll, pitch and yaw.
-    amplitude_rad : float
-    time_s : array_like, shape (n,)
-
-    Returns
-    -------
-    ndarray, shape (R, n, 4)
-        Orbital from body.
+    Shape ``time_s`` (n,). ``phases_rad`` (R, 3): φ of roll, pitch and yaw. Returns (R, n, 4): orbital from body.
     """
     rate = 2.0 * math.pi / (ANGLE_PERIODS * ORBIT.period_s)
     angles = np.asarray(time_s, dtype=np.float64)[:, None] * rate + np.asarray(phases_rad)[:, None, :]

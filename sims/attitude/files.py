@@ -12,19 +12,7 @@ from sims.attitude.scenario import AttitudeScenario, StartConditions
 def simulation_of(file: AttitudeFile) -> AttitudeScenario:
     """Scenario of a simulation.
 
-    Parameters
-    ----------
-    file : AttitudeFile
-        Of :func:`adcs.io.scenario_files.read_scenario`.
-
-    Returns
-    -------
-    AttitudeScenario
-
-    Raises
-    ------
-    InputError
-        The file describes what cannot be simulated.
+    ``file``: of :func:`adcs.io.scenario_files.read_scenario`.
     """
     satellite, start, disturbance = file.satellite, file.start, file.disturbance
     with naming(file.path):

@@ -25,54 +25,24 @@ _SUBSTEPS = 10  # Runge-Kutta steps of 0.2 s: a fifth of the disturbance torque'
 
 @dataclass(frozen=True, eq=False)
 class ErrorRuns:
-    """Runs of the dynamics of the error alone.
+    """Runs of the dynamics of the error alone."""
 
-    Attributes
-    ----------
-    states_rad : ndarray, shape (n_runs, n_steps + 1, 2)
-        (roll, yaw).
-    readings_rad : ndarray, shape (n_runs, n_steps)
-        Roll readings after every step.
-    """
-
-    states_rad: FloatArray
-    readings_rad: FloatArray
+    states_rad: FloatArray  # (n_runs, n_steps + 1, 2): (roll, yaw)
+    readings_rad: FloatArray  # (n_runs, n_steps): roll readings after every step
 
 
 @dataclass(frozen=True)
 class ErrorScenario:
-    """Settings of :func:`error_runs`.
+    """Settings of :func:`error_runs`."""
 
-    Attributes
-    ----------
-    noise_rad : float
-        Readings are wrong by uniform random numbers within ±noise_rad.
-    drift_rad_s : float
-        Zero shift of the yaw gyro, constant.
-    n_steps : int
-    jump_s : float, optional
-        From this time on the readings are wrong by four times as much.
-    """
-
-    noise_rad: float
-    drift_rad_s: float
+    noise_rad: float  # readings are wrong by uniform random numbers within ±noise_rad
+    drift_rad_s: float  # zero shift of the yaw gyro, constant
     n_steps: int
-    jump_s: float | None = None
+    jump_s: float | None = None  # from this time on the readings are wrong by four times as much
 
 
 def error_runs(scenario: ErrorScenario, seeds: Sequence[int]) -> ErrorRuns:
-    """Simulate errors of roll and yaw: uniform at the start in a circle of radius 3 c, then carried by the drift.
-
-    Parameters
-    ----------
-    scenario : ErrorScenario
-    seeds : sequence of int
-        One for each run.
-
-    Returns
-    -------
-    ErrorRuns
-    """
+    """Simulate errors of roll and yaw: uniform at the start in a circle of radius 3 c, then carried by the drift."""
     n_runs, n_steps = len(seeds), scenario.n_steps
     amplitude = _amplitude(scenario)
     states, noise = np.empty((n_runs, n_steps + 1, 2)), np.empty((n_runs, n_steps))
@@ -92,60 +62,30 @@ def error_runs(scenario: ErrorScenario, seeds: Sequence[int]) -> ErrorRuns:
 class LoopScenario:
     """Settings of :func:`fly`.
 
-    Attributes
-    ----------
-    noise_rad : float
-        Horizon readings are wrong by uniform random numbers within ±noise_rad.
-    drift_rad_s : float
-        Zero shift of the pitch and yaw gyros, constant. The roll gyro has none: the observer's disturbance is a
-        segment along yaw.
-    n_steps : int
-        Cycles of 2 s.
-    first_yaw_rad : float
-    jump_s : float, optional
-        From this time on the readings are wrong by four times as much.
-    torque_Nm : float
-        Amplitude of the disturbance torque b sin(ω t + φ) about every axis.
-    torque_rate : float
-        ω [rad/s].
-    torque_phases : ndarray, shape (3,)
-        φ [rad].
-    inertia_kgm2 : ndarray, shape (3, 3)
+    ``drift_rad_s``: zero shift of the pitch and yaw gyros, constant. The roll gyro has none: the observer's disturbance
+    is a segment along yaw. ``torque_phases`` (3,): φ [rad].
     """
 
-    noise_rad: float
+    noise_rad: float  # horizon readings are wrong by uniform random numbers within ±noise_rad
     drift_rad_s: float
-    n_steps: int
+    n_steps: int  # cycles of 2 s
     first_yaw_rad: float
-    jump_s: float | None = None
-    torque_Nm: float = 1e-4
-    torque_rate: float = 6.0
+    jump_s: float | None = None  # from this time on the readings are wrong by four times as much
+    torque_Nm: float = 1e-4  # amplitude of the disturbance torque b sin(ω t + φ) about every axis
+    torque_rate: float = 6.0  # ω [rad/s]
     torque_phases: FloatArray = field(default_factory=lambda: np.array([0.0, math.pi / 4.0, math.pi / 2.0]))
-    inertia_kgm2: FloatArray = field(default_factory=ACTUAL_INERTIA_KGM2.copy)
+    inertia_kgm2: FloatArray = field(default_factory=ACTUAL_INERTIA_KGM2.copy)  # (3, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class LoopRuns:
-    """Flights in the attitude loop.
+    """Flights in the attitude loop."""
 
-    Attributes
-    ----------
-    angles_rad : ndarray, shape (n_runs, n_steps + 1, 3)
-        Roll, pitch and yaw of the body in the orbital frame.
-    rates_rad_s : ndarray, shape (n_runs, n_steps + 1, 3)
-        Angular rate of the body in the inertial frame, body axes.
-    torques_Nm : ndarray, shape (n_runs, n_steps, 3)
-        Control torque of every cycle.
-    increments_rad : ndarray, shape (n_runs, n_steps, 3)
-        Of the gyros in every cycle.
-    roll_readings_rad : ndarray, shape (n_runs, n_steps)
-    """
-
-    angles_rad: FloatArray
-    rates_rad_s: FloatArray
-    torques_Nm: FloatArray
-    increments_rad: FloatArray
-    roll_readings_rad: FloatArray
+    angles_rad: FloatArray  # (n_runs, n_steps + 1, 3): roll, pitch and yaw of the body in the orbital frame
+    rates_rad_s: FloatArray  # (n_runs, n_steps + 1, 3): angular rate of the body in the inertial frame, body axes
+    torques_Nm: FloatArray  # (n_runs, n_steps, 3): control torque of every cycle
+    increments_rad: FloatArray  # (n_runs, n_steps, 3): of the gyros in every cycle
+    roll_readings_rad: FloatArray  # (n_runs, n_steps)
 
 
 def fly(scenario: LoopScenario, controller: Controller, seeds: Sequence[int]) -> LoopRuns:
@@ -153,19 +93,8 @@ def fly(scenario: LoopScenario, controller: Controller, seeds: Sequence[int]) ->
 
     Every cycle of 2 s the horizon sensor is read once, the gyros give their increments and rates, and the controller's
     torque is held during the next cycle; there is none in the first.
-
-    Parameters
-    ----------
-    scenario : LoopScenario
-    controller : callable
-        Takes horizon readings (n_runs, 2), gyro increments (n_runs, 3) and gyro rates (n_runs, 3), and returns torques
-        (n_runs, 3).
-    seeds : sequence of int
-        One for each run.
-
-    Returns
-    -------
-    LoopRuns
+    ``controller``: takes horizon readings (n_runs, 2), gyro increments (n_runs, 3) and gyro rates (n_runs, 3), and
+    returns torques (n_runs, 3). ``seeds``: one for each run.
     """
     n_runs, n_steps = len(seeds), scenario.n_steps
     noise = np.empty((n_runs, n_steps, 2))
@@ -204,19 +133,9 @@ def advance(
     Euler's equations :math:`J\dot\omega = T - \omega \times J\omega`, and small angles against the orbital frame:
     :math:`\dot\gamma = \omega_x + \omega_0\psi`, :math:`\dot\theta = \omega_y + \omega_0`,
     :math:`\dot\psi = \omega_z - \omega_0\gamma`.
-
-    Parameters
-    ----------
-    scenario : LoopScenario
-    angles_rad, rates_rad_s, torque_Nm : ndarray, shape (n_runs, 3)
-        As in :class:`LoopRuns`; the torque is held.
-    time_s : float
-        Phase of the disturbance torque.
-
-    Returns
-    -------
-    ndarray, shape (n_runs, 9)
-        Angles [rad], rates [rad/s], and the integral of the rates over the cycle [rad].
+    ``angles_rad``, ``rates_rad_s``, ``torque_Nm`` (n_runs, 3): as in :class:`LoopRuns`; the torque is held. ``time_s``:
+    phase of the disturbance torque. Returns (n_runs, 9): angles [rad], rates [rad/s], and the integral of the rates
+    over the cycle [rad].
     """
     state = np.concatenate([angles_rad, rates_rad_s, np.zeros_like(rates_rad_s)], axis=1)
     inertia = np.ascontiguousarray(scenario.inertia_kgm2)

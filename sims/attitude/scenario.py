@@ -49,18 +49,10 @@ class AttitudeScenario:
 
     Attributes
     ----------
-    body : RigidBody
-    control : WheelControl
-    orbit : Orbit
     day : datetime64
         Runs start within the 24 hours from here, UTC.
-    conditions : StartConditions
     duration_s, dt_s : float
         Of a run, and between its instants. Readings are taken and torques set at every instant.
-    star_tracker : StarTracker
-    gyro : Gyro
-    magnetometer : Magnetometer
-    sun_sensor : SunSensor
     torque_Nm : float
         Size of a disturbing torque that is constant in the body.
     torque_period_s : float
@@ -71,7 +63,6 @@ class AttitudeScenario:
         Size of the difference between the true field and its model, constant in the orbital frame.
     start_attitude_rad, start_rate_rad_s : float
         Standard deviations, per axis, of attitude and rate from those of the orbital frame.
-    field_model : str or Coefficients
 
     Raises
     ------
@@ -146,17 +137,8 @@ def tabletsat(duration_s: float = 200.0, local_time_h: float = 15.0) -> Attitude
 
     A circular orbit of 600 km and 97.8° on 2014-09-01; a constant torque of 8e-7 N·m; sensors of Table 1. Orbit, date,
     gains and the conditions of the start are ours.
-
-    Parameters
-    ----------
-    duration_s : float
-    local_time_h : float
-        Mean solar time of the ascending node. With 15 h Sun and field never come nearer to each other than 31° in
-        sunlight; with 13 h they come as near as 1.2°.
-
-    Returns
-    -------
-    AttitudeScenario
+    ``local_time_h``: mean solar time of the ascending node. With 15 h Sun and field never come nearer to each other
+    than 31° in sunlight; with 13 h they come as near as 1.2°.
     """
     body = RigidBody(np.array(TABLETSAT_INERTIA_KGM2))
     day = np.datetime64("2014-09-01", "us")

@@ -31,34 +31,20 @@ State = tuple[FloatArray, FloatArray, FloatArray]
 class Prepared:
     """Everything of some runs that does not depend on their motion.
 
-    Attributes
-    ----------
-    scenario : AttitudeScenario
-    seeds : tuple of int
-    environment : Environment
-        As the filters know it; leading axis runs.
-    true_field_orbital_T : ndarray, shape (runs, n, 3)
-        With the error of the model.
-    q, w, momentum_Nms : ndarray, shape (runs, 4), (runs, 3), (runs, 3)
-        True state at the start.
-    torque_Nm : ndarray, shape (runs, n, 3)
-        Disturbing torque in body axes, held from each instant to the next.
-    gyro_bias_rad_s, field_bias_T : ndarray, shape (runs, n, 3)
-    noise : dict of str to ndarray, shape (runs, n, 3)
-        Standard normal numbers for ``star``, ``gyro``, ``field`` and ``sun``.
+    ``q`` (runs, 4), ``w`` (runs, 3), ``momentum_Nms`` (runs, 3): true state at the start.
     """
 
     scenario: AttitudeScenario
     seeds: tuple[int, ...]
-    environment: Environment
-    true_field_orbital_T: FloatArray
+    environment: Environment  # as the filters know it; leading axis runs
+    true_field_orbital_T: FloatArray  # (runs, n, 3): with the error of the model
     q: FloatArray
     w: FloatArray
     momentum_Nms: FloatArray
-    torque_Nm: FloatArray
-    gyro_bias_rad_s: FloatArray
-    field_bias_T: FloatArray
-    noise: dict[str, FloatArray]
+    torque_Nm: FloatArray  # (runs, n, 3): disturbing torque in body axes, held from each instant to the next
+    gyro_bias_rad_s: FloatArray  # (runs, n, 3)
+    field_bias_T: FloatArray  # (runs, n, 3)
+    noise: dict[str, FloatArray]  # (runs, n, 3): standard normal numbers for ``star``, ``gyro``, ``field`` and ``sun``
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +53,6 @@ class AttitudeRuns:
 
     Attributes
     ----------
-    prepared : Prepared
     q : ndarray, shape (runs, n, 4)
         Attitude, orbital from body.
     w : ndarray, shape (runs, n, 3)
@@ -76,7 +61,6 @@ class AttitudeRuns:
         Of the wheels.
     wheel_torque_Nm : ndarray, shape (runs, n, 3)
         Rate of change of the wheels' momentum from each instant to the next.
-    readings : Readings
     """
 
     prepared: Prepared
@@ -128,20 +112,7 @@ class AttitudeRuns:
 def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
     """Starts, surroundings, disturbances, biases and noise of one run for every seed.
 
-    Parameters
-    ----------
-    scenario : AttitudeScenario
-    seeds : sequence of int
-        The numbers of a run depend on its seed alone, and every sensor has its own stream.
-
-    Returns
-    -------
-    Prepared
-
-    Raises
-    ------
-    ValueError
-        There are no seeds, no start fulfils the conditions, or a date is outside of the field model.
+    ``seeds``: the numbers of a run depend on its seed alone, and every sensor has its own stream.
     """
     numbers = [int(seed) for seed in seeds]
     if not numbers:
@@ -180,22 +151,7 @@ def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
 
 
 def simulate(scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
-    """Truth and readings of one run for every seed, with a control that sees the true state.
-
-    Parameters
-    ----------
-    scenario : AttitudeScenario
-    seeds : sequence of int
-
-    Returns
-    -------
-    AttitudeRuns
-
-    Raises
-    ------
-    ValueError
-        As :func:`prepare`.
-    """
+    """Truth and readings of one run for every seed, with a control that sees the true state."""
     from adcs.satellite import dynamics_compiled as rigid_body
     from magloc.compilation import over_rows
 
@@ -220,16 +176,7 @@ def simulate(scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
 def sense(prepared: Prepared, q: FloatArray, w: FloatArray, rows: slice = slice(None)) -> Readings:
     """Readings of the instants ``rows`` of all runs, from their true attitudes and rates.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    q, w : ndarray, shape (runs, len(rows), 4), (runs, len(rows), 3)
-    rows : slice
-        All instants, unless given.
-
-    Returns
-    -------
-    Readings
+    Shapes ``q`` (runs, len(rows), 4), ``w`` (runs, len(rows), 3). ``rows``: all instants, unless given.
     """
     scenario, around = prepared.scenario, prepared.environment
     sun_orbital, lit = around.sun_orbital[:, rows], around.illuminated[:, rows]
@@ -249,17 +196,8 @@ def sense(prepared: Prepared, q: FloatArray, w: FloatArray, rows: slice = slice(
 def advance(prepared: Prepared, state: State, wheel_torque_Nm: FloatArray, row: int) -> State:
     """True state (q, w, momentum) of all runs at instant ``row`` + 1 from that at ``row``.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    state : tuple of ndarray, shapes (runs, 4), (runs, 3), (runs, 3)
-    wheel_torque_Nm : ndarray, shape (runs, 3)
-        As set, by :func:`adcs.satellite.dynamics.commanded_torque` of an estimate.
-    row : int
-
-    Returns
-    -------
-    tuple of ndarray
+    Shape ``state`` (runs, 4), (runs, 3), (runs, 3). ``wheel_torque_Nm`` (runs, 3): as set, by
+    :func:`adcs.satellite.dynamics.commanded_torque` of an estimate.
     """
     around = prepared.environment
     return dynamics.step(
@@ -279,15 +217,7 @@ def start_estimates(
 ) -> tuple[FloatArray, FloatArray]:
     """Attitudes and rates that a filter may start from: the truth with normal errors in body axes.
 
-    Parameters
-    ----------
-    prepared : Prepared
-    attitude_error_rad, rate_error_rad_s : float
-        Standard deviations per axis.
-
-    Returns
-    -------
-    q, w : ndarray, shape (runs, 4), (runs, 3)
+    ``attitude_error_rad``, ``rate_error_rad_s``: standard deviations per axis. Returns ``q, w`` (runs, 4), (runs, 3).
     """
     seeds = list(prepared.seeds)
     error = quaternion.exp(attitude_error_rad * _normal(seeds, "estimate attitude", 1)[:, 0])

@@ -20,22 +20,7 @@ GRID_S = 10.0
 
 
 def starts(scenario: AttitudeScenario, seeds: list[int]) -> Instants:
-    """Start of the run of every seed, drawn from the instants of the day that the conditions allow.
-
-    Parameters
-    ----------
-    scenario : AttitudeScenario
-    seeds : list of int
-
-    Returns
-    -------
-    ndarray of datetime64, shape (runs,)
-
-    Raises
-    ------
-    ValueError
-        The conditions hold at no instant of the day.
-    """
+    """Start of the run of every seed, drawn from the instants of the day that the conditions allow, shape (runs,)."""
     day = _day(scenario.orbit, scenario.day, scenario.duration_s, scenario.field_model)
     n = 1 + math.ceil(scenario.duration_s / GRID_S)
     allowed = np.flatnonzero(_allowed(scenario.conditions, day, n))

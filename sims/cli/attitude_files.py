@@ -26,23 +26,7 @@ from arrays.typing import FloatArray
 def write_attitude_files(
     out: Path, file: AttitudeFile, estimate: EstimatorSettings, parts: Sequence[Part], outcome: Outcome
 ) -> list[str]:
-    """Write everything of some runs into a folder.
-
-    Parameters
-    ----------
-    out : Path
-        The folder.
-    file : AttitudeFile
-    estimate : EstimatorSettings
-    parts : sequence of Part
-        All runs.
-    outcome : Outcome
-
-    Returns
-    -------
-    list of str
-        Names of the files.
-    """
+    """Write everything of some runs into a folder."""
     from adcs.plots.attitude import ConsistencyPicture, StatesPicture, consistency_figure, sensor_gaps, states_figure
     from magloc.plots import style
 
@@ -113,19 +97,7 @@ def _truth_columns(part: Part, time_s: FloatArray) -> dict[str, Any]:
 
 
 def dataset_of(parts: Sequence[Part], estimate: EstimatorSettings, title: str) -> xr.Dataset:
-    """Truth and estimates of all runs.
-
-    Parameters
-    ----------
-    parts : sequence of Part
-    estimate : EstimatorSettings
-    title : str
-
-    Returns
-    -------
-    xarray.Dataset
-        Dimensions run, time and component; every variable with units.
-    """
+    """Truth and estimates of all runs."""
     import xarray as xr
 
     from arrays.io.outputs import installed_version

@@ -65,14 +65,7 @@ def _items(text: str) -> list[str | None]:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One scenario with one filter.
-
-    Attributes
-    ----------
-    file : AttitudeFile
-    estimate : EstimatorSettings
-    outcome : Outcome
-    """
+    """One scenario with one filter."""
 
     file: AttitudeFile
     estimate: EstimatorSettings
@@ -155,17 +148,7 @@ _COLUMNS = (
 
 
 def compare_lines(reports: list[dict[str, Any]]) -> list[str]:
-    """The comparison as text.
-
-    Parameters
-    ----------
-    reports : list of dict
-        Of :meth:`Row.report`.
-
-    Returns
-    -------
-    list of str
-    """
+    """The comparison as text."""
     names = [label_of(report) for report in reports]
     width = max(22, *(len(name) for name in names)) + 1
     lines = [f"{'rms of the last minute':{width}s}" + "".join(f"{title:>12s}" for _, title in _COLUMNS)]

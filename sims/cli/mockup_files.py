@@ -35,21 +35,7 @@ _REST_M, _REST_RAD = (-1.2228, 0.3), 0.5
 
 
 def write_sky_run(options: MockupOptions, run: SkyRun, out: Path) -> list[str]:
-    """Write frames' results: figures, a table, the sky, and a frame of the kind.
-
-    Parameters
-    ----------
-    options : MockupOptions
-        That it was made with.
-    run : SkyRun
-    out : Path
-        Folder that exists.
-
-    Returns
-    -------
-    list of str
-        Names of the files.
-    """
+    """Write frames' results: figures, a table, the sky, and a frame of the kind."""
     from adcs.plots.mockup_vision import SkyPicture, drive_figure, frame_figure, sky_figure
 
     sky, setup = options.led_sky, options.sky_setup()
@@ -147,23 +133,7 @@ def drive_picture(options: MockupOptions, sky: LedSky) -> DrivePicture:
 
 
 def write_frames(results: Mapping[Path, FrameResult], sky: LedSky, camera: Camera, out: Path) -> list[str]:
-    """Write a figure of every frame that was read, and a table.
-
-    Parameters
-    ----------
-    results : mapping
-        From path to result.
-    sky : LedSky
-    camera : Camera
-        As it is believed to be.
-    out : Path
-        Folder that exists.
-
-    Returns
-    -------
-    list of str
-        Names of the files.
-    """
+    """Write a figure of every frame that was read, and a table."""
     from adcs.plots.mockup_vision import FramePicture, frame_figure
 
     names: list[str] = []
@@ -188,19 +158,7 @@ def write_frames(results: Mapping[Path, FrameResult], sky: LedSky, camera: Camer
 
 
 def write_zeros(runs: ZerosRuns, out: Path) -> list[str]:
-    """Write the first run's figure and samples, and a row of every run.
-
-    Parameters
-    ----------
-    runs : ZerosRuns
-    out : Path
-        Folder that exists.
-
-    Returns
-    -------
-    list of str
-        Names of the files.
-    """
+    """Write the first run's figure and samples, and a row of every run."""
     from adcs.plots.mockup_navigation import ZerosPicture, zeros_figure
 
     first = runs.results[0]
@@ -253,19 +211,7 @@ def _zeros_samples(result: ZerosResult) -> FloatArray:
 
 
 def write_fusion(runs: FusionRuns, out: Path) -> list[str]:
-    """Write the first run's figures, samples and fixes, and a row of every run.
-
-    Parameters
-    ----------
-    runs : FusionRuns
-    out : Path
-        Folder that exists.
-
-    Returns
-    -------
-    list of str
-        Names of the files.
-    """
+    """Write the first run's figures, samples and fixes, and a row of every run."""
     from adcs.plots.mockup_navigation import FusionPicture, errors_figure, fusion_figure
 
     first = runs.results[0]
@@ -301,20 +247,7 @@ def write_fusion(runs: FusionRuns, out: Path) -> list[str]:
 
 
 def write_methods(every: Sequence[FusionRuns], out: Path) -> list[str]:
-    """Write a figure of the first run by all methods, and a row of every run and method.
-
-    Parameters
-    ----------
-    every : sequence of FusionRuns
-        Of the same drives.
-    out : Path
-        Folder that exists.
-
-    Returns
-    -------
-    list of str
-        Names of the files.
-    """
+    """Write a figure of the first run by all methods, and a row of every run and method."""
     from adcs.plots.mockup_navigation import methods_figure
 
     lines = []
@@ -383,19 +316,7 @@ def _write_fixes(
 
 
 def write_record(run: RecordRun, out: Path) -> list[str]:
-    """Write the estimate and its figure.
-
-    Parameters
-    ----------
-    run : RecordRun
-    out : Path
-        Folder that exists.
-
-    Returns
-    -------
-    list of str
-        Names of the files.
-    """
+    """Write the estimate and its figure."""
     from adcs.plots.mockup_navigation import FusionPicture, fusion_figure
     from magloc.plots import style
 

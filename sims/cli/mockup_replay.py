@@ -22,17 +22,7 @@ if TYPE_CHECKING:
 
 
 def check_places(replay: ReplayOptions) -> None:
-    """Refuse, before long work, files that cannot be written.
-
-    Parameters
-    ----------
-    replay : ReplayOptions
-
-    Raises
-    ------
-    InputError
-        There is no such folder, or no browser for a picture.
-    """
+    """Refuse, before long work, files that cannot be written."""
     from magloc.viewer.chromium import find_chromium
 
     if replay.html is not None:
@@ -46,20 +36,7 @@ def check_places(replay: ReplayOptions) -> None:
 
 
 def show_replay(runs: FusionRuns, replay: ReplayOptions, *, quiet: bool) -> None:
-    """Show the first drive until Ctrl-C, or write it.
-
-    Parameters
-    ----------
-    runs : FusionRuns
-    replay : ReplayOptions
-    quiet : bool
-        No notes on stderr.
-
-    Raises
-    ------
-    InputError
-        A file cannot be written, there is no free port, or the browser fails.
-    """
+    """Show the first drive until Ctrl-C, or write it."""
     from adcs.viewer.drive_page import drive_page, write_playing_page
     from magloc.viewer.chromium import BrowserError
     from magloc.viewer.server import address, free_port, opened, wait_for_interruption, write_picture
@@ -90,17 +67,7 @@ def show_replay(runs: FusionRuns, replay: ReplayOptions, *, quiet: bool) -> None
 
 
 def drive_of(result: FusionResult, method: str) -> Drive:
-    """What a replay shows of a run.
-
-    Parameters
-    ----------
-    result : FusionResult
-    method : str
-
-    Returns
-    -------
-    Drive
-    """
+    """What a replay shows of a run."""
     from adcs.mockup.navigation.delayed_ekf import FilterTrack
     from adcs.mockup.vision.camera import Camera
     from adcs.mockup.vision.sky import led_sky

@@ -153,30 +153,13 @@ def run_complementary(
 ) -> dict[str, Any]:
     """Run the scenario, and write its figure and data.
 
-    Parameters
-    ----------
-    options : ComplementaryOptions
-    out : Path, optional
-        Folder for ``complementary.png`` (the first run), ``complementary.csv`` (the first run through time, both
-        complementary filters and the adaptive one) and ``complementary-runs.csv`` (all runs); made if it is not there.
-    progress : callable, optional
-        Called with the number of runs finished since the last call.
-
-    Returns
-    -------
-    dict
-        ``rms_deg``, root mean square of the three axes' errors from 0.5 to 3 orbits, ``steady_rms_deg``, the same
-        before the step (with an outage from the time that the step is gone, 1 orbit, until it begins), ``peak_deg``,
-        the largest error of an axis after the step (before the outage), None in a run that ends before it; and
-        ``outage_max_deg``, the largest errors of roll, pitch and yaw from 2 orbits on, or None. Means over the runs;
-        the last one is their median.
-
-    Raises
-    ------
-    InputError
-        An option is out of range, or out is no folder.
-    OSError
-        A file cannot be written.
+    ``out``: folder for ``complementary.png`` (the first run), ``complementary.csv`` (the first run through time, both
+    complementary filters and the adaptive one) and ``complementary-runs.csv`` (all runs); made if it is not there.
+    ``progress``: called with the number of runs finished since the last call. Returns: ``rms_deg``, root mean square of
+    the three axes' errors from 0.5 to 3 orbits, ``steady_rms_deg``, the same before the step (with an outage from the
+    time that the step is gone, 1 orbit, until it begins), ``peak_deg``, the largest error of an axis after the step
+    (before the outage), None in a run that ends before it; and ``outage_max_deg``, the largest errors of roll, pitch
+    and yaw from 2 orbits on, or None. Means over the runs; the last one is their median.
     """
     from sims.attitude.complementary import satellite_runs
     from sims.experiments.complementary import RUN_COLUMNS, errors_deg, row_of_each
@@ -232,18 +215,7 @@ def _write_picture(options: ComplementaryOptions, runs: SatelliteRuns, out: Path
 
 
 def summary_lines(options: ComplementaryOptions, result: dict[str, Any]) -> list[str]:
-    """The settings and the result as text.
-
-    Parameters
-    ----------
-    options : ComplementaryOptions
-    result : dict
-        Of :func:`run_complementary`.
-
-    Returns
-    -------
-    list of str
-    """
+    """The settings and the result as text."""
     peak = result["peak_deg"]
     lines = [
         f"{options.filter} filter" + ("" if options.filter == "adaptive" else f", {options.gains_text}"),

@@ -102,28 +102,11 @@ def run_ellipsoid(
 ) -> dict[str, Any]:
     """Run the scenario, and write its figure and data.
 
-    Parameters
-    ----------
-    options : EllipsoidOptions
-    out : Path, optional
-        Folder for ``ellipsoid.png`` (the first 500 runs at most), ``ellipsoid.csv`` (the first run through time) and
-        ``ellipsoid-runs.csv`` (all runs); made if it is not there.
-    progress : callable, optional
-        Called with the number of runs finished since the last call.
-
-    Returns
-    -------
-    dict
-        ``final_error_mean_deg``, ``final_error_p95_deg`` and ``final_error_max_deg`` of the estimated yaw,
-        ``half_width_mean_deg``, the guaranteed half-width of yaw at the end, ``containment_violations`` of all
-        ``steps``, and ``resets_mean``, contradictions in a run.
-
-    Raises
-    ------
-    InputError
-        An option is out of range, or out is no folder.
-    OSError
-        A file cannot be written.
+    ``out``: folder for ``ellipsoid.png`` (the first 500 runs at most), ``ellipsoid.csv`` (the first run through time)
+    and ``ellipsoid-runs.csv`` (all runs); made if it is not there. ``progress``: called with the number of runs
+    finished since the last call. Returns: ``final_error_mean_deg``, ``final_error_p95_deg`` and ``final_error_max_deg``
+    of the estimated yaw, ``half_width_mean_deg``, the guaranteed half-width of yaw at the end,
+    ``containment_violations`` of all ``steps``, and ``resets_mean``, contradictions in a run.
     """
     from sims.experiments.ellipsoid import RUN_COLUMNS, ellipsoid_runs, row_of_each
 
@@ -207,18 +190,7 @@ _TIME_COLUMNS = (
 
 
 def summary_lines(options: EllipsoidOptions, result: dict[str, Any]) -> list[str]:
-    """The result as text, one line for each number.
-
-    Parameters
-    ----------
-    options : EllipsoidOptions
-    result : dict
-        Of :func:`run_ellipsoid`.
-
-    Returns
-    -------
-    list of str
-    """
+    """The result as text, one line for each number."""
     return [
         f"{options.seeds} runs of {options.n_steps * STEP_S:g} s",
         f"error of yaw at the end, mean / 95 % / largest [°]  {result['final_error_mean_deg']:.3f} /"

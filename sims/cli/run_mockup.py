@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,21 +20,8 @@ if TYPE_CHECKING:
     from sims.experiments.mockup_vision import FrameResult
 
 
-Advance = Callable[[int], None]
-
-
 def frame_entries(results: dict[Path, FrameResult]) -> list[dict[str, Any]]:
-    """What ``--json`` prints of every file.
-
-    Parameters
-    ----------
-    results : dict
-        Of :func:`sims.experiments.mockup_vision.frames_identified`.
-
-    Returns
-    -------
-    list of dict
-    """
+    """What ``--json`` prints of every file."""
     from adcs.mockup.vision.paper_matcher import CameraFix
 
     entries = []
@@ -55,18 +42,7 @@ def frame_entries(results: dict[Path, FrameResult]) -> list[dict[str, Any]]:
 
 
 def sky_lines(options: MockupOptions, result: dict[str, Any]) -> list[str]:
-    """The result of frames as text.
-
-    Parameters
-    ----------
-    options : MockupOptions
-    result : dict
-        ``summary()`` of the run.
-
-    Returns
-    -------
-    list of str
-    """
+    """The result of frames as text."""
     setup = options.sky_setup()
     damage = [f"noise {setup.noise_DN:g} DN"]
     damage += [f"{100.0 * setup.lost:g} % of the lights lost"] if setup.lost else []
@@ -89,17 +65,7 @@ def sky_lines(options: MockupOptions, result: dict[str, Any]) -> list[str]:
 
 
 def frame_lines(entries: Sequence[dict[str, Any]]) -> list[str]:
-    """Fixes of files as a table.
-
-    Parameters
-    ----------
-    entries : sequence of dict
-        Of :func:`frame_entries`.
-
-    Returns
-    -------
-    list of str
-    """
+    """Fixes of files as a table."""
     width = max(5, *(len(entry["file"]) for entry in entries))
     lines = [f"{'frame':{width}s}  stars  matched    X [m]    Y [m]  heading [°]  rms [mm]"]
     for entry in entries:
@@ -115,17 +81,7 @@ def frame_lines(entries: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def fusion_lines(runs: FusionRuns, duration_s: float) -> list[str]:
-    """The result of drives as text.
-
-    Parameters
-    ----------
-    runs : FusionRuns
-    duration_s : float
-
-    Returns
-    -------
-    list of str
-    """
+    """The result of drives as text."""
     from adcs.mockup.navigation.fixes import counts_in_words
 
     result = runs.summary()
@@ -141,18 +97,7 @@ def fusion_lines(runs: FusionRuns, duration_s: float) -> list[str]:
 
 
 def methods_lines(every: Sequence[FusionRuns], duration_s: float) -> list[str]:
-    """The results of several methods as a table.
-
-    Parameters
-    ----------
-    every : sequence of FusionRuns
-        Of the same drives.
-    duration_s : float
-
-    Returns
-    -------
-    list of str
-    """
+    """The results of several methods as a table."""
     first = every[0].summary()
     lines = [
         f"{_runs(first['runs'])} of {duration_s:g} s, errors after {SETTLED_S:g} s:",
@@ -169,17 +114,7 @@ def methods_lines(every: Sequence[FusionRuns], duration_s: float) -> list[str]:
 
 
 def zeros_lines(runs: ZerosRuns, duration_s: float) -> list[str]:
-    """The result of fits as text.
-
-    Parameters
-    ----------
-    runs : ZerosRuns
-    duration_s : float
-
-    Returns
-    -------
-    list of str
-    """
+    """The result of fits as text."""
     result = runs.summary()
     return [
         f"{_runs(result['runs'])} of {duration_s:g} s, unknowns {runs.unknowns}:",

@@ -53,24 +53,7 @@ class RunOptions:
 
 
 def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) -> tuple[AttitudeFile, EstimatorSettings]:
-    """The scenario with the options in it, and its filter.
-
-    Parameters
-    ----------
-    scenario : str
-        Name or file.
-    options : ScenarioOptions
-    duration_s : float, optional
-
-    Returns
-    -------
-    AttitudeFile, EstimatorSettings
-
-    Raises
-    ------
-    InputError
-        The file or an option cannot be used.
-    """
+    """The scenario with the options in it, and its filter."""
     from adcs.io.scenario_tables import MOST_STEPS
 
     file = adcs.read_scenario(scenario)
@@ -171,19 +154,7 @@ _ROWS = (
 
 
 def summary_lines(file: AttitudeFile, estimate: EstimatorSettings, numbers: dict[str, Any]) -> Sequence[str]:
-    """The result as text.
-
-    Parameters
-    ----------
-    file : AttitudeFile
-    estimate : EstimatorSettings
-    numbers : dict
-        What ``--json`` prints.
-
-    Returns
-    -------
-    sequence of str
-    """
+    """The result as text."""
     runs = "1 run" if numbers["runs"] == 1 else f"{numbers['runs']} runs"
     lines = [f"{file.name}: {runs} of {file.duration_s:g} s; {estimate.in_words}"]
     lines += [f"{what:34s}{numbers[key]:.3g} {unit}" for key, what, unit in _ROWS if numbers[key] is not None]

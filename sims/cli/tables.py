@@ -91,16 +91,7 @@ _TITLES = {3: "Table 3", 4: "Table 4, disturbance in the state", 5: "Table 5, co
 
 
 def table_lines(compared: list[Comparison]) -> list[str]:
-    """The comparison as text.
-
-    Parameters
-    ----------
-    compared : list of Comparison
-
-    Returns
-    -------
-    list of str
-    """
+    """The comparison as text."""
     lines: list[str] = []
     table, label = 0, ""
     for one in compared:

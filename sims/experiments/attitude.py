@@ -31,13 +31,7 @@ _NUMBERS_AT_ONCE = 40_000_000
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Some runs that are held together.
-
-    Attributes
-    ----------
-    runs : AttitudeRuns
-    estimates : AttitudeTracks
-    """
+    """Some runs that are held together."""
 
     runs: AttitudeRuns
     estimates: AttitudeTracks
@@ -103,23 +97,7 @@ class Outcome:
 
 
 def parts_of(file: AttitudeFile, estimate: EstimatorSettings, seeds: Sequence[int]) -> Iterator[Part]:
-    """All runs, as many at once as fit into memory.
-
-    Parameters
-    ----------
-    file : AttitudeFile
-    estimate : EstimatorSettings
-    seeds : sequence of int
-
-    Yields
-    ------
-    Part
-
-    Raises
-    ------
-    InputError
-        The conditions of the start hold at no time, or a date is outside of the model of the field.
-    """
+    """All runs, as many at once as fit into memory."""
     # The command line stands on top of all packages; nothing that it imports imports it.
     from sims.attitude.files import simulation_of
     from sims.attitude.simulation import start_estimates
@@ -164,17 +142,10 @@ def run_scenario(
 
     Parameters
     ----------
-    file : AttitudeFile
-    estimate : EstimatorSettings
-    seeds : sequence of int
     look : callable, optional
         Called with every part of the runs.
     advance : callable, optional
         Called with the number of runs finished since the last call.
-
-    Returns
-    -------
-    Outcome
 
     Raises
     ------

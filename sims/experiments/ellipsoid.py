@@ -25,26 +25,15 @@ from sims.attitude.roll_yaw import ErrorScenario, LoopScenario, error_runs, fly
 class EllipsoidSettings:
     """What is simulated and observed.
 
-    Attributes
-    ----------
-    noise_rad, drift_rad_s : float
-        Bounds of the horizon sensor's errors and of the yaw gyro's zero shift.
-    n_steps : int
-        Of 2 s.
-    step : str
-        Rule by which a set shrinks to a reading.
-    jump_s : float or None
-        When the readings become four times as bad as their bound.
-    closed_loop : bool
-        The satellite in its attitude loop in place of the dynamics of the error alone.
+    ``noise_rad``, ``drift_rad_s``: bounds of the horizon sensor's errors and of the yaw gyro's zero shift.
     """
 
     noise_rad: float
     drift_rad_s: float
-    n_steps: int
-    step: StepRule = "tightened"
-    jump_s: float | None = None
-    closed_loop: bool = False
+    n_steps: int  # of 2 s
+    step: StepRule = "tightened"  # rule by which a set shrinks to a reading
+    jump_s: float | None = None  # when the readings become four times as bad as their bound
+    closed_loop: bool = False  # the satellite in its attitude loop in place of the dynamics of the error alone
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,12 +32,7 @@ _DRIFT_M_S3 = (0.002 / 180.0, -0.0015 / 180.0)
 class TrackErrors:
     """Errors of a track against the truth of the same instants.
 
-    Attributes
-    ----------
-    position_rms_mm, position_p95_mm, position_max_mm : float
-        Of the distance.
-    velocity_rms_mm_s : float
-    heading_rms_deg : float
+    ``position_rms_mm``, ``position_p95_mm``, ``position_max_mm``: of the distance.
     """
 
     position_rms_mm: float
@@ -50,15 +45,7 @@ class TrackErrors:
 def track_errors(track: PlanarTrack, truth: PlanarTrack, after_s: float = SETTLED_S) -> TrackErrors:
     """Errors of one run from an instant on.
 
-    Parameters
-    ----------
-    track, truth : PlanarTrack
-        At the same instants.
-    after_s : float
-
-    Returns
-    -------
-    TrackErrors
+    ``track``, ``truth``: at the same instants.
     """
     late = truth.time_s >= after_s
     distance = 1e3 * np.linalg.norm(track.position_m - truth.position_m, axis=1)[late]
@@ -70,33 +57,17 @@ def track_errors(track: PlanarTrack, truth: PlanarTrack, after_s: float = SETTLE
 
 @dataclass(frozen=True, eq=False)
 class FusionResult:
-    """One run of one method.
-
-    Attributes
-    ----------
-    seed : int
-    run : TableRun
-        Truth, samples and fixes.
-    fused : Fused
-        The track is a :class:`adcs.mockup.navigation.delayed_ekf.FilterTrack` for the delayed filter.
-    errors : TrackErrors
-    """
+    """One run of one method."""
 
     seed: int
-    run: TableRun
-    fused: Fused
+    run: TableRun  # truth, samples and fixes
+    fused: Fused  # the track is a :class:`adcs.mockup.navigation.delayed_ekf.FilterTrack` for the delayed filter
     errors: TrackErrors
 
 
 @dataclass(frozen=True, eq=False)
 class FusionRuns:
-    """All runs of one method.
-
-    Attributes
-    ----------
-    method : str
-    results : tuple of FusionResult
-    """
+    """All runs of one method."""
 
     method: Method
     results: tuple[FusionResult, ...]
@@ -138,27 +109,9 @@ def fusion_run(
 ) -> FusionRuns:
     """Drive around the table, and estimate by one method.
 
-    Parameters
-    ----------
-    method : {'paper', 'velocity-corrected', 'ekf', 'camera', 'imu'}
-    seeds : int
-        Number of runs.
-    duration_s : float
-    seed : int
-        Of the first run; the next ones follow.
-    false_fixes : float
-        Fraction of the fixes that are anywhere under the sky.
-    progress : callable, optional
-        Called with 1 after every run.
-
-    Returns
-    -------
-    FusionRuns
-
-    Raises
-    ------
-    ValueError
-        An argument is out of range.
+    ``method`` is one of 'paper', 'velocity-corrected', 'ekf', 'camera', 'imu'. ``seeds``: number of runs. ``seed``: of
+    the first run; the next ones follow. ``false_fixes``: fraction of the fixes that are anywhere under the sky.
+    ``progress``: called with 1 after every run.
     """
     from sims.mockup.table_run import CameraErrors, TableScenario
 
@@ -181,16 +134,10 @@ def fused_runs(
 
     Parameters
     ----------
-    method : str
     scenario : TableScenario
         Longer than 10 s.
-    seeds : sequence of int
     progress : callable, optional
         Called with 1 after every run.
-
-    Returns
-    -------
-    FusionRuns
     """
     from adcs.mockup.navigation.fixes import fuse
 
@@ -236,17 +183,8 @@ def _fusion_of(method: Method, run: TableRun) -> Fusion:
 class ZerosResult:
     """One run, integrated with and without the zeros that were found.
 
-    Attributes
-    ----------
-    seed : int
-    run : TableRun
-    fit : ZeroFit
-    before, after : PlanarTrack
-        Integrated samples without zeros taken off, from a line through two fixes, and with them.
-    position_before_mm, position_rms_mm : float
-        Distance of both from the truth, rms over the run.
-    zero_error_m_s2 : float
-        Length of the error of the zeros, mean over the run.
+    ``before``, ``after``: integrated samples without zeros taken off, from a line through two fixes, and with them.
+    ``position_before_mm``, ``position_rms_mm``: distance of both from the truth, rms over the run.
     """
 
     seed: int
@@ -256,18 +194,12 @@ class ZerosResult:
     after: PlanarTrack
     position_before_mm: float
     position_rms_mm: float
-    zero_error_m_s2: float
+    zero_error_m_s2: float  # length of the error of the zeros, mean over the run
 
 
 @dataclass(frozen=True, eq=False)
 class ZerosRuns:
-    """All runs of one fit.
-
-    Attributes
-    ----------
-    unknowns : str
-    results : tuple of ZerosResult
-    """
+    """All runs of one fit."""
 
     unknowns: Unknowns
     results: tuple[ZerosResult, ...]
@@ -310,10 +242,6 @@ def zeros_run(
         Fixes whose line is the start of "two"; two in the source.
     progress : callable, optional
         Called with 1 after every run.
-
-    Returns
-    -------
-    ZerosRuns
 
     Raises
     ------

@@ -38,34 +38,16 @@ _START = StartSigma(velocity_m_s=0.2, zero_m_s2=0.01, zero_rad_s=math.radians(0.
 
 @dataclass(frozen=True, eq=False)
 class RecordRun:
-    """A recording and its estimate.
-
-    Attributes
-    ----------
-    method : str
-    imu : ImuRecord
-        From the exposure of the first fix on, its gaps filled.
-    fixes : FixRecord
-        After the first one, which is the start.
-    fused : Fused
-    samples : int
-        Without those that fill the gaps.
-    early_fixes : int
-        Before the first one: exposed before the samples or after them.
-    gaps_s : ndarray, shape (k, 2)
-        Of :attr:`adcs.mockup.navigation.strapdown.ImuRecord.gaps_s`, of the whole recording.
-    warnings : tuple of str
-        What the estimate should not be read without.
-    """
+    """A recording and its estimate."""
 
     method: Method
-    imu: ImuRecord
-    fixes: FixRecord
+    imu: ImuRecord  # from the exposure of the first fix on, its gaps filled
+    fixes: FixRecord  # after the first one, which is the start
     fused: Fused
-    samples: int
-    early_fixes: int
-    gaps_s: FloatArray
-    warnings: tuple[str, ...]
+    samples: int  # without those that fill the gaps
+    early_fixes: int  # before the first one: exposed before the samples or after them
+    gaps_s: FloatArray  # (k, 2): of :attr:`adcs.mockup.navigation.strapdown.ImuRecord.gaps_s`, of the whole recording
+    warnings: tuple[str, ...]  # what the estimate should not be read without
 
     def summary(self) -> dict[str, Any]:
         """What ``--json`` prints; the difference is that of fused and measured positions at the exposures."""
@@ -99,11 +81,6 @@ def fused_record(samples: Path, fixes: Path, method: Method) -> RecordRun:
     ----------
     samples, fixes : Path
         CSV files; see :func:`read_samples` and :func:`read_fixes`.
-    method : str
-
-    Returns
-    -------
-    RecordRun
 
     Raises
     ------
@@ -163,10 +140,6 @@ def read_samples(path: Path) -> ImuRecord:
     path : Path
         A time is when the interval of its sample ends; an empty cell is a missing reading.
 
-    Returns
-    -------
-    ImuRecord
-
     Raises
     ------
     InputError
@@ -204,14 +177,6 @@ def read_samples(path: Path) -> ImuRecord:
 def read_fixes(path: Path) -> FixRecord:
     """Fixes from a CSV file with the columns of :data:`FIX_COLUMNS`, in the order of their arrival.
 
-    Parameters
-    ----------
-    path : Path
-
-    Returns
-    -------
-    FixRecord
-
     Raises
     ------
     InputError
@@ -246,16 +211,7 @@ def _table_with(path: Path, columns: tuple[str, ...]) -> Table:
 
 
 def record_lines(run: RecordRun) -> list[str]:
-    """The result as text.
-
-    Parameters
-    ----------
-    run : RecordRun
-
-    Returns
-    -------
-    list of str
-    """
+    """The result as text."""
     result = run.summary()
     x, y = result["position_m"]
     apart = result["difference_rms_mm"]

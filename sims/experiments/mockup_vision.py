@@ -45,7 +45,6 @@ class SkySetup:
         Probability that a light is dark.
     spurious : int
         Lights in view that are in no catalogue.
-    hot_pixels : int
     speed_m_s, turn_rate_rad_s : float
         During the exposure, in random directions.
     footprint_m : float
@@ -184,12 +183,7 @@ def _rms(values: FloatArray) -> float | None:
 class FrameResult:
     """What one frame gave.
 
-    Attributes
-    ----------
-    stars : Stars
-    fix : CameraFix or NoFix
-    identify_s, frame_s : float
-        Time of the identification, and of all from the image to the fix.
+    ``identify_s``, ``frame_s``: time of the identification, and of all from the image to the fix.
     """
 
     stars: Stars
@@ -201,23 +195,8 @@ class FrameResult:
 def frame_result(image: ByteArray, camera: Camera, matcher: Matcher, finder: Finder = find_stars) -> FrameResult:
     """Fix of one frame, timed; a frame in which nothing can shine, such as a black one, has no stars.
 
-    Parameters
-    ----------
-    image : ndarray of uint8, shape (height, width)
-    camera : Camera
-        As it is believed to be.
-    matcher : Matcher
-    finder : callable
-        Of :mod:`adcs.mockup.vision.centroids`.
-
-    Returns
-    -------
-    FrameResult
-
-    Raises
-    ------
-    ValueError
-        This is no grey image of bytes.
+    Shape ``image`` (height, width). ``camera``: as it is believed to be. ``finder``: of
+    :mod:`adcs.mockup.vision.centroids`.
     """
     begin = time.perf_counter()
     try:
@@ -241,22 +220,9 @@ def sky_run(
 ) -> SkyRun:
     """Render frames at random poses, find the lights, identify them, and compare with the truth.
 
-    Parameters
-    ----------
-    sky : LedSky
-    matcher : Matcher
-        For the catalogue of that sky, and a camera of that footprint.
-    setup : SkySetup
-    seed : int
-        Each frame has random numbers of its own, whatever the others do.
-    progress : callable, optional
-        Called with the number of frames finished since the last call.
-    finder : callable
-        Of :mod:`adcs.mockup.vision.centroids`.
-
-    Returns
-    -------
-    SkyRun
+    ``matcher``: for the catalogue of that sky, and a camera of that footprint. ``seed``: each frame has random numbers
+    of its own, whatever the others do. ``progress``: called with the number of frames finished since the last call.
+    ``finder``: of :mod:`adcs.mockup.vision.centroids`.
     """
     truth = np.empty((setup.poses, 3))
     results = []
@@ -272,17 +238,7 @@ def sky_run(
 def random_frame(sky: LedSky, setup: SkySetup, seed: int, row: int) -> tuple[Pose, Frame]:
     """Frame of a row of :func:`sky_run`, the same whatever the other rows are.
 
-    Parameters
-    ----------
-    sky : LedSky
-    setup : SkySetup
-    seed, row : int
-
-    Returns
-    -------
-    Pose
-        In the middle of the exposure.
-    Frame
+    Returns: in the middle of the exposure.
     """
     # The command line stands on top of all packages; nothing that it imports imports it.
     from sims.mockup.frames import Motion, rendered_frame
@@ -317,24 +273,8 @@ def identified_files(
 ) -> dict[Path, FrameResult]:
     """Fixes of frames in PNG files.
 
-    Parameters
-    ----------
-    paths : iterable of Path
-    camera : Camera
-        As it is believed to be; the frames must have its size.
-    matcher : Matcher
-    finder : callable
-        Of :mod:`adcs.mockup.vision.centroids`.
-
-    Returns
-    -------
-    dict
-        From path to result, in the order of the paths.
-
-    Raises
-    ------
-    InputError
-        A file is no frame of this camera.
+    ``camera``: as it is believed to be; the frames must have its size. ``finder``: of
+    :mod:`adcs.mockup.vision.centroids`. Returns: from path to result, in the order of the paths.
     """
     return {path: frame_result(read_frame(path, camera), camera, matcher, finder) for path in paths}
 

@@ -33,15 +33,10 @@ UNITS: dict[Quantity, str] = {
 class Printed:
     """A number of the paper.
 
-    Attributes
-    ----------
-    text : str
-        As it can be read.
-    low, high : float
-        Its value, or the range that is left of it.
+    ``low``, ``high``: its value, or the range that is left of it.
     """
 
-    text: str
+    text: str  # as it can be read
     low: float
     high: float
 
@@ -58,29 +53,15 @@ def printed(text: str) -> Printed:
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A row of a table.
-
-    Attributes
-    ----------
-    table : int
-    label : str
-        Sensors, and what is estimated where the table says so.
-    sensors : str
-    states : tuple of str
-    numbers : dict
-        What is printed.
-    filter : str
-    duration_s : float
-        After which ours is taken.
-    """
+    """A row of a table."""
 
     table: int
-    label: str
+    label: str  # sensors, and what is estimated where the table says so
     sensors: str
     states: tuple[str, ...]
-    numbers: dict[Quantity, Printed]
+    numbers: dict[Quantity, Printed]  # what is printed
     filter: Filter = "mekf"
-    duration_s: float = 200.0
+    duration_s: float = 200.0  # after which ours is taken
 
 
 def _row(
@@ -201,36 +182,19 @@ PAPER_ROWS: tuple[PaperRow, ...] = (
 
 @dataclass(frozen=True)
 class Comparison:
-    """A number of the paper and ours.
-
-    Attributes
-    ----------
-    table : int
-    set : str
-    filter : str
-    quantity, unit : str
-    paper_text : str
-        As it can be read, (?) where it is unsure.
-    paper_low, paper_high : float
-    ours : float
-        Standard deviation by the filter's covariance at the end, worst axis, mean over the runs.
-    ratio : float
-        Ours over the paper's.
-    rms : float
-        Of our errors in the last minute, worst axis.
-    """
+    """A number of the paper and ours."""
 
     table: int
     set: str
     filter: str
     quantity: str
     unit: str
-    paper_text: str
+    paper_text: str  # as it can be read, (?) where it is unsure
     paper_low: float
     paper_high: float
-    ours: float
-    ratio: float
-    rms: float
+    ours: float  # standard deviation by the filter's covariance at the end, worst axis, mean over the runs
+    ratio: float  # ours over the paper's
+    rms: float  # of our errors in the last minute, worst axis
 
 
 def compared_with_paper(row: PaperRow, seeds: Sequence[int], duration_s: float | None = None) -> list[Comparison]:

@@ -23,8 +23,6 @@ class SimulationFiles(NamedTuple):
 
     Attributes
     ----------
-    readings : Path
-    array : Path
     truths : tuple of Path
         One for each source.
     """
@@ -42,15 +40,7 @@ class SimulationFiles(NamedTuple):
 def files_beside(readings: str | PathLike[str], n_sources: int) -> SimulationFiles:
     """Paths of the files of a simulation, from that of the readings.
 
-    Parameters
-    ----------
-    readings : path-like
-    n_sources : int
-
-    Returns
-    -------
-    SimulationFiles
-        READINGS-array.toml, READINGS-truth.csv, READINGS-truth-2.csv and so on beside READINGS.csv.
+    Returns: READINGS-array.toml, READINGS-truth.csv, READINGS-truth-2.csv and so on beside READINGS.csv.
     """
     path = Path(readings)
     names = ["truth", *(f"truth-{number}" for number in range(2, n_sources + 1))][:n_sources]
@@ -63,13 +53,8 @@ def write_simulation(simulation: Simulation, readings: str | PathLike[str]) -> S
 
     Parameters
     ----------
-    simulation : Simulation
     readings : path-like
         Of the readings file; the others are written beside it (:func:`files_beside`). Existing files are replaced.
-
-    Returns
-    -------
-    SimulationFiles
 
     Raises
     ------
@@ -97,19 +82,7 @@ def write_simulation(simulation: Simulation, readings: str | PathLike[str]) -> S
 
 
 def write_truth(truth: Truth, path: str | PathLike[str]) -> None:
-    """Write a truth file, with exact numbers.
-
-    Parameters
-    ----------
-    truth : Truth
-    path : path-like
-        Replaced if it exists.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
-    """
+    """Write a truth file, with exact numbers."""
     header = ["time_s", *TRUE_POSITION_COLUMNS]
     columns = [truth.time_s[:, None], truth.position_m]
     if truth.moment_Am2 is not None:

@@ -29,18 +29,12 @@ _SAME_PLACE_M = 1e-9
 class Motion:
     """Where something is at n instants, and where it goes.
 
-    Attributes
-    ----------
-    position_m : ndarray, shape (n, 3)
-        In the world frame [m].
-    velocity_m_s : ndarray, shape (n, 3)
-        Its derivative [m/s].
-    course_rad : ndarray, shape (n,)
-        Direction of the horizontal velocity, clockwise from north; the last one where there is none [rad].
+    ``course_rad`` (n,): direction of the horizontal velocity, clockwise from north; the last one where there is none
+    [rad].
     """
 
-    position_m: FloatArray
-    velocity_m_s: FloatArray
+    position_m: FloatArray  # (n, 3): in the world frame [m]
+    velocity_m_s: FloatArray  # (n, 3): its derivative [m/s]
     course_rad: FloatArray
 
 
@@ -109,19 +103,8 @@ def circle(
 ) -> Steered:
     """Horizontal circle.
 
-    Parameters
-    ----------
-    centre_m : tuple
-        World frame [m].
-    radius_m, speed_m_s : float
-    start_rad : float
-        Bearing of the position at the time 0, seen from the centre, clockwise from north.
-    clockwise : bool
-        Seen from above.
-
-    Returns
-    -------
-    Steered
+    ``centre_m``: world frame [m]. ``start_rad``: bearing of the position at the time 0, seen from the centre, clockwise
+    from north. ``clockwise``: seen from above.
     """
     x, y, z = centre_m
     start = (x + radius_m * math.sin(start_rad), y + radius_m * math.cos(start_rad), z)
@@ -131,23 +114,10 @@ def circle(
 
 @dataclass(frozen=True)
 class Waypoints:
-    """Straight from point to point at constant speed, and at rest in the last one.
+    """Straight from point to point at constant speed, and at rest in the last one."""
 
-    Attributes
-    ----------
-    points_m : tuple of tuples, shape (k, 3)
-        Two at least, each at some distance from the one before, world frame [m].
-    speed_m_s : float
-        Along the path, also where it climbs.
-
-    Raises
-    ------
-    ValueError
-        Fewer than two points, two that follow each other in one place, or a speed that is not positive.
-    """
-
-    points_m: tuple[Vector, ...]
-    speed_m_s: float
+    points_m: tuple[Vector, ...]  # (k, 3): two at least, each at some distance from the one before, world frame [m]
+    speed_m_s: float  # along the path, also where it climbs
 
     def __post_init__(self) -> None:
         if len(self.points_m) < 2:
@@ -184,25 +154,11 @@ class Waypoints:
 class Lawnmower:
     """Parallel lines at constant height and speed, joined by half circles, and at rest at the end of the last line.
 
-    Attributes
-    ----------
-    start_m : tuple
-        Start of the first line, world frame [m].
-    course_rad : float
-        Course of the first line; the other lines lie to its right.
-    length_m, spacing_m : float
-        Length of every line, distance between neighbours.
-    lines : int
-    speed_m_s : float
-
-    Raises
-    ------
-    ValueError
-        A number is not positive.
+    ``length_m``, ``spacing_m``: length of every line, distance between neighbours.
     """
 
-    start_m: Vector
-    course_rad: float
+    start_m: Vector  # start of the first line, world frame [m]
+    course_rad: float  # course of the first line; the other lines lie to its right
     length_m: float
     spacing_m: float
     lines: int
@@ -248,7 +204,6 @@ class Attitude:
 
     Attributes
     ----------
-    follows_course : bool
     mount_xyzw : tuple
         Unit quaternion, body axes to carrier's axes, at the time 0.
     rate_rad_s : tuple

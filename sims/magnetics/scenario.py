@@ -35,7 +35,7 @@ class Carrier:
 
 @dataclass(frozen=True)
 class Source:
-    r"""A dipole fixed to a body.
+    """A dipole fixed to a body.
 
     Its moment in body axes is :math:`m = m_{permanent} + α B_a/μ_0` with the ambient field B_a in body axes. Only the
     main ambient field magnetises it, not its pulsations.
@@ -60,16 +60,9 @@ class Source:
 
 @dataclass(frozen=True)
 class Pulsation:
-    """A sinusoid of random phase in the ambient field, the same at all sensors.
+    """A sinusoid of random phase in the ambient field, the same at all sensors."""
 
-    Attributes
-    ----------
-    amplitude_T : tuple, shape (3,)
-        World frame.
-    period_s : float
-    """
-
-    amplitude_T: Vector
+    amplitude_T: Vector  # (3,): world frame
     period_s: float
 
 
@@ -128,10 +121,6 @@ class MagneticScenario:
         None is allowed: a recording of noise.
     ambient_T : tuple, shape (3,), optional
         Geomagnetic field, world frame. None: there is none, and the readings have no columns for it.
-    pulsations : tuple of Pulsation
-    platform : Platform
-    missing : Missing
-    name : str
 
     Raises
     ------

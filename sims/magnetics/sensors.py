@@ -140,15 +140,7 @@ SENSOR_KINDS: dict[str, SensorModel] = {
 def model_of(sensor: Sensor, rate_Hz: float) -> SensorModel:
     """The model that an array file's sensor describes, with nothing that the array does not state.
 
-    Parameters
-    ----------
-    sensor : Sensor
-    rate_Hz : float
-        Rate at which its noise is that of one sample.
-
-    Returns
-    -------
-    SensorModel
+    ``rate_Hz``: rate at which its noise is that of one sample.
     """
     model = SensorModel(
         reads=sensor.kind,
@@ -165,22 +157,7 @@ def model_of(sensor: Sensor, rate_Hz: float) -> SensorModel:
 def nominal_array(array: SensorArray, models: tuple[SensorModel, ...], rate_Hz: float) -> SensorArray:
     """The array as its user knows it: noise, limits and uncertainties of its sensors' models.
 
-    Parameters
-    ----------
-    array : SensorArray
-        Where the sensors stand, and their nominal calibration.
-    models : tuple of SensorModel
-        One for each sensor.
-    rate_Hz : float
-
-    Returns
-    -------
-    SensorArray
-
-    Raises
-    ------
-    ValueError
-        A sensor's kind is not what its model reads, or it has no noise at all.
+    ``array``: where the sensors stand, and their nominal calibration. ``models``: one for each sensor.
     """
     return replace(
         array,

@@ -30,8 +30,6 @@ class Simulation:
 
     Attributes
     ----------
-    scenario : MagneticScenario
-    seed : int
     array : SensorArray
         As its user knows it.
     readings : Readings
@@ -77,23 +75,8 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
     The field at every sensor is that of the ambient field with its pulsations, of the platform and of all sources at
     that instant. Then come calibration with its errors, the sensor's low-pass, noise and drift, rounding, and
     saturation: a reading beyond the range is the range.
-
-    Parameters
-    ----------
-    scenario : MagneticScenario
-    seed : int
-        The same seed gives the same numbers. Every feature of every sensor, by its id, has its own stream: leaving out
-        one changes no other.
-
-    Returns
-    -------
-    Simulation
-
-    Raises
-    ------
-    ValueError
-        At one of the instants a sensor is inside a source, or within a millimetre of one or of the platform's dipole;
-        or no row is left between the gaps.
+    ``seed``: the same seed gives the same numbers. Every feature of every sensor, by its id, has its own stream:
+    leaving out one changes no other.
     """
     time_s = scenario.time_s
     array_pose = _pose(scenario.carrier, time_s, seed, "array")

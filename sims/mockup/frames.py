@@ -19,18 +19,10 @@ _MOST_STEPS = 2000
 
 @dataclass(frozen=True)
 class Motion:
-    """How the satellite moves during the exposure.
+    """How the satellite moves during the exposure."""
 
-    Attributes
-    ----------
-    velocity_m_s : tuple, shape (2,)
-        In the table's frame.
-    turn_rate_rad_s : float
-        Counter-clockwise seen from above.
-    """
-
-    velocity_m_s: tuple[float, float] = (0.0, 0.0)
-    turn_rate_rad_s: float = 0.0
+    velocity_m_s: tuple[float, float] = (0.0, 0.0)  # (2,): in the table's frame
+    turn_rate_rad_s: float = 0.0  # counter-clockwise seen from above
 
 
 @dataclass(frozen=True)
@@ -43,7 +35,6 @@ class FrameQuality:
         Standard deviation of the Gaussian image of a light.
     peak_DN : float
         Of a light at rest, above the background; motion spreads the same light over more pixels.
-    background_DN : float
     noise_DN : float
         Standard deviation in a pixel.
     lost : float
@@ -80,22 +71,12 @@ class FrameQuality:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A rendered frame.
+    """A rendered frame."""
 
-    Attributes
-    ----------
-    image : ndarray of uint8, shape (height_px, width_px)
-    lights : ndarray of int, shape (k,)
-        Lights of the sky that shine and are in the frame in the middle of the exposure.
-    lights_px : ndarray, shape (k, 2)
-        Column and row of them.
-    spurious_px : ndarray, shape (spurious, 2)
-    """
-
-    image: ByteArray
-    lights: NDArray[np.intp]
-    lights_px: FloatArray
-    spurious_px: FloatArray
+    image: ByteArray  # (height_px, width_px)
+    lights: NDArray[np.intp]  # (k,): lights of the sky that shine and are in the frame in the middle of the exposure
+    lights_px: FloatArray  # (k, 2): column and row of them
+    spurious_px: FloatArray  # (spurious, 2)
 
 
 def rendered_frame(
@@ -110,20 +91,7 @@ def rendered_frame(
 
     A light's image is a Gaussian, drawn out along the path that it takes during the exposure; the total light does not
     depend on the motion. Gaussian noise, then rounding to whole numbers from 0 to 255.
-
-    Parameters
-    ----------
-    sky : LedSky
-    camera : Camera
-    pose : Pose
-        In the middle of the exposure.
-    rng : numpy.random.Generator
-    motion : Motion
-    quality : FrameQuality
-
-    Returns
-    -------
-    Frame
+    ``pose``: in the middle of the exposure.
     """
     shining = np.flatnonzero(rng.random(len(sky)) >= quality.lost)
     size = np.array([camera.width_px, camera.height_px])

@@ -1,16 +1,6 @@
-r"""Runs of the table-top satellite: how it drives, what its inertial unit reads, and which fixes its camera sends.
+"""Runs of the table-top satellite: how it drives, what its inertial unit reads, and which fixes its camera sends.
 
-The truth is integrated over the polls of the microcontroller, a thousand in a second; a sample is the mean of ten. Two
-drives:
-
-- "perimeter": around the table at about constant speed, for figures 8, 9 and 21 to 24 of the source. Valves of ±0.04
-  m/s² along each body axis, opened and closed by a controller ten times in a second, follow a rounded rectangle, while
-  a flywheel turns the satellite at rates between -10 and 40 °/s, or the other way round.
-- "two-firings": figures 13 to 18, two firings that turn it by about 400° in 15 s, with thrust in between.
-
-Errors are those of our summary of the source, section 8. Zeros drift because the sensor warms.
-
-Random numbers of each feature come from a stream of their own, so that leaving out one changes no other.
+See docs/theory/tabletop-navigation.md.
 """
 
 from __future__ import annotations
@@ -119,11 +109,8 @@ class TableScenario:
     Attributes
     ----------
     drive : {'perimeter', 'two-firings'}
-    duration_s : float
     sample_s : float
         Between samples of the inertial unit, a multiple of :data:`POLL_S`.
-    imu : ImuErrors
-    camera : CameraErrors
 
     Raises
     ------
@@ -163,50 +150,23 @@ class TableScenario:
 class TableRun:
     """Truth and readings.
 
-    Attributes
-    ----------
-    truth : PlanarTrack
-        At the end of each sample.
-    true_start, start : PlanarState
-        At 0 s, and what is known of it: as well as from a fix, and the true velocity.
-    imu : ImuRecord
-    temperature_C : ndarray, shape (n,)
-    zero_m_s2 : ndarray, shape (n, 2)
-        True zeros of the accelerometer in each sample.
-    zero_rad_s : float
-        True zero of the gyro.
-    fixes : FixRecord
-        As they arrive.
-    exposure_s : ndarray, shape (k,)
-        When the images were taken: their time stamps less the latency.
-    false : ndarray of bool, shape (k,)
-        Which of them are false.
+    ``true_start``, ``start``: at 0 s, and what is known of it: as well as from a fix, and the true velocity.
     """
 
-    truth: PlanarTrack
+    truth: PlanarTrack  # at the end of each sample
     true_start: PlanarState
     start: PlanarState
     imu: ImuRecord
-    temperature_C: FloatArray
-    zero_m_s2: FloatArray
-    zero_rad_s: float
-    fixes: FixRecord
-    exposure_s: FloatArray
-    false: BoolArray
+    temperature_C: FloatArray  # (n,)
+    zero_m_s2: FloatArray  # (n, 2): true zeros of the accelerometer in each sample
+    zero_rad_s: float  # true zero of the gyro
+    fixes: FixRecord  # as they arrive
+    exposure_s: FloatArray  # (k,): when the images were taken: their time stamps less the latency
+    false: BoolArray  # (k,): which of them are false
 
 
 def table_run(scenario: TableScenario, seed: int) -> TableRun:
-    """Simulate one run.
-
-    Parameters
-    ----------
-    scenario : TableScenario
-    seed : int
-
-    Returns
-    -------
-    TableRun
-    """
+    """Simulate one run."""
     camera, n, polls = scenario.camera, scenario.n_samples, scenario.polls
     drive = perimeter_drive if scenario.drive == "perimeter" else two_firings_drive
     polled, true_start = drive(n * polls, stream(seed, "drive"))
@@ -282,15 +242,7 @@ def _fixes(flown: PlanarTrack, camera: CameraErrors, seed: int) -> tuple[FixReco
 def perimeter_drive(n_polls: int, rng: np.random.Generator) -> tuple[ImuRecord, PlanarState]:
     """True readings of every poll around the table, and the start, at rest.
 
-    Parameters
-    ----------
-    n_polls : int
-    rng : numpy.random.Generator
-        For where and which way round it starts, its heading, and how it turns.
-
-    Returns
-    -------
-    ImuRecord, PlanarState
+    ``rng``: for where and which way round it starts, its heading, and how it turns.
     """
     time_s = POLL_S * np.arange(1.0, n_polls + 1.0)
     middle_s = time_s - 0.5 * POLL_S
@@ -351,18 +303,7 @@ def _on_perimeter(along_m: float) -> tuple[complex, complex]:
 
 
 def two_firings_drive(n_polls: int, rng: np.random.Generator) -> tuple[ImuRecord, PlanarState]:
-    """True readings of every poll of the run with two firings, and its start; nothing of it is random.
-
-    Parameters
-    ----------
-    n_polls : int
-    rng : numpy.random.Generator
-        Not used.
-
-    Returns
-    -------
-    ImuRecord, PlanarState
-    """
+    """True readings of every poll of the run with two firings, and its start; nothing of it is random."""
     time_s = POLL_S * np.arange(1.0, n_polls + 1.0)
     middle_s = time_s - 0.5 * POLL_S
     knots_s = [2.0, 2.6, 4.5, 5.2, 9.0, 9.5, 11.8, 12.2]

@@ -1,32 +1,6 @@
-r"""Error-state Kalman filter of the table-top satellite that takes late camera fixes where they belong.
+"""Error-state Kalman filter of the table-top satellite that takes late camera fixes where they belong.
 
-The state is (X, Y, v_X, v_Y, φ, α, β, b, α', β'): position, velocity, heading, zeros of the accelerometer along body x
-and y, zero of the gyro, drifts of the accelerometer's zeros. A sample predicts by the formulas of
-:func:`adcs.mockup.navigation.strapdown.step` with the zeros taken off; with ``a`` the acceleration in table axes,
-
-.. math::
-
-    \frac{∂a}{∂φ} = \begin{pmatrix} -a_Y \\ a_X \end{pmatrix}, \quad \frac{∂a}{∂(α, β)} = -R(φ + ωΔ/2), \quad
-    \frac{∂a}{∂b} = -\frac{Δ}{2} \frac{∂a}{∂φ}
-
-The zeros of a sensor that warms drift steadily, and a walk alone would lag behind them by more than it admits. So they
-go on by α'Δ and β'Δ, and walk, and so do their drifts; a sample has the zeros of its beginning:
-
-.. math::
-
-    Q_{(α, α')} = w^2 \begin{pmatrix} Δ & 0 \\ 0 & 0 \end{pmatrix}
-        + u^2 \begin{pmatrix} Δ^3/3 & Δ^2/2 \\ Δ^2/2 & Δ \end{pmatrix}
-
-A fix measures X, Y and φ. State and covariance of every sample are kept. A fix of exposure t_s takes the filter back to
-t_s, corrects it there, and predicts the samples since again; fixes of later exposures that had come before are taken
-again on the way. So the estimate does not depend on the order of arrival, and is the one of fixes without delay.
-
-A fix whose normalised innovation squared exceeds the gate is left out. A filter that is lost would leave all of them
-out for ever: where ``reacquire_after`` fixes in a row are rejected which agree with one another, position, velocity and
-heading start anew from the last of them.
-
-Ours, after section 6 of our summary of Bindel et al.; the source integrates again
-(:mod:`adcs.mockup.navigation.reintegration`).
+See docs/theory/tabletop-navigation.md.
 """
 
 from __future__ import annotations
@@ -87,7 +61,6 @@ class FilterSettings:
         no more than ``agree_m`` and ``agree_m_s`` times the time between them.
     buffer_s : float
         How old a fix may be.
-    sample_gate : Gate
     """
 
     sample_s: float = 0.01
@@ -185,21 +158,9 @@ def predicted(
 ) -> tuple[FloatArray, FloatArray]:
     """State and covariance after one sample, :math:`F P F^T + Q`: the readable twin of the compiled prediction.
 
-    Parameters
-    ----------
-    x : ndarray, shape (10,)
-    P : ndarray, shape (10, 10)
-    step_s : float
-    reading : array_like, shape (3,)
-        Accelerations along body x and y, and the rate.
-    there : array_like of bool, shape (3,)
-        Which of them are believed. One that is not counts as zero acceleration, or as the rate that is given.
-    densities : ndarray, shape (7,)
-        Of :attr:`FilterSettings.densities`.
-
-    Returns
-    -------
-    x, P : ndarray
+    Shapes ``x`` (10,), ``P`` (10, 10). ``reading`` (3,): accelerations along body x and y, and the rate. ``there``
+    (3,): which of them are believed. One that is not counts as zero acceleration, or as the rate that is given.
+    ``densities`` (7,): of :attr:`FilterSettings.densities`.
     """
     h, z, use = step_s, np.asarray(reading, dtype=np.float64), np.asarray(there, dtype=np.bool_)
     rate = z[2] - x[7]
@@ -258,7 +219,6 @@ class DelayedFilter:
         At ``begin_s``.
     begin_s : float
         Where the first samples begin.
-    settings : FilterSettings
     sigma : StartSigma
         How well the start is known. The zeros and their drifts start at 0.
 
@@ -347,12 +307,7 @@ class DelayedFilter:
         return FilterTrack(imu.time_s, position, velocity, heading, zeros, rate_zero, drifts, sigma)
 
     def add_fix(self, fix: Fix) -> Outcome:
-        """Go back to the exposure of a fix, correct the estimate there, and come back.
-
-        Parameters
-        ----------
-        fix : Fix
-        """
+        """Go back to the exposure of a fix, correct the estimate there, and come back."""
         now = float(self._time_s[self._n - 1])
         if fix.time_s > now:
             return Outcome.AHEAD

@@ -164,14 +164,7 @@ _TAKEN = (Outcome.USED, Outcome.REACQUIRED)
 def unused_counts(outcomes: Sequence[Outcome]) -> dict[str, int]:
     """Number of the fixes that were not used, by the reason; with those that were used they are all.
 
-    Parameters
-    ----------
-    outcomes : sequence of Outcome
-
-    Returns
-    -------
-    dict
-        Every reason in words, also where it has none.
+    Returns: every reason in words, also where it has none.
     """
     return {reason.value: outcomes.count(reason) for reason in Outcome if reason not in _TAKEN}
 
@@ -179,15 +172,7 @@ def unused_counts(outcomes: Sequence[Outcome]) -> dict[str, int]:
 def counts_in_words(used: int, unused: Mapping[str, int]) -> str:
     """Numbers of fixes by what became of them, which add up: "187 used, 75 too old".
 
-    Parameters
-    ----------
-    used : int
-    unused : mapping
-        Of :func:`unused_counts`; reasons without fixes are left out.
-
-    Returns
-    -------
-    str
+    ``unused``: of :func:`unused_counts`; reasons without fixes are left out.
     """
     return ", ".join([f"{used} used", *(f"{count} {reason}" for reason, count in unused.items() if count)])
 

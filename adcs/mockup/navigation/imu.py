@@ -30,29 +30,15 @@ def _zero_vector() -> FloatArray:
 
 @dataclass(frozen=True)
 class RateGyro:
-    """The ADIS16100: ±300 °/s, noise 0.1 °/s, a zero that is linear in temperature, -40 to 85 °C.
+    """The ADIS16100: ±300 °/s, noise 0.1 °/s, a zero that is linear in temperature, -40 to 85 °C."""
 
-    Attributes
-    ----------
-    sigma_rad_s : float
-        Noise of a sample.
-    range_rad_s : float
-    zero_rad_s : float
-        At ``reference_C``.
-    zero_slope_rad_s_K : float
-        The source does not state it.
-    reference_C : float
-    lowest_C, highest_C : float
-        Temperatures that it works at.
-    """
-
-    sigma_rad_s: float = math.radians(0.1)
+    sigma_rad_s: float = math.radians(0.1)  # noise of a sample
     range_rad_s: float = math.radians(300.0)
-    zero_rad_s: float = 0.0
-    zero_slope_rad_s_K: float = 0.0
+    zero_rad_s: float = 0.0  # at ``reference_C``
+    zero_slope_rad_s_K: float = 0.0  # the source does not state it
     reference_C: float = 20.0
-    lowest_C: float = -40.0
-    highest_C: float = 85.0
+    lowest_C: float = -40.0  # temperatures that it works at
+    highest_C: float = 85.0  # temperatures that it works at
 
     def __post_init__(self) -> None:
         _check_noise_and_range(self.sigma_rad_s, self.range_rad_s)
@@ -60,21 +46,7 @@ class RateGyro:
     def readings(self, rate_rad_s: ArrayLike, noise: ArrayLike, temperature_C: ArrayLike = 20.0) -> FloatArray:
         """What it reads, NaN beyond its range.
 
-        Parameters
-        ----------
-        rate_rad_s : array_like, shape (...)
-        noise : array_like, shape (...)
-            Standard normal numbers.
-        temperature_C : array_like, shape (...)
-
-        Returns
-        -------
-        ndarray, shape (...)
-
-        Raises
-        ------
-        ValueError
-            It does not work at such a temperature.
+        Shapes ``rate_rad_s`` (...), ``temperature_C`` (...) -> (...). ``noise`` (...): standard normal numbers.
         """
         warmer_K = _checked_temperature(temperature_C, self.lowest_C, self.highest_C) - self.reference_C
         zero = self.zero_rad_s + self.zero_slope_rad_s_K * warmer_K
@@ -84,33 +56,16 @@ class RateGyro:
 
 @dataclass(frozen=True, eq=False)
 class Inclinometer:
-    """The SCA103T-D04 as accelerometer of two axes: ±0.26 g, noise 0.002 m/s², ±0.0003 m/s² per °C, -40 to 125 °C.
+    """The SCA103T-D04 as accelerometer of two axes: ±0.26 g, noise 0.002 m/s², ±0.0003 m/s² per °C, -40 to 125 °C."""
 
-    Attributes
-    ----------
-    sigma_m_s2 : float
-        Noise of a sample, each axis.
-    range_m_s2 : float
-        Of each axis.
-    zero_m_s2 : ndarray, shape (2,)
-        At ``reference_C``.
-    zero_slope_m_s2_K : ndarray, shape (2,)
-        0.0003 at most.
-    tilt_rad : ndarray, shape (2,)
-        Of the axes x and y above the horizontal.
-    reference_C : float
-    lowest_C, highest_C : float
-        Temperatures that it works at.
-    """
-
-    sigma_m_s2: float = 0.002
-    range_m_s2: float = 0.26 * G_M_S2
-    zero_m_s2: FloatArray = field(default_factory=_zero_vector)
-    zero_slope_m_s2_K: FloatArray = field(default_factory=_zero_vector)
-    tilt_rad: FloatArray = field(default_factory=_zero_vector)
+    sigma_m_s2: float = 0.002  # noise of a sample, each axis
+    range_m_s2: float = 0.26 * G_M_S2  # of each axis
+    zero_m_s2: FloatArray = field(default_factory=_zero_vector)  # (2,): at ``reference_C``
+    zero_slope_m_s2_K: FloatArray = field(default_factory=_zero_vector)  # (2,): 0.0003 at most
+    tilt_rad: FloatArray = field(default_factory=_zero_vector)  # (2,): of the axes x and y above the horizontal
     reference_C: float = 20.0
-    lowest_C: float = -40.0
-    highest_C: float = 125.0
+    lowest_C: float = -40.0  # temperatures that it works at
+    highest_C: float = 125.0  # temperatures that it works at
 
     def __post_init__(self) -> None:
         _check_noise_and_range(self.sigma_m_s2, self.range_m_s2)
@@ -123,22 +78,8 @@ class Inclinometer:
     def readings(self, acceleration_m_s2: ArrayLike, noise: ArrayLike, temperature_C: ArrayLike = 20.0) -> FloatArray:
         """What it reads, NaN beyond its range.
 
-        Parameters
-        ----------
-        acceleration_m_s2 : array_like, shape (..., 2)
-            Along body x and y.
-        noise : array_like, shape (..., 2)
-            Standard normal numbers.
-        temperature_C : array_like, shape (...)
-
-        Returns
-        -------
-        ndarray, shape (..., 2)
-
-        Raises
-        ------
-        ValueError
-            It does not work at such a temperature.
+        Shapes ``temperature_C`` (...) -> (..., 2). ``acceleration_m_s2`` (..., 2): along body x and y. ``noise``
+        (..., 2): standard normal numbers.
         """
         warmer_K = _checked_temperature(temperature_C, self.lowest_C, self.highest_C) - self.reference_C
         zero = self.zero_m_s2 + G_M_S2 * np.sin(self.tilt_rad) + self.zero_slope_m_s2_K * warmer_K[..., None]
@@ -152,21 +93,12 @@ class NotAtRestError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class RestZeros:
-    """Zeros of all channels, of a calibration at rest.
+    """Zeros of all channels, of a calibration at rest."""
 
-    Attributes
-    ----------
-    acceleration_m_s2 : ndarray, shape (2,)
-        Zero and tilt.
-    rate_rad_s : float
-    acceleration_sigma_m_s2, rate_sigma_rad_s : float
-        Standard deviations of these means.
-    """
-
-    acceleration_m_s2: FloatArray
+    acceleration_m_s2: FloatArray  # (2,): zero and tilt
     rate_rad_s: float
-    acceleration_sigma_m_s2: float
-    rate_sigma_rad_s: float
+    acceleration_sigma_m_s2: float  # standard deviations of these means
+    rate_sigma_rad_s: float  # standard deviations of these means
 
 
 def zeros_at_rest(
@@ -176,26 +108,8 @@ def zeros_at_rest(
 
     Whether it is at rest is seen in means over 1, 4, 16, … samples: none may be farther from the mean over all than
     noise explains.
-
-    Parameters
-    ----------
-    imu : ImuRecord
-        One run, two samples at least; missing readings are left out.
-    accelerometer, gyro : Inclinometer, RateGyro
-        For their noise.
-    false_alarm : float
-        How often readings at rest are refused.
-
-    Returns
-    -------
-    RestZeros
-
-    Raises
-    ------
-    NotAtRestError
-        A pulse of a valve, a push or a turn: the text says when.
-    ValueError
-        There are fewer than two samples.
+    ``imu``: one run, two samples at least; missing readings are left out. ``accelerometer``, ``gyro``: for their noise.
+    ``false_alarm``: how often readings at rest are refused.
 
     Notes
     -----

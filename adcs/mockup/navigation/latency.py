@@ -1,18 +1,6 @@
-r"""The camera's latency: by how much later than the exposure its fixes are stamped.
+"""The camera's latency: by how much later than the exposure its fixes are stamped.
 
-While the satellite turns at a changing rate, the camera's heading is the gyro's of a moment ago. Between two fixes in a
-row, with stamps t_k and latency L,
-
-.. math:: ψ_{k+1} - ψ_k = φ(t_{k+1} - L) - φ(t_k - L) - b\,(t_{k+1} - t_k) + noise
-
-φ being the integral of the gyro, b its zero. The noises of neighbours share a fix, and the gyro's noise is that of each
-interval, so the covariance is tridiagonal; weighted least squares give L and b. Differences that a false fix spoils are
-left out.
-
-A constant rate shows nothing: every latency then fits as well, with another heading. So L is observable only where the
-rate changes by more than noise, and its standard deviation takes off what noise alone pretends to show.
-
-Ours.
+See docs/theory/tabletop-navigation.md.
 """
 
 from __future__ import annotations
@@ -45,7 +33,6 @@ class LatencyEstimate:
         Its standard deviation, infinite where it is not observable.
     gyro_zero_rad_s : float
         b, NaN likewise.
-    observable : bool
     reason : str
         Why not; empty where it is.
     used : int
@@ -83,10 +70,6 @@ def camera_latency(
         Noise of a sample.
     heading_sigma_rad : float
         Noise of a fix's heading.
-
-    Returns
-    -------
-    LatencyEstimate
 
     Raises
     ------

@@ -1,11 +1,6 @@
-r"""The source's fusion of late fixes: integrate again from the exposure; and the two estimates without fusion.
+"""The source's fusion of late fixes: integrate again from the exposure; and the two estimates without fusion.
 
-Samples are kept since the last exposure. When a fix of exposure t_s arrives, position and heading at t_s are set to it,
-the velocity to what two fixes tell, and the samples since t_s are integrated again. Nothing of the estimate before
-remains, so a false fix is followed until the next one.
-
-The difference of two fixes is the velocity in the middle between them, half a period ago: with 0.6 s and 0.04 m/s² it
-is wrong by 12 mm/s. :func:`corrected_velocity` takes the acceleration in between from the samples.
+See docs/theory/tabletop-navigation.md.
 """
 
 from __future__ import annotations
@@ -58,7 +53,6 @@ class Reintegration:
         Of the samples.
     longest_gap_s : float
         Between two fixes that tell a velocity; the source's slowest fix is 2.7 s late.
-    buffer_s : float
 
     Attributes
     ----------
@@ -92,10 +86,6 @@ class Reintegration:
         imu : ImuRecord
             One run; begins where the last samples ended.
 
-        Returns
-        -------
-        PlanarTrack
-
         Raises
         ------
         ValueError
@@ -112,10 +102,6 @@ class Reintegration:
 
     def add_fix(self, fix: Fix) -> Outcome:
         """Set the state at the exposure to a fix, and integrate again from there.
-
-        Parameters
-        ----------
-        fix : Fix
 
         Returns
         -------
@@ -187,7 +173,6 @@ class ImuOnly:
 
     Parameters
     ----------
-    start : PlanarState
     gate : Gate
         Of the samples.
     """

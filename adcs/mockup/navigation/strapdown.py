@@ -1,17 +1,7 @@
-r"""Planar inertial navigation on the table: samples of the IMU, the gate, the integration.
+"""Planar inertial navigation on the table: samples of the IMU, the gate, the integration.
 
-The table frame is X, Y with Z up, and the heading φ is counter-clockwise seen from above:
-
-.. math:: a_{table} = R(φ)\,a_{body}, \qquad R = \begin{pmatrix} \cosφ & -\sinφ \\ \sinφ & \cosφ \end{pmatrix},
-    \qquad ω = \dot φ
-
-At a heading of 90° a thrust along body x moves the satellite along +Y. The source's formulas have the other sign of the
-sine. All of :mod:`adcs.mockup` uses :func:`turned`, the one place where the sign is.
-
-A sample is the mean over the interval that ends at its time stamp, since the microcontroller averages what it polls. So
-readings are constant over an interval, the heading in its middle turns them, and an interval may be cut anywhere.
-
-Source: Bindel, Ivanov, Nuzhdin, Ovchinnikov, Trofimov, preprint of the Keldysh Institute on the table-top mock-up.
+See docs/theory/tabletop-navigation.md. Source: Bindel, Ivanov, Nuzhdin, Ovchinnikov, Trofimov, preprint of the Keldysh
+Institute on the table-top mock-up.
 """
 
 from __future__ import annotations
@@ -31,15 +21,7 @@ GAP_STEPS = 5.0
 def turned(heading_rad: ArrayLike, vector_body: ArrayLike) -> FloatArray:
     """Vector in table axes, ``R(φ) v``.
 
-    Parameters
-    ----------
-    heading_rad : array_like, shape (...)
-        Counter-clockwise from above.
-    vector_body : array_like, shape (..., 2)
-
-    Returns
-    -------
-    ndarray, shape (..., 2)
+    Shapes ``vector_body`` (..., 2) -> (..., 2). ``heading_rad`` (...): counter-clockwise from above.
     """
     phi, vector = np.asarray(heading_rad, dtype=np.float64), np.asarray(vector_body, dtype=np.float64)
     c, s, x, y = np.cos(phi), np.sin(phi), vector[..., 0], vector[..., 1]
@@ -148,10 +130,6 @@ class ImuRecord:
 
     def between(self, first_s: float, last_s: float) -> ImuRecord:
         """Samples from one instant to another, of which the intervals at both ends are cut.
-
-        Parameters
-        ----------
-        first_s, last_s : float
 
         Returns
         -------
@@ -303,18 +281,8 @@ class Gate:
 def held(imu: ImuRecord, accepted: BoolArray, held_rate_rad_s: ArrayLike = 0.0) -> ImuRecord:
     """Record without the readings that are not believed: velocity and rate are held, and time goes on.
 
-    Parameters
-    ----------
-    imu : ImuRecord
-    accepted : ndarray of bool, shape (..., n, 3)
-        Of :meth:`Gate.accepted`.
-    held_rate_rad_s : array_like, shape (...)
-        The last believed rate before the record.
-
-    Returns
-    -------
-    ImuRecord
-        Such an acceleration is zero, such a rate the last believed one.
+    ``accepted`` (..., n, 3): of :meth:`Gate.accepted`. ``held_rate_rad_s`` (...): the last believed rate before the
+    record. Returns: such an acceleration is zero, such a rate the last believed one.
     """
     rows = np.where(accepted[..., 2], np.arange(len(imu)), -1)
     last = np.maximum.accumulate(rows, axis=-1)
@@ -334,17 +302,7 @@ def step(state: PlanarState, step_s: float, acceleration_m_s2: ArrayLike, rate_r
         a = R(φ_{i-1} + ωΔ/2)\,a_{body}, \quad X_i = X_{i-1} + v_{i-1}Δ + aΔ^2/2, \quad v_i = v_{i-1} + aΔ, \quad
         φ_i = φ_{i-1} + ωΔ
 
-    Parameters
-    ----------
-    state : PlanarState
-    step_s : float
-        Δ.
-    acceleration_m_s2 : array_like, shape (..., 2)
-    rate_rad_s : array_like, shape (...)
-
-    Returns
-    -------
-    PlanarState
+    Shapes ``acceleration_m_s2`` (..., 2), ``rate_rad_s`` (...). ``step_s``: Δ.
 
     Notes
     -----
@@ -368,10 +326,6 @@ def strapdown(imu: ImuRecord, start: PlanarState) -> PlanarTrack:
         All readings there, zeros taken off: see :func:`held`. NaN stays NaN from there on.
     start : PlanarState
         At ``imu.begin_s``.
-
-    Returns
-    -------
-    PlanarTrack
     """
     dt = imu.steps_s
     angle = imu.rate_rad_s * dt

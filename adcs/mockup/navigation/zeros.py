@@ -1,26 +1,7 @@
-r"""Zeros of the accelerometer in closed form, from what its integral and the camera disagree by over a run.
+"""Zeros of the accelerometer in closed form, from what its integral and the camera disagree by over a run.
 
-Table axes are written as complex numbers, X + iY: turning by φ is then a product with :math:`e^{iφ}`, and so is the
-zero ζ = α + iβ of the body axes x and y. With :math:`D_t[u]` the double integral of what is constant over each
-interval, the integrated position is
-
-.. math:: p(t) = p_0 + v_0 t + D_t[a e^{iφ}] - ζ\,D_t[e^{iφ}]
-
-and D is a single sum, :math:`D_t[u] = \sum_j u_j Δ_j (t - \tfrac12(t_j + t_{j-1}))`. Least squares against the fixes
-with start position and velocity known give
-
-.. math:: α = f_1/a_{11}, \quad β = f_2/a_{11}, \quad a_{11} = \sum |D[e^{iφ}]|^2, \quad
-    f_1 + i f_2 = \sum \overline{D[e^{iφ}]}\,(p_0 + v_0 t + D[a e^{iφ}] - p_c)
-
-without a matrix and without a condition: the source's a₁₂ is 0 and its a₂₂ = a₁₁ for every history of the heading,
-since a complex number has one square only. Where the start is a straight line through the first fixes, the zeros' share
-in it goes along, and the same holds. With the start unknown too there are six unknowns, three complex ones.
-
-Constant zeros fit runs of some ten seconds. Over minutes the sensor warms: further zeros may go along with any known
-course, such as time or temperature.
-
-Source: Bindel et al., the section on least squares (its minus sign is lost in print); complex numbers, the start and
-the courses are ours.
+See docs/theory/tabletop-navigation.md. Source: Bindel et al., the section on least squares (its minus sign is lost in
+print); complex numbers, the start and the courses are ours.
 """
 
 from __future__ import annotations
@@ -41,25 +22,9 @@ SIGMA_M = 1e-3
 def double_integral(begin_s: float, time_s: ArrayLike, values: ArrayLike, at_s: ArrayLike) -> ComplexArray:
     r"""Twice integrated from rest, :math:`\sum_j u_j Δ_j (t - \tfrac12(t_j + t_{j-1}))`, in O(n).
 
-    Parameters
-    ----------
-    begin_s : float
-        Where the first interval begins.
-    time_s : array_like, shape (n,)
-        Where each interval ends.
-    values : array_like of real or complex, shape (..., n)
-        Constant over each interval.
-    at_s : array_like, shape (k,)
-        Within the record; where it is within an interval, that one counts up to it.
-
-    Returns
-    -------
-    ndarray of complex, shape (..., k)
-
-    Raises
-    ------
-    ValueError
-        An instant is outside of the record.
+    ``begin_s``: where the first interval begins. ``time_s`` (n,): where each interval ends. ``values`` (..., n):
+    constant over each interval. ``at_s`` (k,): within the record; where it is within an interval, that one counts up to
+    it. Returns shape (..., k).
     """
     t = np.asarray(time_s, dtype=np.float64) - begin_s
     u = np.asarray(values, dtype=np.complex128)
@@ -153,10 +118,6 @@ def zero_problem(
     courses : array_like, shape (m, n), optional
         What further zeros go along with, such as the time or the temperature less that at the beginning.
 
-    Returns
-    -------
-    ZeroProblem
-
     Raises
     ------
     ValueError
@@ -223,24 +184,9 @@ def constant_zeros(
 ) -> ZeroFit:
     """Two zeros in closed form, f₁/a₁₁ and f₂/a₁₁, with a known start.
 
-    Parameters
-    ----------
-    problem : ZeroProblem
-        Without further courses.
-    start_position_m, start_velocity_m_s : array_like, shape (2,)
-        At the beginning of the record. The source takes them from two fixes, and the error of that velocity dominates
-        that of the zeros: see :func:`constant_zeros_after`.
-    sigma_m : float
-        Noise of a fix, each axis, for the covariance.
-
-    Returns
-    -------
-    ZeroFit
-
-    Raises
-    ------
-    ValueError
-        The problem has further courses, or no fix is later than the beginning.
+    ``problem``: without further courses. ``start_position_m``, ``start_velocity_m_s`` (2,): at the beginning of the
+    record. The source takes them from two fixes, and the error of that velocity dominates that of the zeros: see
+    :func:`constant_zeros_after`. ``sigma_m``: noise of a fix, each axis, for the covariance.
     """
     turn = _only_constant(problem)
     a11 = float(np.sum(np.abs(turn) ** 2))
@@ -258,25 +204,9 @@ def constant_zeros_after(problem: ZeroProblem, first: int = 4, sigma_m: float = 
     """Two zeros in closed form, with the start of a straight line through the first fixes.
 
     The line is that of the fixes less what the samples moved by up to each, which depends on the zeros.
-
-    Parameters
-    ----------
-    problem : ZeroProblem
-        Without further courses.
-    first : int
-        Fixes that the line goes through; two as in the source, whose velocity then has √2 times the noise of a fix over
-        one period.
-    sigma_m : float
-        Noise of a fix, each axis, for the covariance.
-
-    Returns
-    -------
-    ZeroFit
-
-    Raises
-    ------
-    ValueError
-        The problem has further courses, or not more fixes than ``first``, which must be two at least.
+    ``problem``: without further courses. ``first``: fixes that the line goes through; two as in the source, whose
+    velocity then has √2 times the noise of a fix over one period. ``sigma_m``: noise of a fix, each axis, for the
+    covariance.
     """
     turn, t = _only_constant(problem), problem.time_s
     if not 2 <= first < t.size:
@@ -303,13 +233,8 @@ def zeros_and_start(problem: ZeroProblem, sigma_m: float = SIGMA_M) -> ZeroFit:
 
     Parameters
     ----------
-    problem : ZeroProblem
     sigma_m : float
         Noise of a fix, each axis, for the covariance.
-
-    Returns
-    -------
-    ZeroFit
 
     Raises
     ------

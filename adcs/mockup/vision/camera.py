@@ -1,17 +1,6 @@
-r"""The camera that looks up at the sky of lights: where a light is in the image, and where on the ceiling a pixel is.
+"""The camera that looks up at the sky of lights: where a light is in the image, and where on the ceiling a pixel is.
 
-Pixels are (column, row) with whole numbers at the pixels' centres, rows downwards, as in every image file. The body's
-x axis is the image's right and its y axis the image's down: with Z up and away from the camera that is the only way an
-image that is not mirrored by optics can be.
-
-Estimators work with *centred* pixels, relative to the optical centre, the lens undone, x to the right and y **up** as
-one looks at the picture. Seen so the ceiling is mirrored relative to the table seen from above: triangles turn the
-other way. In complex numbers, with p a centred pixel and s the size of a pixel on the ceiling,
-
-.. math:: X + iY = s\, e^{i\varphi}\, \bar p + (X_c + i Y_c).
-
-The lens moves a light radially, :math:`r_\mathrm{image} = r\,(1 + k_1 (r / 320\,\mathrm{px})^2)` with r from the
-optical centre; :math:`k_1 < 0` is a barrel. The optical axis is vertical, so a pixel has one size on the whole ceiling.
+See docs/theory/tabletop-vision.md.
 """
 
 from __future__ import annotations
@@ -57,7 +46,6 @@ class Camera:
 
     Attributes
     ----------
-    width_px, height_px : int
     m_per_px : float
         Size of a pixel on the ceiling, at the optical centre [m].
     centre_px : tuple, shape (2,), optional
@@ -116,18 +104,8 @@ def camera_of_footprint(width_m: float, k1: float = 0.0) -> Camera:
 def centred_from_table(camera: Camera, pose: Pose, points_m: ArrayLike) -> FloatArray:
     """Where points of the ceiling are relative to the optical centre, with an ideal lens.
 
-    Parameters
-    ----------
-    camera : Camera
-    pose : Pose
-        Numbers, or arrays of shape (...).
-    points_m : array_like, shape (..., n, 2)
-        In the table's frame [m].
-
-    Returns
-    -------
-    ndarray, shape (..., n, 2)
-        Centred pixels, y up.
+    ``pose``: numbers, or arrays of shape (...). ``points_m`` (..., n, 2): in the table's frame [m]. Returns
+    (..., n, 2): centred pixels, y up.
     """
     offset = np.asarray(points_m, dtype=np.float64) - pose.position_m[..., None, :]
     cos, sin = np.cos(pose.heading_rad)[..., None], np.sin(pose.heading_rad)[..., None]
@@ -138,17 +116,8 @@ def centred_from_table(camera: Camera, pose: Pose, points_m: ArrayLike) -> Float
 def table_from_centred(camera: Camera, pose: Pose, points_px: ArrayLike) -> FloatArray:
     """Points of the ceiling from centred pixels; inverse of :func:`centred_from_table`.
 
-    Parameters
-    ----------
-    camera : Camera
-    pose : Pose
-        Numbers, or arrays of shape (...).
-    points_px : array_like, shape (..., n, 2)
-
-    Returns
-    -------
-    ndarray, shape (..., n, 2)
-        In the table's frame [m].
+    Shape ``points_px`` (..., n, 2). ``pose``: numbers, or arrays of shape (...). Returns (..., n, 2): in the table's
+    frame [m].
     """
     body = np.asarray(points_px, dtype=np.float64) * [camera.m_per_px, -camera.m_per_px]
     cos, sin = np.cos(pose.heading_rad)[..., None], np.sin(pose.heading_rad)[..., None]
@@ -160,17 +129,8 @@ def table_from_centred(camera: Camera, pose: Pose, points_px: ArrayLike) -> Floa
 def distorted(camera: Camera, points_px: ArrayLike) -> FloatArray:
     """Pixels of the image from centred pixels.
 
-    Parameters
-    ----------
-    camera : Camera
-    points_px : array_like, shape (..., 2)
-        Centred, y up.
-
-    Returns
-    -------
-    ndarray, shape (..., 2)
-        Column and row. NaN of a point so far out that the lens would fold it back (of k1 < 0 beyond
-        320 px/√(-3 k1)): such a point is not seen.
+    ``points_px`` (..., 2): centred, y up. Returns (..., 2): column and row. NaN of a point so far out that the lens
+    would fold it back (of k1 < 0 beyond 320 px/√(-3 k1)): such a point is not seen.
     """
     points = np.asarray(points_px, dtype=np.float64)
     squared = np.sum(points**2, axis=-1, keepdims=True) / REFERENCE_RADIUS_PX**2
@@ -187,7 +147,6 @@ def undistorted(camera: Camera, image_px: ArrayLike) -> FloatArray:
 
     Parameters
     ----------
-    camera : Camera
     image_px : array_like, shape (..., 2)
         Column and row.
 
@@ -213,19 +172,9 @@ def undistorted(camera: Camera, image_px: ArrayLike) -> FloatArray:
 def image_from_table(camera: Camera, pose: Pose, points_m: ArrayLike) -> FloatArray:
     """Where points of the ceiling are in the image.
 
-    Parameters
-    ----------
-    camera : Camera
-    pose : Pose
-        Numbers, or arrays of shape (...).
-    points_m : array_like, shape (..., n, 2)
-        In the table's frame [m].
-
-    Returns
-    -------
-    ndarray, shape (..., n, 2)
-        Column and row [px], also outside of the frame; NaN where the lens shows no such point, see
-        :func:`distorted`.
+    ``pose``: numbers, or arrays of shape (...). ``points_m`` (..., n, 2): in the table's frame [m]. Returns
+    (..., n, 2): column and row [px], also outside of the frame; NaN where the lens shows no such point, see
+    :func:`distorted`.
     """
     return distorted(camera, centred_from_table(camera, pose, points_m))
 
@@ -233,18 +182,8 @@ def image_from_table(camera: Camera, pose: Pose, points_m: ArrayLike) -> FloatAr
 def table_from_image(camera: Camera, pose: Pose, image_px: ArrayLike) -> FloatArray:
     """Points of the ceiling from pixels; inverse of :func:`image_from_table`.
 
-    Parameters
-    ----------
-    camera : Camera
-    pose : Pose
-        Numbers, or arrays of shape (...).
-    image_px : array_like, shape (..., n, 2)
-        Column and row.
-
-    Returns
-    -------
-    ndarray, shape (..., n, 2)
-        In the table's frame [m].
+    ``pose``: numbers, or arrays of shape (...). ``image_px`` (..., n, 2): column and row. Returns (..., n, 2): in the
+    table's frame [m].
     """
     return table_from_centred(camera, pose, undistorted(camera, image_px))
 
@@ -262,7 +201,6 @@ def footprint(camera: Camera, pose: Pose, points_per_side: int = 1) -> FloatArra
 
     Parameters
     ----------
-    camera : Camera
     pose : Pose
         Numbers, or arrays of shape (...).
     points_per_side : int

@@ -1,12 +1,6 @@
-r"""Calibration of the camera: scale, distortion and optical centre from frames taken at known poses.
+"""Calibration of the camera: scale, distortion and optical centre from frames taken at known poses.
 
-Each light found in a frame is paired with the light of the sky that the pose predicts nearest to it. The parameters
-:math:`\theta = (s, k_1, c_x, c_y)` are those of least squares of the pairs' distances in the image, each frame weighted
-by :math:`R = \sigma^2 I + J_p P_p J_p^T`: the noise of centroids and what the uncertainty of the pose makes of
-it. :math:`\sigma` is estimated from the residuals that no shift or turn of a frame explains.
-
-Where the optical centre is cannot be told from where the satellite is, but for the lens: it is only as well known as
-the poses are, which its standard deviation says.
+See docs/theory/tabletop-vision.md.
 """
 
 from __future__ import annotations
@@ -37,7 +31,6 @@ class KnownFrame:
 
     Attributes
     ----------
-    pose : Pose
     positions_px : ndarray, shape (n, 2)
         Column and row.
     """
@@ -52,7 +45,6 @@ class CameraCalibration:
 
     Attributes
     ----------
-    camera : Camera
     covariance : ndarray, shape (4, 4)
         Of :data:`PARAMETERS`, in m/px, 1 and px.
     noise_px : float
@@ -91,16 +83,10 @@ def calibrated_camera(
 
     Parameters
     ----------
-    sky : LedSky
-    frames : sequence of KnownFrame
     camera : Camera
         To start from: the scale to some percent, the lens to some hundredths.
     position_sigma_m, heading_sigma_rad : float
         Standard deviations of X, Y and heading of the poses, independent from frame to frame.
-
-    Returns
-    -------
-    CameraCalibration
 
     Raises
     ------

@@ -1,12 +1,6 @@
-r"""Lights in a frame: threshold, connected blobs, intensity-weighted centroids.
+"""Lights in a frame: threshold, connected blobs, intensity-weighted centroids.
 
-Three ways, of one signature. :func:`find_stars` takes six standard deviations of the background above it, both from
-medians, which no star and no hot pixel moves. :func:`find_faint_stars` does so with sums of 3 × 3 pixels, in which
-noise is a third: lights that motion has drawn out are still found whole. :func:`find_stars_between_extremes` is the
-source paper's: intensities are scaled to the darkest and brightest pixel, and one hot pixel is enough to hide all
-stars.
-
-Pixels are (column, row); whole numbers are the pixels' centres.
+See docs/theory/tabletop-vision.md.
 """
 
 from __future__ import annotations
@@ -74,10 +68,6 @@ def find_stars(frame: ArrayLike) -> Stars:
     ----------
     frame : array_like of uint8, shape (height, width)
 
-    Returns
-    -------
-    Stars
-
     Raises
     ------
     NoLightsError
@@ -96,22 +86,7 @@ def find_faint_stars(frame: ArrayLike) -> Stars:
     As :func:`find_stars`, for sums of each pixel and its eight neighbours. A light that moves over 24 pixels is as
     bright as noise and breaks into pieces; its sums do not. At rest centroids are better as well, as less of the light
     is below the threshold. A hot pixel has nine sums, so a star needs more of them.
-
-    Parameters
-    ----------
-    frame : array_like of uint8, shape (height, width)
-
-    Returns
-    -------
-    Stars
-        Intensities, background and threshold are those of the sums.
-
-    Raises
-    ------
-    NoLightsError
-        It is black, saturated or of one value throughout.
-    ValueError
-        This is no grey image of bytes.
+    Shape ``frame`` (height, width). Returns: intensities, background and threshold are those of the sums.
     """
     image = checked_frame(frame).astype(np.uint16)
     if min(image.shape) < 3:
@@ -126,22 +101,7 @@ def find_faint_stars(frame: ArrayLike) -> Stars:
 def find_stars_between_extremes(frame: ArrayLike, level: float = 0.3) -> Stars:
     """Lights above a level between the darkest and the brightest pixel: the threshold of the source paper.
 
-    Parameters
-    ----------
-    frame : array_like of uint8, shape (height, width)
-    level : float
-        0 is the darkest pixel of the frame and 1 the brightest one.
-
-    Returns
-    -------
-    Stars
-
-    Raises
-    ------
-    NoLightsError
-        It is black, saturated or of one value throughout.
-    ValueError
-        This is no grey image of bytes, or the level is not between 0 and 1.
+    Shape ``frame`` (height, width). ``level``: 0 is the darkest pixel of the frame and 1 the brightest one.
     """
     if not 0.0 < level < 1.0:
         raise ValueError(f"Input level must be between 0 and 1; instead received {level}.")
@@ -151,23 +111,7 @@ def find_stars_between_extremes(frame: ArrayLike, level: float = 0.3) -> Stars:
 
 
 def checked_frame(frame: ArrayLike) -> ByteArray:
-    """A grey image in which lights can be looked for.
-
-    Parameters
-    ----------
-    frame : array_like of uint8, shape (height, width)
-
-    Returns
-    -------
-    ndarray of uint8, shape (height, width)
-
-    Raises
-    ------
-    NoLightsError
-        It is black, saturated (more than half of it) or of one value throughout.
-    ValueError
-        This is no grey image of bytes.
-    """
+    """A grey image in which lights can be looked for: ``frame`` (height, width) -> (height, width)."""
     image = np.asarray(frame)
     if image.ndim != 2 or image.size == 0:
         raise ValueError(f"Input frame must be a grey image (height, width); instead received shape {image.shape}.")

@@ -17,23 +17,12 @@ _MOST_CELLS = 2_000_000
 
 @dataclass(frozen=True, eq=False)
 class LightMap:
-    """Nearest light of every cell of a grid over the ceiling; made by :meth:`of`.
+    """Nearest light of every cell of a grid over the ceiling; made by :meth:`of`."""
 
-    Attributes
-    ----------
-    plane : ndarray, shape (n,)
-        The lights, X + iY [m].
-    corner : complex
-        Lower left corner of the grid [m].
-    cell_m : float
-    nearest : ndarray, shape (rows, columns)
-        Number of the light that is nearest to the cell's middle.
-    """
-
-    plane: ComplexArray
-    corner: complex
+    plane: ComplexArray  # (n,): the lights, X + iY [m]
+    corner: complex  # lower left corner of the grid [m]
     cell_m: float
-    nearest: IntArray
+    nearest: IntArray  # (rows, columns): number of the light that is nearest to the cell's middle
 
     @classmethod
     def of(cls, catalogue: TriangleCatalogue) -> LightMap:

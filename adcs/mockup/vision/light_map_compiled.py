@@ -21,19 +21,8 @@ def misses_of_poses(
 ) -> FloatArray:
     """Sum over stars of the squared distance to the nearest light, at most the limit each, under every pose.
 
-    Parameters
-    ----------
-    a, b : ndarray, shape (h,)
-        Poses q = a p̄ + b, see :mod:`adcs.mockup.vision.similarity`.
-    image : ndarray, shape (f,)
-        Mirrored stars.
-    plane, nearest, corner, cells_per_m
-        The map.
-    limit_squared : float
-
-    Returns
-    -------
-    ndarray, shape (h,)
+    ``a``, ``b`` (h,): poses q = a p̄ + b, see :mod:`adcs.mockup.vision.similarity`. ``image`` (f,): mirrored stars.
+    ``plane``, ``nearest``, ``corner``, ``cells_per_m``: the map. Returns shape (h,).
     """
     rows, columns = nearest.shape
     total = np.empty(a.size)

@@ -1,17 +1,6 @@
-r"""A matcher that wins on sparse fields as on damaged ones: pairs of stars, weighed by what all stars say.
+"""A matcher that wins on sparse fields as on damaged ones: pairs of stars, weighed by what all stars say.
 
-The camera's scale is known, so that two stars at a distance of r px are two lights at r s metres; with the handedness
-known too, one such pair gives the pose. (A Delaunay triangle is in the catalogue only if none of its corners is lost
-and no light between them is added, and needs three stars and more for a vote.)
-
-1. Of the shortest pairs of the image, all pairs of lights of about the same length are hypotheses, in both orders.
-2. Each is checked by all stars at once: the nearest light of every star is looked up in a table over the ceiling.
-3. The best are fitted to their stars, and weighed by :mod:`adcs.mockup.vision.pose_odds`: stars matched and how well,
-   lights missing, stars left over.
-4. The best pose is the fix if its odds against all other poses and against "all clutter" together are high enough.
-
-Nothing is known beforehand of where the camera is. :func:`odds_matcher` is the one to use: it tries again with wide
-tolerances where the calibrated camera finds nothing.
+See docs/theory/tabletop-vision.md.
 """
 
 from __future__ import annotations
@@ -42,17 +31,10 @@ _PER_CANDIDATE = 16
 
 @dataclass(frozen=True, eq=False)
 class LightPairs:
-    """Pairs of lights by their distance; made by :meth:`of`.
+    """Pairs of lights by their distance; made by :meth:`of`."""
 
-    Attributes
-    ----------
-    lights : ndarray, shape (k, 2)
-    lengths_m : ndarray, shape (k,)
-        Ascending.
-    """
-
-    lights: IntArray
-    lengths_m: FloatArray
+    lights: IntArray  # (k, 2)
+    lengths_m: FloatArray  # (k,): ascending
 
     @classmethod
     def of(cls, catalogue: TriangleCatalogue, longest_m: float) -> LightPairs:
@@ -65,14 +47,8 @@ class LightPairs:
     def between(self, least_m: FloatArray, most_m: FloatArray) -> tuple[IntArray, IntArray]:
         """Pairs whose lengths are in any of several ranges.
 
-        Parameters
-        ----------
-        least_m, most_m : ndarray, shape (r,)
-
-        Returns
-        -------
-        tuple of ndarray, shapes (c,) and (c, 2)
-            Number of the range, and lights; a pair may be in several ranges.
+        Shape ``least_m``, ``most_m`` (r,). Returns (c,) and (c, 2): number of the range, and lights; a pair may be in
+        several ranges.
         """
         first, last = np.searchsorted(self.lengths_m, least_m), np.searchsorted(self.lengths_m, most_m)
         counts = np.maximum(last - first, 0)
@@ -86,7 +62,6 @@ class OddsMatcher:
 
     Attributes
     ----------
-    odds : PoseOdds
     pairs : LightPairs
         Up to the image's diagonal on the ceiling.
     image_pairs : int
@@ -118,13 +93,8 @@ class OddsMatcher:
 
         Parameters
         ----------
-        catalogue : TriangleCatalogue
         camera : Camera
             Calibrated: its scale and its lens are used.
-
-        Returns
-        -------
-        OddsMatcher
         """
         diagonal = math.hypot(*camera.footprint_m)
         return cls(PoseOdds.of(catalogue, camera), LightPairs.of(catalogue, 1.05 * diagonal))
@@ -141,10 +111,6 @@ class OddsMatcher:
         ----------
         points_px : array_like, shape (f, 2)
             Centred pixels: relative to the optical centre, the lens undone, y up.
-
-        Returns
-        -------
-        CameraFix or NoFix
 
         Raises
         ------
@@ -195,12 +161,7 @@ class OddsMatcher:
 
 @dataclass(frozen=True)
 class FirstFix:
-    """Matchers that are tried in turn, until one has a fix.
-
-    Attributes
-    ----------
-    matchers : tuple of Matcher
-    """
+    """Matchers that are tried in turn, until one has a fix."""
 
     matchers: tuple[Matcher, ...]
 
@@ -220,13 +181,8 @@ def odds_matcher(catalogue: TriangleCatalogue, camera: Camera) -> FirstFix:
 
     Parameters
     ----------
-    catalogue : TriangleCatalogue
     camera : Camera
         As well calibrated as it is.
-
-    Returns
-    -------
-    FirstFix
     """
     precise = OddsMatcher.of(catalogue, camera)
     return FirstFix((precise, precise.rough()))
@@ -242,22 +198,9 @@ def best_fix(
 ) -> CameraFix | NoFix:
     """Fix of the best pose, if it stands out.
 
-    Parameters
-    ----------
-    odds : PoseOdds
-    image : ndarray, shape (f,)
-        Mirrored centred pixels x - iy.
-    poses : Poses
-    log_odds : ndarray, shape (h,)
-        Of each against "all clutter".
-    minimum_log_odds : float
-        That the best must have against all others and "all clutter" together.
-    minimum_stars : int
-        That it must explain.
-
-    Returns
-    -------
-    CameraFix or NoFix
+    ``image`` (f,): mirrored centred pixels x - iy. ``log_odds`` (h,): of each against "all clutter".
+    ``minimum_log_odds``: that the best must have against all others and "all clutter" together. ``minimum_stars``: that
+    it must explain.
     """
     distinct = odds.distinct(poses, log_odds)
     if not len(distinct):

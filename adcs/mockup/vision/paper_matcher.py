@@ -1,14 +1,6 @@
-r"""Where the camera is, from the stars of one image alone: what all matchers return, and the paper's matcher.
+"""Where the camera is, from the stars of one image alone: what all matchers return, and the paper's matcher.
 
-A matcher takes the places of the stars in the image (centred pixels, see :mod:`adcs.mockup.vision.camera`) and returns
-a :class:`CameraFix`, or :class:`NoFix` with the reason. It knows nothing of earlier images.
-
-The paper's matcher [1]_ compares each Delaunay triangle of the image with all of the catalogue by smallest and largest
-angle, places the image's centre by every pair of triangles that agree, and takes the longest list of centres that are
-mutually close. See :mod:`adcs.mockup.vision.robust_matcher` and :mod:`adcs.mockup.vision.odds_matcher` for stronger
-ones.
-
-.. [1] Bindel, Ivanov, Nuzhdin, Ovchinnikov, Trofimov, KIAM preprint.
+See docs/theory/tabletop-vision.md.
 """
 
 from __future__ import annotations
@@ -71,7 +63,6 @@ class PaperMatcher:
 
     Attributes
     ----------
-    catalogue : TriangleCatalogue
     tolerance_rad : float
         Largest difference of either angle of two triangles that match [rad].
     closeness_m : float
@@ -149,19 +140,8 @@ def camera_fix(
 ) -> CameraFix:
     """Fix of a fit q = a p̄ + b, see :mod:`adcs.mockup.vision.similarity`.
 
-    Parameters
-    ----------
-    catalogue : TriangleCatalogue
-    image : ndarray, shape (f,)
-        Mirrored image points x - iy [px].
-    stars : ndarray, shape (k, 2)
-        Pairs of numbers in image and catalogue; pairs may repeat.
-    a, b : complex
-    votes : int
-
-    Returns
-    -------
-    CameraFix
+    ``image`` (f,): mirrored image points x - iy [px]. ``stars`` (k, 2): pairs of numbers in image and catalogue; pairs
+    may repeat.
     """
     pairs = np.unique(stars, axis=0)
     residual = a * image[pairs[:, 0]] + b - catalogue.plane[pairs[:, 1]]
@@ -173,17 +153,8 @@ def longest_close_subset(points: ComplexArray, closeness: float) -> IntArray:
     """Numbers of points that are all within a distance of one another, as many as a greedy search finds.
 
     Around every point in turn the others are added by their distance while they are close to all before.
-
-    Parameters
-    ----------
-    points : ndarray, shape (c,)
-        x + iy.
-    closeness : float
-
-    Returns
-    -------
-    ndarray, shape (k,)
-        Of the longest subset; of equally long ones, that around the point with most neighbours.
+    ``points`` (c,): x + iy. Returns (k,): of the longest subset; of equally long ones, that around the point with most
+    neighbours.
     """
     distance = np.abs(points[:, None] - points)
     close = distance <= closeness

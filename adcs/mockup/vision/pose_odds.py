@@ -1,22 +1,6 @@
-r"""How much better than chance a pose explains the stars of an image.
+"""How much better than chance a pose explains the stars of an image.
 
-Under a pose with the fit :math:`q = a \bar p + b` of :mod:`adcs.mockup.vision.similarity` every catalogued light that
-the camera should see is found or missing, and every star of the image is one of these lights or clutter. With m of f
-stars matched at the distances d_i [px], k lights missing and an image of A square pixels the odds against "all clutter"
-are
-
-.. math:: \frac{B(\alpha + m, \beta + k)}{B(\alpha, \beta)} \left(\frac{A}{f}\right)^m \int p(\theta)
-          \prod_i N(d_i(\theta); \sigma) \, d\theta
-
-* The share of lights that are found is unknown, with the prior Beta(α, β): a field in which few lights are missing is
-  likelier, but a quarter lost is no contradiction.
-* The integral over the pose θ (X, Y, φ and the scale, which is known to a few per mille) is Laplace's: the likelihood
-  at the fit times the volume that the stars leave of the pose, times the prior's density there. The larger the ceiling
-  where the camera might be, the more the stars have to prove; a prediction needs fewer of them.
-* The noise σ of centroids depends on motion and is unknown too: the mean over a few values is taken.
-
-Three stars at known distances prove a pose if their centroids are good; that two poses explain the same image shows as
-odds between them.
+See docs/theory/tabletop-vision.md.
 """
 
 from __future__ import annotations
@@ -44,22 +28,12 @@ _DISTINCT_PX = 20.0
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Fits to one image of f stars, and which star is which light under each.
+    """Fits to one image of f stars, and which star is which light under each."""
 
-    Attributes
-    ----------
-    a, b : ndarray, shape (h,)
-        Of q = a p̄ + b.
-    lights : ndarray, shape (h, f)
-        The light nearest to each star.
-    matched : ndarray, shape (h, f)
-        Whether the star is that light; no light is matched twice.
-    """
-
-    a: ComplexArray
-    b: ComplexArray
-    lights: IntArray
-    matched: BoolArray
+    a: ComplexArray  # (h,): of q = a p̄ + b
+    b: ComplexArray  # (h,): of q = a p̄ + b
+    lights: IntArray  # (h, f): the light nearest to each star
+    matched: BoolArray  # (h, f): whether the star is that light; no light is matched twice
 
     def stars(self, index: int) -> IntArray:
         """Pairs (k, 2) of numbers in image and catalogue under one of them."""
@@ -73,10 +47,8 @@ class PoseOdds:
 
     Attributes
     ----------
-    catalogue : TriangleCatalogue
     camera : Camera
         Calibrated: its scale and its lens are used.
-    light_map : LightMap
     gate_px : float
         A star farther from a light is another one [px].
     scale_sigma : float
@@ -144,13 +116,12 @@ class PoseOdds:
         return Poses(a, b, *self._matched(image, a, b, self.gate_px))
 
     def log_odds(self, image: ComplexArray, poses: Poses, log_density: FloatArray | float) -> FloatArray:
-        """Logarithm of the odds of poses against "all clutter", shape (h,); see the module.
+        """Logarithm of the odds of poses against "all clutter", shape (h,); see docs/theory/tabletop-vision.md.
 
         Parameters
         ----------
         image : ndarray, shape (f,)
             Mirrored centred pixels x - iy.
-        poses : Poses
         log_density : float or ndarray, shape (h,)
             Logarithm of the prior density of a pose, per px² and rad, such as :attr:`log_anywhere`.
 

@@ -1,11 +1,6 @@
-r"""Tracking: a predicted pose says which lights to expect and where, and so two stars are enough for a fix.
+"""Tracking: a predicted pose says which lights to expect and where, and so two stars are enough for a fix.
 
-The prediction has the covariance P of (X, Y, φ). Light q is expected at :math:`p = \overline{(q - b)/a}`, with the
-covariance :math:`J P J^T + \sigma^2`, whose largest axis gives the radius of search. A prediction of the heading by a
-gyro is good to a fraction of a degree, and so every star within the radius of an expected light gives a shift of the
-whole image. The shifts are fitted and weighed as in :mod:`adcs.mockup.vision.pose_odds`, with the prediction in place
-of "any pose above the table". A prediction that is wrong by more than it says finds no pose of good odds and gives no
-fix.
+See docs/theory/tabletop-vision.md.
 """
 
 from __future__ import annotations
@@ -33,21 +28,11 @@ _MOST_TURNED_PX = 20.0
 
 @dataclass(frozen=True, eq=False)
 class ExpectedLights:
-    """What an image should show.
+    """What an image should show."""
 
-    Attributes
-    ----------
-    lights : ndarray, shape (k,)
-        Numbers in the catalogue.
-    points_px : ndarray, shape (k, 2)
-        Centred pixels: relative to the optical centre, the lens undone, y up.
-    radius_px : ndarray, shape (k,)
-        Within which the light's star is expected.
-    """
-
-    lights: IntArray
-    points_px: FloatArray
-    radius_px: FloatArray
+    lights: IntArray  # (k,): numbers in the catalogue
+    points_px: FloatArray  # (k, 2): centred pixels: relative to the optical centre, the lens undone, y up
+    radius_px: FloatArray  # (k,): within which the light's star is expected
 
     def __len__(self) -> int:
         return len(self.lights)
@@ -58,26 +43,8 @@ def expected_lights(
 ) -> ExpectedLights:
     """Lights that a camera should see from a predicted pose, and where.
 
-    Parameters
-    ----------
-    catalogue : TriangleCatalogue
-    camera : Camera
-    pose : Pose
-        One pose.
-    covariance : array_like, shape (3, 3)
-        Of X, Y [m] and heading [rad].
-    sigmas : float
-        Radius in standard deviations along the worst direction.
-
-    Returns
-    -------
-    ExpectedLights
-        Also those outside of the image by no more than their radius.
-
-    Raises
-    ------
-    ValueError
-        The covariance is not symmetric and positive semidefinite.
+    ``pose``: one pose. ``covariance`` (3, 3): of X, Y [m] and heading [rad]. ``sigmas``: radius in standard deviations
+    along the worst direction. Returns: also those outside of the image by no more than their radius.
     """
     P = _checked_covariance(covariance)
     a, b = _fit_of(camera, pose)
@@ -102,7 +69,6 @@ class LightTracker:
 
     Attributes
     ----------
-    odds : PoseOdds
     sigmas : float
         Radius of search, in standard deviations.
     least_radius_px : float
@@ -135,10 +101,6 @@ class LightTracker:
             Predicted for the middle of the exposure.
         covariance : array_like, shape (3, 3)
             Of the prediction's X, Y [m] and heading [rad].
-
-        Returns
-        -------
-        CameraFix or NoFix
 
         Raises
         ------

@@ -1,16 +1,6 @@
-r"""A matcher that stands lost lights, lights that are none and blurred stars: hypotheses of triangles, checked by all.
+"""A matcher that stands lost lights, lights that are none and blurred stars: hypotheses of triangles, checked by all.
 
-1. Triangles of the image are looked up in a k-d tree of the catalogue's pairs of angles, within a radius that is wider
-   than the paper's tolerance: a false match costs little, as it is checked.
-2. A match must have the right handedness and about the nominal scale.
-3. Three corners give a similarity, whose residual must be small: an isosceles triangle whose corners noise has swapped
-   fails here. The best by their angles remain.
-4. Each is checked by all stars of the image: those that fall near a light are counted.
-5. The best are fitted again to their own stars, and the best of these is the fix if it explains enough of the image,
-   more of it than any other, and better than chance would: five stars within 8 mm of lights are not rare enough among
-   six false ones.
-
-Compare :mod:`adcs.mockup.vision.paper_matcher`, the paper's.
+See docs/theory/tabletop-vision.md.
 """
 
 from __future__ import annotations
@@ -39,7 +29,6 @@ class RobustMatcher:
 
     Attributes
     ----------
-    catalogue : TriangleCatalogue
     m_per_px : float
         Nominal scale of the image on the ceiling [m/px].
     radius_rad : float
@@ -83,10 +72,6 @@ class RobustMatcher:
         ----------
         points_px : array_like, shape (f, 2)
             Centred pixels: relative to the optical centre, the lens undone, y up.
-
-        Returns
-        -------
-        CameraFix or NoFix
 
         Raises
         ------
@@ -179,19 +164,8 @@ class RobustMatcher:
 def one_to_one(catalogue: TriangleCatalogue, image: ComplexArray, a: complex, b: complex, radius_m: float) -> IntArray:
     """Pairs (k, 2) of a star's number in image and catalogue that a fit brings within a distance, each light once.
 
-    Parameters
-    ----------
-    catalogue : TriangleCatalogue
-    image : ndarray, shape (f,)
-        Mirrored image points x - iy [px].
-    a, b : complex
-        See :mod:`adcs.mockup.vision.similarity`.
-    radius_m : float
-
-    Returns
-    -------
-    ndarray, shape (k, 2)
-        A light to which several stars fall has the nearest.
+    ``image`` (f,): mirrored image points x - iy [px]. ``a``, ``b``: see :mod:`adcs.mockup.vision.similarity`. Returns
+    (k, 2): a light to which several stars fall has the nearest.
     """
     found = catalogue.star_tree.query(pairs_of(a * image + b), distance_upper_bound=radius_m)
     distance, light = np.asarray(found[0]), np.asarray(found[1], dtype=np.intp)

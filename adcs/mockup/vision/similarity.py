@@ -1,13 +1,6 @@
-r"""Similarities between the image of a camera that looks up and the table frame, in complex numbers.
+"""Similarities between the image of a camera that looks up and the table frame, in complex numbers.
 
-A centred pixel of :mod:`adcs.mockup.vision.camera` (relative to the optical centre, free of distortion, y upwards) is
-:math:`p = x + iy` [px], a point of the ceiling :math:`q = X + iY` [m]. The camera looks up at what the table frame
-looks down upon, so that the image is mirrored, and
-
-.. math:: q = a \bar p + b, \quad a = s\,e^{i\varphi}, \quad b = X_c + iY_c
-
-with the scale s [m/px], the heading φ counter-clockwise and the camera's position b, which is where its optical axis
-meets the ceiling. Leading axes are a batch; the last axis of points holds the points of one fit.
+See docs/theory/tabletop-vision.md.
 """
 
 from __future__ import annotations
@@ -21,20 +14,7 @@ from arrays.typing import ComplexArray, FloatArray
 def complex_points(points: ArrayLike, name: str = "points") -> ComplexArray:
     """Complex numbers x + iy of points (n, 2), checked.
 
-    Parameters
-    ----------
-    points : array_like, shape (n, 2)
-    name : str
-        What an error calls them.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-
-    Raises
-    ------
-    ValueError
-        The shape is another one, or a number is not finite.
+    Shapes ``points`` (n, 2) -> (n,). ``name``: what an error calls them.
     """
     pairs = np.asarray(points, dtype=np.float64)
     if pairs.size == 0:
@@ -46,13 +26,7 @@ def complex_points(points: ArrayLike, name: str = "points") -> ComplexArray:
 
 
 def mirrored_image(points_px: ArrayLike) -> ComplexArray:
-    """Centred pixels (f, 2) as complex numbers x - iy: what is seen from above, see the module.
-
-    Raises
-    ------
-    ValueError
-        The shape is another one, or a number is not finite.
-    """
+    """Centred pixels (f, 2) as complex numbers x - iy: what is seen from above, see docs/theory/tabletop-vision.md."""
     return np.conj(complex_points(points_px, "points_px"))
 
 
@@ -64,27 +38,12 @@ def pairs_of(plane: ComplexArray) -> FloatArray:
 def fitted_similarity(image: ComplexArray, table: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
     """Least squares of table - (a image + b): a and b.
 
-    Parameters
-    ----------
-    image, table : ndarray, shape (..., k)
-        Complex, k ≥ 2, the image points not all in one place (a is NaN there).
-
-    Returns
-    -------
-    tuple of ndarray, shape (...)
-        a and b.
+    ``image``, ``table`` (..., k): complex, k ≥ 2, the image points not all in one place (a is NaN there). Returns
+    (...): a and b.
     """
     p, q = image.mean(axis=-1), table.mean(axis=-1)
     centred = image - p[..., None]
     power = np.sum(centred.real**2 + centred.imag**2, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         a = np.sum(np.conj(centred) * (table - q[..., None]), axis=-1) / power
-    return a, q - a * p
-
-
-def fitted_motion(image: ComplexArray, table: ComplexArray, scale: float) -> tuple[ComplexArray, ComplexArray]:
-    """As :func:`fitted_similarity`, with the scale, the modulus of a, known [m/px]."""
-    p, q = image.mean(axis=-1), table.mean(axis=-1)
-    turned = np.sum(np.conj(image - p[..., None]) * (table - q[..., None]), axis=-1)
-    a = scale * np.exp(1j * np.angle(turned))
     return a, q - a * p

@@ -59,7 +59,6 @@ class LedSky:
     ----------
     positions_m : ndarray, shape (n, 2)
         X and Y of each light in the table's frame [m].
-    name : str, optional
 
     Raises
     ------
@@ -156,16 +155,7 @@ def interior_angles(triangles: FloatArray) -> FloatArray:
     """Interior angles of triangles.
 
     Of sides s and t from a corner the angle is atan2(|s × t|, s · t), exact to rounding for flat triangles as well.
-
-    Parameters
-    ----------
-    triangles : ndarray, shape (..., 3, 2)
-        Corners.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        At each corner [rad].
+    ``triangles`` (..., 3, 2): corners. Returns (..., 3): at each corner [rad].
     """
     s = np.roll(triangles, -1, axis=-2) - triangles
     t = np.roll(triangles, 1, axis=-2) - triangles
@@ -179,14 +169,6 @@ def led_sky(seed: int = 0) -> LedSky:
 
     A triangulation of n points, h of them on the hull, has 2n - 2 - h triangles. A random rectangle has about 15 on its
     hull; here 36 are on a border that bulges by 1.5 %, so that each is a corner of the hull beyond doubt.
-
-    Parameters
-    ----------
-    seed : int
-
-    Returns
-    -------
-    LedSky
     """
     rng = np.random.default_rng(seed)
     half = 0.5 * np.array(SKY_SIZE_M)
@@ -224,14 +206,6 @@ class _SkyFile(File, kw_only=True):
 def read_sky(path: str | PathLike[str]) -> LedSky:
     """Sky from its TOML file.
 
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    LedSky
-
     Raises
     ------
     InputError
@@ -243,19 +217,7 @@ def read_sky(path: str | PathLike[str]) -> LedSky:
 
 
 def write_sky(sky: LedSky, path: str | PathLike[str]) -> None:
-    """Write a sky as a TOML file that :func:`read_sky` reads, to the last digit.
-
-    Parameters
-    ----------
-    sky : LedSky
-    path : path-like
-        Replaced if it exists.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
-    """
+    """Write a sky as a TOML file that :func:`read_sky` reads, to the last digit."""
     rows = [f"    [{x!r}, {y!r}]," for x, y in sky.positions_m.tolist()]
     lines = [
         f"format_version = {FORMAT_VERSION}",

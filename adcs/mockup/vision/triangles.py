@@ -1,14 +1,7 @@
-r"""Delaunay triangles of lights, and the catalogue of them that images are compared with.
+"""Delaunay triangles of lights, and the catalogue of them that images are compared with.
 
-Of a triangle the smallest and the largest interior angle are kept: they stay the same under shift, turn, change of
-scale and reflection, so that an image need not be calibrated to find its triangles in the catalogue. The corners are
-kept in the order of their angles (smallest, largest, third), so that two triangles of the same angles are paired corner
-by corner. What the angles do not see is the reflection: the sense in which the ordered corners go round is kept too,
-and an image of a camera that looks up has the opposite one.
-
-n lights of which h lie on the hull have T = 2n - 2 - h triangles.
-
-Source: Bindel, Ivanov, Nuzhdin, Ovchinnikov, Trofimov, KIAM preprint, "Star image processing".
+See docs/theory/tabletop-vision.md. Source: Bindel, Ivanov, Nuzhdin, Ovchinnikov, Trofimov, KIAM preprint, "Star image
+processing".
 """
 
 from __future__ import annotations
@@ -31,21 +24,11 @@ FLAT_RAD = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """Triangles between numbered points.
+    """Triangles between numbered points."""
 
-    Attributes
-    ----------
-    corners : ndarray, shape (T, 3)
-        Numbers of the points at the smallest, the largest and the third angle.
-    angles_rad : ndarray, shape (T, 2)
-        Smallest and largest interior angle [rad].
-    is_counter_clockwise : ndarray, shape (T,)
-        Whether the corners, in that order, go round counter-clockwise.
-    """
-
-    corners: IntArray
-    angles_rad: FloatArray
-    is_counter_clockwise: BoolArray
+    corners: IntArray  # (T, 3): numbers of the points at the smallest, the largest and the third angle
+    angles_rad: FloatArray  # (T, 2): smallest and largest interior angle [rad]
+    is_counter_clockwise: BoolArray  # (T,): whether the corners, in that order, go round counter-clockwise
 
     def __len__(self) -> int:
         return len(self.corners)
@@ -68,17 +51,9 @@ def triangles_between(plane: ComplexArray, corners: IntArray) -> Triangles:
 def delaunay_triangles(plane: ComplexArray, smallest_rad: float = FLAT_RAD) -> Triangles:
     """Triangles of Delaunay's triangulation, without slivers.
 
-    Parameters
-    ----------
-    plane : ndarray, shape (n,)
-        Points x + iy. There is no triangle of fewer than three points, nor of points in one line.
-    smallest_rad : float
-        A triangle with a smaller angle is a sliver and left out [rad].
-
-    Returns
-    -------
-    Triangles
-        In the order of the numbers of their points, so that it does not depend on that of the computation.
+    ``plane`` (n,): points x + iy. There is no triangle of fewer than three points, nor of points in one line.
+    ``smallest_rad``: a triangle with a smaller angle is a sliver and left out [rad]. Returns: in the order of the
+    numbers of their points, so that it does not depend on that of the computation.
     """
     corners = np.empty((0, 3), dtype=np.intp)
     if len(plane) >= 3:
@@ -112,10 +87,6 @@ class TriangleCatalogue:
         ----------
         positions_m : array_like, shape (n, 2)
 
-        Returns
-        -------
-        TriangleCatalogue
-
         Raises
         ------
         ValueError
@@ -133,11 +104,6 @@ class TriangleCatalogue:
     def n_stars(self) -> int:
         """Number of lights."""
         return len(self.positions_m)
-
-    @property
-    def n_hull(self) -> int:
-        """Lights on the hull, from T = 2n - 2 - h."""
-        return 2 * self.n_stars - 2 - len(self.triangles)
 
     @cached_property
     def plane(self) -> ComplexArray:
