@@ -153,7 +153,7 @@ class TestTwoProposalsMustAgree:
 
     @pytest.mark.parametrize(
         "uncertain",
-        [{"range_observable": False}, {"chi2": 300.0}, {"covariance": np.eye(6)}],
+        [{"range_interval_m": ((1.0, None),)}, {"chi2": 300.0}, {"covariance": np.eye(6)}],
         ids=lambda change: next(iter(change)),
     )
     def test_one_that_is_no_start_proposes_nothing(self, calls: Scripted, uncertain: dict[str, object]) -> None:
