@@ -82,20 +82,9 @@ class Bounds:
 def whitened_jacobian(
     array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, *, ambient_uncertainty_T: float = 0.0
 ) -> FloatArray:
-    """Jacobian of readings that are freed of all nuisances and have unit variance.
+    """Jacobian W (..., C, 6) of readings freed of all nuisances, of unit variance: the information is ``Wᵀ W``.
 
-    Parameters
-    ----------
-    array : SensorArray
-    position_m, moment_Am2 : array_like, shape (..., 3)
-        Source in the array's frame [m], its moment [A·m²].
-    ambient_uncertainty_T : float
-        Standard deviation, per axis, of the error of ``array.ambient_T``, the same for all sensors [T].
-
-    Returns
-    -------
-    ndarray, shape (..., C, 6)
-        W with the information ``Wᵀ W``; columns (p, m) in 1/m and 1/(A·m²). NaN for a source on a sensor.
+    Columns (p, m) in 1/m and 1/(A·m²); NaN for a source on a sensor. Parameters are those of :func:`cramer_rao_bounds`.
     """
     p, m = _sources(position_m, moment_Am2)
     check_uncertainty(ambient_uncertainty_T)
@@ -118,25 +107,9 @@ def whitened_jacobian(
 def fisher_information(
     array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, *, ambient_uncertainty_T: float = 0.0
 ) -> FloatArray:
-    """Information that one set of readings holds about (p, m), all nuisances marginalised.
+    """Information (..., 6, 6) that one set of readings holds about (p, m), all nuisances marginalised.
 
-    Parameters
-    ----------
-    array : SensorArray
-    position_m, moment_Am2 : array_like, shape (..., 3)
-        Source in the array's frame [m], its moment [A·m²].
-    ambient_uncertainty_T : float
-        Standard deviation, per axis, of the error of ``array.ambient_T``, the same for all sensors [T].
-
-    Returns
-    -------
-    ndarray, shape (..., 6, 6)
-        In 1/m² and so on. NaN for a source on a sensor.
-
-    Raises
-    ------
-    ValueError
-        A shape is wrong, or the uncertainty is negative or not finite.
+    Parameters are those of :func:`cramer_rao_bounds`; NaN for a source on a sensor.
     """
     W = whitened_jacobian(array, position_m, moment_Am2, ambient_uncertainty_T=ambient_uncertainty_T)
     return W.mT @ W
@@ -275,19 +248,7 @@ def _sum_of_squares(rows: FloatArray, which: BoolArray) -> FloatArray:
 
 
 def _root_of_sum(rows: FloatArray, inverse: FloatArray, lost: BoolArray) -> FloatArray:
-    """σ of quantities together, by their parts (..., r, n) in the singular vectors; infinite with a part in a lost one.
-
-    Parameters
-    ----------
-    rows : ndarray, shape (..., r, n)
-    inverse : ndarray, shape (..., n)
-        Inverse singular values, zero for lost ones.
-    lost : ndarray of bool, shape (..., n)
-
-    Returns
-    -------
-    ndarray, shape (...)
-    """
+    """σ of quantities by their parts (..., r, n) in the singular vectors; infinite with a part in a lost one."""
     sigma = np.sqrt(np.sum((rows * inverse[..., None, :]) ** 2, axis=(-2, -1)))
     hidden = np.sum(_sum_of_squares(rows, lost), axis=-1) > LOST**2
     result: FloatArray = np.where(hidden, np.inf, sigma)

@@ -124,19 +124,7 @@ class BoundScenario:
 
 
 def bounds_at(scenario: BoundScenario, positions_m: ArrayLike) -> dict[str, FloatArray]:
-    """All bounds of a map.
-
-    Parameters
-    ----------
-    scenario : BoundScenario
-    positions_m : array_like, shape (..., 3)
-        In the array's frame [m].
-
-    Returns
-    -------
-    dict
-        ``sigma_range``, ``sigma_bearing``, ``sigma_position`` with each of :data:`CASES`, shape (...) [m or rad].
-    """
+    """All bounds of a map at positions (..., 3) [m]: σ of range, bearing and position with each of :data:`CASES`."""
     positions = np.asarray(positions_m, dtype=np.float64)
     flat = positions.reshape(-1, 3)
     given, spreads = table_and_spreads(
@@ -155,13 +143,7 @@ def bounds_at(scenario: BoundScenario, positions_m: ArrayLike) -> dict[str, Floa
 
 @dataclass(frozen=True, eq=False)
 class BoundMap:
-    """Bounds over a cube of sources, as :class:`magloc.grids.cube.CubeMap`.
-
-    Raises
-    ------
-    ValueError
-        The grid is less than 2.
-    """
+    """Bounds over a cube of sources, as :class:`magloc.grids.cube.CubeMap`."""
 
     scenario: BoundScenario
     grid: int
@@ -297,23 +279,9 @@ def _tally(values: Values) -> Tally:
 
 
 def bound_slices(scenario: BoundScenario, grid: int = 121) -> xr.Dataset:
-    """Bounds on the planes xy, xz and yz through the array's centroid.
+    """Bounds on the planes xy, xz and yz through the array's centroid, with `grid` points along either axis.
 
-    Parameters
-    ----------
-    scenario : BoundScenario
-    grid : int
-        Points along either axis, at least 2.
-
-    Returns
-    -------
-    xarray.Dataset
-        Over (plane, up, across) with the axes of :data:`PLANES`, across first, relative to the centroid [m].
-
-    Raises
-    ------
-    ValueError
-        The grid is less than 2.
+    Over (plane, up, across) with the axes of :data:`PLANES`, across first, relative to the centroid [m].
     """
     import xarray as xr
 

@@ -157,11 +157,7 @@ def _fill_gram(columns: FloatArray, gram: FloatArray) -> None:
 
 @compiled
 def _fill_forms(gram: FloatArray, whole: FloatArray, frame: FloatArray, forms: FloatArray) -> None:
-    """Coefficients (9, 6) of what is quadratic in the moment: six entries of the information, three of its bounds.
-
-    The information about (u, v, n) is uu, uv, vv, un, vn, nn; the bounds are uu, vv, nn of what it would be for a known
-    moment. They are multiplied by xx, xy, xz, yy, yz, zz of the moment, which is in the array's frame.
-    """
+    """Coefficients (9, 6) of xx, xy, xz, yy, yz, zz of the moment, array frame, in what :func:`fill_entries` writes."""
     form, turned_form = np.empty((3, 3)), np.empty((3, 3))
     for entry in range(9):
         i, j = _ROWS[entry], _COLUMNS_OF[entry]

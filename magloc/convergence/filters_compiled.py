@@ -122,10 +122,7 @@ def repeated_map(
     tolerance_T: float,
     max_iterations: int,
 ) -> Ended:
-    """Repeated-measurement filter from every start, one linearisation a pass; the first arguments as :func:`iekf_map`.
-
-    The variances are multiplied by `inflation` inside the filter; the diagonal of S_q is the two steps.
-    """
+    """As :func:`iekf_map`, of the repeated-measurement filter; S_q has the two steps, variances grow by `inflation`."""
     model = Model.of(z, inflation * variance, sensors, weights, position_step_m, moment_step_Am2)
     ended = _ends(model, REPEATED, starts, 0.0, tolerance_T, max_iterations)
     return ended._replace(chi2=inflation * ended.chi2)

@@ -79,21 +79,7 @@ class StartsScenario:
 
 
 def simulated_measurement(scenario: StartsScenario) -> tuple[FloatArray, DifferenceMeasurement, FloatArray]:
-    """Readings of a scenario, and what the filters make of them.
-
-    Parameters
-    ----------
-    scenario : StartsScenario
-
-    Returns
-    -------
-    readings : ndarray, shape (C,)
-        [T]
-    measurement : DifferenceMeasurement
-        With the noise that goes with these readings.
-    z : ndarray, shape (k,)
-        Their decorrelated differences [T].
-    """
+    """Readings (C,) [T] of a scenario, and what the filters make of them: the measurement, and z (k,) [T]."""
     array = scenario.array
     readings = predicted_channels(array, scenario.position_m, scenario.moment_Am2) + array.channel_offset_T
     if scenario.noise_seed is not None:

@@ -116,20 +116,7 @@ class Sweep:
         return (box for box in boxes(self.cube) if np.isnan(self._seconds[box.place]))
 
     def write(self, chunks: Iterable[Chunk], progress: Callable[[int], None] | None = None) -> None:
-        """Write chunks as they come.
-
-        Parameters
-        ----------
-        chunks : iterable of Chunk
-            Such as ``computed_here(cube, sweep.unfinished())``.
-        progress : callable, optional
-            Called with the number of points written since the last call.
-
-        Raises
-        ------
-        OSError
-            The store cannot be written. The chunks before are done.
-        """
+        """Write chunks as they come; where one cannot be written, those before it are done."""
         for chunk in chunks:
             with uninterrupted():
                 for name, array in self._arrays.items():
@@ -163,18 +150,7 @@ class Sweep:
 
 
 def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Map in a store, loaded piece by piece as it is used.
-
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    xarray.Dataset
-        As :func:`magloc.grids.cube.in_memory` returns it. Where a chunk is not done, numbers are NaN and integers the
-        smallest ones there are.
-    """
+    """Map in a store, loaded piece by piece; NaN, or the smallest integer there is, where a chunk is not done."""
     import xarray as xr
 
     dataset = xr.open_zarr(path, chunks=None, consolidated=False)

@@ -240,10 +240,7 @@ def too_near(
     ambient_T: FloatArray | None = None,
     body_length_m: float | None = None,
 ) -> BoolArray:
-    """Whether the single source of each row (n,) is too near for a dipole: by its length, or by what is left.
-
-    `fixes` are in the array's frame, `ambient_T` (n, 3) stands in place of the array's ambient field.
-    """
+    """Whether each row's source is too near for a dipole, by length or misfit; fixes are in the array's frame."""
     near = np.zeros(len(fixes), dtype=bool)
     solutions, first = fixes.solutions, fixes.first
     for row in np.flatnonzero(fixes.solved).tolist():

@@ -67,27 +67,10 @@ def without_faulty_sensors(
     *,
     free_position: bool = True,
 ) -> Fixes:
-    """Fixes without the sensors that contradict all others.
+    """Fixes without the sensors that contradict all others, which `dropped_sensors` names.
 
-    Parameters
-    ----------
-    array : SensorArray
-    fixes : Fixes
-        Of all rows with all sensors.
-    refit : callable
-        Fixes rows anew from other readings.
-    readings_T : ndarray, shape (n, C)
-        Raw readings [T], NaN where missing.
-    ambient_T : ndarray, shape (n, 3), optional
-        Ambient field of every row [T], in place of the array's.
-    free_position : bool
-        False where the place of the source is known.
-
-    Returns
-    -------
-    Fixes
-        `dropped_sensors` names the sensors that were left out. No sensor is dropped from a row whose χ² is credible,
-        nor where too few would be left to tell which of them is wrong.
+    No sensor is dropped from a row whose χ² is credible, nor where too few would be left to tell which of them is
+    wrong.
     """
     doubtful = _doubtful(fixes)
     examined, found = [], []

@@ -107,20 +107,7 @@ class SensorErrors:
         return kept, np.hypot(stationary, self.walk * math.sqrt(dt_s))
 
     def effect(self, array: SensorArray, readings_T: FloatArray) -> FloatArray:
-        """Derivative of the readings of one row with respect to the errors.
-
-        Parameters
-        ----------
-        array : SensorArray
-            With the ambient field of the row.
-        readings_T : ndarray, shape (C,)
-            Raw readings [T], NaN where missing.
-
-        Returns
-        -------
-        ndarray, shape (C, n)
-            Finite also for missing readings.
-        """
+        """Derivative (C, n) of one row's readings (C,) [T] by the errors; finite also for missing readings."""
         effect = np.zeros((array.n_channels, self.n_states))
         n = len(self.of_sensor)
         if n:
@@ -134,10 +121,7 @@ class SensorErrors:
 
 
 def _of_fields(array: SensorArray) -> FloatArray:
-    """Derivative of the readings, by sensor and axis, with respect to a field in the array's frame: (N, 3, 3).
-
-    A modulus has that of the ambient field, whose direction it sees.
-    """
+    """Derivative (N, 3, 3) of readings by a field in the array's frame; a modulus sees it along the ambient field."""
     ambient = array.ambient_fields
     modulus = np.linalg.norm(ambient, axis=1, keepdims=True)
     direction = np.divide(ambient, modulus, out=np.zeros_like(ambient), where=modulus > 0.0)

@@ -84,13 +84,7 @@ def whitened_rows(
 
 
 def checked_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
-    """Raw readings (n, C) of an array [T] as numbers.
-
-    Raises
-    ------
-    ValueError
-        They have another shape.
-    """
+    """Raw readings (n, C) of an array [T] as numbers; ValueError where they have another shape."""
     readings = np.asarray(readings_T, dtype=np.float64)
     if readings.ndim != 2 or readings.shape[1] != array.n_channels:
         raise ValueError(

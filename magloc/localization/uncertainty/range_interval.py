@@ -52,38 +52,14 @@ _N_BISECTIONS = 24
 
 
 def is_detected(energy: ArrayLike, n_differences: int) -> NDArray[np.bool_]:
-    """Whether readings stand out of noise, which alone makes them do so in one of a thousand rows.
-
-    Parameters
-    ----------
-    energy : array_like, shape (...)
-        Sums of squared whitened differences, as they are without a source.
-    n_differences : int
-
-    Returns
-    -------
-    ndarray of bool, shape (...)
-    """
+    """Whether an energy stands out of noise, which alone makes readings do so in one of a thousand rows."""
     return np.asarray(np.asarray(energy) > energy_threshold(n_differences))
 
 
 def rise(energy: ArrayLike, chi2: ArrayLike, n_differences: int, level: ArrayLike = RISE_95) -> FloatArray:
     """By how much the profile of χ² may rise above the best solution's within the set of ranges.
 
-    Parameters
-    ----------
-    energy : array_like, shape (...)
-        Sums of squared whitened differences, as they are without a source.
-    chi2 : array_like, shape (...)
-        Of the best solutions.
-    n_differences : int
-    level : array_like, shape (...)
-        Rise of -2 log L, as of :func:`levels`.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        The level for strong signals, more for weak ones; infinite where nothing is detected.
+    The level of :func:`levels` for strong signals, more for weak ones; infinite where nothing is detected.
     """
     of_energy, wanted_rise = np.asarray(energy, dtype=np.float64), np.asarray(level, dtype=np.float64)
     explained = np.maximum(of_energy - np.asarray(chi2, dtype=np.float64), 0.0)
@@ -110,20 +86,7 @@ def _left_of_detected(n_differences: int) -> tuple[FloatArray, FloatArray]:
 
 
 def levels(chi2: FloatArray, weight: FloatArray) -> FloatArray:
-    """Rise above the best of several solutions within which 95 % of all of them are, each having one of its own range.
-
-    Parameters
-    ----------
-    chi2 : ndarray, shape (b, n)
-        Infinite where there is no solution.
-    weight : ndarray, shape (b, n)
-        They add up to one.
-
-    Returns
-    -------
-    ndarray, shape (b,)
-        3.84 with one solution, more with several ones.
-    """
+    """Rise (b,) above the best of solutions (b, n) within which 95 % of all of them are; 3.84 for a single one."""
     result = np.full(len(chi2), RISE_95)
     several = np.flatnonzero((weight > 0.0).sum(axis=1) > 1)
     if not several.size:
@@ -142,20 +105,7 @@ def levels(chi2: FloatArray, weight: FloatArray) -> FloatArray:
 
 
 def ranges_of(alpha: FloatArray, unit_m: float = 1.0) -> FloatArray:
-    """Ranges (..., 2) that stretches (..., 2) of α cover, least and largest: a stretch through infinity has two sides.
-
-    Parameters
-    ----------
-    alpha : ndarray, shape (..., 2)
-        Least and largest α, between -π/2 and π/2.
-    unit_m : float
-        Circumradius of the sensors [m].
-
-    Returns
-    -------
-    ndarray, shape (..., 2)
-        [m]; infinite where a stretch reaches infinity.
-    """
+    """Ranges (..., 2) [m] that stretches (..., 2) of α cover; a stretch through infinity has two sides."""
     first, last = alpha[..., 0], alpha[..., 1]
     with np.errstate(invalid="ignore", divide="ignore"):
         nearest = np.where(np.maximum(last, -first) < 0.5 * np.pi, 1.0 / np.tan(np.maximum(last, -first)), 0.0)
@@ -166,23 +116,10 @@ def ranges_of(alpha: FloatArray, unit_m: float = 1.0) -> FloatArray:
 
 
 def gaussian_ranges(covariance: FloatArray, offset_m: FloatArray, unit_m: float) -> FloatArray:
-    """95 % intervals (..., 2) of the range from a Gaussian of the position, symmetric in α.
+    """95 % intervals (..., 2) [m] of the range from a covariance that begins with the position, symmetric in α.
 
-    χ² is nearly a parabola in α and not at all one in the range: so does the interval open where the source is far.
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (..., n, n)
-        Of the position, or of a state that begins with it [m²].
-    offset_m : ndarray, shape (..., 3)
-        Of the source from the sensors' centroid [m].
-    unit_m : float
-        Circumradius of the sensors [m].
-
-    Returns
-    -------
-    ndarray, shape (..., 2)
-        [m]; 0 and infinity where it is open.
+    χ² is nearly a parabola in α and not at all one in the range: so does the interval open where the source is far, to
+    0 and infinity.
     """
     alpha = np.arctan2(unit_m, np.linalg.norm(offset_m, axis=-1))
     sigma = np.sin(alpha) * np.cos(alpha) * relative_range_sigma(covariance, offset_m)
@@ -192,18 +129,7 @@ def gaussian_ranges(covariance: FloatArray, offset_m: FloatArray, unit_m: float)
 
 
 def union(ends: Sequence[Sequence[float]]) -> Intervals:
-    """Disjoint intervals in ascending order, from pairs of ends that may overlap.
-
-    Parameters
-    ----------
-    ends : sequence of (low, high)
-        NaN for none, infinite for an open end.
-
-    Returns
-    -------
-    tuple of (low, high)
-        high is None where it is open.
-    """
+    """Disjoint intervals in ascending order, None for an open end, from pairs that may overlap, NaN for none."""
     merged: list[list[float]] = []
     for low, high in sorted([low, high] for low, high in ends if low == low):
         if merged and low <= merged[-1][1]:
