@@ -35,7 +35,7 @@ class Detector(Protocol):
 
 
 def energy_threshold(n_differences: int, false_alarm_rate: float = FALSE_ALARM) -> float:
-    r"""Quantile of :math:`\|z'\|^2 \sim \chi^2_k`: the energy of k whitened differences that noise exceeds at a rate."""
+    r"""Quantile of :math:`\|z'\|^2 \sim \chi^2_k`: energy of k whitened differences that noise exceeds at a rate."""
     if n_differences < 1:
         raise ValueError(f"Input n_differences must be at least 1; instead received {n_differences}.")
     check_share("false_alarm_rate", false_alarm_rate)

@@ -97,7 +97,7 @@ def hemisphere(n: int) -> FloatArray:
 
 
 def distinct_best(scores: FloatArray, candidates: FloatArray, n_starts: int, apart_rad: float) -> NDArray[np.intp]:
-    """The best candidates (b, n_starts) by scores (b, n) that are some angle apart; the best again where none is left."""
+    """The best candidates (b, n_starts) by scores (b, n) that are some angle apart; the best again if none is left."""
     left = scores.copy()
     chosen = np.empty((len(scores), n_starts), dtype=np.intp)
     for k in range(n_starts):
