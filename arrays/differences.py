@@ -1,18 +1,8 @@
-r"""Differences between sensors, their covariance, and the decorrelated form of both.
+"""Differences between sensors, their covariance, and the decorrelated form of both.
 
-The measurements of a gradiometer are differences between its sensors: what is common to all
-sensors (the ambient field and its variations in time) drops out, and no derivative is estimated.
-Differences that share a base sensor have correlated noise. Two forms remove the correlation:
-
-* :class:`Differences`, the form of the source paper: independent scalars
-  :math:`z' = W y` with variances, which a filter may process one at a time.
-* :class:`Whitening`, the same likelihood written as a projection: the readings of every sensor freed
-  of their own noise, the common field projected out. A model costs O(channels) instead of O(channels²),
-  which is what compiled fits want.
-
-Both hold for any number of vector and scalar sensors, any calibration and missing readings, and any
-noise that is independent between sensors (:func:`reading_covariance`); that they give the same
-:math:`\chi^2` is a tested identity.
+What is common to all sensors drops out of their differences, and no derivative is estimated. Those that share a base
+sensor have correlated noise: :class:`Differences` are the source paper's independent scalars :math:`z' = W y`, which a
+filter may process one at a time; :mod:`arrays.whitening` has the same likelihood as a projection.
 
 Source: Pavlov, Karshakov, Goldin, "Determination of the magnetic field parameters of an object from
 remote magnetogradient measurements", equations (5), (9), (13)-(16), (20), (24), (28).

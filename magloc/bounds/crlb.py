@@ -1,22 +1,8 @@
-r"""Cramér-Rao bounds: how well one set of readings can tell where a dipole is, and what it is, whatever the method.
+"""Cramér-Rao bounds: how well one set of readings can tell where a dipole is, and what it is, whatever the method.
 
 The information about (p, m) is :math:`I = H^T C^{-1} H` with the Jacobian H of the readings and the covariance C of
-all that is not the source. What else is not known is marginalised: a nuisance x that enters the readings as N x, with a
-Gaussian prior of covariance Λ, adds :math:`N Λ N^T` to C. Nuisances are
-
-* the field common to all sensors, unknown or with the prior ``common_field_T`` of the array;
-* what the calibration does not know: ``misalignment_rad``, ``gain_uncertainty`` and ``offset_uncertainty_T`` of every
-  sensor, as errors of one row, in the whole field, the array's ``ambient_T`` included;
-* the ambient field, whose direction scalar sensors need, if it is known to ``ambient_uncertainty_T`` only.
-
-With ``noise_fraction`` the covariance depends on the readings. It counts as known here, as it does for every fix: the
-little that its size tells of the source is left out.
-
-Where the information is singular a bound is infinite: for every source if there are too few readings. The nine
-differences of four vector sensors lose the rank six under four conditions, and a source and its moment have four
-angles: at every range there are isolated pairs of directions for which the bound is infinite, whatever the array. So
-the worst case over directions is infinite in truth, and only grows with the number of directions that are tried.
-Quantiles over directions do not.
+all that is not the source. A nuisance x that enters the readings as N x, with a Gaussian prior of covariance Λ, adds
+:math:`N Λ N^T` to C. Which nuisances there are, and where a bound is infinite: docs/theory/cramer-rao-bounds.md.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
 """Maps of Cramér-Rao bounds: where around an array, and how far from it, can a source be told how well?
 
-One source is put everywhere: with a moment that is given, and with a moment of that size in every direction. Every
-bound comes as four variables, ``sigma_range`` for the given moment, and over the directions its ``_median``, the value
-``_q95`` that 95 % of them stay below, and the ``_worst`` of those sampled (that of all may be infinite: see
-:mod:`magloc.bounds.crlb`).
-
-Two maps: a cube around the array (:class:`BoundMap`, box by box, so that its memory does not grow with it), and planes
-through its centroid. Spheres about it: :mod:`magloc.bounds.spheres`.
+A cube around the array (:class:`BoundMap`) and planes through its centroid; spheres: :mod:`magloc.bounds.spheres`.
+Every bound comes as four variables, ``sigma_range`` for the given moment, and over the directions of a moment of that
+size its ``_median``, the value ``_q95`` that 95 % of them stay below, and the ``_worst`` of those sampled (that of all
+may be infinite: docs/theory/cramer-rao-bounds.md).
 """
 
 from __future__ import annotations

@@ -1,19 +1,8 @@
-r"""Is there a source at all? Detection statistics of readings, their thresholds and how often they find a source.
+"""Is there a source at all? Detection statistics of readings: energy, known position, and the matched filter.
 
-In units of its noise, a set of independent differences z' is standard normal without a source. Three statistics:
-
-========================  =================================================================  ==========================
-energy                    :math:`\|z'\|^2`                                                   :math:`\chi^2_k`
-known position            energy in the space of the moments of a dipole at p, 3-dimensional :math:`\chi^2_3`
-matched filter            the same, at the position where it is largest                      no closed form: simulated
-========================  =================================================================  ==========================
-
-With a source the first two are noncentral :math:`\chi^2`, their noncentrality the energy of its signal. The matched
-filter is the generalised likelihood ratio, χ² without a source less χ² of the best one. Its many positions let noise
-find something more often, but fewer dimensions collect noise than in the energy.
-
-Signals are linear in the moment. Moduli are so where the ambient field is large against the source's, which a source
-that is hard to detect fulfils; they need an ambient field.
+The matched filter is the generalised likelihood ratio, the energy in the space of the moments of a dipole at the
+position where that is largest. Signals are linear in the moment; moduli are so where the ambient field is large against
+the source's, and need one. Distributions: docs/theory/detection.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Whether a source is near enough to be told from a dipole."""
+"""Whether a source is so near that it can be told from a dipole: by its length, or by what a fix leaves.
+
+The patterns that are looked for, quadrupole and octupole, are derived in docs/theory/extended-sources.md.
+"""
 
 from __future__ import annotations
 

@@ -1,16 +1,8 @@
 r"""Errors of sensors that last from row to row, as states that are estimated along with a source.
 
-What a calibration does not know (turned axes, gains, the platform's field), 1/f noise and drift are the same, or nearly
-the same, in the next row: they do not average out as noise does, and a filter that takes them for noise believes itself
-too much. Here every one of them is a number e with a standard deviation at the beginning and a first-order Markov
-process
-
-.. math:: \dot e = -e/τ + w
-
-constant (τ infinite, no noise) for the calibration, a random walk for drift. 1/f noise is the sum of one process for
-each decade of frequency, of equal variance: with corner frequencies :math:`f_k` a factor 10 apart and variance
-:math:`s^2` each, the spectral density :math:`\sum_k (2 s^2/π) f_k/(f_k^2 + f^2)` is that of :math:`s^2/(f \ln 10)`
-within 15 % between the outermost of them.
+Turned axes, gains, the platform's field, 1/f noise and drift do not average out as noise does. Every one of them is a
+first-order Markov process :math:`\dot e = -e/τ + w`: constant for the calibration, a random walk for drift, one
+process a decade of frequency for 1/f noise. See docs/theory/sensor-errors.md.
 """
 
 from __future__ import annotations

@@ -1,11 +1,7 @@
-r"""Any number of dipoles seen by any sensors: the exact model and its damped Gauss-Newton fit, many at once.
+"""Any number of dipoles seen by any sensors: damped Gauss-Newton fits of the exact model, many at once.
 
-Vector sensors read components, scalar sensors the exact modulus :math:`|B_a + B|` of the sum with the ambient field, so
-that the readings are not linear in the moments. Every source has the homogeneous coordinates q = (u, s) and the scaled
-moment μ of :mod:`magloc.measurement.whitened`: infinity (s = 0) is an ordinary point.
-
-Positions are damped, moments are not: after every step of the positions the moments are fitted anew, which for vector
-sensors makes the iteration that of variable projection.
+In the coordinates of :mod:`magloc.measurement.whitened`. Positions are damped, moments are not: after every step of
+the positions the moments are fitted anew, which for vector sensors makes the iteration that of variable projection.
 
 Shapes: b fits, K sources, N sensors, C channels, c columns of the whitening's common field.
 """

@@ -1,33 +1,9 @@
 r"""What one row of readings says of the range: the set of ranges that it allows.
 
-The set of 95 % has every range at which some source, of whatever direction and moment, fits the readings almost as well
-as the best one does: the profile of χ² over the range, all solutions together, is within a rise of its least value. It
-is followed as the angle :math:`\alpha = \mathrm{atan2}(s, |u|)` of homogeneous coordinates
-(:mod:`magloc.measurement.whitened`): π/2 at the sensors' centroid, 0 at infinity, and negative beyond it, on the other
-side. The rise is 3.84, the 95 % quantile of :math:`\chi^2_1`, where the signal is strong and has one solution. Two
-things raise it.
-
-Several solutions. A far source has a mirror image in another direction that fits as well, and each of the two has noise
-of its own: the better one is often the wrong one. The rise c is such that the set holds 95 % of all solutions together,
-each with its weight w (:mod:`magloc.localization.uncertainty.ambiguity`) and its :math:`\Delta\chi^2` above the best
-one, :func:`levels`,
-
-.. math:: \sum_i w_i \, P(\chi^2_1 > c - \Delta\chi^2_i) = 0.05.
-
-Weak signals. A set is only given where something is detected, that is where the energy of the whitened differences
-:math:`E = |y|^2` exceeds a threshold T. Of the sources near the limit only those are seen which noise makes look
-stronger than they are, so that the likelihood of readings that are seen is that of all readings over the probability
-:math:`P(E > T)` to see them at all,
-
-.. math:: -2 \log L(h) = |y - h|^2 + 2 \log P(\chi'^2_k(|h|^2) > T),
-
-with the k predicted differences h. Whatever their pattern, h may be of any strength: with the energy
-:math:`C = E - \chi^2` that the best fit of a pattern explains, the best strength leaves
-
-.. math:: E + D(\sqrt C), \qquad D(a) = \min_l [l^2 - 2 a l + 2 \log P(\chi'^2_k(l^2) > T)],
-
-which falls with C: the best fit at every range stays the best one, and only the scale of χ² changes. :func:`rise` is by
-how much χ² rises while D rises by c.
+The 95 % set is where the profile of χ² over the range, all solutions together, is within a rise of its least value. It
+is followed as the angle :math:`\alpha = \mathrm{atan2}(s, |u|)` of homogeneous coordinates: π/2 at the sensors'
+centroid, 0 at infinity, and negative beyond it. The rise is 3.84 for a strong signal with one solution; several
+solutions raise it, and so do weak signals, given that they are detected: docs/theory/range-interval.md.
 """
 
 from __future__ import annotations
