@@ -96,7 +96,6 @@ def decorrelated_differences(
 
     Parameters
     ----------
-    array : SensorArray
     available : ndarray of bool, shape (C,), optional
         Channels that have a reading; all by default.
     base : int

@@ -20,7 +20,6 @@ def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray
 
     Parameters
     ----------
-    array : SensorArray
     readings_T : ndarray, shape (..., C)
         Raw readings [T], NaN where missing.
 
@@ -61,7 +60,6 @@ def reading_covariance(array: SensorArray, readings_T: FloatArray) -> FloatArray
 
     Parameters
     ----------
-    array : SensorArray
     readings_T : ndarray, shape (..., C)
         Raw readings of the whole field [T], NaN where missing. For a missing axis of b stands the known ambient field,
         else the mean of the other sensors' fields, else zero.

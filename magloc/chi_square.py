@@ -50,7 +50,6 @@ class ChiSquareDetector:
     ----------
     n_dimensions : int
         Dimensions of the space: the number of differences, or 3.
-    false_alarm_rate : float
     """
 
     n_dimensions: int

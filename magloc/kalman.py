@@ -198,10 +198,6 @@ def iterated_update(
         What the length of the steps is multiplied by whenever one changes the prediction no less than the one before:
         Gauss-Newton steps may swing to and fro about an optimum in a strongly curved direction. 1: they are whole, as
         in the paper.
-
-    Returns
-    -------
-    IteratedUpdate
     """
     x_k, predicted = x, Hx(x)
     innovation = z - predicted

@@ -195,7 +195,6 @@ def read_readings(
 
     Parameters
     ----------
-    path : path-like
     array : SensorArray
         Whose sensors the file must have, with a column for each channel.
     sensors : sequence of str, optional

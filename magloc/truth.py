@@ -45,14 +45,6 @@ class Truth:
 def read_truth(path: str | PathLike[str]) -> Truth:
     """True positions, and moments where they are known, from a CSV file.
 
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    Truth
-
     Raises
     ------
     InputError

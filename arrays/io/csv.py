@@ -33,7 +33,6 @@ class Table:
 
     Attributes
     ----------
-    path : str
     header : tuple of str
         Names of the columns, each once.
     header_line : int, optional

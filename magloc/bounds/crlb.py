@@ -108,7 +108,6 @@ def cramer_rao_bounds(
 
     Parameters
     ----------
-    array : SensorArray
     position_m, moment_Am2 : array_like, shape (..., 3)
         Source in the array's frame [m], its moment [A·m²].
     ambient_uncertainty_T : float

@@ -228,7 +228,6 @@ def bound_map(
 
     Parameters
     ----------
-    array : SensorArray
     moment_Am2 : tuple of 3 floats
         Moment of the source; its size is that of the moments of other directions, too [A·m²].
     edge_m : float

@@ -1,7 +1,7 @@
 """Cramér-Rao bounds of many sources, each with many moments: tables, and statistics over the directions of the moment.
 
-Compiled and parallel; the readable twin of every entry is :func:`magloc.bounds.crlb.cramer_rao_bounds`, which says
-what the bounds mean and when they are infinite.
+Compiled and parallel; the readable twin of every entry is :func:`magloc.bounds.crlb.cramer_rao_bounds`;
+for when they are infinite see docs/theory/cramer-rao-bounds.md.
 """
 
 from __future__ import annotations

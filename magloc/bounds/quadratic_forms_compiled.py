@@ -1,7 +1,7 @@
 r"""Compiled information of one source for every moment, where neither axes nor noise depend on the moment.
 
 The derivatives of a channel with the axis a follow from A a and the symmetric G(d; a), see
-:mod:`magloc.bounds.table_compiled`: nine columns, three of the former and six of the latter, hold them for **every**
+docs/theory/cramer-rao-bounds.md: nine columns, three of the former and six of the latter, hold them for **every**
 moment. Before them stand the columns of the nuisances, each with a further row that holds its prior: what is left of
 the six at right angles to all before them has a 6×6 Gram matrix K, with :math:`M_{ij} = \sum_{ab} m_a m_b K_{(ia)(jb)}`
 the information about the position. It is formed once for a position; a moment then costs 100 operations.

@@ -34,7 +34,6 @@ def bound_spheres(scenario: BoundScenario, ranges_m: Sequence[float], step_deg: 
 
     Parameters
     ----------
-    scenario : BoundScenario
     ranges_m : sequence of float
         Radii of the spheres [m].
     step_deg : float

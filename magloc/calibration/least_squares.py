@@ -48,10 +48,8 @@ class Optimum:
 
     Attributes
     ----------
-    state : State
     cost : float
         χ² of the readings and of all priors.
-    iterations : int
     converged : bool
         Whether a full step would lower the cost by less than the tolerance.
     """

@@ -59,8 +59,6 @@ class EllipsoidCalibration:
         Sum of squared distances from the ellipsoid, bias removed, over the noise squared.
     dof : int
         Readings minus nine.
-    iterations : int
-    converged : bool
     reason : str
         Empty if it converged.
     """

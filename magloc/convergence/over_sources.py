@@ -315,7 +315,6 @@ class SourcesSummary:
         Of the latter.
     median_iterations : float
         Over the sources that were found; NaN if there are none.
-    iterations_total : int
     seconds : float
         Duration of the computation alone; that of all machines together.
     truth_listed : float

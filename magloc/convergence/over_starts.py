@@ -65,7 +65,6 @@ class StartsScenario:
         The source.
     half_width_m : float
         The cube reaches from -half_width to +half_width along every axis, around the origin of the array's frame.
-    method : Filter
     noise_seed : int, optional
         Of one realisation of the sensors' noise that all starts share; noise-free readings without it.
     """
@@ -96,10 +95,8 @@ class StartsMap:
 
     Attributes
     ----------
-    scenario : StartsScenario
     grid : int
         Starts along every axis.
-    measurement : DifferenceMeasurement
     z : ndarray, shape (k,)
         Decorrelated differences that every start is given [T].
     optimum : Solution
@@ -207,7 +204,6 @@ class StartsSummary:
 
     Attributes
     ----------
-    starts, converged : int
     fraction, front_fraction, back_fraction : float
         Converged starts over all starts, over those in front of the plane and over those behind it.
     median_iterations : float

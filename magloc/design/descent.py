@@ -100,7 +100,6 @@ class Descent:
         The best places that it came to [m].
     value : float
         Criterion of its sample there [m].
-    iterations : int
     converged : bool
         Whether the criterion had stopped falling; else the iterations were used up.
     """

@@ -41,8 +41,6 @@ class Judgement:
 
     Attributes
     ----------
-    name : str
-    array : SensorArray
     criterion_m : float
         The task's criterion on the independent sources.
     fits : bool

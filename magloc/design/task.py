@@ -163,8 +163,6 @@ class DesignTask:
 
     Attributes
     ----------
-    name : str
-    n_sensors : int
     kind : {"vector", "scalar"}
         Scalar sensors need an ambient field.
     noise_T : float

@@ -45,7 +45,6 @@ class Ball:
     Attributes
     ----------
     centre_m : tuple, shape (3,)
-    radius_m : float
     """
 
     centre_m: tuple[float, float, float]

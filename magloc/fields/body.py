@@ -30,7 +30,6 @@ class EquivalentDipole:
         Centroid of the body [m].
     moment_Am2 : ndarray, shape (3,)
         [A·m²].
-    volume_m3 : float
     semi_axes_m : ndarray, shape (3,)
         Of the ellipsoid, longest first [m].
     axes : ndarray, shape (3, 3)

@@ -49,13 +49,11 @@ class Sweep:
 
     Parameters
     ----------
-    cube : CubeMap
     path : path-like
         The store; made if it does not exist.
 
     Attributes
     ----------
-    points_done, chunks_done, n_chunks : int
     unreadable : list of str
         One sentence for every chunk that was done but cannot be read; it is computed again.
 

@@ -145,10 +145,6 @@ def nearness_test(
     false_alarm : float
         Probability at most of any finding for a dipole with noise of the stated size.
 
-    Returns
-    -------
-    NearnessTest
-
     Raises
     ------
     ValueError

@@ -109,7 +109,6 @@ def distance_along_line(
 
     Parameters
     ----------
-    line : SourceLine
     field_T : array_like, shape (..., 3)
         Field of the source alone, in the sensor's axes [T].
     noise_T, noise_fraction

@@ -67,7 +67,6 @@ class DifferenceMeasurement:
 
     Attributes
     ----------
-    array : SensorArray
     differences : Differences
         Which combinations of channels are measured; see :func:`arrays.differences.decorrelated_differences` for missing
         readings, another base sensor or another noise.

@@ -32,7 +32,6 @@ class SensorErrors:
 
     Attributes
     ----------
-    array : SensorArray
     sigma : ndarray, shape (n,)
         Standard deviations before anything is known.
     decay_Hz : ndarray, shape (n,)

@@ -30,10 +30,8 @@ class WhitenedRows:
     mask : ndarray of bool, shape (C,)
         Channels that have a reading.
     readings_T : ndarray, shape (b, C)
-    model : WhitenedModel
     y : ndarray, shape (b, C)
         Of unit noise, free of the common field.
-    n_differences : int
     """
 
     index: IntArray

@@ -51,7 +51,6 @@ class MultiSourceSearch:
 
     Parameters
     ----------
-    array : SensorArray
     n_sources : int, optional
         Number of sources; by default it is chosen, up to five.
     prior : SourcePrior
