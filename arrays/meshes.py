@@ -60,16 +60,6 @@ def mesh_of(array: SensorArray, size_m: float | None = None) -> trimesh.Trimesh:
     return _joined([sensor_mesh(sensor, size) for sensor in array.sensors])
 
 
-def array_scene(array: SensorArray, size_m: float | None = None) -> trimesh.Scene:
-    """An array as a scene [m]: one node for each sensor, called after its id, at the sensor's pose."""
-    size = glyph_size(array) if size_m is None else size_m
-    scene = trimesh.Scene()
-    for sensor in array.sensors:
-        glyph = _glyph(sensor, size)
-        scene.add_geometry(glyph, node_name=sensor.id, geom_name=sensor.id, transform=_pose(sensor))
-    return scene
-
-
 def _glyph(sensor: Sensor, size_m: float) -> trimesh.Trimesh:
     """Mesh of a sensor in its own axes."""
     if not 0.0 < size_m < np.inf:

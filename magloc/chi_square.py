@@ -1,4 +1,4 @@
-"""χ² tests: thresholds of detection, their operating characteristics, and bounds of means."""
+"""χ² tests: thresholds of detection, and bounds of means."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri, chndtr, chndtrinc
 
 from arrays.typing import FloatArray
-from magloc.levels import CONSISTENCY, DELTA_CHI2_95, FALSE_ALARM
+from magloc.levels import CONSISTENCY, FALSE_ALARM
 
 
 def mean_bounds(degrees_of_freedom: int, level: float = CONSISTENCY) -> tuple[float, float]:
@@ -72,20 +72,6 @@ class ChiSquareDetector:
         return float(chndtrinc(self.threshold, float(self.n_dimensions), 1.0 - probability))
 
 
-def receiver_operating_characteristic(
-    without_source: ArrayLike, with_source: ArrayLike, false_alarm_rate: ArrayLike
-) -> FloatArray:
-    """Probability of detection at false-alarm rates, from draws of a statistic without (n,) and with (m,) a source.
-
-    It is the share with a source above the quantile of those without; its standard error is √(P (1 − P)/m), and that of
-    the rate √(rate (1 − rate)/n).
-    """
-    thresholds = np.quantile(np.asarray(without_source), 1.0 - np.asarray(false_alarm_rate))
-    sorted_ = np.sort(np.asarray(with_source))
-    found: FloatArray = 1.0 - np.searchsorted(sorted_, thresholds, side="right") / sorted_.size
-    return found
-
-
 def check_differences(n: int, least: int, what: str) -> None:
     """Refuse an array that gives fewer than the least number of differences for what is wanted."""
     if n < least:
@@ -107,7 +93,3 @@ def check_probability(probability: float, false_alarm_rate: float) -> None:
             f"Input probability must be between the false-alarm rate {false_alarm_rate:g} and 1;"
             f" instead received {probability}."
         )
-
-
-# Δχ² of a 95 % interval of one parameter, and within which another optimum is a solution too.
-RISE_95 = DELTA_CHI2_95
