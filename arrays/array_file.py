@@ -124,10 +124,6 @@ class _SensorsFile(_Header, kw_only=True):
 def read_array(path: str | PathLike[str]) -> SensorArray:
     """Array from its TOML file.
 
-    Parameters
-    ----------
-    path : path-like
-
     Returns
     -------
     SensorArray
@@ -168,7 +164,6 @@ def write_array(array: SensorArray, path: str | PathLike[str]) -> None:
 
     Parameters
     ----------
-    array : SensorArray
     path : path-like
         Replaced if it exists, in one step: nobody sees half a file.
 

@@ -1,18 +1,8 @@
-r"""Differences between sensors, their covariance, and the decorrelated form of both.
+"""Differences between sensors, their covariance, and the decorrelated form of both.
 
-The measurements of a gradiometer are differences between its sensors: what is common to all
-sensors (the ambient field and its variations in time) drops out, and no derivative is estimated.
-Differences that share a base sensor have correlated noise. Two forms remove the correlation:
-
-* :class:`Differences`, the form of the source paper: independent scalars
-  :math:`z' = W y` with variances, which a filter may process one at a time.
-* :class:`Whitening`, the same likelihood written as a projection: the readings of every sensor freed
-  of their own noise, the common field projected out. A model costs O(channels) instead of O(channels²),
-  which is what compiled fits want.
-
-Both hold for any number of vector and scalar sensors, any calibration and missing readings, and any
-noise that is independent between sensors (:func:`reading_covariance`); that they give the same
-:math:`\chi^2` is a tested identity.
+What is common to all sensors drops out of their differences, and no derivative is estimated. Those that share a base
+sensor have correlated noise: :class:`Differences` are the source paper's independent scalars :math:`z' = W y`, which a
+filter may process one at a time; :mod:`arrays.whitening` has the same likelihood as a projection.
 
 Source: Pavlov, Karshakov, Goldin, "Determination of the magnetic field parameters of an object from
 remote magnetogradient measurements", equations (5), (9), (13)-(16), (20), (24), (28).
@@ -33,20 +23,7 @@ _EQUAL_NOISE_RTOL = 1e-12
 
 
 def contrasts(n_sensors: int, base: int = -1) -> FloatArray:
-    """Differences against a base sensor as a matrix, equations (5) and (20).
-
-    Parameters
-    ----------
-    n_sensors : int
-        Number of sensors, at least 2.
-    base : int
-        Index of the base sensor; the paper's is the last one.
-
-    Returns
-    -------
-    ndarray, shape (n_sensors - 1, n_sensors)
-        Rows with +1 at a sensor and -1 at the base, in sensor order.
-    """
+    """Differences against a base sensor as rows (n_sensors - 1, n_sensors) of +1 and -1, equations (5) and (20)."""
     if n_sensors < 2:
         raise ValueError(f"Input n_sensors must be at least 2; instead received {n_sensors}.")
     base = range(n_sensors)[base]
@@ -56,39 +33,17 @@ def contrasts(n_sensors: int, base: int = -1) -> FloatArray:
 
 
 def difference_covariance(noise: FloatArray, base: int = -1) -> FloatArray:
-    """Covariance of the differences against a base sensor, equation (13) for any noise.
-
-    Parameters
-    ----------
-    noise : ndarray, shape (N,)
-        Standard deviation of each sensor [T].
-    base : int
-        Index of the base sensor.
-
-    Returns
-    -------
-    ndarray, shape (N - 1, N - 1)
-        ``diag(noise_i²) + noise_base² 1 1ᵀ`` [T²].
-    """
+    """Covariance ``diag(noise_i²) + noise_base² 1 1ᵀ`` [T²] of these differences, equation (13) for any noise (N,)."""
     noise = np.asarray(noise, dtype=np.float64)
     d = contrasts(noise.size, base)
     return (d * noise**2) @ d.T
 
 
 def helmert_decorrelation(n_differences: int) -> FloatArray:
-    """Orthonormal eigenvectors of ``I + 1 1ᵀ``, equation (14) for any number of differences.
+    """Orthonormal eigenvectors (n, n) of ``I + 1 1ᵀ``, equation (14) for any number n of differences against one base.
 
-    Row 0 belongs to the eigenvalue ``n_differences + 1``, the others to the eigenvalue 1 (equation (15)).
+    Row 0 belongs to the eigenvalue ``n + 1``, the others to the eigenvalue 1 (equation (15)).
     For three differences this is the paper's T to the sign.
-
-    Parameters
-    ----------
-    n_differences : int
-        Number of differences that share a base sensor, at least 1.
-
-    Returns
-    -------
-    ndarray, shape (n_differences, n_differences)
     """
     if n_differences < 1:
         raise ValueError(f"Input n_differences must be at least 1; instead received {n_differences}.")
@@ -98,20 +53,7 @@ def helmert_decorrelation(n_differences: int) -> FloatArray:
 
 
 def eigen_decorrelation(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Orthonormal T and variances with ``T R Tᵀ = diag(variance)``, for any covariance R.
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (n, n)
-        Symmetric positive definite.
-
-    Returns
-    -------
-    transform : ndarray, shape (n, n)
-        Eigenvectors as rows, largest eigenvalue first as in equation (15).
-    variance : ndarray, shape (n,)
-        Eigenvalues in the same order.
-    """
+    """Orthonormal T and variances, largest first, with ``T R Tᵀ = diag(variance)``, for any covariance R (n, n)."""
     # LAPACK's tolerances are absolute in the largest entry: field variances in T² need scaling to keep their digits.
     scale = float(np.max(np.abs(np.diagonal(covariance))))
     eigenvalue, eigenvector = np.linalg.eigh(covariance / scale)
@@ -154,7 +96,6 @@ def decorrelated_differences(
 
     Parameters
     ----------
-    array : SensorArray
     available : ndarray of bool, shape (C,), optional
         Channels that have a reading; all by default.
     base : int

@@ -31,10 +31,6 @@ def tetrahedron(edge_m: float, kind: SensorKind = "vector", noise_T: float = 1e-
         Kind of the sensors.
     noise_T : float
         Standard deviation of a reading [T].
-
-    Returns
-    -------
-    SensorArray
     """
     edge = _size("edge_m", edge_m)
     base = _ring(3, edge / np.sqrt(3.0))
@@ -54,10 +50,6 @@ def square(edge_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9) ->
         Kind of the sensors.
     noise_T : float
         Standard deviation of a reading [T].
-
-    Returns
-    -------
-    SensorArray
     """
     half = _size("edge_m", edge_m) / 2.0
     return _array("square", half * np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]), kind, noise_T)
@@ -74,10 +66,6 @@ def cross(arm_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9) -> S
         Kind of the sensors.
     noise_T : float
         Standard deviation of a reading [T].
-
-    Returns
-    -------
-    SensorArray
     """
     arm = _size("arm_m", arm_m)
     return _array("cross", arm * np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]]), kind, noise_T)
@@ -94,10 +82,6 @@ def cube(edge_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9) -> S
         Kind of the sensors.
     noise_T : float
         Standard deviation of a reading [T].
-
-    Returns
-    -------
-    SensorArray
     """
     half = _size("edge_m", edge_m) / 2.0
     signs = (-1, 1)
@@ -115,10 +99,6 @@ def hexagon(radius_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9)
         Kind of the sensors.
     noise_T : float
         Standard deviation of a reading [T].
-
-    Returns
-    -------
-    SensorArray
     """
     return _array("hexagon", _ring(6, _size("radius_m", radius_m)), kind, noise_T)
 
@@ -134,10 +114,6 @@ def axial(baseline_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9)
         Kind of the sensors.
     noise_T : float
         Standard deviation of a reading [T].
-
-    Returns
-    -------
-    SensorArray
     """
     half = _size("baseline_m", baseline_m) / 2.0
     return _array("axial", half * np.array([[0, 0, 1], [0, 0, -1]]), kind, noise_T)
@@ -156,10 +132,6 @@ def grid(nx: int, ny: int, pitch_m: float, kind: SensorKind = "vector", noise_T:
         Kind of the sensors.
     noise_T : float
         Standard deviation of a reading [T].
-
-    Returns
-    -------
-    SensorArray
     """
     if min(nx, ny) < 1 or nx * ny < 2:
         raise ValueError(f"Inputs nx and ny must be at least 1, together at least 2; instead received {nx} and {ny}.")

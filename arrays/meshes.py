@@ -31,35 +31,13 @@ _SAME_PLACE_RTOL = 1e-9
 
 
 def glyph_size(array: SensorArray) -> float:
-    """Size at which the glyphs of an array do not touch: 0.4 of the least distance between two sensors.
-
-    Parameters
-    ----------
-    array : SensorArray
-
-    Returns
-    -------
-    float
-        Size [m]. Sensors in the same place do not count.
-    """
+    """Size [m] at which an array's glyphs do not touch: 0.4 of the least distance between sensors in two places."""
     distances = pdist(array.positions)
     return _SIZE_OF_SPACING * float(distances[distances > _SAME_PLACE_RTOL * array.circumradius].min())
 
 
 def sensor_mesh(sensor: Sensor, size_m: float) -> trimesh.Trimesh:
-    """Glyph of a sensor at its place, turned as the sensor is.
-
-    Parameters
-    ----------
-    sensor : Sensor
-    size_m : float
-        Reach of the rods from the sensor's position [m].
-
-    Returns
-    -------
-    trimesh.Trimesh
-        In the array's frame [m], watertight.
-    """
+    """Watertight glyph of a sensor at its place in the array's frame [m], turned as it is; its rods reach `size_m`."""
     glyph = _glyph(sensor, size_m)
     glyph.apply_transform(_pose(sensor))
     return glyph
@@ -70,7 +48,6 @@ def mesh_of(array: SensorArray, size_m: float | None = None) -> trimesh.Trimesh:
 
     Parameters
     ----------
-    array : SensorArray
     size_m : float, optional
         Size of the glyphs [m], :func:`glyph_size` by default.
 
@@ -81,28 +58,6 @@ def mesh_of(array: SensorArray, size_m: float | None = None) -> trimesh.Trimesh:
     """
     size = glyph_size(array) if size_m is None else size_m
     return _joined([sensor_mesh(sensor, size) for sensor in array.sensors])
-
-
-def array_scene(array: SensorArray, size_m: float | None = None) -> trimesh.Scene:
-    """An array as a scene with one node for each sensor, called after its id.
-
-    Parameters
-    ----------
-    array : SensorArray
-    size_m : float, optional
-        Size of the glyphs [m], :func:`glyph_size` by default.
-
-    Returns
-    -------
-    trimesh.Scene
-        In the array's frame [m]. A node's transform is the pose of its sensor.
-    """
-    size = glyph_size(array) if size_m is None else size_m
-    scene = trimesh.Scene()
-    for sensor in array.sensors:
-        glyph = _glyph(sensor, size)
-        scene.add_geometry(glyph, node_name=sensor.id, geom_name=sensor.id, transform=_pose(sensor))
-    return scene
 
 
 def _glyph(sensor: Sensor, size_m: float) -> trimesh.Trimesh:

@@ -20,7 +20,6 @@ def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray
 
     Parameters
     ----------
-    array : SensorArray
     readings_T : ndarray, shape (..., C)
         Raw readings [T], NaN where missing.
 
@@ -61,7 +60,6 @@ def reading_covariance(array: SensorArray, readings_T: FloatArray) -> FloatArray
 
     Parameters
     ----------
-    array : SensorArray
     readings_T : ndarray, shape (..., C)
         Raw readings of the whole field [T], NaN where missing. For a missing axis of b stands the known ambient field,
         else the mean of the other sensors' fields, else zero.
@@ -75,21 +73,7 @@ def reading_covariance(array: SensorArray, readings_T: FloatArray) -> FloatArray
 
 
 def reading_errors(array: SensorArray, readings_T: FloatArray, normal: FloatArray) -> FloatArray:
-    """Errors of the covariance of :func:`reading_covariance`, from independent standard normal numbers.
-
-    Parameters
-    ----------
-    array : SensorArray
-    readings_T : ndarray, shape (..., C)
-        Readings without errors [T].
-    normal : ndarray, shape (..., C)
-        The numbers.
-
-    Returns
-    -------
-    ndarray, shape (..., C)
-        To be added to the readings [T].
-    """
+    """Errors (..., C) [T] of the covariance of :func:`reading_covariance`, from standard normal numbers (..., C)."""
     if not array.noise_depends_on_reading:
         return array.channel_noise_T * normal
     channel, used = array.sensor_channels, array.sensor_channels >= 0
@@ -117,18 +101,10 @@ def _covariance_blocks(array: SensorArray, readings_T: FloatArray) -> FloatArray
 
 
 def calibration_errors(array: SensorArray, readings_T: FloatArray) -> FloatArray:
-    """What small errors of a calibration do to the readings: derivatives with respect to turns θ and gains g.
+    """Derivatives of readings (..., C) with respect to small turns θ and gains g of a calibration: (..., N, 3, 6).
 
-    Parameters
-    ----------
-    array : SensorArray
-    readings_T : ndarray, shape (..., C)
-        Raw readings [T], NaN where missing; see :func:`reading_covariance` for what stands for those.
-
-    Returns
-    -------
-    ndarray, shape (..., N, 3, 6)
-        By sensor, its three axes, and (θ, g): ``S (θ × b + g ∘ b)`` [T]. A scalar sensor has its first axis only.
+    By sensor, its three axes, and (θ, g): ``S (θ × b + g ∘ b)`` [T]. A scalar sensor has its first axis only. For what
+    stands for missing readings see :func:`reading_covariance`.
     """
     readings_T = np.asarray(readings_T, dtype=np.float64)
     scale = np.tile(np.eye(3), (array.n_sensors, 1, 1))

@@ -69,10 +69,6 @@ class Calibration:
             One factor for all channels, one for each, or the matrix.
         offset_T : array-like, shape () or (n,)
             Reading in zero field [T].
-
-        Returns
-        -------
-        Calibration
         """
         n = _n_channels(kind)
         factors, offsets = _numbers("scale", scale), _numbers("offset_T", offset_T)

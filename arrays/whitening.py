@@ -37,18 +37,10 @@ class Whitening:
     n_differences: int
 
     def apply(self, channels: FloatArray) -> FloatArray:
-        """Whitened channels.
+        """Whitened channels (..., C) of readings without offset, predictions or columns of a Jacobian [T].
 
-        Parameters
-        ----------
-        channels : ndarray, shape (..., C)
-            Readings with their offset removed, or predictions, or one column of a Jacobian [T]. Missing entries must
-            be finite; they do not count.
-
-        Returns
-        -------
-        ndarray, shape (..., C)
-            Residuals of unit variance once the common field is projected out.
+        Residuals have unit variance once the common field is projected out. Missing entries must be finite; they do not
+        count.
         """
         e = channels @ self.root.T
         w: FloatArray = e - ((e @ self.basis) * self.shrinkage) @ self.basis.T
@@ -68,21 +60,7 @@ def whitening(
 
 
 def whitenings(array: SensorArray, available: BoolArray, covariances_T2: FloatArray) -> list[Whitening]:
-    """Whitening of each of n covariances at once, for rows that have the same readings.
-
-    Parameters
-    ----------
-    array : SensorArray
-    available : ndarray of bool, shape (C,)
-        Channels that have a reading.
-    covariances_T2 : ndarray, shape (n, C, C)
-        As one of :func:`reading_covariance` [T²].
-
-    Returns
-    -------
-    list of Whitening
-        As :func:`whitening` makes them one by one.
-    """
+    """:func:`whitening` of each of n covariances (n, C, C) [T²] at once, for rows that have the same readings."""
     n_rows, n = len(covariances_T2), array.n_channels
     root = _inverse_root(array, available, covariances_T2)
     gain = root @ array.channel_gain

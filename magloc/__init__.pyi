@@ -17,6 +17,9 @@ from magloc.fields import dipole as dipole
 from magloc.fields import geomagnetic as geomagnetic
 from magloc.fields.body import equivalent_dipole as equivalent_dipole
 from magloc.localization.fit.results import Source as Source
+from magloc.localization.line_ranging import SourceLine as SourceLine
+from magloc.localization.line_ranging import distance_along_line as distance_along_line
+from magloc.localization.line_ranging import fit_source_line as fit_source_line
 from magloc.readings import Readings as Readings
 from magloc.readings import read_readings as read_readings
 from magloc.truth import Truth as Truth

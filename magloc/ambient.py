@@ -28,7 +28,6 @@ class Place:
         Geodetic; above the WGS-84 ellipsoid.
     date : str
         ISO 8601.
-    model : str
     """
 
     latitude_deg: float

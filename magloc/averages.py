@@ -14,25 +14,11 @@ from magloc.readings import Readings, change_between_rows
 
 
 def average(readings: Readings) -> Readings:
-    """All complete rows averaged to one.
+    """All complete rows of an array at rest averaged to one, at the mean time.
 
-    Complete are the rows with every channel that any row has. Rows with less are left out: the field common to all
-    sensors changes from row to row, and cancels only between channels that are averaged over the same rows.
-
-    Parameters
-    ----------
-    readings : Readings
-        Of an array that does not move.
-
-    Returns
-    -------
-    Readings
-        One row, at the mean time. A channel that no row has stays missing.
-
-    Raises
-    ------
-    InputError
-        The array moves, or the ambient field changes, between the rows, or no row is complete.
+    Complete are the rows with every channel that any row has; a channel that no row has stays missing. Rows with less
+    are left out: the field common to all sensors changes from row to row, and cancels only between channels that are
+    averaged over the same rows. InputError if the array moves or the ambient field changes, or no row is complete.
     """
     change = change_between_rows(readings)
     if change is not None:
@@ -61,34 +47,12 @@ def averaging_array(array: SensorArray, readings: Readings) -> SensorArray:
 
     White noise, and the proportional noise with it, falls by :math:`\sqrt n` with n complete rows. Misalignments and
     errors of the gains stay as they are: they are the same in every row, and no average removes them.
-
-    Parameters
-    ----------
-    array : SensorArray
-    readings : Readings
-        The rows that are averaged.
-
-    Returns
-    -------
-    SensorArray
     """
     return _less_noisy(array, math.sqrt(max(1, int(complete_rows(readings).sum()))))
 
 
 def window_averages(readings: Readings, window_s: float) -> Readings:
-    """Means of successive windows of time; the pose is that of the row in the middle.
-
-    Parameters
-    ----------
-    readings : Readings
-    window_s : float
-        Length of a window [s].
-
-    Returns
-    -------
-    Readings
-        One row for each window that has one. A channel is missing where it is missing in the whole window.
-    """
+    """Means of successive windows of time [s] that have a row, at the pose of the row in the middle of each."""
     window = np.floor((readings.time_s - readings.time_s[0]) / window_s + 1e-9).astype(np.intp)
     _, first, count = np.unique(window, return_index=True, return_counts=True)
     middle = first + count // 2

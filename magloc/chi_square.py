@@ -1,4 +1,4 @@
-"""χ² tests: thresholds of detection, their operating characteristics, and bounds of means."""
+"""χ² tests: thresholds of detection, and bounds of means."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri, chndtr, chndtrinc
 
 from arrays.typing import FloatArray
-from magloc.levels import CONSISTENCY, DELTA_CHI2_95, FALSE_ALARM
+from magloc.levels import CONSISTENCY, FALSE_ALARM
 
 
 def mean_bounds(degrees_of_freedom: int, level: float = CONSISTENCY) -> tuple[float, float]:
@@ -35,25 +35,7 @@ class Detector(Protocol):
 
 
 def energy_threshold(n_differences: int, false_alarm_rate: float = FALSE_ALARM) -> float:
-    r"""Energy of the whitened differences that noise alone exceeds at a given rate.
-
-    Parameters
-    ----------
-    n_differences : int
-        Number of independent differences k.
-    false_alarm_rate : float
-        Share of the sets of readings without a source that exceed the threshold.
-
-    Returns
-    -------
-    float
-        Quantile of :math:`\|z'\|^2 \sim \chi^2_k`, every difference in units of its noise.
-
-    Raises
-    ------
-    ValueError
-        There is no difference, or the rate is not between 0 and 1.
-    """
+    r"""Quantile of :math:`\|z'\|^2 \sim \chi^2_k`: energy of k whitened differences that noise exceeds at a rate."""
     if n_differences < 1:
         raise ValueError(f"Input n_differences must be at least 1; instead received {n_differences}.")
     check_share("false_alarm_rate", false_alarm_rate)
@@ -68,7 +50,6 @@ class ChiSquareDetector:
     ----------
     n_dimensions : int
         Dimensions of the space: the number of differences, or 3.
-    false_alarm_rate : float
     """
 
     n_dimensions: int
@@ -80,59 +61,15 @@ class ChiSquareDetector:
         return energy_threshold(self.n_dimensions, self.false_alarm_rate)
 
     def probability(self, signal_energy: ArrayLike) -> FloatArray:
-        """Probability of detection: the noncentral χ² beyond the threshold.
-
-        Parameters
-        ----------
-        signal_energy : array_like
-            Of the noise-free differences, in units of the noise's variance.
-
-        Returns
-        -------
-        ndarray
-        """
+        """Probability of detection: noncentral χ² beyond the threshold, for energies in units of the noise."""
         energy = np.asarray(signal_energy, dtype=np.float64)
         found: FloatArray = 1.0 - chndtr(self.threshold, float(self.n_dimensions), energy)
         return found
 
     def required_energy(self, probability: float) -> float:
-        """Energy of a signal that is found with a probability.
-
-        Parameters
-        ----------
-        probability : float
-            Above the false-alarm rate.
-
-        Returns
-        -------
-        float
-            In units of the noise's variance.
-        """
+        """Energy, in units of the noise, of a signal that is found with a probability above the false-alarm rate."""
         check_probability(probability, self.false_alarm_rate)
         return float(chndtrinc(self.threshold, float(self.n_dimensions), 1.0 - probability))
-
-
-def receiver_operating_characteristic(
-    without_source: ArrayLike, with_source: ArrayLike, false_alarm_rate: ArrayLike
-) -> FloatArray:
-    """Probability of detection at given false-alarm rates, from draws of any statistic.
-
-    Parameters
-    ----------
-    without_source, with_source : array_like, shapes (n,) and (m,)
-        The statistic of simulated readings.
-    false_alarm_rate : array_like, shape (...)
-
-    Returns
-    -------
-    ndarray, shape (...)
-        Share of `with_source` above the quantile of `without_source`; its standard error is √(P (1 − P)/m), and that of
-        the rate √(rate (1 − rate)/n).
-    """
-    thresholds = np.quantile(np.asarray(without_source), 1.0 - np.asarray(false_alarm_rate))
-    sorted_ = np.sort(np.asarray(with_source))
-    found: FloatArray = 1.0 - np.searchsorted(sorted_, thresholds, side="right") / sorted_.size
-    return found
 
 
 def check_differences(n: int, least: int, what: str) -> None:
@@ -156,7 +93,3 @@ def check_probability(probability: float, false_alarm_rate: float) -> None:
             f"Input probability must be between the false-alarm rate {false_alarm_rate:g} and 1;"
             f" instead received {probability}."
         )
-
-
-# Δχ² of a 95 % interval of one parameter, and within which another optimum is a solution too.
-RISE_95 = DELTA_CHI2_95

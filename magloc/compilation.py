@@ -35,15 +35,8 @@ def compiled_parallel(function: Function) -> Function:
 def over_rows(kernel: Callable[..., None], n_rows: int, *arguments: Any) -> None:
     """Run a serial kernel ``kernel(begin, end, *arguments)`` on all rows, with as many threads as numba has.
 
-    For large kernels: a ``prange`` loop around one more than doubles the time that it takes to compile.
-
-    Parameters
-    ----------
-    kernel : callable
-        Made by :func:`compiled`, which lets go of the interpreter's lock.
-    n_rows : int
-    *arguments
-        Arrays of which the kernel writes rows begin to end only.
+    For large kernels: a ``prange`` loop around one more than doubles the time that it takes to compile. The kernel is
+    made by :func:`compiled`, which lets go of the interpreter's lock, and writes rows begin to end only.
     """
     n_threads = min(get_num_threads(), n_rows)
     if n_threads <= 1:

@@ -86,24 +86,9 @@ def scalar_update(
 def sequential_update(
     x: FloatArray, S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Update by independent scalars of one linearisation, in turn.
+    """Update of x (n,) and its root S by independent scalars (k,) of one linearisation H (k, n), in turn.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n,)
-        Estimate to correct.
-    S : ndarray, shape (n, n)
-        Square root of its covariance.
-    H : ndarray, shape (k, n)
-        Measurement matrix at one linearisation point.
-    innovation : ndarray, shape (k,)
-        Innovations at x, before any of these scalars is used.
-    variance : ndarray, shape (k,)
-
-    Returns
-    -------
-    x, S : ndarray
-        Updated copies.
+    The innovations (k,) are those at x, before any of these scalars is used.
     """
     x0 = x
     for h, nu, r in zip(H, innovation, variance, strict=True):
@@ -213,10 +198,6 @@ def iterated_update(
         What the length of the steps is multiplied by whenever one changes the prediction no less than the one before:
         Gauss-Newton steps may swing to and fro about an optimum in a strongly curved direction. 1: they are whole, as
         in the paper.
-
-    Returns
-    -------
-    IteratedUpdate
     """
     x_k, predicted = x, Hx(x)
     innovation = z - predicted
@@ -370,21 +351,7 @@ class IteratedExtendedKalmanFilter:
 
 
 def symmetric_square_root(covariance: FloatArray) -> FloatArray:
-    """S with ``S Sᵀ = covariance``, for a positive semidefinite matrix (Cholesky does not take singular ones).
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (n, n)
-
-    Returns
-    -------
-    ndarray, shape (n, n)
-
-    Raises
-    ------
-    ValueError
-        The matrix is not symmetric positive semidefinite.
-    """
+    """S with ``S Sᵀ = covariance``, for a positive semidefinite matrix (Cholesky does not take singular ones)."""
     covariance = np.asarray(covariance, dtype=np.float64)
     # States of mixed units (m, A·m²) differ by many orders: factor the correlations, whose entries are of order one.
     deviation = np.sqrt(np.clip(np.diagonal(covariance), 0.0, None))

@@ -10,7 +10,7 @@ from magloc.compilation import compiled
 
 @compiled
 def triangular_root(rows: FloatArray, root: FloatArray) -> None:
-    """Lower triangular root, ``L Lᵀ = rows rowsᵀ``, by modified Gram-Schmidt on the rows (n, m), which are spoilt.
+    """Lower root, ``L Lᵀ = rows rowsᵀ``, by modified Gram-Schmidt on the rows (n, m), which are spoilt.
 
     With rows ``[F S, S_q]`` it is the twin of :func:`magloc.kalman.predict_square_root`.
     """
@@ -41,11 +41,7 @@ def triangular_root(rows: FloatArray, root: FloatArray) -> None:
 def scalar_update(
     x: FloatArray, S: FloatArray, h: FloatArray, innovation: float, variance: float, phi: FloatArray
 ) -> float:
-    """Potter's update in place by a scalar of the first states, the twin of :func:`magloc.kalman.scalar_update`.
-
-    The states behind the last element of h are not read directly; phi (n,) is for work. Returns the normalised
-    innovation squared.
-    """
+    """Potter's update in place by a scalar of the first len(h) states, phi (n,) for work; the innovation's NIS."""
     s = variance
     for c in range(phi.size):
         t = 0.0

@@ -195,7 +195,6 @@ def read_readings(
 
     Parameters
     ----------
-    path : path-like
     array : SensorArray
         Whose sensors the file must have, with a column for each channel.
     sensors : sequence of str, optional
@@ -259,23 +258,10 @@ def _readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] 
 
 
 def write_readings(path: str | PathLike[str], readings: Readings, array: SensorArray) -> None:
-    """Write a readings file.
+    """Write a readings file whose columns the array names, replacing it.
 
     Fields are written in nT with 15 significant digits, which are those of the file that they were read from, if it had
     no more; the other numbers are written exactly.
-
-    Parameters
-    ----------
-    path : path-like
-        Replaced if it exists.
-    readings : Readings
-    array : SensorArray
-        Names the columns.
-
-    Raises
-    ------
-    ValueError
-        The readings do not have the array's channels.
     """
     _check_channels(readings, array)
     header = ["time_s", *(f"{name}_nT" for name in array.channel_names)]
@@ -316,24 +302,7 @@ def change_between_rows(readings: Readings) -> tuple[str, int, str] | None:
 
 
 def without_saturated(readings: Readings, array: SensorArray) -> Readings:
-    """The readings without those that are no measurements because their channel saturates.
-
-    Parameters
-    ----------
-    readings : Readings
-    array : SensorArray
-        With ``saturation_T`` of the sensors that have a limit.
-
-    Returns
-    -------
-    Readings
-        NaN where the modulus of a reading reaches the limit of its sensor: of a vector sensor only the axis that does.
-
-    Raises
-    ------
-    ValueError
-        The readings do not have the array's channels.
-    """
+    """The readings with NaN for every single one whose modulus reaches the ``saturation_T`` of its sensor."""
     _check_channels(readings, array)
     # A limit and a reading that are written alike in two files may differ by their rounding.
     saturated = np.abs(readings.values_T) >= array.channel_saturation_T * (1.0 - _SATURATION_RTOL)

@@ -45,14 +45,6 @@ class Truth:
 def read_truth(path: str | PathLike[str]) -> Truth:
     """True positions, and moments where they are known, from a CSV file.
 
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    Truth
-
     Raises
     ------
     InputError
@@ -76,18 +68,7 @@ def read_truth(path: str | PathLike[str]) -> Truth:
 
 
 def rows_of_same_time(readings: Readings, truth: Truth) -> tuple[IntArray, IntArray]:
-    """Rows of readings and of a truth that have the same time, to a microsecond.
-
-    Parameters
-    ----------
-    readings : Readings
-    truth : Truth
-
-    Returns
-    -------
-    in_readings, in_truth : ndarray of int, shape (k,)
-        In the order of the readings; empty where no time agrees.
-    """
+    """Rows (k,) of readings and of a truth that have the same time, to a microsecond, in the order of the readings."""
     order = np.argsort(truth.time_s, kind="stable")
     times = truth.time_s[order]
     after = np.clip(np.searchsorted(times, readings.time_s), 1, max(1, len(times) - 1))
@@ -98,10 +79,7 @@ def rows_of_same_time(readings: Readings, truth: Truth) -> tuple[IntArray, IntAr
 
 
 def truth_of_rows(readings: Readings, truth: Truth, path: Path) -> tuple[FloatArray, FloatArray | None]:
-    """True position, and moment if it is known, of every row (n, 3); NaN where the truth says nothing of that time.
-
-    Between two rows of the truth, as the mean time of a window may be, it is interpolated, but not over a gap.
-    """
+    """True position and moment of rows (n, 3), interpolated but not over a gap; NaN where the truth says nothing."""
     order = np.argsort(truth.time_s, kind="stable")
     times, wanted = truth.time_s[order], readings.time_s
     after = np.clip(np.searchsorted(times, wanted - SAME_TIME_S), 0, len(times) - 1)

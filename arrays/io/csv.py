@@ -33,7 +33,6 @@ class Table:
 
     Attributes
     ----------
-    path : str
     header : tuple of str
         Names of the columns, each once.
     header_line : int, optional
@@ -124,24 +123,7 @@ class Table:
 
 
 def read_table(path: str | PathLike[str], expected_header: str) -> Table:
-    """Read a CSV file of numbers.
-
-    Parameters
-    ----------
-    path : path-like
-    expected_header : str
-        What the header should be, in words, for errors.
-
-    Returns
-    -------
-    Table
-        With one row at least.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read or is not such a table.
-    """
+    """Table, of one row at least, of a CSV file of numbers; `expected_header` says in words what it should have."""
     return table_of_text(read_text(path, "a CSV file"), str(path), expected_header)
 
 
@@ -171,27 +153,7 @@ def table_of_columns(columns: Columns, name: str) -> Table:
 
 
 def table_of_text(text: str, name: str, expected_header: str, *, first_line: int | None = None) -> Table:
-    """Table as of :func:`read_table`, from text.
-
-    Parameters
-    ----------
-    text : str
-    name : str
-        What the text is called in errors.
-    expected_header : str
-        What the header should be, in words, for errors.
-    first_line : int, optional
-        Line number of the first row, where the text is a part of a longer one.
-
-    Returns
-    -------
-    Table
-
-    Raises
-    ------
-    InputError
-        The text is not such a table.
-    """
+    """As :func:`read_table`, from text that errors call `name` and whose rows begin at `first_line` of a longer one."""
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
@@ -289,14 +251,7 @@ Column = NDArray[np.float64] | NDArray[np.int64] | NDArray[np.bool_] | Sequence[
 
 
 def write_columns(columns: Mapping[str, Column], path: Path) -> None:
-    """Write columns of equal length as CSV; numbers in full, those that are not finite as empty cells, texts quoted.
-
-    Parameters
-    ----------
-    columns : mapping
-        From names, with units, to columns.
-    path : Path
-    """
+    """Write columns of equal length as CSV; numbers in full, those that are not finite as empty cells, texts quoted."""
     cells = [[_cell(value) for value in column] for column in columns.values()]
     lines = [",".join(columns), *(",".join(row) for row in zip(*cells, strict=True))]
     write_text("\n".join([*lines, ""]), path)

@@ -11,15 +11,7 @@ from typing import Any
 def lazy_names(
     package: str, modules: Mapping[str, str]
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
-    """``__getattr__``, ``__dir__`` and ``__all__`` of a package.
-
-    Parameters
-    ----------
-    package : str
-        Its ``__name__``.
-    modules : mapping of str to str
-        Module in which each public name is defined; with a colon before it, the name is the module itself.
-    """
+    """``__getattr__``, ``__dir__`` and ``__all__`` from name to module, ``":module"`` for the module itself."""
 
     def getattr_(name: str) -> object:
         if name not in modules:

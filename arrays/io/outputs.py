@@ -11,10 +11,7 @@ from arrays.io.errors import InputError
 
 
 def refuse_file(folder: Path, option: str) -> None:
-    """Refuse what cannot become a folder with files in it, before long work; `option` names it.
-
-    A folder that is not there is made later, with those above it: nothing is left behind here.
-    """
+    """Refuse, before long work and without making it, what cannot become a folder; `option` names it in errors."""
     place = folder.absolute()
     while not place.exists() and place != place.parent:
         place = place.parent
@@ -24,22 +21,7 @@ def refuse_file(folder: Path, option: str) -> None:
 
 
 def refuse_unwritable(path: Path, option: str, suffix: str | None = None) -> None:
-    """Refuse an output file that cannot be written, before long work.
-
-    Parameters
-    ----------
-    path : Path
-        It may be there: it is replaced in the end, and left alone here.
-    option : str
-        That names it, for errors.
-    suffix : str, optional
-        That its name has to end with, such as ``".png"``.
-
-    Raises
-    ------
-    InputError
-        It is a folder, its folder is not there, nothing can be written in that, or the suffix is another one.
-    """
+    """Refuse, before long work, an output file that cannot be written or has another suffix; it is left alone."""
     if path.is_dir():
         raise InputError(f"{option} {path}: found a folder, expected a file.")
     if suffix is not None and path.suffix.lower() != suffix:
@@ -76,19 +58,7 @@ def _refuse_closed(folder: Path, wanted: Path, option: str, prefix: str = ".") -
 
 
 def make_folder(folder: Path, option: str) -> None:
-    """Make a folder if it is not there.
-
-    Parameters
-    ----------
-    folder : Path
-    option : str
-        That names it, for errors.
-
-    Raises
-    ------
-    InputError
-        There is a file of that name, it cannot be made, or nothing can be written in it.
-    """
+    """Make a folder if it is not there; InputError, with the name of its option, if nothing can be written in it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):

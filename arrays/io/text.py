@@ -15,23 +15,7 @@ if TYPE_CHECKING:
 
 
 def read_text(path: str | PathLike[str], expected: str) -> str:
-    """Text of a UTF-8 file, with or without a byte order mark.
-
-    Parameters
-    ----------
-    path : path-like
-    expected : str
-        What the file should be, in words, for errors.
-
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    InputError
-        The file does not exist, cannot be read, or is not UTF-8.
-    """
+    """Text of a UTF-8 file, with or without a byte order mark; `expected` says in words what it should be."""
     try:
         data = Path(path).read_bytes()
     except FileNotFoundError:
@@ -51,19 +35,7 @@ def read_text(path: str | PathLike[str], expected: str) -> str:
 
 
 def write_text(text: str, path: str | PathLike[str]) -> None:
-    """Write a UTF-8 file in one step: a reader finds the old text or the new one, also after an interruption.
-
-    Parameters
-    ----------
-    text : str
-    path : path-like
-        Replaced if it exists; the target of a link, if it is one.
-
-    Raises
-    ------
-    OSError
-        The file cannot be written.
-    """
+    """Write a UTF-8 file, or the target of a link, in one step: a reader finds the old text or the new one, always."""
     target = Path(path)
     in_place = target.exists() and not target.is_file()  # a pipe or a terminal cannot be replaced
     if not in_place:
@@ -82,20 +54,7 @@ def write_text(text: str, path: str | PathLike[str]) -> None:
 
 
 def replace_file(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a file beside its final place first, so that an interruption leaves the old one or the new one.
-
-    Parameters
-    ----------
-    path : Path
-        The final place.
-    write : callable
-        Writes the file to the path that it is given.
-
-    Raises
-    ------
-    InputError
-        It cannot be written.
-    """
+    """Have a file written beside its final place first, so that an interruption leaves the old one or the new one."""
     unfinished = path.with_name(f".{path.name}.tmp")
     try:
         write(unfinished)

@@ -121,23 +121,7 @@ class BuiltIn:
 
 
 def read_toml(path: str | PathLike[str], expected: str) -> dict[str, Any]:
-    """Table of a TOML file, fractional numbers as Decimal.
-
-    Parameters
-    ----------
-    path : path-like
-    expected : str
-        What the file should be, in words, for errors.
-
-    Returns
-    -------
-    dict
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, or is not TOML; the text names the line.
-    """
+    """Table of a TOML file, fractional numbers as Decimal; `expected` says in words what it should be, for errors."""
     text = read_text(path, expected)
     try:
         return tomllib.loads(text, parse_float=Decimal)
@@ -192,22 +176,7 @@ def _within(place: str) -> str:
 
 
 def section_of(place: str, table: dict[str, Any], struct: type[AnyTable]) -> AnyTable:
-    """A table, and those in it, with known keys of the right types and values as they must be.
-
-    Parameters
-    ----------
-    place : str
-        Name of the file, and of the table within it, for errors.
-    table : dict
-        As :func:`read_toml` returns it.
-    struct : type
-        What it should be.
-
-    Raises
-    ------
-    InputError
-        It is not; the text says where and why.
-    """
+    """The struct that a table of :func:`read_toml` and those in it describe; InputError says where and why not."""
     fields = _fields(struct)
     check_keys(place, table, fields)
     read = {key: _with_tables(place, struct, key, value, fields[key][1]) for key, value in table.items()}

@@ -1,22 +1,8 @@
-r"""Cramér-Rao bounds: how well one set of readings can tell where a dipole is, and what it is, whatever the method.
+"""Cramér-Rao bounds: how well one set of readings can tell where a dipole is, and what it is, whatever the method.
 
 The information about (p, m) is :math:`I = H^T C^{-1} H` with the Jacobian H of the readings and the covariance C of
-all that is not the source. What else is not known is marginalised: a nuisance x that enters the readings as N x, with a
-Gaussian prior of covariance Λ, adds :math:`N Λ N^T` to C. Nuisances are
-
-* the field common to all sensors, unknown or with the prior ``common_field_T`` of the array;
-* what the calibration does not know: ``misalignment_rad``, ``gain_uncertainty`` and ``offset_uncertainty_T`` of every
-  sensor, as errors of one row, in the whole field, the array's ``ambient_T`` included;
-* the ambient field, whose direction scalar sensors need, if it is known to ``ambient_uncertainty_T`` only.
-
-With ``noise_fraction`` the covariance depends on the readings. It counts as known here, as it does for every fix: the
-little that its size tells of the source is left out.
-
-Where the information is singular a bound is infinite: for every source if there are too few readings. The nine
-differences of four vector sensors lose the rank six under four conditions, and a source and its moment have four
-angles: at every range there are isolated pairs of directions for which the bound is infinite, whatever the array. So
-the worst case over directions is infinite in truth, and only grows with the number of directions that are tried.
-Quantiles over directions do not.
+all that is not the source. A nuisance x that enters the readings as N x, with a Gaussian prior of covariance Λ, adds
+:math:`N Λ N^T` to C. Which nuisances there are, and where a bound is infinite: docs/theory/cramer-rao-bounds.md.
 """
 
 from __future__ import annotations
@@ -82,20 +68,9 @@ class Bounds:
 def whitened_jacobian(
     array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, *, ambient_uncertainty_T: float = 0.0
 ) -> FloatArray:
-    """Jacobian of readings that are freed of all nuisances and have unit variance.
+    """Jacobian W (..., C, 6) of readings freed of all nuisances, of unit variance: the information is ``Wᵀ W``.
 
-    Parameters
-    ----------
-    array : SensorArray
-    position_m, moment_Am2 : array_like, shape (..., 3)
-        Source in the array's frame [m], its moment [A·m²].
-    ambient_uncertainty_T : float
-        Standard deviation, per axis, of the error of ``array.ambient_T``, the same for all sensors [T].
-
-    Returns
-    -------
-    ndarray, shape (..., C, 6)
-        W with the information ``Wᵀ W``; columns (p, m) in 1/m and 1/(A·m²). NaN for a source on a sensor.
+    Columns (p, m) in 1/m and 1/(A·m²); NaN for a source on a sensor. Parameters are those of :func:`cramer_rao_bounds`.
     """
     p, m = _sources(position_m, moment_Am2)
     check_uncertainty(ambient_uncertainty_T)
@@ -118,25 +93,9 @@ def whitened_jacobian(
 def fisher_information(
     array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, *, ambient_uncertainty_T: float = 0.0
 ) -> FloatArray:
-    """Information that one set of readings holds about (p, m), all nuisances marginalised.
+    """Information (..., 6, 6) that one set of readings holds about (p, m), all nuisances marginalised.
 
-    Parameters
-    ----------
-    array : SensorArray
-    position_m, moment_Am2 : array_like, shape (..., 3)
-        Source in the array's frame [m], its moment [A·m²].
-    ambient_uncertainty_T : float
-        Standard deviation, per axis, of the error of ``array.ambient_T``, the same for all sensors [T].
-
-    Returns
-    -------
-    ndarray, shape (..., 6, 6)
-        In 1/m² and so on. NaN for a source on a sensor.
-
-    Raises
-    ------
-    ValueError
-        A shape is wrong, or the uncertainty is negative or not finite.
+    Parameters are those of :func:`cramer_rao_bounds`; NaN for a source on a sensor.
     """
     W = whitened_jacobian(array, position_m, moment_Am2, ambient_uncertainty_T=ambient_uncertainty_T)
     return W.mT @ W
@@ -149,7 +108,6 @@ def cramer_rao_bounds(
 
     Parameters
     ----------
-    array : SensorArray
     position_m, moment_Am2 : array_like, shape (..., 3)
         Source in the array's frame [m], its moment [A·m²].
     ambient_uncertainty_T : float
@@ -275,19 +233,7 @@ def _sum_of_squares(rows: FloatArray, which: BoolArray) -> FloatArray:
 
 
 def _root_of_sum(rows: FloatArray, inverse: FloatArray, lost: BoolArray) -> FloatArray:
-    """σ of quantities together, by their parts (..., r, n) in the singular vectors; infinite with a part in a lost one.
-
-    Parameters
-    ----------
-    rows : ndarray, shape (..., r, n)
-    inverse : ndarray, shape (..., n)
-        Inverse singular values, zero for lost ones.
-    lost : ndarray of bool, shape (..., n)
-
-    Returns
-    -------
-    ndarray, shape (...)
-    """
+    """σ of quantities by their parts (..., r, n) in the singular vectors; infinite with a part in a lost one."""
     sigma = np.sqrt(np.sum((rows * inverse[..., None, :]) ** 2, axis=(-2, -1)))
     hidden = np.sum(_sum_of_squares(rows, lost), axis=-1) > LOST**2
     result: FloatArray = np.where(hidden, np.inf, sigma)

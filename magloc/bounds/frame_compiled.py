@@ -42,7 +42,6 @@ class BoundModel(NamedTuple):
         [T]
     uncertainty : ndarray, shape (N, 2)
         Standard deviations of turns [rad] and gains.
-    noise_fraction : float
     nuisances : ndarray, shape (q,)
         Which ones there are.
     prior : ndarray, shape (q,)

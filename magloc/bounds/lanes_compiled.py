@@ -1,16 +1,9 @@
-r"""Compiled information of many moments of one source at once, where axes or noise depend on the moment.
+"""Compiled information of many moments of one source at once, where axes or noise depend on the moment.
 
-So it is with scalar sensors, whose axis is the direction of the field, and with noise or errors of the calibration
-that grow with the field. Then nothing can be formed once for all moments, as
-:mod:`magloc.bounds.quadratic_forms_compiled` does.
-
-A moment is a lane. Up to 64 lanes make a block, and every quantity is one row of the block's workspaces: ``w[ROW + i]``
-for lane i, or ``columns[c, k, i]``. Loops over the lanes become vector instructions: the rows of ``w`` lie at offsets
-known to the compiler, which can then see that they do not overlap; and the lanes are counted at run time, for a short
-loop of a fixed length would be unrolled instead. No lane ever reads another one.
-
-A sensor's covariance, :func:`arrays.noise.reading_covariance`, is divided out of its axes: a row of the whitened
-Jacobian is that of a channel with a whitened axis, by the formulas of :mod:`magloc.bounds.table_compiled`.
+So it is with scalar sensors, and with noise or errors of the calibration that grow with the field. A moment is a lane
+(docs/theory/lanes.md), 64 of them at most a block: ``w[ROW + i]`` or ``columns[c, k, i]`` for lane i. A sensor's
+covariance, :func:`arrays.noise.reading_covariance`, is divided out of its axes: a row of the whitened Jacobian is that
+of a channel with a whitened axis, by the formulas of docs/theory/cramer-rao-bounds.md.
 """
 
 from __future__ import annotations

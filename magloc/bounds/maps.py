@@ -1,12 +1,9 @@
 """Maps of Cramér-Rao bounds: where around an array, and how far from it, can a source be told how well?
 
-One source is put everywhere: with a moment that is given, and with a moment of that size in every direction. Every
-bound comes as four variables, ``sigma_range`` for the given moment, and over the directions its ``_median``, the value
-``_q95`` that 95 % of them stay below, and the ``_worst`` of those sampled (that of all may be infinite: see
-:mod:`magloc.bounds.crlb`).
-
-Two maps: a cube around the array (:class:`BoundMap`, box by box, so that its memory does not grow with it), and planes
-through its centroid. Spheres about it: :mod:`magloc.bounds.spheres`.
+A cube around the array (:class:`BoundMap`) and planes through its centroid; spheres: :mod:`magloc.bounds.spheres`.
+Every bound comes as four variables, ``sigma_range`` for the given moment, and over the directions of a moment of that
+size its ``_median``, the value ``_q95`` that 95 % of them stay below, and the ``_worst`` of those sampled (that of all
+may be infinite: docs/theory/cramer-rao-bounds.md).
 """
 
 from __future__ import annotations
@@ -124,19 +121,7 @@ class BoundScenario:
 
 
 def bounds_at(scenario: BoundScenario, positions_m: ArrayLike) -> dict[str, FloatArray]:
-    """All bounds of a map.
-
-    Parameters
-    ----------
-    scenario : BoundScenario
-    positions_m : array_like, shape (..., 3)
-        In the array's frame [m].
-
-    Returns
-    -------
-    dict
-        ``sigma_range``, ``sigma_bearing``, ``sigma_position`` with each of :data:`CASES`, shape (...) [m or rad].
-    """
+    """All bounds of a map at positions (..., 3) [m]: σ of range, bearing and position with each of :data:`CASES`."""
     positions = np.asarray(positions_m, dtype=np.float64)
     flat = positions.reshape(-1, 3)
     given, spreads = table_and_spreads(
@@ -155,13 +140,7 @@ def bounds_at(scenario: BoundScenario, positions_m: ArrayLike) -> dict[str, Floa
 
 @dataclass(frozen=True, eq=False)
 class BoundMap:
-    """Bounds over a cube of sources, as :class:`magloc.grids.cube.CubeMap`.
-
-    Raises
-    ------
-    ValueError
-        The grid is less than 2.
-    """
+    """Bounds over a cube of sources, as :class:`magloc.grids.cube.CubeMap`."""
 
     scenario: BoundScenario
     grid: int
@@ -249,7 +228,6 @@ def bound_map(
 
     Parameters
     ----------
-    array : SensorArray
     moment_Am2 : tuple of 3 floats
         Moment of the source; its size is that of the moments of other directions, too [A·m²].
     edge_m : float
@@ -297,23 +275,9 @@ def _tally(values: Values) -> Tally:
 
 
 def bound_slices(scenario: BoundScenario, grid: int = 121) -> xr.Dataset:
-    """Bounds on the planes xy, xz and yz through the array's centroid.
+    """Bounds on the planes xy, xz and yz through the array's centroid, with `grid` points along either axis.
 
-    Parameters
-    ----------
-    scenario : BoundScenario
-    grid : int
-        Points along either axis, at least 2.
-
-    Returns
-    -------
-    xarray.Dataset
-        Over (plane, up, across) with the axes of :data:`PLANES`, across first, relative to the centroid [m].
-
-    Raises
-    ------
-    ValueError
-        The grid is less than 2.
+    Over (plane, up, across) with the axes of :data:`PLANES`, across first, relative to the centroid [m].
     """
     import xarray as xr
 

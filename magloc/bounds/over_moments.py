@@ -1,7 +1,7 @@
 """Cramér-Rao bounds of many sources, each with many moments: tables, and statistics over the directions of the moment.
 
-Compiled and parallel; the readable twin of every entry is :func:`magloc.bounds.crlb.cramer_rao_bounds`, which says
-what the bounds mean and when they are infinite.
+Compiled and parallel; the readable twin of every entry is :func:`magloc.bounds.crlb.cramer_rao_bounds`;
+for when they are infinite see docs/theory/cramer-rao-bounds.md.
 """
 
 from __future__ import annotations
@@ -51,27 +51,9 @@ def bounds_over_moments(
     *,
     ambient_uncertainty_T: float = 0.0,
 ) -> MomentBounds:
-    """Mean, median, 95 % quantile and worst of the bounds over moments.
+    """Mean, median, 95 % quantile and worst (P,) of the bounds of positions (P, 3) over moments (M, 3) [A·m²].
 
-    Parameters
-    ----------
-    array : SensorArray
-    positions_m : array_like, shape (P, 3)
-        Sources in the array's frame [m].
-    moments_Am2 : array_like, shape (M, 3)
-        Moments that each of them may have [A·m²]: :func:`magloc.directions.moments_on_sphere`.
-    ambient_uncertainty_T : float
-        As for :func:`magloc.bounds.crlb.cramer_rao_bounds`.
-
-    Returns
-    -------
-    MomentBounds
-        Each of shape (P,).
-
-    Raises
-    ------
-    ValueError
-        A shape is wrong, or the uncertainty is negative or not finite.
+    The other parameters are those of :func:`magloc.bounds.crlb.cramer_rao_bounds`.
     """
     none = np.empty((0, 3))
     _, spreads = table_and_spreads(array, positions_m, none, moments_Am2, ambient_uncertainty_T=ambient_uncertainty_T)
@@ -86,30 +68,7 @@ def table_and_spreads(
     *,
     ambient_uncertainty_T: float = 0.0,
 ) -> tuple[SigmaTable, MomentBounds]:
-    """:func:`sigma_table` of some moments and :func:`bounds_over_moments` of others, in one pass over the sources.
-
-    Parameters
-    ----------
-    array : SensorArray
-    positions_m : array_like, shape (P, 3)
-        Sources in the array's frame [m].
-    alone_Am2 : array_like, shape (K, 3)
-        Moments of the table, or none [A·m²].
-    moments_Am2 : array_like, shape (M, 3)
-        Moments of the spreads [A·m²].
-    ambient_uncertainty_T : float
-        As for :func:`magloc.bounds.crlb.cramer_rao_bounds`.
-
-    Returns
-    -------
-    tuple
-        Of shape (P, K) and (P,).
-
-    Raises
-    ------
-    ValueError
-        A shape is wrong, or the uncertainty is negative or not finite.
-    """
+    """:func:`sigma_table` (P, K) of some moments and :func:`bounds_over_moments` (P,) of others, in one pass."""
     from magloc.bounds import table_compiled as bounds
     from magloc.bounds.frame_compiled import BoundModel
 
@@ -126,29 +85,10 @@ def table_and_spreads(
 def sigma_table(
     array: SensorArray, positions_m: ArrayLike, moments_Am2: ArrayLike, *, ambient_uncertainty_T: float = 0.0
 ) -> SigmaTable:
-    """Bounds of range, bearing and position for every pair of a position and a moment.
+    """Bounds (P, M) of range, bearing and position for every pair of positions (P, 3) and moments (M, 3).
 
-    Compiled and parallel; its readable twin is :func:`magloc.bounds.crlb.cramer_rao_bounds`.
-
-    Parameters
-    ----------
-    array : SensorArray
-    positions_m : array_like, shape (P, 3)
-        Sources in the array's frame [m].
-    moments_Am2 : array_like, shape (M, 3)
-        Moments that each of them may have [A·m²].
-    ambient_uncertainty_T : float
-        As for :func:`magloc.bounds.crlb.cramer_rao_bounds`.
-
-    Returns
-    -------
-    SigmaTable
-        Infinite where the information is singular, NaN where :class:`magloc.bounds.crlb.Bounds` is.
-
-    Raises
-    ------
-    ValueError
-        A shape is wrong, or the uncertainty is negative or not finite.
+    Compiled and parallel twin of :func:`magloc.bounds.crlb.cramer_rao_bounds`. Infinite where the information is
+    singular, NaN where :class:`magloc.bounds.crlb.Bounds` is.
     """
     from magloc.bounds import table_compiled as bounds
     from magloc.bounds.frame_compiled import BoundModel
@@ -161,17 +101,7 @@ def sigma_table(
 
 
 def spread_over(sigma: ArrayLike) -> Spread:
-    """Statistics of σ over its last axis; infinite ones count.
-
-    Parameters
-    ----------
-    sigma : array_like, shape (..., M)
-
-    Returns
-    -------
-    Spread
-        Each of shape (...). Quantiles are order statistics, so that an infinite neighbour does not spoil them.
-    """
+    """Statistics of σ over its last axis, by order statistics: an infinite neighbour does not spoil a quantile."""
     ordered = np.sort(np.asarray(sigma, dtype=np.float64), axis=-1)
     n = ordered.shape[-1]
     median, q95 = (ordered[..., int(np.ceil(q * n)) - 1] for q in TYPICAL_AND_BAD)

@@ -1,7 +1,7 @@
 r"""Compiled information of one source for every moment, where neither axes nor noise depend on the moment.
 
 The derivatives of a channel with the axis a follow from A a and the symmetric G(d; a), see
-:mod:`magloc.bounds.table_compiled`: nine columns, three of the former and six of the latter, hold them for **every**
+docs/theory/cramer-rao-bounds.md: nine columns, three of the former and six of the latter, hold them for **every**
 moment. Before them stand the columns of the nuisances, each with a further row that holds its prior: what is left of
 the six at right angles to all before them has a 6×6 Gram matrix K, with :math:`M_{ij} = \sum_{ab} m_a m_b K_{(ia)(jb)}`
 the information about the position. It is formed once for a position; a moment then costs 100 operations.
@@ -157,11 +157,7 @@ def _fill_gram(columns: FloatArray, gram: FloatArray) -> None:
 
 @compiled
 def _fill_forms(gram: FloatArray, whole: FloatArray, frame: FloatArray, forms: FloatArray) -> None:
-    """Coefficients (9, 6) of what is quadratic in the moment: six entries of the information, three of its bounds.
-
-    The information about (u, v, n) is uu, uv, vv, un, vn, nn; the bounds are uu, vv, nn of what it would be for a known
-    moment. They are multiplied by xx, xy, xz, yy, yz, zz of the moment, which is in the array's frame.
-    """
+    """Coefficients (9, 6) of xx, xy, xz, yy, yz, zz of the moment, array frame, in what :func:`fill_entries` writes."""
     form, turned_form = np.empty((3, 3)), np.empty((3, 3))
     for entry in range(9):
         i, j = _ROWS[entry], _COLUMNS_OF[entry]

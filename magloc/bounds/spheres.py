@@ -34,7 +34,6 @@ def bound_spheres(scenario: BoundScenario, ranges_m: Sequence[float], step_deg: 
 
     Parameters
     ----------
-    scenario : BoundScenario
     ranges_m : sequence of float
         Radii of the spheres [m].
     step_deg : float
@@ -80,21 +79,10 @@ def bound_spheres(scenario: BoundScenario, ranges_m: Sequence[float], step_deg: 
 
 
 def accuracy_ranges(scenario: BoundScenario, directions: ArrayLike) -> FloatArray:
-    """Reach in some directions: the largest distance at which σ of the range is as small as required.
+    """Largest distances (D, 4) [m] along directions (D, 3) with the required σ of the range, for each of :data:`CASES`.
 
-    It is looked for at distances from 1.1 circumradii on, each 12 % more than the one before, and interpolated to a
-    part in 10⁴; what happens between two of them that are both in reach is not seen.
-
-    Parameters
-    ----------
-    scenario : BoundScenario
-    directions : array_like, shape (D, 3)
-        Unit vectors from the centroid.
-
-    Returns
-    -------
-    ndarray, shape (D, 4)
-        For each of :data:`CASES` [m]; 0 where no distance will do.
+    0 where no distance will do. It is looked for at distances from 1.1 circumradii on, each 12 % more than the one
+    before, and interpolated to a part in 10⁴; what happens between two of them that are both in reach is not seen.
     """
     directions = np.asarray(directions, dtype=np.float64)
     centroid, nearest = scenario.array.centroid, _NEAREST * scenario.array.circumradius
@@ -151,30 +139,11 @@ def _reach_attributes(case: str) -> dict[str, str]:
 def with_detection_ranges(
     spheres: xr.Dataset, scenario: BoundScenario, detector: Detector, probability: float = 0.9
 ) -> xr.Dataset:
-    """Spheres with the distances at which a source is found.
+    """Spheres of :func:`bound_spheres` with the distances at which a source is detected with a probability.
 
-    Parameters
-    ----------
-    spheres : xarray.Dataset
-        Made by :func:`bound_spheres`.
-    scenario : BoundScenario
-        That they were made for.
-    detector : Detector
-        With its false-alarm rate.
-    probability : float
-        Of detection.
-
-    Returns
-    -------
-    xarray.Dataset
-        The same with ``detection_range`` over (elevation, azimuth) for each of :data:`magloc.bounds.maps.CASES`: the
-        greatest distance from the centroid [m] at which the given moment is found, a half and 95 % of the directions of
-        the moment are, and the worst of them is; 0 where none is beside the array.
-
-    Raises
-    ------
-    ValueError
-        The array has no such detector, see :class:`magloc.detection.dipole_filter.DipoleFilter`.
+    ``detection_range`` over (elevation, azimuth), for each of :data:`magloc.bounds.maps.CASES`, is the greatest
+    distance from the centroid [m] at which the given moment is found, a half and 95 % of the directions of the moment
+    are, and the worst of them is; 0 where none is beside the array.
     """
     directions = sphere_grid(spheres["elevation"].to_numpy(), spheres["azimuth"].to_numpy())
     once = directions[:, :-1]  # the last azimuth is the first one again

@@ -1,14 +1,8 @@
-r"""Compiled Cramér-Rao bounds of range and bearing; the readable twin is :func:`magloc.bounds.crlb.cramer_rao_bounds`.
+"""Compiled Cramér-Rao bounds of range and bearing; the readable twin is :func:`magloc.bounds.crlb.cramer_rao_bounds`.
 
-A channel with the axis a reads a·B. Its derivatives follow from the field and the gradient tensor of a dipole of
-"moment" a, for both are symmetric: with d from the source to the sensor
-
-.. math:: ∂(a·B)/∂m_j = (A(d) a)_j, \qquad ∂(a·B)/∂p_i = -\sum_j m_j G_{ij}(d; a)
-
-What is left of the three columns of the position at right angles to those of the nuisances and of the moment has the
-information about the position as its Gram matrix. :mod:`magloc.bounds.quadratic_forms_compiled` has it for vector
-sensors of constant noise, :mod:`magloc.bounds.lanes_compiled` for all others. Both work in axes (u, v, n) with n along
-the line from the sensors' centroid to the source.
+:mod:`magloc.bounds.quadratic_forms_compiled` has the information for vector sensors of constant noise,
+:mod:`magloc.bounds.lanes_compiled` for all others, both in axes (u, v, n) with n along the line from the sensors'
+centroid to the source: docs/theory/cramer-rao-bounds.md.
 """
 
 from __future__ import annotations

@@ -105,7 +105,7 @@ def calibrate_on_path(
     prior: CalibrationPrior = CalibrationPrior(),
     world_from_array: ArrayLike | None = None,
 ) -> SourceCalibration:
-    """Calibrate an array by a source at positions (n, 3) in the array's frame, of a known moment in the world or none.
+    """Calibrate by a source of known or unknown moment at positions (n, 3) in the array's frame.
 
     With `unknown_height` a constant is added to all positions along the world's z, and estimated.
     """

@@ -32,18 +32,7 @@ _HEIGHTS = np.concatenate([-np.geomspace(4.0, 0.05, 8), np.geomspace(0.05, 4.0, 
 
 
 def calibrated_array(array: SensorArray, change: FloatArray) -> SensorArray:
-    """An array with changed sensors.
-
-    Parameters
-    ----------
-    array : SensorArray
-    change : ndarray, shape (N, 15)
-        Of position [m], gains, axes [rad] and offset [T] of every sensor, as in :mod:`magloc.calibration.model`.
-
-    Returns
-    -------
-    SensorArray
-    """
+    """The array with the change (N, 15) of position [m], gains, axes [rad] and offset [T] of every sensor."""
     factors = moving_source.response_factors(change)
     sensors = []
     for sensor, factor, row in zip(array.sensors, factors, change, strict=True):

@@ -48,10 +48,8 @@ class Optimum:
 
     Attributes
     ----------
-    state : State
     cost : float
         χ² of the readings and of all priors.
-    iterations : int
     converged : bool
         Whether a full step would lower the cost by less than the tolerance.
     """
@@ -119,22 +117,7 @@ def minimised(
     tolerance: float = 1e-3,
     max_iterations: int = 100,
 ) -> Optimum:
-    """Levenberg-Marquardt from a start; only steps that lower the cost are taken.
-
-    Parameters
-    ----------
-    problem : Problem
-    start : State
-    tolerance : float
-        The iteration has converged when a full step promises to lower χ² by less than this, or by less than a part in
-        10¹⁰.
-    max_iterations : int
-        Linearisations at most.
-
-    Returns
-    -------
-    Optimum
-    """
+    """Levenberg-Marquardt until a full step promises to lower χ² by less than the tolerance or a part in 10¹⁰."""
     state, value = start, cost(problem, start)
     n_free = int(problem.free.sum())
     # The priors of the sensors' unknowns, which are counted in prior deviations; the source has none.

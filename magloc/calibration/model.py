@@ -1,19 +1,10 @@
 r"""What an array of vector sensors reads of a source that moves past it, as a function of every unknown.
 
-In row t (one instant) sensor i reads
+In row t (one instant) sensor i reads, with the names of docs/theory/calibration.md,
 
-.. math:: y_{ti} = (I + E_i) K_i \left( B(s_i + d_i;\, p_t, m_t) + c_t \right) + o_i + h_i,
+.. math:: y_{ti} = (I + E_i) K_i \left( B(s_i + d_i;\, p_t, m_t) + c_t \right) + o_i + h_i.
 
-with the nominal calibration and rotation :math:`K_i`, nominal position :math:`s_i` and offset :math:`o_i`, the field B
-of the dipole of moment :math:`m_t` at :math:`p_t`, and a field :math:`c_t` common to all sensors. Unknown are
-
-* of every sensor 15 numbers: the displacement d, the relative gains diag E, the axes (E off its diagonal: which way
-  each channel looks) and the offset h;
-* of the source as a whole: its moment in the world frame if it does not turn, its height if the path does not give it;
-* of every row: the position if the path is unknown, the moment if it is free, the common field.
-
-Unknowns of the sensors are counted in units of their prior standard deviations. :mod:`magloc.calibration.least_squares`
-fits them.
+Unknowns of the sensors are counted in units of their prior standard deviations.
 """
 
 from __future__ import annotations

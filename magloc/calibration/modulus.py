@@ -1,22 +1,9 @@
-r"""Calibration of one vector sensor from the modulus of the field alone, while the sensor is turned in it.
+"""Calibration of one vector sensor from the modulus of the field alone, while the sensor is turned in it.
 
-The readings of a sensor that is turned in a field of known modulus M lie on an ellipsoid,
-
-.. math:: r = o + M P u + n, \qquad |u| = 1,
-
-with the offset o and the scale matrix S = P Q, P symmetric and positive definite, Q a rotation. The modulus says
-nothing of Q: a turn of the sensor's axes is not observable (attitude-independent calibration), P and o are.
-
-Estimated is the maximum of the likelihood with every direction u unknown: the sum of the squared distances of the
-readings from their ellipsoids. The nearest point has two unknowns per reading, which biases the distance by
-:math:`σ^2 (κ_1 + κ_2) / 2` with the principal curvatures κ of the ellipsoid; that is subtracted. To second order in σ/M
-the distance is then unbiased, uncorrelated with the error of the nearest point, and of variance σ² for every reading,
-whatever P is.
-
-TWOSTEP (R. Alonso, M. D. Shuster, "Complete linear attitude-independent magnetometer calibration", Journal of the
-Astronautical Sciences 50, 2002) uses the same likelihood of |field|² with mean -tr Σ and variance 4 Bᵀ Σ B + 2 tr Σ², Σ
-being isotropic in the axes of the field; the two agree to first order in σ/M. Its centred start needs a modulus that
-varies; here it may be constant.
+The readings lie on an ellipsoid :math:`r = o + M P u + n`, :math:`|u| = 1`, of which the offset o and the symmetric P
+are estimated by maximum likelihood with every direction u unknown, the bias :math:`σ^2 (κ_1 + κ_2) / 2` of the distance
+by the curvatures κ subtracted; a turn of the sensor's axes is not observable. See docs/theory/calibration.md, also for
+the relation to TWOSTEP.
 """
 
 from __future__ import annotations
@@ -72,8 +59,6 @@ class EllipsoidCalibration:
         Sum of squared distances from the ellipsoid, bias removed, over the noise squared.
     dof : int
         Readings minus nine.
-    iterations : int
-    converged : bool
     reason : str
         Empty if it converged.
     """

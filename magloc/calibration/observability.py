@@ -39,19 +39,7 @@ class Unobservable:
 
 
 def gauge_vectors(problem: Problem, state: State) -> dict[str, FloatArray]:
-    """How the sensors' unknowns change along every gauge, each (N, 15) in prior standard deviations, of any length.
-
-    Parameters
-    ----------
-    problem : Problem
-    state : State
-        Where they are linearised.
-
-    Returns
-    -------
-    dict of str to ndarray
-        Translation, rotation and common offset along x, y and z, size (positions relative to the centroid) and gain.
-    """
+    """How the sensors' unknowns change along every gauge at a state, each (N, 15) in prior standard deviations."""
     array = problem.array
     relative = array.positions + state.sensors[:, POSITION]
     relative = relative - relative.mean(axis=0)
@@ -72,21 +60,7 @@ def gauge_vectors(problem: Problem, state: State) -> dict[str, FloatArray]:
 
 
 def unobservable(problem: Problem, state: State, information: FloatArray) -> tuple[Unobservable, ...]:
-    """Directions that the readings do not tell.
-
-    Parameters
-    ----------
-    problem : Problem
-    state : State
-    information : ndarray, shape (F, F)
-        Of the readings alone about the free unknowns of the sensors, everything else eliminated, in prior standard
-        deviations.
-
-    Returns
-    -------
-    tuple of Unobservable
-        The gauges first, then what else is not seen.
-    """
+    """Directions that the information (F, F) about the sensors' free unknowns does not tell, the gauges first."""
     if not len(information):
         return ()
     value, vector = np.linalg.eigh(information)

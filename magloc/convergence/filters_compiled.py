@@ -1,26 +1,7 @@
-r"""Compiled filters of the convergence map, many starts at once.
+"""Compiled filters of the convergence map, many starts at once; :mod:`magloc.convergence.over_starts` has the twins.
 
-The readable twins are in :mod:`magloc.convergence.over_starts`.
-
-A start is a lane. 32 lanes make a block, and every quantity is one row of the block's workspace: ``w[ROW + i]`` for
-lane i. All rows lie in one flat array at offsets known to the compiler, which can then see that they do not overlap,
-and turns each loop over the lanes into vector instructions. A lane whose start has ended takes the next start at once,
-so a block never waits for its slowest lane. No lane ever reads another one: the end of a start depends neither on its
-neighbours nor on the number of threads, to the last bit.
-
-Three ideas keep an iteration short:
-
-* *Information form.* With the whitened Jacobian J and residuals r, one update by all differences in turn is one step
-  :math:`(J^T J + A)^{-1} (J^T r + \ldots)`, where A is the information of the prediction.
-* *Recursive contrasts.* For sensors whose noise is the same along their axes the decorrelated differences need no
-  matrix: the common field is estimated sensor by sensor, and what each sensor adds to the estimate is independent of
-  what came before it. That is O(N) where the matrix form is O(N²); any other noise takes the matrix form.
-* *Units of the prior.* Position and moment are counted in standard deviations of the prior, or in steps of S_q, and
-  fields in a unit that leaves no further constant: then the prior's information is the unit matrix.
-
-The information form squares the condition number. Where nothing is left of a pivot but rounding, the lane's state
-becomes NaN: the start ends as not stopped, with a χ² that is not finite, and a damped one tries a shorter step. It
-takes a start within some millimetres of a sensor of 1 nT.
+A start is a lane, 32 of them a block: ``w[ROW + i]`` for lane i, in information form and units of the prior. How, and
+what that costs in digits: docs/theory/lanes.md.
 """
 
 from __future__ import annotations
@@ -122,10 +103,7 @@ def repeated_map(
     tolerance_T: float,
     max_iterations: int,
 ) -> Ended:
-    """Repeated-measurement filter from every start, one linearisation a pass; the first arguments as :func:`iekf_map`.
-
-    The variances are multiplied by `inflation` inside the filter; the diagonal of S_q is the two steps.
-    """
+    """As :func:`iekf_map`, of the repeated-measurement filter; S_q has the two steps, variances grow by `inflation`."""
     model = Model.of(z, inflation * variance, sensors, weights, position_step_m, moment_step_Am2)
     ended = _ends(model, REPEATED, starts, 0.0, tolerance_T, max_iterations)
     return ended._replace(chi2=inflation * ended.chi2)

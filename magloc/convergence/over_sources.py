@@ -87,13 +87,7 @@ class SourcesScenario:
 
 @dataclass(frozen=True, eq=False)
 class SourcesMap:
-    """Map of fixes over a cube of sources, as :class:`magloc.grids.cube.CubeMap`.
-
-    Raises
-    ------
-    ValueError
-        The grid is less than 2, or the array has scalar sensors or too few of them.
-    """
+    """Map of fixes over a cube of sources, as :class:`magloc.grids.cube.CubeMap`."""
 
     scenario: SourcesScenario
     grid: int
@@ -206,10 +200,7 @@ class SourcesMap:
         return values
 
     def _random(self, box: Box) -> tuple[FloatArray, FloatArray]:
-        """Moments (n, 3) [A·m²] and standard normal noise (n, C) of a box's sources.
-
-        Every line along z has a counter-based generator of its own, so they do not depend on the boxes.
-        """
+        """Moments (n, 3) [A·m²] and standard normal noise (n, C) of a box, the same in whatever boxes."""
         key = np.random.SeedSequence(self.scenario.seed).generate_state(2, np.uint64)
         x, y, z = box.region
         lines = []
@@ -324,7 +315,6 @@ class SourcesSummary:
         Of the latter.
     median_iterations : float
         Over the sources that were found; NaN if there are none.
-    iterations_total : int
     seconds : float
         Duration of the computation alone; that of all machines together.
     truth_listed : float

@@ -65,7 +65,6 @@ class StartsScenario:
         The source.
     half_width_m : float
         The cube reaches from -half_width to +half_width along every axis, around the origin of the array's frame.
-    method : Filter
     noise_seed : int, optional
         Of one realisation of the sensors' noise that all starts share; noise-free readings without it.
     """
@@ -79,21 +78,7 @@ class StartsScenario:
 
 
 def simulated_measurement(scenario: StartsScenario) -> tuple[FloatArray, DifferenceMeasurement, FloatArray]:
-    """Readings of a scenario, and what the filters make of them.
-
-    Parameters
-    ----------
-    scenario : StartsScenario
-
-    Returns
-    -------
-    readings : ndarray, shape (C,)
-        [T]
-    measurement : DifferenceMeasurement
-        With the noise that goes with these readings.
-    z : ndarray, shape (k,)
-        Their decorrelated differences [T].
-    """
+    """Readings (C,) [T] of a scenario, and what the filters make of them: the measurement, and z (k,) [T]."""
     array = scenario.array
     readings = predicted_channels(array, scenario.position_m, scenario.moment_Am2) + array.channel_offset_T
     if scenario.noise_seed is not None:
@@ -110,10 +95,8 @@ class StartsMap:
 
     Attributes
     ----------
-    scenario : StartsScenario
     grid : int
         Starts along every axis.
-    measurement : DifferenceMeasurement
     z : ndarray, shape (k,)
         Decorrelated differences that every start is given [T].
     optimum : Solution
@@ -221,7 +204,6 @@ class StartsSummary:
 
     Attributes
     ----------
-    starts, converged : int
     fraction, front_fraction, back_fraction : float
         Converged starts over all starts, over those in front of the plane and over those behind it.
     median_iterations : float

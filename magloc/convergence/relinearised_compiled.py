@@ -85,10 +85,7 @@ def relinearised_map(
     tolerance: float,
     max_iterations: int,
 ) -> tuple[FloatArray, FloatArray, NDArray[np.int64], NDArray[np.bool_]]:
-    """Repeated-measurement filter, linearised anew before every scalar, from every start (n, 6).
-
-    Returns states, χ², passes, and whether the stop rule was met.
-    """
+    """States, χ², passes and whether it stopped, of the filter linearised before every scalar, from starts (n, 6)."""
     n, k = starts.shape[0], z.size
     states = starts.copy()
     chi2 = np.empty(n)

@@ -90,22 +90,7 @@ _FileWithFilters: Any = msgspec.defstruct(
 def read_starts_scenario(
     name_or_path: str, *, method: str | None = None, noise_seed: int | None = None
 ) -> StartsScenario:
-    """Scenario of a map over starts.
-
-    Parameters
-    ----------
-    name_or_path : str
-        A built-in scenario's name, or a TOML file; ``paper.toml`` beside this module documents every key.
-    method : str, optional
-        In place of the file's method: a key of :data:`magloc.convergence.filters.FILTERS`.
-    noise_seed : int, optional
-        See :class:`magloc.convergence.over_starts.StartsScenario`.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read or does not describe a scenario; the text says where and why.
-    """
+    """Scenario of a map over starts: a built-in name or a TOML file; `method` and `noise_seed` in place of its own."""
     path, table, file = _read(name_or_path)
     chosen = file.method if method is None else method
     if chosen not in FILTERS:
@@ -123,20 +108,7 @@ def read_starts_scenario(
 
 
 def read_sources_scenario(name_or_path: str, *, seed: int = 0) -> SourcesScenario:
-    """Scenario of a map over sources: a scenario file's array, and its table ``sources`` if it has one.
-
-    Parameters
-    ----------
-    name_or_path : str
-        As for :func:`read_starts_scenario`.
-    seed : int
-        See :class:`magloc.convergence.over_sources.SourcesScenario`.
-
-    Raises
-    ------
-    InputError
-        As for :func:`read_starts_scenario`.
-    """
+    """Scenario of a map over sources: a scenario file's array, and its table ``sources`` if it has one."""
     path, _, file = _read(name_or_path)
     given = {key: getattr(file.sources, key) for key in _Sources.__struct_fields__}
     return SourcesScenario(array=_array(path, file.array), seed=seed, **given)

@@ -46,18 +46,7 @@ class Sample:
     moments: FloatArray
 
     def deviations(self, task: DesignTask, sensors: FloatArray) -> FloatArray:
-        """Cramér-Rao bounds of the range [m], infinite where there is none: (n,).
-
-        Parameters
-        ----------
-        task : DesignTask
-        sensors : ndarray, shape (N, 3)
-            Places of sensors of the task's kind and noise [m].
-
-        Returns
-        -------
-        ndarray, shape (n,)
-        """
+        """Cramér-Rao bounds of the range (n,) [m] for sensors (N, 3) of the task's kind; infinite where none is."""
         return self._deviations_and_slopes(task, sensors, with_slopes=False)[0]
 
     def value(self, task: DesignTask, sensors: FloatArray) -> float:
@@ -111,7 +100,6 @@ class Descent:
         The best places that it came to [m].
     value : float
         Criterion of its sample there [m].
-    iterations : int
     converged : bool
         Whether the criterion had stopped falling; else the iterations were used up.
     """
@@ -157,23 +145,7 @@ def descend(
     max_iterations: int,
     step_done: Callable[[int], None] = lambda _: None,
 ) -> Descent:
-    """Move sensors from a start until the criterion of a sample falls no more.
-
-    Parameters
-    ----------
-    task : DesignTask
-    sample : Sample
-    start : ndarray, shape (N, 3)
-        Places of the sensors; brought into the volume first [m].
-    max_iterations : int
-    step_done : callable, optional
-        Called with 1 after every iteration, and with what is left of them at the end.
-
-    Returns
-    -------
-    Descent
-        Never worse on this sample than the start, once that is in the volume.
-    """
+    """Move sensors (N, 3) [m], first into the volume, until a sample's criterion falls no more or the steps end."""
     x = feasible(task, start)
     value, slope = sample.log_value_and_slope(task, x)
     best, best_x = value, x

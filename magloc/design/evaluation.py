@@ -41,8 +41,6 @@ class Judgement:
 
     Attributes
     ----------
-    name : str
-    array : SensorArray
     criterion_m : float
         The task's criterion on the independent sources.
     fits : bool
@@ -70,7 +68,7 @@ class Judgement:
 
 
 def references(task: DesignTask, sample: Sample, rng: np.random.Generator) -> list[SensorArray]:
-    """Tetrahedron, cube and cross that have the volume's span, each in the best of 24 random attitudes for a sample.
+    """Tetrahedron, cube and cross of the volume's span, each in the best of 24 random attitudes for a sample.
 
     They need not fit into the volume: what they share with it is the enclosing ball.
     """
@@ -87,22 +85,7 @@ def references(task: DesignTask, sample: Sample, rng: np.random.Generator) -> li
 def judged(
     task: DesignTask, arrays: Sequence[SensorArray], sources: Sample, rng: np.random.Generator
 ) -> tuple[Judgement, ...]:
-    """Arrays on independent sources.
-
-    Parameters
-    ----------
-    task : DesignTask
-    arrays : sequence of SensorArray
-        Of the task's kind and noise; the first one is what the others are compared with.
-    sources : Sample
-    rng : numpy.random.Generator
-        Of the resampling for the standard errors.
-
-    Returns
-    -------
-    tuple of Judgement
-        In the order of the arrays.
-    """
+    """Arrays of the task's kind on independent sources, compared with the first one; errors by resampling."""
     distances = judged_distances(sources)
     own = sources.deviations(task, arrays[0].positions)
     result = []

@@ -44,8 +44,6 @@ class Design:
 
     Attributes
     ----------
-    task : DesignTask
-    array : SensorArray
     fitted_m, start_m : float
         Criterion on the large sample: of the design, and of the best of its starts.
     converged : bool
@@ -105,7 +103,6 @@ def design_array(
 
     Parameters
     ----------
-    task : DesignTask
     starts : int, optional
         Shapes and random places to start from, in place of those of ``task.search``.
     seed : int
@@ -114,10 +111,6 @@ def design_array(
         Called with steps done, of ``task.search.n_steps``.
     better : callable, optional
         Called with every array that is better, on the large sample, than all before.
-
-    Returns
-    -------
-    Design
 
     Raises
     ------

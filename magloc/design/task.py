@@ -96,10 +96,7 @@ class Quantile:
     level: float = 0.95
 
     def weights(self, n: int) -> FloatArray:
-        """Harrell and Davis' weights of the order statistics, which make the quantile a smooth function.
-
-        "A new distribution-free quantile estimator", Biometrika 69 (1982).
-        """
+        """Harrell and Davis' weights of the order statistics (Biometrika 69, 1982), in which the quantile is smooth."""
         edges = np.arange(n + 1) / n
         weights: FloatArray = np.diff(betainc((n + 1) * self.level, (n + 1) * (1.0 - self.level), edges))
         return weights
@@ -166,8 +163,6 @@ class DesignTask:
 
     Attributes
     ----------
-    name : str
-    n_sensors : int
     kind : {"vector", "scalar"}
         Scalar sensors need an ambient field.
     noise_T : float

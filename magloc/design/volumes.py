@@ -45,7 +45,6 @@ class Ball:
     Attributes
     ----------
     centre_m : tuple, shape (3,)
-    radius_m : float
     """
 
     centre_m: tuple[float, float, float]
@@ -210,22 +209,7 @@ class Surface:
 
 
 def read_surface(path: str | PathLike[str]) -> Surface:
-    """Surface of a mesh file, its numbers in metres.
-
-    Parameters
-    ----------
-    path : path-like
-        STL, OBJ or PLY.
-
-    Returns
-    -------
-    Surface
-
-    Raises
-    ------
-    InputError
-        The file cannot be read, is no such mesh, or has no surface.
-    """
+    """Surface of an STL, OBJ or PLY file, its numbers in metres."""
     expected = f"a mesh ({', '.join(MESH_FORMATS).upper()})"
     if Path(path).suffix.lower().lstrip(".") not in MESH_FORMATS:
         raise InputError(f"{path}: found the name of another kind of file, expected {expected}.")

@@ -37,7 +37,6 @@ def detection_range(
 
     Parameters
     ----------
-    array : SensorArray
     moment_Am2 : float
         Size of the moment [A·m²].
     probability : float
@@ -80,7 +79,6 @@ def detection_ranges(
 
     Parameters
     ----------
-    array : SensorArray
     directions : array_like, shape (d, 3)
         From the sensors' centroid, array frame, of any length.
     moments_Am2 : array_like, shape (n, 3)

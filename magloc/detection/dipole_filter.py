@@ -1,19 +1,8 @@
-r"""Is there a source at all? Detection statistics of readings, their thresholds and how often they find a source.
+"""Is there a source at all? Detection statistics of readings: energy, known position, and the matched filter.
 
-In units of its noise, a set of independent differences z' is standard normal without a source. Three statistics:
-
-========================  =================================================================  ==========================
-energy                    :math:`\|z'\|^2`                                                   :math:`\chi^2_k`
-known position            energy in the space of the moments of a dipole at p, 3-dimensional :math:`\chi^2_3`
-matched filter            the same, at the position where it is largest                      no closed form: simulated
-========================  =================================================================  ==========================
-
-With a source the first two are noncentral :math:`\chi^2`, their noncentrality the energy of its signal. The matched
-filter is the generalised likelihood ratio, χ² without a source less χ² of the best one. Its many positions let noise
-find something more often, but fewer dimensions collect noise than in the energy.
-
-Signals are linear in the moment. Moduli are so where the ambient field is large against the source's, which a source
-that is hard to detect fulfils; they need an ambient field.
+The matched filter is the generalised likelihood ratio, the energy in the space of the moments of a dipole at the
+position where that is largest. Signals are linear in the moment; moduli are so where the ambient field is large against
+the source's, and need one. Distributions: docs/theory/detection.md.
 """
 
 from __future__ import annotations
@@ -78,23 +67,7 @@ class DipoleFilter:
         return linear_bases(self._problem, self._gain, 0, self._candidates)
 
     def whitened(self, readings_T: ArrayLike) -> FloatArray:
-        """Readings as an orthogonal transform of the whitened differences.
-
-        Parameters
-        ----------
-        readings_T : array_like, shape (n, C)
-            Raw readings of all channels [T].
-
-        Returns
-        -------
-        ndarray, shape (n, C)
-            In units of the noise.
-
-        Raises
-        ------
-        ValueError
-            They have another shape, or some are missing.
-        """
+        """Raw readings (n, C) [T], none missing, as an orthogonal transform of the whitened differences."""
         readings = np.asarray(readings_T, dtype=np.float64)
         if readings.ndim != 2 or readings.shape[1] != self.array.n_channels or not np.isfinite(readings).all():
             raise ValueError(
@@ -117,17 +90,10 @@ class DipoleFilter:
         return signal
 
     def unit_signals(self, position_m: ArrayLike) -> FloatArray:
-        """Whitened signals of the three unit moments at positions (..., 3) [m].
+        """Whitened signals (..., C, 3) [1/(A·m²)] of the three unit moments at positions (..., 3) [m].
 
-        Parameters
-        ----------
-        position_m : array_like, shape (..., 3)
-
-        Returns
-        -------
-        ndarray, shape (..., C, 3)
-            [1/(A·m²)]. Of a product with its own transpose the eigenvalues are the energies of the best, the middle and
-            the worst moment of 1 A·m².
+        Of a product with its own transpose the eigenvalues are the energies of the best, the middle and the worst
+        moment of 1 A·m².
         """
         position = np.asarray(position_m, dtype=np.float64)[..., None, :]
         fields = dipole.field_matrix(self.array.positions, position)[..., self.array.channel_sensor, :, :]
@@ -157,16 +123,9 @@ class DipoleFilter:
         return np.concatenate([linear_scores(self._bases, part).max(axis=1) for part in parts])
 
     def largest_energy(self, whitened: FloatArray) -> FloatArray:
-        """Matched-filter statistic of whitened readings (n, C): the largest energy that a single source explains.
+        """Matched-filter statistic (n,) of whitened readings (n, C): the largest energy that a single source explains.
 
-        Parameters
-        ----------
-        whitened : ndarray, shape (n, C)
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            The generalised likelihood ratio, χ² without a source less χ² of the best source anywhere.
+        The generalised likelihood ratio, χ² without a source less χ² of the best source anywhere.
         """
         n = len(whitened)
         problem = self._problem

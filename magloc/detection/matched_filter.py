@@ -33,11 +33,8 @@ class MatchedFilterDetector:
 
     Attributes
     ----------
-    filter : DipoleFilter
-    threshold : float
     threshold_error : float
         Standard error of the threshold, from the order statistics beside it.
-    false_alarm_rate : float
     seed : int
         Of the draws for the threshold and for required energies.
     """
@@ -56,15 +53,8 @@ class MatchedFilterDetector:
 
         Parameters
         ----------
-        array : SensorArray
-        false_alarm_rate : float
         n_draws : int
             Sets of noise; a hundred exceedances, n_draws = 100 / rate, know the rate to a tenth.
-        seed : int
-
-        Returns
-        -------
-        MatchedFilterDetector
 
         Raises
         ------

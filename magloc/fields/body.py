@@ -1,16 +1,4 @@
-r"""Sources that are no points: when a dipole describes them, and the dipole that stands for a magnetic body.
-
-Two checks tell whether a source is too near for a dipole: its distance in body lengths, where its size is known
-(:func:`dipole_validity`), and the pattern of the residuals of a fix, where it is not (:func:`nearness_test`): the next
-terms of the multipole expansion about the solution,
-
-.. math::  B = k \frac{(2l + 1)\,(S : n^l)\,n - l\, S : n^{l-1}}{r^{l+2}}, \qquad k = μ_0/4π,
-
-with a symmetric traceless tensor S of rank l (l = 1 is the moment itself), must not explain them better than noise
-does. A uniformly magnetised body that is symmetric about its centre has no quadrupole (l = 2) there; what it has is an
-octupole (l = 3), smaller by (length/distance)². Of the five numbers of a quadrupole a shift of the dipole makes up
-three, so that only two are left to be seen in a fix.
-"""
+"""Magnetic bodies: the dipole that stands for one. When a body counts as a dipole: docs/theory/extended-sources.md."""
 
 from __future__ import annotations
 
@@ -42,7 +30,6 @@ class EquivalentDipole:
         Centroid of the body [m].
     moment_Am2 : ndarray, shape (3,)
         [A·m²].
-    volume_m3 : float
     semi_axes_m : ndarray, shape (3,)
         Of the ellipsoid, longest first [m].
     axes : ndarray, shape (3, 3)

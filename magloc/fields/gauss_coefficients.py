@@ -69,10 +69,6 @@ def coefficients(model: Model) -> Coefficients:
     model : str or Coefficients
         "IGRF-14" (1900 to 2030) or "WMM2025" (2025 to 2030); coefficients are returned as they are.
 
-    Returns
-    -------
-    Coefficients
-
     Raises
     ------
     ValueError

@@ -1,4 +1,4 @@
-"""Multipole fields of any order."""
+"""Multipole fields of any order, equation of docs/theory/extended-sources.md."""
 
 from __future__ import annotations
 

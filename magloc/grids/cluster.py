@@ -39,28 +39,7 @@ def check_address(scheduler: str) -> None:
 
 
 def computed_by(scheduler: str, cube: CubeMap, wanted: Iterable[Box], timeout_s: float = 10.0) -> Iterator[Chunk]:
-    """Values of some boxes, computed by the workers of a cluster, in the order in which they are ready.
-
-    Parameters
-    ----------
-    scheduler : str
-        Address of a running scheduler, such as ``tcp://127.0.0.1:8786``.
-    cube : CubeMap
-    wanted : iterable of Box
-        Only a few for every worker are under way at any time.
-    timeout_s : float
-        How long to wait for the scheduler, and for its first worker.
-
-    Yields
-    ------
-    Chunk
-        The same values as those of :func:`magloc.grids.cube.computed_here`.
-
-    Raises
-    ------
-    SchedulerError
-        There is no scheduler, it has no workers, it went away, or a worker failed.
-    """
+    """Values of boxes, as they become ready, from the workers of a dask scheduler; a few boxes a worker at any time."""
     check_address(scheduler)
     with of_extra("cluster", "a scheduler"):
         from distributed import as_completed

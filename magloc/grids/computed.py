@@ -24,29 +24,11 @@ def computed_map(
     scheduler: str | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> xr.Dataset:
-    """All values of a map.
+    """All values of a map over (x, y, z), here, in a zarr store that resumes, or by the workers of a scheduler.
 
-    Parameters
-    ----------
-    cube : CubeMap
-    out : path-like, optional
-        Folder of a zarr store: the map is written there chunk by chunk, what is there of the same map is not computed
-        again, and the dataset is loaded piece by piece as it is used.
-    scheduler : str, optional
-        Address of a dask scheduler (tcp://HOST:PORT) whose workers compute the map.
-    progress : callable, optional
-        Called with the number of points finished since the last call, first of all with those that were there before.
-
-    Returns
-    -------
-    xarray.Dataset
-        Over (x, y, z), with attributes that reproduce the run.
-
-    Raises
-    ------
-    InputError
-        The store holds something else, or cannot be written; the scheduler or a worker failed. The text says what is
-        done.
+    `out` is the store's folder: what is there of the same map is not computed again, and the dataset is loaded piece by
+    piece. `progress` is called with the number of points finished since the last call, at first with those in the
+    store.
     """
     if scheduler is not None:
         check_address(scheduler)

@@ -241,21 +241,7 @@ def tallied(dataset: xr.Dataset, names: Sequence[str], tally: Callable[[Values],
 def in_memory(
     cube: CubeMap, progress: Callable[[int], None] | None = None, chunks: Iterable[Chunk] | None = None
 ) -> xr.Dataset:
-    """All values of a map.
-
-    Parameters
-    ----------
-    cube : CubeMap
-    progress : callable, optional
-        Called with the number of points finished since the last call.
-    chunks : iterable of Chunk, optional
-        Of all boxes; by default computed here.
-
-    Returns
-    -------
-    xarray.Dataset
-        Over (x, y, z), with the map's attributes and the duration ``seconds``.
-    """
+    """All values of a map over (x, y, z) with its attributes and ``seconds``, from chunks or computed here."""
     import xarray as xr
 
     shape = (cube.grid,) * 3

@@ -49,13 +49,11 @@ class Sweep:
 
     Parameters
     ----------
-    cube : CubeMap
     path : path-like
         The store; made if it does not exist.
 
     Attributes
     ----------
-    points_done, chunks_done, n_chunks : int
     unreadable : list of str
         One sentence for every chunk that was done but cannot be read; it is computed again.
 
@@ -116,20 +114,7 @@ class Sweep:
         return (box for box in boxes(self.cube) if np.isnan(self._seconds[box.place]))
 
     def write(self, chunks: Iterable[Chunk], progress: Callable[[int], None] | None = None) -> None:
-        """Write chunks as they come.
-
-        Parameters
-        ----------
-        chunks : iterable of Chunk
-            Such as ``computed_here(cube, sweep.unfinished())``.
-        progress : callable, optional
-            Called with the number of points written since the last call.
-
-        Raises
-        ------
-        OSError
-            The store cannot be written. The chunks before are done.
-        """
+        """Write chunks as they come; where one cannot be written, those before it are done."""
         for chunk in chunks:
             with uninterrupted():
                 for name, array in self._arrays.items():
@@ -163,18 +148,7 @@ class Sweep:
 
 
 def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Map in a store, loaded piece by piece as it is used.
-
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    xarray.Dataset
-        As :func:`magloc.grids.cube.in_memory` returns it. Where a chunk is not done, numbers are NaN and integers the
-        smallest ones there are.
-    """
+    """Map in a store, loaded piece by piece; NaN, or the smallest integer there is, where a chunk is not done."""
     import xarray as xr
 
     dataset = xr.open_zarr(path, chunks=None, consolidated=False)

@@ -1,9 +1,7 @@
 """Distance of a source that recedes or approaches along a straight line, from one vector sensor.
 
-The source keeps its moment and its attitude, and does not pass the sensor. Readings at known distances along the line
-give where the line is as the sensor sees it, and the moment (:func:`fit_line`, :func:`fit_coil_line`); after that every
-single reading gives a distance (:func:`distance_along_line`). The field of a dipole is the same on both sides of it, so
-that the line may as well be inverted through the sensor: distances are not affected.
+The source keeps its moment and its attitude, and does not pass the sensor. The field of a dipole is the same on both
+sides of it, so that the line may as well be inverted through the sensor: distances are not affected.
 """
 
 from __future__ import annotations
@@ -62,12 +60,8 @@ class SourceLine:
         return loop_field(np.zeros(3), source, self.moment_Am2, self.radius_m)
 
 
-def fit_line(
-    distance_m: ArrayLike,
-    field_T: ArrayLike,
-    noise_T: float,
-    *,
-    noise_fraction: float = 0.0,
+def fit_source_line(
+    distance_m: ArrayLike, field_T: ArrayLike, noise_T: float, *, noise_fraction: float = 0.0, coil: bool = False
 ) -> SourceLine:
     """Find the line and the moment of a source from fields at known distances along the line.
 
@@ -81,11 +75,14 @@ def fit_line(
         Standard deviation per axis [T].
     noise_fraction : float
         Noise proportional to the field, as of an array: variance = noise² + (fraction · |B|)².
+    coil : bool
+        Whether the source is a coil, that is the single loop whose radius fits best, and no dipole.
 
     Returns
     -------
     SourceLine
-        Of a dipole: the best of the fits from many directions of the line.
+        The best of the fits from many directions of the line; after it :func:`distance_along_line` gives a distance
+        for every single reading.
 
     Raises
     ------
@@ -94,28 +91,9 @@ def fit_line(
         unknowns.
     """
     distance, field, sigma = _checked(distance_m, field_T, noise_T, noise_fraction)
-    return _best_line(distance, field, sigma, _starts(distance, field))
-
-
-def fit_coil_line(
-    distance_m: ArrayLike, field_T: ArrayLike, noise_T: float, *, noise_fraction: float = 0.0
-) -> SourceLine:
-    """As :func:`fit_line`, for a coil of unknown radius, which is one more unknown.
-
-    Parameters
-    ----------
-    distance_m, field_T, noise_T, noise_fraction
-        As of :func:`fit_line`.
-
-    Returns
-    -------
-    SourceLine
-        With the radius of the single loop that fits best.
-    """
-    distance, field, sigma = _checked(distance_m, field_T, noise_T, noise_fraction)
-    starts = [
-        np.append(start, share * np.linalg.norm(start[:3])) for start in _starts(distance, field) for share in _RADII
-    ]
+    starts = _starts(distance, field)
+    if coil:
+        starts = [np.append(start, share * np.linalg.norm(start[:3])) for start in starts for share in _RADII]
     return _best_line(distance, field, sigma, starts)
 
 
@@ -131,11 +109,10 @@ def distance_along_line(
 
     Parameters
     ----------
-    line : SourceLine
     field_T : array_like, shape (..., 3)
         Field of the source alone, in the sensor's axes [T].
     noise_T, noise_fraction
-        As of :func:`fit_line`.
+        As of :func:`fit_source_line`.
     within_m : tuple of 2 floats
         Where the source may be [m].
 

@@ -44,7 +44,6 @@ class Locator:
 
     Parameters
     ----------
-    array : SensorArray
     sources : int or "auto"
         How many sources there are in every row; "auto": as many as the readings support, five at most.
     position_m : array_like, shape (3,) or (n, 3), optional
@@ -256,7 +255,6 @@ def locate(
 
     Parameters
     ----------
-    array : SensorArray
     readings : Readings or array_like, shape (n, C) or (C,)
         Raw readings [T], NaN where missing. Those that saturate are not used, and named.
     sources, prior, body_length_m, exclude_faulty, seed

@@ -18,30 +18,11 @@ _ROWS_AT_ONCE = 256
 def fix_residuals(
     array: SensorArray, readings_T: ArrayLike, fixes: Fixes, ambient_T: FloatArray | None = None
 ) -> FloatArray:
-    """Residuals of the best solution of every row, in standard deviations of the noise.
+    """Residuals (n, C) of the best solution of every row, in standard deviations of the noise.
 
     The field common to all sensors, of which nothing is known, is fitted and taken out. The sum of squares of a row is
-    the χ² of its solution; a fitted channel's own variance is therefore a little below 1.
-
-    Parameters
-    ----------
-    array : SensorArray
-    readings_T : array_like, shape (n, C)
-        Raw readings [T]; NaN where missing.
-    fixes : Fixes
-        In the array's frame.
-    ambient_T : ndarray, shape (n, 3), optional
-        Ambient field of every row [T], in place of the array's.
-
-    Returns
-    -------
-    ndarray, shape (n, C)
-        NaN where there is no reading or no solution, and for sensors that the fix left out.
-
-    Raises
-    ------
-    ValueError
-        The readings have another shape.
+    the χ² of its solution; a fitted channel's own variance is therefore a little below 1. NaN where there is no reading
+    or no solution, and for sensors that the fix left out.
     """
     readings = checked_rows(array, readings_T)
     dropped = np.array([[name in names for name in array.ids] for names in fixes.dropped_sensors], dtype=bool)

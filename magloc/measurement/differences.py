@@ -22,39 +22,19 @@ from magloc.fields import dipole
 
 
 def predicted_channels(array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
-    """Noise-free readings of all channels, offset removed.
+    """Noise-free readings (..., C) [T] of a source at (..., 3) in the array's frame, offset removed.
 
-    Parameters
-    ----------
-    array : SensorArray
-        With ``ambient_T`` where scalar sensors stand in an ambient field, and with ``ambient_gradient_T_m`` where it is
-        not uniform, which differences between sensors of either kind see.
-    position_m, moment_Am2 : array_like, shape (..., 3)
-        Source in the array's frame [m], its moment [A·m²].
-
-    Returns
-    -------
-    ndarray, shape (..., C)
-        Readings minus offsets [T]: ``a_c · (B_a + B)`` for a component, ``g |B_a + B|`` for a modulus, with the ambient
-        field B_a at each sensor.
+    ``a_c · (B_a + B)`` for a component, ``g |B_a + B|`` for a modulus, with the ambient field B_a at each sensor: of
+    ``ambient_T`` and, where it is not uniform, ``ambient_gradient_T_m``, which differences of either kind see.
     """
     fields = _fields(array, position_m, moment_Am2)
     return array.readings_of(fields) - array.channel_offset_T
 
 
 def channel_jacobian(array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
-    """Derivative of :func:`predicted_channels` with respect to (p, m).
+    """Derivative (..., C, 6) of :func:`predicted_channels` with respect to (p, m) [T/m], [T/(A·m²)].
 
-    Parameters
-    ----------
-    array : SensorArray
-    position_m, moment_Am2 : array_like, shape (..., 3)
-        Source in the array's frame [m], its moment [A·m²].
-
-    Returns
-    -------
-    ndarray, shape (..., C, 6)
-        [T/m] and [T/(A·m²)]. A modulus has the gradient of its field along the direction of the sum, equation (4).
+    A modulus has the gradient of its field along the direction of the sum, equation (4).
     """
     p = np.asarray(position_m, dtype=np.float64)[..., None, :]
     m = np.asarray(moment_Am2, dtype=np.float64)[..., None, :]
@@ -87,7 +67,6 @@ class DifferenceMeasurement:
 
     Attributes
     ----------
-    array : SensorArray
     differences : Differences
         Which combinations of channels are measured; see :func:`arrays.differences.decorrelated_differences` for missing
         readings, another base sensor or another noise.
@@ -107,17 +86,9 @@ class DifferenceMeasurement:
         return self.differences.variance
 
     def measured(self, readings_T: ArrayLike) -> FloatArray:
-        """Decorrelated differences of raw readings, equations (16) and (28).
+        """Decorrelated differences (..., k) [T] of raw readings (..., C), equations (16) and (28).
 
-        Parameters
-        ----------
-        readings_T : array_like, shape (..., C)
-            Raw readings [T]. Entries of channels that the differences leave out may be NaN.
-
-        Returns
-        -------
-        ndarray, shape (..., k)
-            [T]
+        What the differences leave out may be NaN.
         """
         transform = self.differences.transform
         used = np.any(transform != 0.0, axis=0)
@@ -126,50 +97,17 @@ class DifferenceMeasurement:
         return result
 
     def predicted(self, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
-        """Predicted decorrelated differences (ForwardMT, ForwardMV).
-
-        Parameters
-        ----------
-        position_m, moment_Am2 : array_like, shape (..., 3)
-            Source in the array's frame [m], its moment [A·m²].
-
-        Returns
-        -------
-        ndarray, shape (..., k)
-            [T]
-        """
+        """Predicted decorrelated differences (..., k) [T] of a source in the array's frame (ForwardMT, ForwardMV)."""
         result: FloatArray = predicted_channels(self.array, position_m, moment_Am2) @ self.differences.transform.T
         return result
 
     def jacobian(self, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
-        """Jacobian of :meth:`predicted` (JacobianH).
-
-        Parameters
-        ----------
-        position_m, moment_Am2 : array_like, shape (..., 3)
-            Source in the array's frame [m], its moment [A·m²].
-
-        Returns
-        -------
-        ndarray, shape (..., k, 6)
-            Columns (p, m): [T/m] and [T/(A·m²)].
-        """
+        """Jacobian (..., k, 6) of :meth:`predicted` (JacobianH), columns (p, m): [T/m] and [T/(A·m²)]."""
         result: FloatArray = self.differences.transform @ channel_jacobian(self.array, position_m, moment_Am2)
         return result
 
     def fisher_information(self, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
-        """Information that one set of readings holds about (p, m): ``Hᵀ R⁻¹ H``.
-
-        Parameters
-        ----------
-        position_m, moment_Am2 : array_like, shape (..., 3)
-            Source in the array's frame [m], its moment [A·m²].
-
-        Returns
-        -------
-        ndarray, shape (..., 6, 6)
-            Its inverse is the Cramér-Rao bound.
-        """
+        """Information (..., 6, 6) of one set of readings about (p, m): ``Hᵀ R⁻¹ H``, the inverse of the bound."""
         w = self.jacobian(position_m, moment_Am2) / np.sqrt(self.variance)[:, None]
         information: FloatArray = np.swapaxes(w, -1, -2) @ w
         return information

@@ -1,16 +1,8 @@
 r"""Errors of sensors that last from row to row, as states that are estimated along with a source.
 
-What a calibration does not know (turned axes, gains, the platform's field), 1/f noise and drift are the same, or nearly
-the same, in the next row: they do not average out as noise does, and a filter that takes them for noise believes itself
-too much. Here every one of them is a number e with a standard deviation at the beginning and a first-order Markov
-process
-
-.. math:: \dot e = -e/τ + w
-
-constant (τ infinite, no noise) for the calibration, a random walk for drift. 1/f noise is the sum of one process for
-each decade of frequency, of equal variance: with corner frequencies :math:`f_k` a factor 10 apart and variance
-:math:`s^2` each, the spectral density :math:`\sum_k (2 s^2/π) f_k/(f_k^2 + f^2)` is that of :math:`s^2/(f \ln 10)`
-within 15 % between the outermost of them.
+Turned axes, gains, the platform's field, 1/f noise and drift do not average out as noise does. Every one of them is a
+first-order Markov process :math:`\dot e = -e/τ + w`: constant for the calibration, a random walk for drift, one
+process a decade of frequency for 1/f noise. See docs/theory/sensor-errors.md.
 """
 
 from __future__ import annotations
@@ -40,7 +32,6 @@ class SensorErrors:
 
     Attributes
     ----------
-    array : SensorArray
     sigma : ndarray, shape (n,)
         Standard deviations before anything is known.
     decay_Hz : ndarray, shape (n,)
@@ -107,20 +98,7 @@ class SensorErrors:
         return kept, np.hypot(stationary, self.walk * math.sqrt(dt_s))
 
     def effect(self, array: SensorArray, readings_T: FloatArray) -> FloatArray:
-        """Derivative of the readings of one row with respect to the errors.
-
-        Parameters
-        ----------
-        array : SensorArray
-            With the ambient field of the row.
-        readings_T : ndarray, shape (C,)
-            Raw readings [T], NaN where missing.
-
-        Returns
-        -------
-        ndarray, shape (C, n)
-            Finite also for missing readings.
-        """
+        """Derivative (C, n) of one row's readings (C,) [T] by the errors; finite also for missing readings."""
         effect = np.zeros((array.n_channels, self.n_states))
         n = len(self.of_sensor)
         if n:
@@ -134,10 +112,7 @@ class SensorErrors:
 
 
 def _of_fields(array: SensorArray) -> FloatArray:
-    """Derivative of the readings, by sensor and axis, with respect to a field in the array's frame: (N, 3, 3).
-
-    A modulus has that of the ambient field, whose direction it sees.
-    """
+    """Derivative (N, 3, 3) of readings by a field in the array's frame; a modulus sees it along the ambient field."""
     ambient = array.ambient_fields
     modulus = np.linalg.norm(ambient, axis=1, keepdims=True)
     direction = np.divide(ambient, modulus, out=np.zeros_like(ambient), where=modulus > 0.0)

@@ -30,10 +30,8 @@ class WhitenedRows:
     mask : ndarray of bool, shape (C,)
         Channels that have a reading.
     readings_T : ndarray, shape (b, C)
-    model : WhitenedModel
     y : ndarray, shape (b, C)
         Of unit noise, free of the common field.
-    n_differences : int
     """
 
     index: IntArray
@@ -84,13 +82,7 @@ def whitened_rows(
 
 
 def checked_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
-    """Raw readings (n, C) of an array [T] as numbers.
-
-    Raises
-    ------
-    ValueError
-        They have another shape.
-    """
+    """Raw readings (n, C) of an array [T] as numbers; ValueError where they have another shape."""
     readings = np.asarray(readings_T, dtype=np.float64)
     if readings.ndim != 2 or readings.shape[1] != array.n_channels:
         raise ValueError(

@@ -1,17 +1,8 @@
 r"""Whitened model: dipoles in homogeneous coordinates, and what an array reads of them with unit noise.
 
-For a source at p the field is linear in the moment. Positions are written as homogeneous coordinates
-:math:`q = (u, s)` on the unit sphere of :math:`R^4`,
-
-.. math:: p = c + \rho_0 \, u / s,
-
-with the sensors' centroid c and circumradius :math:`\rho_0`. With the sensors scaled to :math:`x_i = (s_i - c)/\rho_0`,
-:math:`v_i = s x_i - u`, the field of the moment m at sensor i is :math:`a(v_i) \mu`, where
-:math:`a(v) = (3 n n^T - I)/|v|^3` and :math:`\mu = k |s|^3 m / \rho_0^3`. Infinity (s = 0) is an ordinary point, passed
-smoothly, where (p, m) turns into (-p, -m): the two fit alike to first order, and only the finite size of the array
-tells them apart.
-
-The readable twin of :mod:`magloc.measurement.whitened_compiled`.
+Positions are :math:`q = (u, s)` on the unit sphere of :math:`R^4`, :math:`p = c + \rho_0 \, u / s` with the sensors'
+centroid c and circumradius :math:`\rho_0`; moments are :math:`\mu = k |s|^3 m / \rho_0^3`, so that infinity (s = 0) is
+an ordinary point: docs/theory/homogeneous-coordinates.md. The twin of :mod:`magloc.measurement.whitened_compiled`.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
 from arrays.geometries import GEOMETRIES, cube, tetrahedron
-from arrays.meshes import AXIS_COLOURS, array_scene, glyph_size, mesh_of, sensor_mesh
+from arrays.meshes import AXIS_COLOURS, glyph_size, mesh_of, sensor_mesh
 from arrays.sensor import Sensor
 
 BODIES = {"vector": 4, "scalar": 1}  # a cube and three rods, or a sphere
@@ -79,7 +79,7 @@ class TestArray:
         assert mesh.volume > 0.0
         assert mesh.body_count == 8 * BODIES[kind]
 
-    def test_scene_has_a_node_for_each_sensor(self) -> None:
+    def test_mesh_has_every_sensor_in_its_place(self) -> None:
         array = SensorArray(
             (
                 Sensor("a", "vector", (0.0, 0.0, 0.0), 1e-9),
@@ -87,14 +87,10 @@ class TestArray:
                 Sensor("c", "vector", (0.0, 0.0, 2.0), 1e-9, (0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5))),
             )
         )
-        scene = array_scene(array)
-        assert set(scene.graph.nodes_geometry) == set(array.ids)
-        for sensor, rotation in zip(array.sensors, array.rotation_matrices, strict=True):
-            transform, geometry = scene.graph[sensor.id]
-            assert_array_equal(transform[:3, 3], sensor.position_m)
-            assert_allclose(transform[:3, :3], rotation, rtol=0.0, atol=1e-15)
-            assert scene.geometry[geometry].body_count == BODIES[sensor.kind]
-
-    def test_scene_and_mesh_show_the_same(self) -> None:
-        array = tetrahedron(1.5)
-        assert_allclose(array_scene(array, 0.1).bounds, mesh_of(array, 0.1).bounds, rtol=1e-12)
+        mesh = mesh_of(array, 0.1)
+        parts = [sensor_mesh(sensor, 0.1) for sensor in array.sensors]
+        assert mesh.body_count == sum(BODIES[sensor.kind] for sensor in array.sensors)
+        assert_allclose(mesh.volume, sum(part.volume for part in parts), rtol=1e-12)
+        assert_array_equal(
+            mesh.bounds, [np.min([b.bounds[0] for b in parts], 0), np.max([b.bounds[1] for b in parts], 0)]
+        )

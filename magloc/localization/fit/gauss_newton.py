@@ -1,11 +1,7 @@
-r"""Any number of dipoles seen by any sensors: the exact model and its damped Gauss-Newton fit, many at once.
+"""Any number of dipoles seen by any sensors: damped Gauss-Newton fits of the exact model, many at once.
 
-Vector sensors read components, scalar sensors the exact modulus :math:`|B_a + B|` of the sum with the ambient field, so
-that the readings are not linear in the moments. Every source has the homogeneous coordinates q = (u, s) and the scaled
-moment μ of :mod:`magloc.measurement.whitened`: infinity (s = 0) is an ordinary point.
-
-Positions are damped, moments are not: after every step of the positions the moments are fitted anew, which for vector
-sensors makes the iteration that of variable projection.
+In the coordinates of :mod:`magloc.measurement.whitened`. Positions are damped, moments are not: after every step of
+the positions the moments are fitted anew, which for vector sensors makes the iteration that of variable projection.
 
 Shapes: b fits, K sources, N sensors, C channels, c columns of the whitening's common field.
 """
@@ -129,22 +125,7 @@ class _NormalEquations:
 def refine_moments(
     problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray, *, max_iterations: int = 60
 ) -> JointFits:
-    """Moments of sources at known places, from starts: a damped Gauss-Newton iteration.
-
-    Parameters
-    ----------
-    problem : WhitenedModel
-    y : ndarray, shape (b, C)
-        Whitened readings.
-    q, mu : ndarray, shapes (b, K, 4) and (b, K, 3)
-        The places, which stay, and the moments to start from.
-    max_iterations : int
-        Linearisations at most.
-
-    Returns
-    -------
-    JointFits
-    """
+    """Moments (b, K, 3) of sources that stay at q (b, K, 4): damped Gauss-Newton on whitened readings (b, C)."""
     return _descend(problem, y, q, mu, np.zeros((q.shape[1], 3), dtype=bool), max_iterations)
 
 
@@ -157,23 +138,10 @@ def refine(
     free: NDArray[np.bool_] | None = None,
     max_iterations: int = 60,
 ) -> JointFits:
-    """Positions and moments from starts: a damped Gauss-Newton iteration that never raises χ².
+    """Positions and moments from starts (b, K, 4) and (b, K, 3): damped Gauss-Newton that never raises χ².
 
-    Parameters
-    ----------
-    problem : WhitenedModel
-    y : ndarray, shape (b, C)
-        Whitened readings.
-    q, mu : ndarray, shapes (b, K, 4) and (b, K, 3)
-        Starts.
-    free : ndarray of bool, shape (K, 3), optional
-        Which of the :func:`tangents` of a source may change; all by default. Without the third one its range stays.
-    max_iterations : int
-        Linearisations at most.
-
-    Returns
-    -------
-    JointFits
+    y (b, C) are whitened readings, `free` (K, 3) says which :func:`tangents` of a source may change: without the third
+    its range stays.
     """
     free = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
     return _descend(problem, y, q, mu, free, max_iterations)

@@ -17,8 +17,6 @@ class Optima:
 
     Attributes
     ----------
-    rows : WhitenedRows
-    fits : JointFits
     of_row : ndarray of int, shape (f,)
         Place of a fit's row among the b rows.
     reason : list of str

@@ -16,20 +16,10 @@ _MILLIMETRES_BELOW_M = 1.0
 
 
 def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None = None) -> list[str]:
-    """Lines of a table: a header, then one line for every source of the best solution of every fix.
+    """Aligned lines of a table: a header, then one for every source of the best solution of every fix.
 
-    Parameters
-    ----------
-    fixes : Fixes
-    joint : bool, optional
-        With a column for the number of the source; by default where some row has several.
-    most : int, optional
-        Rows at most: the first and the last ones.
-
-    Returns
-    -------
-    list of str
-        Aligned columns separated by spaces. Lengths are in mm if most of the positions are within a metre, else in m.
+    Lengths are in mm if most positions are within a metre, else in m. `joint` adds the number of the source, by default
+    where some row has several; `most` keeps the first and the last rows.
     """
     shown = list(range(len(fixes)))
     if most is not None and len(shown) > most:

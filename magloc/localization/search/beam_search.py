@@ -79,19 +79,7 @@ class Beam:
 
 
 def best_distinct(fits: JointFits, n_rows: int, width: int) -> Beam:
-    """The best fits of every row that differ from each other.
-
-    Parameters
-    ----------
-    fits : JointFits
-        The same number of fits for every row, row after row.
-    n_rows, width : int
-        Rows b, and fits w to keep of each.
-
-    Returns
-    -------
-    Beam
-    """
+    """The `width` best fits of every row that differ, from the same number of fits for every row, row after row."""
     n_sources = fits.q.shape[1]
     chi2 = fits.chi2.reshape(n_rows, -1).copy()
     # q and -q are the same source.

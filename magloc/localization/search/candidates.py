@@ -27,22 +27,10 @@ _CANDIDATES_AT_ONCE = 512
 
 
 def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
-    """Orthonormal whitened bases of the three unit moments at candidates (n, 4), linear channels: (C, 3 n).
+    """Orthonormal whitened bases (C, 3 n) of the unit moments at candidates (n, 4), for linear channels.
 
-    Parameters
-    ----------
-    problem : WhitenedModel
-    gain : ndarray, shape (C, 3)
-        What every channel reads of a small field, divided by its noise.
-    row : int
-        Whose whitening counts.
-    candidates : ndarray, shape (n, 4)
-        Homogeneous coordinates.
-
-    Returns
-    -------
-    ndarray, shape (C, 3 n)
-        In single precision, which ranks the candidates as well; columns by moment axis, then by candidate.
+    By moment axis, then by candidate, under the whitening of `row`; `gain` (C, 3) is in units of the noise. Single
+    precision ranks the candidates as well.
     """
     bases = np.zeros((len(candidates), 3, gain.shape[0]))
     over_rows(
@@ -109,22 +97,7 @@ def hemisphere(n: int) -> FloatArray:
 
 
 def distinct_best(scores: FloatArray, candidates: FloatArray, n_starts: int, apart_rad: float) -> NDArray[np.intp]:
-    """Candidates (b, n_starts) of the best scores (b, n) that are some angle apart, best first.
-
-    Parameters
-    ----------
-    scores : ndarray, shape (b, n)
-    candidates : ndarray, shape (n, 4)
-        Homogeneous coordinates of unit norm; q and -q are the same point.
-    n_starts : int
-    apart_rad : float
-        Least angle between two that are chosen.
-
-    Returns
-    -------
-    ndarray of int, shape (b, n_starts)
-        The best one again where no other is left.
-    """
+    """The best candidates (b, n_starts) by scores (b, n) that are some angle apart; the best again if none is left."""
     left = scores.copy()
     chosen = np.empty((len(scores), n_starts), dtype=np.intp)
     for k in range(n_starts):
@@ -143,23 +116,10 @@ def candidate_positions(
     n_ranges: int = 10,
     n_near_directions: int = 12,
 ) -> FloatArray:
-    """Positions that a search scores before it refines the best of them.
+    """Positions (n, 3) [m] that a search scores before it refines the best of them.
 
     Directions times geometric ranges of 0.6 to 60 circumradii around the centroid, and shells of 0.35, 0.7 and 1.4
     times the distance of the next sensor around every sensor, for sources close to a large array.
-
-    Parameters
-    ----------
-    array : SensorArray
-    n_directions, n_ranges : int
-        Size of the outer grid.
-    n_near_directions : int
-        Directions of the shells around the sensors.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        Positions in the array's frame [m].
     """
     ranges = array.circumradius * np.geomspace(0.6, 60.0, n_ranges)
     outer = array.centroid + (ranges[:, None, None] * fibonacci_directions(n_directions)).reshape(-1, 3)

@@ -35,7 +35,6 @@ class MomentSearch:
 
     Parameters
     ----------
-    array : SensorArray
     position_m : array_like, shape (3,) or (n, 3)
         The source in the array's frame [m]: in all rows, or in every one of an array that moves.
     prior : SourcePrior

@@ -49,18 +49,7 @@ def stacked_rows(
     R_world_from_array: FloatArray,
     ambient_T: FloatArray | None = None,
 ) -> WhitenedRows:
-    """Rows of an array whose pose is known as one row of a large array in the world frame.
-
-    Parameters
-    ----------
-    array : SensorArray
-    readings_T : ndarray, shape (n, C)
-        Raw readings [T], NaN where missing.
-    origins_m, R_world_from_array : ndarray, shapes (n, 3) and (n, 3, 3)
-        Pose of the array in every row.
-    ambient_T : ndarray, shape (n, 3), optional
-        Ambient field of every row in the array's frame [T], in place of the array's own.
-    """
+    """Rows (n, C) of an array whose pose in the world is known as one row of a large array in the world frame."""
     n, available = len(readings_T), np.isfinite(readings_T)
     whitenings = [whitenings_of(array, mask, row[None])[0] for mask, row in zip(available, readings_T, strict=True)]
     fields = ambient_fields(array, n, ambient_T)

@@ -123,20 +123,7 @@ class SingleSourceSearch:
         return [Optima(rows, fits, of_row, reason, np.zeros((len(of_row), 1), dtype=bool), found.counts[:, 1])]
 
     def optima_from(self, readings_T: ArrayLike, starts_m: ArrayLike) -> BestFits:
-        """Best optimum that the search finds when a start is refined before the best candidates, for many starts.
-
-        Parameters
-        ----------
-        readings_T : array_like, shape (C,)
-            Raw readings in channel order [T]; NaN where missing.
-        starts_m : array_like, shape (n, 3)
-            Positions in the array's frame [m].
-
-        Returns
-        -------
-        BestFits
-            Of every start; `prior` is not used.
-        """
+        """Best optimum of readings (C,) for every start (n, 3) [m], refined before the candidates; without prior."""
         (rows,) = whitened_rows(self.array, np.asarray(readings_T, dtype=np.float64)[None], None, 1)
         starts = rows.model.homogeneous(np.asarray(starts_m, dtype=np.float64))[:, None]
         found = self._search(rows, np.zeros(len(starts), dtype=np.intp), starts, DISTINCT_WITHIN)

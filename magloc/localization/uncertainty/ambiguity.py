@@ -9,35 +9,21 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from arrays.typing import FloatArray
-from magloc.chi_square import RISE_95
+from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95
 from magloc.localization.fit.results import EVERYWHERE, Intervals, is_observable_set, span
 from magloc.localization.uncertainty.range_interval import levels, ranges_of, relative_range_sigma, rise, union
 
 LARGEST_GAUSSIAN_SIGMA = 0.04
 """Standard deviations of position and moment, over range and moment, up to which their errors are Gaussian."""
-CERTAIN_WEIGHT = 0.99
-"""Weight from which on a solution is as good as the only one."""
 
 
 def log_evidence_volume(covariance: FloatArray, moment: FloatArray, offset_m: FloatArray | None = None) -> FloatArray:
-    r"""Logarithm of how much of what may be thought of beforehand a solution stands for, up to a constant.
+    r"""Logarithm of how much of what may be thought of beforehand a solution stands for, up to a constant: (...).
 
     Nothing is known beforehand of the scale: direction, orientation and the logarithms of range and moment are uniform,
     a density :math:`\propto r^{-3} |m|^{-3}` of position and moment. By Laplace's method a solution then stands for the
-    root of the determinant of its covariance in units of r and |m|. The logarithm of the range counts with a standard
-    deviation of one at most: χ² is no parabola over more than that.
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (..., 6 K, 6 K)
-        Of position and moment of the first of K sources, then of the second, and so on; (..., 3, 3) of a moment alone.
-        NaN where there is no solution.
-    moment, offset_m : ndarray, shape (..., K, 3)
-        Moments, in the covariance's units, and positions from the sensors' centroid; no position where it is known.
-
-    Returns
-    -------
-    ndarray, shape (...)
+    root of the determinant of its covariance (..., 6 K, 6 K), or (..., 3, 3) of a moment alone, in units of r and |m|.
+    The logarithm of the range counts with a standard deviation of one at most: χ² is no parabola over more than that.
     """
     vectors = [moment] if offset_m is None else [offset_m, moment]
     lengths = np.stack([np.linalg.norm(vector, axis=-1) for vector in vectors], axis=-1)
@@ -55,20 +41,7 @@ def log_evidence_volume(covariance: FloatArray, moment: FloatArray, offset_m: Fl
 
 
 def weights(chi2: ArrayLike, volume: ArrayLike) -> FloatArray:
-    r"""How likely each of several solutions is, :math:`\propto V \exp(-\chi^2/2)`.
-
-    Parameters
-    ----------
-    chi2 : array_like, shape (..., n)
-        Infinite where there is no solution.
-    volume : array_like, shape (..., n)
-        :func:`log_evidence_volume`.
-
-    Returns
-    -------
-    ndarray, shape (..., n)
-        They add up to one, or are all zero.
-    """
+    r"""How likely each of the solutions (..., n) is, :math:`\propto V \exp(-\chi^2/2)`; all zero where none is."""
     values = np.asarray(volume, dtype=np.float64) - 0.5 * np.asarray(chi2, dtype=np.float64)
     best = values.max(axis=-1, keepdims=True)
     relative = np.exp(values - np.where(np.isfinite(best), best, 0.0))
@@ -77,13 +50,7 @@ def weights(chi2: ArrayLike, volume: ArrayLike) -> FloatArray:
 
 
 def relative_sigma(covariance: FloatArray, offset_m: FloatArray, moment: FloatArray) -> FloatArray:
-    """The larger one of the standard deviations of position and moment, over the range and the moment: (...).
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (..., 6, 6)
-    offset_m, moment : ndarray, shape (..., 3)
-    """
+    """Larger one of the standard deviations of position and moment (..., 6, 6), over the range and the moment."""
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         parts = [
@@ -95,19 +62,7 @@ def relative_sigma(covariance: FloatArray, offset_m: FloatArray, moment: FloatAr
 
 
 def longest_axes(covariance: FloatArray, offset_m: FloatArray, moment: FloatArray) -> FloatArray:
-    """Longest half axes of the ellipsoids of one standard deviation, lengths being in units of ranges and moments.
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (..., 6 K, 6 K)
-        Of position and moment of the first of K sources, then of the second, and so on.
-    offset_m, moment : ndarray, shape (..., K, 3)
-
-    Returns
-    -------
-    ndarray, shape (..., 6 K)
-        In the units of the covariance.
-    """
+    """Longest half axes (..., 6 K) of ellipsoids of one σ, lengths being in units of ranges and moments."""
     lengths = np.stack([np.linalg.norm(vector, axis=-1) for vector in (offset_m, moment)], axis=-1)
     unit = np.repeat(lengths.reshape(*lengths.shape[:-2], covariance.shape[-1] // 3), 3, axis=-1)
     variance, axis = np.linalg.eigh(covariance / (unit[..., :, None] * unit[..., None, :]))
@@ -118,30 +73,14 @@ def longest_axes(covariance: FloatArray, offset_m: FloatArray, moment: FloatArra
 def widened(
     covariance: FloatArray, offset_m: FloatArray, low_m: FloatArray, high_m: FloatArray, source: int = 0
 ) -> FloatArray:
-    r"""Covariances that are as long as the set of ranges, for ranges that are not observable.
+    """Covariances (..., 6 K, 6 K) that are as long as the set of ranges of one source, where that is not observable.
 
     The state follows the range along :math:`w = C e / e^T C e`, with e the gradient of the range: it is there that
-    variance is added. Given the range, all else is as certain as before.
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (..., 6 K, 6 K)
-        Of position and moment of the first of K sources, then of the second, and so on: the inverse information.
-    offset_m : ndarray, shape (..., 3)
-        Of the positions of one of them from the sensors' centroid [m].
-    low_m, high_m : ndarray, shape (...)
-        Ends of its set of ranges [m], infinite where it is open.
-    source : int
-        Which of them.
-
-    Returns
-    -------
-    ndarray, shape (..., 6 K, 6 K)
-        Their 95 % intervals of the range reach the farther end of the set; where that is open, σ of the range is no
-        less than the range itself.
+    variance is added. Given the range, all else is as certain as before. The 95 % interval then reaches the farther end
+    of the set; where that is open, σ of the range is no less than the range itself.
     """
     distance = np.linalg.norm(offset_m, axis=-1)
-    farther = np.maximum(distance - low_m, high_m - distance) / math.sqrt(RISE_95)
+    farther = np.maximum(distance - low_m, high_m - distance) / math.sqrt(DELTA_CHI2_95)
     wanted = np.where(np.isfinite(farther), farther, distance)
     place = slice(6 * source, 6 * source + 3)
     with np.errstate(invalid="ignore", divide="ignore"):

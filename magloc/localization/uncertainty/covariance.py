@@ -15,12 +15,12 @@ from scipy.special import chdtrc
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.compilation import over_rows
 from magloc.fields.dipole import MU0_OVER_4PI
+from magloc.levels import CERTAIN_WEIGHT, MISFIT
 from magloc.localization.fit.columns import Solutions
 from magloc.localization.fit.gauss_newton import covariances
 from magloc.localization.fit.optima import Optima
-from magloc.localization.fit.results import EVERYWHERE, MISFIT, Intervals, is_observable_set, span
+from magloc.localization.fit.results import EVERYWHERE, Intervals, is_observable_set, span
 from magloc.localization.uncertainty.ambiguity import (
-    CERTAIN_WEIGHT,
     LARGEST_GAUSSIAN_SIGMA,
     Rivals,
     log_evidence_volume,
@@ -52,16 +52,7 @@ class _Known:
 
 
 def solutions_of(optima: Optima, energy: FloatArray, detected: BoolArray) -> Solutions:
-    """Solutions of b rows: the optima whose covariance is finite, with what is known of them.
-
-    Parameters
-    ----------
-    optima : Optima
-    energy : ndarray, shape (b,)
-        Sums of squared differences, as they are without a source.
-    detected : ndarray of bool, shape (b,)
-        Whether they stand out of noise.
-    """
+    """Solutions of b rows: the optima whose covariance is finite, with what is known of them."""
     model, fits, of_row = optima.rows.model, optima.fits, optima.of_row
     position, moment = model.position(fits.q), model.moment(fits.q, fits.mu)
     n_fits, n_sources = position.shape[:2]
@@ -99,27 +90,10 @@ def covariance_is_valid(
     dof: int,
     covariance: FloatArray,
 ) -> BoolArray:
-    """Whether covariances describe the errors of f fits of K sources, as far as the model near the fits tells.
+    """Whether covariances (f, 6 K, 6 K) describe the errors of f fits of K sources, as far as the model tells.
 
     They do where χ² is one of noise, and rises by one, give or take a half, at one standard deviation along the longest
-    axis, to either side: not where the errors follow a curve.
-
-    Parameters
-    ----------
-    problem : WhitenedModel
-        Of f fits.
-    y : ndarray, shape (f, C)
-        Whitened readings.
-    position_m, moment_Am2 : ndarray, shape (f, K, 3)
-    chi2 : ndarray, shape (f,)
-    dof : int
-        Zero where every χ² is as it must be.
-    covariance : ndarray, shape (f, 6 K, 6 K)
-        Inverse information.
-
-    Returns
-    -------
-    ndarray of bool, shape (f,)
+    axis, to either side: not where the errors follow a curve. With no degrees of freedom every χ² is as it must be.
     """
     axis = longest_axes(covariance, position_m - problem.centroid, moment_Am2).reshape(*position_m.shape[:2], 2, 3)
     described = chdtrc(dof, chi2) >= MISFIT if dof > 0 else np.ones(len(y), dtype=bool)

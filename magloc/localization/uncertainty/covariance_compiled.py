@@ -82,10 +82,7 @@ def covariance_rows(
     counts: NDArray[np.int64],
     out_covariance: FloatArray,
 ) -> None:
-    """Scaled covariances of the optima of :func:`search_rows`, rows begin to end, into (rows, starts, 6, 6).
-
-    They are left as they are where the information is singular.
-    """
+    """Scaled covariances (rows, starts, 6, 6) of the optima of :func:`search_rows`, left alone where singular."""
     for row in range(begin, end):
         model = row_at(rows, row)
         for j in range(counts[row, 0]):

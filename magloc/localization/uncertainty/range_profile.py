@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.chi_square import RISE_95
+from magloc.levels import DELTA_CHI2_95
 from magloc.localization.fit.gauss_newton import JointFits, refine
 from magloc.localization.uncertainty.range_interval import ranges_of, relative_range_sigma
 from magloc.measurement.whitened import WhitenedModel
@@ -29,26 +29,10 @@ def profile_stretches(
     sigma_over_range: FloatArray,
     rise: FloatArray,
 ) -> FloatArray:
-    """Stretches of α of one source, of b fits, in which the profile of χ² stays within a rise.
+    """Stretches (b, 2) of α of one source, of b fits, in which the profile of χ² stays within a rise (b,).
 
-    Parameters
-    ----------
-    problem : WhitenedModel
-    y : ndarray, shape (b, C)
-        Whitened readings.
-    fits : JointFits
-        Optima.
-    source : int
-        Which source's range.
-    sigma_over_range : ndarray, shape (b,)
-        Relative standard deviation of the range as the covariance has it, for the first steps; NaN if unknown.
-    rise : ndarray, shape (b,)
-        Above each optimum, positive.
-
-    Returns
-    -------
-    ndarray, shape (b, 2)
-        Least and largest α; -π/2 and π/2 where χ² does not rise so much.
+    -π/2 and π/2 where χ² does not rise so much. The relative σ of the range as the covariance has it, NaN if unknown,
+    serves for the first steps.
     """
     n = len(y)
     if not n:
@@ -95,11 +79,8 @@ def ranges_within(
     covariance: FloatArray,
     rise: FloatArray | None = None,
 ) -> FloatArray:
-    """Ends (b, 2) of the ranges [m] of one source in which χ² stays within a rise (b,) of each fit, 3.84 by default.
-
-    The first steps are taken from the covariances of the fits (b, 6 K, 6 K).
-    """
-    allowed = np.full(len(y), RISE_95) if rise is None else rise
+    """Ends (b, 2) of the ranges [m] of one source in which χ² stays within a rise (b,) of each fit, 3.84 by default."""
+    allowed = np.full(len(y), DELTA_CHI2_95) if rise is None else rise
     offset = problem.position(fits.q)[:, source] - problem.centroid
     sigma = relative_range_sigma(covariance[:, 6 * source :, 6 * source :], offset)
     return ranges_of(profile_stretches(problem, y, fits, source, sigma, allowed), problem.radius)

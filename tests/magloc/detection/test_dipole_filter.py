@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 from arrays.array import SensorArray
 from arrays.differences import decorrelated_differences
 from arrays.geometries import cube, hexagon, square, tetrahedron
-from magloc.chi_square import ChiSquareDetector, energy_threshold, receiver_operating_characteristic
+from magloc.chi_square import ChiSquareDetector, energy_threshold
 from magloc.detection.detection_range import detection_ranges
 from magloc.detection.dipole_filter import DipoleFilter
 from magloc.detection.matched_filter import MatchedFilterDetector
@@ -179,6 +179,15 @@ class TestMatchedFilter:
     def test_seed_makes_the_threshold(self):
         a, b, c = (MatchedFilterDetector.of(ARRAY, 0.1, n_draws=500, seed=seed).threshold for seed in (3, 3, 4))
         assert a == b != c
+
+
+def receiver_operating_characteristic(without_source, with_source, false_alarm_rate):
+    """Share (m,) with a source above the quantile of those without (n,).
+
+    Its standard error is √(P (1 − P)/m), and that of the rate √(rate (1 − rate)/n).
+    """
+    thresholds = np.quantile(without_source, 1.0 - np.asarray(false_alarm_rate))
+    return 1.0 - np.searchsorted(np.sort(with_source), thresholds, side="right") / with_source.size
 
 
 class TestReceiverOperatingCharacteristic:

@@ -3,7 +3,7 @@
 | what | who checks it |
 |---|---|
 | loop_field | magpylib's circular current |
-| fit_line, fit_coil_line | the simulated line |
+| fit_source_line | the simulated line |
 | distances | the stage's positions, on rows that the fit has not seen |
 """
 
@@ -18,9 +18,9 @@ from numpy.testing import assert_allclose
 from scipy.io import loadmat
 from scipy.spatial.transform import Rotation
 
+from magloc import SourceLine, distance_along_line, fit_source_line
 from magloc.fields import dipole
 from magloc.fields.coil import loop_field
-from magloc.localization.line_ranging import SourceLine, distance_along_line, fit_coil_line, fit_line
 from tests import oracles
 
 RADIUS = 0.05
@@ -78,7 +78,7 @@ class TestSimulatedLines:
     @pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(3))])
     def test_dipole(self, seed):
         line = random_line(seed, 0.0)
-        found = fit_line(STAGE[::2], line.field(STAGE[::2]), 1e-12, noise_fraction=0.01)
+        found = fit_source_line(STAGE[::2], line.field(STAGE[::2]), 1e-12, noise_fraction=0.01)
         sign = np.sign(found.start_m @ line.start_m)  # the line inverted through the sensor has the same field
         assert found.converged
         assert_allclose(sign * found.start_m, line.start_m, atol=1e-6)
@@ -91,7 +91,7 @@ class TestSimulatedLines:
     @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
     def test_coil(self, seed):
         line = random_line(seed, 0.08)
-        found = fit_coil_line(STAGE, line.field(STAGE), 1e-12, noise_fraction=0.001)
+        found = fit_source_line(STAGE, line.field(STAGE), 1e-12, noise_fraction=0.001, coil=True)
         assert found.radius_m == pytest.approx(0.08, abs=1e-4)
         distance, _ = distance_along_line(found, line.field(STAGE), 1e-9, within_m=(-0.05, 1.0))
         assert_allclose(distance, STAGE, atol=1e-4)
@@ -116,7 +116,7 @@ class TestSimulatedLines:
     )
     def test_misuse(self, distance, field, noise, sentence):
         with pytest.raises(ValueError, match=sentence):
-            fit_line(distance, field, noise)
+            fit_source_line(distance, field, noise)
 
     def test_bounds(self):
         line = random_line(0, 0.0)
@@ -138,13 +138,13 @@ class TestRecording:
     The second record of the set has no field of a coil in it.
     """
 
-    def errors(self, fit, field):
+    def errors(self, field, coil):
         """Errors of both halves of the rows, the line fitted to the other half, and their standard deviations."""
         error, deviation = np.empty(81), np.empty(81)
         lines = []
         for first in (0, 1):
             seen, unseen = np.arange(1 - first, 81, 2), np.arange(first, 81, 2)
-            line = fit(STAGE[seen], field[seen], NOISE_T, noise_fraction=NOISE_FRACTION)
+            line = fit_source_line(STAGE[seen], field[seen], NOISE_T, noise_fraction=NOISE_FRACTION, coil=coil)
             found, deviation[unseen] = distance_along_line(
                 line, field[unseen], NOISE_T, noise_fraction=NOISE_FRACTION, within_m=(-0.05, 1.2)
             )
@@ -160,7 +160,7 @@ class TestRecording:
 
         At 0.8 m the field is 8 times the noise, which there is 3 cm of distance: over all rows noise alone makes 15 mm.
         """
-        error, deviation, lines = self.errors(fit_coil_line, coil_field_T)
+        error, deviation, lines = self.errors(coil_field_T, coil=True)
         signal = np.linalg.norm(coil_field_T, axis=1)
         assert np.count_nonzero(deviation < 0.01) >= 52
         assert self.rms(error, deviation < 0.01) < 0.008
@@ -174,7 +174,7 @@ class TestRecording:
 
     def test_a_dipole_does_not_describe_the_near_rows_as_well(self, coil_field_T):
         """9.1 mm where the coil's loop has 6.6, χ² of 1.8 per degree of freedom instead of 1.1."""
-        error, deviation, lines = self.errors(fit_line, coil_field_T)
+        error, deviation, lines = self.errors(coil_field_T, coil=False)
         assert self.rms(error, deviation < 0.01) < 0.01
         for line in lines:
             assert line.chi2 > 1.5 * line.dof
