@@ -54,7 +54,7 @@ def track_record(
         if compiled is not None and tracker.is_tracking:
             points += compiled.follow(before)
         if len(points) < len(rows):
-            points.append(tracker.advance(rows[len(points)]))
+            points.append(tracker.update(rows[len(points)]))
         if progress is not None:
             progress(len(points) - before)
     return points
