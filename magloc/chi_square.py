@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtri, chndtr, chndtrinc
 
 from arrays.typing import FloatArray
-from magloc.levels import CONSISTENCY, DELTA_CHI2_95, FALSE_ALARM
+from magloc.levels import CONSISTENCY, FALSE_ALARM
 
 
 def mean_bounds(degrees_of_freedom: int, level: float = CONSISTENCY) -> tuple[float, float]:
@@ -156,7 +156,3 @@ def check_probability(probability: float, false_alarm_rate: float) -> None:
             f"Input probability must be between the false-alarm rate {false_alarm_rate:g} and 1;"
             f" instead received {probability}."
         )
-
-
-# Δχ² of a 95 % interval of one parameter, and within which another optimum is a solution too.
-RISE_95 = DELTA_CHI2_95

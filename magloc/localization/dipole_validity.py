@@ -16,15 +16,13 @@ from arrays.noise import reading_covariance
 from arrays.typing import BoolArray, FloatArray
 from magloc.fields import dipole
 from magloc.fields.multipole import multipole_field_matrix
+from magloc.levels import EXTENDED_BODY, NO_OTHER_MISFIT, SECOND_LOOK
 from magloc.localization.fit.fixes import Fixes
 from magloc.measurement.differences import DifferenceMeasurement, channel_jacobian
 
 BODY_LENGTHS = 3.0
 _ORDERS = (2, 3)
 _NAMES = {2: "a quadrupole", 3: "an octupole"}
-_NO_OTHER_MISFIT = 0.05
-# Probability of a χ² under noise below which what is left is looked at.
-_MISFIT = 1e-3
 # Columns whose part outside the earlier ones is smaller than this are not seen by the array.
 _UNSEEN_RTOL = 1e-6
 
@@ -122,7 +120,7 @@ def nearness_test(
     moment_Am2: ArrayLike,
     readings_T: ArrayLike,
     *,
-    false_alarm: float = 1e-3,
+    false_alarm: float = EXTENDED_BODY,
 ) -> NearnessTest:
     """Whether the residuals of a fix have the pattern of a source that is extended or too near.
 
@@ -182,7 +180,7 @@ def nearness_test(
     gains = tuple(_tested(order, gain, n, rest, left) for order, gain, n in steps)
     level = false_alarm / 3.0
     misfit = dof > 0 and bool(chdtrc(dof, chi2) < level)
-    extended = any(gain.noise_probability < level and gain.misfit_probability < _NO_OTHER_MISFIT for gain in gains)
+    extended = any(gain.noise_probability < level and gain.misfit_probability < NO_OTHER_MISFIT for gain in gains)
     return NearnessTest(misfit, extended, chi2, dof, gains, _warning(misfit, extended, chi2, dof, gains))
 
 
@@ -255,7 +253,7 @@ def too_near(
             nearest = np.linalg.norm(array.positions - place, axis=1).min()
             near[row] = not dipole_validity(nearest, body_length_m)
         dof = int(solutions.dof[best])
-        if not near[row] and dof > 0 and chdtrc(dof, solutions.chi2[best]) < _MISFIT:
+        if not near[row] and dof > 0 and chdtrc(dof, solutions.chi2[best]) < SECOND_LOOK:
             used = ~np.isin(array.ids, fixes.dropped_sensors[row])[array.channel_sensor]
             of_row = array if ambient_T is None else replace(array, ambient_T=tuple(ambient_T[row].tolist()))
             near[row] = nearness_test(of_row, place, moment, np.where(used, readings_T[row], np.nan)).extended

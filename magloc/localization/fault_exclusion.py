@@ -18,6 +18,7 @@ from scipy.special import chdtri, fdtri
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.levels import CREDIBLE_ROW, SENSOR_FALSE_ALARM
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.gauss_newton import refine
 from magloc.localization.fit.results import Fix
@@ -30,9 +31,6 @@ from magloc.measurement.rows import (
 from magloc.measurement.whitened import WhitenedModel
 
 DEGREES_OF_FREEDOM = 4.0
-# Rows above this quantile of χ² are examined, and sensors above the other one, shared among them all, are dropped.
-_CREDIBLE = 0.999
-_SENSOR_FALSE_ALARM = 1e-3
 # Above this χ² per degree of freedom a bad sensor may have bent the fit so much that it does not stand out.
 _SPOILT = 4.0
 # Above this variance, in units of what is stated, the noise is taken to be larger than stated.
@@ -109,7 +107,7 @@ def _doubtful(fixes: Fixes) -> BoolArray:
     result = ~fixes.solved & np.array([reason != NO_SIGNAL for reason in fixes.reason], dtype=bool)
     solutions, first = fixes.solutions, fixes.first[fixes.solved]
     dof = solutions.dof[first]
-    incredible = (dof > 0) & (solutions.chi2[first] > chdtri(np.maximum(dof, 1), 1.0 - _CREDIBLE))
+    incredible = (dof > 0) & (solutions.chi2[first] > chdtri(np.maximum(dof, 1), 1.0 - CREDIBLE_ROW))
     result[fixes.solved] = incredible | (solutions.n_sources[first] > 1)
     return result
 
@@ -121,7 +119,7 @@ def _explains(fix: Fix) -> bool:
 
 def _is_credible(fix: Fix) -> bool:
     best = fix.solutions[0]
-    return best.dof <= 0 or bool(best.chi2 <= chdtri(best.dof, 1.0 - _CREDIBLE))
+    return best.dof <= 0 or bool(best.chi2 <= chdtri(best.dof, 1.0 - CREDIBLE_ROW))
 
 
 def _is_worth_dropping_for(fix: Fix, plain: Fix) -> bool:
@@ -164,7 +162,7 @@ class _Examination:
         self.free_position = free_position
         self.problem, self.raw = whitened_model(array, mask, readings, whitenings_of(array, mask, readings), ambient)
         self.count = np.bincount(array.channel_sensor[mask], minlength=array.n_sensors)
-        level = 1.0 - _SENSOR_FALSE_ALARM / array.n_sensors
+        level = 1.0 - SENSOR_FALSE_ALARM / array.n_sensors
         self.limits = np.array(chdtri(np.maximum(self.count, 1), 1.0 - level), dtype=np.float64)
 
     def without_lonely_sources(self, plain: Sequence[Fix]) -> list[Fix]:
@@ -329,7 +327,7 @@ class _Examination:
         count = np.maximum(self.count, 1)
         # A median is about as good as the mean of half as many.
         spare = 0.5 * max(2.0, self.count.sum() - 6.0 * n_sources - 6.0)
-        quantile: FloatArray = fdtri(count, spare, 1.0 - _SENSOR_FALSE_ALARM / self.array.n_sensors)
+        quantile: FloatArray = fdtri(count, spare, 1.0 - SENSOR_FALSE_ALARM / self.array.n_sensors)
         return np.array(count * quantile, dtype=np.float64)
 
     def _reweighted(

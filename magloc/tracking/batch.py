@@ -8,13 +8,13 @@ import numpy as np
 from scipy.special import chdtri
 
 from magloc.kalman import estimability
+from magloc.levels import CONTRADICTION
 from magloc.measurement.rows import ambient_fields
 from magloc.tracking import batch_compiled as kernels
 from magloc.tracking.measurement import LEAST_SINGULAR
 from magloc.tracking.motion import N_SOURCE, LinearMotion
 from magloc.tracking.results import Prediction, Row, Step, TrackPoint
 from magloc.tracking.tracker import (
-    CONTRADICTION,
     LARGEST_GROWTH,
     LARGEST_RANGE_ERROR,
     MOST_ITERATIONS,

@@ -30,6 +30,7 @@ from magloc.kalman import (
     predict_square_root,
     symmetric_square_root,
 )
+from magloc.levels import CONTRADICTION
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import Solution
 from magloc.measurement.differences import DifferenceMeasurement
@@ -40,8 +41,6 @@ from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.results import Prediction, Row, Step, TrackPoint, rows_of
 
-CONTRADICTION = 1e-6
-"""Probability under noise below which a row contradicts the track."""
 ROWS_TO_LOSE = 3
 """Contradicting rows in a row that end a track."""
 REFIX_RANGE_ERROR = 0.15

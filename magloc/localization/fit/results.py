@@ -11,14 +11,13 @@ from numpy.typing import ArrayLike
 from scipy.special import chdtrc
 
 from arrays.typing import FloatArray
+from magloc.levels import MISFIT
 
 Intervals = tuple[tuple[float, float | None], ...]
 EVERYWHERE: Intervals = ((0.0, None),)
 """The set of ranges of a row that says nothing."""
 # Δχ² within which another optimum is a solution too.
 DISTINCT_WITHIN = 20.0
-MISFIT = 1e-6
-"""Probability of χ² under noise below which the model does not hold, or the search missed the best solution."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

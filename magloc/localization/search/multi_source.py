@@ -18,6 +18,7 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.levels import CREDIBLE_FIT, FALSE_ALARM, SUSPICIOUS_FIT
 from magloc.localization.fit.gauss_newton import JointFits, covariances, refine
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
@@ -27,10 +28,6 @@ from magloc.localization.search.candidates import allowed_positions, linear_base
 from magloc.measurement.rows import WhitenedRows, whitenings_of
 
 N_UNKNOWNS = 6
-# A fit whose χ² is above this quantile is no optimum worth the name yet; above the lower one another source is tried.
-_CREDIBLE = 0.9999
-_SUSPICIOUS = 0.99
-FALSE_ALARM = 1e-3
 _N_DRAWS = 5_000
 _MOST_RESTARTS = 20
 # Squares, in units of their covariance, of a moment that is hardly known and of an offset that hardly is one.
@@ -144,7 +141,7 @@ class _Levels:
             last = len(beams) + 1 == self.most
             gained = wider.chi2[:, 0] < before.chi2[:, 0] - threshold
             # Where no number of sources is credible so far, the search failed, at this number or at an earlier one.
-            credible = self._quantile(wider.n_sources, _CREDIBLE)
+            credible = self._quantile(wider.n_sources, CREDIBLE_FIT)
             failed = np.flatnonzero(~(wider.chi2[:, 0] <= credible) & (last | ~gained))
             if failed.size:
                 wider = wider.replaced(failed, self._restarted(rows[failed], wider.rows(failed)))
@@ -188,7 +185,7 @@ class _Levels:
 
     def _first(self, rows: IntArray) -> Beam:
         beam = self.search.first(self.problem, self.y)
-        doubtful = rows[beam.chi2[:, 0] > self._quantile(1, _CREDIBLE)]
+        doubtful = rows[beam.chi2[:, 0] > self._quantile(1, CREDIBLE_FIT)]
         if doubtful.size and self.most == 1:
             wide = replace(self.search, n_starts=5 * self.search.n_starts, apart_rad=0.4 * self.search.apart_rad)
             again = wide.first(self.problem.rows(doubtful), self.y[doubtful])
@@ -197,7 +194,7 @@ class _Levels:
 
     def _worth_another(self, rows: IntArray, beam: Beam, threshold: float) -> BoolArray:
         """Whether another source might pay: a suspicious χ², or a candidate that explains much of what is left."""
-        suspicious = ~(beam.chi2[:, 0] <= self._quantile(beam.n_sources, _SUSPICIOUS))
+        suspicious = ~(beam.chi2[:, 0] <= self._quantile(beam.n_sources, SUSPICIOUS_FIT))
         clean = np.flatnonzero(~suspicious)
         if clean.size:
             scores = self.search.left_scores(
@@ -208,7 +205,7 @@ class _Levels:
 
     def _restarted(self, rows: IntArray, beam: Beam, rounds: int = _MOST_RESTARTS) -> Beam:
         """Beams of rows, with random sources replaced until the best fit is credible."""
-        credible = self._quantile(beam.n_sources, _CREDIBLE)
+        credible = self._quantile(beam.n_sources, CREDIBLE_FIT)
         for _ in range(rounds):
             bad = np.flatnonzero(~(beam.chi2[:, 0] <= credible))
             if not bad.size:

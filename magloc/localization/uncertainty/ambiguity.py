@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from arrays.typing import FloatArray
-from magloc.chi_square import RISE_95
+from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95
 from magloc.localization.fit.results import EVERYWHERE, Intervals, is_observable_set, span
 from magloc.localization.uncertainty.range_interval import levels, ranges_of, relative_range_sigma, rise, union
 
 LARGEST_GAUSSIAN_SIGMA = 0.04
 """Standard deviations of position and moment, over range and moment, up to which their errors are Gaussian."""
-CERTAIN_WEIGHT = 0.99
-"""Weight from which on a solution is as good as the only one."""
 
 
 def log_evidence_volume(covariance: FloatArray, moment: FloatArray, offset_m: FloatArray | None = None) -> FloatArray:
@@ -141,7 +139,7 @@ def widened(
         less than the range itself.
     """
     distance = np.linalg.norm(offset_m, axis=-1)
-    farther = np.maximum(distance - low_m, high_m - distance) / math.sqrt(RISE_95)
+    farther = np.maximum(distance - low_m, high_m - distance) / math.sqrt(DELTA_CHI2_95)
     wanted = np.where(np.isfinite(farther), farther, distance)
     place = slice(6 * source, 6 * source + 3)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -15,12 +15,12 @@ from scipy.special import chdtrc
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.compilation import over_rows
 from magloc.fields.dipole import MU0_OVER_4PI
+from magloc.levels import CERTAIN_WEIGHT, MISFIT
 from magloc.localization.fit.columns import Solutions
 from magloc.localization.fit.gauss_newton import covariances
 from magloc.localization.fit.optima import Optima
-from magloc.localization.fit.results import EVERYWHERE, MISFIT, Intervals, is_observable_set, span
+from magloc.localization.fit.results import EVERYWHERE, Intervals, is_observable_set, span
 from magloc.localization.uncertainty.ambiguity import (
-    CERTAIN_WEIGHT,
     LARGEST_GAUSSIAN_SIGMA,
     Rivals,
     log_evidence_volume,

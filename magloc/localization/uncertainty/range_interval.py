@@ -41,7 +41,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import chndtr, erfc
 
 from arrays.typing import FloatArray
-from magloc.chi_square import RISE_95, energy_threshold
+from magloc.chi_square import energy_threshold
+from magloc.levels import DELTA_CHI2_95
 from magloc.localization.fit.results import Intervals
 
 # Signals so many standard deviations above the root of the threshold are seen for certain.
@@ -67,7 +68,7 @@ def is_detected(energy: ArrayLike, n_differences: int) -> NDArray[np.bool_]:
     return np.asarray(np.asarray(energy) > energy_threshold(n_differences))
 
 
-def rise(energy: ArrayLike, chi2: ArrayLike, n_differences: int, level: ArrayLike = RISE_95) -> FloatArray:
+def rise(energy: ArrayLike, chi2: ArrayLike, n_differences: int, level: ArrayLike = DELTA_CHI2_95) -> FloatArray:
     """By how much the profile of χ² may rise above the best solution's within the set of ranges.
 
     Parameters
@@ -124,13 +125,13 @@ def levels(chi2: FloatArray, weight: FloatArray) -> FloatArray:
     ndarray, shape (b,)
         3.84 with one solution, more with several ones.
     """
-    result = np.full(len(chi2), RISE_95)
+    result = np.full(len(chi2), DELTA_CHI2_95)
     several = np.flatnonzero((weight > 0.0).sum(axis=1) > 1)
     if not several.size:
         return result
     above, share = chi2[several] - chi2[several].min(axis=1, keepdims=True), weight[several]
     above = np.where(share > 0.0, above, 0.0)
-    low, high = np.full(several.size, RISE_95), RISE_95 + above.max(axis=1, initial=0.0)
+    low, high = np.full(several.size, DELTA_CHI2_95), DELTA_CHI2_95 + above.max(axis=1, initial=0.0)
     for _ in range(_N_BISECTIONS):
         middle = 0.5 * (low + high)
         # P(χ²_1 > x) = erfc(√(x/2)).
@@ -186,7 +187,7 @@ def gaussian_ranges(covariance: FloatArray, offset_m: FloatArray, unit_m: float)
     """
     alpha = np.arctan2(unit_m, np.linalg.norm(offset_m, axis=-1))
     sigma = np.sin(alpha) * np.cos(alpha) * relative_range_sigma(covariance, offset_m)
-    reach = math.sqrt(RISE_95) * np.where(np.isfinite(sigma), sigma, np.inf)
+    reach = math.sqrt(DELTA_CHI2_95) * np.where(np.isfinite(sigma), sigma, np.inf)
     first, last = np.maximum(alpha - reach, -0.5 * np.pi), np.minimum(alpha + reach, 0.5 * np.pi)
     return ranges_of(np.stack([first, last], axis=-1), unit_m)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.chi_square import RISE_95
+from magloc.levels import DELTA_CHI2_95
 from magloc.localization.fit.gauss_newton import JointFits, refine
 from magloc.localization.uncertainty.range_interval import ranges_of, relative_range_sigma
 from magloc.measurement.whitened import WhitenedModel
@@ -99,7 +99,7 @@ def ranges_within(
 
     The first steps are taken from the covariances of the fits (b, 6 K, 6 K).
     """
-    allowed = np.full(len(y), RISE_95) if rise is None else rise
+    allowed = np.full(len(y), DELTA_CHI2_95) if rise is None else rise
     offset = problem.position(fits.q)[:, source] - problem.centroid
     sigma = relative_range_sigma(covariance[:, 6 * source :, 6 * source :], offset)
     return ranges_of(profile_stretches(problem, y, fits, source, sigma, allowed), problem.radius)

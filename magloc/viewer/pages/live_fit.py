@@ -12,8 +12,8 @@ from arrays.array import SensorArray
 from arrays.differences import Differences, decorrelated_differences
 from arrays.noise import reading_covariance, reading_errors
 from arrays.typing import FloatArray
-from magloc.chi_square import RISE_95
 from magloc.fields.dipole import MU0_OVER_4PI
+from magloc.levels import DELTA_CHI2_95
 from magloc.localization.fit.results import Fix, Solution, is_observable, open_ended
 from magloc.localization.locator import Locator
 from magloc.localization.search.single_source import N_UNKNOWNS
@@ -164,7 +164,7 @@ def range_interval(offset_m: FloatArray, covariance_m2: FloatArray, radius_m: fl
     """
     distance = float(np.linalg.norm(offset_m))
     if not distance > 0.0:
-        return 0.0, float(np.sqrt(RISE_95 * np.trace(covariance_m2)))
+        return 0.0, float(np.sqrt(DELTA_CHI2_95 * np.trace(covariance_m2)))
     low, high = gaussian_ranges(covariance_m2, offset_m, radius_m).tolist()
     return low, high
 

@@ -19,11 +19,11 @@ from scipy.stats import chi2 as chi2_distribution
 from arrays.array import SensorArray
 from arrays.geometries import cube, tetrahedron
 from arrays.sensor import Sensor
-from magloc.chi_square import RISE_95
+from magloc.levels import DELTA_CHI2_95, FALSE_ALARM
 from magloc.localization.fit.columns import in_stable_order
 from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.fit.results import Fix, Solution, Source
-from magloc.localization.search.multi_source import FALSE_ALARM, most_sources
+from magloc.localization.search.multi_source import most_sources
 from tests.magloc.localization.fit.test_gauss_newton import (
     AMBIENT,
     array_of,
@@ -298,7 +298,7 @@ class TestUncertainty:
 
                 start = np.concatenate([[0.0, 0.0], position[1 - k], moment.ravel() / size])
                 found = scipy.optimize.least_squares(residual, start, jac="3-point", method="lm", x_scale="jac")
-                assert 2.0 * found.cost - best.chi2 == pytest.approx(RISE_95, abs=0.05)
+                assert 2.0 * found.cost - best.chi2 == pytest.approx(DELTA_CHI2_95, abs=0.05)
 
     def test_an_observable_range_is_a_closed_interval(self, pairs):
         for source in (source for fix in pairs for source in fix.solutions[0].sources):

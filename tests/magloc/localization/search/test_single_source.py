@@ -24,7 +24,7 @@ from arrays.geometries import axial, cross, square, tetrahedron
 from arrays.noise import proportional_noise
 from arrays.sensor import Sensor
 from arrays.whitening import whitening
-from magloc.chi_square import RISE_95
+from magloc.levels import DELTA_CHI2_95
 from magloc.localization.fit import variable_projection_compiled
 from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.fit.variable_projection import best_moment, projected_chi2, unit_basis
@@ -241,7 +241,7 @@ class TestUncertainty:
                 u = (s.position_m - problem.centroid) / radius
                 start = [np.arccos(u[2]), np.arctan2(u[1], u[0])]
                 profile = scipy.optimize.minimize(chi2, start, method="Nelder-Mead", options={"xatol": 1e-7}).fun
-                assert profile - s.chi2 == pytest.approx(RISE_95, abs=0.05)
+                assert profile - s.chi2 == pytest.approx(DELTA_CHI2_95, abs=0.05)
 
     def test_far_sources_have_no_observable_range(self):
         rng = np.random.default_rng(9)

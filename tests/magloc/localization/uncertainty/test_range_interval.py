@@ -23,8 +23,8 @@ from arrays.array import SensorArray
 from arrays.geometries import square, tetrahedron
 from arrays.sensor import Sensor
 from arrays.whitening import whitening
-from magloc.chi_square import RISE_95
 from magloc.directions import fibonacci_directions
+from magloc.levels import DELTA_CHI2_95
 from magloc.localization.fit.results import EVERYWHERE, Fix, Intervals, Solution, Source, is_observable_set
 from magloc.localization.fit.variable_projection import projected_chi2
 from magloc.localization.uncertainty.ambiguity import weights
@@ -336,7 +336,7 @@ class TestRise:
     """3.84 for a strong signal with one solution, more for weak ones and for several."""
 
     def test_strong_signals(self) -> None:
-        assert_allclose(rise([1e3, 1e5, 1e9], [5.0, 5.0, 5.0], 9), RISE_95)
+        assert_allclose(rise([1e3, 1e5, 1e9], [5.0, 5.0, 5.0], 9), DELTA_CHI2_95)
 
     def test_nothing_detected(self) -> None:
         assert np.isinf(rise([20.0], [5.0], 9)).all()
@@ -361,8 +361,8 @@ class TestRise:
             return float(scipy.optimize.minimize_scalar(cost, bounds=bounds, method="bounded").fun)
 
         raised = float(rise(energy, chi2, k))
-        assert raised > RISE_95
-        assert best(chi2 + raised) - best(chi2) == pytest.approx(RISE_95, abs=0.01)
+        assert raised > DELTA_CHI2_95
+        assert best(chi2 + raised) - best(chi2) == pytest.approx(DELTA_CHI2_95, abs=0.01)
 
     def test_several_solutions_leave_a_twentieth_outside(self) -> None:
         rng = np.random.default_rng(9)
@@ -372,8 +372,8 @@ class TestRise:
         c = levels(5.0 + above, weight)
         outside = np.sum(weight * scipy.stats.chi2.sf(c[:, None] - above, 1), axis=1)
         assert_allclose(outside, 0.05, rtol=1e-4)
-        assert levels(np.array([[3.0, np.inf]]), np.array([[1.0, 0.0]]))[0] == RISE_95
-        assert levels(np.array([[3.0, 3.0]]), np.array([[0.5, 0.5]]))[0] == pytest.approx(RISE_95, abs=1e-5)
+        assert levels(np.array([[3.0, np.inf]]), np.array([[1.0, 0.0]]))[0] == DELTA_CHI2_95
+        assert levels(np.array([[3.0, 3.0]]), np.array([[0.5, 0.5]]))[0] == pytest.approx(DELTA_CHI2_95, abs=1e-5)
 
 
 class TestWeights:
