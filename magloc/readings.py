@@ -20,7 +20,7 @@ from os import PathLike
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from arrays.array import AMBIENT_CHANNELS, SensorArray
 from arrays.io.csv import Columns, Table, read_table, table_of_columns, table_of_text
@@ -181,6 +181,11 @@ class Readings:
         if self.array_position_m is None or self.array_rotation is None:
             return None
         return self.array_position_m, self.array_rotation
+
+
+def as_readings(values: Readings | ArrayLike) -> Readings:
+    """Readings as they are, or from values (n, C) or (C,) [T]."""
+    return values if isinstance(values, Readings) else Readings(np.atleast_2d(np.asarray(values, dtype=np.float64)))
 
 
 def read_readings(

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from os import PathLike
-from pathlib import Path
 
 import numpy as np
 
@@ -35,11 +34,14 @@ class Truth:
         Position of the source [m]; z is NaN where the file does not give it.
     moment_Am2 : ndarray, shape (n, 3), optional
         Moment of the source [A·m²].
+    name : str
+        What errors call it: the file that it was read from.
     """
 
     time_s: FloatArray
     position_m: FloatArray
     moment_Am2: FloatArray | None = None
+    name: str = "truth"
 
 
 def read_truth(path: str | PathLike[str]) -> Truth:
@@ -64,7 +66,7 @@ def read_truth(path: str | PathLike[str]) -> Truth:
     columns = TRUE_POSITION_COLUMNS if "z_m" in table.header else TRUE_POSITION_COLUMNS[:2]
     position_m[:, : len(columns)] = table.complete(columns)
     moment_Am2 = table.complete(TRUE_MOMENT_COLUMNS) if table.has_group(TRUE_MOMENT_COLUMNS) else None
-    return Truth(time_s, position_m, moment_Am2)
+    return Truth(time_s, position_m, moment_Am2, str(path))
 
 
 def rows_of_same_time(readings: Readings, truth: Truth) -> tuple[IntArray, IntArray]:
@@ -78,7 +80,7 @@ def rows_of_same_time(readings: Readings, truth: Truth) -> tuple[IntArray, IntAr
     return np.flatnonzero(same), order[nearest[same]]
 
 
-def truth_of_rows(readings: Readings, truth: Truth, path: Path) -> tuple[FloatArray, FloatArray | None]:
+def truth_of_rows(readings: Readings, truth: Truth) -> tuple[FloatArray, FloatArray | None]:
     """True position and moment of rows (n, 3), interpolated but not over a gap; NaN where the truth says nothing."""
     order = np.argsort(truth.time_s, kind="stable")
     times, wanted = truth.time_s[order], readings.time_s
@@ -89,7 +91,7 @@ def truth_of_rows(readings: Readings, truth: Truth, path: Path) -> tuple[FloatAr
     longest = _LONGEST_STEP * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     known = exact | ((times[before] <= wanted) & (wanted <= times[after]) & (length <= longest))
     if not known.any():
-        raise InputError(f"{path}: found none of the times of the readings, expected rows with the same time_s.")
+        raise InputError(f"{truth.name}: found none of the times of the readings, expected rows with the same time_s.")
     share = np.divide(wanted - times[before], length, out=np.zeros_like(wanted), where=length > 0.0)[:, None]
 
     def of_rows(values: FloatArray) -> FloatArray:

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from arrays import geometries
 from arrays.array import SensorArray
 from magloc.measurement.differences import predicted_channels
+from magloc.readings import Readings
 from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
 from magloc.tracking.tracker import Tracker
@@ -37,7 +38,7 @@ def readings_of(array: SensorArray, p: FloatArray, m: FloatArray, seed: int = 0)
 
 
 def rows_from(time_s: FloatArray, readings_T: FloatArray) -> list[Row]:
-    return list(rows_of(time_s, readings_T))
+    return list(rows_of(Readings(readings_T, time_s=time_s)))
 
 
 def statuses(points: list[TrackPoint]) -> list[str]:

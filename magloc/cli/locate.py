@@ -2,34 +2,70 @@
 
 from __future__ import annotations
 
-import math
-import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
 from cyclopts import Parameter
 
+import magloc
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
+from arrays.io.outputs import refuse_file
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, print_json, progress
-from magloc.cli.options import print_note
+from magloc.cli.options import KnownOptions, print_note
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from arrays.array import SensorArray
     from magloc.localization.fit.fixes import Fixes
-    from magloc.localization.fit.prior import SourcePrior
     from magloc.readings import Readings
 
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_BOUNDS = re.compile(rf"(?:(?P<below>{_NUMBER})<(?=[xyz]<))?(?P<axis>[xyz])(?P<sign>[<>])(?P<bound>{_NUMBER})")
 # Of a known place from the array, along each axis: farther than any field that can be measured, and not out of range.
 _FARTHEST_M = 1e6
+
+
+@Parameter(name="*", group="Fixes")
+@dataclass(frozen=True)
+class FixOptions:
+    """What is looked for in every row.
+
+    Parameters
+    ----------
+    sources : str
+        Number of sources in every row, or "auto": as many as the readings support, five at most. One by default.
+    position : tuple of 3 floats
+        Where the source is [m], in the frame of the results: only its moment is looked for.
+    average : bool
+        Average all rows to one fix. The array and the source must stand still.
+    ambient_gradient : bool
+        Take the gradient of the geomagnetic field into account too (tens of pT/m).
+    body_length_m : float
+        Length of the object; flags fixes that are nearer than three lengths, where it is no dipole.
+    keep_sensors : bool
+        Use all sensors, also those that contradict the others.
+    """
+
+    sources: str | None = None
+    position: Vector | None = None
+    average: Flag = False
+    ambient_gradient: Flag = False
+    body_length_m: float | None = None
+    keep_sensors: Flag = False
+
+    @property
+    def n_sources(self) -> int | Literal["auto"]:
+        """The number of sources that is asked for."""
+        if self.sources is None:
+            return 1
+        if self.sources == "auto":
+            return "auto"
+        try:
+            return int(self.sources)
+        except ValueError:
+            raise InputError(f"--sources: found {self.sources!r}, expected a whole number or auto.") from None
 
 
 def locate(
@@ -37,18 +73,8 @@ def locate(
     /,
     *,
     array: Path,
-    sensors: str | None = None,
-    sources: str | None = None,
-    position: Vector | None = None,
-    average: Flag = False,
-    region: str | None = None,
-    max_moment_Am2: Annotated[float | None, Parameter(name="--max-moment-Am2")] = None,
-    place: Vector | None = None,
-    date: str | None = None,
-    geomagnetic_model: str | None = None,
-    ambient_gradient: Flag = False,
-    body_length_m: float | None = None,
-    keep_sensors: Flag = False,
+    known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
+    wanted: FixOptions = FixOptions(),
     truth: Path | None = None,
     out: Path | None = None,
     json: Flag = False,
@@ -72,32 +98,10 @@ def locate(
         Readings file (CSV).
     array : Path
         Array file (TOML).
-    sensors : str
-        Ids of the sensors to use, separated by commas; columns of others are ignored. All by default.
-    sources : str
-        Number of sources in every row, or "auto": as many as the readings support, five at most. One by default.
-    position : tuple of 3 floats
-        Where the source is [m], in the frame of the results: only its moment is looked for.
-    average : bool
-        Average all rows to one fix. The array and the source must stand still.
-    region : str
-        Where the source is known to be, in m in the array's frame, as "z>0" or "-1<x<1,z>0"; solutions elsewhere are
-        left out.
-    max_moment_Am2 : float
-        Largest moment that the source can have [A·m²]; solutions with a larger one are left out.
-    place : tuple of 3 floats
-        Latitude, longitude [deg] and height [m] of the array, for the ambient field of scalar sensors. The world frame,
-        or that of the array if the readings have no pose, is then east, north, up.
-    date : str
-        When, such as 2026-11-21; goes with --place.
-    geomagnetic_model : str
-        IGRF-14 (1900 to 2030) or WMM2025 (2025 to 2030). IGRF-14 by default.
-    ambient_gradient : bool
-        Take the gradient of the geomagnetic field into account too (tens of pT/m).
-    body_length_m : float
-        Length of the object; flags fixes that are nearer than three lengths, where it is no dipole.
-    keep_sensors : bool
-        Use all sensors, also those that contradict the others.
+    known : KnownOptions
+        What is known of the sensors, of the source and of the ambient field.
+    wanted : FixOptions
+        What is looked for in every row.
     truth : Path
         Truth file (CSV) to draw in the figures, with the errors; goes with --out.
     out : Path
@@ -108,47 +112,43 @@ def locate(
     common : CommonOptions
         Common options.
     """
-    from arrays.array_file import read_array
-    from arrays.io.outputs import refuse_file
     from magloc.ambient import with_ambient_field
-    from magloc.cli.options import place_of_options
     from magloc.localization.files import json_of_fixes
     from magloc.localization.fit.table import lines_of_fixes
-    from magloc.localization.locator import locate as fixes_of
     from magloc.localization.locator import used_rows
-    from magloc.readings import read_readings
+    from magloc.truth import truth_of_rows
 
-    ids = None if sensors is None else [name.strip() for name in sensors.split(",")]
-    where = place_of_options(place, date, geomagnetic_model)
-    prior, n_sources = prior_of(region, max_moment_Am2), _n_sources(sources)
-    if body_length_m is not None and not body_length_m > 0.0:
-        raise InputError(f"--body-length-m: found {body_length_m:g}, expected a positive length.")
-    if position is not None and (sources is not None or region is not None):
-        other = "--sources" if sources is not None else "--region"
-        raise InputError(f"--position: found it together with {other}, expected one of them.")
+    where, prior, n_sources = known.where, known.prior, wanted.n_sources
+    length_m, position, joint = wanted.body_length_m, wanted.position, wanted.sources is not None
+    if length_m is not None and not length_m > 0.0:
+        raise InputError(f"--body-length-m: found {length_m:g}, expected a positive length.")
+    if position is not None and (joint or known.region is not None):
+        raise InputError(
+            f"--position: found it together with {'--sources' if joint else '--region'}, expected one of them."
+        )
     if truth is not None and out is None:
         raise InputError("--truth: found no --out, expected a folder for the figures with it.")
     if out is not None:
         refuse_file(out, "--out")
-    used = subset_of(read_array(array), ids, array)
-    rows = read_readings(readings, used, sensors=ids, still=average)
+    used = known.array(array)
+    rows = magloc.read_readings(readings, used, sensors=known.ids, still=wanted.average)
     if position is not None:
         _refuse_farther(position, rows)
-    used, ambient_T = with_ambient_field(used, rows, where, gradient=ambient_gradient)
+    used, ambient_T = with_ambient_field(used, rows, where, gradient=wanted.ambient_gradient)
     try:
-        pictured, noisy, _ = used_rows(rows, used, average=average)
-        true_position_m = None if truth is None else _true_position(pictured, truth)
+        pictured, noisy, _ = used_rows(rows, used, average=wanted.average)
+        true_position_m = None if truth is None else truth_of_rows(pictured, magloc.read_truth(truth))[0]
         with progress(len(rows), "rows", quiet=common.quiet) as advance:
-            fixes = fixes_of(
+            fixes = magloc.locate(
                 used,
                 rows,
                 sources=n_sources,
                 position_m=position,
                 prior=prior,
                 ambient_T=ambient_T,
-                body_length_m=body_length_m,
-                exclude_faulty=not keep_sensors,
-                average=average,
+                body_length_m=length_m,
+                exclude_faulty=not wanted.keep_sensors,
+                average=wanted.average,
                 seed=common.seed,
                 progress=advance,
             )
@@ -156,13 +156,13 @@ def locate(
         raise InputError(f"{readings}: {error}") from None
     except ValueError as error:
         sentence = str(error).removeprefix("Input ")
-        option = "" if sentence.startswith("array") else _option_of(sentence, region, sources)
+        option = "" if sentence.startswith("array") else _option_of(sentence, known.region, wanted.sources)
         raise InputError(f"{option or array}: {sentence}{_advice(sentence, used)}") from None
 
     if json:
-        print_json(json_of_fixes(fixes, joint=sources is not None))
+        print_json(json_of_fixes(fixes, joint=joint))
     else:
-        print("\n".join(lines_of_fixes(fixes, joint=sources is not None)))
+        print("\n".join(lines_of_fixes(fixes, joint=joint)))
     reasons = counted_reasons(reason for reason, solved in zip(fixes.reason, fixes.solved, strict=True) if not solved)
     n_solved = int(fixes.solved.sum())
     if not n_solved:
@@ -179,19 +179,6 @@ def locate(
         print_note(note)
 
 
-def subset_of(array: SensorArray, ids: Sequence[str] | None, path: Path) -> SensorArray:
-    """The sensors of an array that the fixes use."""
-    if ids is None:
-        return array
-    for name in ids:
-        if name not in array.ids:
-            raise InputError(f"--sensors: found {name!r}, expected ids of sensors in {path}: {', '.join(array.ids)}.")
-    try:
-        return array.subset(ids)
-    except ValueError as error:
-        raise InputError(f"--sensors {','.join(ids)}: {error}") from None
-
-
 def _refuse_farther(position: Vector, rows: Readings) -> None:
     """Refuse a place that is too far away from the array in some row."""
     import numpy as np
@@ -202,25 +189,6 @@ def _refuse_farther(position: Vector, rows: Readings) -> None:
         raise InputError(
             f"--position: found a place {farthest:g} m from the array, expected one within {_FARTHEST_M:g} m."
         )
-
-
-def _true_position(rows: Readings, path: Path) -> NDArray[np.float64]:
-    from magloc.truth import read_truth, truth_of_rows
-
-    position_m, _ = truth_of_rows(rows, read_truth(path), path)
-    return position_m
-
-
-def _n_sources(option: str | None) -> int | Literal["auto"]:
-    """The number of sources that is asked for."""
-    if option is None:
-        return 1
-    if option == "auto":
-        return "auto"
-    try:
-        return int(option)
-    except ValueError:
-        raise InputError(f"--sources: found {option!r}, expected a whole number or auto.") from None
 
 
 def _option_of(sentence: str, region: str | None, sources: str | None) -> str:
@@ -236,33 +204,6 @@ def _advice(sentence: str, array: SensorArray) -> str:
     if sentence.startswith("array must give") and array.channel_is_scalar.any():
         return " Add sensors, or name the place of the source with --position."
     return ""
-
-
-def prior_of(region: str | None, largest_moment: float | None) -> SourcePrior:
-    """What the options say of the source."""
-    from magloc.localization.fit.prior import SourcePrior
-
-    low, high = [-math.inf] * 3, [math.inf] * 3
-    for part in [] if region is None else region.split(","):
-        bounds = _BOUNDS.fullmatch(part.replace(" ", ""))
-        if not bounds:
-            raise InputError(f"--region: found {part.strip()!r}, expected bounds such as z>0 or -1<x<1, in m.")
-        i = "xyz".index(bounds["axis"])
-        lower = bounds["below"] or (bounds["bound"] if bounds["sign"] == ">" else None)
-        upper = bounds["bound"] if bounds["sign"] == "<" else None
-        low[i] = max(low[i], float(lower)) if lower else low[i]
-        high[i] = min(high[i], float(upper)) if upper else high[i]
-        if not low[i] < high[i]:
-            raise InputError(
-                f"--region: found {region!r}, expected bounds that leave some room along {bounds['axis']}."
-            )
-    if largest_moment is not None and not largest_moment > 0.0:
-        raise InputError(f"--max-moment-Am2: found {largest_moment:g}, expected a positive number.")
-    return SourcePrior(
-        (low[0], low[1], low[2]),
-        (high[0], high[1], high[2]),
-        math.inf if largest_moment is None else largest_moment,
-    )
 
 
 def _notes(fixes: Fixes) -> Iterator[str]:

@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Annotated
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+import arrays
+import magloc
 from arrays.io.arguments import whole_number
 from arrays.io.errors import InputError
+from arrays.typing import Vector
 from magloc.ambient import Place
 from magloc.cli import framework
+
+if TYPE_CHECKING:
+    from arrays.array import SensorArray
+    from magloc.localization.fit.prior import SourcePrior
 
 
 def print_note(text: str) -> None:
@@ -36,18 +46,95 @@ def naming_scheduler() -> Iterator[None]:
         raise InputError(f"--{error}") from None
 
 
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_BOUNDS = re.compile(rf"(?:(?P<below>{_NUMBER})<(?=[xyz]<))?(?P<axis>[xyz])(?P<sign>[<>])(?P<bound>{_NUMBER})")
 _DATE = re.compile(r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}(:\d{2}(\.\d+)?)?)?")
 
 
-def place_of_options(place: tuple[float, float, float] | None, date: str | None, model: str | None) -> Place | None:
-    """The place that the options name, or None if they name none."""
-    if place is None and date is None and model is None:
-        return None
-    if place is None:
-        given = "--date" if date is not None else "--geomagnetic-model"
-        raise InputError(f"{given}: found no --place, expected --place LAT LON ALT_M with it.")
-    if date is None:
-        raise InputError("--place: found no --date, expected the date of the readings, such as --date 2026-11-21.")
-    if not _DATE.fullmatch(date):
-        raise InputError(f"--date: found {date!r}, expected a date such as 2026-11-21.")
-    return Place(*place, date, model or "IGRF-14")
+@Parameter(name="*", group="What is known")
+@dataclass(frozen=True)
+class KnownOptions:
+    """What is known of the sensors, of the source and of the ambient field.
+
+    Parameters
+    ----------
+    sensors : str
+        Ids of the sensors to use, separated by commas; columns of others are ignored. All by default.
+    region : str
+        Where the source is known to be, in m in the array's frame, as "z>0" or "-1<x<1,z>0"; solutions elsewhere are
+        left out.
+    max_moment_Am2 : float
+        Largest moment that the source can have [A·m²]; solutions with a larger one are left out.
+    place : tuple of 3 floats
+        Latitude, longitude [deg] and height [m] of the array, for the ambient field of scalar sensors. The world frame,
+        or that of the array if the readings have no pose, is then east, north, up.
+    date : str
+        When, such as 2026-11-21; goes with --place.
+    geomagnetic_model : str
+        IGRF-14 (1900 to 2030) or WMM2025 (2025 to 2030). IGRF-14 by default.
+    """
+
+    sensors: str | None = None
+    region: str | None = None
+    max_moment_Am2: Annotated[float | None, Parameter(name="--max-moment-Am2")] = None
+    place: Vector | None = None
+    date: str | None = None
+    geomagnetic_model: str | None = None
+
+    @property
+    def ids(self) -> list[str] | None:
+        """Ids of the sensors in use, None for all."""
+        return None if self.sensors is None else [name.strip() for name in self.sensors.split(",")]
+
+    def array(self, path: Path) -> SensorArray:
+        """The array of a file, reduced to the sensors in use."""
+        array, ids = arrays.read_array(path), self.ids
+        if ids is None:
+            return array
+        for name in ids:
+            if name not in array.ids:
+                expected = f"ids of sensors in {path}: {', '.join(array.ids)}"
+                raise InputError(f"--sensors: found {name!r}, expected {expected}.")
+        try:
+            return array.subset(ids)
+        except ValueError as error:
+            raise InputError(f"--sensors {','.join(ids)}: {error}") from None
+
+    @property
+    def prior(self) -> SourcePrior:
+        """What is known of the source."""
+        low, high = [-math.inf] * 3, [math.inf] * 3
+        for part in [] if self.region is None else self.region.split(","):
+            bounds = _BOUNDS.fullmatch(part.replace(" ", ""))
+            if not bounds:
+                raise InputError(f"--region: found {part.strip()!r}, expected bounds such as z>0 or -1<x<1, in m.")
+            i = "xyz".index(bounds["axis"])
+            lower = bounds["below"] or (bounds["bound"] if bounds["sign"] == ">" else None)
+            upper = bounds["bound"] if bounds["sign"] == "<" else None
+            low[i] = max(low[i], float(lower)) if lower else low[i]
+            high[i] = min(high[i], float(upper)) if upper else high[i]
+            if not low[i] < high[i]:
+                raise InputError(
+                    f"--region: found {self.region!r}, expected bounds that leave some room along {bounds['axis']}."
+                )
+        if self.max_moment_Am2 is not None and not self.max_moment_Am2 > 0.0:
+            raise InputError(f"--max-moment-Am2: found {self.max_moment_Am2:g}, expected a positive number.")
+        return magloc.SourcePrior(
+            (low[0], low[1], low[2]),
+            (high[0], high[1], high[2]),
+            math.inf if self.max_moment_Am2 is None else self.max_moment_Am2,
+        )
+
+    @property
+    def where(self) -> Place | None:
+        """Where and when the geomagnetic field is wanted, None where the options do not ask for it."""
+        if self.place is None and self.date is None and self.geomagnetic_model is None:
+            return None
+        if self.place is None:
+            given = "--date" if self.date is not None else "--geomagnetic-model"
+            raise InputError(f"{given}: found no --place, expected --place LAT LON ALT_M with it.")
+        if self.date is None:
+            raise InputError("--place: found no --date, expected the date of the readings, such as --date 2026-11-21.")
+        if not _DATE.fullmatch(self.date):
+            raise InputError(f"--date: found {self.date!r}, expected a date such as 2026-11-21.")
+        return Place(*self.place, self.date, self.geomagnetic_model or "IGRF-14")

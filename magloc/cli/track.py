@@ -4,29 +4,30 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
+import magloc
 from arrays.io.arguments import Flag
-from arrays.io.errors import InputError
-from arrays.typing import Vector
+from arrays.io.errors import InputError, naming
+from arrays.io.outputs import refuse_file, refuse_one_for_two, refuse_unwritable
+from arrays.io.text import write_text
 from magloc.cli.framework import CommonOptions, print_json, progress
-from magloc.cli.options import print_note
+from magloc.cli.options import KnownOptions, print_note
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from arrays.array import SensorArray
     from magloc.ambient import Place
     from magloc.readings import Readings
     from magloc.tracking.consistency import Consistency
     from magloc.tracking.motion import MotionModel
     from magloc.tracking.results import TrackPoint
+    from magloc.tracking.track import Track
     from magloc.tracking.tracker import Tracker
 
 
@@ -57,6 +58,20 @@ class MotionOptions:
     motion: Literal["unknown", "wandering", "turn"] | None = None
     correlation_s: float | None = None
 
+    def model(self, *, smooth: bool) -> MotionModel:
+        """The motion model that the options name."""
+        for name in ("speed_m_s", "turn_deg_s", "correlation_s"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < math.inf:
+                raise InputError(f"--{name.replace('_', '-')}: found {value:g}, expected a positive number.")
+        turn = math.radians(self.turn_deg_s)
+        name = self.motion or ("wandering" if smooth else "unknown")
+        if name == "unknown":
+            return magloc.RandomWalk(self.speed_m_s, turn)
+        if name == "wandering":
+            return magloc.OrnsteinUhlenbeck(self.speed_m_s, turn, self.correlation_s)
+        return magloc.CoordinatedTurn(self.speed_m_s, turn)
+
 
 @Parameter(name="*", group="Conditioning of the readings")
 @dataclass(frozen=True)
@@ -80,6 +95,27 @@ class ConditioningOptions:
     mains_hz: float | None = None
     window_s: float | None = None
 
+    def apply(self, rows: Readings, array: SensorArray, path: Path) -> tuple[Readings, SensorArray]:
+        """Readings without those that saturate, conditioned, and the array with their noise."""
+        from magloc.averages import window_averages, window_averaging_array
+        from magloc.readings import without_saturated
+
+        if self.window_s is not None and not 0.0 < self.window_s < math.inf:
+            raise InputError(f"--window-s: found {self.window_s:g}, expected a positive number.")
+        rows = without_saturated(rows, array)
+        try:
+            if self.detrend:
+                rows = rows.detrended()
+            if self.high_pass_hz is not None:
+                rows = rows.high_passed(self.high_pass_hz)
+            if self.mains_hz is not None:
+                rows = rows.without_hum(self.mains_hz)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+        if self.window_s is None:
+            return rows, array
+        return window_averages(rows, self.window_s), window_averaging_array(array, rows, self.window_s)
+
 
 def track(
     readings: Annotated[Path, Parameter(allow_leading_hyphen=True)],
@@ -90,12 +126,7 @@ def track(
     smooth: Flag = False,
     json: Flag = False,
     jsonl: Flag = False,
-    sensors: str | None = None,
-    region: str | None = None,
-    max_moment_Am2: Annotated[float | None, Parameter(name="--max-moment-Am2")] = None,
-    place: Vector | None = None,
-    date: str | None = None,
-    geomagnetic_model: str | None = None,
+    known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
     geojson: Path | None = None,
     out: Path | None = None,
     motion: MotionOptions = MotionOptions(),
@@ -123,16 +154,8 @@ def track(
         Print one JSON object in place of the table.
     jsonl : bool
         Print one JSON line for every row, as soon as it is known.
-    sensors : str
-        Ids of the sensors to use, separated by commas; columns of others are ignored. All by default.
-    region, max_moment_Am2
-        What is known of the source when a track starts, as in locate.
-    place : tuple of 3 floats
-        Latitude, longitude [deg] and height [m] of the origin of the world frame, which is east, north, up.
-    date : str
-        When, for the ambient field of scalar sensors at that place.
-    geomagnetic_model : str
-        IGRF-14 or WMM2025.
+    known : KnownOptions
+        What is known of the sensors, of the source when a track starts, and of the ambient field.
     geojson : Path
         Write the track as a GeoJSON file; needs --place.
     out : Path
@@ -144,205 +167,104 @@ def track(
     common : CommonOptions
         Common options.
     """
-    import numpy as np
-
-    from arrays.array_file import read_array
-    from arrays.io.outputs import refuse_file, refuse_one_for_two, refuse_unwritable
-    from magloc.cli.locate import prior_of, subset_of
-    from magloc.cli.options import place_of_options
-    from magloc.cli.tables import report
-    from magloc.readings import read_readings, without_saturated
-    from magloc.tracking.batch import track_record
-    from magloc.tracking.consistency import consistency, nees_of_rows
-    from magloc.tracking.files import geojson_text
-    from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
-    from magloc.tracking.results import rows_of
-    from magloc.tracking.smoother import smoothed
-    from magloc.tracking.tracker import Tracker
-    from magloc.truth import read_truth, truth_of_rows
-
     if json and jsonl:
         raise InputError("--json: found it together with --jsonl, expected one of them.")
     if out is not None:
         refuse_file(out, "--out")
-    if geojson is not None and place is None:
+    if geojson is not None and known.place is None:
         raise InputError("--geojson: found no --place, expected the origin of the world frame with it.")
     refuse_one_for_two({"--out": out, "--geojson": geojson})
     if geojson is not None:
         refuse_unwritable(geojson, "--geojson")
-    where = None if place is not None and date is None else place_of_options(place, date, geomagnetic_model)
-    ids = None if sensors is None else [name.strip() for name in sensors.split(",")]
-    used = subset_of(read_array(array), ids, array)
-    model = _motion(motion, smooth=smooth)
-    prior = prior_of(region, max_moment_Am2)
+    # A place without a date may be there for the map alone.
+    where = None if known.place is not None and known.date is None else known.where
+    used, model, prior = known.array(array), motion.model(smooth=smooth), known.prior
     if str(readings) == STREAM:
         whole = smooth or json or any(option is not None for option in (truth, out, geojson))
         if whole or conditioning != ConditioningOptions():
             raise InputError("READINGS -: found an option that needs the whole record, expected a stream of --jsonl.")
-        _stream(used, ids, model, prior, where)
+        _stream(used, known, model, where)
         return
-    rows = without_saturated(read_readings(readings, used, sensors=ids, ordered=True), used)
-    rows, used = _conditioned(rows, used, conditioning, readings)
-    used, ambient_T = _ambient(used, rows, where)
-    try:
-        tracker = Tracker(used, model, prior=prior, keep_steps=smooth)
-    except ValueError as error:
-        raise InputError(f"{array}: {str(error).removeprefix('Input ')}") from None
-    records = list(rows_of(rows.time_s, rows.values_T, rows.array_position_m, rows.array_rotation, ambient_T))
-    points: list[TrackPoint] = []
-    with progress(len(records), "rows", quiet=common.quiet) as advance:
+    rows = magloc.read_readings(readings, used, sensors=known.ids, ordered=True)
+    rows, used = conditioning.apply(rows, used, readings)
+    used, rows = _in_ambient_field(used, rows, where)
+    with progress(len(rows), "rows", quiet=common.quiet) as advance, naming(str(array)):
         if jsonl and not smooth:
-            for point in tracker.run(records, advance):
-                points.append(point)
-                _print_line(point)
+            tracker = magloc.Tracker(used, model, prior=prior)
+            points = [_printed(point) for point in tracker.run(rows, advance)]
+            found = magloc.Track(tuple(points), rows, tracker)
         else:
-            points = track_record(tracker, records, advance)
-    if smooth:
-        points = smoothed(points, tracker.steps)
-    if not any(point.position_m is not None for point in points):
-        _print_points(points, None, json=json, jsonl=jsonl, printed=jsonl and not smooth)
-        raise _no_track(str(readings), {point.status for point in points})
-    result = truth_position = bound = nees = None
-    if truth is not None:
-        truth_position, moment = truth_of_rows(rows, read_truth(truth), truth)
-        complete = moment is not None and bool(np.isfinite(truth_position).all() and np.isfinite(moment).all())
-        if complete and moment is not None:
-            # Later rows make less error possible.
-            bound_of = smoothing_bound if smooth else posterior_bound
-            bound = bound_of(tracker, records, truth_position, moment)
-        result = consistency(points, tracker, records, truth_position, moment, bound)
-        if out is not None:
-            nees = nees_of_rows(points, tracker, records, truth_position, moment)
-    if geojson is not None and place is not None:
-        from arrays.io.text import write_text
-
-        write_text(geojson_text(points, place), geojson)
+            found = magloc.track(used, rows, motion=model, smooth=smooth, prior=prior, progress=advance)
+    printed = jsonl and not smooth
+    if not found.tracked.any():
+        _print_track(found, None, json=json, jsonl=jsonl, printed=printed)
+        raise _no_track(str(readings), found.status)
+    result = None if truth is None else found.consistency(magloc.read_truth(truth))
+    if geojson is not None and known.place is not None:
+        write_text(dumps(found.to_geojson(known.place), allow_nan=False) + "\n", geojson)
     if out is not None:
         from magloc.plots.tracks import write_picture
 
         write_picture(
-            points,
-            truth_position,
+            found,
+            None if result is None else result.true_position_m,
             out,
-            nees=nees,
-            bound_m=bound,
+            nees=None if result is None else (result.nees, result.nees_dof),
+            bound_m=None if result is None else result.bound_m,
             array_m=rows.array_position_m,
             quiet=common.quiet,
         )
-    _print_points(points, result, json=json, jsonl=jsonl, printed=jsonl and not smooth)
+    _print_track(found, result, json=json, jsonl=jsonl, printed=printed)
     if result is not None and not json:
-        print("\n".join(report(result)), file=sys.stderr if jsonl else sys.stdout)
+        print("\n".join(result.lines()), file=sys.stderr if jsonl else sys.stdout)
     if not (json or jsonl or common.quiet):
-        tracked = sum(point.position_m is not None for point in points)
-        print_note(f"{tracked} of {len(points)} rows tracked")
+        print_note(f"{found.tracked.sum()} of {len(found)} rows tracked")
 
 
-def _motion(options: MotionOptions, *, smooth: bool) -> MotionModel:
-    from magloc.tracking.motion import CoordinatedTurn, OrnsteinUhlenbeck, RandomWalk
-
-    for name in ("speed_m_s", "turn_deg_s", "correlation_s"):
-        value = getattr(options, name)
-        if value is not None and not 0.0 < value < math.inf:
-            raise InputError(f"--{name.replace('_', '-')}: found {value:g}, expected a positive number.")
-    turn = math.radians(options.turn_deg_s)
-    name = options.motion or ("wandering" if smooth else "unknown")
-    if name == "unknown":
-        return RandomWalk(options.speed_m_s, turn)
-    if name == "wandering":
-        return OrnsteinUhlenbeck(options.speed_m_s, turn, options.correlation_s)
-    return CoordinatedTurn(options.speed_m_s, turn)
-
-
-def _conditioned(
-    rows: Readings, array: SensorArray, options: ConditioningOptions, path: Path
-) -> tuple[Readings, SensorArray]:
-    from magloc.averages import window_averages, window_averaging_array
-
-    if options.window_s is not None and not 0.0 < options.window_s < math.inf:
-        raise InputError(f"--window-s: found {options.window_s:g}, expected a positive number.")
-    try:
-        if options.detrend:
-            rows = rows.detrended()
-        if options.high_pass_hz is not None:
-            rows = rows.high_passed(options.high_pass_hz)
-        if options.mains_hz is not None:
-            rows = rows.without_hum(options.mains_hz)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    if options.window_s is not None:
-        averaged = window_averages(rows, options.window_s)
-        return averaged, window_averaging_array(array, rows, options.window_s)
-    return rows, array
-
-
-def _ambient(array: SensorArray, rows: Readings, where: Place | None) -> tuple[SensorArray, NDArray[np.float64] | None]:
+def _in_ambient_field(array: SensorArray, rows: Readings, where: Place | None) -> tuple[SensorArray, Readings]:
     from magloc.ambient import with_ambient_field
 
-    return with_ambient_field(array, rows, where, gradient=False)
+    array, ambient_T = with_ambient_field(array, rows, where, gradient=False)
+    return array, replace(rows, ambient_T=ambient_T)
 
 
-def _print_points(
-    points: Sequence[TrackPoint], result: Consistency | None, *, json: bool, jsonl: bool, printed: bool
-) -> None:
+def _print_track(found: Track, result: Consistency | None, *, json: bool, jsonl: bool, printed: bool) -> None:
     """Print a finished track as it is asked for, unless its lines are `printed` already."""
-    from magloc.cli.tables import track_table
-    from magloc.tracking.files import json_entry
+    from magloc.tracking.files import json_of_track
 
     if json:
-        entries = {"results": [json_entry(point) for point in points]}
-        print_json(entries if result is None else {**entries, "consistency": result})
+        print_json(json_of_track(found, result))
     elif not jsonl:
-        print("\n".join(track_table(points)))
+        print(found.table())
     elif not printed:
-        for point in points:
-            _print_line(point)
+        for point in found:
+            _printed(point)
 
 
-def _no_track(readings: str, statuses: Collection[str]) -> InputError:
-    reasons = "; ".join(sorted(statuses)[:3])
+def _no_track(readings: str, statuses: Iterable[str]) -> InputError:
+    reasons = "; ".join(sorted(set(statuses))[:3])
     return InputError(f"{readings}: found no row where a source can be tracked ({reasons}).")
 
 
-def _print_line(point: TrackPoint) -> None:
+def _printed(point: TrackPoint) -> TrackPoint:
+    """The point, after its line is printed."""
     from magloc.tracking.files import json_entry
 
     print_json(json_entry(point))
     sys.stdout.flush()
+    return point
 
 
-def _stream(array: SensorArray, ids: list[str] | None, model: MotionModel, prior: object, where: Place | None) -> None:
+def _stream(array: SensorArray, known: KnownOptions, model: MotionModel, where: Place | None) -> None:
     """Answer every row of standard input by one line; none that is tracked is an InputError at its end."""
-    from magloc.readings import readings_of_text, without_saturated
-    from magloc.tracking.results import rows_of
-    from magloc.tracking.tracker import Tracker
-
-    lines = _lines_of_stdin()
-    header = next(lines, None)
-    if header is None:
-        raise InputError("standard input: found nothing, expected a header with time_s and the sensors' columns.")
     tracker: Tracker | None = None
     statuses: set[str] = set()
     is_tracked = False
-    last = -math.inf
-    for number, line in enumerate(lines, start=2):
-        if not line.strip():
-            continue
-        rows = without_saturated(
-            readings_of_text(f"{header}\n{line}", "standard input", array, sensors=ids, first_line=number), array
-        )
-        time = float(rows.time_s[0])
-        if time <= last:
-            raise InputError(
-                f"standard input, line {number}, column time_s: found {time:.15g} after {last:.15g}, expected time to"
-                " increase from row to row."
-            )
-        last = time
-        array_here, ambient = _ambient(array, rows, where)
+    for row in _rows_of_stdin(array, known.ids):
+        array_here, row_here = _in_ambient_field(array, row, where)
         if tracker is None:
-            tracker = Tracker(array_here, model, prior=prior)  # type: ignore[arg-type]
-        (row,) = rows_of(rows.time_s, rows.values_T, rows.array_position_m, rows.array_rotation, ambient)
-        point = tracker.advance(row)
-        _print_line(point)
+            tracker = magloc.Tracker(array_here, model, prior=known.prior)
+        point = _printed(tracker.update(row_here))
         statuses.add(point.status)
         is_tracked = is_tracked or point.position_m is not None
     if not statuses:
@@ -351,6 +273,24 @@ def _stream(array: SensorArray, ids: list[str] | None, model: MotionModel, prior
         raise _no_track("standard input", statuses)
 
 
-def _lines_of_stdin() -> Iterator[str]:
+def _rows_of_stdin(array: SensorArray, ids: list[str] | None) -> Iterator[Readings]:
+    """Every row of standard input below its header, as soon as it comes."""
+    from magloc.readings import readings_of_text
+
+    header = sys.stdin.readline()
+    if not header:
+        raise InputError("standard input: found nothing, expected a header with time_s and the sensors' columns.")
+    number, last = 1, -math.inf
     while line := sys.stdin.readline():
-        yield line.rstrip("\r\n")
+        number += 1
+        if not line.strip():
+            continue
+        row = readings_of_text(f"{header}{line}", "standard input", array, sensors=ids, first_line=number)
+        time = float(row.time_s[0])
+        if time <= last:
+            raise InputError(
+                f"standard input, line {number}, column time_s: found {time:.15g} after {last:.15g}, expected time to"
+                " increase from row to row."
+            )
+        last = time
+        yield row

@@ -31,7 +31,7 @@ from magloc.localization.search.single_source import N_UNKNOWNS, SingleSourceSea
 from magloc.localization.uncertainty.covariance import solutions_of
 from magloc.localization.uncertainty.range_interval import is_detected
 from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, checked_rows, whitened_rows
-from magloc.readings import Readings, saturated_channels, without_saturated
+from magloc.readings import Readings, as_readings, saturated_channels, without_saturated
 
 _LOG = logging.getLogger(__name__)
 _ROWS_AT_ONCE = 256
@@ -280,7 +280,7 @@ def locate(
     ValueError
         As of :class:`Locator`.
     """
-    measured = readings if isinstance(readings, Readings) else _as_readings(readings)
+    measured = as_readings(readings)
     n_complete = int(complete_rows(without_saturated(measured, array)).sum()) if average else 0
     if 0 < n_complete < len(measured):
         _LOG.info(f"note: {n_complete} of {len(measured)} rows are averaged, the others miss some readings")
@@ -302,11 +302,6 @@ def locate(
     fixes = locator.fit_rows(rows.values_T, ambient, time_s=rows.time_s, progress=progress)
     fixes = replace(fixes, saturated_channels=saturated)
     return fixes if pose is None else fixes.moved(*pose, frame="world")
-
-
-def _as_readings(values_T: ArrayLike) -> Readings:
-    values = np.atleast_2d(np.asarray(values_T, dtype=np.float64))
-    return Readings(values)
 
 
 def used_rows(

@@ -9,23 +9,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from arrays.io.csv import Column, write_columns
 from arrays.io.outputs import make_folder
+from arrays.typing import FloatArray, IntArray
 from magloc.plots import style
 from magloc.plots.style import bounds99, save
-from magloc.tracking.results import TrackPoint
+from magloc.tracking.results import TrackPoint, stacked
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from magloc.tracking.results import TrackPoint
-from arrays.typing import FloatArray
-
 _LOG = logging.getLogger(__name__)
-
-IntArray = NDArray[np.int64]
 _NAMES = ("x_m", "y_m", "z_m", "mx_Am2", "my_Am2", "mz_Am2")
 
 
@@ -63,17 +58,17 @@ def write_picture(
         The folder cannot be written.
     """
     make_folder(folder, "--out")
-    time, position, moment, covariance = columns_of(points)
+    time, position, moment, covariance = _columns_of(points)
     nis, nis_dof = np.array([point.nis for point in points]), np.array([point.nis_dof for point in points])
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    estimability = [np.full(6, np.nan) if point.estimability is None else point.estimability for point in points]
+    estimability = stacked(points, "estimability", 6)
     state = np.concatenate([position, moment], axis=1)
     columns: dict[str, Column] = {"time_s": time}
     columns |= dict(zip(_NAMES, state.T, strict=True))
     columns |= dict(zip((f"s_{name}" for name in _NAMES), sigma.T, strict=True))
     columns |= _square("nis", nis, nis_dof)
     components = (name.split("_")[0] for name in _NAMES)
-    columns |= dict(zip((f"estimability_{name}" for name in components), np.array(estimability).T, strict=True))
+    columns |= dict(zip((f"estimability_{name}" for name in components), estimability.T, strict=True))
     if truth_m is not None:
         columns |= dict(zip((f"true_{name}" for name in _NAMES), truth_m.T, strict=False))
     if nees is not None:
@@ -119,7 +114,7 @@ def track_figure(
     -------
     matplotlib.figure.Figure
     """
-    time, position, moment, covariance = columns_of(points)
+    time, position, moment, covariance = _columns_of(points)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     origin_m = np.zeros((1, 3)) if array_m is None else array_m
     extent = [position] + ([] if truth_m is None else [truth_m])
@@ -172,7 +167,7 @@ def track_figure(
 def consistency_figure(
     points: Sequence[TrackPoint],
     truth_m: FloatArray | None = None,
-    nees: tuple[FloatArray, NDArray[np.int64]] | None = None,
+    nees: tuple[FloatArray, IntArray] | None = None,
     bound_m: FloatArray | None = None,
 ) -> Figure:
     """Whether a track is as certain as it says: errors, NEES and NIS with bounds, and what the readings taught.
@@ -191,7 +186,7 @@ def consistency_figure(
     -------
     matplotlib.figure.Figure
     """
-    time, position, _, covariance = columns_of(points)
+    time, position, _, covariance = _columns_of(points)
     n_panels = 5 if truth_m is not None and nees is not None else 3
     figure = style.new_figure(1.35 * n_panels + 0.3)
     axes = list(figure.subplots(n_panels, 1, sharex=True))
@@ -202,9 +197,7 @@ def consistency_figure(
     nis = np.array([point.nis for point in points])
     nis_dof = np.array([point.nis_dof for point in points])
     style.squares_panel(axes[-3], time, nis, nis_dof, "NIS")
-    estimability = np.array(
-        [np.full(6, np.nan) if point.estimability is None else point.estimability for point in points]
-    )
+    estimability = stacked(points, "estimability", 6)
     for ax, first, what in ((axes[-2], 0, "position"), (axes[-1], 3, "moment")):
         for i, (name, colour, _, line) in enumerate(style.COMPONENTS):
             label = name if first == 0 else f"m{name}"
@@ -220,13 +213,14 @@ def consistency_figure(
     return figure
 
 
-def columns_of(points: Sequence[TrackPoint]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _columns_of(points: Sequence[TrackPoint]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Times (n,), positions, moments (n, 3) and covariances (n, 6, 6) of a track, NaN where there is none."""
-    time = np.array([point.time_s for point in points])
-    position = np.array([np.full(3, np.nan) if p.position_m is None else p.position_m for p in points])
-    moment = np.array([np.full(3, np.nan) if p.moment_Am2 is None else p.moment_Am2 for p in points])
-    covariance = np.array([np.full((6, 6), np.nan) if p.covariance is None else p.covariance for p in points])
-    return time, position, moment, covariance
+    return (
+        stacked(points, "time_s"),
+        stacked(points, "position_m", 3),
+        stacked(points, "moment_Am2", 3),
+        stacked(points, "covariance", 6, 6),
+    )
 
 
 def _at_least(width: float, low: float, high: float) -> tuple[float, float]:
@@ -244,7 +238,7 @@ def _plan(
     per_m: float,
 ) -> None:
     """Seen from above, with the array."""
-    _, position, _, covariance = columns_of(points)
+    _, position, _, covariance = _columns_of(points)
     shown = per_m * position
     if truth_m is not None:
         style.draw_truth(ax, per_m * truth_m[:, 0], per_m * truth_m[:, 1])

@@ -13,6 +13,7 @@ from scipy.special import chdtri
 from arrays.array import SensorArray
 from arrays.differences import decorrelated_differences
 from arrays.typing import FloatArray
+from magloc.levels import CONTRADICTION, DISAGREEMENT
 from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.fit.results import Fix, Solution
 from magloc.localization.locator import Locator, fit_at_rest
@@ -30,8 +31,6 @@ STACKED_POSITION_ERROR = 0.01
 """Standard deviation of the whole position over the range, for a start from several rows of which one alone does not
 determine the source: the prediction is then Gaussian in Cartesian coordinates, so that it must be as good as linear."""
 _BEYOND_DOUBT = 0.5 * START_RANGE_ERROR
-# Probability under noise below which a row contradicts a dipole.
-_CONTRADICTION = 1e-6
 # Another solution within this Δχ² forbids a start.
 _RIVAL_WITHIN = 9.0
 # Rows that together may determine a source at rest: how far back, how many, how often it is tried.
@@ -40,8 +39,6 @@ _STACKED_ROWS = 16
 _TRY_EVERY = 4
 # A source is as good as at rest while it moves by less than this share of its range.
 _AT_REST = 0.01
-# Probability under noise below which two successive proposals for a start disagree.
-_DISAGREEMENT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +199,7 @@ def _certain_solution(
     if not fix.solutions:
         return None, f"not acquired: {fix.reason}"
     best = fix.solutions[0]
-    if best.dof > 0 and best.chi2 > chdtri(best.dof, _CONTRADICTION):
+    if best.dof > 0 and best.chi2 > chdtri(best.dof, CONTRADICTION):
         return None, "not acquired: no dipole fits the readings"
     if not best.range_observable:
         return None, "not acquired: the range is not observable"
@@ -225,4 +222,4 @@ def _agree(before: Solution | None, after: Solution) -> bool:
         return False
     offset = after.position_m - before.position_m
     both = before.covariance[:3, :3] + after.covariance[:3, :3]
-    return bool(offset @ np.linalg.solve(both, offset) < chdtri(3, _DISAGREEMENT))
+    return bool(offset @ np.linalg.solve(both, offset) < chdtri(3, DISAGREEMENT))

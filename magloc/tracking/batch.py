@@ -8,13 +8,13 @@ import numpy as np
 from scipy.special import chdtri
 
 from magloc.kalman import estimability
+from magloc.levels import CONTRADICTION
 from magloc.measurement.rows import ambient_fields
 from magloc.tracking import batch_compiled as kernels
 from magloc.tracking.measurement import LEAST_SINGULAR
 from magloc.tracking.motion import N_SOURCE, LinearMotion
 from magloc.tracking.results import Prediction, Row, Step, TrackPoint
 from magloc.tracking.tracker import (
-    CONTRADICTION,
     LARGEST_GROWTH,
     LARGEST_RANGE_ERROR,
     MOST_ITERATIONS,
@@ -54,7 +54,7 @@ def track_record(
         if compiled is not None and tracker.is_tracking:
             points += compiled.follow(before)
         if len(points) < len(rows):
-            points.append(tracker.advance(rows[len(points)]))
+            points.append(tracker.update(rows[len(points)]))
         if progress is not None:
             progress(len(points) - before)
     return points

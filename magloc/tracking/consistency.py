@@ -15,16 +15,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from arrays.typing import FloatArray
+from arrays.typing import FloatArray, IntArray
 from magloc.chi_square import mean_bounds
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.results import Row, TrackPoint
 from magloc.tracking.tracker import Tracker
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Consistency:
     """A track against the truth.
 
@@ -47,6 +46,13 @@ class Consistency:
         Mean NIS over its degrees of freedom.
     nis_bounds : tuple of 2 floats
         Two-sided 99 % bounds of it; the innovations of a right filter are independent.
+    nees, nees_dof : ndarray, shape (n,)
+        NEES of every row, NaN where the source is not tracked or nothing is known of the truth, and the number of its
+        dimensions.
+    true_position_m : ndarray, shape (n, 3)
+        NaN where it is not known.
+    bound_m : ndarray, shape (n,), optional
+        The posterior Cramér-Rao bound of every row.
     """
 
     rows: int
@@ -57,6 +63,31 @@ class Consistency:
     nees_bounds: tuple[float, float]
     nis_per_dimension: float
     nis_bounds: tuple[float, float]
+    nees: FloatArray
+    nees_dof: IntArray
+    true_position_m: FloatArray
+    bound_m: FloatArray | None
+
+    def lines(self) -> list[str]:
+        """Errors against the truth, and what they should be."""
+        lines = [
+            f"against the truth, {self.tracked_rows} of {self.rows} rows tracked:",
+            f"  position rms {self.position_rms_m:.4g} m",
+        ]
+        if np.isfinite(self.position_bound_m):
+            ratio = self.position_rms_m / self.position_bound_m
+            lines[-1] += (
+                f", least possible {self.position_bound_m:.4g} m on average over such motions (posterior Cramér-Rao"
+                f" bound), ratio {ratio:.2f}"
+            )
+        for name, value, (low, high) in (
+            ("NEES", self.nees_per_dimension, self.nees_bounds),
+            ("NIS", self.nis_per_dimension, self.nis_bounds),
+        ):
+            lines.append(
+                f"  {name} per dimension {value:.3f}, 99 % bounds for independent rows {low:.3f} to {high:.3f}"
+            )
+        return lines
 
 
 def consistency(
@@ -67,25 +98,7 @@ def consistency(
     moment_Am2: FloatArray | None,
     bound_m: FloatArray | None = None,
 ) -> Consistency:
-    """Errors of a track.
-
-    Parameters
-    ----------
-    points : sequence of TrackPoint
-    tracker : Tracker
-        That made them.
-    rows : sequence of Row
-    position_m, moment_Am2 : ndarray, shape (n, 3)
-        Truth of every row in the track's frame; NaN where a coordinate is not known.
-        With the moment NEES is that of all six numbers, else that of the position.
-    bound_m : ndarray, shape (n,), optional
-        Posterior Cramér-Rao bound of every row: :func:`posterior_bound` of a filtered track, :func:`smoothing_bound`
-        of a smoothed one.
-
-    Returns
-    -------
-    Consistency
-    """
+    """Errors of a track; true coordinates (n, 3) are NaN where they are not known, the bound is that of every row."""
     squares, bounds, nis, nis_dof = [], [], 0.0, 0
     for i, point in enumerate(points):
         if point.position_m is None:
@@ -98,7 +111,7 @@ def consistency(
             squares.append(float(error @ error))
             if bound_m is not None:
                 bounds.append(float(bound_m[i]))
-    of_rows, dof_of_rows = nees_of_rows(points, tracker, rows, position_m, moment_Am2)
+    of_rows, dof_of_rows = _nees_of_rows(points, tracker, rows, position_m, moment_Am2)
     nees, nees_dof = float(np.nansum(of_rows)), int(dof_of_rows.sum())
     return Consistency(
         rows=int(np.isfinite(position_m).any(axis=1).sum()),
@@ -109,32 +122,24 @@ def consistency(
         nees_bounds=mean_bounds(nees_dof),
         nis_per_dimension=nis / nis_dof if nis_dof else math.nan,
         nis_bounds=mean_bounds(nis_dof),
+        nees=of_rows,
+        nees_dof=dof_of_rows,
+        true_position_m=position_m,
+        bound_m=bound_m,
     )
 
 
-def nees_of_rows(
+def _nees_of_rows(
     points: Sequence[TrackPoint],
     tracker: Tracker,
     rows: Sequence[Row],
     position_m: FloatArray,
     moment_Am2: FloatArray | None,
-) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Normalised estimation error squared of every row, see :func:`nees_of`.
-
-    Parameters
-    ----------
-    points, tracker, rows, position_m, moment_Am2
-        As of :func:`consistency`.
-
-    Returns
-    -------
-    nees : ndarray, shape (n,)
-        NaN where the source is not tracked, or nothing is known of the truth.
-    dof : ndarray of int, shape (n,)
-    """
+) -> tuple[FloatArray, IntArray]:
+    """Normalised estimation error squared of every row (n,), NaN where it has none, and its degrees of freedom (n,)."""
     moments = np.full_like(position_m, np.nan) if moment_Am2 is None else moment_Am2
     truth = np.concatenate([position_m, moments], axis=1)
-    nees, dof = np.full(len(points), np.nan), np.zeros(len(points), dtype=np.int64)
+    nees, dof = np.full(len(points), np.nan), np.zeros(len(points), dtype=np.intp)
     for i, point in enumerate(points):
         if point.position_m is None or point.moment_Am2 is None or point.covariance is None:
             continue

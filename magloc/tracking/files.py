@@ -1,29 +1,32 @@
-"""What a track looks like: JSON, table, GeoJSON, picture, and the report of its consistency."""
+"""Tracks in JSON and GeoJSON."""
 
 from __future__ import annotations
 
-import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-import numpy as np
-
-from arrays.io.errors import InputError, of_extra
-from magloc.tracking.results import TrackPoint
-
-if TYPE_CHECKING:
-    from arrays.typing import Vector
-import math
 from typing import Any
 
 import msgspec
+import numpy as np
 
+from arrays.io.errors import InputError
 from arrays.io.text import read_text
-from arrays.typing import FloatArray
-from magloc.tracking.results import TrackResult
+from arrays.typing import FloatArray, Vector
+from magloc.tracking.consistency import Consistency
+from magloc.tracking.results import TrackPoint, TrackResult
 
 _RIVAL_KEYS = ("position_m", "moment_Am2", "chi2", "dof", "weight")
+_CONSISTENCY_KEYS = (
+    "rows",
+    "tracked_rows",
+    "position_rms_m",
+    "position_bound_m",
+    "nees_per_dimension",
+    "nees_bounds",
+    "nis_per_dimension",
+    "nis_bounds",
+)
 
 
 def json_entry(point: TrackPoint) -> dict[str, object]:
@@ -50,23 +53,17 @@ def json_entry(point: TrackPoint) -> dict[str, object]:
     }
 
 
-def geojson_text(points: Sequence[TrackPoint], origin: Vector) -> str:
-    """A GeoJSON feature collection: the track as a line for every unbroken part, and every row as a point.
+def json_of_track(points: Sequence[TrackPoint], consistency: Consistency | None) -> dict[str, object]:
+    """What ``magloc track --json`` prints."""
+    entries: dict[str, object] = {"results": [json_entry(point) for point in points]}
+    if consistency is not None:
+        entries["consistency"] = {key: getattr(consistency, key) for key in _CONSISTENCY_KEYS}
+    return entries
 
-    Parameters
-    ----------
-    points : sequence of TrackPoint
-        In east, north, up from the origin [m].
-    origin : tuple of 3 floats
-        Latitude, longitude [deg] and height [m] of the origin.
 
-    Returns
-    -------
-    str
-        Coordinates are longitude, latitude [deg] and height above the ellipsoid [m], as RFC 7946 has them.
-    """
-    with of_extra("geo", "a place on the Earth"):
-        from pymap3d import enu2geodetic
+def geojson_of_track(points: Sequence[TrackPoint], origin: Vector) -> dict[str, Any]:
+    """:meth:`magloc.tracking.track.Track.to_geojson`."""
+    from pymap3d import enu2geodetic
 
     features: list[dict[str, object]] = []
     line: list[list[float]] = []
@@ -100,7 +97,7 @@ def geojson_text(points: Sequence[TrackPoint], origin: Vector) -> str:
         if len(part) > 1:
             geometry = {"type": "LineString", "coordinates": part}
             features.insert(0, {"type": "Feature", "geometry": geometry, "properties": {"name": "track"}})
-    return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"
+    return {"type": "FeatureCollection", "features": features}
 
 
 def _read_track(path: Path) -> TrackResult:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from arrays.typing import FloatArray
 from magloc.localization.fit.results import EVERYWHERE, Intervals, Solution, is_observable_set
 from magloc.localization.uncertainty.ambiguity import LARGEST_GAUSSIAN_SIGMA, relative_sigma
 from magloc.localization.uncertainty.range_interval import gaussian_ranges, union
+from magloc.readings import Readings
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,20 +138,21 @@ class Step:
     S: FloatArray
 
 
-def rows_of(
-    time_s: FloatArray,
-    readings_T: FloatArray,
-    array_position_m: FloatArray | None = None,
-    array_rotation: Rotation | None = None,
-    ambient_T: FloatArray | None = None,
-) -> Iterator[Row]:
-    """Rows of readings for a tracker, from columns as :class:`magloc.readings.Readings` has them."""
-    rotations = None if array_rotation is None else array_rotation.as_matrix()
-    for i, time in enumerate(time_s.tolist()):
-        row = Row(time, readings_T[i], ambient_T=None if ambient_T is None else ambient_T[i])
-        if array_position_m is not None and rotations is not None:
-            row = replace(row, origin_m=array_position_m[i], R_world_from_array=rotations[i])
+def rows_of(readings: Readings) -> Iterator[Row]:
+    """Rows of readings for a tracker."""
+    rotations = None if readings.pose is None else readings.pose[1].as_matrix()
+    for i, time in enumerate(readings.time_s.tolist()):
+        row = Row(time, readings.values_T[i], ambient_T=None if readings.ambient_T is None else readings.ambient_T[i])
+        if readings.array_position_m is not None and rotations is not None:
+            row = replace(row, origin_m=readings.array_position_m[i], R_world_from_array=rotations[i])
         yield row
+
+
+def stacked(points: Sequence[TrackPoint], name: str, *shape: int) -> FloatArray:
+    """A column of a track (n, ...), NaN where there is no track."""
+    empty = np.full(shape, np.nan)
+    values = [empty if value is None else value for value in (getattr(point, name) for point in points)]
+    return np.array(values, dtype=np.float64).reshape(len(points), *shape)
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,17 +30,17 @@ from magloc.kalman import (
     predict_square_root,
     symmetric_square_root,
 )
+from magloc.levels import CONTRADICTION
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import Solution
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
+from magloc.readings import Readings, without_saturated
 from magloc.tracking.acquisition import CONFIRMED_RANGE_ERROR, STACKED_POSITION_ERROR, Acquisition
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import Prediction, Row, Step, TrackPoint
+from magloc.tracking.results import Prediction, Row, Step, TrackPoint, rows_of
 
-CONTRADICTION = 1e-6
-"""Probability under noise below which a row contradicts the track."""
 ROWS_TO_LOSE = 3
 """Contradicting rows in a row that end a track."""
 REFIX_RANGE_ERROR = 0.15
@@ -112,23 +112,23 @@ class Tracker:
         self._n_rows = 0
         self._weight = math.nan
 
-    def advance(self, row: Row) -> TrackPoint:
+    def update(self, row: Row | Readings) -> TrackPoint:
         """What is known of the source after one more row.
 
         Parameters
         ----------
-        row : Row
-            Later than the one before.
-
-        Returns
-        -------
-        TrackPoint
+        row : Row or Readings of length one
+            Later than the one before. Of readings those that saturate are not used.
 
         Raises
         ------
         ValueError
-            Time goes backwards.
+            Time goes backwards, or the readings are not one row.
         """
+        if isinstance(row, Readings):
+            if len(row) != 1:
+                raise ValueError(f"Input row must be readings of length one; instead received {len(row)} rows.")
+            row = next(rows_of(without_saturated(row, self.array)))
         if row.time_s <= self._time_s:
             raise ValueError(f"Input time_s must increase; instead {row.time_s} s follows {self._time_s} s.")
         dt_s, self._time_s = row.time_s - self._time_s, row.time_s
@@ -179,10 +179,12 @@ class Tracker:
             iterations=update.iterations,
         )
 
-    def run(self, rows: Iterable[Row], progress: Callable[[int], None] | None = None) -> Iterator[TrackPoint]:
+    def run(
+        self, rows: Iterable[Row | Readings], progress: Callable[[int], None] | None = None
+    ) -> Iterator[TrackPoint]:
         """Points of successive rows."""
         for row in rows:
-            yield self.advance(row)
+            yield self.update(row)
             if progress is not None:
                 progress(1)
 

@@ -13,6 +13,7 @@ from magloc.convergence.filters import IekfFilter
 from magloc.convergence.over_starts import StartsScenario, simulated_measurement
 from magloc.kalman import IteratedExtendedKalmanFilter
 from magloc.measurement.differences import DifferenceMeasurement
+from magloc.readings import Readings
 from magloc.tracking.batch import track_record
 from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import Row as TrackRow
@@ -71,7 +72,7 @@ def track_of_weaving(size: Size) -> tuple[list[TrackRow], Callable[[], Tracker]]
     readings = simulation.readings.values_T[60:260]  # where the range is certain
     there_and_back = np.concatenate([readings, readings[::-1]])
     values = np.tile(there_and_back, (max(1, size.rows // len(there_and_back)), 1))
-    record = list(rows_of(0.5 * np.arange(len(values)), values))
+    record = list(rows_of(Readings(values, time_s=0.5 * np.arange(len(values)))))
     return record, lambda: Tracker(simulation.array, RandomWalk(0.1, np.radians(1.2)))
 
 

@@ -141,7 +141,7 @@ class TestJson:
         results = results_of(run("track", readings, "--array", array, "--json", *MOTION))
         tracker = Tracker(read_array(array), RandomWalk(0.1, float(np.deg2rad(1.2))))
         table = read_readings(readings, tracker.array)
-        points = track_record(tracker, list(rows_of(table.time_s, table.values_T)))
+        points = track_record(tracker, list(rows_of(table)))
         for entry, point in zip(results, points, strict=True):
             expected = None if point.position_m is None else point.position_m.tolist()
             assert entry["position_m"] == expected
@@ -205,7 +205,7 @@ class TestSmooth:
         results = results_of(run("track", readings, "--array", array, "--json", "--smooth", *MOTION))
         tracker = Tracker(read_array(array), OrnsteinUhlenbeck(0.1, float(np.deg2rad(1.2))), keep_steps=True)
         table = read_readings(readings, tracker.array)
-        points = track_record(tracker, list(rows_of(table.time_s, table.values_T)))
+        points = track_record(tracker, list(rows_of(table)))
         for entry, point in zip(results, smoothed(points, tracker.steps), strict=True):
             assert entry["position_m"] == (None if point.position_m is None else point.position_m.tolist())
 
@@ -250,7 +250,7 @@ class TestTruth:
         found = json.loads(outcome.out)["consistency"]["position_bound_m"]
         tracker = Tracker(read_array(array), OrnsteinUhlenbeck(0.1, float(np.deg2rad(1.2))))
         table, (_, p, m) = read_readings(readings, tracker.array), source()
-        rows = list(rows_of(table.time_s, table.values_T))
+        rows = list(rows_of(table))
         of_smoother, of_filter = (
             float(np.sqrt(np.mean(bound(tracker, rows, p, m)[N_EMPTY:] ** 2)))
             for bound in (smoothing_bound, posterior_bound)
@@ -281,7 +281,7 @@ class TestTruthBetweenItsRows:
     def test_is_interpolated_but_not_over_a_gap(self) -> None:
         truth = Truth(np.array([0.0, 1.0, 2.0, 10.0, 11.0]), np.arange(15.0).reshape(5, 3), None)
         time = np.array([0.0, 0.5, 2.0, 5.0, 10.25, 12.0])
-        position, moment = truth_of_rows(Readings(np.zeros((6, 1)), time_s=time), truth, Path("truth.csv"))
+        position, moment = truth_of_rows(Readings(np.zeros((6, 1)), time_s=time), truth)
         assert moment is None
         np.testing.assert_allclose(position[:, 0], [0.0, 1.5, 6.0, np.nan, 9.75, np.nan])
 

@@ -26,6 +26,7 @@ from arrays.sensor import Calibration, Sensor
 from magloc.kalman import iterated_update, predict_square_root
 from magloc.measurement.differences import predicted_channels
 from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
+from magloc.readings import Readings
 from magloc.tracking.batch import track_record
 from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, rows_of
@@ -224,7 +225,7 @@ class TestWithoutLastingErrors:
         t = 0.5 * np.arange(30.0)
         readings = np.tile(predicted_channels(array, SOURCE[:3], SOURCE[3:]), (30, 1))
         readings += 2e-10 * np.random.default_rng(6).normal(size=readings.shape)
-        rows = list(rows_of(t, readings))
+        rows = list(rows_of(Readings(readings, time_s=t)))
         tracker = Tracker(array, motion, keep_steps=True)
         points = list(tracker.run(rows))
         x, S = tracker.steps[0].x, tracker.steps[0].S
@@ -268,7 +269,7 @@ class TestStart:
         array = replace(with_errors(geometries.tetrahedron(1.5, "vector", 2e-10), **LASTING), ambient_T=AMBIENT_T)
         _, true = uncalibrated(array, rng)
         readings = predicted_channels(true, SOURCE[:3], SOURCE[3:]) + 2e-10 * rng.normal(size=(6, 12))
-        rows = list(rows_of(np.arange(6.0), readings))
+        rows = list(rows_of(Readings(readings)))
         tracker = Tracker(array, RandomWalk(1e-6, 1e-6))
         measurements = [tracker.measurement(row) for row in rows]
         scale = np.concatenate([UNIT, tracker.errors.sigma])
@@ -297,8 +298,7 @@ class TestStart:
         """
         simulation = sims.simulate(replace(sims.read_scenario("drone"), duration_s=14.0), 1010)
         readings, truth = simulation.readings, simulation.truth
-        pose = (readings.array_position_m, readings.array_rotation)
-        rows = list(rows_of(readings.time_s, readings.values_T, *pose, readings.ambient_T))[79::4]
+        rows = list(rows_of(readings))[79::4]
         tracker = Tracker(simulation.array, RandomWalk(1e-6, 1e-6))
         source = np.array([1.259, 0.109, -0.234, 6.0, 3.0, -4.0])
         covariance = np.diag([0.18, 0.47, 0.46, 3.0, 3.0, 3.0]) ** 2
@@ -355,15 +355,7 @@ class TestErrorsAreFound:
         for seed in range(self.N_RUNS):
             simulation = sims.simulate(scenario, seed)
             readings, truth = simulation.readings, simulation.truth
-            rows = list(
-                rows_of(
-                    readings.time_s,
-                    readings.values_T,
-                    readings.array_position_m,
-                    readings.array_rotation,
-                    readings.ambient_T,
-                )
-            )
+            rows = list(rows_of(readings))
             tracker = Tracker(simulation.array, RandomWalk(1e-7, 1e-7))
             points = track_record(tracker, rows)
             assert points[-1].status == "tracked"

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 import sims
 from arrays import geometries
 from arrays.array import SensorArray
+from magloc.readings import Readings
 from magloc.tracking.batch import track_record
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
@@ -92,7 +93,7 @@ class TestCompiledRecord:
         noise = NOISE_T * np.random.default_rng(0).normal(size=(n, 8))
         fields = np.stack([magpylib_field(array.positions, *source) for source in zip(p, m, strict=True)])
         readings = np.linalg.norm(fields + ambient[:, None], axis=-1) + noise
-        rows = list(rows_of(time_s, readings, ambient_T=ambient))
+        rows = list(rows_of(Readings(readings, time_s=time_s, ambient_T=ambient)))
         points = self.both(array, SLOW, rows)
         assert statuses(points).count("tracked") > 50
         assert np.nanmax(np.linalg.norm(positions(points) - p, axis=1)) < 0.3
@@ -105,7 +106,7 @@ class TestCompiledRecord:
         world_p = p + np.array([10.0, -4.0, 2.0])
         in_array = rotation.inv().apply(world_p - origin)
         readings = readings_of(ARRAY, in_array, rotation.inv().apply(m))
-        rows = list(rows_of(time_s, readings, origin, rotation))
+        rows = list(rows_of(Readings(readings, time_s=time_s, array_position_m=origin, array_rotation=rotation)))
         points = self.both(ARRAY, SLOW, rows)
         assert statuses(points) == ["acquired"] + ["tracked"] * (n - 1)
         assert np.linalg.norm(positions(points) - world_p, axis=1).max() < 0.2

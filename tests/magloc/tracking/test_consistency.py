@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from arrays import geometries
 from arrays.differences import contrasts, difference_covariance
 from magloc.chi_square import mean_bounds
+from magloc.readings import Readings
 from magloc.tracking.consistency import consistency, nees_of
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
@@ -34,7 +35,7 @@ def point_of(
 
 def blank_rows(n: int) -> list[Row]:
     """Rows without readings: they give no coordinates, and NEES is that of position and moment."""
-    return list(rows_of(np.arange(float(n)), np.full((n, 12), np.nan)))
+    return list(rows_of(Readings(np.full((n, 12), np.nan))))
 
 
 TRACKER = Tracker(ARRAY, RandomWalk(0.1, 0.1))
@@ -211,7 +212,9 @@ class MovingArray:
 
         origin = np.outer(t, [0.1, -0.1, 0.0])
         rotation = Rotation.from_rotvec(np.outer(t, [0.1, 0.0, -0.2]))
-        rows = list(rows_of(t, np.zeros((self.N_ROWS, 12)), origin, rotation))
+        rows = list(
+            rows_of(Readings(np.zeros((self.N_ROWS, 12)), time_s=t, array_position_m=origin, array_rotation=rotation))
+        )
         return rows, rotation.as_matrix(), origin
 
 
@@ -247,7 +250,7 @@ class TestPosteriorBound(MovingArray):
 
     def test_of_rest_falls_with_the_root_of_the_rows(self) -> None:
         t, p, m = self.truth()
-        rows = list(rows_of(t, np.zeros((self.N_ROWS, 12))))
+        rows = list(rows_of(Readings(np.zeros((self.N_ROWS, 12)), time_s=t)))
         still_p, still_m = np.tile(p[0], (self.N_ROWS, 1)), m
         bounds = posterior_bound(Tracker(ARRAY, RandomWalk(1e-9, 1e-9)), rows, still_p, still_m)
         np.testing.assert_allclose(bounds, bounds[0] / np.sqrt(np.arange(1.0, self.N_ROWS + 1.0)), rtol=1e-6)
@@ -274,7 +277,9 @@ class TestPosteriorBound(MovingArray):
         readings[0] = np.nan
         readings[1, 6:] = np.nan  # three differences
         readings[4] = np.nan
-        bounds = posterior_bound(Tracker(ARRAY, OrnsteinUhlenbeck(0.2, 0.05)), list(rows_of(t, readings)), p, m)
+        bounds = posterior_bound(
+            Tracker(ARRAY, OrnsteinUhlenbeck(0.2, 0.05)), list(rows_of(Readings(readings, time_s=t))), p, m
+        )
         assert np.isinf(bounds[:2]).all()
         assert np.isfinite(bounds[2:]).all()
         assert bounds[4] > bounds[3]
@@ -303,7 +308,7 @@ class TestSmoothingBound(MovingArray):
         t, p, m = self.truth()
         readings = np.zeros((self.N_ROWS, 12))
         readings[3] = np.nan
-        rows = list(rows_of(t, readings))
+        rows = list(rows_of(Readings(readings, time_s=t)))
         motion = OrnsteinUhlenbeck(0.2, 0.05)
         tracker = Tracker(ARRAY, motion)
         bounds = smoothing_bound(tracker, rows, p, m)
@@ -324,7 +329,7 @@ class TestSmoothingBound(MovingArray):
         t, p, m = self.truth()
         readings = np.zeros((self.N_ROWS, 12))
         readings[0, 6:] = np.nan  # three differences: no source yet
-        rows, tracker = list(rows_of(t, readings)), Tracker(ARRAY, OrnsteinUhlenbeck(0.2, 0.05))
+        rows, tracker = list(rows_of(Readings(readings, time_s=t))), Tracker(ARRAY, OrnsteinUhlenbeck(0.2, 0.05))
         filtered, with_later_rows = posterior_bound(tracker, rows, p, m), smoothing_bound(tracker, rows, p, m)
         assert np.isinf(with_later_rows[0])
         assert np.all(with_later_rows[1:-1] < filtered[1:-1])

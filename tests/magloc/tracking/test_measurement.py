@@ -205,7 +205,7 @@ class TestSourceAtRest:
         """Mahalanobis distances of both filters from the fit, and their σ over its."""
         simulation = sims.simulate(sims.read_scenario("paper"), seed)
         array, readings = simulation.array, simulation.readings.values_T
-        rows = list(rows_of(simulation.readings.time_s, readings))
+        rows = list(rows_of(simulation.readings))
         tracker = Tracker(array, REST, keep_steps=True)
         last = list(tracker.run(rows))[-1]
         first = tracker.steps[0]

@@ -16,6 +16,7 @@ import sims
 from arrays.array import SensorArray
 from arrays.sensor import Sensor
 from magloc.measurement.differences import predicted_channels
+from magloc.readings import Readings
 from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import consistency
 from magloc.tracking.motion import CoordinatedTurn, MotionModel, OrnsteinUhlenbeck, RandomWalk
@@ -370,7 +371,7 @@ class TestEstimability:
         tracker.resume(source, np.diag(np.repeat([0.05, 5.0], 3)), 0.0, 0, [])
         readings = predicted_channels(line, source[:3], source[3:])
         readings[np.arange(12) % 3 != 0] = np.nan
-        point = tracker.advance(Row(0.5, readings))
+        point = tracker.update(Row(0.5, readings))
         assert point.status == "tracked"
         assert point.nis_dof == 3
         assert point.estimability is not None
@@ -382,7 +383,7 @@ class TestEstimability:
         tracker = Tracker(ARRAY, SLOW)
         source = np.concatenate([POSITION, MOMENT])
         tracker.resume(source, np.diag([0.3] * 3 + [1e5] * 3), 0.0, 0, [])
-        point = tracker.advance(Row(0.5, predicted_channels(ARRAY, POSITION, MOMENT)))
+        point = tracker.update(Row(0.5, predicted_channels(ARRAY, POSITION, MOMENT)))
         assert point.estimability is not None
         assert (point.estimability[3:] > 0.9999).all()
 
@@ -394,8 +395,13 @@ class TestFrames:
         readings = readings_of(ARRAY, p, m)
         rotation, origin = Rotation.from_rotvec([0.4, -1.1, 0.7]), np.array([100.0, -40.0, 7.0])
         here = track_record(Tracker(ARRAY, SLOW), rows_from(time_s, readings))
-        pose = (np.tile(origin, (30, 1)), Rotation.from_quat(np.tile(rotation.as_quat(), (30, 1))))
-        there = track_record(Tracker(ARRAY, SLOW), list(rows_of(time_s, readings, *pose)))
+        turned = Readings(
+            readings,
+            time_s=time_s,
+            array_position_m=np.tile(origin, (30, 1)),
+            array_rotation=Rotation.from_quat(np.tile(rotation.as_quat(), (30, 1))),
+        )
+        there = track_record(Tracker(ARRAY, SLOW), list(rows_of(turned)))
         np.testing.assert_allclose(positions(there), rotation.apply(positions(here)) + origin, atol=1e-8)
         R6 = np.kron(np.eye(2), rotation.as_matrix())
         for a, b in zip(here, there, strict=True):

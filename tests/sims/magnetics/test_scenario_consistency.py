@@ -58,8 +58,7 @@ def track_statistics(simulation: Simulation, motion: MotionModel) -> dict[str, A
     truth, in m² and in σ at the end; the sum of all NIS and its degrees of freedom.
     """
     readings, truth = simulation.readings, simulation.truth
-    pose = (readings.array_position_m, readings.array_rotation)
-    rows = list(rows_of(readings.time_s, readings.values_T, *pose, readings.ambient_T))
+    rows = list(rows_of(readings))
     tracker = Tracker(simulation.array, motion)
     points = track_record(tracker, rows)
     assert truth.moment_Am2 is not None
@@ -96,7 +95,7 @@ def at_rest_with_bound(simulation: Simulation, _: None) -> dict[str, Any]:
     The bound is that of the rows from the track's first one on: what the start drops is not held against the filter.
     """
     readings, truth = simulation.readings, simulation.truth
-    rows = list(rows_of(readings.time_s, readings.values_T))
+    rows = list(rows_of(readings))
     tracker = Tracker(simulation.array, REST)
     assert truth.moment_Am2 is not None
     points = track_record(tracker, rows)
@@ -200,9 +199,8 @@ def linear_filter(simulation: Simulation) -> dict[str, Any]:
     A linear filter is consistent at once if the array states its errors as they are, and seldom if it does not.
     """
     readings, truth = simulation.readings, simulation.truth
-    pose = (readings.array_position_m, readings.array_rotation)
     tracker = Tracker(simulation.array, REST)
-    rows = rows_of(readings.time_s, readings.values_T, *pose, readings.ambient_T)
+    rows = rows_of(readings)
     measurements = [tracker.measurement(row) for row in rows]
     assert truth.moment_Am2 is not None
     source = np.concatenate([truth.position_m[-1], truth.moment_Am2[-1]])

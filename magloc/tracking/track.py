@@ -1,0 +1,230 @@
+"""The one door to a track: one source followed through the rows of readings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from html import escape
+from typing import TYPE_CHECKING, Any, Literal, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from arrays.array import SensorArray
+from arrays.io.lazy import by_name
+from arrays.typing import BoolArray, FloatArray, IntArray, Vector
+from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
+from magloc.readings import Readings, as_readings, without_saturated
+from magloc.tracking.batch import track_record
+from magloc.tracking.consistency import Consistency, consistency
+from magloc.tracking.files import geojson_of_track
+from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
+from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
+from magloc.tracking.results import Row, TrackPoint, rows_of, stacked
+from magloc.tracking.smoother import smoothed
+from magloc.tracking.table import lines_of_track
+from magloc.tracking.tracker import Tracker
+from magloc.truth import Truth, truth_of_rows
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
+
+SPEED_M_S = 0.5
+"""Characteristic speed of a source of which nothing is said."""
+TURN_RAD_S = math.radians(5.0)
+"""Characteristic rate at which its moment turns."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Track(Sequence[TrackPoint]):
+    """A source through time: columns first, a :class:`TrackPoint` where one row is asked for.
+
+    Columns are NaN where the source is not tracked.
+
+    Attributes
+    ----------
+    points : tuple of TrackPoint
+        Of every row.
+    readings : Readings
+        That they were found from.
+    tracker : Tracker
+        That found them.
+    is_smoothed : bool
+        Whether later rows were used too.
+    """
+
+    points: tuple[TrackPoint, ...]
+    readings: Readings
+    tracker: Tracker
+    is_smoothed: bool = False
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @overload
+    def __getitem__(self, row: int) -> TrackPoint: ...
+    @overload
+    def __getitem__(self, row: slice) -> tuple[TrackPoint, ...]: ...
+    def __getitem__(self, row: int | slice) -> TrackPoint | tuple[TrackPoint, ...]:
+        return self.points[row]
+
+    @property
+    def frame(self) -> Literal["array", "world"]:
+        """Of positions, moments and covariances."""
+        return "array" if self.readings.array_position_m is None else "world"
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Instants (n,) [s]."""
+        return self.readings.time_s
+
+    @cached_property
+    def position_m(self) -> FloatArray:
+        """Positions (n, 3) [m]."""
+        return stacked(self, "position_m", 3)
+
+    @cached_property
+    def moment_Am2(self) -> FloatArray:
+        """Moments (n, 3) [A·m²]."""
+        return stacked(self, "moment_Am2", 3)
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariances (n, 6, 6) of position and moment."""
+        return stacked(self, "covariance", 6, 6)
+
+    @cached_property
+    def estimability(self) -> FloatArray:
+        """What the row's readings taught (n, 6): 1 - σ after / σ predicted without them."""
+        return stacked(self, "estimability", 6)
+
+    @cached_property
+    def nis(self) -> FloatArray:
+        """Normalised innovations squared (n,)."""
+        return stacked(self, "nis")
+
+    @cached_property
+    def nis_dof(self) -> IntArray:
+        """Their degrees of freedom (n,)."""
+        return np.array([point.nis_dof for point in self], dtype=np.intp)
+
+    @cached_property
+    def weight(self) -> FloatArray:
+        """How likely the track is the right one (n,)."""
+        return stacked(self, "weight")
+
+    @property
+    def status(self) -> list[str]:
+        """How every row was used, or why there is no track."""
+        return [point.status for point in self]
+
+    @property
+    def tracked(self) -> BoolArray:
+        """Whether the source is tracked (n,)."""
+        return np.array([point.position_m is not None for point in self], dtype=bool)
+
+    @cached_property
+    def _rows(self) -> list[Row]:
+        return list(rows_of(self.readings))
+
+    def consistency(self, truth: Truth) -> Consistency:
+        """Errors of the track, its NEES and its NIS, and the least error that is possible where the moment is known.
+
+        Raises
+        ------
+        InputError
+            The truth has none of the times of the readings.
+        """
+        position_m, moment_Am2 = truth_of_rows(self.readings, truth)
+        bound = None
+        if moment_Am2 is not None and np.isfinite(position_m).all() and np.isfinite(moment_Am2).all():
+            # Later rows make less error possible.
+            bound_of = smoothing_bound if self.is_smoothed else posterior_bound
+            bound = bound_of(self.tracker, self._rows, position_m, moment_Am2)
+        return consistency(self, self.tracker, self._rows, position_m, moment_Am2, bound)
+
+    def table(self) -> str:
+        """The table that ``magloc track`` prints."""
+        return "\n".join(lines_of_track(self))
+
+    def plot(self) -> Figure:
+        """The track from above with 95 % ellipses, and its coordinates and its strength through time."""
+        figure: Figure = by_name("magloc.plots.tracks:track_figure")(self, None, self.readings.array_position_m)
+        return figure
+
+    def to_xarray(self) -> xr.Dataset:
+        """Columns with units and names, along `row`."""
+        from magloc.tracking.export import dataset_of_track
+
+        return dataset_of_track(self)
+
+    def to_geojson(self, place: Vector) -> dict[str, Any]:
+        """A FeatureCollection: a line for every unbroken part, and a point for every row.
+
+        Parameters
+        ----------
+        place : tuple of 3 floats
+            Latitude, longitude [deg] and height [m] of the origin of the track's frame, which is east, north, up.
+
+        Returns
+        -------
+        dict
+            Coordinates are longitude, latitude [deg] and height above the ellipsoid [m], as RFC 7946 has them.
+        """
+        return geojson_of_track(self, place)
+
+    def __repr__(self) -> str:
+        return "\n".join(lines_of_track(self, most=10))
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
+
+
+def track(
+    array: SensorArray,
+    readings: Readings | ArrayLike,
+    *,
+    motion: MotionModel | None = None,
+    smooth: bool = False,
+    prior: SourcePrior = NOTHING_KNOWN,
+    progress: Callable[[int], None] | None = None,
+) -> Track:
+    """Follow one source through the rows of readings.
+
+    The track starts by itself from the first row whose fix is certain, is updated by every row, and ends where the
+    readings contradict it three times in a row or its range is no longer known; then it starts anew.
+
+    Parameters
+    ----------
+    array : SensorArray
+    readings : Readings or array_like, shape (n, C)
+        Raw readings [T], NaN where missing, in the order of time. Those that saturate are not used.
+    motion : MotionModel, optional
+        By default :class:`magloc.RandomWalk` of 0.5 m/s and 5°/s; with `smooth` :class:`magloc.OrnsteinUhlenbeck` of
+        the same.
+    smooth : bool
+        Use later rows too: a fixed-interval smoother.
+    prior : SourcePrior
+        Bounds for the fixes that start a track, in the array's frame.
+    progress : callable, optional
+        Called with the number of rows finished since the last call.
+
+    Returns
+    -------
+    Track
+        In the world frame where the readings have the array's pose, else in the array's.
+
+    Raises
+    ------
+    ValueError
+        Time does not increase from row to row, or the array has too few sensors for the prior.
+    """
+    used = without_saturated(as_readings(readings), array)
+    if motion is None:
+        motion = (OrnsteinUhlenbeck if smooth else RandomWalk)(SPEED_M_S, TURN_RAD_S)
+    tracker = Tracker(array, motion, prior=prior, keep_steps=smooth)
+    points = track_record(tracker, list(rows_of(used)), progress)
+    return Track(tuple(smoothed(points, tracker.steps) if smooth else points), used, tracker, smooth)
