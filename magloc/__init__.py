@@ -24,6 +24,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "moments_on_sphere": "magloc.directions",
         "plots": ":magloc.plots",
         "source_map": "magloc.convergence.over_sources",
+        "view": "magloc.viewer.view",
         "Readings": "magloc.readings",
         "Truth": "magloc.truth",
         "read_readings": "magloc.readings",

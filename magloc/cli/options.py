@@ -36,6 +36,21 @@ def naming_scheduler() -> Iterator[None]:
         raise InputError(f"--{error}") from None
 
 
+@contextmanager
+def naming_outputs() -> Iterator[None]:
+    """Let errors of a viewer speak of the options --html, --png and --port."""
+    from magloc.viewer.chromium import BrowserError
+
+    try:
+        yield
+    except BrowserError as error:
+        raise InputError(f"--png: {error}") from None
+    except InputError as error:
+        if str(error).startswith(("Input html", "Input png", "Input port")):
+            raise InputError(f"--{str(error).removeprefix('Input ')}") from None
+        raise
+
+
 _DATE = re.compile(r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}(:\d{2}(\.\d+)?)?)?")
 
 
