@@ -254,7 +254,7 @@ class DipoleEditor:
                 forecast.covariance,
                 array.centroid,
                 range_observable=forecast.range_observable,
-                range_interval95_m=[forecast.range_interval95_m],
+                range_interval_m=[forecast.range_interval_m],
                 farthest_m=max(_FARTHEST * array.circumradius, _FARTHEST_OF_RANGE * distance),
             )
         )

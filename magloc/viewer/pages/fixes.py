@@ -97,7 +97,7 @@ class FixView:
             source.covariance,
             centroid,
             range_observable=source.range_observable,
-            range_interval95_m=source.range_interval_m,
+            range_interval_m=source.range_interval_m,
             farthest_m=_FARTHEST_OF_RANGE * float(np.linalg.norm(source.position_m - centroid)),
         )
 

@@ -42,7 +42,7 @@ class Forecast:
         Whether a fix finds the signal to stand out of noise more often than not.
     covariance : ndarray, shape (6, 6), optional
         Cramér-Rao bound of (position, moment); None where the readings do not determine them.
-    range_interval95_m : tuple of (low, high)
+    range_interval_m : tuple of (low, high)
         95 % interval of the distance from the sensors' centroid by the bound [m]; high is None where it is open.
     range_observable : bool
         Whether it is closed and its ends differ by a factor of two at most.
@@ -55,7 +55,7 @@ class Forecast:
     signal_to_noise: float
     detectable: bool
     covariance: FloatArray | None = None
-    range_interval95_m: tuple[float, float | None] = (0.0, None)
+    range_interval_m: tuple[float, float | None] = (0.0, None)
     range_observable: bool = False
     reason: str = ""
 

@@ -79,7 +79,7 @@ def bound_words(forecast: Forecast) -> list[str]:
         *lines,
         f"σ x {x}, y {y}, z {z}",
         f"σ of the moment {_plain(float(np.linalg.norm(sigma[3:])), 3)} A·m²",
-        range_words(forecast.range_interval95_m, observable=forecast.range_observable),
+        range_words(forecast.range_interval_m, observable=forecast.range_observable),
     ]
 
 
