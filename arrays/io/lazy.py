@@ -18,14 +18,16 @@ def lazy_names(
     package : str
         Its ``__name__``.
     modules : mapping of str to str
-        Module in which each public name is defined; with a colon before it, the name is the module itself.
+        Module in which each public name is defined; with a colon before it, the name is the module itself,
+        with a colon and another name after it, it has that name there.
     """
 
     def getattr_(name: str) -> object:
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         where = modules[name]
-        value = import_module(where[1:]) if where.startswith(":") else getattr(import_module(where), name)
+        module, _, of_module = where.partition(":")
+        value = getattr(import_module(module), of_module or name) if module else import_module(of_module)
         setattr(sys.modules[package], name, value)
         return value
 

@@ -164,6 +164,8 @@ def _filling(
     if isinstance(result, Truth):
         result = path_of_truth(result)
     if isinstance(result, TrackResult):
+        if all(point.position_m is None for point in result.points):
+            raise ValueError("Input result must have a row where the source is tracked; instead received none.")
         return lambda server: track_page(server, result, array, readings)
     if not isinstance(result, MapResult | Readings | Fixes | None):
         if not hasattr(result, "data_vars"):
