@@ -44,5 +44,6 @@ __getattr__, __dir__, __all__ = lazy_names(
         "read_truth": "magloc.truth",
         "source_map": "magloc.convergence.over_sources",
         "track": "magloc.tracking.track",
+        "view": "magloc.viewer.view",
     },
 )

@@ -37,3 +37,4 @@ from magloc.tracking.track import track as track
 from magloc.tracking.tracker import Tracker as Tracker
 from magloc.truth import Truth as Truth
 from magloc.truth import read_truth as read_truth
+from magloc.viewer.view import view as view

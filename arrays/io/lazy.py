@@ -11,13 +11,17 @@ from typing import Any
 def lazy_names(
     package: str, modules: Mapping[str, str]
 ) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
-    """``__getattr__``, ``__dir__`` and ``__all__`` from name to module, ``":module"`` for the module itself."""
+    """``__getattr__``, ``__dir__`` and ``__all__`` of a package, from name to module.
+
+    ``":module"`` is the module itself, ``"module:other"`` what it names otherwise.
+    """
 
     def getattr_(name: str) -> object:
         if name not in modules:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         where = modules[name]
-        value = import_module(where[1:]) if where.startswith(":") else getattr(import_module(where), name)
+        module, _, of_module = where.partition(":")
+        value = getattr(import_module(module), of_module or name) if module else import_module(of_module)
         setattr(sys.modules[package], name, value)
         return value
 

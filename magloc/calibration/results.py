@@ -51,7 +51,7 @@ class Calibration:
 
     def plot(self) -> Figure:
         """What is left of the readings before and after, and what the calibration changes."""
-        figure: Figure = by_name("magloc.plots.calibration:figure_of_calibration")(self)
+        figure: Figure = by_name("magloc.plots.calibrations:calibration")(self)
         return figure
 
 

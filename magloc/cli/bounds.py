@@ -298,7 +298,7 @@ def _pictures(
 
     from magloc.bounds.maps import bound_slices
     from magloc.bounds.spheres import bound_spheres, with_detection_ranges
-    from magloc.plots.bounds import bound_slices_figure, bound_sphere_figure, reach_figure, write_bound_animation
+    from magloc.plots.bounds import write_bound_animation
 
     nearest = min(max(0.5 * range_m, 1.1 * task.array.circumradius), range_m)
     ranges = np.geomspace(nearest, 2.0 * range_m, _FRAMES) if gif else np.empty(0)
@@ -309,9 +309,9 @@ def _pictures(
     write_netcdf(slices, folder / "slices.nc")
     write_netcdf(spheres, folder / "spheres.nc")
     figures = {
-        "bounds-slices.png": bound_slices_figure(slices, task),
-        "bounds-sphere.png": bound_sphere_figure(spheres, task, range_m),
-        "bounds-reach.png": reach_figure(spheres, task),
+        "bounds-slices.png": magloc.plots.bound_slices(slices, task),
+        "bounds-sphere.png": magloc.plots.bound_sphere(spheres, task, range_m),
+        "bounds-reach.png": magloc.plots.bound_reach(spheres, task),
     }
     for name, figure in figures.items():
         magloc.plots.write(figure, folder / name)

@@ -167,7 +167,7 @@ def _check_converged(result: SourceCalibration, readings: Path, out: Path) -> No
 
 def _draw(result: SourceCalibration | TurningCalibration, folder: Path, *, quiet: bool) -> None:
     from magloc.calibration.results import TurningCalibration
-    from magloc.plots.calibration import columns_of_calibration
+    from magloc.plots.calibrations import columns_of_calibration
 
     make_folder(folder, "--figures")
     name = "turning" if isinstance(result, TurningCalibration) else "calibration"

@@ -168,7 +168,7 @@ def locate(
     if not n_solved:
         raise InputError(f"{readings}: found no row that can be solved ({reasons}).")
     if out is not None:
-        from magloc.plots.fixes import write_pictures
+        from magloc.plots.localization import write_pictures
 
         write_pictures(pictured, noisy, fixes, ambient_T, true_position_m, out, quiet=common.quiet)
     if common.quiet:

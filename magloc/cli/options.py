@@ -48,6 +48,23 @@ def naming_scheduler() -> Iterator[None]:
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _BOUNDS = re.compile(rf"(?:(?P<below>{_NUMBER})<(?=[xyz]<))?(?P<axis>[xyz])(?P<sign>[<>])(?P<bound>{_NUMBER})")
+
+
+@contextmanager
+def naming_outputs() -> Iterator[None]:
+    """Let errors of a viewer speak of the options --html, --png and --port."""
+    from magloc.viewer.chromium import BrowserError
+
+    try:
+        yield
+    except BrowserError as error:
+        raise InputError(f"--png: {error}") from None
+    except InputError as error:
+        if str(error).startswith(("Input html", "Input png", "Input port")):
+            raise InputError(f"--{str(error).removeprefix('Input ')}") from None
+        raise
+
+
 _DATE = re.compile(r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}(:\d{2}(\.\d+)?)?)?")
 
 

@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from arrays.array import SensorArray
 from arrays.io.arguments import Flag, whole_number
 from arrays.io.errors import InputError
-from arrays.io.outputs import refuse_unwritable
 from magloc.cli.framework import CommonOptions, progress
-from magloc.cli.options import print_note
+from magloc.cli.options import naming_outputs, print_note
 
 if TYPE_CHECKING:
-    import viser
-
-    from arrays.array import SensorArray
     from magloc.localization.fit.fixes import Fixes
     from magloc.readings import Readings
     from magloc.viewer.pages.open_result import ReadingsResult, Result
-    from magloc.viewer.pages.pages import Page
 
 
 Port = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, lte=65535))]
-_MOST_ROWS = 2000
 
 
 def view(
@@ -66,48 +61,34 @@ def view(
     common : CommonOptions
         Common options.
     """
-    from magloc.viewer.chromium import BrowserError, find_chromium
+    import magloc
     from magloc.viewer.pages.open_result import ReadingsResult, read_result
-    from magloc.viewer.server import address, free_port, opened, wait_for_interruption, write_page, write_picture
+    from magloc.viewer.server import check_outputs, free_port
 
-    if html is not None:
-        refuse_unwritable(html, "--html")
-    if png is not None:
-        refuse_unwritable(png, "--png", ".png")
-    if png is not None:
-        try:
-            find_chromium()
-        except InputError as error:
-            raise InputError(f"--png: {error}") from None
+    with naming_outputs():
+        check_outputs(html, png)
     result = read_result(path, array)
-    with_track = _with_track(result, array, readings)
-    fixes = _fixes(result, quiet=common.quiet) if isinstance(result, ReadingsResult) else None
-    written = html is not None or png is not None
-    used = 0 if written else free_port(port)
-    if used not in (0, port) and port and not common.quiet:
-        print_note(f"port {port} is in use, {used} is taken")
-    with opened(used, f"magloc · {path.name or path.resolve().name}") as server:
-        page = _filled(server, result, with_track, fixes, live=not written)
-        if html is not None:
-            write_page(server, page, html)
-        if png is not None:
-            try:
-                write_picture(server, png)
-            except BrowserError as error:
-                raise InputError(f"--png: {error}") from None
-        if written:
-            if not common.quiet:
-                print_note(f"wrote {', '.join(str(file) for file in (html, png) if file is not None)}")
-            return
-        print(address(server), flush=True)
+    sensors, rows = _with_track(result, array, readings)
+    shown: Any = result
+    if isinstance(result, ReadingsResult):
+        sensors, (shown, rows) = result.array, _fixes(result, quiet=common.quiet)
+    elif isinstance(result, SensorArray):
+        sensors, shown = result, None
+    written = [str(file) for file in (html, png) if file is not None]
+    with naming_outputs():
+        used = port if written else free_port(port)
+        if used != port and port and not common.quiet:
+            print_note(f"port {port} is in use, {used} is taken")
+        title = path.name or path.resolve().name
+        scene = magloc.view(sensors, shown, readings=rows, html=html, png=png, open=open, port=used, title=title)
+    if written:
         if not common.quiet:
-            print_note("open this address in a browser; Ctrl-C ends the viewer")
-        if open:
-            import webbrowser
-
-            webbrowser.open(address(server))
-        wait_for_interruption()
-        page.close()
+            print_note(f"wrote {', '.join(written)}")
+        return
+    print(scene.address, flush=True)
+    if not common.quiet:
+        print_note("open this address in a browser; Ctrl-C ends the viewer")
+    scene.wait()
 
 
 def _with_track(
@@ -132,48 +113,10 @@ def _with_track(
 
 def _fixes(result: ReadingsResult, *, quiet: bool) -> tuple[Fixes, Readings]:
     """Fixes of the rows as ``magloc locate`` finds them, in its frame; of 2000 rows at most, evenly."""
-    from magloc.ambient import with_ambient_field
-    from magloc.localization.fit.fixes import Fixes
-    from magloc.localization.locator import locate
+    from magloc.viewer.view import fixes_of, thinned
 
-    step = -(-len(result.readings) // _MOST_ROWS)
-    if step > 1 and not quiet:
-        print_note(f"note: every {step}th of {len(result.readings)} rows is fixed and shown")
-    rows = _every(result.readings, step)
-    used, ambient_T = with_ambient_field(result.array, rows, None, gradient=False)
+    rows, n = thinned(result.readings), len(result.readings)
+    if len(rows) < n and not quiet:
+        print_note(f"note: every {-(-n // len(rows))}th of {n} rows is fixed and shown")
     with progress(len(rows), "rows", quiet=quiet) as advance:
-        try:
-            return locate(used, rows, ambient_T=ambient_T, progress=advance), rows
-        except ValueError as error:
-            # Readings can be looked at although nothing can be located.
-            return Fixes.unsolved(rows.time_s, str(error).removeprefix("Input ")), rows
-
-
-def _every(rows: Readings, step: int) -> Readings:
-    from dataclasses import fields, replace
-
-    parts = {field.name: getattr(rows, field.name) for field in fields(rows)}
-    return replace(rows, **{name: part[::step] for name, part in parts.items() if part is not None})
-
-
-def _filled(
-    server: viser.ViserServer,
-    result: Result,
-    with_track: tuple[SensorArray | None, Readings | None],
-    fixes: tuple[Fixes, Readings] | None,
-    *,
-    live: bool,
-) -> Page:
-    """The scene and the panels of a result."""
-    from magloc.viewer.pages.open_result import ArrayResult, MapResult, ReadingsResult
-    from magloc.viewer.pages.pages import array_page, map_page, readings_page, track_page
-
-    if isinstance(result, ArrayResult):
-        return array_page(server, result, live=live)
-    if isinstance(result, MapResult):
-        return map_page(server, result)
-    if isinstance(result, ReadingsResult):
-        if fixes is None:
-            raise ValueError("Input fixes must be those of the readings; instead received None.")
-        return readings_page(server, result, *fixes)
-    return track_page(server, result, *with_track)
+        return fixes_of(result.array, rows, advance), rows

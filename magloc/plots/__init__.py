@@ -1,20 +1,22 @@
 """Figures of results, in one house style (:mod:`magloc.plots.style`): units on every axis, fit for print."""
 
-from magloc.plots.calibration import calibration_figure, turning_figure
-from magloc.plots.fixes import fix_figure, residual_figure
-from magloc.plots.maps import convergence, sources
-from magloc.plots.style import save, write
-from magloc.plots.tracks import consistency_figure, track_figure
+from arrays.io.lazy import lazy_names
 
-__all__ = [
-    "calibration_figure",
-    "consistency_figure",
-    "convergence",
-    "fix_figure",
-    "residual_figure",
-    "save",
-    "sources",
-    "track_figure",
-    "turning_figure",
-    "write",
-]
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "bound_reach": "magloc.plots.bounds",
+        "bound_slices": "magloc.plots.bounds",
+        "bound_sphere": "magloc.plots.bounds",
+        "calibration": "magloc.plots.calibrations",
+        "consistency": "magloc.plots.tracks:consistency_figure",
+        "convergence": "magloc.plots.maps",
+        "design": "magloc.plots.designs",
+        "fixes": "magloc.plots.localization",
+        "residuals": "magloc.plots.localization",
+        "save": "magloc.plots.style",
+        "sources": "magloc.plots.maps",
+        "track": "magloc.plots.tracks:track_figure",
+        "write": "magloc.plots.style",
+    },
+)

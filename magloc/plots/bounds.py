@@ -38,7 +38,7 @@ _FRAME_MS, _LAST_FRAME_MS = 200, 1500
 _FRAME_DPI = 110
 
 
-def bound_slices_figure(dataset: xr.Dataset, scenario: BoundScenario) -> Figure:
+def bound_slices(dataset: xr.Dataset, scenario: BoundScenario) -> Figure:
     """Bounds on three planes through the array, on logarithmic colours with labelled contours.
 
     Parameters
@@ -79,7 +79,7 @@ def bound_slices_figure(dataset: xr.Dataset, scenario: BoundScenario) -> Figure:
     return figure
 
 
-def bound_sphere_figure(dataset: xr.Dataset, scenario: BoundScenario, range_m: float) -> Figure:
+def bound_sphere(dataset: xr.Dataset, scenario: BoundScenario, range_m: float) -> Figure:
     """Bounds on a sphere about the array, in Mollweide's equal-area projection.
 
     Parameters
@@ -121,7 +121,7 @@ def bound_sphere_figure(dataset: xr.Dataset, scenario: BoundScenario, range_m: f
     return figure
 
 
-def reach_figure(dataset: xr.Dataset, scenario: BoundScenario) -> Figure:
+def bound_reach(dataset: xr.Dataset, scenario: BoundScenario) -> Figure:
     """How far away the range is known as well as required, and how far a source is found, in three planes.
 
     Parameters

@@ -89,7 +89,7 @@ class Chromium:
         self._process: subprocess.Popen[bytes] | None = None
         try:
             self._process = _started(find_chromium(), self._profile, size)
-            self._socket = connect(self._page_address(timeout_s), max_size=None, proxy=None)
+            self._socket = connect(self._page_address(timeout_s), max_size=None, proxy=None, ping_interval=None)
             for domain in ("Network", "Page", "Runtime"):
                 self.call(f"{domain}.enable")
             # The window's size counts its frame too; this one is the page's own.

@@ -11,14 +11,18 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import viser
 
 from arrays.io.errors import InputError
+from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import write_text
-from magloc.viewer.chromium import BrowserError, Chromium
-from magloc.viewer.pages.pages import Page
+from magloc.viewer.chromium import BrowserError, Chromium, find_chromium
 from magloc.viewer.scene.legend import with_legend
+
+if TYPE_CHECKING:
+    from magloc.viewer.pages.pages import Page
 
 HOST = "127.0.0.1"  # a viewer for whoever sits at this machine, not for the network
 FIRST_PORT = 8080
@@ -29,23 +33,20 @@ _CONNECTION_S = 60.0
 _CLOSE_NOTICES = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(button => button.click())"
 
 
+def check_outputs(html: str | Path | None, png: str | Path | None) -> None:
+    """Refuse, before long work, files that cannot be written, and a picture without a browser."""
+    if html is not None:
+        refuse_unwritable(Path(html), "Input html")
+    if png is not None:
+        refuse_unwritable(Path(png), "Input png", ".png")
+        try:
+            find_chromium()
+        except InputError as error:
+            raise InputError(f"Input png: {error}") from None
+
+
 def free_port(wanted: int) -> int:
-    """A port of this machine on which nobody listens.
-
-    Parameters
-    ----------
-    wanted : int
-        The first that is tried, and 19 after it; 0 takes any.
-
-    Returns
-    -------
-    int
-
-    Raises
-    ------
-    InputError
-        All of them are in use.
-    """
+    """A port of this machine on which nobody listens: the one that is wanted, or of the next 19; 0 takes any."""
     last = wanted if wanted == 0 else min(wanted + _PORTS - 1, 65535)
     for port in range(wanted, last + 1):
         with socket.socket() as probe:
@@ -57,24 +58,12 @@ def free_port(wanted: int) -> int:
                 continue
             found: int = probe.getsockname()[1]
             return found
-    raise InputError(f"--port: found the ports {wanted} to {last} in use, expected a free one.")
+    raise InputError(f"Input port: found the ports {wanted} to {last} in use, expected a free one.")
 
 
 @contextmanager
 def opened(port: int, title: str) -> Iterator[viser.ViserServer]:
-    """A server that is stopped afterwards, whatever happens.
-
-    Parameters
-    ----------
-    port : int
-        Free.
-    title : str
-        Above the panel.
-
-    Yields
-    ------
-    viser.ViserServer
-    """
+    """A server on a free port, its title above the panel, that is stopped afterwards, whatever happens."""
     # viser writes its own greetings to stdout.
     with redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=HOST, port=port, label=title, verbose=False)
@@ -104,44 +93,21 @@ def wait_for_interruption() -> None:
         return
 
 
-def write_page(server: viser.ViserServer, page: Page, path: Path) -> None:
-    """Write the scene as one HTML file that needs nothing else.
+def page_html(server: viser.ViserServer, page: Page) -> str:
+    """The scene as one HTML page that needs nothing else."""
+    return with_legend(server.scene.as_html(), page.title, page.entries, page.notes)
 
-    Parameters
-    ----------
-    server : viser.ViserServer
-    page : Page
-    path : Path
-        Replaced if it exists.
 
-    Raises
-    ------
-    InputError
-        It cannot be written.
-    """
-    html = with_legend(server.scene.as_html(), page.title, page.entries, page.notes)
+def write_page(html: str, path: Path) -> None:
+    """Write a page; InputError if it cannot be written."""
     try:
         write_text(html, path)
     except OSError as error:
-        raise InputError(f"--html {path} cannot be written ({error.strerror}).") from None
+        raise InputError(f"Input html {path} cannot be written ({error.strerror}).") from None
 
 
 def write_picture(server: viser.ViserServer, path: Path) -> None:
-    """Write the page as a headless Chromium shows it, a PNG file.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-    path : Path
-        Replaced if it exists.
-
-    Raises
-    ------
-    InputError
-        There is no Chromium, or the file cannot be written.
-    BrowserError
-        The browser fails.
-    """
+    """Write the page as a headless Chromium shows it, a PNG file; InputError if it cannot be, BrowserError."""
     with Chromium(address(server), _PICTURE_PX) as browser:
         browser.wait_for("document.querySelector('canvas') !== null")
         # The scene is sent when the page has reported its camera; before that a blank page is at rest too.
@@ -165,6 +131,6 @@ def _write_bytes(data: bytes, path: Path) -> None:
         unfinished.write_bytes(data)
         os.replace(unfinished, path)
     except OSError as error:
-        raise InputError(f"--png {path} cannot be written ({error.strerror}).") from None
+        raise InputError(f"Input png {path} cannot be written ({error.strerror}).") from None
     finally:
         unfinished.unlink(missing_ok=True)

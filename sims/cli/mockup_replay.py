@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from adcs.cli.options import print_note
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
-from arrays.io.outputs import refuse_unwritable
+from magloc.cli.options import naming_outputs
 from sims.experiments.mockup_settings import METHOD_WORDS, MockupOptions, Port
 
 if TYPE_CHECKING:
@@ -22,39 +22,31 @@ if TYPE_CHECKING:
 
 
 def check_places(replay: ReplayOptions) -> None:
-    """Refuse, before long work, files that cannot be written."""
-    from magloc.viewer.chromium import find_chromium
+    """Refuse, before long work, files that cannot be written, and a picture without a browser."""
+    from magloc.viewer.server import check_outputs
 
-    if replay.html is not None:
-        refuse_unwritable(replay.html, "--html")
-    if replay.png is not None:
-        refuse_unwritable(replay.png, "--png", ".png")
-        try:
-            find_chromium()
-        except InputError as error:
-            raise InputError(f"--png: {error}") from None
+    with naming_outputs():
+        check_outputs(replay.html, replay.png)
 
 
 def show_replay(runs: FusionRuns, replay: ReplayOptions, *, quiet: bool) -> None:
     """Show the first drive until Ctrl-C, or write it."""
     from adcs.viewer.drive_page import drive_page, write_playing_page
-    from magloc.viewer.chromium import BrowserError
     from magloc.viewer.server import address, free_port, opened, wait_for_interruption, write_picture
 
     drive = drive_of(runs.results[0], runs.method)
     at_s = 0.5 * drive.duration_s if replay.at is None else replay.at
-    used = free_port(replay.port) if replay.view else 0
+    with naming_outputs():
+        used = free_port(replay.port) if replay.view else 0
     if used not in (0, replay.port) and replay.port and not quiet:
         print_note(f"port {replay.port} is in use, {used} is taken")
     with opened(used, f"adcs · mockup {runs.method}") as server:
         page, player = drive_page(server, drive, at_s)
-        try:
+        with naming_outputs():
             if replay.png is not None:
                 write_picture(server, replay.png)
             if replay.html is not None:
                 write_playing_page(server, page, player, drive, replay.html)
-        except BrowserError as error:
-            raise InputError(f"--png: {error}") from None
         if not replay.view:
             if not quiet:
                 print_note(f"wrote {', '.join(str(file) for file in (replay.html, replay.png) if file is not None)}")

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from arrays.geometries import tetrahedron
 from magloc.viewer.pages.live_fit import suitable_dipole
-from magloc.viewer.pages.open_result import ArrayResult
 from magloc.viewer.pages.pages import array_page
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, FIELD_LINE_COLOUR, FIT_COLOUR, ArrayGlyphs
 from magloc.viewer.scene.shapes import field_lines
@@ -32,7 +31,7 @@ ROD_BLUE = hue_of((70, 110, 200))
 def server(screen: Screen) -> Iterator[viser.ViserServer]:
     """The page of the array, open in the browser."""
     with opened(0, "array") as server:
-        page = array_page(server, ArrayResult(ARRAY), live=True)
+        page = array_page(server, ARRAY, live=True)
         screen.open_server(server)
         yield server
         screen.leave()

@@ -12,7 +12,6 @@ from arrays.geometries import tetrahedron
 from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
 from magloc.viewer.pages.live_fit import LiveFit
-from magloc.viewer.pages.open_result import ReadingsResult
 from magloc.viewer.pages.pages import readings_page
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, FIT_COLOUR
 from magloc.viewer.server import opened
@@ -25,13 +24,13 @@ ORANGE = hue_of(DIPOLE_COLOUR)
 
 
 @pytest.fixture(scope="module")
-def server(screen: Screen, tmp_path_factory: pytest.TempPathFactory) -> Iterator[viser.ViserServer]:
+def server(screen: Screen) -> Iterator[viser.ViserServer]:
     values = np.array([predicted_channels(ARRAY, position, MOMENT) for position in POSITIONS])
     rows = Readings(values, time_s=0.5 * np.arange(9.0))
     fit = LiveFit(ARRAY)
     fixes = [fit.fix(reading) for reading in values]
     with opened(0, "readings") as server:
-        page = readings_page(server, ReadingsResult(rows, ARRAY, tmp_path_factory.getbasetemp()), fixes, rows)
+        page = readings_page(server, ARRAY, fixes, rows)
         screen.open_server(server)
         yield server
         screen.leave()

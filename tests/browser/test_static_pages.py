@@ -8,10 +8,10 @@ import numpy as np
 
 from arrays.array_file import write_array
 from arrays.geometries import tetrahedron
-from magloc.viewer.pages.open_result import ArrayResult, MapResult
+from magloc.viewer.pages.open_result import MapResult
 from magloc.viewer.pages.pages import array_page, map_page
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR
-from magloc.viewer.server import opened, write_page
+from magloc.viewer.server import opened, page_html, write_page
 from tests.browser.screen import Screen, Sight, dark_grey, hue_of
 from tests.browser.test_map_page import DIPOLE, RESULT, sights
 from tests.command_line import Run
@@ -26,7 +26,7 @@ class TestStaticPages:
         page = tmp_path / "array.html"
         assert run("view", tmp_path / "array.toml", "--html", page, "--quiet").status == 0
         with opened(0, "array") as server:
-            array_page(server, ArrayResult(array), live=False)
+            array_page(server, array, live=False)
             screen.open(page.as_uri())
             camera = screen.camera(server.initial_camera)
         screen.until_seen(
@@ -40,7 +40,7 @@ class TestStaticPages:
     def test_map(self, screen: Screen, tmp_path: Path) -> None:
         page = tmp_path / "map.html"
         with opened(0, "map") as server:
-            write_page(server, map_page(server, RESULT), page)
+            write_page(page_html(server, map_page(server, RESULT)), page)
             screen.open(page.as_uri())
             camera = screen.camera(server.initial_camera)
         on_slice = np.array([[x, 0.0, z] for x in (0.5, 3.5) for z in (-3.5, -2.0, 3.5)])
@@ -58,5 +58,5 @@ class TestStaticPages:
         array = tetrahedron(1.0)
         result = MapResult(axis, values, known, "starts", "passes", False, array, None, None, "random", 1)
         with opened(0, "map") as server:
-            write_page(server, map_page(server, result), tmp_path / "map.html")
+            write_page(page_html(server, map_page(server, result)), tmp_path / "map.html")
         assert (tmp_path / "map.html").stat().st_size < LARGEST

@@ -221,7 +221,7 @@ class Fixes(Sequence[Fix]):
 
     def plot(self) -> Figure:
         """Fixes in three planes with 95 % ellipses, their standard deviations and their χ²."""
-        figure: Figure = by_name("magloc.plots.fixes:figure_of_fixes")(self)
+        figure: Figure = by_name("magloc.plots.localization:fixes")(self)
         return figure
 
     def to_xarray(self, which: Literal["best", "all"] = "best") -> xr.Dataset:

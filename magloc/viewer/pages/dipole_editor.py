@@ -23,6 +23,7 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.localization.fit.results import Fix
 from magloc.viewer.pages import words
+from magloc.viewer.pages.fixes import heaviest_first
 from magloc.viewer.pages.live_fit import Forecast, LiveFit, rounded, suitable_dipole
 from magloc.viewer.panels.inputs import SharedInput, set_value
 from magloc.viewer.panels.latest import Latest
@@ -253,7 +254,7 @@ class DipoleEditor:
                 forecast.covariance,
                 array.centroid,
                 range_observable=forecast.range_observable,
-                range_interval95_m=[forecast.range_interval95_m],
+                range_interval_m=[forecast.range_interval_m],
                 farthest_m=max(_FARTHEST * array.circumradius, _FARTHEST_OF_RANGE * distance),
             )
         )
@@ -279,14 +280,14 @@ class DipoleEditor:
         if self.noise_checkbox.value and np.isfinite(readings).all():
             readings = live.simulated(readings, int(self.seed_input.value))
         self.fix = fix = live.fix(readings) if not forecast.reason else Fix((), forecast.reason)
-        shown = fix.solutions[:_SOLUTIONS_SHOWN] if self.visible else ()
+        shown = heaviest_first(fix)[:_SOLUTIONS_SHOWN] if self.visible else []
         for i, glyph in enumerate(self._found):
             glyph.visible = i < len(shown)
             if i < len(shown):
                 glyph.show(shown[i].position_m, shown[i].moment_Am2)
         of_best = None
         if fix.solutions:
-            of_best = words.difference(fix.solutions[0], position, moment, forecast.covariance)
+            of_best = words.difference(fix.best, position, moment, forecast.covariance)
         self.fit_panel.content = words.panel(words.fix_words(fix, forecast, of_best))
         self.milliseconds = (self.milliseconds[0], 1e3 * (perf_counter() - begin))
 

@@ -8,8 +8,8 @@ from html import escape
 import numpy as np
 import viser
 
-from arrays.typing import FloatArray
-from magloc.localization.fit.results import Fix
+from arrays.typing import FloatArray, IntArray
+from magloc.localization.fit.results import Fix, Solution, Source
 from magloc.viewer.pages import words
 from magloc.viewer.panels.latest import Latest
 from magloc.viewer.scene.glyphs import (
@@ -22,41 +22,22 @@ from magloc.viewer.scene.glyphs import (
     SurfaceGlyph,
 )
 from magloc.viewer.scene.legend import Entry, Swatch
-from magloc.viewer.scene.shapes import NOTHING, uncertainty
+from magloc.viewer.scene.shapes import NOTHING, Surface, joined, uncertainty
 
 _MOST_OTHERS = 3
 _FARTHEST_OF_RANGE = 2.5
 
 
 class FixView:
-    """Fixes in a scene.
+    """Fixes in a scene, in its frame, and the source of one row, with where it may be.
 
     Parameters
     ----------
-    server : viser.ViserServer
     times_s : ndarray, shape (n,)
-        Of the rows [s].
-    fixes : sequence of Fix
-        Of the rows, in the frame of the scene.
     centroids_m : ndarray, shape (n, 3)
-        Of the sensors at every row, in the frame of the scene [m].
-    size_m : float
-        Length of the arrows.
-    reach_m : float
-        Of the field lines.
-    dot_m : float
-        Diameter of the dots that stand for all fixes.
-
-    Attributes
-    ----------
-    best : DipoleGlyph
-        Of the row that is shown.
-    region : SurfaceGlyph
-        Where its source may be.
-    row : int
-        Row that is shown.
-    slider : viser.GuiSliderHandle
-        Of the row, after :meth:`add_controls`, where there are several.
+        Of the sensors.
+    size_m, reach_m, dot_m : float
+        Length of the arrows and of the field lines, diameter of the dots that stand for all fixes.
     """
 
     def __init__(
@@ -71,59 +52,57 @@ class FixView:
         dot_m: float,
     ) -> None:
         self._server, self._times, self._fixes, self._centroids = server, times_s, fixes, centroids_m
-        self.positions_m = best_positions(fixes)
         scene = server.scene
-        known = self.positions_m[np.isfinite(self.positions_m).all(axis=1)]
-        if len(known) > 1:
+        of_row, positions = best_positions(fixes)
+        if len(positions) > 1:
             scene.add_point_cloud(
                 "/fixes/all",
-                known.astype(np.float32),
+                positions.astype(np.float32),
                 FIT_COLOUR,
                 point_size=dot_m,
                 point_shape="circle",
                 precision="float32",
             )
+        most = int(np.bincount(of_row, minlength=1).max())  # sources of a row
         self.best = DipoleGlyph(scene, "/fixes/best", size_m, DIPOLE_COLOUR, reach_m)
-        self.others = [DipoleGlyph(scene, f"/fixes/other-{i}", 0.8 * size_m, OTHER_COLOUR) for i in range(_MOST_OTHERS)]
+        more = [DipoleGlyph(scene, f"/fixes/best-{i}", size_m, DIPOLE_COLOUR, reach_m) for i in range(2, most + 1)]
+        self._best = [self.best, *more]
+        n_others = _MOST_OTHERS * max(most, 1)
+        self.others = [DipoleGlyph(scene, f"/fixes/other-{i}", 0.8 * size_m, OTHER_COLOUR) for i in range(n_others)]
         self.region = SurfaceGlyph(scene, "/fixes/region", REGION_COLOUR, 0.4)
         self.row = _clearest(fixes, centroids_m)
         self.show_row(self.row)
 
     def show_row(self, row: int) -> None:
-        """Show another row.
-
-        Parameters
-        ----------
-        row : int
-        """
+        """Show another row."""
         self.row = row
-        solutions = self._fixes[row].solutions
-        for glyph in (self.best, *self.others):
-            glyph.visible = False
-        for glyph, solution in zip((self.best, *self.others), solutions, strict=False):
-            glyph.visible = True
-            glyph.show(solution.position_m, solution.moment_Am2)
-        surface = NOTHING
-        if solutions:
-            best = solutions[0]
-            surface = uncertainty(
-                best.position_m,
-                best.covariance,
-                self._centroids[row],
-                range_observable=best.range_observable,
-                range_interval95_m=best.range_interval_m,
-                farthest_m=_FARTHEST_OF_RANGE * float(np.linalg.norm(best.position_m - self._centroids[row])),
-            )
-        self.region.show(surface)
+        solutions = heaviest_first(self._fixes[row])
+        best, others = _sources(solutions[:1]), _sources(solutions[1 : 1 + _MOST_OTHERS])
+        for glyphs, sources in ((self._best, best), (self.others, others)):
+            for glyph in glyphs:
+                glyph.visible = False
+            for glyph, source in zip(glyphs, sources, strict=False):
+                glyph.visible = True
+                glyph.show(source.position_m, source.moment_Am2)
+        regions = [self._region_of(source) for source in best]
+        self.region.show(regions[0] if len(regions) == 1 else joined(regions))
+
+    def _region_of(self, source: Source) -> Surface:
+        """Where a source may be; nowhere else if its place is known beforehand."""
+        if source.covariance is None or len(source.covariance) < 6:
+            return NOTHING
+        centroid = self._centroids[self.row]
+        return uncertainty(
+            source.position_m,
+            source.covariance,
+            centroid,
+            range_observable=source.range_observable,
+            range_interval_m=source.range_interval_m,
+            farthest_m=_FARTHEST_OF_RANGE * float(np.linalg.norm(source.position_m - centroid)),
+        )
 
     def add_controls(self, on_row: Sequence[Callable[[int], None]] = ()) -> None:
-        """Put the choice of the row, and what is known of its fix, into the panel.
-
-        Parameters
-        ----------
-        on_row : sequence of callable
-            Called with every row that is chosen.
-        """
+        """Put the choice of the row, which calls `on_row`, and what is known of its fix, into the panel."""
         gui = self._server.gui
         with gui.add_folder("Fix"):
             if len(self._fixes) > 1:
@@ -145,12 +124,20 @@ class FixView:
         time = f"<b>time {self._times[self.row]:.6g} s</b>"
         if not fix.solutions:
             return words.panel([time, f"<b>no fix</b>: {escape(fix.reason)}"], warning=True)
-        best = fix.solutions[0]
+        best = fix.best
+        places = []
+        for source in best.sources:
+            places.append(words.place(source.position_m))
+            places.append(f"moment {np.linalg.norm(source.moment_Am2):.3g} A·m²")
         lines = [
-            f"{time}, {words.place(best.position_m)}",
-            f"moment {np.linalg.norm(best.moment_Am2):.3g} A·m²",
+            f"{time}, {places[0]}",
+            *places[1:],
             f"χ² {best.chi2:.3g}, {best.dof} degrees of freedom",
-            *(words.range_words(ends, observable=best.range_observable) for ends in best.range_interval_m),
+            *(
+                words.range_words(ends, observable=source.range_observable)
+                for source in best.sources
+                for ends in source.range_interval_m
+            ),
         ]
         others = len(fix.solutions) - 1
         if others:
@@ -182,14 +169,29 @@ def _clearest(fixes: Sequence[Fix], centroids_m: FloatArray) -> int:
     def relative_variance(row: int) -> float:
         if not fixes[row].solutions:
             return np.inf
-        best = fixes[row].solutions[0]
-        variance = float(np.trace(best.covariance[:3, :3]) / np.sum((best.position_m - centroids_m[row]) ** 2))
+        source = fixes[row].best.sources[0]
+        if source.covariance is None:
+            return np.inf
+        variance = float(np.trace(source.covariance[:3, :3]) / np.sum((source.position_m - centroids_m[row]) ** 2))
         return variance if np.isfinite(variance) else np.inf
 
     return min(range(len(fixes)), key=relative_variance)
 
 
-def best_positions(fixes: Sequence[Fix]) -> FloatArray:
-    """Positions of the best solutions, shape (n, 3), NaN where there is none [m]."""
-    nowhere = np.full(3, np.nan)
-    return np.array([fix.solutions[0].position_m if fix.solutions else nowhere for fix in fixes]).reshape(-1, 3)
+def heaviest_first(fix: Fix) -> list[Solution]:
+    """The solutions of a fix: its best one, and then the others in their order."""
+    if not fix.solutions:
+        return []
+    best = fix.best
+    return [best, *(solution for solution in fix.solutions if solution is not best)]
+
+
+def _sources(solutions: Sequence[Solution]) -> list[Source]:
+    return [source for solution in solutions for source in solution.sources]
+
+
+def best_positions(fixes: Sequence[Fix]) -> tuple[IntArray, FloatArray]:
+    """Rows (k,) and positions (k, 3) of all sources of the best solutions [m]."""
+    found = [(row, source) for row, fix in enumerate(fixes) if fix.solutions for source in fix.best.sources]
+    positions = np.array([source.position_m for _, source in found]).reshape(-1, 3)
+    return np.array([row for row, _ in found], dtype=np.intp), positions

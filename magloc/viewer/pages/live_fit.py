@@ -6,25 +6,22 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtri, chndtr
+from scipy.special import chndtr
 
 from arrays.array import SensorArray
 from arrays.differences import Differences, decorrelated_differences
 from arrays.noise import reading_covariance, reading_errors
 from arrays.typing import FloatArray
+from magloc.bounds.crlb import cramer_rao_bounds
+from magloc.chi_square import energy_threshold
 from magloc.fields.dipole import MU0_OVER_4PI
-from magloc.levels import DELTA_CHI2_95
-from magloc.localization.fit.results import Fix, Solution, is_observable, open_ended
+from magloc.localization.fit.results import Fix, is_observable, open_ended
 from magloc.localization.locator import Locator
 from magloc.localization.search.single_source import N_UNKNOWNS
 from magloc.localization.uncertainty.range_interval import gaussian_ranges
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 
-# A signal counts as detectable if a test of the differences with this false-alarm rate finds it more often than not.
-_FALSE_ALARM = 0.01
 _CERTAIN = 1e5  # squared signal over noise that is detected by any array; the distribution is not evaluated beyond
-# Information whose eigenvalues, in scaled unknowns, differ by more than this determines nothing in double precision.
-_SINGULAR = 1e-13
 _NICE_SIGNAL = 300.0
 _NICE_RANGE = 3.0
 
@@ -42,10 +39,10 @@ class Forecast:
     signal_to_noise : float
         Root of the sum of squared whitened differences: the signal in standard deviations of its noise.
     detectable : bool
-        Whether a χ² test of the differences with a false-alarm rate of 1 % finds the signal more often than not.
+        Whether a fix finds the signal to stand out of noise more often than not.
     covariance : ndarray, shape (6, 6), optional
         Cramér-Rao bound of (position, moment); None where the readings do not determine them.
-    range_interval95_m : tuple of (low, high)
+    range_interval_m : tuple of (low, high)
         95 % interval of the distance from the sensors' centroid by the bound [m]; high is None where it is open.
     range_observable : bool
         Whether it is closed and its ends differ by a factor of two at most.
@@ -58,18 +55,13 @@ class Forecast:
     signal_to_noise: float
     detectable: bool
     covariance: FloatArray | None = None
-    range_interval95_m: tuple[float, float | None] = (0.0, None)
+    range_interval_m: tuple[float, float | None] = (0.0, None)
     range_observable: bool = False
     reason: str = ""
 
 
 class LiveFit:
-    """Forecasts and fixes with one array, fast enough to follow a dragged dipole.
-
-    Parameters
-    ----------
-    array : SensorArray
-    """
+    """Forecasts and fixes with one array, fast enough to follow a dragged dipole."""
 
     def __init__(self, array: SensorArray) -> None:
         self.array = array
@@ -83,18 +75,7 @@ class LiveFit:
             self._reason = str(error).removeprefix("Input ").rstrip(".")
 
     def forecast(self, position_m: ArrayLike, moment_Am2: ArrayLike) -> Forecast:
-        """Readings of a dipole and their Cramér-Rao bound.
-
-        Parameters
-        ----------
-        position_m, moment_Am2 : array-like, shape (3,)
-            Source in the array's frame [m], its moment [A·m²].
-
-        Returns
-        -------
-        Forecast
-            With NaN readings of a sensor that the dipole stands on.
-        """
+        """Readings of a dipole, NaN of a sensor that it stands on, and their Cramér-Rao bound."""
         array = self.array
         readings = predicted_channels(array, position_m, moment_Am2) + array.channel_offset_T
         signal = readings - self._without_source
@@ -104,20 +85,21 @@ class LiveFit:
         measurement = DifferenceMeasurement(array, self._differences_at(readings))
         whitened = measurement.differences.transform @ signal / np.sqrt(measurement.variance)
         energy, k = float(whitened @ whitened), whitened.size
-        detectable = k > 0 and float(chndtr(chdtri(k, _FALSE_ALARM), k, min(energy, _CERTAIN))) < 0.5
+        detectable = k > 0 and float(chndtr(energy_threshold(k), k, min(energy, _CERTAIN))) < 0.5
         if k < N_UNKNOWNS:
             reason = f"the array gives {k} independent differences, {N_UNKNOWNS} are needed"
             return Forecast(readings, signal, energy**0.5, detectable, reason=reason)
-        covariance = _inverse(measurement.fisher_information(position_m, moment_Am2))
-        if covariance is None:
+        bounds = cramer_rao_bounds(array, position_m, moment_Am2)
+        if not bounds.is_regular:
             return Forecast(readings, signal, energy**0.5, detectable, reason=_why_singular(moment_Am2))
-        low, high = range_interval(np.asarray(position_m) - array.centroid, covariance[:3, :3], array.circumradius)
+        offset_m = np.asarray(position_m) - array.centroid
+        low, high = gaussian_ranges(bounds.covariance, offset_m, array.circumradius).tolist()
         return Forecast(
             readings,
             signal,
             energy**0.5,
             detectable,
-            covariance,
+            bounds.covariance,
             open_ended(low, high),
             is_observable(low, high),
         )
@@ -141,46 +123,8 @@ class LiveFit:
         return decorrelated_differences(self.array, covariance_T2=reading_covariance(self.array, readings_T))
 
 
-def range_interval(offset_m: FloatArray, covariance_m2: FloatArray, radius_m: float) -> tuple[float, float]:
-    """95 % interval of a distance from a Gaussian of the position.
-
-    As :func:`magloc.localization.uncertainty.range_interval.gaussian_ranges`.
-
-    A source in the centroid, which that knows nothing of, may be as far off as its position.
-
-    Parameters
-    ----------
-    offset_m : ndarray, shape (3,)
-        Of the source from the sensors' centroid [m].
-    covariance_m2 : ndarray, shape (3, 3)
-        Of its position [m²].
-    radius_m : float
-        Circumradius R of the sensors [m].
-
-    Returns
-    -------
-    low, high : float
-        [m]; 0 and infinity where it is open.
-    """
-    distance = float(np.linalg.norm(offset_m))
-    if not distance > 0.0:
-        return 0.0, float(np.sqrt(DELTA_CHI2_95 * np.trace(covariance_m2)))
-    low, high = gaussian_ranges(covariance_m2, offset_m, radius_m).tolist()
-    return low, high
-
-
 def suitable_dipole(array: SensorArray) -> tuple[FloatArray, FloatArray]:
-    """A dipole that an array locates well: three radii from its centroid, its field a few hundred times the noise.
-
-    Parameters
-    ----------
-    array : SensorArray
-
-    Returns
-    -------
-    position_m, moment_Am2 : ndarray, shape (3,)
-        In the array's frame [m], upright [A·m²]; rounded.
-    """
+    """Place and moment of a dipole that an array locates well: three radii away, a few hundred times the noise."""
     direction = np.array([2.0, 1.0, 2.0]) / 3.0
     distance = _NICE_RANGE * array.circumradius
     field_T = _NICE_SIGNAL * float(np.median(array.channel_noise_T))
@@ -193,27 +137,6 @@ def suitable_dipole(array: SensorArray) -> tuple[FloatArray, FloatArray]:
 def rounded(value: float) -> float:
     """A positive number to one significant digit."""
     return float(f"{value:.0e}")
-
-
-def nearest(fix: Fix, position_m: FloatArray) -> Solution | None:
-    """The solution of a fix that is nearest to a position."""
-    if not fix.solutions:
-        return None
-    return min(fix.solutions, key=lambda solution: float(np.linalg.norm(solution.position_m - position_m)))
-
-
-def _inverse(information: FloatArray) -> FloatArray | None:
-    """Inverse of an information matrix, None if it is singular. Unknowns are scaled first: they have other units."""
-    with np.errstate(divide="ignore"):
-        scale = 1.0 / np.sqrt(np.diagonal(information))
-    if not np.isfinite(scale).all():
-        return None
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-    if not values[0] > _SINGULAR * values[-1]:
-        return None
-    root = scale[:, None] * vectors / np.sqrt(values)
-    covariance: FloatArray = root @ root.T
-    return covariance
 
 
 def _why_singular(moment_Am2: ArrayLike) -> str:

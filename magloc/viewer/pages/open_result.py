@@ -11,6 +11,7 @@ import tomllib
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,9 @@ from magloc.tracking.files import _read_track
 from magloc.tracking.results import TrackPoint, TrackResult
 from magloc.truth import Truth, read_truth
 
+if TYPE_CHECKING:
+    import xarray as xr
+
 KINDS = (
     "an array (.toml), readings or a truth (.csv), a track of `magloc track` (.json, .jsonl), or the folder of a map"
 )
@@ -33,29 +37,8 @@ _MOST_POINTS = 64  # along an axis of a map: more would not be told apart
 
 
 @dataclass(frozen=True, eq=False)
-class ArrayResult:
-    """An array file.
-
-    Attributes
-    ----------
-    array : SensorArray
-    """
-
-    array: SensorArray
-
-
-@dataclass(frozen=True, eq=False)
 class ReadingsResult:
-    """A readings file.
-
-    Attributes
-    ----------
-    readings : Readings
-        With a reading at least.
-    array : SensorArray
-    array_path : Path
-        Where the array was found.
-    """
+    """Readings, with one at least, and the array that was found for them."""
 
     readings: Readings
     array: SensorArray
@@ -100,34 +83,18 @@ class MapResult:
     every: int
 
 
-Result = ArrayResult | ReadingsResult | TrackResult | MapResult
+Result = SensorArray | ReadingsResult | TrackResult | MapResult
 
 
 def read_result(path: Path, array_path: Path | None = None) -> Result:
-    """Whatever a path holds.
-
-    Parameters
-    ----------
-    path : Path
-    array_path : Path, optional
-        Array file that readings belong to; by default the one that stands beside them, NAME-array.toml or array.toml.
-
-    Returns
-    -------
-    ArrayResult, ReadingsResult, TrackResult or MapResult
-
-    Raises
-    ------
-    InputError
-        There is nothing, or something of another kind, or nothing in it that can be shown.
-    """
+    """Whatever a path holds; the array of readings is by default the one that stands beside them."""
     if path.is_dir():
         return _read_map(path)
     suffix = path.suffix.lower()
     if not path.exists() and suffix in (".toml", ".csv", ".json", ".jsonl", ""):
         raise InputError(f"{path} does not exist, expected {KINDS}.")
     if suffix == ".toml":
-        return ArrayResult(read_sensors(path))
+        return read_sensors(path)
     if suffix == ".csv":
         return _read_csv(path, array_path)
     if suffix in (".json", ".jsonl"):
@@ -136,23 +103,7 @@ def read_result(path: Path, array_path: Path | None = None) -> Result:
 
 
 def read_rows(path: Path, array_path: Path | None) -> ReadingsResult:
-    """A readings file with its array.
-
-    Parameters
-    ----------
-    path : Path
-    array_path : Path, optional
-        By default the array file that stands beside the readings.
-
-    Returns
-    -------
-    ReadingsResult
-
-    Raises
-    ------
-    InputError
-        One of them cannot be read, no array is found, or there is no reading.
-    """
+    """A readings file with its array, by default the one that stands beside it."""
     where = _array_beside(path) if array_path is None else array_path
     array = read_sensors(where)
     readings = read_readings(path, array)
@@ -164,7 +115,7 @@ def read_rows(path: Path, array_path: Path | None) -> ReadingsResult:
 def _read_csv(path: Path, array_path: Path | None) -> ReadingsResult | TrackResult:
     header = read_table(path, "a header with time_s and the sensors' columns").header
     if "x_m" in header and "y_m" in header:
-        return _as_track(read_truth(path))
+        return path_of_truth(read_truth(path))
     if not any(name.endswith("_nT") for name in header):
         raise InputError(
             f"{path}: found neither readings (columns in nT) nor a truth (columns x_m, y_m), expected {KINDS}."
@@ -181,7 +132,8 @@ def _array_beside(path: Path) -> Path:
     )
 
 
-def _as_track(truth: Truth) -> TrackResult:
+def path_of_truth(truth: Truth) -> TrackResult:
+    """The true path, in the order of time."""
     position = np.where(np.isfinite(truth.position_m), truth.position_m, 0.0)  # a truth in the plane is at z = 0
     moments = [None] * len(position) if truth.moment_Am2 is None else list(truth.moment_Am2)
     order = np.argsort(truth.time_s, kind="stable")
@@ -200,6 +152,18 @@ def _read_map(folder: Path) -> MapResult:
 
     try:
         dataset = open_map(store)
+    except (KeyError, ValueError, OSError, RuntimeError, EOFError):
+        raise _no_map(store) from None
+    return map_of(dataset, str(folder))
+
+
+def _no_map(place: str | Path) -> InputError:
+    return InputError(f"{place}: found something else than a map, expected one that `magloc map` wrote.")
+
+
+def map_of(dataset: xr.Dataset, place: str = "Input result") -> MapResult:
+    """A map over starts or sources, thinned to what can be told apart; `place` names it in errors."""
+    try:
         axis = dataset["x"].to_numpy().astype(np.float64)
         every = max(1, math.ceil(len(axis) / _MOST_POINTS))
         part = dataset.isel(x=slice(None, None, every), y=slice(None, None, every), z=slice(None, None, every))
@@ -207,15 +171,15 @@ def _read_map(folder: Path) -> MapResult:
         status = part["status"].to_numpy()
         shown = part["iterations" if over == "starts" else "sigma_range"].to_numpy().astype(np.float64)
         attributes = dataset.attrs
-        array = array_of_table(str(store), tomllib.loads(attributes["array"], parse_float=Decimal))
-    except (KeyError, ValueError, OSError, RuntimeError, EOFError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{store}: found something else than a map, expected one that `magloc map` wrote.") from None
+        array = array_of_table(place, tomllib.loads(attributes["array"], parse_float=Decimal))
+    except InputError:
+        raise
+    except (KeyError, ValueError, OSError, RuntimeError, EOFError):
+        raise _no_map(place) from None
     # What is not computed yet has the smallest integer there is.
     done = status >= 0
     if not done.any():
-        raise InputError(f"{folder}: found a map of which nothing is computed yet, expected some points of it.")
+        raise InputError(f"{place}: found a map of which nothing is computed yet, expected some points of it.")
     if over == "starts":
         values = np.where(status == 0, shown, np.nan)
         failed = done & (status != 0)

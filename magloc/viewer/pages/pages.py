@@ -16,7 +16,7 @@ from magloc.readings import Readings
 from magloc.tracking.results import TrackPoint, TrackResult
 from magloc.viewer.pages.fixes import FixView, best_positions
 from magloc.viewer.pages.map import MapControls, MapView
-from magloc.viewer.pages.open_result import ArrayResult, MapResult, ReadingsResult
+from magloc.viewer.pages.open_result import MapResult
 from magloc.viewer.pages.track_player import TrackPlayer
 from magloc.viewer.panels.readings_plot import ReadingsPlot
 from magloc.viewer.scene.framing import Extent, corners_of, extent_of, prepare
@@ -65,21 +65,8 @@ class Page:
     close: Callable[[], None] = lambda: None
 
 
-def array_page(server: viser.ViserServer, result: ArrayResult, *, live: bool) -> Page:
-    """An array.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-    result : ArrayResult
-    live : bool
-        Whether somebody is there to drag a dipole and the sensors.
-
-    Returns
-    -------
-    Page
-    """
-    array = result.array
+def array_page(server: viser.ViserServer, array: SensorArray, *, live: bool) -> Page:
+    """An array; live if somebody is there to drag a dipole and the sensors."""
     glyphs = ArrayGlyphs(server.scene, array)
     ball = extent_of(*(corners_of(place, glyphs.size_m) for place in array.positions))
     entries: list[Entry] = [_sensors_entry(array)]
@@ -105,40 +92,28 @@ def array_page(server: viser.ViserServer, result: ArrayResult, *, live: bool) ->
     return _finished(server, legend, ball, array.name or "array", entries)
 
 
-def readings_page(server: viser.ViserServer, result: ReadingsResult, fixes: Sequence[Fix], rows: Readings) -> Page:
-    """Readings and the fixes of their rows.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-    result : ReadingsResult
-    fixes : sequence of Fix
-        Of rows that are shown; in the world frame if the array's pose is known.
-    rows : Readings
-        These rows.
-
-    Returns
-    -------
-    Page
-    """
-    array, gui = result.array, server.gui
+def readings_page(server: viser.ViserServer, array: SensorArray, fixes: Sequence[Fix], rows: Readings | None) -> Page:
+    """The fixes of rows, in the world frame if the array's pose is known; with the readings themselves, if given."""
+    gui = server.gui
     glyphs = ArrayGlyphs(server.scene, array)
     legend = gui.add_folder("Legend")
-    centroids = _centroids(array, rows)
-    near = _not_far(best_positions(fixes), centroids)
+    centroids = _centroids(array, rows, len(fixes))
+    of_row, positions = best_positions(fixes)
+    near = _not_far(positions, centroids[of_row])
     ball = extent_of(array.positions + (centroids - array.centroid)[:, None], near)
     size, dot = max(0.4 * array.circumradius, 0.11 * ball.radius_m), 0.012 * ball.radius_m
-    view = FixView(server, rows.time_s, fixes, centroids, size_m=size, reach_m=1.4 * size, dot_m=dot)
+    times = np.array([fix.time_s for fix in fixes]) if rows is None else rows.time_s
+    view = FixView(server, times, fixes, centroids, size_m=size, reach_m=1.4 * size, dot_m=dot)
 
     def move_array(row: int) -> None:
-        if rows.array_position_m is not None and rows.array_rotation is not None:
+        if rows is not None and rows.array_position_m is not None and rows.array_rotation is not None:
             glyphs.set_pose(rows.array_position_m[row], rows.array_rotation[row].as_quat())
 
     move_array(view.row)
     # The plot stands below the choice of the row, which has to move its mark.
     followers: list[Callable[[int], None]] = [move_array]
     view.add_controls(followers)
-    if len(rows) > 1:
+    if rows is not None and len(rows) > 1:
         plot = ReadingsPlot(server, rows, array)
         plot.show_row(view.row)
         followers.append(plot.show_row)
@@ -151,21 +126,7 @@ def readings_page(server: viser.ViserServer, result: ReadingsResult, fixes: Sequ
 def track_page(
     server: viser.ViserServer, result: TrackResult, array: SensorArray | None, rows: Readings | None
 ) -> Page:
-    """A track.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-    result : TrackResult
-    array : SensorArray, optional
-        That it was found with.
-    rows : Readings, optional
-        Of the array; needs `array`.
-
-    Returns
-    -------
-    Page
-    """
+    """A track, with the array that found it and its readings, if they are given."""
     points, gui = result.points, server.gui
     positions = np.array([np.full(3, np.nan) if p.position_m is None else p.position_m for p in points])
     legend = gui.add_folder("Legend")
@@ -204,17 +165,7 @@ def track_page(
 
 
 def map_page(server: viser.ViserServer, result: MapResult) -> Page:
-    """A map over starts or sources.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-    result : MapResult
-
-    Returns
-    -------
-    Page
-    """
+    """A map over starts or sources."""
     legend = server.gui.add_folder("Legend")
     view = MapView(server, result)
     view.add_box()
@@ -282,10 +233,10 @@ def _sensors_entry(array: SensorArray) -> Swatch:
     return Swatch(SENSOR_COLOUR, f"{array.n_sensors} {kind}sensor{'s' if array.n_sensors > 1 else ''}, noise {noise}")
 
 
-def _centroids(array: SensorArray, rows: Readings) -> FloatArray:
+def _centroids(array: SensorArray, rows: Readings | None, n: int) -> FloatArray:
     """Mean position of the sensors at every row, in the frame of the fixes (n, 3)."""
-    if rows.array_position_m is None or rows.array_rotation is None:
-        return np.tile(array.centroid, (len(rows), 1))
+    if rows is None or rows.array_position_m is None or rows.array_rotation is None:
+        return np.tile(array.centroid, (n, 1))
     turned: FloatArray = rows.array_rotation.apply(array.centroid.copy())  # scipy takes no read-only array
     return rows.array_position_m + turned
 

@@ -79,7 +79,7 @@ def bound_words(forecast: Forecast) -> list[str]:
         *lines,
         f"σ x {x}, y {y}, z {z}",
         f"σ of the moment {_plain(float(np.linalg.norm(sigma[3:])), 3)} A·m²",
-        range_words(forecast.range_interval95_m, observable=forecast.range_observable),
+        range_words(forecast.range_interval_m, observable=forecast.range_observable),
     ]
 
 
@@ -87,7 +87,7 @@ def fix_words(fix: Fix, forecast: Forecast, of_best: Difference | None) -> list[
     """What a fix of simulated readings found, and how far from the truth it is."""
     if not fix.solutions or of_best is None:
         return [f"<b>no solution</b>: {escape(fix.reason)}"]
-    best = fix.solutions[0]
+    best = fix.best
     lines = []
     if not forecast.detectable:
         lines.append("<b>this is a fit of noise</b>: the signal is too weak to be detected")

@@ -84,23 +84,13 @@ def add_legend(gui: viser.GuiApi, entries: Sequence[Entry], notes: Sequence[str]
     return gui.add_html(legend_html(entries, notes))
 
 
-def with_legend(page: str, title: str, entries: Sequence[Entry], notes: Sequence[str] = ()) -> str:
-    """A static page with the title and the legend in its corner.
-
-    Parameters
-    ----------
-    page : str
-        HTML as viser makes it, which has no panel.
-    title : str
-    entries, notes
-        As in :func:`legend_html`.
-
-    Returns
-    -------
-    str
-    """
+def with_legend(
+    page: str, title: str, entries: Sequence[Entry], notes: Sequence[str] = (), *, bottom: str = ".8em"
+) -> str:
+    """A static page as viser makes it, without a panel, with the title and the legend in its corner."""
     box = (
-        '<div style="position:fixed;bottom:.8em;left:.8em;z-index:1000;max-width:19rem;background:rgba(255,255,255,.9);'
+        f'<div style="position:fixed;bottom:{bottom};left:.8em;z-index:1000;max-width:19rem;'
+        "background:rgba(255,255,255,.9);"
         "color:#222;border-radius:.4em;box-shadow:0 1px 4px rgba(0,0,0,.25);font-family:sans-serif;"
         f'pointer-events:none"><div style="font-weight:600;padding:.5em .6em .2em">{escape(title)}</div>'
         f"{legend_html(entries, notes)}</div>"

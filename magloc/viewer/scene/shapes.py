@@ -314,7 +314,7 @@ def uncertainty(
     centroid_m: ArrayLike,
     *,
     range_observable: bool,
-    range_interval95_m: Iterable[tuple[float, float | None]],
+    range_interval_m: Iterable[tuple[float, float | None]],
     farthest_m: float,
 ) -> Surface:
     """Where the source of a fix may be: the 95 % ellipsoid if its range is observable, else the long region.
@@ -328,7 +328,7 @@ def uncertainty(
     centroid_m : array-like, shape (3,)
         Of the sensors [m].
     range_observable : bool
-    range_interval95_m : iterable of (low, high)
+    range_interval_m : iterable of (low, high)
         As in :class:`magloc.localization.fit.results.Solution`.
     farthest_m : float
         Where an open interval is cut [m].
@@ -341,7 +341,7 @@ def uncertainty(
     if range_observable:
         return ellipsoid(position_m, of_position)
     return joined(
-        range_region(position_m, of_position, centroid_m, interval, farthest_m) for interval in range_interval95_m
+        range_region(position_m, of_position, centroid_m, interval, farthest_m) for interval in range_interval_m
     )
 
 

@@ -64,8 +64,8 @@ def coarse(monkeypatch):
 @pytest.fixture
 def plain_pictures(coarse, monkeypatch):
     """Pictures without contents, which take no time."""
-    for name in ("bound_slices_figure", "bound_sphere_figure", "reach_figure"):
-        monkeypatch.setattr(f"magloc.plots.bounds.{name}", lambda *_: style.new_figure(1.0))
+    for name in ("bound_slices", "bound_sphere", "bound_reach"):
+        monkeypatch.setattr(f"magloc.plots.{name}", lambda *_: style.new_figure(1.0))
 
 
 with_plain_pictures = pytest.mark.usefixtures("plain_pictures")

@@ -22,7 +22,7 @@ from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings, write_readings
 from magloc.tracking.results import TrackResult
 from magloc.viewer.chromium import BINARIES, Chromium, find_chromium
-from magloc.viewer.pages.open_result import ArrayResult, MapResult, ReadingsResult, read_result
+from magloc.viewer.pages.open_result import MapResult, ReadingsResult, read_result
 from magloc.viewer.pages.pages import array_page
 from magloc.viewer.scene.glyphs import ArrayGlyphs
 from magloc.viewer.server import free_port, opened
@@ -315,7 +315,7 @@ class TestPicture:
         red, green, blue = np.moveaxis(read_png(picture).astype(int), -1, 0)
         array = tetrahedron(1.5)
         with opened(0, "test") as server:
-            array_page(server, ArrayResult(array), live=False)
+            array_page(server, array, live=False)
             camera = server.initial_camera
             size = ArrayGlyphs(server.scene, array).size_m
             seen = places_in_picture(array.positions + np.array([0.0, 0.0, 0.8 * size]), camera)

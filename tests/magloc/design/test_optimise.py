@@ -36,7 +36,7 @@ from magloc.design.optimise import design_array, random_sample, sobol_sample, st
 from magloc.design.task import Block, Cap, DesignSearch, DesignTask, Mean, Quantile
 from magloc.design.volumes import Ball, Box, Cylinder, Surface
 from magloc.fields.dipole import field
-from magloc.plots.design import clear_azimuth
+from magloc.plots.designs import clear_azimuth
 from tests.plain_locator import plain_locator
 
 RADIUS = 0.92

@@ -33,8 +33,8 @@ from arrays.sensor import Calibration
 from magloc.convergence.over_starts import Status
 from magloc.localization.fit.results import Fix, Solution
 from magloc.plots import style
-from magloc.plots.calibration import calibration_figure, turning_figure
-from magloc.plots.fixes import distances_from_truth, fix_columns, fix_figure, residual_figure
+from magloc.plots.calibrations import calibration_figure, turning_figure
+from magloc.plots.localization import distances_from_truth, fix_columns, fix_figure, residual_figure
 from magloc.plots.maps import _SOURCE_ENDS, convergence
 from magloc.plots.style import save
 from magloc.plots.tracks import consistency_figure, track_figure

@@ -26,10 +26,12 @@ from arrays.array import SensorArray
 from arrays.array_file import read_array, write_array
 from arrays.geometries import axial, cube, square, tetrahedron
 from arrays.sensor import Calibration
+from magloc.levels import FALSE_ALARM
 from magloc.localization.fit.results import Fix
+from magloc.localization.uncertainty.range_interval import gaussian_ranges
 from magloc.viewer.pages.array_editor import ArrayEditor, fault_of_path, moved
 from magloc.viewer.pages.dipole_editor import DipoleEditor, angles_of, direction_of, sensible_step, turned_to
-from magloc.viewer.pages.live_fit import LiveFit, range_interval, suitable_dipole
+from magloc.viewer.pages.live_fit import LiveFit, suitable_dipole
 from magloc.viewer.pages.words import panel
 from magloc.viewer.panels.inputs import set_value
 from magloc.viewer.panels.latest import Latest
@@ -152,7 +154,7 @@ class TestForecast:
     @given(st.floats(0.05, 20.0), st.floats(1e-4, 1.0))
     def test_range_interval_holds_the_range(self, distance, relative_sigma):
         offset = distance * np.array([0.6, 0.0, 0.8])
-        low, high = range_interval(offset, (relative_sigma * distance) ** 2 * np.eye(3), 1.0)
+        low, high = gaussian_ranges((relative_sigma * distance) ** 2 * np.eye(3), offset, 1.0)
         assert low < distance < high
 
     def test_detectable_is_what_a_test_finds_more_often_than_not(self):
@@ -160,7 +162,7 @@ class TestForecast:
         live = LiveFit(SMALL)
         strong = live.forecast(position, moment).signal_to_noise
         # Twelve readings less the three components of the common field.
-        energy = brentq(lambda energy: ncx2.sf(chi2.isf(0.01, 9), 9, energy) - 0.5, 1.0, 100.0)
+        energy = brentq(lambda energy: ncx2.sf(chi2.isf(FALSE_ALARM, 9), 9, energy) - 0.5, 1.0, 100.0)
         for factor in (0.1, 0.99, 1.01, 10.0, 1e4):
             wanted = factor * np.sqrt(energy)
             forecast = live.forecast(position, moment * wanted / strong)
@@ -382,15 +384,15 @@ class TestDipoleEditor:
 
     def test_noise_has_a_seed_and_may_be_left_out(self, server, array):
         editor = DipoleEditor(server, array)
-        first = editor.fix.solutions[0].position_m
+        first = editor.fix.best.position_m
         set_value(editor.draw_button, True)
         assert editor.seed_input.value == 1
-        second = editor.fix.solutions[0].position_m
+        second = editor.fix.best.position_m
         assert np.linalg.norm(second - first) > 0.0
         set_value(editor.seed_input, 0)
-        np.testing.assert_array_equal(editor.fix.solutions[0].position_m, first)
+        np.testing.assert_array_equal(editor.fix.best.position_m, first)
         set_value(editor.noise_checkbox, False)
-        np.testing.assert_allclose(editor.fix.solutions[0].position_m, editor.position_m, rtol=1e-5)
+        np.testing.assert_allclose(editor.fix.best.position_m, editor.position_m, rtol=1e-5)
 
     def test_a_changed_array_reads_the_same_dipole(self, server, array):
         editor = DipoleEditor(server, array)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ from magloc.tracking.results import TrackPoint, TrackResult
 from magloc.viewer.pages import pages
 from magloc.viewer.pages.fixes import FixView
 from magloc.viewer.pages.map import MapControls, MapView
-from magloc.viewer.pages.open_result import ArrayResult, MapResult, ReadingsResult
+from magloc.viewer.pages.open_result import MapResult
 from magloc.viewer.panels.inputs import set_value
 from magloc.viewer.scene import framing, shapes
 from magloc.viewer.scene import glyphs as scene
@@ -99,7 +98,7 @@ class TestFirstCamera:
     def test_it_scales_with_the_array(self, server: viser.ViserServer) -> None:
         cameras = []
         for edge in (0.03, 30.0):
-            pages.array_page(server, ArrayResult(tetrahedron_of(edge)), live=False)
+            pages.array_page(server, tetrahedron_of(edge), live=False)
             cameras.append((server.initial_camera.position / edge, server.initial_camera.near / edge))
         assert cameras[0][0] == pytest.approx(cameras[1][0])
         assert cameras[0][1] == pytest.approx(cameras[1][1])
@@ -174,12 +173,12 @@ class TestArray:
     @pytest.mark.parametrize("kind", ["vector", "scalar"])
     def test_every_geometry_has_a_page(self, server: viser.ViserServer, shape: str, kind: SensorKind) -> None:
         array = GEOMETRIES[shape].make(0.3, kind, 1e-9)
-        page = pages.array_page(server, ArrayResult(array), live=True)
+        page = pages.array_page(server, array, live=True)
         assert any(str(array.n_sensors) in getattr(entry, "text", "") for entry in page.entries)
 
     def test_a_single_sensor_can_be_seen(self, server: viser.ViserServer) -> None:
         single = SensorArray((Sensor("a", "vector", (5.0, 0.0, 0.0), 1e-9),))
-        pages.array_page(server, ArrayResult(single), live=True)
+        pages.array_page(server, single, live=True)
         assert server.initial_camera.look_at == pytest.approx([5.0, 0.0, 0.0])
 
 
@@ -426,7 +425,7 @@ class TestFixes:
         turn = Rotation.identity(2)
         rows = Readings(np.zeros((2, 12)), array_position_m=pose, array_rotation=turn)
         fixes = [Fix((solution(np.array([5.0, 0.0, 0.0])),)), Fix((solution(np.array([15.0, 0.0, 0.0])),))]
-        page = pages.readings_page(server, ReadingsResult(rows, array, Path("array.toml")), fixes, rows)
+        page = pages.readings_page(server, array, fixes, rows)
         assert any("95 %" in getattr(entry, "text", "") for entry in page.entries)
 
 

@@ -211,12 +211,12 @@ class TestRangeRegion:
     def test_an_observable_range_is_an_ellipsoid_and_others_are_long(self) -> None:
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = self.SIGMA
-        options = {"range_interval95_m": [(3.0, 9.0)], "farthest_m": 30.0}
+        options = {"range_interval_m": [(3.0, 9.0)], "farthest_m": 30.0}
         small = shapes.uncertainty(self.AT, covariance, self.CENTROID, range_observable=True, **options)  # type: ignore[arg-type]
         assert small.vertices.tolist() == shapes.ellipsoid(self.AT, self.SIGMA).vertices.tolist()
         two = [(3.0, 4.0), (6.0, None)]
         long = shapes.uncertainty(
-            self.AT, covariance, self.CENTROID, range_observable=False, range_interval95_m=two, farthest_m=30.0
+            self.AT, covariance, self.CENTROID, range_observable=False, range_interval_m=two, farthest_m=30.0
         )
         assert len(mesh_of(long).split()) == 2
         assert np.linalg.norm(long.vertices - self.CENTROID, axis=1).max() == pytest.approx(30.0)

@@ -21,7 +21,7 @@ from arrays.typing import FloatArray
 _T_IN_nT = 1e9
 
 
-def figure_of_calibration(result: SourceCalibration | TurningCalibration) -> Figure:
+def calibration(result: SourceCalibration | TurningCalibration) -> Figure:
     """The figure that suits a calibration."""
     return turning_figure(result) if isinstance(result, TurningCalibration) else calibration_figure(result)
 

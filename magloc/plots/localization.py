@@ -13,13 +13,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from arrays.array import SensorArray
-from arrays.io.csv import Column, write_columns
+from arrays.io.csv import Column
 from arrays.io.outputs import make_folder
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.results import is_observable, span
 from magloc.localization.residuals import fix_residuals
 from magloc.plots import style
-from magloc.plots.style import bounds99, save
+from magloc.plots.style import bounds99, write
 from magloc.readings import Readings
 
 if TYPE_CHECKING:
@@ -29,6 +29,47 @@ from arrays.typing import FloatArray
 _LOG = logging.getLogger(__name__)
 
 _NAMES = ("x_m", "y_m", "z_m", "mx_Am2", "my_Am2", "mz_Am2")
+
+
+def fixes(
+    fixes: Fixes, array: SensorArray | None = None, readings: Readings | None = None, truth_m: FloatArray | None = None
+) -> Figure:
+    """Fixes in three planes with 95 % ellipses, their standard deviations and their χ².
+
+    Where the range is not observable there is no ellipse but a line, the 95 % interval of the range, which ends in an
+    arrow where it is open. It counts from the array: without that it is not drawn.
+
+    Parameters
+    ----------
+    fixes : Fixes
+    array : SensorArray, optional
+        That they were found with.
+    readings : Readings, optional
+        That they were found in, for the poses of an array that moves.
+    truth_m : ndarray, shape (n, 3), optional
+        True positions in the frame of the fixes [m], NaN where they are not known.
+    """
+    sensors_m = np.zeros((len(fixes), 0, 3)) if array is None else _sensors_of(fixes, array, readings)
+    return fix_figure(fix_columns(fixes), sensors_m, truth_m)
+
+
+def residuals(array: SensorArray, readings: Readings, fixes: Fixes, *, ambient_T: FloatArray | None = None) -> Figure:
+    """What fixes leave of every channel, in standard deviations of its noise.
+
+    Thick bars hold half of the rows, thin ones nine tenths; of noise alone, nine tenths are in the grey band.
+
+    Parameters
+    ----------
+    array : SensorArray
+    readings : Readings
+        That the fixes were found in.
+    fixes : Fixes
+        In either frame.
+    ambient_T : ndarray, shape (n, 3), optional
+        Ambient field of every row in the array's frame [T], in place of the array's.
+    """
+    left = _residuals_of(array, readings, fixes, ambient_T)
+    return residual_figure(left, array.channel_names, array.ids, array.channel_sensor)
 
 
 def write_pictures(
@@ -41,34 +82,9 @@ def write_pictures(
     *,
     quiet: bool = False,
 ) -> None:
-    """Write fixes.png and residuals.png, and the data behind them as fixes.csv and residuals.csv.
-
-    Parameters
-    ----------
-    rows : Readings
-        That the fixes were made of (:func:`magloc.localization.locator.used_rows`).
-    array : SensorArray
-    fixes : Fixes
-    ambient_T : ndarray, shape (n, 3), optional
-        Ambient field of every row in the array's frame [T], in place of the array's.
-    truth_m : ndarray, shape (n, 3), optional
-        True positions in the frame of the fixes [m], NaN where they are not known.
-    folder : Path
-        Made if it is not there.
-    quiet : bool
-        Do not name the files on stderr.
-
-    Raises
-    ------
-    InputError
-        The folder cannot be written.
-    """
+    """Write fixes.png and residuals.png, and the data behind them as fixes.csv and residuals.csv."""
     make_folder(folder, "--out")
-    in_array, pose = fixes, rows.pose
-    if fixes.frame == "world" and pose is not None:
-        back = pose[1].inv()
-        in_array = fixes.moved(-back.apply(pose[0]), back, frame="array")
-    residuals = fix_residuals(array, rows.values_T, in_array, ambient_T)
+    left = _residuals_of(array, rows, fixes, ambient_T)
     found = fix_columns(fixes)
     state = np.concatenate([found.position_m, found.moment_Am2], axis=1)
     sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
@@ -84,28 +100,30 @@ def write_pictures(
         columns["error_m"] = distances_from_truth(found, truth_m)
     columns["dropped_sensors"] = [" ".join(fixes.dropped_sensors[row]) for row in found.row]
     columns["reason"] = [fixes.reason[row] for row in found.row]
-    write_columns(columns, folder / "fixes.csv")
+    write(fix_figure(found, _sensors_of(fixes, array, rows), truth_m), folder / "fixes.png", columns)
     names = (f"{name}_residual_sigmas" for name in array.channel_names)
-    write_columns({"time_s": rows.time_s, **dict(zip(names, residuals.T, strict=True))}, folder / "residuals.csv")
-    save(fix_figure(found, sensors_of_rows(rows, array), truth_m), folder / "fixes.png")
-    save(
-        residual_figure(residuals, array.channel_names, array.ids, array.channel_sensor),
+    write(
+        residual_figure(left, array.channel_names, array.ids, array.channel_sensor),
         folder / "residuals.png",
+        {"time_s": rows.time_s, **dict(zip(names, left.T, strict=True))},
     )
     if not quiet:
         _LOG.info(f"wrote fixes.png, fixes.csv, residuals.png and residuals.csv into {folder}/")
 
 
-def figure_of_fixes(fixes: Fixes) -> Figure:
-    """:meth:`magloc.localization.fit.fixes.Fixes.plot`."""
-    return fix_figure(fix_columns(fixes), np.zeros((len(fixes), 0, 3)))
+def _residuals_of(array: SensorArray, rows: Readings, fixes: Fixes, ambient_T: FloatArray | None) -> FloatArray:
+    """Residuals (n, C) of fixes in either frame, in standard deviations of the noise."""
+    if fixes.frame == "world" and rows.pose is not None:
+        back = rows.pose[1].inv()
+        fixes = fixes.moved(-back.apply(rows.pose[0]), back, frame="array")
+    return fix_residuals(array, rows.values_T, fixes, ambient_T)
 
 
-def sensors_of_rows(rows: Readings, array: SensorArray) -> FloatArray:
-    """Sensors in every row (n, N, 3) [m]: in the world frame if the array's pose is known, else in the array's."""
-    pose = rows.pose
+def _sensors_of(fixes: Fixes, array: SensorArray, rows: Readings | None) -> FloatArray:
+    """Sensors in every row (n, N, 3), in the frame of the fixes [m]."""
+    pose = None if rows is None else rows.pose
     if pose is None:
-        return np.broadcast_to(array.positions, (len(rows), *array.positions.shape))
+        return np.broadcast_to(array.positions, (len(fixes), *array.positions.shape))
     result: FloatArray = np.einsum("nab,sb->nsa", pose[1].as_matrix(), array.positions) + pose[0][:, None]
     return result
 
@@ -199,22 +217,7 @@ def distances_from_truth(columns: FixColumns, truth_m: FloatArray) -> FloatArray
 
 
 def fix_figure(columns: FixColumns, sensors_m: FloatArray, truth_m: FloatArray | None = None) -> Figure:
-    """Fixes in three planes with 95 % ellipses, their standard deviation and error, and their χ².
-
-    Parameters
-    ----------
-    columns : FixColumns
-    sensors_m : ndarray, shape (n, N, 3)
-        Sensors in every row, in the frame of the fixes [m].
-    truth_m : ndarray, shape (n, 3), optional
-        True positions [m], NaN where they are not known.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Where the range is not observable there is no ellipse but a line, the 95 % interval of the range; it ends in an
-        arrow where the interval is open.
-    """
+    """Fixes by their columns, sensors (n, N, 3) and truth (n, 3) in their frame [m]."""
     parts = [columns.position_m] + ([] if truth_m is None else [truth_m])
     limits = [style.limits_of([part[:, i] for part in parts], [sensors_m[..., i]]) for i in range(3)]
     half_m = 0.5 * max(high - low for low, high in limits)
@@ -247,22 +250,7 @@ def fix_figure(columns: FixColumns, sensors_m: FloatArray, truth_m: FloatArray |
 def residual_figure(
     residuals: FloatArray, channel_names: Sequence[str], sensor_ids: Sequence[str], channel_sensor: NDArray[np.int64]
 ) -> Figure:
-    """What the fixes leave of every channel, in standard deviations of its noise.
-
-    Parameters
-    ----------
-    residuals : ndarray, shape (n, C)
-        NaN where a reading is missing or not used.
-    channel_names : sequence of str
-    sensor_ids : sequence of str
-    channel_sensor : ndarray of int, shape (C,)
-        Index of each channel's sensor.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Thick bars hold half of the rows, thin ones nine tenths; of noise alone, nine tenths are in the grey band.
-    """
+    """Residuals (n, C) of every channel, NaN where a reading is missing or not used."""
     few = len(sensor_ids) <= _FEW_SENSORS
     figure = style.new_figure(3.0)
     ax = figure.subplots()
@@ -320,7 +308,8 @@ def _plane(
         ax.add_patch(style.ellipse95(position[k, [a, b]], block, label=label))
         label = "_"
     label = "95 % of the range"
-    for k in style.some_of(solved[~columns.range_observable[solved] & np.isfinite(columns.range95_m[solved, 0])]):
+    unknown = ~columns.range_observable[solved] & np.isfinite(columns.range95_m[solved, 0]) & bool(sensors.size)
+    for k in style.some_of(solved[unknown]):
         centroid = sensors[columns.row[k]].mean(axis=0)
         offset = position[k] - centroid
         distance = float(np.linalg.norm(offset))
@@ -337,6 +326,8 @@ def _plane(
     if truth_m is not None:
         style.draw_truth(ax, per_m * truth_m[:, a], per_m * truth_m[:, b])
     ax.plot(position[solved, a], position[solved, b], ".", color=style.ESTIMATE, ms=size, label="fixes", zorder=2.2)
+    if not sensors.size:
+        return
     if np.ptp(sensors.mean(axis=1), axis=0).max() > 0.0:
         ax.plot(*sensors.mean(axis=1)[:, [a, b]].T, color=style.GREY, lw=1.0, ls="-.", label="path of the array")
     ax.plot(*sensors[-1][:, [a, b]].T, "^", color="white", mec=style.BLACK, ms=4, mew=0.6, label="sensors", zorder=2.6)

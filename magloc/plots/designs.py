@@ -34,7 +34,7 @@ _TURNS = (0.0, -15.0, 15.0, 90.0, -90.0, 180.0, 75.0, 105.0, -75.0, -105.0, 165.
 _REACH, _ARROW, _ARROW_LABEL, _FLAT = 1.25, 1.2, 1.42, 0.5
 
 
-def design_figure(result: Design, seed: int = 0) -> Figure:
+def design(result: Design, seed: int = 0) -> Figure:
     """Sensors in their volume, and the 95 % quantile of the range's σ over the distance, against the references.
 
     Parameters

@@ -1,0 +1,15 @@
+from magloc.plots import tracks as _tracks
+from magloc.plots.bounds import bound_reach as bound_reach
+from magloc.plots.bounds import bound_slices as bound_slices
+from magloc.plots.bounds import bound_sphere as bound_sphere
+from magloc.plots.calibrations import calibration as calibration
+from magloc.plots.designs import design as design
+from magloc.plots.localization import fixes as fixes
+from magloc.plots.localization import residuals as residuals
+from magloc.plots.maps import convergence as convergence
+from magloc.plots.maps import sources as sources
+from magloc.plots.style import save as save
+from magloc.plots.style import write as write
+
+consistency = _tracks.consistency_figure
+track = _tracks.track_figure
