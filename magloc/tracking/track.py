@@ -19,12 +19,11 @@ from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.readings import Readings, as_readings, without_saturated
 from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import Consistency, consistency
-from magloc.tracking.files import geojson_of_track
+from magloc.tracking.files import dataset_of_track, geojson_of_track, lines_of_track
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import Row, TrackPoint, rows_of, stacked
 from magloc.tracking.smoother import smoothed
-from magloc.tracking.table import lines_of_track
 from magloc.tracking.tracker import Tracker
 from magloc.truth import Truth, truth_of_rows
 
@@ -157,8 +156,6 @@ class Track(Sequence[TrackPoint]):
 
     def to_xarray(self) -> xr.Dataset:
         """Columns with units and names, along `row`."""
-        from magloc.tracking.export import dataset_of_track
-
         return dataset_of_track(self)
 
     def to_geojson(self, place: Vector) -> dict[str, Any]:
