@@ -95,7 +95,7 @@ def json_entry(point: TrackPoint) -> dict[str, object]:
         "nis_dof": point.nis_dof,
         "status": point.status,
         "range_observable": point.range_observable,
-        "range_interval95_m": point.range_interval95_m,
+        "range_interval95_m": point.range_interval_m,
         "gaussian": point.gaussian if tracked else None,
         "weight": point.weight,
         "rivals": [{key: getattr(rival, key) for key in _RIVAL_KEYS} for rival in point.rivals],

@@ -16,6 +16,7 @@ from arrays.array import SensorArray
 from arrays.io.lazy import by_name
 from arrays.typing import BoolArray, FloatArray, IntArray, Vector
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
+from magloc.localization.fit.results import EVERYWHERE, Intervals
 from magloc.readings import Readings, as_readings, without_saturated
 from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import Consistency, consistency
@@ -114,6 +115,11 @@ class Track(Sequence[TrackPoint]):
     def weight(self) -> FloatArray:
         """How likely the track is the right one (n,)."""
         return stacked(self, "weight")
+
+    @property
+    def range_interval_m(self) -> list[Intervals]:
+        """95 % sets of the distance from the sensors' centroid [m], of every row."""
+        return [point.range_interval_m or EVERYWHERE for point in self]
 
     @property
     def status(self) -> list[str]:
