@@ -83,8 +83,8 @@ class KnownOptions:
     max_moment_Am2 : float
         Largest moment that the source can have [A·m²]; solutions with a larger one are left out.
     place : tuple of 3 floats
-        Latitude, longitude [deg] and height [m] of the array, for the ambient field of scalar sensors. The world frame,
-        or that of the array if the readings have no pose, is then east, north, up.
+        Latitude, longitude [deg] and height [m] of the origin of the world frame, or of the array if the readings have
+        no pose, for the ambient field of scalar sensors. That frame is then east, north, up.
     date : str
         When, such as 2026-11-21; goes with --place.
     geomagnetic_model : str

@@ -61,21 +61,7 @@ class Start:
 
 
 class Acquisition:
-    """Looks for a source, row by row.
-
-    Parameters
-    ----------
-    array : SensorArray
-    prior : SourcePrior
-        Bounds for the fix of one row, in the array's frame.
-    speed_m_s : float
-        Characteristic speed of the source.
-
-    Attributes
-    ----------
-    of_last_row : Fix
-        What the last row says on its own, in the world frame.
-    """
+    """Looks for a source, row by row; `of_last_row` is what the last row says on its own, in the world frame."""
 
     def __init__(self, array: SensorArray, prior: SourcePrior, speed_m_s: float) -> None:
         self.array = array
@@ -94,20 +80,7 @@ class Acquisition:
         self._confirmable: Solution | None = None
 
     def start(self, row: Row, near: tuple[FloatArray, FloatArray] | None = None) -> tuple[Start | None, str]:
-        """A start with one more row, or why there is none.
-
-        Parameters
-        ----------
-        row : Row
-        near : tuple of (x, S), optional
-            A prediction, state and square root of its covariance: the nearest solution to it is taken.
-
-        Returns
-        -------
-        Start or None
-        str
-            Why there is none.
-        """
+        """A start with one more row, the nearest one to a prediction (x, S) if there is one, or why there is none."""
         reason, fix = "not acquired: one row does not determine the source", Fix(())
         self.of_last_row = fix
         if self._locator is not None:

@@ -34,17 +34,6 @@ def track_record(
     """Points of a whole record: as :meth:`Tracker.run`, with compiled steps where the motion is linear.
 
     Sensors with lasting errors are tracked by the readable steps.
-
-    Parameters
-    ----------
-    tracker : Tracker
-    rows : sequence of Row
-    progress : callable, optional
-        Called with the number of rows finished since the last call.
-
-    Returns
-    -------
-    list of TrackPoint
     """
     points: list[TrackPoint] = []
     can_be = isinstance(tracker.motion, LinearMotion) and not tracker.errors.n_states

@@ -154,19 +154,8 @@ def nees_of(
 ) -> tuple[float, int]:
     """Normalised estimation error squared of one estimate, and how many numbers it is of.
 
-    Parameters
-    ----------
-    measurement : RowMeasurement
-        Of the row.
-    estimate, covariance : ndarray, shapes (6,) and (6, 6)
-        Of position and moment.
-    truth : ndarray, shape (6,)
-        NaN where a number is not known: NEES is then that of what is known. If all six are, the error is counted in the
-        coordinates of :mod:`magloc.tracking.measurement`, in which it is Gaussian.
-
-    Returns
-    -------
-    float, int
+    It is that of what is known of the truth (6,), NaN elsewhere. If all of it is, the error is counted in the
+    coordinates of :mod:`magloc.tracking.measurement`, in which it is Gaussian.
     """
     known = np.isfinite(truth)
     known[3:] &= known[3:].all()

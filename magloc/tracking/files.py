@@ -1,11 +1,12 @@
-"""Tracks in JSON and GeoJSON."""
+"""Tracks as a table for people, and for other programs: JSON, GeoJSON, xarray."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
@@ -15,6 +16,11 @@ from arrays.io.text import read_text
 from arrays.typing import FloatArray, Vector
 from magloc.tracking.consistency import Consistency
 from magloc.tracking.results import TrackPoint, TrackResult
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from magloc.tracking.track import Track
 
 _RIVAL_KEYS = ("position_m", "moment_Am2", "chi2", "dof", "weight")
 _CONSISTENCY_KEYS = (
@@ -27,6 +33,49 @@ _CONSISTENCY_KEYS = (
     "nis_per_dimension",
     "nis_bounds",
 )
+
+_COLUMNS = {
+    "position_m": (("axis",), "m", "position of the source"),
+    "moment_Am2": (("axis",), "A m2", "magnetic moment of the source"),
+    "covariance": (("component", "component_"), "m, A m2", "covariance of (position, moment)"),
+    "estimability": (("component",), "1", "what the row taught: 1 - sigma after / sigma predicted"),
+    "nis": ((), "1", "normalised innovation squared"),
+    "nis_dof": ((), "1", "degrees of freedom of nis"),
+    "weight": ((), "1", "probability that the track is the right one"),
+    "tracked": ((), "1", "whether the source is tracked"),
+    "status": ((), "1", "how the row was used, or why there is no track"),
+}
+
+
+def lines_of_track(points: Sequence[TrackPoint], *, most: int | None = None) -> list[str]:
+    """Aligned lines: a header, then one for every row, or for the first and the last ones of `most`."""
+    shown = list(points)
+    if most is not None and len(shown) > most:
+        shown = shown[: most // 2] + shown[-(most // 2) :]
+    header = ["time_s", "x_m", "y_m", "z_m", "s_x_m", "s_y_m", "s_z_m", "m_Am2", "nis", "status"]
+    rows = [header]
+    for point in shown:
+        if point.position_m is None or point.moment_Am2 is None or point.covariance is None:
+            rows.append([f"{point.time_s:.10g}", *["-"] * 8, point.status])
+            continue
+        deviations = np.sqrt(np.diagonal(point.covariance)[:3])
+        rows.append(
+            [
+                f"{point.time_s:.10g}",
+                *(f"{value:.3f}" for value in point.position_m),
+                *(f"{value:.2g}" for value in deviations),
+                f"{np.linalg.norm(point.moment_Am2):.4g}",
+                f"{point.nis:.1f}/{point.nis_dof}" if np.isfinite(point.nis) else "-",
+                point.status if point.range_observable or point.centroid_m is None else f"{point.status}, range?",
+            ]
+        )
+    widths = [max(len(row[i]) for row in rows) for i in range(len(header) - 1)]
+    lines = [
+        "  ".join([*(cell.rjust(width) for cell, width in zip(row, widths, strict=False)), row[-1]]) for row in rows
+    ]
+    if len(shown) < len(points):
+        lines.insert(1 + len(shown) // 2, f"… {len(points)} rows")
+    return lines
 
 
 def json_entry(point: TrackPoint) -> dict[str, object]:
@@ -46,7 +95,7 @@ def json_entry(point: TrackPoint) -> dict[str, object]:
         "nis_dof": point.nis_dof,
         "status": point.status,
         "range_observable": point.range_observable,
-        "range_interval95_m": point.range_interval95_m,
+        "range_interval95_m": point.range_interval_m,
         "gaussian": point.gaussian if tracked else None,
         "weight": point.weight,
         "rivals": [{key: getattr(rival, key) for key in _RIVAL_KEYS} for rival in point.rivals],
@@ -98,6 +147,19 @@ def geojson_of_track(points: Sequence[TrackPoint], origin: Vector) -> dict[str, 
             geometry = {"type": "LineString", "coordinates": part}
             features.insert(0, {"type": "Feature", "geometry": geometry, "properties": {"name": "track"}})
     return {"type": "FeatureCollection", "features": features}
+
+
+def dataset_of_track(track: Track) -> xr.Dataset:
+    """:meth:`magloc.tracking.track.Track.to_xarray`."""
+    import xarray as xr
+
+    dataset = xr.Dataset(coords={"time_s": ("row", track.time_s), "axis": list("xyz")})
+    for name, (dimensions, unit, words) in _COLUMNS.items():
+        attributes = {"units": unit, "long_name": words}
+        dataset[name] = (("row", *dimensions), np.asarray(getattr(track, name)), attributes)
+    dataset["time_s"].attrs = {"units": "s", "long_name": "time"}
+    dataset.attrs = {"frame": track.frame, "source": f"magloc {metadata.version('magloc')}, track"}
+    return dataset
 
 
 def _read_track(path: Path) -> TrackResult:

@@ -90,17 +90,9 @@ class RowMeasurement:
         return Coordinates(self, source, M)
 
     def curved_prior(self, x: FloatArray, S: FloatArray) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
-        """A prediction that is Gaussian in the coordinates about it, linearised at a state.
+        """A prediction (x, S) that is Gaussian in the coordinates about it.
 
-        Parameters
-        ----------
-        x, S : ndarray
-            Predicted state and square root of its covariance.
-
-        Returns
-        -------
-        callable
-            Of a state: mean (n,) and square root (n, n) of the Gaussian that looks there as the prediction does.
+        It gives, of a state, mean (n,) and square root (n, n) of the Gaussian that looks there as the prediction does.
         """
         source = slice(0, N_SOURCE)
         coordinates = self.coordinates(x[source], np.linalg.norm(S[source], axis=1))

@@ -26,20 +26,8 @@ def posterior_bound(
 
     Nothing is known before the first row but the standard deviations of the sensors' lasting errors, which count as
     unknowns of their own, and until the readings determine it the source counts as at rest. Speed and turn rate are
-    those of the truth.
-
-    Parameters
-    ----------
-    tracker : Tracker
-        Whose array and motion model count.
-    rows : sequence of Row
-    position_m, moment_Am2 : ndarray, shape (n, 3)
-        Truth in the track's frame.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Root of the trace of the position's bound [m]; infinite as long as the readings do not determine it.
+    those of the truth. The root of the trace of the position's bound (n,) [m] is infinite as long as the readings do
+    not determine it.
     """
     bounds = np.full(len(rows), np.inf)
     for step in _steps_at_truth(tracker, rows, position_m, moment_Am2):
@@ -54,17 +42,8 @@ def smoothing_bound(
 
     The diagonal blocks of the inverse of the information of all states together (Šimandl, Královec and Tichavský 2001),
     by the recursion of Rauch, Tung and Striebel from the last row backwards:
-    :math:`P_{j|n} = P_j + G (P_{j+1|n} - P_{j+1|j}) G^T` with :math:`G = P_j F^T P_{j+1|j}^{-1}`.
-
-    Parameters
-    ----------
-    tracker, rows, position_m, moment_Am2
-        As of :func:`posterior_bound`.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        As of :func:`posterior_bound`, and infinite at the same rows: a track that has not begun is not smoothed.
+    :math:`P_{j|n} = P_j + G (P_{j+1|n} - P_{j+1|j}) G^T` with :math:`G = P_j F^T P_{j+1|j}^{-1}`. It is infinite at the
+    same rows as :func:`posterior_bound`: a track that has not begun is not smoothed.
     """
     steps = _steps_at_truth(tracker, rows, position_m, moment_Am2)
     at_truth = [TrackPoint(row.time_s, place) for row, place in zip(rows, position_m, strict=True)]

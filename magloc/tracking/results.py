@@ -82,7 +82,7 @@ class TrackPoint:
     radius_m: float = math.nan
 
     @property
-    def range_interval95_m(self) -> Intervals | None:
+    def range_interval_m(self) -> Intervals | None:
         """95 % set of the distance from the sensors' centroid [m], None where the sensors are not known.
 
         Of a track it is :func:`magloc.localization.uncertainty.range_interval.gaussian_ranges` of its covariance;
@@ -98,7 +98,7 @@ class TrackPoint:
     @property
     def range_observable(self) -> bool:
         """Whether that set is closed, and its ends differ by a factor of two at most."""
-        return is_observable_set(self.range_interval95_m or EVERYWHERE)
+        return is_observable_set(self.range_interval_m or EVERYWHERE)
 
     @property
     def gaussian(self) -> bool:

@@ -14,17 +14,6 @@ def smoothed(points: list[TrackPoint], steps: list[Step]) -> list[TrackPoint]:
     """Points of a finished record with what later rows tell as well: a fixed-interval smoother over every track.
 
     Rauch, Tung and Striebel's recursion on the filter's steps: its gain is :math:`P F^T P_{pred}^{-1}`.
-
-    Parameters
-    ----------
-    points : list of TrackPoint
-        Of every row.
-    steps : list of Step
-        Of the tracker that made them.
-
-    Returns
-    -------
-    list of TrackPoint
     """
     result = list(points)
     x, P = np.empty(0), np.empty((0, 0))

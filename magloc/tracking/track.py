@@ -16,15 +16,15 @@ from arrays.array import SensorArray
 from arrays.io.lazy import by_name
 from arrays.typing import BoolArray, FloatArray, IntArray, Vector
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
+from magloc.localization.fit.results import EVERYWHERE, Intervals
 from magloc.readings import Readings, as_readings, without_saturated
 from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import Consistency, consistency
-from magloc.tracking.files import geojson_of_track
+from magloc.tracking.files import dataset_of_track, geojson_of_track, lines_of_track
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import Row, TrackPoint, rows_of, stacked
 from magloc.tracking.smoother import smoothed
-from magloc.tracking.table import lines_of_track
 from magloc.tracking.tracker import Tracker
 from magloc.truth import Truth, truth_of_rows
 
@@ -117,6 +117,11 @@ class Track(Sequence[TrackPoint]):
         return stacked(self, "weight")
 
     @property
+    def range_interval_m(self) -> list[Intervals]:
+        """95 % sets of the distance from the sensors' centroid [m], of every row."""
+        return [point.range_interval_m or EVERYWHERE for point in self]
+
+    @property
     def status(self) -> list[str]:
         """How every row was used, or why there is no track."""
         return [point.status for point in self]
@@ -157,8 +162,6 @@ class Track(Sequence[TrackPoint]):
 
     def to_xarray(self) -> xr.Dataset:
         """Columns with units and names, along `row`."""
-        from magloc.tracking.export import dataset_of_track
-
         return dataset_of_track(self)
 
     def to_geojson(self, place: Vector) -> dict[str, Any]:

@@ -246,23 +246,11 @@ class Tracker:
         return self._differences[key]
 
     def start(self, source: FloatArray, covariance: FloatArray, rows: Sequence[Row]) -> FilteredStart | None:
-        """State and square root of its covariance from a source and the readings that it was found from.
+        """State at the last of the rows that a source (6,) was found from, as if at rest, with a covariance (6, 6).
 
-        Parameters
-        ----------
-        source : ndarray, shape (6,)
-            Position and moment that fit all rows best, were it at rest and were errors of sensors new in every row.
-        covariance : ndarray, shape (6, 6)
-            Of that fit.
-        rows : sequence of Row
-            In the order of time.
-
-        Returns
-        -------
-        FilteredStart or None
-            At the last row. The rows are filtered once more, from a source that is hardly known, until they are
-            linearised where they lead: what moves between them, and the errors of sensors that they have in common,
-            are counted as in the rows to come. None where that does not converge, or they contradict each other then.
+        The rows are filtered once more, from a source that is hardly known, until they are linearised where they lead:
+        what moves between them, and the errors of sensors that they have in common, are counted as in the rows to come.
+        None where that does not converge, or they contradict each other then.
         """
         if len(rows) == 1 and not self.errors.n_states:
             return FilteredStart(*self.motion.start(source, symmetric_square_root(covariance)), 0.0)

@@ -3,7 +3,7 @@
 ====================================  ==================================================================================
 what                                  who checks it
 ====================================  ==================================================================================
-public names                          the stub; what they are; no function is called like a direct submodule
+public names                          that they stay functions once a command of the same name is loaded
 the first minute, story 1             the source that made the readings; what the command prints
 a sensor that lies (story 3)          the sensor that was bent
 a track (story 4)                     the path that made the readings; the same rows one by one
@@ -12,7 +12,6 @@ a track (story 4)                     the path that made the readings; the same 
 
 from __future__ import annotations
 
-import ast
 import math
 from dataclasses import replace
 from inspect import ismodule
@@ -31,23 +30,10 @@ from tests.passing_source import ARRAY, MOMENT, POSITION, moving_source, reading
 N_ROWS = 30
 
 
-class TestNames:
-    def test_the_stub_names_them_all(self) -> None:
-        tree = ast.parse((Path(magloc.__file__).parent / "__init__.pyi").read_text(encoding="utf-8"))
-        names = {
-            alias.asname or alias.name for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names
-        }
-        assert sorted(names) == magloc.__all__
-
-    def test_none_is_called_like_a_submodule_that_it_is_not(self) -> None:
-        folder = Path(magloc.__file__).parent
-        modules = {path.stem for path in folder.iterdir() if path.suffix == ".py" or path.is_dir()}
-        assert all(ismodule(getattr(magloc, name)) for name in modules & set(magloc.__all__))
-
-    def test_a_function_stays_a_function_once_its_command_is_loaded(self, run: Run) -> None:
-        run("track", "none.csv", "--array", "none.toml")
-        run("locate", "none.csv", "--array", "none.toml")
-        assert not any(ismodule(getattr(magloc, name)) for name in ("track", "locate"))
+def test_a_function_stays_one_once_its_command_is_loaded(run: Run) -> None:
+    run("track", "none.csv", "--array", "none.toml")
+    run("locate", "none.csv", "--array", "none.toml")
+    assert not any(ismodule(getattr(magloc, name)) for name in ("track", "locate"))
 
 
 @pytest.fixture
