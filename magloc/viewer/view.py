@@ -16,9 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 import viser
 
 from arrays.array import SensorArray
-from magloc.ambient import with_ambient_field
 from magloc.localization.fit.fixes import Fixes
-from magloc.localization.locator import locate
 from magloc.readings import Readings
 from magloc.tracking.results import TrackResult
 from magloc.truth import Truth
@@ -38,6 +36,8 @@ from magloc.viewer.server import (
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from magloc.tracking.track import Track
 
 _MOST_ROWS = 2000
 _INLINE_PX = 560
@@ -93,7 +93,7 @@ class View:
 
 def view(
     array: SensorArray | None,
-    result: Readings | Fixes | TrackResult | Truth | xr.Dataset | MapResult | None = None,
+    result: Readings | Fixes | Track | TrackResult | Truth | xr.Dataset | MapResult | None = None,
     *,
     readings: Readings | None = None,
     html: str | Path | None = None,
@@ -111,12 +111,12 @@ def view(
     Parameters
     ----------
     array : SensorArray, optional
-        None for a map, which has its own, and for a path without an array.
-    result : Readings, Fixes, TrackResult, Truth or xarray.Dataset, optional
+        None for a map or a Track, which have their own, and for a path without an array.
+    result : Readings, Fixes, Track, TrackResult, Truth or xarray.Dataset, optional
         Of the array; a Dataset is a map over starts or sources. Readings are located first, 2000 rows at most, evenly.
         Without it the array alone is seen, with a dipole to be dragged.
     readings : Readings, optional
-        Rows that fixes or a track were made of, for their plot and the array's poses.
+        Rows that fixes were made of, or a track that does not have its own, for their plot and the array's poses.
     html, png : path, optional
         Write a static page or, by Chromium, a picture, and serve nothing.
     open : bool
@@ -163,6 +163,10 @@ def _filling(
     """What fills the scene; all that can be wrong is found, and all that is slow is done, before it is opened."""
     if isinstance(result, Truth):
         result = path_of_truth(result)
+    if hasattr(result, "tracker"):
+        array = result.tracker.array if array is None else array
+        readings = result.readings if readings is None else readings
+        result = TrackResult(result.points, is_truth=False)
     if isinstance(result, TrackResult):
         if all(point.position_m is None for point in result.points):
             raise ValueError("Input result must have a row where the source is tracked; instead received none.")
@@ -202,6 +206,10 @@ def thinned(rows: Readings) -> Readings:
 
 def fixes_of(array: SensorArray, rows: Readings, progress: Callable[[int], None] | None = None) -> Fixes:
     """Fixes of readings in the ambient field that they show; without any, and a reason, where none can be located."""
+    # What locates takes a second to load, and other results do without.
+    from magloc.ambient import with_ambient_field
+    from magloc.localization.locator import locate
+
     used, ambient_T = with_ambient_field(array, rows, None, gradient=False)
     try:
         return locate(used, rows, ambient_T=ambient_T, progress=progress)

@@ -19,6 +19,7 @@ from magloc.localization.fit.fixes import Fixes
 from magloc.localization.locator import locate
 from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
+from magloc.tracking.results import TrackPoint, TrackResult
 from magloc.viewer.chromium import Chromium
 from magloc.viewer.pages.pages import readings_page
 from magloc.viewer.server import address, opened
@@ -114,6 +115,15 @@ class TestInline:
         fixes = locate(ARRAY, VALUES_T[:1], position_m=PLACES[:1])
         assert "source of the row" in self.page(magloc.view(ARRAY, fixes))
 
+    def test_track_brings_its_array_and_readings(self) -> None:
+        noise = np.random.default_rng(0).normal(0.0, ARRAY.channel_noise_T, (40, ARRAY.n_channels))
+        path = np.stack([np.linspace(-1.0, 1.0, 40), np.full(40, 3.0), np.full(40, 0.5)], axis=-1)
+        values = np.array([predicted_channels(ARRAY, place, [0.0, 80.0, 30.0]) for place in path])
+        found = magloc.track(ARRAY, Readings(values + noise, time_s=0.1 * np.arange(40.0)))
+        page = self.page(magloc.view(None, found))
+        assert "95 % ellipsoids" in page
+        assert "4 vector sensors" in page
+
     def test_truth_and_map(self) -> None:
         assert "true path" in self.page(magloc.view(None, magloc.Truth(np.arange(5.0), PLACES)))
         source = magloc.Source([5.0, 0.0, 0.3], [100.0, 0.0, 0.0])
@@ -161,6 +171,11 @@ class TestArguments:
     def test_no_array(self, fixes: Fixes) -> None:
         with pytest.raises(ValueError, match="Input array"):
             magloc.view(None, fixes)
+
+    def test_nothing_tracked(self) -> None:
+        nothing = TrackResult((TrackPoint(0.0),), is_truth=False)
+        with pytest.raises(ValueError, match="a row where the source is tracked"):
+            magloc.view(ARRAY, nothing)
 
     def test_something_else(self) -> None:
         with pytest.raises(ValueError, match="instead received str"):
