@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from arrays.array import SensorArray
 from arrays.io.arguments import Flag, whole_number
 from arrays.io.errors import InputError
 from magloc.cli.framework import CommonOptions, progress
 from magloc.cli.options import naming_outputs, print_note
 
 if TYPE_CHECKING:
+    from arrays.array import SensorArray
     from magloc.localization.fit.fixes import Fixes
     from magloc.readings import Readings
     from magloc.viewer.pages.open_result import ReadingsResult, Result
