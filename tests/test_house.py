@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import ast
 import importlib
+import importlib.util
 import pkgutil
 import re
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
@@ -42,9 +44,7 @@ class TestPublicNames:
 
     def test_each_has_a_user(self, package: str) -> None:
         """A command, a page or a notebook."""
-        users = [path for other in PACKAGES for path in (REPOSITORY / other / "cli").glob("*.py")]
-        users += [REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md")]
-        users += (REPOSITORY / "notebooks").glob("*.ipynb")
+        users = [path for other in PACKAGES for path in (REPOSITORY / other / "cli").glob("*.py")] + pages()
         words = {word for path in users for word in re.findall(r"\w+", path.read_text(encoding="utf-8"))}
         assert sorted(set(importlib.import_module(package).__all__) - words) == []
 
@@ -63,6 +63,27 @@ def test_only_command_lines_import_the_root_of_their_package() -> None:
             if whole or (name and any(alias.name not in modules for alias in node.names)):
                 found.append(f"{path.relative_to(REPOSITORY)}:{node.lineno}")
     assert found == []
+
+
+def pages() -> list[Path]:
+    return [REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md"), *(REPOSITORY / "notebooks").glob("*.ipynb")]
+
+
+def test_names_in_pages_are_there() -> None:
+    dotted = re.compile(r"\b(?:arrays|magloc|adcs|sims)(?:\.[A-Za-z_]\w*)+")
+    files = (".csv", ".toml", ".png", ".gif", ".zarr", ".json", ".py", ".html")
+    found = {name for page in pages() for name in dotted.findall(page.read_text(encoding="utf-8"))}
+    missing = []
+    for name in sorted(found):
+        package, *rest = name.split(".")
+        there: object = importlib.import_module(package)
+        for i, part in enumerate(rest):
+            if not hasattr(there, part) and importlib.util.find_spec(".".join([package, *rest[: i + 1]])):
+                importlib.import_module(".".join([package, *rest[: i + 1]]))
+            there = getattr(there, part, None)
+        if there is None and not name.endswith(files):
+            missing.append(name)
+    assert missing == []
 
 
 class TestSizes:
