@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Callable
 
@@ -15,9 +16,13 @@ def calls_of(action: Callable[[], object]) -> int:
         nonlocal count
         count += event in ("call", "c_call")
 
+    # What the collector finalises of others in between is none of it.
+    gc.collect()
+    gc.disable()
     sys.setprofile(one_more)
     try:
         action()
     finally:
         sys.setprofile(None)
+        gc.enable()
     return count

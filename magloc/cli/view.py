@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+import arrays
 from arrays.io.arguments import Flag, whole_number
 from arrays.io.errors import InputError
 from magloc.cli.framework import CommonOptions, progress
@@ -72,7 +73,7 @@ def view(
     shown: Any = result
     if isinstance(result, ReadingsResult):
         sensors, (shown, rows) = result.array, _fixes(result, quiet=common.quiet)
-    elif isinstance(result, SensorArray):
+    elif isinstance(result, arrays.SensorArray):
         sensors, shown = result, None
     written = [str(file) for file in (html, png) if file is not None]
     with naming_outputs():
