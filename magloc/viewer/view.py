@@ -136,7 +136,7 @@ def view(
         A file cannot be written, or Chromium is not there.
     """
     check_outputs(html, png)
-    static = html is not None or png is not None or "ipykernel" in sys.modules
+    static = html is not None or png is not None or _in_notebook()
     fill = _filling(array, result, readings, progress, live=not static)
     shown = View(title or (array.name if array is not None else "") or "view", fill, 0 if static else port)
     if not static:
@@ -150,6 +150,12 @@ def view(
             shown.write_png(Path(png))
         _ = shown.html  # taken while there is a server
     return shown
+
+
+def _in_notebook() -> bool:
+    """Whether this process is a notebook's kernel; that its package is loaded says nothing yet."""
+    kernel = sys.modules.get("ipykernel.kernelapp")
+    return kernel is not None and bool(kernel.IPKernelApp.initialized())
 
 
 def _filling(
