@@ -19,7 +19,11 @@ from arrays.io.errors import InputError
 from arrays.typing import ByteArray
 
 _EXPECTED = "expected a grey PNG image of 8 bits"
-_MODES = {"1": "an image of black and white alone", "I;16": "an image of more than 8 bits", "I": "an image of more than 8 bits"}
+_MODES = {
+    "1": "an image of black and white alone",
+    "I;16": "an image of more than 8 bits",
+    "I": "an image of more than 8 bits",
+}
 
 
 def read_frame(path: str | PathLike[str], camera: Camera = Camera()) -> ByteArray:  # noqa: B008 - frozen
