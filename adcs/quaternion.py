@@ -140,11 +140,6 @@ def cross_matrix(a: ArrayLike) -> FloatArray:
     return np.cross(a[..., None, :], np.eye(3)).mT
 
 
-def random_attitudes(n: int, rng: np.random.Generator) -> FloatArray:
-    """Attitudes (n, 4), uniform over all rotations."""
-    return normalised(rng.standard_normal((n, 4)))
-
-
 def to_rotation(q: ArrayLike) -> Rotation:
     """Rotation of scipy of quaternions (..., 4), with ``Rotation.apply(v)`` = :func:`rotate` (q, v)."""
     from scipy.spatial.transform import Rotation

@@ -23,6 +23,15 @@ def mean_bounds(degrees_of_freedom: int, level: float = CONSISTENCY) -> tuple[fl
     return float(low) / degrees_of_freedom, float(high) / degrees_of_freedom
 
 
+def normalised_square(error: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Squared errors (..., N) in units of a covariance (..., N, N), shape (...): χ² of N numbers where it is right."""
+    # States of mixed units: solved with the correlations, which are well-conditioned.
+    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    correlation = covariance / (sigma[..., :, None] * sigma[..., None, :])
+    scaled = error / sigma
+    return np.sum(scaled * np.linalg.solve(correlation, scaled[..., None])[..., 0], axis=-1)
+
+
 class Detector(Protocol):
     """A statistic with a threshold, and the energy of a signal that it finds."""
 

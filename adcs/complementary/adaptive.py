@@ -16,6 +16,7 @@ from adcs import quaternion
 from adcs.complementary.explicit import first_attitude, turned
 from adcs.satellite.vector_record import VectorRecord
 from arrays.typing import FloatArray
+from magloc.chi_square import normalised_square
 from magloc.compilation import over_rows
 
 
@@ -85,11 +86,7 @@ class AdaptiveTrack:
         """
         angle = 2.0 * quaternion.error_vector(self.q, q_true)
         x = np.concatenate([angle, np.broadcast_to(bias_true_rad_s, angle.shape) - self.bias_rad_s], axis=-1)
-        # Angles and rates differ by a factor of millions: scaled, the covariance is well-conditioned.
-        sigma = np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
-        scaled = self.covariance / (sigma[..., :, None] * sigma[..., None, :])
-        z = x / sigma
-        return np.sum(z * np.linalg.solve(scaled, z[..., None])[..., 0], axis=-1)
+        return normalised_square(x, self.covariance)
 
 
 def adaptive_track(

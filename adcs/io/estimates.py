@@ -6,18 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from adcs.kalman.results import UNITS
+from adcs.kalman.results import SHOWN
 from adcs.satellite.attitude_track import AttitudeTrack
+from adcs.satellite.sensors import NIS_SIZES
 
-_NAMES = {"st": ("star", 3), "gyro": ("gyro", 3), "mag": ("field", 3), "sun": ("sun", 2)}
-"""What files call a sensor's innovations, and how many numbers they have."""
-_WORDS = {
-    "attitude": ("attitude, 1σ", "°"),
-    "rate": ("rate", "°/s"),
-    "gyro-bias": ("bias of the gyro", "°/s"),
-    "field-bias": ("bias of the magnetometer", "nT"),
-    "disturbance": ("disturbing acceleration", "1/s²"),
-}
+_NAMES = {"st": "star", "gyro": "gyro", "mag": "field", "sun": "sun"}
+"""What files call a sensor's innovations."""
 
 
 def estimate_columns(track: AttitudeTrack) -> dict[str, Any]:
@@ -26,14 +20,14 @@ def estimate_columns(track: AttitudeTrack) -> dict[str, Any]:
     for prefix, q in (("", track.q_orbital), ("eci_", track.q)):
         if q is not None:
             columns |= dict(zip((f"{prefix}q{part}" for part in "wxyz"), q.T, strict=True))
-    for state, (column, scale) in UNITS.items():
+    for state, shown in SHOWN.items():
         for i, axis in enumerate("xyz"):
             for prefix, values in (("", track.states), ("sigma_", track.sigma)):
                 if state in values:
-                    columns[prefix + column.format(axis)] = scale * values[state][:, i]
+                    columns[prefix + shown.column.format(axis)] = shown.scale * values[state][:, i]
     for sensor, nis in track.nis.items():
         if not np.isnan(nis).all():
-            columns[f"nis_{_NAMES[sensor][0]}"] = nis
+            columns[f"nis_{_NAMES[sensor]}"] = nis
     return {name: values[track.rows] for name, values in columns.items()}
 
 
@@ -42,17 +36,18 @@ def summary_lines(track: AttitudeTrack, columns: dict[str, Any]) -> list[str]:
     lines = [f"{len(track.rows)} rows from {track.time_s[0]:g} to {track.time_s[-1]:g} s; {track.title}"]
     q = ", ".join(f"{columns[name][-1]:.6f}" for name in ("qw", "qx", "qy", "qz"))
     lines.append(f"attitude at the end, orbital from body (w, x, y, z)   {q}")
-    for state, (what, unit) in _WORDS.items():
-        names = [UNITS[state][0].format(axis) for axis in "xyz"]
+    for state, shown in SHOWN.items():
+        names = [shown.column.format(axis) for axis in "xyz"]
         if state not in track.sigma:
             continue
         sigma = max(float(columns[f"sigma_{name}"][-1]) for name in names)
         if state in track.states:
             values = ", ".join(f"{columns[name][-1]:.3g}" for name in names)
-            lines.append(f"{what:27s}{values} {unit} (1σ {sigma:.2g})")
+            lines.append(f"{shown.words:27s}{values} {shown.unit} (1σ {sigma:.2g})")
         else:
-            lines.append(f"{what:27s}{sigma:.2g} {unit}")
-    for name, numbers in _NAMES.values():
+            lines.append(f"{shown.words + ', 1σ':27s}{sigma:.2g} {shown.unit}")
+    for sensor, name in _NAMES.items():
+        numbers = NIS_SIZES[sensor]
         if f"nis_{name}" in columns:
             nis = float(np.nanmean(columns[f"nis_{name}"])) / numbers
             lines.append(f"NIS of {name} / {numbers} (1 is consistent){'':3s}{nis:.3g}")

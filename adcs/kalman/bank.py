@@ -21,13 +21,12 @@ from adcs.kalman.separate_bias import run_parallel
 from adcs.kalman.smoother import smoothed
 from adcs.satellite.attitude_track import AttitudeTrack
 from adcs.satellite.satellite import Satellite
-from adcs.satellite.sensors import SENSORS
-from adcs.satellite.telemetry import FilterRecord, Record, Telemetry, orbital_from_eci, part
+from adcs.satellite.sensors import SENSOR_WORDS, SENSORS
+from adcs.satellite.telemetry import Record, Telemetry, orbital_from_eci, part
 from arrays.io.errors import InputError, naming
 
 IMPLIED_STATES = {"parallel-disturbance": ("disturbance",), "reduced": ("gyro-bias",)}
 """What a filter estimates whether it is asked to or not."""
-_WORDS = dict(zip(SENSORS, ("star tracker", "gyro", "magnetometer", "Sun sensor"), strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +115,7 @@ def estimate(
     for name in used.sensors.split("+"):
         if not record.readings.seen[name].any():
             raise ValueError(
-                f"Input found no reading of the {_WORDS[name]}, expected some because the sensors in use are "
+                f"Input found no reading of the {SENSOR_WORDS[name]}, expected some because the sensors in use are "
                 f"{used.sensors}."
             )
     first = first_told(record, used, with_gyro=chosen.filter == "reduced")
@@ -128,21 +127,16 @@ def estimate(
 
 
 def _track(
-    telemetry: Telemetry, first: int, record: FilterRecord, chosen: EstimatorSettings, tracks: AttitudeTracks
+    telemetry: Telemetry, first: int, record: Record, chosen: EstimatorSettings, tracks: AttitudeTracks
 ) -> AttitudeTrack:
     """The only run of some tracks, from an instant of its log on."""
     used, q = chosen.settings.sensors, tracks.q[0]
-    optional = {
-        "gyro-bias": tracks.gyro_bias_rad_s,
-        "field-bias": tracks.field_bias_T,
-        "disturbance": tracks.disturbance_s2,
-    }
     return AttitudeTrack(
         title=chosen.in_words,
         time_s=telemetry.instants_s[first:],
         rows=telemetry.rows[telemetry.rows >= first] - first,
         q=quaternion.multiply(quaternion.conjugate(orbital_from_eci(record.environment)[0]), q),
-        states={"rate": tracks.w[0]} | {state: optional[state][0] for state in used.states},
+        states={state: values[0] for state, values in tracks.states.items()},
         used=tuple(used.sensors.split("+")),
         seen={name: seen[0] for name, seen in record.readings.seen.items()},
         sigma={state: sigma[0] for state, sigma in sigma_by_state(tracks).items()},

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from adcs.environment.environment import Environment
 from adcs.kalman.error_state import AttitudeTracks, SensorSet
 from adcs.kalman.mekf import deviations
-from adcs.satellite.sensors import SENSORS
+from adcs.satellite.sensors import NIS_SIZES
 from adcs.satellite.telemetry import Record, is_read
 from arrays.typing import BoolArray
 
@@ -136,9 +136,7 @@ def _field_model(record: Record, estimates: AttitudeTracks, run: int) -> list[st
 def _innovations(estimates: AttitudeTracks, run: int) -> list[str]:
     """Compare the sum of NIS over the second half of the run, after the start, with its χ²."""
     nis = estimates.nis[run, estimates.nis.shape[1] // 2 :]
-    # Noise of the direction to the Sun has two components.
-    sizes = np.array([2 if name == "sun" else 3 for name in SENSORS])
-    numbers = int((np.isfinite(nis) * sizes).sum())
+    numbers = int((np.isfinite(nis) * list(NIS_SIZES.values())).sum())
     total = float(np.nansum(nis))
     if numbers == 0 or total <= chi2.isf(FALSE_ALARM, numbers):
         return []

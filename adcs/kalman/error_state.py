@@ -10,14 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from adcs.satellite.sensors import SENSORS
 from arrays.typing import FloatArray
 
-STATES = ("field-bias", "gyro-bias", "disturbance")
-"""Optional states in the order of the error state."""
+ATTRIBUTES = {"field-bias": "field_bias_T", "gyro-bias": "gyro_bias_rad_s", "disturbance": "disturbance_s2"}
+"""Optional states in the order of the error state, and what they are called in :class:`State` and its like."""
+STATES = tuple(ATTRIBUTES)
 ALWAYS = 6
 """Numbers of attitude and rate, which every filter has."""
 
@@ -228,14 +230,8 @@ class FilterSettings:
     @property
     def process_variance(self) -> FloatArray:
         """Diagonal of Q, shape (N,)."""
-        n = self.noise
-        by_state = {
-            "field-bias": n.field_bias_T,
-            "gyro-bias": n.gyro_bias_rad_s,
-            "disturbance": n.disturbance_s2,
-        }
-        deviations = [n.attitude, n.rate_rad_s, *(by_state[state] for state in self.sensors.states)]
-        return np.repeat(np.square(deviations), 3)
+        always = [self.noise.attitude, self.noise.rate_rad_s]
+        return np.repeat(np.square([*always, *optional_of(self.noise, self.sensors).values()]), 3)
 
     @property
     def start_variance(self) -> FloatArray:
@@ -283,6 +279,11 @@ class State:
     P: FloatArray  # (runs, N, N): covariance of the error state
 
 
+def optional_of(owner: ProcessNoise | State | AttitudeTracks, used: SensorSet) -> dict[str, Any]:
+    """What belongs to the optional states of a set, by their names."""
+    return {state: getattr(owner, ATTRIBUTES[state]) for state in used.states}
+
+
 @dataclass(frozen=True, eq=False)
 class AttitudeTracks:
     """Estimates at the n instants of some runs.
@@ -311,6 +312,11 @@ class AttitudeTracks:
     def sigma(self) -> FloatArray:
         """Standard deviations of the error state, shape (runs, n, N)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+    @property
+    def states(self) -> dict[str, FloatArray]:
+        """Rate [rad/s] and the optional states that there are, by their names, shape (runs, n, 3)."""
+        return {"rate": self.w} | optional_of(self, self.settings.sensors)
 
     def at(self, row: int) -> State:
         """Estimate of all runs at one instant."""

@@ -7,23 +7,30 @@ See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovc
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
 from adcs import quaternion
-from adcs.kalman.error_state import ALWAYS, AttitudeTracks, FilterSettings, SensorSet, Start, State
+from adcs.kalman.error_state import (
+    ALWAYS,
+    ATTRIBUTES,
+    STATES,
+    AttitudeTracks,
+    FilterSettings,
+    SensorSet,
+    Start,
+    State,
+    optional_of,
+)
 from adcs.quaternion import cross_matrix, rotate_back
 from adcs.satellite import dynamics
 from adcs.satellite.sensors import SENSORS
 from adcs.satellite.telemetry import Record, is_read
 from arrays.typing import FloatArray
-from magloc.kalman import sequential_update, symmetric_square_root
 
 Jacobian = Callable[[Record, int, FloatArray, FloatArray], FloatArray]
 """F (runs, 6, 6) of attitude and rate from record, row, q (runs, 4) and w (runs, 3)."""
-Update = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-"""Correction (runs, N) and covariance from P (runs, N, N), H (runs, k, N) and residual (runs, k), in noise units."""
 
 
 def first_state(settings: FilterSettings, start: Start) -> State:
@@ -174,59 +181,29 @@ def nis_of(noise: FloatArray, H: FloatArray, residual: FloatArray, used: SensorS
 
 
 def joseph_update(P: FloatArray, H: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Correction and covariance (E - KH) P (E - KH)ᵀ + KKᵀ, in noise units; see :data:`Update`."""
+    """Correction (runs, N) and covariance (E - KH) P (E - KH)ᵀ + KKᵀ, from residuals (runs, k) in noise units."""
     PHt = P @ H.mT
     K = np.linalg.solve(H @ PHt + np.eye(H.shape[-2]), PHt.mT).mT
     rest = np.eye(P.shape[-1]) - K @ H
     return (K @ residual[..., None])[..., 0], rest @ P @ rest.mT + K @ K.mT
 
 
-def square_root_update(P: FloatArray, H: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The same by Potter's square roots, one scalar after the other; see :func:`magloc.kalman.sequential_update`."""
-    corrections, covariances = [], []
-    for P_run, H_run, residual_run in zip(P, H, residual, strict=True):
-        S = symmetric_square_root(P_run)
-        dx, S = sequential_update(np.zeros(len(P_run)), S, H_run, residual_run, np.ones(len(residual_run)))
-        corrections.append(dx)
-        covariances.append(S @ S.T)
-    return np.array(corrections), np.array(covariances)
-
-
-def corrected(
-    record: Record, row: int, state: State, settings: FilterSettings, update: Update = joseph_update
-) -> tuple[State, FloatArray]:
+def corrected(record: Record, row: int, state: State, settings: FilterSettings) -> tuple[State, FloatArray]:
     """State with the readings of instant ``row``, and NIS (runs, 4); all sensors are linearised at ``state``."""
-    sigma = deviations(record, settings)
-    P, dx = state.P, np.zeros(state.P.shape[:-1])
-    nis = np.full((len(state.q), len(SENSORS)), np.nan)
-    for sensor, residual, H in residuals(record, row, state, settings.sensors):
-        seen = is_read(residual)
-        # Without a reading: rows of zeros, which teach nothing.
-        H = np.where(seen[:, None, None], H / sigma[sensor], 0.0)
-        left = np.where(seen[:, None], residual / sigma[sensor], 0.0) - (H @ dx[..., None])[..., 0]
-        S = H @ P @ H.mT + np.eye(3)
-        nis[:, sensor] = np.where(seen, np.sum(left * np.linalg.solve(S, left[..., None])[..., 0], axis=-1), np.nan)
-        step, P = update(P, H, left)
-        dx = dx + step
+    H, residual = stacked_residuals(record, row, state, settings)
+    nis = nis_of(H @ state.P @ H.mT + np.eye(H.shape[1]), H, residual, settings.sensors)
+    dx, P = joseph_update(state.P, H, residual)
     return replace(with_error(state, dx, settings.sensors), P=P), nis
 
 
 def with_error(state: State, dx: FloatArray, used: SensorSet) -> State:
     """State into which an error (runs, N) is put."""
-
-    def moved_by(values: FloatArray, name: str) -> FloatArray:
-        first = used.first_of(name)
-        return values + dx[:, first : first + 3] if name in used.states else values
-
     q = quaternion.multiply(state.q, quaternion.from_error_vector(dx[:, :3]))
-    return replace(
-        state,
-        q=quaternion.normalised(q),
-        w=state.w + dx[:, 3:6],
-        field_bias_T=moved_by(state.field_bias_T, "field-bias"),
-        gyro_bias_rad_s=moved_by(state.gyro_bias_rad_s, "gyro-bias"),
-        disturbance_s2=moved_by(state.disturbance_s2, "disturbance"),
-    )
+    optional = {}
+    for name, values in optional_of(state, used).items():
+        first = used.first_of(name)
+        optional[ATTRIBUTES[name]] = values + dx[:, first : first + 3]
+    return replace(state, q=quaternion.normalised(q), w=state.w + dx[:, 3:6], **optional)
 
 
 def run_readable(
@@ -234,19 +211,17 @@ def run_readable(
     settings: FilterSettings,
     start: Start,
     jacobian: Jacobian = known_torque_jacobian,
-    update: Update = joseph_update,
 ) -> AttitudeTracks:
     """Filter of whole runs in NumPy, the reference of :func:`run_filter`.
 
     ``jacobian``: :func:`known_torque_jacobian`, or :func:`closed_loop_jacobian` to reproduce the source paper.
-    ``update``: :func:`joseph_update` or :func:`square_root_update`.
     """
     check_start(record, start)
-    state, nis = corrected(record, 0, first_state(settings, start), settings, update)
+    state, nis = corrected(record, 0, first_state(settings, start), settings)
     states, innovations = [state], [nis]
     for row in range(record.momentum_Nms.shape[1] - 1):
         state, _ = predicted(record, row, state, settings, jacobian)
-        state, nis = corrected(record, row + 1, state, settings, update)
+        state, nis = corrected(record, row + 1, state, settings)
         states.append(state)
         innovations.append(nis)
     return collected(settings, states, np.stack(innovations, axis=1))
@@ -254,20 +229,9 @@ def run_readable(
 
 def collected(settings: FilterSettings, states: list[State], nis: FloatArray) -> AttitudeTracks:
     """Estimates of the states of all instants."""
-
-    def all_of(values: Callable[[State], FloatArray]) -> FloatArray:
-        return np.stack([values(state) for state in states], axis=1)
-
-    return AttitudeTracks(
-        settings,
-        all_of(lambda state: state.q),
-        all_of(lambda state: state.w),
-        all_of(lambda state: state.field_bias_T),
-        all_of(lambda state: state.gyro_bias_rad_s),
-        all_of(lambda state: state.disturbance_s2),
-        all_of(lambda state: state.P),
-        nis,
-    )
+    # A state has the fields of a track, in their order.
+    stacked = [np.stack([getattr(state, one.name) for state in states], axis=1) for one in fields(State)]
+    return AttitudeTracks(settings, *[*stacked, nis])
 
 
 def check_start(record: Record, start: Start) -> None:
@@ -307,7 +271,6 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
     wheels = (record.momentum_Nms, record.wheel_torque_Nm)
     read = (readings.star, readings.gyro_rad_s, readings.field_T, readings.sun, around.sun_orbital)
     places = (around.orbital_rate_rad_s, around.gravity_s2, around.b_orbital_T)
-    firsts = [used.first_of("field-bias"), used.first_of("gyro-bias"), used.first_of("disturbance")]
     over_rows(
         kernel.run,
         runs,
@@ -320,7 +283,7 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
         kernel.Settings(
             np.array([used.star, used.gyro, used.magnetometer, used.sun]),
             deviations(record, settings),
-            np.array(firsts),
+            np.array([used.first_of(state) for state in STATES]),
             settings.process_variance,
         ),
         record.dt_s,

@@ -3,31 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
-from adcs.kalman.error_state import AttitudeTracks
+from adcs.kalman.error_state import AttitudeTracks, SensorSet
 from arrays.typing import FloatArray
 
-UNITS = {
-    "attitude": ("attitude_{}_deg", np.degrees(1.0)),
-    "rate": ("rate_{}_deg_s", np.degrees(1.0)),
-    "gyro-bias": ("gyro_bias_{}_deg_s", np.degrees(1.0)),
-    "field-bias": ("field_bias_{}_nT", 1e9),
-    "disturbance": ("disturbance_{}_s2", 1.0),
+
+class Shown(NamedTuple):
+    """How a state is written: its column with the axis left open, its unit and what makes it of the SI's, in words."""
+
+    column: str
+    scale: float
+    unit: str
+    words: str
+
+
+SHOWN = {
+    "attitude": Shown("attitude_{}_deg", np.degrees(1.0), "°", "attitude"),
+    "rate": Shown("rate_{}_deg_s", np.degrees(1.0), "°/s", "rate"),
+    "gyro-bias": Shown("gyro_bias_{}_deg_s", np.degrees(1.0), "°/s", "bias of the gyro"),
+    "field-bias": Shown("field_bias_{}_nT", 1e9, "nT", "bias of the magnetometer"),
+    "disturbance": Shown("disturbance_{}_s2", 1.0, "1/s²", "disturbing acceleration"),
 }
-"""Column of each state, with its axis left open, and what makes its unit of the SI's."""
-STATE_COLUMNS = tuple(column.format(axis) for column, _ in UNITS.values() for axis in "xyz")
+STATE_COLUMNS = tuple(shown.column.format(axis) for shown in SHOWN.values() for axis in "xyz")
+
+
+def by_state(error: FloatArray, used: SensorSet) -> dict[str, FloatArray]:
+    """Errors (..., N) or their standard deviations as (..., 3) of each state; that of the attitude is of the angle."""
+    parts = np.split(error, error.shape[-1] // 3, axis=-1)
+    return dict(zip(("attitude", "rate", *used.states), [2.0 * parts[0], *parts[1:]], strict=True))
 
 
 def sigma_by_state(tracks: AttitudeTracks) -> dict[str, FloatArray]:
-    """Standard deviations (runs, n, 3) of the states that there are; that of the attitude is of the angle."""
-    sigma, used = tracks.sigma, tracks.settings.sensors
-    first = {"attitude": 0, "rate": 3} | {state: used.first_of(state) for state in used.states}
-    return {state: (2.0 if i == 0 else 1.0) * sigma[..., i : i + 3] for state, i in first.items()}
+    """Standard deviations of the states that there are, shape (runs, n, 3)."""
+    return by_state(tracks.sigma, tracks.settings.sensors)
 
 
 def in_units(states: Mapping[str, FloatArray]) -> FloatArray:
     """States (..., 3) as (..., 15) in the order and units of :data:`STATE_COLUMNS`; NaN of one that is not there."""
     missing = np.full_like(next(iter(states.values())), np.nan)
-    return np.concatenate([scale * states.get(state, missing) for state, (_, scale) in UNITS.items()], axis=-1)
+    return np.concatenate([shown.scale * states.get(state, missing) for state, shown in SHOWN.items()], axis=-1)

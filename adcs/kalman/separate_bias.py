@@ -6,7 +6,6 @@ See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovc
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -16,31 +15,18 @@ from adcs.kalman.mekf import check_start, collected, first_state, nis_of, predic
 from adcs.satellite.telemetry import Record
 from arrays.typing import FloatArray
 
-Correction = Callable[[FloatArray, FloatArray], FloatArray]
-
 
 def by_sensitivity(S: FloatArray, change: FloatArray) -> FloatArray:
-    """Correction S⁺(d⁺ - d⁻) of the state, (runs, N, 3) and (runs, 3) -> (runs, N)."""
+    """Correction S⁺(d⁺ - d⁻) of the state, which the source lacks, (runs, N, 3) and (runs, 3) -> (runs, N)."""
     return (S @ change[..., None])[..., 0]
 
 
-def without_correction(S: FloatArray, change: FloatArray) -> FloatArray:
-    """No correction, as the source prints it: it does not work."""
-    return np.zeros(S.shape[:-1])
-
-
-def run_parallel(
-    record: Record,
-    settings: FilterSettings,
-    start: Start,
-    forgetting: float = 0.99,
-    correction: Correction = by_sensitivity,
-) -> AttitudeTracks:
+def run_parallel(record: Record, settings: FilterSettings, start: Start, forgetting: float = 0.99) -> AttitudeTracks:
     """Filter of whole runs with a parallel filter of the disturbance.
 
     ``settings``: of a set with the state ``disturbance``; its process noise q_d is not used, forgetting takes its
-    place. ``forgetting``: λ, above 0 and up to 1. ``correction``: :func:`by_sensitivity`, or :func:`without_correction`
-    to see the printed form fail. Returns: of the set with the disturbance; its covariance is that of the whole.
+    place. ``forgetting``: λ, above 0 and up to 1. Returns: of the set with the disturbance; its
+    covariance is that of the whole.
     """
     if not settings.sensors.disturbance:
         raise ValueError("Input settings must have the state disturbance; instead received a set without it.")
@@ -75,7 +61,7 @@ def run_parallel(
         P = rest @ state.P @ rest.mT + K @ K.mT
         P_d = rest_d @ P_d @ rest_d.mT + K_d @ noise @ K_d.mT
         change = (K_d @ residual[..., None])[..., 0]
-        dx = (K @ residual[..., None])[..., 0] + correction(S, change)
+        dx = (K @ residual[..., None])[..., 0] + by_sensitivity(S, change)
         state = with_error(state, dx, inner.sensors)
         state = replace(state, disturbance_s2=state.disturbance_s2 + change, P=P)
         states.append(replace(state, P=_whole(P, S, P_d)))

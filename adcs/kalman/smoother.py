@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from adcs import quaternion
-from adcs.kalman.error_state import AttitudeTracks, SensorSet, State
+from adcs.kalman.error_state import AttitudeTracks, SensorSet, State, optional_of
 from adcs.kalman.mekf import Jacobian, collected, known_torque_jacobian, predicted, with_error
 from adcs.satellite.telemetry import Record
 from arrays.typing import FloatArray
@@ -41,16 +41,6 @@ def smoothed(record: Record, estimates: AttitudeTracks, jacobian: Jacobian = kno
 
 def difference(state: State, other: State, used: SensorSet) -> FloatArray:
     """Error state (runs, N) that :func:`adcs.kalman.mekf.with_error` puts into ``other`` to make it ``state``."""
-    optional = {
-        "field-bias": state.field_bias_T - other.field_bias_T,
-        "gyro-bias": state.gyro_bias_rad_s - other.gyro_bias_rad_s,
-        "disturbance": state.disturbance_s2 - other.disturbance_s2,
-    }
-    return np.concatenate(
-        [
-            quaternion.error_vector(other.q, state.q),
-            state.w - other.w,
-            *(optional[name] for name in used.states),
-        ],
-        axis=-1,
-    )
+    pairs = zip(optional_of(state, used).values(), optional_of(other, used).values(), strict=True)
+    always = [quaternion.error_vector(other.q, state.q), state.w - other.w]
+    return np.concatenate([*always, *(one - two for one, two in pairs)], axis=-1)

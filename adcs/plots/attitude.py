@@ -9,31 +9,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from scipy.special import chdtri
 
 from adcs import quaternion
-from adcs.kalman.results import in_units
+from adcs.kalman.results import SHOWN, in_units
 from adcs.satellite.attitude_track import AttitudeTrack
-from adcs.satellite.sensors import SENSORS
+from adcs.satellite.sensors import NIS_SIZES, SENSOR_WORDS, SENSORS
 from arrays.typing import BoolArray, FloatArray
 from magloc.plots import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-GROUPS = (
-    ("attitude", "°"),
-    ("rate", "°/s"),
-    ("gyro bias", "°/s"),
-    ("field bias", "nT"),
-    ("disturbance", "1e-6/s²"),
-)
-"""What the columns of a picture's states are, three axes each, and their units; the last is in millionths here."""
-_SCALES = np.repeat([1.0, 1.0, 1.0, 1.0, 1e6], 3)
+_MILLIONTHS = "disturbance"
+"""The state that is drawn in millionths of its unit."""
 _SETTLED = 0.25
-_SENSORS = ("star tracker", "gyro", "magnetometer", "Sun sensor")
-_SENSOR_COLOURS = (style.BLACK, style.BLUE, style.ORANGE, "#009e73")
-_SENSOR_LINES = ("-", "--", "-.", ":")
+_SENSOR_STYLES = ((style.BLACK, "-"), (style.BLUE, "--"), (style.ORANGE, "-."), ("#009e73", ":"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,12 +42,9 @@ class StatesPicture:
     gaps: Sequence[tuple[str, BoolArray]] = ()  # (n,): what was missing, and whether it was there
 
 
-_MISSING = dict(zip(SENSORS, ("no star tracker", "no gyro", "no magnetometer", "no Sun sensor"), strict=True))
-
-
 def sensor_gaps(seen: Mapping[str, BoolArray], used: Iterable[str]) -> list[tuple[str, BoolArray]]:
     """Sensors in use that have no reading at times, in words, and where they have."""
-    return [(_MISSING.get(name, f"no {name}"), seen[name]) for name in used if not seen[name].all()]
+    return [(f"no {SENSOR_WORDS.get(name, name)}", seen[name]) for name in used if not seen[name].all()]
 
 
 def track_figure(track: AttitudeTrack, name: str = "") -> Figure:
@@ -72,15 +59,16 @@ def track_figure(track: AttitudeTrack, name: str = "") -> Figure:
 
 def states_figure(picture: StatesPicture) -> Figure:
     """Every state's three axes side by side, with the filter's ±3σ."""
-    rows = [row for row in range(len(GROUPS)) if not np.isnan(picture.values[:, 3 * row]).all()]
+    rows = [row for row in range(len(SHOWN)) if not np.isnan(picture.values[:, 3 * row]).all()]
     figure = style.new_figure(1.25 * len(rows) + 0.75)
     axes = figure.subplots(len(rows), 3, sharex=True, sharey="row", squeeze=False)
     settled = picture.time_s >= picture.time_s[0] + _SETTLED * np.ptp(picture.time_s)
     for across, row in zip(axes, rows, strict=True):
-        name, unit = GROUPS[row]
+        state, shown = list(SHOWN.items())[row]
+        scale, unit = (1e6, f"1e-6{shown.unit.removeprefix('1')}") if state == _MILLIONTHS else (1.0, shown.unit)
+        label = f"{state.replace('-', ' ')} [{unit}]"
         columns = slice(3 * row, 3 * row + 3)
-        values = picture.values[:, columns] * _SCALES[columns]
-        wide = 3.0 * picture.sigma[:, columns] * _SCALES[columns]
+        values, wide = scale * picture.values[:, columns], 3.0 * scale * picture.sigma[:, columns]
         middle = np.zeros_like(values) if picture.are_errors else values
         for axis, ax in enumerate(across):
             ax.fill_between(
@@ -98,10 +86,15 @@ def states_figure(picture: StatesPicture) -> Figure:
                 lw=0.8,
                 label="error" if picture.are_errors else "estimate",
             )
-            for label, there in picture.gaps:
-                style.shade_gaps(ax, picture.time_s, there, label)
+            for gap, there in picture.gaps:
+                style.shade_gaps(ax, picture.time_s, there, gap)
             outside = float(np.mean(np.abs(values[settled, axis]) > wide[settled, axis]))
-            style.dress(ax, "", f"{name} [{unit}]" if axis == 0 else "", "xyz"[axis] if row == rows[0] else "")
+            style.dress(
+                ax,
+                "",
+                label if axis == 0 else "",
+                "xyz"[axis] if row == rows[0] else "",
+            )
             if picture.are_errors and outside > 0.0:
                 ax.text(
                     0.98,
@@ -114,8 +107,8 @@ def states_figure(picture: StatesPicture) -> Figure:
                 )
             # The band at rest fills half of the panel; what happens at the start may leave it.
             ax.axhline(0.0, color=style.GREY, lw=0.5, zorder=1.5)
-        shown = [(middle - wide)[settled], (middle + wide)[settled], values[settled]]
-        low, high = style.limits_of(shown, share=1.0, margin=0.25)
+        inside = [(middle - wide)[settled], (middle + wide)[settled], values[settled]]
+        low, high = style.limits_of(inside, share=1.0, margin=0.25)
         across[0].set_ylim(low, high)
     for ax in axes[-1]:
         ax.set_xlabel("time [s]", fontsize=style.LETTERS)
@@ -183,14 +176,8 @@ def _errors(ax: Axes, time_s: FloatArray, error_deg: FloatArray, sigma_deg: Floa
     style.legend(ax)
 
 
-def bounds_of_mean(numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Two-sided 99 % bounds of χ² of so many numbers, over these; NaN where there are none."""
-    known = np.where(numbers > 0.0, numbers, np.nan)
-    return chdtri(known, 0.995) / known, chdtri(known, 0.005) / known
-
-
 def _nees(ax: Axes, time_s: FloatArray, nees: FloatArray, size: int) -> None:
-    low, high = bounds_of_mean(np.full(len(time_s), float(size * len(nees))))
+    low, high = style.bounds99(np.full(len(time_s), float(size * len(nees))))
     mean = nees.mean(axis=0)
     ax.fill_between(time_s, low, high, color=style.LIGHT_GREY, lw=0.0, label="99 % bounds of χ²")
     ax.plot(time_s, mean, color=style.BLUE, lw=0.9, label="mean of the runs")
@@ -207,18 +194,18 @@ def _nis(ax: Axes, time_s: FloatArray, nis: FloatArray) -> None:
     n = len(time_s) // width * width
     times = time_s[:n].reshape(-1, width).mean(axis=1)
     drawn: list[FloatArray] = []
-    for sensor, (name, colour, line) in enumerate(zip(_SENSORS, _SENSOR_COLOURS, _SENSOR_LINES, strict=True)):
-        values = nis[:, :n, sensor].reshape(len(nis), -1, width)
+    for i, (sensor, (colour, line)) in enumerate(zip(SENSORS, _SENSOR_STYLES, strict=True)):
+        values = nis[:, :n, i].reshape(len(nis), -1, width)
         count = np.isfinite(values).sum(axis=(0, 2)).astype(np.float64)
         if not count.any():
             continue
-        numbers = 2.0 if name == "Sun sensor" else 3.0
+        numbers = NIS_SIZES[sensor]
         mean = np.where(count > 0.0, np.nansum(values, axis=(0, 2)) / np.maximum(count, 1.0), np.nan) / numbers
         if not drawn:
-            low, high = bounds_of_mean(numbers * count)
+            low, high = style.bounds99(numbers * count)
             ax.fill_between(times, low, high, color=style.LIGHT_GREY, lw=0.0, label="99 % bounds of χ²")
             drawn += [low, high]
-        ax.plot(times, mean, color=colour, ls=line, lw=0.9, label=name)
+        ax.plot(times, mean, color=colour, ls=line, lw=0.9, label=SENSOR_WORDS[sensor])
         drawn.append(mean)
     ax.axhline(1.0, color=style.GREY, lw=0.5)
     style.logarithmic(ax, drawn)

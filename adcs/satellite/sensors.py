@@ -17,8 +17,6 @@ from arrays.typing import BoolArray, FloatArray
 
 ANGLE_NOISE_RAD = math.radians(0.0005)
 """Noise of the star tracker's quaternion where 0.001° is the angle, twice that."""
-PAPER_NOISE_RAD = math.radians(0.001)
-"""The same where 0.001° is the noise of the quaternion's components, which the source's tables need."""
 FIVE_HEADS: FloatArray = np.array(
     [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
 )
@@ -26,6 +24,9 @@ FIVE_HEADS: FloatArray = np.array(
 
 SENSORS = ("st", "gyro", "mag", "sun")
 """Names of star tracker, gyro, magnetometer and Sun sensor, in the order in which filters take them."""
+SENSOR_WORDS = dict(zip(SENSORS, ("star tracker", "gyro", "magnetometer", "Sun sensor"), strict=True))
+NIS_SIZES = dict(zip(SENSORS, (3, 3, 3, 2), strict=True))
+"""Numbers of which the normalised square of a sensor's innovation is a χ²; a direction to the Sun has two."""
 
 
 def _aligned() -> FloatArray:
@@ -230,17 +231,6 @@ def in_field(sensor: SunSensor, direction_body: ArrayLike) -> BoolArray:
     angles = np.abs(np.arctan2(along[..., :2], along[..., 2:]))
     # A direction on the edge between two heads must not fall between them by rounding.
     return np.asarray((angles <= sensor.half_field_rad + 1e-12).all(axis=-1))
-
-
-def bias_walk(start: ArrayLike, walk: float, dt_s: float, unit_noise: ArrayLike) -> FloatArray:
-    """Biases whose derivative is white noise.
-
-    Shapes ``unit_noise`` (..., n, 3) -> (..., n, 3). ``start`` (..., 3): first bias. ``walk``: growth of the standard
-    deviation in one second [unit/√s]. ``dt_s``: between readings.
-    """
-    steps = walk * math.sqrt(dt_s) * np.asarray(unit_noise, dtype=np.float64)
-    steps[..., 0, :] = start
-    return np.cumsum(steps, axis=-2)
 
 
 def _vector_readings(

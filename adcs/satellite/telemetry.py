@@ -1,23 +1,22 @@
 """What the filters of attitude are given: readings, wheels and surroundings of some runs at once.
 
-:class:`sims.attitude.simulation.AttitudeRuns` is a :class:`TrueRecord`, and a log, :class:`Telemetry`, gives a
-:class:`Record` without the truth. The leading axis of all arrays is the run, the second the instant.
+:class:`sims.attitude.simulation.AttitudeRuns` is a :class:`Record` with the truth, and a log, :class:`Telemetry`, gives
+one without it. The leading axis of all arrays is the run, the second the instant.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from adcs import quaternion
 from adcs.environment.environment import Environment, environment
-from adcs.satellite.dynamics import RigidBody, WheelControl
 from adcs.satellite.satellite import Satellite
-from adcs.satellite.sensors import SENSORS, Gyro, Magnetometer, StarTracker, SunSensor
+from adcs.satellite.sensors import SENSORS
 from arrays.typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -55,125 +54,30 @@ class Readings:
         return dict(zip(SENSORS, map(is_read, values), strict=True))
 
 
-class KnownSatellite(Protocol):
-    """The satellite and its sensors, as its user believes them to be."""
-
-    @property
-    def body(self) -> RigidBody:
-        """Inertia and residual dipole."""
-        ...
-
-    @property
-    def control(self) -> WheelControl:
-        """Wheel control, which only the F of the source paper needs."""
-        ...
-
-    @property
-    def star_tracker(self) -> StarTracker:
-        """Its noise and rate limit."""
-        ...
-
-    @property
-    def gyro(self) -> Gyro:
-        """Its noise."""
-        ...
-
-    @property
-    def magnetometer(self) -> Magnetometer:
-        """Its noise."""
-        ...
-
-    @property
-    def sun_sensor(self) -> SunSensor:
-        """Its noise."""
-        ...
-
-
-class Record(Protocol):
-    """Everything that a filter may know.
-
-    There are readings at every instant; the torque of the wheels acts from an instant to the next.
-    """
-
-    @property
-    def satellite(self) -> KnownSatellite:
-        """Satellite and sensors."""
-        ...
-
-    @property
-    def dt_s(self) -> float:
-        """Time between instants."""
-        ...
-
-    @property
-    def environment(self) -> Environment:
-        """Surroundings, leading axis runs."""
-        ...
-
-    @property
-    def readings(self) -> Readings:
-        """Of all sensors."""
-        ...
-
-    @property
-    def momentum_Nms(self) -> FloatArray:
-        """Of the wheels, shape (runs, n, 3)."""
-        ...
-
-    @property
-    def wheel_torque_Nm(self) -> FloatArray:
-        """Rate of change of the wheels' momentum from each instant to the next, shape (runs, n, 3)."""
-        ...
-
-
-class TrueBiases(Protocol):
-    """Biases that a simulation has given to its sensors, shape (runs, n, 3)."""
-
-    @property
-    def gyro_bias_rad_s(self) -> FloatArray:
-        """Of the gyro."""
-        ...
-
-    @property
-    def field_bias_T(self) -> FloatArray:
-        """Of the magnetometer."""
-        ...
-
-
-class TrueRecord(Record, Protocol):
-    """A record with the truth, of a simulation."""
-
-    @property
-    def q(self) -> FloatArray:
-        """Attitude, orbital from body, shape (runs, n, 4)."""
-        ...
-
-    @property
-    def w(self) -> FloatArray:
-        """Rate against inertial space, shape (runs, n, 3)."""
-        ...
-
-    @property
-    def acceleration_s2(self) -> FloatArray:
-        """Disturbance, shape (runs, n, 3)."""
-        ...
-
-    @property
-    def prepared(self) -> TrueBiases:
-        """Biases."""
-        ...
-
-
 def is_read(values: FloatArray) -> BoolArray:
     """Whether there is a reading, (..., k) -> (...)."""
     return ~np.isnan(values[..., 0])
 
 
 @dataclass(frozen=True, eq=False)
-class FilterRecord:
-    """A log, or some runs and instants of a record; see :class:`Record`."""
+class Record:
+    """Everything that a filter may know of some runs, or of a log.
 
-    satellite: KnownSatellite
+    There are readings at every instant; the torque of the wheels acts from an instant to the next.
+
+    Attributes
+    ----------
+    satellite : Satellite
+        With its sensors, as its user believes them to be.
+    dt_s : float
+        Time between instants.
+    environment : Environment
+        Leading axis runs.
+    momentum_Nms, wheel_torque_Nm : ndarray, shape (runs, n, 3)
+        Momentum of the wheels, and its rate of change from each instant to the next.
+    """
+
+    satellite: Satellite
     dt_s: float
     environment: Environment
     readings: Readings
@@ -181,13 +85,13 @@ class FilterRecord:
     wheel_torque_Nm: FloatArray
 
 
-def part(record: Record, runs: NDArray[np.intp], rows: slice = slice(None)) -> FilterRecord:
+def part(record: Record, runs: NDArray[np.intp], rows: slice = slice(None)) -> Record:
     """Some runs of a record, each as often as its index comes, and instants that follow one another."""
     around, readings = record.environment, record.readings
     of_runs = {
         field.name: getattr(around, field.name)[runs, rows] for field in fields(around) if field.name != "time_s"
     }
-    return FilterRecord(
+    return Record(
         record.satellite,
         record.dt_s,
         Environment(time_s=around.time_s[rows], **of_runs),
@@ -285,7 +189,7 @@ class Telemetry:
         """Instant of every row, counted in steps from the first."""
         return steps_of(self.time_s, self.step_s)[0]
 
-    def record(self, satellite: Satellite) -> FilterRecord:
+    def record(self, satellite: Satellite) -> Record:
         """What the filters are given: readings at every instant, field and Sun along the satellite's orbit."""
         rows, step_s = self.rows, self.step_s
         n = int(rows[-1]) + 1
@@ -313,7 +217,7 @@ class Telemetry:
             field_T=spread(self.field_T)[None],
             sun=(sun / np.linalg.norm(sun, axis=1, keepdims=True))[None],
         )
-        return FilterRecord(satellite, step_s, around, readings, momentum[None], torque[None])
+        return Record(satellite, step_s, around, readings, momentum[None], torque[None])
 
     @property
     def instants_s(self) -> FloatArray:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from arrays.typing import FloatArray, IntArray
-from magloc.chi_square import mean_bounds
+from magloc.chi_square import mean_bounds, normalised_square
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.results import Row, TrackPoint
 from magloc.tracking.tracker import Tracker
@@ -163,6 +163,4 @@ def nees_of(
     if known.all():
         error, _ = measurement.coordinates(estimate, np.sqrt(np.diagonal(covariance))).at(truth)
     error, covariance = error[known], covariance[np.ix_(known, known)]
-    scale = np.sqrt(np.diagonal(covariance))
-    normalised = error / scale
-    return float(normalised @ np.linalg.solve(covariance / np.outer(scale, scale), normalised)), int(known.sum())
+    return float(normalised_square(error, covariance)), int(known.sum())

@@ -14,13 +14,10 @@ def simulation_of(file: AttitudeFile) -> AttitudeScenario:
 
     ``file``: of :func:`adcs.io.scenario_files.read_scenario`.
     """
-    satellite, start, disturbance = file.satellite, file.start, file.disturbance
+    start, disturbance = file.start, file.disturbance
     with naming(file.path):
         return AttitudeScenario(
-            body=satellite.body,
-            control=satellite.control,
-            orbit=satellite.orbit,
-            day=satellite.start,
+            file.satellite,
             conditions=StartConditions(
                 sunlit=start.sunlit,
                 least_separation_rad=math.radians(start.least_separation_deg),
@@ -30,10 +27,6 @@ def simulation_of(file: AttitudeFile) -> AttitudeScenario:
             ),
             duration_s=file.duration_s,
             dt_s=file.step_s,
-            star_tracker=satellite.star_tracker,
-            gyro=satellite.gyro,
-            magnetometer=satellite.magnetometer,
-            sun_sensor=satellite.sun_sensor,
             torque_Nm=disturbance.torque_Nm,
             torque_period_s=disturbance.torque_period_s,
             gyro_bias_rad_s=math.radians(disturbance.gyro_bias_deg_s),
@@ -41,5 +34,4 @@ def simulation_of(file: AttitudeFile) -> AttitudeScenario:
             field_error_T=1e-9 * disturbance.field_error_nT,
             start_attitude_rad=math.radians(start.attitude_deg),
             start_rate_rad_s=math.radians(start.rate_deg_s),
-            field_model=satellite.field_model,
         )

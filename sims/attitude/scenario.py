@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-import numpy as np
-
-from adcs.environment.orbit import CircularOrbit, Orbit, node_of_local_time
-from adcs.satellite.dynamics import RigidBody, WheelControl, wheel_control
+from adcs.environment.orbit import circular_orbit
 from adcs.satellite.satellite import Satellite
-from adcs.satellite.sensors import Gyro, Magnetometer, StarTracker, SunSensor
-from magloc.fields.geomagnetic import Model
 
 
 @dataclass(frozen=True)
@@ -37,10 +32,6 @@ class StartConditions:
     eclipse_after_s: float | None = None
 
 
-ANY_START = StartConditions(sunlit=False, least_separation_rad=0.0, least_field_T=0.0)
-"""No condition at all."""
-
-
 @dataclass(frozen=True, eq=False)
 class AttitudeScenario:
     """A satellite under wheel control that holds the orbital frame.
@@ -49,8 +40,8 @@ class AttitudeScenario:
 
     Attributes
     ----------
-    day : datetime64
-        Runs start within the 24 hours from here, UTC.
+    satellite : Satellite
+        Runs start within the 24 hours from its start; its control sees the true state.
     duration_s, dt_s : float
         Of a run, and between its instants. Readings are taken and torques set at every instant.
     torque_Nm : float
@@ -70,17 +61,10 @@ class AttitudeScenario:
         A duration or step is not positive, or a size is negative.
     """
 
-    body: RigidBody
-    control: WheelControl
-    orbit: Orbit
-    day: np.datetime64
+    satellite: Satellite
     conditions: StartConditions = StartConditions()
     duration_s: float = 200.0
     dt_s: float = 1.0
-    star_tracker: StarTracker = field(default_factory=StarTracker)
-    gyro: Gyro = field(default_factory=Gyro)
-    magnetometer: Magnetometer = field(default_factory=Magnetometer)
-    sun_sensor: SunSensor = field(default_factory=SunSensor)
     torque_Nm: float = 0.0
     torque_period_s: float = math.inf
     gyro_bias_rad_s: float = 0.0
@@ -88,7 +72,6 @@ class AttitudeScenario:
     field_error_T: float = 0.0
     start_attitude_rad: float = math.radians(1.0)
     start_rate_rad_s: float = math.radians(0.01)
-    field_model: Model = "IGRF-14"
 
     def __post_init__(self) -> None:
         for name in ("dt_s", "torque_period_s"):
@@ -108,22 +91,6 @@ class AttitudeScenario:
                 raise ValueError(f"Input {name} must be 0 or more and finite; instead received {getattr(self, name)}.")
 
     @property
-    def satellite(self) -> Satellite:
-        """What its user knows of it; a log's time counts from the day on."""
-        return Satellite(
-            inertia_kgm2=self.body.inertia_kgm2,
-            residual_dipole_Am2=self.body.residual_dipole_Am2,
-            orbit=self.orbit,
-            star_tracker=self.star_tracker,
-            gyro=self.gyro,
-            magnetometer=self.magnetometer,
-            sun_sensor=self.sun_sensor,
-            control=self.control,
-            start=self.day,
-            field_model=self.field_model,
-        )
-
-    @property
     def n_instants(self) -> int:
         """Instants of a run, the start included."""
         return 1 + round(self.duration_s / self.dt_s)
@@ -140,7 +107,6 @@ def tabletsat(duration_s: float = 200.0, local_time_h: float = 15.0) -> Attitude
     ``local_time_h``: mean solar time of the ascending node. With 15 h Sun and field never come nearer to each other
     than 31° in sunlight; with 13 h they come as near as 1.2°.
     """
-    body = RigidBody(np.array(TABLETSAT_INERTIA_KGM2))
-    day = np.datetime64("2014-09-01", "us")
-    orbit = CircularOrbit(600e3, math.radians(97.8), node_of_local_time(local_time_h, day), day)
-    return AttitudeScenario(body, wheel_control(body), orbit, day, duration_s=duration_s, torque_Nm=8e-7)
+    orbit = circular_orbit(altitude_m=600e3, inclination_deg=97.8, epoch="2014-09-01", local_time_h=local_time_h)
+    satellite = Satellite(inertia_kgm2=TABLETSAT_INERTIA_KGM2, orbit=orbit)
+    return AttitudeScenario(satellite, duration_s=duration_s, torque_Nm=8e-7)

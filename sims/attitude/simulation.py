@@ -18,11 +18,11 @@ from adcs.environment.environment import Environment, environment
 from adcs.environment.orbit import EARTH_RADIUS_M
 from adcs.satellite import dynamics, sensors
 from adcs.satellite.attitude_track import AttitudeTrack
-from adcs.satellite.telemetry import Readings, orbital_from_eci
+from adcs.satellite.telemetry import Readings, Record, orbital_from_eci
 from arrays.typing import FloatArray
 from sims.attitude.scenario import AttitudeScenario
 from sims.attitude.starts import starts
-from sims.noise import stream
+from sims.noise import HOUR_S, random_walk, stream
 
 State = tuple[FloatArray, FloatArray, FloatArray]
 
@@ -48,7 +48,7 @@ class Prepared:
 
 
 @dataclass(frozen=True, eq=False)
-class AttitudeRuns:
+class AttitudeRuns(Record):
     """Truth and readings.
 
     Attributes
@@ -57,23 +57,35 @@ class AttitudeRuns:
         Attitude, orbital from body.
     w : ndarray, shape (runs, n, 3)
         Rate against inertial space, body axes [rad/s].
-    momentum_Nms : ndarray, shape (runs, n, 3)
-        Of the wheels.
-    wheel_torque_Nm : ndarray, shape (runs, n, 3)
-        Rate of change of the wheels' momentum from each instant to the next.
     """
 
     prepared: Prepared
     q: FloatArray
     w: FloatArray
-    momentum_Nms: FloatArray
-    wheel_torque_Nm: FloatArray
-    readings: Readings
+
+    @classmethod
+    def of(
+        cls, prepared: Prepared, q: FloatArray, w: FloatArray, momentum_Nms: FloatArray, wheel_torque_Nm: FloatArray
+    ) -> AttitudeRuns:
+        """Runs of a motion, with its readings."""
+        scenario, readings = prepared.scenario, sense(prepared, q, w)
+        known = scenario.satellite, scenario.dt_s, prepared.environment
+        return cls(*known, readings, momentum_Nms, wheel_torque_Nm, prepared, q, w)
 
     @property
     def scenario(self) -> AttitudeScenario:
         """What was simulated."""
         return self.prepared.scenario
+
+    @property
+    def states(self) -> dict[str, FloatArray]:
+        """True rate [rad/s], biases and disturbance d = J⁻¹·torque [1/s²] by their names, shape (runs, n, 3)."""
+        return {
+            "rate": self.w,
+            "field-bias": self.prepared.field_bias_T,
+            "gyro-bias": self.prepared.gyro_bias_rad_s,
+            "disturbance": self.prepared.torque_Nm @ self.satellite.body.inverse,
+        }
 
     def error_deg(self, track: AttitudeTrack) -> FloatArray:
         """Angle between the first run's truth and a track of its log, shape (n,) [°]; NaN before the track begins."""
@@ -84,29 +96,9 @@ class AttitudeRuns:
         return error
 
     @property
-    def satellite(self) -> AttitudeScenario:
-        """The satellite and its sensors, as the filters know them."""
-        return self.prepared.scenario
-
-    @property
-    def dt_s(self) -> float:
-        """Between instants."""
-        return self.prepared.scenario.dt_s
-
-    @property
-    def environment(self) -> Environment:
-        """Surroundings as the filters know them."""
-        return self.prepared.environment
-
-    @property
     def time_s(self) -> FloatArray:
         """Since the start of every run, shape (n,)."""
-        return self.prepared.environment.time_s
-
-    @property
-    def acceleration_s2(self) -> FloatArray:
-        """The disturbance d = J⁻¹·torque that filters estimate, shape (runs, n, 3) [rad/s²]."""
-        return self.prepared.torque_Nm @ self.scenario.body.inverse
+        return self.environment.time_s
 
 
 def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
@@ -119,12 +111,12 @@ def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
         raise ValueError("Input seeds must hold one seed at least; instead received none.")
     n = scenario.n_instants
     time_s = scenario.dt_s * np.arange(n)
-    around = environment(scenario.orbit, starts(scenario, numbers), time_s, model=scenario.field_model)
+    satellite = scenario.satellite
+    around = environment(satellite.orbit, starts(scenario, numbers), time_s, model=satellite.field_model)
     error_T = scenario.field_error_T * _directions(numbers, "field error")
     q = quaternion.exp(scenario.start_attitude_rad * _normal(numbers, "start attitude", 1)[:, 0])
     w_relative = scenario.start_rate_rad_s * _normal(numbers, "start rate", 1)[:, 0]
     wave = np.cos(2.0 * math.pi * time_s / scenario.torque_period_s)
-    gyro, magnetometer = scenario.gyro, scenario.magnetometer
     return Prepared(
         scenario=scenario,
         seeds=tuple(numbers),
@@ -134,18 +126,8 @@ def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
         w=dynamics.absolute_rate(q, w_relative, around.orbital_rate_rad_s[:, 0]),
         momentum_Nms=np.zeros((len(numbers), 3)),
         torque_Nm=scenario.torque_Nm * _directions(numbers, "torque")[:, None] * wave[:, None],
-        gyro_bias_rad_s=sensors.bias_walk(
-            scenario.gyro_bias_rad_s * _directions(numbers, "gyro bias"),
-            gyro.bias_walk_rad_s,
-            scenario.dt_s,
-            _normal(numbers, "gyro walk", n),
-        ),
-        field_bias_T=sensors.bias_walk(
-            scenario.field_bias_T * _directions(numbers, "field bias"),
-            magnetometer.bias_walk_T,
-            scenario.dt_s,
-            _normal(numbers, "field walk", n),
-        ),
+        gyro_bias_rad_s=_bias(scenario, numbers, "gyro", scenario.gyro_bias_rad_s, satellite.gyro.bias_walk_rad_s),
+        field_bias_T=_bias(scenario, numbers, "field", scenario.field_bias_T, satellite.magnetometer.bias_walk_T),
         noise={name: _normal(numbers, f"{name} noise", n) for name in ("star", "gyro", "field", "sun")},
     )
 
@@ -164,13 +146,13 @@ def simulate(scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
         rigid_body.run,
         runs,
         rigid_body.Motion(q, w, momentum, wheel_torque),
-        rigid_body.Body.of(scenario.body),
-        rigid_body.Control.of(scenario.control, quaternion.IDENTITY),
+        rigid_body.Body.of(scenario.satellite.body),
+        rigid_body.Control.of(scenario.satellite.control, quaternion.IDENTITY),
         prepared.torque_Nm,
         rigid_body.Surroundings(around.orbital_rate_rad_s, around.gravity_s2, prepared.true_field_orbital_T),
         scenario.dt_s,
     )
-    return AttitudeRuns(prepared, q, w, momentum, wheel_torque, sense(prepared, q, w))
+    return AttitudeRuns.of(prepared, q, w, momentum, wheel_torque)
 
 
 def sense(prepared: Prepared, q: FloatArray, w: FloatArray, rows: slice = slice(None)) -> Readings:
@@ -178,18 +160,18 @@ def sense(prepared: Prepared, q: FloatArray, w: FloatArray, rows: slice = slice(
 
     Shapes ``q`` (runs, len(rows), 4), ``w`` (runs, len(rows), 3). ``rows``: all instants, unless given.
     """
-    scenario, around = prepared.scenario, prepared.environment
+    satellite, around = prepared.scenario.satellite, prepared.environment
     sun_orbital, lit = around.sun_orbital[:, rows], around.illuminated[:, rows]
     earth_radius = np.arcsin(EARTH_RADIUS_M / np.linalg.norm(around.position_eci_m[:, rows], axis=-1))
     b_body = quaternion.rotate_back(q, prepared.true_field_orbital_T[:, rows])
     noise = {name: numbers[:, rows] for name, numbers in prepared.noise.items()}
     return Readings(
-        star=sensors.star_tracker_readings(scenario.star_tracker, q, w, sun_orbital, earth_radius, lit, noise["star"]),
-        gyro_rad_s=sensors.gyro_readings(scenario.gyro, w, prepared.gyro_bias_rad_s[:, rows], noise["gyro"]),
+        star=sensors.star_tracker_readings(satellite.star_tracker, q, w, sun_orbital, earth_radius, lit, noise["star"]),
+        gyro_rad_s=sensors.gyro_readings(satellite.gyro, w, prepared.gyro_bias_rad_s[:, rows], noise["gyro"]),
         field_T=sensors.magnetometer_readings(
-            scenario.magnetometer, b_body, prepared.field_bias_T[:, rows], noise["field"]
+            satellite.magnetometer, b_body, prepared.field_bias_T[:, rows], noise["field"]
         ),
-        sun=sensors.sun_readings(scenario.sun_sensor, quaternion.rotate_back(q, sun_orbital), lit, noise["sun"]),
+        sun=sensors.sun_readings(satellite.sun_sensor, quaternion.rotate_back(q, sun_orbital), lit, noise["sun"]),
     )
 
 
@@ -201,7 +183,7 @@ def advance(prepared: Prepared, state: State, wheel_torque_Nm: FloatArray, row: 
     """
     around = prepared.environment
     return dynamics.step(
-        prepared.scenario.body,
+        prepared.scenario.satellite.body,
         *state,
         wheel_torque_Nm,
         prepared.torque_Nm[:, row],
@@ -223,6 +205,13 @@ def start_estimates(
     error = quaternion.exp(attitude_error_rad * _normal(seeds, "estimate attitude", 1)[:, 0])
     rate_error = rate_error_rad_s * _normal(seeds, "estimate rate", 1)[:, 0]
     return quaternion.multiply(prepared.q, quaternion.conjugate(error)), prepared.w - rate_error
+
+
+def _bias(scenario: AttitudeScenario, seeds: list[int], sensor: str, size: float, walk: float) -> FloatArray:
+    """Biases (runs, n, 3): of a size at the start, then changed by white noise, ``walk`` per √s."""
+    n, rate_Hz, per_root_hour = scenario.n_instants, 1.0 / scenario.dt_s, walk * math.sqrt(HOUR_S)
+    walks = [random_walk(n, 3, rate_Hz, per_root_hour, stream(seed, f"{sensor} walk")) for seed in seeds]
+    return size * _directions(seeds, f"{sensor} bias")[:, None] + np.stack(walks)
 
 
 def _normal(seeds: list[int], feature: str, n: int) -> FloatArray:

@@ -21,13 +21,14 @@ GRID_S = 10.0
 
 def starts(scenario: AttitudeScenario, seeds: list[int]) -> Instants:
     """Start of the run of every seed, drawn from the instants of the day that the conditions allow, shape (runs,)."""
-    day = _day(scenario.orbit, scenario.day, scenario.duration_s, scenario.field_model)
+    satellite = scenario.satellite
+    day = _day(satellite.orbit, satellite.start, scenario.duration_s, satellite.field_model)
     n = 1 + math.ceil(scenario.duration_s / GRID_S)
     allowed = np.flatnonzero(_allowed(scenario.conditions, day, n))
     if not allowed.size:
         raise ValueError(
-            f"Input conditions must hold for {scenario.duration_s:g} s somewhere in the 24 hours from {scenario.day}; "
-            f"instead received {scenario.conditions}, which never do."
+            f"Input conditions must hold for {scenario.duration_s:g} s somewhere in the 24 hours from "
+            f"{satellite.start}; instead received {scenario.conditions}, which never do."
         )
     return np.array([day.utc[stream(seed, "start").choice(allowed)] for seed in seeds])
 

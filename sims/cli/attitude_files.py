@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,17 +83,9 @@ def _runs_table(outcome: Outcome) -> dict[str, Any]:
 def _truth_columns(part: Part, time_s: FloatArray) -> dict[str, Any]:
     """What the estimates of the telemetry may be compared with."""
     runs = part.runs
-    columns: dict[str, Any] = {"time_s": time_s}
-    groups = (
-        (["qw", "qx", "qy", "qz"], runs.q[0]),
-        ([f"rate_{axis}_deg_s" for axis in "xyz"], np.degrees(runs.w[0])),
-        ([f"gyro_bias_{axis}_deg_s" for axis in "xyz"], np.degrees(runs.prepared.gyro_bias_rad_s[0])),
-        ([f"field_bias_{axis}_nT" for axis in "xyz"], 1e9 * runs.prepared.field_bias_T[0]),
-        ([f"disturbance_{axis}_s2" for axis in "xyz"], runs.acceleration_s2[0]),
-    )
-    for names, values in groups:
-        columns |= dict(zip(names, values.T, strict=True))
-    return columns
+    states = in_units({state: values[0] for state, values in runs.states.items()})
+    columns: dict[str, Any] = {"time_s": time_s} | dict(zip(("qw", "qx", "qy", "qz"), runs.q[0].T, strict=True))
+    return columns | dict(zip(STATE_COLUMNS[3:], states.T[3:], strict=True))
 
 
 def dataset_of(parts: Sequence[Part], estimate: EstimatorSettings, title: str) -> xr.Dataset:
@@ -102,49 +94,41 @@ def dataset_of(parts: Sequence[Part], estimate: EstimatorSettings, title: str) -
 
     from arrays.io.outputs import installed_version
 
-    def joined(values: Any) -> FloatArray:
+    def joined(values: Callable[[Part], FloatArray]) -> FloatArray:
         return np.concatenate([values(part) for part in parts])
 
-    axis, n3 = ("run", "time", "axis"), ("run", "time", "component")
-    used = estimate.settings.sensors
-    variables: dict[str, Any] = {
-        "q": (n3, joined(lambda p: p.estimates.q), {"units": "1", "long_name": "attitude, orbital from body"}),
-        "q_true": (n3, joined(lambda p: p.runs.q), {"units": "1", "long_name": "true attitude"}),
-        "rate": (axis, joined(lambda p: p.estimates.w), {"units": "rad/s", "long_name": "rate, body axes"}),
-        "rate_true": (axis, joined(lambda p: p.runs.w), {"units": "rad/s", "long_name": "true rate"}),
-        "sigma_attitude": (
-            axis,
-            2.0 * joined(lambda p: p.estimates.sigma[..., :3]),
-            {"units": "rad", "long_name": "standard deviation of the angle"},
-        ),
-        "sigma_rate": (
-            axis,
-            joined(lambda p: p.estimates.sigma[..., 3:6]),
-            {"units": "rad/s", "long_name": "standard deviation of the rate"},
-        ),
-        "nis": (
-            ("run", "time", "sensor"),
-            joined(lambda p: p.estimates.nis),
-            {"units": "1", "long_name": "normalised innovation squared"},
-        ),
-    }
-    optional = {
-        "gyro-bias": ("gyro_bias_rad_s", "gyro_bias", "rad/s", lambda p: p.runs.prepared.gyro_bias_rad_s),
-        "field-bias": ("field_bias_T", "field_bias", "T", lambda p: p.runs.prepared.field_bias_T),
-        "disturbance": ("disturbance_s2", "disturbance", "s-2", lambda p: p.runs.acceleration_s2),
-    }
-    for state, (attribute, name, units, true) in optional.items():
-        if state not in used.states:
-            continue
-        values = joined(lambda p, attribute=attribute: getattr(p.estimates, attribute))
-        variables[name] = (axis, values, {"units": units, "long_name": name.replace("_", " ")})
-        variables[f"{name}_true"] = (axis, joined(true), {"units": units, "long_name": f"true {name}"})
-        first = used.first_of(state)
-        sigma = joined(lambda p, first=first: p.estimates.sigma[..., first : first + 3])
-        variables[f"sigma_{name}"] = (axis, sigma, {"units": units, "long_name": "standard deviation"})
+    def of(state: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Estimates, truth and standard deviations of a state."""
+        return (
+            joined(lambda part: part.estimates.states[state]),
+            joined(lambda part: part.runs.states[state]),
+            joined(lambda part: sigma_by_state(part.estimates)[state]),
+        )
+
+    axis, component = ("run", "time", "axis"), ("run", "time", "component")
+    rate, true_rate, sigma_rate = of("rate")
+    sigma_attitude = joined(lambda part: sigma_by_state(part.estimates)["attitude"])
+    nis = joined(lambda part: part.estimates.nis)
+    listed: list[tuple[str, tuple[str, ...], FloatArray, str, str]] = [
+        ("q", component, joined(lambda part: part.estimates.q), "1", "attitude, orbital from body"),
+        ("q_true", component, joined(lambda part: part.runs.q), "1", "true attitude"),
+        ("rate", axis, rate, "rad/s", "rate, body axes"),
+        ("rate_true", axis, true_rate, "rad/s", "true rate"),
+        ("sigma_attitude", axis, sigma_attitude, "rad", "standard deviation of the angle"),
+        ("sigma_rate", axis, sigma_rate, "rad/s", "standard deviation of the rate"),
+        ("nis", ("run", "time", "sensor"), nis, "1", "normalised innovation squared"),
+    ]
+    for state, units in (("gyro-bias", "rad/s"), ("field-bias", "T"), ("disturbance", "s-2")):
+        if state in estimate.settings.sensors.states:
+            name, (values, true, sigma) = state.replace("-", "_"), of(state)
+            listed += [
+                (name, axis, values, units, state.replace("-", " ")),
+                (f"{name}_true", axis, true, units, f"true {name}"),
+                (f"sigma_{name}", axis, sigma, units, "standard deviation"),
+            ]
     seeds = [seed for part in parts for seed in part.runs.prepared.seeds]
     return xr.Dataset(
-        variables,
+        {name: (dims, values, {"units": units, "long_name": words}) for name, dims, values, units, words in listed},
         coords={
             "run": ("run", seeds, {"long_name": "seed"}),
             "time": ("time", parts[0].runs.time_s, {"units": "s", "long_name": "time since the start of the run"}),

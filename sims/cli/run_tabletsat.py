@@ -13,6 +13,7 @@ from cyclopts import Parameter
 import adcs
 import sims.experiments
 from adcs.cli.options import ScenarioOptions, print_note
+from adcs.kalman.results import SHOWN
 from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import InputError
 from arrays.io.outputs import make_folder, refuse_file
@@ -144,20 +145,15 @@ def run_attitude(
         print("\n".join(summary_lines(file, estimate, numbers)))
 
 
-_ROWS = (
-    ("angle_rms_deg", "angle, rms of the last minute", "°"),
-    ("rate_rms_deg_s", "rate", "°/s"),
-    ("gyro_bias_rms_deg_s", "bias of the gyro", "°/s"),
-    ("field_bias_rms_nT", "bias of the magnetometer", "nT"),
-    ("disturbance_rms_s2", "disturbing acceleration", "1/s²"),
-)
-
-
 def summary_lines(file: AttitudeFile, estimate: EstimatorSettings, numbers: dict[str, Any]) -> Sequence[str]:
     """The result as text."""
     runs = "1 run" if numbers["runs"] == 1 else f"{numbers['runs']} runs"
     lines = [f"{file.name}: {runs} of {file.duration_s:g} s; {estimate.in_words}"]
-    lines += [f"{what:34s}{numbers[key]:.3g} {unit}" for key, what, unit in _ROWS if numbers[key] is not None]
+    # The first numbers are those of the states, in this order.
+    for (state, shown), number in zip(SHOWN.items(), numbers.values(), strict=False):
+        if number is not None:
+            words = "angle, rms of the last minute" if state == "attitude" else shown.words
+            lines.append(f"{words:34s}{number:.3g} {shown.unit}")
     lines.append(f"{'NEES / numbers (1 is consistent)':34s}{numbers['nees_per_dimension']:.3g}")
     lines.append(f"{'diverged runs':34s}{numbers['diverged_runs']}")
     return lines

@@ -11,12 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adcs import quaternion
 from adcs.io.scenario_files import AttitudeFile
-from adcs.kalman import accuracy
 from adcs.kalman.bank import EstimatorSettings
 from adcs.kalman.error_state import AttitudeTracks, start_near
-from adcs.kalman.results import in_units
+from adcs.kalman.results import by_state, in_units
 from arrays.io.errors import InputError
 
 if TYPE_CHECKING:
@@ -24,6 +22,7 @@ if TYPE_CHECKING:
     from sims.attitude.simulation import AttitudeRuns
 from adcs.kalman.bank import estimated, start_of
 from arrays.typing import FloatArray
+from sims.experiments import accuracy
 
 _NUMBERS_AT_ONCE = 40_000_000
 """Of all covariances that are held together: 320 MB."""
@@ -154,43 +153,23 @@ def run_scenario(
     """
     outcomes = []
     for part in parts_of(file, estimate, seeds):
-        outcomes.append(_outcome(part))
+        outcomes.append(outcome_of(part))
         if look is not None:
             look(part)
         if advance is not None:
             advance(len(outcomes[-1].seeds))
-    warnings = [texts for outcome in outcomes for texts in outcome.warnings]
-
-    def joined(name: str) -> Any:
-        return np.concatenate([getattr(outcome, name) for outcome in outcomes])
-
-    return replace(
-        outcomes[0],
-        seeds=joined("seeds"),
-        axis_rms=joined("axis_rms"),
-        nees=joined("nees"),
-        nis=joined("nis"),
-        error_deg=joined("error_deg"),
-        diverged=joined("diverged"),
-        warnings=warnings,
-    )
+    of_runs = ("seeds", "axis_rms", "nees", "nis", "error_deg", "diverged")
+    joined: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in outcomes]) for name in of_runs}
+    return replace(outcomes[0], **joined, warnings=[texts for one in outcomes for texts in one.warnings])
 
 
 def errors_in_units(part: Part) -> FloatArray:
     """Truth minus estimate, shape (runs, n, 15), in the order and units of :attr:`Outcome.axis_rms`."""
-    runs, estimates = part.runs, part.estimates
-    states = estimates.settings.sensors.states
-    errors = {
-        "attitude": 2.0 * quaternion.error_vector(estimates.q, runs.q),
-        "rate": runs.w - estimates.w,
-        "gyro-bias": runs.prepared.gyro_bias_rad_s - estimates.gyro_bias_rad_s,
-        "field-bias": runs.prepared.field_bias_T - estimates.field_bias_T,
-        "disturbance": runs.acceleration_s2 - estimates.disturbance_s2,
-    }
-    return in_units({state: errors[state] for state in ("attitude", "rate", *states)})
+    return in_units(by_state(accuracy.errors(part.runs, part.estimates), part.estimates.settings.sensors))
 
 
-def _outcome(part: Part) -> Outcome:
+def outcome_of(part: Part) -> Outcome:
+    """How good the estimates of some runs are."""
     from adcs.kalman.diagnostics import warnings_of
 
     runs, estimates = part.runs, part.estimates
@@ -204,7 +183,7 @@ def _outcome(part: Part) -> Outcome:
         nees=accuracy.normalised_error_squared(runs, estimates) / size,
         nis=estimates.nis,
         error_deg=error_deg,
-        diverged=error_deg[:, late].max(axis=1) > math.degrees(accuracy.DIVERGED_RAD),
+        diverged=np.any(~(error_deg[:, late] <= accuracy.DIVERGED_DEG), axis=1),
         size=size,
         late=late,
         warnings=[list(texts) for texts in warnings_of(runs, estimates)],

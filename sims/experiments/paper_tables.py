@@ -8,25 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from adcs.io.scenario_files import read_scenario
 from adcs.kalman.names import Filter
-from adcs.kalman.results import in_units, sigma_by_state
+from adcs.kalman.results import SHOWN, in_units, sigma_by_state
 from arrays.typing import FloatArray
 from sims.experiments.attitude import Part, run_scenario
-
-Quantity = Literal["attitude", "rate", "gyro bias", "field bias", "disturbance"]
-UNITS: dict[Quantity, str] = {
-    "attitude": "°",
-    "rate": "°/s",
-    "gyro bias": "°/s",
-    "field bias": "nT",
-    "disturbance": "1/s²",
-}
-"""The attitude is σ of the quaternion's vector part in degrees, half of the angle, as the paper has it."""
 
 
 @dataclass(frozen=True)
@@ -59,130 +48,87 @@ class PaperRow:
     label: str  # sensors, and what is estimated where the table says so
     sensors: str
     states: tuple[str, ...]
-    numbers: dict[Quantity, Printed]  # what is printed
+    texts: dict[str, str]  # what is printed
     filter: Filter = "mekf"
-    duration_s: float = 200.0  # after which ours is taken
 
+    @property
+    def numbers(self) -> dict[str, Printed]:
+        """What is printed."""
+        return {quantity: printed(text) for quantity, text in self.texts.items()}
 
-def _row(
-    table: int,
-    label: str,
-    sensors: str,
-    states: tuple[str, ...],
-    numbers: dict[Quantity, str],
-    filter: Filter = "mekf",
-    duration_s: float = 200.0,
-) -> PaperRow:
-    return PaperRow(
-        table, label, sensors, states, {key: printed(text) for key, text in numbers.items()}, filter, duration_s
-    )
+    @property
+    def duration_s(self) -> float:
+        """After which ours is taken."""
+        return 200.0 if self.table == 3 else 600.0
 
 
 _G, _B, _D = "gyro-bias", "field-bias", "disturbance"
-_STAR: dict[Quantity, str] = {"attitude": "5e-4", "rate": "4e-4"}
+_CONSTANT: Filter = "constant-gain"
+_STAR: dict[str, str] = {"attitude": "5e-4", "rate": "4e-4"}
+_STAR_D: dict[str, str] = {"attitude": "8e-4", "rate": "1e-4", "disturbance": "5e-8 (?)"}
+_VECTORS_D: dict[str, str] = {"attitude": "3e-2", "rate": "2e-3", "disturbance": "5e-7 (?)"}
+_GYRO_D: dict[str, str] = {"attitude": "2e-2", "rate": "2e-3", "gyro bias": "5e-4", "disturbance": "8e-7"}
 PAPER_ROWS: tuple[PaperRow, ...] = (
-    _row(3, "ST+G+M+S", "st+gyro+mag+sun", (), _STAR),
-    _row(3, "ST+G+M", "st+gyro+mag", (), _STAR),
-    _row(3, "ST+G", "st+gyro", (), _STAR),
-    _row(3, "ST+M+S", "st+mag+sun", (), {"attitude": "7e-4", "rate": "6e-4"}),
-    _row(3, "ST+M, Δb", "st+mag", (_B,), {"attitude": "7e-4", "rate": "6e-4", "field bias": "80"}),
-    _row(3, "ST+G, Δω", "st+gyro", (_G,), {"attitude": "5e-4", "rate": "4e-4", "gyro bias": "3e-3 (?)"}),
-    _row(3, "Mag+Sun+G", "mag+sun+gyro", (), {"attitude": "2e-2 (?)", "rate": "4e-3 (?)"}),
-    _row(3, "Mag+Sun+G, Δω", "mag+sun+gyro", (_G,), {"attitude": "2e-2", "rate": "4e-3", "gyro bias": "5e-4"}),
-    _row(3, "Mag+Sun+G, Δb", "mag+sun+gyro", (_B,), {"attitude": "5e-2 (?)", "rate": "4e-3", "field bias": "400"}),
-    _row(3, "Mag+Sun", "mag+sun", (), {"attitude": "1.2e-1 (?)", "rate": "2e-2 (?)"}),
-    _row(3, "Mag+G", "mag+gyro", (), {"attitude": "2e-1 (?)", "rate": "5e-3 (?)"}),
-    _row(3, "ST", "st", (), {"attitude": "8e-4", "rate": "6e-4"}),
-    _row(4, "ST, d", "st", (_D,), {"attitude": "8e-4", "rate": "1e-4", "disturbance": "5e-8 (?)"}, duration_s=600.0),
-    _row(
+    PaperRow(3, "ST+G+M+S", "st+gyro+mag+sun", (), _STAR),
+    PaperRow(3, "ST+G+M", "st+gyro+mag", (), _STAR),
+    PaperRow(3, "ST+G", "st+gyro", (), _STAR),
+    PaperRow(3, "ST+M+S", "st+mag+sun", (), {"attitude": "7e-4", "rate": "6e-4"}),
+    PaperRow(3, "ST+M, Δb", "st+mag", (_B,), {"attitude": "7e-4", "rate": "6e-4", "field bias": "80"}),
+    PaperRow(3, "ST+G, Δω", "st+gyro", (_G,), {"attitude": "5e-4", "rate": "4e-4", "gyro bias": "3e-3 (?)"}),
+    PaperRow(3, "Mag+Sun+G", "mag+sun+gyro", (), {"attitude": "2e-2 (?)", "rate": "4e-3 (?)"}),
+    PaperRow(3, "Mag+Sun+G, Δω", "mag+sun+gyro", (_G,), {"attitude": "2e-2", "rate": "4e-3", "gyro bias": "5e-4"}),
+    PaperRow(3, "Mag+Sun+G, Δb", "mag+sun+gyro", (_B,), {"attitude": "5e-2 (?)", "rate": "4e-3", "field bias": "400"}),
+    PaperRow(3, "Mag+Sun", "mag+sun", (), {"attitude": "1.2e-1 (?)", "rate": "2e-2 (?)"}),
+    PaperRow(3, "Mag+G", "mag+gyro", (), {"attitude": "2e-1 (?)", "rate": "5e-3 (?)"}),
+    PaperRow(3, "ST", "st", (), {"attitude": "8e-4", "rate": "6e-4"}),
+    PaperRow(4, "ST, d", "st", (_D,), _STAR_D),
+    PaperRow(
         4,
         "ST+G, Δω, d",
         "st+gyro",
         (_G, _D),
         {"attitude": "8e-4", "rate": "7e-5 (?)", "gyro bias": "1e-5…1e-3 (?)", "disturbance": "5e-8 (?)"},
-        duration_s=600.0,
     ),
-    _row(
-        4,
-        "Mag+Sun, d",
-        "mag+sun",
-        (_D,),
-        {"attitude": "3e-2", "rate": "2e-3", "disturbance": "5e-7 (?)"},
-        duration_s=600.0,
-    ),
-    _row(
-        4,
-        "Mag+Sun+G, Δω, d",
-        "mag+sun+gyro",
-        (_G, _D),
-        {"attitude": "2e-2", "rate": "2e-3", "gyro bias": "5e-4", "disturbance": "8e-7"},
-        duration_s=600.0,
-    ),
-    _row(5, "ST", "st", (), {"attitude": "2e-3 (?)", "rate": "4e-4"}, "constant-gain", 600.0),
-    _row(
-        5,
-        "ST, d",
-        "st",
-        (_D,),
-        {"attitude": "8e-4", "rate": "1e-4", "disturbance": "5e-8 (?)"},
-        "constant-gain",
-        600.0,
-    ),
-    _row(
+    PaperRow(4, "Mag+Sun, d", "mag+sun", (_D,), _VECTORS_D),
+    PaperRow(4, "Mag+Sun+G, Δω, d", "mag+sun+gyro", (_G, _D), _GYRO_D),
+    PaperRow(5, "ST", "st", (), {"attitude": "2e-3 (?)", "rate": "4e-4"}, _CONSTANT),
+    PaperRow(5, "ST, d", "st", (_D,), _STAR_D, _CONSTANT),
+    PaperRow(
         5,
         "ST+G, Δω",
         "st+gyro",
         (_G,),
         {"attitude": "1.5e-3", "rate": "3e-4…5e-3 (?)", "gyro bias": "4e-4"},
-        "constant-gain",
-        600.0,
+        _CONSTANT,
     ),
-    _row(
+    PaperRow(
         5,
         "ST+G, Δω, d",
         "st+gyro",
         (_G, _D),
         {"attitude": "8e-4", "rate": "7e-5", "gyro bias": "1e-5 (?)"},
-        "constant-gain",
-        600.0,
+        _CONSTANT,
     ),
-    _row(5, "Mag+Sun+G", "mag+sun+gyro", (), {"attitude": "2e-2", "rate": "2.2e-2"}, "constant-gain", 600.0),
-    _row(5, "Mag+Sun+G, Δb", "mag+sun+gyro", (_B,), {"attitude": "2e-2", "rate": "5e-3"}, "constant-gain", 600.0),
-    _row(
+    PaperRow(5, "Mag+Sun+G", "mag+sun+gyro", (), {"attitude": "2e-2", "rate": "2.2e-2"}, _CONSTANT),
+    PaperRow(5, "Mag+Sun+G, Δb", "mag+sun+gyro", (_B,), {"attitude": "2e-2", "rate": "5e-3"}, _CONSTANT),
+    PaperRow(
         5,
         "Mag+Sun+G, [λ, Δω]",
         "mag+sun+gyro",
         (_G,),
         {"attitude": "2e-2", "rate": "5e-3", "gyro bias": "1e-3"},
         "reduced",
-        600.0,
     ),
-    _row(
-        5,
-        "Mag+Sun+G, Δω, d",
-        "mag+sun+gyro",
-        (_G, _D),
-        {"attitude": "2e-2", "rate": "2e-3", "gyro bias": "5e-4", "disturbance": "8e-7"},
-        "constant-gain",
-        600.0,
-    ),
-    _row(5, "Mag+Sun", "mag+sun", (), {"attitude": "0.1", "rate": "5e-3"}, "constant-gain", 600.0),
-    _row(
-        5,
-        "Mag+Sun, d",
-        "mag+sun",
-        (_D,),
-        {"attitude": "3e-2", "rate": "2e-3", "disturbance": "5e-7 (?)"},
-        "constant-gain",
-        600.0,
-    ),
+    PaperRow(5, "Mag+Sun+G, Δω, d", "mag+sun+gyro", (_G, _D), _GYRO_D, _CONSTANT),
+    PaperRow(5, "Mag+Sun", "mag+sun", (), {"attitude": "0.1", "rate": "5e-3"}, _CONSTANT),
+    PaperRow(5, "Mag+Sun, d", "mag+sun", (_D,), _VECTORS_D, _CONSTANT),
 )
 """All rows. What Table 5 prints for Δb, 6e-1°, has a lost exponent and another unit; it is left out."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A number of the paper and ours."""
+    """A number of the paper and ours; that of the attitude is half of the angle, as the paper has it."""
 
     table: int
     set: str
@@ -202,14 +148,11 @@ def compared_with_paper(row: PaperRow, seeds: Sequence[int], duration_s: float |
     file = read_scenario("tabletsat")
     sensors = dict(file.tables["sensors"])
     sensors["star_tracker"] = {**sensors["star_tracker"], "noise_deg": 0.002}
-    estimate = {
-        "sensors": row.sensors,
-        "states": list(row.states),
-        "filter": row.filter,
-        "process_noise": "paper",
-    }
+    chosen = {"sensors": row.sensors, "states": list(row.states), "filter": row.filter, "process_noise": "paper"}
     duration_s = row.duration_s if duration_s is None else duration_s
-    file = file.changed({"duration_s": duration_s, "sensors": sensors, "estimate": estimate})
+    file = file.changed(
+        {"duration_s": duration_s, "sensors": sensors, "estimate": {**chosen, "process_noise": "paper"}}
+    )
     last: list[FloatArray] = []
 
     def look(part: Part) -> None:
@@ -219,24 +162,12 @@ def compared_with_paper(row: PaperRow, seeds: Sequence[int], duration_s: float |
     sigma = np.concatenate(last).reshape(-1, 5, 3).max(axis=2).mean(axis=0)
     rms = outcome.axis_rms.mean(axis=0).reshape(5, 3).max(axis=1)
     found = []
-    for place, quantity in enumerate(UNITS):
+    for place, (state, shown) in enumerate(SHOWN.items()):
+        quantity = state.replace("-", " ")
         if quantity not in row.numbers:
             continue
         paper, half = row.numbers[quantity], 0.5 if quantity == "attitude" else 1.0
-        ours = float(half * sigma[place])
-        found.append(
-            Comparison(
-                table=row.table,
-                set=row.label,
-                filter=row.filter,
-                quantity=quantity,
-                unit=UNITS[quantity],
-                paper_text=paper.text,
-                paper_low=paper.low,
-                paper_high=paper.high,
-                ours=ours,
-                ratio=paper.ratio(ours),
-                rms=float(half * rms[place]),
-            )
-        )
+        ours, error = float(half * sigma[place]), float(half * rms[place])
+        what = row.table, row.label, row.filter, quantity, shown.unit
+        found.append(Comparison(*what, paper.text, paper.low, paper.high, ours, paper.ratio(ours), error))
     return found

@@ -5,20 +5,33 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adcs import quaternion
-from adcs.kalman.error_state import FilterSettings, SensorSet, Start, sensor_set, start_near, tuned_noise
+from adcs.kalman.error_state import (
+    AttitudeTracks,
+    FilterSettings,
+    SensorSet,
+    Start,
+    sensor_set,
+    start_near,
+    tuned_noise,
+)
 from adcs.satellite import dynamics
 from sims.attitude.scenario import AttitudeScenario, StartConditions, tabletsat
-from sims.attitude.simulation import AttitudeRuns, Prepared, prepare, sense, simulate, start_estimates
+from sims.attitude.simulation import AttitudeRuns, Prepared, prepare, simulate, start_estimates
+from sims.experiments.attitude import Part, outcome_of
+from tests.adcs.attitudes import random_attitudes
 
 Array = NDArray[np.float64]
 START_RAD, START_RAD_S = math.radians(5.0), math.radians(0.1)
 GYRO_BIAS_RAD_S, FIELD_BIAS_T = math.radians(0.027), 500e-9
 SEEDS = range(10)
+ANY_START = StartConditions(sunlit=False, least_separation_rad=0.0, least_field_T=0.0)
+"""No condition at all."""
 
 
 def settings(sensors: str, states: Iterable[str] = ()) -> FilterSettings:
@@ -45,33 +58,38 @@ def runs_for(used: SensorSet, duration_s: float, seeds: Iterable[int] = SEEDS) -
     return runs, start_of(runs)
 
 
+def evaluate(runs: AttitudeRuns, estimates: AttitudeTracks) -> dict[str, Any]:
+    """Accuracy over the last minute, as ``adcs run --json`` prints it."""
+    return outcome_of(Part(runs, estimates)).numbers()
+
+
 def followed(prepared: Prepared) -> AttitudeRuns:
     """Truth and readings from the start and the torques of ``prepared``, which may have been changed."""
-    scenario, around = prepared.scenario, prepared.environment
+    satellite, around = prepared.scenario.satellite, prepared.environment
     states, torques = [(prepared.q, prepared.w, prepared.momentum_Nms)], []
     n = prepared.torque_Nm.shape[1]
     for row in range(n):
         rate = around.orbital_rate_rad_s[:, row]
         torques.append(
             dynamics.commanded_torque(
-                scenario.body, scenario.control, *states[row], quaternion.IDENTITY, rate, scenario.dt_s
+                satellite.body, satellite.control, *states[row], quaternion.IDENTITY, rate, prepared.scenario.dt_s
             )
         )
         if row < n - 1:
             states.append(
                 dynamics.step(
-                    scenario.body,
+                    satellite.body,
                     *states[row],
                     torques[row],
                     prepared.torque_Nm[:, row],
                     rate,
                     around.gravity_s2[:, row],
                     prepared.true_field_orbital_T[:, row],
-                    scenario.dt_s,
+                    prepared.scenario.dt_s,
                 )
             )
     q, w, momentum = (np.stack(part, axis=1) for part in zip(*states, strict=True))
-    return AttitudeRuns(prepared, q, w, momentum, np.stack(torques, axis=1), sense(prepared, q, w))
+    return AttitudeRuns.of(prepared, q, w, momentum, np.stack(torques, axis=1))
 
 
 def believed_runs(filter_settings: FilterSettings, duration_s: float, seeds: range) -> AttitudeRuns:
@@ -87,7 +105,7 @@ def believed_runs(filter_settings: FilterSettings, duration_s: float, seeds: ran
         steps[:, 0] = start * rng.standard_normal((shape[0], 3))
         return np.cumsum(steps, axis=1)
 
-    body, dt_s = prepared.scenario.body, prepared.scenario.dt_s
+    body, dt_s = prepared.scenario.satellite.body, prepared.scenario.dt_s
     acceleration = noise.rate_rad_s / dt_s * rng.standard_normal(shape)
     if used.disturbance:
         acceleration = acceleration + walk(filter_settings.disturbance_sigma_s2, noise.disturbance_s2)
@@ -102,6 +120,6 @@ def believed_runs(filter_settings: FilterSettings, duration_s: float, seeds: ran
 def tumbled(duration_s: float, seeds: range, conditions: StartConditions | None = None) -> AttitudeRuns:
     """Runs whose true attitude is uniform over all rotations at the start."""
     prepared = prepare(replace(tabletsat(duration_s), conditions=conditions or StartConditions()), seeds)
-    q = quaternion.random_attitudes(len(seeds), np.random.default_rng(seeds[0]))
+    q = random_attitudes(len(seeds), np.random.default_rng(seeds[0]))
     rest = dynamics.absolute_rate(q, np.zeros((len(seeds), 3)), prepared.environment.orbital_rate_rad_s[:, 0])
     return followed(replace(prepared, q=q, w=rest))

@@ -40,13 +40,13 @@ def flight():
     """A satellite of our own, simulated: its scenario, its run, and its log as plain arrays."""
     scenario = replace(sims.read_scenario("tabletsat"), duration_s=120.0, gyro_bias_rad_s=math.radians(0.02))
     runs = sims.simulate(scenario, 7)
-    return scenario, runs, Telemetry.of(runs, scenario.day)
+    return scenario, runs, Telemetry.of(runs, scenario.satellite.start)
 
 
 def satellite_of(scenario):
-    orbit = scenario.orbit
+    orbit = scenario.satellite.orbit
     return adcs.Satellite(
-        inertia_kgm2=scenario.body.inertia_kgm2,
+        inertia_kgm2=scenario.satellite.body.inertia_kgm2,
         orbit=adcs.circular_orbit(
             altitude_m=orbit.altitude_m,
             inclination_deg=math.degrees(orbit.inclination_rad),

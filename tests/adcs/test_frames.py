@@ -15,7 +15,6 @@ from adcs.frames import (
     R_ecef_from_eci,
     R_eci_from_teme,
     R_orbital_from_eci,
-    geodetic_from_ecef,
     instants,
     julian_dates,
     orbital_rate,
@@ -23,7 +22,6 @@ from adcs.frames import (
     terrestrial_dates,
     turned,
 )
-from magloc.fields.geomagnetic import ecef_from_geodetic
 
 UTC = instants(["2000-01-01T12:00:00", "2008-03-01T00:00:00", "2014-09-01T17:03:21.5", "2027-06-30T23:59:59"])
 
@@ -142,13 +140,3 @@ class TestSmallOnes:
         R = rotation_about_z([0.1, 0.2])
         v = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
         np.testing.assert_array_equal(turned(R, v)[1], R[1] @ v[1])
-
-    def test_geodetic_positions_and_back(self) -> None:
-        latitude, longitude, height = (
-            np.array([-80.0, 0.0, 48.1]),
-            np.array([10.0, -170.0, 11.6]),
-            np.array([0, 6e5, 520]),
-        )
-        back = geodetic_from_ecef(ecef_from_geodetic(latitude, longitude, height))
-        for one, expected in zip(back, (latitude, longitude, height), strict=True):
-            np.testing.assert_allclose(one, expected, rtol=0, atol=1e-6)

@@ -11,10 +11,11 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from adcs import quaternion as quat
+from tests.adcs.attitudes import random_attitudes
 
 Array = NDArray[np.float64]
 RNG = np.random.default_rng(7)
-P, Q = quat.random_attitudes(50, RNG), quat.random_attitudes(50, RNG)
+P, Q = random_attitudes(50, RNG), random_attitudes(50, RNG)
 V = RNG.standard_normal((50, 3))
 seeds = st.integers(0, 2**32 - 1)
 
@@ -113,7 +114,7 @@ class TestErrorVector:
 
     @given(seeds)
     def test_correction_by_the_error_is_the_truth(self, seed: int) -> None:
-        p, q = quat.random_attitudes(2, np.random.default_rng(seed))
+        p, q = random_attitudes(2, np.random.default_rng(seed))
         corrected = quat.multiply(p, quat.from_error_vector(quat.error_vector(p, q)))
         assert abs(float(corrected @ q)) == pytest.approx(1.0, abs=1e-12)
 
@@ -135,5 +136,5 @@ class TestRandomAttitudes:
         # The mean of R over all rotations is zero; each entry has variance 1/3. Five standard deviations of nine
         # entries fail by chance once in 200,000.
         n = 3000
-        mean = quat.matrix(quat.random_attitudes(n, np.random.default_rng(0))).mean(axis=0)
+        mean = quat.matrix(random_attitudes(n, np.random.default_rng(0))).mean(axis=0)
         assert np.abs(mean).max() < 5.0 / np.sqrt(3 * n)

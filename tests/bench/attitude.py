@@ -8,9 +8,9 @@ from dataclasses import replace
 from adcs import quaternion
 from adcs.kalman.mekf import run_filter, run_readable
 from adcs.satellite import dynamics
-from sims.attitude.scenario import ANY_START, tabletsat
+from sims.attitude.scenario import tabletsat
 from sims.attitude.simulation import AttitudeRuns, advance, simulate
-from tests.adcs.filter_runs import settings, start_of
+from tests.adcs.filter_runs import ANY_START, settings, start_of
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
 
@@ -44,11 +44,11 @@ def rows(size: Size) -> Iterator[Row]:
 
 def readable_truth(runs: AttitudeRuns) -> None:
     """Truth of the runs, step by step."""
-    prepared, scenario = runs.prepared, runs.scenario
+    prepared, satellite = runs.prepared, runs.satellite
     state = (prepared.q, prepared.w, prepared.momentum_Nms)
     for row in range(len(runs.time_s) - 1):
         rate = prepared.environment.orbital_rate_rad_s[:, row]
         torque = dynamics.commanded_torque(
-            scenario.body, scenario.control, *state, quaternion.IDENTITY, rate, scenario.dt_s
+            satellite.body, satellite.control, *state, quaternion.IDENTITY, rate, runs.dt_s
         )
         state = advance(prepared, state, torque, row)

@@ -76,7 +76,7 @@ class TestManySeeds:
         )
         assert list(runs.error.values) == ["", ""]
         assert runs.error_deg.shape == (2, 31)
-        assert float(runs.error_deg.max()) < 6.0 * np.degrees(2.0 * scenario.star_tracker.sigma_rad)
+        assert float(runs.error_deg.max()) < 6.0 * np.degrees(2.0 * scenario.satellite.star_tracker.sigma_rad)
 
 
 class TestEitherKind:

@@ -15,6 +15,7 @@ from adcs.complementary.gauss_newton import MeasuredQuaternion, gauss_newton_tra
 from adcs.complementary.outage import RULES, Substitution
 from adcs.satellite.vector_record import VectorRecord
 from sims.attitude.complementary import ORBIT, SatelliteScenario, attitude, satellite_runs
+from tests.adcs.attitudes import random_attitudes
 from tests.calls import calls_of
 
 TRACKS = [explicit_track, gauss_newton_track]
@@ -92,7 +93,7 @@ class TestError:
     def test_small_error(self, seed):
         """e = Σ(E - vvᵀ)δθ, with the eigenvalues 1 ± |cos| and 2."""
         rng = np.random.default_rng(seed)
-        q = quaternion.random_attitudes(1, rng)[0]
+        q = random_attitudes(1, rng)[0]
         body = rng.standard_normal((2, 3))
         body /= np.linalg.norm(body, axis=1, keepdims=True)
         delta = 1e-6 * rng.standard_normal(3)

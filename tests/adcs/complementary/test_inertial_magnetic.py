@@ -16,6 +16,7 @@ from adcs.complementary.inertial_magnetic import (
     undisturbed,
 )
 from adcs.io.broad import orientation_errors, read_broad
+from tests.adcs.attitudes import random_attitudes
 
 DT = 0.01
 FIELD_T = np.array([0.0, 18e-6, -45e-6])
@@ -108,7 +109,7 @@ class TestErrors:
     def test_parts_of_a_turn(self):
         """Around the vertical all of it is heading, around a horizontal axis all of it inclination."""
         rng = np.random.default_rng(0)
-        q = quaternion.random_attitudes(100, rng)
+        q = random_attitudes(100, rng)
         counted = np.ones(100, dtype=bool)
         for axis, expected in (([0.0, 0.0, 0.3], (0.3, 0.3, 0.0)), ([0.2, 0.0, 0.0], (0.2, 0.0, 0.2))):
             errors = orientation_errors(quaternion.multiply(quaternion.exp(axis), q), q, counted)
@@ -116,7 +117,7 @@ class TestErrors:
 
     def test_total_against_scipy(self):
         rng = np.random.default_rng(1)
-        p, q = quaternion.random_attitudes(50, rng), quaternion.random_attitudes(50, rng)
+        p, q = random_attitudes(50, rng), random_attitudes(50, rng)
         q[:5] = np.nan
         counted = np.arange(50) < 40
         turns = Rotation.from_quat(p[5:40], scalar_first=True) * Rotation.from_quat(q[5:40], scalar_first=True).inv()

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from adcs.kalman.accuracy import evaluate
 from adcs.kalman.constant_gain import converged_gain, run_constant_gain
 from adcs.kalman.gyro_driven import run_reduced
 from adcs.kalman.mekf import predicted, run_filter, stacked_residuals
-from tests.adcs.filter_runs import runs_for, settings
+from tests.adcs.filter_runs import evaluate, runs_for, settings
 
 
 class TestConstantGain:

@@ -1,4 +1,4 @@
-"""Tests of adcs.kalman.mekf, adcs.kalman.mekf_compiled, adcs.kalman.accuracy and adcs.kalman.diagnostics.
+"""Tests of adcs.kalman.mekf, adcs.kalman.mekf_compiled, sims.experiments.accuracy and adcs.kalman.diagnostics.
 
 One class per property.
 
@@ -9,6 +9,7 @@ a prototype of its own reached, and χ² for runs whose truth does exactly what 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +20,6 @@ from scipy.stats import chi2
 
 from adcs import quaternion
 from adcs.kalman import mekf as multiplicative
-from adcs.kalman.accuracy import axis_rms, error_norm_deg, evaluate, last_rows, normalised_error_squared
 from adcs.kalman.diagnostics import warnings_of
 from adcs.kalman.error_state import AttitudeTracks, FilterSettings, ProcessNoise, Start, State, paper_noise, sensor_set
 from adcs.kalman.mekf import (
@@ -34,19 +34,32 @@ from adcs.kalman.mekf import (
     residuals,
     run_filter,
     run_readable,
-    square_root_update,
     with_error,
 )
 from adcs.kalman.smoother import difference
 from adcs.satellite import dynamics
-from adcs.satellite.sensors import PAPER_NOISE_RAD, StarTracker
-from sims.attitude.scenario import ANY_START, StartConditions, tabletsat
+from adcs.satellite.sensors import StarTracker
+from magloc.kalman import sequential_update, symmetric_square_root
+from sims.attitude.scenario import AttitudeScenario, StartConditions, tabletsat
 from sims.attitude.simulation import AttitudeRuns, advance, prepare, sense, simulate
-from tests.adcs.filter_runs import GYRO_BIAS_RAD_S, SEEDS, believed_runs, followed, runs_for, settings, start_of
+from sims.experiments.accuracy import error_norm_deg, errors, last_rows, normalised_error_squared
+from tests.adcs.attitudes import random_attitudes
+from tests.adcs.filter_runs import (
+    ANY_START,
+    GYRO_BIAS_RAD_S,
+    SEEDS,
+    believed_runs,
+    evaluate,
+    followed,
+    runs_for,
+    settings,
+    start_of,
+)
 from tests.adcs.kalman.test_error_state import TABLE_3
 from tests.calls import calls_of
 
 Array = NDArray[np.float64]
+Update = Callable[[Array, Array, Array], tuple[Array, Array]]
 ALL = ("st+gyro+mag+sun", ("field-bias", "gyro-bias", "disturbance"))
 
 
@@ -54,6 +67,10 @@ def filtered(sensors: str, states: tuple[str, ...], duration_s: float) -> tuple[
     chosen = settings(sensors, states)
     runs, start = runs_for(chosen.sensors, duration_s)
     return runs, run_filter(runs, chosen, start)
+
+
+def with_star_tracker(scenario: AttitudeScenario, **changes: float) -> AttitudeScenario:
+    return replace(scenario, satellite=replace(scenario.satellite, star_tracker=StarTracker(**changes)))
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +83,7 @@ def state(runs: AttitudeRuns) -> State:
     rng = np.random.default_rng(2)
     return replace(
         first_state(settings(*ALL), start_of(runs)),
-        q=quaternion.random_attitudes(6, rng),
+        q=random_attitudes(6, rng),
         w=0.02 * rng.standard_normal((6, 3)),
         disturbance_s2=1e-6 * rng.standard_normal((6, 3)),
     )
@@ -141,6 +158,17 @@ def information_update(P: Array, H: Array, residual: Array) -> tuple[Array, Arra
     return (updated @ H.mT @ residual[..., None])[..., 0], updated
 
 
+def square_root_update(P: Array, H: Array, residual: Array) -> tuple[Array, Array]:
+    """Update by Potter's square roots, one scalar after the other."""
+    corrections, covariances = [], []
+    for P_run, H_run, residual_run in zip(P, H, residual, strict=True):
+        S = symmetric_square_root(P_run)
+        dx, S = sequential_update(np.zeros(len(P_run)), S, H_run, residual_run, np.ones(len(residual_run)))
+        corrections.append(dx)
+        covariances.append(S @ S.T)
+    return np.array(corrections), np.array(covariances)
+
+
 class TestUpdates:
     def problem(self) -> tuple[Array, Array, Array]:
         rng = np.random.default_rng(4)
@@ -148,16 +176,17 @@ class TestUpdates:
         return root @ root.mT, rng.standard_normal((8, 5, 9)), rng.standard_normal((8, 5))
 
     @pytest.mark.parametrize("other", [square_root_update, information_update])
-    def test_forms_agree(self, other: multiplicative.Update) -> None:
+    def test_forms_agree(self, other: Update) -> None:
         P, H, residual = self.problem()
         for one, two in zip(joseph_update(P, H, residual), other(P, H, residual), strict=True):
             np.testing.assert_allclose(one, two, rtol=0, atol=1e-9)
 
-    def test_whole_filter_with_square_roots(self) -> None:
+    def test_whole_filter_with_square_roots(self, monkeypatch: pytest.MonkeyPatch) -> None:
         chosen = settings("mag+sun+gyro", ["gyro-bias", "disturbance"])
         runs, start = runs_for(chosen.sensors, 60.0, range(2))
         joseph = run_readable(runs, chosen, start)
-        root = run_readable(runs, chosen, start, update=square_root_update)
+        monkeypatch.setattr(multiplicative, "joseph_update", square_root_update)
+        root = run_readable(runs, chosen, start)
         np.testing.assert_allclose(joseph.q, root.q, rtol=0, atol=1e-12)
         np.testing.assert_allclose(joseph.sigma, root.sigma, rtol=1e-8)
 
@@ -233,8 +262,8 @@ class TestClosedLoop:
             state, _ = corrected(runs, row, state, chosen)
             states.append(state)
             runs.wheel_torque_Nm[:, row] = dynamics.commanded_torque(
-                scenario.body,
-                scenario.control,
+                runs.satellite.body,
+                runs.satellite.control,
                 state.q,
                 state.w,
                 runs.momentum_Nms[:, row],
@@ -312,7 +341,7 @@ class TestAcceptance:
     ) -> None:
         runs, estimates = filtered(sensors, states, duration_s)
         reached = evaluate(runs, estimates)
-        pooled = np.degrees(np.sqrt(np.mean(axis_rms(runs, estimates) ** 2, axis=0)))
+        pooled = np.degrees(np.sqrt(np.mean(errors(runs, estimates)[:, last_rows(runs)] ** 2, axis=(0, 1))))
         assert max(reached["angle_rms_deg"] or 0.0, 2.0 * pooled[:3].max()) <= angle
         assert max(reached["rate_rms_deg_s"] or 0.0, pooled[3:6].max()) <= rate
         assert nees[0] <= (reached["nees_per_dimension"] or 0.0) <= nees[1]
@@ -327,7 +356,8 @@ class TestAcceptance:
 
     def test_noise_and_process_noise_of_the_source(self) -> None:
         used = sensor_set("st")
-        runs = simulate(replace(tabletsat(), star_tracker=StarTracker(sigma_rad=PAPER_NOISE_RAD)), SEEDS)
+        # 0.001° as the noise of the quaternion's components, which the source's tables need.
+        runs = simulate(with_star_tracker(tabletsat(), sigma_rad=math.radians(0.001)), SEEDS)
         reached = evaluate(runs, run_filter(runs, FilterSettings(used, paper_noise(used)), start_of(runs)))
         assert (reached["angle_rms_deg"] or 9.0) <= 1.9e-3
         assert (reached["rate_rms_deg_s"] or 9.0) <= 1.1e-3
@@ -453,8 +483,7 @@ class TestProblems:
 
     def test_star_tracker_over_rate_and_blinded(self) -> None:
         fast = replace(tabletsat(100.0), start_rate_rad_s=math.radians(2.5))
-        fast = replace(fast, star_tracker=StarTracker(sun_exclusion_rad=math.radians(70.0)))
-        runs = simulate(fast, range(20))
+        runs = simulate(with_star_tracker(fast, sun_exclusion_rad=math.radians(70.0)), range(20))
         estimates = run_filter(runs, settings("st+gyro"), start_of(runs))
         sentences = warnings_of(runs, estimates)
         assert any("star tracker over-rate: above 2°/s" in " ".join(one) for one in sentences)

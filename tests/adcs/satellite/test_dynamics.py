@@ -20,6 +20,7 @@ from adcs.frames import turned
 from adcs.satellite import dynamics
 from adcs.satellite import dynamics_compiled as rigid_body
 from adcs.satellite.dynamics import RigidBody, WheelControl, wheel_control
+from tests.adcs.attitudes import random_attitudes
 
 Array = NDArray[np.float64]
 J = np.array([[0.519, 0.002, 0.005], [0.002, 0.579, 0.009], [0.005, 0.009, 0.71]])
@@ -33,7 +34,7 @@ ZERO = np.zeros(3)
 
 
 def random_state(rng: np.random.Generator, n: int = 20) -> tuple[Array, Array, Array]:
-    return quaternion.random_attitudes(n, rng), 0.02 * rng.standard_normal((n, 3)), 0.01 * rng.standard_normal((n, 3))
+    return random_attitudes(n, rng), 0.02 * rng.standard_normal((n, 3)), 0.01 * rng.standard_normal((n, 3))
 
 
 def follow(
@@ -382,7 +383,7 @@ class TestKernels:
 
     def test_small_functions(self) -> None:
         rng = np.random.default_rng(21)
-        p, q = quaternion.random_attitudes(2, rng)
+        p, q = random_attitudes(2, rng)
         v = rng.standard_normal(3)
         np.testing.assert_allclose(rigid_body.multiply(tuple(p), tuple(q)), quaternion.multiply(p, q), atol=1e-16)
         np.testing.assert_allclose(rigid_body.rotate_back(tuple(q), tuple(v)), quaternion.rotate_back(q, v), atol=1e-15)

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from adcs import quaternion
 from adcs.satellite import dynamics
 from adcs.satellite.sensors import Gyro, Magnetometer, StarTracker
-from sims.attitude.scenario import ANY_START, AttitudeScenario, StartConditions, tabletsat
+from sims.attitude.scenario import AttitudeScenario, StartConditions, tabletsat
 from sims.attitude.simulation import AttitudeRuns, advance, prepare, sense, simulate, start_estimates
+from tests.adcs.filter_runs import ANY_START
 from tests.calls import calls_of
 
 Array = NDArray[np.float64]
@@ -33,15 +34,15 @@ class TestTruth:
     def test_shapes(self, runs: AttitudeRuns) -> None:
         assert runs.time_s.shape == (201,)
         assert runs.q.shape == runs.readings.star.shape == (12, 201, 4)
-        for values in (runs.w, runs.momentum_Nms, runs.wheel_torque_Nm, runs.readings.sun, runs.acceleration_s2):
+        for values in (runs.w, runs.momentum_Nms, runs.wheel_torque_Nm, runs.readings.sun, runs.states["disturbance"]):
             assert values.shape == (12, 201, 3)
 
     def test_compiled_run_agrees_with_the_readable_steps(self, runs: AttitudeRuns) -> None:
-        prepared, scenario = runs.prepared, runs.scenario
+        prepared, known = runs.prepared, runs.satellite
         state = (prepared.q, prepared.w, prepared.momentum_Nms)
         for row in range(200):
             rate = prepared.environment.orbital_rate_rad_s[:, row]
-            torque = dynamics.commanded_torque(scenario.body, scenario.control, *state, quaternion.IDENTITY, rate, 1.0)
+            torque = dynamics.commanded_torque(known.body, known.control, *state, quaternion.IDENTITY, rate, 1.0)
             np.testing.assert_allclose(runs.wheel_torque_Nm[:, row], torque, rtol=0, atol=1e-15)
             state = advance(prepared, state, torque, row)
         for compiled, readable in zip((runs.q, runs.w, runs.momentum_Nms), state, strict=True):
@@ -54,8 +55,8 @@ class TestTruth:
 
     def test_disturbance(self, runs: AttitudeRuns) -> None:
         np.testing.assert_allclose(np.linalg.norm(runs.prepared.torque_Nm, axis=-1), 8e-7, rtol=1e-12)
-        d = runs.acceleration_s2[3, 0]
-        np.testing.assert_allclose(runs.scenario.body.inertia_kgm2 @ d, runs.prepared.torque_Nm[3, 0], rtol=1e-12)
+        d = runs.states["disturbance"][3, 0]
+        np.testing.assert_allclose(runs.satellite.body.inertia_kgm2 @ d, runs.prepared.torque_Nm[3, 0], rtol=1e-12)
         slow = prepare(replace(runs.scenario, torque_period_s=400.0), [3]).torque_Nm[0]
         np.testing.assert_allclose(slow[200], -slow[0], rtol=1e-12)
         np.testing.assert_allclose(slow[100], 0.0, rtol=0, atol=1e-20)
@@ -64,7 +65,7 @@ class TestTruth:
         fast = replace(tabletsat(), start_rate_rad_s=np.radians(2.5))
         tumbling = simulate(fast, SEEDS)
         has_star = tumbling.readings.seen["st"]
-        above = np.linalg.norm(tumbling.w, axis=-1) > fast.star_tracker.rate_limit_rad_s
+        above = np.linalg.norm(tumbling.w, axis=-1) > fast.satellite.star_tracker.rate_limit_rad_s
         assert above[:, 0].any()
         assert not (has_star & above).any()
         assert has_star[:, -1].all()
@@ -74,10 +75,10 @@ class TestReadings:
     def test_are_the_truth_with_noise_of_the_given_size(self, runs: AttitudeRuns) -> None:
         readings, around, prepared = runs.readings, runs.environment, runs.prepared
         # 7236 numbers each: five standard deviations of their rms are 4 %.
-        star = quaternion.error_vector(runs.q, readings.star) / runs.scenario.star_tracker.sigma_rad
-        gyro = (readings.gyro_rad_s - runs.w - prepared.gyro_bias_rad_s) / runs.scenario.gyro.sigma_rad_s
+        star = quaternion.error_vector(runs.q, readings.star) / runs.satellite.star_tracker.sigma_rad
+        gyro = (readings.gyro_rad_s - runs.w - prepared.gyro_bias_rad_s) / runs.satellite.gyro.sigma_rad_s
         b_body = quaternion.rotate_back(runs.q, around.b_orbital_T)
-        field = (readings.field_T - b_body - prepared.field_bias_T) / runs.scenario.magnetometer.sigma_T
+        field = (readings.field_T - b_body - prepared.field_bias_T) / runs.satellite.magnetometer.sigma_T
         for residual in (star, gyro, field):
             assert np.sqrt(np.mean(residual**2)) == pytest.approx(1.0, abs=0.042)
         # Two of three components are noise.
@@ -169,16 +170,19 @@ class TestSeeds:
         np.testing.assert_array_equal(short.noise["gyro"][0], long.noise["gyro"][0, :101])
 
     def test_sensors_have_their_own_streams(self, scenario: AttitudeScenario, runs: AttitudeRuns) -> None:
-        other = replace(scenario, gyro=Gyro(sigma_rad_s=1.0), star_tracker=StarTracker(sigma_rad=0.1))
+        worse = replace(scenario.satellite, gyro=Gyro(sigma_rad_s=1.0), star_tracker=StarTracker(sigma_rad=0.1))
+        other = replace(scenario, satellite=worse)
         np.testing.assert_array_equal(simulate(other, SEEDS).readings.sun, runs.readings.sun)
 
     def test_walks(self, scenario: AttitudeScenario) -> None:
-        walking = replace(
-            scenario, gyro=Gyro(bias_walk_rad_s=1e-5), magnetometer=Magnetometer(bias_walk_T=1e-9), gyro_bias_rad_s=0.0
-        )
+        wandering = {"gyro": Gyro(bias_walk_rad_s=1e-5), "magnetometer": Magnetometer(bias_walk_T=1e-9)}
+        walking = replace(scenario, satellite=replace(scenario.satellite, **wandering), dt_s=2.0, duration_s=400.0)
         prepared = prepare(walking, range(100))
-        # 300 numbers: five standard deviations of their rms are 20 %.
-        assert np.sqrt(np.mean(prepared.gyro_bias_rad_s[:, 200] ** 2)) == pytest.approx(1e-5 * np.sqrt(200.0), rel=0.2)
+        for walk, walks in ((1e-5, prepared.gyro_bias_rad_s), (1e-9, prepared.field_bias_T)):
+            grown = walks[:, 200] - walks[:, 0]
+            # 300 numbers: five standard deviations of their rms are 20 %.
+            assert np.sqrt(np.mean(grown**2)) == pytest.approx(walk * np.sqrt(400.0), rel=0.2)
+        np.testing.assert_array_equal(walks[:, 0], prepare(scenario, range(100)).field_bias_T[:, 0])
 
     def test_no_seeds(self, scenario: AttitudeScenario) -> None:
         with pytest.raises(ValueError, match=r"Input seeds must hold one seed at least; instead received none\."):
@@ -194,7 +198,7 @@ class TestScenario:
             replace(tabletsat(), **bad)
 
     def test_dates_outside_of_the_field_model(self) -> None:
-        late = replace(tabletsat(), day=np.datetime64("2035-01-01", "us"))
+        late = replace(tabletsat(), satellite=replace(tabletsat().satellite, start=np.datetime64("2035-01-01", "us")))
         with pytest.raises(ValueError, match=r"Input date must lie within the validity of IGRF-14"):
             simulate(late, [0])
 
