@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from adcs import quaternion
 from adcs.complementary.explicit import first_attitude, turned
 from adcs.satellite.vector_record import VectorRecord
+from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 from magloc.chi_square import normalised_square
 from magloc.compilation import over_rows
@@ -58,9 +59,10 @@ class AdaptiveTuning:
     start_bias_rad_s: float = math.radians(0.02)
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not (0.0 < value < math.inf or (name == "attitude_noise_rad" and value == 0.0)):
-                raise ValueError(f"Input {name} must be positive and finite; instead received {value}.")
+        # Noise of the attitude may be zero.
+        check_positive(
+            **{name: value for name, value in vars(self).items() if (name, value) != ("attitude_noise_rad", 0)}
+        )
         if not self.memory < 1.0:
             raise ValueError(f"Input memory must be less than 1; instead received {self.memory}.")
 

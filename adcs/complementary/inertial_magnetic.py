@@ -13,6 +13,7 @@ import numpy as np
 from adcs import quaternion
 from adcs.complementary.explicit import Gains, explicit_track
 from adcs.satellite.vector_record import VectorRecord
+from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 
 GRAVITY_TIME_S = 2.0
@@ -48,8 +49,7 @@ class InertialMagneticRecord:
     field_T: FloatArray
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.dt_s < math.inf:
-            raise ValueError(f"Input dt_s must be positive and finite; instead received {self.dt_s}.")
+        check_positive(dt_s=self.dt_s)
         shape = np.shape(self.rate_rad_s)
         if len(shape) != 2 or shape[1] != 3 or shape[0] * self.dt_s < 1.0:
             raise ValueError(f"Input rate_rad_s must be rows of 3 for a second at least; instead received {shape}.")

@@ -5,7 +5,6 @@ See docs/theory/complementary-filters.md.
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -13,6 +12,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from adcs import quaternion
+from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 
 Pair = tuple[FloatArray, FloatArray]
@@ -43,8 +43,7 @@ class Substitution:
     def __post_init__(self) -> None:
         if self.rule not in RULES:
             raise ValueError(f"Input rule must be one of {', '.join(RULES)}; instead received {self.rule!r}.")
-        if not 0.0 < self.delay_s < math.inf:
-            raise ValueError(f"Input delay_s must be positive and finite; instead received {self.delay_s}.")
+        check_positive(delay_s=self.delay_s)
 
 
 NO_SUBSTITUTE = Substitution()

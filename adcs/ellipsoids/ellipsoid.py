@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from adcs.ellipsoids.strip import STEP_RULES, StepRule, cut, tightened_strip
+from arrays.io.errors import check_positive
 from arrays.typing import BoolArray, FloatArray
 
 # Eigenvalues below zero by this much of the largest one are rounding, as is a difference from the transpose.
@@ -72,13 +73,6 @@ class Ellipsoid:
         """Half-widths of the box around the ellipsoid, √H_ii, shape (n,)."""
         return np.sqrt(np.diagonal(self.shape))
 
-    def support(self, direction: ArrayLike) -> FloatArray:
-        """Largest lᵀx of its points, for directions l of shape (..., n)."""
-        direction = np.asarray(direction, dtype=np.float64)
-        squared = np.einsum("...i,ij,...j->...", direction, self.shape, direction)
-        value: FloatArray = direction @ self.centre + np.sqrt(np.maximum(squared, 0.0))
-        return value
-
     def form(self, points: ArrayLike) -> FloatArray:
         """Quadratic form of points, see :func:`quadratic_form`.
 
@@ -125,7 +119,7 @@ def transformed(ellipsoid: Ellipsoid, A: ArrayLike, offset: ArrayLike = 0.0) -> 
     """
     A, offset = np.asarray(A, dtype=np.float64), np.asarray(offset, dtype=np.float64)
     # An entry of A H Aᵀ is known to n eps r_i r_j, see the notes of intersect_strip.
-    reach = np.abs(A) @ np.sqrt(np.diagonal(ellipsoid.shape))
+    reach = np.abs(A) @ ellipsoid.half_widths
     shape = A @ ellipsoid.shape @ A.T + 4.0 * ellipsoid.n * EPS * np.diag(reach**2)
     size = np.abs(A) @ np.abs(ellipsoid.centre) + np.abs(offset)
     return Ellipsoid(A @ ellipsoid.centre + offset, _around_rounded(_symmetric(shape), size))
@@ -170,8 +164,8 @@ def sum_with_segment(ellipsoid: Ellipsoid, direction: ArrayLike, half_length: fl
 def segment_shape(direction: ArrayLike, half_length: float, n: int) -> FloatArray:
     """Shape d² f fᵀ of rank one of the segment from -d f to d f, f of length 1; see :func:`sum_with_segment`."""
     f = unit_direction(direction, n)
-    d = positive_bound(half_length, "half_length")
-    return d * d * np.outer(f, f)
+    check_positive(half_length=half_length)
+    return half_length * half_length * np.outer(f, f)
 
 
 class Outcome(IntEnum):
@@ -227,7 +221,7 @@ def intersect_strip(
     below √(H_ii H_jj) is below n diag(H). So some n eps (r/e)² diag(H) is added.
     """
     h = measurement_direction(direction, ellipsoid.n)
-    c = positive_bound(bound, "bound")
+    check_positive(bound=bound)
     if rule not in STEP_RULES:
         raise ValueError(f"Input rule must be one of {', '.join(STEP_RULES)}; instead received {rule!r}.")
     if not math.isfinite(value):
@@ -237,8 +231,8 @@ def intersect_strip(
     e2, trace = float(h @ Hh), ellipsoid.trace
     e = math.sqrt(max(e2, 0.0))
     nu = float(value - h @ x)
-    c += BOUND_MARGIN * c + 4.0 * EPS * (abs(value) + float(np.abs(h) @ np.abs(x)))
-    rounding = 4.0 * ellipsoid.n * EPS * float(np.abs(h) @ np.sqrt(np.diagonal(H))) ** 2
+    c = bound + BOUND_MARGIN * bound + 4.0 * EPS * (abs(value) + float(np.abs(h) @ np.abs(x)))
+    rounding = 4.0 * ellipsoid.n * EPS * float(np.abs(h) @ ellipsoid.half_widths) ** 2
     if abs(nu) > c + math.sqrt(max(e2, 0.0) + rounding):
         return StripUpdate(ellipsoid, Outcome.INCONSISTENT)
     if e2 <= UNSEEN_RTOL * trace * float(h @ h):
@@ -298,13 +292,6 @@ def unit_direction(direction: ArrayLike, n: int) -> FloatArray:
     h = h / np.abs(h).max()
     unit: FloatArray = h / np.linalg.norm(h)
     return unit
-
-
-def positive_bound(bound: float, name: str) -> float:
-    """Bound of a noise, checked: positive and finite."""
-    if not 0.0 < bound < math.inf:
-        raise ValueError(f"Input {name} must be positive and finite; instead received {bound}.")
-    return float(bound)
 
 
 def _around_rounded(shape: FloatArray, size: FloatArray) -> FloatArray:

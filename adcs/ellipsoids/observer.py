@@ -17,12 +17,12 @@ from adcs.ellipsoids.ellipsoid import (
     intersect_strip,
     measurement_direction,
     minimum_trace_sum,
-    positive_bound,
     shape_matrix,
     sum_with_ellipsoid,
     transformed,
 )
 from adcs.ellipsoids.strip import STEP_RULES, StepRule
+from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 
 IntArray = NDArray[np.int64]
@@ -61,7 +61,9 @@ class BoundedSystem:
             raise ValueError(f"Input A must be a square matrix of finite numbers; instead received shape {A.shape}.")
         n = len(A)
         directions = np.array([measurement_direction(h, n) for h in np.atleast_2d(self.directions)])
-        bounds = np.array([positive_bound(c, "bounds") for c in np.atleast_1d(self.bounds)])
+        bounds = np.array(np.atleast_1d(self.bounds), dtype=np.float64)
+        for c in bounds:
+            check_positive(bounds=c)
         if len(bounds) != len(directions):
             raise ValueError(f"Input bounds must be {len(directions)} numbers; instead received {len(bounds)}.")
         object.__setattr__(self, "A", A)

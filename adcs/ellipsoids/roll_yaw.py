@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from adcs.ellipsoids.ellipsoid import Ellipsoid, positive_bound, quadratic_form, segment_shape
+from adcs.ellipsoids.ellipsoid import Ellipsoid, quadratic_form, segment_shape
 from adcs.ellipsoids.observer import BoundedSystem, EllipsoidObserver
 from adcs.ellipsoids.strip import StepRule
+from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 from magloc.kalman import predict_square_root, scalar_update
 
@@ -55,13 +56,13 @@ def roll_yaw_system(
     ``orbital_rate``: ω₀ [rad/s]. The source paper takes what the pitch gyro shows, whose zero shift is in no bound:
     0.02 °/s are a third of ω₀, and void the guarantee.
     """
-    c = positive_bound(noise_rad, "noise_rad")
-    drift = positive_bound(drift_rad_s, "drift_rad_s") * step_s * input_matrix(orbital_rate, step_s)[:, YAW]
+    check_positive(noise_rad=noise_rad, drift_rad_s=drift_rad_s)
+    drift = drift_rad_s * step_s * input_matrix(orbital_rate, step_s)[:, YAW]
     return BoundedSystem(
         A=transition(orbital_rate, step_s),
         disturbance=segment_shape(drift, float(np.linalg.norm(drift)), 2),
         directions=np.array([[1.0, 0.0]]),
-        bounds=np.array([c]),
+        bounds=np.array([noise_rad]),
     )
 
 
@@ -79,13 +80,13 @@ def constant_shift_system(noise_rad: float, drift_rad_s: float) -> tuple[Bounded
     / drift_rad_s), so that the states have comparable sizes. Returns ``first`` around roll and yaw within 3 c and all
     shifts within the bound.
     """
-    c, drift = positive_bound(noise_rad, "noise_rad"), positive_bound(drift_rad_s, "drift_rad_s")
+    check_positive(noise_rad=noise_rad, drift_rad_s=drift_rad_s)
     A = np.eye(3)
     A[:2, :2] = transition()
-    A[:2, 2] = input_matrix()[:, YAW] * STEP_S * drift / (3.0 * c)
-    system = BoundedSystem(A, np.zeros((3, 3)), np.array([[1.0, 0.0, 0.0]]), np.array([c]))
+    A[:2, 2] = input_matrix()[:, YAW] * STEP_S * drift_rad_s / (3.0 * noise_rad)
+    system = BoundedSystem(A, np.zeros((3, 3)), np.array([[1.0, 0.0, 0.0]]), np.array([noise_rad]))
     # The least ellipsoid of this kind around a circle times an interval.
-    return system, Ellipsoid(np.zeros(3), 2.0 * (3.0 * c) ** 2 * np.eye(3))
+    return system, Ellipsoid(np.zeros(3), 2.0 * (3.0 * noise_rad) ** 2 * np.eye(3))
 
 
 def roll_yaw_observer(

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from adcs.frames import Dates, Instants, R_eci_from_teme, instants, julian_dates, pyerfa, turned
-from arrays.io.errors import of_extra
+from arrays.io.errors import check_positive, of_extra
 from arrays.typing import FloatArray
 
 MU_M3_S2 = 3.986004418e14
@@ -65,8 +65,7 @@ class CircularOrbit:
     latitude_argument_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.altitude_m < math.inf:
-            raise ValueError(f"Input altitude_m must be positive and finite; instead received {self.altitude_m}.")
+        check_positive(altitude_m=self.altitude_m)
         for name in ("inclination_rad", "node_rad", "latitude_argument_rad"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"Input {name} must be finite; instead received {getattr(self, name)}.")

@@ -10,13 +10,14 @@ from __future__ import annotations
 import datetime
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from adcs.environment.orbit import Orbit, Sgp4Orbit, circular_orbit
+from adcs.frames import instants
 from adcs.io.scenario_tables import (
     SENSOR_TABLES,
     DisturbanceTable,
@@ -64,11 +65,6 @@ class AttitudeFile:
     def estimator(self, place: str = "") -> EstimatorSettings:
         """What the table ``estimate`` orders, checked; errors name a place, or the file."""
         return _estimator(place or self.path, self.estimate)
-
-
-def built_in_text(name: str) -> str:
-    """Text of a built-in scenario's file."""
-    return _FILES.path(name).read_text(encoding="utf-8")
 
 
 def read_scenario(name_or_path: str) -> AttitudeFile:
@@ -206,15 +202,16 @@ def _process_noise(place: str, wanted: str | dict[str, Any], used: SensorSet) ->
 def _satellite(place: str, section: SatelliteTable) -> tuple[RigidBody, WheelControl]:
     with naming(place):
         body = RigidBody(np.array(section.inertia_kgm2), np.array(section.residual_dipole_Am2))
-        gains = wheel_control(body, section.control_rad_s, section.control_damping)
-        control = WheelControl(
-            gains.attitude_gain_Nm, gains.rate_gain_Nms, section.torque_limit_Nm, section.momentum_limit_Nms
+        control = replace(
+            wheel_control(body, section.control_rad_s, section.control_damping),
+            torque_limit_Nm=section.torque_limit_Nm,
+            momentum_limit_Nms=section.momentum_limit_Nms,
         )
     return body, control
 
 
 def _orbit(place: str, section: OrbitTable) -> tuple[Orbit, np.datetime64, Model]:
-    start = _instant(section.start)
+    start: np.datetime64 = instants(datetime.datetime.fromisoformat(section.start))[()]  # type: ignore[assignment]
     if section.elements is not None:
         with naming(f"{place}, key elements"):
             return Sgp4Orbit(*section.elements), start, section.field_model
@@ -228,10 +225,3 @@ def _orbit(place: str, section: OrbitTable) -> tuple[Orbit, np.datetime64, Model
             latitude_argument_deg=section.latitude_argument_deg,
         )
     return orbit, start, section.field_model
-
-
-def _instant(text: str) -> np.datetime64:
-    date = datetime.datetime.fromisoformat(text)
-    if date.tzinfo is not None:
-        date = date.astimezone(datetime.UTC).replace(tzinfo=None)
-    return np.datetime64(date, "us")

@@ -11,7 +11,6 @@ import math
 import numpy as np
 from scipy.stats import chi2
 
-from adcs.environment.environment import Environment
 from adcs.kalman.error_state import AttitudeTracks, SensorSet
 from adcs.kalman.mekf import deviations
 from adcs.satellite.sensors import NIS_SIZES
@@ -33,16 +32,18 @@ def warnings_of(record: Record, estimates: AttitudeTracks) -> tuple[tuple[str, .
     - a field that does not fit its model: an error of the model, or the satellite's own field,
     - innovations that the covariance does not explain.
     """
-    used, runs = estimates.settings.sensors, len(estimates.q)
-    found: list[list[str]] = [[] for _ in range(runs)]
-    for run in range(runs):
-        found[run] += _lost_sun(record, used, run)
-        found[run] += _lost_stars(record, estimates, run)
-        found[run] += _collinear(record.environment, record, used, run)
-        found[run] += _one_vector(record, used, run)
-        found[run] += _field_model(record, estimates, run)
-        found[run] += _innovations(estimates, run)
-    return tuple(tuple(sentences) for sentences in found)
+    used = estimates.settings.sensors
+    return tuple(
+        (
+            *_lost_sun(record, used, run),
+            *_lost_stars(record, estimates, run),
+            *_collinear(record, used, run),
+            *_one_vector(record, used, run),
+            *_field_model(record, estimates, run),
+            *_innovations(estimates, run),
+        )
+        for run in range(len(estimates.q))
+    )
 
 
 def _lost_sun(record: Record, used: SensorSet, run: int) -> list[str]:
@@ -72,13 +73,14 @@ def _lost_stars(record: Record, estimates: AttitudeTracks, run: int) -> list[str
     return sentences
 
 
-def _collinear(around: Environment, record: Record, used: SensorSet, run: int) -> list[str]:
+def _collinear(record: Record, used: SensorSet, run: int) -> list[str]:
     if used.star or not (used.magnetometer and used.sun):
         return []
-    near = (around.separation_rad[run] < COLLINEAR_RAD) & is_read(record.readings.sun[run])
+    separation_rad = record.environment.separation_rad[run]
+    near = (separation_rad < COLLINEAR_RAD) & is_read(record.readings.sun[run])
     if not near.any():
         return []
-    least = math.degrees(float(around.separation_rad[run, near].min()))
+    least = math.degrees(float(separation_rad[near].min()))
     return [
         f"Sun and field on one line within {least:.0f}° for {_seconds(near, record)}: the turn about it is "
         + ("known by the gyro only" if used.gyro else "not observable there")

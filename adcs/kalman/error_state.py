@@ -7,7 +7,6 @@ then reaches.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from adcs.satellite.sensors import SENSORS
+from arrays.io.errors import check_not_negative, check_positive
 from arrays.typing import FloatArray
 
 ATTRIBUTES = {"field-bias": "field_bias_T", "gyro-bias": "gyro_bias_rad_s", "disturbance": "disturbance_s2"}
@@ -59,11 +59,6 @@ class SensorSet:
     def first_of(self, state: str) -> int:
         """Where an optional state begins in the error state; -1 where the set does not have it."""
         return ALWAYS + 3 * self.states.index(state) if state in self.states else -1
-
-    @property
-    def vectors(self) -> int:
-        """Directions in use that are measured without the star tracker."""
-        return int(self.magnetometer) + int(self.sun)
 
 
 def sensor_set(sensors: str, states: Iterable[str] = ()) -> SensorSet:
@@ -148,9 +143,7 @@ class ProcessNoise:
     disturbance_s2: float = 1e-8
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if not 0.0 <= value < math.inf:
-                raise ValueError(f"Input {name} must be 0 or more and finite; instead received {value}.")
+        check_not_negative(**vars(self))
 
 
 def tuned_noise(used: SensorSet) -> ProcessNoise:
@@ -219,13 +212,12 @@ class FilterSettings:
     disturbance_sigma_s2: float = 2e-6
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.field_error_T < np.inf:
-            raise ValueError(
-                f"Input field_error_T must be 0 or more and finite; instead received {self.field_error_T}."
-            )
-        for name in ("field_bias_sigma_T", "gyro_bias_sigma_rad_s", "disturbance_sigma_s2"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ValueError(f"Input {name} must be positive and finite; instead received {getattr(self, name)}.")
+        check_not_negative(field_error_T=self.field_error_T)
+        check_positive(
+            field_bias_sigma_T=self.field_bias_sigma_T,
+            gyro_bias_sigma_rad_s=self.gyro_bias_sigma_rad_s,
+            disturbance_sigma_s2=self.disturbance_sigma_s2,
+        )
 
     @property
     def process_variance(self) -> FloatArray:

@@ -125,32 +125,28 @@ def residuals(record: Record, row: int, state: State, used: SensorSet) -> list[t
     NaN where there is no reading.
     """
     readings, around = record.readings, record.environment
-    H = np.zeros((len(state.q), 3, used.size))
+
+    def rows(first: int, part: FloatArray, bias: str = "") -> FloatArray:
+        """H with a part (3, 3) from one column on, and ones for a bias that is estimated."""
+        H = np.zeros((len(state.q), 3, used.size))
+        H[..., first : first + 3] = part
+        if bias in used.states:
+            H[..., used.first_of(bias) : used.first_of(bias) + 3] = np.eye(3)
+        return H
+
     parts: list[tuple[int, FloatArray, FloatArray]] = []
     if used.star:
-        rows = H.copy()
-        rows[..., :3] = np.eye(3)
-        parts.append((SENSORS.index("st"), quaternion.error_vector(state.q, readings.star[:, row]), rows))
+        parts.append((0, quaternion.error_vector(state.q, readings.star[:, row]), rows(0, np.eye(3))))
     if used.gyro:
-        rows = H.copy()
-        rows[..., 3:6] = np.eye(3)
-        if used.gyro_bias:
-            first = used.first_of("gyro-bias")
-            rows[..., first : first + 3] = np.eye(3)
-        parts.append((SENSORS.index("gyro"), readings.gyro_rad_s[:, row] - state.w - state.gyro_bias_rad_s, rows))
+        residual = readings.gyro_rad_s[:, row] - state.w - state.gyro_bias_rad_s
+        parts.append((1, residual, rows(3, np.eye(3), "gyro-bias")))
     if used.magnetometer:
-        rows = H.copy()
         b = rotate_back(state.q, around.b_orbital_T[:, row])
-        rows[..., :3] = 2.0 * cross_matrix(b)
-        if used.field_bias:
-            first = used.first_of("field-bias")
-            rows[..., first : first + 3] = np.eye(3)
-        parts.append((SENSORS.index("mag"), readings.field_T[:, row] - b - state.field_bias_T, rows))
+        residual = readings.field_T[:, row] - b - state.field_bias_T
+        parts.append((2, residual, rows(0, 2.0 * cross_matrix(b), "field-bias")))
     if used.sun:
-        rows = H.copy()
         s = rotate_back(state.q, around.sun_orbital[:, row])
-        rows[..., :3] = 2.0 * cross_matrix(s)
-        parts.append((SENSORS.index("sun"), readings.sun[:, row] - s, rows))
+        parts.append((3, readings.sun[:, row] - s, rows(0, 2.0 * cross_matrix(s))))
     return parts
 
 

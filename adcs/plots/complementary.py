@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from arrays.typing import FloatArray
+from magloc.plots import style
 
 _STYLES = {
     "explicit": ("#d55e00", "--", "explicit"),
@@ -69,10 +70,7 @@ def _draw(ax: Axes, orbits: FloatArray, values: FloatArray, name: str) -> None:
 def _limits(picture: ComplementaryPicture, axis: int) -> tuple[float, float]:
     """Of all errors after the first tenth of an orbit, when the start is over."""
     late = picture.orbits >= 0.1
-    values = np.concatenate([errors[late, axis] for errors in picture.errors_deg.values()])
-    low, high = float(values.min()), float(values.max())
-    margin = 0.08 * max(high - low, 1e-6)
-    return low - margin, high + margin
+    return style.limits_of([errors[late, axis] for errors in picture.errors_deg.values()], share=1.0)
 
 
 def _mark(ax: Axes, picture: ComplementaryPicture) -> None:

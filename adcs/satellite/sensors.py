@@ -7,7 +7,7 @@ Ovchinnikov, Keldysh Institute preprint 64, 2014.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,8 +33,29 @@ def _aligned() -> FloatArray:
     return np.zeros(3)
 
 
+class _Sensor:
+    """What is checked of all sensors."""
+
+    def __post_init__(self) -> None:
+        """Raise if a number is not finite or negative, or a noise, range, limit or field not positive."""
+        for name, value in vars(self).items():
+            values = np.array(value, dtype=np.float64)
+            if np.isnan(values).any():
+                raise ValueError(f"Input {name} must be numbers; instead received NaN.")
+            if name in ("misalignment_rad", "boresight_body", "heads_body"):
+                if values.shape[-1:] != (3,) or not np.isfinite(values).all():
+                    raise ValueError(f"Input {name} must be 3 finite numbers; instead received shape {values.shape}.")
+                object.__setattr__(self, name, values)
+                continue
+            may_be_zero = name.endswith("exclusion_rad") or name.startswith("bias_walk")
+            if values < 0.0 or (values == 0.0 and not may_be_zero):
+                raise ValueError(
+                    f"Input {name} must be {'0 or more' if may_be_zero else 'positive'}; instead received {values}."
+                )
+
+
 @dataclass(frozen=True, eq=False)
-class StarTracker:
+class StarTracker(_Sensor):
     """Measures the attitude.
 
     Attributes
@@ -64,7 +85,7 @@ class StarTracker:
     misalignment_rad: FloatArray = field(default_factory=_aligned)
 
     def __post_init__(self) -> None:
-        _check(self)
+        super().__post_init__()
         length = float(np.linalg.norm(self.boresight_body))
         if not length > 0.0:
             raise ValueError("Input boresight_body must have a length; instead received a zero vector.")
@@ -72,7 +93,7 @@ class StarTracker:
 
 
 @dataclass(frozen=True, eq=False)
-class Gyro:
+class Gyro(_Sensor):
     """Measures the rate against inertial space.
 
     Attributes
@@ -97,12 +118,9 @@ class Gyro:
     bias_walk_rad_s: float = 0.0
     misalignment_rad: FloatArray = field(default_factory=_aligned)
 
-    def __post_init__(self) -> None:
-        _check(self)
-
 
 @dataclass(frozen=True, eq=False)
-class Magnetometer:
+class Magnetometer(_Sensor):
     """Measures the field.
 
     Attributes
@@ -127,12 +145,9 @@ class Magnetometer:
     bias_walk_T: float = 0.0
     misalignment_rad: FloatArray = field(default_factory=_aligned)
 
-    def __post_init__(self) -> None:
-        _check(self)
-
 
 @dataclass(frozen=True, eq=False)
-class SunSensor:
+class SunSensor(_Sensor):
     """Heads that measure the direction to the Sun.
 
     Attributes
@@ -159,7 +174,7 @@ class SunSensor:
     misalignment_rad: FloatArray = field(default_factory=_aligned)
 
     def __post_init__(self) -> None:
-        _check(self)
+        super().__post_init__()
         heads = np.atleast_2d(self.heads_body)
         lengths = np.linalg.norm(heads, axis=-1, keepdims=True)
         if heads.ndim != 2 or heads.shape[1] != 3 or not (lengths > 0.0).all():
@@ -254,21 +269,3 @@ def _head_axes(axis: FloatArray) -> FloatArray:
     x = side - axis * (axis @ side)
     x = x / np.linalg.norm(x)
     return np.stack([x, np.cross(axis, x), axis])
-
-
-def _check(sensor: StarTracker | Gyro | Magnetometer | SunSensor) -> None:
-    """Raise if a number is not finite or negative, or a noise, range, limit or field not positive."""
-    for one in fields(sensor):
-        values = np.array(getattr(sensor, one.name), dtype=np.float64)
-        if np.isnan(values).any():
-            raise ValueError(f"Input {one.name} must be numbers; instead received NaN.")
-        if one.name in ("misalignment_rad", "boresight_body", "heads_body"):
-            if values.shape[-1:] != (3,) or not np.isfinite(values).all():
-                raise ValueError(f"Input {one.name} must be 3 finite numbers; instead received shape {values.shape}.")
-            object.__setattr__(sensor, one.name, values)
-            continue
-        may_be_zero = one.name.endswith("exclusion_rad") or one.name.startswith("bias_walk")
-        if values < 0.0 or (values == 0.0 and not may_be_zero):
-            raise ValueError(
-                f"Input {one.name} must be {'0 or more' if may_be_zero else 'positive'}; instead received {values}."
-            )

@@ -6,7 +6,6 @@ one without it. The leading axis of all arrays is the run, the second the instan
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
@@ -17,6 +16,7 @@ from adcs import quaternion
 from adcs.environment.environment import Environment, environment
 from adcs.satellite.satellite import Satellite
 from adcs.satellite.sensors import SENSORS
+from arrays.io.errors import check_positive
 from arrays.typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -152,8 +152,7 @@ class Telemetry:
             raise ValueError(f"Input time_s must be finite with shape (n,); instead received shape {times.shape}.")
         if step_s is None:
             step_s = float(np.diff(times).min()) if len(times) > 1 else 1.0
-        if not 0.0 < step_s < math.inf:
-            raise ValueError(f"Input step_s must be positive and finite; instead received {step_s}.")
+        check_positive(step_s=step_s)
         rows, off, back = steps_of(times, step_s)
         if (off | back).any():
             raise ValueError(

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 
 
@@ -42,8 +42,7 @@ class VectorRecord:
     frame_rate_rad_s: FloatArray
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.dt_s < math.inf:
-            raise ValueError(f"Input dt_s must be positive and finite; instead received {self.dt_s}.")
+        check_positive(dt_s=self.dt_s)
         for name in ("rate_rad_s", *_OF_RUNS, *_OF_FRAME):
             values = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
             if values.ndim not in (2, 3):

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 from scipy.stats import binom
 
+from arrays.io.errors import check_positive
 from arrays.typing import BoolArray, FloatArray, IntArray
 
 # Brighter neighbours with which a star makes triangles, and the neighbours among which they are looked for.
@@ -102,9 +103,7 @@ class StarCamera:
     rad_per_px: float
 
     def __post_init__(self) -> None:
-        for name in ("width_px", "height_px", "rad_per_px"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"Input {name} must be positive and finite; instead received {getattr(self, name)}.")
+        check_positive(**vars(self))
         if max(self.width_px, self.height_px) > MOST_PIXELS:
             raise ValueError(
                 f"Inputs width_px and height_px must be at most {MOST_PIXELS}; "

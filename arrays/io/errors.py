@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -38,6 +39,20 @@ def of_extra(extra: str, what: str) -> Iterator[None]:
         yield
     except ModuleNotFoundError:
         raise InputError(f'{what} needs the extra "{extra}": pip install "magloc[{extra}]".') from None
+
+
+def check_positive(**values: float) -> None:
+    """Raise ValueError for the first of some arguments that is not positive and finite."""
+    for name, value in values.items():
+        if not 0.0 < value < math.inf:
+            raise ValueError(f"Input {name} must be positive and finite; instead received {value}.")
+
+
+def check_not_negative(**values: float) -> None:
+    """Raise ValueError for the first of some arguments that is not 0 or more and finite."""
+    for name, value in values.items():
+        if not 0.0 <= value < math.inf:
+            raise ValueError(f"Input {name} must be 0 or more and finite; instead received {value}.")
 
 
 def _vector(name: str, value: ArrayLike) -> FloatArray:

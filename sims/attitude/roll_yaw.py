@@ -83,7 +83,6 @@ class LoopRuns:
 
     angles_rad: FloatArray  # (n_runs, n_steps + 1, 3): roll, pitch and yaw of the body in the orbital frame
     rates_rad_s: FloatArray  # (n_runs, n_steps + 1, 3): angular rate of the body in the inertial frame, body axes
-    torques_Nm: FloatArray  # (n_runs, n_steps, 3): control torque of every cycle
     increments_rad: FloatArray  # (n_runs, n_steps, 3): of the gyros in every cycle
     roll_readings_rad: FloatArray  # (n_runs, n_steps)
 
@@ -105,16 +104,14 @@ def fly(scenario: LoopScenario, controller: Controller, seeds: Sequence[int]) ->
     angles[:, 0, 2] = scenario.first_yaw_rad
     # At rest in the orbital frame.
     rates[:, 0] = ORBITAL_RATE * np.array([-scenario.first_yaw_rad, -1.0, 0.0])
-    torques, torque = np.empty((n_runs, n_steps, 3)), np.zeros((n_runs, 3))
-    increments = np.empty((n_runs, n_steps, 3))
+    torque, increments = np.zeros((n_runs, 3)), np.empty((n_runs, n_steps, 3))
     for step in range(n_steps):
-        torques[:, step] = torque
         state = advance(scenario, angles[:, step], rates[:, step], torque, step * STEP_S)
         angles[:, step + 1], rates[:, step + 1] = state[:, :3], state[:, 3:6]
         horizon = state[:, :2] + noise[:, step]
         increments[:, step] = state[:, 6:] + shift * STEP_S
         torque = controller(horizon, increments[:, step], state[:, 3:6] + shift)
-    return LoopRuns(angles, rates, torques, increments, angles[:, 1:, 0] + noise[..., 0])
+    return LoopRuns(angles, rates, increments, angles[:, 1:, 0] + noise[..., 0])
 
 
 def _amplitude(scenario: ErrorScenario | LoopScenario) -> FloatArray:
@@ -133,9 +130,9 @@ def advance(
     Euler's equations :math:`J\dot\omega = T - \omega \times J\omega`, and small angles against the orbital frame:
     :math:`\dot\gamma = \omega_x + \omega_0\psi`, :math:`\dot\theta = \omega_y + \omega_0`,
     :math:`\dot\psi = \omega_z - \omega_0\gamma`.
-    ``angles_rad``, ``rates_rad_s``, ``torque_Nm`` (n_runs, 3): as in :class:`LoopRuns`; the torque is held. ``time_s``:
-    phase of the disturbance torque. Returns (n_runs, 9): angles [rad], rates [rad/s], and the integral of the rates
-    over the cycle [rad].
+    ``angles_rad``, ``rates_rad_s``, ``torque_Nm`` (n_runs, 3): as in :class:`LoopRuns`; the control torque is
+    held. ``time_s``: phase of the disturbance torque. Returns (n_runs, 9): angles [rad], rates [rad/s],
+    and the integral of the rates over the cycle [rad].
     """
     state = np.concatenate([angles_rad, rates_rad_s, np.zeros_like(rates_rad_s)], axis=1)
     inertia = np.ascontiguousarray(scenario.inertia_kgm2)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from adcs.environment.orbit import circular_orbit
 from adcs.satellite.satellite import Satellite
+from arrays.io.errors import check_not_negative
 
 
 @dataclass(frozen=True)
@@ -79,34 +79,16 @@ class AttitudeScenario:
                 raise ValueError(f"Input {name} must be positive; instead received {getattr(self, name)}.")
         if not self.dt_s <= self.duration_s < math.inf:
             raise ValueError(f"Input duration_s must be dt_s or more and finite; instead received {self.duration_s}.")
-        for name in (
-            "torque_Nm",
-            "gyro_bias_rad_s",
-            "field_bias_T",
-            "field_error_T",
-            "start_attitude_rad",
-            "start_rate_rad_s",
-        ):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"Input {name} must be 0 or more and finite; instead received {getattr(self, name)}.")
+        check_not_negative(
+            torque_Nm=self.torque_Nm,
+            gyro_bias_rad_s=self.gyro_bias_rad_s,
+            field_bias_T=self.field_bias_T,
+            field_error_T=self.field_error_T,
+            start_attitude_rad=self.start_attitude_rad,
+            start_rate_rad_s=self.start_rate_rad_s,
+        )
 
     @property
     def n_instants(self) -> int:
         """Instants of a run, the start included."""
         return 1 + round(self.duration_s / self.dt_s)
-
-
-TABLETSAT_INERTIA_KGM2 = ((0.519, 0.002, 0.005), (0.002, 0.579, 0.009), (0.005, 0.009, 0.71))
-
-
-def tabletsat(duration_s: float = 200.0, local_time_h: float = 15.0) -> AttitudeScenario:
-    """TabletSat-Aurora as in Ivanov et al., Keldysh Institute preprint 64, 2014, with what it leaves open filled in.
-
-    A circular orbit of 600 km and 97.8° on 2014-09-01; a constant torque of 8e-7 N·m; sensors of Table 1. Orbit, date,
-    gains and the conditions of the start are ours.
-    ``local_time_h``: mean solar time of the ascending node. With 15 h Sun and field never come nearer to each other
-    than 31° in sunlight; with 13 h they come as near as 1.2°.
-    """
-    orbit = circular_orbit(altitude_m=600e3, inclination_deg=97.8, epoch="2014-09-01", local_time_h=local_time_h)
-    satellite = Satellite(inertia_kgm2=TABLETSAT_INERTIA_KGM2, orbit=orbit)
-    return AttitudeScenario(satellite, duration_s=duration_s, torque_Nm=8e-7)

@@ -6,22 +6,21 @@ import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adcs.io.scenario_files import AttitudeFile
-from adcs.kalman.bank import EstimatorSettings
+from adcs.kalman.bank import EstimatorSettings, estimated, start_of
+from adcs.kalman.diagnostics import warnings_of
 from adcs.kalman.error_state import AttitudeTracks, start_near
 from adcs.kalman.results import by_state, in_units
 from arrays.io.errors import InputError
-
-if TYPE_CHECKING:
-    from sims.attitude.scenario import AttitudeScenario
-    from sims.attitude.simulation import AttitudeRuns
-from adcs.kalman.bank import estimated, start_of
 from arrays.typing import FloatArray
+from sims.attitude.files import simulation_of
+from sims.attitude.scenario import AttitudeScenario
+from sims.attitude.simulation import AttitudeRuns, simulate, start_estimates
 from sims.experiments import accuracy
 
 _NUMBERS_AT_ONCE = 40_000_000
@@ -97,10 +96,6 @@ class Outcome:
 
 def parts_of(file: AttitudeFile, estimate: EstimatorSettings, seeds: Sequence[int]) -> Iterator[Part]:
     """All runs, as many at once as fit into memory."""
-    # The command line stands on top of all packages; nothing that it imports imports it.
-    from sims.attitude.files import simulation_of
-    from sims.attitude.simulation import start_estimates
-
     scenario = simulation_of(file)
     at_once = max(1, _NUMBERS_AT_ONCE // (scenario.n_instants * estimate.settings.sensors.size**2))
     for begin in range(0, len(seeds), at_once):
@@ -114,8 +109,6 @@ def parts_of(file: AttitudeFile, estimate: EstimatorSettings, seeds: Sequence[in
 
 
 def _simulated(file: AttitudeFile, scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
-    from sims.attitude.simulation import simulate
-
     try:
         return simulate(scenario, seeds)
     except ValueError as error:
@@ -170,8 +163,6 @@ def errors_in_units(part: Part) -> FloatArray:
 
 def outcome_of(part: Part) -> Outcome:
     """How good the estimates of some runs are."""
-    from adcs.kalman.diagnostics import warnings_of
-
     runs, estimates = part.runs, part.estimates
     late = accuracy.last_rows(runs)
     error_deg = accuracy.error_norm_deg(runs, estimates)

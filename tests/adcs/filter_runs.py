@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adcs import quaternion
+from adcs.environment.orbit import circular_orbit
 from adcs.kalman.error_state import (
     AttitudeTracks,
     FilterSettings,
@@ -21,7 +22,8 @@ from adcs.kalman.error_state import (
     tuned_noise,
 )
 from adcs.satellite import dynamics
-from sims.attitude.scenario import AttitudeScenario, StartConditions, tabletsat
+from adcs.satellite.satellite import Satellite
+from sims.attitude.scenario import AttitudeScenario, StartConditions
 from sims.attitude.simulation import AttitudeRuns, Prepared, prepare, simulate, start_estimates
 from sims.experiments.attitude import Part, outcome_of
 from tests.adcs.attitudes import random_attitudes
@@ -32,6 +34,22 @@ GYRO_BIAS_RAD_S, FIELD_BIAS_T = math.radians(0.027), 500e-9
 SEEDS = range(10)
 ANY_START = StartConditions(sunlit=False, least_separation_rad=0.0, least_field_T=0.0)
 """No condition at all."""
+
+
+TABLETSAT_INERTIA_KGM2 = ((0.519, 0.002, 0.005), (0.002, 0.579, 0.009), (0.005, 0.009, 0.71))
+
+
+def tabletsat(duration_s: float = 200.0, local_time_h: float = 15.0) -> AttitudeScenario:
+    """TabletSat-Aurora as in Ivanov et al., Keldysh Institute preprint 64, 2014, with what it leaves open filled in.
+
+    A circular orbit of 600 km and 97.8° on 2014-09-01; a constant torque of 8e-7 N·m; sensors of Table 1. Orbit, date,
+    gains and the conditions of the start are ours.
+    ``local_time_h``: mean solar time of the ascending node. With 15 h Sun and field never come nearer to each other
+    than 31° in sunlight; with 13 h they come as near as 1.2°.
+    """
+    orbit = circular_orbit(altitude_m=600e3, inclination_deg=97.8, epoch="2014-09-01", local_time_h=local_time_h)
+    satellite = Satellite(inertia_kgm2=TABLETSAT_INERTIA_KGM2, orbit=orbit)
+    return AttitudeScenario(satellite, duration_s=duration_s, torque_Nm=8e-7)
 
 
 def settings(sensors: str, states: Iterable[str] = ()) -> FilterSettings:

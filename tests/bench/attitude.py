@@ -8,9 +8,8 @@ from dataclasses import replace
 from adcs import quaternion
 from adcs.kalman.mekf import run_filter, run_readable
 from adcs.satellite import dynamics
-from sims.attitude.scenario import tabletsat
 from sims.attitude.simulation import AttitudeRuns, advance, simulate
-from tests.adcs.filter_runs import ANY_START, settings, start_of
+from tests.adcs.filter_runs import ANY_START, settings, start_of, tabletsat
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
 

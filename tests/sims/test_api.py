@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from dataclasses import dataclass, replace
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -85,10 +86,8 @@ class TestEitherKind:
         assert isinstance(sims.read_scenario("eclipse"), sims.AttitudeScenario)
 
     def test_by_file(self, tmp_path: Path) -> None:
-        from adcs.io.scenario_files import built_in_text
-
         path = tmp_path / "mine.toml"
-        path.write_text(built_in_text("tabletsat"), encoding="utf-8")
+        path.write_bytes((files("adcs") / "scenarios" / "tabletsat.toml").read_bytes())
         assert isinstance(sims.read_scenario(str(path)), sims.AttitudeScenario)
 
     def test_no_such_scenario(self) -> None:

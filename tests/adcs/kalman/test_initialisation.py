@@ -12,10 +12,10 @@ from adcs import quaternion
 from adcs.kalman.error_state import start_near
 from adcs.kalman.initialisation import AGAIN, KNOWN_RAD, any_start, largest_deviation_rad, vector_start
 from adcs.kalman.mekf import run_filter
-from sims.attitude.scenario import StartConditions, tabletsat
+from sims.attitude.scenario import StartConditions
 from sims.attitude.simulation import AttitudeRuns, simulate, start_estimates
 from sims.experiments.accuracy import error_norm_deg, normalised_error_squared
-from tests.adcs.filter_runs import START_RAD_S, believed_runs, runs_for, settings, tumbled
+from tests.adcs.filter_runs import START_RAD_S, believed_runs, runs_for, settings, tabletsat, tumbled
 
 ORBIT_S = 5801.0
 

@@ -40,7 +40,7 @@ from adcs.kalman.smoother import difference
 from adcs.satellite import dynamics
 from adcs.satellite.sensors import StarTracker
 from magloc.kalman import sequential_update, symmetric_square_root
-from sims.attitude.scenario import AttitudeScenario, StartConditions, tabletsat
+from sims.attitude.scenario import AttitudeScenario, StartConditions
 from sims.attitude.simulation import AttitudeRuns, advance, prepare, sense, simulate
 from sims.experiments.accuracy import error_norm_deg, errors, last_rows, normalised_error_squared
 from tests.adcs.attitudes import random_attitudes
@@ -54,6 +54,7 @@ from tests.adcs.filter_runs import (
     runs_for,
     settings,
     start_of,
+    tabletsat,
 )
 from tests.adcs.kalman.test_error_state import TABLE_3
 from tests.calls import calls_of

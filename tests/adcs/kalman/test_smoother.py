@@ -13,10 +13,9 @@ from adcs import quaternion
 from adcs.kalman.error_state import FilterSettings, ProcessNoise, Start
 from adcs.kalman.mekf import first_state, predicted, run_filter, stacked_residuals
 from adcs.kalman.smoother import smoothed
-from sims.attitude.scenario import tabletsat
 from sims.attitude.simulation import AttitudeRuns, simulate
 from sims.experiments.accuracy import errors, normalised_error_squared
-from tests.adcs.filter_runs import runs_for, settings, start_of
+from tests.adcs.filter_runs import runs_for, settings, start_of, tabletsat
 
 Array = NDArray[np.float64]
 CASES = [

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from adcs import quaternion
 from adcs.satellite import dynamics
 from adcs.satellite.sensors import Gyro, Magnetometer, StarTracker
-from sims.attitude.scenario import AttitudeScenario, StartConditions, tabletsat
+from sims.attitude.scenario import AttitudeScenario, StartConditions
 from sims.attitude.simulation import AttitudeRuns, advance, prepare, sense, simulate, start_estimates
-from tests.adcs.filter_runs import ANY_START
+from tests.adcs.filter_runs import ANY_START, tabletsat
 from tests.calls import calls_of
 
 Array = NDArray[np.float64]
