@@ -18,7 +18,8 @@ DIVERGED_DEG = 10.0
 
 def errors(runs: AttitudeRuns, estimates: AttitudeTracks) -> FloatArray:
     """Error state of truth against estimate, shape (runs, n, N)."""
-    others = (runs.states[state] - values for state, values in estimates.states.items())
+    true = runs.states
+    others = (true[state] - values for state, values in estimates.states.items())
     return np.concatenate([quaternion.error_vector(estimates.q, runs.q), *others], axis=-1)
 
 
