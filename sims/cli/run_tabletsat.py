@@ -13,7 +13,6 @@ from cyclopts import Parameter
 import adcs
 import sims.experiments
 from adcs.cli.options import ScenarioOptions, print_note
-from adcs.kalman.results import SHOWN
 from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import InputError
 from arrays.io.outputs import make_folder, refuse_file
@@ -147,6 +146,8 @@ def run_attitude(
 
 def summary_lines(file: AttitudeFile, estimate: EstimatorSettings, numbers: dict[str, Any]) -> Sequence[str]:
     """The result as text."""
+    from adcs.kalman.results import SHOWN
+
     runs = "1 run" if numbers["runs"] == 1 else f"{numbers['runs']} runs"
     lines = [f"{file.name}: {runs} of {file.duration_s:g} s; {estimate.in_words}"]
     # The first numbers are those of the states, in this order.
