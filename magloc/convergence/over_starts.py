@@ -39,7 +39,8 @@ from magloc.measurement.differences import DifferenceMeasurement, predicted_chan
 if TYPE_CHECKING:
     import xarray as xr
 from arrays.typing import FloatArray
-from magloc.convergence.filters import FILTERS, Ends, Filter, RepeatedFilter
+from magloc.convergence.filters import FILTERS, Filter, RepeatedFilter
+from magloc.convergence.filters_compiled import Ends
 
 
 class Status(IntEnum):
