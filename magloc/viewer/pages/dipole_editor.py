@@ -27,7 +27,7 @@ from magloc.viewer.pages.fixes import heaviest_first
 from magloc.viewer.pages.live_fit import Forecast, LiveFit, rounded, suitable_dipole
 from magloc.viewer.panels.inputs import SharedInput, set_value
 from magloc.viewer.panels.latest import Latest
-from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, FIT_COLOUR, DipoleGlyph, SurfaceGlyph
+from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, FIT_COLOUR, DipoleGlyph, SurfaceGlyph, turned_to
 from magloc.viewer.scene.shapes import uncertainty
 
 _SOLUTIONS_SHOWN = 3
@@ -296,16 +296,6 @@ def direction_of(wxyz: ArrayLike) -> FloatArray:
     """The z axis of a frame that a unit quaternion turns, shape (3,)."""
     w, x, y, z = np.asarray(wxyz, dtype=np.float64)
     return np.array([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)])
-
-
-def turned_to(direction: FloatArray) -> FloatArray:
-    """The shortest turn of the z axis to a unit vector, as a unit quaternion wxyz."""
-    x, y, z = direction
-    if z < -1.0 + 1e-12:
-        return np.array([0.0, 1.0, 0.0, 0.0])
-    quaternion = np.array([1.0 + z, -y, x, 0.0])
-    unit: FloatArray = quaternion / np.linalg.norm(quaternion)
-    return unit
 
 
 def angles_of(vector: FloatArray) -> tuple[float, float]:

@@ -30,6 +30,7 @@ from magloc.viewer.scene.glyphs import (
     DipoleGlyph,
     length_text,
     screen_label,
+    screen_lines,
 )
 from magloc.viewer.scene.legend import Entry, Swatch, add_legend
 from magloc.viewer.scene.shapes import line_segments
@@ -161,7 +162,7 @@ def track_page(
     for i in dict.fromkeys((tracked[0], tracked[-1])):
         below = positions[i] - np.array([0.0, 0.0, 0.14 * ball.radius_m])  # above, the arrow of the moment may be
         screen_label(server.scene, f"/times/{i}", f"{points[i].time_s:.6g} s", below)
-    return _finished(server, legend, ball, name, entries, close=player.close)
+    return _finished(server, legend, ball, name, entries, close=player.pause)
 
 
 def map_page(server: viser.ViserServer, result: MapResult) -> Page:
@@ -218,9 +219,7 @@ def _array_entries(server: viser.ViserServer, glyphs: ArrayGlyphs, rows: Reading
         glyphs.name_as_a_whole("array")
     if rows is not None and rows.array_position_m is not None:
         path = line_segments(rows.array_position_m)
-        server.scene.add_line_segments(
-            "/array-path", path, ARRAY_PATH_COLOUR, thickness=1.5, thickness_units="screen", visible=bool(len(path))
-        )
+        screen_lines(server.scene, "/array-path", path, ARRAY_PATH_COLOUR, 1.5, visible=bool(len(path)))
         entries.append(Swatch(ARRAY_PATH_COLOUR, "path of the array"))
     return entries
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from threading import Event, Lock, Thread, current_thread
 from time import perf_counter
 
 import viser
+
+from magloc.viewer.panels.latest import Latest
 
 _FRAMES_PER_SECOND = 15.0
 
@@ -27,8 +28,8 @@ class PlayedTime:
     Parameters
     ----------
     duration_s : float
-    follow : callable
-        Called, without arguments, whenever the time has moved.
+    follow : Latest
+        Called whenever the time has moved.
     button : viser.GuiButtonHandle
         Plays and pauses, and says which.
     speed : viser.GuiDropdownHandle
@@ -45,7 +46,7 @@ class PlayedTime:
     def __init__(
         self,
         duration_s: float,
-        follow: Callable[[], None],
+        follow: Latest,
         button: viser.GuiButtonHandle,
         speed: viser.GuiDropdownHandle[str],
         name: str,
