@@ -137,16 +137,6 @@ def orbital_rate(position_eci_m: ArrayLike, velocity_eci_m_s: ArrayLike) -> Floa
     return np.linalg.norm(momentum, axis=-1) / np.sum(position * position, axis=-1)
 
 
-def geodetic_from_ecef(position_ecef_m: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Geodetic latitude and longitude [°] and height above the ellipsoid [m] (WGS-84) of positions (..., 3)."""
-    with of_extra("geo", "a place on the Earth"):
-        from pymap3d import ecef2geodetic
-
-    x, y, z = np.moveaxis(np.asarray(position_ecef_m, dtype=np.float64), -1, 0)
-    latitude, longitude, height = ecef2geodetic(x, y, z)
-    return np.asarray(latitude), np.asarray(longitude), np.asarray(height)
-
-
 def turned(rotation: ArrayLike, vectors: ArrayLike) -> FloatArray:
     """Vectors (..., 3), each turned by its rotation matrix (..., 3, 3)."""
     return (np.asarray(rotation, dtype=np.float64) @ np.asarray(vectors, dtype=np.float64)[..., None])[..., 0]

@@ -66,11 +66,6 @@ class AttitudeFile:
         return _estimator(place or self.path, self.estimate)
 
 
-def built_in_text(name: str) -> str:
-    """Text of a built-in scenario's file."""
-    return _FILES.path(name).read_text(encoding="utf-8")
-
-
 def read_scenario(name_or_path: str) -> AttitudeFile:
     """Scenario of a satellite.
 

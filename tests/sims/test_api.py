@@ -16,6 +16,7 @@ from arrays import SensorArray
 from magloc.readings import Readings
 from magloc.truth import Truth
 from sims.attitude.simulation import AttitudeRuns
+from tests.conftest import REPOSITORY
 
 
 def public_names(package: Path) -> list[str]:
@@ -85,10 +86,8 @@ class TestEitherKind:
         assert isinstance(sims.read_scenario("eclipse"), sims.AttitudeScenario)
 
     def test_by_file(self, tmp_path: Path) -> None:
-        from adcs.io.scenario_files import built_in_text
-
         path = tmp_path / "mine.toml"
-        path.write_text(built_in_text("tabletsat"), encoding="utf-8")
+        path.write_bytes((REPOSITORY / "adcs" / "scenarios" / "tabletsat.toml").read_bytes())
         assert isinstance(sims.read_scenario(str(path)), sims.AttitudeScenario)
 
     def test_no_such_scenario(self) -> None:

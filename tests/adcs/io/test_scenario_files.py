@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from adcs.environment.orbit import CircularOrbit, Sgp4Orbit
-from adcs.io.scenario_files import built_in_scenarios, built_in_text, read_scenario, scenario_text
+from adcs.io.scenario_files import built_in_scenarios, read_scenario, scenario_text
 from adcs.kalman.error_state import ProcessNoise, paper_noise, tuned_noise
 from arrays.io.errors import InputError
 from sims.attitude.files import simulation_of
 from sims.attitude.scenario import tabletsat
+from tests.conftest import REPOSITORY
 
 MINIMAL = """
 [satellite]
@@ -101,7 +102,7 @@ class TestBuiltIn:
     def test_tabletsat_documents_every_key(self):
         from adcs.io import scenario_tables as module
 
-        text = built_in_text("tabletsat")
+        text = (REPOSITORY / "adcs" / "scenarios" / "tabletsat.toml").read_text(encoding="utf-8")
         for table in (
             module.FileTable,
             module.SatelliteTable,
