@@ -12,7 +12,7 @@ from adcs.viewer.drive_player import DrivePlayer
 from adcs.viewer.table_scene import TableScene, scene_entries, scene_extent
 from magloc.viewer.pages.pages import Page
 from magloc.viewer.scene.framing import prepare
-from magloc.viewer.scene.legend import add_legend, with_legend
+from magloc.viewer.scene.legend import legend_html, with_legend
 from magloc.viewer.server import write_page
 
 _STEP_S = 0.2
@@ -32,7 +32,7 @@ def drive_page(server: viser.ViserServer, drive: Drive, at_s: float) -> tuple[Pa
         *((f"Errors are enlarged {scene.enlarged:g} times at first.",) if scene.enlarged > 1.0 else ()),
     )
     with server.gui.add_folder("Legend"):
-        add_legend(server.gui, entries, notes)
+        server.gui.add_html(legend_html(entries, notes))
     player.move_to(at_s)
     return Page(drive.title, entries, notes, player.pause), player
 

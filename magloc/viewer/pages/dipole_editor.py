@@ -6,7 +6,6 @@ Use, inside a tab or folder of the GUI; everything is in the array's frame::
     editor = DipoleEditor(server, array, position_m, moment_Am2, parent="/array")   # parent: node of the array's frame
     editor.set_array(array)                                    # after the array was edited: everything follows
     editor.move_to(position_m, moment_Am2)                     # as if the user had dragged it
-    editor.visible = False                                     # takes it out of the scene (its GUI stays)
     editor.extent_m                                            # points (k, 3) that the first camera should see
 """
 
@@ -108,16 +107,6 @@ class DipoleEditor:
         """Points that the first camera should see, shape (k, 3) [m]."""
         tip = self.position_m + _ARROW * self.array.circumradius * direction_of(self.control.wxyz)
         return np.vstack([self.array.positions, self.position_m, tip])
-
-    @property
-    def visible(self) -> bool:
-        """Whether the dipole and all that follows it are in the scene."""
-        return self.control.visible
-
-    @visible.setter
-    def visible(self, visible: bool) -> None:
-        self.control.visible = visible
-        self._follow()
 
     def move_to(self, position_m: ArrayLike, moment_Am2: ArrayLike) -> None:
         """Put the dipole somewhere, as if the user had dragged it.
@@ -236,7 +225,6 @@ class DipoleEditor:
         self.forecast = forecast = live.forecast(position, moment)
         self._forecast_of = (live, position, moment, forecast)
         self._glyph.show(position, moment)
-        self._glyph.visible = self.visible
         self._show_region(live.array, position, forecast)
         self._show_inputs(position)
         self.readings_panel.content = words.readings_table(live.array, forecast.readings_T, forecast.signal_T)
@@ -244,7 +232,7 @@ class DipoleEditor:
         self.milliseconds = (1e3 * (perf_counter() - begin), self.milliseconds[1])
 
     def _show_region(self, array: SensorArray, position: FloatArray, forecast: Forecast) -> None:
-        if forecast.covariance is None or not self.visible:
+        if forecast.covariance is None:
             self._region.show(None)
             return
         distance = float(np.linalg.norm(position - array.centroid))
@@ -280,15 +268,12 @@ class DipoleEditor:
         if self.noise_checkbox.value and np.isfinite(readings).all():
             readings = live.simulated(readings, int(self.seed_input.value))
         self.fix = fix = live.fix(readings) if not forecast.reason else Fix((), forecast.reason)
-        shown = heaviest_first(fix)[:_SOLUTIONS_SHOWN] if self.visible else []
+        shown = heaviest_first(fix)[:_SOLUTIONS_SHOWN]
         for i, glyph in enumerate(self._found):
             glyph.visible = i < len(shown)
             if i < len(shown):
                 glyph.show(shown[i].position_m, shown[i].moment_Am2)
-        of_best = None
-        if fix.solutions:
-            of_best = words.difference(fix.best, position, moment, forecast.covariance)
-        self.fit_panel.content = words.panel(words.fix_words(fix, forecast, of_best))
+        self.fit_panel.content = words.panel(words.fix_words(fix, forecast, position, moment))
         self.milliseconds = (self.milliseconds[0], 1e3 * (perf_counter() - begin))
 
 

@@ -32,7 +32,7 @@ from magloc.viewer.scene.glyphs import (
     screen_label,
     screen_lines,
 )
-from magloc.viewer.scene.legend import Entry, Swatch, add_legend
+from magloc.viewer.scene.legend import Entry, Swatch, legend_html
 from magloc.viewer.scene.shapes import line_segments
 
 SENSOR_COLOUR = (90, 96, 105)
@@ -200,7 +200,7 @@ def _finished(
     cell = prepare(server, ball)
     all_notes = (*notes, AXES_WORDS, f"one square of the floor: {length_text(cell)}")
     with legend:
-        add_legend(server.gui, entries, all_notes)
+        server.gui.add_html(legend_html(entries, all_notes))
     return Page(title, tuple(entries), all_notes, close)
 
 

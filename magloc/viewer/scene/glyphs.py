@@ -357,33 +357,28 @@ class TrackGlyph:
         if covariances_m2 is not None:
             self._add_ellipsoids(covariances_m2)
 
-    def show_until(self, index: int | None, tail: int | None = None) -> None:
+    def show_until(self, index: int, tail: int) -> None:
         """Show the track up to a point.
 
         Parameters
         ----------
-        index : int, optional
-            Of the point, which is marked, with its ellipsoid; None shows the whole track.
-        tail : int, optional
-            Intervals before the point that are shown; all by default.
+        index : int
+            Of the point, which is marked, with its ellipsoid.
+        tail : int
+            Intervals before the point that are shown.
         """
-        first, last = 0, len(self.positions_m) - 1
-        position = np.full(3, np.nan)
-        if index is not None:
-            first, last = 0 if tail is None else max(0, index - tail), index
-            position = self.positions_m[index]
-        segments = line_segments(self.positions_m[first : last + 1])
+        first, position = max(0, index - tail), self.positions_m[index]
+        segments = line_segments(self.positions_m[first : index + 1])
         self.line.visible = bool(len(segments))
         if len(segments):
             self.line.points = segments.astype(np.float32)
         self.mark.visible = bool(np.isfinite(position).all())
         if self.mark.visible:
             self.mark.position = position
-        with_region = index is not None and self.covariances_m2 is not None
-        self.region.show(ellipsoid(position, self.covariances_m2[index]) if with_region else None)  # type: ignore[index]
+        self.region.show(None if self.covariances_m2 is None else ellipsoid(position, self.covariances_m2[index]))
         if self.regions is not None:
             # Those that are not to be seen shrink to nothing: their number cannot change.
-            seen = (self._chosen >= first) & (self._chosen <= last)
+            seen = (self._chosen >= first) & (self._chosen <= index)
             self.regions.batched_scales = np.where(seen[:, None], self._semi_axes, 0.0).astype(np.float32)
 
     def _add_ellipsoids(self, covariances_m2: FloatArray) -> None:

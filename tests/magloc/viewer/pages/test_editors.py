@@ -402,14 +402,6 @@ class TestDipoleEditor:
         expected = magpylib_field(other.positions, editor.position_m, editor.moment_Am2).ravel()
         np.testing.assert_allclose(editor.forecast.signal_T, expected, rtol=1e-12)
 
-    def test_it_can_be_taken_out_of_the_scene(self, server, array):
-        editor = DipoleEditor(server, array)
-        editor.visible = False
-        names = ("control", "true", "fit 1", "region")
-        assert not any(node(server, f"/dipole/{name}").visible for name in names)
-        editor.visible = True
-        assert all(node(server, f"/dipole/{name}").visible for name in names)
-
 
 class TestArrayEditor:
     def test_a_dragged_sensor_changes_the_array_and_the_bound(self, server):
