@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import trimesh
 import viser
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from adcs.mockup.navigation.fixes import Outcome
 from adcs.mockup.vision.camera import Pose, footprint
@@ -38,19 +36,6 @@ _RING_M, _ARROW_M = 0.105, 0.24
 _LIGHT_M = 0.016
 _TRAIL_POINTS = 400
 _AROUND = 40
-
-
-class Mark(NamedTuple):
-    """A ring with an arrow, and the frame that moves them."""
-
-    frame: viser.FrameHandle
-    lines: viser.LineSegmentsHandle
-
-    def show(self, place_m: ArrayLike, heading_rad: float) -> None:
-        """Move it, and show it."""
-        x, y = np.asarray(place_m, dtype=np.float64).tolist()
-        stand(self.frame, Pose(x, y, heading_rad))
-        self.frame.visible = True
 
 
 class TableScene:
@@ -113,7 +98,7 @@ class TableScene:
         truth, pose = drive.truth.position_m[row], drive.true_pose(row)
         stand(self._satellite, pose)
         place = truth + self.enlarged * drive.errors_m[row]
-        self._estimate.show(place, float(drive.track.heading_rad[row]))
+        show_at(self._estimate, place, float(drive.track.heading_rad[row]))
         if drive.sigma_m is not None:
             semi_axes = 3.0 * self.enlarged * drive.sigma_m[row]
             self._ellipse.scale = (float(semi_axes[0]), float(semi_axes[1]), 1.0)
@@ -138,7 +123,7 @@ class TableScene:
         drive = self._drive
         fix = drive.last_fix(row)
         if fix is None or frame is None:
-            for handle in (self._late.frame, self._rejected.frame, self._exposure, self._age):
+            for handle in (self._late, self._rejected, self._exposure, self._age):
                 handle.visible = False
             if self._fix is not None:
                 self._lights.batched_colors = self._light_colours(None)
@@ -151,8 +136,8 @@ class TableScene:
         self._fix = fix
         rejected = drive.outcomes[fix] is Outcome.REJECTED
         shown, hidden = (self._rejected, self._late) if rejected else (self._late, self._rejected)
-        shown.show(drive.fixes.position_m[fix], float(drive.fixes.heading_rad[fix]))
-        hidden.frame.visible = False
+        show_at(shown, drive.fixes.position_m[fix], float(drive.fixes.heading_rad[fix]))
+        hidden.visible = False
         self._age.position = np.array([*drive.fixes.position_m[fix], _HEIGHT_M + 0.16])
         self._age.visible = True
         self._show_frame(frame, drive.pose_of_exposure(fix))
@@ -183,13 +168,15 @@ class TableScene:
         closed = np.concatenate([outline, outline[:1]])
         return np.column_stack([closed, np.full(len(closed), CEILING_M)])
 
-    def _mark(self, name: str, colour: Colour, height_m: float, width: float) -> Mark:
+    def _mark(self, name: str, colour: Colour, height_m: float, width: float) -> viser.FrameHandle:
+        """A ring with an arrow, in a frame that moves them."""
         frame = self._scene.add_frame(name, show_axes=False, visible=False)
         tip = np.array([_ARROW_M, 0.0, 0.0])
         barbs = [tip + np.array([-0.06, side * 0.045, 0.0]) for side in (1.0, -1.0)]
         shaft = np.array([[[_RING_M, 0.0, 0.0], tip], [barbs[0], tip], [barbs[1], tip]])
         lines = np.concatenate([line_segments(_RING_M * unit_circle()), shaft]) + np.array([0.0, 0.0, height_m])
-        return Mark(frame, screen_lines(self._scene, f"{name}/lines", lines, colour, width))
+        screen_lines(self._scene, f"{name}/lines", lines, colour, width)
+        return frame
 
     def _add_room(self) -> None:
         scene, lights = self._scene, self._drive.lights_m
@@ -241,6 +228,13 @@ def stand(frame: viser.FrameHandle, pose: Pose) -> None:
     """Put a frame on the table."""
     frame.position = np.array([pose.x_m, pose.y_m, 0.0])
     frame.wxyz = turn_about_z(float(pose.heading_rad))
+
+
+def show_at(frame: viser.FrameHandle, place_m: FloatArray, heading_rad: float) -> None:
+    """Put a frame on the table, and show it."""
+    x, y = place_m.tolist()
+    stand(frame, Pose(x, y, heading_rad))
+    frame.visible = True
 
 
 def turn_about_z(angle_rad: float) -> FloatArray:

@@ -20,7 +20,7 @@ from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.noise import reading_errors
 from arrays.typing import FloatArray
-from arrays.whitening import Whitening, whitening
+from arrays.whitening import whitening
 from magloc.bounds.crlb import cramer_rao_bounds
 from magloc.grids.computed import computed_map
 from magloc.grids.cube import (
@@ -238,11 +238,6 @@ class SourcesMap(CubeMap):
         exact = predicted_channels(array, position, moment) + array.channel_offset_T
         return exact + reading_errors(array, exact, noise)
 
-    def _whitenings(self, readings: FloatArray) -> list[Whitening]:
-        """Whitening of every row, as of its fix."""
-        array = self.scenario.array
-        return whitenings_of(array, np.ones(array.n_channels, dtype=bool), readings)
-
     def _searched_from(self, truth: FloatArray, readings: FloatArray) -> list[tuple[FloatArray, float]]:
         """Ends q (4,) and χ² of the refinements that start at the truth (n, 3).
 
@@ -253,7 +248,8 @@ class SourcesMap(CubeMap):
         without_source = array.readings_of(array.ambient_fields)
         ends = []
         model = self._model
-        for position, row, white in zip(truth, readings, self._whitenings(readings), strict=True):
+        whitenings = whitenings_of(array, np.ones(array.n_channels, dtype=bool), readings)
+        for position, row, white in zip(truth, readings, whitenings, strict=True):
             q = model.homogeneous(position)
             chi2, _, _ = variable_projection_compiled.refine(
                 q,

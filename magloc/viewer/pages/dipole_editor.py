@@ -3,7 +3,7 @@
 Use, inside a tab or folder of the GUI; everything is in the array's frame::
 
     editor = DipoleEditor(server, array)                       # a position and a moment that suit the array
-    editor = DipoleEditor(server, array, position_m, moment_Am2, parent="/array")   # parent: node of the array's frame
+    editor = DipoleEditor(server, array, parent="/array")      # parent: node of the array's frame
     editor.set_array(array)                                    # after the array was edited: everything follows
     editor.move_to(position_m, moment_Am2)                     # as if the user had dragged it
     editor.extent_m                                            # points (k, 3) that the first camera should see
@@ -49,8 +49,6 @@ class DipoleEditor:
     server : viser.ViserServer
         The panels are added where its GUI is at present.
     array : SensorArray
-    position_m, moment_Am2 : array-like, shape (3,), optional
-        Where the dipole starts, in the array's frame [m], and its moment [A·m²].
     parent : str
         Name of the scene node of the array's frame; empty for the scene itself.
 
@@ -64,20 +62,10 @@ class DipoleEditor:
         How long the last forecast and the last fix took, from the state of the controls to the scene [ms].
     """
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        array: SensorArray,
-        position_m: ArrayLike | None = None,
-        moment_Am2: ArrayLike | None = None,
-        *,
-        parent: str = "",
-    ) -> None:
-        position, moment = suitable_dipole(array)
-        self._start_m = position if position_m is None else np.asarray(position_m, dtype=np.float64)
-        self._start_Am2 = moment if moment_Am2 is None else np.asarray(moment_Am2, dtype=np.float64)
+    def __init__(self, server: viser.ViserServer, array: SensorArray, *, parent: str = "") -> None:
+        self._start = suitable_dipole(array)
         self._live = LiveFit(array)
-        self._magnitude = float(np.linalg.norm(self._start_Am2)) or float(np.linalg.norm(moment))
+        self._magnitude = float(np.linalg.norm(self._start[1]))
         self.milliseconds = (math.nan, math.nan)
         self._follow_dipole = Latest(self._show_forecast)
         self._follow_fit = Latest(self._show_fix)
@@ -85,7 +73,7 @@ class DipoleEditor:
         self._add_panels(server, array)
         self.forecast: Forecast
         self.fix: Fix
-        self.move_to(self._start_m, self._start_Am2)
+        self.move_to(*self._start)
 
     @property
     def array(self) -> SensorArray:
@@ -183,33 +171,26 @@ class DipoleEditor:
             self.draw_button = gui.add_button("Another draw of the noise")
             self.fit_panel = gui.add_html("")
         self._position = SharedInput(self.position_input, self._position_typed)
-        self._moment = SharedInput(self.moment_input, self._moment_typed)
-        self._decades = SharedInput(self.decades_slider, self._decades_moved)
+        self._moment = SharedInput(self.moment_input, lambda: self._strengthen(self.moment_input.value))
+        self._decades = SharedInput(self.decades_slider, lambda: self._strengthen(10.0**self.decades_slider.value))
         self._azimuth = SharedInput(self.azimuth_slider, self._turned_by_sliders)
         self._elevation = SharedInput(self.elevation_slider, self._turned_by_sliders)
-        self.back_button.on_click(lambda _: self.move_to(self._start_m, self._start_Am2))
+        self.back_button.on_click(lambda _: self.move_to(*self._start))
         self.noise_checkbox.on_update(self._follow_fit)
         self.seed_input.on_update(self._follow_fit)
-        self.draw_button.on_click(lambda _: self._draw())
+        self.draw_button.on_click(lambda _: set_value(self.seed_input, self.seed_input.value + 1))
 
     def _follow(self, *_: object) -> None:
         # The fit is a work of its own: while a slow one runs, the readings and the bound still follow the hand.
         self._follow_dipole()
         self._follow_fit()
 
-    def _draw(self) -> None:
-        set_value(self.seed_input, self.seed_input.value + 1)
-
     def _position_typed(self) -> None:
         self.control.position = np.array(self.position_input.value)
         self._follow()
 
-    def _moment_typed(self) -> None:
-        self._magnitude = float(self.moment_input.value)
-        self._follow()
-
-    def _decades_moved(self) -> None:
-        self._magnitude = float(10.0**self.decades_slider.value)
+    def _strengthen(self, magnitude_Am2: float) -> None:
+        self._magnitude = float(magnitude_Am2)
         self._follow()
 
     def _turned_by_sliders(self) -> None:

@@ -25,7 +25,7 @@ import viser
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.tracking.results import TrackPoint
+from magloc.tracking.results import TrackPoint, stacked
 from magloc.viewer.pages import words
 from magloc.viewer.panels.inputs import SharedInput
 from magloc.viewer.panels.latest import Latest
@@ -88,13 +88,15 @@ class TrackPlayer(PlayedTime):
     ) -> None:
         self.points = points
         self._poses, self._on_pose, self._on_row = array_poses, on_pose, on_row
-        time = np.array([point.time_s for point in points])
+        time = stacked(points, "time_s")
         self._since_first_s = time - time[0]
         self._span_s = float(self._since_first_s[-1])
+        positions, self._moments = stacked(points, "position_m", 3), stacked(points, "moment_Am2", 3)
         self._tracked = np.array([point.position_m is not None for point in points])
-        positions = np.array([_vector(point.position_m) for point in points])
         self.whole = screen_lines(server.scene, f"{name}/whole", line_segments(positions), _WHOLE_COLOUR, 1.5)
-        self.glyph = TrackGlyph(server.scene, f"{name}/tail", positions, _covariances(points), size_m=0.15 * size_m)
+        has_any = any(point.covariance is not None for point in points)
+        covariances = stacked(points, "covariance", 6, 6)[:, :3, :3] if has_any else None
+        self.glyph = TrackGlyph(server.scene, f"{name}/tail", positions, covariances, size_m=0.15 * size_m)
         self.dipole = DipoleGlyph(server.scene, f"{name}/moment", size_m, DIPOLE_COLOUR)
         self.index = int(np.flatnonzero(self._tracked)[-1]) if self._tracked.any() else 0
         self._follow = Latest(self._show)
@@ -153,7 +155,7 @@ class TrackPlayer(PlayedTime):
         self.index, point, now = index, self.points[index], float(self._since_first_s[index])
         first = int(np.searchsorted(self._since_first_s, now - self.tail_slider.value - 1e-9 * self._span_s))
         self.glyph.show_until(index, index - first)
-        self.dipole.show(_vector(point.position_m), _vector(point.moment_Am2))
+        self.dipole.show(self.glyph.positions_m[index], self._moments[index])
         if self._poses is not None and self._on_pose is not None:
             self._on_pose(self._poses[0][index], self._poses[1][index])
         self._time.show(now)
@@ -176,18 +178,6 @@ def row_words(point: TrackPoint, index: int, n_rows: int) -> str:
     if np.isfinite(point.nis) and point.nis_dof:
         lines.append(f"NIS/dof {point.nis:.3g}/{point.nis_dof}")
     return words.panel(lines)
-
-
-def _vector(value: FloatArray | None) -> FloatArray:
-    return np.full(3, np.nan) if value is None else value
-
-
-def _covariances(points: Sequence[TrackPoint]) -> FloatArray | None:
-    """Of the positions (n, 3, 3), NaN where there is none; None if there is none at all."""
-    if all(point.covariance is None for point in points):
-        return None
-    unknown = np.full((3, 3), np.nan)
-    return np.array([unknown if point.covariance is None else point.covariance[:3, :3] for point in points])
 
 
 def _strip(since_first_s: FloatArray, tracked: NDArray[np.bool_]) -> str:

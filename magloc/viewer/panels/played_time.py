@@ -17,11 +17,6 @@ def speed_text(speed: float) -> str:
     return f"{speed:g} ×"
 
 
-def speed_of(text: str) -> float:
-    """The speed of an entry of a dropdown."""
-    return float(text.split()[0])
-
-
 class PlayedTime:
     """A time between 0 and a duration, which a thread of its own moves while it is played.
 
@@ -96,7 +91,7 @@ class PlayedTime:
         try:
             while self.now_s < self._duration_s and not stop.wait(1.0 / _FRAMES_PER_SECOND):
                 now = perf_counter()
-                self.now_s += (now - last) * speed_of(self._speed.value)
+                self.now_s += (now - last) * float(self._speed.value.split()[0])
                 last = now
                 self._follow()
         finally:

@@ -234,14 +234,12 @@ class DipoleGlyph:
         # The moment is the frame's z axis: a turn of the frame turns all that belongs to it.
         self.frame = scene.add_frame(name, show_axes=False, visible=False)
         solid(scene, f"{name}/body", dipole_body(size_m, thickness_m), colour)
-        self.lines: viser.LineSegmentsHandle | None = None
         if reach_m is not None:
             segments = line_segments(field_lines(np.zeros(3), np.array([0.0, 0.0, 1.0]), reach_m))
-            self.lines = screen_lines(scene, f"{name}/field-lines", segments, FIELD_LINE_COLOUR, 1.3)
-        self.label: viser.LabelHandle | None = None
+            screen_lines(scene, f"{name}/field-lines", segments, FIELD_LINE_COLOUR, 1.3)
         if label:
             # Beside the tip, beyond which there may be the arrow of a control.
-            self.label = screen_label(scene, f"{name}/text", label, np.array([0.0, 0.0, 0.9 * size_m]), "center-right")
+            screen_label(scene, f"{name}/text", label, np.array([0.0, 0.0, 0.9 * size_m]), "center-right")
         self._wanted = True
         self._defined = False
 
