@@ -12,12 +12,12 @@ import tempfile
 import time
 import urllib.request
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
+from arrays.io.closing import Closing
 from arrays.io.errors import InputError
 
 BINARIES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -50,7 +50,7 @@ def find_chromium() -> str:
     raise InputError(f"found none of {', '.join(BINARIES)} on the PATH, expected one of them to draw a picture.")
 
 
-class Chromium:
+class Chromium(Closing):
     """One page of a headless Chromium; a context manager.
 
     Parameters
@@ -87,14 +87,6 @@ class Chromium:
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> Chromium:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the browser and remove its files."""
