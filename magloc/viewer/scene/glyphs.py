@@ -181,12 +181,7 @@ class ArrayGlyphs:
             label.position = self._label_place(i)
 
     def name_as_a_whole(self, text: str) -> None:
-        """One text for the array in place of the ids of its sensors, where these would be too small to be read.
-
-        Parameters
-        ----------
-        text : str
-        """
+        """One text for the array in place of the ids of its sensors, where these would be too small to be read."""
         for label in (*self.labels.values(), *self.axis_labels):
             label.visible = False
         place = self.array.centroid + np.array([0.0, 0.0, 1.3 * self.array.circumradius])
@@ -356,15 +351,7 @@ class TrackGlyph:
             self._add_ellipsoids(covariances_m2)
 
     def show_until(self, index: int, tail: int) -> None:
-        """Show the track up to a point.
-
-        Parameters
-        ----------
-        index : int
-            Of the point, which is marked, with its ellipsoid.
-        tail : int
-            Intervals before the point that are shown.
-        """
+        """Show the track up to a point, which is marked with its ellipsoid, and some intervals before it."""
         first, position = max(0, index - tail), self.positions_m[index]
         segments = line_segments(self.positions_m[first : index + 1])
         self.line.visible = bool(len(segments))
@@ -407,21 +394,7 @@ class TrackGlyph:
 def screen_label(
     scene: viser.SceneApi, name: str, text: str, place_m: ArrayLike, anchor: LabelAnchor = "bottom-center"
 ) -> viser.LabelHandle:
-    """A text that is as large on the screen from near as from far.
-
-    Parameters
-    ----------
-    scene : viser.SceneApi
-    name, text : str
-    place_m : array-like, shape (3,)
-        [m].
-    anchor : str
-        Which of the text's places that is.
-
-    Returns
-    -------
-    viser.LabelHandle
-    """
+    """A text that is as large on the screen from near as from far, with its anchor at a place (3,) [m]."""
     place = np.asarray(place_m, dtype=np.float64)
     return scene.add_label(name, text, position=place, anchor=anchor)
 
