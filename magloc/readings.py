@@ -275,9 +275,9 @@ def write_readings(path: str | PathLike[str], readings: Readings, array: SensorA
     if readings.ambient_T is not None:
         header += AMBIENT_COLUMNS
         fields.append(readings.ambient_T)
-    if readings.array_position_m is not None and readings.array_rotation is not None:
+    if readings.pose is not None:
         header += POSITION_COLUMNS + ROTATION_COLUMNS
-        plain += [readings.array_position_m, readings.array_rotation.as_quat()]
+        plain += [readings.pose[0], readings.pose[1].as_quat()]
     fields_nT = (np.hstack(fields) * _T_IN_nT).tolist()
     numbers = np.hstack(plain).tolist() if plain else [[]] * len(readings)
     lines = [",".join(header)]
@@ -289,9 +289,9 @@ def write_readings(path: str | PathLike[str], readings: Readings, array: SensorA
 
 def change_between_rows(readings: Readings) -> tuple[str, int, str] | None:
     """What keeps rows from being averaged, the first row that differs from row 0 in it, and what is expected."""
-    position_m, rotation, ambient_T = readings.array_position_m, readings.array_rotation, readings.ambient_T
-    if position_m is not None and rotation is not None:
-        pose = np.hstack([position_m, rotation.as_quat()])
+    ambient_T = readings.ambient_T
+    if readings.pose is not None:
+        pose = np.hstack([readings.pose[0], readings.pose[1].as_quat()])
         moved = np.any(pose != pose[0], axis=1)
         if moved.any():
             return "the array moved", int(moved.argmax()), "one pose for all rows that are averaged"

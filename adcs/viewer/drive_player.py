@@ -3,9 +3,9 @@
 Use::
 
     player = DrivePlayer(server, drive, scene)
-    player.show_time(90.0)
-    player.play(); player.pause()
-    player.close()                           # ends the playing thread; call it before server.stop()
+    player.move_to(90.0)
+    player.play()
+    player.pause()                           # ends the playing thread; call it before server.stop()
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _FRAMES_KEPT = 32
 _JPEG_QUALITY = 85
 
 
-class DrivePlayer:
+class DrivePlayer(PlayedTime):
     """A drive in the scene at one time, and the panels that move the time.
 
     Frames are rendered and identified when they are to be seen, and a few are kept.
@@ -57,37 +57,8 @@ class DrivePlayer:
         self._pictured: int | None = None
         self._follow = Latest(self._show)
         self._add_panels(server.gui)
-        self._played = PlayedTime(
-            drive.duration_s, self._follow, self.play_button, self.speed_dropdown, "adcs-drive-player"
-        )
-        self.show_time(0.0)
-
-    @property
-    def is_playing(self) -> bool:
-        """Whether time runs."""
-        return self._played.is_playing
-
-    def show_time(self, time_s: float) -> None:
-        """Show the drive at a time.
-
-        Parameters
-        ----------
-        time_s : float
-            Times before the beginning and after the end are those.
-        """
-        self._played.move_to(time_s)
-
-    def play(self) -> None:
-        """Let time run, from the beginning if it is at the end."""
-        self._played.play()
-
-    def pause(self) -> None:
-        """Let time stand still."""
-        self._played.pause()
-
-    def close(self) -> None:
-        """End the thread that plays; to be called before the server is stopped."""
-        self.pause()
+        super().__init__(drive.duration_s, self._follow, self.play_button, self.speed_dropdown, "adcs-drive-player")
+        self.move_to(0.0)
 
     def _add_panels(self, gui: viser.GuiApi) -> None:
         duration = self._drive.duration_s
@@ -112,11 +83,8 @@ class DrivePlayer:
             self.frame_panel = gui.add_html("")
         with tabs.add_tab("Error"):
             self.dial_panel = gui.add_html("")
-        self._time = SharedInput(self.time_slider, self._time_moved)
+        self._time = SharedInput(self.time_slider, lambda: self.move_to(float(self.time_slider.value)))
         self.enlarge_dropdown.on_update(self._enlarged)
-
-    def _time_moved(self) -> None:
-        self._played.move_to(float(self.time_slider.value))
 
     def _enlarged(self, _: object) -> None:
         self._scene.enlarged = float(self.enlarge_dropdown.value.split()[0])
@@ -124,17 +92,15 @@ class DrivePlayer:
 
     def _show(self) -> None:
         drive = self._drive
-        self.row = row = drive.row_at(self._played.now_s)
+        self.row = row = drive.row_at(self.now_s)
         fix = drive.last_fix(row)
         frame = None if fix is None else self._frame_of(fix)
         self._scene.show(row, frame)
         self._time.show(round(float(drive.truth.time_s[row]) / _STEP_S) * _STEP_S)
         self.row_panel.content = words.panel(words_of(drive, row))
+        believed = "" if drive.sigma_m is None else ", with its 3σ ellipse"
         self.dial_panel.content = self._dial.svg(row) + words.panel(
-            [
-                f"cross: truth; dot: estimate{'' if drive.sigma_m is None else ', with its 3σ ellipse'}; "
-                "line: the last 5 s. Table axes."
-            ]
+            [f"cross: truth; dot: estimate{believed}; line: the last 5 s. Table axes."]
         )
         if fix == self._pictured:
             return

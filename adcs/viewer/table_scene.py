@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import trimesh
 import viser
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from adcs.mockup.navigation.fixes import Outcome
 from adcs.mockup.vision.camera import Pose, footprint
@@ -16,9 +14,9 @@ from adcs.viewer.drive import Drive, SeenFrame
 from adcs.viewer.frame_image import IDENTIFIED_COLOUR, OTHER_STAR_COLOUR, ceiling_sheet
 from arrays.typing import FloatArray
 from magloc.viewer.scene.framing import Extent, extent_of
-from magloc.viewer.scene.glyphs import screen_label
+from magloc.viewer.scene.glyphs import screen_label, screen_lines, solid
 from magloc.viewer.scene.legend import Colour, Swatch
-from magloc.viewer.scene.shapes import Surface, joined, line_segments
+from magloc.viewer.scene.shapes import Surface, line_segments, surface_of
 
 CEILING_M = 1.5
 """Height of the sky above the table; the source does not tell it."""
@@ -38,20 +36,6 @@ _RING_M, _ARROW_M = 0.105, 0.24
 _LIGHT_M = 0.016
 _TRAIL_POINTS = 400
 _AROUND = 40
-
-
-class Mark(NamedTuple):
-    """A ring with an arrow, and the frame that moves them."""
-
-    frame: viser.FrameHandle
-    lines: viser.LineSegmentsHandle
-
-    def show(self, place_m: ArrayLike, heading_rad: float) -> None:
-        """Move it, and show it."""
-        x, y = np.asarray(place_m, dtype=np.float64).tolist()
-        self.frame.position = np.array([x, y, 0.0])
-        self.frame.wxyz = turn_about_z(heading_rad)
-        self.frame.visible = True
 
 
 class TableScene:
@@ -75,43 +59,28 @@ class TableScene:
         self._add_room()
         path = np.column_stack([drive.truth.position_m, np.full(len(drive.truth), 0.003)])
         step = max(1, len(path) // (5 * _TRAIL_POINTS))
-        scene.add_line_segments(
-            "/path/whole", line_segments(path[::step]), _PATH_COLOUR, thickness=1.0, thickness_units="screen"
-        )
+        screen_lines(scene, "/path/whole", line_segments(path[::step]), _PATH_COLOUR, 1.0)
         self._trails = [
-            scene.add_line_segments(
-                f"/path/{name}", np.zeros((1, 2, 3)), colour, thickness=width, thickness_units="screen", visible=False
-            )
+            screen_lines(scene, f"/path/{name}", np.zeros((1, 2, 3)), colour, width, visible=False)
             for name, colour, width in (("truth", TRUTH_COLOUR, 2.5), ("estimate", ESTIMATE_COLOUR, 2.0))
         ]
         self._satellite = scene.add_frame("/satellite", show_axes=False)
-        body = satellite_body()
-        scene.add_mesh_simple(
-            "/satellite/body", body.vertices, body.faces, color=TRUTH_COLOUR, flat_shading=True, cast_shadow=False,
-            receive_shadow=False,
-        )  # fmt: skip
+        solid(scene, "/satellite/body", satellite_body(), TRUTH_COLOUR, flat=True)
         self._estimate = self._mark("/estimate", ESTIMATE_COLOUR, _HEIGHT_M + 0.01, 4.0)
         self._late = self._mark("/fix", FIX_COLOUR, _HEIGHT_M + 0.006, 3.0)
         self._rejected = self._mark("/rejected-fix", _REJECTED_COLOUR, _HEIGHT_M + 0.006, 3.0)
         rim = unit_circle()
         disc = np.concatenate([np.zeros((1, 3)), rim[:-1]])
         faces = np.array([[0, i + 1, (i + 1) % (_AROUND) + 1] for i in range(_AROUND)])
-        self._ellipse = scene.add_mesh_simple(
-            "/ellipse", disc, faces, color=ESTIMATE_COLOUR, opacity=0.3, side="double", visible=False,
-            cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
+        self._ellipse = solid(scene, "/ellipse", Surface(disc, faces), ESTIMATE_COLOUR, opacity=0.3)
+        self._ellipse.visible = False
         # What the camera sees moves with it: only poses change.
         outline = self._outline_from_body()
         lens = np.array([0.0, 0.0, _HEIGHT_M])
         edges = np.stack([np.broadcast_to(lens, (4, 3)), outline[: -1 : len(outline) // 4]], axis=1)
-        scene.add_line_segments(
-            "/satellite/view", np.concatenate([line_segments(outline), edges]), VIEW_COLOUR, thickness=1.6,
-            thickness_units="screen",
-        )  # fmt: skip
+        screen_lines(scene, "/satellite/view", np.concatenate([line_segments(outline), edges]), VIEW_COLOUR, 1.6)
         self._exposure = scene.add_frame("/exposure", show_axes=False, visible=False)
-        scene.add_line_segments(
-            "/exposure/edge", line_segments(outline), FIX_COLOUR, thickness=2.0, thickness_units="screen"
-        )
+        screen_lines(scene, "/exposure/edge", line_segments(outline), FIX_COLOUR, 2.0)
         self._sheet: viser.ImageHandle | None = None
         self._age = screen_label(scene, "/age", "", np.zeros(3))
         self._age.visible = False
@@ -127,10 +96,9 @@ class TableScene:
         """
         drive = self._drive
         truth, pose = drive.truth.position_m[row], drive.true_pose(row)
-        self._satellite.position = np.array([*truth, 0.0])
-        self._satellite.wxyz = turn_about_z(float(pose.heading_rad))
+        stand(self._satellite, pose)
         place = truth + self.enlarged * drive.errors_m[row]
-        self._estimate.show(place, float(drive.track.heading_rad[row]))
+        show_at(self._estimate, place, float(drive.track.heading_rad[row]))
         if drive.sigma_m is not None:
             semi_axes = 3.0 * self.enlarged * drive.sigma_m[row]
             self._ellipse.scale = (float(semi_axes[0]), float(semi_axes[1]), 1.0)
@@ -155,7 +123,7 @@ class TableScene:
         drive = self._drive
         fix = drive.last_fix(row)
         if fix is None or frame is None:
-            for handle in (self._late.frame, self._rejected.frame, self._exposure, self._age):
+            for handle in (self._late, self._rejected, self._exposure, self._age):
                 handle.visible = False
             if self._fix is not None:
                 self._lights.batched_colors = self._light_colours(None)
@@ -168,8 +136,8 @@ class TableScene:
         self._fix = fix
         rejected = drive.outcomes[fix] is Outcome.REJECTED
         shown, hidden = (self._rejected, self._late) if rejected else (self._late, self._rejected)
-        shown.show(drive.fixes.position_m[fix], float(drive.fixes.heading_rad[fix]))
-        hidden.frame.visible = False
+        show_at(shown, drive.fixes.position_m[fix], float(drive.fixes.heading_rad[fix]))
+        hidden.visible = False
         self._age.position = np.array([*drive.fixes.position_m[fix], _HEIGHT_M + 0.16])
         self._age.visible = True
         self._show_frame(frame, drive.pose_of_exposure(fix))
@@ -185,8 +153,7 @@ class TableScene:
                 cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
         self._sheet.image = sheet
-        self._exposure.position = np.array([pose.x_m, pose.y_m, 0.0])
-        self._exposure.wxyz = turn_about_z(float(pose.heading_rad))
+        stand(self._exposure, pose)
         self._exposure.visible = True
 
     def _light_colours(self, frame: SeenFrame | None) -> NDArray[np.uint8]:
@@ -201,16 +168,15 @@ class TableScene:
         closed = np.concatenate([outline, outline[:1]])
         return np.column_stack([closed, np.full(len(closed), CEILING_M)])
 
-    def _mark(self, name: str, colour: Colour, height_m: float, width: float) -> Mark:
+    def _mark(self, name: str, colour: Colour, height_m: float, width: float) -> viser.FrameHandle:
+        """A ring with an arrow, in a frame that moves them."""
         frame = self._scene.add_frame(name, show_axes=False, visible=False)
         tip = np.array([_ARROW_M, 0.0, 0.0])
         barbs = [tip + np.array([-0.06, side * 0.045, 0.0]) for side in (1.0, -1.0)]
         shaft = np.array([[[_RING_M, 0.0, 0.0], tip], [barbs[0], tip], [barbs[1], tip]])
         lines = np.concatenate([line_segments(_RING_M * unit_circle()), shaft]) + np.array([0.0, 0.0, height_m])
-        return Mark(
-            frame,
-            self._scene.add_line_segments(f"{name}/lines", lines, colour, thickness=width, thickness_units="screen"),
-        )
+        screen_lines(self._scene, f"{name}/lines", lines, colour, width)
+        return frame
 
     def _add_room(self) -> None:
         scene, lights = self._scene, self._drive.lights_m
@@ -222,15 +188,9 @@ class TableScene:
         )  # fmt: skip
         (x0, y0), (x1, y1) = lights.min(axis=0) - 0.05, lights.max(axis=0) + 0.05
         corners = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
-        scene.add_line_segments(
-            "/ceiling", line_segments(np.column_stack([corners, np.full(5, CEILING_M)])), LIGHT_COLOUR, thickness=1.5,
-            thickness_units="screen",
-        )  # fmt: skip
-        table = table_body()
-        scene.add_mesh_simple(
-            "/table", table.vertices, table.faces, color=TABLE_COLOUR, flat_shading=True, cast_shadow=False,
-            receive_shadow=False,
-        )  # fmt: skip
+        edges = line_segments(np.column_stack([corners, np.full(5, CEILING_M)]))
+        screen_lines(scene, "/ceiling", edges, LIGHT_COLOUR, 1.5)
+        solid(scene, "/table", table_body(), TABLE_COLOUR, flat=True)
 
 
 def scene_extent(drive: Drive) -> Extent:
@@ -264,6 +224,19 @@ def suitable_enlargement(usual_error_m: float) -> float:
 ENLARGEMENTS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 
 
+def stand(frame: viser.FrameHandle, pose: Pose) -> None:
+    """Put a frame on the table."""
+    frame.position = np.array([pose.x_m, pose.y_m, 0.0])
+    frame.wxyz = turn_about_z(float(pose.heading_rad))
+
+
+def show_at(frame: viser.FrameHandle, place_m: FloatArray, heading_rad: float) -> None:
+    """Put a frame on the table, and show it."""
+    x, y = place_m.tolist()
+    stand(frame, Pose(x, y, heading_rad))
+    frame.visible = True
+
+
 def turn_about_z(angle_rad: float) -> FloatArray:
     """Quaternion (w, x, y, z)."""
     return np.array([np.cos(0.5 * angle_rad), 0.0, 0.0, np.sin(0.5 * angle_rad)])
@@ -281,7 +254,7 @@ def satellite_body() -> Surface:
     lens = trimesh.creation.cylinder(0.3 * _RADIUS_M, sections=24, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, _HEIGHT_M]])
     nose = trimesh.creation.box(extents=[0.06, 0.035, 0.03])
     nose.apply_translation([_RADIUS_M + 0.02, 0.0, 0.05])
-    return _joined(can, lens, nose)
+    return surface_of(can, lens, nose)
 
 
 def table_body() -> Surface:
@@ -296,8 +269,4 @@ def table_body() -> Surface:
         for a in (-1.0, 1.0)
         for b in (-1.0, 1.0)
     ]
-    return _joined(slab, *legs)
-
-
-def _joined(*parts: trimesh.Trimesh) -> Surface:
-    return joined(Surface(np.array(part.vertices), np.array(part.faces, dtype=np.int64)) for part in parts)
+    return surface_of(slab, *legs)

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
-from importlib.metadata import version
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +25,7 @@ from arrays.typing import FloatArray
 from magloc.bounds.over_moments import table_and_spreads
 from magloc.directions import moments_on_sphere
 from magloc.grids.computed import computed_map
-from magloc.grids.cube import Box, Tally, Values, Variable, check_half_width, tallied
+from magloc.grids.cube import Box, CubeMap, Tally, Values, Variable, check_half_width, described, flags, tallied
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -43,7 +42,7 @@ CASES = tuple(CASES_IN_WORDS)
 """Endings of the variables: the given moment, and the statistics over the directions of the moment."""
 PLANES = ("xy", "xz", "yz")
 _UNITS = {"range": "m", "bearing": "rad", "position": "m"}
-_EDGE = 32
+_TITLE = "Cramer-Rao bounds of a magnetic dipole"
 
 
 class Reached(IntEnum):
@@ -104,20 +103,19 @@ class BoundScenario:
         return moments_on_sphere(size, self.n_moments, half=half)
 
     @property
-    def attributes(self) -> dict[str, Any]:
-        """What determines the bounds, for a dataset."""
-        from arrays.array_file import array_toml
-
+    def settings(self) -> dict[str, Any]:
+        """What determines the bounds beside the array, for a dataset."""
         return {
-            "Conventions": "CF-1.10",
-            "title": "Cramer-Rao bounds of a magnetic dipole",
-            "source": f"magloc {version('magloc')}",
-            "array": array_toml(self.array),
             "moment_Am2": np.asarray(self.moment_Am2, dtype=np.float64),
             "n_moments": self.n_moments,
             "accuracy_m": self.accuracy_m,
             "ambient_uncertainty_nT": 1e9 * self.ambient_uncertainty_T,
         }
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """All of it, for a dataset."""
+        return {**described(_TITLE, self.array), **self.settings}
 
 
 def bounds_at(scenario: BoundScenario, positions_m: ArrayLike) -> dict[str, FloatArray]:
@@ -138,57 +136,47 @@ def bounds_at(scenario: BoundScenario, positions_m: ArrayLike) -> dict[str, Floa
     return values
 
 
+VARIABLES: dict[str, Variable] = {
+    f"sigma_{name}{case}": Variable(
+        np.float64,
+        {"long_name": f"Cramer-Rao bound of the {name}, standard deviation, {CASES_IN_WORDS[case]}", "units": unit},
+    )
+    for name, unit in _UNITS.items()
+    for case in CASES
+} | {
+    "reached": Variable(
+        np.int8,
+        {
+            "long_name": "for which directions of the moment the range is as accurate as required",
+            **flags(Reached),
+        },
+    )
+}
+
+
 @dataclass(frozen=True, eq=False)
-class BoundMap:
-    """Bounds over a cube of sources, as :class:`magloc.grids.cube.CubeMap`."""
+class BoundMap(CubeMap):
+    """Bounds over a cube of sources."""
+
+    title = _TITLE
+    variables = VARIABLES
 
     scenario: BoundScenario
-    grid: int
-
-    def __post_init__(self) -> None:
-        if self.grid < 2:
-            raise ValueError(f"Input grid must be at least 2; instead received {self.grid}.")
 
     @property
-    def edge(self) -> int:
-        """Points along the edges of a box."""
-        return _EDGE
-
-    @property
-    def axis(self) -> FloatArray:
-        """Coordinates of the sources relative to the array's centroid [m], shape (grid,)."""
-        return np.linspace(-self.scenario.half_width_m, self.scenario.half_width_m, self.grid)
-
-    @property
-    def point(self) -> str:
-        """What a point is."""
-        return "source"
-
-    @property
-    def variables(self) -> Mapping[str, Variable]:
-        """Variables over the cube."""
-        return VARIABLES
-
-    @property
-    def attributes(self) -> Mapping[str, Any]:
-        """All that determines the map."""
-        return {**self.scenario.attributes, "grid": self.grid, "half_width_m": self.scenario.half_width_m}
-
-    @property
-    def findings(self) -> Mapping[str, Any]:
-        """Where the cube is."""
-        return {"centroid_m": self.scenario.array.centroid}
+    def settings(self) -> Mapping[str, Any]:
+        """Moment, and what is required."""
+        return self.scenario.settings
 
     def warm_up(self) -> None:
         """Compile, or load what was compiled."""
         array = self.scenario.array
         bounds_at(self.scenario, array.centroid + 3.0 * array.circumradius * np.eye(3)[:1])
 
-    def values(self, box: Box) -> Values:
+    def values_at(self, box: Box) -> Mapping[str, Any]:
         """Bounds of the sources of a box."""
         sigma = bounds_at(self.scenario, self.scenario.array.centroid + box.points(self.axis))
-        values = {**sigma, "reached": _reached(sigma, self.scenario.accuracy_m)}
-        return {name: values[name].reshape(box.shape).astype(VARIABLES[name].dtype) for name in VARIABLES}
+        return {**sigma, "reached": _reached(sigma, self.scenario.accuracy_m)}
 
 
 @dataclass(frozen=True)
@@ -306,22 +294,3 @@ def _reached(sigma: Mapping[str, FloatArray], accuracy_m: float) -> Any:
     undefined = np.isnan(sigma["sigma_range"])
     count = sum((sigma[f"sigma_range{case}"] <= accuracy_m).astype(np.int8) for case in CASES[1:])
     return np.where(undefined, Reached.UNDEFINED, count)
-
-
-VARIABLES: dict[str, Variable] = {
-    f"sigma_{name}{case}": Variable(
-        np.float64,
-        {"long_name": f"Cramer-Rao bound of the {name}, standard deviation, {CASES_IN_WORDS[case]}", "units": unit},
-    )
-    for name, unit in _UNITS.items()
-    for case in CASES
-} | {
-    "reached": Variable(
-        np.int8,
-        {
-            "long_name": "for which directions of the moment the range is as accurate as required",
-            "flag_values": np.array([s.value for s in Reached], dtype=np.int8),
-            "flag_meanings": " ".join(s.name.lower() for s in Reached),
-        },
-    )
-}

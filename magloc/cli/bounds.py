@@ -18,7 +18,7 @@ from arrays.io.outputs import refuse_file
 from arrays.io.text import replace_file, write_netcdf
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, print_json, progress
-from magloc.cli.options import Grid, print_note
+from magloc.cli.options import Grid, print_note, refuse_not_positive
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -184,10 +184,7 @@ def _checked(array: SensorArray, place: FloatArray, of: SourceOptions, task: Tas
     """Radius of the sphere, once the options are known to be in bounds."""
     import numpy as np
 
-    lengths = (("--range-m", task.range_m), ("--half-width-m", task.half_width_m), ("--accuracy-m", task.accuracy_m))
-    for option, value in lengths:
-        if value is not None and not 0.0 < value < math.inf:
-            raise InputError(f"{option}: found {value:g}, expected a positive length.")
+    refuse_not_positive(task, "range_m", "half_width_m", "accuracy_m", expected="a positive length")
     if not 1e-4 <= task.false_alarm_rate < 0.5:
         raise InputError(
             f"--false-alarm-rate: found {task.false_alarm_rate:g}, expected 0.0001 or more, and less than 0.5."

@@ -15,7 +15,7 @@ from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import make_folder, refuse_file, refuse_unwritable
 from magloc.cli.framework import CommonOptions, print_json
-from magloc.cli.options import print_note
+from magloc.cli.options import print_note, refuse_not_positive
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -189,10 +189,7 @@ def _prior(options: PriorOptions, array: SensorArray, path: Path) -> Calibration
                 raise InputError(
                     f"{option}: found {name!r}, expected ids of sensors in {path}: {', '.join(array.ids)}."
                 )
-    for name in ("position_prior_mm", "gain_prior", "axes_prior_deg", "offset_prior_nT"):
-        value = getattr(options, name)
-        if not 0.0 < value < math.inf:
-            raise InputError(f"--{name.replace('_', '-')}: found {value:g}, expected a positive number.")
+    refuse_not_positive(options, "position_prior_mm", "gain_prior", "axes_prior_deg", "offset_prior_nT")
     return magloc.CalibrationPrior(
         position_m=options.position_prior_mm * 1e-3,
         gain=options.gain_prior,

@@ -170,7 +170,7 @@ def locate(
     if out is not None:
         from magloc.plots.localization import write_pictures
 
-        write_pictures(pictured, noisy, fixes, ambient_T, true_position_m, out, quiet=common.quiet)
+        write_pictures(pictured, noisy, fixes, ambient_T, true_position_m, out)
     if common.quiet:
         return
     if not json:

@@ -31,6 +31,14 @@ def print_note(text: str) -> None:
     framework.print_note(text, "magloc")
 
 
+def refuse_not_positive(options: object, *names: str, expected: str = "a positive number") -> None:
+    """Refuse an option that is given and not positive and finite, by the names of the fields that hold them."""
+    for name in names:
+        value = getattr(options, name)
+        if value is not None and not 0.0 < value < math.inf:
+            raise InputError(f"--{name.replace('_', '-')}: found {value:g}, expected {expected}.")
+
+
 Grid = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=2, lte=2000))]
 """Points along an axis: 2000 are 8,000,000,000 points, more than a day of work."""
 

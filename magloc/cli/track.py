@@ -18,7 +18,7 @@ from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file, refuse_one_for_two, refuse_unwritable
 from arrays.io.text import write_text
 from magloc.cli.framework import CommonOptions, print_json, progress
-from magloc.cli.options import KnownOptions, print_note
+from magloc.cli.options import KnownOptions, print_note, refuse_not_positive
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -60,10 +60,7 @@ class MotionOptions:
 
     def model(self, *, smooth: bool) -> MotionModel:
         """The motion model that the options name."""
-        for name in ("speed_m_s", "turn_deg_s", "correlation_s"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 < value < math.inf:
-                raise InputError(f"--{name.replace('_', '-')}: found {value:g}, expected a positive number.")
+        refuse_not_positive(self, "speed_m_s", "turn_deg_s", "correlation_s")
         turn = math.radians(self.turn_deg_s)
         name = self.motion or ("wandering" if smooth else "unknown")
         if name == "unknown":
@@ -100,8 +97,7 @@ class ConditioningOptions:
         from magloc.averages import window_averages, window_averaging_array
         from magloc.readings import without_saturated
 
-        if self.window_s is not None and not 0.0 < self.window_s < math.inf:
-            raise InputError(f"--window-s: found {self.window_s:g}, expected a positive number.")
+        refuse_not_positive(self, "window_s")
         rows = without_saturated(rows, array)
         try:
             if self.detrend:
@@ -212,7 +208,6 @@ def track(
             nees=None if result is None else (result.nees, result.nees_dof),
             bound_m=None if result is None else result.bound_m,
             array_m=rows.array_position_m,
-            quiet=common.quiet,
         )
     _print_track(found, result, json=json, jsonl=jsonl, printed=printed)
     if result is not None and not json:

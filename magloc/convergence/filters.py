@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.convergence import filters_compiled as lanes
+from magloc.convergence.filters_compiled import DAMPED, DAMPING_DECREASE, DAMPING_INCREASE, IEKF, REPEATED, Ends, ends
+from magloc.convergence.linearisation_compiled import Model
 from magloc.convergence.relinearised_compiled import relinearised_map
 from magloc.kalman import IteratedUpdate, iterated_update, predict_square_root, scalar_update, sequential_update
 from magloc.localization.search.single_source import SingleSourceSearch
@@ -19,27 +20,6 @@ from magloc.measurement.differences import DifferenceMeasurement
 CHI2_REACHED = 0.05
 # Distance from the maximum-likelihood position that a filter with a prior may keep.
 PRIOR_REACHED_M = 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class Ends:
-    """Ends of many starts.
-
-    Attributes
-    ----------
-    states : ndarray, shape (n, 6)
-        (position [m], moment [A·m²]).
-    chi2 : ndarray, shape (n,)
-    iterations : ndarray of int, shape (n,)
-        Passes over the readings.
-    stopped : ndarray of bool, shape (n,)
-        Whether the stop rule was met.
-    """
-
-    states: FloatArray
-    chi2: FloatArray
-    iterations: NDArray[np.int64]
-    stopped: NDArray[np.bool_]
 
 
 class Filter(Protocol):
@@ -115,17 +95,13 @@ class RepeatedFilter(_LikelihoodFilter):
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
-        run_all = relinearised_map if self.relinearise_every_scalar else lanes.repeated_map
-        return Ends(
-            *run_all(
-                *_inputs(measurement, z, starts),
-                self.noise_inflation,
-                self.position_step_m,
-                self.moment_step_Am2,
-                self.tolerance_T,
-                self.max_iterations,
-            )
-        )
+        z, variance, sensors, weights = _inputs(measurement, z)
+        inflation, rule = self.noise_inflation, (self.tolerance_T, self.max_iterations)
+        steps = self.position_step_m, self.moment_step_Am2
+        if self.relinearise_every_scalar:
+            return relinearised_map(starts, z, variance, sensors, weights, inflation, *steps, *rule)
+        found = ends(REPEATED, Model.of(z, inflation * variance, sensors, weights, *steps), starts, *rule)
+        return found._replace(chi2=inflation * found.chi2)
 
     def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
         """End of one start (6,), by the square-root filter of :mod:`magloc.kalman`."""
@@ -168,15 +144,8 @@ class IekfFilter(_PriorFilter):
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
-        return Ends(
-            *lanes.iekf_map(
-                *_inputs(measurement, z, starts),
-                self.position_sigma_m,
-                self.moment_sigma_Am2,
-                self.tolerance_T,
-                self.max_iterations,
-            )
-        )
+        model = Model.of(*_inputs(measurement, z), self.position_sigma_m, self.moment_sigma_Am2)
+        return ends(IEKF, model, starts, self.tolerance_T, self.max_iterations)
 
     def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
         """End of one start (6,), by :func:`magloc.kalman.iterated_update`."""
@@ -225,16 +194,8 @@ class DampedFilter(_PriorFilter):
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """End of every start (n, 6), compiled; :meth:`run_one` is the readable twin."""
-        return Ends(
-            *lanes.damped_map(
-                *_inputs(measurement, z, starts),
-                self.position_sigma_m,
-                self.moment_sigma_Am2,
-                self.first_damping,
-                self.tolerance_T,
-                self.max_iterations,
-            )
-        )
+        model = Model.of(*_inputs(measurement, z), self.position_sigma_m, self.moment_sigma_Am2)
+        return ends(DAMPED, model, starts, self.tolerance_T, self.max_iterations, self.first_damping)
 
     def run_one(self, measurement: DifferenceMeasurement, z: FloatArray, start: FloatArray) -> IteratedUpdate:
         """End of one start (6,), in units of the standard deviations of readings and prior."""
@@ -261,10 +222,10 @@ class DampedFilter(_PriorFilter):
             small = change < self.tolerance_T
             stopped = small and damping == 0.0
             if at_trial[1] @ at_trial[1] < residual @ residual:
-                x, kept = trial, kept / lanes.DAMPING_DECREASE
+                x, kept = trial, kept / DAMPING_DECREASE
                 predicted, residual, J = at_trial
             else:
-                kept *= lanes.DAMPING_INCREASE
+                kept *= DAMPING_INCREASE
             # Damping alone can make a step small: the stop rule is left to the step without it.
             damping = 0.0 if small else kept
             ended = stopped or iteration >= self.max_iterations or not np.all(np.isfinite(residual))
@@ -310,14 +271,11 @@ FILTERS: dict[str, Filter] = {
 }
 
 
-_Inputs = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
-
-
-def _inputs(measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> _Inputs:
-    """What every compiled filter is given first; the known ambient field, which none models, is taken out of z."""
+def _inputs(measurement: DifferenceMeasurement, z: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Differences, their variances, sensors and weights; the known ambient field, which no model has, is taken out."""
     array = measurement.array
     of_source = z - measurement.measured(array.readings_of(array.ambient_fields))
-    return starts, of_source, measurement.variance, array.positions, field_weights(measurement)
+    return of_source, measurement.variance, array.positions, field_weights(measurement)
 
 
 def field_weights(measurement: DifferenceMeasurement) -> FloatArray:

@@ -54,8 +54,19 @@ DAMPING_DECREASE = 5.0
 DAMPING_INCREASE = 4.0
 
 
-class Ended(NamedTuple):
-    """States (n, 6) in SI, χ², iterations, whether the stop rule was met."""
+class Ends(NamedTuple):
+    """Ends of many starts.
+
+    Attributes
+    ----------
+    states : ndarray, shape (n, 6)
+        (position [m], moment [A·m²]).
+    chi2 : ndarray, shape (n,)
+    iterations : ndarray of int, shape (n,)
+        Passes over the readings.
+    stopped : ndarray of bool, shape (n,)
+        Whether the stop rule was met.
+    """
 
     states: FloatArray
     chi2: FloatArray
@@ -71,85 +82,30 @@ class _Rules(NamedTuple):
     max_iterations: float
 
 
-def iekf_map(
-    starts: FloatArray,
-    z: FloatArray,
-    variance: FloatArray,
-    sensors: FloatArray,
-    weights: FloatArray,
-    position_sigma_m: float,
-    moment_sigma_Am2: float,
-    tolerance_T: float,
-    max_iterations: int,
-) -> Ended:
-    """Iterated update from every start (n, 6) as prior mean, with the prior's standard deviations.
-
-    Difference j of the readings, z[j] of the given variance, is ``Σ_i weights[j, i] · B_i`` with weights (k, N, 3) and
-    the sensors (N, 3) in the array's frame.
-    """
-    model = Model.of(z, variance, sensors, weights, position_sigma_m, moment_sigma_Am2)
-    return _ends(model, IEKF, starts, 0.0, tolerance_T, max_iterations)
-
-
-def repeated_map(
-    starts: FloatArray,
-    z: FloatArray,
-    variance: FloatArray,
-    sensors: FloatArray,
-    weights: FloatArray,
-    inflation: float,
-    position_step_m: float,
-    moment_step_Am2: float,
-    tolerance_T: float,
-    max_iterations: int,
-) -> Ended:
-    """As :func:`iekf_map`, of the repeated-measurement filter; S_q has the two steps, variances grow by `inflation`."""
-    model = Model.of(z, inflation * variance, sensors, weights, position_step_m, moment_step_Am2)
-    ended = _ends(model, REPEATED, starts, 0.0, tolerance_T, max_iterations)
-    return ended._replace(chi2=inflation * ended.chi2)
-
-
-def damped_map(
-    starts: FloatArray,
-    z: FloatArray,
-    variance: FloatArray,
-    sensors: FloatArray,
-    weights: FloatArray,
-    position_sigma_m: float,
-    moment_sigma_Am2: float,
-    first_damping: float,
-    tolerance_T: float,
-    max_iterations: int,
-) -> Ended:
-    """Levenberg-Marquardt iteration on the cost that :func:`iekf_map` minimises, with the same arguments."""
-    model = Model.of(z, variance, sensors, weights, position_sigma_m, moment_sigma_Am2)
-    return _ends(model, DAMPED, starts, first_damping, tolerance_T, max_iterations)
-
-
-def _ends(
-    model: Model, method: int, starts: FloatArray, first_damping: float, tolerance_T: float, max_iterations: int
-) -> Ended:
-    """End of every start (n, 6) in SI."""
+def ends(
+    method: int, model: Model, starts: FloatArray, tolerance_T: float, max_iterations: int, first_damping: float = 0.0
+) -> Ends:
+    """End of every start (n, 6), the mean of its prior, by IEKF, REPEATED or DAMPED; a step has the prior's units."""
     unit = np.repeat([model.length, model.moment], 3)
     tolerance = tolerance_T / (model.moment / model.length**3)
-    states, chi2, iterations, stopped = _run(
+    found = _run(
         method,
         np.ascontiguousarray(starts / unit),
         _Rules(float(first_damping), tolerance**2, float(max_iterations)),
         min(get_num_threads(), -(-len(starts) // LANES)),
         model,
     )
-    return Ended(states * unit, chi2, iterations, stopped)
+    return Ends(found.states * unit, found.chi2, found.iterations, found.stopped)
 
 
 @compiled_parallel
-def _run(method: int, starts: FloatArray, rules: _Rules, n_blocks: int, model: Model) -> Ended:
+def _run(method: int, starts: FloatArray, rules: _Rules, n_blocks: int, model: Model) -> Ends:
     n = starts.shape[0]
     states, chi2 = np.empty((n, 6)), np.empty(n)
     iterations, stopped = np.empty(n, np.int64), np.empty(n, np.bool_)
     for block in prange(n_blocks):
-        _run_block(method, starts, block, n_blocks, rules, model, Ended(states, chi2, iterations, stopped))
-    return Ended(states, chi2, iterations, stopped)
+        _run_block(method, starts, block, n_blocks, rules, model, Ends(states, chi2, iterations, stopped))
+    return Ends(states, chi2, iterations, stopped)
 
 
 @compiled
@@ -160,7 +116,7 @@ def _run_block(
     n_blocks: int,
     rules: _Rules,
     model: Model,
-    out: Ended,
+    out: Ends,
 ) -> None:
     """Starts block, block + n_blocks, … from first to last."""
     n, first = starts.shape[0], np.int64(block)  # prange counts in unsigned numbers

@@ -7,12 +7,10 @@ truth. Whether that solution is any good is physics, not search: the Cramér-Rao
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
-from importlib.metadata import version
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -22,10 +20,21 @@ from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.noise import reading_errors
 from arrays.typing import FloatArray
-from arrays.whitening import Whitening, whitening
+from arrays.whitening import whitening
 from magloc.bounds.crlb import cramer_rao_bounds
 from magloc.grids.computed import computed_map
-from magloc.grids.cube import Box, Tally, Values, Variable, check_half_width, histogram, tallied
+from magloc.grids.cube import (
+    Box,
+    CubeMap,
+    Summary,
+    Tally,
+    Values,
+    Variable,
+    check_half_width,
+    common_counts,
+    flags,
+    tallied,
+)
 from magloc.localization.fit.results import Fix
 from magloc.localization.locator import Locator
 from magloc.localization.search.single_source import N_UNKNOWNS
@@ -85,16 +94,55 @@ class SourcesScenario:
             raise ValueError(f"Input moment_Am2 must be positive and finite; instead received {self.moment_Am2}.")
 
 
+_NO_YES = {"flag_values": np.array([-1, 0, 1], dtype=np.int8), "flag_meanings": "left_out no yes"}
+_LEFT_OUT = {
+    "status": SourceStatus.LEFT_OUT,
+    "iterations": 0,
+    "solutions": 0,
+    "truth_listed": -1,
+    "range_observable": -1,
+}
+_VARIABLES = {
+    "status": Variable(
+        np.int8,
+        {
+            "long_name": "how the fix of the source ended",
+            **flags(SourceStatus),
+        },
+    ),
+    "iterations": Variable(np.int32, {"long_name": "linearisations that led to the best solution", "units": "1"}),
+    "chi2": Variable(np.float64, {"long_name": "chi-square of the best solution", "units": "1"}),
+    "chi2_from_truth": Variable(
+        np.float64, {"long_name": "chi-square of the optimum searched from the truth", "units": "1"}
+    ),
+    "distance": Variable(np.float64, {"long_name": "distance of the best solution from the truth", "units": "m"}),
+    "solutions": Variable(np.int32, {"long_name": "distinct solutions within 20 of the best chi-square", "units": "1"}),
+    "truth_listed": Variable(
+        np.int8, {"long_name": "whether the optimum searched from the truth is among the solutions", **_NO_YES}
+    ),
+    "range_observable": Variable(
+        np.int8, {"long_name": "whether the readings fix the range of the best solution", **_NO_YES}
+    ),
+    "sigma_range": Variable(
+        np.float64, {"long_name": "Cramer-Rao bound of the standard deviation of the range", "units": "m"}
+    ),
+    "sigma_position": Variable(
+        np.float64, {"long_name": "Cramer-Rao bound of the position, root of the trace", "units": "m"}
+    ),
+}
+
+
 @dataclass(frozen=True, eq=False)
-class SourcesMap:
-    """Map of fixes over a cube of sources, as :class:`magloc.grids.cube.CubeMap`."""
+class SourcesMap(CubeMap):
+    """Map of fixes over a cube of sources."""
+
+    title = "Start-free fixes over a cube of sources"
+    variables = _VARIABLES
 
     scenario: SourcesScenario
-    grid: int
 
     def __post_init__(self) -> None:
-        if self.grid < 2:
-            raise ValueError(f"Input grid must be at least 2; instead received {self.grid}.")
+        super().__post_init__()
         if self.scenario.array.channel_is_scalar.any():
             raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
         n_differences = whitening(self.scenario.array).n_differences
@@ -119,44 +167,16 @@ class SourcesMap:
         return _EDGE
 
     @property
-    def axis(self) -> FloatArray:
-        """Coordinates of the sources relative to the array's centroid [m], shape (grid,)."""
-        return np.linspace(-self.scenario.half_width_m, self.scenario.half_width_m, self.grid)
-
-    @property
-    def point(self) -> str:
-        """What a point is."""
-        return "source"
-
-    @property
-    def variables(self) -> Mapping[str, Variable]:
-        """Variables over the cube."""
-        return _VARIABLES
-
-    @property
-    def attributes(self) -> Mapping[str, Any]:
-        """All that determines the map."""
-        from arrays.array_file import array_toml
-
+    def settings(self) -> Mapping[str, Any]:
+        """Which sources, and how they are found."""
         scenario = self.scenario
         return {
-            "Conventions": "CF-1.10",
-            "title": "Start-free fixes over a cube of sources",
-            "source": f"magloc {version('magloc')}",
-            "grid": self.grid,
             "method": "global",
-            "array": array_toml(scenario.array),
-            "half_width_m": scenario.half_width_m,
             "nearest_m": scenario.nearest_m,
             "farthest_m": scenario.farthest_m,
             "moment_magnitude_Am2": scenario.moment_Am2,
             "seed": str(scenario.seed),  # of any size
         }
-
-    @property
-    def findings(self) -> Mapping[str, Any]:
-        """Where the cube is."""
-        return {"centroid_m": self.scenario.array.centroid}
 
     def warm_up(self) -> None:
         """Compile, or load what was compiled."""
@@ -166,7 +186,7 @@ class SourcesMap:
         readings = self._readings(position, moment, np.zeros((1, array.n_channels)))
         self._lists(self._locator.fit_rows(readings)[0], *self._searched_from(position, readings)[0])
 
-    def values(self, box: Box) -> Values:
+    def values_at(self, box: Box) -> Mapping[str, Any]:
         """Fixes of the sources of a box."""
         relative = box.points(self.axis)
         distance = np.linalg.norm(relative, axis=1)
@@ -196,7 +216,7 @@ class SourcesMap:
         for name, variable in _VARIABLES.items():
             of_all = np.full(box.size, _LEFT_OUT.get(name, np.nan), variable.dtype)
             of_all[used] = of_used[name]
-            values[name] = of_all.reshape(box.shape)
+            values[name] = of_all
         return values
 
     def _random(self, box: Box) -> tuple[FloatArray, FloatArray]:
@@ -218,11 +238,6 @@ class SourcesMap:
         exact = predicted_channels(array, position, moment) + array.channel_offset_T
         return exact + reading_errors(array, exact, noise)
 
-    def _whitenings(self, readings: FloatArray) -> list[Whitening]:
-        """Whitening of every row, as of its fix."""
-        array = self.scenario.array
-        return whitenings_of(array, np.ones(array.n_channels, dtype=bool), readings)
-
     def _searched_from(self, truth: FloatArray, readings: FloatArray) -> list[tuple[FloatArray, float]]:
         """Ends q (4,) and χ² of the refinements that start at the truth (n, 3).
 
@@ -233,7 +248,8 @@ class SourcesMap:
         without_source = array.readings_of(array.ambient_fields)
         ends = []
         model = self._model
-        for position, row, white in zip(truth, readings, self._whitenings(readings), strict=True):
+        whitenings = whitenings_of(array, np.ones(array.n_channels, dtype=bool), readings)
+        for position, row, white in zip(truth, readings, whitenings, strict=True):
             q = model.homogeneous(position)
             chi2, _, _ = variable_projection_compiled.refine(
                 q,
@@ -264,69 +280,10 @@ def _error(fix: Fix, truth: FloatArray) -> float:
     return float(np.linalg.norm(fix.solutions[0].position_m - truth)) if fix.solutions else np.nan
 
 
-_NO_YES = {"flag_values": np.array([-1, 0, 1], dtype=np.int8), "flag_meanings": "left_out no yes"}
-_LEFT_OUT = {
-    "status": SourceStatus.LEFT_OUT,
-    "iterations": 0,
-    "solutions": 0,
-    "truth_listed": -1,
-    "range_observable": -1,
-}
-_VARIABLES = {
-    "status": Variable(
-        np.int8,
-        {
-            "long_name": "how the fix of the source ended",
-            "flag_values": np.array([s.value for s in SourceStatus], dtype=np.int8),
-            "flag_meanings": " ".join(s.name.lower() for s in SourceStatus),
-        },
-    ),
-    "iterations": Variable(np.int32, {"long_name": "linearisations that led to the best solution", "units": "1"}),
-    "chi2": Variable(np.float64, {"long_name": "chi-square of the best solution", "units": "1"}),
-    "chi2_from_truth": Variable(
-        np.float64, {"long_name": "chi-square of the optimum searched from the truth", "units": "1"}
-    ),
-    "distance": Variable(np.float64, {"long_name": "distance of the best solution from the truth", "units": "m"}),
-    "solutions": Variable(np.int32, {"long_name": "distinct solutions within 20 of the best chi-square", "units": "1"}),
-    "truth_listed": Variable(
-        np.int8, {"long_name": "whether the optimum searched from the truth is among the solutions", **_NO_YES}
-    ),
-    "range_observable": Variable(
-        np.int8, {"long_name": "whether the readings fix the range of the best solution", **_NO_YES}
-    ),
-    "sigma_range": Variable(
-        np.float64, {"long_name": "Cramer-Rao bound of the standard deviation of the range", "units": "m"}
-    ),
-    "sigma_position": Variable(
-        np.float64, {"long_name": "Cramer-Rao bound of the position, root of the trace", "units": "m"}
-    ),
-}
-
-
 @dataclass(frozen=True)
-class SourcesSummary:
-    """Counts of a map over sources.
+class SourcesSummary(Summary):
+    """Counts of a map over sources, with the fraction whose solutions have the end of the search from the truth."""
 
-    Attributes
-    ----------
-    starts, converged : int
-        Sources that were fixed, and those of them that were found.
-    fraction : float
-        Of the latter.
-    median_iterations : float
-        Over the sources that were found; NaN if there are none.
-    seconds : float
-        Duration of the computation alone; that of all machines together.
-    truth_listed : float
-        Fraction of the sources whose solutions have the optimum that the search from the truth ended at.
-    """
-
-    starts: int
-    converged: int
-    fraction: float
-    median_iterations: float
-    iterations_total: int
-    seconds: float
     truth_listed: float
 
     def lines(self) -> list[str]:
@@ -339,14 +296,12 @@ class SourcesSummary:
 
 def _tally(values: Values) -> Tally:
     """Counts of ``status``, ``truth_listed`` and ``iterations`` of a part of a map over sources."""
-    found = values["status"] == SourceStatus.FOUND
-    counts = {
-        "sources": (values["status"] != SourceStatus.LEFT_OUT).sum(),
-        "found": found.sum(),
-        "truth listed": (values["truth_listed"] == 1).sum(),
-        "iterations": values["iterations"].sum(dtype=np.int64),
+    points = {
+        "starts": values["status"] != SourceStatus.LEFT_OUT,
+        "converged": values["status"] == SourceStatus.FOUND,
+        "truth listed": values["truth_listed"] == 1,
     }
-    return Tally(Counter({name: int(count) for name, count in counts.items()}), histogram(values["iterations"][found]))
+    return Tally.of(points, values["iterations"])
 
 
 def source_map(
@@ -403,12 +358,4 @@ def source_map(
 def summary(dataset: xr.Dataset) -> SourcesSummary:
     """Counts of a map made by :func:`source_map`, which need not fit into memory."""
     tally = tallied(dataset, ("status", "truth_listed", "iterations"), _tally)
-    return SourcesSummary(
-        starts=tally.counts["sources"],
-        converged=tally.counts["found"],
-        fraction=tally.fraction("found", "sources"),
-        median_iterations=tally.median_iterations(),
-        iterations_total=tally.counts["iterations"],
-        seconds=float(dataset.attrs["seconds"]),
-        truth_listed=tally.fraction("truth listed", "sources"),
-    )
+    return SourcesSummary(**common_counts(dataset, tally), truth_listed=tally.fraction("truth listed", "starts"))

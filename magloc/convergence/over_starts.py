@@ -15,11 +15,9 @@ magnetogradient measurements", the function table, equations (19), (30), and the
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from importlib.metadata import version
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +29,18 @@ from arrays.differences import decorrelated_differences
 from arrays.geometries import tetrahedron
 from arrays.noise import reading_covariance, reading_errors
 from magloc.grids.computed import computed_map
-from magloc.grids.cube import Box, Tally, Values, Variable, check_half_width, histogram, tallied
+from magloc.grids.cube import (
+    Box,
+    CubeMap,
+    Summary,
+    Tally,
+    Values,
+    Variable,
+    check_half_width,
+    common_counts,
+    flags,
+    tallied,
+)
 from magloc.localization.fit.results import Solution, Source
 from magloc.localization.locator import Locator
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
@@ -39,7 +48,8 @@ from magloc.measurement.differences import DifferenceMeasurement, predicted_chan
 if TYPE_CHECKING:
     import xarray as xr
 from arrays.typing import FloatArray
-from magloc.convergence.filters import FILTERS, Ends, Filter, RepeatedFilter
+from magloc.convergence.filters import FILTERS, Filter, RepeatedFilter
+from magloc.convergence.filters_compiled import Ends
 
 
 class Status(IntEnum):
@@ -89,22 +99,45 @@ def simulated_measurement(scenario: StartsScenario) -> tuple[FloatArray, Differe
     return readings, measurement, measurement.measured(readings)
 
 
+_VARIABLES = {
+    "iterations": Variable(np.int32, {"long_name": "passes over the readings", "units": "1"}),
+    "chi2": Variable(np.float64, {"long_name": "chi-square at the end", "units": "1"}),
+    "distance": Variable(np.float64, {"long_name": "distance from the maximum-likelihood position", "units": "m"}),
+    "status": Variable(
+        np.int8,
+        {
+            "long_name": "how the start ended",
+            **flags(Status),
+        },
+    ),
+    "half": Variable(
+        np.int8,
+        {
+            "long_name": "side of the plane through the centroid, orthogonal to the source's direction",
+            "flag_values": np.array([-1, 0, 1], dtype=np.int8),
+            "flag_meanings": "back plane front",
+        },
+    ),
+}
+
+
 @dataclass(frozen=True, eq=False)
-class StartsMap:
-    """Map of a filter's ends over a cube of starts, as :class:`magloc.grids.cube.CubeMap`.
+class StartsMap(CubeMap):
+    """Map of a filter's ends over a cube of starts.
 
     Attributes
     ----------
-    grid : int
-        Starts along every axis.
     z : ndarray, shape (k,)
         Decorrelated differences that every start is given [T].
     optimum : Solution
         The best one for them.
     """
 
+    title = "Convergence of a dipole filter over its starts"
+    point = "start"
+    variables = _VARIABLES
+
     scenario: StartsScenario
-    grid: int
     measurement: DifferenceMeasurement
     z: FloatArray
     optimum: Solution
@@ -112,8 +145,6 @@ class StartsMap:
     @classmethod
     def of(cls, scenario: StartsScenario, grid: int) -> StartsMap:
         """Map of a scenario; the errors of :func:`convergence_map`."""
-        if grid < 2:
-            raise ValueError(f"Input grid must be at least 2; instead received {grid}.")
         if scenario.array.channel_is_scalar.any():
             raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
         locator = Locator(scenario.array, exclude_faulty=False)
@@ -131,38 +162,15 @@ class StartsMap:
         return 32 if self.grid <= 128 else 64
 
     @property
-    def axis(self) -> FloatArray:
-        """Coordinates of the starts [m], shape (grid,)."""
-        return np.linspace(-self.scenario.half_width_m, self.scenario.half_width_m, self.grid)
-
-    @property
-    def point(self) -> str:
-        """What a point is."""
-        return "start"
-
-    @property
-    def variables(self) -> Mapping[str, Variable]:
-        """Variables over the cube."""
-        return _VARIABLES
-
-    @property
-    def attributes(self) -> Mapping[str, Any]:
-        """All that determines the map."""
-        from arrays.array_file import array_toml
-
+    def settings(self) -> Mapping[str, Any]:
+        """Filter, source and noise."""
         scenario = self.scenario
         return {
-            "Conventions": "CF-1.10",
-            "title": "Convergence of a dipole filter over its starts",
-            "source": f"magloc {version('magloc')}",
-            "grid": self.grid,
             "method": scenario.method.name,
             **{f"method_{key}": _attribute(value) for key, value in vars(scenario.method).items()},
-            "array": array_toml(scenario.array),
             "position_m": np.asarray(scenario.position_m),
             "moment_Am2": np.asarray(scenario.moment_Am2),
             "centroid_m": scenario.array.centroid,
-            "half_width_m": scenario.half_width_m,
             "noise_seed": -1 if scenario.noise_seed is None else scenario.noise_seed,
         }
 
@@ -179,7 +187,7 @@ class StartsMap:
         """Compile, or load what was compiled."""
         self.scenario.method.run(self.measurement, self.z, np.full((1, 6), self.scenario.half_width_m))
 
-    def values(self, box: Box) -> Values:
+    def values_at(self, box: Box) -> Mapping[str, Any]:
         """Ends of the starts of a box."""
         scenario, centroid = self.scenario, self.scenario.array.centroid
         positions = box.points(self.axis)
@@ -188,40 +196,21 @@ class StartsMap:
         # On a grid the plane itself is hit to rounding only.
         depth = (positions - centroid) @ (np.asarray(scenario.position_m) - centroid)
         half = np.sign(np.where(np.abs(depth) < 1e-9 * scenario.half_width_m**2, 0.0, depth))
-        values = {
+        return {
             "iterations": ends.iterations,
             "chi2": ends.chi2,
             "distance": np.linalg.norm(ends.states[:, :3] - self.optimum.position_m, axis=1),
             "status": _status(ends, scenario.method.reached(ends, self.optimum.chi2, self.optimum.position_m)),
             "half": half,
         }
-        return {name: values[name].reshape(box.shape).astype(_VARIABLES[name].dtype) for name in _VARIABLES}
 
 
 @dataclass(frozen=True)
-class StartsSummary:
-    """Counts of a map over starts.
+class StartsSummary(Summary):
+    """Counts of a map over starts, with the fractions in front of the plane through the array and behind it."""
 
-    Attributes
-    ----------
-    fraction, front_fraction, back_fraction : float
-        Converged starts over all starts, over those in front of the plane and over those behind it.
-    median_iterations : float
-        Over the converged starts; NaN if there are none.
-    iterations_total : int
-        Of all starts.
-    seconds : float
-        Duration of the computation alone; that of all machines together.
-    """
-
-    starts: int
-    converged: int
-    fraction: float
     front_fraction: float
     back_fraction: float
-    median_iterations: float
-    iterations_total: int
-    seconds: float
 
     def lines(self) -> list[str]:
         """The counts in words."""
@@ -236,18 +225,15 @@ def _tally(values: Values) -> Tally:
     """Counts of ``status``, ``half`` and ``iterations`` of a part of a map over starts."""
     converged = values["status"] == Status.CONVERGED
     front, back = values["half"] == 1, values["half"] == -1
-    counts = {
-        "starts": converged.size,
-        "converged": converged.sum(),
-        "front": front.sum(),
-        "converged front": (converged & front).sum(),
-        "back": back.sum(),
-        "converged back": (converged & back).sum(),
-        "iterations": values["iterations"].sum(dtype=np.int64),
+    points = {
+        "starts": np.ones_like(converged),
+        "converged": converged,
+        "front": front,
+        "converged front": converged & front,
+        "back": back,
+        "converged back": converged & back,
     }
-    return Tally(
-        Counter({name: int(count) for name, count in counts.items()}), histogram(values["iterations"][converged])
-    )
+    return Tally.of(points, values["iterations"])
 
 
 def convergence_map(
@@ -310,29 +296,6 @@ def _status(ends: Ends, reached: NDArray[np.bool_]) -> NDArray[np.int8]:
     return np.where(reached, Status.CONVERGED, status).astype(np.int8)
 
 
-_VARIABLES = {
-    "iterations": Variable(np.int32, {"long_name": "passes over the readings", "units": "1"}),
-    "chi2": Variable(np.float64, {"long_name": "chi-square at the end", "units": "1"}),
-    "distance": Variable(np.float64, {"long_name": "distance from the maximum-likelihood position", "units": "m"}),
-    "status": Variable(
-        np.int8,
-        {
-            "long_name": "how the start ended",
-            "flag_values": np.array([s.value for s in Status], dtype=np.int8),
-            "flag_meanings": " ".join(s.name.lower() for s in Status),
-        },
-    ),
-    "half": Variable(
-        np.int8,
-        {
-            "long_name": "side of the plane through the centroid, orthogonal to the source's direction",
-            "flag_values": np.array([-1, 0, 1], dtype=np.int8),
-            "flag_meanings": "back plane front",
-        },
-    ),
-}
-
-
 def _attribute(value: Any) -> Any:
     return int(value) if isinstance(value, bool) else value  # netCDF has no booleans
 
@@ -341,12 +304,7 @@ def summary(dataset: xr.Dataset) -> StartsSummary:
     """Counts of a map made by :func:`convergence_map`, which need not fit into memory."""
     tally = tallied(dataset, ("status", "half", "iterations"), _tally)
     return StartsSummary(
-        starts=tally.counts["starts"],
-        converged=tally.counts["converged"],
-        fraction=tally.fraction("converged", "starts"),
+        **common_counts(dataset, tally),
         front_fraction=tally.fraction("converged front", "front"),
         back_fraction=tally.fraction("converged back", "back"),
-        median_iterations=tally.median_iterations(),
-        iterations_total=tally.counts["iterations"],
-        seconds=float(dataset.attrs["seconds"]),
     )

@@ -77,7 +77,6 @@ _LARGEST = 1e9
 _LEAST_LOG2, _MOST_LOG2 = 8, 20
 _MOST_OF_ANYTHING = 10_000_000
 _FILES = BuiltIn("magloc.design", "tasks", "task")
-built_in_tasks = _FILES.names
 
 
 class _Sensors(Table, kw_only=True):

@@ -10,18 +10,24 @@ from __future__ import annotations
 import signal
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from enum import IntEnum
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from arrays.array import SensorArray
+from arrays.array_file import array_toml
+from arrays.typing import FloatArray
+
 if TYPE_CHECKING:
     import xarray as xr
-from arrays.typing import FloatArray
 
 Values = Mapping[str, NDArray[Any]]
 DIMENSIONS = ("x", "y", "z")
@@ -86,6 +92,14 @@ class Tally:
     counts: Counter[str] = field(default_factory=Counter)
     iterations_of_converged: Counter[int] = field(default_factory=Counter)
 
+    @classmethod
+    def of(cls, points: Mapping[str, NDArray[np.bool_]], iterations: NDArray[Any]) -> Tally:
+        """From a mask of the points of every kind, with "converged" among them."""
+        counts = Counter({name: int(mask.sum()) for name, mask in points.items()})
+        counts["iterations"] = int(iterations.sum(dtype=np.int64))
+        values, times = np.unique(iterations[points["converged"]], return_counts=True)
+        return cls(counts, Counter(dict(zip(values.tolist(), times.tolist(), strict=True))))
+
     def __add__(self, other: Tally) -> Tally:
         return Tally(self.counts + other.counts, self.iterations_of_converged + other.iterations_of_converged)
 
@@ -103,63 +117,124 @@ class Tally:
         return float(values[np.searchsorted(last_of_value, middle, side="right")].mean())
 
 
-def histogram(iterations: NDArray[Any]) -> Counter[int]:
-    """How often every number of iterations occurs."""
-    values, counts = np.unique(iterations, return_counts=True)
-    return Counter(dict(zip(values.tolist(), counts.tolist(), strict=True)))
+@dataclass(frozen=True)
+class Summary:
+    """Counts of a whole map.
+
+    Attributes
+    ----------
+    starts, converged : int
+        Points that were computed, and those of them that converged.
+    fraction : float
+        Of the latter.
+    median_iterations : float
+        Over the points that converged; NaN if there are none.
+    iterations_total : int
+        Of all points.
+    seconds : float
+        Duration of the computation alone; that of all machines together.
+    """
+
+    starts: int
+    converged: int
+    fraction: float
+    median_iterations: float
+    iterations_total: int
+    seconds: float
 
 
-class Summary(Protocol):
-    """Counts of a whole map."""
-
-    @property
-    def iterations_total(self) -> int:
-        """Of all points."""
-
-    @property
-    def seconds(self) -> float:
-        """Duration of the computation alone; that of all machines together."""
-
-    def lines(self) -> list[str]:
-        """The counts in words."""
+def common_counts(dataset: xr.Dataset, tally: Tally) -> dict[str, Any]:
+    """The fields of a :class:`Summary`, from a map and its tally of "starts", "converged" and "iterations"."""
+    return {
+        "starts": tally.counts["starts"],
+        "converged": tally.counts["converged"],
+        "fraction": tally.fraction("converged", "starts"),
+        "median_iterations": tally.median_iterations(),
+        "iterations_total": tally.counts["iterations"],
+        "seconds": float(dataset.attrs["seconds"]),
+    }
 
 
-class CubeMap(Protocol):
-    """A map over a cube of points. It is sent to other processes: keep it small when pickled."""
+def described(title: str, array: SensorArray) -> dict[str, Any]:
+    """Attributes of every dataset about an array."""
+    source = f"magloc {version('magloc')}"
+    return {"Conventions": "CF-1.10", "title": title, "source": source, "array": array_toml(array)}
 
-    @property
-    def grid(self) -> int:
-        """Points along every axis."""
+
+def flags(statuses: type[IntEnum]) -> dict[str, Any]:
+    """CF attributes of a variable that holds a status."""
+    values = np.array([status.value for status in statuses], dtype=np.int8)
+    return {"flag_values": values, "flag_meanings": " ".join(status.name.lower() for status in statuses)}
+
+
+@dataclass(frozen=True, eq=False)
+class CubeMap(ABC):
+    """A map over a cube of points around an array. It is sent to other processes: keep it small when pickled.
+
+    Attributes
+    ----------
+    scenario
+        With an ``array``, and the ``half_width_m`` of the cube.
+    grid : int
+        Points along every axis, at least 2.
+    title, point : str
+        What the map is, and what a point is, in one word.
+    variables : mapping
+        Over the cube; with an integer one among them.
+    """
+
+    scenario: Any
+    grid: int
+
+    title: ClassVar[str]
+    point: ClassVar[str] = "source"
+    variables: ClassVar[Mapping[str, Variable]]
+
+    def __post_init__(self) -> None:
+        if self.grid < 2:
+            raise ValueError(f"Input grid must be at least 2; instead received {self.grid}.")
 
     @property
     def edge(self) -> int:
         """Points along the edges of a box."""
+        return 32
 
     @property
     def axis(self) -> FloatArray:
         """Coordinates [m] along every axis, shape (grid,)."""
+        return np.linspace(-self.scenario.half_width_m, self.scenario.half_width_m, self.grid)
 
     @property
-    def point(self) -> str:
-        """What a point is, in one word."""
-
-    @property
-    def variables(self) -> Mapping[str, Variable]:
-        """Variables over the cube; with an integer one among them."""
-
-    @property
-    def attributes(self) -> Mapping[str, Any]:
+    def attributes(self) -> dict[str, Any]:
         """All that determines the values: two maps with equal attributes are the same."""
+        cube = {"grid": self.grid, "half_width_m": self.scenario.half_width_m}
+        return {**described(self.title, self.scenario.array), **cube, **self.settings}
 
     @property
     def findings(self) -> Mapping[str, Any]:
         """Further attributes, which follow from the others."""
-
-    def warm_up(self) -> None:
-        """Compile, or load what was compiled."""
+        return {"centroid_m": self.scenario.array.centroid}
 
     def values(self, box: Box) -> Values:
         """Values of every variable, of the box's shape. They depend neither on the box nor on the number of threads."""
+        flat = self.values_at(box)
+        return {
+            name: np.asarray(flat[name]).reshape(box.shape).astype(variable.dtype, copy=False)
+            for name, variable in self.variables.items()
+        }
+
+    @property
+    @abstractmethod
+    def settings(self) -> Mapping[str, Any]:
+        """What determines the values beside the array and the cube."""
+
+    @abstractmethod
+    def warm_up(self) -> None:
+        """Compile, or load what was compiled."""
+
+    @abstractmethod
+    def values_at(self, box: Box) -> Mapping[str, Any]:
+        """Values of every variable at the points of a box, in their order."""
 
 
 class Chunk(NamedTuple):

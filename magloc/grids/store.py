@@ -15,11 +15,11 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from arrays.io.closing import Closing
 from arrays.io.errors import InputError, of_extra
 from arrays.typing import FloatArray
 from magloc.grids.cube import (
@@ -44,7 +44,7 @@ _SOMETHING_ELSE = "{}: found something else than a map, expected a map or nothin
 _UNREADABLE = (OSError, RuntimeError, ValueError, EOFError)
 
 
-class Sweep:
+class Sweep(Closing):
     """The store of one map, open for writing: a context manager that keeps other processes from writing to it.
 
     Parameters
@@ -84,14 +84,6 @@ class Sweep:
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> Sweep:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Let other processes write."""

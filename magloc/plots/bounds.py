@@ -301,6 +301,8 @@ def _contours(
     accuracy: float | None,
 ) -> Any:
     """Thin lines at the levels, a thick one at the accuracy; returns the thin ones, if there are any."""
+    if accuracy is not None:
+        ax.plot([], [], color=style.ORANGE, lw=1.8, label=f"required: {accuracy:g} m")
     finite = np.where(np.isfinite(values), values, np.nan)
     if np.isnan(finite).all():
         return None
@@ -332,8 +334,6 @@ def _slice(ax: Axes, dataset: xr.Dataset, values: FloatArray, norm: LogNorm, acc
     lines = _contours(ax, across, up, values, norm, _levels(values, norm, accuracy), accuracy)
     if lines is not None:
         ax.clabel(lines, fontsize=style.SMALL_LETTERS - 1.5, fmt=lambda value: f"{10.0**value:.3g}")
-    if accuracy is not None:
-        ax.plot([], [], color=style.ORANGE, lw=1.8, label=f"required: {accuracy:g} m")
     ax.set_aspect("equal")
 
 
@@ -356,8 +356,6 @@ def _sphere(
     colours = _shown(ax, values, norm)
     ax.pcolormesh(azimuth, elevation, colours, norm=norm, cmap=_COLOURS, shading="gouraud", rasterized=True)
     _contours(ax, azimuth, elevation, values, norm, levels, accuracy)
-    if accuracy is not None:
-        ax.plot([], [], color=style.ORANGE, lw=1.8, label=f"required: {accuracy:g} m")
     ax.set_title(title, fontsize=style.LETTERS, pad=8)
     ax.grid(visible=False)
     ax.set_xticks(np.radians([-90.0, 90.0]), ["−90°", "90°"], color=_ON_DARK)

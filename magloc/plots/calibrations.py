@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
 from arrays.io.csv import Column
 from magloc.calibration.model import AXES, AXIS_PAIRS, GAINS, OFFSET, POSITION
@@ -62,8 +60,6 @@ def turning_columns(result: TurningCalibration) -> dict[str, Column]:
     return columns
 
 
-_FEW_SENSORS = 10
-_MOST_NAMED_SENSORS = 60
 _GROUPS = (
     (POSITION, 1e3, "position [mm]"),
     (GAINS, 1e2, "gain [%]"),
@@ -81,21 +77,16 @@ def calibration_figure(result: SourceCalibration) -> Figure:
     groups = [(place, scale, label) for place, scale, label in _GROUPS if estimated[:, place].any()]
     figure = style.new_figure(1.5 + 1.35 * len(groups))
     axes = np.atleast_1d(figure.subplots(1 + len(groups), 1, sharex=True))
-    sensors = np.arange(len(ids))
     _before_and_after(axes[0], *result.rms_T, "residual rms [nT]", "what is left of the readings")
     for ax, (place, scale, label) in zip(axes[1:], groups, strict=True):
         values = scale * np.where(estimated[:, place], result.change[:, place], np.nan)
         spread = scale * style.SIGMAS_95 * result.sigma[:, place]
-        if place == AXES:
-            _angles(ax, sensors, values, spread)
-        else:
-            _components(ax, sensors, values, spread)
-        ax.axhline(0.0, color=style.GREY, lw=0.6, zorder=1.2)
+        _values(ax, values, spread)
         style.dress(ax, "", f"change of\n{label}")
     if groups:
         axes[1].set_title("what the calibration changes, 95 % intervals", fontsize=style.LETTERS, loc="left")
         style.legend(axes[1])
-    _name_sensors(axes[-1], ids)
+    style.name_sensors(axes[-1], ids)
     return figure
 
 
@@ -117,12 +108,11 @@ def turning_figure(result: TurningCalibration) -> Figure:
         (axes[1], 1e2 * (gains[1] / gains[0] - 1.0), "gain [%]"),
         (axes[2], 1e6 * offset_change_T, "offset [µT]"),
     ):
-        _components(ax, np.arange(len(ids)), values, np.full_like(values, np.nan))
-        ax.axhline(0.0, color=style.GREY, lw=0.6, zorder=1.2)
+        _values(ax, values, np.full_like(values, np.nan))
         style.dress(ax, "", f"change of\n{label}")
     axes[1].set_title("what the calibration changes", fontsize=style.LETTERS, loc="left")
     style.legend(axes[1])
-    _name_sensors(axes[-1], ids)
+    style.name_sensors(axes[-1], ids)
     return figure
 
 
@@ -136,26 +126,15 @@ def _before_and_after(ax: Axes, before_T: FloatArray, after_T: FloatArray, label
     style.legend(ax)
 
 
-def _components(ax: Axes, sensors: NDArray[np.intp], values: FloatArray, spread: FloatArray) -> None:
-    for k, (name, colour, marker, _) in enumerate(style.COMPONENTS):
-        ax.errorbar(
-            sensors + 0.22 * (k - 1), values[:, k], spread[:, k], fmt=marker, color=colour, ms=2.8, mfc="white",
-            mew=0.8, elinewidth=0.8, label=name,
-        )  # fmt: skip
-
-
-def _angles(ax: Axes, sensors: NDArray[np.intp], values: FloatArray, spread: FloatArray) -> None:
-    """Six angles of every sensor: two for each channel."""
+def _values(ax: Axes, values: FloatArray, spread: FloatArray) -> None:
+    """Three components (n, 3) of every sensor, or its six angles, two for each channel."""
+    per_component = values.shape[1] // 3
+    step, thin = (0.22, 0.0) if per_component == 1 else (0.13, 1.0)
     for k in range(values.shape[1]):
-        name, colour, marker, _ = style.COMPONENTS[k // 2]
+        name, colour, marker, _ = style.COMPONENTS[k // per_component]
+        places = np.arange(len(values)) + step * (k - 0.5 * (values.shape[1] - 1))
         ax.errorbar(
-            sensors + 0.13 * (k - 2.5), values[:, k], spread[:, k], fmt=marker, color=colour, ms=2.2, mfc="white",
-            mew=0.7, elinewidth=0.6, label=name if k % 2 == 0 else "_",
+            places, values[:, k], spread[:, k], fmt=marker, color=colour, ms=2.8 - 0.6 * thin, mfc="white",
+            mew=0.8 - 0.1 * thin, elinewidth=0.8 - 0.2 * thin, label="_" if k % per_component else name,
         )  # fmt: skip
-
-
-def _name_sensors(ax: Axes, ids: Sequence[str]) -> None:
-    shown = range(0, len(ids), -(-len(ids) // _MOST_NAMED_SENSORS))
-    ax.set_xlabel("sensor", fontsize=style.LETTERS)
-    ax.set_xlim(-0.7, len(ids) - 0.3)
-    ax.set_xticks(list(shown), [ids[i] for i in shown], rotation=0.0 if len(ids) <= _FEW_SENSORS else 90.0)
+    ax.axhline(0.0, color=style.GREY, lw=0.6, zorder=1.2)

@@ -19,7 +19,7 @@ from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.results import is_observable, span
 from magloc.localization.residuals import fix_residuals
 from magloc.plots import style
-from magloc.plots.style import bounds99, write
+from magloc.plots.style import write
 from magloc.readings import Readings
 
 if TYPE_CHECKING:
@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 from arrays.typing import FloatArray
 
 _LOG = logging.getLogger(__name__)
-
-_NAMES = ("x_m", "y_m", "z_m", "mx_Am2", "my_Am2", "mz_Am2")
 
 
 def fixes(
@@ -79,24 +77,18 @@ def write_pictures(
     ambient_T: FloatArray | None,
     truth_m: FloatArray | None,
     folder: Path,
-    *,
-    quiet: bool = False,
 ) -> None:
     """Write fixes.png and residuals.png, and the data behind them as fixes.csv and residuals.csv."""
     make_folder(folder, "--out")
     left = _residuals_of(array, rows, fixes, ambient_T)
     found = fix_columns(fixes)
-    state = np.concatenate([found.position_m, found.moment_Am2], axis=1)
-    sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
     columns: dict[str, Column] = {"time_s": found.time_s, "source": found.source}
-    columns |= dict(zip(_NAMES, state.T, strict=True))
-    columns |= dict(zip((f"s_{name}" for name in _NAMES), sigma.T, strict=True))
-    low, high = bounds99(found.dof)
-    columns |= {"chi2": found.chi2, "dof": found.dof, "chi2_low99": low * found.dof, "chi2_high99": high * found.dof}
+    columns |= style.state_columns(found.position_m, found.moment_Am2, found.covariance)
+    columns |= style.square_columns("chi2", found.chi2, found.dof)
     columns |= {"range95_low_m": found.range95_m[:, 0], "range95_high_m": found.range95_m[:, 1]}
     columns["range_observable"] = found.range_observable
     if truth_m is not None:
-        columns |= dict(zip((f"true_{name}" for name in _NAMES), truth_m[found.row].T, strict=False))
+        columns |= style.truth_columns(truth_m[found.row])
         columns["error_m"] = distances_from_truth(found, truth_m)
     columns["dropped_sensors"] = [" ".join(fixes.dropped_sensors[row]) for row in found.row]
     columns["reason"] = [fixes.reason[row] for row in found.row]
@@ -107,8 +99,7 @@ def write_pictures(
         folder / "residuals.png",
         {"time_s": rows.time_s, **dict(zip(names, left.T, strict=True))},
     )
-    if not quiet:
-        _LOG.info(f"wrote fixes.png, fixes.csv, residuals.png and residuals.csv into {folder}/")
+    _LOG.info(f"wrote fixes.png, fixes.csv, residuals.png and residuals.csv into {folder}/")
 
 
 def _residuals_of(array: SensorArray, rows: Readings, fixes: Fixes, ambient_T: FloatArray | None) -> FloatArray:
@@ -131,8 +122,6 @@ def _sensors_of(fixes: Fixes, array: SensorArray, rows: Readings | None) -> Floa
 _PLANES = ((0, 1), (0, 2), (1, 2))
 # How far beyond its fix an open interval of the range is drawn.
 _OPEN = 3.0
-_MOST_NAMED_SENSORS = 60
-_FEW_SENSORS = 10
 # Quantiles of the boxes: half and nine tenths of the rows; of a normal distribution in σ.
 _HALF, _MOST = (0.25, 0.75), (0.05, 0.95)
 _MOST_OF_NOISE = 1.6448536269514722
@@ -251,7 +240,7 @@ def residual_figure(
     residuals: FloatArray, channel_names: Sequence[str], sensor_ids: Sequence[str], channel_sensor: NDArray[np.int64]
 ) -> Figure:
     """Residuals (n, C) of every channel, NaN where a reading is missing or not used."""
-    few = len(sensor_ids) <= _FEW_SENSORS
+    few = len(sensor_ids) <= style.FEW_SENSORS
     figure = style.new_figure(3.0)
     ax = figure.subplots()
     ax.axhspan(-_MOST_OF_NOISE, _MOST_OF_NOISE, color=style.LIGHT_GREY, lw=0.0, label="nine tenths of the stated noise")
@@ -277,12 +266,9 @@ def residual_figure(
             ls="none", label="_" if label in named else label,
         )  # fmt: skip
         named.add(label)
-    step = -(-len(sensor_ids) // _MOST_NAMED_SENSORS)
-    shown = range(0, len(sensor_ids), step)
     ax.set_ylim(style.limits_of(bars[1:], bars[:1]))
-    ax.set_xlim(-0.7, len(sensor_ids) - 0.3)
     style.dress(ax, "sensor", "residual / σ of the noise [1]", "half and nine tenths of the rows")
-    ax.set_xticks(list(shown), [sensor_ids[i] for i in shown], rotation=0.0 if few else 90.0)
+    style.name_sensors(ax, sensor_ids)
     ax.grid(visible=False, axis="x")
     style.legend(ax)
     return figure

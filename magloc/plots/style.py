@@ -40,6 +40,9 @@ _MOST_ELLIPSES = 24
 # Ratios of the limits below which some, many, or all numbers between the powers of ten are written.
 _FEW_DECADES, _FEW_TIMES, _NO_TIMES = 30.0, 4.0, 2.5
 _FEW_MARKS = 40
+FEW_SENSORS, _MOST_NAMED_SENSORS = 10, 60
+STATE = ("x_m", "y_m", "z_m", "mx_Am2", "my_Am2", "mz_Am2")
+"""Columns of position and moment."""
 
 
 def new_figure(height_in: float, *, layout: str | None = "constrained") -> Figure:
@@ -86,6 +89,14 @@ def legend(where: Axes | Figure, **options: Any) -> None:
         # Above the panel, at its right; the title is at its left.
         house |= {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "borderpad": 0.1, "ncols": 6}
     where.legend(**{**house, **options})
+
+
+def name_sensors(ax: Axes, ids: Sequence[str]) -> None:
+    """Sensors by their number across, with so many of their ids that they can be read."""
+    shown = range(0, len(ids), -(-len(ids) // _MOST_NAMED_SENSORS))
+    ax.set_xlabel("sensor", fontsize=LETTERS)
+    ax.set_xlim(-0.7, len(ids) - 0.3)
+    ax.set_xticks(list(shown), [ids[i] for i in shown], rotation=0.0 if len(ids) <= FEW_SENSORS else 90.0)
 
 
 def length_unit(span_m: float) -> tuple[str, float]:
@@ -195,6 +206,26 @@ def bounds99(degrees_of_freedom: ArrayLike) -> tuple[FloatArray, FloatArray]:
     dof = np.asarray(degrees_of_freedom, dtype=np.float64)
     known = np.where(dof > 0.0, dof, np.nan)
     return chdtri(known, 0.995) / known, chdtri(known, 0.005) / known
+
+
+def state_columns(position_m: FloatArray, moment_Am2: FloatArray, covariance: FloatArray) -> dict[str, Column]:
+    """Columns of positions, moments (n, 3) and their standard deviations."""
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    state = np.concatenate([position_m, moment_Am2], axis=1)
+    columns: dict[str, Column] = dict(zip(STATE, state.T, strict=True))
+    return columns | dict(zip((f"s_{name}" for name in STATE), sigma.T, strict=True))
+
+
+def truth_columns(truth_m: FloatArray) -> dict[str, Column]:
+    """Columns of true positions (n, 3)."""
+    return dict(zip((f"true_{name}" for name in STATE), truth_m.T, strict=False))
+
+
+def square_columns(name: str, square: FloatArray, dof: NDArray[np.int64]) -> dict[str, Column]:
+    """A normalised square, its degrees of freedom, and its 99 % bounds."""
+    low, high = bounds99(dof)
+    prefix = "" if name == "chi2" else f"{name}_"
+    return {name: square, f"{prefix}dof": dof, f"{name}_low99": low * dof, f"{name}_high99": high * dof}
 
 
 def dot_size(n: int) -> float:

@@ -14,14 +14,13 @@ from arrays.io.csv import Column, write_columns
 from arrays.io.outputs import make_folder
 from arrays.typing import FloatArray, IntArray
 from magloc.plots import style
-from magloc.plots.style import bounds99, save
+from magloc.plots.style import save
 from magloc.tracking.results import TrackPoint, stacked
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _LOG = logging.getLogger(__name__)
-_NAMES = ("x_m", "y_m", "z_m", "mx_Am2", "my_Am2", "mz_Am2")
 
 
 def write_picture(
@@ -32,7 +31,6 @@ def write_picture(
     nees: tuple[FloatArray, IntArray] | None = None,
     bound_m: FloatArray | None = None,
     array_m: FloatArray | None = None,
-    quiet: bool = False,
 ) -> None:
     """Write track.png and consistency.png, and track.csv with the data behind both.
 
@@ -49,8 +47,6 @@ def write_picture(
         Posterior Cramér-Rao bound of the distance from the truth.
     array_m : ndarray, shape (n, 3), optional
         Origin of the array's frame in every row.
-    quiet : bool
-        Do not name the files on stderr.
 
     Raises
     ------
@@ -60,19 +56,16 @@ def write_picture(
     make_folder(folder, "--out")
     time, position, moment, covariance = _columns_of(points)
     nis, nis_dof = np.array([point.nis for point in points]), np.array([point.nis_dof for point in points])
-    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     estimability = stacked(points, "estimability", 6)
-    state = np.concatenate([position, moment], axis=1)
     columns: dict[str, Column] = {"time_s": time}
-    columns |= dict(zip(_NAMES, state.T, strict=True))
-    columns |= dict(zip((f"s_{name}" for name in _NAMES), sigma.T, strict=True))
-    columns |= _square("nis", nis, nis_dof)
-    components = (name.split("_")[0] for name in _NAMES)
+    columns |= style.state_columns(position, moment, covariance)
+    columns |= style.square_columns("nis", nis, nis_dof)
+    components = (name.split("_")[0] for name in style.STATE)
     columns |= dict(zip((f"estimability_{name}" for name in components), estimability.T, strict=True))
     if truth_m is not None:
-        columns |= dict(zip((f"true_{name}" for name in _NAMES), truth_m.T, strict=False))
+        columns |= style.truth_columns(truth_m)
     if nees is not None:
-        columns |= _square("nees", *nees)
+        columns |= style.square_columns("nees", *nees)
     if bound_m is not None:
         columns["bound_m"] = bound_m
     if array_m is not None:
@@ -81,14 +74,7 @@ def write_picture(
     write_columns(columns, folder / "track.csv")
     save(track_figure(points, truth_m, array_m), folder / "track.png")
     save(consistency_figure(points, truth_m, nees, bound_m), folder / "consistency.png")
-    if not quiet:
-        _LOG.info(f"wrote track.png, consistency.png and track.csv into {folder}/")
-
-
-def _square(name: str, square: FloatArray, dof: IntArray) -> dict[str, Column]:
-    """A normalised square, its degrees of freedom, and its 99 % bounds."""
-    low, high = bounds99(dof)
-    return {name: square, f"{name}_dof": dof, f"{name}_low99": low * dof, f"{name}_high99": high * dof}
+    _LOG.info(f"wrote track.png, consistency.png and track.csv into {folder}/")
 
 
 # Least and largest height of the plan, and its width [in].

@@ -12,19 +12,17 @@ import tempfile
 import time
 import urllib.request
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal
+from typing import Any
 
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
+from arrays.io.closing import Closing
 from arrays.io.errors import InputError
 
-Button = Literal["left", "middle", "right"]
 BINARIES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 # WebGL in software: without both of these the canvas stays blank on a machine without a graphics card.
 _SOFTWARE_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-_BUTTON_BITS: dict[Button, int] = {"left": 1, "right": 2, "middle": 4}
 _POLL_S = 0.05
 _REPLY_S = 60.0
 
@@ -52,7 +50,7 @@ def find_chromium() -> str:
     raise InputError(f"found none of {', '.join(BINARIES)} on the PATH, expected one of them to draw a picture.")
 
 
-class Chromium:
+class Chromium(Closing):
     """One page of a headless Chromium; a context manager.
 
     Parameters
@@ -64,14 +62,6 @@ class Chromium:
     timeout_s : float
         How long the browser may take to start.
 
-    Attributes
-    ----------
-    requests : list of str
-        Addresses that the page has asked for, in order; the page's own is the first. What the page itself carries
-        (``data:``, ``blob:``) does not count.
-    errors : list of str
-        Uncaught exceptions of the page and what it wrote as errors.
-
     Raises
     ------
     InputError
@@ -81,8 +71,6 @@ class Chromium:
     """
 
     def __init__(self, url: str, size: tuple[int, int] = (1280, 800), timeout_s: float = 60.0) -> None:
-        self.requests: list[str] = []
-        self.errors: list[str] = []
         self._numbers = itertools.count(1)
         self._profile = tempfile.mkdtemp(prefix="magloc-chromium-")
         self._socket: ClientConnection | None = None
@@ -100,14 +88,6 @@ class Chromium:
             self.close()
             raise
 
-    def __enter__(self) -> Chromium:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
-
     def close(self) -> None:
         """End the browser and remove its files."""
         if self._socket is not None:
@@ -124,7 +104,7 @@ class Chromium:
         shutil.rmtree(self._profile, ignore_errors=True)
 
     def open(self, url: str) -> None:
-        """Open another page. What the one before asked for and complained of is forgotten.
+        """Open another page.
 
         Parameters
         ----------
@@ -135,8 +115,6 @@ class Chromium:
         BrowserError
             It cannot be reached.
         """
-        self.requests.clear()
-        self.errors.clear()
         fault = self.call("Page.navigate", url=url).get("errorText")
         if fault:
             raise BrowserError(f"Chromium cannot open {url}: {fault}.")
@@ -168,7 +146,7 @@ class Chromium:
                 message = json.loads(self._socket.recv(timeout=_REPLY_S))
                 if message.get("id") == number:
                     break
-                self._note(message)
+                self.note(message)
         except (ConnectionClosed, TimeoutError) as error:
             raise BrowserError(f"Chromium did not answer {method} ({type(error).__name__}).") from None
         if "error" in message:
@@ -195,7 +173,7 @@ class Chromium:
         """
         answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
         if "exceptionDetails" in answer:
-            raise BrowserError(_exception_text(answer["exceptionDetails"]))
+            raise BrowserError(exception_text(answer["exceptionDetails"]))
         return answer["result"].get("value")
 
     def wait_for(self, expression: str, timeout_s: float = 30.0) -> Any:
@@ -265,56 +243,8 @@ class Chromium:
             time.sleep(interval_s)
         return last
 
-    def press(self, x: float, y: float, button: Button = "left") -> None:
-        """Press a mouse button at a place of the page [px]."""
-        self.move(x, y)
-        self._mouse("mousePressed", x, y, button, _BUTTON_BITS[button])
-
-    def move(self, x: float, y: float, button: Button | None = None) -> None:
-        """Move the mouse to a place [px], with a button held down or none."""
-        self._mouse("mouseMoved", x, y, button or "none", 0 if button is None else _BUTTON_BITS[button])
-
-    def release(self, x: float, y: float, button: Button = "left") -> None:
-        """Release a mouse button."""
-        self._mouse("mouseReleased", x, y, button, 0)
-
-    def click(self, x: float, y: float, button: Button = "left") -> None:
-        """Press and release a mouse button."""
-        self.press(x, y, button)
-        self.release(x, y, button)
-
-    def drag(
-        self, begin: tuple[float, float], end: tuple[float, float], steps: int = 10, interval_s: float = 0.02
-    ) -> None:
-        """Drag from one place to another [px] in a number of steps."""
-        self.press(*begin)
-        for i in range(1, steps + 1):
-            share = i / steps
-            self.move(begin[0] + share * (end[0] - begin[0]), begin[1] + share * (end[1] - begin[1]), "left")
-            time.sleep(interval_s)
-        self.release(*end)
-
-    def _mouse(self, kind: str, x: float, y: float, button: str, buttons: int) -> None:
-        clicks = 0 if kind == "mouseMoved" else 1
-        self.call(
-            "Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, buttons=buttons, clickCount=clicks
-        )  # fmt: skip
-
-    def _note(self, event: dict[str, Any]) -> None:
-        """Keep what the page asked for and complained of."""
-        parameters = event.get("params", {})
-        match event.get("method"):
-            case "Network.requestWillBeSent":
-                address = parameters["request"]["url"]
-                if not address.startswith(("data:", "blob:")):
-                    self.requests.append(address)
-            case "Network.webSocketCreated":
-                self.requests.append(parameters["url"])
-            case "Runtime.exceptionThrown":
-                self.errors.append(_exception_text(parameters["exceptionDetails"]))
-            case "Runtime.consoleAPICalled" if parameters["type"] == "error":
-                words = (str(argument.get("value", argument.get("description", ""))) for argument in parameters["args"])
-                self.errors.append(" ".join(words))
+    def note(self, event: dict[str, Any]) -> None:
+        """What the page reports while a method is under way; nothing of it is kept."""
 
     def _page_address(self, timeout_s: float) -> str:
         """Address of the page's DevTools socket, once the browser has written its port."""
@@ -356,5 +286,6 @@ def _started(binary: str, profile: str, size: tuple[int, int]) -> subprocess.Pop
     return subprocess.Popen([binary, *flags, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
-def _exception_text(details: dict[str, Any]) -> str:
+def exception_text(details: dict[str, Any]) -> str:
+    """What a page's exception says of itself."""
     return str(details.get("exception", {}).get("description", details.get("text", "an exception")))

@@ -6,16 +6,15 @@ import sys
 import webbrowser
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import fields, replace
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import viser
 
 from arrays.array import SensorArray
+from arrays.io.closing import Closing
 from magloc.localization.fit.fixes import Fixes
 from magloc.readings import Readings
 from magloc.tracking.results import TrackResult
@@ -43,7 +42,7 @@ _MOST_ROWS = 2000
 _INLINE_PX = 560
 
 
-class View:
+class View(Closing):
     """A scene; a context manager that closes it.
 
     Attributes
@@ -77,12 +76,6 @@ class View:
     def close(self) -> None:
         """Stop the server; the page remains where it was taken before."""
         self._open.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
 
     def __repr__(self) -> str:
         return f"View({self._page.title!r}, {self.address})"
@@ -203,11 +196,7 @@ def _filling(
 
 def thinned(rows: Readings) -> Readings:
     """Every so many of the rows, so that 2000 remain at most."""
-    step = -(-len(rows) // _MOST_ROWS)
-    if step == 1:
-        return rows
-    parts = {field.name: getattr(rows, field.name) for field in fields(rows)}
-    return replace(rows, **{name: part[::step] for name, part in parts.items() if part is not None})
+    return rows[:: -(-len(rows) // _MOST_ROWS)]
 
 
 def fixes_of(array: SensorArray, rows: Readings, progress: Callable[[int], None] | None = None) -> Fixes:

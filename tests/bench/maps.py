@@ -8,7 +8,8 @@ from functools import partial
 import numba
 import numpy as np
 
-from magloc.convergence.filters import Ends, IekfFilter, RepeatedFilter
+from magloc.convergence.filters import IekfFilter, RepeatedFilter
+from magloc.convergence.filters_compiled import Ends
 from magloc.convergence.over_starts import StartsScenario, simulated_measurement
 from magloc.measurement.differences import DifferenceMeasurement
 from tests.bench.filters import TIME, functions, stonesoup_update

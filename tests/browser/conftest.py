@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import pytest
 
 from arrays.io.errors import InputError
-from magloc.viewer.chromium import Chromium, find_chromium
+from magloc.viewer.chromium import find_chromium
+from tests.browser.browser import Browser
 from tests.browser.screen import Screen
 from tests.conftest import REPOSITORY
 
@@ -21,5 +22,5 @@ def screen() -> Iterator[Screen]:
         find_chromium()
     except InputError:
         pytest.skip("needs Chromium or Chrome on the PATH: on Debian and Ubuntu, apt-get install chromium")
-    with Chromium("about:blank") as browser:
+    with Browser("about:blank") as browser:
         yield Screen(browser, ARTEFACTS)

@@ -16,7 +16,7 @@ from matplotlib.colors import rgb_to_hsv
 from matplotlib.image import imread
 from numpy.typing import ArrayLike, NDArray
 
-from magloc.viewer.chromium import Chromium
+from tests.browser.browser import Browser
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -58,7 +58,7 @@ class Camera:
 class Screen:
     """The page of a browser, looked at and worked with the mouse."""
 
-    def __init__(self, browser: Chromium, folder: Path) -> None:
+    def __init__(self, browser: Browser, folder: Path) -> None:
         self.browser, self._folder = browser, folder
         self._server: viser.ViserServer | None = None
 

@@ -21,10 +21,10 @@ from magloc.localization.locator import locate
 from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
 from magloc.tracking.results import TrackPoint, TrackResult
-from magloc.viewer.chromium import Chromium
 from magloc.viewer.pages.pages import readings_page
 from magloc.viewer.server import address, opened
 from magloc.viewer.view import View, thinned
+from tests.browser.browser import Browser
 from tests.magloc.cli.test_view import needs_chromium
 
 ARRAY = tetrahedron(1.5)
@@ -147,7 +147,7 @@ class TestFiles:
         page, picture = tmp_path / "fixes.html", tmp_path / "fixes.png"
         magloc.view(ARRAY, fixes, html=page, png=picture)
         assert picture.read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
-        with Chromium(page.as_uri(), (640, 400)) as browser:
+        with Browser(page.as_uri(), (640, 400)) as browser:
             browser.wait_for("document.querySelector('canvas') !== null")
             browser.settled_screenshot()
             assert browser.requests == [page.as_uri()]

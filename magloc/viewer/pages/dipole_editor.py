@@ -3,10 +3,9 @@
 Use, inside a tab or folder of the GUI; everything is in the array's frame::
 
     editor = DipoleEditor(server, array)                       # a position and a moment that suit the array
-    editor = DipoleEditor(server, array, position_m, moment_Am2, parent="/array")   # parent: node of the array's frame
+    editor = DipoleEditor(server, array, parent="/array")      # parent: node of the array's frame
     editor.set_array(array)                                    # after the array was edited: everything follows
     editor.move_to(position_m, moment_Am2)                     # as if the user had dragged it
-    editor.visible = False                                     # takes it out of the scene (its GUI stays)
     editor.extent_m                                            # points (k, 3) that the first camera should see
 """
 
@@ -27,7 +26,7 @@ from magloc.viewer.pages.fixes import heaviest_first
 from magloc.viewer.pages.live_fit import Forecast, LiveFit, rounded, suitable_dipole
 from magloc.viewer.panels.inputs import SharedInput, set_value
 from magloc.viewer.panels.latest import Latest
-from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, FIT_COLOUR, DipoleGlyph, SurfaceGlyph
+from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, FIT_COLOUR, DipoleGlyph, SurfaceGlyph, turned_to
 from magloc.viewer.scene.shapes import uncertainty
 
 _SOLUTIONS_SHOWN = 3
@@ -50,8 +49,6 @@ class DipoleEditor:
     server : viser.ViserServer
         The panels are added where its GUI is at present.
     array : SensorArray
-    position_m, moment_Am2 : array-like, shape (3,), optional
-        Where the dipole starts, in the array's frame [m], and its moment [A·m²].
     parent : str
         Name of the scene node of the array's frame; empty for the scene itself.
 
@@ -65,20 +62,10 @@ class DipoleEditor:
         How long the last forecast and the last fix took, from the state of the controls to the scene [ms].
     """
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        array: SensorArray,
-        position_m: ArrayLike | None = None,
-        moment_Am2: ArrayLike | None = None,
-        *,
-        parent: str = "",
-    ) -> None:
-        position, moment = suitable_dipole(array)
-        self._start_m = position if position_m is None else np.asarray(position_m, dtype=np.float64)
-        self._start_Am2 = moment if moment_Am2 is None else np.asarray(moment_Am2, dtype=np.float64)
+    def __init__(self, server: viser.ViserServer, array: SensorArray, *, parent: str = "") -> None:
+        self._start = suitable_dipole(array)
         self._live = LiveFit(array)
-        self._magnitude = float(np.linalg.norm(self._start_Am2)) or float(np.linalg.norm(moment))
+        self._magnitude = float(np.linalg.norm(self._start[1]))
         self.milliseconds = (math.nan, math.nan)
         self._follow_dipole = Latest(self._show_forecast)
         self._follow_fit = Latest(self._show_fix)
@@ -86,7 +73,7 @@ class DipoleEditor:
         self._add_panels(server, array)
         self.forecast: Forecast
         self.fix: Fix
-        self.move_to(self._start_m, self._start_Am2)
+        self.move_to(*self._start)
 
     @property
     def array(self) -> SensorArray:
@@ -108,16 +95,6 @@ class DipoleEditor:
         """Points that the first camera should see, shape (k, 3) [m]."""
         tip = self.position_m + _ARROW * self.array.circumradius * direction_of(self.control.wxyz)
         return np.vstack([self.array.positions, self.position_m, tip])
-
-    @property
-    def visible(self) -> bool:
-        """Whether the dipole and all that follows it are in the scene."""
-        return self.control.visible
-
-    @visible.setter
-    def visible(self, visible: bool) -> None:
-        self.control.visible = visible
-        self._follow()
 
     def move_to(self, position_m: ArrayLike, moment_Am2: ArrayLike) -> None:
         """Put the dipole somewhere, as if the user had dragged it.
@@ -194,33 +171,26 @@ class DipoleEditor:
             self.draw_button = gui.add_button("Another draw of the noise")
             self.fit_panel = gui.add_html("")
         self._position = SharedInput(self.position_input, self._position_typed)
-        self._moment = SharedInput(self.moment_input, self._moment_typed)
-        self._decades = SharedInput(self.decades_slider, self._decades_moved)
+        self._moment = SharedInput(self.moment_input, lambda: self._strengthen(self.moment_input.value))
+        self._decades = SharedInput(self.decades_slider, lambda: self._strengthen(10.0**self.decades_slider.value))
         self._azimuth = SharedInput(self.azimuth_slider, self._turned_by_sliders)
         self._elevation = SharedInput(self.elevation_slider, self._turned_by_sliders)
-        self.back_button.on_click(lambda _: self.move_to(self._start_m, self._start_Am2))
+        self.back_button.on_click(lambda _: self.move_to(*self._start))
         self.noise_checkbox.on_update(self._follow_fit)
         self.seed_input.on_update(self._follow_fit)
-        self.draw_button.on_click(lambda _: self._draw())
+        self.draw_button.on_click(lambda _: set_value(self.seed_input, self.seed_input.value + 1))
 
     def _follow(self, *_: object) -> None:
         # The fit is a work of its own: while a slow one runs, the readings and the bound still follow the hand.
         self._follow_dipole()
         self._follow_fit()
 
-    def _draw(self) -> None:
-        set_value(self.seed_input, self.seed_input.value + 1)
-
     def _position_typed(self) -> None:
         self.control.position = np.array(self.position_input.value)
         self._follow()
 
-    def _moment_typed(self) -> None:
-        self._magnitude = float(self.moment_input.value)
-        self._follow()
-
-    def _decades_moved(self) -> None:
-        self._magnitude = float(10.0**self.decades_slider.value)
+    def _strengthen(self, magnitude_Am2: float) -> None:
+        self._magnitude = float(magnitude_Am2)
         self._follow()
 
     def _turned_by_sliders(self) -> None:
@@ -236,7 +206,6 @@ class DipoleEditor:
         self.forecast = forecast = live.forecast(position, moment)
         self._forecast_of = (live, position, moment, forecast)
         self._glyph.show(position, moment)
-        self._glyph.visible = self.visible
         self._show_region(live.array, position, forecast)
         self._show_inputs(position)
         self.readings_panel.content = words.readings_table(live.array, forecast.readings_T, forecast.signal_T)
@@ -244,7 +213,7 @@ class DipoleEditor:
         self.milliseconds = (1e3 * (perf_counter() - begin), self.milliseconds[1])
 
     def _show_region(self, array: SensorArray, position: FloatArray, forecast: Forecast) -> None:
-        if forecast.covariance is None or not self.visible:
+        if forecast.covariance is None:
             self._region.show(None)
             return
         distance = float(np.linalg.norm(position - array.centroid))
@@ -280,15 +249,12 @@ class DipoleEditor:
         if self.noise_checkbox.value and np.isfinite(readings).all():
             readings = live.simulated(readings, int(self.seed_input.value))
         self.fix = fix = live.fix(readings) if not forecast.reason else Fix((), forecast.reason)
-        shown = heaviest_first(fix)[:_SOLUTIONS_SHOWN] if self.visible else []
+        shown = heaviest_first(fix)[:_SOLUTIONS_SHOWN]
         for i, glyph in enumerate(self._found):
             glyph.visible = i < len(shown)
             if i < len(shown):
                 glyph.show(shown[i].position_m, shown[i].moment_Am2)
-        of_best = None
-        if fix.solutions:
-            of_best = words.difference(fix.best, position, moment, forecast.covariance)
-        self.fit_panel.content = words.panel(words.fix_words(fix, forecast, of_best))
+        self.fit_panel.content = words.panel(words.fix_words(fix, forecast, position, moment))
         self.milliseconds = (self.milliseconds[0], 1e3 * (perf_counter() - begin))
 
 
@@ -296,16 +262,6 @@ def direction_of(wxyz: ArrayLike) -> FloatArray:
     """The z axis of a frame that a unit quaternion turns, shape (3,)."""
     w, x, y, z = np.asarray(wxyz, dtype=np.float64)
     return np.array([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)])
-
-
-def turned_to(direction: FloatArray) -> FloatArray:
-    """The shortest turn of the z axis to a unit vector, as a unit quaternion wxyz."""
-    x, y, z = direction
-    if z < -1.0 + 1e-12:
-        return np.array([0.0, 1.0, 0.0, 0.0])
-    quaternion = np.array([1.0 + z, -y, x, 0.0])
-    unit: FloatArray = quaternion / np.linalg.norm(quaternion)
-    return unit
 
 
 def angles_of(vector: FloatArray) -> tuple[float, float]:

@@ -20,6 +20,7 @@ from magloc.viewer.scene.glyphs import (
     REGION_COLOUR,
     DipoleGlyph,
     SurfaceGlyph,
+    dots,
 )
 from magloc.viewer.scene.legend import Entry, Swatch
 from magloc.viewer.scene.shapes import NOTHING, Surface, joined, uncertainty
@@ -55,14 +56,7 @@ class FixView:
         scene = server.scene
         of_row, positions = best_positions(fixes)
         if len(positions) > 1:
-            scene.add_point_cloud(
-                "/fixes/all",
-                positions.astype(np.float32),
-                FIT_COLOUR,
-                point_size=dot_m,
-                point_shape="circle",
-                precision="float32",
-            )
+            dots(scene, "/fixes/all", positions, FIT_COLOUR, dot_m)
         most = int(np.bincount(of_row, minlength=1).max())  # sources of a row
         self.best = DipoleGlyph(scene, "/fixes/best", size_m, DIPOLE_COLOUR, reach_m)
         more = [DipoleGlyph(scene, f"/fixes/best-{i}", size_m, DIPOLE_COLOUR, reach_m) for i in range(2, most + 1)]

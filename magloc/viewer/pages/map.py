@@ -12,7 +12,15 @@ from arrays.typing import ByteArray, FloatArray
 from magloc.viewer.pages.open_result import MapResult
 from magloc.viewer.panels.inputs import set_value
 from magloc.viewer.panels.latest import Latest
-from magloc.viewer.scene.glyphs import REGION_COLOUR, Colour, LabelAnchor, SurfaceGlyph, screen_label
+from magloc.viewer.scene.glyphs import (
+    REGION_COLOUR,
+    Colour,
+    LabelAnchor,
+    SurfaceGlyph,
+    dots,
+    screen_label,
+    screen_lines,
+)
 from magloc.viewer.scene.legend import ColourScale, Entry, Swatch
 from magloc.viewer.scene.shapes import box_edges, iso_surface
 
@@ -150,8 +158,9 @@ class MapView:
         through = np.zeros(3) if result.source_m is None else result.source_m
         self.indices = [int(np.argmin(np.abs(axis - through[i]))) for i in range(3)]
         self.cut = True
-        self.cloud = self._cloud(f"{name}/points", *self._points(np.isfinite(result.values)))
-        self.failed = self._cloud(f"{name}/failed-points", *self._points(result.failed))
+        size = POINT_OF_SPACING * self.spacing_m
+        self.cloud = dots(server.scene, f"{name}/points", *self._points(np.isfinite(result.values)), size)
+        self.failed = dots(server.scene, f"{name}/failed-points", *self._points(result.failed), size)
         self.failed.visible = False
         self.surface = SurfaceGlyph(server.scene, f"{name}/surface", REGION_COLOUR, 0.45)
         self.surface.visible = False
@@ -187,7 +196,7 @@ class MapView:
         scene, axis = self._server.scene, self.result.axis_m
         low, high = float(axis[0]), float(axis[-1])
         edges = box_edges([low] * 3, [high] * 3)
-        scene.add_line_segments(f"{name}/edges", edges, _BOX_COLOUR, thickness=1.0, thickness_units="screen")
+        screen_lines(scene, f"{name}/edges", edges, _BOX_COLOUR, 1.0)
         beyond = low - 0.06 * (high - low)
         # Along the edges that the first camera sees at the border: x in front, y to the right, z to the left.
         edges_seen: tuple[tuple[list[float], LabelAnchor], ...] = (
@@ -264,10 +273,10 @@ class MapView:
             points, colours = self._points(where)
             # Fewer colours than points, for a moment, would be an error in the browser.
             with self._server.atomic():
-                cloud.points = points
+                cloud.points = points.astype(np.float32)
                 cloud.colors = colours
 
-    def _points(self, where: NDArray[np.bool_]) -> tuple[NDArray[np.float32], ByteArray]:
+    def _points(self, where: NDArray[np.bool_]) -> tuple[FloatArray, ByteArray]:
         """Places and colours of some points of the cube, of those behind the cut."""
         if self.cut:
             behind = np.arange(len(self.result.axis_m)) >= self.indices[_CUT_AXIS]
@@ -277,17 +286,7 @@ class MapView:
         values = self.result.values[where]
         known = np.isfinite(values)
         colours[known] = self._colours(values[known])
-        return points.astype(np.float32), colours
-
-    def _cloud(self, name: str, points: NDArray[np.float32], colours: ByteArray) -> viser.PointCloudHandle:
-        return self._server.scene.add_point_cloud(
-            name,
-            points,
-            colours,
-            point_size=POINT_OF_SPACING * self.spacing_m,
-            point_shape="circle",
-            precision="float32",
-        )
+        return points, colours
 
     def _scale(self, share: FloatArray) -> ByteArray:
         return np.asarray(_SCALE(share, bytes=True)[..., :3], dtype=np.uint8)

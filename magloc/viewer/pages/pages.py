@@ -13,7 +13,7 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.localization.fit.results import Fix
 from magloc.readings import Readings
-from magloc.tracking.results import TrackPoint, TrackResult
+from magloc.tracking.results import TrackPoint, TrackResult, stacked
 from magloc.viewer.pages.fixes import FixView, best_positions
 from magloc.viewer.pages.map import MapControls, MapView
 from magloc.viewer.pages.open_result import MapResult
@@ -30,8 +30,9 @@ from magloc.viewer.scene.glyphs import (
     DipoleGlyph,
     length_text,
     screen_label,
+    screen_lines,
 )
-from magloc.viewer.scene.legend import Entry, Swatch, add_legend
+from magloc.viewer.scene.legend import Entry, Swatch, legend_html
 from magloc.viewer.scene.shapes import line_segments
 
 SENSOR_COLOUR = (90, 96, 105)
@@ -106,8 +107,8 @@ def readings_page(server: viser.ViserServer, array: SensorArray, fixes: Sequence
     view = FixView(server, times, fixes, centroids, size_m=size, reach_m=1.4 * size, dot_m=dot)
 
     def move_array(row: int) -> None:
-        if rows is not None and rows.array_position_m is not None and rows.array_rotation is not None:
-            glyphs.set_pose(rows.array_position_m[row], rows.array_rotation[row].as_quat())
+        if rows is not None and rows.pose is not None:
+            glyphs.set_pose(rows.pose[0][row], rows.pose[1][row].as_quat())
 
     move_array(view.row)
     # The plot stands below the choice of the row, which has to move its mark.
@@ -128,7 +129,7 @@ def track_page(
 ) -> Page:
     """A track, with the array that found it and its readings, if they are given."""
     points, gui = result.points, server.gui
-    positions = np.array([np.full(3, np.nan) if p.position_m is None else p.position_m for p in points])
+    positions = stacked(points, "position_m", 3)
     legend = gui.add_folder("Legend")
     name = "true path" if result.is_truth else "track"
     ellipsoids = "" if result.is_truth else ", with 95 % ellipsoids"
@@ -141,9 +142,9 @@ def track_page(
     if array is not None:
         glyphs = ArrayGlyphs(server.scene, array)
         on_pose = glyphs.set_pose
-        if rows is not None and rows.array_position_m is not None and rows.array_rotation is not None:
+        if rows is not None and rows.pose is not None:
             of_point = _nearest_rows(rows, points)
-            poses = (rows.array_position_m[of_point], rows.array_rotation[of_point].as_quat())
+            poses = (rows.pose[0][of_point], rows.pose[1][of_point].as_quat())
             seen.append(poses[0])
         else:
             seen.append(array.positions)
@@ -161,7 +162,7 @@ def track_page(
     for i in dict.fromkeys((tracked[0], tracked[-1])):
         below = positions[i] - np.array([0.0, 0.0, 0.14 * ball.radius_m])  # above, the arrow of the moment may be
         screen_label(server.scene, f"/times/{i}", f"{points[i].time_s:.6g} s", below)
-    return _finished(server, legend, ball, name, entries, close=player.close)
+    return _finished(server, legend, ball, name, entries, close=player.pause)
 
 
 def map_page(server: viser.ViserServer, result: MapResult) -> Page:
@@ -199,7 +200,7 @@ def _finished(
     cell = prepare(server, ball)
     all_notes = (*notes, AXES_WORDS, f"one square of the floor: {length_text(cell)}")
     with legend:
-        add_legend(server.gui, entries, all_notes)
+        server.gui.add_html(legend_html(entries, all_notes))
     return Page(title, tuple(entries), all_notes, close)
 
 
@@ -218,9 +219,7 @@ def _array_entries(server: viser.ViserServer, glyphs: ArrayGlyphs, rows: Reading
         glyphs.name_as_a_whole("array")
     if rows is not None and rows.array_position_m is not None:
         path = line_segments(rows.array_position_m)
-        server.scene.add_line_segments(
-            "/array-path", path, ARRAY_PATH_COLOUR, thickness=1.5, thickness_units="screen", visible=bool(len(path))
-        )
+        screen_lines(server.scene, "/array-path", path, ARRAY_PATH_COLOUR, 1.5, visible=bool(len(path)))
         entries.append(Swatch(ARRAY_PATH_COLOUR, "path of the array"))
     return entries
 
@@ -235,16 +234,15 @@ def _sensors_entry(array: SensorArray) -> Swatch:
 
 def _centroids(array: SensorArray, rows: Readings | None, n: int) -> FloatArray:
     """Mean position of the sensors at every row, in the frame of the fixes (n, 3)."""
-    if rows is None or rows.array_position_m is None or rows.array_rotation is None:
+    if rows is None or rows.pose is None:
         return np.tile(array.centroid, (n, 1))
-    turned: FloatArray = rows.array_rotation.apply(array.centroid.copy())  # scipy takes no read-only array
-    return rows.array_position_m + turned
+    origin_m, rotation = rows.pose
+    return origin_m + np.asarray(rotation.apply(array.centroid.copy()))  # scipy takes no read-only array
 
 
 def _nearest_rows(rows: Readings, points: Sequence[TrackPoint]) -> NDArray[np.intp]:
     """The row of the readings that is nearest in time, for every point of a track."""
-    times = np.array([point.time_s for point in points])
-    return np.abs(rows.time_s[:, None] - times).argmin(axis=0)
+    return np.abs(rows.time_s[:, None] - stacked(points, "time_s")).argmin(axis=0)
 
 
 def _not_far(positions_m: FloatArray, centroids_m: FloatArray) -> FloatArray:

@@ -11,8 +11,8 @@ Use, inside a tab or folder of the GUI::
         on_row=[readings_plot.show_row],     # called with the index of the row
     )
     player.show_row(index)
-    player.play(); player.pause()
-    player.close()                           # ends the playing thread; call it before server.stop()
+    player.play()
+    player.pause()                           # ends the playing thread; call it before server.stop()
 """
 
 from __future__ import annotations
@@ -25,12 +25,20 @@ import viser
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.tracking.results import TrackPoint
+from magloc.tracking.results import TrackPoint, stacked
 from magloc.viewer.pages import words
 from magloc.viewer.panels.inputs import SharedInput
 from magloc.viewer.panels.latest import Latest
 from magloc.viewer.panels.played_time import PlayedTime, speed_text
-from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, TRACK_COLOUR, DipoleGlyph, TrackGlyph, length_text, round_length
+from magloc.viewer.scene.glyphs import (
+    DIPOLE_COLOUR,
+    TRACK_COLOUR,
+    DipoleGlyph,
+    TrackGlyph,
+    length_text,
+    round_length,
+    screen_lines,
+)
 from magloc.viewer.scene.shapes import line_segments
 
 Poses = tuple[FloatArray, FloatArray]
@@ -41,7 +49,7 @@ _STRIP_PARTS = 200
 _WHOLE_COLOUR = (190, 196, 203)
 
 
-class TrackPlayer:
+class TrackPlayer(PlayedTime):
     """A track in the scene at one time, and the panels that move the time.
 
     Parameters
@@ -80,28 +88,21 @@ class TrackPlayer:
     ) -> None:
         self.points = points
         self._poses, self._on_pose, self._on_row = array_poses, on_pose, on_row
-        time = np.array([point.time_s for point in points])
+        time = stacked(points, "time_s")
         self._since_first_s = time - time[0]
         self._span_s = float(self._since_first_s[-1])
+        positions, self._moments = stacked(points, "position_m", 3), stacked(points, "moment_Am2", 3)
         self._tracked = np.array([point.position_m is not None for point in points])
-        positions = np.array([_vector(point.position_m) for point in points])
-        self.whole = server.scene.add_line_segments(
-            f"{name}/whole", line_segments(positions), _WHOLE_COLOUR, thickness=1.5, thickness_units="screen"
-        )
-        self.glyph = TrackGlyph(server.scene, f"{name}/tail", positions, _covariances(points), size_m=0.15 * size_m)
+        self.whole = screen_lines(server.scene, f"{name}/whole", line_segments(positions), _WHOLE_COLOUR, 1.5)
+        has_any = any(point.covariance is not None for point in points)
+        covariances = stacked(points, "covariance", 6, 6)[:, :3, :3] if has_any else None
+        self.glyph = TrackGlyph(server.scene, f"{name}/tail", positions, covariances, size_m=0.15 * size_m)
         self.dipole = DipoleGlyph(server.scene, f"{name}/moment", size_m, DIPOLE_COLOUR)
         self.index = int(np.flatnonzero(self._tracked)[-1]) if self._tracked.any() else 0
         self._follow = Latest(self._show)
         self._add_panels(server)
-        self._played = PlayedTime(
-            self._span_s, self._follow, self.play_button, self.speed_dropdown, "magloc-track-player"
-        )
+        super().__init__(self._span_s, self._follow, self.play_button, self.speed_dropdown, "magloc-track-player")
         self.show_row(self.index)
-
-    @property
-    def is_playing(self) -> bool:
-        """Whether time runs."""
-        return self._played.is_playing
 
     def show_row(self, index: int) -> None:
         """Show the track at the time of a row.
@@ -112,19 +113,7 @@ class TrackPlayer:
             Rows before the first and after the last are those.
         """
         index = min(max(index, 0), len(self.points) - 1)
-        self._played.move_to(float(self._since_first_s[index]))
-
-    def play(self) -> None:
-        """Let time run, from the beginning if it is at the end."""
-        self._played.play()
-
-    def pause(self) -> None:
-        """Let time stand still."""
-        self._played.pause()
-
-    def close(self) -> None:
-        """End the thread that plays; to be called before the server is stopped."""
-        self.pause()
+        self.move_to(float(self._since_first_s[index]))
 
     def _add_panels(self, server: viser.ViserServer) -> None:
         gui, span = server.gui, self._span_s
@@ -152,7 +141,7 @@ class TrackPlayer:
         self.whole_checkbox.on_update(self._whole_switched)
 
     def _time_moved(self) -> None:
-        self._played.move_to(float(self.time_slider.value) + 0.5 * self._step_s)
+        self.move_to(float(self.time_slider.value) + 0.5 * self._step_s)
 
     def _step_row(self, direction: str) -> None:
         self.pause()
@@ -162,11 +151,11 @@ class TrackPlayer:
         self.whole.visible = self.whole_checkbox.value
 
     def _show(self) -> None:
-        index = max(0, int(np.searchsorted(self._since_first_s, self._played.now_s, side="right")) - 1)
+        index = max(0, int(np.searchsorted(self._since_first_s, self.now_s, side="right")) - 1)
         self.index, point, now = index, self.points[index], float(self._since_first_s[index])
         first = int(np.searchsorted(self._since_first_s, now - self.tail_slider.value - 1e-9 * self._span_s))
         self.glyph.show_until(index, index - first)
-        self.dipole.show(_vector(point.position_m), _vector(point.moment_Am2))
+        self.dipole.show(self.glyph.positions_m[index], self._moments[index])
         if self._poses is not None and self._on_pose is not None:
             self._on_pose(self._poses[0][index], self._poses[1][index])
         self._time.show(now)
@@ -189,18 +178,6 @@ def row_words(point: TrackPoint, index: int, n_rows: int) -> str:
     if np.isfinite(point.nis) and point.nis_dof:
         lines.append(f"NIS/dof {point.nis:.3g}/{point.nis_dof}")
     return words.panel(lines)
-
-
-def _vector(value: FloatArray | None) -> FloatArray:
-    return np.full(3, np.nan) if value is None else value
-
-
-def _covariances(points: Sequence[TrackPoint]) -> FloatArray | None:
-    """Of the positions (n, 3, 3), NaN where there is none; None if there is none at all."""
-    if all(point.covariance is None for point in points):
-        return None
-    unknown = np.full((3, 3), np.nan)
-    return np.array([unknown if point.covariance is None else point.covariance[:3, :3] for point in points])
 
 
 def _strip(since_first_s: FloatArray, tracked: NDArray[np.bool_]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from html import escape
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,35 +17,6 @@ if TYPE_CHECKING:
 from arrays.typing import FloatArray
 
 _POSITIVE, _NEGATIVE = "0,114,178", "213,94,0"
-
-
-class Difference(NamedTuple):
-    """How far a solution is from the truth.
-
-    Attributes
-    ----------
-    position_m : float
-        Distance [m].
-    in_sigma : float, optional
-        The same over the root mean square that the Cramér-Rao bound allows; None where there is no bound.
-    moment : float
-        Length of the moment's error over the moment.
-    """
-
-    position_m: float
-    in_sigma: float | None
-    moment: float
-
-
-def difference(
-    solution: Solution, position_m: FloatArray, moment_Am2: FloatArray, covariance: FloatArray | None
-) -> Difference:
-    """How far a solution is from a known dipole, with the bound (6, 6) of the dipole's position and moment."""
-    distance = float(np.linalg.norm(solution.position_m - position_m))
-    moment = float(np.linalg.norm(solution.moment_Am2 - moment_Am2) / np.linalg.norm(moment_Am2))
-    if covariance is None:
-        return Difference(distance, None, moment)
-    return Difference(distance, distance / float(np.sqrt(np.trace(covariance[:3, :3]))), moment)
 
 
 def place(position_m: FloatArray) -> str:
@@ -83,19 +54,22 @@ def bound_words(forecast: Forecast) -> list[str]:
     ]
 
 
-def fix_words(fix: Fix, forecast: Forecast, of_best: Difference | None) -> list[str]:
+def fix_words(fix: Fix, forecast: Forecast, position_m: FloatArray, moment_Am2: FloatArray) -> list[str]:
     """What a fix of simulated readings found, and how far from the truth it is."""
-    if not fix.solutions or of_best is None:
+    if not fix.solutions:
         return [f"<b>no solution</b>: {escape(fix.reason)}"]
     best = fix.best
     lines = []
     if not forecast.detectable:
         lines.append("<b>this is a fit of noise</b>: the signal is too weak to be detected")
     lines.append(f"found at {place(best.position_m)}")
-    error = f"error {length_text(of_best.position_m)}"
-    if of_best.in_sigma is not None:
-        error += f", {_plain(of_best.in_sigma, 2)} × the least rms error that is possible"
-    lines += [error, f"error of the moment {_plain(100.0 * of_best.moment, 2)} %", _chi2_words(best)]
+    distance = float(np.linalg.norm(best.position_m - position_m))
+    error = f"error {length_text(distance)}"
+    if forecast.covariance is not None:
+        least = float(np.sqrt(np.trace(forecast.covariance[:3, :3])))
+        error += f", {_plain(distance / least, 2)} × the least rms error that is possible"
+    moment = float(np.linalg.norm(best.moment_Am2 - moment_Am2) / np.linalg.norm(moment_Am2))
+    lines += [error, f"error of the moment {_plain(100.0 * moment, 2)} %", _chi2_words(best)]
     lines += [range_words(interval, observable=best.range_observable) for interval in best.range_interval_m]
     others = len(fix.solutions) - 1
     if others:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from threading import Event, Lock, Thread, current_thread
 from time import perf_counter
 
 import viser
+
+from magloc.viewer.panels.latest import Latest
 
 _FRAMES_PER_SECOND = 15.0
 
@@ -16,19 +17,14 @@ def speed_text(speed: float) -> str:
     return f"{speed:g} ×"
 
 
-def speed_of(text: str) -> float:
-    """The speed of an entry of a dropdown."""
-    return float(text.split()[0])
-
-
 class PlayedTime:
     """A time between 0 and a duration, which a thread of its own moves while it is played.
 
     Parameters
     ----------
     duration_s : float
-    follow : callable
-        Called, without arguments, whenever the time has moved.
+    follow : Latest
+        Called whenever the time has moved.
     button : viser.GuiButtonHandle
         Plays and pauses, and says which.
     speed : viser.GuiDropdownHandle
@@ -45,7 +41,7 @@ class PlayedTime:
     def __init__(
         self,
         duration_s: float,
-        follow: Callable[[], None],
+        follow: Latest,
         button: viser.GuiButtonHandle,
         speed: viser.GuiDropdownHandle[str],
         name: str,
@@ -95,7 +91,7 @@ class PlayedTime:
         try:
             while self.now_s < self._duration_s and not stop.wait(1.0 / _FRAMES_PER_SECOND):
                 now = perf_counter()
-                self.now_s += (now - last) * speed_of(self._speed.value)
+                self.now_s += (now - last) * float(self._speed.value.split()[0])
                 last = now
                 self._follow()
         finally:

@@ -65,7 +65,7 @@ class ReadingsPlot:
     def __init__(self, server: viser.ViserServer, readings: Readings, array: SensorArray) -> None:
         self._server, self._order = server, np.argsort(readings.time_s, kind="stable")
         self._time_s = readings.time_s[self._order] - readings.time_s.min()
-        self._channels = channels_of(array)
+        self._channels, self._ids = channels_of(array), array.ids
         ordered = readings.values_T[self._order]
         self._values_nT = {RAW: 1e9 * ordered, DIFFERENCES: 1e9 * differences_from_mean(array, ordered)}
         self._follow = Latest(self._show)
@@ -138,11 +138,10 @@ class ReadingsPlot:
         row = int(np.flatnonzero(self._order == self.index)[0]) if len(self._order) else 0
         time, shown = thinned(self._time_s, values, _MOST_POINTS)
         time, shown, mark = with_mark(time, shown, float(self._time_s[row]), values[row])
-        sensors = list(self.sensor_index)
         series = [uplot.Series(label="time [s]")]
         for column, i in enumerate(chosen):
             channel = self._channels[i]
-            colour = _COLOURS[sensors.index(channel.sensor) % len(_COLOURS)]
+            colour = _COLOURS[self._ids.index(channel.sensor) % len(_COLOURS)]
             broken = bool(np.isnan(values[:, column]).any())
             series.append(_series(channel, colour, broken=broken))
         series.append(uplot.Series(label="now", scale="mark", stroke="#000000", width=1.5, points={"show": False}))
@@ -153,11 +152,6 @@ class ReadingsPlot:
             "mark": uplot.Scale(range=(0.0, 1.0)),
         }
         return tuple(series), (time, *shown.T, mark), scales
-
-    @property
-    def sensor_index(self) -> dict[str, None]:
-        """Ids of the sensors in their order."""
-        return dict.fromkeys(channel.sensor for channel in self._channels)
 
 
 def channels_of(array: SensorArray) -> list[Channel]:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from arrays.array import SensorArray
 from arrays.meshes import glyph_size, sensor_mesh
 from arrays.sensor import Sensor, SensorKind
-from arrays.typing import FloatArray
+from arrays.typing import ByteArray, FloatArray
 from magloc.viewer.scene.shapes import (
     CHI2_95,
     NOTHING,
@@ -56,6 +56,40 @@ def length_text(length_m: float) -> str:
         if abs(length_m) >= least * (1.0 - 1e-9):
             return f"{length_m / metres:.3g} {unit}"
     return f"{length_m:g} m"
+
+
+def screen_lines(
+    scene: viser.SceneApi, name: str, segments_m: FloatArray, colour: Colour, width: float, *, visible: bool = True
+) -> viser.LineSegmentsHandle:
+    """Lines (k, 2, 3) that are as wide on the screen from near as from far."""
+    return scene.add_line_segments(name, segments_m, colour, thickness=width, thickness_units="screen", visible=visible)
+
+
+def solid(
+    scene: viser.SceneApi, name: str, surface: Surface, colour: Colour, *, flat: bool = False, opacity: float = 1.0
+) -> viser.MeshHandle:
+    """A mesh that neither casts nor shows shadows; both sides are seen of one that is translucent."""
+    vertices, faces = surface
+    return scene.add_mesh_simple(
+        name,
+        vertices,
+        faces,
+        color=colour,
+        flat_shading=flat,
+        opacity=opacity if opacity < 1.0 else None,
+        side="double" if opacity < 1.0 else "front",
+        cast_shadow=False,
+        receive_shadow=False,
+    )
+
+
+def dots(
+    scene: viser.SceneApi, name: str, points_m: FloatArray, colours: Colour | ByteArray, size_m: float
+) -> viser.PointCloudHandle:
+    """Round points (n, 3) of one colour, or one each."""
+    return scene.add_point_cloud(
+        name, points_m.astype(np.float32), colours, point_size=size_m, point_shape="circle", precision="float32"
+    )
 
 
 class ArrayGlyphs:
@@ -147,12 +181,7 @@ class ArrayGlyphs:
             label.position = self._label_place(i)
 
     def name_as_a_whole(self, text: str) -> None:
-        """One text for the array in place of the ids of its sensors, where these would be too small to be read.
-
-        Parameters
-        ----------
-        text : str
-        """
+        """One text for the array in place of the ids of its sensors, where these would be too small to be read."""
         for label in (*self.labels.values(), *self.axis_labels):
             label.visible = False
         place = self.array.centroid + np.array([0.0, 0.0, 1.3 * self.array.circumradius])
@@ -199,20 +228,13 @@ class DipoleGlyph:
     ) -> None:
         # The moment is the frame's z axis: a turn of the frame turns all that belongs to it.
         self.frame = scene.add_frame(name, show_axes=False, visible=False)
-        body = dipole_body(size_m, thickness_m)
-        scene.add_mesh_simple(
-            f"{name}/body", body.vertices, body.faces, color=colour, cast_shadow=False, receive_shadow=False
-        )
-        self.lines: viser.LineSegmentsHandle | None = None
+        solid(scene, f"{name}/body", dipole_body(size_m, thickness_m), colour)
         if reach_m is not None:
             segments = line_segments(field_lines(np.zeros(3), np.array([0.0, 0.0, 1.0]), reach_m))
-            self.lines = scene.add_line_segments(
-                f"{name}/field-lines", segments, FIELD_LINE_COLOUR, thickness=1.3, thickness_units="screen"
-            )
-        self.label: viser.LabelHandle | None = None
+            screen_lines(scene, f"{name}/field-lines", segments, FIELD_LINE_COLOUR, 1.3)
         if label:
             # Beside the tip, beyond which there may be the arrow of a control.
-            self.label = screen_label(scene, f"{name}/text", label, np.array([0.0, 0.0, 0.9 * size_m]), "center-right")
+            screen_label(scene, f"{name}/text", label, np.array([0.0, 0.0, 0.9 * size_m]), "center-right")
         self._wanted = True
         self._defined = False
 
@@ -239,7 +261,7 @@ class DipoleGlyph:
         self._defined = bool(np.isfinite(position).all() and np.isfinite(strength) and strength > 0.0)
         if self._defined:
             self.frame.position = position
-            self.frame.wxyz = _wxyz_along(moment / strength)
+            self.frame.wxyz = turned_to(moment / strength)
         self.visible = self._wanted
 
 
@@ -279,23 +301,14 @@ class SurfaceGlyph:
         surface : Surface, optional
             None, or one without faces, is not seen.
         """
-        vertices, faces = NOTHING if surface is None else surface
-        if len(faces):
-            if self.mesh is not None and faces is self._faces:
-                self.mesh.vertices = vertices.astype(np.float32)
+        shown = NOTHING if surface is None else surface
+        if len(shown.faces):
+            if self.mesh is not None and shown.faces is self._faces:
+                self.mesh.vertices = shown.vertices.astype(np.float32)
             else:
                 # Vertices and faces have to change together: the node is replaced.
-                self.mesh = self._scene.add_mesh_simple(
-                    self._name,
-                    vertices,
-                    faces,
-                    color=self._colour,
-                    opacity=self._opacity,
-                    side="double",
-                    cast_shadow=False,
-                    receive_shadow=False,
-                )
-        self._faces = faces
+                self.mesh = solid(self._scene, self._name, shown, self._colour, opacity=self._opacity)
+        self._faces = shown.faces
         self.visible = self._wanted
 
 
@@ -328,9 +341,7 @@ class TrackGlyph:
     ) -> None:
         self.positions_m, self.covariances_m2 = positions_m, covariances_m2
         self._scene, self._name, self._colour = scene, name, colour
-        self.line = scene.add_line_segments(
-            f"{name}/line", line_segments(positions_m), colour, thickness=3.0, thickness_units="screen"
-        )
+        self.line = screen_lines(scene, f"{name}/line", line_segments(positions_m), colour, 3.0)
         self.mark = scene.add_icosphere(
             f"{name}/mark", radius=0.5 * size_m, color=colour, visible=False, cast_shadow=False, receive_shadow=False
         )
@@ -339,33 +350,20 @@ class TrackGlyph:
         if covariances_m2 is not None:
             self._add_ellipsoids(covariances_m2)
 
-    def show_until(self, index: int | None, tail: int | None = None) -> None:
-        """Show the track up to a point.
-
-        Parameters
-        ----------
-        index : int, optional
-            Of the point, which is marked, with its ellipsoid; None shows the whole track.
-        tail : int, optional
-            Intervals before the point that are shown; all by default.
-        """
-        first, last = 0, len(self.positions_m) - 1
-        position = np.full(3, np.nan)
-        if index is not None:
-            first, last = 0 if tail is None else max(0, index - tail), index
-            position = self.positions_m[index]
-        segments = line_segments(self.positions_m[first : last + 1])
+    def show_until(self, index: int, tail: int) -> None:
+        """Show the track up to a point, which is marked with its ellipsoid, and some intervals before it."""
+        first, position = max(0, index - tail), self.positions_m[index]
+        segments = line_segments(self.positions_m[first : index + 1])
         self.line.visible = bool(len(segments))
         if len(segments):
             self.line.points = segments.astype(np.float32)
         self.mark.visible = bool(np.isfinite(position).all())
         if self.mark.visible:
             self.mark.position = position
-        with_region = index is not None and self.covariances_m2 is not None
-        self.region.show(ellipsoid(position, self.covariances_m2[index]) if with_region else None)  # type: ignore[index]
+        self.region.show(None if self.covariances_m2 is None else ellipsoid(position, self.covariances_m2[index]))
         if self.regions is not None:
             # Those that are not to be seen shrink to nothing: their number cannot change.
-            seen = (self._chosen >= first) & (self._chosen <= last)
+            seen = (self._chosen >= first) & (self._chosen <= index)
             self.regions.batched_scales = np.where(seen[:, None], self._semi_axes, 0.0).astype(np.float32)
 
     def _add_ellipsoids(self, covariances_m2: FloatArray) -> None:
@@ -396,21 +394,7 @@ class TrackGlyph:
 def screen_label(
     scene: viser.SceneApi, name: str, text: str, place_m: ArrayLike, anchor: LabelAnchor = "bottom-center"
 ) -> viser.LabelHandle:
-    """A text that is as large on the screen from near as from far.
-
-    Parameters
-    ----------
-    scene : viser.SceneApi
-    name, text : str
-    place_m : array-like, shape (3,)
-        [m].
-    anchor : str
-        Which of the text's places that is.
-
-    Returns
-    -------
-    viser.LabelHandle
-    """
+    """A text that is as large on the screen from near as from far, with its anchor at a place (3,) [m]."""
     place = np.asarray(place_m, dtype=np.float64)
     return scene.add_label(name, text, position=place, anchor=anchor)
 
@@ -432,8 +416,8 @@ def _wxyz_of_sensors(array: SensorArray) -> FloatArray:
     return np.roll(np.array([sensor.rotation_xyzw for sensor in array.sensors]), 1, axis=-1)
 
 
-def _wxyz_along(direction: FloatArray) -> FloatArray:
-    """The shortest turn (w, x, y, z) of the z axis to a unit vector."""
+def turned_to(direction: FloatArray) -> FloatArray:
+    """The shortest turn of the z axis to a unit vector, as a unit quaternion wxyz."""
     x, y, z = direction
     if z < -1.0 + 1e-12:
         return np.array([0.0, 1.0, 0.0, 0.0])

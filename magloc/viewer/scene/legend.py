@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
-import viser
-
 Colour = tuple[int, int, int]
 
 
@@ -66,22 +64,6 @@ def legend_html(entries: Sequence[Entry], notes: Sequence[str] = ()) -> str:
     rows = [_row(entry) for entry in entries]
     rows += [f'<div style="margin-top:.35em;opacity:.8">{escape(note)}</div>' for note in notes]
     return f'<div style="font-size:.8rem;line-height:1.35;padding:.2em .6em .5em">{"".join(rows)}</div>'
-
-
-def add_legend(gui: viser.GuiApi, entries: Sequence[Entry], notes: Sequence[str] = ()) -> viser.GuiHtmlHandle:
-    """Put the legend into the panel, where its GUI is at present.
-
-    Parameters
-    ----------
-    gui : viser.GuiApi
-    entries, notes
-        As in :func:`legend_html`.
-
-    Returns
-    -------
-    viser.GuiHtmlHandle
-    """
-    return gui.add_html(legend_html(entries, notes))
 
 
 def with_legend(

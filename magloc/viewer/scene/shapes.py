@@ -65,6 +65,11 @@ def joined(surfaces: Iterable[Surface]) -> Surface:
     return Surface(np.concatenate(vertices), np.concatenate(faces))
 
 
+def surface_of(*meshes: trimesh.Trimesh) -> Surface:
+    """Meshes as one surface."""
+    return joined(Surface(np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64)) for mesh in meshes)
+
+
 def dipole_body(size_m: float, thickness_m: float | None = None) -> Surface:
     """A ball at the origin and an arrow from it along z, which stand for a dipole.
 
@@ -84,12 +89,9 @@ def dipole_body(size_m: float, thickness_m: float | None = None) -> Surface:
     neck = size_m - 1.23 * thickness
     head = trimesh.creation.cone(0.46 * thickness, size_m - neck, sections=24)
     head.apply_translation([0.0, 0.0, neck])
-    parts = (
-        trimesh.creation.icosphere(subdivisions=3, radius=0.5 * thickness),
-        trimesh.creation.cylinder(0.17 * thickness, sections=16, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, neck]]),
-        head,
-    )
-    return joined(Surface(np.array(part.vertices), np.array(part.faces, dtype=np.int64)) for part in parts)
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5 * thickness)
+    shaft = trimesh.creation.cylinder(0.17 * thickness, sections=16, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, neck]])
+    return surface_of(ball, shaft, head)
 
 
 def box_edges(corner_m: ArrayLike, opposite_m: ArrayLike) -> FloatArray:
@@ -382,8 +384,7 @@ def iso_surface(axis_m: ArrayLike, values: ArrayLike, level: float) -> Surface:
 
 @cache
 def _unit_sphere() -> Surface:
-    sphere = trimesh.creation.icosphere(subdivisions=3)
-    return Surface(np.array(sphere.vertices), np.array(sphere.faces, dtype=np.int64))
+    return surface_of(trimesh.creation.icosphere(subdivisions=3))
 
 
 @cache

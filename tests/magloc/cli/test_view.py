@@ -21,11 +21,12 @@ from arrays.io.errors import InputError
 from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings, write_readings
 from magloc.tracking.results import TrackResult
-from magloc.viewer.chromium import BINARIES, Chromium, find_chromium
+from magloc.viewer.chromium import BINARIES, find_chromium
 from magloc.viewer.pages.open_result import MapResult, ReadingsResult, read_result
 from magloc.viewer.pages.pages import array_page
 from magloc.viewer.scene.glyphs import ArrayGlyphs
 from magloc.viewer.server import free_port, opened
+from tests.browser.browser import Browser
 from tests.command_line import Run, assert_refused, viewer_started
 
 LARGEST_PAGE = 15_000_000
@@ -294,7 +295,7 @@ class TestPages:
     def test_nothing_is_downloaded(self, run: Run, array_file: Path, tmp_path: Path) -> None:
         page = tmp_path / "page.html"
         run("view", array_file, "--html", page, "--quiet")
-        with Chromium(page.as_uri(), (640, 400)) as browser:
+        with Browser(page.as_uri(), (640, 400)) as browser:
             browser.wait_for("document.querySelector('canvas') !== null")
             browser.settled_screenshot()
             assert browser.requests == [page.as_uri()]

@@ -32,7 +32,8 @@ from numpy.typing import NDArray
 from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.sensor import Sensor
-from magloc.convergence.filters import DampedFilter, Ends, IekfFilter, RepeatedFilter, field_weights
+from magloc.convergence.filters import DampedFilter, IekfFilter, RepeatedFilter, field_weights
+from magloc.convergence.filters_compiled import Ends
 from magloc.convergence.linearisation_compiled import Model
 from magloc.convergence.workspace_compiled import LANES
 from magloc.kalman import predict_square_root, sequential_update

@@ -25,7 +25,7 @@ import xarray as xr
 from arrays.io.errors import InputError
 from magloc.convergence.filters import IekfFilter
 from magloc.convergence.over_starts import StartsMap, StartsScenario, summary
-from magloc.grids.cube import Box, Tally, Variable, boxes, computed_here, histogram, in_memory
+from magloc.grids.cube import Box, Tally, Variable, boxes, computed_here, in_memory
 from magloc.grids.store import Sweep, chunk_seconds, open_map
 from tests.conftest import REPOSITORY
 from tests.waiting import wait_for
@@ -145,9 +145,8 @@ class TestStore:
     @pytest.mark.parametrize("n", [1, 2, 7, 8])
     def test_median_of_a_histogram(self, n):
         iterations = np.random.default_rng(n).integers(1, 9, n)
-        tally = Tally(iterations_of_converged=histogram(iterations[: n // 2])) + Tally(
-            iterations_of_converged=histogram(iterations[n // 2 :])
-        )
+        halves = (iterations[: n // 2], iterations[n // 2 :])
+        tally = sum((Tally.of({"converged": np.ones(len(half), bool)}, half) for half in halves), Tally())
         assert tally.median_iterations() == np.median(iterations)
 
 

@@ -130,7 +130,7 @@ class TestScene:
     def test_satellite_estimate_and_ellipse(self, server, player, drive):
         for time_s, enlarged in ((12.0, "10 ×"), (16.0, "1 ×")):
             set_value(player.enlarge_dropdown, enlarged)
-            player.show_time(time_s)
+            player.move_to(time_s)
             row, times = drive.row_at(time_s), float(enlarged.split()[0])
             satellite, estimate = node(server, "/satellite"), node(server, "/estimate")
             np.testing.assert_allclose(satellite.position[:2], drive.truth.position_m[row])
@@ -165,7 +165,7 @@ class TestScene:
 
     def test_late_fix_and_rejected_fix(self, server, player, drive):
         for fix, outcome in enumerate(drive.outcomes):
-            player.show_time(float(drive.fixes.arrival_s[fix]) + 0.02)
+            player.move_to(float(drive.fixes.arrival_s[fix]) + 0.02)
             wrong = outcome is Outcome.REJECTED
             shown, hidden = ("/rejected-fix", "/fix") if wrong else ("/fix", "/rejected-fix")
             assert (node(server, shown).visible, node(server, hidden).visible) == (True, False)
@@ -174,12 +174,12 @@ class TestScene:
             assert ("<b>rejected</b>" in player.row_panel.content) == wrong
 
     def test_before_the_first_fix_there_is_none(self, server, player):
-        player.show_time(0.3)
+        player.move_to(0.3)
         for name in ("/fix", "/rejected-fix", "/exposure", "/age"):
             assert not node(server, name).visible
         assert "no fix has arrived" in player.frame_panel.content
         assert np.ptp(np.asarray(node(server, "/sky").batched_colors), axis=0).max() == 0
-        player.show_time(5.0)
+        player.move_to(5.0)
         assert node(server, "/fix").visible
 
     def test_trails_end_at_the_present(self, server, player, drive):
@@ -195,11 +195,11 @@ class TestPlayer:
     def test_slider(self, player, drive):
         set_value(player.time_slider, 8.0)
         assert drive.truth.time_s[player.row] == pytest.approx(8.0)
-        player.show_time(99.0)
+        player.move_to(99.0)
         assert player.time_slider.value == pytest.approx(DURATION_S)
 
     def test_play_and_pause(self, player):
-        player.show_time(0.0)
+        player.move_to(0.0)
         set_value(player.speed_dropdown, "1 ×")
         player.play()
         player.play()  # a second time changes nothing
@@ -216,7 +216,7 @@ class TestPlayer:
     def test_it_stops_at_the_end_and_begins_again(self, player, drive, monkeypatch):
         tenths = iter(range(20))  # the clock stands still early in the second time
         monkeypatch.setattr("magloc.viewer.panels.played_time.perf_counter", lambda: 0.1 * next(tenths, 20))
-        player.show_time(DURATION_S - 0.1)
+        player.move_to(DURATION_S - 0.1)
         player.play()
         wait_for(lambda: not player.is_playing)
         assert player.row == len(drive.truth) - 1
@@ -234,8 +234,8 @@ class TestPlayer:
         watched = Drive(**{**{k: getattr(drive, k) for k in Drive.__dataclass_fields__}, "frame_of": frame_of})
         page, player = drive_page(server, watched, 12.0)
         shown = watched.last_fix(player.row)
-        player.show_time(12.01)
-        player.show_time(11.99)
+        player.move_to(12.01)
+        player.move_to(11.99)
         assert asked == [shown]
         page.close()
 

@@ -30,11 +30,12 @@ from magloc.levels import FALSE_ALARM
 from magloc.localization.fit.results import Fix
 from magloc.localization.uncertainty.range_interval import gaussian_ranges
 from magloc.viewer.pages.array_editor import ArrayEditor, fault_of_path, moved
-from magloc.viewer.pages.dipole_editor import DipoleEditor, angles_of, direction_of, sensible_step, turned_to
+from magloc.viewer.pages.dipole_editor import DipoleEditor, angles_of, direction_of, sensible_step
 from magloc.viewer.pages.live_fit import LiveFit, suitable_dipole
 from magloc.viewer.pages.words import panel
 from magloc.viewer.panels.inputs import set_value
 from magloc.viewer.panels.latest import Latest
+from magloc.viewer.scene.glyphs import turned_to
 from magloc.viewer.server import free_port, opened
 from tests.oracles import derivative, magpylib_field
 from tests.plain_locator import plain_locator
@@ -400,14 +401,6 @@ class TestDipoleEditor:
         editor.set_array(other)
         expected = magpylib_field(other.positions, editor.position_m, editor.moment_Am2).ravel()
         np.testing.assert_allclose(editor.forecast.signal_T, expected, rtol=1e-12)
-
-    def test_it_can_be_taken_out_of_the_scene(self, server, array):
-        editor = DipoleEditor(server, array)
-        editor.visible = False
-        names = ("control", "true", "fit 1", "region")
-        assert not any(node(server, f"/dipole/{name}").visible for name in names)
-        editor.visible = True
-        assert all(node(server, f"/dipole/{name}").visible for name in names)
 
 
 class TestArrayEditor:

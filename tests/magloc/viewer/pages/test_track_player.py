@@ -87,7 +87,7 @@ def server() -> Iterator[viser.ViserServer]:
 def player(server) -> Iterator[TrackPlayer]:
     player = TrackPlayer(server, track(), 0.5)
     yield player
-    player.close()
+    player.pause()
 
 
 def node(server: viser.ViserServer, name: str) -> viser.SceneNodeHandle:

@@ -244,16 +244,15 @@ class TestTrack:
     def test_tail(self, server: viser.ViserServer) -> None:
         track = scene.TrackGlyph(server.scene, "/t", self.POSITIONS, self.COVARIANCES, size_m=0.1)
         assert len(track.line.points) == 9
+        assert track.line.visible
+        assert not track.mark.visible
         track.show_until(6, tail=2)
         assert track.line.points[:, :, 0].tolist() == [[4.0, 5.0], [5.0, 6.0]]
         assert track.mark.position == pytest.approx([6.0, 0.0, 0.0])
         assert track.regions is not None
         assert (track.regions.batched_scales.max(axis=1) > 0.0).tolist() == [False] * 4 + [True] * 3 + [False] * 3
-        track.show_until(0)
+        track.show_until(0, tail=2)
         assert not track.line.visible
-        track.show_until(None)
-        assert track.line.visible
-        assert not track.mark.visible
 
     def test_ellipsoids_have_the_axes_of_the_covariance(self, server: viser.ViserServer) -> None:
         track = scene.TrackGlyph(server.scene, "/t", self.POSITIONS, self.COVARIANCES, size_m=0.1)
@@ -267,7 +266,7 @@ class TestTrack:
         positions[5] = np.nan
         track = scene.TrackGlyph(server.scene, "/t", positions, None, size_m=0.1)
         assert len(track.line.points) == 7
-        track.show_until(5)
+        track.show_until(5, tail=5)
         assert not track.mark.visible
 
     def test_many_ellipsoids_are_thinned(self, server: viser.ViserServer) -> None:
@@ -470,7 +469,7 @@ class TestSpeed:
         few, many = (calls_of(lambda view=view: view.show_row(3)) for view in views)
         assert many == few
         short, long = (self.track(server, n) for n in (20, 2000))
-        assert calls_of(lambda: long.show_until(1500)) == calls_of(lambda: short.show_until(15))
+        assert calls_of(lambda: long.show_until(1500, 1500)) == calls_of(lambda: short.show_until(15, 15))
 
     @staticmethod
     def track(server: viser.ViserServer, n: int) -> scene.TrackGlyph:
