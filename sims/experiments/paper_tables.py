@@ -6,9 +6,11 @@ or the digit, is what the context needs. "1" of a quantity is one standard devia
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import csv
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import Literal, cast
 
 import numpy as np
 
@@ -60,123 +62,26 @@ class PaperRow:
     sensors: str
     states: tuple[str, ...]
     numbers: dict[Quantity, Printed]  # what is printed
-    filter: Filter = "mekf"
-    duration_s: float = 200.0  # after which ours is taken
+    filter: Filter
+    duration_s: float  # after which ours is taken
 
 
-def _row(
-    table: int,
-    label: str,
-    sensors: str,
-    states: tuple[str, ...],
-    numbers: dict[Quantity, str],
-    filter: Filter = "mekf",
-    duration_s: float = 200.0,
-) -> PaperRow:
-    return PaperRow(
-        table, label, sensors, states, {key: printed(text) for key, text in numbers.items()}, filter, duration_s
-    )
+def _paper_rows() -> Iterator[PaperRow]:
+    """Rows of the file beside this module."""
+    with Path(__file__).with_suffix(".csv").open(encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            yield PaperRow(
+                table=int(row["table"]),
+                label=row["set"],
+                sensors=row["sensors"],
+                states=tuple(row["states"].split("+")) if row["states"] else (),
+                numbers={quantity: printed(row[quantity]) for quantity in UNITS if row[quantity]},
+                filter=cast(Filter, row["filter"]),
+                duration_s=float(row["duration_s"]),
+            )
 
 
-_G, _B, _D = "gyro-bias", "field-bias", "disturbance"
-_STAR: dict[Quantity, str] = {"attitude": "5e-4", "rate": "4e-4"}
-PAPER_ROWS: tuple[PaperRow, ...] = (
-    _row(3, "ST+G+M+S", "st+gyro+mag+sun", (), _STAR),
-    _row(3, "ST+G+M", "st+gyro+mag", (), _STAR),
-    _row(3, "ST+G", "st+gyro", (), _STAR),
-    _row(3, "ST+M+S", "st+mag+sun", (), {"attitude": "7e-4", "rate": "6e-4"}),
-    _row(3, "ST+M, Δb", "st+mag", (_B,), {"attitude": "7e-4", "rate": "6e-4", "field bias": "80"}),
-    _row(3, "ST+G, Δω", "st+gyro", (_G,), {"attitude": "5e-4", "rate": "4e-4", "gyro bias": "3e-3 (?)"}),
-    _row(3, "Mag+Sun+G", "mag+sun+gyro", (), {"attitude": "2e-2 (?)", "rate": "4e-3 (?)"}),
-    _row(3, "Mag+Sun+G, Δω", "mag+sun+gyro", (_G,), {"attitude": "2e-2", "rate": "4e-3", "gyro bias": "5e-4"}),
-    _row(3, "Mag+Sun+G, Δb", "mag+sun+gyro", (_B,), {"attitude": "5e-2 (?)", "rate": "4e-3", "field bias": "400"}),
-    _row(3, "Mag+Sun", "mag+sun", (), {"attitude": "1.2e-1 (?)", "rate": "2e-2 (?)"}),
-    _row(3, "Mag+G", "mag+gyro", (), {"attitude": "2e-1 (?)", "rate": "5e-3 (?)"}),
-    _row(3, "ST", "st", (), {"attitude": "8e-4", "rate": "6e-4"}),
-    _row(4, "ST, d", "st", (_D,), {"attitude": "8e-4", "rate": "1e-4", "disturbance": "5e-8 (?)"}, duration_s=600.0),
-    _row(
-        4,
-        "ST+G, Δω, d",
-        "st+gyro",
-        (_G, _D),
-        {"attitude": "8e-4", "rate": "7e-5 (?)", "gyro bias": "1e-5…1e-3 (?)", "disturbance": "5e-8 (?)"},
-        duration_s=600.0,
-    ),
-    _row(
-        4,
-        "Mag+Sun, d",
-        "mag+sun",
-        (_D,),
-        {"attitude": "3e-2", "rate": "2e-3", "disturbance": "5e-7 (?)"},
-        duration_s=600.0,
-    ),
-    _row(
-        4,
-        "Mag+Sun+G, Δω, d",
-        "mag+sun+gyro",
-        (_G, _D),
-        {"attitude": "2e-2", "rate": "2e-3", "gyro bias": "5e-4", "disturbance": "8e-7"},
-        duration_s=600.0,
-    ),
-    _row(5, "ST", "st", (), {"attitude": "2e-3 (?)", "rate": "4e-4"}, "constant-gain", 600.0),
-    _row(
-        5,
-        "ST, d",
-        "st",
-        (_D,),
-        {"attitude": "8e-4", "rate": "1e-4", "disturbance": "5e-8 (?)"},
-        "constant-gain",
-        600.0,
-    ),
-    _row(
-        5,
-        "ST+G, Δω",
-        "st+gyro",
-        (_G,),
-        {"attitude": "1.5e-3", "rate": "3e-4…5e-3 (?)", "gyro bias": "4e-4"},
-        "constant-gain",
-        600.0,
-    ),
-    _row(
-        5,
-        "ST+G, Δω, d",
-        "st+gyro",
-        (_G, _D),
-        {"attitude": "8e-4", "rate": "7e-5", "gyro bias": "1e-5 (?)"},
-        "constant-gain",
-        600.0,
-    ),
-    _row(5, "Mag+Sun+G", "mag+sun+gyro", (), {"attitude": "2e-2", "rate": "2.2e-2"}, "constant-gain", 600.0),
-    _row(5, "Mag+Sun+G, Δb", "mag+sun+gyro", (_B,), {"attitude": "2e-2", "rate": "5e-3"}, "constant-gain", 600.0),
-    _row(
-        5,
-        "Mag+Sun+G, [λ, Δω]",
-        "mag+sun+gyro",
-        (_G,),
-        {"attitude": "2e-2", "rate": "5e-3", "gyro bias": "1e-3"},
-        "reduced",
-        600.0,
-    ),
-    _row(
-        5,
-        "Mag+Sun+G, Δω, d",
-        "mag+sun+gyro",
-        (_G, _D),
-        {"attitude": "2e-2", "rate": "2e-3", "gyro bias": "5e-4", "disturbance": "8e-7"},
-        "constant-gain",
-        600.0,
-    ),
-    _row(5, "Mag+Sun", "mag+sun", (), {"attitude": "0.1", "rate": "5e-3"}, "constant-gain", 600.0),
-    _row(
-        5,
-        "Mag+Sun, d",
-        "mag+sun",
-        (_D,),
-        {"attitude": "3e-2", "rate": "2e-3", "disturbance": "5e-7 (?)"},
-        "constant-gain",
-        600.0,
-    ),
-)
+PAPER_ROWS = tuple(_paper_rows())
 """All rows. What Table 5 prints for Δb, 6e-1°, has a lost exponent and another unit; it is left out."""
 
 
