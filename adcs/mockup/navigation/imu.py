@@ -1,10 +1,7 @@
-r"""The mock-up's gyro and its inclinometer, which serves as accelerometer, and their calibration at rest.
+r"""The mock-up's gyro and its inclinometer, which serves as accelerometer.
 
 A reading is the true value plus a zero that is linear in temperature, plus noise; beyond the range there is none (NaN).
 An inclinometer that is mounted with a tilt also reads g·sin(tilt), which nothing tells from a zero.
-
-Calibration averages readings at rest and is repeated after every power-on. A pulse of a valve meanwhile would shift the
-zeros by up to 0.005 m/s², so readings that are not those of a satellite at rest are refused.
 """
 
 from __future__ import annotations
@@ -14,14 +11,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
 
-from adcs.mockup.navigation.strapdown import ImuRecord
 from arrays.typing import FloatArray
 
 G_M_S2 = 9.80665
-FALSE_ALARM = 1e-3
-"""Of a calibration at rest: how often one that nothing disturbs is refused."""
 
 
 def _zero_vector() -> FloatArray:
@@ -85,59 +78,6 @@ class Inclinometer:
         zero = self.zero_m_s2 + G_M_S2 * np.sin(self.tilt_rad) + self.zero_slope_m_s2_K * warmer_K[..., None]
         noise = np.asarray(noise, dtype=np.float64)
         return _within(np.asarray(acceleration_m_s2) + zero + self.sigma_m_s2 * noise, self.range_m_s2)
-
-
-class NotAtRestError(ValueError):
-    """Readings for a calibration are not those of a satellite at rest."""
-
-
-@dataclass(frozen=True, eq=False)
-class RestZeros:
-    """Zeros of all channels, of a calibration at rest."""
-
-    acceleration_m_s2: FloatArray  # (2,): zero and tilt
-    rate_rad_s: float
-    acceleration_sigma_m_s2: float  # standard deviations of these means
-    rate_sigma_rad_s: float  # standard deviations of these means
-
-
-def zeros_at_rest(
-    imu: ImuRecord, accelerometer: Inclinometer, gyro: RateGyro, *, false_alarm: float = FALSE_ALARM
-) -> RestZeros:
-    """Zeros of a satellite at rest: the means of its readings.
-
-    Whether it is at rest is seen in means over 1, 4, 16, … samples: none may be farther from the mean over all than
-    noise explains.
-    ``imu``: one run, two samples at least; missing readings are left out. ``accelerometer``, ``gyro``: for their noise.
-    ``false_alarm``: how often readings at rest are refused.
-
-    Notes
-    -----
-    A mean of k among n samples differs from that of all by σ√(1/k - 1/n); the quantile is shared by all means
-    (Bonferroni). A thrust that lasts throughout is not told from a zero.
-    """
-    channels = np.concatenate([imu.acceleration_m_s2, imu.rate_rad_s[:, None]], axis=1)
-    channels = np.where(np.isnan(channels).any(axis=1, keepdims=True), np.nan, channels)
-    there = ~np.isnan(channels[:, 0])
-    readings, time_s = channels[there], imu.time_s[there]
-    n = len(readings)
-    if n < 2:
-        raise ValueError(f"Input imu must have two samples at least; instead received {n}.")
-    sigma = np.array([accelerometer.sigma_m_s2, accelerometer.sigma_m_s2, gyro.sigma_rad_s])
-    mean = readings.mean(axis=0)
-    lengths = [4**power for power in range(12) if 2 * 4**power <= n]
-    limit = float(stats.norm.isf(0.5 * false_alarm / (3 * sum(n // k for k in lengths))))
-    for k in lengths:
-        blocks = readings[: n // k * k].reshape(-1, k, 3).mean(axis=1)
-        far = np.abs(blocks - mean) > limit * sigma * math.sqrt(1.0 / k - 1.0 / n)
-        if far.any():
-            block, channel = np.argwhere(far)[0]
-            raise NotAtRestError(
-                "Input imu must be of a satellite at rest; instead received "
-                f"{('an acceleration along x', 'an acceleration along y', 'a rate')[channel]} that noise does not "
-                f"explain at {time_s[block * k]:.2f} s (mean of {k} samples)."
-            )
-    return RestZeros(mean[:2], float(mean[2]), float(sigma[0]) / math.sqrt(n), float(sigma[2]) / math.sqrt(n))
 
 
 def _within(readings: FloatArray, largest: float) -> FloatArray:
