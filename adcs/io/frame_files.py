@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 import struct
 import warnings
 import zlib
@@ -15,7 +16,6 @@ from PIL import Image, UnidentifiedImageError
 from adcs.mockup.vision.camera import Camera
 from adcs.mockup.vision.centroids import checked_frame
 from arrays.io.errors import InputError
-from arrays.io.text import replace_file
 from arrays.typing import ByteArray
 
 _EXPECTED = "expected a grey PNG image of 8 bits"
@@ -86,4 +86,10 @@ def write_frame(frame: ByteArray, path: str | PathLike[str]) -> None:
 
     Shape ``frame`` (height, width). ``path``: replaced if it exists.
     """
-    replace_file(Path(os.path.realpath(path)), lambda place: Image.fromarray(frame).save(place, format="PNG"))
+    target = Path(os.path.realpath(path))
+    written = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    try:
+        Image.fromarray(frame).save(written, format="PNG")
+        os.replace(written, target)
+    finally:
+        written.unlink(missing_ok=True)

@@ -132,7 +132,7 @@ def drive_picture(options: MockupOptions, sky: LedSky) -> mockup_vision.DrivePic
     rng = np.random.default_rng([seed, 2])
 
     def place(pose: Pose, motion: Motion) -> FloatArray:
-        image = rendered_frame(sky, setup.camera, pose, rng, motion, setup.quality).image
+        image = rendered_frame(sky, setup.camera, pose, rng, motion, setup).image
         return frame_result(image, setup.believed_camera, matcher, finder).pose[:2]
 
     fixes_m = np.array([place(*pose_and_motion(truth, at_s)) for at_s in driven.time_s.tolist()])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -191,23 +192,20 @@ class MockupOptions:
     def _check_frames(self) -> None:
         if self.sky is None:
             raise InputError(f"--frames {self.frames}: found no --sky, expected the file of the lights' places.")
-        for name in self.given():
-            if name not in _OF_FRAMES:
-                raise InputError(
-                    f"{option_name(name)}: found it with --frames, expected it with simulated frames only."
-                )
+        self._refuse_given_but(_OF_FRAMES, "found it with --frames, expected it with simulated frames only.")
 
     def _check_record(self) -> None:
         for name, other in (("samples", "fixes"), ("fixes", "samples")):
             if getattr(self, name) is not None and getattr(self, other) is None:
                 raise InputError(f"{option_name(name)}: found it without --{other}, expected both.")
-        for name in self.given():
-            if name not in _OF_RECORDS:
-                raise InputError(
-                    f"{option_name(name)}: found it with --samples, expected it with simulated drives only."
-                )
+        self._refuse_given_but(_OF_RECORDS, "found it with --samples, expected it with simulated drives only.")
         if self.fusion == "all":
             raise InputError("--fusion all: found it with --samples, expected one method.")
+
+    def _refuse_given_but(self, names: Sequence[str], fault: str) -> None:
+        for name in self.given():
+            if name not in names:
+                raise InputError(f"{option_name(name)}: {fault}")
 
     def _check_range(self, name: str, low: float, high: float, expected: str) -> None:
         value = getattr(self, name)
@@ -256,11 +254,9 @@ class MockupOptions:
         catalogue, camera = TriangleCatalogue.of(self.led_sky.positions_m), self.camera()
         if self.matcher_name == "paper":
             return PaperMatcher(catalogue)
-        return (
-            odds_matcher(catalogue, camera)
-            if self.matcher_name == "odds"
-            else RobustMatcher(catalogue, camera.m_per_px)
-        )
+        if self.matcher_name == "odds":
+            return odds_matcher(catalogue, camera)
+        return RobustMatcher(catalogue, camera.m_per_px)
 
     def finder(self) -> Finder:
         """What finds the stars of an image."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,10 +19,8 @@ from adcs.mockup.vision.centroids import NoLightsError, Stars, find_stars
 from adcs.mockup.vision.paper_matcher import CameraFix, Matcher
 from adcs.mockup.vision.sky import LedSky
 from adcs.stars.identification import NoFix
-
-if TYPE_CHECKING:
-    from sims.mockup.frames import Frame, FrameQuality
 from arrays.typing import BoolArray, ByteArray, FloatArray
+from sims.mockup.frames import Frame, FrameQuality, Motion, rendered_frame
 
 Finder = Callable[[ByteArray], Stars]
 REACH_M = (1.25, 1.0)
@@ -31,20 +29,14 @@ FALSE_POSITION_M = 0.02
 FALSE_HEADING_RAD = math.radians(2.0)
 
 
-@dataclass(frozen=True)
-class SkySetup:
-    """Frames that are taken and what is believed of the camera.
+@dataclass(frozen=True, kw_only=True)
+class SkySetup(FrameQuality):
+    """Frames that are taken, what they are like, and what is believed of the camera.
 
     Attributes
     ----------
     poses : int
         Number of frames, at random places and headings.
-    noise_DN : float
-        Of a pixel.
-    lost : float
-        Probability that a light is dark.
-    spurious : int
-        Lights in view that are in no catalogue.
     speed_m_s, turn_rate_rad_s : float
         During the exposure, in random directions.
     footprint_m : float
@@ -61,10 +53,6 @@ class SkySetup:
     """
 
     poses: int = 120
-    noise_DN: float = 4.0
-    lost: float = 0.0
-    spurious: int = 0
-    hot_pixels: int = 0
     speed_m_s: float = 0.0
     turn_rate_rad_s: float = 0.0
     footprint_m: float = 0.9
@@ -73,6 +61,7 @@ class SkySetup:
     reach_m: tuple[float, float] = REACH_M
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.poses < 1:
             raise ValueError(f"Input poses must be 1 or more; instead received {self.poses}.")
         most = Camera.width_px * Camera.height_px
@@ -86,13 +75,6 @@ class SkySetup:
     def camera(self) -> Camera:
         """The camera that takes the frames."""
         return camera_of_footprint(self.footprint_m, self.k1)
-
-    @property
-    def quality(self) -> FrameQuality:
-        """What the frames are like."""
-        from sims.mockup.frames import FrameQuality
-
-        return FrameQuality(noise_DN=self.noise_DN, lost=self.lost, spurious=self.spurious, hot_pixels=self.hot_pixels)
 
     @property
     def believed_camera(self) -> Camera:
@@ -244,14 +226,12 @@ def random_frame(sky: LedSky, setup: SkySetup, seed: int, row: int) -> tuple[Pos
 
     Returns: in the middle of the exposure.
     """
-    from sims.mockup.frames import Motion, rendered_frame
-
     rng = np.random.default_rng([seed, row])
     x, y, heading = rng.uniform(-1.0, 1.0, 3) * [*setup.reach_m, math.pi]
     course, turn = rng.uniform(-math.pi, math.pi), rng.choice([-1.0, 1.0])
     velocity = (setup.speed_m_s * math.cos(course), setup.speed_m_s * math.sin(course))
     pose, motion = Pose(x, y, heading), Motion(velocity, turn * setup.turn_rate_rad_s)
-    return pose, rendered_frame(sky, setup.camera, pose, rng, motion, setup.quality)
+    return pose, rendered_frame(sky, setup.camera, pose, rng, motion, setup)
 
 
 def identified_files(

@@ -31,8 +31,8 @@ from sims.experiments.mockup_vision import SkyRun, SkySetup, frame_result, ident
 from sims.mockup.frames import rendered_frame
 
 sky = cache(led_sky)
-MOVING = SkySetup(60, speed_m_s=0.6, turn_rate_rad_s=math.radians(29.0))
-DISTORTED = SkySetup(60, k1=-0.05)
+MOVING = SkySetup(poses=60, speed_m_s=0.6, turn_rate_rad_s=math.radians(29.0))
+DISTORTED = SkySetup(poses=60, k1=-0.05)
 DAMAGED = SkySetup(lost=0.25, spurious=4)
 BADLY_DAMAGED = SkySetup(lost=0.4, spurious=6)
 
@@ -126,7 +126,7 @@ class TestAcceptance:
 
     def test_sums_of_pixels_stand_motion_that_breaks_lights_into_pieces(self):
         """1 m/s and 57°/s: with plain pixels spec 5 has 60 %, and 3.0 mm."""
-        setup = SkySetup(60, speed_m_s=1.0, turn_rate_rad_s=math.radians(57.0))
+        setup = SkySetup(poses=60, speed_m_s=1.0, turn_rate_rad_s=math.radians(57.0))
         result = sky_run(sky(), robust(setup), setup, finder=find_faint_stars).summary()
         assert result["success"] >= 0.97
         assert result["position_rms_mm"] <= 0.5
@@ -134,7 +134,7 @@ class TestAcceptance:
         assert summary(robust, setup)["success"] < 0.95
 
     def test_hot_pixels_do_nothing(self):
-        assert summary(robust, SkySetup(20, hot_pixels=10))["success"] == 1.0
+        assert summary(robust, SkySetup(poses=20, hot_pixels=10))["success"] == 1.0
 
 
 @pytest.mark.slow
@@ -269,7 +269,7 @@ class TestRun:
 
     def test_frames_in_which_nothing_shines_have_no_stars(self):
         """All lights dark, and no noise: one value in all pixels, which as a file is refused."""
-        result = sky_run(sky(), robust(SkySetup()), SkySetup(2, noise_DN=0.0, lost=1.0))
+        result = sky_run(sky(), robust(SkySetup()), SkySetup(poses=2, noise_DN=0.0, lost=1.0))
         assert [len(each.stars) for each in result.results] == [0, 0]
         assert [each.reason for each in result.results] == ["0 stars, 5 needed"] * 2
 
