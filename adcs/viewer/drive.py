@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from adcs.mockup.navigation.fixes import FixRecord, Outcome
-from adcs.mockup.navigation.strapdown import PlanarTrack
+from adcs.mockup.navigation.strapdown import PlanarState, PlanarTrack
 from adcs.mockup.vision.camera import Camera, Pose
 from adcs.mockup.vision.paper_matcher import CameraFix
 from adcs.stars.identification import NoFix
@@ -97,14 +97,13 @@ class Drive:
 
     def true_pose(self, row: int) -> Pose:
         """Where the satellite is."""
-        x, y = self.truth.position_m[row].tolist()
-        return Pose(x, y, float(self.truth.heading_rad[row]))
+        return _pose(self.truth.state(row))
 
     def pose_of_exposure(self, fix: int) -> Pose:
         """Where it was when the image of a fix was taken."""
-        at = self.exposure_s[fix]
-        x, y, heading = (
-            float(np.interp(at, self.truth.time_s, values))
-            for values in (*self.truth.position_m.T, self.truth.heading_rad)
-        )
-        return Pose(x, y, heading)
+        return _pose(self.truth.at(self.exposure_s[fix : fix + 1]).state(0))
+
+
+def _pose(state: PlanarState) -> Pose:
+    x, y = state.position_m.tolist()
+    return Pose(x, y, float(state.heading_rad))

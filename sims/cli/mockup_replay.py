@@ -14,7 +14,8 @@ from adcs.cli.options import print_note
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
 from magloc.cli.options import naming_outputs
-from sims.experiments.mockup_settings import METHOD_WORDS, MockupOptions, Port
+from sims.cli.mockup_options import MockupOptions, Port
+from sims.experiments.mockup_settings import METHOD_WORDS
 
 if TYPE_CHECKING:
     from adcs.viewer.drive import Drive, SeenFrame
@@ -84,27 +85,23 @@ def drive_of(result: FusionResult, method: str) -> Drive:
 
 def _frames_of(result: FusionResult) -> Callable[[int], SeenFrame]:
     """Frames of a run's fixes, rendered where the satellite truly was, and identified."""
-    from adcs.mockup.vision.camera import Camera, Pose, undistorted
+    from adcs.mockup.vision.camera import Camera, undistorted
     from adcs.mockup.vision.centroids import find_stars
     from adcs.mockup.vision.robust_matcher import RobustMatcher
     from adcs.mockup.vision.sky import led_sky
     from adcs.mockup.vision.triangles import TriangleCatalogue
     from adcs.viewer.drive import SeenFrame
-    from sims.mockup.frames import Motion, rendered_frame
+    from sims.mockup.frames import pose_and_motion, rendered_frame
 
-    sky, camera, truth = led_sky(), Camera(), result.run.truth
+    sky, camera = led_sky(), Camera()
     matcher = RobustMatcher(TriangleCatalogue.of(sky.positions_m), camera.m_per_px)
-    rate = np.gradient(truth.heading_rad, truth.time_s)
 
     def frame_of(fix: int) -> SeenFrame:
         at_s = result.run.exposure_s[fix]
-        x, y, heading, along_x, along_y, turn = (
-            float(np.interp(at_s, truth.time_s, values))
-            for values in (*truth.position_m.T, truth.heading_rad, *truth.velocity_m_s.T, rate)
-        )
         # One image for a fix that comes twice.
         rng = np.random.default_rng([result.seed, round(1e3 * at_s)])
-        frame = rendered_frame(sky, camera, Pose(x, y, heading), rng, Motion((along_x, along_y), turn))
+        pose, motion = pose_and_motion(result.run.truth, at_s)
+        frame = rendered_frame(sky, camera, pose, rng, motion)
         stars = find_stars(frame.image)
         return SeenFrame(frame.image, stars.positions_px, matcher.identify(undistorted(camera, stars.positions_px)))
 

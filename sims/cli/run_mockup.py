@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import sims.experiments
 from adcs.cli.options import naming_options, print_note
 from arrays.io.arguments import Flag
-from arrays.io.outputs import make_folder, refuse_file
+from arrays.io.outputs import refuse_file
 from magloc.cli.framework import QuietOptions, print_json, progress
+from sims.cli.mockup_options import MockupOptions, value_or
 from sims.cli.mockup_replay import ReplayOptions
-from sims.experiments.mockup_settings import METHODS, SETTLED_S, Method, MockupOptions, value_or
+from sims.experiments.mockup_settings import METHODS, SETTLED_S, Method
 
 if TYPE_CHECKING:
     from sims.experiments.mockup_navigation import FusionRuns, ZerosRuns
@@ -53,7 +54,7 @@ def sky_lines(options: MockupOptions, result: dict[str, Any]) -> list[str]:
     damage += [f"k1 {setup.k1:g} (believed {setup.believed_k1:g})"] if setup.k1 or setup.believed_k1 else []
     poses, good = result["poses"], round(result["success"] * result["poses"])
     return [
-        f"{poses} frames {setup.footprint_m:g} m wide, matcher {value_or(options.matcher, 'robust')}",
+        f"{poses} frames {setup.footprint_m:g} m wide, matcher {options.matcher_name}",
         ", ".join(damage),
         f"good fixes, within 20 mm and 2°    {good} of {poses} ({100.0 * result['success']:.1f} %)",
         f"false fixes                        {result['false_fixes']}",
@@ -160,120 +161,84 @@ def mockup(
     replay.check(options, json=json)
     if out is not None:
         refuse_file(out, "--out")
+    if replay.wanted:
+        from sims.cli.mockup_replay import check_places, show_replay
+
+        check_places(replay)
     if options.frames is not None:
-        result, lines, written = _frames(options, out)
+        told = _frames(options, options.frames)
     elif options.samples is not None and options.fixes is not None:
-        result, lines, written = _recording(options.samples, options.fixes, options, out, quiet=common.quiet)
-    elif options.part == "sky":
-        result, lines, written = _sky(options, out, quiet=common.quiet)
-    elif options.part == "zeros":
-        result, lines, written = _zeros(options, out, quiet=common.quiet)
+        told = _recording(options.samples, options.fixes, options, quiet=common.quiet)
     else:
-        _drives(options, replay, out, json=json, quiet=common.quiet)
-        return
-    _tell(result, lines, written, out, json=json, quiet=common.quiet)
-
-
-Told = tuple[dict[str, Any], list[str], list[str]]
-"""What is printed as JSON, what as text, and which files were written."""
-
-
-def _frames(options: MockupOptions, out: Path | None) -> Told:
-    results = sims.experiments.frames_identified(options)
-    entries = frame_entries(results)
-    fixed = sum(entry["position_m"] is not None for entry in entries)
+        told = {"sky": _sky, "zeros": _zeros, "fusion": _drives}[options.part](options, common.quiet)
     written = []
     if out is not None:
-        from sims.cli.mockup_files import write_frames
+        from sims.cli.mockup_files import write_files
 
-        make_folder(out, "--out")
-        written = write_frames(results, options.led_sky, options.camera(), out)
-    return {"frames": entries, "identified": fixed}, frame_lines(entries), written
+        written = write_files(options, told.run, out)
+    if json:
+        print_json(told.result)
+    else:
+        print("\n".join(told.lines))
+    if written and not common.quiet:
+        print_note(f"wrote {', '.join(written)} into {out}")
+    if replay.wanted:
+        show_replay(told.run[0], replay, quiet=common.quiet)
 
 
-def _recording(samples: Path, fixes: Path, options: MockupOptions, out: Path | None, *, quiet: bool) -> Told:
-    from sims.cli.mockup_files import write_record
-    from sims.experiments.mockup_recording import fused_record, record_lines
+class Told(NamedTuple):
+    """A run of some kind, what is printed of it as JSON, and what as text."""
 
-    run = fused_record(samples, fixes, value_or(options.fusion, "ekf"))
+    run: Any
+    result: dict[str, Any]
+    lines: list[str]
+
+
+def _frames(options: MockupOptions, frames: Path) -> Told:
+    from adcs.io.frame_files import frame_paths
+
+    sky_matcher, finder = options.sky_matcher(), options.finder()
+    results = sims.experiments.identified_files(frame_paths(frames), options.camera(), sky_matcher, finder)
+    entries = frame_entries(results)
+    fixed = sum(entry["position_m"] is not None for entry in entries)
+    return Told(results, {"frames": entries, "identified": fixed}, frame_lines(entries))
+
+
+def _recording(samples: Path, fixes: Path, options: MockupOptions, *, quiet: bool) -> Told:
+    from sims.experiments.mockup_recording import record_lines
+
+    run = sims.experiments.fused_record(samples, fixes, value_or(options.fusion, "ekf"))
     if not quiet:
         for line in run.warnings:
             print_note(f"warning: {line}")
-    written = []
-    if out is not None:
-        make_folder(out, "--out")
-        written = write_record(run, out)
-    return run.summary(), record_lines(run), written
+    return Told(run, run.summary(), record_lines(run))
 
 
-def _sky(options: MockupOptions, out: Path | None, *, quiet: bool) -> Told:
+def _sky(options: MockupOptions, quiet: bool) -> Told:
     setup, seeds = options.sky_setup(), options.runs(1)
+    sky, matcher, finder = options.led_sky, options.sky_matcher(), options.finder()
     with progress(setup.poses * len(seeds), "frames", quiet=quiet) as advance:
-        run = sims.experiments.sky_runs(options, advance)
+        run = sims.experiments.sky_run(sky, matcher, setup, seeds, advance, finder)
     result = run.summary()
-    written = []
-    if out is not None:
-        from sims.cli.mockup_files import write_sky_run
-
-        make_folder(out, "--out")
-        written = write_sky_run(options, run, out)
-    return result, sky_lines(options, result), written
+    return Told(run, result, sky_lines(options, result))
 
 
-def _zeros(options: MockupOptions, out: Path | None, *, quiet: bool) -> Told:
-    seeds = options.runs(6)
+def _zeros(options: MockupOptions, quiet: bool) -> Told:
+    seeds, unknowns, start_fixes = options.runs(6), value_or(options.unknowns, "six"), value_or(options.start_fixes, 4)
     with progress(len(seeds), "runs", quiet=quiet) as advance, naming_options():
         runs = sims.experiments.zeros_run(
-            value_or(options.unknowns, "six"),
-            len(seeds),
-            options.duration_s,
-            seed=options.seed,
-            start_fixes=value_or(options.start_fixes, 4),
-            progress=advance,
+            unknowns, seeds, options.duration_s, start_fixes=start_fixes, progress=advance
         )
-    written = []
-    if out is not None:
-        from sims.cli.mockup_files import write_zeros
-
-        make_folder(out, "--out")
-        written = write_zeros(runs, out)
-    return runs.summary(), zeros_lines(runs, options.duration_s), written
+    return Told(runs, runs.summary(), zeros_lines(runs, options.duration_s))
 
 
-def _drives(options: MockupOptions, replay: ReplayOptions, out: Path | None, *, json: bool, quiet: bool) -> None:
-    if replay.wanted:
-        from sims.cli.mockup_replay import check_places
-
-        check_places(replay)
+def _drives(options: MockupOptions, quiet: bool) -> Told:
     scenario, seeds = options.table_scenario(), options.runs(6)
     wanted = value_or(options.fusion, "ekf")
     methods: tuple[Method, ...] = METHODS if wanted == "all" else (wanted,)
     with progress(len(seeds) * len(methods), "runs", quiet=quiet) as advance:
         every = [sims.experiments.fused_runs(method, scenario, seeds, advance) for method in methods]
-    runs, written = every[0], []
-    if out is not None:
-        from sims.cli.mockup_files import write_fusion, write_methods
-
-        make_folder(out, "--out")
-        written = write_methods(every, out) if wanted == "all" else write_fusion(runs, out)
-    result = runs.summary()
-    lines = fusion_lines(runs, options.duration_s)
     if wanted == "all":
         result = {str(one.method): one.summary() for one in every}
-        lines = methods_lines(every, options.duration_s)
-    _tell(result, lines, written, out, json=json, quiet=quiet)
-    if replay.wanted:
-        from sims.cli.mockup_replay import show_replay
-
-        show_replay(runs, replay, quiet=quiet)
-
-
-def _tell(
-    result: dict[str, Any], lines: list[str], written: list[str], out: Path | None, *, json: bool, quiet: bool
-) -> None:
-    if json:
-        print_json(result)
-    else:
-        print("\n".join(lines))
-    if written and not quiet:
-        print_note(f"wrote {', '.join(written)} into {out}")
+        return Told(every, result, methods_lines(every, options.duration_s))
+    return Told(every, every[0].summary(), fusion_lines(every[0], options.duration_s))

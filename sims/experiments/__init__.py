@@ -7,11 +7,11 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         "PAPER_ROWS": "sims.experiments.paper_tables",
         "compared_with_paper": "sims.experiments.paper_tables",
-        "frames_identified": "sims.experiments.mockup_vision",
+        "identified_files": "sims.experiments.mockup_vision",
         "fused_record": "sims.experiments.mockup_recording",
         "fused_runs": "sims.experiments.mockup_navigation",
         "run_scenario": "sims.experiments.attitude",
-        "sky_runs": "sims.experiments.mockup_vision",
+        "sky_run": "sims.experiments.mockup_vision",
         "zeros_run": "sims.experiments.mockup_navigation",
     },
 )

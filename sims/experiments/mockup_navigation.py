@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -13,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from adcs.mockup.navigation.strapdown import PlanarTrack, strapdown, wrapped
+from adcs.mockup.navigation.strapdown import PlanarState, PlanarTrack, strapdown, wrapped
 from sims.experiments.mockup_settings import METHODS, SETTLED_S, UNKNOWNS, Method, Unknowns
 
 if TYPE_CHECKING:
+    from adcs.mockup.navigation.delayed_ekf import StartSigma
     from adcs.mockup.navigation.fixes import Fused, Fusion
     from adcs.mockup.navigation.zeros import ZeroFit
     from sims.mockup.table_run import TableRun, TableScenario
@@ -98,39 +98,13 @@ class FusionRuns:
         }
 
 
-def fusion_run(
-    method: Method,
-    seeds: int = 6,
-    duration_s: float = 180.0,
-    *,
-    seed: int = 0,
-    false_fixes: float = 0.0,
-    progress: Callable[[int], None] | None = None,
-) -> FusionRuns:
-    """Drive around the table, and estimate by one method.
-
-    ``method`` is one of 'paper', 'velocity-corrected', 'ekf', 'camera', 'imu'. ``seeds``: number of runs. ``seed``: of
-    the first run; the next ones follow. ``false_fixes``: fraction of the fixes that are anywhere under the sky.
-    ``progress``: called with 1 after every run.
-    """
-    from sims.mockup.table_run import CameraErrors, TableScenario
-
-    if method not in METHODS:
-        raise ValueError(f"Input method must be one of {', '.join(METHODS)}; instead received {method!r}.")
-    _check(seeds, seed, duration_s, lowest_s=SETTLED_S)
-    if not 0.0 <= false_fixes <= 1.0:
-        raise ValueError(f"Input false_fixes must be a fraction between 0 and 1; instead received {false_fixes:g}.")
-    scenario = TableScenario(duration_s=duration_s, camera=CameraErrors(false=false_fixes))
-    return fused_runs(method, scenario, range(seed, seed + seeds), progress)
-
-
 def fused_runs(
     method: Method,
     scenario: TableScenario,
     seeds: Sequence[int],
     progress: Callable[[int], None] | None = None,
 ) -> FusionRuns:
-    """The same for any scenario, such as one with drop-outs or fixes out of order.
+    """Drive around the table, seed by seed, and estimate by one method.
 
     Parameters
     ----------
@@ -138,13 +112,19 @@ def fused_runs(
         Longer than 10 s.
     progress : callable, optional
         Called with 1 after every run.
+
+    Raises
+    ------
+    ValueError
+        An argument is out of range.
     """
     from adcs.mockup.navigation.fixes import fuse
 
+    _check("method", method, METHODS, seeds, scenario.duration_s)
     results = []
     for seed in seeds:
         run = _table_run(scenario, seed)
-        fused = fuse(_fusion_of(method, run), run.imu, run.fixes)
+        fused = fuse(fusion_of(method, run.start, run.imu.begin_s), run.imu, run.fixes)
         results.append(FusionResult(seed, run, fused, track_errors(fused.track, run.truth)))
         if progress is not None:
             progress(1)
@@ -159,8 +139,9 @@ def _table_run(scenario: TableScenario, seed: int) -> TableRun:
     return table_run(scenario, seed)
 
 
-def _fusion_of(method: Method, run: TableRun) -> Fusion:
-    from adcs.mockup.navigation.delayed_ekf import DelayedFilter
+def fusion_of(method: Method, start: PlanarState, begin_s: float, sigma: StartSigma | None = None) -> Fusion:
+    """What estimates by a method; ``sigma`` says to the delayed filter how well another start than usual is known."""
+    from adcs.mockup.navigation.delayed_ekf import DelayedFilter, StartSigma
     from adcs.mockup.navigation.reintegration import (
         CameraOnly,
         ImuOnly,
@@ -170,11 +151,11 @@ def _fusion_of(method: Method, run: TableRun) -> Fusion:
     )
 
     makers: dict[Method, Callable[[], Fusion]] = {
-        "paper": lambda: Reintegration(run.start, run.imu.begin_s, finite_difference),
-        "velocity-corrected": lambda: Reintegration(run.start, run.imu.begin_s, corrected_velocity),
-        "ekf": lambda: DelayedFilter(run.start, run.imu.begin_s),
-        "camera": lambda: CameraOnly(run.start),
-        "imu": lambda: ImuOnly(run.start),
+        "paper": lambda: Reintegration(start, begin_s, finite_difference),
+        "velocity-corrected": lambda: Reintegration(start, begin_s, corrected_velocity),
+        "ekf": lambda: DelayedFilter(start, begin_s, sigma=sigma or StartSigma()),
+        "camera": lambda: CameraOnly(start),
+        "imu": lambda: ImuOnly(start),
     }
     return makers[method]()
 
@@ -217,10 +198,9 @@ class ZerosRuns:
 
 def zeros_run(
     unknowns: Unknowns = "two",
-    seeds: int = 6,
+    seeds: Sequence[int] = range(6),
     duration_s: float = 15.0,
     *,
-    seed: int = 0,
     start_fixes: int = 4,
     progress: Callable[[int], None] | None = None,
 ) -> ZerosRuns:
@@ -232,12 +212,8 @@ def zeros_run(
     ----------
     unknowns : {'two', 'six', 'drift'}
         Constant zeros; these and the start; these, the start, and slopes of the zeros in time.
-    seeds : int
-        Number of runs.
     duration_s : float
         Up to 20 s the run with two firings, else a drive around the table.
-    seed : int
-        Of the first run; the next ones follow.
     start_fixes : int
         Fixes whose line is the start of "two"; two in the source.
     progress : callable, optional
@@ -250,9 +226,7 @@ def zeros_run(
     """
     from sims.mockup.table_run import ImuErrors, TableScenario
 
-    if unknowns not in UNKNOWNS:
-        raise ValueError(f"Input unknowns must be one of {', '.join(UNKNOWNS)}; instead received {unknowns!r}.")
-    _check(seeds, seed, duration_s, lowest_s=SETTLED_S)
+    _check("unknowns", unknowns, UNKNOWNS, seeds, duration_s)
     drift = (_DRIFT_M_S3[0] * duration_s, _DRIFT_M_S3[1] * duration_s)
     scenario = TableScenario(
         "two-firings" if duration_s <= SHORT_S else "perimeter",
@@ -260,8 +234,8 @@ def zeros_run(
         imu=ImuErrors(calibration_m_s2=0.0, zero_m_s2=ZERO_M_S2, drift_m_s2=drift),
     )
     results = []
-    for each in range(seed, seed + seeds):
-        results.append(_zeros_result(unknowns, start_fixes, each, _table_run(scenario, each)))
+    for seed in seeds:
+        results.append(_zeros_result(unknowns, start_fixes, seed, _table_run(scenario, seed)))
         if progress is not None:
             progress(1)
     return ZerosRuns(unknowns, tuple(results))
@@ -300,12 +274,12 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _check(seeds: int, seed: int, duration_s: float, lowest_s: float) -> None:
-    if seeds < 1:
-        raise ValueError(f"Input seeds must be a positive number; instead received {seeds}.")
-    if seed < 0:
-        raise ValueError(f"Input seed must be 0 or more; instead received {seed}.")
-    if not lowest_s < duration_s <= 1e4 or math.isnan(duration_s):
+def _check(name: str, value: str, known: Sequence[str], seeds: Sequence[int], duration_s: float) -> None:
+    if value not in known:
+        raise ValueError(f"Input {name} must be one of {', '.join(known)}; instead received {value!r}.")
+    if not seeds or min(seeds) < 0:
+        raise ValueError(f"Input seeds must be numbers from 0 on, one at least; instead received {list(seeds)}.")
+    if not SETTLED_S < duration_s <= 1e4:
         raise ValueError(
-            f"Input duration_s must be more than {lowest_s:g} and up to 10000 s; instead received {duration_s:g} s."
+            f"Input duration_s must be more than {SETTLED_S:g} and up to 10000 s; instead received {duration_s:g} s."
         )

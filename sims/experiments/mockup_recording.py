@@ -9,19 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from adcs.mockup.navigation.delayed_ekf import DelayedFilter, StartSigma
-from adcs.mockup.navigation.fixes import FixRecord, Fused, Fusion, Outcome, counts_in_words, fuse, unused_counts
-from adcs.mockup.navigation.reintegration import (
-    CameraOnly,
-    ImuOnly,
-    Reintegration,
-    corrected_velocity,
-    finite_difference,
-)
+from adcs.mockup.navigation.delayed_ekf import StartSigma
+from adcs.mockup.navigation.fixes import FixRecord, Fused, Outcome, counts_in_words, fuse, unused_counts
 from adcs.mockup.navigation.strapdown import Gate, ImuRecord, PlanarState, wrapped
 from arrays.io.csv import Table, read_table
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
+from sims.experiments.mockup_navigation import fusion_of
 from sims.experiments.mockup_settings import SETTLED_S, Method
 
 SAMPLE_COLUMNS = ("time_s", "acceleration_x_m_s2", "acceleration_y_m_s2", "rate_deg_s")
@@ -54,8 +48,7 @@ class RecordRun:
         track, used = self.fused.track, self.fused.used
         fixes = self.fixes.rows(np.flatnonzero(used))
         late = fixes.time_s >= self.imu.begin_s + SETTLED_S
-        fused = np.stack([np.interp(fixes.time_s, track.time_s, axis) for axis in track.position_m.T], axis=1)
-        apart_m = np.linalg.norm(fused - fixes.position_m, axis=1)[late]
+        apart_m = np.linalg.norm(track.at(fixes.time_s).position_m - fixes.position_m, axis=1)[late]
         return {
             "samples": self.samples,
             "gaps_s": self.gaps_s.tolist(),
@@ -99,7 +92,7 @@ def fused_record(samples: Path, fixes: Path, method: Method) -> RecordRun:
     later = record.rows(np.flatnonzero(np.arange(len(record)) > first))
     start = PlanarState(record.position_m[first], np.zeros(2), float(record.heading_rad[first]))
     part = imu.between(float(record.time_s[first]), imu.end_s)
-    fused = fuse(_fusion_of(method, start, part.begin_s), part, later)
+    fused = fuse(fusion_of(method, start, part.begin_s, _START), part, later)
     kept = int(np.count_nonzero(recorded.time_s > part.begin_s))
     warnings = _gap_warnings(samples, recorded, method)
     return RecordRun(method, part, later, fused, kept, first, recorded.gaps_s, warnings)
@@ -119,17 +112,6 @@ def _gap_warnings(path: Path, imu: ImuRecord, method: Method) -> tuple[str, ...]
         "camera": "this fusion does not use samples",
     }.get(method, "velocity and rate are held there, and how wrong that is only ekf tells")
     return (f"{path}: found {where}, expected one every {imu.usual_step_s:.4g} s; {held}.",)
-
-
-def _fusion_of(method: Method, start: PlanarState, begin_s: float) -> Fusion:
-    if method == "camera":
-        return CameraOnly(start)
-    if method == "imu":
-        return ImuOnly(start)
-    if method == "ekf":
-        return DelayedFilter(start, begin_s, sigma=_START)
-    rule = finite_difference if method == "paper" else corrected_velocity
-    return Reintegration(start, begin_s, rule)
 
 
 def read_samples(path: Path) -> ImuRecord:

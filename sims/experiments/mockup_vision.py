@@ -6,23 +6,21 @@ import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from adcs.io.frame_files import frame_paths, read_frame
+from adcs.io.frame_files import read_frame
 from adcs.mockup.vision.camera import Camera, Pose, camera_of_footprint, undistorted
 from adcs.mockup.vision.centroids import NoLightsError, Stars, find_stars
 from adcs.mockup.vision.paper_matcher import CameraFix, Matcher
 from adcs.mockup.vision.sky import LedSky
 from adcs.stars.identification import NoFix
-
-if TYPE_CHECKING:
-    from sims.experiments.mockup_settings import MockupOptions
-    from sims.mockup.frames import Frame, FrameQuality
 from arrays.typing import BoolArray, ByteArray, FloatArray
+from sims.mockup.frames import Frame, FrameQuality, Motion, rendered_frame
 
 Finder = Callable[[ByteArray], Stars]
 REACH_M = (1.25, 1.0)
@@ -31,20 +29,14 @@ FALSE_POSITION_M = 0.02
 FALSE_HEADING_RAD = math.radians(2.0)
 
 
-@dataclass(frozen=True)
-class SkySetup:
-    """Frames that are taken and what is believed of the camera.
+@dataclass(frozen=True, kw_only=True)
+class SkySetup(FrameQuality):
+    """Frames that are taken, what they are like, and what is believed of the camera.
 
     Attributes
     ----------
     poses : int
         Number of frames, at random places and headings.
-    noise_DN : float
-        Of a pixel.
-    lost : float
-        Probability that a light is dark.
-    spurious : int
-        Lights in view that are in no catalogue.
     speed_m_s, turn_rate_rad_s : float
         During the exposure, in random directions.
     footprint_m : float
@@ -61,10 +53,6 @@ class SkySetup:
     """
 
     poses: int = 120
-    noise_DN: float = 4.0
-    lost: float = 0.0
-    spurious: int = 0
-    hot_pixels: int = 0
     speed_m_s: float = 0.0
     turn_rate_rad_s: float = 0.0
     footprint_m: float = 0.9
@@ -73,6 +61,7 @@ class SkySetup:
     reach_m: tuple[float, float] = REACH_M
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.poses < 1:
             raise ValueError(f"Input poses must be 1 or more; instead received {self.poses}.")
         most = Camera.width_px * Camera.height_px
@@ -88,46 +77,57 @@ class SkySetup:
         return camera_of_footprint(self.footprint_m, self.k1)
 
     @property
-    def quality(self) -> FrameQuality:
-        """What the frames are like."""
-        from sims.mockup.frames import FrameQuality
-
-        return FrameQuality(noise_DN=self.noise_DN, lost=self.lost, spurious=self.spurious, hot_pixels=self.hot_pixels)
-
-    @property
     def believed_camera(self) -> Camera:
         """The camera as its user knows it."""
         return camera_of_footprint(self.footprint_m, self.believed_k1)
 
 
 @dataclass(frozen=True, eq=False)
-class SkyRun:
-    """Frames and what was found in them, row by row.
+class FrameResult:
+    """What one frame gave.
 
-    Attributes
-    ----------
-    truth : ndarray, shape (n, 3)
-        X, Y [m] and heading [rad].
-    found : ndarray of bool, shape (n,)
-        Whether there is a fix.
-    estimates : ndarray, shape (n, 3)
-        X, Y and heading; NaN without a fix.
-    n_stars, n_matched : ndarray of int, shape (n,)
-        Stars in the image, and those of them that the fix names.
-    identify_s, frame_s : ndarray, shape (n,)
-        Time of the identification, and of all from the image to the fix.
-    reasons : tuple of str, length n
-        Why there is no fix; empty where there is one.
+    ``identify_s``, ``frame_s``: time of the identification, and of all from the image to the fix.
     """
 
-    truth: FloatArray
-    found: BoolArray
-    estimates: FloatArray
-    n_stars: NDArray[np.intp]
-    n_matched: NDArray[np.intp]
-    identify_s: FloatArray
-    frame_s: FloatArray
-    reasons: tuple[str, ...]
+    stars: Stars
+    fix: CameraFix | NoFix
+    identify_s: float
+    frame_s: float
+
+    @property
+    def pose(self) -> FloatArray:
+        """X, Y [m] and heading [rad] of the fix, shape (3,); NaN without one."""
+        return np.array(
+            [*self.fix.position_m, self.fix.heading_rad] if isinstance(self.fix, CameraFix) else [np.nan] * 3
+        )
+
+    @property
+    def matched(self) -> int:
+        """Number of the stars that the fix names."""
+        return len(self.fix.stars) if isinstance(self.fix, CameraFix) else 0
+
+    @property
+    def reason(self) -> str:
+        """Why there is no fix; empty where there is one."""
+        return "" if isinstance(self.fix, CameraFix) else self.fix.reason
+
+
+@dataclass(frozen=True, eq=False)
+class SkyRun:
+    """Frames and what was found in them, row by row."""
+
+    truth: FloatArray  # (n, 3): X, Y [m] and heading [rad]
+    results: tuple[FrameResult, ...]
+
+    @cached_property
+    def estimates(self) -> FloatArray:
+        """X, Y and heading, shape (n, 3); NaN without a fix."""
+        return np.array([result.pose for result in self.results])
+
+    @property
+    def found(self) -> BoolArray:
+        """Whether there is a fix, shape (n,)."""
+        return np.isfinite(self.estimates[:, 0])
 
     @property
     def position_errors_m(self) -> FloatArray:
@@ -170,26 +170,13 @@ class SkyRun:
             "false_fixes": int(self.false_fixes.sum()),
             "position_rms_mm": None if position is None else 1e3 * position,
             "heading_rms_deg": None if heading is None else math.degrees(heading),
-            "identify_ms_median": 1e3 * float(np.median(self.identify_s)),
-            "frame_ms_median": 1e3 * float(np.median(self.frame_s)),
+            "identify_ms_median": 1e3 * float(np.median([result.identify_s for result in self.results])),
+            "frame_ms_median": 1e3 * float(np.median([result.frame_s for result in self.results])),
         }
 
 
 def _rms(values: FloatArray) -> float | None:
     return float(np.sqrt(np.mean(values**2))) if values.size else None
-
-
-@dataclass(frozen=True, eq=False)
-class FrameResult:
-    """What one frame gave.
-
-    ``identify_s``, ``frame_s``: time of the identification, and of all from the image to the fix.
-    """
-
-    stars: Stars
-    fix: CameraFix | NoFix
-    identify_s: float
-    frame_s: float
 
 
 def frame_result(image: ByteArray, camera: Camera, matcher: Matcher, finder: Finder = find_stars) -> FrameResult:
@@ -214,25 +201,24 @@ def sky_run(
     sky: LedSky,
     matcher: Matcher,
     setup: SkySetup = SkySetup(),
-    seed: int = 0,
+    seeds: Sequence[int] = (0,),
     progress: Callable[[int], None] | None = None,
     finder: Finder = find_stars,
 ) -> SkyRun:
     """Render frames at random poses, find the lights, identify them, and compare with the truth.
 
-    ``matcher``: for the catalogue of that sky, and a camera of that footprint. ``seed``: each frame has random numbers
-    of its own, whatever the others do. ``progress``: called with the number of frames finished since the last call.
-    ``finder``: of :mod:`adcs.mockup.vision.centroids`.
+    ``matcher``: for the catalogue of that sky, and a camera of that footprint. ``seeds``: of all frames, one after the
+    other; each frame has random numbers of its own, whatever the others do. ``progress``: called with the number of
+    frames finished since the last call. ``finder``: of :mod:`adcs.mockup.vision.centroids`.
     """
-    truth = np.empty((setup.poses, 3))
-    results = []
-    for row in range(setup.poses):
+    truth, results = [], []
+    for seed, row in product(seeds, range(setup.poses)):
         pose, frame = random_frame(sky, setup, seed, row)
-        truth[row] = *pose.position_m, pose.heading_rad
+        truth.append([*pose.position_m, pose.heading_rad])
         results.append(frame_result(frame.image, setup.believed_camera, matcher, finder))
         if progress is not None:
             progress(1)
-    return _run_of(truth, results)
+    return SkyRun(np.array(truth), tuple(results))
 
 
 def random_frame(sky: LedSky, setup: SkySetup, seed: int, row: int) -> tuple[Pose, Frame]:
@@ -240,32 +226,12 @@ def random_frame(sky: LedSky, setup: SkySetup, seed: int, row: int) -> tuple[Pos
 
     Returns: in the middle of the exposure.
     """
-    # The command line stands on top of all packages; nothing that it imports imports it.
-    from sims.mockup.frames import Motion, rendered_frame
-
     rng = np.random.default_rng([seed, row])
     x, y, heading = rng.uniform(-1.0, 1.0, 3) * [*setup.reach_m, math.pi]
     course, turn = rng.uniform(-math.pi, math.pi), rng.choice([-1.0, 1.0])
     velocity = (setup.speed_m_s * math.cos(course), setup.speed_m_s * math.sin(course))
     pose, motion = Pose(x, y, heading), Motion(velocity, turn * setup.turn_rate_rad_s)
-    return pose, rendered_frame(sky, setup.camera, pose, rng, motion, setup.quality)
-
-
-def _run_of(truth: FloatArray, results: list[FrameResult]) -> SkyRun:
-    fixes = [result.fix for result in results]
-    nothing = np.full(3, np.nan)
-    return SkyRun(
-        truth=truth,
-        found=np.array([isinstance(fix, CameraFix) for fix in fixes]),
-        estimates=np.array(
-            [[*fix.position_m, fix.heading_rad] if isinstance(fix, CameraFix) else nothing for fix in fixes]
-        ),
-        n_stars=np.array([len(result.stars) for result in results]),
-        n_matched=np.array([len(fix.stars) if isinstance(fix, CameraFix) else 0 for fix in fixes]),
-        identify_s=np.array([result.identify_s for result in results]),
-        frame_s=np.array([result.frame_s for result in results]),
-        reasons=tuple(fix.reason if isinstance(fix, NoFix) else "" for fix in fixes),
-    )
+    return pose, rendered_frame(sky, setup.camera, pose, rng, motion, setup)
 
 
 def identified_files(
@@ -277,23 +243,3 @@ def identified_files(
     :mod:`adcs.mockup.vision.centroids`. Returns: from path to result, in the order of the paths.
     """
     return {path: frame_result(read_frame(path, camera), camera, matcher, finder) for path in paths}
-
-
-def sky_runs(options: MockupOptions, advance: Callable[[int], None] | None = None) -> SkyRun:
-    """Frames of all seeds, identified, one seed after the other; ``advance`` is told how many more are finished."""
-    sky, setup = options.led_sky, options.sky_setup()
-    matcher = options.matcher_of(sky)
-    return _joined([sky_run(sky, matcher, setup, seed, advance, options.finder()) for seed in options.runs(1)])
-
-
-def _joined(runs: Sequence[SkyRun]) -> SkyRun:
-    """Runs as one, row after row."""
-    arrays = {name: np.concatenate([getattr(run, name) for run in runs]) for name in vars(runs[0]) if name != "reasons"}
-    return SkyRun(**arrays, reasons=tuple(reason for run in runs for reason in run.reasons))
-
-
-def frames_identified(options: MockupOptions) -> dict[Path, FrameResult]:
-    """Frames of files, identified, by their path."""
-    sky = options.led_sky
-    paths = frame_paths(options.frames) if options.frames is not None else []
-    return identified_files(paths, options.camera(), options.matcher_of(sky), options.finder())

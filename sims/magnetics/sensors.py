@@ -10,7 +10,9 @@ of a scalar sensor stands for its heading error.
 from __future__ import annotations
 
 import math
+import tomllib
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from arrays.array import SensorArray
 from arrays.sensor import Sensor, SensorKind
@@ -79,62 +81,9 @@ class SensorModel:
         return replace(self, noise_T_rtHz=sigma_T / white_sigma(rate_Hz, 1.0, self.bandwidth_Hz))
 
 
-SENSOR_KINDS: dict[str, SensorModel] = {
-    "fluxgate": SensorModel(
-        reads="vector",
-        noise_T_rtHz=5e-12,
-        corner_Hz=0.5,
-        bandwidth_Hz=3000.0,
-        range_T=100e-6,
-        resolution_T=10e-12,
-        misalignment_rad=1e-4,
-        gain_error=1e-4,
-        drift_T_rth=100e-12,
-    ),
-    "opm": SensorModel(
-        reads="scalar",
-        noise_T_rtHz=3e-12,
-        corner_Hz=0.1,
-        bandwidth_Hz=200.0,
-        range_T=150e-6,
-        resolution_T=1e-12,
-        gain_error=5e-6,
-        drift_T_rth=10e-12,
-    ),
-    "overhauser": SensorModel(
-        reads="scalar",
-        noise_T_rtHz=30e-12,
-        corner_Hz=0.0,
-        bandwidth_Hz=2.5,
-        range_T=120e-6,
-        resolution_T=10e-12,
-        gain_error=2e-6,
-        drift_T_rth=0.0,
-    ),
-    "squid": SensorModel(
-        reads="vector",
-        noise_T_rtHz=10e-15,
-        corner_Hz=1.0,
-        bandwidth_Hz=10_000.0,
-        range_T=150e-6,
-        resolution_T=1e-15,
-        misalignment_rad=1e-5,
-        gain_error=1e-6,
-        drift_T_rth=1e-12,
-    ),
-    "magnetoresistive": SensorModel(
-        reads="vector",
-        noise_T_rtHz=4e-9,
-        corner_Hz=1.0,
-        bandwidth_Hz=100.0,
-        range_T=800e-6,
-        resolution_T=6.25e-9,
-        misalignment_rad=2e-3,
-        gain_error=2e-3,
-        drift_T_rth=20e-9,
-    ),
-}
-"""Sensors by the name of their kind."""
+_FIGURES = tomllib.loads(Path(__file__).with_name("sensor_kinds.toml").read_text(encoding="utf-8"))
+SENSOR_KINDS = {kind: SensorModel(**attributes) for kind, attributes in _FIGURES.items()}
+"""Sensors by the name of their kind, of the file beside this module."""
 
 
 def model_of(sensor: Sensor, rate_Hz: float) -> SensorModel:

@@ -80,7 +80,7 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
     """
     time_s = scenario.time_s
     array_pose = _pose(scenario.carrier, time_s, seed, "array")
-    sensors_m = array_pose.position_m[:, None, :] + _applied(array_pose.rotation, scenario.array.positions)
+    sensors_m = array_pose.position_m[:, None, :] + _applied(array_pose.rotation, scenario.array.positions[None])
     ambient_T = np.zeros(3) if scenario.ambient_T is None else np.array(scenario.ambient_T)
     fields_T = np.zeros_like(sensors_m) + (ambient_T + _pulsations(scenario, time_s, seed))[:, None, :]
     truths = []
@@ -90,7 +90,7 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
         _refuse_contact(scenario, number, time_s, sensors_m - pose.position_m[:, None, :])
         fields_T += field(sensors_m, pose.position_m[:, None, :], moment_Am2[:, None, :])
         truths.append(Truth(time_s, pose.position_m, moment_Am2))
-    fields_T = _applied_each(array_pose.rotation.inv(), fields_T) + _platform_fields(scenario, time_s, seed)
+    fields_T = _applied(array_pose.rotation.inv(), fields_T) + _platform_fields(scenario, time_s, seed)
     fields_T += _stray_fields(scenario, seed)
     true_array = _true_array(scenario, seed)
     values_T = _sensed(scenario, true_array.readings_of(fields_T), seed)
@@ -228,12 +228,6 @@ def _rows(values: FloatArray | None, rows: NDArray[np.bool_]) -> FloatArray | No
 
 
 def _applied(rotation: Rotation, vectors: FloatArray) -> FloatArray:
-    """Every vector (N, 3) turned by every rotation: (n, N, 3)."""
-    turned: FloatArray = np.einsum("tij,kj->tki", rotation.as_matrix(), vectors)
-    return turned
-
-
-def _applied_each(rotation: Rotation, vectors: FloatArray) -> FloatArray:
-    """The vectors (n, N, 3) of every instant turned by its rotation."""
+    """The vectors (n, N, 3) of every instant, or (1, N, 3) of all of them, turned by its rotation."""
     turned: FloatArray = np.einsum("tij,tkj->tki", rotation.as_matrix(), vectors)
     return turned

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from adcs.mockup.navigation.strapdown import PlanarTrack
 from adcs.mockup.vision.camera import Camera, Pose, image_from_table, in_frame, table_from_image
 from adcs.mockup.vision.sky import LedSky
 from arrays.typing import ByteArray, FloatArray
@@ -23,6 +24,14 @@ class Motion:
 
     velocity_m_s: tuple[float, float] = (0.0, 0.0)  # (2,): in the table's frame
     turn_rate_rad_s: float = 0.0  # counter-clockwise seen from above
+
+
+def pose_and_motion(track: PlanarTrack, at_s: float) -> tuple[Pose, Motion]:
+    """Where a satellite is at an instant of its track, and how it moves."""
+    state = track.at([at_s]).state(0)
+    turn_rate = np.interp(at_s, track.time_s, np.gradient(track.heading_rad, track.time_s))
+    (x, y), (velocity_x, velocity_y) = state.position_m.tolist(), state.velocity_m_s.tolist()
+    return Pose(x, y, state.heading_rad), Motion((velocity_x, velocity_y), float(turn_rate))
 
 
 @dataclass(frozen=True)

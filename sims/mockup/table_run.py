@@ -84,6 +84,11 @@ class CameraErrors:
         From when to when there are no exposures.
     latency_s : float
         By how much later than the exposure the time stamps are.
+
+    Raises
+    ------
+    ValueError
+        A fraction is none.
     """
 
     period_s: float = 0.6
@@ -97,9 +102,12 @@ class CameraErrors:
     outages_s: tuple[tuple[float, float], ...] = ()
     latency_s: float = 0.0
 
-
-NO_IMU_ERRORS = ImuErrors(0.0, 0.0, 0.0, 0.0, 0.0, drift_m_s2=(0.0, 0.0), warming_K=1.0, zero_rad_s=0.0)
-NO_CAMERA_ERRORS = CameraErrors(position_m=0.0, heading_rad=0.0, failed=0.0)
+    def __post_init__(self) -> None:
+        for name in ("failed", "false", "overtaken", "repeated"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(
+                    f"Input {name} must be a fraction between 0 and 1; instead received {getattr(self, name):g}."
+                )
 
 
 @dataclass(frozen=True)
@@ -217,7 +225,8 @@ def _fixes(flown: PlanarTrack, camera: CameraErrors, seed: int) -> tuple[FixReco
     phase = stream(seed, "camera").uniform(0.0, camera.period_s)
     time_s = np.arange(phase, flown.time_s[-1], camera.period_s)
     k = len(time_s)
-    true = np.stack([np.interp(time_s, flown.time_s, y) for y in (*flown.position_m.T, flown.heading_rad)], axis=1)
+    seen = flown.at(time_s)
+    true = np.column_stack([seen.position_m, seen.heading_rad])
     noise = stream(seed, "fixes").standard_normal((k, 3))
     measured = true + noise * [camera.position_m, camera.position_m, camera.heading_rad]
     false = stream(seed, "false fixes").random(k) < camera.false

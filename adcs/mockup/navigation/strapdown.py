@@ -237,6 +237,13 @@ class PlanarTrack:
         """State at an instant."""
         return PlanarState(self.position_m[..., row, :], self.velocity_m_s[..., row, :], self.heading_rad[..., row])
 
+    def at(self, time_s: ArrayLike) -> PlanarTrack:
+        """States of one run at other instants (k,), linear between its own."""
+        t = np.asarray(time_s, dtype=np.float64)
+        columns = (*self.position_m.T, *self.velocity_m_s.T, self.heading_rad)
+        x, y, vx, vy, heading = (np.interp(t, self.time_s, column) for column in columns)
+        return PlanarTrack(t, np.stack([x, y], axis=1), np.stack([vx, vy], axis=1), heading)
+
     def rows(self, rows: slice) -> PlanarTrack:
         """Some of the instants."""
         return PlanarTrack(

@@ -179,27 +179,6 @@ class ZeroFit:
         return PlanarState(self.start_position_m, self.start_velocity_m_s, heading_rad)
 
 
-def constant_zeros(
-    problem: ZeroProblem, start_position_m: ArrayLike, start_velocity_m_s: ArrayLike, sigma_m: float = SIGMA_M
-) -> ZeroFit:
-    """Two zeros in closed form, f₁/a₁₁ and f₂/a₁₁, with a known start.
-
-    ``problem``: without further courses. ``start_position_m``, ``start_velocity_m_s`` (2,): at the beginning of the
-    record. The source takes them from two fixes, and the error of that velocity dominates that of the zeros: see
-    :func:`constant_zeros_after`. ``sigma_m``: noise of a fix, each axis, for the covariance.
-    """
-    turn = _only_constant(problem)
-    a11 = float(np.sum(np.abs(turn) ** 2))
-    if not a11 > 0.0:
-        raise ValueError("Input problem must have a fix after the beginning; instead received none.")
-    p0 = _complex(np.asarray(start_position_m, dtype=np.float64))
-    v0 = _complex(np.asarray(start_velocity_m_s, dtype=np.float64))
-    f = p0 + v0 * problem.time_s + problem.moved
-    zeta = np.sum(turn.conj() * (f - problem.measured)) / a11
-    residual = f - zeta * turn - problem.measured
-    return ZeroFit(_real([zeta]), _real(p0), _real(v0), sigma_m**2 / a11 * np.eye(2), _rms(residual))
-
-
 def constant_zeros_after(problem: ZeroProblem, first: int = 4, sigma_m: float = SIGMA_M) -> ZeroFit:
     """Two zeros in closed form, with the start of a straight line through the first fixes.
 
@@ -208,7 +187,9 @@ def constant_zeros_after(problem: ZeroProblem, first: int = 4, sigma_m: float = 
     velocity then has √2 times the noise of a fix over one period. ``sigma_m``: noise of a fix, each axis, for the
     covariance.
     """
-    turn, t = _only_constant(problem), problem.time_s
+    if len(problem.by_zero) != 1:
+        raise ValueError(f"Input problem must be without further courses; instead received {len(problem.by_zero) - 1}.")
+    turn, t = problem.by_zero[0], problem.time_s
     if not 2 <= first < t.size:
         raise ValueError(f"Input first must be 2 or more and less than the {t.size} fixes; instead received {first}.")
     middle = t[:first].mean()
@@ -268,12 +249,6 @@ def _real(value: ArrayLike) -> FloatArray:
 
 def _rms(residual: ComplexArray) -> float:
     return float(np.sqrt(np.mean(np.abs(residual) ** 2)))
-
-
-def _only_constant(problem: ZeroProblem) -> ComplexArray:
-    if len(problem.by_zero) != 1:
-        raise ValueError(f"Input problem must be without further courses; instead received {len(problem.by_zero) - 1}.")
-    return problem.by_zero[0]
 
 
 def _real_covariance(C: ComplexArray) -> FloatArray:

@@ -76,7 +76,7 @@ class _Recorder:
 def rendered_set(setup: SkySetup, seed=0):
     """Poses and the stars that were found in rendered frames."""
     recorder = _Recorder()
-    truth = sky_run(led_sky(0), recorder, setup, seed).truth
+    truth = sky_run(led_sky(0), recorder, setup, [seed]).truth
     return [(Pose(*row), points) for row, points in zip(truth, recorder.points, strict=True)]
 
 

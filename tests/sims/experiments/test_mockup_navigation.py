@@ -15,14 +15,14 @@ import pytest
 from adcs.mockup.navigation.delayed_ekf import DelayedFilter, FilterSettings, FilterTrack
 from adcs.mockup.navigation.fixes import Outcome, fuse
 from adcs.mockup.navigation.strapdown import PlanarTrack
-from sims.experiments.mockup_navigation import fused_runs, fusion_run, track_errors, zeros_run
+from sims.experiments.mockup_navigation import fused_runs, track_errors, zeros_run
 from sims.experiments.mockup_settings import METHODS
 from sims.mockup.table_run import CameraErrors, ImuErrors, TableScenario, table_run
 
 
 @pytest.fixture(scope="module")
 def summaries():
-    return {method: fusion_run(method).summary() for method in METHODS}
+    return {method: fused_runs(method, TableScenario(), range(6)).summary() for method in METHODS}
 
 
 class TestFusion:
@@ -48,7 +48,7 @@ class TestFusion:
         assert max(heading, key=heading.__getitem__) == "camera"
 
     def test_one_false_fix_in_fifty(self) -> None:
-        runs = fusion_run("ekf", false_fixes=0.02)
+        runs = fused_runs("ekf", TableScenario(camera=CameraErrors(false=0.02)), range(6))
         summary = runs.summary()
         assert summary["false_fixes"] >= 20
         assert summary["position_rms_mm"] <= 6.0
@@ -78,21 +78,21 @@ class TestFusion:
         assert summary["rejected_fixes"] == 0
 
     def test_the_zeros_are_found(self) -> None:
-        result = fusion_run("ekf", seeds=1).results[0]
+        result = fused_runs("ekf", TableScenario(), [0]).results[0]
         assert isinstance(result.fused.track, FilterTrack)
         error = result.fused.track.zero_m_s2[-1] - result.run.zero_m_s2[-1]
         assert np.abs(error).max() < 0.001
         assert result.fused.track.zero_rad_s[-1] == pytest.approx(result.run.zero_rad_s, abs=math.radians(0.01))
 
     def test_a_number_of_seeds_and_the_first_one(self) -> None:
-        three = fusion_run("camera", seeds=2, duration_s=12.0, seed=3)
+        three = fused_runs("camera", TableScenario(duration_s=12.0), range(3, 5))
         assert [result.seed for result in three.results] == [3, 4]
-        alone = fusion_run("camera", seeds=1, duration_s=12.0, seed=4)
+        alone = fused_runs("camera", TableScenario(duration_s=12.0), [4])
         assert alone.results[0].errors == three.results[1].errors
 
     def test_progress_and_json(self) -> None:
         done: list[int] = []
-        runs = fusion_run("paper", seeds=2, duration_s=12.0, progress=done.append)
+        runs = fused_runs("paper", TableScenario(duration_s=12.0), range(2), done.append)
         assert done == [1, 1]
         assert {"position_rms_mm", "position_max_mm", "velocity_rms_mm_s", "heading_rms_deg"} <= set(
             json.loads(json.dumps(runs.summary()))
@@ -143,7 +143,7 @@ class TestZeros:
         assert summary["zero_error_m_s2"] <= 0.0005
 
     def test_constant_zeros_fail_over_180_s(self) -> None:
-        two, six, drift = (zeros_run(unknowns, 2, 180.0).summary() for unknowns in ("two", "six", "drift"))
+        two, six, drift = (zeros_run(unknowns, range(2), 180.0).summary() for unknowns in ("two", "six", "drift"))
         assert two["position_before_rms_mm"] > 1000.0
         assert two["position_rms_mm"] > six["position_rms_mm"] > 30.0
         # A slope helps, but the noise of the samples alone is integrated to centimetres.
@@ -151,7 +151,7 @@ class TestZeros:
 
     def test_progress_and_json(self) -> None:
         done: list[int] = []
-        runs = zeros_run("six", 2, 12.0, progress=done.append)
+        runs = zeros_run("six", range(2), 12.0, progress=done.append)
         assert done == [1, 1]
         assert {"position_rms_mm", "zero_error_m_s2"} <= set(json.loads(json.dumps(runs.summary())))
         assert len(runs.results[0].before) == len(runs.results[0].after) == 1200
@@ -180,16 +180,25 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("call", "text"),
         [
-            (lambda: fusion_run("moon"), "Input method must be one of paper, velocity-corrected, ekf.*received 'moon'"),
-            (lambda: fusion_run("ekf", seeds=0), "Input seeds must be a positive number; instead received 0"),
-            (lambda: fusion_run("ekf", seed=-1), "Input seed must be 0 or more; instead received -1"),
-            (lambda: fusion_run("ekf", duration_s=10.0), "Input duration_s must be more than 10 .* received 10 s"),
-            (lambda: fusion_run("ekf", duration_s=math.nan), "Input duration_s .* received nan"),
-            (lambda: fusion_run("ekf", false_fixes=1.5), "Input false_fixes .* received 1.5"),
+            (
+                lambda: fused_runs("moon", TableScenario(), [0]),
+                "Input method must be one of paper, velocity-corrected, ekf.*received 'moon'",
+            ),
+            (
+                lambda: fused_runs("ekf", TableScenario(), []),
+                r"Input seeds must be .*, one at least; instead received \[\]",
+            ),
+            (lambda: fused_runs("ekf", TableScenario(), [-1]), "Input seeds must be numbers from 0 on.* received .-1"),
+            (
+                lambda: fused_runs("ekf", TableScenario(duration_s=10.0), [0]),
+                "Input duration_s must be more than 10 .* received 10 s",
+            ),
+            (lambda: zeros_run(duration_s=math.nan), "Input duration_s .* received nan"),
+            (lambda: CameraErrors(false=1.5), "Input false must be a fraction between 0 and 1; instead received 1.5"),
             (lambda: zeros_run("nine"), "Input unknowns .* received 'nine'"),
             (lambda: zeros_run(duration_s=5.0), "Input duration_s .* received 5 s"),
-            (lambda: zeros_run(seeds=1, start_fixes=60), "Input start_fixes must be 2 to .* received 60"),
-            (lambda: zeros_run(seeds=1, start_fixes=1), "Input start_fixes must be 2 to .* received 1"),
+            (lambda: zeros_run(seeds=[0], start_fixes=60), "Input start_fixes must be 2 to .* received 60"),
+            (lambda: zeros_run(seeds=[0], start_fixes=1), "Input start_fixes must be 2 to .* received 1"),
         ],
     )
     def test_arguments(self, call, text: str) -> None:

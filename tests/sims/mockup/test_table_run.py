@@ -14,8 +14,6 @@ from scipy import stats
 
 from adcs.mockup.navigation.strapdown import strapdown, turned, wrapped
 from sims.mockup.table_run import (
-    NO_CAMERA_ERRORS,
-    NO_IMU_ERRORS,
     THRUST_M_S2,
     CameraErrors,
     ImuErrors,
@@ -26,6 +24,9 @@ from sims.mockup.table_run import (
 from sims.noise import stream
 
 FALSE_ALARM = 1e-4
+
+NO_IMU_ERRORS = ImuErrors(0.0, 0.0, 0.0, 0.0, 0.0, drift_m_s2=(0.0, 0.0), warming_K=1.0, zero_rad_s=0.0)
+NO_CAMERA_ERRORS = CameraErrors(position_m=0.0, heading_rad=0.0, failed=0.0)
 
 
 def ideal(drive="perimeter", duration_s=60.0, imu=NO_IMU_ERRORS, camera=NO_CAMERA_ERRORS):

@@ -186,7 +186,7 @@ class TestFrames:
             "blind": SkySetup(poses=40, k1=-0.05),
             "calibrated": SkySetup(poses=40, k1=-0.05, believed_k1=k1),
         }.items():
-            run = sky_run(sky(0), RobustMatcher(catalogue, setup.believed_camera.m_per_px), setup, seed=4)
+            run = sky_run(sky(0), RobustMatcher(catalogue, setup.believed_camera.m_per_px), setup, [4])
             assert run.good.all()
             rms[name] = run.summary()["position_rms_mm"]
         assert rms["blind"] > 0.5

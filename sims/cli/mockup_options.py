@@ -1,0 +1,311 @@
+"""Options of ``adcs run mockup``, and what they mean."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from arrays.io.arguments import Count, Seed, whole_number
+from arrays.io.errors import InputError, naming
+from sims.experiments.mockup_settings import SETTLED_S, Method, Unknowns
+
+if TYPE_CHECKING:
+    from adcs.mockup.vision.camera import Camera
+    from adcs.mockup.vision.paper_matcher import Matcher
+    from adcs.mockup.vision.sky import LedSky
+    from sims.experiments.mockup_vision import Finder, SkySetup
+    from sims.mockup.table_run import TableScenario
+
+Part = Literal["sky", "fusion", "zeros"]
+MatcherName = Literal["paper", "robust", "odds"]
+StarFinder = Literal["bright", "faint", "level"]
+FusionName = Literal[Method, "all"]
+Number0 = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0))]
+Port = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, lte=65535))]
+_EVERYWHERE = {"part", "seeds", "seed"}
+_BELONGS: dict[str, tuple[str, ...]] = {
+    "sky": (
+        *("poses", "matcher", "lost", "spurious", "hot_pixels", "noise_dn", "speed_m_s", "turn_deg_s"),
+        *("footprint_m", "k1", "believed_k1", "stars", "sky", "frames"),
+    ),
+    "fusion": (
+        "fusion",
+        "duration",
+        "false_fixes",
+        "failed",
+        "overtaken",
+        "repeated",
+        "delay_s",
+        "outage",
+        "samples",
+        "fixes",
+    ),
+    "zeros": ("unknowns", "start_fixes", "duration"),
+}
+_OF_FRAMES = ("part", "frames", "sky", "matcher", "footprint_m", "believed_k1", "stars")
+"""What counts for frames that are read: all else is about frames that are simulated."""
+_OF_RECORDS = ("part", "samples", "fixes", "fusion")
+"""The same of a recording."""
+_CLOSEST_PX = 4.0
+"""Lights that are nearer to each other are one blob."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class MockupOptions:
+    """What is run.
+
+    Parameters
+    ----------
+    part : str
+        Frames of the camera, rendered and identified ("sky"), drives with late fixes ("fusion"), or zeros of the
+        accelerometer from short runs ("zeros").
+    seeds : int, optional
+        Number of runs: 6; of "sky" 1.
+    seed : int
+        Of the first run; the next ones follow.
+    poses : int, optional
+        sky: frames of a run, at random places and headings; 120.
+    matcher : str, optional
+        sky: the source's triangles ("paper"), triangles checked by all stars ("robust", the default), or pairs of stars
+        weighed by odds ("odds").
+    lost : float, optional
+        sky: part of the lights that are dark, 0 to 1; none.
+    spurious : int, optional
+        sky: lights in view that are in no catalogue; 0.
+    hot_pixels : int, optional
+        sky: pixels that are white always; 0.
+    noise_dn : float, optional
+        sky: of a pixel, of 255; 4.
+    speed_m_s : float, optional
+        sky: during the exposure of 1/30 s [m/s]; at rest.
+    turn_deg_s : float, optional
+        sky: during the exposure [°/s]; at rest.
+    footprint_m : float, optional
+        sky: width of the seen part of the ceiling [m]; 0.9.
+    k1 : float, optional
+        sky: radial distortion of the lens at 320 px from its centre, such as -0.05; 0.
+    believed_k1 : float, optional
+        sky: what the calibration says of it; 0.
+    stars : str, optional
+        sky: pixels far above the background ("bright", the default), sums of pixels for faint and smeared lights
+        ("faint"), or the source's level between the darkest and the brightest pixel ("level").
+    sky : Path, optional
+        sky: TOML file of the lights' places; by default 180 random ones.
+    frames : Path, optional
+        sky: PNG file, or folder of them, to be identified in place of simulated frames; needs --sky.
+    fusion : str, optional
+        fusion: integration from the exposure of each fix ("paper"), the same with the velocity corrected
+        ("velocity-corrected"), the delayed error-state filter ("ekf", the default), fixes alone, held and late
+        ("camera"), samples alone ("imu"), or each of these ("all").
+    duration : float, optional
+        fusion, zeros: seconds; 180, of "zeros" 15. Runs of zeros of up to 20 s are the one with two firings.
+    false_fixes : float, optional
+        fusion: part of the fixes that are anywhere; none.
+    failed : float, optional
+        fusion: part of the frames without a fix; 0.12.
+    overtaken : float, optional
+        fusion: part of the fixes that arrive up to 1.8 s later than usual; none.
+    repeated : float, optional
+        fusion: part of the fixes that arrive twice; none.
+    delay_s : float, optional
+        fusion: from the exposure to the fix [s]; 0.6.
+    outage : float, optional
+        fusion: from when to when there are no frames [s].
+    samples, fixes : Path, optional
+        fusion: CSV files of a recording, in place of simulated drives: time_s, acceleration_x_m_s2,
+        acceleration_y_m_s2 and rate_deg_s of every sample; exposure_s, arrival_s, x_m, y_m and heading_deg of every
+        fix.
+    unknowns : str, optional
+        zeros: zeros alone ("two"), with the start ("six", the default), or also their slopes ("drift").
+    start_fixes : int, optional
+        zeros: fixes whose line is the start of "two"; 4, and 2 in the source.
+    """
+
+    part: Part = "sky"
+    seeds: Annotated[Count | None, Parameter(name=["--seeds", "--runs"])] = None
+    seed: Seed = 0
+    poses: Count | None = None
+    matcher: MatcherName | None = None
+    lost: float | None = None
+    spurious: Number0 | None = None
+    hot_pixels: Number0 | None = None
+    noise_dn: float | None = None
+    speed_m_s: float | None = None
+    turn_deg_s: float | None = None
+    footprint_m: float | None = None
+    k1: float | None = None
+    believed_k1: float | None = None
+    stars: StarFinder | None = None
+    sky: Path | None = None
+    frames: Path | None = None
+    fusion: FusionName | None = None
+    duration: float | None = None
+    false_fixes: float | None = None
+    failed: float | None = None
+    overtaken: float | None = None
+    repeated: float | None = None
+    delay_s: float | None = None
+    outage: tuple[float, float] | None = None
+    samples: Path | None = None
+    fixes: Path | None = None
+    unknowns: Unknowns | None = None
+    start_fixes: Annotated[int | None, Parameter(converter=whole_number, validator=Number(gte=2))] = None
+
+    def check(self) -> None:
+        """Raise InputError for what cannot be run."""
+        belongs = {*_BELONGS[self.part], *_EVERYWHERE}
+        for name in self.given():
+            if name not in belongs:
+                parts = " or ".join(f"--part {part}" for part, names in _BELONGS.items() if name in names)
+                raise InputError(f"{option_name(name)}: found it with --part {self.part}, expected it with {parts}.")
+        if self.frames is not None:
+            self._check_frames()
+        if self.samples is not None or self.fixes is not None:
+            self._check_record()
+        for name in ("lost", "false_fixes", "failed", "overtaken", "repeated"):
+            self._check_range(name, 0.0, 1.0, "a fraction between 0 and 1")
+        for name in ("noise_dn", "speed_m_s", "turn_deg_s"):
+            self._check_range(name, 0.0, 1e6, "0 or more")
+        self._check_range("hot_pixels", 0, 640 * 480, f"0 to {640 * 480}, all pixels of the frame")
+        self._check_range("delay_s", 0.0, 10.0, "0 to 10 s, as long as samples are kept")
+        if self.footprint_m is not None and not 0.01 <= self.footprint_m <= 100.0:
+            raise InputError(f"--footprint-m: found {self.footprint_m:g}, expected 0.01 to 100 m.")
+        if self.start_fixes is not None and self.unknowns != "two":
+            raise InputError("--start-fixes: found it without --unknowns two, expected it with that.")
+        if self.outage is not None and not 0.0 <= self.outage[0] < self.outage[1]:
+            raise InputError(
+                f"--outage: found {self.outage[0]:g} to {self.outage[1]:g} s, expected a time and a later one."
+            )
+
+    def given(self) -> list[str]:
+        """Names of the options that are not as by default."""
+        return [field.name for field in fields(self) if getattr(self, field.name) != field.default]
+
+    def _check_frames(self) -> None:
+        if self.sky is None:
+            raise InputError(f"--frames {self.frames}: found no --sky, expected the file of the lights' places.")
+        self._refuse_given_but(_OF_FRAMES, "found it with --frames, expected it with simulated frames only.")
+
+    def _check_record(self) -> None:
+        for name, other in (("samples", "fixes"), ("fixes", "samples")):
+            if getattr(self, name) is not None and getattr(self, other) is None:
+                raise InputError(f"{option_name(name)}: found it without --{other}, expected both.")
+        self._refuse_given_but(_OF_RECORDS, "found it with --samples, expected it with simulated drives only.")
+        if self.fusion == "all":
+            raise InputError("--fusion all: found it with --samples, expected one method.")
+
+    def _refuse_given_but(self, names: Sequence[str], fault: str) -> None:
+        for name in self.given():
+            if name not in names:
+                raise InputError(f"{option_name(name)}: {fault}")
+
+    def _check_range(self, name: str, low: float, high: float, expected: str) -> None:
+        value = getattr(self, name)
+        if value is not None and not low <= value <= high:
+            raise InputError(f"{option_name(name)}: found {value:g}, expected {expected}.")
+
+    def runs(self, default: int) -> range:
+        """Seeds of the runs."""
+        return range(self.seed, self.seed + (default if self.seeds is None else self.seeds))
+
+    def camera(self) -> Camera:
+        """The camera as its user knows it."""
+        from adcs.mockup.vision.camera import camera_of_footprint
+
+        with naming("--believed-k1"):
+            return camera_of_footprint(value_or(self.footprint_m, 0.9), value_or(self.believed_k1, 0.0))
+
+    @cached_property
+    def led_sky(self) -> LedSky:
+        """Lights on the ceiling."""
+        from adcs.mockup.vision.sky import led_sky, read_sky
+
+        if self.sky is None:
+            return led_sky()
+        sky, camera = read_sky(self.sky), self.camera()
+        least_m, most_m = _CLOSEST_PX * camera.m_per_px, math.hypot(*camera.footprint_m)
+        if not least_m <= sky.spacing_m <= most_m:
+            raise InputError(
+                f"{self.sky}, key positions_m: found lights {sky.spacing_m:.3g} m apart, expected {least_m:.2g} to "
+                f"{most_m:.2g} m in frames {camera.footprint_m[0]:g} m wide; the file's unit is the metre."
+            )
+        return sky
+
+    @property
+    def matcher_name(self) -> MatcherName:
+        """The matcher that is asked for, or else the usual one."""
+        return self.matcher or "robust"
+
+    def sky_matcher(self) -> Matcher:
+        """What identifies the stars of an image of the sky."""
+        from adcs.mockup.vision.odds_matcher import odds_matcher
+        from adcs.mockup.vision.paper_matcher import PaperMatcher
+        from adcs.mockup.vision.robust_matcher import RobustMatcher
+        from adcs.mockup.vision.triangles import TriangleCatalogue
+
+        catalogue, camera = TriangleCatalogue.of(self.led_sky.positions_m), self.camera()
+        if self.matcher_name == "paper":
+            return PaperMatcher(catalogue)
+        if self.matcher_name == "odds":
+            return odds_matcher(catalogue, camera)
+        return RobustMatcher(catalogue, camera.m_per_px)
+
+    def finder(self) -> Finder:
+        """What finds the stars of an image."""
+        from adcs.mockup.vision.centroids import find_faint_stars, find_stars, find_stars_between_extremes
+
+        if self.stars == "faint":
+            return find_faint_stars
+        return find_stars_between_extremes if self.stars == "level" else find_stars
+
+    def sky_setup(self) -> SkySetup:
+        """Frames that are simulated."""
+        from sims.experiments.mockup_vision import SkySetup
+
+        names = ("poses", "lost", "spurious", "hot_pixels", "speed_m_s", "footprint_m", "k1", "believed_k1")
+        turn_rad_s = None if self.turn_deg_s is None else math.radians(self.turn_deg_s)
+        setup = SkySetup(**self._known(*names, noise_DN=self.noise_dn, turn_rate_rad_s=turn_rad_s))
+        for option, camera in (("--k1", "camera"), ("--believed-k1", "believed_camera")):
+            with naming(option):
+                getattr(setup, camera)
+        return setup
+
+    def _known(self, *names: str, **more: Any) -> dict[str, Any]:
+        """Options by their names, and more, without those that are not given."""
+        values = {name: getattr(self, name) for name in names} | more
+        return {name: value for name, value in values.items() if value is not None}
+
+    def table_scenario(self) -> TableScenario:
+        """Drives that are simulated."""
+        from sims.mockup.table_run import CameraErrors, TableScenario
+
+        outages_s = None if self.outage is None else (self.outage,)
+        names = ("delay_s", "failed", "overtaken", "repeated")
+        camera = CameraErrors(**self._known(*names, false=self.false_fixes, outages_s=outages_s))
+        return TableScenario(duration_s=self.duration_s, camera=camera)
+
+    @property
+    def duration_s(self) -> float:
+        """Of a run."""
+        duration = value_or(self.duration, 15.0 if self.part == "zeros" else 180.0)
+        if not SETTLED_S < duration <= 1e4:
+            raise InputError(f"--duration: found {duration:g} s, expected more than {SETTLED_S:g} and up to 10000 s.")
+        return duration
+
+
+def option_name(name: str) -> str:
+    """Option as it is written on the command line."""
+    return f"--{name.replace('_', '-')}"
+
+
+def value_or(value: Any, default: Any) -> Any:
+    """The value, or where there is none the default."""
+    return default if value is None else value
