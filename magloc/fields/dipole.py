@@ -265,10 +265,6 @@ def total_gradient_tensor(points: ArrayLike, sources: ArrayLike, moments: ArrayL
     ValueError
         If an argument is not an array of 3-vectors, the numbers of sources and moments differ, or the leading axes
         do not broadcast.
-
-    See Also
-    --------
-    magloc.fields.dipole_compiled.gradient_at_points : the same, compiled and parallel, for many points.
     """
     return _sum_over_dipoles(gradient_tensor, (3, 3), points, sources, moments)
 

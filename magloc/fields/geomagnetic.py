@@ -314,27 +314,6 @@ def tilted_dipole_ecef(date: Dates, model: Model = "IGRF-14") -> FloatArray:
     return REFERENCE_RADIUS_M**3 / MU0_OVER_4PI * np.stack([g[..., across], h[..., across], g[..., axial]], axis=-1)
 
 
-def axial_dipole_ecef(date: Dates, model: Model = "IGRF-14") -> FloatArray:
-    """Moment of the dipole along the Earth's axis: the part of :func:`tilted_dipole_ecef` that g10 makes.
-
-    Parameters
-    ----------
-    date, model
-        As in :func:`tilted_dipole_ecef`.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        ECEF [A·m²]: (0, 0, m), m < 0.
-
-    Raises
-    ------
-    ValueError
-        As :func:`tilted_dipole_ecef`.
-    """
-    return tilted_dipole_ecef(date, model) * np.array([0.0, 0.0, 1.0])
-
-
 def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike) -> FloatArray:
     """Earth-centred Earth-fixed positions of geodetic ones (WGS-84).
 

@@ -1,8 +1,8 @@
 """Search for one dipole by vector sensors, without a start.
 
-The moment is eliminated (:mod:`magloc.localization.fit.variable_projection`), a grid of positions is scored by how much
-of the readings' energy they explain, the best distinct ones are refined by a damped Gauss-Newton iteration that only
-accepts steps which decrease χ², and every distinct optimum near the best one is returned.
+The moment is eliminated (:mod:`magloc.localization.fit.variable_projection_compiled`), a grid of positions is scored by
+how much of the readings' energy they explain, the best distinct ones are refined by a damped Gauss-Newton iteration
+that only accepts steps which decrease χ², and every distinct optimum near the best one is returned.
 """
 
 from __future__ import annotations
