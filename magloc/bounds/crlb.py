@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
+from arrays.io.errors import _vectors
 from arrays.noise import reading_covariance
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.measurement.differences import channel_jacobian, fields_at_sensors, predicted_channels
@@ -219,13 +220,7 @@ def _root_of_sum(rows: FloatArray, inverse: FloatArray, lost: BoolArray) -> Floa
 
 
 def _sources(position_m: ArrayLike, moment_Am2: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    vectors = []
-    for name, value in (("position_m", position_m), ("moment_Am2", moment_Am2)):
-        vector = np.asarray(value, dtype=np.float64)
-        if vector.ndim == 0 or vector.shape[-1] != 3:
-            raise ValueError(f"Input {name} must have shape (..., 3); instead received shape {vector.shape}.")
-        vectors.append(vector)
-    p, m = np.broadcast_arrays(*vectors)
+    p, m = np.broadcast_arrays(_vectors("position_m", position_m), _vectors("moment_Am2", moment_Am2))
     return p, m
 
 

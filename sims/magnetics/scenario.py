@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -172,15 +172,3 @@ class MagneticScenario:
     def nominal_array(self) -> SensorArray:
         """The array as its user knows it."""
         return nominal_array(self.array, self.models, self.rate_Hz)
-
-    def with_white_noise_only(self) -> MagneticScenario:
-        """The same without anything that an array file with white noise does not describe.
-
-        No 1/f noise, bandwidth, rounding, misalignment, error of gain, drift and noise of the platform; saturation,
-        pulsations, the ambient field and missing readings stay, and so does the noise of one sample.
-        """
-        models = tuple(
-            SensorModel(model.reads, 0.0, range_T=model.range_T).with_sigma(model.sigma_T(self.rate_Hz), self.rate_Hz)
-            for model in self.models
-        )
-        return replace(self, models=models, platform=Platform())

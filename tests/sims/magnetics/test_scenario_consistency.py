@@ -33,6 +33,7 @@ from sims.magnetics.scenario import MagneticScenario
 from sims.magnetics.scenario_files import read_scenario
 from sims.magnetics.simulation import Simulation
 from sims.montecarlo import run_many
+from tests.white_noise import with_white_noise_only
 
 FloatArray = NDArray[np.float64]
 FAR = chi2.isf(math.erfc(5.0 / math.sqrt(2.0)), 3)
@@ -290,7 +291,7 @@ class TestUnmatchedPaths:
 
         Measured 0.92 over 14 runs (seeds 0 to 13).
         """
-        scenario = replace(read_scenario("hand-magnet").with_white_noise_only(), duration_s=duration_s)
+        scenario = replace(with_white_noise_only(read_scenario("hand-magnet")), duration_s=duration_s)
         result = found(scenario, hand, n_runs)
         assert 0.6 < nees_of_the_last(result, 5) < 1.4
         assert_none_is_far(result)

@@ -25,6 +25,7 @@ from sims.magnetics.scenario_tables import PATH_TABLES
 from sims.magnetics.sensors import SENSOR_KINDS
 from sims.magnetics.simulation import simulate
 from tests.conftest import REPOSITORY
+from tests.white_noise import with_white_noise_only
 
 NAMES = ("diver", "drone", "hand-magnet", "paper", "ship", "weaving")
 FILES = REPOSITORY / "sims" / "magnetics" / "scenarios"
@@ -85,7 +86,7 @@ class TestBuiltIn:
     @pytest.mark.parametrize("name", NAMES)
     def test_the_source_is_seen(self, name: str) -> None:
         # Without its source the readings differ by 20 times the noise of a sample, at the best channel and time.
-        wanted = read_scenario(name).with_white_noise_only()
+        wanted = with_white_noise_only(read_scenario(name))
         seen, empty = (simulate(s, 3).readings.values_T for s in (wanted, replace(wanted, sources=())))
         change = np.abs(np.diff(seen - empty, axis=1)) / wanted.nominal_array.channel_noise_T[1:]
         assert np.nanmax(change) > 20.0

@@ -24,6 +24,7 @@ from sims.magnetics.sensors import SensorModel
 from sims.magnetics.simulation import MU0, Simulation, simulate
 from sims.noise import stream
 from tests.oracles import magpylib_field
+from tests.white_noise import with_white_noise_only
 
 FloatArray = NDArray[np.float64]
 FALSE_ALARM = 1e-4
@@ -397,7 +398,7 @@ class TestScenario:
 
     def test_white_noise_only_keeps_the_noise_of_a_sample(self) -> None:
         full = TestRandomNumbers.FULL
-        white = full.with_white_noise_only()
+        white = with_white_noise_only(full)
         for before, after in zip(full.nominal_array.sensors, white.nominal_array.sensors, strict=True):
             assert after.noise_T == pytest.approx(before.noise_T, rel=1e-11)
             assert after.misalignment_rad == after.gain_uncertainty == 0.0
