@@ -197,6 +197,18 @@ class SensorArray:
                 gain[channels, 0] = scale[0, 0]
         return _read_only(gain)
 
+    def linear_gain(self, fields_T: FloatArray) -> FloatArray:
+        """What each channel reads of a small change of the fields (..., N, 3) at the sensors: (..., C, 3) or (C, 3).
+
+        A modulus reads what is along its field; NaN where that is zero.
+        """
+        if not self.channel_is_scalar.any():
+            return self.channel_gain
+        with np.errstate(invalid="ignore", divide="ignore"):
+            direction = fields_T / np.linalg.norm(fields_T, axis=-1, keepdims=True)
+        of_modulus = self.channel_gain[:, :1] * direction[..., self.channel_sensor, :]
+        return np.where(self.channel_is_scalar[:, None], of_modulus, self.channel_gain)
+
     def subset(self, ids: Sequence[str]) -> SensorArray:
         """The array reduced to some of its sensors.
 

@@ -56,3 +56,8 @@ def fibonacci_directions(n: int) -> FloatArray:
     azimuth = np.pi * (1.0 + np.sqrt(5.0)) * i
     in_plane = np.sqrt(1.0 - z * z)
     return np.stack([in_plane * np.cos(azimuth), in_plane * np.sin(azimuth), z], axis=-1)
+
+
+def hemisphere(n: int) -> FloatArray:
+    """Nearly uniform unit vectors (n, 3) with z > 0."""
+    return fibonacci_directions(2 * n)[:n]

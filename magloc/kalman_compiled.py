@@ -15,9 +15,7 @@ def triangular_root(rows: FloatArray, root: FloatArray) -> None:
     With rows ``[F S, S_q]`` it is the twin of :func:`magloc.kalman.predict_square_root`.
     """
     n, m = rows.shape
-    for i in range(n):
-        for j in range(n):
-            root[i, j] = 0.0
+    root[:] = 0.0
     for i in range(n):
         norm = 0.0
         for c in range(m):

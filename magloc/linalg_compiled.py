@@ -47,16 +47,24 @@ def _tangent(q: FloatArray, tangent: FloatArray) -> None:
 
 
 @compiled
+def fill_frame(line: FloatArray, frame: FloatArray) -> float:
+    """Axes u, v, n as rows, n along a line, and its length. Duff et al., "Building an orthonormal basis, revisited"."""
+    length = math.sqrt(line[0] * line[0] + line[1] * line[1] + line[2] * line[2])
+    x, y, z = line[0] / length, line[1] / length, line[2] / length
+    sign = math.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    frame[0, 0], frame[0, 1], frame[0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
+    frame[1, 0], frame[1, 1], frame[1, 2] = b, sign + y * y * a, -y
+    frame[2, 0], frame[2, 1], frame[2, 2] = x, y, z
+    return length
+
+
+@compiled
 def _directional_tangent(q: FloatArray, tangent: FloatArray) -> None:
-    """Two orthonormal rows orthogonal to u that leave s, and with it the range, alone."""
-    norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
-    u0, u1, u2 = q[0] / norm, q[1] / norm, q[2] / norm
-    sign = 1.0 if u2 >= 0.0 else -1.0
-    a = -1.0 / (sign + u2)
-    b = u0 * u1 * a
-    tangent[0, 3] = tangent[1, 3] = 0.0
-    tangent[0, 0], tangent[0, 1], tangent[0, 2] = 1.0 + sign * u0 * u0 * a, sign * b, -sign * u0
-    tangent[1, 0], tangent[1, 1], tangent[1, 2] = b, sign + u1 * u1 * a, -u1
+    """Two orthonormal rows orthogonal to u that leave s, and with it the range, alone; the third row is u itself."""
+    fill_frame(q[:3], tangent[:, :3])
+    tangent[:, 3] = 0.0
 
 
 @compiled

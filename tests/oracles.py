@@ -19,6 +19,8 @@ from stonesoup.types.prediction import GaussianStatePrediction
 from stonesoup.types.state import StateVector
 from stonesoup.updater.kalman import IteratedKalmanUpdater
 
+from magloc.measurement.differences import DifferenceMeasurement
+
 Array = NDArray[np.float64]
 K = 1e-7
 CHOCLO_K: float = choclo.constants.VACUUM_MAGNETIC_PERMEABILITY / (4.0 * np.pi)
@@ -131,3 +133,9 @@ def stonesoup_iterated_update(x, P, z, R, h, H, max_iterations=100):
     updater = IteratedKalmanUpdater(model, max_iterations=max_iterations, tolerance=1e-8)
     posterior = updater.update(SingleHypothesis(prediction, detection))
     return np.asarray(posterior.mean, dtype=float).ravel(), np.asarray(posterior.covar, dtype=float)
+
+
+def fisher_information(measurement: DifferenceMeasurement, position: ArrayLike, moment: ArrayLike) -> Array:
+    """Information (..., 6, 6) about (p, m) of a set of differences: HᵀR⁻¹H, in which R is diagonal."""
+    whitened = measurement.jacobian(position, moment) / np.sqrt(measurement.variance)[:, None]
+    return whitened.mT @ whitened

@@ -62,3 +62,13 @@ def _vector(name: str, value: ArrayLike) -> FloatArray:
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise ValueError(f"Input {name} must be finite and have shape (3,); instead received {vector.tolist()}.")
     return vector
+
+
+def _vectors(name: str, values: ArrayLike) -> FloatArray:
+    import numpy as np
+
+    # A length of 1 would broadcast to nonsense.
+    vectors = np.asarray(values, dtype=np.float64)
+    if vectors.ndim == 0 or vectors.shape[-1] != 3:
+        raise ValueError(f"Input {name} must have shape (..., 3); instead received shape {vectors.shape}.")
+    return vectors

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
+from arrays.io.errors import _vectors
 from arrays.noise import reading_covariance
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.measurement.differences import channel_jacobian, predicted_channels
+from magloc.measurement.differences import channel_jacobian, fields_at_sensors, predicted_channels
 
 LOST = 1e-6
 """A combination of parameters is not estimable if the readings tell of it so much less than of others."""
@@ -79,7 +80,7 @@ def whitened_jacobian(
     with np.errstate(invalid="ignore"):
         W = root @ W
         common = root @ _common_field(array)
-        ambient = root @ _ambient_effect(array, p, m) if ambient_uncertainty_T else None
+        ambient = root @ array.linear_gain(fields_at_sensors(array, p, m)) if ambient_uncertainty_T else None
     prior = np.inf if array.common_field_T is None else array.common_field_T
     for group in _kinds(array):
         # Written out for every kind: one of them has no effect on the readings of the other.
@@ -88,17 +89,6 @@ def whitened_jacobian(
         if ambient is not None:
             ambient = _marginalised(ambient, part, prior)
     return W if ambient is None else _marginalised(W, ambient, ambient_uncertainty_T)
-
-
-def fisher_information(
-    array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, *, ambient_uncertainty_T: float = 0.0
-) -> FloatArray:
-    """Information (..., 6, 6) that one set of readings holds about (p, m), all nuisances marginalised.
-
-    Parameters are those of :func:`cramer_rao_bounds`; NaN for a source on a sensor.
-    """
-    W = whitened_jacobian(array, position_m, moment_Am2, ambient_uncertainty_T=ambient_uncertainty_T)
-    return W.mT @ W
 
 
 def cramer_rao_bounds(
@@ -201,17 +191,6 @@ def _common_field(array: SensorArray) -> FloatArray:
     return np.concatenate([np.where(scalar, 0.0, gain), np.where(scalar, gain[:, :1], 0.0)], axis=1)
 
 
-def _ambient_effect(array: SensorArray, position: FloatArray, moment: FloatArray) -> FloatArray:
-    """Derivative (..., C, 3) of the channels with respect to the ambient field, the same at all sensors."""
-    from magloc.fields.dipole import field
-
-    fields = field(array.positions, position[..., None, :], moment[..., None, :]) + array.ambient_fields
-    with np.errstate(invalid="ignore", divide="ignore"):
-        direction = fields / np.linalg.norm(fields, axis=-1, keepdims=True)
-    of_modulus = array.channel_gain[:, :1] * direction[..., array.channel_sensor, :]
-    return np.where(array.channel_is_scalar[:, None], of_modulus, array.channel_gain)
-
-
 def _marginalised(W: FloatArray, nuisance: FloatArray, sigma: float) -> FloatArray:
     """Whitened rows (..., C, n) freed of nuisances (..., C, q) of prior σ: ``(I + σ² N Nᵀ)^(-1/2) W`` by an SVD of N.
 
@@ -241,13 +220,7 @@ def _root_of_sum(rows: FloatArray, inverse: FloatArray, lost: BoolArray) -> Floa
 
 
 def _sources(position_m: ArrayLike, moment_Am2: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    vectors = []
-    for name, value in (("position_m", position_m), ("moment_Am2", moment_Am2)):
-        vector = np.asarray(value, dtype=np.float64)
-        if vector.ndim == 0 or vector.shape[-1] != 3:
-            raise ValueError(f"Input {name} must have shape (..., 3); instead received shape {vector.shape}.")
-        vectors.append(vector)
-    p, m = np.broadcast_arrays(*vectors)
+    p, m = np.broadcast_arrays(_vectors("position_m", position_m), _vectors("moment_Am2", moment_Am2))
     return p, m
 
 

@@ -72,8 +72,9 @@ class BoundModel(NamedTuple):
         for scale, sensor in zip(scales, array.sensors, strict=True):
             scale[: sensor.n_channels, : sensor.n_channels] = sensor.calibration.scale
         scalar = np.array([sensor.kind == "scalar" for sensor in array.sensors])
-        deviation = 3 * [0.0 if scalar.all() else _or_infinite(array.common_field_T)]
-        deviation += [_or_infinite(array.common_field_T) if scalar.any() else 0.0]
+        common = math.inf if array.common_field_T is None else array.common_field_T
+        deviation = 3 * [0.0 if scalar.all() else common]
+        deviation += [common if scalar.any() else 0.0]
         deviation += 3 * [ambient_uncertainty_T if scalar.any() else 0.0]
         nuisances = np.flatnonzero(deviation)
         return cls(
@@ -99,24 +100,6 @@ def read_only(values: NDArray) -> NDArray:  # type: ignore[type-arg]
     array = np.ascontiguousarray(values).view()
     array.setflags(write=False)
     return array
-
-
-def _or_infinite(deviation: float | None) -> float:
-    return math.inf if deviation is None else deviation
-
-
-@compiled
-def fill_frame(line: FloatArray, frame: FloatArray) -> float:
-    """Axes u, v, n as rows, n along a line, and its length. Duff et al., "Building an orthonormal basis, revisited"."""
-    length = math.sqrt(line[0] * line[0] + line[1] * line[1] + line[2] * line[2])
-    x, y, z = line[0] / length, line[1] / length, line[2] / length
-    sign = math.copysign(1.0, z)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    frame[0, 0], frame[0, 1], frame[0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
-    frame[1, 0], frame[1, 1], frame[1, 2] = b, sign + y * y * a, -y
-    frame[2, 0], frame[2, 1], frame[2, 2] = x, y, z
-    return length
 
 
 @compiled

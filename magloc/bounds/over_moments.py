@@ -16,8 +16,6 @@ from arrays.typing import FloatArray
 from magloc.bounds.crlb import check_uncertainty
 from magloc.levels import TYPICAL_AND_BAD
 
-"""Quantiles over the directions of the moment: the smallest σ that is not exceeded by this share of the directions."""
-
 
 class Spread(NamedTuple):
     """A σ over the directions of the moment, each of shape (...)."""
@@ -72,10 +70,8 @@ def table_and_spreads(
     from magloc.bounds import table_compiled as bounds
     from magloc.bounds.frame_compiled import BoundModel
 
-    positions, moments = _table_inputs(positions_m, moments_Am2)
-    alone = np.ascontiguousarray(alone_Am2, dtype=np.float64)
-    if alone.ndim != 2 or alone.shape[1] != 3:
-        raise ValueError(f"Input alone_Am2 must have shape (n, 3); instead received {alone.shape}.")
+    positions, alone = _rows("positions_m", positions_m, least=1), _rows("alone_Am2", alone_Am2)
+    moments = _rows("moments_Am2", moments_Am2, least=0 if len(alone) else 1)
     check_uncertainty(ambient_uncertainty_T)
     model = BoundModel.of(array, ambient_uncertainty_T)
     table, spreads = bounds.table_and_spreads(model, positions, alone, moments, np.array(TYPICAL_AND_BAD))
@@ -90,14 +86,8 @@ def sigma_table(
     Compiled and parallel twin of :func:`magloc.bounds.crlb.cramer_rao_bounds`. Infinite where the information is
     singular, NaN where :class:`magloc.bounds.crlb.Bounds` is.
     """
-    from magloc.bounds import table_compiled as bounds
-    from magloc.bounds.frame_compiled import BoundModel
-
-    positions, moments = _table_inputs(positions_m, moments_Am2)
-    check_uncertainty(ambient_uncertainty_T)
-    model, none = BoundModel.of(array, ambient_uncertainty_T), np.empty((0, 3))
-    table, _ = bounds.table_and_spreads(model, positions, moments, none, np.empty(0))
-    return SigmaTable(*table)
+    moments, none = _rows("moments_Am2", moments_Am2, least=1), np.empty((0, 3))
+    return table_and_spreads(array, positions_m, moments, none, ambient_uncertainty_T=ambient_uncertainty_T)[0]
 
 
 def spread_over(sigma: ArrayLike) -> Spread:
@@ -109,11 +99,9 @@ def spread_over(sigma: ArrayLike) -> Spread:
     return Spread(ordered.mean(axis=-1), median + blank, q95 + blank, ordered[..., -1])
 
 
-def _table_inputs(positions_m: ArrayLike, moments_Am2: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    tables = []
-    for name, value in (("positions_m", positions_m), ("moments_Am2", moments_Am2)):
-        rows = np.ascontiguousarray(value, dtype=np.float64)
-        if rows.ndim != 2 or rows.shape[1] != 3 or len(rows) == 0:
-            raise ValueError(f"Input {name} must have shape (n, 3), n at least 1; instead received {rows.shape}.")
-        tables.append(rows)
-    return tables[0], tables[1]
+def _rows(name: str, values: ArrayLike, least: int = 0) -> FloatArray:
+    rows = np.ascontiguousarray(values, dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[1] != 3 or len(rows) < least:
+        shape = "(n, 3), n at least 1" if least else "(n, 3)"
+        raise ValueError(f"Input {name} must have shape {shape}; instead received {rows.shape}.")
+    return rows

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from arrays.typing import FloatArray
 from magloc.bounds import lanes_compiled as bound_lanes
 from magloc.bounds import quadratic_forms_compiled as bound_forms
-from magloc.bounds.frame_compiled import LOST_INFORMATION, BoundModel, fill_frame, read_only
+from magloc.bounds.frame_compiled import LOST_INFORMATION, BoundModel, read_only
 from magloc.compilation import compiled, over_rows
+from magloc.linalg_compiled import fill_frame
 
 
 class _Work(NamedTuple):
@@ -46,16 +47,6 @@ def table_and_spreads(
 
 
 @compiled
-def _work(model: BoundModel, moments: FloatArray) -> _Work:
-    return _Work(
-        np.empty((3, 3)),
-        np.empty((9, moments.shape[0] + bound_lanes.LANES)),
-        bound_forms.new_forms(model, moments),
-        bound_lanes.new_block(model, moments.shape[0]),
-    )
-
-
-@compiled
 def _fill(
     begin: int,
     end: int,
@@ -67,7 +58,12 @@ def _fill(
     spreads: FloatArray,
 ) -> None:
     """The first moments are those of the table, the others those of the spreads."""
-    work = _work(model, moments)
+    work = _Work(
+        np.empty((3, 3)),
+        np.empty((9, moments.shape[0] + bound_lanes.LANES)),
+        bound_forms.new_forms(model, moments),
+        bound_lanes.new_block(model, moments.shape[0]),
+    )
     n_alone = table.shape[1]
     sigmas, ordered = np.empty(moments.shape), np.empty(moments.shape[0] - n_alone)
     for i in range(begin, end):

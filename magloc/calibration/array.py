@@ -26,6 +26,7 @@ from magloc.calibration.model import AXES, GAINS, OFFSET, PER_SENSOR, POSITION, 
 from magloc.calibration.observability import unobservable
 from magloc.calibration.results import SourceCalibration
 from magloc.localization.locator import Locator
+from magloc.measurement.rows import checked_rows
 
 Quantity = Literal["positions", "gains", "axes", "offsets"]
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
@@ -158,11 +159,7 @@ def _checked(
 ) -> tuple[FloatArray, FloatArray]:
     if array.channel_is_scalar.any():
         raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
-    readings = np.asarray(readings_T, dtype=np.float64)
-    if readings.ndim != 2 or readings.shape[1] != array.n_channels:
-        raise ValueError(
-            f"Input readings_T must have shape (n, {array.n_channels}); instead received {readings.shape}."
-        )
+    readings = checked_rows(array, readings_T)
     attitude = np.eye(3) if world_from_array is None else np.asarray(world_from_array, dtype=np.float64)
     if attitude.shape not in ((3, 3), (len(readings), 3, 3)):
         raise ValueError(

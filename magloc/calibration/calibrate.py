@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.calibration.array import CalibrationPrior, calibrate_on_path, self_calibrate
-from magloc.calibration.model import AXES, AXIS_PAIRS, GAINS, OFFSET, PER_SENSOR
+from magloc.calibration.model import GAINS, PER_SENSOR, unknowns
 from magloc.calibration.modulus import EllipsoidCalibration, calibrated_in_modulus, symmetric
 from magloc.calibration.observability import Unobservable
 from magloc.calibration.results import SourceCalibration, TurningCalibration
@@ -124,7 +124,7 @@ def _turned(nominal: SensorArray, rows: Readings, modulus_T: FloatArray) -> Turn
         if fits[before.id].converged:
             old, new = (np.asarray(sensor.calibration.scale) for sensor in (before, after))
             offsets = np.subtract(after.calibration.offset_T, before.calibration.offset_T)
-            change[i] = _unknowns(new @ np.linalg.inv(old) - np.eye(3), offsets)
+            change[i] = unknowns(1, response=new @ np.linalg.inv(old) - np.eye(3), offset=offsets)[0]
             sigma[i] = _sigma(fits[before.id], old, new)
         else:
             sigma[i, GAINS.start :] = np.inf
@@ -148,12 +148,4 @@ def _sigma(fit: EllipsoidCalibration, old: FloatArray, new: FloatArray) -> Float
     """Standard deviations (15,): with S = P R the change E = S S₀⁻¹ - 1 moves by dP R S₀⁻¹."""
     by_entry = np.stack([symmetric(unit) for unit in np.eye(6)]) @ (np.linalg.inv(fit.scale) @ new @ np.linalg.inv(old))
     variance = np.einsum("eab,ef,fab->ab", by_entry, fit.covariance[3:, 3:], by_entry)
-    return _unknowns(np.sqrt(variance), np.sqrt(np.diagonal(fit.covariance)[:3]))
-
-
-def _unknowns(response: FloatArray, offset: FloatArray) -> FloatArray:
-    """The 15 unknowns of a sensor, of the change of its response (3, 3) and its offset (3,)."""
-    row = np.zeros(PER_SENSOR)
-    row[GAINS], row[OFFSET] = np.diagonal(response), offset
-    row[AXES] = [response[channel, component] for channel, component in AXIS_PAIRS]
-    return row
+    return unknowns(1, response=np.sqrt(variance), offset=np.sqrt(np.diagonal(fit.covariance)[:3]))[0]

@@ -25,6 +25,7 @@ PER_SENSOR = 15
 POSITION, GAINS, AXES, OFFSET = slice(0, 3), slice(3, 6), slice(6, 12), slice(12, 15)
 AXIS_PAIRS = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 """Channel and component of the six axis unknowns."""
+_CHANNEL, _COMPONENT = (list(places) for places in zip(*AXIS_PAIRS, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,9 +137,24 @@ def response_factors(sensors: FloatArray) -> FloatArray:
     """I + E of every sensor, shape (N, 3, 3), from its unknowns (N, 15)."""
     factors = np.tile(np.eye(3), (len(sensors), 1, 1))
     factors[:, range(3), range(3)] += sensors[:, GAINS]
-    for k, (channel, component) in enumerate(AXIS_PAIRS):
-        factors[:, channel, component] = sensors[:, AXES.start + k]
+    factors[:, _CHANNEL, _COMPONENT] = sensors[:, AXES]
     return factors
+
+
+def unknowns(
+    n_sensors: int,
+    *,
+    position: FloatArray | float = 0.0,
+    response: FloatArray | None = None,
+    offset: FloatArray | float = 0.0,
+) -> FloatArray:
+    """Changes of positions (N, 3), of responses, E (N, 3, 3), and of offsets (N, 3) as unknowns (N, 15)."""
+    result = np.zeros((n_sensors, PER_SENSOR))
+    result[:, POSITION], result[:, OFFSET] = position, offset
+    if response is not None:
+        result[:, GAINS] = np.diagonal(response, axis1=-2, axis2=-1)
+        result[:, AXES] = response[..., _CHANNEL, _COMPONENT]
+    return result
 
 
 def predicted_T(problem: Problem, state: State) -> FloatArray:
@@ -181,8 +197,7 @@ def linearised(problem: Problem, state: State) -> Linearisation:
     by_sensor = np.zeros((n_rows, n_sensors, 3, PER_SENSOR))
     by_sensor[..., POSITION] = gradient
     by_sensor[..., GAINS] = nominal[..., None] * np.eye(3)
-    for k, (channel, component) in enumerate(AXIS_PAIRS):
-        by_sensor[..., channel, AXES.start + k] = nominal[..., component]
+    by_sensor[..., _CHANNEL, range(AXES.start, AXES.stop)] = nominal[..., _COMPONENT]
     by_sensor[..., OFFSET] = np.eye(3)
     by_sensor[..., GAINS.start :] *= weight
     by_sensor *= np.where(problem.free, problem.prior, 0.0)[:, None, :]

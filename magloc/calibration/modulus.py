@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.sensor import Calibration
 from arrays.typing import FloatArray
+from magloc.measurement.rows import checked_rows
 
 N_PARAMETERS = 9
 """Three of the offset, six of the symmetric scale matrix."""
@@ -122,7 +123,8 @@ def ellipsoid_calibration(readings_T: ArrayLike, modulus_T: ArrayLike, noise_T: 
     if unit == 0.0:
         return _failure("all readings are the same", len(readings), 0)
     problem = _Problem((readings - centre) / unit, modulus / field_unit, noise_T / unit)
-    fit, iterations, converged = _best_fit(problem)
+    fits = [_minimised(problem, offset, scale) for offset, scale in _starts(problem)]
+    fit, iterations, converged = min(fits, key=lambda fit: (not fit[2], fit[0].chi2))
     if not converged:
         return _failure("the iteration did not converge", len(readings), iterations)
     if problem.noise > _LARGEST_NOISE * _least_radius_of_curvature(problem, fit):
@@ -173,11 +175,7 @@ def calibrated_in_modulus(
     ValueError
         The shapes do not agree, a modulus is not positive and finite, or the array has no vector sensor.
     """
-    readings = np.asarray(readings_T, dtype=np.float64)
-    if readings.ndim != 2 or readings.shape[1] != array.n_channels:
-        raise ValueError(
-            f"Input readings_T must have shape (n, {array.n_channels}); instead received {readings.shape}."
-        )
+    readings = checked_rows(array, readings_T)
     if array.channel_is_scalar.all():
         raise ValueError("Input array must have a vector sensor; instead received scalar sensors only.")
     sensors, results = list(array.sensors), {}
@@ -224,12 +222,6 @@ def _failure(reason: str, n_readings: int, iterations: int) -> EllipsoidCalibrat
         converged=False,
         reason=reason,
     )
-
-
-def _best_fit(problem: _Problem) -> tuple[_Fit, int, bool]:
-    """The best of the fits from all starts."""
-    fits = [_minimised(problem, offset, scale) for offset, scale in _starts(problem)]
-    return min(fits, key=lambda fit: (not fit[2], fit[0].chi2))
 
 
 def _starts(problem: _Problem) -> list[tuple[FloatArray, FloatArray]]:

@@ -13,7 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.calibration.model import AXES, AXIS_PAIRS, GAINS, OFFSET, PER_SENSOR, POSITION, Problem, State, responses
+from magloc.calibration.model import (
+    AXES,
+    AXIS_PAIRS,
+    GAINS,
+    OFFSET,
+    PER_SENSOR,
+    POSITION,
+    Problem,
+    State,
+    responses,
+    unknowns,
+)
 
 UNSEEN = 1e-3
 """Information, in units of the prior's, below which a direction counts as unobservable."""
@@ -40,7 +51,7 @@ class Unobservable:
 
 def gauge_vectors(problem: Problem, state: State) -> dict[str, FloatArray]:
     """How the sensors' unknowns change along every gauge at a state, each (N, 15) in prior standard deviations."""
-    array = problem.array
+    array, n = problem.array, problem.array.n_sensors
     relative = array.positions + state.sensors[:, POSITION]
     relative = relative - relative.mean(axis=0)
     response = responses(problem, state)
@@ -48,15 +59,15 @@ def gauge_vectors(problem: Problem, state: State) -> dict[str, FloatArray]:
     vectors = {}
     for axis, name in enumerate("xyz"):
         unit = np.eye(3)[axis]
-        vectors[f"translation along {name}"] = _vector(problem, position=np.broadcast_to(unit, relative.shape))
+        vectors[f"translation along {name}"] = unknowns(n, position=unit)
         turned = np.cross(unit, np.eye(3)).T
-        vectors[f"rotation about {name}"] = _vector(
-            problem, position=relative @ turned.T, response=-response @ turned @ np.linalg.inv(nominal)
+        vectors[f"rotation about {name}"] = unknowns(
+            n, position=relative @ turned.T, response=-response @ turned @ np.linalg.inv(nominal)
         )
-        vectors[f"common offset along {name}"] = _vector(problem, offset=response @ unit)
-    vectors["size of the array against the moment"] = _vector(problem, position=relative)
-    vectors["common gain against the moment"] = _vector(problem, response=response @ np.linalg.inv(nominal))
-    return vectors
+        vectors[f"common offset along {name}"] = unknowns(n, offset=response @ unit)
+    vectors["size of the array against the moment"] = unknowns(n, position=relative)
+    vectors["common gain against the moment"] = unknowns(n, response=response @ np.linalg.inv(nominal))
+    return {name: vector / problem.prior for name, vector in vectors.items()}
 
 
 def unobservable(problem: Problem, state: State, information: FloatArray) -> tuple[Unobservable, ...]:
@@ -112,26 +123,6 @@ def unknown_name(problem: Problem, index: int) -> str:
         return f"{name} offset {'xyz'[k - OFFSET.start]}"
     channel, component = AXIS_PAIRS[k - AXES.start]
     return f"{name} axis {'xyz'[channel]} towards {'xyz'[component]}"
-
-
-def _vector(
-    problem: Problem,
-    *,
-    position: FloatArray | None = None,
-    response: FloatArray | None = None,
-    offset: FloatArray | None = None,
-) -> FloatArray:
-    """Changes of position (N, 3), E (N, 3, 3) and offset (N, 3) as unknowns (N, 15) in prior standard deviations."""
-    vector = np.zeros(problem.prior.shape)
-    if position is not None:
-        vector[:, POSITION] = position
-    if response is not None:
-        vector[:, GAINS] = np.diagonal(response, axis1=1, axis2=2)
-        for k, (channel, component) in enumerate(AXIS_PAIRS):
-            vector[:, AXES.start + k] = response[:, channel, component]
-    if offset is not None:
-        vector[:, OFFSET] = offset
-    return vector / problem.prior
 
 
 def _mirrored_cost(problem: Problem, state: State) -> float:

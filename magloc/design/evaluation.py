@@ -134,15 +134,12 @@ def _worst_near(task: DesignTask, sensors: FloatArray, position: FloatArray, mom
         one = Sample((distance * p / np.linalg.norm(p))[None], (size * m / np.linalg.norm(m))[None])
         return float(one.deviations(task, sensors)[0])
 
-    options = {"maxiter": 2000, "maxfev": 2000, "xatol": 1e-12, "fatol": 1e-6, "initial_simplex": _simplex(0.02)}
+    simplex = 0.02 * np.eye(7, 6, -1)
+    options = {"maxiter": 2000, "maxfev": 2000, "xatol": 1e-12, "fatol": 1e-6, "initial_simplex": simplex}
     found = minimize(  # type: ignore[call-overload]
         lambda x: -np.log(min(deviation(x), _INFINITE)), np.zeros(6), method="Nelder-Mead", options=options
     )
     return deviation(found.x)
-
-
-def _simplex(size: float) -> FloatArray:
-    return np.concatenate([np.zeros((1, 6)), size * np.eye(6)])
 
 
 def _gain(task: DesignTask, own: FloatArray, theirs: FloatArray, rng: np.random.Generator) -> tuple[float, float]:

@@ -39,7 +39,19 @@ class Volume(Protocol):
 
 
 @dataclass(frozen=True)
-class Ball:
+class _Solid:
+    """What solid bodies have in common."""
+
+    centre_m: tuple[float, float, float]
+
+    @property
+    def centre(self) -> FloatArray:
+        """Its centre [m]."""
+        return np.array(self.centre_m)
+
+
+@dataclass(frozen=True)
+class Ball(_Solid):
     """A solid ball.
 
     Attributes
@@ -47,13 +59,7 @@ class Ball:
     centre_m : tuple, shape (3,)
     """
 
-    centre_m: tuple[float, float, float]
     radius_m: float
-
-    @property
-    def centre(self) -> FloatArray:
-        """Its centre [m]."""
-        return np.array(self.centre_m)
 
     @property
     def radius(self) -> float:
@@ -74,7 +80,7 @@ class Ball:
 
 
 @dataclass(frozen=True)
-class Box:
+class Box(_Solid):
     """A solid box along the axes.
 
     Attributes
@@ -84,13 +90,7 @@ class Box:
         Full lengths; a plate has a zero among them.
     """
 
-    centre_m: tuple[float, float, float]
     size_m: tuple[float, float, float]
-
-    @property
-    def centre(self) -> FloatArray:
-        """Its centre [m]."""
-        return np.array(self.centre_m)
 
     @property
     def radius(self) -> float:
@@ -109,7 +109,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Cylinder:
+class Cylinder(_Solid):
     """A solid cylinder along z.
 
     Attributes
@@ -119,14 +119,8 @@ class Cylinder:
         A disc has the height zero, a rod the radius zero.
     """
 
-    centre_m: tuple[float, float, float]
     radius_m: float
     height_m: float
-
-    @property
-    def centre(self) -> FloatArray:
-        """Its centre [m]."""
-        return np.array(self.centre_m)
 
     @property
     def radius(self) -> float:

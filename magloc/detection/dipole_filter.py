@@ -107,13 +107,6 @@ class DipoleFilter:
         energy: FloatArray = np.einsum("nc,nc->n", whitened, whitened)
         return energy
 
-    def energy_at(self, whitened: FloatArray, position_m: ArrayLike) -> FloatArray:
-        """Energy of whitened readings (n, C) that a source at one position (3,) [m] explains: (n,)."""
-        orthonormal = np.linalg.qr(self.unit_signals(position_m)).Q
-        components = whitened @ orthonormal
-        energy: FloatArray = np.einsum("nj,nj->n", components, components)
-        return energy
-
     def candidate_energy(self, whitened: FloatArray) -> FloatArray:
         """Energy of whitened readings (n, C) that the best of the candidate positions explains: (n,).
 

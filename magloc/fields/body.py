@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import elliprd
 
-from arrays.io.errors import _vector
+from arrays.io.errors import _vector, _vectors
 from arrays.typing import FloatArray
 from magloc.fields.dipole import MU0_OVER_4PI
 
 if TYPE_CHECKING:
     import trimesh
 
-"""Distance in body lengths from which on a body counts as a dipole."""
 _MU0 = 4.0 * np.pi * MU0_OVER_4PI
 
 
@@ -76,9 +75,7 @@ def demagnetising_factors(semi_axes_m: ArrayLike) -> FloatArray:
     ValueError
         A semi-axis is not positive and finite.
     """
-    axes = np.asarray(semi_axes_m, dtype=np.float64)
-    if axes.ndim == 0 or axes.shape[-1] != 3:
-        raise ValueError(f"Input semi_axes_m must have shape (..., 3); instead received shape {axes.shape}.")
+    axes = _vectors("semi_axes_m", semi_axes_m)
     if not (np.isfinite(axes).all() and (axes > 0.0).all()):
         raise ValueError(f"Input semi_axes_m must be positive and finite; instead received {axes.tolist()}.")
     axes = axes / axes.max(axis=-1, keepdims=True)

@@ -26,6 +26,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from arrays.io.errors import _vectors
+
 Array = NDArray[np.float64]
 MU0_OVER_4PI = 1e-7
 """Magnetic constant over 4 pi, T m/A: exact until the SI of 2019, and 1.3e-10 above the measured value since."""
@@ -265,10 +267,6 @@ def total_gradient_tensor(points: ArrayLike, sources: ArrayLike, moments: ArrayL
     ValueError
         If an argument is not an array of 3-vectors, the numbers of sources and moments differ, or the leading axes
         do not broadcast.
-
-    See Also
-    --------
-    magloc.fields.dipole_compiled.gradient_at_points : the same, compiled and parallel, for many points.
     """
     return _sum_over_dipoles(gradient_tensor, (3, 3), points, sources, moments)
 
@@ -295,14 +293,6 @@ def _sum_over_dipoles(
     for j in range(p.shape[-2]):
         total += quantity(s, p[..., j, :], m[..., j, :])
     return total
-
-
-def _vectors(name: str, values: ArrayLike) -> Array:
-    """Return values as a float array whose last axis has length 3 (a length of 1 would broadcast to nonsense)."""
-    array = np.asarray(values, dtype=np.float64)
-    if array.ndim == 0 or array.shape[-1] != 3:
-        raise ValueError(f"Input {name} must have shape (..., 3); instead received shape {array.shape}.")
-    return array
 
 
 def _direction_and_distance(points: ArrayLike, source: ArrayLike) -> tuple[Array, Array]:

@@ -34,7 +34,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from arrays.io.errors import of_extra
+from arrays.io.errors import _vectors, of_extra
 from arrays.typing import FloatArray
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.fields.gauss_coefficients import FIELD
@@ -276,9 +276,7 @@ def field_ecef(position_ecef_m: ArrayLike, date: Dates, model: Model = "IGRF-14"
     ValueError
         As :func:`field_ned`, or if a position has not three components.
     """
-    position = _finite("position_ecef_m", position_ecef_m)
-    if position.ndim == 0 or position.shape[-1] != 3:
-        raise ValueError(f"Input position_ecef_m must have shape (..., 3); instead received shape {position.shape}.")
+    position = _vectors("position_ecef_m", _finite("position_ecef_m", position_ecef_m))
     x, y, z = np.moveaxis(position, -1, 0)
     latitude, longitude = np.degrees(np.arctan2(z, np.hypot(x, y))), np.degrees(np.arctan2(y, x))
     b_ned = field_geocentric_ned(np.linalg.norm(position, axis=-1), latitude, longitude, date, model)
@@ -312,27 +310,6 @@ def tilted_dipole_ecef(date: Dates, model: Model = "IGRF-14") -> FloatArray:
     (axial,) = np.flatnonzero((table.degree == 1) & (table.order == 0))
     (across,) = np.flatnonzero((table.degree == 1) & (table.order == 1))
     return REFERENCE_RADIUS_M**3 / MU0_OVER_4PI * np.stack([g[..., across], h[..., across], g[..., axial]], axis=-1)
-
-
-def axial_dipole_ecef(date: Dates, model: Model = "IGRF-14") -> FloatArray:
-    """Moment of the dipole along the Earth's axis: the part of :func:`tilted_dipole_ecef` that g10 makes.
-
-    Parameters
-    ----------
-    date, model
-        As in :func:`tilted_dipole_ecef`.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        ECEF [A·m²]: (0, 0, m), m < 0.
-
-    Raises
-    ------
-    ValueError
-        As :func:`tilted_dipole_ecef`.
-    """
-    return tilted_dipole_ecef(date, model) * np.array([0.0, 0.0, 1.0])
 
 
 def ecef_from_geodetic(latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike) -> FloatArray:

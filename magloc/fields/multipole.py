@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import null_space
 
+from arrays.io.errors import _vectors
 from arrays.typing import FloatArray
 from magloc.fields.dipole import MU0_OVER_4PI
 
@@ -37,11 +38,7 @@ def multipole_field_matrix(points_m: ArrayLike, source_m: ArrayLike, order: int)
     """
     if order < 1:
         raise ValueError(f"Input order must be at least 1; instead received {order}.")
-    points, source = np.asarray(points_m, dtype=np.float64), np.asarray(source_m, dtype=np.float64)
-    for name, values in (("points_m", points), ("source_m", source)):
-        if values.ndim == 0 or values.shape[-1] != 3:
-            raise ValueError(f"Input {name} must have shape (..., 3); instead received shape {values.shape}.")
-    separation = points - source
+    separation = _vectors("points_m", points_m) - _vectors("source_m", source_m)
     r = np.linalg.norm(separation, axis=-1)[..., None]
     r = np.where(r > 0.0, r, np.nan)
     n = separation / r

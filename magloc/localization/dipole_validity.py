@@ -17,11 +17,10 @@ from arrays.differences import decorrelated_differences
 from arrays.io.errors import _vector
 from arrays.noise import reading_covariance
 from arrays.typing import BoolArray, FloatArray
-from magloc.fields import dipole
 from magloc.fields.multipole import multipole_field_matrix
 from magloc.levels import EXTENDED_BODY, NO_OTHER_MISFIT, SECOND_LOOK
 from magloc.localization.fit.fixes import Fixes
-from magloc.measurement.differences import DifferenceMeasurement, channel_jacobian
+from magloc.measurement.differences import DifferenceMeasurement, channel_jacobian, fields_at_sensors
 
 BODY_LENGTHS = 3.0
 _ORDERS = (2, 3)
@@ -165,11 +164,12 @@ def nearness_test(
     known = _orthonormal(whitener @ channel_jacobian(array, position, moment), np.zeros((residual.size, 0)))
     residual = residual - known @ (known.T @ residual)
     chi2, dof = float(residual @ residual), residual.size - known.shape[1]
+    rows = array.linear_gain(fields_at_sensors(array, position, moment))
     steps: list[tuple[int, float, int]] = []
     left = dof
     for order in _ORDERS:
         fields = multipole_field_matrix(array.positions, position, order)[array.channel_sensor]
-        columns = np.einsum("ci,cij->cj", _channel_rows(array, position, moment), fields)
+        columns = np.einsum("ci,cij->cj", rows, fields)
         new = _orthonormal(whitener @ columns, known)
         if new.shape[1] == 0 or (steps and left - new.shape[1] <= 0):
             break
@@ -208,16 +208,6 @@ def _warning(misfit: bool, extended: bool, chi2: float, dof: int, gains: Sequenc
             "too near, too large or one of several, or the noise or the calibration is wrong."
         )
     return ""
-
-
-def _channel_rows(array: SensorArray, position: FloatArray, moment: FloatArray) -> FloatArray:
-    """What each channel reads of a small change of the field, (C, 3)."""
-    if not array.channel_is_scalar.any():
-        return array.channel_gain
-    total = dipole.field(array.positions, position, moment) + array.ambient_fields
-    direction = total / np.linalg.norm(total, axis=-1, keepdims=True)
-    of_modulus = array.channel_gain[:, :1] * direction[array.channel_sensor]
-    return np.where(array.channel_is_scalar[:, None], of_modulus, array.channel_gain)
 
 
 def _orthonormal(columns: FloatArray, known: FloatArray) -> FloatArray:

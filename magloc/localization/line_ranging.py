@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares, minimize_scalar
 
+from arrays.io.errors import _vectors
 from arrays.typing import FloatArray
+from magloc.directions import hemisphere
 from magloc.fields import dipole
 from magloc.fields.coil import loop_field
 
@@ -128,9 +130,7 @@ def distance_along_line(
     ValueError
         The shapes do not agree, or the bounds are none.
     """
-    field = np.asarray(field_T, dtype=np.float64)
-    if field.ndim == 0 or field.shape[-1] != 3:
-        raise ValueError(f"Input field_T must have shape (..., 3); instead received shape {field.shape}.")
+    field = _vectors("field_T", field_T)
     low, high = within_m
     if not -np.inf < low < high < np.inf:
         raise ValueError(f"Input within_m must be two finite bounds, the lower first; instead received {within_m}.")
@@ -178,19 +178,17 @@ def _starts(distance: FloatArray, field: FloatArray) -> list[FloatArray]:
 
     Along a line through the sensor |B|^(-1/3) is linear in the distance, and zero at the sensor.
     """
-    slope, intercept = np.polyfit(distance, np.linalg.norm(field, axis=1) ** (-1.0 / 3.0), 1)
+    size = np.linalg.norm(field, axis=1)
+    slope, intercept = np.polyfit(distance, size ** (-1.0 / 3.0), 1)
     at_zero = intercept / slope if slope != 0.0 else np.ptp(distance)
-    i = np.arange(_N_DIRECTIONS) + 0.5
-    z = 1.0 - i / _N_DIRECTIONS
-    turn = np.pi * (1.0 + np.sqrt(5.0)) * i
-    directions = np.stack([np.cos(turn) * np.sqrt(1 - z**2), np.sin(turn) * np.sqrt(1 - z**2), z], axis=1)
     lines = []
-    for direction in directions:
+    for direction in hemisphere(_N_DIRECTIONS):
         source = (at_zero + distance[:, None]) * direction
-        matrix = dipole.field_matrix(np.zeros(3), source) / np.linalg.norm(field, axis=1)[:, None, None]
-        relative = field / np.linalg.norm(field, axis=1)[:, None]
+        matrix = dipole.field_matrix(np.zeros(3), source) / size[:, None, None]
+        relative = field / size[:, None]
         moment = np.linalg.lstsq(matrix.reshape(-1, 3), relative.ravel(), rcond=None)[0]
-        lines.append(np.concatenate([at_zero * direction, _angles(direction), moment]))
+        elevation, azimuth = np.arcsin(direction[2]), np.arctan2(direction[1], direction[0])
+        lines.append(np.concatenate([at_zero * direction, [elevation, azimuth], moment]))
     return lines
 
 
@@ -218,8 +216,3 @@ def _line(x: FloatArray, chi2: float, dof: int, converged: bool) -> SourceLine:
     # The field of a loop is even in its radius.
     radius = float(abs(x[8])) if len(x) > 8 else 0.0
     return SourceLine(x[:3], direction, x[5:8], radius, chi2, dof, converged)
-
-
-def _angles(direction: FloatArray) -> FloatArray:
-    """Elevation and azimuth."""
-    return np.array([np.arcsin(np.clip(direction[2], -1.0, 1.0)), np.arctan2(direction[1], direction[0])])

@@ -40,6 +40,5 @@ def fix_residuals(
 def _fields(array: SensorArray, fix: Fix) -> FloatArray:
     """Field of all sources of the best solution at the sensors (N, 3) [T]."""
     sources = fix.best.sources
-    fields = [dipole.field(array.positions, source.position_m, source.moment_Am2) for source in sources]
-    total: FloatArray = np.sum(fields, axis=0)
-    return total
+    moments = np.stack([source.moment_Am2 for source in sources])
+    return dipole.total_field(array.positions, np.stack([source.position_m for source in sources]), moments)

@@ -27,7 +27,7 @@ def predicted_channels(array: SensorArray, position_m: ArrayLike, moment_Am2: Ar
     ``a_c · (B_a + B)`` for a component, ``g |B_a + B|`` for a modulus, with the ambient field B_a at each sensor: of
     ``ambient_T`` and, where it is not uniform, ``ambient_gradient_T_m``, which differences of either kind see.
     """
-    fields = _fields(array, position_m, moment_Am2)
+    fields = fields_at_sensors(array, position_m, moment_Am2)
     return array.readings_of(fields) - array.channel_offset_T
 
 
@@ -39,26 +39,16 @@ def channel_jacobian(array: SensorArray, position_m: ArrayLike, moment_Am2: Arra
     p = np.asarray(position_m, dtype=np.float64)[..., None, :]
     m = np.asarray(moment_Am2, dtype=np.float64)[..., None, :]
     jacobian = dipole.field_jacobian(array.positions, p, m)
-    rows = array.channel_gain
-    if array.channel_is_scalar.any():
-        fields = _fields(array, position_m, moment_Am2)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            direction = fields / np.linalg.norm(fields, axis=-1, keepdims=True)
-        rows = np.where(
-            array.channel_is_scalar[:, None],
-            array.channel_gain[:, :1] * direction[..., array.channel_sensor, :],
-            array.channel_gain,
-        )
+    rows = array.linear_gain(fields_at_sensors(array, position_m, moment_Am2))
     result: FloatArray = np.einsum("...ci,...cij->...cj", rows, jacobian[..., array.channel_sensor, :, :])
     return result
 
 
-def _fields(array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
+def fields_at_sensors(array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
     """Field at every sensor, the ambient field included: (..., N, 3) [T]."""
     p = np.asarray(position_m, dtype=np.float64)[..., None, :]
     m = np.asarray(moment_Am2, dtype=np.float64)[..., None, :]
-    fields = dipole.field(array.positions, p, m)
-    return fields + array.ambient_fields
+    return dipole.field(array.positions, p, m) + array.ambient_fields
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +95,3 @@ class DifferenceMeasurement:
         """Jacobian (..., k, 6) of :meth:`predicted` (JacobianH), columns (p, m): [T/m] and [T/(A·m²)]."""
         result: FloatArray = self.differences.transform @ channel_jacobian(self.array, position_m, moment_Am2)
         return result
-
-    def fisher_information(self, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
-        """Information (..., 6, 6) of one set of readings about (p, m): ``Hᵀ R⁻¹ H``, the inverse of the bound."""
-        w = self.jacobian(position_m, moment_Am2) / np.sqrt(self.variance)[:, None]
-        information: FloatArray = np.swapaxes(w, -1, -2) @ w
-        return information

@@ -113,11 +113,7 @@ class SensorErrors:
 
 def _of_fields(array: SensorArray) -> FloatArray:
     """Derivative (N, 3, 3) of readings by a field in the array's frame; a modulus sees it along the ambient field."""
-    ambient = array.ambient_fields
-    modulus = np.linalg.norm(ambient, axis=1, keepdims=True)
-    direction = np.divide(ambient, modulus, out=np.zeros_like(ambient), where=modulus > 0.0)
-    along = array.channel_gain[:, :1] * direction[array.channel_sensor]
-    rows = np.where(array.channel_is_scalar[:, None], along, array.channel_gain)
+    rows = np.nan_to_num(array.linear_gain(array.ambient_fields))
     derivative: FloatArray = np.where(array.sensor_channels[..., None] >= 0, rows[array.sensor_channels], 0.0)
     return derivative
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.fit.results import Fix, Solution
 from magloc.localization.locator import Locator, fit_at_rest
 from magloc.localization.uncertainty.ambiguity import weights
+from magloc.localization.uncertainty.range_interval import relative_range_sigma
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row
 
@@ -92,9 +92,10 @@ class Acquisition:
             found = self.of_last_row if near is None else _after(self.of_last_row, *near)
             solution, reason = _certain_solution(found, centroid, limit, alone=near is None)
             if solution is not None:
-                if _agree(last, solution) or _range_error(solution, centroid) < _BEYOND_DOUBT or near is not None:
+                range_error = relative_range_sigma(solution.covariance, solution.position_m - centroid)
+                if _agree(last, solution) or range_error < _BEYOND_DOUBT or near is not None:
                     return Start(solution, [row], found.solutions[1:]), ""
-                if _range_error(solution, centroid) < START_RANGE_ERROR:
+                if range_error < START_RANGE_ERROR:
                     self._confirmable = solution
                 reason = "not acquired: the next row is to confirm the source"
         start = self._start_from_recent(row, fix)
@@ -176,17 +177,11 @@ def _certain_solution(
         return None, "not acquired: no dipole fits the readings"
     if not best.range_observable:
         return None, "not acquired: the range is not observable"
-    if _range_error(best, centroid) > largest_range_error:
+    if relative_range_sigma(best.covariance, best.position_m - centroid) > largest_range_error:
         return None, "not acquired: the range is not certain enough"
     if alone and any(solution.chi2 < best.chi2 + _RIVAL_WITHIN for solution in fix.solutions[1:]):
         return None, "not acquired: several solutions fit alike"
     return best, ""
-
-
-def _range_error(solution: Solution, centroid: FloatArray) -> float:
-    """Standard deviation of the range over the range."""
-    offset = solution.position_m - centroid
-    return math.sqrt(float(offset @ solution.covariance[:3, :3] @ offset)) / float(offset @ offset)
 
 
 def _agree(before: Solution | None, after: Solution) -> bool:

@@ -36,8 +36,9 @@ def track_record(
     Sensors with lasting errors are tracked by the readable steps.
     """
     points: list[TrackPoint] = []
-    can_be = isinstance(tracker.motion, LinearMotion) and not tracker.errors.n_states
-    compiled = _CompiledSteps(tracker, rows) if can_be and rows else None
+    motion, compiled = tracker.motion, None
+    if isinstance(motion, LinearMotion) and rows and not tracker.errors.n_states:
+        compiled = _CompiledSteps(tracker, motion, rows)
     while len(points) < len(rows):
         before = len(points)
         if compiled is not None and tracker.is_tracking:
@@ -52,10 +53,8 @@ def track_record(
 class _CompiledSteps:
     """A record in the layout of :func:`magloc.tracking.batch_compiled.follow`."""
 
-    def __init__(self, tracker: Tracker, rows: Sequence[Row]) -> None:
-        array, motion = tracker.array, tracker.motion
-        if not isinstance(motion, LinearMotion):
-            raise TypeError("Input tracker must have a linear motion; instead received one that is not.")
+    def __init__(self, tracker: Tracker, motion: LinearMotion, rows: Sequence[Row]) -> None:
+        array = tracker.array
         self.tracker = tracker
         self.times = [row.time_s for row in rows]
         differences = [tracker.differences_of(row) for row in rows]

@@ -133,10 +133,9 @@ def _predicted(
         for i in range(3):
             slopes[c, i] = R[i, 0] * q0 + R[i, 1] * q1 + R[i, 2] * q2
             slopes[c, 3 + i] = R[i, 0] * u0 + R[i, 1] * u1 + R[i, 2] * u2
+    predicted[:] = 0.0
+    H[:] = 0.0
     for j in range(k):
-        predicted[j] = 0.0
-        for i in range(6):
-            H[j, i] = 0.0
         for c in range(n_channels):
             w = transform[j, c]
             if w != 0.0:
@@ -148,9 +147,7 @@ def _predicted(
 @compiled
 def _updated(x: FloatArray, S: FloatArray, H: FloatArray, innovation: FloatArray, phi: FloatArray) -> float:
     """Updates by all scalars of unit variance in turn, in place; the sum of normalised squared innovations."""
-    x0 = np.empty(6)
-    for i in range(6):
-        x0[i] = x[i]
+    x0 = x[:6].copy()
     squares = 0.0
     for j in range(innovation.size):
         nu = innovation[j]
@@ -329,19 +326,13 @@ def follow(
         else:
             if _range_error(predicted_x, predicted_S, origin, rotation, centroid) > rules.start_range_error:
                 return row, contradictions
-            for i in range(n):
-                x_k[i] = predicted_x[i]
+            x_k[:] = predicted_x
             w, a = transform_of_row[row], ambient_of_row[row]
             _predicted(x_k, origin, rotation, ambients[a], array, transforms[w], channels, slopes, predicted, H)
             curved = _is_of_readings(S, predicted_S, rules.largest_growth) and _chart(
                 H, predicted_S, rules.least_singular, M
             )
-            for j in range(k):
-                predicted_first[j] = predicted[j]
-            for i in range(n):
-                mean[i] = predicted_x[i]
-                for c in range(n):
-                    root[i, c] = predicted_S[i, c]
+            predicted_first[:], mean[:], root[:] = predicted, predicted_x, predicted_S
             converged, change_before, length = False, math.inf, 1.0
             for _ in range(rules.max_iterations):
                 iterations += 1
@@ -354,10 +345,7 @@ def follow(
                     for i in range(6):
                         t -= H[j, i] * (mean[i] - x_k[i])
                     innovation[j] = t
-                for i in range(n):
-                    x_next[i] = mean[i]
-                    for c in range(n):
-                        S_k[i, c] = root[i, c]
+                x_next[:], S_k[:] = mean, root
                 nis = _updated(x_next, S_k, H, innovation, phi)
                 for i in range(n):
                     x_next[i] = x_k[i] + length * (x_next[i] - x_k[i])
@@ -369,8 +357,7 @@ def follow(
                 for j in range(k):
                     change += (predicted_next[j] - predicted[j]) ** 2
                     predicted[j] = predicted_next[j]
-                for i in range(n):
-                    x_k[i] = x_next[i]
+                x_k[:] = x_next
                 change = math.sqrt(change) / length
                 if not math.isfinite(change):
                     break
@@ -391,12 +378,8 @@ def follow(
         used_x, used_S = (x_k, S_k) if status == TRACKED else (predicted_x, predicted_S)
         if _range_error(used_x, used_S, origin, rotation, centroid) > rules.largest_range_error:
             return row, contradictions
-        for i in range(n):
-            x[i] = used_x[i]
-            out.x[row, i], out.predicted_x[row, i] = used_x[i], predicted_x[i]
-            for c in range(n):
-                S[i, c] = used_S[i, c]
-                out.S[row, i, c], out.predicted_S[row, i, c] = used_S[i, c], predicted_S[i, c]
+        x[:], S[:] = used_x, used_S
+        out.x[row], out.S[row], out.predicted_x[row], out.predicted_S[row] = x, S, predicted_x, predicted_S
         out.nis[row], out.iterations[row], out.status[row] = nis, iterations, status
     return end, contradictions
 

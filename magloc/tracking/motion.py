@@ -105,11 +105,6 @@ class LinearMotion(MotionModel, Protocol):
         """F, and A and B (n, m) of the noise ``S_q = A + |m| B``."""
 
 
-def _stepped(motion: LinearMotion, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    F, of_position, of_moment = motion.linear_step(dt_s)
-    return F @ x, F, of_position + math.sqrt(float(x[3:6] @ x[3:6])) * of_moment
-
-
 def _without_rest(source: FloatArray, S: FloatArray, rest_sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
     """A state whose further components are unknown but for their standard deviations."""
     n = N_SOURCE + rest_sigma.size
@@ -153,7 +148,8 @@ class RandomWalk:
 
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """As :class:`MotionModel`."""
-        return _stepped(self, x, dt_s)
+        F, of_position, of_moment = self.linear_step(dt_s)
+        return F @ x, F, of_position + math.sqrt(float(x[3:6] @ x[3:6])) * of_moment
 
 
 @dataclass(frozen=True)

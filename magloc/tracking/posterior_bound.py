@@ -9,6 +9,7 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.kalman import block_update
+from magloc.localization.fit.gauss_newton import inverse_information
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row, Step, TrackPoint
@@ -84,23 +85,12 @@ def _steps_at_truth(
             root = np.linalg.cholesky(np.eye(len(H)) + lasting @ lasting.T)
             seen.append(np.linalg.solve(root, H[:, :N_SOURCE]))
             measurements.append(measurement)
-            covariance = _bound_at_rest(np.concatenate(seen))
-            if covariance is None:
+            covariance = inverse_information(np.concatenate(seen)[None], _SINGULAR_RTOL)[0]
+            if np.isnan(covariance).any():
                 continue
             S = tracker.filtered_start(truth[i], covariance, measurements).S
         steps.append(Step(i, prediction, state, S))
     return steps
-
-
-def _bound_at_rest(H: FloatArray) -> FloatArray | None:
-    """Covariance (6, 6) of a source at rest from a whitened Jacobian (k, 6), or None where it is not determined."""
-    norm = np.linalg.norm(H, axis=0)
-    scaled = H / np.where(norm > 0.0, norm, 1.0)
-    singular = np.linalg.svd(scaled, compute_uv=False)
-    if len(H) < N_SOURCE or singular[-1] < _SINGULAR_RTOL * singular[0]:
-        return None
-    covariance: FloatArray = np.linalg.inv(scaled.T @ scaled) / np.outer(norm, norm)
-    return covariance
 
 
 def _velocities(time_s: FloatArray, truth: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -304,16 +304,22 @@ class Tracker:
         self._x, self._S = x, S
         if self.keep_steps:
             self.steps.append(Step(index, prediction, x, S))
+        learned = estimability(S, prediction.S)[:N_SOURCE]
+        return replace(self._tracked(row, x, S, learned, iterations, status), nis=nis, nis_dof=nis_dof)
+
+    def _tracked(
+        self, row: Row, x: FloatArray, S: FloatArray, learned: FloatArray, iterations: int, status: str
+    ) -> TrackPoint:
+        """What is known of a row with a track."""
+        covariance = S[:N_SOURCE] @ S[:N_SOURCE].T
         return TrackPoint(
             row.time_s,
             x[:3].copy(),
             x[3:6].copy(),
-            S[:N_SOURCE] @ S[:N_SOURCE].T,
-            estimability(S, prediction.S)[:N_SOURCE],
+            covariance,
+            learned,
             iterations,
-            nis,
-            nis_dof,
-            status,
+            status=status,
             weight=self._weight,
             centroid_m=self.centroid(row),
             radius_m=self.array.circumradius,
@@ -361,20 +367,9 @@ class Tracker:
         self._contradictions = 0
         self._weight = solution.weight
         if self.keep_steps:
-            self.steps.append(Step(index, None, self._x, self._S))
-        return TrackPoint(
-            row.time_s,
-            self._x[:3].copy(),
-            self._x[3:6].copy(),
-            self._S[:N_SOURCE] @ self._S[:N_SOURCE].T,
-            np.ones(N_SOURCE),
-            solution.iterations,
-            status="acquired",
-            weight=self._weight,
-            rivals=start.rivals,
-            centroid_m=self.centroid(row),
-            radius_m=self.array.circumradius,
-        )
+            self.steps.append(Step(index, None, x, S))
+        learned = np.ones(N_SOURCE)
+        return replace(self._tracked(row, x, S, learned, solution.iterations, "acquired"), rivals=start.rivals)
 
     def _range_error(self, x: FloatArray, S: FloatArray, row: Row) -> float:
         """Standard deviation of the range over the range."""

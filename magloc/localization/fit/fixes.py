@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from html import escape
-from typing import TYPE_CHECKING, Any, Literal, overload
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
 
 import numpy as np
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.figure import Figure
     from scipy.spatial.transform import Rotation
+
+_Column = TypeVar("_Column")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -91,14 +93,16 @@ class Fixes(Sequence[Fix]):
         result[self.solutions.of_row[order]] = order
         return result
 
-    def _column(self, values: Any, empty: Any) -> Any:
+    def _column(self, values: _Column, empty: float) -> _Column:
         """Values of the best solutions (n, ...), `empty` where there is none."""
+        every: Any = values
         if not len(self.solutions):
-            return np.full((len(self), *values.shape[1:]), empty)
-        solved = (self.best >= 0).reshape(-1, *[1] * (values.ndim - 1))
-        return np.where(solved, values[self.best], empty)
+            every = np.full((1, *every.shape[1:]), empty)
+        column: Any = every[self.best]
+        column[~self.solved] = empty
+        return column
 
-    def _of_one(self, values: Any) -> Any:
+    def _of_one(self, values: _Column) -> _Column:
         if (self.solutions.n_sources[self.best[self.solved]] > 1).any():
             raise ValueError("Some rows have several sources: see fixes[row].best.sources, or to_xarray().")
         return values
@@ -111,38 +115,32 @@ class Fixes(Sequence[Fix]):
     @property
     def position_m(self) -> FloatArray:
         """Positions (n, 3) of the best solutions of one source [m]; NaN where there is none."""
-        column: FloatArray = self._column(self._of_one(self.solutions.position_m[:, 0]), np.nan)
-        return column
+        return self._column(self._of_one(self.solutions.position_m[:, 0]), np.nan)
 
     @property
     def moment_Am2(self) -> FloatArray:
         """Moments (n, 3) of the best solutions of one source [A·m²]."""
-        column: FloatArray = self._column(self._of_one(self.solutions.moment_Am2[:, 0]), np.nan)
-        return column
+        return self._column(self._of_one(self.solutions.moment_Am2[:, 0]), np.nan)
 
     @property
     def covariance(self) -> FloatArray:
         """Covariances (n, 6, 6) of the best solutions of one source; (n, 3, 3) of moments where the place is known."""
-        column: FloatArray = self._column(self._of_one(self.solutions.covariance[:, :6, :6]), np.nan)
-        return column
+        return self._column(self._of_one(self.solutions.covariance[:, :6, :6]), np.nan)
 
     @property
     def chi2(self) -> FloatArray:
         """χ² (n,) of the best solutions."""
-        column: FloatArray = self._column(self.solutions.chi2, np.nan)
-        return column
+        return self._column(self.solutions.chi2, np.nan)
 
     @property
     def dof(self) -> IntArray:
         """Degrees of freedom (n,) of the best solutions."""
-        column: IntArray = self._column(self.solutions.dof, 0)
-        return column
+        return self._column(self.solutions.dof, 0)
 
     @property
     def weight(self) -> FloatArray:
         """Weights (n,) of the best solutions."""
-        column: FloatArray = self._column(self.solutions.weight, np.nan)
-        return column
+        return self._column(self.solutions.weight, np.nan)
 
     @property
     def range_interval_m(self) -> list[Intervals]:

@@ -9,6 +9,7 @@ Shapes: b fits, K sources, N sensors, C channels, c columns of the whitening's c
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,15 +27,15 @@ _LARGEST_DAMPING = 1e9
 
 @dataclass(frozen=True, eq=False)
 class JointFits:
-    """Results of :func:`refine` and :func:`refine_moments`.
+    """Fits of K sources each, over leading axes: b of them, or of every row of a search the best ones, best first.
 
     Attributes
     ----------
-    q : ndarray, shape (b, K, 4)
-    mu : ndarray, shape (b, K, 3)
-    chi2 : ndarray, shape (b,)
-        Infinite where the fit did not converge.
-    iterations : ndarray of int, shape (b,)
+    q : ndarray, shape (..., K, 4)
+    mu : ndarray, shape (..., K, 3)
+    chi2 : ndarray, shape (...)
+        Infinite where the fit did not converge, or where there is none.
+    iterations : ndarray of int, shape (...)
         Linearisations.
     """
 
@@ -43,10 +44,41 @@ class JointFits:
     chi2: FloatArray
     iterations: NDArray[np.int64]
 
+    @classmethod
+    def none(cls, shape: tuple[int, ...], n_sources: int) -> JointFits:
+        """Places for fits of some sources, all empty."""
+        q, mu = np.full((*shape, n_sources, 4), np.nan), np.full((*shape, n_sources, 3), np.nan)
+        return cls(q, mu, np.full(shape, np.inf), np.zeros(shape, dtype=np.int64))
+
+    @property
+    def n_sources(self) -> int:
+        """Number of sources K."""
+        return self.q.shape[-2]
+
     @property
     def converged(self) -> NDArray[np.bool_]:
-        """Whether the iteration ended at an optimum, shape (b,)."""
+        """Whether the iteration ended at an optimum, shape (...)."""
         return np.isfinite(self.chi2)
+
+    def rows(self, index: Any) -> JointFits:
+        """Some of the fits, by an index of the leading axes."""
+        return JointFits(*(values[index] for values in vars(self).values()))
+
+    def shaped(self, *shape: int) -> JointFits:
+        """The same fits with other leading axes."""
+        n_axes = self.chi2.ndim
+        return JointFits(*(values.reshape(*shape, *values.shape[n_axes:]) for values in vars(self).values()))
+
+    def put(self, index: Any, fits: JointFits) -> None:
+        """Write fits to some of the places."""
+        for values, others in zip(vars(self).values(), vars(fits).values(), strict=True):
+            values[index] = others
+
+    def replaced(self, index: Any, fits: JointFits) -> JointFits:
+        """With some of the fits replaced."""
+        result = JointFits(*(values.copy() for values in vars(self).values()))
+        result.put(index, fits)
+        return result
 
     def with_opposite_moments(self, n_rows: int) -> JointFits:
         """The fits of n rows, equally many each, and beside every fit that of the opposite moment."""
@@ -54,10 +86,6 @@ class JointFits:
         fits = self.rows(both)
         fits.mu[1::2] *= -1.0
         return fits
-
-    def rows(self, index: NDArray[np.intp]) -> JointFits:
-        """Some of the fits."""
-        return JointFits(self.q[index], self.mu[index], self.chi2[index], self.iterations[index])
 
 
 def tangents(q: FloatArray) -> FloatArray:
@@ -126,7 +154,7 @@ def refine_moments(
     problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray, *, max_iterations: int = 60
 ) -> JointFits:
     """Moments (b, K, 3) of sources that stay at q (b, K, 4): damped Gauss-Newton on whitened readings (b, C)."""
-    return _descend(problem, y, q, mu, np.zeros((q.shape[1], 3), dtype=bool), max_iterations)
+    return refine(problem, y, q, mu, free=np.zeros((q.shape[1], 3), dtype=bool), max_iterations=max_iterations)
 
 
 def refine(
@@ -144,17 +172,6 @@ def refine(
     its range stays.
     """
     free = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
-    return _descend(problem, y, q, mu, free, max_iterations)
-
-
-def _descend(
-    problem: WhitenedModel,
-    y: FloatArray,
-    q: FloatArray,
-    mu: FloatArray,
-    free: NDArray[np.bool_],
-    max_iterations: int,
-) -> JointFits:
     n_fits, n_sources = q.shape[:2]
     columns = np.flatnonzero(free.ravel())
     # Without free positions the moments themselves are what has to be damped.
@@ -272,19 +289,20 @@ def covariances(problem: WhitenedModel, fits: JointFits) -> FloatArray:
     by_moment = problem.moment_jacobian(rho, gain).reshape(n_fits, -1, n_sources, 3)
     jacobian = np.concatenate([by_position, by_moment], axis=-1).reshape(n_fits, -1, 6 * n_sources)
     unit = np.tile(np.repeat([problem.radius, problem.radius**3 / MU0_OVER_4PI], 3), n_sources)
-    return _inverse_information(jacobian) * np.outer(unit, unit)
+    return inverse_information(jacobian) * np.outer(unit, unit)
 
 
-def _inverse_information(jacobian: FloatArray) -> FloatArray:
-    """``(JᵀJ)⁻¹`` of every fit by singular values of the Jacobian in columns of unit norm."""
+def inverse_information(jacobian: FloatArray, least_singular: float = 1e-13) -> FloatArray:
+    """``(JᵀJ)⁻¹`` (b, n, n) of whitened Jacobians (b, C, n) by singular values, columns scaled; NaN where singular."""
+    n_fits, n_rows, n = jacobian.shape
     norm = np.linalg.norm(jacobian, axis=1)
-    good = np.isfinite(norm).all(axis=-1) & (norm > 0.0).all(axis=-1)
+    good = np.isfinite(norm).all(axis=-1) & (norm > 0.0).all(axis=-1) & (n_rows >= n)
+    if not good.any():
+        return np.full((n_fits, n, n), np.nan)
     safe = np.where(good[:, None], norm, 1.0)
     unit = np.where(good[:, None, None], jacobian, 0.0) / safe[:, None]
     singular, vt = np.linalg.svd(unit, full_matrices=False)[1:]
-    good &= (singular.shape[-1] == norm.shape[-1]) & (singular[:, -1] > 1e-13 * singular[:, 0])
-    if not good.any():
-        return np.full((len(norm), norm.shape[-1], norm.shape[-1]), np.nan)
+    good &= singular[:, -1] > least_singular * singular[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         rooted = vt / singular[..., None] / safe[:, None]
         inverse: FloatArray = rooted.transpose(0, 2, 1) @ rooted

@@ -34,12 +34,12 @@ class Optima:
     fits: JointFits
     of_row: IntArray
     reason: list[str]
-    merged: BoolArray
-    failed_starts: IntArray
+    merged: BoolArray | bool = False
+    failed_starts: IntArray | int = 0
     position_m: FloatArray | None = None
     undetermined: str = UNDETERMINED
 
     @property
-    def n_unknowns(self) -> int:
-        """Unknowns of a fit."""
-        return 3 if self.position_m is not None else 6 * self.fits.q.shape[1]
+    def dof(self) -> int:
+        """Degrees of freedom of a fit."""
+        return self.rows.n_differences - (3 if self.position_m is not None else 6 * self.fits.n_sources)

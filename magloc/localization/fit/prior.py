@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from arrays.typing import FloatArray
+from arrays.typing import BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from magloc.measurement.whitened import ScaledSensors
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,12 @@ class SourcePrior:
     def allows_moment(self, moment_Am2: FloatArray) -> Any:
         """Whether moments (..., 3) are small enough."""
         return np.linalg.norm(moment_Am2, axis=-1) <= self.largest_moment_Am2
+
+    def allows(self, sensors: ScaledSensors, q: FloatArray, mu: FloatArray) -> BoolArray:
+        """Whether sources at q (..., 4) with scaled moments μ (..., 3) agree with both."""
+        with np.errstate(invalid="ignore"):
+            allowed = self.allows_position(sensors.position(q)) & self.allows_moment(sensors.moment(q, mu))
+        return np.asarray(allowed)
 
 
 NOTHING_KNOWN = SourcePrior()

@@ -188,10 +188,7 @@ def refine(
             damping *= 0.1
         elif gained < 0.5 * promised:
             damping = max(damping, 0.1) * 3.0
-        for d in range(4):
-            q[d] = new_q[d]
-        for d in range(3):
-            mu[d] = new_mu[d]
+        q[:], mu[:] = new_q, new_mu
         chi2 = new_chi2
         basis, new_basis = new_basis, basis
         residual, new_residual = new_residual, residual

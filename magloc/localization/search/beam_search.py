@@ -6,17 +6,16 @@ Everything works on b sets of readings of one :class:`magloc.measurement.whitene
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
+from magloc.directions import hemisphere
 from magloc.localization.fit.gauss_newton import JointFits, fit_moments, refine
 from magloc.localization.search.candidates import (
-    SingleArray,
     distinct_best,
-    hemisphere,
     linear_bases,
     linear_scores,
     modulus_scores,
@@ -34,66 +33,13 @@ _N_TEMPLATE_DIRECTIONS = 24
 _RESTART_CANDIDATES = 16
 
 
-@dataclass(frozen=True, eq=False)
-class Beam:
-    """The best distinct fits of K sources to every set of readings, best first.
-
-    Attributes
-    ----------
-    q : ndarray, shape (b, w, K, 4)
-    mu : ndarray, shape (b, w, K, 3)
-    chi2 : ndarray, shape (b, w)
-        Infinite where there is no such fit; the first is then one that did not converge or is not allowed.
-    iterations : ndarray of int, shape (b, w)
-    """
-
-    q: FloatArray
-    mu: FloatArray
-    chi2: FloatArray
-    iterations: NDArray[np.int64]
-
-    @property
-    def n_sources(self) -> int:
-        """Number of sources K."""
-        return self.q.shape[2]
-
-    def rows(self, index: NDArray[np.intp]) -> Beam:
-        """Beams of some of the readings."""
-        return Beam(self.q[index], self.mu[index], self.chi2[index], self.iterations[index])
-
-    def flat(self) -> JointFits:
-        """All fits in one row after the other."""
-        n_sources = self.n_sources
-        return JointFits(
-            self.q.reshape(-1, n_sources, 4),
-            self.mu.reshape(-1, n_sources, 3),
-            self.chi2.ravel(),
-            self.iterations.ravel(),
-        )
-
-    def replaced(self, index: NDArray[np.intp], beam: Beam) -> Beam:
-        """With the beams of some of the readings replaced."""
-        q, mu, chi2, iterations = self.q.copy(), self.mu.copy(), self.chi2.copy(), self.iterations.copy()
-        q[index], mu[index], chi2[index], iterations[index] = beam.q, beam.mu, beam.chi2, beam.iterations
-        return Beam(q, mu, chi2, iterations)
-
-
-def best_distinct(fits: JointFits, n_rows: int, width: int) -> Beam:
+def best_distinct(fits: JointFits, n_rows: int, width: int) -> JointFits:
     """The `width` best fits of every row that differ, from the same number of fits for every row, row after row."""
-    n_sources = fits.q.shape[1]
-    chi2 = fits.chi2.reshape(n_rows, -1).copy()
     # q and -q are the same source.
     sign = np.where(fits.q[..., 3:] < 0.0, -1.0, 1.0)
-    q = (fits.q * sign).reshape(n_rows, -1, n_sources, 4)
-    mu = fits.mu.reshape(n_rows, -1, n_sources, 3)
-    iterations = fits.iterations.reshape(n_rows, -1)
-    rows = np.arange(n_rows)
-    kept = Beam(
-        np.full((n_rows, width, n_sources, 4), np.nan),
-        np.full((n_rows, width, n_sources, 3), np.nan),
-        np.full((n_rows, width), np.inf),
-        np.zeros((n_rows, width), dtype=np.int64),
-    )
+    every = replace(fits, q=fits.q * sign, chi2=fits.chi2.copy()).shaped(n_rows, -1)
+    chi2, rows = every.chi2, np.arange(n_rows)
+    kept = JointFits.none((n_rows, width), fits.n_sources)
     for k in range(width):
         best = np.argmin(chi2, axis=1)
         value = chi2[rows, best]
@@ -101,11 +47,10 @@ def best_distinct(fits: JointFits, n_rows: int, width: int) -> Beam:
         fit = np.isfinite(value) | (k == 0)
         if not fit.any():
             break
-        kept.q[fit, k], kept.mu[fit, k], kept.chi2[fit, k] = q[rows, best][fit], mu[rows, best][fit], value[fit]
-        kept.iterations[fit, k] = iterations[rows, best][fit]
+        kept.put((fit, k), every.rows((rows[fit], best[fit])))
         with np.errstate(invalid="ignore"):
             same = np.abs(chi2 - value[:, None]) < _SAME_CHI2 * (1.0 + 1e-6 * value[:, None])
-            same &= _same_sources(q, mu, kept.q[:, None, k], kept.mu[:, None, k])
+            same &= _same_sources(every.q, every.mu, kept.q[:, None, k], kept.mu[:, None, k])
         chi2[same] = np.inf
         chi2[rows, best] = np.inf
     return kept
@@ -144,15 +89,15 @@ class Search:
     n_starts: int = 6
     apart_rad: float = 0.25
 
-    def first(self, problem: WhitenedModel, y: FloatArray) -> Beam:
+    def first(self, problem: WhitenedModel, y: FloatArray) -> JointFits:
         """One source, from the candidates that explain most."""
         silent = np.zeros_like(problem.ambient)
         gain = problem.linear_gain(silent)
         residual = y - problem.predicted(silent)
         starts: list[tuple[FloatArray, FloatArray]] = []
         if np.any(gain):
-            chosen = self._linear_starts(problem, gain, residual)
-            q = self.candidates[chosen]
+            scores = self._linear_scores(problem, gain, residual)
+            q = self.candidates[distinct_best(scores, self.candidates, self.n_starts, self.apart_rad)]
             row = np.repeat(np.arange(len(y)), self.n_starts)
             mu = fit_moments(problem.rows(row), y[row], q.reshape(-1, 1, 4))
             starts.append((q, mu.reshape(len(y), self.n_starts, 3)))
@@ -195,27 +140,19 @@ class Search:
         length = np.sum(unit * y[row], axis=-1) / np.maximum(np.sum(unit * unit, axis=-1), 1e-300)
         return q, direction * np.maximum(length, 1e-30).reshape(len(y), n_starts, 1)
 
-    def _linear_starts(self, problem: WhitenedModel, gain: FloatArray, residual: FloatArray) -> NDArray[np.intp]:
-        return distinct_best(
-            self._linear_scores(problem, gain, residual), self.candidates, self.n_starts, self.apart_rad
-        )
-
     def _linear_scores(self, problem: WhitenedModel, gain: FloatArray, residual: FloatArray) -> FloatArray:
         scores = np.empty((len(residual), len(self.candidates)))
         for rows in rows_of_equal_gain(gain):
-            bases = self._bases(problem, gain[rows[0]], int(rows[0]))
+            bases = linear_bases(problem, gain[rows[0]], int(rows[0]), self.candidates)
             scores[rows] = linear_scores(bases, residual[rows])
         return scores
-
-    def _bases(self, problem: WhitenedModel, gain: FloatArray, row: int) -> SingleArray:
-        return linear_bases(problem, gain, row, self.candidates)
 
     def _known(self, fits: JointFits) -> JointFits:
         """Fits that agree with what is known of the sources; the others count as none."""
         allowed = np.all(self.allowed(fits.q, fits.mu), axis=1)
-        return JointFits(fits.q, fits.mu, np.where(allowed, fits.chi2, np.inf), fits.iterations)
+        return replace(fits, chi2=np.where(allowed, fits.chi2, np.inf))
 
-    def one_more(self, problem: WhitenedModel, y: FloatArray, beam: Beam) -> Beam:
+    def one_more(self, problem: WhitenedModel, y: FloatArray, beam: JointFits) -> JointFits:
         """Beam with another source: every fit is extended by the candidates that explain most of what it leaves."""
         width = beam.chi2.shape[1]
         row = np.repeat(np.arange(len(y)), width)
@@ -257,7 +194,7 @@ class Search:
         fits = refine(at, y_each, np.concatenate([q[each], new], axis=1), np.concatenate([mu[each], new_mu], axis=1))
         return self._known(fits)
 
-    def one_less(self, problem: WhitenedModel, y: FloatArray, beam: Beam) -> Beam:
+    def one_less(self, problem: WhitenedModel, y: FloatArray, beam: JointFits) -> JointFits:
         """Beam without one source: every source of the best fits is left out in turn."""
         n_sources, width = beam.n_sources, beam.chi2.shape[1]
         q, mu = _filled(beam)
@@ -267,7 +204,7 @@ class Search:
         row = np.repeat(np.arange(len(y)), width * n_sources)
         return best_distinct(self._known(refine(problem.rows(row), y[row], q, mu)), len(y), self.width)
 
-    def restarted(self, problem: WhitenedModel, y: FloatArray, beam: Beam, rng: np.random.Generator) -> Beam:
+    def restarted(self, problem: WhitenedModel, y: FloatArray, beam: JointFits, rng: np.random.Generator) -> JointFits:
         """Beam after a random source of random fits is replaced by a random one of the best candidates."""
         n_rows, width = beam.chi2.shape
         n_sources, n_tries = beam.n_sources, self.n_starts * self.width
@@ -286,19 +223,15 @@ class Search:
         return merged(beam, best_distinct(fits, n_rows, self.width))
 
 
-def merged(first: Beam, second: Beam) -> Beam:
+def merged(first: JointFits, second: JointFits) -> JointFits:
     """The best distinct fits of two beams of equally many sources."""
     n_rows, width = first.chi2.shape
-    both = Beam(
-        np.concatenate([first.q, second.q], axis=1),
-        np.concatenate([first.mu, second.mu], axis=1),
-        np.concatenate([first.chi2, second.chi2], axis=1),
-        np.concatenate([first.iterations, second.iterations], axis=1),
-    )
-    return best_distinct(both.flat(), n_rows, width)
+    pairs = zip(vars(first).values(), vars(second).values(), strict=True)
+    both = JointFits(*(np.concatenate(pair, axis=1) for pair in pairs))
+    return best_distinct(both.shaped(-1), n_rows, width)
 
 
-def _filled(beam: Beam) -> tuple[FloatArray, FloatArray]:
+def _filled(beam: JointFits) -> tuple[FloatArray, FloatArray]:
     """Sources (b·w, K, …) with the best fit in place of those that there are not."""
     missing = ~np.isfinite(beam.chi2)
     q = np.where(missing[..., None, None], beam.q[:, :1], beam.q)

@@ -91,11 +91,6 @@ def modulus_scores(templates: SingleArray, residual: FloatArray) -> tuple[FloatA
     return np.take_along_axis(along, best[..., None], axis=-1)[..., 0].astype(np.float64) ** 2, best
 
 
-def hemisphere(n: int) -> FloatArray:
-    """Nearly uniform unit vectors (n, 3) with z > 0."""
-    return fibonacci_directions(2 * n)[:n]
-
-
 def distinct_best(scores: FloatArray, candidates: FloatArray, n_starts: int, apart_rad: float) -> NDArray[np.intp]:
     """The best candidates (b, n_starts) by scores (b, n) that are some angle apart; the best again if none is left."""
     left = scores.copy()

@@ -7,6 +7,8 @@ in the moment, and the solution unique, equations (20) to (30).
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -17,7 +19,6 @@ from magloc.localization.fit.gauss_newton import JointFits, fit_moments, refine_
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
-from magloc.localization.search.beam_search import Beam
 from magloc.measurement.rows import WhitenedRows
 from magloc.measurement.whitened import WhitenedModel
 
@@ -76,19 +77,13 @@ class MomentSearch:
         moment = model.moment(beam.q[:, :, 0], beam.mu[:, :, 0])
         with np.errstate(invalid="ignore"):
             chi2 = np.where(self.prior.allows_moment(moment), beam.chi2, np.inf)
-        listed = np.isfinite(chi2) & (chi2 <= chi2.min(axis=1, keepdims=True) + DISTINCT_WITHIN)
-        of_row, of_fit = np.nonzero(listed)
-        fits = JointFits(
-            beam.q[of_row, of_fit], beam.mu[of_row, of_fit], chi2[of_row, of_fit], beam.iterations[of_row, of_fit]
-        )
-        converged = np.asarray(np.isfinite(beam.chi2).any(axis=1))
+        of_row, of_fit = np.nonzero(np.isfinite(chi2) & (chi2 <= chi2.min(axis=1, keepdims=True) + DISTINCT_WITHIN))
+        fits, converged = beam.rows((of_row, of_fit)), np.asarray(beam.converged.any(axis=1))
         reason = ["" if found else "the search did not converge from any of its starts" for found in converged]
-        merged = np.zeros((len(of_row), 1), dtype=bool)
-        failed = np.zeros(len(rows), dtype=np.intp)
-        return [Optima(rows, fits, of_row, reason, merged, failed, position, _TOO_LARGE)]
+        return [Optima(rows, fits, of_row, reason, position_m=position, undetermined=_TOO_LARGE)]
 
 
-def _all_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> Beam:
+def _all_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> JointFits:
     """Every distinct optimum of the moment at q (b, 1, 4), from the linear solution and from moments all around."""
     n = len(y)
     starts = [fit_moments(problem, y, q)]
@@ -107,35 +102,29 @@ def _all_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> Beam:
     return _distinct(problem, y, q, fits)
 
 
-def _distinct(problem: WhitenedModel, y: FloatArray, q: FloatArray, fits: JointFits) -> Beam:
+def _distinct(problem: WhitenedModel, y: FloatArray, q: FloatArray, fits: JointFits) -> JointFits:
     """The best optima of every row that χ² rises between, and their opposites where χ² is even in the moment."""
     n = len(y)
-    mu, chi2 = fits.mu.reshape(n, -1, 3), fits.chi2.reshape(n, -1).copy()
-    iterations = fits.iterations.reshape(n, -1)
+    every = replace(fits, chi2=fits.chi2.copy()).shaped(n, -1)
+    mu, chi2 = every.mu[:, :, 0], every.chi2
     row, rows = np.repeat(np.arange(n), mu.shape[1]), np.arange(n)
     each = problem.rows(row)
     even = _is_even(problem)
-    kept_mu = np.full((n, _MOST_SOLUTIONS, 3), np.nan)
-    kept_chi2 = np.full((n, _MOST_SOLUTIONS), np.inf)
-    kept_iterations = np.zeros((n, _MOST_SOLUTIONS), dtype=np.int64)
+    kept = JointFits.none((n, _MOST_SOLUTIONS), 1)
     for k in range(_MOST_SOLUTIONS):
         best = np.argmin(chi2, axis=1)
-        value = chi2[rows, best]
-        if not np.isfinite(value).any():
+        if not np.isfinite(chi2[rows, best]).any():
             break
-        kept_mu[:, k], kept_chi2[:, k] = mu[rows, best], value
-        kept_iterations[:, k] = iterations[rows, best]
-        opposite = even[:, None] & (np.sum(mu * kept_mu[:, k, None], axis=-1) < 0.0)
-        halfway = 0.5 * (np.where(opposite[..., None], -mu, mu) + kept_mu[:, k, None])
+        kept.put((rows, k), every.rows((rows, best)))
+        opposite = even[:, None] & (np.sum(mu * kept.mu[:, k], axis=-1) < 0.0)
+        halfway = 0.5 * (np.where(opposite[..., None], -mu, mu) + kept.mu[:, k])
         residual = y[row] - each.predicted(each.source_fields(q[row], halfway.reshape(-1, 1, 3)))
         between = np.sum(residual**2, axis=-1).reshape(n, -1)
         chi2[between < np.where(np.isfinite(chi2), chi2, 0.0) + _BARRIER] = np.inf
         chi2[rows, best] = np.inf
-    both_mu = np.stack([kept_mu, -kept_mu], axis=2).reshape(n, -1, 1, 3)
-    both_chi2 = np.stack([kept_chi2, np.where(even[:, None], kept_chi2, np.inf)], axis=2).reshape(n, -1)
-    return Beam(
-        np.repeat(q[:, None], both_chi2.shape[1], axis=1), both_mu, both_chi2, np.repeat(kept_iterations, 2, axis=1)
-    )
+    both = kept.shaped(-1).with_opposite_moments(n).shaped(n, -1)
+    both.chi2[~even, 1::2] = np.inf
+    return both
 
 
 def _is_even(problem: WhitenedModel) -> NDArray[np.bool_]:

@@ -6,11 +6,13 @@ field, so that what changes from row to row in the ambient field does not matter
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from scipy.linalg import block_diag
 
 from arrays.array import SensorArray
-from arrays.typing import BoolArray, FloatArray
+from arrays.typing import FloatArray
 from magloc.directions import fibonacci_directions
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
@@ -27,19 +29,12 @@ _UNSEEN = "the rows together do not determine the source"
 
 def optima_at_rest(rows: WhitenedRows, prior: SourcePrior = NOTHING_KNOWN) -> Optima:
     """Distinct optima of a source at rest by :func:`stacked_rows`; `prior` bounds its position in the world frame."""
-    model = rows.model
-
-    def allowed(q: FloatArray, mu: FloatArray) -> BoolArray:
-        with np.errstate(invalid="ignore"):
-            kept = prior.allows_position(model.position(q)) & prior.allows_moment(model.moment(q, mu))
-        return np.asarray(kept)
-
+    model, allowed = rows.model, partial(prior.allows, rows.model)
     beam = Search(model.homogeneous(_candidates(model)), allowed, width=_WIDTH).first(model, rows.y)
-    fits = beam.flat()
+    fits = beam.rows(0)
     listed = np.flatnonzero(np.isfinite(fits.chi2) & (fits.chi2 <= fits.chi2[0] + DISTINCT_WITHIN))
     of_row = np.zeros(len(listed), dtype=np.intp)
-    merged = np.zeros((len(listed), 1), dtype=bool)
-    return Optima(rows, fits.rows(listed), of_row, [""], merged, np.zeros(1, np.intp), undetermined=_UNSEEN)
+    return Optima(rows, fits.rows(listed), of_row, [""], undetermined=_UNSEEN)
 
 
 def stacked_rows(

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.special import chdtri
@@ -23,7 +24,7 @@ from magloc.localization.fit.gauss_newton import JointFits, covariances, refine
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
-from magloc.localization.search.beam_search import Beam, Search, best_distinct, merged
+from magloc.localization.search.beam_search import Search, best_distinct, merged
 from magloc.localization.search.candidates import allowed_positions, linear_bases, linear_scores
 from magloc.measurement.rows import WhitenedRows, whitenings_of
 
@@ -95,7 +96,7 @@ class MultiSourceSearch:
         """Distinct optima with the chosen number of sources: one entry for every number."""
         return _Levels(self, rows).optima()
 
-    def threshold_of(self, levels: _Levels, first: Beam) -> float:
+    def threshold_of(self, levels: _Levels, first: JointFits) -> float:
         """The threshold for another source, drawn once for every number of differences."""
         if levels.n_differences not in self._thresholds:
             self._thresholds[levels.n_differences] = levels.threshold(first)
@@ -108,25 +109,21 @@ class _Levels:
     def __init__(self, locator: MultiSourceSearch, rows: WhitenedRows) -> None:
         self.locator, self.rows, self.n_differences = locator, rows, rows.n_differences
         self.problem, self.y = rows.model, rows.y
-        problem, prior = rows.model, locator.prior
         self.asked = locator.n_sources
         self.most = min(locator.most, max(1, most_sources(self.n_differences)))
         self.rng = np.random.default_rng(locator.seed)
 
-        def allowed(q: FloatArray, mu: FloatArray) -> BoolArray:
-            with np.errstate(invalid="ignore"):
-                kept: BoolArray = prior.allows_position(problem.position(q)) & prior.allows_moment(
-                    problem.moment(q, mu)
-                )
-            return kept
-
         # A single source is listed with all its solutions, several ones with those of the beam.
-        self.search = Search(problem.homogeneous(locator._candidates), allowed, width=8 if self.most == 1 else 3)
+        self.search = Search(
+            rows.model.homogeneous(locator._candidates),
+            partial(locator.prior.allows, rows.model),
+            width=8 if self.most == 1 else 3,
+        )
 
     def optima(self) -> list[Optima]:
         """Optima with the chosen number of sources of every row: one entry for every number."""
         everything = np.arange(len(self.y))
-        beams: list[Beam] = [self._first(everything)]
+        beams: list[JointFits] = [self._first(everything)]
         level = np.zeros(len(self.y), dtype=np.intp)
         threshold = self.locator.threshold_of(self, beams[0]) if self.most > 1 else math.inf
         rows = everything
@@ -145,7 +142,9 @@ class _Levels:
             if failed.size:
                 wider = wider.replaced(failed, self._restarted(rows[failed], wider.rows(failed)))
                 gained = wider.chi2[:, 0] < before.chi2[:, 0] - threshold
-            beams.append(_scattered(wider, rows, len(self.y)))
+            # The other rows have no fit.
+            nowhere = JointFits.none((len(self.y), wider.chi2.shape[1]), wider.n_sources)
+            beams.append(nowhere.replaced(rows, wider))
             rows = rows if self.asked is not None else rows[gained]
             level[rows] = len(beams) - 1
         wanted = level.copy()
@@ -182,7 +181,7 @@ class _Levels:
             if (level == n).any()
         ]
 
-    def _first(self, rows: IntArray) -> Beam:
+    def _first(self, rows: IntArray) -> JointFits:
         beam = self.search.first(self.problem, self.y)
         doubtful = rows[beam.chi2[:, 0] > self._quantile(1, CREDIBLE_FIT)]
         if doubtful.size and self.most == 1:
@@ -191,7 +190,7 @@ class _Levels:
             beam = beam.replaced(doubtful, merged(beam.rows(doubtful), again))
         return beam
 
-    def _worth_another(self, rows: IntArray, beam: Beam, threshold: float) -> BoolArray:
+    def _worth_another(self, rows: IntArray, beam: JointFits, threshold: float) -> BoolArray:
         """Whether another source might pay: a suspicious χ², or a candidate that explains much of what is left."""
         suspicious = ~(beam.chi2[:, 0] <= self._quantile(beam.n_sources, SUSPICIOUS_FIT))
         clean = np.flatnonzero(~suspicious)
@@ -202,7 +201,7 @@ class _Levels:
             suspicious[clean] = scores.max(axis=1) > 0.5 * threshold
         return suspicious
 
-    def _restarted(self, rows: IntArray, beam: Beam, rounds: int = _MOST_RESTARTS) -> Beam:
+    def _restarted(self, rows: IntArray, beam: JointFits, rounds: int = _MOST_RESTARTS) -> JointFits:
         """Beams of rows, with random sources replaced until the best fit is credible."""
         credible = self._quantile(beam.n_sources, CREDIBLE_FIT)
         for _ in range(rounds):
@@ -217,7 +216,7 @@ class _Levels:
         dof = self.n_differences - N_UNKNOWNS * n_sources
         return float(chdtri(dof, 1.0 - level)) if dof > 0 else 1e-6
 
-    def threshold(self, beam: Beam) -> float:
+    def threshold(self, beam: JointFits) -> float:
         """By how much χ² must fall for another source: what noise reaches in one of a thousand rows, or BIC's penalty.
 
         Noise is drawn around the best fit of all rows; only the loudest draws, where a candidate explains most, are
@@ -247,13 +246,13 @@ class _Levels:
         n_above = int(FALSE_ALARM * _N_DRAWS)
         return max(penalty, float(fall[-n_above - 1])) if fall.size > n_above else penalty
 
-    def _has_unresolved_pair(self, rows: IntArray, beam: Beam) -> BoolArray:
+    def _has_unresolved_pair(self, rows: IntArray, beam: JointFits) -> BoolArray:
         """Whether a source of the best fit is hardly known beside another one, so that other pairs would do as well.
 
         Its moment is not far from nothing, and its place not far from the other's, both by their own covariance. In
         such a fit χ² has curved valleys and several optima, and the covariance of one of them says far too little.
         """
-        fits = JointFits(beam.q[:, 0], beam.mu[:, 0], beam.chi2[:, 0], beam.iterations[:, 0])
+        fits = beam.rows((slice(None), 0))
         problem = self.problem.rows(rows)
         covariance = covariances(problem, fits).reshape(len(rows), beam.n_sources, 6, beam.n_sources, 6)
         position, moment = problem.position(fits.q), problem.moment(fits.q, fits.mu)
@@ -274,7 +273,7 @@ class _Levels:
         self,
         n: int,
         rows: IntArray,
-        beams: list[Beam],
+        beams: list[JointFits],
         fewer: BoolArray,
         certain: BoolArray,
         noise_alone: BoolArray,
@@ -284,9 +283,7 @@ class _Levels:
         listed = np.isfinite(beam.chi2) & (beam.chi2 <= beam.chi2[:, :1] + DISTINCT_WITHIN)
         listed[noise_alone[rows]] = False
         of_row, of_fit = np.nonzero(listed)
-        fits = JointFits(
-            beam.q[of_row, of_fit], beam.mu[of_row, of_fit], beam.chi2[of_row, of_fit], beam.iterations[of_row, of_fit]
-        )
+        fits = beam.rows((of_row, of_fit))
         reason = ["" if found else _NOT_CONVERGED for found in np.asarray(listed.any(axis=1))]
         merged = np.zeros((len(of_row), n + 1), dtype=bool)
         for i, row in enumerate(rows.tolist()):
@@ -297,9 +294,9 @@ class _Levels:
                 reason[i], merged[best] = self._merged(
                     fits.q[best], fits.mu[best], beams[n + 1], row, bool(certain[row])
                 )
-        return Optima(self.rows.chosen(rows), fits, of_row, reason, merged, np.zeros(len(rows), dtype=np.intp))
+        return Optima(self.rows.chosen(rows), fits, of_row, reason, merged)
 
-    def _merged(self, q: FloatArray, mu: FloatArray, more: Beam, row: int, certain: bool) -> tuple[str, BoolArray]:
+    def _merged(self, q: FloatArray, mu: FloatArray, more: JointFits, row: int, certain: bool) -> tuple[str, BoolArray]:
         """Why a row has fewer sources, and which of them stands for the closest pair of the larger fit."""
         n = len(q)
         reason = f"the readings support {n} source{'s' if n > 1 else ''}"
@@ -320,18 +317,6 @@ class _Levels:
         if not certain and not (stands_for_both and offsets[nearest] < 2.0 * distance[i, j]):
             return reason, nothing
         return f"{reason}: two are closer than the array resolves", np.arange(n) == nearest
-
-
-def _scattered(beam: Beam, rows: IntArray, n_rows: int) -> Beam:
-    """A beam of some rows among all; the others have no fit."""
-    width, n_sources = beam.chi2.shape[1], beam.n_sources
-    empty = Beam(
-        np.full((n_rows, width, n_sources, 4), np.nan),
-        np.full((n_rows, width, n_sources, 3), np.nan),
-        np.full((n_rows, width), np.inf),
-        np.zeros((n_rows, width), dtype=np.int64),
-    )
-    return empty.replaced(rows, beam)
 
 
 def _squared_ratio(values: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -1,8 +1,8 @@
 """Search for one dipole by vector sensors, without a start.
 
-The moment is eliminated (:mod:`magloc.localization.fit.variable_projection`), a grid of positions is scored by how much
-of the readings' energy they explain, the best distinct ones are refined by a damped Gauss-Newton iteration that only
-accepts steps which decrease χ², and every distinct optimum near the best one is returned.
+The moment is eliminated (:mod:`magloc.localization.fit.variable_projection_compiled`), a grid of positions is scored by
+how much of the readings' energy they explain, the best distinct ones are refined by a damped Gauss-Newton iteration
+that only accepts steps which decrease χ², and every distinct optimum near the best one is returned.
 """
 
 from __future__ import annotations
@@ -113,14 +113,12 @@ class SingleSourceSearch:
             found = self._known(rows.model, found)
         kept = found.counts[:, 0]
         listed = np.arange(found.chi2.shape[1]) < kept[:, None]
-        fits = JointFits(
-            found.q[listed][:, None], found.mu[listed][:, None], found.chi2[listed], found.iterations[listed]
-        )
+        fits = JointFits(found.q[:, :, None], found.mu[:, :, None], found.chi2, found.iterations).rows(listed)
         reason = [
             "" if n else _why_unsolved(int(of_all)) for n, of_all in zip(kept.tolist(), unknown.tolist(), strict=True)
         ]
         of_row = np.nonzero(listed)[0]
-        return [Optima(rows, fits, of_row, reason, np.zeros((len(of_row), 1), dtype=bool), found.counts[:, 1])]
+        return [Optima(rows, fits, of_row, reason, failed_starts=found.counts[:, 1])]
 
     def optima_from(self, readings_T: ArrayLike, starts_m: ArrayLike) -> BestFits:
         """Best optimum of readings (C,) for every start (n, 3) [m], refined before the candidates; without prior."""
@@ -179,10 +177,7 @@ class SingleSourceSearch:
 
     def _known(self, model: WhitenedModel, found: kernels.Ends) -> kernels.Ends:
         """Optima that agree with what is known, again those within Δχ² of the best of them."""
-        position, moment = model.position(found.q), model.moment(found.q, found.mu)
-        with np.errstate(invalid="ignore"):
-            allowed = self.prior.allows_position(position) & self.prior.allows_moment(moment)
-        chi2 = np.where(allowed, found.chi2, np.inf)
+        chi2 = np.where(self.prior.allows(model, found.q, found.mu), found.chi2, np.inf)
         order = np.argsort(chi2, axis=1, kind="stable")
         chi2 = np.take_along_axis(chi2, order, axis=1)
         counts = found.counts.copy()

@@ -64,8 +64,7 @@ def _pick_starts(y: FloatArray, among: Candidates, starts: FloatArray) -> int:
                 best = i
         if score[best] < 0.0:
             return k
-        for d in range(4):
-            starts[k, d] = candidates[best, d]
+        starts[k] = candidates[best]
         q0, q1, q2, q3 = starts[k]
         for i in range(n):
             t = candidates[i, 0] * q0 + candidates[i, 1] * q1 + candidates[i, 2] * q2 + candidates[i, 3] * q3
@@ -94,16 +93,13 @@ def _search_row(
     moments = np.empty((n_starts, 3))
     chi2 = np.empty(n_starts)
     iterations = np.empty(n_starts, np.int64)
-    for k in range(n_first):
-        for d in range(4):
-            starts[k, d] = first[k, d]
+    starts[:n_first] = first
     n = n_first + _pick_starts(ranked, candidates, starts[n_first:])
     found = runtime_int(0)
     counts[1] = counts[2] = 0
     for k in range(n):
         # The optima found so far fill the places of the starts that led to them.
-        for d in range(4):
-            starts[found, d] = starts[k, d]
+        starts[found] = starts[k]
         chi2[found], iterations[found], end = refine(
             starts[found], y, model, runtime_int(3), OPTIMUM_TOLERANCE, max_iterations,
             starts, chi2, found, moments[found],
@@ -127,12 +123,8 @@ def _search_row(
         best = min(best, chi2[k])
         if chi2[k] > best + keep_within or chi2[k] == math.inf:
             break
-        for d in range(4):
-            out_q[kept, d] = starts[k, d]
-        for d in range(3):
-            out_mu[kept, d] = moments[k, d]
-        out_chi2[kept] = chi2[k]
-        out_iterations[kept] = iterations[k]
+        out_q[kept], out_mu[kept] = starts[k], moments[k]
+        out_chi2[kept], out_iterations[kept] = chi2[k], iterations[k]
         chi2[k] = math.inf
         kept += 1
     counts[0] = kept

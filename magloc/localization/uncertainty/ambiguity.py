@@ -25,12 +25,10 @@ def log_evidence_volume(covariance: FloatArray, moment: FloatArray, offset_m: Fl
     root of the determinant of its covariance (..., 6 K, 6 K), or (..., 3, 3) of a moment alone, in units of r and |m|.
     The logarithm of the range counts with a standard deviation of one at most: χ² is no parabola over more than that.
     """
-    vectors = [moment] if offset_m is None else [offset_m, moment]
-    lengths = np.stack([np.linalg.norm(vector, axis=-1) for vector in vectors], axis=-1)
-    unit = np.repeat(lengths.reshape(*lengths.shape[:-2], covariance.shape[-1] // 3), 3, axis=-1)
+    unit = _units(*([moment] if offset_m is None else [offset_m, moment]))
     with np.errstate(invalid="ignore", divide="ignore"):
         relative = covariance / (unit[..., :, None] * unit[..., None, :])
-    known = np.isfinite(relative).all(axis=(-2, -1))
+    known = np.asarray(np.isfinite(relative).all(axis=(-2, -1)))
     relative = np.where(known[..., None, None], relative, np.eye(unit.shape[-1]))
     volume: FloatArray = 0.5 * np.linalg.slogdet(relative)[1]
     if offset_m is not None:
@@ -38,6 +36,12 @@ def log_evidence_volume(covariance: FloatArray, moment: FloatArray, offset_m: Fl
             sigma = relative_range_sigma(covariance[..., 6 * k :, 6 * k :], offset_m[..., k, :])
             volume = volume - np.log(np.fmax(np.where(known, sigma, 1.0), 1.0))
     return volume
+
+
+def _units(*vectors: FloatArray) -> FloatArray:
+    """Lengths of the vectors (..., K, 3) of every source, in the order of a state (..., 6 K) or (..., 3 K)."""
+    lengths = np.stack([np.linalg.norm(vector, axis=-1) for vector in vectors], axis=-1)
+    return np.repeat(lengths.reshape(*lengths.shape[:-2], lengths.shape[-2] * len(vectors)), 3, axis=-1)
 
 
 def weights(chi2: ArrayLike, volume: ArrayLike) -> FloatArray:
@@ -63,8 +67,7 @@ def relative_sigma(covariance: FloatArray, offset_m: FloatArray, moment: FloatAr
 
 def longest_axes(covariance: FloatArray, offset_m: FloatArray, moment: FloatArray) -> FloatArray:
     """Longest half axes (..., 6 K) of ellipsoids of one σ, lengths being in units of ranges and moments."""
-    lengths = np.stack([np.linalg.norm(vector, axis=-1) for vector in (offset_m, moment)], axis=-1)
-    unit = np.repeat(lengths.reshape(*lengths.shape[:-2], covariance.shape[-1] // 3), 3, axis=-1)
+    unit = _units(offset_m, moment)
     variance, axis = np.linalg.eigh(covariance / (unit[..., :, None] * unit[..., None, :]))
     longest: FloatArray = unit * axis[..., -1] * np.sqrt(np.maximum(variance[..., -1:], 0.0))
     return longest

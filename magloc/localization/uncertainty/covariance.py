@@ -34,7 +34,6 @@ from magloc.localization.uncertainty.moment_covariance import moment_covariances
 from magloc.localization.uncertainty.range_interval import relative_range_sigma, union
 from magloc.localization.uncertainty.range_profile import profile_stretches, ranges_within
 from magloc.localization.uncertainty.range_profile_compiled import profile_rows
-from magloc.measurement.whitened import WhitenedModel
 from magloc.measurement.whitened_compiled import ModelRows
 
 # By how much the rise of χ² at one standard deviation may differ from one where errors are Gaussian.
@@ -70,53 +69,34 @@ def solutions_of(optima: Optima, energy: FloatArray, detected: BoolArray) -> Sol
         moment_Am2=moment,
         covariance=known.covariance,
         chi2=fits.chi2,
-        dof=np.full(n_fits, optima.rows.n_differences - optima.n_unknowns),
+        dof=np.full(n_fits, optima.dof),
         weight=known.weight,
         iterations=fits.iterations,
         ranges=known.ranges,
         gaussian=known.gaussian,
-        merged=optima.merged,
+        merged=np.full((n_fits, n_sources), optima.merged),
     )
     determined = np.asarray(np.isfinite(known.covariance).all(axis=(1, 2)))
     return every if determined.all() else every.chosen(determined)
 
 
-def covariance_is_valid(
-    problem: WhitenedModel,
-    y: FloatArray,
-    position_m: FloatArray,
-    moment_Am2: FloatArray,
-    chi2: FloatArray,
-    dof: int,
-    covariance: FloatArray,
-) -> BoolArray:
-    """Whether covariances (f, 6 K, 6 K) describe the errors of f fits of K sources, as far as the model tells.
+def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray) -> BoolArray:
+    """Whether covariances (f, 6 K, 6 K) of some fits describe their errors, as far as the model tells.
 
     They do where χ² is one of noise, and rises by one, give or take a half, at one standard deviation along the longest
     axis, to either side: not where the errors follow a curve. With no degrees of freedom every χ² is as it must be.
     """
-    axis = longest_axes(covariance, position_m - problem.centroid, moment_Am2).reshape(*position_m.shape[:2], 2, 3)
-    described = chdtrc(dof, chi2) >= MISFIT if dof > 0 else np.ones(len(y), dtype=bool)
+    fits, of_row = optima.fits.rows(which), optima.of_row[which]
+    problem, y, dof = optima.rows.model.rows(of_row), optima.rows.y[of_row], optima.dof
+    position, moment = problem.position(fits.q), problem.moment(fits.q, fits.mu)
+    axis = longest_axes(covariance, position - problem.centroid, moment).reshape(*position.shape[:2], 2, 3)
+    described = chdtrc(dof, fits.chi2) >= MISFIT if dof > 0 else np.ones(len(y), dtype=bool)
     for side in (axis, -axis):
-        q = problem.homogeneous(position_m + side[:, :, 0])
-        mu = problem.scaled_moment(q, moment_Am2 + side[:, :, 1])
+        q = problem.homogeneous(position + side[:, :, 0])
+        mu = problem.scaled_moment(q, moment + side[:, :, 1])
         residual = y - problem.predicted(problem.source_fields(q, mu))
-        described &= np.abs(np.sum(residual**2, axis=1) - chi2 - 1.0) <= _BEND
+        described &= np.abs(np.sum(residual**2, axis=1) - fits.chi2 - 1.0) <= _BEND
     return np.asarray(described)
-
-
-def _valid(optima: Optima, covariance: FloatArray, which: IntArray) -> BoolArray:
-    """:func:`covariance_is_valid` of some of the fits."""
-    model, fits, of_row = optima.rows.model, optima.fits.rows(which), optima.of_row[which]
-    return covariance_is_valid(
-        model.rows(of_row),
-        optima.rows.y[of_row],
-        model.position(fits.q),
-        model.moment(fits.q, fits.mu),
-        fits.chi2,
-        optima.rows.n_differences - optima.n_unknowns,
-        covariance[which],
-    )
 
 
 def _of_one(optima: Optima, energy: FloatArray) -> _Known:
@@ -156,7 +136,7 @@ def _of_one(optima: Optima, energy: FloatArray) -> _Known:
     gaussian = ranges.gaussian[at]
     claimed = np.flatnonzero(gaussian)
     if claimed.size:
-        gaussian[claimed] = _valid(optima, covariance[at], claimed)
+        gaussian[claimed] = covariance_is_valid(optima, covariance[at][claimed], claimed)
     return _Known([(ranges.sets[row],) for row in of_row], ranges.covariance[at], gaussian[:, None], rivals.weight[at])
 
 
@@ -185,7 +165,7 @@ def _of_several(optima: Optima, detected: BoolArray) -> _Known:
     weight = _weights_of_rows(of_row, chi2, log_evidence_volume(covariance, moment, offset))
     gaussian &= (weight >= CERTAIN_WEIGHT)[:, None]
     claimed = np.flatnonzero(gaussian.any(axis=1))
-    gaussian[claimed] &= _valid(optima, covariance, claimed)[:, None]
+    gaussian[claimed] &= covariance_is_valid(optima, covariance[claimed], claimed)[:, None]
     return _Known([tuple(of_fit) for of_fit in sets], wide, gaussian, weight)
 
 

@@ -77,13 +77,11 @@ def ranges_within(
     fits: JointFits,
     source: int,
     covariance: FloatArray,
-    rise: FloatArray | None = None,
 ) -> FloatArray:
-    """Ends (b, 2) of the ranges [m] of one source in which χ² stays within a rise (b,) of each fit, 3.84 by default."""
-    allowed = np.full(len(y), DELTA_CHI2_95) if rise is None else rise
+    """Ends (b, 2) of the ranges [m] of one source in which χ² stays within 3.84 of each fit."""
     offset = problem.position(fits.q)[:, source] - problem.centroid
     sigma = relative_range_sigma(covariance[:, 6 * source :, 6 * source :], offset)
-    return ranges_of(profile_stretches(problem, y, fits, source, sigma, allowed), problem.radius)
+    return ranges_of(profile_stretches(problem, y, fits, source, sigma, np.full(len(y), DELTA_CHI2_95)), problem.radius)
 
 
 def _rises(

@@ -38,8 +38,7 @@ def _profile_end(
     """
     mu = np.empty(3)
     norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2])
-    best = np.empty(4)
-    trial = np.empty(4)
+    best, trial = np.empty(3), np.empty(3)
     for d in range(3):
         best[d] = q[d] / norm
     alpha = math.atan2(abs(q[3]), norm)
@@ -62,8 +61,7 @@ def _profile_end(
             break
         if outside == bound:
             break
-        for d in range(3):
-            best[d] = trial[d]
+        best[:] = trial
         inside, f_inside = outside, f_outside
         step = min(1.7 * step, LARGEST_PROFILE_STEP)
     if not found:
@@ -81,8 +79,7 @@ def _profile_end(
             outside, f_outside = middle, f
         else:
             inside, f_inside = middle, max(f, -rise)
-            for d in range(3):
-                best[d] = trial[d]
+            best[:] = trial
     return inside
 
 

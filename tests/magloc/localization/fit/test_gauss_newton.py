@@ -5,7 +5,7 @@
 | predictions, χ² | magpylib; DifferenceMeasurement |
 | Jacobians | scipy.differentiate |
 | the optimum | scipy.optimize.least_squares on magpylib's field |
-| covariance | DifferenceMeasurement.fisher_information; scipy.differentiate on magpylib's field; scatter of the fits |
+| covariance | oracles.fisher_information; scipy.differentiate on magpylib's field; scatter of the fits |
 | range interval | the compiled Locator |
 """
 
@@ -463,7 +463,7 @@ class TestCovariance:
         problem, y = problem_of(array, noisy_readings(array, p, m, rng))
         fits = refined_from(problem, y, p, m)
         position, moment = problem.position(fits.q), problem.moment(fits.q, fits.mu)
-        information = DifferenceMeasurement.of(array).fisher_information(position[:, 0], moment[:, 0])
+        information = oracles.fisher_information(DifferenceMeasurement.of(array), position[:, 0], moment[:, 0])
         for found, expected in zip(covariances(problem, fits), np.linalg.inv(information), strict=True):
             sigma = np.sqrt(np.diagonal(expected))
             assert_allclose(found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-5)

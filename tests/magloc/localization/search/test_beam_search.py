@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from arrays.geometries import cube
+from magloc.directions import hemisphere
 from magloc.localization.fit.gauss_newton import JointFits
 from magloc.localization.search.beam_search import Search, best_distinct, merged
 from magloc.localization.search.candidates import (
     candidate_positions,
     distinct_best,
-    hemisphere,
     linear_bases,
     linear_scores,
     modulus_scores,

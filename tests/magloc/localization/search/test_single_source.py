@@ -4,7 +4,7 @@
 |---|---|
 | the optimum | scipy.optimize.least_squares from the truth; noise-free readings from magpylib |
 | compiled search | magloc.measurement.whitened, its readable twin |
-| covariance | DifferenceMeasurement.fisher_information; scatter of the fixes |
+| covariance | oracles.fisher_information; scatter of the fixes |
 | range interval | scipy's minimiser of χ² on spheres |
 """
 
@@ -27,7 +27,6 @@ from arrays.whitening import whitening
 from magloc.levels import DELTA_CHI2_95
 from magloc.localization.fit import variable_projection_compiled
 from magloc.localization.fit.prior import SourcePrior
-from magloc.localization.fit.variable_projection import best_moment, projected_chi2, unit_basis
 from magloc.localization.search.candidates import candidate_positions
 from magloc.localization.search.single_source import SingleSourceSearch
 from magloc.measurement import whitened_compiled
@@ -36,6 +35,7 @@ from magloc.measurement.whitened import WhitenedModel
 from tests import oracles
 from tests.arrays.test_differences import random_array
 from tests.plain_locator import plain_locator
+from tests.variable_projection import best_moment, projected_chi2, unit_basis
 
 SEEDS = st.integers(0, 2**32 - 1)
 TETRAHEDRON = tetrahedron(1.5, noise_T=1e-9)
@@ -201,7 +201,7 @@ class TestUncertainty:
         p, m = random_sources(rng, 5, 2.0, 6.0)
         for fix in plain_locator(TETRAHEDRON).fit_rows(noisy_readings(TETRAHEDRON, p, m, rng)):
             s = fix.solutions[0]
-            information = DifferenceMeasurement.of(TETRAHEDRON).fisher_information(s.position_m, s.moment_Am2)
+            information = oracles.fisher_information(DifferenceMeasurement.of(TETRAHEDRON), s.position_m, s.moment_Am2)
             sigma = np.sqrt(np.diagonal(s.covariance))
             assert_allclose(
                 np.linalg.inv(information) / np.outer(sigma, sigma), s.covariance / np.outer(sigma, sigma), atol=1e-5

@@ -26,7 +26,6 @@ from arrays.whitening import whitening
 from magloc.directions import fibonacci_directions
 from magloc.levels import DELTA_CHI2_95
 from magloc.localization.fit.results import EVERYWHERE, Fix, Intervals, Solution, Source, is_observable_set
-from magloc.localization.fit.variable_projection import projected_chi2
 from magloc.localization.uncertainty.ambiguity import weights
 from magloc.localization.uncertainty.range_interval import (
     gaussian_ranges,
@@ -42,8 +41,10 @@ from magloc.tracking.batch import track_record
 from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import Row, TrackPoint
 from magloc.tracking.tracker import Tracker
+from tests import oracles
 from tests.passing_source import ARRAY, MOMENT, POSITION, readings_of
 from tests.plain_locator import plain_locator
+from tests.variable_projection import projected_chi2
 
 FloatArray = NDArray[np.float64]
 TETRAHEDRON = tetrahedron(1.5, noise_T=1e-9)
@@ -436,7 +437,7 @@ class TestWeights:
 def range_sigma(problems: Problems, i: int) -> float:
     """σ of the range over the range by the information at the best solution."""
     best = problems.fixes[i].solutions[0]
-    information = DifferenceMeasurement.of(problems.array).fisher_information(best.position_m, best.moment_Am2)
+    information = oracles.fisher_information(DifferenceMeasurement.of(problems.array), best.position_m, best.moment_Am2)
     unit = np.repeat([np.linalg.norm(v) for v in (best.position_m - problems.array.centroid, best.moment_Am2)], 3)
     covariance = np.linalg.inv(information * np.outer(unit, unit))
     along = (best.position_m - problems.array.centroid) / unit[0]
@@ -497,7 +498,9 @@ class TestCovariance:
             for s in fix.solutions:
                 offset = s.position_m - problems.array.centroid
                 unit = np.repeat([np.linalg.norm(offset), np.linalg.norm(s.moment_Am2)], 3)
-                information = DifferenceMeasurement.of(problems.array).fisher_information(s.position_m, s.moment_Am2)
+                information = oracles.fisher_information(
+                    DifferenceMeasurement.of(problems.array), s.position_m, s.moment_Am2
+                )
                 information = information * np.outer(unit, unit)
                 if np.linalg.cond(information) > 1e10:
                     continue

@@ -1,6 +1,6 @@
 """Variable projection: the moment is linear and eliminated, so that a fit of one source is a search over its position.
 
-The readable twin of :mod:`magloc.localization.fit.variable_projection_compiled`, for models of one row.
+The readable twin of :mod:`magloc.localization.fit.variable_projection_compiled`, for models of one row: its oracle.
 """
 
 from __future__ import annotations
