@@ -24,6 +24,11 @@ from magloc.measurement.whitened import ScaledSensors, WhitenedModel
 SMALLEST_S = 1e-5
 
 
+def _own(values: FloatArray) -> FloatArray:
+    """A contiguous copy: kernels are compiled anew, for seconds, for each mixture of read-only and other arrays."""
+    return np.array(values, order="C")
+
+
 class ModelRow(NamedTuple):
     """Whitened channels of one row: their sensors, gains (c, 3), common field (q, c), shrinkage (q,)."""
 
@@ -36,8 +41,7 @@ class ModelRow(NamedTuple):
     @classmethod
     def of(cls, scaled: ScaledSensors, gain: FloatArray, basis: FloatArray, shrinkage: FloatArray) -> ModelRow:
         """From a whitening's basis (c, q) in the order of the twin."""
-        arrays = (np.ascontiguousarray(values) for values in (gain, basis.T, shrinkage))
-        return cls(scaled.sensors, scaled.channel_sensor, *arrays)
+        return cls(scaled.sensors, scaled.channel_sensor, *map(_own, (gain, basis.T, shrinkage)))
 
 
 class ModelRows(NamedTuple):
@@ -57,9 +61,9 @@ class ModelRows(NamedTuple):
         return cls(
             model.sensors,
             model.channel_sensor,
-            np.ascontiguousarray(model.gain[sets]),
-            np.ascontiguousarray(model.basis[sets].transpose(0, 2, 1)),
-            np.ascontiguousarray(model.shrinkage[sets]),
+            _own(model.gain[sets]),
+            _own(model.basis[sets].transpose(0, 2, 1)),
+            _own(model.shrinkage[sets]),
             np.zeros(len(model), dtype=np.intp) if model.shares_whitening else np.arange(len(model), dtype=np.intp),
         )
 

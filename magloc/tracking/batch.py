@@ -67,7 +67,8 @@ class _CompiledSteps:
             transforms[i, : of_row.n_differences] = of_row.transform / np.sqrt(of_row.variance)[:, None]
         transform_of_row = np.array([index[id(of_row)] for of_row in differences])
         channels = np.nan_to_num(np.stack([row.readings_T for row in rows]) - array.channel_offset_T)
-        ambients, ambient_of_row = array.ambient_fields[None], np.zeros(len(rows), dtype=np.int64)
+        # A copy, as writable as those of rows: the kernel is compiled anew where one of its arrays is read-only.
+        ambients, ambient_of_row = array.ambient_fields[None].copy(), np.zeros(len(rows), dtype=np.int64)
         if any(row.ambient_T is not None for row in rows):
             own = np.zeros(3) if array.ambient_T is None else np.asarray(array.ambient_T)
             of_rows = np.stack([own if row.ambient_T is None else row.ambient_T for row in rows])
