@@ -14,12 +14,12 @@ from tests.adcs.refusals import assert_refused
 from tests.command_line import refuse_constant
 
 
-@pytest.fixture(scope="module")
-def rows(tmp_path_factory):
+@pytest.fixture(scope="module", params=["1", pytest.param("2", marks=pytest.mark.slow)])
+def rows(tmp_path_factory, request):
     from adcs.cli.app import main
 
     out = tmp_path_factory.mktemp("tables")
-    assert main(["tables", "--seeds", "2", "--out", str(out), "--quiet"]) == 0
+    assert main(["tables", "--seeds", request.param, "--out", str(out), "--quiet"]) == 0
     with (out / "tables.csv").open() as file:
         return list(csv.DictReader(file))
 
