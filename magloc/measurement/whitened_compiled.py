@@ -16,17 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled
+from magloc.compilation import compiled, own
 from magloc.linalg_compiled import orthonormalise
 from magloc.measurement.whitened import ScaledSensors, WhitenedModel
 
 # |s| stays above this: below it the differences lose their digits, and no array resolves a range of 10⁵ radii.
 SMALLEST_S = 1e-5
-
-
-def _own(values: FloatArray) -> FloatArray:
-    """A contiguous copy: kernels are compiled anew, for seconds, for each mixture of read-only and other arrays."""
-    return np.array(values, order="C")
 
 
 class ModelRow(NamedTuple):
@@ -41,7 +36,7 @@ class ModelRow(NamedTuple):
     @classmethod
     def of(cls, scaled: ScaledSensors, gain: FloatArray, basis: FloatArray, shrinkage: FloatArray) -> ModelRow:
         """From a whitening's basis (c, q) in the order of the twin."""
-        return cls(scaled.sensors, scaled.channel_sensor, *map(_own, (gain, basis.T, shrinkage)))
+        return cls(scaled.sensors, scaled.channel_sensor, *map(own, (gain, basis.T, shrinkage)))
 
 
 class ModelRows(NamedTuple):
@@ -61,9 +56,9 @@ class ModelRows(NamedTuple):
         return cls(
             model.sensors,
             model.channel_sensor,
-            _own(model.gain[sets]),
-            _own(model.basis[sets].transpose(0, 2, 1)),
-            _own(model.shrinkage[sets]),
+            own(model.gain[sets]),
+            own(model.basis[sets].transpose(0, 2, 1)),
+            own(model.shrinkage[sets]),
             np.zeros(len(model), dtype=np.intp) if model.shares_whitening else np.arange(len(model), dtype=np.intp),
         )
 
