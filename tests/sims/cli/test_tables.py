@@ -13,7 +13,6 @@ from sims.experiments.paper_tables import PAPER_ROWS, printed
 from tests.adcs.refusals import assert_refused
 from tests.command_line import refuse_constant
 
-
 # Of table 5, whose gains take a second each, one row for every filter.
 QUICK_ROWS = [row for row in PAPER_ROWS if row.table != 5]
 QUICK_ROWS += {row.filter: row for row in PAPER_ROWS if row.table == 5}.values()
