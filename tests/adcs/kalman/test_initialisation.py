@@ -104,7 +104,7 @@ class TestAnyStart:
         runs, chosen = tumbling, settings("mag+gyro")
         # A few runs at once: 36 hypotheses of each, with all their covariances, are large.
         few = np.array_split(np.arange(100), 10)
-        starts = [any_start(part(runs, some, slice(None)), chosen) for some in few]
+        starts = [any_start(part(runs, some), chosen) for some in few]
         start = Start(*(np.concatenate([getattr(one, of) for one in starts]) for of in ("q", "w", "covariance")))
         estimates = run_filter(runs, chosen, start)
         assert np.mean(error_norm_deg(runs, estimates)[:, -60:].max(axis=-1) < 1.5) >= 0.95
