@@ -19,6 +19,8 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numba import get_num_threads, njit
 
+from arrays.typing import FloatArray
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -47,6 +49,11 @@ def over_rows(kernel: Callable[..., None], n_rows: int, *arguments: Any) -> None
     with ThreadPoolExecutor(n_threads) as pool:
         for done in [pool.submit(kernel, *part, *arguments) for part in pairwise(edges)]:
             done.result()
+
+
+def own(values: FloatArray) -> FloatArray:
+    """A contiguous copy that may be written: kernels are compiled anew, for seconds, for arrays of any other kind."""
+    return np.array(values, order="C")
 
 
 # Numba compiles a function once more for every literal integer that it is called with; a converted one is no literal.

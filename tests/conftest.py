@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -40,15 +41,35 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the longer notebooks as slow, and take first what takes longest: parallel processes then end together."""
+    """Mark the longer notebooks as slow, and choose the order for parallel processes.
+
+    What takes longest comes first, so that they end together; beside it what needs other kernels, so that where none is
+    cached yet no two processes compile the same ones.
+    """
 
     def rank(item: pytest.Item) -> int:
-        return 0 if "browser" in item.path.parts else 1 if item.path.suffix == ".ipynb" else 2
+        if "browser" in item.path.parts:
+            return 0
+        if item.path.is_relative_to(REPOSITORY / "tests" / "adcs"):
+            return 1
+        return 2 if item.path.suffix == ".ipynb" else 3
 
     for item in items:
         if item.path.suffix == ".ipynb" and item.path.stem not in QUICK_NOTEBOOKS:
             item.add_marker(pytest.mark.slow)
     items.sort(key=rank)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Spare the garbage collector the modules and tests, which stay to the end: it would walk them again and again."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.collect()
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -16,8 +16,12 @@ from tests.conftest import REPOSITORY
 
 PACKAGES = ("arrays", "magloc", "adcs", "sims")
 FILES = sorted(path for package in PACKAGES for path in (REPOSITORY / package).rglob("*.py"))
-TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 MOST_PARAMETERS, MOST_LINES, MOST_FILES = 12, 450, 14
+
+
+@pytest.fixture(scope="module")
+def trees() -> dict[Path, ast.Module]:
+    return {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 
 
 def test_every_file_is_read() -> None:
@@ -49,10 +53,10 @@ class TestPublicNames:
         assert sorted(set(importlib.import_module(package).__all__) - words) == []
 
 
-def test_only_command_lines_import_the_root_of_their_package() -> None:
+def test_only_command_lines_import_the_root_of_their_package(trees: dict[Path, ast.Module]) -> None:
     """A lazy root would hide an upward import from the linter."""
     found = []
-    for path, tree in TREES.items():
+    for path, tree in trees.items():
         package, *rest = path.relative_to(REPOSITORY).parts
         if rest[0] == "cli":
             continue
@@ -87,9 +91,9 @@ def test_names_in_pages_are_there() -> None:
 
 
 class TestSizes:
-    def test_no_function_has_too_many_parameters(self) -> None:
+    def test_no_function_has_too_many_parameters(self, trees: dict[Path, ast.Module]) -> None:
         found = []
-        for path, tree in TREES.items():
+        for path, tree in trees.items():
             for node in ast.walk(tree):
                 if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
                     names = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]

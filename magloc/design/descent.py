@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.distance import pdist
 
 from arrays.typing import FloatArray
-from magloc.compilation import over_rows
+from magloc.compilation import over_rows, own
 from magloc.design.criterion_compiled import range_deviation_rows
 from magloc.design.task import DesignTask
 
@@ -78,12 +78,12 @@ class Sample:
         over_rows(
             range_deviation_rows,
             n,
-            np.ascontiguousarray(sensors),
+            own(sensors),
             task.kind == "scalar",
             np.zeros(3) if task.ambient_T is None else np.array(task.ambient_T),
             task.noise_T,
-            self.positions,
-            self.moments,
+            own(self.positions),
+            own(self.moments),
             deviations,
             slopes,
         )

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled
+from magloc.compilation import compiled, own
 from magloc.linalg_compiled import orthonormalise
 from magloc.measurement.whitened import ScaledSensors, WhitenedModel
 
@@ -36,8 +36,7 @@ class ModelRow(NamedTuple):
     @classmethod
     def of(cls, scaled: ScaledSensors, gain: FloatArray, basis: FloatArray, shrinkage: FloatArray) -> ModelRow:
         """From a whitening's basis (c, q) in the order of the twin."""
-        arrays = (np.ascontiguousarray(values) for values in (gain, basis.T, shrinkage))
-        return cls(scaled.sensors, scaled.channel_sensor, *arrays)
+        return cls(scaled.sensors, scaled.channel_sensor, *map(own, (gain, basis.T, shrinkage)))
 
 
 class ModelRows(NamedTuple):
@@ -57,9 +56,9 @@ class ModelRows(NamedTuple):
         return cls(
             model.sensors,
             model.channel_sensor,
-            np.ascontiguousarray(model.gain[sets]),
-            np.ascontiguousarray(model.basis[sets].transpose(0, 2, 1)),
-            np.ascontiguousarray(model.shrinkage[sets]),
+            own(model.gain[sets]),
+            own(model.basis[sets].transpose(0, 2, 1)),
+            own(model.shrinkage[sets]),
             np.zeros(len(model), dtype=np.intp) if model.shares_whitening else np.arange(len(model), dtype=np.intp),
         )
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy.special import chdtri
 
+from magloc.compilation import own
 from magloc.kalman import estimability
 from magloc.levels import CONTRADICTION
 from magloc.measurement.rows import ambient_fields
@@ -66,10 +67,10 @@ class _CompiledSteps:
             transforms[i, : of_row.n_differences] = of_row.transform / np.sqrt(of_row.variance)[:, None]
         transform_of_row = np.array([index[id(of_row)] for of_row in differences])
         channels = np.nan_to_num(np.stack([row.readings_T for row in rows]) - array.channel_offset_T)
-        ambients, ambient_of_row = array.ambient_fields[None], np.zeros(len(rows), dtype=np.int64)
+        ambients, ambient_of_row = own(array.ambient_fields[None]), np.zeros(len(rows), dtype=np.int64)
         if any(row.ambient_T is not None for row in rows):
-            own = np.zeros(3) if array.ambient_T is None else np.asarray(array.ambient_T)
-            of_rows = np.stack([own if row.ambient_T is None else row.ambient_T for row in rows])
+            usual = np.zeros(3) if array.ambient_T is None else np.asarray(array.ambient_T)
+            of_rows = np.stack([usual if row.ambient_T is None else row.ambient_T for row in rows])
             ambients, ambient_of_row = ambient_fields(array, len(rows), of_rows), np.arange(len(rows))
         self.given = kernels.Rows(
             z=(transforms[transform_of_row] @ channels[..., None])[..., 0],

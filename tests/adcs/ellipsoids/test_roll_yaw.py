@@ -6,6 +6,7 @@ Sixty runs, and three hundred in ``make test-full``, with the seeds from 0 on, w
 acceptance figures; the comments have what was measured of three hundred.
 """
 
+import functools
 import math
 
 import numpy as np
@@ -42,18 +43,15 @@ def seeds(request):
 
 @pytest.fixture(scope="module")
 def experiment(seeds):
-    """Runs of the dynamics of the error alone, each made once."""
-    made = {}
+    """Runs of the dynamics of the error alone; of the latest, as each is large."""
 
+    @functools.lru_cache(maxsize=4)
     def run(noise_deg, drift_deg_s, rule, *, jump=False, reinflation_deg=None):
-        key = (noise_deg, drift_deg_s, rule, jump, reinflation_deg)
-        if key not in made:
-            noise, drift = math.radians(noise_deg), math.radians(drift_deg_s)
-            truth = error_runs(ErrorScenario(noise, drift, ORBIT, jump_s=2000.0 if jump else None), seeds)
-            radius = None if reinflation_deg is None else math.radians(reinflation_deg)
-            observer = roll_yaw_observer(roll_yaw_system(noise, drift), len(seeds), rule, reinflation_rad=radius)
-            made[key] = truth, observe(observer, truth.readings_rad)
-        return made[key]
+        noise, drift = math.radians(noise_deg), math.radians(drift_deg_s)
+        truth = error_runs(ErrorScenario(noise, drift, ORBIT, jump_s=2000.0 if jump else None), seeds)
+        radius = None if reinflation_deg is None else math.radians(reinflation_deg)
+        observer = roll_yaw_observer(roll_yaw_system(noise, drift), len(seeds), rule, reinflation_rad=radius)
+        return truth, observe(observer, truth.readings_rad)
 
     return run
 

@@ -259,6 +259,7 @@ class TestBadInput:
         assert expected in err
         assert not list(tmp_path.iterdir())
 
+    @with_plain_pictures
     def test_an_interruption_says_what_is_done(self, tmp_path, capsys, monkeypatch):
         def interrupted(*_):
             raise KeyboardInterrupt

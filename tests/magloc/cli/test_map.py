@@ -20,6 +20,7 @@ from magloc.convergence.over_sources import SourcesScenario
 from magloc.convergence.over_starts import StartsScenario
 from magloc.convergence.scenario_files import built_in_scenarios, read_sources_scenario, read_starts_scenario
 from magloc.grids.store import open_map
+from magloc.plots import style
 from tests.conftest import REPOSITORY
 
 SOURCE = "[source]\nposition_m = [5, 0, 0.3]\nmoment_Am2 = [100, 0, 0]\n"
@@ -35,6 +36,16 @@ STARTS_KEYS = [
     "out",
 ]
 ARRAY = '[array]\ngeometry = "tetrahedron"\nedge_m = 1.5\nkind = "vector"\nnoise_nT = 1.0\n'
+
+
+@pytest.fixture
+def plain_pictures(monkeypatch):
+    """Pictures without contents, which take no time."""
+    for name in ("convergence", "sources"):
+        monkeypatch.setattr(f"magloc.plots.{name}", lambda *_: style.new_figure(1.0))
+
+
+with_plain_pictures = pytest.mark.usefixtures("plain_pictures")
 
 
 class TestResult:
@@ -59,6 +70,7 @@ class TestResult:
         assert re.search(r"\d+ of 125 starts converged", out)
         assert err == ""
 
+    @with_plain_pictures
     def test_threads_do_not_matter(self, tmp_path, capsys):
         results = []
         for threads in ("1", "2"):
@@ -68,6 +80,7 @@ class TestResult:
             del result["seconds"], result["out"]
         assert results[0] == results[1]
 
+    @with_plain_pictures
     def test_noise_is_drawn_with_the_seed(self, tmp_path, capsys):
         optima = []
         for i, options in enumerate(([], ["--noise"], ["--noise", "--seed", "1"], ["--noise", "--seed", "1"])):
@@ -79,6 +92,7 @@ class TestResult:
 
 
 class TestDefaultFolder:
+    @with_plain_pictures
     def test_other_settings_go_to_other_folders(self, tmp_path, capsys, monkeypatch):
         monkeypatch.chdir(tmp_path)
         sources = ["--over", "sources"]
@@ -110,6 +124,7 @@ class TestOverSources:
         assert 0.9 < result["truth_listed"] <= 1.0
         assert (tmp_path / "out/convergence.png").read_bytes().startswith(b"\x89PNG")
 
+    @with_plain_pictures
     def test_seed_counts_and_threads_do_not(self, tmp_path, capsys):
         chi2 = []
         for i, options in enumerate((["--threads", "1"], ["--threads", "2"], ["--seed", "1"])):
@@ -209,6 +224,7 @@ class TestInterrupted:
         )
         self.resumed(tmp_path / "out", whole, capsys)
 
+    @with_plain_pictures
     def test_finished(self, tmp_path, capsys):
         arguments = ["map", "--grid", "5", "--out", str(tmp_path)]
         results = []

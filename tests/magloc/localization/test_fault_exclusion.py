@@ -32,6 +32,7 @@ from tests.plain_locator import plain_locator
 
 AMBIENT = np.array([2e-5, 0.0, 4.5e-5])
 NOISE = 1e-9
+SLOW = pytest.mark.slow
 CUBE = cube(1.0, "vector", NOISE)
 
 
@@ -108,19 +109,21 @@ def assert_breakdown(fault, n, seed):
 class TestBreakdown:
     """One of eight sensors is arbitrary: the error stays within 1.5 times that of the remaining seven."""
 
+    @pytest.mark.parametrize(("n_gross", "n_others"), [(10, 100), pytest.param(20, 300, marks=SLOW)])
     @pytest.mark.parametrize("fault", ["dead", "stuck", "saturated", "spikes of 1e+06 σ", WORST])
-    def test_one_of_eight(self, fault):
-        assert_breakdown(fault, 10 if fault in GROSS else 100, seed=0)
+    def test_one_of_eight(self, fault, n_gross, n_others):
+        assert_breakdown(fault, n_gross if fault in GROSS else n_others, seed=0)
 
-    @pytest.mark.slow
+    @SLOW
     @pytest.mark.parametrize("fault", FAULTS)
     def test_one_of_eight_in_many_rows(self, fault):
         assert_breakdown(fault, 200 if fault in GROSS else 1500, seed=1)
 
+    @pytest.mark.parametrize("n", [6, pytest.param(15, marks=SLOW)])
     @pytest.mark.parametrize("fault", ["dead", "saturated", "spikes of 1000 σ"])
-    def test_two_of_eight(self, fault):
+    def test_two_of_eight(self, fault, n):
         """Gross faults of two sensors at once are both found."""
-        clean, position, first = on_cube(6, seed=2)
+        clean, position, first = on_cube(n, seed=2)
         second = (first + np.random.default_rng(3).integers(1, 8, size=len(first))) % 8
         owner = CUBE.channel_sensor
         bad = (owner == first[:, None]) | (owner == second[:, None])
@@ -131,9 +134,10 @@ class TestBreakdown:
         assert [set(fix.dropped_sensors) for fix in fixes] == expected
         assert_allclose(error, remaining, rtol=1e-3, atol=1e-6)
 
-    def test_with_missing_readings(self):
+    @pytest.mark.parametrize("n", [10, pytest.param(25, marks=SLOW)])
+    def test_with_missing_readings(self, n):
         """A sensor is silent, another one is wrong."""
-        clean, position, which = on_cube(10, seed=4)
+        clean, position, which = on_cube(n, seed=4)
         owner = CUBE.channel_sensor
         missing = owner == ((which + 3) % 8)[:, None]
         missing[::2, 0] = True
@@ -148,7 +152,7 @@ class TestBreakdown:
 class TestGoodSensors:
     """Nothing happens where no sensor contradicts the others."""
 
-    @pytest.mark.parametrize("n", [3000, pytest.param(30_000, marks=pytest.mark.slow)])
+    @pytest.mark.parametrize("n", [3000, pytest.param(30_000, marks=SLOW)])
     def test_rows_without_a_bad_sensor_are_those_of_the_plain_fit(self, n):
         """Sensors are dropped from at most a thousandth of the rows; a false alarm in a thousand seeds."""
         clean, _, _ = on_cube(n, seed=5)
@@ -160,7 +164,7 @@ class TestGoodSensors:
         assert_array_equal(fixes.position_m[kept], plain.position_m[kept])
         assert_array_equal(fixes.chi2[kept], plain.chi2[kept])
 
-    @pytest.mark.parametrize("n", [40, pytest.param(400, marks=pytest.mark.slow)])
+    @pytest.mark.parametrize("n", [40, pytest.param(400, marks=SLOW)])
     def test_too_small_noise_is_no_bad_sensor(self, n):
         """Everything fits badly if the noise is five times what is stated: one row in thirty loses a sensor."""
         rng = np.random.default_rng(6)
@@ -213,8 +217,8 @@ def scattered_scalars(rng):
 class TestOtherLocators:
     """Whatever fixes the rows, a bad sensor is found."""
 
-    @pytest.mark.parametrize("reading_T", [0.0, pytest.param(6e-5, marks=pytest.mark.slow)])
-    @pytest.mark.parametrize("n", [1, pytest.param(12, marks=pytest.mark.slow)])
+    @pytest.mark.parametrize("reading_T", [0.0, pytest.param(6e-5, marks=SLOW)])
+    @pytest.mark.parametrize("n", [1, pytest.param(12, marks=SLOW)])
     def test_one_of_twelve_scalar_sensors(self, n, reading_T):
         rng = np.random.default_rng(10)
         array = scattered_scalars(rng)
@@ -237,7 +241,7 @@ class TestOtherLocators:
         assert [fix.dropped_sensors for fix in fixes] == [("t5",)]
         assert position_errors(fixes, position).max() <= 1e-2
 
-    @pytest.mark.parametrize("fault", ["dead", pytest.param("spikes of 1000 σ", marks=pytest.mark.slow)])
+    @pytest.mark.parametrize("fault", ["dead", pytest.param("spikes of 1000 σ", marks=SLOW)])
     def test_two_dipoles_and_one_of_sixteen_sensors(self, fault):
         rng = np.random.default_rng(12)
         grid = np.stack(np.meshgrid(*2 * [np.linspace(-1.0, 1.0, 4)]), axis=-1).reshape(-1, 2)
@@ -334,10 +338,8 @@ class TestRecording:
         for fix, same in zip(fixes, plain, strict=True):
             assert_allclose(fix.solutions[0].position_m, same.solutions[0].position_m, rtol=1e-12)
 
-    @pytest.mark.parametrize(
-        "reading_T", [1e-3, *(pytest.param(value, marks=pytest.mark.slow) for value in (0.0, -5e-5))]
-    )
-    @pytest.mark.parametrize("sensor", [7, pytest.param(19, marks=pytest.mark.slow)])
+    @pytest.mark.parametrize("reading_T", [1e-3, *(pytest.param(value, marks=SLOW) for value in (0.0, -5e-5))])
+    @pytest.mark.parametrize("sensor", [7, pytest.param(19, marks=SLOW)])
     def test_one_sensor_that_reads_a_constant(self, recording, sensor, reading_T):
         array, readings, truth = recording
         readings = readings.copy()

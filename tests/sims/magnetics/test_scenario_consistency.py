@@ -275,7 +275,7 @@ class TestUnmatchedPaths:
         assert 0.6 < nees_of_the_last(result, 5) < 1.4
         assert_none_is_far(result)
 
-    @pytest.mark.parametrize("n_runs", [1, pytest.param(60, marks=SLOW)])
+    @pytest.mark.parametrize("n_runs", [1, *(pytest.param(n, marks=SLOW) for n in (2, 60))])
     def test_ship(self, n_runs: int) -> None:
         """The last 30 s, when it has passed: measured 0.9 to 1.1 over 40 runs (seeds 1000 to 1039).
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from arrays.geometries import cube, tetrahedron
 from arrays.sensor import Sensor
 from magloc.levels import DELTA_CHI2_95, FALSE_ALARM
 from magloc.localization.fit.columns import in_stable_order
+from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.fit.results import Fix, Solution, Source
 from magloc.localization.search.multi_source import most_sources
@@ -94,9 +96,10 @@ class TestSixteenVectorSensors:
         assert np.median(every) <= 3.2e-3
         assert np.percentile(every, 95) <= 20e-3
 
-    def test_none_is_worse_than_scipy_from_the_truth(self):
+    @pytest.mark.parametrize("n_rows", [3, pytest.param(6, marks=pytest.mark.slow)])
+    def test_none_is_worse_than_scipy_from_the_truth(self, n_rows):
         rng = np.random.default_rng(102)
-        p, m = sources_below(rng, 3, 2)
+        p, m = sources_below(rng, n_rows, 2)
         readings = noisy_readings(PLATE, p, m, rng)
         for row, fix, *truth in zip(readings, BY_ITSELF.fit_rows(readings), p, m, strict=True):
             best = fix.solutions[0]
@@ -243,19 +246,33 @@ class TestMergedSources:
         assert not source.merged
 
 
-@pytest.fixture(scope="module")
-def pairs():
-    """Fixes of the rows of TestUncertainty."""
-    return plain_locator(PLATE, sources=2).fit_rows(TestUncertainty.readings)
+class Pairs(NamedTuple):
+    """Rows of two sources, and their fixes."""
+
+    p: np.ndarray
+    m: np.ndarray
+    readings: np.ndarray
+    fixes: Fixes
+    n_reported: int
+
+
+def pairs_of(seed, n_rows, sources):
+    rng = np.random.default_rng(seed)
+    p, m = sources_below(rng, n_rows, 2)
+    readings = noisy_readings(PLATE, p, m, rng)
+    counts = []
+    fixes = plain_locator(PLATE, sources=sources).fit_rows(readings, progress=counts.append)
+    return Pairs(p, m, readings, fixes, sum(counts))
+
+
+@pytest.fixture(scope="module", params=[12, pytest.param(25, marks=pytest.mark.slow)])
+def pairs(request):
+    return pairs_of(106, request.param, 2)
 
 
 class TestUncertainty:
-    rng = np.random.default_rng(106)
-    p, m = sources_below(rng, 12, 2)
-    readings = noisy_readings(PLATE, p, m, rng)
-
     def test_blocks_of_the_joint_covariance_are_the_sources(self, pairs):
-        for fix in pairs:
+        for fix in pairs.fixes:
             for solution in fix.solutions:
                 assert solution.covariance.shape == (12, 12)
                 assert_allclose(solution.covariance, solution.covariance.T, rtol=1e-9, atol=0.0)
@@ -266,17 +283,17 @@ class TestUncertainty:
     def test_scatter_of_fixes(self, pairs):
         """NEES of all sources together by the joint covariance, two-sided false-alarm rate 1e-4."""
         nees = 0.0
-        for fix, p, m in zip(pairs, self.p, self.m, strict=True):
+        for fix, p, m in zip(pairs.fixes, pairs.p, pairs.m, strict=True):
             order = scipy.optimize.linear_sum_assignment(np.linalg.norm(found_positions(fix)[:, None] - p, axis=-1))[1]
             truth = np.concatenate([p[order], m[order]], axis=-1).ravel()
             found = np.concatenate([[*s.position_m, *s.moment_Am2] for s in fix.solutions[0].sources])
             nees += (found - truth) @ np.linalg.solve(fix.solutions[0].covariance, found - truth)
-        low, high = chi2_distribution.ppf([0.5e-4, 1 - 0.5e-4], 12 * 12)
+        low, high = chi2_distribution.ppf([0.5e-4, 1 - 0.5e-4], 12 * len(pairs.p))
         assert low < nees < high
 
     def test_range_interval_against_scipy_at_its_ends(self, pairs):
         """With the range of one source held at an end, scipy's best χ² over all the rest has risen by 3.84."""
-        row, best = self.readings[0], pairs[0].solutions[0]
+        row, best = pairs.readings[0], pairs.fixes[0].solutions[0]
         position = np.stack([s.position_m for s in best.sources])
         moment = np.stack([s.moment_Am2 for s in best.sources])
         size = np.linalg.norm(moment)
@@ -301,7 +318,7 @@ class TestUncertainty:
                 assert 2.0 * found.cost - best.chi2 == pytest.approx(DELTA_CHI2_95, abs=0.05)
 
     def test_an_observable_range_is_a_closed_interval(self, pairs):
-        for source in (source for fix in pairs for source in fix.solutions[0].sources):
+        for source in (source for fix in pairs.fixes for source in fix.solutions[0].sources):
             low, high = source.range_interval_m[0]
             distance = np.linalg.norm(source.position_m - PLATE.centroid)
             assert low < distance < (np.inf if high is None else high)
@@ -347,59 +364,53 @@ class TestLabels:
             assert np.diagonal(found.solutions[0].covariance)[::6].tolist() == expected
 
 
-@pytest.fixture(scope="module")
-def together():
-    """Fixes of the rows of TestRows, all at once."""
-    return plain_locator(PLATE, sources="auto").fit_rows(TestRows.readings)
+@pytest.fixture(scope="module", params=[4, pytest.param(8, marks=pytest.mark.slow)])
+def together(request):
+    """Rows, and their fixes all at once."""
+    return pairs_of(109, request.param, "auto")
 
 
 class TestRows:
     """Every row on its own, whatever rows are beside it."""
-
-    rng = np.random.default_rng(109)
-    p, m = sources_below(rng, 4, 2)
-    readings = noisy_readings(PLATE, p, m, rng)
 
     @staticmethod
     def sorted_positions(fix):
         return np.array(sorted(found_positions(fix).tolist()))
 
     def test_alone_or_together(self, together):
-        for i, fix in enumerate(together[:2]):
-            alone = plain_locator(PLATE, sources="auto").fit_rows(self.readings[i : i + 1])[0]
+        for i, fix in enumerate(together.fixes[: len(together.p) // 2]):
+            alone = plain_locator(PLATE, sources="auto").fit_rows(together.readings[i : i + 1])[0]
             assert_allclose(self.sorted_positions(alone), self.sorted_positions(fix), rtol=1e-4)
             assert alone.solutions[0].chi2 == pytest.approx(fix.solutions[0].chi2, rel=1e-6)
 
     def test_in_any_order(self, together):
-        order = np.random.default_rng(0).permutation(4)
-        for fix, i in zip(plain_locator(PLATE, sources="auto").fit_rows(self.readings[order]), order, strict=True):
-            assert_allclose(self.sorted_positions(fix), self.sorted_positions(together[i]), rtol=1e-4)
+        order = np.random.default_rng(0).permutation(len(together.p))
+        for fix, i in zip(BY_ITSELF.fit_rows(together.readings[order]), order, strict=True):
+            assert_allclose(self.sorted_positions(fix), self.sorted_positions(together.fixes[i]), rtol=1e-4)
 
     def test_in_any_number_at_once(self, together, monkeypatch):
         monkeypatch.setattr("magloc.localization.locator._ROWS_OF_SEVERAL", 3)
-        for fix, whole in zip(plain_locator(PLATE, sources="auto").fit_rows(self.readings), together, strict=True):
+        for fix, whole in zip(BY_ITSELF.fit_rows(together.readings), together.fixes, strict=True):
             assert_allclose(self.sorted_positions(fix), self.sorted_positions(whole), rtol=1e-4)
 
-    def test_progress_counts_every_row(self):
-        counts = []
-        BY_ITSELF.fit_rows(self.readings, progress=counts.append)
-        assert sum(counts) == 4
+    def test_progress_counts_every_row(self, together):
+        assert together.n_reported == len(together.p)
 
-    def test_missing_readings(self):
-        readings = self.readings[:4].copy()
+    def test_missing_readings(self, together):
+        readings = together.readings[:4].copy()
         readings[0, [1, 7]] = readings[1, 3:6] = np.nan
         readings[2, 8:] = np.nan
         readings[3] = np.nan
         fixes = BY_ITSELF.fit_rows(readings)
         assert [fix.solutions[0].dof for fix in fixes[:2]] == [31, 30]
-        for fix, truth in zip(fixes[:2], self.p[:2], strict=True):
+        for fix, truth in zip(fixes[:2], together.p[:2], strict=True):
             assert errors_of(fix, truth).max() < 0.1
         assert [fix.solutions for fix in fixes[2:]] == [(), ()]
         assert fixes[2].reason == "8 readings give 5 independent differences, 6 are needed"
         assert fixes[3].reason == "0 readings give 0 independent differences, 6 are needed"
 
-    def test_too_few_readings_for_the_number_asked_for(self):
-        readings = self.readings[:1].copy()
+    def test_too_few_readings_for_the_number_asked_for(self, together):
+        readings = together.readings[:1].copy()
         readings[0, 14:] = np.nan
         fix = plain_locator(PLATE, sources=2).fit_rows(readings)[0]
         assert fix.solutions == ()
