@@ -50,16 +50,16 @@ def with_ambient_field(
         model_T, gradient_T_m = _of_model(place)
     if gradient:
         if gradient_T_m is None:
-            raise InputError("--ambient-gradient: found no --place, expected --place LAT LON ALT_M and --date with it.")
+            raise InputError("Input ambient_gradient: found no place, expected a place and a date with it.")
         if readings.array_rotation is not None:
-            raise InputError("--ambient-gradient: found an array with a pose, expected one that stands east-north-up.")
+            raise InputError("Input ambient_gradient: found an array with a pose, expected one without.")
         rows = [(float(x), float(y), float(z)) for x, y, z in gradient_T_m]
         array = replace(array, ambient_gradient_T_m=tuple(rows))
     scalar = bool(array.channel_is_scalar.any())
     if scalar and readings.ambient_T is None and array.ambient_T is not None and _turns(readings):
         raise InputError(
             "key ambient_nT of the array file: found an array that turns, for which it is not constant; expected"
-            " columns ambient_x_nT and so on in the readings, or --place and --date without that key."
+            " columns ambient_x_nT and so on in the readings, or place and date without that key."
         )
     if scalar and array.common_field_T is not None:
         _LOG.warning(
@@ -69,13 +69,13 @@ def with_ambient_field(
     if readings.ambient_T is not None or array.ambient_T is not None:
         if place is not None and not gradient:
             where = "readings have" if readings.ambient_T is not None else "array file has"
-            _LOG.info(f"--place is not used: the {where} the ambient field")
+            _LOG.info(f"place and date are not used: the {where} the ambient field")
         return array, readings.ambient_T
     if model_T is None:
         if scalar:
             _LOG.warning(
                 "no ambient field is known (ambient_x_nT and so on in the readings, ambient_nT in the array"
-                " file, or --place and --date): moduli are taken as those of the source alone"
+                " file, or place and date): moduli are taken as those of the source alone"
             )
         return array, None
     if scalar:
@@ -99,14 +99,14 @@ def _of_model(place: Place) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     from magloc.fields.geomagnetic import MODELS, field_enu, gradient_enu
 
     if place.model not in MODELS:
-        raise InputError(f"--geomagnetic-model: found {place.model!r}, expected one of {', '.join(MODELS)}.")
+        raise InputError(f"Input geomagnetic_model: found {place.model!r}, expected one of {', '.join(MODELS)}.")
     try:
         date = np.datetime64(place.date)
     except ValueError:
-        raise InputError(f"--date: found {place.date!r}, expected a date such as 2026-11-21.") from None
+        raise InputError(f"Input date: found {place.date!r}, expected a date such as 2026-11-21.") from None
     where = (place.latitude_deg, place.longitude_deg, place.height_m, date, place.model)
     try:
         return field_enu(*where), gradient_enu(*where)
     except ValueError as error:
-        option = "--date" if "date" in str(error) else "--place"
-        raise InputError(f"{option}: {str(error).removeprefix('Input ')}") from None
+        wrong = "date" if "date" in str(error) else "place"
+        raise InputError(f"Input {wrong}: {str(error).removeprefix('Input ')}") from None

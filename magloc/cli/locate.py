@@ -16,7 +16,7 @@ from arrays.io.errors import InputError
 from arrays.io.outputs import refuse_file
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, print_json, progress
-from magloc.cli.options import KnownOptions, print_note
+from magloc.cli.options import KnownOptions, ambient_field, print_note
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -112,7 +112,6 @@ def locate(
     common : CommonOptions
         Common options.
     """
-    from magloc.ambient import with_ambient_field
     from magloc.localization.files import json_of_fixes
     from magloc.localization.fit.table import lines_of_fixes
     from magloc.localization.locator import used_rows
@@ -134,7 +133,7 @@ def locate(
     rows = magloc.read_readings(readings, used, sensors=known.ids, still=wanted.average)
     if position is not None:
         _refuse_farther(position, rows)
-    used, ambient_T = with_ambient_field(used, rows, where, gradient=wanted.ambient_gradient)
+    used, ambient_T = ambient_field(used, rows, where, gradient=wanted.ambient_gradient)
     try:
         pictured, noisy, _ = used_rows(rows, used, average=wanted.average)
         true_position_m = None if truth is None else truth_of_rows(pictured, magloc.read_truth(truth))[0]

@@ -22,8 +22,12 @@ from magloc.ambient import Place
 from magloc.cli import framework
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from arrays.array import SensorArray
     from magloc.localization.fit.prior import SourcePrior
+    from magloc.readings import Readings
 
 
 def print_note(text: str) -> None:
@@ -59,18 +63,37 @@ _BOUNDS = re.compile(rf"(?:(?P<below>{_NUMBER})<(?=[xyz]<))?(?P<axis>[xyz])(?P<s
 
 
 @contextmanager
+def naming_options(*names: str) -> Iterator[None]:
+    """Say of an option what the library says of the argument of that name."""
+    try:
+        yield
+    except InputError as error:
+        said = re.match(r"Input (\w+)", str(error))
+        if said is None or said[1] not in names:
+            raise
+        raise InputError(f"--{said[1].replace('_', '-')}{str(error)[said.end() :]}") from None
+
+
+@contextmanager
 def naming_outputs() -> Iterator[None]:
     """Let errors of a viewer speak of the options --html, --png and --port."""
     from magloc.viewer.chromium import BrowserError
 
     try:
-        yield
+        with naming_options("html", "png", "port"):
+            yield
     except BrowserError as error:
         raise InputError(f"--png: {error}") from None
-    except InputError as error:
-        if str(error).startswith(("Input html", "Input png", "Input port")):
-            raise InputError(f"--{str(error).removeprefix('Input ')}") from None
-        raise
+
+
+def ambient_field(
+    array: SensorArray, rows: Readings, where: Place | None, *, gradient: bool = False
+) -> tuple[SensorArray, NDArray[np.float64] | None]:
+    """The array with its ambient field, and that of every row if it differs; errors speak of the options."""
+    from magloc.ambient import with_ambient_field
+
+    with naming_options("place", "date", "geomagnetic_model", "ambient_gradient"):
+        return with_ambient_field(array, rows, where, gradient=gradient)
 
 
 _DATE = re.compile(r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}(:\d{2}(\.\d+)?)?)?")

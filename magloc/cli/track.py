@@ -18,7 +18,7 @@ from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file, refuse_one_for_two, refuse_unwritable
 from arrays.io.text import write_text
 from magloc.cli.framework import CommonOptions, print_json, progress
-from magloc.cli.options import KnownOptions, print_note, refuse_not_positive
+from magloc.cli.options import KnownOptions, ambient_field, print_note, refuse_not_positive
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -217,9 +217,7 @@ def track(
 
 
 def _in_ambient_field(array: SensorArray, rows: Readings, where: Place | None) -> tuple[SensorArray, Readings]:
-    from magloc.ambient import with_ambient_field
-
-    array, ambient_T = with_ambient_field(array, rows, where, gradient=False)
+    array, ambient_T = ambient_field(array, rows, where)
     return array, replace(rows, ambient_T=ambient_T)
 
 

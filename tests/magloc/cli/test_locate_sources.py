@@ -356,7 +356,7 @@ class TestGeomagneticOptions:
                 ("--place", "48", "11", "0", "--date", "2026-11-21", "--geomagnetic-model", "WMM"),
                 ("--geomagnetic-model", "WMM2025"),
             ),
-            (("--ambient-gradient",), ("--ambient-gradient", "--place")),
+            (("--ambient-gradient",), ("--ambient-gradient", "no place")),
             (("--position", "1", "2"), ("--position",)),
             (("--position", "1", "2", "nan"), ("--position",)),
             (("--position", "0", "0", "0.9185586535436918"), ("--position", "sensor")),
