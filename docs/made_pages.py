@@ -1,0 +1,88 @@
+"""Pages that are made when the site is built: of the command lines, of the notebooks, and what links code to theory."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+HERE = Path(__file__).parent
+NOTEBOOKS = HERE.parent / "notebooks"
+# How a docstring names a page of the theory.
+PAGE = re.compile(r"docs/theory/([\w-]+)\.md")
+# A link of a command's page to a heading that is on another page now.
+LINK = re.compile(r"^(\* )\[(`[\w-]+`)\]\(#[\w-]+\)", re.MULTILINE)
+# What a bar stands in: literal text and formulas keep it, elsewhere it would be a substitution.
+BAR = re.compile(r"(``.*?``|:math:`[^`]*`)|\|")
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Register with Sphinx."""
+    # Before autosummary, which looks at the same event for what it has to make.
+    app.connect("builder-inited", make_all, priority=100)
+    # Before numpydoc, which makes other lines of them.
+    app.connect("autodoc-process-docstring", readable, priority=100)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
+
+
+def make_all(app: Sphinx) -> None:
+    """Write what git does not keep: commands, notebooks, MathJax."""
+    commands = fresh(HERE / "reference" / "commands")
+    for name, text in command_pages():
+        (commands / f"{name.replace(' ', '-')}.md").write_text(text, encoding="utf-8")
+    notebooks = fresh(HERE / "gallery" / "notebooks")
+    for path in sorted(NOTEBOOKS.glob("*.ipynb")):
+        shutil.copy(path, notebooks)
+        (notebooks / f"{path.stem}.png").write_bytes(first_picture(path))
+    app.config.html_static_path.append(str(mathjax(fresh(HERE / "_build" / "mathjax"))))
+
+
+def fresh(folder: Path) -> Path:
+    """An empty folder."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder
+
+
+def first_picture(path: Path) -> bytes:
+    """The first picture of a notebook that is kept with its outputs."""
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    outputs = (output.get("data", {}) for cell in cells for output in cell.get("outputs", []))
+    return base64.b64decode(next(data["image/png"] for data in outputs if "image/png" in data))
+
+
+def command_pages() -> Iterator[tuple[str, str]]:
+    """Name and page of every command, from the help that the command prints."""
+    from adcs.cli.app import app as adcs
+    from magloc.cli.app import app as magloc
+
+    for app in (magloc, adcs):
+        text = app.generate_docs(output_format="markdown", recursive=True)
+        for part in re.split(r"^## (?=(?:magloc|adcs) )", text, flags=re.MULTILINE)[1:]:
+            name, _, rest = part.partition("\n")
+            rest = LINK.sub(r"\1\2", rest)
+            yield name, f"# {name}\n{re.sub(r'^###', '##', rest, flags=re.MULTILINE)}"
+
+
+def mathjax(folder: Path) -> Path:
+    """A folder with MathJax as one file, from the package that carries it."""
+    package = find_spec("sphinx-mathjax-offline")
+    if package is None or package.submodule_search_locations is None:
+        raise ModuleNotFoundError("formulas need MathJax: pip install sphinx-mathjax-offline")
+    [place] = package.submodule_search_locations
+    shutil.copy(Path(place) / "static" / "mathjax" / "tex-svg-full.js", folder / "mathjax.js")
+    return folder
+
+
+def readable(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Make links of the pages of the theory that a docstring names, and a modulus of every pair of bars."""
+    text = "\n".join(BAR.sub(lambda part: part[1] or r"\|", PAGE.sub(r":doc:`/theory/\1`", line)) for line in lines)
+    if what == "module":
+        text = text.replace("References\n----------\n", ".. rubric:: References\n\n")
+    lines[:] = text.split("\n")
