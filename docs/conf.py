@@ -53,7 +53,7 @@ html_show_sourcelink = False
 html_sidebars = {"index": [], "quickstart": [], "glossary": []}
 html_theme_options = {
     "logo": {"text": "magloc"},
-    "header_links_before_dropdown": 8,
+    "header_links_before_dropdown": 6,
     "navbar_end": ["theme-switcher"],
     "footer_start": ["copyright"],
     "footer_end": [],

@@ -7,9 +7,13 @@ import json
 import re
 import shutil
 from collections.abc import Iterator
+from functools import cache
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
+from docutils import nodes
+from sphinx.addnodes import pending_xref
 from sphinx.application import Sphinx
 
 HERE = Path(__file__).parent
@@ -28,6 +32,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("builder-inited", make_all, priority=100)
     # Before numpydoc, which makes other lines of them.
     app.connect("autodoc-process-docstring", readable, priority=100)
+    app.connect("doctree-read", link_names)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
 
@@ -86,3 +91,20 @@ def readable(app: Sphinx, what: str, name: str, obj: object, options: object, li
     if what == "module":
         text = text.replace("References\n----------\n", ".. rubric:: References\n\n")
     lines[:] = text.split("\n")
+
+
+def link_names(app: Sphinx, doctree: nodes.document) -> None:
+    """Make a link to the reference of every public name that stands in a text as code."""
+    for literal in list(doctree.findall(nodes.literal)):
+        if literal.astext() in public_names() and not isinstance(literal.parent, (nodes.reference, pending_xref)):
+            target = {"refdomain": "py", "reftype": "obj", "reftarget": literal.astext(), "refexplicit": False}
+            link = pending_xref("", refdoc=app.env.current_document.docname, refwarn=False, **target)
+            literal.replace_self(link)
+            link += literal
+
+
+@cache
+def public_names() -> frozenset[str]:
+    """All of them, with their package."""
+    packages = [import_module(package) for package in ("arrays", "magloc", "adcs", "sims")]
+    return frozenset(f"{package.__name__}.{name}" for package in packages for name in package.__all__)
