@@ -46,7 +46,7 @@ chromium:
 	fi; \
 	echo "no Chromium: the tests in a browser are skipped (on Debian and Ubuntu: apt-get install chromium)"
 
-# The notebooks executed anew, and the README's pictures of them.
+# The notebooks executed anew, and the gallery's pictures of them.
 notebooks: .venv/installed-test
 	$(BIN)/python -m tests.notebooks
 

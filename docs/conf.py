@@ -27,7 +27,9 @@ extensions = [
 exclude_patterns = ["_build", "templates", "static"]
 templates_path = ["templates"]
 
-myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "amsmath", "smartquotes"]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "amsmath"]
+# Two hyphens begin an option.
+smartquotes = False
 myst_heading_anchors = 3
 # Notebooks are kept with their outputs, and executed by the tests.
 nb_execution_mode = "off"

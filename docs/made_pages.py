@@ -23,7 +23,7 @@ PAGE = re.compile(r"docs/theory/([\w-]+)\.md")
 # A link of a command's page to a heading that is on another page now.
 LINK = re.compile(r"^(\* )\[(`[\w-]+`)\]\(#[\w-]+\)", re.MULTILINE)
 # What a bar stands in: literal text and formulas keep it, elsewhere it would be a substitution.
-BAR = re.compile(r"(``.*?``|:math:`[^`]*`)|\|")
+BAR = re.compile(r"(``.*?``|:math:`[^`]*`)|\\?\|")
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
