@@ -11,6 +11,7 @@ from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from docutils import nodes
 from sphinx.addnodes import pending_xref
@@ -43,8 +44,12 @@ def make_all(app: Sphinx) -> None:
         (commands / f"{name.replace(' ', '-')}.md").write_text(text, encoding="utf-8")
     notebooks = fresh(HERE / "gallery" / "notebooks")
     for path in sorted(NOTEBOOKS.glob("*.ipynb")):
-        shutil.copy(path, notebooks)
-        (notebooks / f"{path.stem}.png").write_bytes(first_picture(path))
+        notebook = json.loads(path.read_text(encoding="utf-8"))
+        drawing = [cell for cell in notebook["cells"] if pictures([cell])]
+        for cell in drawing:
+            cell["metadata"]["tags"] = ["hide-input"]
+        (notebooks / path.name).write_text(json.dumps(notebook), encoding="utf-8")
+        (notebooks / f"{path.stem}.png").write_bytes(pictures(drawing)[0])
     app.config.html_static_path.append(str(mathjax(fresh(HERE / "_build" / "mathjax"))))
 
 
@@ -55,11 +60,10 @@ def fresh(folder: Path) -> Path:
     return folder
 
 
-def first_picture(path: Path) -> bytes:
-    """The first picture of a notebook that is kept with its outputs."""
-    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+def pictures(cells: list[dict[str, Any]]) -> list[bytes]:
+    """Those among the kept outputs of a notebook."""
     outputs = (output.get("data", {}) for cell in cells for output in cell.get("outputs", []))
-    return base64.b64decode(next(data["image/png"] for data in outputs if "image/png" in data))
+    return [base64.b64decode(data["image/png"]) for data in outputs if "image/png" in data]
 
 
 def command_pages() -> Iterator[tuple[str, str]]:
