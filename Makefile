@@ -1,6 +1,6 @@
 # Every target does its whole set-up: a virtual environment of its own in .venv, with the versions of constraints.txt.
 # `make map` installs what a map needs, `make test` the rest; `make test-full` adds the slow Monte-Carlo sizes, the
-# longer notebooks, and examples that are new in every run.
+# longer notebooks, and examples that are new in every run. `make docs` builds the site, without a network.
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 MAKE_VENV = $(PYTHON) -m venv --clear
 
-.PHONY: map test test-full test-oldest bench notebooks chromium lint clean
+.PHONY: map test test-full test-oldest bench docs notebooks chromium lint clean
 
 map: .venv/installed
 	$(BIN)/magloc map
@@ -28,6 +28,11 @@ lint: .venv/installed-test
 bench: .venv/installed-bench
 	$(BIN)/python -m tests.bench
 
+docs: .venv/installed-docs
+	rm -rf docs/_build docs/reference/names
+	$(BIN)/python -m sphinx -b html --fail-on-warning --keep-going --quiet docs docs/_build/html
+	@echo "docs/_build/html/index.html"
+
 # Headless Chromium, for the tests in a browser, which are skipped without it.
 chromium:
 	@for name in chromium chromium-browser google-chrome google-chrome-stable; do \
@@ -41,7 +46,7 @@ chromium:
 	fi; \
 	echo "no Chromium: the tests in a browser are skipped (on Debian and Ubuntu: apt-get install chromium)"
 
-# The notebooks executed anew, and the README's pictures of them.
+# The notebooks executed anew, and the gallery's pictures of them.
 notebooks: .venv/installed-test
 	$(BIN)/python -m tests.notebooks
 
@@ -65,11 +70,15 @@ test-oldest: .venv-oldest/installed chromium
 	$(PIP) install --constraint constraints.txt --editable '.[test,bench]'
 	@touch $@
 
+.venv/installed-docs: .venv/installed
+	$(PIP) install --constraint constraints.txt --editable '.[docs]'
+	@touch $@
+
 .venv-oldest/installed: pyproject.toml constraints-oldest.txt
 	$(MAKE_VENV) .venv-oldest
 	.venv-oldest/bin/python -m pip --disable-pip-version-check --quiet install --constraint constraints-oldest.txt --editable '.[test]'
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-oldest build dist *.egg-info
+	rm -rf .venv .venv-oldest build dist *.egg-info docs/_build docs/gallery/notebooks docs/reference/commands docs/reference/names
 	find . -name __pycache__ -prune -exec rm -rf {} +

@@ -18,7 +18,7 @@ from arrays.typing import FloatArray
 
 
 def tetrahedron(edge_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9) -> SensorArray:
-    """Four sensors on a regular tetrahedron, the shape of the source paper.
+    """Four sensors on a regular tetrahedron, the shape in Pavlov, Karshakov and Goldin.
 
     The base s1, s2, s3 is parallel to the x-y plane and lies edge/√24 below it, with s1 towards +x and s2 at y > 0; the
     apex s4 stands on +z. The circumradius is edge·√(3/8).

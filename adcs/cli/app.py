@@ -27,7 +27,11 @@ for _name, _where, _help in (
         "sims.cli.compare:compare",
         "Run several scenarios, sets of sensors or filters on the same seeds and show them side by side.",
     ),
-    ("tables", "sims.cli.tables:tables", "Tables 3, 4 and 5 of the paper: its value, ours, and the ratio."),
+    (
+        "tables",
+        "sims.cli.tables:tables",
+        "Tables 3, 4 and 5 of Ivanov et al. (Keldysh Institute preprint 64, 2014): their value, ours, and the ratio.",
+    ),
     (
         "estimate",
         "adcs.cli.estimate:estimate",

@@ -93,7 +93,7 @@ class ScenarioOptions(EstimateOptions):
     start_error_deg : float
         Error per axis of what the filter starts from.
     closed_loop_F : bool
-        The Jacobian of the paper, which takes the feedback of the control for dynamics.
+        The Jacobian as printed by Ivanov et al., which takes the feedback of the control for dynamics.
     """
 
     process_noise: Noise | None = None

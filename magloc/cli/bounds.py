@@ -118,8 +118,8 @@ def bounds(
     Parameters
     ----------
     scenario : str
-        Built-in scenario or scenario file (TOML) of magloc map, for its array and source. "paper" is the source
-        paper's.
+        Built-in scenario or scenario file (TOML) of magloc map, for its array and source. "paper" is
+        that of Pavlov, Karshakov and Goldin.
     of : SourceOptions
         Array and source.
     task : TaskOptions

@@ -116,7 +116,7 @@ def _without_rest(source: FloatArray, S: FloatArray, rest_sigma: FloatArray) -> 
 
 @dataclass(frozen=True)
 class RandomWalk:
-    """Position and moment as random walks of the characteristic speed and turn rate: the paper's S_q.
+    """Position and moment as random walks of the characteristic speed and turn rate: S_q of Pavlov et al.
 
     ``S_q = diag(V Δt, V Δt, V Δt, |m| W Δt, …)``: every step is as long as the object may have moved in that time.
 

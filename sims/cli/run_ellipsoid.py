@@ -41,7 +41,7 @@ class EllipsoidOptions:
         Zero shift of the yaw gyro, and its bound [°/s]: 0.02, or 0.0001 of a better one.
     step : str
         How far a set shrinks to a reading: least trace of a strip that is narrowed first ("tightened"), of the strip as
-        it is ("optimal"), or the source paper's step ("lemma").
+        it is ("optimal"), or that of Pankratova and Sholokhov ("lemma").
     jump : bool
         The readings become four times as bad as their bound at 2000 s.
     closed_loop : bool

@@ -1,4 +1,4 @@
-"""``adcs tables``: what the source paper's Tables 3 to 5 say, what we find, and the ratio."""
+"""``adcs tables``: Tables 3 to 5 of Ivanov et al. (Keldysh Institute, 2014), what we find, and the ratio."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ def tables(
     json: Flag = False,
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Tables 3, 4 and 5 of the paper: its value, ours, and the ratio.
+    """Tables 3, 4 and 5 of Ivanov et al. (Keldysh Institute preprint 64, 2014): their value, ours, and the ratio.
 
-    Process noise and noise of the star tracker are the paper's, as far as they can be read. Ours is the standard
+    Process noise and noise of the star tracker are as printed, as far as they can be read. Ours is the standard
     deviation that the filter gives at the end, worst axis, the mean of the runs, and beside it the rms of its errors in
-    the last minute. The attitude is half of the angle, as in the paper.
+    the last minute. The attitude is half of the angle, as there.
 
     Parameters
     ----------

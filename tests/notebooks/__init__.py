@@ -19,7 +19,7 @@ from PIL import Image
 FOLDER = Path(__file__).parents[2] / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 DOCS = FOLDER.parent / "docs"
-# Which picture of a notebook stands in the README, as docs/notebook-NAME.png.
+# Which picture of a notebook stands in the gallery, as docs/notebook-NAME.png.
 SHOWN = {
     "01-first-fix": 2,
     "02-convergence-map": 1,

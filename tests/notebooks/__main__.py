@@ -1,4 +1,4 @@
-"""``python -m tests.notebooks [NAME…]``: execute the notebooks, write them back, and the README's pictures of them."""
+"""``python -m tests.notebooks [NAME…]``: execute the notebooks, write them back, and the gallery's pictures of them."""
 
 from __future__ import annotations
 

@@ -50,9 +50,9 @@ class TestKeptOutputs:
         assert pictures(notebook)
         assert path.stat().st_size < LARGEST_BYTES
 
-    def test_the_picture_of_the_readme_is_one_of_them(self, notebook, path):
+    def test_the_picture_of_the_gallery_is_one_of_them(self, notebook, path):
         if path.stem not in SHOWN:
-            pytest.skip("the README shows none of its pictures")
+            pytest.skip("the gallery takes its first picture")
         assert (DOCS / f"notebook-{path.stem}.png").read_bytes() == pictures(notebook)[SHOWN[path.stem]]
 
     def test_what_is_not_known_is_said(self, notebook, path):

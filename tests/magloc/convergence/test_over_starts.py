@@ -88,7 +88,7 @@ class TestStartFree:
 
 
 class TestOtherRowsOfTheTable:
-    """Those rows that the specification's recipe reproduces within its ±0.08; the README has all of them."""
+    """Those rows that the specification's recipe reproduces within its ±0.08; all: docs/validation/convergence.md."""
 
     @pytest.mark.parametrize(
         ("method", "moment", "front", "near", "back"),

@@ -57,7 +57,7 @@ class TestNoiseThatGrowsWithTheField:
         assert errors.max() <= 1.5e-3
 
     def test_a_prior_of_the_common_field_tells_four_sensors_which_side_the_magnet_is_on(self, magnet_array):
-        """Without it about a tenth of the rows is beyond 5 mm, with it seven of 1,196 (the README has the figures)."""
+        """Without it about a tenth of the rows is beyond 5 mm, with it seven of 1,196: docs/validation/fixes.md."""
         unknown = errors_m(magnet_array, noisy_array(magnet_array, ids=FOUR))
         bounded = errors_m(magnet_array, noisy_array(magnet_array, ids=FOUR, common_field_T=1e-6))
         assert np.mean(unknown > 5e-3) > 0.05

@@ -1,0 +1,114 @@
+"""Pages that are made when the site is built: of the command lines, of the notebooks, and what links code to theory."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+from collections.abc import Iterator
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from docutils import nodes
+from sphinx.addnodes import pending_xref
+from sphinx.application import Sphinx
+
+HERE = Path(__file__).parent
+NOTEBOOKS = HERE.parent / "notebooks"
+# How a docstring names a page of the theory.
+PAGE = re.compile(r"docs/theory/([\w-]+)\.md")
+# A link of a command's page to a heading that is on another page now.
+LINK = re.compile(r"^(\* )\[(`[\w-]+`)\]\(#[\w-]+\)", re.MULTILINE)
+# What a bar stands in: literal text and formulas keep it, elsewhere it would be a substitution.
+BAR = re.compile(r"(``.*?``|:math:`[^`]*`)|\\?\|")
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Register with Sphinx."""
+    # Before autosummary, which looks at the same event for what it has to make.
+    app.connect("builder-inited", make_all, priority=100)
+    # Before numpydoc, which makes other lines of them.
+    app.connect("autodoc-process-docstring", readable, priority=100)
+    app.connect("doctree-read", link_names)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
+
+
+def make_all(app: Sphinx) -> None:
+    """Write what git does not keep: commands, notebooks, MathJax."""
+    commands = fresh(HERE / "reference" / "commands")
+    for name, text in command_pages():
+        (commands / f"{name.replace(' ', '-')}.md").write_text(text, encoding="utf-8")
+    notebooks = fresh(HERE / "gallery" / "notebooks")
+    for path in sorted(NOTEBOOKS.glob("*.ipynb")):
+        notebook = json.loads(path.read_text(encoding="utf-8"))
+        drawing = [cell for cell in notebook["cells"] if pictures([cell])]
+        for cell in drawing:
+            cell["metadata"]["tags"] = ["hide-input"]
+        (notebooks / path.name).write_text(json.dumps(notebook), encoding="utf-8")
+        (notebooks / f"{path.stem}.png").write_bytes(pictures(drawing)[0])
+    app.config.html_static_path.append(str(mathjax(fresh(HERE / "_build" / "mathjax"))))
+
+
+def fresh(folder: Path) -> Path:
+    """An empty folder."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder
+
+
+def pictures(cells: list[dict[str, Any]]) -> list[bytes]:
+    """Those among the kept outputs of a notebook."""
+    outputs = (output.get("data", {}) for cell in cells for output in cell.get("outputs", []))
+    return [base64.b64decode(data["image/png"]) for data in outputs if "image/png" in data]
+
+
+def command_pages() -> Iterator[tuple[str, str]]:
+    """Name and page of every command, from the help that the command prints."""
+    from adcs.cli.app import app as adcs
+    from magloc.cli.app import app as magloc
+
+    for app in (magloc, adcs):
+        text = app.generate_docs(output_format="markdown", recursive=True)
+        for part in re.split(r"^## (?=(?:magloc|adcs) )", text, flags=re.MULTILINE)[1:]:
+            name, _, rest = part.partition("\n")
+            rest = LINK.sub(r"\1\2", rest)
+            yield name, f"# {name}\n{re.sub(r'^###', '##', rest, flags=re.MULTILINE)}"
+
+
+def mathjax(folder: Path) -> Path:
+    """A folder with MathJax as one file, from the package that carries it."""
+    package = find_spec("sphinx-mathjax-offline")
+    if package is None or package.submodule_search_locations is None:
+        raise ModuleNotFoundError("formulas need MathJax: pip install sphinx-mathjax-offline")
+    [place] = package.submodule_search_locations
+    shutil.copy(Path(place) / "static" / "mathjax" / "tex-svg-full.js", folder / "mathjax.js")
+    return folder
+
+
+def readable(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Make links of the pages of the theory that a docstring names, and a modulus of every pair of bars."""
+    text = "\n".join(BAR.sub(lambda part: part[1] or r"\|", PAGE.sub(r":doc:`/theory/\1`", line)) for line in lines)
+    if what == "module":
+        text = text.replace("References\n----------\n", ".. rubric:: References\n\n")
+    lines[:] = text.split("\n")
+
+
+def link_names(app: Sphinx, doctree: nodes.document) -> None:
+    """Make a link to the reference of every public name that stands in a text as code."""
+    for literal in list(doctree.findall(nodes.literal)):
+        if literal.astext() in public_names() and not isinstance(literal.parent, (nodes.reference, pending_xref)):
+            target = {"refdomain": "py", "reftype": "obj", "reftarget": literal.astext(), "refexplicit": False}
+            link = pending_xref("", refdoc=app.env.current_document.docname, refwarn=False, **target)
+            literal.replace_self(link)
+            link += literal
+
+
+@cache
+def public_names() -> frozenset[str]:
+    """All of them, with their package."""
+    packages = [import_module(package) for package in ("arrays", "magloc", "adcs", "sims")]
+    return frozenset(f"{package.__name__}.{name}" for package in packages for name in package.__all__)
