@@ -19,6 +19,7 @@ from arrays.io.errors import InputError
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import write_text
 from magloc.viewer.chromium import BrowserError, Chromium, find_chromium
+from magloc.viewer.origin import guarded_server
 from magloc.viewer.scene.legend import with_legend
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ def opened(port: int, title: str) -> Iterator[viser.ViserServer]:
     """A server on a free port, its title above the panel, that is stopped afterwards, whatever happens."""
     # viser writes its own greetings to stdout.
     with redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host=HOST, port=port, label=title, verbose=False)
+        server = guarded_server(host=HOST, port=port, label=title, verbose=False)
     try:
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
