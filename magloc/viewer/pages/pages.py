@@ -68,7 +68,7 @@ class Page:
 
 
 def array_page(server: viser.ViserServer, array: SensorArray, *, live: bool, file: Path | None = None) -> Page:
-    """An array; live if somebody is there to drag a dipole and the sensors, and to replace the file it was read from."""
+    """An array; live if somebody is there to drag a dipole and the sensors, and to replace its file."""
     glyphs = ArrayGlyphs(server.scene, array)
     ball = extent_of(*(corners_of(place, glyphs.size_m) for place in array.positions))
     entries: list[Entry] = [_sensors_entry(array)]
