@@ -15,7 +15,7 @@ import magloc
 from arrays.io.arguments import Flag, whole_number
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file
-from arrays.io.text import replace_file, write_netcdf
+from arrays.io.text import write_netcdf
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, print_json, progress
 from magloc.cli.options import Grid, print_note, refuse_not_positive
@@ -315,7 +315,7 @@ def _pictures(
     if gif:
         frames = spheres.sel(range=ranges)
         with progress(_FRAMES, "pictures", quiet=quiet) as advance:
-            replace_file(folder / "bounds.gif", lambda path: write_bound_animation(frames, task, path, advance))
+            write_bound_animation(frames, task, folder / "bounds.gif", advance)
     return spheres
 
 
