@@ -275,18 +275,22 @@ def computed_here(cube: CubeMap, wanted: Iterable[Box]) -> Iterator[Chunk]:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Let Ctrl-C wait for the end of the block: compiled code and writing would fail with errors of their own."""
+    """Let signals wait for the end of the block: compiled code and writing would fail with errors of their own."""
     if threading.current_thread() is not threading.main_thread():
         yield  # which no signal interrupts
         return
     signals: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: signals.append(number))
+    before = {
+        number: signal.signal(number, lambda number, _: signals.append(number)) or signal.SIG_DFL
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     if signals:
-        raise KeyboardInterrupt
+        signal.raise_signal(signals[0])
 
 
 def coordinates(cube: CubeMap) -> dict[str, tuple[FloatArray, dict[str, str]]]:
