@@ -136,10 +136,10 @@ class TestWholeFiles:
         calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and node not in whole]
         return [call for call in calls if self.writes(call)]
 
-    def test_no_file_is_written_in_place(self) -> None:
+    def test_no_file_is_written_in_place(self, trees: dict[Path, ast.Module]) -> None:
         found = [
             f"{path.relative_to(REPOSITORY)}:{call.lineno}: {ast.unparse(call)[:80]}"
-            for path, tree in TREES.items()
+            for path, tree in trees.items()
             for call in self.in_place(tree)
         ]
         assert found == []
