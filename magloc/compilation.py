@@ -11,27 +11,80 @@ This module holds the one set of compiler options that all kernels share:
 
 from __future__ import annotations
 
+import atexit
+import logging
+import os
+import shutil
+import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from functools import cache
 from itertools import pairwise
 from typing import Any, TypeVar, cast
 
 import numpy as np
-from numba import get_num_threads, njit
+from numba import config, get_num_threads, njit
+from numba.core import caching
 
 from arrays.typing import FloatArray
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
+_NumbasCache: Any = caching.FunctionCache  # which has no types
+
+
+class _Cache(_NumbasCache):  # type: ignore[misc]
+    """numba's cache of a function, but a damaged file is compiled anew, and one that cannot be written is no error."""
+
+    def load_overload(self, *arguments: Any) -> Any:
+        """What was compiled for these types, if it is there and whole."""
+        try:
+            return super().load_overload(*arguments)
+        except Exception:  # a file that is cut short may mean anything to pickle
+            with suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, *arguments: Any) -> None:
+        """Keep what was compiled, if there is room for it."""
+        try:
+            super().save_overload(*arguments)
+        except OSError as error:
+            _say_not_kept(f"{self.cache_path}: {error.strerror or error}")
+            self.disable()
+
+
+@cache
+def _say_not_kept(reason: str) -> None:
+    """Say once in a process why the next one compiles again."""
+    logging.getLogger(__name__).warning("compiled code cannot be kept for the next run (%s)", reason)
+
+
+def cached(made: Any) -> Any:
+    """Let a compiled function be kept on disk; for this process and its children alone if no place can be written."""
+    if not hasattr(made, "enable_caching"):
+        return made  # compiling is switched off
+    try:
+        made._cache = _Cache(made.py_func)
+    except RuntimeError:  # "no locator available"
+        folder = tempfile.mkdtemp(prefix="magloc-numba-")
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = folder  # type: ignore[attr-defined]
+        _say_not_kept("neither beside the package nor in the user's folder can files be made")
+        made._cache = _Cache(made.py_func)
+    return made
+
+
 def compiled(function: Function) -> Function:
     """Compile a serial kernel. Inside another kernel it is inlined, as a C function would be."""
-    return cast(Function, njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})(function))
+    return cast(Function, cached(njit(nogil=True, error_model="numpy", fastmath={"contract"})(function)))
 
 
 def compiled_parallel(function: Function) -> Function:
     """Compile a kernel whose ``prange`` loops run on numba's threads."""
-    return cast(Function, njit(parallel=True, cache=True, error_model="numpy", fastmath={"contract"})(function))
+    return cast(Function, cached(njit(parallel=True, error_model="numpy", fastmath={"contract"})(function)))
 
 
 def over_rows(kernel: Callable[..., None], n_rows: int, *arguments: Any) -> None:

@@ -92,6 +92,81 @@ def test_names_in_pages_are_there() -> None:
     assert missing == []
 
 
+class TestWholeFiles:
+    """Whatever writes a file does so beside its place first, by the one piece that puts it there at the end."""
+
+    WRITERS = frozenset(
+        [
+            "savefig",
+            "to_netcdf",
+            "to_zarr",
+            "to_csv",
+            "to_json",
+            "write_text",
+            "write_bytes",
+            "savez",
+            "savetxt",
+            "tofile",
+            "imsave",
+            "dump",
+            "open",
+        ]
+    )
+
+    def writes(self, call: ast.Call) -> bool:
+        """Whether it may make or change a file; `open` does by its mode, and `save` of what is no function of ours."""
+        name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
+        if name == "open":
+            modes = [a.value for a in [*call.args, *(k.value for k in call.keywords)] if isinstance(a, ast.Constant)]
+            return any(isinstance(mode, str) and re.fullmatch(r"[rwaxbt+]*[wax+][rwaxbt+]*", mode) for mode in modes)
+        if name == "save":
+            return ast.unparse(call.func) not in ("style.save", "magloc.plots.save", "self.save", "save")
+        return isinstance(call.func, ast.Attribute) and name in self.WRITERS
+
+    def whole(self, tree: ast.AST) -> set[ast.AST]:
+        """What stands within ``with replaced(…)`` or is handed to ``replace_file``."""
+        found: set[ast.AST] = set()
+        for node in ast.walk(tree):
+            made = [item.context_expr for item in node.items] if isinstance(node, ast.With) else [node]
+            names = {call.func.id for call in made if isinstance(call, ast.Call) and isinstance(call.func, ast.Name)}
+            if names & ({"replaced"} if isinstance(node, ast.With) else {"replace_file"}):
+                found |= set(ast.walk(node))
+        return found
+
+    def in_place(self, tree: ast.AST) -> list[ast.Call]:
+        whole = self.whole(tree)
+        calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and node not in whole]
+        return [call for call in calls if self.writes(call)]
+
+    def test_no_file_is_written_in_place(self, trees: dict[Path, ast.Module]) -> None:
+        found = [
+            f"{path.relative_to(REPOSITORY)}:{call.lineno}: {ast.unparse(call)[:80]}"
+            for path, tree in trees.items()
+            for call in self.in_place(tree)
+        ]
+        assert found == []
+
+    def test_such_would_be_found(self) -> None:
+        for code in (
+            "figure.savefig(path)",
+            "image.save(path)",
+            "open(path, 'w')",
+            "path.open(mode='ab')",
+            "path.write_text('')",
+            "dataset.to_netcdf(path)",
+            "with open(path, 'x') as file: pass",
+        ):
+            assert self.in_place(ast.parse(code)), code
+        for code in (
+            "with replaced(path) as written: figure.savefig(written)",
+            "replace_file(path, lambda place: image.save(place))",
+            "write_text('', path)",
+            "open(path)",
+            "style.save(figure, path)",
+        ):
+            assert not self.in_place(ast.parse(code)), code
+
+
 class TestSizes:
     def test_no_function_has_too_many_parameters(self, trees: dict[Path, ast.Module]) -> None:
         found = []

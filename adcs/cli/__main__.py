@@ -1,7 +1,18 @@
-"""``python -m adcs.cli``."""
+"""The program ``adcs``, and ``python -m adcs.cli``: Ctrl-C ends it in order while it still loads, too."""
 
 import sys
 
-from adcs.cli.app import main
 
-sys.exit(main())
+def main() -> int:
+    """Run one command; its exit status."""
+    try:
+        from adcs.cli import app
+
+        return app.main()
+    except KeyboardInterrupt:
+        print("adcs: interrupted", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 import warnings
 import zlib
@@ -86,4 +85,4 @@ def write_frame(frame: ByteArray, path: str | PathLike[str]) -> None:
 
     Shape ``frame`` (height, width). ``path``: replaced if it exists.
     """
-    replace_file(Path(os.path.realpath(path)), lambda unfinished: Image.fromarray(frame).save(unfinished, format="PNG"))
+    replace_file(path, lambda unfinished: Image.fromarray(frame).save(unfinished, format="PNG"))

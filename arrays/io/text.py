@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -34,35 +35,42 @@ def read_text(path: str | PathLike[str], expected: str) -> str:
         ) from None
 
 
-def write_text(text: str, path: str | PathLike[str]) -> None:
-    """Write a UTF-8 file, or the target of a link, in one step: a reader finds the old text or the new one, always."""
+@contextmanager
+def replaced(path: str | PathLike[str]) -> Iterator[Path]:
+    """Where to write a file that replaces another, or the target of a link, in one step: none sees half of it, ever.
+
+    What cannot be replaced, such as a pipe or a terminal, is written in place. An OSError names the path.
+    """
     target = Path(path)
-    in_place = target.exists() and not target.is_file()  # a pipe or a terminal cannot be replaced
+    in_place = target.exists() and not target.is_file()
     if not in_place:
         target = Path(os.path.realpath(path))
     written = target if in_place else target.with_name(f".{target.name}.{os.urandom(4).hex()}.tmp")
     try:
         try:
-            written.write_text(text, encoding="utf-8", newline="\n")
+            yield written
             if not in_place:
                 os.replace(written, target)
         finally:
             if not in_place:
                 written.unlink(missing_ok=True)
     except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from None
+        raise OSError(error.errno, error.strerror or str(error), str(path)) from None
 
 
-def replace_file(path: Path, write: Callable[[Path], object]) -> None:
-    """Have a file written beside its final place first, so that an interruption leaves the old one or the new one."""
-    unfinished = path.with_name(f".{path.name}.tmp")
+def write_text(text: str, path: str | PathLike[str]) -> None:
+    """Write a UTF-8 file, whole or not at all."""
+    with replaced(path) as written:
+        written.write_text(text, encoding="utf-8", newline="\n")
+
+
+def replace_file(path: str | PathLike[str], write: Callable[[Path], object]) -> None:
+    """Have a file written, whole or not at all; InputError if it cannot be."""
     try:
-        write(unfinished)
-        os.replace(unfinished, path)
+        with replaced(path) as written:
+            write(written)
     except (OSError, RuntimeError) as error:  # netCDF's own errors are RuntimeErrors
         raise InputError(f"{path} cannot be written ({getattr(error, 'strerror', None) or error}).") from None
-    finally:
-        unfinished.unlink(missing_ok=True)
 
 
 def check_netcdf() -> None:

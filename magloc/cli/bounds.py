@@ -15,7 +15,7 @@ import magloc
 from arrays.io.arguments import Flag, whole_number
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file
-from arrays.io.text import replace_file, write_netcdf
+from arrays.io.text import write_netcdf
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, print_json, progress
 from magloc.cli.options import Grid, print_note, refuse_not_positive
@@ -127,7 +127,7 @@ def bounds(
     gif : bool
         Write bounds.gif as well: the sphere, from half to twice the range.
     out : Path
-        Folder to write; by default bounds-SCENARIO-GRID, or bounds-ARRAY-GRID.
+        Folder to write; by default bounds-SCENARIO-GRID, or bounds-ARRAY-GRID, and the moment if one is given.
     json : bool
         Print one JSON object: "position_m", "moment_Am2", "range_m"; "rank" of the information, 6 if everything is
         estimable; "sigma_position_m", "sigma_moment_Am2" (three numbers), "sigma_range_m", "sigma_bearing_deg" (null:
@@ -156,7 +156,8 @@ def bounds(
     of_source = magloc.cramer_rao_bounds(array, place, wanted.moment_Am2, **ambient)
     over_moments = bounds_over_moments(array, place[None], wanted.moments_Am2, **ambient)
     name = Path(scenario).stem if of.array is None else of.array.stem
-    folder = Path(f"bounds-{name}-{task.grid}") if out is None else out
+    moment = "" if of.moment_Am2 is None else "-" + "_".join(f"{value:g}" for value in of.moment_Am2)
+    folder = Path(f"bounds-{name}-{task.grid}{moment}") if out is None else out
     refuse_file(folder, "--out")
     detector = _detector(array, task.false_alarm_rate, common.seed)
     counts = _cube(wanted, task.grid, folder, quiet=common.quiet)
@@ -315,7 +316,7 @@ def _pictures(
     if gif:
         frames = spheres.sel(range=ranges)
         with progress(_FRAMES, "pictures", quiet=quiet) as advance:
-            replace_file(folder / "bounds.gif", lambda path: write_bound_animation(frames, task, path, advance))
+            write_bound_animation(frames, task, folder / "bounds.gif", advance)
     return spheres
 
 

@@ -7,9 +7,12 @@ whatever is wrong with the input becomes one line on stderr and exit status 2, a
 from __future__ import annotations
 
 import difflib
+import errno
 import logging
 import os
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -24,6 +27,7 @@ DONE = 0
 BAD_INPUT = 2
 INTERRUPTED = 130
 BROKEN_PIPE = 141
+TERMINATED = 143
 _PACKAGES = ("arrays", "magloc", "adcs", "sims")
 
 
@@ -84,12 +88,22 @@ def run(app: App, arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0 done, 2 bad input, 130 interrupted, 141 the reader of the output is gone.
+        Exit status: 0 done, 2 bad input, 130 interrupted, 141 the reader of the output is gone, 143 terminated.
     """
     program = app.name[0]
     tokens = sys.argv[1:] if arguments is None else list(arguments)
     # Before numpy is loaded: threads of linear algebra only wait for each other over matrices as small as ours.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # None where the shell closed it. In this order the first file that is opened does not become one of the others.
+    for name in ("stdin", "stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))  # noqa: SIM115
+    with _terminations() as terminations:
+        status = _status(app, tokens, program)
+    return TERMINATED if terminations else status
+
+
+def _status(app: App, tokens: Sequence[str], program: str) -> int:
     try:
         with _one_line_warnings(program), _notes_of_the_library(program):
             _run(app, tokens)
@@ -101,13 +115,46 @@ def run(app: App, arguments: Sequence[str] | None = None) -> int:
         print_note(str(interruption) or "interrupted", program)
         return INTERRUPTED
     except BrokenPipeError:
-        # The interpreter flushes stdout once more when it exits, which must not fail again.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _give_up_stdout()
+        return BROKEN_PIPE
+    except SystemExit as error:
+        if not isinstance(error.__context__, BrokenPipeError):  # which rich, that prints the help, turns into this
+            raise
+        _give_up_stdout()
         return BROKEN_PIPE
     except OSError as error:
+        # Whatever writes a file names it.
+        if not error.filename and error.errno in (errno.ENOSPC, errno.EIO, errno.EBADF):
+            error.filename = "standard output"
+            _give_up_stdout()
         print_note(f"{error.filename}: {error.strerror}" if error.filename else str(error), program)
         return BAD_INPUT
     return DONE
+
+
+def _give_up_stdout() -> None:
+    """The interpreter flushes stdout once more when it exits, which must not fail again."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@contextmanager
+def _terminations() -> Iterator[list[int]]:
+    """Let SIGTERM interrupt as Ctrl-C does, once, so that what is half done is taken away; those that came."""
+    came: list[int] = []
+
+    def interrupt(number: int, _: object) -> None:
+        came.append(number)
+        if len(came) == 1:
+            raise KeyboardInterrupt("terminated")
+
+    if threading.current_thread() is not threading.main_thread():
+        yield came  # no signal comes here
+        return
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield came
+    finally:
+        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
 def _run(app: App, tokens: Sequence[str]) -> None:

@@ -70,6 +70,7 @@ def view(
         check_outputs(html, png)
     result = read_result(path, array)
     sensors, rows = _with_track(result, array, readings)
+    file = path if isinstance(result, arrays.SensorArray) else None
     shown: Any = result
     if isinstance(result, ReadingsResult):
         sensors, (shown, rows) = result.array, _fixes(result, quiet=common.quiet)
@@ -81,7 +82,9 @@ def view(
         if used != port and port and not common.quiet:
             print_note(f"port {port} is in use, {used} is taken")
         title = path.name or path.resolve().name
-        scene = magloc.view(sensors, shown, readings=rows, html=html, png=png, open=open, port=used, title=title)
+        scene = magloc.view(
+            sensors, shown, readings=rows, html=html, png=png, open=open, port=used, title=title, file=file
+        )
     if written:
         if not common.quiet:
             print_note(f"wrote {', '.join(written)}")

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled
+from magloc.compilation import cached, compiled
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 LANES = 32
@@ -41,7 +41,7 @@ DIAGONAL = (0, 6, 11, 15, 18, 20)  # rows of an upper triangle
 
 def inlined(function: Function) -> Function:
     """Compile a piece of a loop over the lanes: a call that remained one would keep the loop from being vectorised."""
-    return cast(Function, njit(cache=True, error_model="numpy", fastmath={"contract"}, forceinline=True)(function))
+    return cast(Function, cached(njit(error_model="numpy", fastmath={"contract"}, forceinline=True)(function)))
 
 
 @compiled

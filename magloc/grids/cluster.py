@@ -97,10 +97,19 @@ def _check_answer(scheduler: str, timeout_s: float) -> None:
 
     A client that cannot connect is not asked: it waits for itself when it is deleted, and prints a traceback then.
     """
-    from distributed import rpc
+    from distributed import Security, rpc
+
+    try:
+        by_tls = Security().get_connection_args("client")  # of dask's own configuration
+    except OSError as error:
+        raise SchedulerError(f"scheduler {scheduler}: dask's certificates cannot be read ({error}).") from None
+    if scheduler.startswith("tls:") and by_tls["ssl_context"] is None:
+        raise SchedulerError(
+            f"scheduler {scheduler}: found no certificates in dask's configuration, expected distributed.comm.tls."
+        )
 
     async def answer() -> object:
-        async with rpc(scheduler, timeout=timeout_s) as there:
+        async with rpc(scheduler, timeout=timeout_s, connection_args=by_tls) as there:
             return (await there.identity())["type"]
 
     async def answer_in_time() -> object:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 Values = Mapping[str, NDArray[Any]]
 DIMENSIONS = ("x", "y", "z")
+_UNINTERRUPTED_S = 0.5
 _PART = 64  # points along the edges of the parts that are counted at once
 
 
@@ -258,35 +259,47 @@ def _tiles(grid: int, edge: int) -> Iterator[Box]:
 
 
 def computed(cube: CubeMap, box: Box) -> Chunk:
-    """Values of one box, with their time; compiling is not part of it."""
-    cube.warm_up()
+    """Values of one box, with their time; compiling is not part of it. Ctrl-C waits half a second, not for the box."""
+    with uninterrupted():
+        cube.warm_up()
     began = time.perf_counter()
-    values = cube.values(box)
+    x, y, z = box.region
+    parts: list[Values] = []
+    begin, layers = x.start, 1
+    while begin < x.stop:
+        since, end = time.perf_counter(), min(begin + layers, x.stop)
+        with uninterrupted():
+            parts.append(cube.values(Box(box.place, (slice(begin, end), y, z))))
+        per_layer_s = (time.perf_counter() - since) / (end - begin)
+        layers = max(1, int(_UNINTERRUPTED_S / max(per_layer_s, 1e-6)))
+        begin = end
+    values = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return Chunk(box, values, time.perf_counter() - began)
 
 
 def computed_here(cube: CubeMap, wanted: Iterable[Box]) -> Iterator[Chunk]:
     """Values of some boxes, one after the other, in this process."""
-    for box in wanted:
-        with uninterrupted():
-            chunk = computed(cube, box)
-        yield chunk
+    return (computed(cube, box) for box in wanted)
 
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Let Ctrl-C wait for the end of the block: compiled code and writing would fail with errors of their own."""
+    """Let signals wait for the end of the block: compiled code and writing would fail with errors of their own."""
     if threading.current_thread() is not threading.main_thread():
         yield  # which no signal interrupts
         return
     signals: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: signals.append(number))
+    before = {
+        number: signal.signal(number, lambda number, _: signals.append(number)) or signal.SIG_DFL
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
     if signals:
-        raise KeyboardInterrupt
+        signal.raise_signal(signals[0])
 
 
 def coordinates(cube: CubeMap) -> dict[str, tuple[FloatArray, dict[str, str]]]:

@@ -205,7 +205,11 @@ def _make_store(cube: CubeMap, path: Path) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # not yet in zarr's specification; xarray asks for it, others ignore it
             zarr.consolidate_metadata(unfinished)
-        os.replace(unfinished, path)
+        try:
+            os.replace(unfinished, path)
+        except OSError:
+            if not path.is_dir():  # else another process was faster: whose it is, and whether it writes, is seen next
+                raise
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
 

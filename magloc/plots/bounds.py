@@ -12,6 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, to_rgb
 from matplotlib.figure import Figure
 
+from arrays.io.text import replace_file
 from magloc.bounds.maps import CASES, PLANES, BoundScenario
 from magloc.plots import style
 
@@ -236,8 +237,9 @@ def write_bound_animation(
             progress(1)
     durations = [_FRAME_MS] * (len(frames) - 1) + [_LAST_FRAME_MS]
     # The name may end in anything: the format is not taken from it.
-    frames[0].save(
-        path, format="GIF", save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=False
+    options: dict[str, Any] = {"duration": durations, "loop": 0, "optimize": False}
+    replace_file(
+        path, lambda place: frames[0].save(place, format="GIF", save_all=True, append_images=frames[1:], **options)
     )
 
 

@@ -50,14 +50,14 @@ def new_figure(height_in: float, *, layout: str | None = "constrained") -> Figur
     return Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout=layout)  # type: ignore[arg-type]
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, fine enough for print."""
-    figure.savefig(path, format="png", dpi=DPI, pil_kwargs={"compress_level": 3})
+def save(figure: Figure, path: str | Path, dpi: int = DPI) -> None:
+    """Write a figure as PNG, fine enough for print, whole or not at all."""
+    replace_file(path, lambda place: figure.savefig(place, format="png", dpi=dpi, pil_kwargs={"compress_level": 3}))
 
 
 def write(figure: Figure, path: Path, columns: Mapping[str, Column] | None = None) -> None:
     """Write a figure as PNG, whole or not at all, and the data behind it beside it as CSV."""
-    replace_file(path, lambda place: save(figure, place))
+    save(figure, path)
     if columns is not None:
         write_columns(columns, path.with_suffix(".csv"))
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
-import secrets
 import socket
 import threading
 import time
@@ -17,8 +15,9 @@ import viser
 
 from arrays.io.errors import InputError
 from arrays.io.outputs import refuse_unwritable
-from arrays.io.text import write_text
+from arrays.io.text import replaced, write_text
 from magloc.viewer.chromium import BrowserError, Chromium, find_chromium
+from magloc.viewer.origin import guarded_server
 from magloc.viewer.scene.legend import with_legend
 
 if TYPE_CHECKING:
@@ -66,7 +65,7 @@ def opened(port: int, title: str) -> Iterator[viser.ViserServer]:
     """A server on a free port, its title above the panel, that is stopped afterwards, whatever happens."""
     # viser writes its own greetings to stdout.
     with redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host=HOST, port=port, label=title, verbose=False)
+        server = guarded_server(host=HOST, port=port, label=title, verbose=False)
     try:
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
@@ -113,7 +112,11 @@ def write_picture(server: viser.ViserServer, path: Path) -> None:
         # The scene is sent when the page has reported its camera; before that a blank page is at rest too.
         _wait_for_client(server)
         picture = browser.settled_screenshot(before=_CLOSE_NOTICES)
-    _write_bytes(picture, path)
+    try:
+        with replaced(path) as written:
+            written.write_bytes(picture)
+    except OSError as error:
+        raise InputError(f"Input png {path} cannot be written ({error.strerror}).") from None
 
 
 def _wait_for_client(server: viser.ViserServer) -> None:
@@ -122,15 +125,3 @@ def _wait_for_client(server: viser.ViserServer) -> None:
         if time.monotonic() > deadline:
             raise BrowserError(f"The page did not connect to the server within {_CONNECTION_S:g} s.")
         time.sleep(0.05)
-
-
-def _write_bytes(data: bytes, path: Path) -> None:
-    """Write a file in one step: a reader finds the old one or the new one."""
-    unfinished = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
-    try:
-        unfinished.write_bytes(data)
-        os.replace(unfinished, path)
-    except OSError as error:
-        raise InputError(f"Input png {path} cannot be written ({error.strerror}).") from None
-    finally:
-        unfinished.unlink(missing_ok=True)

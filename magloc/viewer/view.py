@@ -94,6 +94,7 @@ def view(
     open: bool = True,
     port: int = FIRST_PORT,
     title: str = "",
+    file: str | Path | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> View:
     """See an array, and what it reads or finds, in three dimensions.
@@ -118,6 +119,9 @@ def view(
         The next one that is free is taken if it is in use.
     title : str
         Of the browser's tab; by default the array's name.
+    file : path, optional
+        That the array was read from: the page, where sensors are dragged, may replace it. Otherwise it writes new files
+        only, below the working directory.
     progress : callable, optional
         Called with the number of readings located since the last call.
 
@@ -130,7 +134,7 @@ def view(
     """
     check_outputs(html, png)
     static = html is not None or png is not None or _in_notebook()
-    fill = _filling(array, result, readings, progress, live=not static)
+    fill = _filling(array, result, readings, progress, None if file is None else Path(file), live=not static)
     shown = View(title or (array.name if array is not None else "") or "view", fill, 0 if static else port)
     if not static:
         if open:
@@ -156,6 +160,7 @@ def _filling(
     result: Any,
     readings: Readings | None,
     progress: Callable[[int], None] | None,
+    file: Path | None,
     *,
     live: bool,
 ) -> Callable[[viser.ViserServer], Page]:
@@ -182,7 +187,7 @@ def _filling(
     if array is None:
         raise ValueError("Input array must be the one that the result belongs to; instead received None.")
     if result is None:
-        return lambda server: array_page(server, array, live=live)
+        return lambda server: array_page(server, array, live=live, file=file)
     if isinstance(result, Readings):
         readings = thinned(result)
         result = fixes_of(array, readings, progress)

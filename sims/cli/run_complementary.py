@@ -193,6 +193,7 @@ def run_complementary(
 
 def _write_picture(options: ComplementaryOptions, runs: SatelliteRuns, out: Path) -> None:
     from adcs.plots.complementary import ComplementaryPicture, complementary_figure
+    from magloc.plots import style
     from sims.experiments.complementary import errors_deg
 
     names: tuple[Filter, ...] = ("gauss-newton", "explicit", "adaptive")
@@ -205,7 +206,7 @@ def _write_picture(options: ComplementaryOptions, runs: SatelliteRuns, out: Path
         runs.scenario.step_orbits,
         runs.scenario.outage_orbits,
     )
-    complementary_figure(picture).savefig(out / "complementary.png", dpi=130)
+    style.save(complementary_figure(picture), out / "complementary.png", dpi=130)
     columns = [f"{name.replace('-', '_')}_{axis}_deg" for name in names for axis in ("roll", "pitch", "yaw")]
     write_table(
         out / "complementary.csv",

@@ -141,6 +141,7 @@ def run_ellipsoid(
 def _write_picture(options: EllipsoidOptions, runs: EllipsoidRuns, out: Path) -> None:
     from adcs.ellipsoids.roll_yaw import kalman_track, roll_yaw_system
     from adcs.plots.ellipsoids import RollYawPicture, roll_yaw_figure
+    from magloc.plots import style
 
     system = roll_yaw_system(math.radians(options.noise_deg), math.radians(options.drift_deg_s))
     increments = None if runs.increments_rad is None else runs.increments_rad[0]
@@ -155,7 +156,7 @@ def _write_picture(options: EllipsoidOptions, runs: EllipsoidRuns, out: Path) ->
     ]
     jump_s = JUMP_S if options.jump else None
     picture = RollYawPicture("; ".join(parts), time_s, runs.states_rad, runs.track, kalman, options.closed_loop, jump_s)
-    roll_yaw_figure(picture).savefig(out / "ellipsoid.png", dpi=130)
+    style.save(roll_yaw_figure(picture), out / "ellipsoid.png", dpi=130)
     track, H, P = runs.track, runs.track.shapes[0], kalman.covariances
     columns = [
         time_s,

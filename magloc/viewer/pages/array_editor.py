@@ -10,7 +10,7 @@ Use, inside a tab or folder of the GUI::
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -45,6 +45,8 @@ class ArrayEditor:
         Called with the array after every change of it.
     parent : str
         Name of the scene node of the array's frame; empty for the scene itself.
+    file : Path, optional
+        That the array was read from: the only file there is that may be replaced.
 
     Attributes
     ----------
@@ -60,7 +62,9 @@ class ArrayEditor:
         save_as: str = "edited-array.toml",
         on_change: Sequence[Callable[[SensorArray], None]] = (),
         parent: str = "",
+        file: Path | None = None,
     ) -> None:
+        self._own = set() if file is None else {file.resolve()}
         self.array = self._original = array
         self._on_change = on_change
         self._follow = Latest(self._move_to_control)
@@ -82,7 +86,7 @@ class ArrayEditor:
             self.back_button = gui.add_button("Put all sensors back")
             self.move_panel = gui.add_html("")
         with gui.add_folder("Save the array"):
-            self.path_input = gui.add_text("File", save_as, hint="TOML array file, in the folder of the viewer")
+            self.path_input = gui.add_text("File", save_as, hint="TOML array file, below the folder of the viewer")
             self.save_button = gui.add_button("Save")
             self.overwrite_button = gui.add_button("Overwrite the file", visible=False, color="red")
             self.save_panel = gui.add_html("")
@@ -118,26 +122,26 @@ class ArrayEditor:
         self._follow()
 
     def save(self, *, overwrite: bool) -> None:
-        """Write the array to the path that the user typed; an existing file only if told to.
+        """Write the array to the path that the user typed; what this run opened or wrote only if told to.
 
         Parameters
         ----------
         overwrite : bool
             Whether the user has agreed that an existing file is replaced.
         """
-        path = Path(self.path_input.value.strip()).expanduser()
-        fault = fault_of_path(path)
-        if fault:
-            self._say_of_file(fault, ask=False)
-        elif path.exists() and not overwrite:
-            self._say_of_file(f"{path} exists already: nothing was written yet.", ask=True)
-        else:
-            try:
-                write_array(self.array, path)
-            except OSError as error:
-                self._say_of_file(f"{path} cannot be written: {error.strerror or error}.", ask=False)
+        path = Path(self.path_input.value.strip())
+        try:
+            fault = fault_of_path(path, self._own)
+            if fault:
+                self._say_of_file(fault, ask=False)
+            elif path.exists() and not overwrite:
+                self._say_of_file(f"{path} exists already: nothing was written yet.", ask=True)
             else:
-                self._say_of_file(f"saved as {path.resolve()}", ask=False, warning=False)
+                write_array(self.array, path)
+                self._own.add(path.resolve())
+                self._say_of_file(f"saved as {path}", ask=False, warning=False)
+        except (OSError, RuntimeError, ValueError) as error:  # of names that no file can have too
+            self._say_of_file(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}.", ask=False)
 
     def _say_of_file(self, text: str, *, ask: bool, warning: bool = True) -> None:
         self.overwrite_button.visible = ask
@@ -216,12 +220,22 @@ def moved(array: SensorArray, sensor_id: str, position_m: ArrayLike) -> SensorAr
     return replace(array, sensors=sensors)
 
 
-def fault_of_path(path: Path) -> str:
-    """Why an array file cannot be written to a path, as a sentence; empty if nothing speaks against it."""
+def fault_of_path(path: Path, own: Collection[Path] = ()) -> str:
+    """Why an array file must not be written to a path, as a sentence; empty if nothing speaks against it.
+
+    A file below the working directory, where there is none yet, or one of `own`.
+    """
     if path.suffix.lower() != ".toml":
         return f"{path}: expected the name of a file that ends in .toml."
-    if path.is_dir():
+    place = path.resolve()
+    if place in own:
+        return ""
+    if not place.is_relative_to(Path.cwd().resolve()):
+        return f"{path}: expected a file below the folder in which the viewer was started."
+    if place.is_dir():
         return f"{path} is a folder, expected the name of a file."
-    if not path.parent.is_dir():
+    if not place.parent.is_dir():
         return f"{path}: there is no folder {path.parent}."
+    if place.exists():
+        return f"{path} exists already and was not opened here, expected the name of a new file."
     return ""

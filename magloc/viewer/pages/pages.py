@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import viser
@@ -66,8 +67,8 @@ class Page:
     close: Callable[[], None] = lambda: None
 
 
-def array_page(server: viser.ViserServer, array: SensorArray, *, live: bool) -> Page:
-    """An array; live if somebody is there to drag a dipole and the sensors."""
+def array_page(server: viser.ViserServer, array: SensorArray, *, live: bool, file: Path | None = None) -> Page:
+    """An array; live if somebody is there to drag a dipole and the sensors, and to replace its file."""
     glyphs = ArrayGlyphs(server.scene, array)
     ball = extent_of(*(corners_of(place, glyphs.size_m) for place in array.positions))
     entries: list[Entry] = [_sensors_entry(array)]
@@ -81,7 +82,8 @@ def array_page(server: viser.ViserServer, array: SensorArray, *, live: bool) -> 
         with tabs.add_tab("Dipole"):
             dipole = DipoleEditor(server, array)
         with tabs.add_tab("Array"):
-            ArrayEditor(server, array, on_change=[glyphs.set_array, dipole.set_array], parent="/array")
+            follow = [glyphs.set_array, dipole.set_array]
+            ArrayEditor(server, array, on_change=follow, parent="/array", file=file)
         # Its control and most of its field lines too.
         ball = extent_of(ball.points_m, dipole.extent_m, corners_of(dipole.position_m, 0.8 * array.circumradius))
         entries += [

@@ -6,9 +6,12 @@ import os
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
 from arrays.io.errors import InputError
 from arrays.io.outputs import make_folder, refuse_file, refuse_one_for_two, refuse_unwritable
+from arrays.io.text import replaced
+from magloc.plots import style
 
 # Nobody can make a file in it.
 CLOSED = Path("/proc")
@@ -75,3 +78,53 @@ class TestOneForTwo:
 
     def test_several_and_none(self, tmp_path: Path) -> None:
         refuse_one_for_two({"--out": tmp_path / "a", "--png": None, "--json": None, "--csv": tmp_path / "b"})
+
+
+class TestReplaced:
+    """A file is there as it was or as it is to be; nothing of the attempt is left."""
+
+    def test_whole_at_the_end(self, tmp_path: Path) -> None:
+        path = tmp_path / "a.png"
+        path.write_text("old")
+        with replaced(path) as written:
+            written.write_text("ne")
+            assert path.read_text() == "old"
+        assert path.read_text() == "ne"
+        assert [file.name for file in tmp_path.iterdir()] == ["a.png"]
+
+    @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(28, "No space left on device"), ValueError("no")])
+    def test_not_at_all(self, tmp_path: Path, error: BaseException) -> None:
+        path = tmp_path / "a.png"
+        path.write_text("old")
+
+        def attempt() -> None:
+            with replaced(path) as written:
+                written.write_text("half")
+                raise error
+
+        with pytest.raises(type(error)) as raised:
+            attempt()
+        assert getattr(raised.value, "filename", None) in (None, str(path))
+        assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [("a.png", "old")]
+
+    def test_a_full_disk_leaves_the_old_figure(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def full(_: Figure, place: Path, **__: object) -> None:
+            place.write_bytes(b"\x89PNG")
+            raise OSError(28, "No space left on device")
+
+        path = tmp_path / "a.png"
+        style.save(style.new_figure(1.0), path)
+        before = path.read_bytes()
+        monkeypatch.setattr(Figure, "savefig", full)
+        with pytest.raises(InputError, match=r"a\.png cannot be written \(No space left on device\)"):
+            style.save(style.new_figure(1.0), path)
+        assert [file.read_bytes() for file in tmp_path.iterdir()] == [before]
+
+    def test_a_link_keeps_leading_there_and_a_pipe_is_written_to(self, tmp_path: Path) -> None:
+        (tmp_path / "link").symlink_to(tmp_path / "target")
+        for place in (tmp_path / "link", Path(os.devnull)):
+            with replaced(place) as written:
+                written.write_text("new")
+        assert (tmp_path / "link").is_symlink()
+        assert (tmp_path / "target").read_text() == "new"
+        assert not Path(os.devnull).is_file()

@@ -144,9 +144,10 @@ class TestResult:
     def test_default_folder(self, tmp_path, capsys, monkeypatch):
         monkeypatch.chdir(tmp_path)
         (tmp_path / "mine.toml").write_text('geometry = "cube"\nedge_m = 1.0\nkind = "vector"\nnoise_nT = 1.0\n')
-        for options in ([], ["--array", "mine.toml"]):
+        for options in ([], ["--array", "mine.toml"], ["--moment-Am2", "0", "-0.5", "3"]):
             assert main(["bounds", *QUICK, "--quiet", *options]) == 0
-        assert {path.name for path in tmp_path.iterdir()} == {"bounds-paper-3", "bounds-mine-3", "mine.toml"}
+        found = {path.name for path in tmp_path.iterdir()}
+        assert found == {"bounds-paper-3", "bounds-mine-3", "bounds-paper-3-0_-0.5_3", "mine.toml"}
 
 
 class TestArrays:

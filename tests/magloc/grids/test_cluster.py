@@ -5,6 +5,8 @@ from __future__ import annotations
 import gc
 import json
 import os
+import re
+import shutil
 import socket
 import subprocess
 import sys
@@ -26,6 +28,7 @@ from tests.conftest import REPOSITORY
 
 pytest.importorskip("distributed")
 dask = pytest.importorskip("dask")
+ROLES = ("client", "scheduler", "worker")
 CUBE = StartsMap.of(StartsScenario(method=IekfFilter(max_iterations=5)), 70)  # 27 chunks
 
 
@@ -58,6 +61,33 @@ def wait_for_address(path):
         except (OSError, ValueError):
             time.sleep(0.02)
     raise TimeoutError(f"{path} was not written")
+
+
+@pytest.fixture(scope="module")
+def tls(tmp_path_factory):
+    """dask's configuration."""
+    openssl = shutil.which("openssl")
+    if openssl is None:
+        pytest.skip("needs openssl to make a certificate")
+    key, certificate = (str(tmp_path_factory.getbasetemp() / name) for name in ("key.pem", "cert.pem"))
+    command = [openssl, "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
+    command += ["-keyout", key, "-out", certificate, "-days", "1", "-subj", "/CN=magloc"]
+    subprocess.run(command, check=True, capture_output=True)
+    files = {f"{role}.{part}": file for role in ROLES for part, file in (("cert", certificate), ("key", key))}
+    return {"distributed.comm.require-encryption": True} | {
+        f"distributed.comm.tls.{name}": file for name, file in {"ca-file": certificate, **files}.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def tls_scheduler(tls):
+    from distributed import LocalCluster, Security
+
+    with dask.config.set(tls):
+        security = Security()
+    here = {"host": "127.0.0.1", "dashboard_address": None, "processes": False, "n_workers": 1}
+    with LocalCluster(**here, threads_per_worker=1, protocol="tls://", security=security) as cluster:
+        yield cluster.scheduler_address
 
 
 class TestCluster:
@@ -104,6 +134,31 @@ class TestCluster:
         with open_map(path) as stored:
             for name in expected:
                 np.testing.assert_array_equal(stored[name], expected[name])
+
+
+class TestTls:
+    """Scheduler, workers and we show each other certificates, of which each machine has the same here."""
+
+    def test_same_values(self, tls_scheduler, tls):
+        assert tls_scheduler.startswith("tls://127.0.0.1:")
+        cube = StartsMap.of(StartsScenario(method=IekfFilter(max_iterations=5)), 5)
+        with dask.config.set(tls):
+            (chunk,) = computed_by(tls_scheduler, cube, boxes(cube))
+        (expected,) = computed_here(cube, boxes(cube))
+        for name, values in expected.values.items():
+            np.testing.assert_array_equal(chunk.values[name], values)
+
+    def test_nobody_without_a_certificate(self, tls_scheduler):
+        with pytest.raises(InputError, match="found no certificates in dask's configuration"):
+            list(computed_by(tls_scheduler, CUBE, boxes(CUBE)))
+        plain = tls_scheduler.replace("tls:", "tcp:")
+        with pytest.raises(InputError, match=f"scheduler {plain}: found (no scheduler|another service) there"):
+            list(computed_by(plain, CUBE, boxes(CUBE), timeout_s=2.0))
+
+    def test_certificates_that_are_not_there(self, tls_scheduler, tls, tmp_path):
+        wrong = tls | {"distributed.comm.tls.ca-file": str(tmp_path / "none.pem")}
+        with dask.config.set(wrong), pytest.raises(InputError, match="dask's certificates cannot be read"):
+            list(computed_by(tls_scheduler, CUBE, boxes(CUBE)))
 
 
 class TestNoCluster:
@@ -154,3 +209,13 @@ class TestNoCluster:
 
 def marks_of(path):
     return {p: p.stat().st_mtime_ns for p in (path / "seconds_of_chunk" / "c").rglob("*") if p.is_file()}
+
+
+def test_commands_in_pages_listen_to_this_machine_or_ask_for_certificates():
+    pages = [REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md")]
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    commands = re.findall(r"^ {4}dask (?:scheduler|worker) .*$", text, re.MULTILINE)
+    assert len(commands) == 4
+    for command in commands:
+        assert "--host 127.0.0.1 " in command or "--protocol tls " in command, command
+        assert "--dashboard-address 127.0.0.1:" in command, command

@@ -65,8 +65,9 @@ class Waves:
         pass
 
     def values(self, box: Box) -> dict[str, np.ndarray]:
-        with self.log.open("a") as log:
-            log.write(f"{box.place}\n")
+        if box.region[0].start % self.edge == 0:  # a box is computed layer by layer
+            with self.log.open("a") as log:
+                log.write(f"{box.place}\n")
         time.sleep(self.pause_s)
         height = np.sin(box.points(self.axis) @ [3.0, 5.0, 7.0] + self.phase).reshape(box.shape)
         return {"height": height, "sign": np.where(height < 0.0, -1, 1).astype(np.int8)}
@@ -148,6 +149,22 @@ class TestStore:
         halves = (iterations[: n // 2], iterations[n // 2 :])
         tally = sum((Tally.of({"converged": np.ones(len(half), bool)}, half) for half in halves), Tally())
         assert tally.median_iterations() == np.median(iterations)
+
+
+class TestInterruption:
+    def test_waits_for_a_layer_of_a_box_and_not_for_the_box(self, waves, monkeypatch):
+        """However long a layer takes, no second one is begun."""
+        layers = []
+
+        def values(_, box):
+            layers.append(box.shape)
+            signal.raise_signal(signal.SIGINT)
+            return {}
+
+        monkeypatch.setattr(Waves, "values", values)
+        with pytest.raises(KeyboardInterrupt):
+            next(computed_here(waves, boxes(waves)))
+        assert layers == [(1, 16, 16)]
 
 
 class TestResume:
@@ -283,6 +300,16 @@ class TestRefused:
         ):
             Sweep(waves, tmp_path / "map.zarr")
         assert run(waves, tmp_path / "map.zarr").chunks_done == 27
+
+    def test_another_process_made_it_in_the_meantime(self, waves, tmp_path, monkeypatch):
+        """Between the look at the path and the new store in its place."""
+        path = tmp_path / "map.zarr"
+        run(waves, path)
+        exists, first = Path.exists, iter([False])
+        monkeypatch.setattr(Path, "exists", lambda place, **_: next(first, True) and exists(place))
+        with Sweep(waves, path) as sweep:
+            assert sweep.chunks_done == 27
+        assert {place.name for place in tmp_path.iterdir()} == {"log", "map.zarr"}
 
 
 class TestFullDisk:

@@ -447,7 +447,8 @@ class TestArrayEditor:
         set_value(editor.position_input, (0.02, 0.0, 0.0))
         np.testing.assert_allclose(editor.array.positions[0], [0.02, 0.0, 0.0], atol=1e-12)
 
-    def test_saved_array_is_read_back(self, server, tmp_path: Path):
+    def test_saved_array_is_read_back(self, server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+        monkeypatch.chdir(tmp_path)
         array = replace(SMALL, name="edited", ambient_T=(1e-5, 0.0, 4e-5))
         editor = ArrayEditor(server, array, save_as=str(tmp_path / "a.toml"))
         editor.move("s4", [0.001, 0.002, 0.05])
@@ -459,7 +460,7 @@ class TestArrayEditor:
     def test_an_existing_file_is_replaced_after_a_confirmation_only(self, server, tmp_path: Path):
         path = tmp_path / "a.toml"
         write_array(LARGE, path)
-        editor = ArrayEditor(server, SMALL, save_as=str(path))
+        editor = ArrayEditor(server, SMALL, save_as=str(path), file=path)
         set_value(editor.save_button, True)
         assert read_array(path) == LARGE
         assert editor.overwrite_button.visible
@@ -473,7 +474,8 @@ class TestArrayEditor:
         assert read_array(path) == SMALL
         assert not editor.overwrite_button.visible
 
-    def test_paths_that_cannot_be_written_are_one_sentence(self, server, tmp_path: Path):
+    def test_paths_that_cannot_be_written_are_one_sentence(self, server, tmp_path: Path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
         editor = ArrayEditor(server, SMALL)
         for path, words in {
             tmp_path / "a.txt": "ends in .toml",

@@ -1,0 +1,71 @@
+"""Who may speak to a viewer: the page that it serves itself, and nobody else.
+
+Any page that a browser shows can open a websocket to this machine, and a name of its own can be made to point here; the
+browser says of both where they come from. So ``Host`` has to be this machine, by whatever port (a tunnel may lead
+here), and ``Origin`` the same. A websocket has to name its origin: every browser does; programs of this machine, which
+could read and write the user's files themselves, may state it. The page is told to connect to nobody else either, for
+an address with ``?websocket=`` would let another server run scripts in it, and to be framed by this machine's pages
+only.
+"""
+
+from __future__ import annotations
+
+import threading
+from http import HTTPStatus
+from typing import Any
+
+import viser
+import websockets.asyncio.server as websockets_server
+from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+NAMES = ("127.0.0.1", "localhost")
+MOST_BYTES = 2**20  # of a message: a page sends what was typed, dragged or clicked
+_one_at_a_time = threading.Lock()
+
+
+def comes_from_outside(headers: Headers) -> bool:
+    """Whether a request is that of another page than the viewer's own, by its Host and Origin."""
+    hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+    if len(hosts) != 1 or hosts[0].partition(":")[0] not in NAMES:
+        return True
+    may_be_silent = not headers.get_all("Upgrade")  # a page that is opened by its address has no origin
+    return origins != [f"http://{hosts[0]}"] and not (may_be_silent and not origins)
+
+
+def guarded_server(**options: Any) -> viser.ViserServer:
+    """A server of viser that answers its own page only, whatever asks.
+
+    viser has no hook for it: its call of websockets' ``serve``, in a thread of its own, is met while it starts.
+    """
+    plain, met = websockets_server.serve, threading.Event()
+
+    def serve(handler: Any, *arguments: Any, process_request: Any = None, **others: Any) -> Any:
+        if not handler.__module__.startswith("viser."):
+            return plain(handler, *arguments, process_request=process_request, **others)
+
+        def checked(connection: ServerConnection, request: Request) -> Response | None:
+            if comes_from_outside(request.headers):
+                return connection.respond(HTTPStatus.FORBIDDEN, "Only the viewer's own page is answered.\n")
+            reply: Response | None = process_request(connection, request)
+            if reply is not None:
+                reply.headers["Content-Security-Policy"] = (
+                    f"connect-src 'self' ws://{request.headers['Host']} data: blob:; "
+                    f"frame-ancestors 'self' {' '.join(f'http://{name}:*' for name in NAMES)}"
+                )
+            return reply
+
+        met.set()
+        return plain(handler, *arguments, process_request=checked, **{**others, "max_size": MOST_BYTES})
+
+    with _one_at_a_time:
+        websockets_server.serve = serve  # type: ignore[assignment, misc]
+        try:
+            server = viser.ViserServer(**options)
+        finally:
+            websockets_server.serve = plain  # type: ignore[misc]
+    if not met.is_set():
+        server.stop()
+        raise RuntimeError(f"This version of viser ({viser.__version__}) starts its server in a way that is not known.")
+    return server

@@ -1,0 +1,82 @@
+"""Streams that are closed, full or read no longer, and signals: one sentence, a status that tells it, nothing left."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+
+from arrays.array_file import write_array
+from arrays.geometries import tetrahedron
+from tests.magloc.cli.test_view import needs_chromium
+from tests.waiting import WAIT_S, wait_for
+
+CALLS = ("--help", "--version", "bounds --help", "wrong")
+
+
+def in_shell(arguments: str, streams: str) -> subprocess.CompletedProcess[str]:
+    command = f"exec {sys.executable} -m magloc.cli {arguments} {streams}"
+    return subprocess.run(["sh", "-c", command], capture_output=True, text=True, timeout=WAIT_S, check=False)
+
+
+class TestStreams:
+    @pytest.mark.parametrize("streams", [">&-", "2>&-", "<&-", "<&- >&- 2>&-"])
+    @pytest.mark.parametrize("arguments", CALLS)
+    def test_closed(self, arguments: str, streams: str) -> None:
+        done = in_shell(arguments, streams)
+        assert done.returncode == (2 if arguments == "wrong" else 0)
+        assert "Traceback" not in done.stderr
+
+    @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+    @pytest.mark.parametrize("arguments", CALLS[:3])
+    def test_full(self, arguments: str) -> None:
+        done = in_shell(arguments, "> /dev/full")
+        assert (done.returncode, done.stderr) == (2, "magloc: standard output: No space left on device\n")
+
+    @pytest.mark.parametrize("arguments", CALLS[:3])
+    def test_read_no_longer(self, arguments: str) -> None:
+        reader, writer = os.pipe()
+        os.close(reader)
+        with os.fdopen(writer, "wb") as nobody:
+            command = [sys.executable, "-m", "magloc.cli", *arguments.split()]
+            done = subprocess.run(command, stdout=nobody, stderr=subprocess.PIPE, timeout=WAIT_S, check=False)
+        assert (done.returncode, done.stderr) == (141, b"")
+
+
+class TestSignals:
+    @pytest.mark.parametrize("program", ["magloc", "adcs"])
+    def test_interrupted_while_it_loads(self, program: str) -> None:
+        code = f"""
+import sys
+class Hand:
+    def find_spec(self, name, *_):
+        if name == "cyclopts":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Hand())
+from {program}.cli.__main__ import main
+sys.exit(main())
+"""
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
+        assert (done.returncode, done.stderr) == (130, f"{program}: interrupted\n")
+
+    @needs_chromium
+    def test_terminated_with_a_browser(self, tmp_path: Path) -> None:
+        """Browser, its folder and the unfinished picture are gone."""
+        write_array(tetrahedron(1.0), tmp_path / "array.toml")
+        command = [sys.executable, "-m", "magloc.cli", "view", "array.toml", "--png", "out.png"]
+        with TemporaryDirectory(prefix="m") as short:  # Chromium makes a socket in it, whose path must not be long
+            environment = {**os.environ, "TMPDIR": short}
+            with subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True) as process:
+                there = Path(short).glob
+                wait_for(lambda: any(there("magloc-chromium-*/DevToolsActivePort")) or process.poll() is not None)
+                process.send_signal(signal.SIGTERM)
+                _, err = process.communicate(timeout=WAIT_S)
+            assert (process.returncode, err) == (143, "magloc: terminated\n")
+            assert not list(there("magloc-*"))
+        assert [path.name for path in tmp_path.iterdir()] == ["array.toml"]
