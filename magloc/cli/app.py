@@ -45,6 +45,11 @@ for _name, _where, _help in (
         "magloc.cli.design:design",
         "Design an array: place its sensors for the sources that it is to locate.",
     ),
+    (
+        "new-array",
+        "magloc.cli.new_array:new_array",
+        "Write an array file: a shape, a size and a sensor, by options or by answering questions.",
+    ),
     ("simulate", "sims.cli.simulate:simulate", "Simulate the readings of an array."),
     ("view", "magloc.cli.view:view", "See an array, readings, a track or a map in three dimensions."),
 ):
