@@ -11,6 +11,7 @@ This module holds the one set of compiler options that all kernels share:
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -18,10 +19,31 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 from numba import get_num_threads, njit
+from numba.core import event
 
 from arrays.typing import FloatArray
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+_LOG = logging.getLogger(__name__)
+COMPILING = "compiling for this machine, up to a minute; later calls start at once, and warm-up does it ahead"
+
+
+class _Announcement(event.Listener):
+    """Says once a process that something is compiled, which nobody should have to guess from a minute of silence."""
+
+    said = False
+
+    def on_start(self, event: event.Event) -> None:
+        """Say so, the first time."""
+        if not self.said:
+            self.said = True
+            _LOG.info(COMPILING)
+
+    def on_end(self, event: event.Event) -> None:
+        """Say nothing."""
+
+
+event.register("numba:compile", _Announcement())  # type: ignore[no-untyped-call]
 
 
 def compiled(function: Function) -> Function:

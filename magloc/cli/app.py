@@ -47,11 +47,17 @@ for _name, _where, _help in (
     ),
     (
         "new-array",
-        "magloc.cli.new_array:new_array",
+        "magloc.cli.first_steps.new_array:new_array",
         "Write an array file: a shape, a size and a sensor, by options or by answering questions.",
     ),
+    ("demo", "magloc.cli.first_steps.demo:demo", "Simulate, locate and track a source, and draw what comes out."),
     ("simulate", "sims.cli.simulate:simulate", "Simulate the readings of an array."),
     ("view", "magloc.cli.view:view", "See an array, readings, a track or a map in three dimensions."),
+    (
+        "warm-up",
+        "magloc.cli.first_steps.warm_up:warm_up",
+        "Compile ahead what locate, track, map and bounds compile when they are first used.",
+    ),
 ):
     app.command(_where, name=_name, help=_help)
 
