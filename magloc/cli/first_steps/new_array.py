@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from dataclasses import dataclass, replace
 from decimal import Decimal
@@ -17,7 +16,7 @@ from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import write_text
 from magloc.cli.framework import QuietOptions
-from magloc.cli.options import print_note
+from magloc.cli.options import print_note, refuse_not_positive
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -131,12 +130,11 @@ def _array(wanted: ArrayOptions) -> tuple[SensorArray, list[str]]:
     if wanted.shape not in shapes:
         found = "nothing" if wanted.shape is None else repr(wanted.shape)
         raise InputError(f"--shape: found {found}, expected one of {', '.join(shapes)}.")
-    if wanted.size_m is None or not 0.0 < wanted.size_m < math.inf:
-        raise InputError(f"--size-m: found {wanted.size_m or 'nothing'}, expected a positive length in m.")
+    if wanted.size_m is None:
+        raise InputError("--size-m: found nothing, expected a length in m.")
     if (wanted.grid is not None) != (wanted.shape == _GRID):
         raise InputError("--grid: expected it, as NX NY, with --shape grid and with no other shape.")
-    if not 0.0 < wanted.rate_Hz < math.inf:
-        raise InputError(f"--rate-Hz: found {wanted.rate_Hz:g}, expected a positive number.")
+    refuse_not_positive(wanted, "size_m", "noise_nT", "rate_Hz")
     preset = None if wanted.sensor is None else arrays.SENSOR_PRESETS.get(wanted.sensor)
     if preset is None and wanted.sensor is not None:
         raise InputError(f"--sensor: found {wanted.sensor!r}, expected one of {', '.join(arrays.SENSOR_PRESETS)}.")
@@ -146,9 +144,9 @@ def _array(wanted: ArrayOptions) -> tuple[SensorArray, list[str]]:
     noise_nT = wanted.noise_nT
     if noise_nT is None and preset is not None:
         noise_nT = preset.noise_of_reading_nT(wanted.rate_Hz)
-    if noise_nT is None or not 0.0 < noise_nT < math.inf:
-        why = f" ({preset.source})" if preset is not None and wanted.noise_nT is None else ""
-        raise InputError(f"--noise-nT: found {noise_nT or 'nothing'}{why}, expected a positive number.")
+    if noise_nT is None:
+        why = "" if preset is None else f" ({preset.source})"
+        raise InputError(f"--noise-nT: found nothing{why}, expected a positive number.")
     noise_T = _tesla(noise_nT)
     with naming("--grid" if wanted.grid else "--size-m"):
         if wanted.grid is not None:
