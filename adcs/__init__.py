@@ -13,6 +13,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "Telemetry": "adcs.satellite.telemetry",
         "circular_orbit": "adcs.environment.orbit",
         "complementary_filter": "adcs.complementary.filters",
+        "datasets": ":adcs.datasets",
         "estimate": "adcs.kalman.bank",
         "frames": ":adcs.frames",
         "identify_stars": "adcs.stars.identification",

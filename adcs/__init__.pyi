@@ -1,3 +1,4 @@
+from adcs import datasets as datasets
 from adcs import frames as frames
 from adcs import mockup as mockup
 from adcs.complementary.filters import complementary_filter as complementary_filter

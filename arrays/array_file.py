@@ -18,7 +18,8 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
     id = "s1"
     kind = "vector"
     position_m = [0.0, 0.0, 0.918]  # array frame
-    rotation_xyzw = [0, 0, 0, 1]    # optional, sensor axes -> array frame
+    rotation_xyzw = [0, 0, 0, 1]    # optional, sensor axes -> array frame; or, in its place,
+    ypr_deg = [90.0, 0.0, 0.0]      # yaw, pitch, roll: turns about z, then the new y, then the new x
     noise_nT = 1.0
     saturation_nT = 100_000.0       # this and the following optional, as above
     misalignment_mrad = 1.0
@@ -30,6 +31,10 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
     scale = 1.0                     # a number, 3 numbers or a 3×3 matrix
     offset_nT = [0.0, 0.0, 0.0]     # one number for a scalar sensor
 
+    [defaults]                      # optional, what every [[sensor]] has that does not say otherwise
+    kind = "vector"                 # any key of a sensor but id, position and calibration
+    noise_nT = 1.0
+
 Both may have ``noise_fraction``, ``common_field_nT``, ``ambient_nT = [x, y, z]``, the gradient of that field
 ``ambient_gradient_nT_m = [[…], […], […]]`` (symmetric and traceless) and ``format_version = 1``; see
 :class:`arrays.array.SensorArray` for what they mean.
@@ -38,6 +43,7 @@ Both may have ``noise_fraction``, ``common_field_nT``, ``ambient_nT = [x, y, z]`
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable
 from dataclasses import replace
 from decimal import Context, Decimal
@@ -69,6 +75,8 @@ from arrays.typing import Vector
 # Units are converted, nT to T and mrad to rad, by shifting the decimal point of what is written, never by a
 # multiplication: 1.0 nT is the number 1e-9 to the last digit, and every float survives the way to a file and back.
 _SHIFT = Context(prec=1000, traps=[])
+_DEFAULTS, _TURNS = "defaults", ("rotation_xyzw", "ypr_deg")
+_NOT_TURNED = (0.0, 0.0, 0.0, 1.0)
 _Number = int | Decimal
 _NotNegative = Annotated[_Number, NOT_NEGATIVE]
 _NumberVector = tuple[_Number, _Number, _Number]
@@ -113,7 +121,8 @@ class _SensorTable(_Quality, kw_only=True):
     id: str
     kind: str
     position_m: Vector
-    rotation_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    rotation_xyzw: tuple[float, float, float, float] | None = None
+    ypr_deg: Vector | None = None
     calibration: _CalibrationTable = msgspec.field(default_factory=_CalibrationTable)
 
 
@@ -154,8 +163,8 @@ def array_of_table(place: str, table: dict[str, Any]) -> SensorArray:
     if "geometry" in table:
         return _array_of_geometry(place, table)
     if "sensor" in table:
-        return _array_of_sensors(place, table)
-    check_keys(place, table, {*_keys(_GeometryFile), *_keys(_Quality), *_keys(_SensorsFile), *_size_keys()})
+        return _array_of_sensors(place, _with_defaults(place, table))
+    check_keys(place, table, {*_keys(_GeometryFile), *_keys(_Quality), *_keys(_SensorsFile), *_size_keys(), _DEFAULTS})
     raise InputError(f"{place}: found neither the key geometry nor [[sensor]] tables, expected one of them.")
 
 
@@ -192,7 +201,7 @@ def array_toml(array: SensorArray) -> str:
     for sensor in array.sensors:
         lines += ["", "[[sensor]]", f"id = {_quoted(sensor.id)}", f'kind = "{sensor.kind}"']
         lines.append(f"position_m = {list(sensor.position_m)}")
-        if sensor.rotation_xyzw != (0.0, 0.0, 0.0, 1.0):
+        if sensor.rotation_xyzw != _NOT_TURNED:
             lines.append(f"rotation_xyzw = {list(sensor.rotation_xyzw)}")
         for key in _keys(_Quality):
             name, exponent = in_si(key)
@@ -228,6 +237,27 @@ def _array_of_geometry(path: str, table: dict[str, Any]) -> SensorArray:
     return _with_header(path, array, file)
 
 
+def _with_defaults(path: str, table: dict[str, Any]) -> dict[str, Any]:
+    """Table of an array with the values of its table defaults in every sensor."""
+    defaults, sensors = table.get(_DEFAULTS), table["sensor"]
+    if defaults is None or not isinstance(sensors, list):
+        return table
+    if not isinstance(defaults, dict):
+        raise InputError(f"{path}, key {_DEFAULTS}: found a value, expected a table.")
+    check_keys(f"{path}, table {_DEFAULTS}", defaults, {"kind", *_TURNS, *_keys(_Quality)})
+    others = {key: value for key, value in table.items() if key != _DEFAULTS}
+    return {
+        **others,
+        "sensor": [_merged(defaults, sensor) if isinstance(sensor, dict) else sensor for sensor in sensors],
+    }
+
+
+def _merged(defaults: dict[str, Any], sensor: dict[str, Any]) -> dict[str, Any]:
+    """A sensor's own keys, and the defaults of those that it does not have; its own turn replaces either kind."""
+    turned = not sensor.keys().isdisjoint(_TURNS)
+    return {key: value for key, value in defaults.items() if not (turned and key in _TURNS)} | sensor
+
+
 def _array_of_sensors(path: str, table: dict[str, Any]) -> SensorArray:
     misplaced = next((key for key in ("kind", *_keys(_Quality)) if key in table), None)
     if misplaced is not None:
@@ -249,7 +279,7 @@ def _sensor(place: str, table: _SensorTable) -> Sensor:
             id=table.id,
             kind=table.kind,  # type: ignore[arg-type]  # checked there
             position_m=table.position_m,
-            rotation_xyzw=table.rotation_xyzw,
+            rotation_xyzw=_rotation(place, table),
             **quality,
         )
     offset_nT: list[_Number] = [0] * sensor.n_channels
@@ -264,6 +294,23 @@ def _sensor(place: str, table: _SensorTable) -> Sensor:
     with naming(place):
         calibration = Calibration.of(sensor.kind, table.calibration.scale, [_tesla(key, x) for x in offset_nT])
     return replace(sensor, calibration=calibration)
+
+
+def _rotation(place: str, table: _SensorTable) -> tuple[float, float, float, float]:
+    """Quaternion of a sensor's axes in the array's frame."""
+    if table.ypr_deg is None:
+        return table.rotation_xyzw or _NOT_TURNED
+    if table.rotation_xyzw is not None:
+        raise InputError(f"{place}, key ypr_deg: found it together with rotation_xyzw, expected one of them.")
+    if not all(map(math.isfinite, table.ypr_deg)):
+        raise InputError(f"{place}, key ypr_deg: found an infinite number, expected finite numbers.")
+    (cz, sz), (cy, sy), (cx, sx) = ((math.cos(a), math.sin(a)) for a in (math.radians(x) / 2 for x in table.ypr_deg))
+    return (
+        sx * cy * cz - cx * sy * sz,
+        cx * sy * cz + sx * cy * sz,
+        cx * cy * sz - sx * sy * cz,
+        cx * cy * cz + sx * sy * sz,
+    )
 
 
 def _with_header(path: str, array: SensorArray, header: _Header) -> SensorArray:

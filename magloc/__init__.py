@@ -30,6 +30,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "calibrate": "magloc.calibration.calibrate",
         "convergence_map": "magloc.convergence.over_starts",
         "cramer_rao_bounds": "magloc.bounds.crlb",
+        "datasets": ":magloc.datasets",
         "design_array": "magloc.design.optimise",
         "detection_range": "magloc.detection.detection_range",
         "dipole": ":magloc.fields.dipole",

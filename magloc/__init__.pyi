@@ -1,3 +1,4 @@
+from magloc import datasets as datasets
 from magloc import plots as plots
 from magloc.bounds.crlb import Bounds as Bounds
 from magloc.bounds.crlb import cramer_rao_bounds as cramer_rao_bounds

@@ -25,11 +25,31 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 from numba import config, get_num_threads, njit
-from numba.core import caching
+from numba.core import caching, event
 
 from arrays.typing import FloatArray
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+_LOG = logging.getLogger(__name__)
+COMPILING = "compiling for this machine, up to a minute; later calls start at once, and warm-up does it ahead"
+
+
+class _Announcement(event.Listener):
+    """Says once a process that something is compiled, which nobody should have to guess from a minute of silence."""
+
+    said = False
+
+    def on_start(self, event: event.Event) -> None:
+        """Say so, the first time."""
+        if not self.said:
+            self.said = True
+            _LOG.info(COMPILING)
+
+    def on_end(self, event: event.Event) -> None:
+        """Say nothing."""
+
+
+event.register("numba:compile", _Announcement())  # type: ignore[no-untyped-call]
 
 
 _NumbasCache: Any = caching.FunctionCache  # which has no types
@@ -59,7 +79,7 @@ class _Cache(_NumbasCache):  # type: ignore[misc]
 @cache
 def _say_not_kept(reason: str) -> None:
     """Say once in a process why the next one compiles again."""
-    logging.getLogger(__name__).warning("compiled code cannot be kept for the next run (%s)", reason)
+    _LOG.warning("compiled code cannot be kept for the next run (%s)", reason)
 
 
 def cached(made: Any) -> Any:

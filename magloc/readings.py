@@ -329,11 +329,18 @@ def _check_sensor_columns(table: Table, array: SensorArray, channels: Sequence[s
     for sensor in array.sensors:
         for name in _columns_of_other_kind(sensor):
             if name in table.header and name not in known:
-                own = ", ".join(f"{channel}_nT" for channel in sensor.channel_names)
+                own = ", ".join(_columns_of(sensor))
                 raise InputError(
                     f"{table.header_place(name)}: found a column of another kind of sensor, expected {own} "
                     f"because sensor {sensor.id} of {called} is a {sensor.kind} sensor."
                 )
+    missing = {sensor.id for sensor in array.sensors if not set(_columns_of(sensor)) & set(table.header)}
+    if missing and len(missing) < array.n_sensors and not set(table.header) - set(known):
+        raise InputError(
+            f"{table.header_place(next(c for s in array.sensors if s.id in missing for c in _columns_of(s)))}: found no"
+            f" column of sensor {_listed(sorted(missing))}, expected those of all sensors of {called}, or those of a"
+            f" subset of it: {_listed([name for name in array.ids if name not in missing])}."
+        )
     for name in channels:
         table.require(name, known)
     for name in table.header:
@@ -349,6 +356,10 @@ def _check_sensor_columns(table: Table, array: SensorArray, channels: Sequence[s
             f"{table.header_place(name)}: found an unknown column, expected time_s, "
             "<sensor>_x_nT and so on, and optionally array_x_m and so on (pose) or ambient_x_nT and so on."
         )
+
+
+def _columns_of(sensor: Sensor) -> list[str]:
+    return [f"{channel}_nT" for channel in sensor.channel_names]
 
 
 def _columns_of_other_kind(sensor: Sensor) -> list[str]:

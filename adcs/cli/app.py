@@ -37,11 +37,13 @@ for _name, _where, _help in (
         "adcs.cli.estimate:estimate",
         "Estimate attitude and rate from telemetry, with the filters of `adcs run`.",
     ),
+    ("demo", "adcs.cli.demo:demo", "Estimate the attitude of a simulated satellite, and draw what comes out."),
     (
         "stars",
         "adcs.cli.stars:stars",
         "Identify the stars of images by a catalogue, without knowing where the camera looked.",
     ),
+    ("warm-up", "adcs.cli.warm_up:warm_up", "Compile ahead what run and estimate compile when they are first used."),
 ):
     app.command(_where, name=_name, help=_help)
 

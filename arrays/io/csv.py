@@ -68,7 +68,8 @@ class Table:
             return
         nearest = difflib.get_close_matches(column, [name for name in self.header if name not in known], n=1)
         hint = f" (the nearest is {nearest[0]})" if nearest else ""
-        raise InputError(f"{self.header_place(column)}: found no such column{hint}, expected {column}.")
+        there = ", ".join(self.header if len(self.header) < 9 else [*self.header[:6], "…", self.header[-1]])
+        raise InputError(f"{self.header_place(column)}: found no such column{hint}, expected it beside {there}.")
 
     def has_group(self, columns: Sequence[str]) -> bool:
         """Whether the file has these columns; some of them without the others are an InputError."""

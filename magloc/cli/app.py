@@ -45,8 +45,19 @@ for _name, _where, _help in (
         "magloc.cli.design:design",
         "Design an array: place its sensors for the sources that it is to locate.",
     ),
+    (
+        "new-array",
+        "magloc.cli.first_steps.new_array:new_array",
+        "Write an array file: a shape, a size and a sensor, by options or by answering questions.",
+    ),
+    ("demo", "magloc.cli.first_steps.demo:demo", "Simulate, locate and track a source, and draw what comes out."),
     ("simulate", "sims.cli.simulate:simulate", "Simulate the readings of an array."),
     ("view", "magloc.cli.view:view", "See an array, readings, a track or a map in three dimensions."),
+    (
+        "warm-up",
+        "magloc.cli.first_steps.warm_up:warm_up",
+        "Compile ahead what locate, track, map and bounds compile when they are first used.",
+    ),
 ):
     app.command(_where, name=_name, help=_help)
 

@@ -6,10 +6,13 @@ whatever is wrong with the input becomes one line on stderr and exit status 2, a
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import errno
+import io
 import logging
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -28,6 +31,7 @@ BAD_INPUT = 2
 INTERRUPTED = 130
 BROKEN_PIPE = 141
 TERMINATED = 143
+_COMPILATION = "magloc.compilation"
 _PACKAGES = ("arrays", "magloc", "adcs", "sims")
 
 
@@ -106,7 +110,7 @@ def run(app: App, arguments: Sequence[str] | None = None) -> int:
 def _status(app: App, tokens: Sequence[str], program: str) -> int:
     try:
         with _one_line_warnings(program), _notes_of_the_library(program):
-            _run(app, tokens)
+            call(app, tokens)
             sys.stdout.flush()
     except (InputError, CycloptsError) as error:
         print_note(str(error), program)
@@ -157,7 +161,8 @@ def _terminations() -> Iterator[list[int]]:
         signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
-def _run(app: App, tokens: Sequence[str]) -> None:
+def call(app: App, tokens: Sequence[str]) -> None:
+    """Run one command; what is wrong is raised."""
     try:
         _show_whole_help(app, tokens)
         command, bound, _ = app.parse_args(tokens, print_error=False, exit_on_error=False)
@@ -203,7 +208,9 @@ class _Notes(logging.Handler):
         self.program = program
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print one record."""
+        """Print one record; progress only where somebody watches."""
+        if record.name == _COMPILATION and not sys.stderr.isatty():
+            return
         prefix = "warning: " if record.levelno >= logging.WARNING else ""
         print_note(prefix + record.getMessage(), self.program)
 
@@ -224,6 +231,31 @@ def _notes_of_the_library(program: str) -> Iterator[None]:
             logger.removeHandler(handler)
             logger.setLevel(logging.NOTSET)
             logger.propagate = True
+
+
+def demonstrate(app: App, calls: Sequence[Sequence[str]], first: int = 4, last: int = 6) -> None:
+    """Run commands one after the other as a user would, each shown as it is typed, with some lines that it prints."""
+    for tokens in calls:
+        print(f"\n$ {' '.join([app.name[0], *map(shlex.quote, tokens)])}", flush=True)
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            call(app, tokens)
+        lines = printed.getvalue().splitlines()
+        if len(lines) > first + last:
+            lines[first:-last] = [f"… {len(lines) - first - last} more lines …"]
+        print("".join(f"{line}\n" for line in lines), end="", flush=True)
+
+
+def warm_up(app: App, calls: Sequence[Sequence[str]], common: QuietOptions) -> None:
+    """Run commands for what they compile, not for what they print."""
+    if not common.quiet:
+        print_note("compiling for this machine, some minutes if nothing is compiled yet", app.name[0])
+    with progress(len(calls), "commands", quiet=common.quiet) as advance:
+        for tokens in calls:
+            with contextlib.redirect_stdout(io.StringIO()):
+                call(app, [*tokens, "--quiet"])
+            advance(1)
+    if not common.quiet:
+        print_note("compiled: no command has to wait for that again", app.name[0])
 
 
 def print_json(value: object) -> None:

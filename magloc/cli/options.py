@@ -123,7 +123,7 @@ class KnownOptions:
     """
 
     sensors: str | None = None
-    region: str | None = None
+    region: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None
     max_moment_Am2: Annotated[float | None, Parameter(name="--max-moment-Am2")] = None
     place: Vector | None = None
     date: str | None = None

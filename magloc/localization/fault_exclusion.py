@@ -18,10 +18,12 @@ from scipy.special import chdtri, fdtri
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.chi_square import energy_threshold
 from magloc.levels import CREDIBLE_ROW, SENSOR_FALSE_ALARM
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.gauss_newton import refine
 from magloc.localization.fit.results import Fix
+from magloc.localization.search.multi_source import NOISE_ALONE
 from magloc.measurement.rows import (
     NO_SIGNAL,
     rows_of_equal_mask,
@@ -143,7 +145,9 @@ class _Examination:
         self.array, self.readings, self.ambient = array, readings, ambient
         self.refit, self.of_all = refit, rows
         self.free_position = free_position
-        self.problem, self.raw = whitened_model(array, mask, readings, whitenings_of(array, mask, readings), ambient)
+        of_rows = whitenings_of(array, mask, readings)
+        self.n_differences = of_rows[0].n_differences
+        self.problem, self.raw = whitened_model(array, mask, readings, of_rows, ambient)
         self.count = np.bincount(array.channel_sensor[mask], minlength=array.n_sensors)
         level = 1.0 - SENSOR_FALSE_ALARM / array.n_sensors
         self.limits = np.array(chdtri(np.maximum(self.count, 1), 1.0 - level), dtype=np.float64)
@@ -209,7 +213,14 @@ class _Examination:
             spoilt[of_count] = np.any(
                 misfit > unseen[of_count, None] * self.limits * self._scale2(misfit)[:, None], axis=1
             )
-        return np.flatnonzero(spoilt & ~credible)
+        return np.flatnonzero(spoilt & ~credible & ~self._as_noise(plain))
+
+    def _as_noise(self, plain: Sequence[Fix]) -> BoolArray:
+        """Rows without a source whose energy is one of noise: there is nothing that a bad sensor would explain."""
+        without = self.problem.whitened(self.raw) - self.problem.predicted(np.zeros_like(self.problem.ambient))
+        energy = np.einsum("bc,bc->b", without, without)
+        alone = np.array([fix.reason == NOISE_ALONE for fix in plain], dtype=bool)
+        return alone & (energy <= energy_threshold(self.n_differences))
 
     def _by_count(self, fixes: Sequence[tuple[int, Fix]]) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
         """Rows, and best solutions (f, K, …), of fixes of equally many sources."""

@@ -232,6 +232,8 @@ def fit_at_rest(
     if rows.n_differences < N_UNKNOWNS:
         reason = f"{len(readings_T)} rows give {rows.n_differences} independent differences, {N_UNKNOWNS} are needed"
         found.refuse(rows.index, reason)
+    elif not is_detected(rows.energy, rows.n_differences).all():
+        found.refuse(rows.index, NOISE_ALONE)
     else:
         found.fill(rows, lambda loud: [optima_at_rest(loud, prior)])
     return found.fixes()[0]

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
-from arrays.array_file import array_toml, read_array, write_array
+from arrays.array_file import array_of_table, array_toml, read_array, write_array
 from arrays.geometries import GEOMETRIES, tetrahedron
 from arrays.io.errors import InputError
 from arrays.sensor import Calibration, Sensor
@@ -512,3 +513,61 @@ class TestRefused:
     )
     def test_second_sensor(self, write: WriteFile, kind: str, line: str, parts: tuple[str, ...]) -> None:
         assert_refused(write(changed(SENSORS, '"scalar"', f'"{kind}"') + line), "sensor s2", *parts)
+
+
+class TestDefaults:
+    BOARD = """
+[defaults]
+kind = "vector"
+noise_nT = 15
+ypr_deg = [90, 0, 0]
+[[sensor]]
+id = "s1"
+position_m = [0, 0, 0]
+[[sensor]]
+id = "s2"
+kind = "scalar"
+position_m = [1, 0, 0]
+noise_nT = 0.1
+[[sensor]]
+id = "s3"
+position_m = [0, 1, 0]
+rotation_xyzw = [1, 0, 0, 0]
+"""
+
+    def test_hold_where_a_sensor_says_nothing(self, write: WriteFile) -> None:
+        array = read_array(write(self.BOARD))
+        assert [sensor.kind for sensor in array.sensors] == ["vector", "scalar", "vector"]
+        assert [sensor.noise_T for sensor in array.sensors] == [15e-9, 1e-10, 15e-9]
+        np.testing.assert_allclose(array.sensors[0].rotation_xyzw, [0, 0, np.sqrt(0.5), np.sqrt(0.5)], rtol=1e-15)
+        assert array.sensors[2].rotation_xyzw == (1.0, 0.0, 0.0, 0.0)
+
+    def test_survive_writing(self, write: WriteFile, tmp_path: Path) -> None:
+        array = read_array(write(self.BOARD))
+        write_array(array, tmp_path / "again.toml")
+        assert read_array(tmp_path / "again.toml") == array
+
+    @pytest.mark.parametrize(
+        ("old", "new", "fragments"),
+        [
+            ("noise_nT = 15", "noise_T = 15", ("table defaults", "key noise_T", "nearest is noise_nT")),
+            ("noise_nT = 15", 'id = "s1"', ("table defaults", "key id", "unknown")),
+            ("[defaults]", "defaults = 1\n[other]", ("key defaults", "expected a table")),
+            ("noise_nT = 15", 'noise_nT = "15"', ("sensor s1", "key noise_nT")),
+            ("rotation_xyzw = [1, 0, 0, 0]", "rotation_xyzw = [1, 0, 0, 0]\nypr_deg = [0, 0, 0]", ("one of them",)),
+            ("ypr_deg = [90, 0, 0]", "ypr_deg = [inf, 0, 0]", ("sensor s1", "ypr_deg", "finite")),
+            ("ypr_deg = [90, 0, 0]", "ypr_deg = [90, 0]", ("sensor s1", "ypr_deg")),
+        ],
+    )
+    def test_refused(self, old: str, new: str, fragments: tuple[str, ...], write: WriteFile) -> None:
+        with pytest.raises(InputError) as error:
+            read_array(write(self.BOARD.replace(old, new)))
+        assert all(fragment in str(error.value) for fragment in fragments)
+
+
+@given(st.tuples(*[st.floats(-360.0, 360.0)] * 3))
+def test_yaw_pitch_and_roll_are_those_of_scipy(ypr_deg: tuple[float, float, float]) -> None:
+    sensor = {"id": "s1", "kind": "vector", "position_m": [0, 0, 0], "noise_nT": 1, "ypr_deg": list(ypr_deg)}
+    array = array_of_table("test", {"sensor": [sensor, {**sensor, "id": "s2", "position_m": [1, 0, 0]}]})
+    found = Rotation.from_quat(array.sensors[0].rotation_xyzw)
+    assert (found * Rotation.from_euler("ZYX", ypr_deg, degrees=True).inv()).magnitude() < 1e-12

@@ -179,7 +179,11 @@ BAD_FILES = {
     "no time column": (f"t{HEADER[4:]}\n{ROW}\n", ["line 1", "column time_s", "t_s"]),
     "missing sensor column": (
         f"{HEADER.replace('s2_y_nT', 's2_y_T')}\n{ROW}\n",
-        ["column s2_y_nT", "nearest is s2_y_T"],
+        ["column s2_y_nT", "nearest is s2_y_T", "beside time_s, s1_x_nT"],
+    ),
+    "missing sensor": (
+        "time_s,s1_x_nT,s1_y_nT,s1_z_nT,s3_nT\n0,1,2,3,4\n",
+        ["column s2_x_nT", "no column of sensor s2", "'mixed'", "subset of it: s1, s3"],
     ),
     "vector columns of a scalar sensor": (
         f"{HEADER[:-5]}s3_x_nT,s3_y_nT,s3_z_nT\n{ROW},8,9\n",

@@ -19,6 +19,7 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.chi_square import energy_threshold
 from magloc.levels import CREDIBLE_FIT, FALSE_ALARM, SUSPICIOUS_FIT
 from magloc.localization.fit.gauss_newton import JointFits, covariances, refine
 from magloc.localization.fit.optima import Optima
@@ -126,7 +127,8 @@ class _Levels:
         beams: list[JointFits] = [self._first(everything)]
         level = np.zeros(len(self.y), dtype=np.intp)
         threshold = self.locator.threshold_of(self, beams[0]) if self.most > 1 else math.inf
-        rows = everything
+        weak = self._weak(beams[0], threshold)
+        rows = everything[~weak]
         while len(beams) < self.most:
             if self.asked is None:
                 rows = rows[self._worth_another(rows, beams[-1].rows(rows), threshold)]
@@ -167,7 +169,7 @@ class _Levels:
         if self.asked is None and self.most > 1:
             # Against the chosen number: a single source may have no fit where several ones stand out.
             chosen = np.array([beams[n].chi2[row, 0] for row, n in enumerate(level)])
-            alone = np.isfinite(chosen) & (self.rows.energy - chosen <= threshold)
+            alone = weak | (np.isfinite(chosen) & (self.rows.energy - chosen <= threshold))
         return [
             self._listed(
                 n,
@@ -189,6 +191,13 @@ class _Levels:
             again = wide.first(self.problem.rows(doubtful), self.y[doubtful])
             beam = beam.replaced(doubtful, merged(beam.rows(doubtful), again))
         return beam
+
+    def _weak(self, beam: JointFits, threshold: float) -> BoolArray:
+        """Rows decided without a search for more: neither their energy nor the best source stands out of noise."""
+        if self.asked is not None or self.most == 1:
+            return np.zeros(len(self.y), dtype=bool)
+        energy = self.rows.energy
+        return (energy <= energy_threshold(self.n_differences)) & ~(energy - beam.chi2[:, 0] > threshold)
 
     def _worth_another(self, rows: IntArray, beam: JointFits, threshold: float) -> BoolArray:
         """Whether another source might pay: a suspicious χ², or a candidate that explains much of what is left."""

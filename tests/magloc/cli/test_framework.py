@@ -14,7 +14,19 @@ from arrays import read_array
 from arrays.io.errors import InputError
 from tests.command_line import Outcome, Run, assert_refused
 
-COMMANDS = ("calibrate", "locate", "map", "track", "bounds", "design", "simulate", "view")
+COMMANDS = (
+    "calibrate",
+    "locate",
+    "map",
+    "track",
+    "bounds",
+    "design",
+    "new-array",
+    "demo",
+    "simulate",
+    "view",
+    "warm-up",
+)
 HEAVY = {"numpy", "scipy", "numba", "matplotlib", "filterpy", "pandas", "xarray", "zarr", "trimesh", "viser", "msgspec"}
 
 

@@ -433,7 +433,7 @@ class TestRecording:
 
 class TestKnowledge:
     def test_region_and_largest_moment_rule_solutions_out(self, run: Run, array: Path, readings: Path) -> None:
-        inside = results_of(run("locate", readings, "--array", array, "--region", "x>0, -3<y<3", "--json"))
+        inside = results_of(run("locate", readings, "--array", array, "--region", "-3<y<3, x>0", "--json"))
         assert np.allclose(inside[0]["solutions"][0]["position_m"], SOURCE, atol=1e-3)
         for option, value in (("--region", "x<-1"), ("--max-moment-Am2", "1e-6")):
             outcome = run("locate", readings, "--array", array, option, value)

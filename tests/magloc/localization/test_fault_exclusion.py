@@ -22,10 +22,12 @@ from arrays.array import SensorArray
 from arrays.array_file import read_array
 from arrays.geometries import cube, tetrahedron
 from arrays.sensor import Sensor
+from magloc.chi_square import energy_threshold
 from magloc.fields import dipole
 from magloc.localization.fault_exclusion import weighted
 from magloc.localization.locator import Locator
-from magloc.measurement.rows import whitened_model, whitenings_of
+from magloc.measurement.differences import predicted_channels
+from magloc.measurement.rows import whitened_model, whitened_rows, whitenings_of
 from magloc.readings import read_readings
 from magloc.truth import read_truth
 from tests.plain_locator import plain_locator
@@ -350,3 +352,34 @@ class TestRecording:
         ]
         assert np.median(error) <= 0.25e-3
         assert np.max(error) <= 1.5e-3
+
+
+class TestNoiseAlone:
+    """Rows are decided by their energy before any sensor is left out."""
+
+    N_DIFFERENCES = 21  # eight sensors of three axes, without a common field
+
+    @pytest.fixture
+    def unit_signal(self):
+        """Readings of a source whose energy is one."""
+        signal = predicted_channels(CUBE, np.array([[0.3, 1.4, -0.8]]), np.array([[1.0, 2.0, -1.0]]))
+        (rows,) = whitened_rows(CUBE, signal, None, 1)
+        return signal / np.sqrt(rows.energy)
+
+    def test_no_sensor_is_left_out(self, monkeypatch):
+        asked = []
+        whole = Locator.__dict__["_plain"]
+        monkeypatch.setattr(Locator, "_plain", lambda *args: asked.append(len(args[1])) or whole(*args))
+        noise = np.random.default_rng(5).normal(size=(20, CUBE.n_channels)) * NOISE
+        (rows,) = whitened_rows(CUBE, noise, None, 20)
+        assert np.all(rows.energy <= energy_threshold(self.N_DIFFERENCES))
+        fixes = Locator(CUBE, sources="auto").fit_rows(noise)
+        assert not fixes.detected.any()
+        assert not fixes.solved.any()
+        assert asked == [20]
+
+    def test_a_source_is_found_that_its_energy_alone_does_not_tell_from_noise(self, unit_signal):
+        energy = 0.95 * energy_threshold(self.N_DIFFERENCES)
+        fix = Locator(CUBE, sources="auto").fit_rows(unit_signal * np.sqrt(energy))[0]
+        assert not fix.detected
+        assert_allclose(fix.best.position_m, [0.3, 1.4, -0.8], rtol=1e-3)
