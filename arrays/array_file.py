@@ -168,7 +168,7 @@ def array_of_table(place: str, table: dict[str, Any]) -> SensorArray:
     raise InputError(f"{place}: found neither the key geometry nor [[sensor]] tables, expected one of them.")
 
 
-def write_array(array: SensorArray, path: str | PathLike[str]) -> None:
+def write_array(path: str | PathLike[str], array: SensorArray) -> None:
     """Write an array's TOML file, from which :func:`read_array` makes an equal array.
 
     Parameters

@@ -144,7 +144,7 @@ def calibrate(
     else:
         _check_converged(result, readings, out)
         report, lines, notes = _report(result, len(rows), out), _table(result), _notes(result, len(rows), prior)
-    arrays.write_array(result.array, out)
+    arrays.write_array(out, result.array)
     if json:
         print_json(report)
     else:

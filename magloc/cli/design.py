@@ -63,10 +63,10 @@ def design(
     except KeyboardInterrupt:
         if not best:
             raise KeyboardInterrupt("interrupted: nothing is written, no start had been judged") from None
-        arrays.write_array(best[-1], target)
+        arrays.write_array(target, best[-1])
         raise KeyboardInterrupt(f"interrupted: the best array so far is in {target}") from None
     seconds = time.perf_counter() - begin
-    arrays.write_array(result.array, target)
+    arrays.write_array(target, result.array)
     if png is not None:
         magloc.plots.save(result.plot(common.seed), png)
     if json:

@@ -73,7 +73,7 @@ def write_simulation(simulation: Simulation, readings: str | PathLike[str]) -> S
     with tempfile.TemporaryDirectory(dir=folder, prefix=".magloc-") as name:
         hidden = Path(name)
         write_readings(hidden / files.readings.name, simulation.readings, simulation.array)
-        write_array(simulation.array, hidden / files.array.name)
+        write_array(hidden / files.array.name, simulation.array)
         for path, truth in zip(files.truths, simulation.truths, strict=True):
             write_truth(truth, hidden / path.name)
         for path in files.all:

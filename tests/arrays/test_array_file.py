@@ -244,19 +244,19 @@ class TestRoundTrip:
     @given(any_arrays())
     def test_any_array(self, tmp_path_factory: pytest.TempPathFactory, array: SensorArray) -> None:
         path = tmp_path_factory.getbasetemp() / "any.toml"
-        write_array(array, path)
+        write_array(path, array)
         assert read_array(path) == array
 
     @given(positive)
     def test_any_noise(self, tmp_path_factory: pytest.TempPathFactory, noise_T: float) -> None:
         path = tmp_path_factory.getbasetemp() / "noise.toml"
-        write_array(tetrahedron(1.0, noise_T=noise_T), path)
+        write_array(path, tetrahedron(1.0, noise_T=noise_T))
         assert read_array(path).sensors[0].noise_T == noise_T
 
     @pytest.mark.parametrize("name", GEOMETRIES)
     def test_geometries(self, tmp_path: Path, name: str) -> None:
         array = GEOMETRIES[name].make(1.1)
-        write_array(array, tmp_path / "array.toml")
+        write_array(tmp_path / "array.toml", array)
         assert read_array(tmp_path / "array.toml") == array
 
     def test_defaults_are_left_out(self) -> None:
@@ -271,13 +271,13 @@ class TestWriting:
     def test_replaces(self, tmp_path: Path) -> None:
         path = tmp_path / "array.toml"
         path.write_text("old", encoding="utf-8")
-        write_array(tetrahedron(1.5), path)
+        write_array(path, tetrahedron(1.5))
         assert path.read_text(encoding="utf-8") == array_toml(tetrahedron(1.5))
         assert os.listdir(tmp_path) == ["array.toml"]
 
     def test_through_a_link(self, tmp_path: Path) -> None:
         (tmp_path / "link.toml").symlink_to(tmp_path / "array.toml")
-        write_array(tetrahedron(1.5), tmp_path / "link.toml")
+        write_array(tmp_path / "link.toml", tetrahedron(1.5))
         assert (tmp_path / "link.toml").is_symlink()
         assert read_array(tmp_path / "array.toml") == tetrahedron(1.5)
 
@@ -289,19 +289,19 @@ class TestWriting:
         path.write_text("old", encoding="utf-8")
         monkeypatch.setattr(os, "replace", no_space)
         with pytest.raises(OSError, match="No space left on device") as error:
-            write_array(tetrahedron(1.5), path)
+            write_array(path, tetrahedron(1.5))
         assert error.value.filename == str(path)
         assert path.read_text(encoding="utf-8") == "old"
         assert os.listdir(tmp_path) == ["array.toml"]
 
     def test_no_such_folder(self, tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError) as error:
-            write_array(tetrahedron(1.5), tmp_path / "none" / "array.toml")
+            write_array(tmp_path / "none" / "array.toml", tetrahedron(1.5))
         assert error.value.filename == str(tmp_path / "none" / "array.toml")
 
     def test_a_folder(self, tmp_path: Path) -> None:
         with pytest.raises(IsADirectoryError):
-            write_array(tetrahedron(1.5), tmp_path)
+            write_array(tmp_path, tetrahedron(1.5))
 
 
 def assert_refused(path: Path, *parts: str) -> None:
@@ -544,7 +544,7 @@ rotation_xyzw = [1, 0, 0, 0]
 
     def test_survive_writing(self, write: WriteFile, tmp_path: Path) -> None:
         array = read_array(write(self.BOARD))
-        write_array(array, tmp_path / "again.toml")
+        write_array(tmp_path / "again.toml", array)
         assert read_array(tmp_path / "again.toml") == array
 
     @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ ARRAY = tetrahedron(1.5)
 
 @pytest.fixture
 def array_file(tmp_path: Path) -> Path:
-    write_array(ARRAY, tmp_path / "tetra.toml")
+    write_array(tmp_path / "tetra.toml", ARRAY)
     return tmp_path / "tetra.toml"
 
 

@@ -22,7 +22,7 @@ LARGEST = 15_000_000
 class TestStaticPages:
     def test_array_of_3_cm(self, screen: Screen, run: Run, tmp_path: Path) -> None:
         array = tetrahedron(0.03)
-        write_array(array, tmp_path / "array.toml")
+        write_array(tmp_path / "array.toml", array)
         page = tmp_path / "array.html"
         assert run("view", tmp_path / "array.toml", "--html", page, "--quiet").status == 0
         with opened(0, "array") as server:

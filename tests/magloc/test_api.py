@@ -38,7 +38,7 @@ def test_a_function_stays_one_once_its_command_is_loaded(run: Run) -> None:
 
 @pytest.fixture
 def board(tmp_path: Path) -> Path:
-    arrays.write_array(ARRAY, tmp_path / "board.toml")
+    arrays.write_array(tmp_path / "board.toml", ARRAY)
     return tmp_path / "board.toml"
 
 

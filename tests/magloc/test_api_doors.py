@@ -72,7 +72,7 @@ class TestCalibrate:
         true = [s.calibration.offset_T for s in case.true.sensors]
         assert np.abs(error).max() < 5.0
         assert np.abs(np.subtract(offset, true) / calibration.sigma[:, 12:]).max() < 5.0
-        arrays.write_array(calibration.array, tmp_path / "calibrated.toml")
+        arrays.write_array(tmp_path / "calibrated.toml", calibration.array)
         read = arrays.read_array(tmp_path / "calibrated.toml")
         np.testing.assert_allclose(read.positions, calibration.array.positions)
         assert isinstance(calibration.plot(), Figure)

@@ -137,7 +137,7 @@ class ArrayEditor:
             elif path.exists() and not overwrite:
                 self._say_of_file(f"{path} exists already: nothing was written yet.", ask=True)
             else:
-                write_array(self.array, path)
+                write_array(path, self.array)
                 self._own.add(path.resolve())
                 self._say_of_file(f"saved as {path}", ask=False, warning=False)
         except (OSError, RuntimeError, ValueError) as error:  # of names that no file can have too

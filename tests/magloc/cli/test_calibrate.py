@@ -93,7 +93,7 @@ def made(folder: Path, *, n: int = 40, posed: bool = False) -> Files:
     fields = np.stack([magpylib_field(true.positions, p, m) for p, m in zip(position, moments, strict=True)])
     values = true.readings_of(fields) + NOISE_T * rng.normal(size=(n, true.n_channels))
     files = Files(folder, true, position, origin, attitude)
-    write_array(nominal, files.array)
+    write_array(files.array, nominal)
     pose = {"array_position_m": origin, "array_rotation": rotation} if posed else {}
     write_readings(files.readings, Readings(values, **pose), nominal)
     return files
@@ -156,7 +156,7 @@ class TestArrayFile:
             )
             for s, t in zip(nominal.sensors, files.true.sensors, strict=True)
         ]
-        write_array(replace(nominal, sensors=tuple(sensors)), files.array)
+        write_array(files.array, replace(nominal, sensors=tuple(sensors)))
         outcome = run(
             "calibrate", files.readings, "--array", files.array, "--out", files.out,
             "--trust-position", ",".join(trusted), "--trust-scale", "s4", "--quiet",
@@ -307,7 +307,7 @@ class TestRefusals:
     def test_scalar_sensors(self, run: Run, files: Files) -> None:
         sensors = [Sensor(f"s{i}", "scalar", (float(i), 0.0, 0.0), 1e-9) for i in range(3)]
         array = SensorArray(tuple(sensors))
-        write_array(array, files.array)
+        write_array(files.array, array)
         write_readings(files.readings, Readings(np.ones((4, 3))), array)
         assert_nothing_written(run(*self.arguments(files)), files, "must have vector sensors only")
 

@@ -66,7 +66,7 @@ class Files:
         pose: tuple[FloatArray, Rotation] | None = None,
     ) -> tuple[str, ...]:
         origin, rotation = pose or (None, None)
-        write_array(array, self.array)
+        write_array(self.array, array)
         write_readings(
             self.readings,
             Readings(values, array_position_m=origin, array_rotation=rotation, ambient_T=ambient),

@@ -68,7 +68,7 @@ sys.exit(main())
     @needs_chromium
     def test_terminated_with_a_browser(self, tmp_path: Path) -> None:
         """Browser, its folder and the unfinished picture are gone."""
-        write_array(tetrahedron(1.0), tmp_path / "array.toml")
+        write_array(tmp_path / "array.toml", tetrahedron(1.0))
         command = [sys.executable, "-m", "magloc.cli", "view", "array.toml", "--png", "out.png"]
         with TemporaryDirectory(prefix="m") as short:  # Chromium makes a socket in it, whose path must not be long
             environment = {**os.environ, "TMPDIR": short}

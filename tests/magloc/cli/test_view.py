@@ -64,7 +64,7 @@ needs_chromium = pytest.mark.skipif(not has_chromium(), reason=f"needs one of {'
 @pytest.fixture
 def array_file(tmp_path: Path) -> Path:
     path = tmp_path / "tetra.toml"
-    write_array(tetrahedron(1.5), path)
+    write_array(path, tetrahedron(1.5))
     return path
 
 
@@ -72,7 +72,7 @@ def array_file(tmp_path: Path) -> Path:
 def readings_file(tmp_path: Path) -> Path:
     """Readings with their array beside them."""
     array = tetrahedron(1.5)
-    write_array(array, tmp_path / "readings-array.toml")
+    write_array(tmp_path / "readings-array.toml", array)
     x = np.linspace(-2.0, 2.0, 5)
     positions = np.stack([x, np.full(5, 3.0), np.full(5, 0.5)], axis=-1)
     values = np.array([predicted_channels(array, p, [0.0, 80.0, 30.0]) for p in positions])

@@ -186,7 +186,7 @@ class TestWhatIsWritten:
 
     @pytest.fixture
     def opened_file(self, tmp_path: Path) -> Path:
-        write_array(LARGE, tmp_path / "opened.toml")
+        write_array(tmp_path / "opened.toml", LARGE)
         return tmp_path / "opened.toml"
 
     @pytest.fixture
@@ -203,9 +203,9 @@ class TestWhatIsWritten:
         self, hand: Hand, opened_file: Path, folder: Path
     ) -> None:
         hand.save("a.toml")
-        write_array(LARGE, folder / "a.toml")
+        write_array(folder / "a.toml", LARGE)
         for path in (str(opened_file), "../opened.toml", "a.toml"):
-            write_array(LARGE, folder / path)
+            write_array(folder / path, LARGE)
             assert "nothing was written yet" in hand.save(path)
             assert read_array(folder / path) == LARGE
             assert "saved as" in hand.save(path, overwrite=True)
@@ -214,7 +214,7 @@ class TestWhatIsWritten:
     def test_nothing_else(self, hand: Hand, tmp_path: Path, folder: Path) -> None:
         foreign, near = tmp_path / "foreign.toml", folder / "near.toml"
         for path in (foreign, near):
-            write_array(LARGE, path)
+            write_array(path, LARGE)
         (folder / "link.toml").symlink_to(foreign)
         (folder / "out").symlink_to(tmp_path)
         for path, words in {

@@ -459,7 +459,7 @@ class TestArrayEditor:
 
     def test_an_existing_file_is_replaced_after_a_confirmation_only(self, server, tmp_path: Path):
         path = tmp_path / "a.toml"
-        write_array(LARGE, path)
+        write_array(path, LARGE)
         editor = ArrayEditor(server, SMALL, save_as=str(path), file=path)
         set_value(editor.save_button, True)
         assert read_array(path) == LARGE
