@@ -1,0 +1,218 @@
+"""A valid, short command line for every command, and the files that these read."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import chdir, redirect_stdout
+from pathlib import Path
+
+import numpy as np
+from cyclopts import App
+from scipy.spatial.transform import Rotation
+
+import arrays
+from adcs.cli.app import app as adcs_app
+from adcs.cli.app import main as adcs_main
+from magloc.cli.app import app as magloc_app
+from magloc.cli.app import main as magloc_main
+from magloc.measurement.differences import predicted_channels
+from tests.adcs.stars.test_identification import random_sky, write_frames
+
+APPS = {"magloc": magloc_app, "adcs": adcs_app}
+MAINS = {"magloc": magloc_main, "adcs": adcs_main}
+
+# What is written is written into "out"; a command that is not here fails the test that reads this table.
+LINES: dict[str, tuple[str, ...]] = {
+    "magloc simulate": ("simulate.toml --out out.csv --json", "moving.toml --out out.csv"),
+    "magloc locate": (
+        "readings.csv --array array.toml --json",
+        "readings.csv --array array.toml --sources auto --json",
+        "readings.csv --array array.toml --position 3 0.5 0.3 --json",
+        "readings.csv --array array.toml --region=z<2 --max-moment-Am2 1000 --json",
+        "readings.csv --array array.toml --average",
+        "scalar.csv --array scalar.toml --json",
+        "moving.csv --array moving-array.toml",
+    ),
+    "magloc track": (
+        "readings.csv --array array.toml --json",
+        "moving.csv --array moving-array.toml --truth moving-truth.csv --smooth",
+        "- --array array.toml --jsonl",
+    ),
+    "magloc calibrate": ("readings.csv --array array.toml --truth readings-truth.csv --out out.toml --json",),
+    "magloc map": (
+        "paper --grid 3 --out out --json",
+        "map.toml --method iekf --grid 3 --out out",
+        "map.toml --over sources --grid 3 --out out --json",
+    ),
+    "magloc bounds": ("map.toml --grid 3 --moments 4 --out out --json", "--array array.toml --grid 3 --moments 4"),
+    "magloc design": ("task.toml --out out.toml --json",),
+    "magloc view": (
+        "array.toml --html out.html",
+        "readings.csv --array array.toml --html out.html",
+        "track.json --array array.toml --readings readings.csv --html out.html",
+        "readings-truth.csv --html out.html",
+        "map --html out.html",
+    ),
+    "magloc new-array": ("out.toml --shape tetrahedron --size-m 1.5 --noise-nT 1",),
+    "magloc demo": ("out",),
+    "magloc warm-up": ("",),
+    "adcs demo": ("out",),
+    "adcs warm-up": ("",),
+    "adcs run": ("scenario.toml --duration 20 --seeds 1 --json", "tabletsat --duration 20 --seeds 1"),
+    "adcs run complementary": ("--duration 3000 --json",),
+    "adcs run ellipsoid": ("--duration 300 --seeds 2 --json", "--closed-loop --duration 300 --seeds 1"),
+    "adcs run mockup": (
+        "--part fusion --duration 12 --seeds 1 --json",
+        "--part zeros --duration 12 --seeds 1",
+        "--part sky --poses 1 --sky sky.toml --json",
+    ),
+    "adcs compare": ("scenario.toml eclipse --duration 20 --seeds 1 --json",),
+    "adcs tables": ("--duration 20 --seeds 1 --json",),
+    "adcs estimate": (
+        "telemetry.csv --config scenario.toml --json",
+        "telemetry.csv --config scenario.toml --sensors mag+sun+gyro --filter smoother --out out",
+    ),
+    "adcs stars": ("frames --catalogue stars.csv --json",),
+}  # fmt: skip
+STREAM = "readings.csv"  # what stands on stdin where a line reads from there
+
+_FILES = {
+    "simulate.toml": """format_version = 1
+duration_s = 11.0
+rate_Hz = 1.0
+[array]
+geometry = "tetrahedron"
+edge_m = 1.5
+kind = "vector"
+noise_nT = 1.0
+[[source]]
+moment_Am2 = [100.0, 0.0, 0.0]
+path = { kind = "fixed", position_m = [3.0, 0.5, 0.306] }
+""",
+    "moving.toml": """format_version = 1
+duration_s = 4.0
+rate_Hz = 1.0
+[array]
+geometry = "tetrahedron"
+edge_m = 0.6
+kind = "vector"
+noise_nT = 0.05
+[carrier]
+attitude = "course"
+[carrier.path]
+kind = "line"
+start_m = [-2.0, 0.8, 1.2]
+course_deg = 90.0
+speed_m_s = 0.5
+[[source]]
+moment_Am2 = [12.0, -5.0, 9.0]
+path = { kind = "fixed", position_m = [0.0, 0.0, -0.6] }
+""",
+    "scalar.toml": """format_version = 1
+geometry = "cube"
+edge_m = 1.0
+kind = "scalar"
+noise_nT = 0.01
+ambient_nT = [20000.0, 1000.0, 45000.0]
+""",
+    "map.toml": """format_version = 1
+method = "repeated"
+half_width_m = 8.0
+[array]
+geometry = "tetrahedron"
+edge_m = 1.5
+kind = "vector"
+noise_nT = 1.0
+[source]
+position_m = [5.0, 0.0, 0.306]
+moment_Am2 = [100.0, 0.0, 0.0]
+[repeated]
+position_step_m = 0.1
+moment_step_Am2 = 100.0
+max_iterations = 50
+[iekf]
+position_sigma_m = 3.0
+moment_sigma_Am2 = 300.0
+[sources]
+half_width_m = 6.0
+nearest_m = 1.0
+farthest_m = 6.0
+moment_Am2 = 300.0
+""",
+    "task.toml": """format_version = 1
+[sensors]
+count = 4
+kind = "vector"
+noise_nT = 1.0
+[volume]
+shape = "ball"
+radius_m = 0.92
+[sources]
+region = "half-space"
+towards = [1.0, 0.0, 0.0]
+nearest_m = 2.0
+farthest_m = 2.0
+moment_Am2 = 100.0
+""",
+}
+
+
+def commands() -> Iterator[tuple[str, list[str]]]:
+    """Every command of both programs by name, with the names of its options, as the programs know them."""
+    for program, app in APPS.items():
+        yield from _commands(program, app)
+
+
+def _commands(name: str, app: App) -> Iterator[tuple[str, list[str]]]:
+    inner = [key for key in app if not key.startswith("-")]
+    for key in inner:
+        yield from _commands(f"{name} {key}", app[key])
+    if app.default_command is not None:
+        yield name, [option for one in app.assemble_argument_collection() for option in one.names if option[0] == "-"]
+
+
+def write_files(folder: Path) -> None:
+    """All files that the lines read, in a folder."""
+
+    def run(program: str, line: str) -> None:
+        with chdir(folder):
+            if MAINS[program]([*line.split(), "--quiet"]) != 0:
+                raise RuntimeError(f"{program} {line}")
+
+    for name, text in _FILES.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    run("magloc", "simulate simulate.toml --out readings.csv")
+    (folder / "readings-array.toml").rename(folder / "array.toml")
+    run("magloc", "simulate moving.toml --out moving.csv")
+    run("magloc", "map paper --grid 3 --out map")
+    run("adcs", "run tabletsat --duration 20 --seeds 1 --out sat")
+    run("adcs", "run mockup --part sky --poses 1 --out sky")
+    for made in ("sat/telemetry.csv", "sat/scenario.toml", "sky/sky.toml"):
+        (folder / made).rename(folder / Path(made).name)
+    for made in ("sat", "sky"):
+        shutil.rmtree(folder / made)
+    with (folder / "track.json").open("w") as file, redirect_stdout(file):
+        run("magloc", "track readings.csv --array array.toml --json")
+    _write_scalars(folder)
+    _write_stars(folder)
+
+
+def _write_scalars(folder: Path) -> None:
+    """Readings of total-field sensors near a dipole."""
+    array = arrays.read_array(folder / "scalar.toml")
+    values = predicted_channels(array, np.array([2.0, 1.0, 0.5]), np.array([50.0, 20.0, -80.0]))
+    noise = 1e-11 * np.random.default_rng(0).standard_normal((3, len(values)))
+    rows = [",".join([str(float(i)), *(f"{1e9 * value:.5f}" for value in row)]) for i, row in enumerate(values + noise)]
+    head = ",".join(["time_s", *(f"{name}_nT" for name in array.channel_names)])
+    (folder / "scalar.csv").write_text("\n".join([head, *rows]) + "\n")
+
+
+def _write_stars(folder: Path) -> None:
+    """Two frames of a small sky, and its catalogue."""
+    sky = random_sky(3_000)
+    ra, dec = np.degrees(np.arctan2(*sky.directions.T[1::-1])) % 360.0, np.degrees(np.arcsin(sky.directions[:, 2]))
+    rows = zip(sky.numbers, ra, dec, sky.magnitudes, strict=True)
+    lines = [f"{number},{a:.9f},{d:.9f},{m:.3f}\n" for number, a, d, m in rows]
+    (folder / "stars.csv").write_text("hip,ra_deg,dec_deg,mag\n" + "".join(lines))
+    write_frames(folder / "frames", sky, Rotation.random(2, random_state=1).as_matrix(), np.random.default_rng(2))

@@ -1,0 +1,180 @@
+"""Mutations of a valid command line and of the files that it reads."""
+
+from __future__ import annotations
+
+import random
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+NUMBERS = (
+    "0", "-0", "1", "-1", "2", "3.5", "1e-300", "5e-324", "1e300", "-1e300", "2e300", "1e308", "nan", "inf", "-inf",
+    "", "x", "1e", "0x10", "9" * 400, "1_000", "٣", "true", "None", "1;2", "1 2", "é", "\x1b[31m", "--", "..", "/",
+)  # fmt: skip
+_NUMBER = re.compile(rb"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
+_WORD = re.compile(rb"[A-Za-z_]{2,}")
+
+
+def mangled_file(data: bytes, rng: random.Random) -> bytes:
+    """A file's bytes after one to three mutations."""
+    for _ in range(rng.choice((1, 1, 1, 2, 3))):
+        data = rng.choice(_OF_BYTES)(data, rng)
+    return data
+
+
+def mangled_arguments(arguments: Sequence[str], options: Sequence[str], rng: random.Random) -> list[str]:
+    """A command's arguments after one or two mutations; the command's name stays."""
+    mangled = list(arguments)
+    for _ in range(rng.choice((1, 1, 2))):
+        rng.choice(_OF_ARGUMENTS)(mangled, options, rng)
+    return mangled
+
+
+def _numbers(data: bytes, rng: random.Random) -> bytes:
+    """Some numbers are others."""
+    found = list(_NUMBER.finditer(data))
+    if not found:
+        return data
+    chosen = rng.sample(found, min(len(found), rng.choice((1, 1, 1, 2, 5, len(found)))))
+    value = rng.choice(NUMBERS).encode()
+    for match in sorted(chosen, key=lambda one: -one.start()):
+        data = data[: match.start()] + value + data[match.end() :]
+    return data
+
+
+def _scaled(data: bytes, rng: random.Random) -> bytes:
+    """One number with another exponent or sign."""
+    found = list(_NUMBER.finditer(data))
+    if not found:
+        return data
+    match = rng.choice(found)
+    try:
+        value = float(match[0]) * rng.choice((-1.0, 1e-9, 1e-3, 1e3, 1e6, 1e9, 1e30))
+    except OverflowError:
+        return data
+    return data[: match.start()] + repr(value).encode() + data[match.end() :]
+
+
+def _words(data: bytes, rng: random.Random) -> bytes:
+    """One word is another one of the file."""
+    found = list(_WORD.finditer(data))
+    if not found:
+        return data
+    match, other = rng.choice(found), rng.choice(found)
+    return data[: match.start()] + other[0] + data[match.end() :]
+
+
+def _of_lines(change: Callable[[list[bytes], random.Random], object]) -> Callable[[bytes, random.Random], bytes]:
+    def mutation(data: bytes, rng: random.Random) -> bytes:
+        lines = data.split(b"\n")
+        change(lines, rng)
+        return b"\n".join(lines)
+
+    return mutation
+
+
+def _delete_line(lines: list[bytes], rng: random.Random) -> None:
+    del lines[rng.randrange(len(lines))]
+
+
+def _repeat_line(lines: list[bytes], rng: random.Random) -> None:
+    lines.insert(rng.randrange(len(lines)), rng.choice(lines))
+
+
+def _delete_lines(lines: list[bytes], rng: random.Random) -> None:
+    start = rng.randrange(len(lines))
+    del lines[start : start + rng.randrange(1, len(lines) + 1)]
+
+
+def _shuffle(lines: list[bytes], rng: random.Random) -> None:
+    rest = lines[1:]
+    rng.shuffle(rest)
+    lines[1:] = rest
+
+
+def _column(lines: list[bytes], rng: random.Random) -> None:
+    """One column goes, or stands twice."""
+    column, again = rng.randrange(lines[0].count(b",") + 1), rng.random() < 0.5
+    for i, line in enumerate(lines):
+        cells = line.split(b",")
+        if column < len(cells):
+            cells[column : column + 1] = [cells[column]] * 2 if again else []
+            lines[i] = b",".join(cells)
+
+
+def _cells(lines: list[bytes], rng: random.Random) -> None:
+    """A whole column has one value."""
+    column, value = rng.randrange(lines[0].count(b",") + 1), rng.choice(NUMBERS).encode()
+    for i, line in enumerate(lines[1:], 1):
+        cells = line.split(b",")
+        if column < len(cells) and line:
+            cells[column] = value
+            lines[i] = b",".join(cells)
+
+
+def _bytes(data: bytes, rng: random.Random) -> bytes:
+    """Bytes that belong to no text."""
+    at = rng.randrange(len(data) + 1)
+    return data[:at] + rng.randbytes(rng.choice((1, 2, 8))) + data[at + rng.choice((0, 1, 4)) :]
+
+
+def _cut(data: bytes, rng: random.Random) -> bytes:
+    return data[: rng.randrange(len(data) + 1)]
+
+
+def _dressed(data: bytes, rng: random.Random) -> bytes:
+    """Line ends, byte-order mark, and characters that no editor shows."""
+    return rng.choice(
+        (
+            data.replace(b"\n", b"\r\n"),
+            data.replace(b"\n", b"\r"),
+            b"\xef\xbb\xbf" + data,
+            data.decode("utf-8", "replace").encode("utf-16"),
+            data.replace(b",", b";"),
+            data.replace(b".", b","),
+            data + b"\0",
+            data + data,
+            data.rstrip(b"\n"),
+            b"\n\n" + data,
+            b"",
+        )
+    )
+
+
+_OF_BYTES = (
+    _numbers, _numbers, _numbers, _scaled, _scaled, _words, _bytes, _cut, _dressed,
+    *map(_of_lines, (_delete_line, _repeat_line, _delete_lines, _shuffle, _column, _cells, _cells)),
+)  # fmt: skip
+
+
+def _change_value(arguments: list[str], options: Sequence[str], rng: random.Random) -> None:
+    at = rng.randrange(len(arguments))
+    arguments[at] = rng.choice((*NUMBERS, *options, *arguments))
+
+
+def _drop(arguments: list[str], options: Sequence[str], rng: random.Random) -> None:
+    if arguments:
+        del arguments[rng.randrange(len(arguments))]
+
+
+def _repeat(arguments: list[str], options: Sequence[str], rng: random.Random) -> None:
+    arguments.insert(rng.randrange(len(arguments) + 1), rng.choice(arguments))
+
+
+def _add_option(arguments: list[str], options: Sequence[str], rng: random.Random) -> None:
+    arguments += [rng.choice(options), *rng.choices((*NUMBERS, *arguments), k=rng.choice((0, 1, 1, 1, 3)))]
+
+
+_OF_ARGUMENTS = (_change_value, _drop, _repeat, _add_option, _add_option)
+
+
+def mangle_names(folder: Path, rng: random.Random) -> None:
+    """One file is a folder, a link to itself, gone, or must not be read."""
+    files = [file for file in folder.rglob("*") if file.is_file()]
+    file = rng.choice(files)
+    file.unlink()
+    kind = rng.choice(("gone", "folder", "loop"))
+    if kind == "folder":
+        file.mkdir()
+    elif kind == "loop":
+        file.symlink_to(file.name)

@@ -1,0 +1,154 @@
+"""One mangled case: run in this process, and what is wrong with how it ended."""
+
+from __future__ import annotations
+
+import io
+import json
+import random
+import shutil
+import signal
+import sys
+import traceback
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
+from pathlib import Path
+from typing import NamedTuple
+
+from tests.command_line import refuse_constant
+from tests.fuzz.cases import LINES, MAINS, STREAM, commands
+from tests.fuzz.mangle import mangle_names, mangled_arguments, mangled_file
+
+LONGEST_S = 20.0  # of the processor's time: a loaded machine is no hang
+LONGEST_WAIT_S = 300.0
+LONGEST_SENTENCE = 300
+_OPTIONS = dict(commands())
+
+
+class Hang(BaseException):
+    """Not caught by whatever expects an Exception."""
+
+
+class Case(NamedTuple):
+    """What is run, in a folder that is the command's working directory."""
+
+    program: str
+    arguments: list[str]
+    stdin: bytes
+
+
+class Ended(NamedTuple):
+    """How it ended."""
+
+    status: int | None
+    out: str
+    err: str
+    trace: str
+
+
+def made_case(seed: int, files: Path, folder: Path) -> Case:
+    """The case of a seed: a line, its files in a new folder, and one of stream, files, names or arguments mangled."""
+    rng = random.Random(seed)
+    shutil.copytree(files, folder)
+    command = rng.choice(sorted(LINES))
+    program, *name = command.split()
+    words = rng.choice(LINES[command]).split()
+    stdin = (folder / STREAM).read_bytes()
+    read = [word for word in words if (folder / word).exists()]
+    what = rng.random()
+    if "-" in words and what < 0.6:
+        stdin = mangled_file(stdin, rng)
+    elif read and what < 0.65:
+        target = folder / rng.choice(read)
+        inside = [file for file in sorted(target.rglob("*")) if file.is_file()] if target.is_dir() else [target]
+        file = rng.choice(inside)
+        file.write_bytes(mangled_file(file.read_bytes(), rng))
+    elif read and what < 0.7:
+        mangle_names(folder, rng)
+    else:
+        words = mangled_arguments(words, _OPTIONS[command], rng)
+    if "view" in name and not any(word.startswith("--html") for word in words):
+        words += ["--html", "out.html"]  # a server would wait for its reader
+    return Case(program, [*name, *(word for word in words if word not in ("--view", "--open"))], stdin)
+
+
+def run_case(case: Case, folder: Path, seconds: float = LONGEST_S) -> Ended:
+    """Run a case; warnings that are not the program's own are errors."""
+    out, err, trace, status = io.StringIO(), io.StringIO(), "", None
+    with chdir(folder), _stdin(case.stdin), redirect_stdout(out), redirect_stderr(err), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with _alarm(seconds):
+            try:
+                status = MAINS[case.program](case.arguments)
+            except (Exception, SystemExit, Hang):
+                trace = traceback.format_exc()
+    return Ended(status, out.getvalue(), err.getvalue(), trace)
+
+
+def faults(case: Case, ended: Ended, before: set[str], folder: Path) -> Iterator[str]:
+    """What is wrong: nothing, for a good program."""
+    if ended.trace:
+        yield "hang" if "Hang" in ended.trace.splitlines()[-1] else "traceback"
+    elif ended.status not in (0, 2):
+        yield f"status {ended.status}"
+    if "Traceback" in ended.err or "Warning:" in ended.err:
+        yield "foreign text on stderr"
+    lines = ended.err.splitlines()
+    if any(not line.startswith((f"{case.program}: ", "  ")) for line in lines):
+        yield "a line of stderr without the program's name"
+    if any(not char.isprintable() for line in lines for char in line):
+        yield "control characters on stderr"
+    if ended.status == 2 and (not lines or len(lines[-1]) > LONGEST_SENTENCE):
+        yield f"a sentence of {len(lines[-1]) if lines else 0} characters"
+    after = {str(file.relative_to(folder)) for file in folder.rglob("*")}
+    made = after - before
+    if any(part.startswith(".") or part.endswith(".tmp") for file in made for part in Path(file).parts):
+        yield f"left behind: {sorted(made)[:3]}"
+    if ended.status == 2 and any(Path(file).suffix and (folder / file).is_file() for file in made):
+        yield f"refused, but wrote {sorted(made)[:3]}"
+    if ended.status == 0 and "--json" in case.arguments and ended.out:
+        try:
+            json.loads(ended.out, parse_constant=refuse_constant)
+        except (ValueError, AssertionError) as error:
+            yield f"not JSON: {error}"
+
+
+def verdict(seed: int, files: Path, folder: Path) -> tuple[Case, Ended, list[str]]:
+    """One case from its seed to what is wrong with it; the folder is left as it is then."""
+    case = made_case(seed, files, folder)
+    before = {str(file.relative_to(folder)) for file in folder.rglob("*")}
+    ended = run_case(case, folder)
+    return case, ended, list(faults(case, ended, before, folder))
+
+
+def report(seed: int, case: Case, ended: Ended, wrong: Sequence[str]) -> str:
+    """What a person needs to see one fault again."""
+    end = ended.trace or ended.err
+    return f"seed {seed}: {'; '.join(wrong)}\n  {case.program} {case.arguments}\n  status {ended.status}\n{end[-1500:]}"
+
+
+@contextmanager
+def _stdin(data: bytes) -> Iterator[None]:
+    kept = sys.stdin
+    sys.stdin = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8")
+    try:
+        yield
+    finally:
+        sys.stdin = kept
+
+
+@contextmanager
+def _alarm(seconds: float) -> Iterator[None]:
+    def ring(*_: object) -> None:
+        raise Hang
+
+    kept = {name: signal.signal(name, ring) for name in (signal.SIGPROF, signal.SIGALRM)}
+    signal.setitimer(signal.ITIMER_PROF, seconds)
+    signal.setitimer(signal.ITIMER_REAL, LONGEST_WAIT_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        for name, handler in kept.items():
+            signal.signal(name, handler)

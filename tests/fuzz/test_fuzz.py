@@ -1,0 +1,46 @@
+"""Every command, fed with mangled files, streams, names and arguments, ends in a result or in one sentence."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+
+from tests.fuzz.cases import LINES, STREAM, commands, write_files
+from tests.fuzz.runner import Case, report, run_case, verdict
+
+QUICK, FULL = 300, 10_000
+CHUNK = 100
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("files")
+    write_files(folder)
+    return folder
+
+
+def test_every_command_has_a_line():
+    assert sorted(LINES) == sorted(name for name, _ in commands())
+
+
+@pytest.mark.parametrize(("command", "line"), [(command, line) for command in LINES for line in LINES[command]])
+def test_the_lines_are_good(command, line, files, tmp_path):
+    """A mutation of what is refused anyway would test nothing."""
+    program, *name = command.split()
+    shutil.copytree(files, tmp_path / "case")
+    case = Case(program, [*name, *line.split()], (files / STREAM).read_bytes())
+    ended = run_case(case, tmp_path / "case", seconds=300.0)  # compiles on a new machine
+    assert ended.status == 0, ended.err + ended.trace
+
+
+@pytest.mark.parametrize(
+    "first", [pytest.param(i, marks=[pytest.mark.slow] if i >= QUICK else []) for i in range(0, FULL, CHUNK)]
+)
+def test_mangled(first, files, tmp_path):
+    found = []
+    for seed in range(first, first + CHUNK):
+        case, ended, wrong = verdict(seed, files, tmp_path / str(seed))
+        if wrong:
+            found.append(report(seed, case, ended, wrong))
+    assert not found, "\n\n".join(found)
