@@ -10,6 +10,10 @@ body        of the satellite
 ned         north, east, down of a place: geodetic, see :func:`magloc.fields.geomagnetic.R_ned_from_ecef`
 ==========  ======================================================================================================
 
+Quaternions are Hamilton's, scalar part first, in files and in arrays called ``q``, and take components from body axes
+to the named frame: ``v_orbital = q∘v_body∘q*``. Rotations are scipy's, whose ``as_quat`` has the scalar last; only
+:mod:`adcs.quaternion` converts.
+
 Matrices are called ``R_to_from``: ``v_to = R_to_from @ v_from``. Everything is computed offline, so that the Earth's
 rotation runs on UTC in place of UT1, and without polar motion: up to 0.9 s or 0.004° of longitude, some 400 m on the
 ground, where the geomagnetic field changes by about 1 nT.

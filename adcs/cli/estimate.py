@@ -68,7 +68,7 @@ def estimate(
         entries = [dict(zip(columns, row, strict=True)) for row in rows]
         print_json({"results": entries, "warnings": list(track.warnings)})
     else:
-        print("\n".join(summary_lines(track, columns)))
+        print("\n".join(summary_lines(track)))
 
 
 def _write(out: Path, name: str, track: adcs.AttitudeTrack, columns: dict[str, Any]) -> None:

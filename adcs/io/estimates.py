@@ -31,11 +31,15 @@ def estimate_columns(track: AttitudeTrack) -> dict[str, Any]:
     return {name: values[track.rows] for name, values in columns.items()}
 
 
-def summary_lines(track: AttitudeTrack, columns: dict[str, Any]) -> list[str]:
-    """The result as text, of a track and its :func:`estimate_columns`: what is known at the end, how readings fit."""
+def summary_lines(track: AttitudeTrack) -> list[str]:
+    """The result as text: what is known at the end, and how readings fit."""
+    if not len(track.rows):
+        return [f"no rows; {track.title}"]
+    columns = estimate_columns(track)
     lines = [f"{len(track.rows)} rows from {track.time_s[0]:g} to {track.time_s[-1]:g} s; {track.title}"]
-    q = ", ".join(f"{columns[name][-1]:.6f}" for name in ("qw", "qx", "qy", "qz"))
-    lines.append(f"attitude at the end, orbital from body (w, x, y, z)   {q}")
+    prefix, frame = ("eci_", "reference") if track.q_orbital is None else ("", "orbital")
+    q = ", ".join(f"{columns[f'{prefix}q{part}'][-1]:.6f}" for part in "wxyz")
+    lines.append(f"attitude at the end, {frame} from body (w, x, y, z)   {q}")
     for state, shown in SHOWN.items():
         names = [shown.column.format(axis) for axis in "xyz"]
         if state not in track.sigma:

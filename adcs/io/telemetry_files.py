@@ -55,7 +55,7 @@ def read_telemetry(path: str | PathLike[str], step_s: float | None = None) -> Te
     """
     table = read_table(path, f"a header with {TIME} and columns of sensors")
     known = [TIME, *(name for group in GROUPS for name in group)]
-    check_keys(f"{path}, line {table.header_line}", dict.fromkeys(table.header), known)
+    check_keys(f"{path}, line {table.header_line}", dict.fromkeys(table.header), known, "column")
     table.require(TIME, known)
     time_s = table.complete([TIME])[:, 0]
     if step_s is not None:

@@ -80,6 +80,11 @@ class AttitudeTrack:
         """Readings that were not used, by sensor, shape (n,): no filter has a gate, so all of sensors not in use."""
         return {name: seen & (name not in self.used) for name, seen in self.seen.items()}
 
+    def __repr__(self) -> str:
+        """What ``adcs estimate`` prints, then the warnings."""
+        lines = by_name("adcs.io.estimates:summary_lines")(self)
+        return "\n".join((*lines, *(f"warning: {text}" for text in self.warnings)))
+
     def plot(self) -> Figure:
         """Every state's three axes side by side, with the filter's ±3σ, and the gaps of its sensors."""
         return by_name("adcs.plots.attitude:track_figure")(self)

@@ -48,7 +48,10 @@ class RigidBody:
         J = np.array(self.inertia_kgm2, dtype=np.float64)
         dipole = np.array(self.residual_dipole_Am2, dtype=np.float64)
         if J.shape != (3, 3) or not np.isfinite(J).all():
-            raise ValueError(f"Input inertia_kgm2 must be 3×3 finite numbers; instead received shape {J.shape}.")
+            raise ValueError(
+                "Input inertia_kgm2 must be 3×3 finite numbers, numpy.diag(moments) for principal axes; "
+                f"instead received shape {J.shape}."
+            )
         if not np.allclose(J, J.T, rtol=0.0, atol=1e-9 * np.abs(J).max()):
             raise ValueError("Input inertia_kgm2 must be symmetric; instead received a matrix that is not.")
         J = 0.5 * (J + J.T)

@@ -26,8 +26,8 @@ class Satellite:
         Of :func:`adcs.circular_orbit`, or :class:`adcs.environment.orbit.Sgp4Orbit`.
     residual_dipole_Am2 : ndarray, shape (3,)
         Magnetic moment that stays with the satellite, body axes.
-    sun_sensor : SunSensor
-        Their noise is what the filters believe; by default that of TabletSat-Aurora.
+    star_tracker, gyro, magnetometer, sun_sensor : StarTracker, Gyro, Magnetometer, SunSensor
+        Of :mod:`adcs.satellite.sensors`. Their noise is what the filters believe; by default that of TabletSat-Aurora.
     control : WheelControl
         Only of use to a simulation, and to the Jacobian of the closed loop.
     start : datetime64

@@ -142,14 +142,14 @@ def in_si(key: str) -> tuple[str, int]:
     return key.replace("nT", "T").replace("mrad", "rad"), exponent
 
 
-def check_keys(place: str, table: Mapping[str, Any], known: Collection[str]) -> None:
+def check_keys(place: str, table: Mapping[str, Any], known: Collection[str], what: str = "key") -> None:
     """Refuse a table with a key that is not known, naming the nearest one that is."""
     for key in table:
         if key not in known:
             nearest = difflib.get_close_matches(key, sorted(known), n=1, cutoff=0.0)[0]
             shown = key if key and key.isprintable() else repr(key)
-            where, within = key_place(place, shown), _within(place)
-            raise InputError(f"{where}: found an unknown key, expected a known one (the nearest is {within}{nearest}).")
+            where, near = key_place(place, shown, what), f"{_within(place)}{nearest}"
+            raise InputError(f"{where}: found an unknown {what}, expected a known one (the nearest is {near}).")
 
 
 _TYPE_ERROR = re.compile(r"Expected `(?P<expected>[^`]+)`(?P<length> of length \d+)?, got `?(?P<found>[^`]+)`?")
@@ -166,9 +166,9 @@ _TYPES = {
 }
 
 
-def key_place(place: str, key: str) -> str:
+def key_place(place: str, key: str, what: str = "key") -> str:
     """Where a key is: of a place that ends with a stop, as of an inline table, in one word with it."""
-    return f"{place}{key}" if place.endswith(".") else f"{place}, key {key}"
+    return f"{place}{key}" if place.endswith(".") else f"{place}, {what} {key}"
 
 
 def _within(place: str) -> str:

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from cyclopts import App, CycloptsError, Parameter, UnknownCommandError
+from cyclopts import App, CycloptsError, MissingArgumentError, Parameter, UnknownCommandError
 
 from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import InputError
@@ -168,6 +168,10 @@ def call(app: App, tokens: Sequence[str]) -> None:
         command, bound, _ = app.parse_args(tokens, print_error=False, exit_on_error=False)
     except UnknownCommandError as error:
         raise InputError(_unknown_command(app, error)) from None
+    except MissingArgumentError as error:
+        if error.keyword is not None:
+            raise  # the option is there without its value
+        raise InputError(str(error).replace(" requires an argument.", " is missing.")) from None
     except ImportError as error:
         raise InputError(f"the command cannot be loaded ({error.__cause__ or error}).") from None
     for value in bound.arguments.values():

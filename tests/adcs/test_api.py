@@ -32,7 +32,7 @@ class TestNames:
     def test_none_is_that_of_a_submodule_unless_it_is_the_module(self):
         folder = Path(adcs.__file__).parent
         modules = {path.stem for path in folder.iterdir() if path.is_dir() or path.suffix == ".py"}
-        assert modules & set(adcs.__all__) == {"frames", "mockup"}
+        assert modules & set(adcs.__all__) == {"datasets", "frames", "mockup"}
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +89,15 @@ class TestEstimate:
         scenario, _, log = flight
         figure = adcs.estimate(log, satellite_of(scenario), sensors="st+gyro", states=["gyro-bias"]).plot()
         assert len(figure.axes) == 3 * 3
+
+    def test_prints_what_the_command_prints_and_its_warnings(self, flight):
+        scenario, _, log = flight
+        track = adcs.estimate(log, satellite_of(scenario), sensors="st+gyro", states=("gyro-bias",))
+        lines = repr(replace(track, warnings=("too good",))).splitlines()
+        assert lines[0].endswith("st+gyro, estimating gyro-bias; filter mekf")
+        assert lines[1].startswith("attitude at the end, orbital from body")
+        assert lines[-1] == "warning: too good"
+        assert len(lines) < 12
 
     def test_settings_are_those_of_the_names(self, flight):
         scenario, _, log = flight
@@ -174,6 +183,7 @@ class TestComplementaryFilter:
         assert off[0] < 1e-6
         assert off.max() < 5.0
         assert np.isnan(attitude.sigma_deg).all()
+        assert "reference from body" in repr(attitude)
 
     def test_adaptive_finds_the_bias_of_the_gyro(self, imu):
         """Its first vector is to be the field, in tesla."""

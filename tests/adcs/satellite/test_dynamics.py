@@ -74,6 +74,10 @@ class TestBody:
         with pytest.raises(ValueError, match=r"Input inertia_kgm2 must be .*; instead received"):
             RigidBody(inertia)
 
+    def test_principal_moments_alone(self) -> None:
+        with pytest.raises(ValueError, match=r"numpy\.diag\(moments\) .*received shape \(3,\)"):
+            RigidBody(np.ones(3))
+
     def test_no_dipole(self) -> None:
         with pytest.raises(ValueError, match=r"Input residual_dipole_Am2 must be 3 finite numbers"):
             RigidBody(J, np.array([1.0, 2.0]))

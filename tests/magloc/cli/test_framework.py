@@ -92,6 +92,12 @@ class TestWrongCommand:
     def test_names_the_nearest(self, run: Run) -> None:
         assert_refused(run("calibrat"), 'Unknown command "calibrat". Did you mean "calibrate"? ', "locate, map")
 
+    @pytest.mark.parametrize(
+        ("line", "what"), [("locate x.csv", "--array is missing"), ("locate x.csv --array", "--array requires")]
+    )
+    def test_tells_a_missing_option_from_one_without_its_value(self, run: Run, line: str, what: str) -> None:
+        assert_refused(run(*line.split()), what)
+
     def test_names_all(self, run: Run) -> None:
         assert_refused(run("zzz"), f'Unknown command "zzz". Available commands: {", ".join(COMMANDS)}.')
 
