@@ -103,7 +103,7 @@ class TestGaps:
     ("header", "rows", "fragments"),
     [
         ("time_s,gyro_x", ["0,1"], ["line 1, column gyro_x: found an unknown column", "nearest is gyro_x_deg_s"]),
-        (",".join(GYRO), ["1,2,3"], ["line 1", "expected time_s"]),
+        (",".join(GYRO), ["1,2,3"], ["line 1, column time_s", "expected it beside"]),
         (f"time_s,{GYRO[0]}", ["0,1"], ["line 1", GYRO[1], "all or none"]),
         (f"time_s,{','.join(FIELD)}", ["0,1,2,3", "1.5,1,2,3"], ["line 3", "time_s", "step_s = 1 s"]),
         (f"time_s,{','.join(FIELD)}", ["0,1,2,3", "0,1,2,3"], ["line 3", "ascend"]),
