@@ -2,6 +2,7 @@
 
 | what | who checks it |
 |---|---|
+| block_update | scalar_update, sequential_update, and an expansion in how little is learnt |
 | scalar_update, sequential_update | exact rational arithmetic, filterpy's batch update, information form |
 | predict_square_root | F P Fᵀ + Q |
 | iterated_update | scipy's minimiser of the MAP cost, Stone Soup's IteratedKalmanUpdater, the affine closed form |
@@ -24,6 +25,7 @@ from scipy.stats import chi2 as chi2_distribution
 from arrays.geometries import tetrahedron
 from magloc.kalman import (
     IteratedExtendedKalmanFilter,
+    block_update,
     estimability,
     iterated_update,
     predict_square_root,
@@ -113,6 +115,46 @@ class TestScalarUpdateIsBayes:
         assert np.linalg.norm(S.T @ along) ** 2 == pytest.approx(float(exact_along), rel=1e-6)
         naive = 1e8 * np.eye(2) - np.outer([3e8, 4e8], [3e8, 4e8]) / (25e8 + 1e-8)
         assert abs(along @ naive @ along - float(exact_along)) > 0.5 * float(exact_along)
+
+
+class TestBlockUpdate:
+    """All scalars of one linearisation at once."""
+
+    @given(st.integers(0, 2**32 - 1), st.integers(1, 8), st.integers(1, 12))
+    @settings(max_examples=30)
+    def test_is_the_update_in_turn(self, seed, n, k):
+        x, S, H, nu, r = random_problem(seed, n, k)
+        x_new, S_new = block_update(x, S, H, nu, r)
+        x_turn, S_turn = sequential_update(x, S, H, nu, r)
+        phi = np.linalg.norm(H / np.sqrt(r)[:, None] @ S, 2)
+        size = np.finfo(np.float64).eps * (1.0 + phi**2) * n * k * np.linalg.norm(S)
+        np.testing.assert_allclose(S_new @ S_new.T, S_turn @ S_turn.T, rtol=0.0, atol=size * np.linalg.norm(S))
+        np.testing.assert_allclose(x_new, x_turn, rtol=0.0, atol=size * np.linalg.norm(nu / np.sqrt(r)))
+
+    @given(st.integers(0, 2**32 - 1), st.integers(1, 8))
+    @settings(max_examples=30)
+    def test_of_one_scalar_is_potters_root(self, seed, n):
+        """The root itself, not the covariance alone: of all that have its square, the one nearest to what was."""
+        x, S, H, nu, r = random_problem(seed, n, 1)
+        x_new, S_new = block_update(x, S, H, nu, r)
+        x_potter, S_potter = scalar_update(x, S, H[0], float(nu[0]), float(r[0]))
+        np.testing.assert_allclose(S_new, S_potter, rtol=0.0, atol=1e-13 * np.linalg.norm(S) ** 2)
+        np.testing.assert_allclose(x_new, x_potter, rtol=0.0, atol=1e-12 * np.linalg.norm(x_potter))
+
+    @pytest.mark.parametrize("weight", [0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-4])
+    @pytest.mark.parametrize("k", [1, 3, 9])
+    def test_readings_that_teach_next_to_nothing(self, weight, k):
+        """S⁺ = S (I - ΦᵀΦ/2) but for Φ⁴: a factor of the other sign would divide by the digits that 1 - L loses."""
+        x, S, H, nu, r = random_problem(5, k=k)
+        x_new, S_new = block_update(x, S, weight * H, nu, r)
+        phi = weight * H / np.sqrt(r)[:, None] @ S
+        size = np.linalg.norm(S)
+        off = 1e-14 * size + size * np.linalg.norm(phi) ** 4
+        np.testing.assert_allclose(S_new, S - S @ (phi.T @ phi) / 2.0, rtol=0.0, atol=off)
+        first = S @ phi.T @ (nu / np.sqrt(r))
+        np.testing.assert_allclose(
+            x_new, x + first, rtol=0.0, atol=1e-14 + np.linalg.norm(phi) ** 2 * np.abs(first).max()
+        )
 
 
 class TestPrediction:

@@ -20,7 +20,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from arrays.array import SensorArray
 from arrays.differences import decorrelated_differences
-from arrays.geometries import axial, cross, square, tetrahedron
+from arrays.geometries import axial, cross, grid, square, tetrahedron
 from arrays.noise import proportional_noise
 from arrays.sensor import Sensor
 from arrays.whitening import whitening
@@ -481,3 +481,31 @@ class TestCandidates:
         m = rng.normal(size=(50, 3))
         for source, fix in zip(p, plain_locator(array).fit_rows(noisy_readings(array, p, m, rng)), strict=True):
             assert np.linalg.norm(fix.solutions[0].position_m - source) < 1e-3
+
+
+class TestNeighbouringOptima:
+    """What is one optimum and what are two: 0.01 rad on the sphere of homogeneous coordinates, 0.01 in χ²."""
+
+    @pytest.mark.parametrize("position", [[1.2, 0.36, 0.18], [1.2, 0.36, 0.24], [3.0, 0.9, 0.45], [3.0, 0.9, 0.6]])
+    def test_mirror_images_are_both_listed(self, position):
+        """Sensors of one axis that stand in a plane across it cannot know on which side a source is."""
+        array = grid(3, 3, 0.5, noise_T=1e-9)
+        readings = predicted_channels(array, position, 5.0 * np.array([30.0, -20.0, 50.0])) + array.channel_offset_T
+        readings[np.arange(readings.size) % 3 != 2] = np.nan
+        found = plain_locator(array).fit(readings).solutions
+        image = np.array([1.0, 1.0, -1.0]) * position
+        for side in (position, image):
+            assert min(np.linalg.norm(s.position_m - side) + s.chi2 for s in found) < 1e-3
+
+    @pytest.mark.parametrize("sign", [-1.0, 1.0])
+    @pytest.mark.parametrize(
+        ("angle_rad", "delta_chi2", "same"),
+        [(0.0, 0.0, True), (0.0099, 0.0, True), (0.0101, 0.0, False), (0.0, 0.0099, True), (0.0, 0.0101, False)],
+    )
+    def test_by_angle_and_by_chi2(self, sign, angle_rad, delta_chi2, same):
+        """q and -q are one position."""
+        for one, other in np.array([[0, 1], [1, 2], [2, 3], [3, 0]]):
+            q = np.eye(4)[one]
+            turned = sign * (np.cos(angle_rad) * q + np.sin(angle_rad) * np.eye(4)[other])
+            for step in (delta_chi2, -delta_chi2):
+                assert variable_projection_compiled.same_optimum(q, 7.0, turned, 7.0 + step) == same
