@@ -22,8 +22,6 @@ _PSD_RTOL = 1e-9
 UNSEEN_RTOL = 1e-12
 # Addition to a shape, in units of its trace, with which points are tested against a flat one.
 _FLAT_RTOL = 1e-13
-# Enlargement of the bounds and of the shape's diagonal that covers rounding.
-BOUND_MARGIN = 1e-12
 EPS = float(np.finfo(np.float64).eps)
 
 
@@ -218,7 +216,8 @@ def intersect_strip(
 
     Rounding is covered. With r = Σ \|h_i\| √H_ii, the largest half-width that an ellipsoid in the same box could have
     along h, e² is known to n eps r², and an entry of the cut shape to n eps (r/e)² √(H_ii H_jj); a matrix of entries
-    below √(H_ii H_jj) is below n diag(H). So some n eps (r/e)² diag(H) is added.
+    below √(H_ii H_jj) is below n diag(H). So some n eps (r/e)² diag(H) is added, and as much to the growth of the
+    shape, which may be a small difference of large numbers.
     """
     h = measurement_direction(direction, ellipsoid.n)
     check_positive(bound=bound)
@@ -231,7 +230,7 @@ def intersect_strip(
     e2, trace = float(h @ Hh), ellipsoid.trace
     e = math.sqrt(max(e2, 0.0))
     nu = float(value - h @ x)
-    c = bound + BOUND_MARGIN * bound + 4.0 * EPS * (abs(value) + float(np.abs(h) @ np.abs(x)))
+    c = bound + 4.0 * EPS * (abs(value) + float(np.abs(h) @ np.abs(x)))
     rounding = 4.0 * ellipsoid.n * EPS * float(np.abs(h) @ ellipsoid.half_widths) ** 2
     if abs(nu) > c + math.sqrt(max(e2, 0.0) + rounding):
         return StripUpdate(ellipsoid, Outcome.INCONSISTENT)
@@ -242,12 +241,12 @@ def intersect_strip(
         if abs(mu) + 1.0 <= delta:
             return StripUpdate(ellipsoid, Outcome.UNINFORMATIVE)
         mu, delta = tightened_strip(mu, delta)
-        shape = _around_rounded(delta * delta * H, np.abs(x))
+        shape = _around_rounded(delta * delta * H, np.abs(x) + ellipsoid.half_widths)
         return StripUpdate(Ellipsoid(x + (mu / e) * Hh, shape), Outcome.REDUCED)
     g = min(float(Hh @ Hh) / (e2 * trace), 1.0)
-    found = cut(mu, delta, g, rule)
     margin = rounding / e2
-    if found is None or found[2] * (1.0 - found[1] * g + margin) >= 1.0:
+    found = cut(mu, delta, g, rule, margin)
+    if found is None:
         return StripUpdate(ellipsoid, Outcome.UNINFORMATIVE)
     mu, step, beta2 = found
     shape = beta2 * (H - (step / e2) * np.outer(Hh, Hh) + margin * np.diag(np.diagonal(H)))

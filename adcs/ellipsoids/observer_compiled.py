@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adcs.ellipsoids.ellipsoid import BOUND_MARGIN, EPS, UNSEEN_RTOL, Outcome
+from adcs.ellipsoids.ellipsoid import EPS, UNSEEN_RTOL, Outcome
 from adcs.ellipsoids.strip import LARGEST_STEP, SMALLEST_GROWTH, SMALLEST_TIGHTENED_DELTA, STEP_RULES
 from arrays.typing import FloatArray
 from magloc.compilation import compiled, over_rows
@@ -155,7 +155,7 @@ def _intersect(x: FloatArray, H: FloatArray, h: FloatArray, y: float, c: float, 
         size += abs(h[i] * x[i])
         reach += abs(h[i]) * np.sqrt(H[i, i])
     e = np.sqrt(max(e2, 0.0))
-    c += BOUND_MARGIN * c + 4.0 * EPS * (abs(y) + size)
+    c += 4.0 * EPS * (abs(y) + size)
     rounding = 4.0 * n * EPS * reach * reach
     if abs(nu) > c + np.sqrt(max(e2, 0.0) + rounding):
         return _INCONSISTENT
@@ -167,8 +167,9 @@ def _intersect(x: FloatArray, H: FloatArray, h: FloatArray, y: float, c: float, 
             return _UNINFORMATIVE
         mu, delta = _tightened(mu, delta)
         Hh[0] *= mu / e
+        size = abs(x[0]) + np.sqrt(H[0, 0])
         H[0, 0] *= delta * delta
-        _cover(H, np.abs(x))
+        _cover(H, np.array([size]))
         x[0] += Hh[0]
         return _REDUCED
     g = min(squared / (e2 * trace), 1.0)
@@ -176,9 +177,10 @@ def _intersect(x: FloatArray, H: FloatArray, h: FloatArray, y: float, c: float, 
         mu, delta = _tightened(mu, delta)
     if mu * mu + g <= delta * delta:
         return _UNINFORMATIVE
-    step = min(1.0 - delta * delta / (g + mu * mu), LARGEST_STEP) if rule == LEMMA else _optimal(mu, delta, g)
-    beta2 = max(1.0 + step * (delta * delta / (1.0 - step) - mu * mu), SMALLEST_GROWTH)
     margin = rounding / e2
+    step = min(1.0 - delta * delta / (g + mu * mu), LARGEST_STEP) if rule == LEMMA else _optimal(mu, delta, g)
+    step = min(step, 1.0 / (1.0 + 2.0 * margin))
+    beta2 = max(1.0 + step * (delta * delta / (1.0 - step * (1.0 + margin)) - mu * mu) + margin, SMALLEST_GROWTH)
     if beta2 * (1.0 - step * g + margin) >= 1.0 or not np.isfinite(beta2):
         return _UNINFORMATIVE
     for i in range(n):

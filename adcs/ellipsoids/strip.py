@@ -24,9 +24,12 @@ def is_informative(mu: float, delta: float, g: float) -> bool:
     return mu * mu + g > delta * delta
 
 
-def growth(mu: float, delta: float, step: float) -> float:
-    """β² = 1 + λ (δ²/(1 - λ) - μ²), the factor of the shape after a step λ in [0, 1)."""
-    return 1.0 + step * (delta * delta / (1.0 - step) - mu * mu)
+def growth(mu: float, delta: float, step: float, margin: float = 0.0) -> float:
+    """β² = 1 + λ (δ²/(1 - λ) - μ²), the factor of the shape after a step λ in [0, 1), where e² is known to a margin.
+
+    With another e² the same cut has another λ, but the same λ μ² and λ δ²: only 1 - λ is not known.
+    """
+    return 1.0 + step * (delta * delta / (1.0 - step * (1.0 + margin)) - mu * mu) + margin
 
 
 def trace_ratio(mu: float, delta: float, g: float, step: float) -> float:
@@ -71,17 +74,18 @@ def tightened_strip(mu: float, delta: float) -> tuple[float, float]:
     return 0.5 * (low + high), max(0.5 * (high - low), SMALLEST_TIGHTENED_DELTA)
 
 
-def cut(mu: float, delta: float, g: float, rule: StepRule) -> tuple[float, float, float] | None:
+def cut(mu: float, delta: float, g: float, rule: StepRule, margin: float = 0.0) -> tuple[float, float, float] | None:
     r"""Middle μ of the strip that is used, step λ and growth β² of an update, floors included.
 
     ``mu``, ``delta``, ``g``: of a strip that touches the ellipsoid, \|μ\| ≤ 1 + δ. ``rule``, one of 'lemma', 'optimal',
-    'tightened': ``tightened`` is the optimal step of :func:`tightened_strip`. Returns: None where the update would not
-    decrease the trace.
+    'tightened': ``tightened`` is the optimal step of :func:`tightened_strip`. ``margin``: to which part of itself e² is
+    known. Returns: None where the update would not decrease the trace.
     """
     if rule == "tightened":
         mu, delta = tightened_strip(mu, delta)
     if not is_informative(mu, delta, g):
         return None
     step = lemma_step(mu, delta, g) if rule == "lemma" else optimal_step(mu, delta, g)
-    beta2 = max(growth(mu, delta, step), SMALLEST_GROWTH)
-    return (mu, step, beta2) if beta2 * (1.0 - step * g) < 1.0 else None
+    step = min(step, 1.0 / (1.0 + 2.0 * margin))
+    beta2 = max(growth(mu, delta, step, margin), SMALLEST_GROWTH)
+    return (mu, step, beta2) if beta2 * (1.0 - step * g + margin) < 1.0 else None
