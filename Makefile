@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 MAKE_VENV = $(PYTHON) -m venv --clear
 
-.PHONY: map test test-full test-oldest bench docs notebooks chromium lint clean
+.PHONY: map test test-full test-oldest mutation licences bench docs notebooks chromium lint clean
 
 map: .venv/installed
 	$(BIN)/magloc map
@@ -24,6 +24,14 @@ lint: .venv/installed-test
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache --no-logo
+
+# Whether the tests see a change in 300 lines of the code; hours, and it goes on where it was stopped.
+mutation: .venv/installed-test
+	$(BIN)/python -m tests.mutation
+
+# The licences of all that is installed; fails where one of the base is copyleft.
+licences: .venv/installed-test
+	$(BIN)/python -m tests.licences
 
 bench: .venv/installed-bench
 	$(BIN)/python -m tests.bench

@@ -1,0 +1,377 @@
+"""``python -m tests.mutation``: one change at a time in lines drawn at random, and whether the tests see it.
+
+Nothing is changed in place: the tree is copied, and the tests run there. A change is killed by the first test file that
+fails or hangs among those nearest to it: its mirror first, then those that reach it by the fewest imports. What is
+found goes to a file line by line, and the same seed goes on where it was stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import difflib
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+REPOSITORY = Path(__file__).parents[1]
+PACKAGES = ("arrays", "magloc", "adcs", "sims")
+OPPOSITE: dict[type[ast.AST], type[ast.AST]] = {
+    ast.Lt: ast.GtE,
+    ast.LtE: ast.Gt,
+    ast.Gt: ast.LtE,
+    ast.GtE: ast.Lt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot,
+    ast.IsNot: ast.Is,
+    ast.In: ast.NotIn,
+    ast.NotIn: ast.In,
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.FloorDiv: ast.Div,
+    ast.Mod: ast.Mult,
+    ast.Pow: ast.Mult,
+    ast.MatMult: ast.Mult,
+    ast.And: ast.Or,
+    ast.Or: ast.And,
+    ast.BitAnd: ast.BitOr,
+    ast.BitOr: ast.BitAnd,
+}
+# Of numbers that count, 1 is at the edge; for all others only the opposite says something.
+EDGE: dict[type[ast.AST], type[ast.AST]] = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt}
+# A hang: longer than this, with kernels to compile or without, and than some times what the file takes unchanged.
+LONGEST_S, LONGEST_COMPILED_S, SLOWER = 60.0, 300.0, 4.0
+UNTESTED = "untested"  # no test file reaches it, or none in time: no part of the score
+
+
+class Mutant(NamedTuple):
+    """One change: what stands at some bytes of a file, and what is put there."""
+
+    path: str
+    line: int
+    kind: str
+    begin: int
+    end: int
+    text: str
+
+    @property
+    def name(self) -> str:
+        """The same in every run."""
+        return f"{self.path}:{self.line}:{self.begin}:{self.kind}:{self.text}"
+
+    def applied(self, source: bytes) -> bytes:
+        """The file with the change."""
+        return source[: self.begin] + self.text.encode() + source[self.end :]
+
+    def diff(self, source: bytes) -> str:
+        """The lines that differ."""
+        before, after = source.decode().splitlines(), self.applied(source).decode().splitlines()
+        lines = list(difflib.unified_diff(before, after, self.path, self.path, lineterm="", n=1))
+        return "\n".join(lines[1:])
+
+
+def mutants(path: str, source: bytes) -> Iterator[Mutant]:
+    """All changes of a file, but for words: docstrings, types, what an error or a log says, formatted text."""
+    starts = [0]
+    for line in source.splitlines(keepends=True):
+        starts.append(starts[-1] + len(line))
+    for node, kind, new in _changes(ast.parse(source), ast.Module(body=[], type_ignores=[])):
+        begin, end = starts[node.lineno - 1] + node.col_offset, starts[node.end_lineno - 1] + node.end_col_offset
+        text = new if isinstance(new, str) else f"({ast.unparse(new)})"
+        yield Mutant(path, node.lineno, kind, begin, end, text)
+
+
+def _changes(node: ast.AST, parent: ast.AST) -> Iterator[tuple[Any, str, ast.AST | str]]:
+    if isinstance(node, ast.JoinedStr | ast.Import | ast.ImportFrom):
+        return
+    if isinstance(node, ast.If) and ast.unparse(node.test) in {"TYPE_CHECKING", "__name__ == '__main__'"}:
+        return
+    if isinstance(node, ast.Assign) and isinstance(parent, ast.Module) and _is_type(node.value):
+        return
+    yield from _changes_here(node)
+    for field, value in ast.iter_fields(node):
+        if field in {"annotation", "returns", "decorator_list", "exc", "bases"}:
+            continue
+        if field in {"args", "keywords"} and isinstance(node, ast.Call) and _is_words(node):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.AST):
+                yield from _changes(child, node)
+
+
+def _changes_here(node: ast.AST) -> Iterator[tuple[Any, str, ast.AST | str]]:
+    match node:
+        case ast.Compare(ops=[op], comparators=[right]):
+            yield node, "comparison", _with(node, ops=[OPPOSITE[type(op)]()])
+            if type(op) in EDGE and (_counts(node.left) or _counts(right)):
+                yield node, "edge", _with(node, ops=[EDGE[type(op)]()])
+        case ast.BinOp(op=op) if type(op) in OPPOSITE:
+            yield node, "operator", _with(node, op=OPPOSITE[type(op)]())
+        case ast.BoolOp(op=op):
+            yield node, "operator", _with(node, op=OPPOSITE[type(op)]())
+        case ast.UnaryOp(op=ast.USub() | ast.Not(), operand=operand):
+            yield node, "sign", operand
+        case ast.Constant(value=bool() as value):
+            yield node, "constant", repr(not value)
+        case ast.Constant(value=int() as value):
+            yield node, "constant", repr(value + 1 if value < 10 else 2 * value)
+        case ast.Constant(value=float() as value):
+            yield node, "constant", repr(10.0 * value if value else 1.0)
+        case ast.If(test=test) | ast.IfExp(test=test) if isinstance(test, ast.Name | ast.Attribute | ast.Call):
+            yield test, "condition", ast.UnaryOp(ast.Not(), test)
+        case ast.AugAssign(op=op, target=target, value=value):
+            yield node, "statement", "pass"
+            if type(op) in OPPOSITE:
+                yield node, "operator", ast.unparse(ast.AugAssign(target, OPPOSITE[type(op)](), value))
+        case ast.Assign(targets=[ast.Subscript() | ast.Attribute()]):
+            yield node, "statement", "pass"
+        case ast.Raise() | ast.Continue() | ast.Break() | ast.Expr(value=ast.Call()):
+            yield node, "statement", "pass"
+        case ast.Call(args=[first, second, *rest]) if not _is_words(node):
+            if not isinstance(first, ast.Starred) and not isinstance(second, ast.Starred) and _differ(first, second):
+                yield node, "arguments", _with(node, args=[second, first, *rest])
+
+
+def _with(node: ast.AST, **fields: object) -> ast.AST:
+    changed = copy.copy(node)
+    for field, value in fields.items():
+        setattr(changed, field, value)
+    return changed
+
+
+def _differ(first: ast.AST, second: ast.AST) -> bool:
+    return ast.dump(first) != ast.dump(second)
+
+
+def _counts(node: ast.AST) -> bool:
+    """Whether a number is a count by its looks: a whole number, a size."""
+    if isinstance(node, ast.Constant):
+        return type(node.value) is int
+    return bool(re.search(r"\b(len\(.*\)|size|ndim|shape\[\d\]|n_\w+)$", ast.unparse(node)))
+
+
+def _is_type(node: ast.AST) -> bool:
+    """Whether a value at the top of a module looks like a type."""
+    return bool(
+        re.match(r"(Callable|dict|list|tuple|Literal|NDArray|Mapping|Sequence|\w+( \| \w+)+$)", ast.unparse(node))
+    )
+
+
+def _is_words(node: ast.Call) -> bool:
+    """Whether a call only says something or names a type."""
+    return bool(re.match(r"(_LOG\.|warnings\.warn|log\w*\.|cast$|TypeVar$|NewType$)", ast.unparse(node.func)))
+
+
+class Reach:
+    """Which test files reach a module, by the fewest imports; a test file reaches its mirror at once."""
+
+    def __init__(self) -> None:
+        files = [path for folder in (*PACKAGES, "tests") for path in (REPOSITORY / folder).rglob("*.py")]
+        self.modules = {".".join(path.relative_to(REPOSITORY).with_suffix("").parts): path for path in files}
+        self.importers: dict[str, set[str]] = defaultdict(set)
+        public = {
+            f"{package}.{alias.asname}": f"{node.module}.{alias.name}"
+            for package in PACKAGES
+            for node in ast.parse((REPOSITORY / package / "__init__.pyi").read_text(encoding="utf-8")).body
+            if isinstance(node, ast.ImportFrom)
+            for alias in node.names
+        }
+        for module, path in self.modules.items():
+            for name in _names(module, ast.parse(path.read_text(encoding="utf-8"))):
+                full = public.get(name, name)
+                target = full if full in self.modules else full.rpartition(".")[0]
+                if target in self.modules:
+                    self.importers[target].add(module)
+
+    def from_module(self, path: str) -> dict[str, int]:
+        """All modules that import a file, themselves or by others, with how many imports that takes."""
+        first = path.removesuffix(".py").replace("/", ".")
+        found, last = {first: 0}, [first]
+        while last:
+            last = sorted({name for one in last for name in self.importers[one]} - found.keys())
+            found |= dict.fromkeys(last, max(found.values()) + 1)
+        return found
+
+    def tests(self, path: str) -> list[str]:
+        """Test files of a product file: its mirror, then by imports and by how much of the path is the same."""
+        where = Path("tests", path).with_name(f"test_{Path(path).stem.removesuffix('_compiled')}.py")
+
+        def near(module: str) -> tuple[bool, bool, int, int, str]:
+            file = Path(*module.split(".")).with_suffix(".py")
+            shared = sum(one == other for one, other in zip(file.parts, where.parts, strict=False))
+            return file != where, file.name != where.name, distance[module], -shared, module
+
+        distance = self.from_module(path)
+        names = [name for name in distance if name.startswith("tests.") and name.rpartition(".")[2].startswith("test_")]
+        return [str(self.modules[name].relative_to(REPOSITORY)) for name in sorted(names, key=near)]
+
+
+def _names(module: str, tree: ast.Module) -> Iterator[str]:
+    """Dotted names that a module may have of others: imported, or taken from a package's root."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (f"{alias.name}.x" for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            yield f"{node.value.id}.{node.attr}"
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and re.fullmatch(r"[\w.]+:\w+", node.value):
+            yield node.value.replace(":", ".")  # as commands are registered
+    if ".test_" in module:
+        mirror = module.removeprefix("tests.").replace(".test_", ".")
+        yield from (f"{mirror}.x", f"{mirror}_compiled.x")
+
+
+class Laboratory:
+    """A copy of the tree in which changes are tried, with what numba has compiled for it."""
+
+    def __init__(self, folder: Path, reach: Reach) -> None:
+        self.root, self.reach, self.seconds = folder / "tree", reach, dict[str, float]()
+        left_out = shutil.ignore_patterns(".git", ".venv*", ".artefacts", "_build", ".*_cache")
+        shutil.copytree(REPOSITORY, self.root, ignore=left_out)
+
+    def verdict(self, mutant: Mutant, most_files: int, most_s: float) -> str:
+        """What killed a change; empty where it survives."""
+        file = self.root / mutant.path
+        source, times = file.read_bytes(), file.stat()
+        # A compiled caller holds what it called, and numba does not look whether that is still the same.
+        inside = [name for name in self.reach.from_module(mutant.path) if not name.startswith("tests.")]
+        left, tried = most_s, 0
+        for test in self.reach.tests(mutant.path)[:most_files]:
+            unchanged = self._unchanged(test, most_s)
+            if unchanged > left:
+                continue
+            left, tried = left - unchanged, tried + 1
+            try:
+                compiled = sum(self._forget(name) for name in inside)
+                file.write_bytes(mutant.applied(source))
+                killed = self._run(test, max(LONGEST_COMPILED_S if compiled else LONGEST_S, SLOWER * unchanged))
+            finally:
+                file.write_bytes(source)
+                os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
+                for name in inside:
+                    self._recall(name)
+            if killed:
+                return killed
+        return "" if tried else UNTESTED
+
+    def _unchanged(self, test: str, most_s: float) -> float:
+        """Seconds that a test file takes as the tree is; infinite where it fails, or takes longer than some."""
+        if test not in self.seconds:
+            begin = time.monotonic()
+            failed = self._run(test, most_s)
+            self.seconds[test] = float("inf") if failed else time.monotonic() - begin
+        return self.seconds[test]
+
+    def _run(self, test: str, most_s: float) -> str:
+        """What fails first in a test file, or that it hangs; empty where all is well."""
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", test]
+        variables = os.environ | {"PYTHONPATH": str(self.root), "PYTHONDONTWRITEBYTECODE": "1"}
+        pipe = subprocess.PIPE
+        with subprocess.Popen(
+            command, cwd=self.root, env=variables, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+        ) as process:
+            try:
+                out, _ = process.communicate(timeout=most_s)
+            except subprocess.TimeoutExpired:
+                return f"{test}: hangs"
+            finally:
+                if process.poll() is None:
+                    os.killpg(process.pid, signal.SIGKILL)
+        if process.returncode in {0, 5}:  # 5: all of its tests are slow
+            return ""
+        failed = re.search(r"^(?:FAILED|ERROR) (\S+)", out, re.MULTILINE)
+        return failed[1] if failed else f"{test}: status {process.returncode}"
+
+    def _caches(self, root: Path, module: str) -> list[Path]:
+        path = root / module.replace(".", "/")
+        return [file for end in ("nbi", "nbc") for file in (path.parent / "__pycache__").glob(f"{path.name}.*.{end}")]
+
+    def _forget(self, module: str) -> int:
+        files = self._caches(self.root, module)
+        for file in files:
+            file.unlink()
+        return len(files)
+
+    def _recall(self, module: str) -> None:
+        self._forget(module)
+        for file in self._caches(REPOSITORY, module):
+            shutil.copy2(file, self.root / file.relative_to(REPOSITORY))
+
+
+def drawn(n_lines: int, seed: int, packages: tuple[str, ...]) -> list[Mutant]:
+    """One change in each of some lines, all lines that can be changed being as likely."""
+    lines: dict[tuple[str, int], list[Mutant]] = defaultdict(list)
+    for package in packages:
+        for path in sorted((REPOSITORY / package).rglob("*.py")):
+            name = str(path.relative_to(REPOSITORY))
+            for mutant in mutants(name, path.read_bytes()):
+                lines[name, mutant.line].append(mutant)
+    rng = random.Random(seed)
+    return [rng.choice(lines[line]) for line in rng.sample(sorted(lines), min(n_lines, len(lines)))]
+
+
+def table(found: list[dict[str, str]]) -> str:
+    """Score of every package and kind, and the diff of every survivor."""
+    n_untested = len(found)
+    found = [one for one in found if one["killed"] != UNTESTED]
+    n_untested -= len(found)
+    lines = [f"{one['diff']}\n" for one in found if not one["killed"]]
+    for by in ("package", "kind"):
+        total = Counter(one[by] for one in found)
+        killed = Counter(one[by] for one in found if one["killed"])
+        lines += [f"{name:12s}{killed[name]:5d} of {n:4d} killed" for name, n in sorted(total.items())]
+    n_killed = sum(bool(one["killed"]) for one in found)
+    score = f"{n_killed} of {len(found)} killed, {100.0 * n_killed / max(len(found), 1):.0f} %; {n_untested} not tried"
+    return "\n".join([*lines, score])
+
+
+def main() -> int:
+    """Draw, try, and say what survives."""
+    parser = argparse.ArgumentParser(prog="python -m tests.mutation", description=__doc__)
+    parser.add_argument("--lines", type=int, default=300)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--package", choices=PACKAGES, action="append")
+    parser.add_argument("--files", type=int, default=6, help="test files at most for a change")
+    parser.add_argument("--limit-s", type=float, default=180.0, help="seconds at most that these take unchanged")
+    parser.add_argument("--out", type=Path, help="where the results go (default .artefacts/mutation-SEED.jsonl)")
+    arguments = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # and leave nothing behind
+    out = arguments.out or REPOSITORY / ".artefacts" / f"mutation-{arguments.seed}.jsonl"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    lines = out.read_text(encoding="utf-8").splitlines() if out.exists() else []
+    known = {one["name"]: one for one in map(json.loads, lines)}
+    found = []
+    with tempfile.TemporaryDirectory(prefix="mutation-") as folder, out.open("a", encoding="utf-8") as stream:
+        laboratory = Laboratory(Path(folder), Reach())
+        for mutant in drawn(arguments.lines, arguments.seed, tuple(arguments.package or PACKAGES)):
+            if mutant.name not in known:
+                killed = laboratory.verdict(mutant, arguments.files, arguments.limit_s)
+                diff = mutant.diff((laboratory.root / mutant.path).read_bytes())
+                package = mutant.path.partition("/")[0]
+                one = {"name": mutant.name, "package": package, "kind": mutant.kind, "killed": killed, "diff": diff}
+                print(json.dumps(one, ensure_ascii=False), file=stream, flush=True)
+                print(f"{mutant.path}:{mutant.line} {mutant.kind}: {killed or 'SURVIVES'}", flush=True)
+                known[mutant.name] = one
+            found.append(known[mutant.name])
+    print(table(found))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
