@@ -456,6 +456,19 @@ class TestStream:
         monkeypatch.setattr("sys.stdin", io.StringIO(HEADER + "\n"))
         assert_refused(run("track", "-", "--array", array), "standard input, line 1", "without rows")
 
+    @pytest.mark.parametrize(
+        ("data", "fragments"),
+        [
+            (f"{HEADER}\n0,1,2,\xff".encode("latin-1"), ("0xff", "not UTF-8")),
+            (f"\ufeff{HEADER}\n".encode(), ("line 1", "without rows")),
+        ],
+    )
+    def test_bytes(
+        self, run: Run, array: Path, monkeypatch: pytest.MonkeyPatch, data: bytes, fragments: Sequence[str]
+    ) -> None:
+        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(data), encoding="utf-8"))
+        assert_refused(run("track", "-", "--array", array), "standard input", *fragments)
+
     def test_nothing_on_standard_input(self, stream: Stream) -> None:
         assert_refused(stream.finish(), "standard input: found nothing")
 
