@@ -363,8 +363,13 @@ class TestConditioning:
     def test_refuses_a_window(self, run: Run, array: Path, readings: Path, window: str) -> None:
         assert_refused(run("track", readings, "--array", array, f"--window-s={window}"), "--window-s", "positive")
 
-    @pytest.mark.parametrize("option", ["--mains-hz=50", "--high-pass-hz=1", "--high-pass-hz=-1"])
-    def test_refuses_frequencies_above_half_the_rate(self, run: Run, array: Path, readings: Path, option: str) -> None:
+    @pytest.mark.parametrize(
+        "option",
+        ["--mains-hz=50", "--high-pass-hz=1", "--high-pass-hz=-1", "--mains-hz=1e-30", "--high-pass-hz=1e-30"],
+    )
+    def test_refuses_frequencies_that_the_rate_does_not_show(
+        self, run: Run, array: Path, readings: Path, option: str
+    ) -> None:
         assert_refused(run("track", readings, "--array", array, option), str(readings), "2 Hz")
 
     def test_refuses_missing_readings_for_a_filter(self, run: Run, array: Path, tmp_path: Path) -> None:
