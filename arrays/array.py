@@ -17,6 +17,7 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 
 AnyArray = TypeVar("AnyArray", bound=NDArray[Any])
 AMBIENT_CHANNELS = ("ambient_x", "ambient_y", "ambient_z")
+_FARTHEST_M = 1e9
 _SAME_PLACE_RTOL = 1e-9
 _GRADIENT_RTOL = 1e-6
 
@@ -75,6 +76,8 @@ class SensorArray:
         if not self.sensors:
             raise ValueError("Input sensors must be at least 1; instead received 0.")
         _check_distinct_names(self)
+        if np.abs(self.positions).max() > _FARTHEST_M:
+            raise ValueError(f"Input sensors must stand within {_FARTHEST_M:g} m of the origin; instead they do not.")
         if self.n_sensors > 1 and self.circumradius <= _SAME_PLACE_RTOL * np.abs(self.positions).max():
             raise ValueError(
                 f"Input sensors must stand in two places at least; instead received {self.n_sensors} sensors "

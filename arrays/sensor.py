@@ -13,6 +13,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from arrays.io.errors import LARGEST
 from arrays.typing import FloatArray
 
 SensorKind = Literal["vector", "scalar"]
@@ -229,6 +230,8 @@ def _finite(name: str, value: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
         raise ValueError(f"Input {name} must have shape {shape}; instead received {_plain(value)}.")
     if not np.isfinite(numbers).all():
         raise ValueError(f"Input {name} must be finite; instead received {_plain(value)}.")
+    if shape and not (np.abs(numbers) <= LARGEST).all():
+        raise ValueError(f"Input {name} must be {LARGEST:g} at most; instead received {_plain(value)}.")
     return numbers
 
 

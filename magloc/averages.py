@@ -53,7 +53,7 @@ def averaging_array(array: SensorArray, readings: Readings) -> SensorArray:
 
 def window_averages(readings: Readings, window_s: float) -> Readings:
     """Means of successive windows of time [s] that have a row, at the pose of the row in the middle of each."""
-    window = np.floor((readings.time_s - readings.time_s[0]) / window_s + 1e-9).astype(np.intp)
+    window = np.floor((readings.time_s - readings.time_s[0]) / window_s + 1e-9)
     _, first, count = np.unique(window, return_index=True, return_counts=True)
     middle = first + count // 2
     known = np.isfinite(readings.values_T)

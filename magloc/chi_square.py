@@ -24,12 +24,22 @@ def mean_bounds(degrees_of_freedom: int, level: float = CONSISTENCY) -> tuple[fl
 
 
 def normalised_square(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Squared errors (..., N) in units of a covariance (..., N, N), shape (...): χ² of N numbers where it is right."""
+    """Squared errors (..., N) in units of a covariance (..., N, N), shape (...): χ² of N numbers where it is right.
+
+    NaN where the covariance is none, as that of a filter that has diverged.
+    """
     # States of mixed units: solved with the correlations, which are well-conditioned.
-    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-    correlation = covariance / (sigma[..., :, None] * sigma[..., None, :])
-    scaled = error / sigma
-    return np.sum(scaled * np.linalg.solve(correlation, scaled[..., None])[..., 0], axis=-1)
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        correlation = covariance / (sigma[..., :, None] * sigma[..., None, :])
+        scaled = error / sigma
+        try:
+            solved = np.linalg.solve(correlation, scaled[..., None])[..., 0]
+        except np.linalg.LinAlgError:
+            regular = np.linalg.slogdet(correlation).sign > 0.0
+            correlation = np.where(regular[..., None, None], correlation, np.nan)
+            solved = np.linalg.solve(correlation, scaled[..., None])[..., 0]
+        return np.asarray(np.sum(scaled * solved, axis=-1))
 
 
 class Detector(Protocol):

@@ -35,20 +35,20 @@ def detrended(time_s: FloatArray, values_T: FloatArray) -> FloatArray:
 
 def high_passed(time_s: FloatArray, values_T: FloatArray, corner_Hz: float) -> FloatArray:
     """Columns without what changes more slowly than a corner frequency: a Butterworth filter of second order."""
-    rate = _rate_Hz(time_s, values_T, corner_Hz)
+    rate = _rate_Hz(time_s, values_T, corner_Hz, 1e6)
     return _filtered(values_T, np.asarray(butter(_HIGH_PASS_ORDER, corner_Hz, "highpass", fs=rate, output="sos")))
 
 
 def without_hum(time_s: FloatArray, values_T: FloatArray, mains_Hz: float) -> FloatArray:
     """Columns without the mains frequency and those of its harmonics that the rate of the rows shows."""
-    rate = _rate_Hz(time_s, values_T, mains_Hz)
+    rate = _rate_Hz(time_s, values_T, mains_Hz, 2000.0)
     for harmonic in np.arange(mains_Hz, 0.5 * rate, mains_Hz):
         values_T = _filtered(values_T, np.asarray(tf2sos(*iirnotch(harmonic, _NOTCH_QUALITY, fs=rate))))
     return values_T
 
 
-def _rate_Hz(time_s: FloatArray, values_T: FloatArray, frequency_Hz: float) -> float:
-    """Rate of the rows."""
+def _rate_Hz(time_s: FloatArray, values_T: FloatArray, frequency_Hz: float, most: float) -> float:
+    """Rate of the rows, that is more than twice a frequency and at most so many times it."""
     intervals = np.diff(time_s)
     interval = float(np.median(intervals)) if intervals.size else 0.0
     if not interval > 0.0 or np.any(np.abs(intervals - interval) > _EQUAL_INTERVAL_RTOL * interval):
@@ -58,6 +58,10 @@ def _rate_Hz(time_s: FloatArray, values_T: FloatArray, frequency_Hz: float) -> f
     if not 0.0 < frequency_Hz < 0.5 / interval:
         raise InputError(
             f"found rows at {1.0 / interval:g} Hz, expected more than twice the {frequency_Hz:g} Hz of the filter."
+        )
+    if frequency_Hz * interval * most < 1.0:
+        raise InputError(
+            f"found rows at {1.0 / interval:g} Hz, expected at most {most:g} times the {frequency_Hz:g} Hz of a filter."
         )
     return 1.0 / interval
 

@@ -112,7 +112,8 @@ def states_figure(picture: StatesPicture) -> Figure:
         across[0].set_ylim(low, high)
     for ax in axes[-1]:
         ax.set_xlabel("time [s]", fontsize=style.LETTERS)
-        ax.set_xlim(picture.time_s[0], picture.time_s[-1])
+        if len(picture.time_s) > 1:
+            ax.set_xlim(picture.time_s[0], picture.time_s[-1])
         ax.xaxis.set_major_locator(MaxNLocator(4))
     handles, labels = axes[0, 0].get_legend_handles_labels()
     named = dict(zip(labels, handles, strict=True))
@@ -151,7 +152,8 @@ def consistency_figure(picture: ConsistencyPicture) -> Figure:
         _nees(axes[1], picture.time_s, picture.nees, picture.size)
     _nis(axes[-1], picture.time_s, picture.nis)
     for ax in axes:
-        ax.set_xlim(picture.time_s[0], picture.time_s[-1])
+        if len(picture.time_s) > 1:
+            ax.set_xlim(picture.time_s[0], picture.time_s[-1])
         if ax is not axes[-1]:
             ax.set_xlabel("")
     style.headline(figure, picture.title)

@@ -24,7 +24,7 @@ import numpy as np
 
 from adcs.stars.identification import MOST_PIXELS, SCALE_ARCSEC, WIDEST_RAD, StarCamera, StarCatalogue
 from arrays.io.csv import read_table
-from arrays.io.errors import InputError
+from arrays.io.errors import LARGEST, InputError
 from arrays.io.text import read_text
 from arrays.typing import FloatArray, IntArray
 
@@ -157,8 +157,9 @@ def _read_lines(path: Path, what: str) -> list[tuple[int, FloatArray]]:
         cells = text.strip().rstrip(",")
         if cells:
             row = np.array([_number(cell) for cell in cells.split(",")])
-            if not np.isfinite(row).all():
-                bad = cells.split(",")[int(np.argmin(np.isfinite(row)))].strip()
+            usable = np.abs(row) <= LARGEST
+            if not usable.all():
+                bad = cells.split(",")[int(np.argmin(usable))].strip()
                 raise InputError(f"{path}, line {line}: found {bad[:40]!r}, expected a finite number.")
             rows.append((line, row))
     if not rows:

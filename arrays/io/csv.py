@@ -20,7 +20,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from arrays.io.errors import InputError
+from arrays.io.errors import LARGEST, InputError
 from arrays.io.text import read_text, write_text
 from arrays.typing import FloatArray, IntArray
 
@@ -81,17 +81,19 @@ class Table:
             )
         return bool(present)
 
-    def finite_or_missing(self, columns: Sequence[str]) -> FloatArray:
-        """Values of some columns (n, k); an infinite one is an InputError."""
+    def finite_or_missing(self, columns: Sequence[str], largest: float = LARGEST) -> FloatArray:
+        """Values of some columns (n, k); an infinite one, or one above the largest, is an InputError."""
         values = self.values[:, [self.header.index(name) for name in columns]]
         self.refuse(np.isinf(values), columns, "found an infinite number, expected a finite number or an empty cell")
+        self._refuse_larger(values, columns, largest)
         return values
 
-    def complete(self, columns: Sequence[str]) -> FloatArray:
-        """Values of some columns (n, k); a missing or infinite one is an InputError."""
+    def complete(self, columns: Sequence[str], largest: float = LARGEST) -> FloatArray:
+        """Values of some columns (n, k); a missing or infinite one, or one above the largest, is an InputError."""
         values = self.values[:, [self.header.index(name) for name in columns]]
         self.refuse(np.isnan(values), columns, "found no value, expected a number")
         self.refuse(np.isinf(values), columns, "found an infinite number, expected a finite number")
+        self._refuse_larger(values, columns, largest)
         return values
 
     def complete_and_distinct(self, column: str) -> FloatArray:
@@ -107,6 +109,9 @@ class Table:
                 f"as on {self.row_place(first).removeprefix(self.path + ', ')}, expected every value once."
             )
         return values
+
+    def _refuse_larger(self, values: FloatArray, columns: Sequence[str], largest: float) -> None:
+        self.refuse(np.abs(values) > largest, columns, f"found a number above {largest:g}, expected a smaller one")
 
     def refuse(self, bad: NDArray[np.bool_], columns: Sequence[str], fault: str) -> None:
         """Raise an InputError with the place of the first bad cell (n, k) of some columns, and the fault in words."""

@@ -12,6 +12,9 @@ if TYPE_CHECKING:
 
     from arrays.typing import FloatArray
 
+LARGEST = 1e30
+"""Of the numbers in files: more than anything measured, and less than what double precision cannot raise to a power."""
+
 
 class InputError(ValueError):
     """Bad input from outside: a file, a command's option.

@@ -23,7 +23,7 @@ from typing import Annotated, Any, ClassVar, TypeVar, get_args, get_origin, get_
 
 import msgspec
 
-from arrays.io.errors import InputError
+from arrays.io.errors import LARGEST, InputError
 from arrays.io.text import read_text
 
 FORMAT_VERSION = 1
@@ -213,6 +213,8 @@ def _check_value(where: str, value: Any, rules: tuple[Rule, ...]) -> None:
     )
     if not is_finite and not (value == math.inf and any(rule.may_be_infinite for rule in rules)):
         raise InputError(f"{where}: found {value}, expected a finite number.")
+    if isinstance(value, float) and LARGEST < abs(value) < math.inf:
+        raise InputError(f"{where}: found {value:g}, expected a number of {LARGEST:g} at most.")
     for rule in rules:
         if not rule.holds(value):
             found = repr(value) if isinstance(value, str) else f"{value:g}"

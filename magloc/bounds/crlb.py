@@ -17,6 +17,7 @@ from arrays.io.errors import _vectors
 from arrays.noise import reading_covariance
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.measurement.differences import channel_jacobian, fields_at_sensors, predicted_channels
+from magloc.measurement.rows import check_magnitudes
 
 LOST = 1e-6
 """A combination of parameters is not estimable if the readings tell of it so much less than of others."""
@@ -113,6 +114,7 @@ def cramer_rao_bounds(
     ValueError
         A shape is wrong, or the uncertainty is negative or not finite.
     """
+    check_magnitudes(array)
     p, m = _sources(position_m, moment_Am2)
     W = whitened_jacobian(array, p, m, ambient_uncertainty_T=ambient_uncertainty_T)
     line = p - array.centroid

@@ -26,6 +26,7 @@ from magloc.bounds.over_moments import table_and_spreads
 from magloc.directions import moments_on_sphere
 from magloc.grids.computed import computed_map
 from magloc.grids.cube import Box, CubeMap, Tally, Values, Variable, check_half_width, described, flags, tallied
+from magloc.measurement.rows import check_magnitudes
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -88,6 +89,7 @@ class BoundScenario:
     ambient_uncertainty_T: float = 0.0
 
     def __post_init__(self) -> None:
+        check_magnitudes(self.array)
         for name in ("half_width_m", "accuracy_m"):
             if not 0.0 < getattr(self, name) < np.inf:
                 raise ValueError(f"Input {name} must be positive; instead received {getattr(self, name)}.")

@@ -14,6 +14,7 @@ from magloc.calibration.model import GAINS, PER_SENSOR, unknowns
 from magloc.calibration.modulus import EllipsoidCalibration, calibrated_in_modulus, symmetric
 from magloc.calibration.observability import Unobservable
 from magloc.calibration.results import SourceCalibration, TurningCalibration
+from magloc.measurement.rows import check_magnitudes
 from magloc.readings import Readings, without_saturated
 from magloc.truth import Truth, rows_of_same_time
 
@@ -63,6 +64,7 @@ def calibrate(
         The shapes do not agree, the array has scalar sensors (with `modulus_T`: no vector sensor), no time of the truth
         is one of the readings, no row can be located with the nominal array, or there are fewer readings than unknowns.
     """
+    check_magnitudes(array)
     rows = without_saturated(readings, array)
     if modulus_T is not None:
         if truth is not None or moment is not None:

@@ -144,9 +144,12 @@ def bounds(
 
     from magloc.bounds.over_moments import bounds_over_moments
     from magloc.convergence.scenario_files import read_starts_scenario
+    from magloc.measurement.rows import check_magnitudes
 
     source = read_starts_scenario(scenario)
     array = source.array if of.array is None else _array_of(of.array)
+    with naming(scenario if of.array is None else str(of.array)):
+        check_magnitudes(array)
     place = np.asarray(source.position_m if of.position is None else of.position)
     radius = _checked(array, place, of, task)
     wanted = _scenario(array, source.moment_Am2 if of.moment_Am2 is None else of.moment_Am2, radius, of, task)

@@ -32,6 +32,7 @@ INTERRUPTED = 130
 BROKEN_PIPE = 141
 TERMINATED = 143
 _COMPILATION = "magloc.compilation"
+_LONGEST_WORD = 200
 _PACKAGES = ("arrays", "magloc", "adcs", "sims")
 
 
@@ -270,8 +271,10 @@ def print_json(value: object) -> None:
 
 
 def print_note(text: str, program: str) -> None:
-    """Print one line of a program on stderr, whatever the text."""
-    print(f"{program}: {' '.join(text.split())}", file=sys.stderr)
+    """Print one line of a program on stderr, whatever the text: as a terminal shows it, no word of it endless."""
+    words = (word if len(word) <= _LONGEST_WORD else f"{word[:20]}…{word[-20:]}" for word in text.split())
+    line = "".join(char if char.isprintable() else ascii(char)[1:-1] for char in " ".join(words))
+    print(f"{program}: {line}", file=sys.stderr)
 
 
 @contextmanager

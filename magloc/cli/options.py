@@ -16,7 +16,7 @@ from cyclopts.validators import Number
 import arrays
 import magloc
 from arrays.io.arguments import whole_number
-from arrays.io.errors import InputError
+from arrays.io.errors import LARGEST, InputError
 from arrays.typing import Vector
 from magloc.ambient import Place
 from magloc.cli import framework
@@ -36,10 +36,10 @@ def print_note(text: str) -> None:
 
 
 def refuse_not_positive(options: object, *names: str, expected: str = "a positive number") -> None:
-    """Refuse an option that is given and not positive and finite, by the names of the fields that hold them."""
+    """Refuse an option that is given and not positive, or endless, by the names of the fields that hold them."""
     for name in names:
         value = getattr(options, name)
-        if value is not None and not 0.0 < value < math.inf:
+        if value is not None and not 0.0 < value <= LARGEST:
             raise InputError(f"--{name.replace('_', '-')}: found {value:g}, expected {expected}.")
 
 

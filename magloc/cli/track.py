@@ -179,7 +179,8 @@ def track(
         whole = smooth or json or any(option is not None for option in (truth, out, geojson))
         if whole or conditioning != ConditioningOptions():
             raise InputError("READINGS -: found an option that needs the whole record, expected a stream of --jsonl.")
-        _stream(used, known, model, where)
+        with naming(str(array)):
+            _stream(used, known, model, where)
         return
     rows = magloc.read_readings(readings, used, sensors=known.ids, ordered=True)
     rows, used = conditioning.apply(rows, used, readings)
@@ -270,11 +271,11 @@ def _rows_of_stdin(array: SensorArray, ids: list[str] | None) -> Iterator[Readin
     """Every row of standard input below its header, as soon as it comes."""
     from magloc.readings import readings_of_text
 
-    header = sys.stdin.readline()
+    header = _line_of_stdin().removeprefix("\ufeff")
     if not header:
         raise InputError("standard input: found nothing, expected a header with time_s and the sensors' columns.")
     number, last = 1, -math.inf
-    while line := sys.stdin.readline():
+    while line := _line_of_stdin():
         number += 1
         if not line.strip():
             continue
@@ -287,3 +288,13 @@ def _rows_of_stdin(array: SensorArray, ids: list[str] | None) -> Iterator[Readin
             )
         last = time
         yield row
+
+
+def _line_of_stdin() -> str:
+    try:
+        return sys.stdin.readline()
+    except UnicodeDecodeError as error:
+        byte = error.object[error.start]
+        raise InputError(
+            f"standard input: found the byte 0x{byte:02x}, which is not UTF-8, expected UTF-8 text."
+        ) from None

@@ -40,8 +40,18 @@ if TYPE_CHECKING:
 
 SECONDS_OF_CHUNK = "seconds_of_chunk"
 _SOMETHING_ELSE = "{}: found something else than a map, expected a map or nothing."
-# What zarr raises for a chunk that is cut short or damaged depends on the codec.
-_UNREADABLE = (OSError, RuntimeError, ValueError, EOFError)
+# What zarr and xarray raise for a store that is cut short or damaged depends on the place and the codec.
+UNREADABLE = (
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    MemoryError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
 
 
 class Sweep(Closing):
@@ -127,7 +137,7 @@ class Sweep(Closing):
             try:
                 values = {name: np.asarray(array[box.region]) for name, array in self._arrays.items()}
                 self._check_complete(values)
-            except _UNREADABLE as error:
+            except UNREADABLE as error:
                 self.unreadable.append(f"{self.path}: chunk {box.place} cannot be read ({error}) and is computed again")
                 self._marks[box.place] = self._seconds[box.place] = np.nan
             else:
@@ -156,7 +166,7 @@ def chunk_seconds(path: str | os.PathLike[str]) -> FloatArray:
     """Duration of every chunk of a store, NaN where it is not done; empty where there is no map."""
     try:
         return _readable_marks(_opened(Path(path))[SECONDS_OF_CHUNK])
-    except (KeyError, OSError, ValueError):
+    except UNREADABLE:
         return np.empty(0)
 
 
@@ -220,7 +230,7 @@ def _opened(path: Path) -> zarr.Group:
 
     try:
         return zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-    except (FileNotFoundError, KeyError, TypeError, ValueError):
+    except UNREADABLE:
         raise InputError(_SOMETHING_ELSE.format(path)) from None
 
 
@@ -238,7 +248,7 @@ def _arrays_of_same_map(cube: CubeMap, group: zarr.Group, path: Path) -> dict[st
             )
     try:
         arrays = {name: group[name] for name in (*cube.variables, SECONDS_OF_CHUNK)}
-    except (KeyError, ValueError):
+    except UNREADABLE:
         raise InputError(
             f"{path}: found a map of which a part is missing: remove it, or choose another folder."
         ) from None
@@ -256,10 +266,10 @@ def _readable_marks(marks: Any) -> FloatArray:
     """What is done (seconds) and what is not (NaN, also where the mark itself is damaged)."""
     try:
         return np.array(marks[:])
-    except _UNREADABLE:
+    except UNREADABLE:
         seconds = np.full(marks.shape, np.nan)
         for index in np.ndindex(marks.shape):
-            with contextlib.suppress(*_UNREADABLE):
+            with contextlib.suppress(*UNREADABLE):
                 seconds[index] = marks[index]
         return seconds
 

@@ -146,3 +146,20 @@ def whitened_model(
     else:
         raw = np.stack([w.root @ row for w, row in zip(whitenings, channels, strict=True)])
     return WhitenedModel.of(array, whitenings, fields), raw
+
+
+def check_magnitudes(array: SensorArray) -> None:
+    """Refuse what double precision cannot square."""
+    noise = array.channel_noise_T
+    if noise.min() < 1e-20 or noise.max() > 1e3:
+        raise ValueError(
+            f"Input array must have a noise between 1e-11 and 1e12 nT; instead received {1e9 * noise.min():g} nT"
+            f" to {1e9 * noise.max():g} nT."
+        )
+    if array.common_field_T is not None and array.common_field_T > 1e3:
+        common_nT = 1e9 * array.common_field_T
+        raise ValueError(f"Input array must have a common field of 1e12 nT at most; instead received {common_nT:g} nT.")
+    if not np.abs(array.ambient_fields).max() <= 1e3:
+        raise ValueError("Input array must have an ambient field of 1e12 nT at most; instead received a larger one.")
+    if array.noise_fraction > 10.0:
+        raise ValueError(f"Input array must have a noise_fraction of 10 at most; instead: {array.noise_fraction:g}.")

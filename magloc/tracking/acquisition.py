@@ -18,6 +18,7 @@ from magloc.localization.fit.results import Fix, Solution
 from magloc.localization.locator import Locator, fit_at_rest
 from magloc.localization.uncertainty.ambiguity import weights
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
+from magloc.measurement.rows import check_magnitudes
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row
 
@@ -64,6 +65,7 @@ class Acquisition:
     """Looks for a source, row by row; `of_last_row` is what the last row says on its own, in the world frame."""
 
     def __init__(self, array: SensorArray, prior: SourcePrior, speed_m_s: float) -> None:
+        check_magnitudes(array)
         self.array = array
         self.speed_m_s = speed_m_s
         self.of_last_row = Fix(())

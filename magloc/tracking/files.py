@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from arrays.io.errors import InputError
+from arrays.io.errors import LARGEST, InputError
 from arrays.io.text import read_text
 from arrays.typing import FloatArray, Vector
 from magloc.tracking.consistency import Consistency
@@ -185,19 +185,26 @@ def _read_track(path: Path) -> TrackResult:
 
 
 def _track_point(place: str, entry: dict[str, Any]) -> TrackPoint:
-    time_s = entry.get("time_s")
-    if not isinstance(time_s, int | float):
-        raise InputError(f"{place}, key time_s: found {time_s!r}, expected a number.")
-    nis = entry.get("nis")
+    time_s, nis, nis_dof = (_number(place, entry, key) for key in ("time_s", "nis", "nis_dof"))
+    if time_s is None:
+        raise InputError(f"{place}, key time_s: found None, expected a number.")
     return TrackPoint(
-        float(time_s),
+        time_s,
         _numbers(place, entry, "position_m", (3,)),
         _numbers(place, entry, "moment_Am2", (3,)),
         _numbers(place, entry, "covariance", (6, 6)),
-        nis=math.nan if nis is None else float(nis),
-        nis_dof=int(entry.get("nis_dof") or 0),
+        nis=math.nan if nis is None else nis,
+        nis_dof=int(nis_dof or 0),
         status=str(entry.get("status", "")),
     )
+
+
+def _number(place: str, entry: dict[str, Any], key: str) -> float | None:
+    """A number of an entry; None where the key is missing or null."""
+    value = entry.get(key)
+    if value is not None and not (isinstance(value, int | float) and abs(value) <= LARGEST):
+        raise InputError(f"{place}, key {key}: found {value!r:.40}, expected a number.")
+    return None if value is None else float(value)
 
 
 def _numbers(place: str, entry: dict[str, Any], key: str, shape: tuple[int, ...]) -> FloatArray | None:
@@ -207,9 +214,9 @@ def _numbers(place: str, entry: dict[str, Any], key: str, shape: tuple[int, ...]
         return None
     try:
         numbers = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (OverflowError, TypeError, ValueError):
         numbers = np.zeros(0)
-    if numbers.shape != shape or not np.isfinite(numbers).all():
+    if numbers.shape != shape or not (np.abs(numbers) <= LARGEST).all():
         size = "×".join(map(str, shape))
         raise InputError(f"{place}, key {key}: found something else, expected {size} numbers or null.")
     return numbers

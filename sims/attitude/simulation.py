@@ -162,7 +162,7 @@ def sense(prepared: Prepared, q: FloatArray, w: FloatArray, rows: slice = slice(
     """
     satellite, around = prepared.scenario.satellite, prepared.environment
     sun_orbital, lit = around.sun_orbital[:, rows], around.illuminated[:, rows]
-    earth_radius = np.arcsin(EARTH_RADIUS_M / np.linalg.norm(around.position_eci_m[:, rows], axis=-1))
+    earth_radius = np.arcsin(np.minimum(1.0, EARTH_RADIUS_M / np.linalg.norm(around.position_eci_m[:, rows], axis=-1)))
     b_body = quaternion.rotate_back(q, prepared.true_field_orbital_T[:, rows])
     noise = {name: numbers[:, rows] for name, numbers in prepared.noise.items()}
     return Readings(

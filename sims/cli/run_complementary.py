@@ -15,7 +15,7 @@ from adcs.cli.options import print_note
 from adcs.complementary.outage import Rule
 from arrays.io.arguments import Flag
 from arrays.io.csv import write_table
-from arrays.io.errors import InputError
+from arrays.io.errors import LARGEST, InputError
 from arrays.io.outputs import refuse_file
 from magloc.cli.framework import QuietOptions, print_json, progress
 
@@ -74,11 +74,11 @@ class ComplementaryOptions:
     def check(self) -> None:
         """Raise InputError for what cannot be run."""
         for name, value in (("--kp", self.kp), ("--ki", self.ki)):
-            if value is not None and not 0.0 <= value < math.inf:
+            if value is not None and not 0.0 <= value <= LARGEST:
                 raise InputError(f"{name}: found {value:g}, expected 0 or more.")
             if value is not None and self.filter == "adaptive":
                 raise InputError(f"{name}: found {value:g}, expected no gain: --filter adaptive has none.")
-        if not 0.0 < self.sigma_nT < math.inf:
+        if not 0.0 < self.sigma_nT <= LARGEST:
             raise InputError(f"--sigma-nT: found {self.sigma_nT:g}, expected a positive number.")
         if not 0.0 <= self.amplitude_deg < 90.0:
             raise InputError(f"--amplitude-deg: found {self.amplitude_deg:g}, expected 0 to less than 90.")

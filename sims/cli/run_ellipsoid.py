@@ -16,7 +16,7 @@ from adcs.ellipsoids.roll_yaw import STEP_S
 from adcs.ellipsoids.strip import StepRule
 from arrays.io.arguments import Flag
 from arrays.io.csv import write_table
-from arrays.io.errors import InputError
+from arrays.io.errors import LARGEST, InputError
 from arrays.io.outputs import refuse_file
 from arrays.typing import FloatArray
 from magloc.cli.framework import QuietOptions, print_json, progress
@@ -66,7 +66,7 @@ class EllipsoidOptions:
     def check(self) -> None:
         """Raise InputError for what cannot be run."""
         for name, value in (("--noise-deg", self.noise_deg), ("--drift-deg-s", self.drift_deg_s)):
-            if not 0.0 < value < math.inf:
+            if not 0.0 < value <= LARGEST:
                 raise InputError(f"{name}: found {value:g}, expected a positive number.")
         if not STEP_S <= self.duration <= 1e7:
             raise InputError(f"--duration: found {self.duration:g} s, expected {STEP_S:g} to 1e7 s.")

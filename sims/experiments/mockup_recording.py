@@ -129,7 +129,7 @@ def read_samples(path: Path) -> ImuRecord:
         a column has no reading that is believed.
     """
     table = _table_with(path, SAMPLE_COLUMNS)
-    time_s = table.complete(["time_s"])[:, 0]
+    time_s = table.complete(["time_s"], math.inf)[:, 0]
     if len(time_s) < 2:
         raise InputError(f"{path}: found one row, expected two samples at least.")
     table.refuse_back("time_s", ~(np.diff(time_s) > 0.0), "times that increase")
@@ -142,7 +142,7 @@ def read_samples(path: Path) -> ImuRecord:
             f"{time_s[row - 1]:.10g} s, expected the next sample within {_LONGEST_GAP * usual_s:.4g} s, "
             f"{_LONGEST_GAP} usual intervals."
         )
-    readings = table.finite_or_missing(list(SAMPLE_COLUMNS[1:]))
+    readings = table.finite_or_missing(list(SAMPLE_COLUMNS[1:]), math.inf)
     imu = ImuRecord(float(time_s[0]) - usual_s, time_s, readings[:, :2], np.radians(readings[:, 2]))
     gate = Gate()
     limits = [f"{gate.acceleration_m_s2:g} m/s²"] * 2 + [f"{math.degrees(gate.rate_rad_s):g} °/s"]
@@ -165,7 +165,7 @@ def read_fixes(path: Path) -> FixRecord:
         It is no such file, arrivals go back, a fix arrives before its exposure, or is nowhere near the table.
     """
     table = _table_with(path, FIX_COLUMNS)
-    values = table.complete(list(FIX_COLUMNS))
+    values = table.complete(list(FIX_COLUMNS), math.inf)
     table.refuse(
         np.abs(values[:, 2:4]) > _FARTHEST_M,
         FIX_COLUMNS[2:4],

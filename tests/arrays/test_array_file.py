@@ -461,6 +461,8 @@ class TestRefused:
             ("[0.0, 0.0, 0.918]", "0.918", ("sensor s1, key position_m", "found a number, expected a list")),
             ("[0.0, 0.0, 0.918]", '[0.0, 0.0, "up"]', ("sensor s1, key position_m[2]", "found text")),
             ("[0.0, 0.0, 0.918]", "[0.0, 0.0, nan]", ("sensor s1", "position_m must be finite")),
+            ("[0.0, 0.0, 0.918]", "[0.0, 0.0, 1e300]", ("sensor s1", "position_m must be 1e+30 at most")),
+            ("[0.0, 0.0, 0.918]", "[0.0, 0.0, 2e9]", ("sensors must stand within 1e+09 m",)),
             ("[0.0, 0.0, 0.918]", "[1.0, 0.0, 0.0]", ("sensors must stand in two places at least",)),
             ("noise_nT = 1.0", "noise_nT = 0", ("sensor s1, key noise_nT", "expected a positive number")),
             ("noise_nT = 1.0", "noise_nT = nan", ("sensor s1, key noise_nT", "expected a finite number")),

@@ -75,6 +75,14 @@ LINES: dict[str, tuple[str, ...]] = {
     ),
     "adcs stars": ("frames --catalogue stars.csv --json",),
 }  # fmt: skip
+SELDOM = (
+    "magloc bounds",
+    "magloc design",
+    "magloc demo",
+    "magloc warm-up",
+    "adcs demo",
+    "adcs warm-up",
+)  # seconds each
 STREAM = "readings.csv"  # what stands on stdin where a line reads from there
 
 _FILES = {

@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 NUMBERS = (
-    "0", "-0", "1", "-1", "2", "3.5", "1e-300", "5e-324", "1e300", "-1e300", "2e300", "1e308", "nan", "inf", "-inf",
+    "0", "-0", "1", "-1", "2", "3.5", "1e-300", "5e-324", "1e-9", "1e9", "1e18", "1e80", "1e155", "1e300", "-1e300",
+    "2e300", "1e308", "nan", "inf", "-inf",
     "", "x", "1e", "0x10", "9" * 400, "1_000", "٣", "true", "None", "1;2", "1 2", "é", "\x1b[31m", "--", "..", "/",
 )  # fmt: skip
 _NUMBER = re.compile(rb"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
@@ -26,7 +27,7 @@ def mangled_arguments(arguments: Sequence[str], options: Sequence[str], rng: ran
     """A command's arguments after one or two mutations; the command's name stays."""
     mangled = list(arguments)
     for _ in range(rng.choice((1, 1, 2))):
-        rng.choice(_OF_ARGUMENTS)(mangled, options, rng)
+        rng.choice(_OF_ARGUMENTS if mangled else (_add_option,))(mangled, options, rng)
     return mangled
 
 
@@ -36,8 +37,9 @@ def _numbers(data: bytes, rng: random.Random) -> bytes:
     if not found:
         return data
     chosen = rng.sample(found, min(len(found), rng.choice((1, 1, 1, 2, 5, len(found)))))
-    value = rng.choice(NUMBERS).encode()
+    values, several = rng.choices(NUMBERS, k=3), rng.random() < 0.5
     for match in sorted(chosen, key=lambda one: -one.start()):
+        value = (rng.choice(values) if several else values[0]).encode()
         data = data[: match.start()] + value + data[match.end() :]
     return data
 
@@ -49,10 +51,20 @@ def _scaled(data: bytes, rng: random.Random) -> bytes:
         return data
     match = rng.choice(found)
     try:
-        value = float(match[0]) * rng.choice((-1.0, 1e-9, 1e-3, 1e3, 1e6, 1e9, 1e30))
+        value = float(match[0]) * rng.choice((-1.0, 1e-30, 1e-9, 1e-3, 1e3, 1e6, 1e9, 1e30, 1e150))
     except OverflowError:
         return data
     return data[: match.start()] + repr(value).encode() + data[match.end() :]
+
+
+def _exponents(data: bytes, rng: random.Random) -> bytes:
+    """Several numbers, each with another power of ten."""
+    share = rng.choice((0.02, 0.1, 0.5))
+
+    def other(match: re.Match[bytes]) -> bytes:
+        return match[0] if rng.random() > share else match[0] + b"e%d" % rng.randint(-40, 40)
+
+    return re.sub(rb"(?<![\w.])\d+\.?\d*(?![\w.])", other, data)
 
 
 def _words(data: bytes, rng: random.Random) -> bytes:
@@ -142,7 +154,7 @@ def _dressed(data: bytes, rng: random.Random) -> bytes:
 
 
 _OF_BYTES = (
-    _numbers, _numbers, _numbers, _scaled, _scaled, _words, _bytes, _cut, _dressed,
+    _numbers, _numbers, _numbers, _scaled, _scaled, _exponents, _words, _bytes, _cut, _dressed,
     *map(_of_lines, (_delete_line, _repeat_line, _delete_lines, _shuffle, _column, _cells, _cells)),
 )  # fmt: skip
 
@@ -153,8 +165,7 @@ def _change_value(arguments: list[str], options: Sequence[str], rng: random.Rand
 
 
 def _drop(arguments: list[str], options: Sequence[str], rng: random.Random) -> None:
-    if arguments:
-        del arguments[rng.randrange(len(arguments))]
+    del arguments[rng.randrange(len(arguments))]
 
 
 def _repeat(arguments: list[str], options: Sequence[str], rng: random.Random) -> None:

@@ -176,6 +176,7 @@ BAD_FILES = {
     "missing time": (f"{HEADER}\n{ROW}\n,2,3,4,5,6,7,8\n", ["line 3", "column time_s", "no value"]),
     "infinite time": (f"{HEADER}\ninf{ROW[1:]}\n", ["line 2", "column time_s", "infinite"]),
     "time twice": (f"{HEADER}\n{ROW}\n1{ROW[1:]}\n\n0.0{ROW[1:]}\n", ["line 5", "column time_s", "as on line 2"]),
+    "endless time": (f"{HEADER}\n{ROW}\n2e300{ROW[1:]}\n", ["line 3", "column time_s", "above 1e+30"]),
     "no time column": (f"t{HEADER[4:]}\n{ROW}\n", ["line 1", "column time_s", "t_s"]),
     "missing sensor column": (
         f"{HEADER.replace('s2_y_nT', 's2_y_T')}\n{ROW}\n",

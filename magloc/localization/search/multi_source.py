@@ -27,7 +27,7 @@ from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
 from magloc.localization.search.beam_search import Search, best_distinct, merged
 from magloc.localization.search.candidates import allowed_positions, linear_bases, linear_scores
-from magloc.measurement.rows import WhitenedRows, whitenings_of
+from magloc.measurement.rows import WhitenedRows, check_magnitudes, whitenings_of
 
 N_UNKNOWNS = 6
 _N_DRAWS = 5_000
@@ -71,6 +71,7 @@ class MultiSourceSearch:
         prior: SourcePrior = NOTHING_KNOWN,
         seed: int = 0,
     ) -> None:
+        check_magnitudes(array)
         whitening = whitenings_of(array, np.ones(array.n_channels, dtype=bool), np.zeros((1, array.n_channels)))[0]
         if whitening.n_differences < N_UNKNOWNS:
             raise ValueError(

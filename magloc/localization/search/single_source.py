@@ -23,7 +23,7 @@ from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
 from magloc.localization.search import single_source_compiled as kernels
 from magloc.localization.search.candidates import SingleArray, allowed_positions, linear_bases
-from magloc.measurement.rows import WhitenedRows, channels_above_ambient, whitened_rows
+from magloc.measurement.rows import WhitenedRows, channels_above_ambient, check_magnitudes, whitened_rows
 from magloc.measurement.whitened import WhitenedModel
 from magloc.measurement.whitened_compiled import ModelRows
 
@@ -90,7 +90,9 @@ class SingleSourceSearch:
     ) -> None:
         if array.channel_is_scalar.any():
             raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
-        _check_magnitudes(array)
+        check_magnitudes(array)
+        if array.circumradius < 1e-9:
+            raise ValueError("Input array must span 1e-9 m at least; instead it does not.")
         self.array = array
         self.n_starts = n_starts
         self.apart_rad = apart_rad
@@ -189,27 +191,6 @@ class SingleSourceSearch:
             np.take_along_axis(found.iterations, order, axis=1),
             counts,
         )
-
-
-def _check_magnitudes(array: SensorArray) -> None:
-    """Refuse what double precision cannot square."""
-    noise = array.channel_noise_T
-    if noise.min() < 1e-20 or noise.max() > 1e3:
-        raise ValueError(
-            f"Input array must have a noise between 1e-11 and 1e12 nT; instead received {1e9 * noise.min():g} nT"
-            f" to {1e9 * noise.max():g} nT."
-        )
-    if np.abs(array.positions).max() > 1e9 or array.circumradius < 1e-9:
-        raise ValueError(
-            "Input array must span 1e-9 m at least and lie within 1e9 m of its origin; instead it does not."
-        )
-    if array.common_field_T is not None and array.common_field_T > 1e3:
-        common_nT = 1e9 * array.common_field_T
-        raise ValueError(f"Input array must have a common field of 1e12 nT at most; instead received {common_nT:g} nT.")
-    if not np.abs(array.ambient_fields).max() <= 1e3:
-        raise ValueError("Input array must have an ambient field of 1e12 nT at most; instead received a larger one.")
-    if array.noise_fraction > 10.0:
-        raise ValueError(f"Input array must have a noise_fraction of 10 at most; instead: {array.noise_fraction:g}.")
 
 
 def _why_unsolved(n_optima: int) -> str:

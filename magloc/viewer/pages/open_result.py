@@ -148,11 +148,11 @@ def _read_map(folder: Path) -> MapResult:
     if not (store / "zarr.json").is_file():
         what = "an empty folder" if not any(folder.iterdir()) else "a folder without a map"
         raise InputError(f"{folder}: found {what}, expected one that `magloc map` wrote, with {_STORE}.")
-    from magloc.grids.store import open_map
+    from magloc.grids.store import UNREADABLE, open_map
 
     try:
         dataset = open_map(store)
-    except (KeyError, ValueError, OSError, RuntimeError, EOFError):
+    except UNREADABLE:
         raise _no_map(store) from None
     return map_of(dataset, str(folder))
 
@@ -163,19 +163,25 @@ def _no_map(place: str | Path) -> InputError:
 
 def map_of(dataset: xr.Dataset, place: str = "Input result") -> MapResult:
     """A map over starts or sources, thinned to what can be told apart; `place` names it in errors."""
+    from magloc.grids.store import UNREADABLE
+
     try:
-        axis = dataset["x"].to_numpy().astype(np.float64)
-        every = max(1, math.ceil(len(axis) / _MOST_POINTS))
-        part = dataset.isel(x=slice(None, None, every), y=slice(None, None, every), z=slice(None, None, every))
-        over = "starts" if "half" in dataset else "sources"
-        status = part["status"].to_numpy()
-        shown = part["iterations" if over == "starts" else "sigma_range"].to_numpy().astype(np.float64)
-        attributes = dataset.attrs
-        array = array_of_table(place, tomllib.loads(attributes["array"], parse_float=Decimal))
+        return _map_of(dataset, place)
     except InputError:
         raise
-    except (KeyError, ValueError, OSError, RuntimeError, EOFError):
+    except UNREADABLE:
         raise _no_map(place) from None
+
+
+def _map_of(dataset: xr.Dataset, place: str) -> MapResult:
+    axis = dataset["x"].to_numpy().astype(np.float64)
+    every = max(1, math.ceil(len(axis) / _MOST_POINTS))
+    part = dataset.isel(x=slice(None, None, every), y=slice(None, None, every), z=slice(None, None, every))
+    over = "starts" if "half" in dataset else "sources"
+    status = part["status"].to_numpy()
+    shown = part["iterations" if over == "starts" else "sigma_range"].to_numpy().astype(np.float64)
+    attributes = dataset.attrs
+    array = array_of_table(place, tomllib.loads(attributes["array"], parse_float=Decimal))
     # What is not computed yet has the smallest integer there is.
     done = status >= 0
     if not done.any():

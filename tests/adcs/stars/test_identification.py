@@ -359,6 +359,7 @@ class TestCommand:
             ),
             ("input.csv", "1,2,3,4\n", ["line 1: found 4 numbers, expected three for each star"]),
             ("input.csv", "1,2,x\n", ["line 1: found 'x', expected a finite number"]),
+            ("input.csv", "1,1e300,3\n", ["line 1: found '1e300', expected a finite number"]),
             ("input.csv", "\n", ["found no frame, expected one at least"]),
             ("result.csv", "1,2\n", ["found 1 frames, expected 3"]),
             ("result.csv", "1\n1\n1\n", ["line 1: found 1 numbers"]),

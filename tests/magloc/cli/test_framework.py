@@ -102,6 +102,16 @@ class TestWrongCommand:
         assert_refused(run("zzz"), f'Unknown command "zzz". Available commands: {", ".join(COMMANDS)}.')
 
 
+class TestSentence:
+    def test_without_what_a_terminal_obeys(self, run: Run) -> None:
+        assert_refused(run("view", "\x1b[31m"), r"magloc: \x1b[31m does not exist")
+
+    def test_without_a_word_that_does_not_end(self, run: Run) -> None:
+        outcome = run("view", "9" * 400)
+        assert_refused(outcome, "99999…99999")
+        assert len(outcome.err) < 300
+
+
 class TestMissingExtra:
     def test_view(self, recording: tuple[Path, Path]) -> None:
         assert_refused(

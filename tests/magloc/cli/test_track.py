@@ -363,8 +363,13 @@ class TestConditioning:
     def test_refuses_a_window(self, run: Run, array: Path, readings: Path, window: str) -> None:
         assert_refused(run("track", readings, "--array", array, f"--window-s={window}"), "--window-s", "positive")
 
-    @pytest.mark.parametrize("option", ["--mains-hz=50", "--high-pass-hz=1", "--high-pass-hz=-1"])
-    def test_refuses_frequencies_above_half_the_rate(self, run: Run, array: Path, readings: Path, option: str) -> None:
+    @pytest.mark.parametrize(
+        "option",
+        ["--mains-hz=50", "--high-pass-hz=1", "--high-pass-hz=-1", "--mains-hz=1e-30", "--high-pass-hz=1e-30"],
+    )
+    def test_refuses_frequencies_that_the_rate_does_not_show(
+        self, run: Run, array: Path, readings: Path, option: str
+    ) -> None:
         assert_refused(run("track", readings, "--array", array, option), str(readings), "2 Hz")
 
     def test_refuses_missing_readings_for_a_filter(self, run: Run, array: Path, tmp_path: Path) -> None:
@@ -455,6 +460,19 @@ class TestStream:
     def test_a_header_alone(self, run: Run, array: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr("sys.stdin", io.StringIO(HEADER + "\n"))
         assert_refused(run("track", "-", "--array", array), "standard input, line 1", "without rows")
+
+    @pytest.mark.parametrize(
+        ("data", "fragments"),
+        [
+            (f"{HEADER}\n0,1,2,\xff".encode("latin-1"), ("0xff", "not UTF-8")),
+            (f"\ufeff{HEADER}\n".encode(), ("line 1", "without rows")),
+        ],
+    )
+    def test_bytes(
+        self, run: Run, array: Path, monkeypatch: pytest.MonkeyPatch, data: bytes, fragments: Sequence[str]
+    ) -> None:
+        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(data), encoding="utf-8"))
+        assert_refused(run("track", "-", "--array", array), "standard input", *fragments)
 
     def test_nothing_on_standard_input(self, stream: Stream) -> None:
         assert_refused(stream.finish(), "standard input: found nothing")

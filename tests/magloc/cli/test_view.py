@@ -191,6 +191,25 @@ class TestBadInput:
         zarr.create_array(tmp_path / "map.zarr", shape=(3,), dtype="f8")
         assert_refused(run("view", tmp_path), "something else than a map")
 
+    @pytest.mark.parametrize(
+        ("file", "right", "wrong"),
+        [
+            ("iterations/zarr.json", '"level": 1', '"level": 1.5'),
+            ("iterations/zarr.json", '"zstd"', '"nothing"'),
+            ("x/zarr.json", '"shape"', '"shapes"'),
+            ("zarr.json", '"position_m": [', '"position_m": ["here", '),
+        ],
+    )
+    def test_a_damaged_map(self, run: Run, tmp_path: Path, file: str, right: str, wrong: str) -> None:
+        run("map", "paper", "--grid", 3, "--out", tmp_path / "map", "--quiet")
+        damaged = tmp_path / "map" / "map.zarr" / file
+        text = damaged.read_text()
+        assert right in text
+        damaged.write_text(text.replace(right, wrong))
+        assert_refused(
+            run("view", tmp_path / "map"), "map.zarr" if "x/" in file else "map", "something else than a map"
+        )
+
     def test_readings_that_all_miss(self, run: Run, readings_file: Path) -> None:
         header = readings_file.read_text().splitlines()[0]
         readings_file.write_text(f"{header}\n0{',' * 12}\n1{',nan' * 12}\n")
@@ -215,6 +234,10 @@ class TestBadInput:
             ('{"results": [{"time_s": 0, "position_m": [1, 2]}]}', "position_m"),
             ('{"results": [{"time_s": 0, "position_m": "here"}]}', "position_m"),
             ('{"results": [{"time_s": null, "position_m": [1, 2, 3]}]}', "time_s"),
+            ('{"results": [{"time_s": 0, "position_m": [1, 2, 1e300]}]}', "position_m"),
+            (f'{{"results": [{{"time_s": 0, "position_m": [1, 2, {"9" * 400}]}}]}}', "position_m"),
+            ('{"results": [{"time_s": 1e300, "position_m": [1, 2, 3]}]}', "time_s"),
+            ('{"results": [{"time_s": 0, "position_m": [1, 2, 3], "nis": "x"}]}', "nis"),
             ('{"results": [{"time_s": 0, "position_m": null}]}', "no row where the source is tracked"),
         ],
     )

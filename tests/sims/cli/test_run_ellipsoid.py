@@ -152,6 +152,8 @@ class TestFiles:
     ("options", "sentence"),
     [
         ({"noise_deg": 0.0}, "--noise-deg: found 0, expected a positive number."),
+        ({"noise_deg": 1e308}, "--noise-deg: found 1e.308, expected a positive number."),
+        ({"drift_deg_s": 1e308}, "--drift-deg-s: found 1e.308, expected a positive number."),
         ({"noise_deg": -1.0}, "--noise-deg: found -1, expected a positive number."),
         ({"noise_deg": math.nan}, "--noise-deg: found nan, expected a positive number."),
         ({"drift_deg_s": 0.0}, "--drift-deg-s: found 0, expected a positive number."),

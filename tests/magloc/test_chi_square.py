@@ -1,0 +1,16 @@
+"""χ² of errors in units of a covariance."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magloc.chi_square import normalised_square
+
+
+def test_a_covariance_that_is_none_spoils_no_other() -> None:
+    """That of a filter that has diverged may be singular, indefinite or infinite."""
+    good = np.diag([4.0, 1e-20])
+    bad = [np.ones((2, 2)), np.diag([1.0, -1.0]), np.zeros((2, 2)), np.full((2, 2), np.inf)]
+    error = np.tile([2.0, 1e-10], (5, 1))
+    squares = normalised_square(error, np.stack([good, *bad]))
+    np.testing.assert_allclose(squares, [2.0, *[np.nan] * 4], rtol=1e-12)
