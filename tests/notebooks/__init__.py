@@ -24,7 +24,7 @@ DOCS = FOLDER.parent / "docs"
 SHOWN = {
     "01-first-fix": 1,
     "02-convergence-map": 1,
-    "03-real-magnet": 1,
+    "03-real-magnet": 0,
     "04-scalar-sign": 0,
     "05-tracking": 1,
     "06-which-array": 2,
