@@ -7,6 +7,7 @@ or more in CIE lightness, and by its marker or line as well.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,7 @@ from magloc.levels import SIGMAS_95 as SIGMAS_95
 
 WIDTH_IN = 7.1
 DPI = 200
+_SCREEN_DPI = 120
 LETTERS = 8.0
 SMALL_LETTERS = 7.0
 BLACK, BLUE, ORANGE = "#000000", "#0072b2", "#e69f00"
@@ -45,9 +47,18 @@ STATE = ("x_m", "y_m", "z_m", "mx_Am2", "my_Am2", "mz_Am2")
 """Columns of position and moment."""
 
 
-def new_figure(height_in: float, *, layout: str | None = "constrained") -> Figure:
+class HouseFigure(Figure):
+    """A figure that a notebook shows by itself: otherwise that takes pyplot, which nothing here imports."""
+
+    def _repr_png_(self) -> bytes:
+        picture = io.BytesIO()
+        self.canvas.print_figure(picture, format="png", dpi=_SCREEN_DPI)
+        return picture.getvalue()
+
+
+def new_figure(height_in: float, *, layout: str | None = "constrained") -> HouseFigure:
     """An empty figure of the width of a page."""
-    return Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout=layout)  # type: ignore[arg-type]
+    return HouseFigure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout=layout)  # type: ignore[arg-type]
 
 
 def save(figure: Figure, path: str | Path, dpi: int = DPI) -> None:

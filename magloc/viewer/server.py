@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import rich
 import viser
 
 from arrays.io.errors import InputError
@@ -63,8 +63,7 @@ def free_port(wanted: int) -> int:
 @contextmanager
 def opened(port: int, title: str) -> Iterator[viser.ViserServer]:
     """A server on a free port, its title above the panel, that is stopped afterwards, whatever happens."""
-    # viser writes its own greetings to stdout.
-    with redirect_stdout(io.StringIO()):
+    with _silent():
         server = guarded_server(host=HOST, port=port, label=title, verbose=False)
     try:
         server.gui.configure_theme(show_logo=False, show_share_button=False)
@@ -72,8 +71,19 @@ def opened(port: int, title: str) -> Iterator[viser.ViserServer]:
         server.gui.main_panel.set_width(_PANEL_PX)
         yield server
     finally:
-        with redirect_stdout(io.StringIO()):
+        with _silent():
             server.stop()
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Without viser's own greetings, which go to stdout and, in a notebook, beside it."""
+    console = rich.get_console()
+    was, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = was
 
 
 def address(server: viser.ViserServer) -> str:

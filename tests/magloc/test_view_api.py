@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import rich
 import viser
 from scipy.spatial.transform import Rotation
 
@@ -22,7 +23,7 @@ from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
 from magloc.tracking.results import TrackPoint, TrackResult
 from magloc.viewer.pages.pages import readings_page
-from magloc.viewer.server import address, opened
+from magloc.viewer.server import address, free_port, opened
 from magloc.viewer.view import View, thinned
 from tests.browser.browser import Browser
 from tests.magloc.cli.test_view import needs_chromium
@@ -62,6 +63,13 @@ class TestServer:
             assert "dipole to be dragged" in shown.html
         with pytest.raises(OSError, match="refused"):
             page_of(shown.address)
+
+    def test_nothing_is_said_and_others_may_speak_again(self, capsys: pytest.CaptureFixture[str]) -> None:
+        with opened(free_port(0), "quiet"):
+            pass
+        assert capsys.readouterr().out == ""
+        rich.print("heard")
+        assert capsys.readouterr().out == "heard\n"
 
     def test_a_scene_that_cannot_be_filled_leaves_no_server(self, monkeypatch: pytest.MonkeyPatch) -> None:
         def refuse(server: viser.ViserServer, *_: object, **__: object) -> None:

@@ -8,8 +8,6 @@ import nbformat
 from tests.notebooks import DOCS, FOLDER, NOTEBOOKS, SHOWN, executed, kept, pictures
 
 
-
-
 def main(names: list[str]) -> None:
     """Execute the notebooks whose file name contains one of the names; all without names."""
     for path in (p for p in NOTEBOOKS if not names or any(name in p.name for name in names)):

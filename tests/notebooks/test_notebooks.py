@@ -8,10 +8,10 @@ from pathlib import Path
 import nbformat
 import pytest
 from nbformat import NotebookNode
-from tests.notebooks import DOCS, FOLDER, NOTEBOOKS, SHOWN, executed, pictures, texts
+from tests.notebooks import DOCS, FOLDER, NOTEBOOKS, SHOWN, executed, pictures, texts, views, without_views
 
 
-LARGEST_BYTES = 400_000
+LARGEST_BYTES, LARGEST_VIEW_BYTES = 400_000, 1_200_000
 # Folders of a machine: no output may name one.
 MACHINE_PATH = re.compile(r"(?<![\w.])/[a-zA-Z]\w*/|ipykernel_\d|\b[A-Z]:\\")
 
@@ -48,7 +48,11 @@ class TestKeptOutputs:
 
     def test_they_are_small_and_have_pictures(self, notebook, path):
         assert pictures(notebook)
-        assert path.stat().st_size < LARGEST_BYTES
+        assert len(nbformat.writes(without_views(notebook)).encode()) < LARGEST_BYTES
+        assert path.stat().st_size < LARGEST_BYTES + LARGEST_VIEW_BYTES
+
+    def test_the_viewer_shows_once_at_most(self, notebook):
+        assert views(notebook) <= 1
 
     def test_the_picture_of_the_gallery_is_one_of_them(self, notebook, path):
         if path.stem not in SHOWN:

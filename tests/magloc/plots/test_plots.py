@@ -6,6 +6,7 @@ colour-blind see.
 
 from __future__ import annotations
 
+import io
 import math
 import re
 from dataclasses import replace
@@ -14,6 +15,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import PIL.Image
 import pytest
 import xarray as xr
 from hypothesis import given
@@ -455,3 +457,11 @@ class TestCalibration:
         assert_units(figure)
         np.testing.assert_allclose(line(figure.axes[0], "after").get_ydata(), 5.0)
         np.testing.assert_allclose(figure.axes[1].containers[0].lines[0].get_ydata(), 1.0)
+
+
+def test_a_notebook_shows_a_figure_without_pyplot() -> None:
+    """IPython asks for PNG by this name; 120 dots an inch are as wide as a page on a screen."""
+    figure = style.new_figure(2.0)
+    picture = PIL.Image.open(io.BytesIO(figure._repr_png_()))
+    assert picture.format == "PNG"
+    assert picture.size == (round(120 * style.WIDTH_IN), 240)

@@ -1,0 +1,120 @@
+"""What notebooks are written with: public names alone; and that each says where it stands in the reading order."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+from pathlib import Path
+from types import ModuleType
+import nbformat
+import pytest
+from tests.notebooks import DOCS, NOTEBOOKS
+
+
+OURS = ("arrays", "magloc", "adcs", "sims")
+MOST_IMPORTS = 3
+# These teach what has no public name.
+INSIDE = {"02-convergence-map", "complementary", "ellipsoid", "kalman-bank", "mockup"}
+PLACE = re.compile(r"^\*Notebook (\d+) of (\d+) · (\d+) minutes · [^*]+\*$", re.MULTILINE)
+CARD = re.compile(
+    r":::\{grid-item-card\} (\d+)\. [^\n]+\n:link: notebooks/([\w-]+)\n(?:[^\n]+\n)*?[^\n]*\*(\d+) min\.\*\n:::"
+)
+
+
+def code_of(path: Path) -> ast.Module:
+    notebook = nbformat.read(path, as_version=4)
+    return ast.parse("\n".join(cell.source for cell in notebook.cells if cell.cell_type == "code"))
+
+
+def public(module: ModuleType) -> set[str]:
+    """Public names of a package, or of a module that is one of them."""
+    stated = getattr(module, "__all__", None)
+    names = set(stated) if stated is not None else {name for name in vars(module) if not name.startswith("_")}
+    modules = {name for name in names if stated is None and isinstance(getattr(module, name), ModuleType)}
+    return names - modules
+
+
+def imports_of_ours(tree: ast.Module) -> list[ast.Import | ast.ImportFrom]:
+    found = []
+    for node in ast.walk(tree):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+        if any(name.split(".")[0] in OURS for name in names):
+            found.append(node)
+    return found
+
+
+def private_names(tree: ast.Module) -> list[str]:
+    """What the code takes of our packages and is not public, wherever it stands in a chain of attributes."""
+    bound: dict[str, object] = {}
+    found = []
+    for node in imports_of_ours(tree):
+        for alias in node.names:
+            whole = alias.name if isinstance(node, ast.Import) else f"{node.module}.{alias.name}"
+            package, *rest = whole.split(".")
+            root = importlib.import_module(package)
+            if len(rest) > (0 if isinstance(node, ast.Import) else 1) or not public(root).issuperset(rest):
+                found.append(whole)
+            else:
+                bound[alias.asname or alias.name] = getattr(root, rest[0]) if rest else root
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            module = module_of(node.value, bound)
+            if module is not None and node.attr not in public(module):
+                found.append(ast.unparse(node))
+    return found
+
+
+def module_of(node: ast.expr, bound: dict[str, object]) -> ModuleType | None:
+    """The module of ours that an expression is."""
+    if isinstance(node, ast.Name):
+        there = bound.get(node.id)
+    elif isinstance(node, ast.Attribute):
+        there = getattr(module_of(node.value, bound), node.attr, None)
+    else:
+        there = None
+    return there if isinstance(there, ModuleType) else None
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_public_names_only_and_few_imports(path: Path) -> None:
+    tree = code_of(path)
+    if path.stem in INSIDE:
+        assert private_names(tree), "it has become public: take it from the list"
+        return
+    assert private_names(tree) == []
+    assert len(imports_of_ours(tree)) <= MOST_IMPORTS
+
+
+@pytest.mark.parametrize(
+    ("code", "private"),
+    [
+        ("import magloc\nmagloc.plots.fixes, magloc.dipole.field, magloc.datasets.load, magloc.locate", []),
+        ("from adcs import mockup\nmockup.Camera()", []),
+        ("from magloc.fields import dipole", ["magloc.fields.dipole"]),
+        ("import magloc.kalman", ["magloc.kalman"]),
+        ("from magloc import readings", ["magloc.readings"]),
+        ("import magloc\nmagloc.plots.style.BLUE", ["magloc.plots.style"]),
+        ("import magloc as m\nm.kalman, m.dipole.np", ["m.kalman", "m.dipole.np"]),
+    ],
+)
+def test_a_private_name_is_found(code: str, private: list[str]) -> None:
+    assert private_names(ast.parse(code)) == private
+
+
+def test_they_say_their_place_as_the_gallery_does() -> None:
+    said = {}
+    for path in NOTEBOOKS:
+        found = PLACE.findall(nbformat.read(path, as_version=4).cells[0].source)
+        assert len(found) == 1, path.name
+        number, of, minutes = found[0]
+        assert int(of) == len(NOTEBOOKS)
+        said[path.stem] = (number, minutes)
+    cards = CARD.findall((DOCS / "gallery" / "index.md").read_text(encoding="utf-8"))
+    assert {name: (number, minutes) for number, name, minutes in cards} == said
+    assert sorted(int(number) for number, _ in said.values()) == list(range(1, len(NOTEBOOKS) + 1))
+    listed = re.findall(
+        r"^notebooks/([\w-]+)$", (DOCS / "gallery" / "index.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    assert listed == sorted(said, key=lambda name: int(said[name][0]))
