@@ -1,14 +1,16 @@
 """Magnetometers that can be bought, with the figures of their makers.
 
 Only figures that were checked against the document that is named stand here; what could not be checked is left out, and
-has to be given by whoever makes an array of such a sensor.
+has to be given by whoever makes an array of such a sensor. They stand in ``presets.toml``.
 """
 
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType
 
 from arrays.sensor import SensorKind
@@ -44,37 +46,10 @@ class SensorPreset:
         return float(f"{self.noise_nT_rtHz * math.sqrt(0.5 * rate_Hz):.3g}")
 
 
-_UNCHECKED = "no document at hand states its noise: give that of your data sheet"
-
 SENSOR_PRESETS: Mapping[str, SensorPreset] = MappingProxyType(
     {
-        "rm3100": SensorPreset(
-            "vector",
-            "PNI Sensor, 'Magneto-Inductive (MI) Technology Introduction' (support article): 15 nT RMS at 200 cycle"
-            " counts; noise only",
-            noise_nT=15.0,
-        ),
-        "lis3mdl": SensorPreset(
-            "vector",
-            "STMicroelectronics, LIS3MDL data sheet DocID024204: full scale ±4 gauss (features, page 1); RMS noise"
-            " 4.1 mgauss along z, 3.2 along x and y, ultra-high-performance mode (its magnetic characteristics, as"
-            " others quote them)",
-            noise_nT=410.0,
-            saturation_nT=400_000.0,
-        ),
-        "tlv493d": SensorPreset(
-            "vector",
-            f"Infineon, TLV493D-A1B6 product description: ±130 mT, 98 µT per digit; {_UNCHECKED}",
-            saturation_nT=130e6,
-        ),
-        "mlx90393": SensorPreset("vector", f"Melexis, MLX90393: {_UNCHECKED}"),
-        "fluxgate": SensorPreset("vector", f"fluxgates such as Bartington's Mag-13: {_UNCHECKED}"),
-        "opm": SensorPreset("scalar", f"optically pumped sensors such as QuSpin's QTFM: {_UNCHECKED}"),
-        "overhauser": SensorPreset(
-            "scalar",
-            "GEM Systems GSM-19 version 6, brochure of Aegis Instruments: 0.015 nT/√Hz",
-            noise_nT_rtHz=0.015,
-        ),
+        name: SensorPreset(**table)
+        for name, table in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items()
     }
 )
 """Sensors by the name that ``magloc new-array --sensor`` takes."""

@@ -194,7 +194,7 @@ def nees_of_the_last(result: xr.Dataset, n_instants: int) -> float:
     return float(nees.mean()) / 6.0
 
 
-def linear_filter(simulation: Simulation) -> dict[str, Any]:
+def linear_filter(simulation: Simulation, _: None) -> dict[str, Any]:
     """Of a source at rest, were the readings linear about the truth: NEES at the end, and the sum of all NIS.
 
     A linear filter is consistent at once if the array states its errors as they are, and seldom if it does not.
