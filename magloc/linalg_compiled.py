@@ -47,6 +47,20 @@ def _tangent(q: FloatArray, tangent: FloatArray) -> None:
 
 
 @compiled
+def put(target: FloatArray, source: FloatArray) -> None:
+    """Copy a vector. A slice's assignment would do, but it compiles an error sentence of its own every time."""
+    for i in range(target.size):
+        target[i] = source[i]
+
+
+@compiled
+def put_rows(target: FloatArray, source: FloatArray) -> None:
+    """Copy a matrix."""
+    for i in range(len(target)):
+        put(target[i], source[i])
+
+
+@compiled
 def fill_frame(line: FloatArray, frame: FloatArray) -> float:
     """Axes u, v, n as rows, n along a line, and its length. Duff et al., "Building an orthonormal basis, revisited"."""
     length = math.sqrt(line[0] * line[0] + line[1] * line[1] + line[2] * line[2])

@@ -207,7 +207,8 @@ def star_triangles(directions: FloatArray, longest: float) -> StarTriangles:
     corners, sides = np.take_along_axis(corners, order, axis=1), np.take_along_axis(opposite, order, axis=1)
     short = sides[:, 2] <= longest
     # Turned inside out: the triple product is positive for corners that go round clockwise seen from the centre.
-    sense = np.linalg.det(directions[corners[short]]) < 0.0
+    one, two, three = np.moveaxis(directions[corners[short]], 1, 0)
+    sense = np.sum(np.cross(one, two) * three, axis=-1) < 0.0
     return StarTriangles(corners[short], sides[short], sense)
 
 

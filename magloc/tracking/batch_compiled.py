@@ -16,7 +16,7 @@ from arrays.typing import FloatArray
 from magloc.compilation import compiled
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.kalman_compiled import scalar_update, triangular_root
-from magloc.linalg_compiled import orthonormalise
+from magloc.linalg_compiled import orthonormalise, put, put_rows
 
 IntArray = NDArray[np.int64]
 TRACKED, PREDICTED, OUTLIER = 0, 1, 2
@@ -326,13 +326,15 @@ def follow(
         else:
             if _range_error(predicted_x, predicted_S, origin, rotation, centroid) > rules.start_range_error:
                 return row, contradictions
-            x_k[:] = predicted_x
+            put(x_k, predicted_x)
             w, a = transform_of_row[row], ambient_of_row[row]
             _predicted(x_k, origin, rotation, ambients[a], array, transforms[w], channels, slopes, predicted, H)
             curved = _is_of_readings(S, predicted_S, rules.largest_growth) and _chart(
                 H, predicted_S, rules.least_singular, M
             )
-            predicted_first[:], mean[:], root[:] = predicted, predicted_x, predicted_S
+            put(predicted_first, predicted)
+            put(mean, predicted_x)
+            put_rows(root, predicted_S)
             converged, change_before, length = False, math.inf, 1.0
             for _ in range(rules.max_iterations):
                 iterations += 1
@@ -345,7 +347,8 @@ def follow(
                     for i in range(6):
                         t -= H[j, i] * (mean[i] - x_k[i])
                     innovation[j] = t
-                x_next[:], S_k[:] = mean, root
+                put(x_next, mean)
+                put_rows(S_k, root)
                 nis = _updated(x_next, S_k, H, innovation, phi)
                 for i in range(n):
                     x_next[i] = x_k[i] + length * (x_next[i] - x_k[i])
@@ -357,7 +360,7 @@ def follow(
                 for j in range(k):
                     change += (predicted_next[j] - predicted[j]) ** 2
                     predicted[j] = predicted_next[j]
-                x_k[:] = x_next
+                put(x_k, x_next)
                 change = math.sqrt(change) / length
                 if not math.isfinite(change):
                     break
@@ -378,8 +381,12 @@ def follow(
         used_x, used_S = (x_k, S_k) if status == TRACKED else (predicted_x, predicted_S)
         if _range_error(used_x, used_S, origin, rotation, centroid) > rules.largest_range_error:
             return row, contradictions
-        x[:], S[:] = used_x, used_S
-        out.x[row], out.S[row], out.predicted_x[row], out.predicted_S[row] = x, S, predicted_x, predicted_S
+        put(x, used_x)
+        put_rows(S, used_S)
+        put(out.x[row], x)
+        put_rows(out.S[row], S)
+        put(out.predicted_x[row], predicted_x)
+        put_rows(out.predicted_S[row], predicted_S)
         out.nis[row], out.iterations[row], out.status[row] = nis, iterations, status
     return end, contradictions
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.compilation import compiled
-from magloc.linalg_compiled import _directional_tangent, _solve_damped, _tangent, orthonormalise
+from magloc.linalg_compiled import _directional_tangent, _solve_damped, _tangent, orthonormalise, put
 from magloc.measurement.whitened_compiled import (
     SMALLEST_S,
     ModelRow,
@@ -188,7 +188,8 @@ def refine(
             damping *= 0.1
         elif gained < 0.5 * promised:
             damping = max(damping, 0.1) * 3.0
-        q[:], mu[:] = new_q, new_mu
+        put(q, new_q)
+        put(mu, new_mu)
         chi2 = new_chi2
         basis, new_basis = new_basis, basis
         residual, new_residual = new_residual, residual

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
 from magloc.compilation import compiled, runtime_int
+from magloc.linalg_compiled import put, put_rows
 from magloc.localization.fit.variable_projection_compiled import (
     CONVERGED,
     FAILED,
@@ -64,7 +65,7 @@ def _pick_starts(y: FloatArray, among: Candidates, starts: FloatArray) -> int:
                 best = i
         if score[best] < 0.0:
             return k
-        starts[k] = candidates[best]
+        put(starts[k], candidates[best])
         q0, q1, q2, q3 = starts[k]
         for i in range(n):
             t = candidates[i, 0] * q0 + candidates[i, 1] * q1 + candidates[i, 2] * q2 + candidates[i, 3] * q3
@@ -93,13 +94,13 @@ def _search_row(
     moments = np.empty((n_starts, 3))
     chi2 = np.empty(n_starts)
     iterations = np.empty(n_starts, np.int64)
-    starts[:n_first] = first
+    put_rows(starts[:n_first], first)
     n = n_first + _pick_starts(ranked, candidates, starts[n_first:])
     found = runtime_int(0)
     counts[1] = counts[2] = 0
     for k in range(n):
         # The optima found so far fill the places of the starts that led to them.
-        starts[found] = starts[k]
+        put(starts[found], starts[k])
         chi2[found], iterations[found], end = refine(
             starts[found], y, model, runtime_int(3), OPTIMUM_TOLERANCE, max_iterations,
             starts, chi2, found, moments[found],
@@ -123,7 +124,8 @@ def _search_row(
         best = min(best, chi2[k])
         if chi2[k] > best + keep_within or chi2[k] == math.inf:
             break
-        out_q[kept], out_mu[kept] = starts[k], moments[k]
+        put(out_q[kept], starts[k])
+        put(out_mu[kept], moments[k])
         out_chi2[kept], out_iterations[kept] = chi2[k], iterations[k]
         chi2[k] = math.inf
         kept += 1

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
 from magloc.compilation import compiled, runtime_int
+from magloc.linalg_compiled import put
 from magloc.localization.fit.variable_projection_compiled import refine
 from magloc.measurement.whitened_compiled import SMALLEST_S, ModelRow, ModelRows, row_at
 
@@ -61,7 +62,7 @@ def _profile_end(
             break
         if outside == bound:
             break
-        best[:] = trial
+        put(best, trial)
         inside, f_inside = outside, f_outside
         step = min(1.7 * step, LARGEST_PROFILE_STEP)
     if not found:
@@ -79,7 +80,7 @@ def _profile_end(
             outside, f_outside = middle, f
         else:
             inside, f_inside = middle, max(f, -rise)
-            best[:] = trial
+            put(best, trial)
     return inside
 
 

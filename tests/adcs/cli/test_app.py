@@ -65,7 +65,7 @@ class TestExitStatus:
         def interrupted(*_):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(framework, "_run", interrupted)
+        monkeypatch.setattr(framework, "call", interrupted)
         outcome = adcs("tables")
         assert (outcome.status, outcome.err) == (framework.INTERRUPTED, "adcs: interrupted\n")
 
@@ -73,7 +73,7 @@ class TestExitStatus:
         def full(*_):
             raise OSError(28, "No space left on device", "somewhere.csv")
 
-        monkeypatch.setattr(framework, "_run", full)
+        monkeypatch.setattr(framework, "call", full)
         outcome = adcs("tables")
         assert (outcome.status, outcome.err) == (2, "adcs: somewhere.csv: No space left on device\n")
 
