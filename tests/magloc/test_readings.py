@@ -108,7 +108,7 @@ class TestValues:
         lines = ["time_s," + ",".join(f"s{i}_nT" for i in range(7))]
         lines += [",".join([str(i), *("" if v is None else repr(v) for v in row)]) for i, row in enumerate(values)]
         path.write_text("\n".join(lines), encoding="utf-8")
-        expected_nT = pd.read_csv(path, float_precision="round_trip").to_numpy(dtype=np.float64)[:, 1:]
+        expected_nT = pd.read_csv(path, dtype=str).to_numpy(dtype=object).astype(np.float64)[:, 1:]
         readings = read_readings(path, SensorArray(tuple(sensors)))
         np.testing.assert_allclose(readings.values_T, expected_nT / 1e9, rtol=1e-15, atol=0.0)
 
