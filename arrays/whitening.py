@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -56,6 +57,15 @@ def whitening(
     ``L⁻¹ U = Q diag(s) Vᵀ`` gives the shrinkage ``1 - 1/√(1 + s² λ)``, which is 1 for an unknown field.
     """
     mask, covariance = _channels(array, available, covariance_T2)
+    if covariance_T2 is None:
+        return _of_constant_noise(array, mask.tobytes())
+    return whitenings(array, mask, covariance[None])[0]
+
+
+@lru_cache(maxsize=16)  # readings that come one by one miss the same channels
+def _of_constant_noise(array: SensorArray, available: bytes) -> Whitening:
+    """Whitening of the channels of a mask, with the noise that the array states."""
+    mask, covariance = _channels(array, np.frombuffer(available, dtype=np.bool_), None)
     return whitenings(array, mask, covariance[None])[0]
 
 

@@ -1,4 +1,4 @@
-"""Compiled hot loops. Each has a readable NumPy twin outside this package, and a test that the two agree.
+"""Compiled hot loops. Each has a readable NumPy twin beside it, and a test that the two agree.
 
 This module holds the one set of compiler options that all kernels share:
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from arrays.io.outputs import make_folder, refuse_file
 from magloc.cli import framework
 from magloc.cli.framework import QuietOptions, print_note
 
@@ -26,13 +25,11 @@ def demo(
     """
     from adcs.cli.app import app
 
-    refuse_file(out, "OUT")
-    make_folder(out, "OUT")
     telemetry, scenario = (str(out / "run" / name) for name in ("telemetry.csv", "scenario.toml"))
     calls = [
         ("run", "tabletsat", "--duration", "300", "--seeds", "1", "--out", str(out / "run")),
         ("estimate", telemetry, "--config", scenario, "--out", str(out / "estimates")),
     ]
-    framework.demonstrate(app, [[*tokens, "--quiet"] if common.quiet else tokens for tokens in calls])
+    framework.demonstrate(app, out, calls, common)
     if not common.quiet:
         print_note(f"the picture is {out / 'estimates' / 'estimates.png'}", "adcs")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from adcs.complementary.names import METHODS
 from magloc.cli import framework
 from magloc.cli.framework import QuietOptions
 
@@ -21,7 +22,7 @@ def warm_up(*, common: QuietOptions = QuietOptions()) -> None:  # noqa: B008 - f
     calls = [
         *(("run", "tabletsat", "--filter", name, *few) for name in filters),
         ("run", "tabletsat", "--sensors", "mag+sun+gyro", "--states", "gyro-bias", *few),
-        *(("run", "complementary", "--filter", name) for name in ("explicit", "gauss-newton", "adaptive")),
+        *(("run", "complementary", "--filter", name) for name in METHODS),
         ("run", "ellipsoid", "--seeds", "1"),
     ]
     framework.warm_up(app, calls, common)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, TypeVar, get_args
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,13 +12,12 @@ from adcs import quaternion
 from adcs.complementary.adaptive import AdaptiveTuning, adaptive_track
 from adcs.complementary.explicit import BEST_GAINS, Gains, explicit_track
 from adcs.complementary.gauss_newton import gauss_newton_track
+from adcs.complementary.names import METHODS, Method
 from adcs.satellite.attitude_track import AttitudeTrack
 from adcs.satellite.telemetry import is_read
 from adcs.satellite.vector_record import VectorRecord
 from arrays.typing import FloatArray
 
-Method = Literal["explicit", "gauss-newton", "adaptive"]
-METHODS: tuple[Method, ...] = get_args(Method)
 _STEP_TOLERANCE = 1e-2
 _NAMES = ("first vector", "second vector")
 

@@ -7,17 +7,15 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 
 from adcs import quaternion
+from adcs.complementary.names import RULES, Rule
 from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 
 Pair = tuple[FloatArray, FloatArray]
-Rule = Literal["magnetometer-only", "raw", "transported"]
-RULES: tuple[Rule, ...] = get_args(Rule)  # in the order of the codes of the compiled filter
 
 
 @dataclass(frozen=True)

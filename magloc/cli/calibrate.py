@@ -14,7 +14,7 @@ import magloc
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import make_folder, refuse_file, refuse_unwritable
-from magloc.cli.framework import CommonOptions, print_json
+from magloc.cli.framework import CommonOptions, print_result
 from magloc.cli.options import print_note, refuse_not_positive
 
 if TYPE_CHECKING:
@@ -145,10 +145,7 @@ def calibrate(
         _check_converged(result, readings, out)
         report, lines, notes = _report(result, len(rows), out), _table(result), _notes(result, len(rows), prior)
     arrays.write_array(out, result.array)
-    if json:
-        print_json(report)
-    else:
-        print("\n".join(lines))
+    print_result(report, lines, as_json=json)
     if figures is not None:
         _draw(result, figures, quiet=common.quiet)
     if not (json or common.quiet):

@@ -20,11 +20,13 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
 from cyclopts import App, CycloptsError, MissingArgumentError, Parameter, UnknownCommandError
 
 from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import InputError
+from arrays.io.outputs import make_folder
 
 DONE = 0
 BAD_INPUT = 2
@@ -238,9 +240,12 @@ def _notes_of_the_library(program: str) -> Iterator[None]:
             logger.propagate = True
 
 
-def demonstrate(app: App, calls: Sequence[Sequence[str]], first: int = 4, last: int = 6) -> None:
-    """Run commands one after the other as a user would, each shown as it is typed, with some lines that it prints."""
-    for tokens in calls:
+def demonstrate(
+    app: App, out: Path, calls: Sequence[Sequence[str]], common: QuietOptions, first: int = 4, last: int = 6
+) -> None:
+    """Run commands that write into a folder, each shown as a user types it, with some lines that it prints."""
+    make_folder(out, "OUT")
+    for tokens in [[*call, "--quiet"] if common.quiet else call for call in calls]:
         print(f"\n$ {' '.join([app.name[0], *map(shlex.quote, tokens)])}", flush=True)
         with contextlib.redirect_stdout(io.StringIO()) as printed:
             call(app, tokens)
@@ -268,6 +273,14 @@ def print_json(value: object) -> None:
     import msgspec
 
     print(msgspec.json.encode(value, enc_hook=lambda array: array.tolist()).decode())
+
+
+def print_result(result: object, lines: Sequence[str], *, as_json: bool) -> None:
+    """Print a result as one JSON value, or as text."""
+    if as_json:
+        print_json(result)
+    else:
+        print("\n".join(lines))
 
 
 def print_note(text: str, program: str) -> None:

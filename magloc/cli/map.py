@@ -12,7 +12,7 @@ from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file
 from arrays.io.text import write_netcdf
-from magloc.cli.framework import CommonOptions, print_json, progress
+from magloc.cli.framework import CommonOptions, print_result, progress
 from magloc.cli.options import Grid, naming_scheduler, print_note
 
 if TYPE_CHECKING:
@@ -96,10 +96,7 @@ def map_(
         magloc.plots.write(draw(dataset), folder / "convergence.png")
         if netcdf:
             write_netcdf(dataset, folder / "convergence.nc")
-    if json:
-        print_json({**_KEYS, **asdict(counts), "out": str(folder)})
-    else:
-        print("\n".join(counts.lines()))
+    print_result({**_KEYS, **asdict(counts), "out": str(folder)}, counts.lines(), as_json=json)
     if not (json or common.quiet):
         print_note(_how_done(int((before == done).sum()) if before.size else 0, done.size, counts, folder))
 

@@ -164,8 +164,6 @@ def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
 
 def chunk_seconds(path: str | os.PathLike[str]) -> FloatArray:
     """Duration of every chunk of a store, NaN where it is not done; empty where there is no map."""
-    if not Path(path).is_dir():  # early versions of zarr make what they are to open
-        return np.empty(0)
     try:
         return _readable_marks(_opened(Path(path))[SECONDS_OF_CHUNK])
     except UNREADABLE:
@@ -230,6 +228,8 @@ def _opened(path: Path) -> zarr.Group:
     with of_extra("maps", "a stored map"):
         import zarr
 
+    if not path.is_dir():  # early versions of zarr make what they are to open
+        raise InputError(_SOMETHING_ELSE.format(path))
     try:
         return zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
     except UNREADABLE:

@@ -63,7 +63,9 @@ class WhitenedRows:
     @property
     def energy(self) -> FloatArray:
         """Sums of squared differences (b,), as they are without a source."""
-        without = self.y - self.model.predicted(np.zeros((len(self), *self.model.ambient.shape[1:])))
+        without = self.y
+        if self.model.channel_is_scalar.any():
+            without = without - self.model.predicted(np.zeros_like(self.model.ambient))
         energy: FloatArray = np.einsum("bc,bc->b", without, without)
         return energy
 
@@ -93,6 +95,9 @@ def checked_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
 
 def rows_of_equal_mask(available: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.intp]]]:
     """Every distinct row of available channels (n, C), and the rows that have it."""
+    if len(available) and (available == available[0]).all():
+        yield available[0], np.arange(len(available))
+        return
     masks, of_row = np.unique(available, axis=0, return_inverse=True)
     for i, mask in enumerate(masks):
         yield mask, np.flatnonzero(of_row.ravel() == i)

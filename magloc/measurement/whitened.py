@@ -95,7 +95,9 @@ class WhitenedModel(ScaledSensors):
 
         def of_rows(values: list[FloatArray]) -> FloatArray:
             stacked = np.stack(values)
-            return np.broadcast_to(stacked, (len(whitenings), *stacked.shape[1:])) if shared else stacked
+            if len(distinct) == len(whitenings):
+                return stacked
+            return np.broadcast_to(stacked, (len(whitenings), *stacked.shape[1:]))
 
         return cls(
             centroid=array.centroid,

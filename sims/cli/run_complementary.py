@@ -6,25 +6,22 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 from cyclopts import Parameter
 
 from adcs.cli.options import print_note
-from adcs.complementary.outage import Rule
+from adcs.complementary.names import Method, Rule
 from arrays.io.arguments import Flag
-from arrays.io.csv import write_table
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.outputs import refuse_file
-from magloc.cli.framework import QuietOptions, print_json, progress
+from magloc.cli.framework import QuietOptions, print_result, progress
 
 if TYPE_CHECKING:
     from adcs.complementary.explicit import Gains
+    from arrays.typing import FloatArray
     from sims.attitude.complementary import SatelliteRuns, SatelliteScenario
-from arrays.typing import FloatArray
 
-Filter = Literal["explicit", "gauss-newton", "adaptive"]
 STEP_ORBITS, OUTAGE_STEP_ORBITS, OUTAGE_ORBITS = 1.7, 0.3, 1.5
 ORBITS, ORBITS_WITH_OUTAGE = 3.5, 4.0
 _ALONE_KP_PER_S, _OUTAGE_KP_PER_S = 0.02, 0.005
@@ -61,7 +58,7 @@ class ComplementaryOptions:
         Seconds: 3.5 orbits of 5881 s, or 4 with an outage.
     """
 
-    filter: Filter = "explicit"
+    filter: Method = "explicit"
     kp: float | None = None
     ki: float | None = None
     sigma_nT: Annotated[float, Parameter(name="--sigma-nT")] = 1000.0
@@ -161,6 +158,9 @@ def run_complementary(
     (before the outage), None in a run that ends before it; and ``outage_max_deg``, the largest errors of roll, pitch
     and yaw from 2 orbits on, or None. Means over the runs; the last one is their median.
     """
+    import numpy as np
+
+    from arrays.io.csv import write_table
     from sims.attitude.complementary import satellite_runs
     from sims.experiments.complementary import RUN_COLUMNS, errors_deg, row_of_each
 
@@ -192,11 +192,14 @@ def run_complementary(
 
 
 def _write_picture(options: ComplementaryOptions, runs: SatelliteRuns, out: Path) -> None:
+    import numpy as np
+
     from adcs.plots.complementary import ComplementaryPicture, complementary_figure
+    from arrays.io.csv import write_table
     from magloc.plots import style
     from sims.experiments.complementary import errors_deg
 
-    names: tuple[Filter, ...] = ("gauss-newton", "explicit", "adaptive")
+    names: tuple[Method, ...] = ("gauss-newton", "explicit", "adaptive")
     errors: dict[str, FloatArray] = {name: errors_deg(runs, name, options.gains, options.outage)[0] for name in names}
     orbits = runs.scenario.orbits
     picture = ComplementaryPicture(
@@ -260,9 +263,6 @@ def complementary(
         print_note(f"warning: {warning}")
     with progress(options.seeds, "runs", quiet=common.quiet) as advance:
         result = run_complementary(options, out, advance)
-    if json:
-        print_json(result)
-    else:
-        print("\n".join(summary_lines(options, result)))
+    print_result(result, summary_lines(options, result), as_json=json)
     if out is not None and not common.quiet:
         print_note(f"wrote complementary.png, complementary.csv and complementary-runs.csv into {out}")

@@ -8,20 +8,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 from cyclopts import Parameter
 
 from adcs.cli.options import print_note
-from adcs.ellipsoids.roll_yaw import STEP_S
 from adcs.ellipsoids.strip import StepRule
 from arrays.io.arguments import Flag
-from arrays.io.csv import write_table
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.outputs import refuse_file
-from arrays.typing import FloatArray
-from magloc.cli.framework import QuietOptions, print_json, progress
+from magloc.cli.framework import QuietOptions, print_result, progress
 
 if TYPE_CHECKING:
+    from arrays.typing import FloatArray
     from sims.experiments.ellipsoid import EllipsoidRuns, EllipsoidSettings
 
 JUMP_S = 2000.0
@@ -65,6 +62,8 @@ class EllipsoidOptions:
 
     def check(self) -> None:
         """Raise InputError for what cannot be run."""
+        from adcs.ellipsoids.roll_yaw import STEP_S
+
         for name, value in (("--noise-deg", self.noise_deg), ("--drift-deg-s", self.drift_deg_s)):
             if not 0.0 < value <= LARGEST:
                 raise InputError(f"{name}: found {value:g}, expected a positive number.")
@@ -80,6 +79,8 @@ class EllipsoidOptions:
     @property
     def n_steps(self) -> int:
         """Steps of 2 s."""
+        from adcs.ellipsoids.roll_yaw import STEP_S
+
         return int(self.duration / STEP_S)
 
     @property
@@ -108,6 +109,9 @@ def run_ellipsoid(
     of the estimated yaw, ``half_width_mean_deg``, the guaranteed half-width of yaw at the end,
     ``containment_violations`` of all ``steps``, and ``resets_mean``, contradictions in a run.
     """
+    import numpy as np
+
+    from arrays.io.csv import write_table
     from sims.experiments.ellipsoid import RUN_COLUMNS, ellipsoid_runs, row_of_each
 
     options.check()
@@ -139,8 +143,11 @@ def run_ellipsoid(
 
 
 def _write_picture(options: EllipsoidOptions, runs: EllipsoidRuns, out: Path) -> None:
-    from adcs.ellipsoids.roll_yaw import kalman_track, roll_yaw_system
+    import numpy as np
+
+    from adcs.ellipsoids.roll_yaw import STEP_S, kalman_track, roll_yaw_system
     from adcs.plots.ellipsoids import RollYawPicture, roll_yaw_figure
+    from arrays.io.csv import write_table
     from magloc.plots import style
 
     system = roll_yaw_system(math.radians(options.noise_deg), math.radians(options.drift_deg_s))
@@ -158,40 +165,32 @@ def _write_picture(options: EllipsoidOptions, runs: EllipsoidRuns, out: Path) ->
     picture = RollYawPicture("; ".join(parts), time_s, runs.states_rad, runs.track, kalman, options.closed_loop, jump_s)
     style.save(roll_yaw_figure(picture), out / "ellipsoid.png", dpi=130)
     track, H, P = runs.track, runs.track.shapes[0], kalman.covariances
-    columns = [
-        time_s,
-        *np.degrees(runs.states_rad[0]).T,
-        *np.degrees(track.centres[0]).T,
-        *(np.degrees(np.degrees(H[:, i, j])) for i, j in ((0, 0), (0, 1), (1, 1))),
-        np.degrees(track.bounds[0]),
-        track.resets[0],
-        *np.degrees(kalman.means).T,
-        *(np.degrees(np.degrees(P[:, i, j])) for i, j in ((0, 0), (0, 1), (1, 1))),
-    ]
-    write_table(out / "ellipsoid.csv", _TIME_COLUMNS, np.stack(columns, axis=1))
+    columns = {
+        "time_s": time_s,
+        **_of_axes("true_", runs.states_rad[0]),
+        **_of_axes("", track.centres[0]),
+        **_of_matrix("shape_", H),
+        "bound_deg": np.degrees(track.bounds[0]),
+        "resets": track.resets[0],
+        **_of_axes("kalman_", kalman.means),
+        **_of_matrix("kalman_", P),
+    }
+    write_table(out / "ellipsoid.csv", tuple(columns), np.stack(list(columns.values()), axis=1))
 
 
-_TIME_COLUMNS = (
-    "time_s",
-    "true_roll_deg",
-    "true_yaw_deg",
-    "roll_deg",
-    "yaw_deg",
-    "shape_roll_roll_deg2",
-    "shape_roll_yaw_deg2",
-    "shape_yaw_yaw_deg2",
-    "bound_deg",
-    "resets",
-    "kalman_roll_deg",
-    "kalman_yaw_deg",
-    "kalman_roll_roll_deg2",
-    "kalman_roll_yaw_deg2",
-    "kalman_yaw_yaw_deg2",
-)
+def _of_axes(name: str, angles_rad: FloatArray) -> dict[str, FloatArray]:
+    return {f"{name}{axis}_deg": math.degrees(1.0) * angles_rad[:, i] for i, axis in enumerate(("roll", "yaw"))}
+
+
+def _of_matrix(name: str, matrix_rad2: FloatArray) -> dict[str, FloatArray]:
+    places = {"roll_roll": (0, 0), "roll_yaw": (0, 1), "yaw_yaw": (1, 1)}
+    return {f"{name}{key}_deg2": math.degrees(1.0) ** 2 * matrix_rad2[:, i, j] for key, (i, j) in places.items()}
 
 
 def summary_lines(options: EllipsoidOptions, result: dict[str, Any]) -> list[str]:
     """The result as text, one line for each number."""
+    from adcs.ellipsoids.roll_yaw import STEP_S
+
     return [
         f"{options.seeds} runs of {options.n_steps * STEP_S:g} s",
         f"error of yaw at the end, mean / 95 % / largest [°]  {result['final_error_mean_deg']:.3f} /"
@@ -228,9 +227,6 @@ def ellipsoid(
     """
     with progress(options.seeds, "runs", quiet=common.quiet) as advance:
         result = run_ellipsoid(options, out, advance)
-    if json:
-        print_json(result)
-    else:
-        print("\n".join(summary_lines(options, result)))
+    print_result(result, summary_lines(options, result), as_json=json)
     if out is not None and not common.quiet:
         print_note(f"wrote ellipsoid.png, ellipsoid.csv and ellipsoid-runs.csv into {out}")

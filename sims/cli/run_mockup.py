@@ -11,7 +11,7 @@ import sims.experiments
 from adcs.cli.options import naming_options, print_note
 from arrays.io.arguments import Flag
 from arrays.io.outputs import refuse_file
-from magloc.cli.framework import QuietOptions, print_json, progress
+from magloc.cli.framework import QuietOptions, print_result, progress
 from sims.cli.mockup_options import MockupOptions, value_or
 from sims.cli.mockup_replay import ReplayOptions
 from sims.experiments.mockup_settings import METHODS, SETTLED_S, Method
@@ -176,10 +176,7 @@ def mockup(
         from sims.cli.mockup_files import write_files
 
         written = write_files(options, told.run, out)
-    if json:
-        print_json(told.result)
-    else:
-        print("\n".join(told.lines))
+    print_result(told.result, told.lines, as_json=json)
     if written and not common.quiet:
         print_note(f"wrote {', '.join(written)} into {out}")
     if replay.wanted:

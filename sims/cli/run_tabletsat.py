@@ -16,7 +16,7 @@ from adcs.cli.options import ScenarioOptions, print_note
 from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import InputError
 from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_json, progress
+from magloc.cli.framework import QuietOptions, print_result, progress
 
 if TYPE_CHECKING:
     from adcs.io.scenario_files import AttitudeFile
@@ -138,10 +138,7 @@ def run_attitude(
         written = write_attitude_files(out, file, estimate, parts, outcome)
         if not common.quiet:
             print_note(f"wrote {', '.join(written)} into {out}")
-    if json:
-        print_json(numbers)
-    else:
-        print("\n".join(summary_lines(file, estimate, numbers)))
+    print_result(numbers, summary_lines(file, estimate, numbers), as_json=json)
 
 
 def summary_lines(file: AttitudeFile, estimate: EstimatorSettings, numbers: dict[str, Any]) -> Sequence[str]:

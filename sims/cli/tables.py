@@ -14,7 +14,7 @@ from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.csv import write_columns
 from arrays.io.errors import InputError
 from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_json, progress
+from magloc.cli.framework import QuietOptions, print_result, progress
 
 if TYPE_CHECKING:
     from sims.experiments.paper_tables import Comparison
@@ -81,10 +81,7 @@ def tables(
         write_columns({name: [getattr(one, name) for one in compared] for name in names}, out / "tables.csv")
         if not common.quiet:
             print_note(f"wrote tables.csv into {out}")
-    if json:
-        print_json({"rows": [asdict(one) for one in compared]})
-    else:
-        print("\n".join(table_lines(compared)))
+    print_result({"rows": [asdict(one) for one in compared]}, table_lines(compared), as_json=json)
 
 
 _TITLES = {3: "Table 3", 4: "Table 4, disturbance in the state", 5: "Table 5, constant gain"}

@@ -9,9 +9,9 @@ import numpy as np
 from adcs import quaternion
 from adcs.complementary.adaptive import AdaptiveTuning, adaptive_track
 from adcs.complementary.explicit import Gains, explicit_track
-from adcs.complementary.filters import Method
 from adcs.complementary.gauss_newton import gauss_newton_track
-from adcs.complementary.outage import Rule, Substitution
+from adcs.complementary.names import Method, Rule
+from adcs.complementary.outage import Substitution
 from arrays.typing import FloatArray
 from sims.attitude.complementary import SatelliteRuns, SatelliteScenario
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
-from arrays.io.outputs import make_folder, refuse_file
 from magloc.cli import framework
 from magloc.cli.framework import QuietOptions
 from magloc.cli.options import print_note
@@ -28,8 +27,6 @@ def demo(
     """
     from magloc.cli.app import app
 
-    refuse_file(out, "OUT")
-    make_folder(out, "OUT")
     readings, array, truth = (str(out / f"target{ending}") for ending in (".csv", "-array.toml", "-truth.csv"))
     motion = ("--speed-m-s", "0.1", "--turn-deg-s", "1.2")
     calls = [
@@ -39,7 +36,7 @@ def demo(
         ("view", readings, "--html", str(out / "target.html")),
     ]
     seen = calls if find_spec("viser") and find_spec("trimesh") else calls[:-1]
-    framework.demonstrate(app, [[*tokens, "--quiet"] if common.quiet else tokens for tokens in seen])
+    framework.demonstrate(app, out, seen, common)
     if not common.quiet:
         print_note(f"the picture is {out / 'track' / 'track.png'}")
         page = (

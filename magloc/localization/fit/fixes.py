@@ -166,6 +166,8 @@ class Fixes(Sequence[Fix]):
     @classmethod
     def joined(cls, parts: Sequence[Fixes]) -> Fixes:
         """The fixes of parts, row after row."""
+        if len(parts) == 1:
+            return parts[0]
         begins = np.cumsum([0, *map(len, parts)])
         solutions = [
             part.solutions.chosen(np.arange(len(part.solutions)), begin + part.solutions.of_row)

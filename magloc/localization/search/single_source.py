@@ -51,9 +51,10 @@ class BestFits:
 
 @dataclass(frozen=True, eq=False)
 class _Ranking:
-    """Bases of all candidates under the whitening of a mask, by which its rows rank them."""
+    """All candidates, and their bases under the whitening of a mask, by which its rows rank them."""
 
     whitening: Whitening
+    candidates: FloatArray
     bases: SingleArray
 
 
@@ -140,8 +141,9 @@ class SingleSourceSearch:
             self._ranking_of.clear()  # bases are large, and rows come sorted by their mask
             of_mask = whitening(self.array, mask)
             model = WhitenedModel.of(self.array, [of_mask], self.array.ambient_fields[None])
-            bases = linear_bases(model, model.gain[0], 0, model.homogeneous(self._candidates))
-            self._ranking_of[key] = _Ranking(of_mask, bases)
+            candidates = model.homogeneous(self._candidates)
+            bases = linear_bases(model, model.gain[0], 0, candidates)
+            self._ranking_of[key] = _Ranking(of_mask, candidates, bases)
         return self._ranking_of[key]
 
     def _search(
@@ -168,7 +170,7 @@ class SingleSourceSearch:
             rows.y,
             ranked,
             reading_of_row,
-            kernels.Candidates(model.homogeneous(self._candidates), ranking.bases, math.cos(self.apart_rad)),
+            kernels.Candidates(ranking.candidates, ranking.bases, math.cos(self.apart_rad)),
             first,
             keep_within,
             self.max_iterations,

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from adcs import quaternion
 from adcs.complementary.explicit import Gains, explicit_error, explicit_track, high_pass, low_pass, steps
 from adcs.complementary.gauss_newton import MeasuredQuaternion, gauss_newton_track
-from adcs.complementary.outage import RULES, Substitution
+from adcs.complementary.names import RULES
+from adcs.complementary.outage import Substitution
 from adcs.satellite.vector_record import VectorRecord
 from sims.attitude.complementary import ORBIT, SatelliteScenario, attitude, satellite_runs
 from tests.adcs.attitudes import random_attitudes

@@ -9,7 +9,8 @@ from adcs import quaternion
 from adcs.complementary import filters_compiled as kernel
 from adcs.complementary.explicit import Gains, explicit_track
 from adcs.complementary.gauss_newton import gauss_newton_track
-from adcs.complementary.outage import RULES, Substitute, Substitution, delay_steps, substitute_code
+from adcs.complementary.names import RULES
+from adcs.complementary.outage import Substitute, Substitution, delay_steps, substitute_code
 from sims.attitude.complementary import ORBIT, SatelliteScenario, satellite_runs
 
 
