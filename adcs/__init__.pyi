@@ -1,8 +1,11 @@
 from adcs import datasets as datasets
 from adcs import frames as frames
 from adcs import mockup as mockup
+from adcs.complementary.explicit import Gains as Gains
 from adcs.complementary.filters import complementary_filter as complementary_filter
+from adcs.complementary.filters import inertial_magnetic_filter as inertial_magnetic_filter
 from adcs.ellipsoids.ellipsoid import Ellipsoid as Ellipsoid
+from adcs.ellipsoids.observer import BoundedSystem as BoundedSystem
 from adcs.ellipsoids.observer import EllipsoidObserver as EllipsoidObserver
 from adcs.environment.orbit import circular_orbit as circular_orbit
 from adcs.io.scenario_files import read_scenario as read_scenario

@@ -1,6 +1,9 @@
 """Notebooks as tests (``pytest --nbmake notebooks``): their warnings are errors, as everywhere else."""
 
+import os
+import sys
 from collections.abc import Generator
+from pathlib import Path
 
 import pytest
 
@@ -11,4 +14,5 @@ def pytest_runtest_call(item: pytest.Item) -> Generator[None, object, object]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONWARNINGS", "error")
         patch.setenv("JUPYTER_PLATFORM_DIRS", "1")
+        patch.setenv("PATH", str(Path(sys.executable).parent), prepend=os.pathsep)  # the commands of this Python
         return (yield)

@@ -11,9 +11,10 @@ from numpy.testing import assert_allclose
 
 import adcs
 import magloc
+from adcs.complementary.names import MAGNETS
 from arrays.io.csv import read_table
 from arrays.io.errors import InputError
-from tests.datasets import ADCS, MAGLOC, RATES_HZ, write_magnetic, write_satellite
+from tests.datasets import ADCS, MAGLOC, RATES_HZ, write_imu, write_magnetic, write_satellite
 
 LARGEST_BYTES = 600_000
 
@@ -36,8 +37,9 @@ def test_recordings_are_what_the_simulation_gives(name: str, tmp_path: Path) -> 
     assert_same_files(tmp_path, MAGLOC)
 
 
-def test_telemetry_is_what_the_simulation_gives(tmp_path: Path) -> None:
-    write_satellite(tmp_path)
+@pytest.mark.parametrize("write", [write_satellite, write_imu])
+def test_logs_are_what_the_simulation_gives(write: Callable[[Path], None], tmp_path: Path) -> None:
+    write(tmp_path)
     assert_same_files(tmp_path, ADCS)
 
 
@@ -47,7 +49,7 @@ def test_they_are_small() -> None:
 
 def test_names() -> None:
     assert set(magloc.datasets.names()) == set(RATES_HZ)
-    assert adcs.datasets.names() == ("satellite",)
+    assert adcs.datasets.names() == ("imu", "satellite")
 
 
 @pytest.mark.parametrize("load", [magloc.datasets.load, adcs.datasets.load])
@@ -74,3 +76,18 @@ def test_the_attitude_of_the_satellite_is_right() -> None:
     attitude = adcs.estimate(log.telemetry, log.satellite, sensors="st+gyro", states=("gyro-bias",))
     error_deg = np.degrees((attitude.rotation.inv() * log.truth).magnitude())
     assert error_deg[-60:].max() < 0.02
+
+
+def test_the_attitude_of_the_inertial_unit_is_right() -> None:
+    """Before the magnet to a degree or two; with it, what is subtracted serves better than what is left."""
+    log = adcs.datasets.load("imu")
+    error_deg = {
+        magnet: np.degrees((found.rotation.inv() * log.truth).magnitude())
+        for magnet in MAGNETS
+        for found in [
+            adcs.inertial_magnetic_filter(log.time_s, log.gyro_rad_s, log.acceleration_m_s2, log.field_T, magnet=magnet)
+        ]
+    }
+    before, with_magnet = log.time_s < 30.0, (log.time_s >= 32.0) & (log.time_s < 45.0)
+    assert error_deg["subtracted"][before].max() < 4.0
+    assert error_deg["subtracted"][with_magnet].mean() < 0.5 * error_deg["kept"][with_magnet].mean()

@@ -1,4 +1,4 @@
-"""The door to the complementary filters: attitude of any record of a gyro and two vectors."""
+"""The doors to the complementary filters: attitude of any record of a gyro and two vectors."""
 
 from __future__ import annotations
 
@@ -12,7 +12,14 @@ from adcs import quaternion
 from adcs.complementary.adaptive import AdaptiveTuning, adaptive_track
 from adcs.complementary.explicit import BEST_GAINS, Gains, explicit_track
 from adcs.complementary.gauss_newton import gauss_newton_track
-from adcs.complementary.names import METHODS, Method
+from adcs.complementary.inertial_magnetic import (
+    InertialMagneticRecord,
+    inertial_magnetic_track,
+    prepare,
+    sensor_fixed_field,
+    undisturbed,
+)
+from adcs.complementary.names import MAGNETS, METHODS, Magnet, Method
 from adcs.satellite.attitude_track import AttitudeTrack
 from adcs.satellite.telemetry import is_read
 from adcs.satellite.vector_record import VectorRecord
@@ -64,9 +71,7 @@ def complementary_filter(
     if method not in METHODS:
         raise ValueError(f"Input method must be one of {', '.join(METHODS)}; instead received {method!r}.")
     times = np.asarray(time_s, dtype=np.float64)
-    steps = np.diff(times)
-    if times.ndim != 1 or len(times) < 2 or not np.ptp(steps) <= _STEP_TOLERANCE * steps.mean():
-        raise ValueError("Input time_s must ascend in equal steps; instead received others.")
+    step_s = _step_s(times)
     for name, vectors in (("body_vectors", body_vectors), ("frame_vectors", frame_vectors)):
         if len(vectors) != 2:
             raise ValueError(f"Input {name} must be two vectors; instead received {len(vectors)}.")
@@ -74,7 +79,7 @@ def complementary_filter(
     body = [np.asarray(v, dtype=np.float64) for v in body_vectors]
     frame = [np.broadcast_to(np.asarray(v, dtype=np.float64), (len(times), 3)) for v in frame_vectors]
     vectors = body[0], body[1], frame[0], frame[1]
-    record = VectorRecord(float(steps.mean()), rate, *vectors, np.zeros_like(rate))
+    record = VectorRecord(step_s, rate, *vectors, np.zeros_like(rate))
     start = _first_attitude(body, frame)
     sigma: dict[str, FloatArray] = {}
     if method == "adaptive":
@@ -96,6 +101,68 @@ def complementary_filter(
         seen=dict(zip(_NAMES, map(is_read, body), strict=True)),
         sigma=sigma,
     )
+
+
+def inertial_magnetic_filter(
+    time_s: ArrayLike,
+    gyro_rad_s: ArrayLike,
+    acceleration_m_s2: ArrayLike,
+    field_T: ArrayLike,
+    *,
+    magnet: Magnet = "subtracted",
+) -> AttitudeTrack:
+    """Attitude of an inertial unit with a magnetometer that is moved by hand, with magnets near it or not.
+
+    The acceleration is smoothed in a frame that does not turn, the gyro's bias is that of rests, and the
+    magnetometer's lag is found. The field of the first second, which must be at rest, is north.
+
+    Parameters
+    ----------
+    time_s : array_like, shape (n,)
+        In equal steps.
+    gyro_rad_s, acceleration_m_s2, field_T : array_like, shape (n, 3)
+        Body axes; at rest the acceleration is upwards.
+    magnet : str
+        A field that moves with the sensor is ``subtracted`` as it is estimated beside the heading; or readings of an
+        unusual length or dip are ``rejected``; or all are ``kept``.
+
+    Returns
+    -------
+    AttitudeTrack
+        East, north, up from body.
+
+    Raises
+    ------
+    ValueError
+        A shape does not match, the steps differ, a value is missing, or a vector is zero.
+    """
+    if magnet not in MAGNETS:
+        raise ValueError(f"Input magnet must be one of {', '.join(MAGNETS)}; instead received {magnet!r}.")
+    times, rate, acceleration, field = (
+        np.asarray(values, dtype=np.float64) for values in (time_s, gyro_rad_s, acceleration_m_s2, field_T)
+    )
+    prepared = prepare(InertialMagneticRecord(_step_s(times), rate, acceleration, field))
+    used = prepared.field_T
+    if magnet == "subtracted":
+        used = used - sensor_fixed_field(prepared)
+    elif magnet == "rejected":
+        used = undisturbed(prepared)
+    return AttitudeTrack(
+        title=f"inertial and magnetic filter, magnet {magnet}",
+        time_s=times,
+        rows=np.arange(len(times)),
+        q=inertial_magnetic_track(prepared, used),
+        states={"rate": prepared.rate_rad_s, "gyro-bias": rate - prepared.rate_rad_s},
+        used=("accelerometer", "magnetometer"),
+        seen={"accelerometer": np.ones(len(times), dtype=np.bool_), "magnetometer": is_read(used)},
+    )
+
+
+def _step_s(times: FloatArray) -> float:
+    steps = np.diff(times)
+    if times.ndim != 1 or len(times) < 2 or not np.ptp(steps) <= _STEP_TOLERANCE * steps.mean():
+        raise ValueError("Input time_s must ascend in equal steps; instead received others.")
+    return float(steps.mean())
 
 
 _Settings = TypeVar("_Settings", Gains, AdaptiveTuning)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, overload
 
 from scipy.spatial.transform import Rotation
 
@@ -12,9 +13,10 @@ from adcs.io.telemetry_files import read_telemetry
 from adcs.satellite.satellite import Satellite
 from adcs.satellite.telemetry import Telemetry
 from arrays.io.csv import read_table
-from arrays.io.errors import InputError
+from arrays.io.toml import BuiltIn
+from arrays.typing import FloatArray
 
-_FOLDER = Path(__file__).parent
+_FILES = BuiltIn("adcs", "datasets", "log", "-truth.csv")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +40,45 @@ class Dataset:
     path: Path
 
 
+@dataclass(frozen=True, eq=False)
+class ImuDataset:
+    """Readings of an inertial unit with a magnetometer, with the truth behind them.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n,)
+    gyro_rad_s, acceleration_m_s2, field_T : ndarray, shape (n, 3)
+        Body axes; at rest the acceleration is 9.81 m/s² upwards. There is a field of (0, 20, -43) µT.
+    truth : Rotation of n
+        East, north, up from body.
+    path : Path
+        Of the file; NAME-truth.csv stands beside it.
+    """
+
+    time_s: FloatArray
+    gyro_rad_s: FloatArray
+    acceleration_m_s2: FloatArray
+    field_T: FloatArray
+    truth: Rotation
+    path: Path
+
+
 def names() -> tuple[str, ...]:
-    """Names of the logs; ``satellite``: star tracker, gyro, magnetometer and Sun sensor of a microsatellite."""
-    return tuple(sorted(path.name.removesuffix("-scenario.toml") for path in _FOLDER.glob("*-scenario.toml")))
+    """Names of the logs.
+
+    ``satellite``: star tracker, gyro, magnetometer and Sun sensor of a microsatellite; ``imu``: gyro, accelerometer and
+    magnetometer that are turned by hand, with a magnet beside them for a while.
+    """
+    return _FILES.names()
 
 
-def load(name: str) -> Dataset:
+@overload
+def load(name: Literal["imu"]) -> ImuDataset: ...
+@overload
+def load(name: Literal["satellite"]) -> Dataset: ...
+@overload
+def load(name: str) -> Dataset | ImuDataset: ...
+def load(name: str) -> Dataset | ImuDataset:
     """A log by its name.
 
     Raises
@@ -51,10 +86,15 @@ def load(name: str) -> Dataset:
     InputError
         There is none of that name.
     """
-    if name not in names():
-        raise InputError(f"Input name must be one of {', '.join(names())}; instead received {name!r}.")
-    path = _FOLDER / f"{name}.csv"
+    beside = _FILES.chosen(name)
+    path = beside.with_name(f"{name}.csv")
+    truth = Rotation.from_quat(read_table(beside, "qx, qy, qz and qw").complete(("qx", "qy", "qz", "qw")))
+    if name == "imu":
+        table = read_table(path, "columns of an inertial unit")
+        gyro, acceleration, field = (
+            table.complete([f"{kind}_{axis}_{unit}" for axis in "xyz"])
+            for kind, unit in (("gyro", "rad_s"), ("acceleration", "m_s2"), ("field", "nT"))
+        )
+        return ImuDataset(table.complete(["time_s"])[:, 0], gyro, acceleration, 1e-9 * field, truth, path)
     satellite = read_scenario(str(path.with_name(f"{name}-scenario.toml"))).satellite
-    truth = read_table(path.with_name(f"{name}-truth.csv"), "qx, qy, qz and qw")
-    rotation = Rotation.from_quat(truth.complete(("qx", "qy", "qz", "qw")))
-    return Dataset(read_telemetry(path), satellite, rotation, path)
+    return Dataset(read_telemetry(path), satellite, truth, path)

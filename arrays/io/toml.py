@@ -94,19 +94,26 @@ AnyTable = TypeVar("AnyTable", bound=Table)
 
 @dataclass(frozen=True)
 class BuiltIn:
-    """TOML files of one kind that come with a package, in a folder of it."""
+    """Files of one kind that come with a package, in a folder of it: NAME and how their names end."""
 
     package: str
     folder: str
     called: str
+    ending: str = ".toml"
 
     def names(self) -> tuple[str, ...]:
         """Of the files."""
-        return tuple(sorted(path.stem for path in self._folder().glob("*.toml")))
+        return tuple(sorted(path.name.removesuffix(self.ending) for path in self._folder().glob(f"*{self.ending}")))
 
     def path(self, name: str) -> Path:
         """Of the file of a name."""
-        return self._folder() / f"{name}.toml"
+        return self._folder() / f"{name}{self.ending}"
+
+    def chosen(self, name: str) -> Path:
+        """Of the file of a name; InputError where there is none."""
+        if name not in self.names():
+            raise InputError(f"Input name must be one of {', '.join(self.names())}; instead received {name!r}.")
+        return self.path(name)
 
     def _folder(self) -> Path:
         from importlib import resources  # of some milliseconds, which an array's file does not need

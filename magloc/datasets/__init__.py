@@ -10,11 +10,11 @@ from pathlib import Path
 
 from arrays.array import SensorArray
 from arrays.array_file import read_array
-from arrays.io.errors import InputError
+from arrays.io.toml import BuiltIn
 from magloc.readings import Readings, read_readings
 from magloc.truth import Truth, read_truth
 
-_FOLDER = Path(__file__).parent
+_FILES = BuiltIn("magloc", "datasets", "recording", "-truth.csv")
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ def names() -> tuple[str, ...]:
     buried object; ``drone``: four optically pumped sensors survey a field; ``ship``: a boat passes over eight fluxgates
     on the bottom of a harbour.
     """
-    return tuple(sorted(path.name.removesuffix("-array.toml") for path in _FOLDER.glob("*-array.toml")))
+    return _FILES.names()
 
 
 def load(name: str) -> Dataset:
@@ -56,8 +56,7 @@ def load(name: str) -> Dataset:
     InputError
         There is none of that name.
     """
-    if name not in names():
-        raise InputError(f"Input name must be one of {', '.join(names())}; instead received {name!r}.")
-    path = _FOLDER / f"{name}.csv"
+    truth = _FILES.chosen(name)
+    path = truth.with_name(f"{name}.csv")
     array = read_array(path.with_name(f"{name}-array.toml"))
-    return Dataset(array, read_readings(path, array), read_truth(path.with_name(f"{name}-truth.csv")), path)
+    return Dataset(array, read_readings(path, array), read_truth(truth), path)

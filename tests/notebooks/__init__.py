@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import io
 import os
+import sys
 from copy import deepcopy
 from pathlib import Path
 import nbformat
@@ -36,6 +37,13 @@ LONGEST_CELL_S = 300
 """A cell that compiles what it uses, on slow cores."""
 # Otherwise jupyter_core warns that its folders will move.
 os.environ.setdefault("JUPYTER_PLATFORM_DIRS", "1")
+MOST_PIXELS = 1000
+"""Across a picture: those that commands write are for print."""
+
+
+def with_commands() -> str:
+    """PATH with the commands of this Python first."""
+    return os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
 
 
 def executed(path: Path, folder: Path) -> NotebookNode:
@@ -53,7 +61,7 @@ def executed(path: Path, folder: Path) -> NotebookNode:
         resources={"metadata": {"path": str(folder)}},
         timeout=LONGEST_CELL_S,
         record_timing=False,
-    ).execute()
+    ).execute(env={**os.environ, "PATH": with_commands()})
     return notebook
 
 
@@ -61,7 +69,7 @@ def kept(notebook: NotebookNode) -> NotebookNode:
     """The notebook with small pictures, and with nothing that differs from machine to machine but the numbers."""
     notebook.metadata = NotebookNode(
         kernelspec={"name": "python3", "display_name": "Python 3", "language": "python"},
-        language_info={"name": "python"},
+        language_info={"name": "python", "pygments_lexer": "ipython3"},
     )
     for number, cell in enumerate(notebook.cells):
         cell.id = f"cell-{number:02d}"
@@ -81,6 +89,7 @@ def _small(png: bytes) -> bytes:
     """A picture with a palette of its own: less than half the size, and the same to the eye."""
     result = io.BytesIO()
     picture = Image.open(io.BytesIO(png)).convert("RGB")
+    picture.thumbnail((MOST_PIXELS, MOST_PIXELS), Image.Resampling.LANCZOS)
     # Maximum coverage keeps small spots of a colour that is rare, such as a star on a map.
     picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
         result, "png", optimize=True

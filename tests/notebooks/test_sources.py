@@ -9,13 +9,13 @@ from pathlib import Path
 from types import ModuleType
 import nbformat
 import pytest
+from IPython.core.inputtransformer2 import TransformerManager
 from tests.notebooks import DOCS, NOTEBOOKS
 
 
 OURS = ("arrays", "magloc", "adcs", "sims")
 MOST_IMPORTS = 3
-# These teach what has no public name.
-INSIDE = {"02-convergence-map", "complementary", "ellipsoid", "kalman-bank", "mockup"}
+MOST_DRAWN = 12
 PLACE = re.compile(r"^\*Notebook (\d+) of (\d+) · (\d+) minutes · [^*]+\*$", re.MULTILINE)
 CARD = re.compile(
     r":::\{grid-item-card\} (\d+)\. [^\n]+\n:link: notebooks/([\w-]+)\n(?:[^\n]+\n)*?[^\n]*\*(\d+) min\.\*\n:::"
@@ -23,8 +23,10 @@ CARD = re.compile(
 
 
 def code_of(path: Path) -> ast.Module:
+    """Code of a notebook, with calls in place of lines of a shell."""
     notebook = nbformat.read(path, as_version=4)
-    return ast.parse("\n".join(cell.source for cell in notebook.cells if cell.cell_type == "code"))
+    cells = [cell.source for cell in notebook.cells if cell.cell_type == "code"]
+    return ast.parse("\n".join(TransformerManager().transform_cell(cell) for cell in cells))
 
 
 def public(module: ModuleType) -> set[str]:
@@ -80,9 +82,6 @@ def module_of(node: ast.expr, bound: dict[str, object]) -> ModuleType | None:
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_public_names_only_and_few_imports(path: Path) -> None:
     tree = code_of(path)
-    if path.stem in INSIDE:
-        assert private_names(tree), "it has become public: take it from the list"
-        return
     assert private_names(tree) == []
     assert len(imports_of_ours(tree)) <= MOST_IMPORTS
 
@@ -101,6 +100,58 @@ def test_public_names_only_and_few_imports(path: Path) -> None:
 )
 def test_a_private_name_is_found(code: str, private: list[str]) -> None:
     assert private_names(ast.parse(code)) == private
+
+
+def drawing_calls(tree: ast.Module) -> list[str]:
+    """Calls of matplotlib, and of what comes of it by assignments and loops."""
+    drawing = {"ax", "axes", "fig", "figure"}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            whole = getattr(node, "module", None) or ""
+            named = [alias for alias in node.names if (whole or alias.name).split(".")[0] == "matplotlib"]
+            drawing |= {alias.asname or alias.name.split(".")[0] for alias in named}
+    before = -1
+    while before != len(drawing):
+        before = len(drawing)
+        for node in ast.walk(tree):
+            made = node.value if isinstance(node, ast.Assign) else getattr(node, "iter", None)
+            if made is None or not drawing & names_in(made):
+                continue
+            if isinstance(node, ast.Assign) and root_of(made) not in drawing:
+                continue  # a value that is computed of a drawing is none
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            drawing |= {name for target in targets for name in names_in(target)}
+    return [ast.unparse(n) for n in ast.walk(tree) if isinstance(n, ast.Call) and root_of(n) in drawing]
+
+
+def names_in(node: ast.AST) -> set[str]:
+    return {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
+
+
+def root_of(node: ast.AST) -> str:
+    """The name at the beginning of a chain of attributes, items and calls."""
+    while isinstance(node, ast.Attribute | ast.Subscript | ast.Call):
+        node = node.func if isinstance(node, ast.Call) else node.value
+    return node.id if isinstance(node, ast.Name) else ""
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_the_library_draws(path: Path) -> None:
+    assert len(drawing_calls(code_of(path))) <= MOST_DRAWN
+
+
+def test_drawing_by_hand_is_found() -> None:
+    code = """
+import matplotlib.pyplot as plt
+import magloc
+fixes.plot(), magloc.plots.fixes(fixes, array), starts["distance"].plot()
+picture, (left, right) = plt.subplots(1, 2)
+for panel, value in zip((left, right), values):
+    panel.plot(value)
+    panel.lines[0].set(lw=2)
+plt.show()
+"""
+    assert len(drawing_calls(ast.parse(code))) == 4
 
 
 def test_they_say_their_place_as_the_gallery_does() -> None:

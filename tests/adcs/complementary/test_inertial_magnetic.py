@@ -15,8 +15,8 @@ from adcs.complementary.inertial_magnetic import (
     sensor_fixed_field,
     undisturbed,
 )
-from adcs.io.broad import orientation_errors, read_broad
 from tests.adcs.attitudes import random_attitudes
+from tests.adcs.broad import orientation_errors, read_broad
 
 DT = 0.01
 FIELD_T = np.array([0.0, 18e-6, -45e-6])

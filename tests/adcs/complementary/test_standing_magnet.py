@@ -9,7 +9,7 @@ import pytest
 from adcs import quaternion
 from adcs.complementary.inertial_magnetic import Prepared, inertial_magnetic_track, prepare, undisturbed
 from adcs.complementary.standing_magnet import locate_standing_magnet, standing_field
-from adcs.io.broad import orientation_errors, read_broad
+from tests.adcs.broad import orientation_errors, read_broad
 
 POSITION_M, MOMENT_AM2 = np.array([0.1, -0.05, 0.9]), np.array([0.01, 0.03, -0.05])
 
