@@ -19,6 +19,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "OrnsteinUhlenbeck": "magloc.tracking.motion",
         "RandomWalk": "magloc.tracking.motion",
         "Readings": "magloc.readings",
+        "RepeatedFilter": "magloc.convergence.filters",
         "Solution": "magloc.localization.fit.results",
         "Source": "magloc.localization.fit.results",
         "SourceLine": "magloc.localization.line_ranging",

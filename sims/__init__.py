@@ -6,11 +6,15 @@ __getattr__, __dir__, __all__ = lazy_names(
     __name__,
     {
         "AttitudeScenario": "sims.attitude.scenario",
+        "CameraErrors": "sims.mockup.table_run",
         "MagneticScenario": "sims.magnetics.scenario",
+        "TableScenario": "sims.mockup.table_run",
         "experiments": ":sims.experiments",
         "read_scenario": "sims.scenarios",
+        "rendered_frame": "sims.mockup.frames",
         "run_many": "sims.montecarlo",
         "simulate": "sims.scenarios",
+        "table_run": "sims.mockup.table_run",
         "write_simulation": "sims.magnetics.files",
     },
 )

@@ -2,6 +2,10 @@ from sims import experiments as experiments
 from sims.attitude.scenario import AttitudeScenario as AttitudeScenario
 from sims.magnetics.files import write_simulation as write_simulation
 from sims.magnetics.scenario import MagneticScenario as MagneticScenario
+from sims.mockup.frames import rendered_frame as rendered_frame
+from sims.mockup.table_run import CameraErrors as CameraErrors
+from sims.mockup.table_run import TableScenario as TableScenario
+from sims.mockup.table_run import table_run as table_run
 from sims.montecarlo import run_many as run_many
 from sims.scenarios import read_scenario as read_scenario
 from sims.scenarios import simulate as simulate

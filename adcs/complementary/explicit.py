@@ -16,27 +16,13 @@ from numpy.typing import ArrayLike
 from adcs import quaternion
 from adcs.complementary.outage import NO_SUBSTITUTE, Substitute, Substitution, delay_steps, substitute_code
 from adcs.satellite.vector_record import VectorRecord
-from arrays.typing import ComplexArray, FloatArray
+from arrays.typing import FloatArray
 from magloc.compilation import over_rows
 
 LARGEST_EIGENVALUE = 2.0
 """Of e against the error angle, for unit vectors: the eigenvalues are 1 ± |cos| of their angle, and 2."""
 WARNING_FRACTION = 0.9
 """Of the stability limit."""
-
-
-def low_pass(k: float, s: ArrayLike) -> ComplexArray:
-    """G_a(s) = k/(s + k), what the filter passes of the vector sensor's angle; s is complex [1/s], k the gain [1/s]."""
-    values = np.asarray(s, dtype=np.complex128)
-    passed: ComplexArray = k / (values + k)
-    return passed
-
-
-def high_pass(k: float, s: ArrayLike) -> ComplexArray:
-    """G_g(s) = s/(s + k), what the filter passes of the gyro's integral; as :func:`low_pass`."""
-    values = np.asarray(s, dtype=np.complex128)
-    passed: ComplexArray = values / (values + k)
-    return passed
 
 
 @dataclass(frozen=True)

@@ -71,24 +71,6 @@ def first_set(noise_rad: float) -> Ellipsoid:
     return Ellipsoid(np.zeros(2), (3.0 * noise_rad) ** 2 * np.eye(2))
 
 
-def constant_shift_system(noise_rad: float, drift_rad_s: float) -> tuple[BoundedSystem, Ellipsoid]:
-    """The system with the gyro's shift as a third state that stays as it is, and the set of its first state.
-
-    Ours. Where the shift is known to be constant the set becomes far smaller: after an orbit, with c = 1° and
-    0.02 °/s, half a degree in yaw instead of four. A shift that drifts is a disturbance of the third state.
-    ``noise_rad``: c, positive. ``drift_rad_s``: largest shift, positive. Returns ``system`` of (roll, yaw, 3 c · shift
-    / drift_rad_s), so that the states have comparable sizes. Returns ``first`` around roll and yaw within 3 c and all
-    shifts within the bound.
-    """
-    check_positive(noise_rad=noise_rad, drift_rad_s=drift_rad_s)
-    A = np.eye(3)
-    A[:2, :2] = transition()
-    A[:2, 2] = input_matrix()[:, YAW] * STEP_S * drift_rad_s / (3.0 * noise_rad)
-    system = BoundedSystem(A, np.zeros((3, 3)), np.array([[1.0, 0.0, 0.0]]), np.array([noise_rad]))
-    # The least ellipsoid of this kind around a circle times an interval.
-    return system, Ellipsoid(np.zeros(3), 2.0 * (3.0 * noise_rad) ** 2 * np.eye(3))
-
-
 def roll_yaw_observer(
     system: BoundedSystem, n_runs: int, rule: StepRule = "tightened", *, reinflation_rad: float | None = None
 ) -> EllipsoidObserver:

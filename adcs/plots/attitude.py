@@ -77,7 +77,7 @@ def states_figure(picture: StatesPicture) -> Figure:
                 (middle + wide)[:, axis],
                 color=style.LIGHT_GREY,
                 lw=0.0,
-                label="±3σ of the filter",
+                label="±3σ of the filter" if np.isfinite(wide).any() else "_",
             )
             ax.plot(
                 picture.time_s,

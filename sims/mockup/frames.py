@@ -100,7 +100,15 @@ def rendered_frame(
 
     A light's image is a Gaussian, drawn out along the path that it takes during the exposure; the total light does not
     depend on the motion. Gaussian noise, then rounding to whole numbers from 0 to 255.
-    ``pose``: in the middle of the exposure.
+
+    Parameters
+    ----------
+    pose : Pose
+        In the middle of the exposure.
+    motion : Motion
+        Velocity and turn rate meanwhile; at rest by default.
+    quality : FrameQuality
+        Noise, lights that are dark, spurious ones, hot pixels.
     """
     shining = np.flatnonzero(rng.random(len(sky)) >= quality.lost)
     size = np.array([camera.width_px, camera.height_px])

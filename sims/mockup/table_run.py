@@ -174,7 +174,15 @@ class TableRun:
 
 
 def table_run(scenario: TableScenario, seed: int) -> TableRun:
-    """Simulate one run."""
+    """Simulate one run of the table-top satellite: truth, samples of its inertial unit, and fixes of its camera.
+
+    Parameters
+    ----------
+    scenario : TableScenario
+        The drive, and the errors of the sensors.
+    seed : int
+        Of all random numbers.
+    """
     camera, n, polls = scenario.camera, scenario.n_samples, scenario.polls
     drive = perimeter_drive if scenario.drive == "perimeter" else two_firings_drive
     polled, true_start = drive(n * polls, stream(seed, "drive"))

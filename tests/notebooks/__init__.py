@@ -24,15 +24,17 @@ DOCS = FOLDER.parent / "docs"
 # Which picture of a notebook stands in the gallery, as docs/notebook-NAME.png.
 SHOWN = {
     "01-first-fix": 1,
-    "02-convergence-map": 1,
+    "02-convergence-map": 0,
     "03-real-magnet": 0,
     "04-scalar-sign": 0,
     "05-tracking": 1,
-    "06-which-array": 2,
+    "06-which-array": 1,
     "07-own-csv": 1,
     "08-calibration": 1,
     "09-several-sources": 1,
 }
+# Another page's picture of a notebook.
+ON_PAGES = {"kalman-bank": ("attitude-track.png", 0)}
 LONGEST_CELL_S = 300
 """A cell that compiles what it uses, on slow cores."""
 # Otherwise jupyter_core warns that its folders will move.
@@ -90,8 +92,8 @@ def _small(png: bytes) -> bytes:
     result = io.BytesIO()
     picture = Image.open(io.BytesIO(png)).convert("RGB")
     picture.thumbnail((MOST_PIXELS, MOST_PIXELS), Image.Resampling.LANCZOS)
-    # Maximum coverage keeps small spots of a colour that is rare, such as a star on a map.
-    picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+    # Maximum coverage keeps small spots of a colour that is rare, such as a star on a map; means keep large areas.
+    picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=2, dither=Image.Dither.NONE).save(
         result, "png", optimize=True
     )
     return result.getvalue()
@@ -101,6 +103,14 @@ def pictures(notebook: NotebookNode) -> list[bytes]:
     """Its pictures as PNG files."""
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     return [base64.b64decode(o.data["image/png"]) for o in outputs if "image/png" in o.get("data", {})]
+
+
+def picture_files(path: Path, notebook: NotebookNode) -> dict[Path, bytes]:
+    """Files of the pages with pictures of a notebook."""
+    all_of_it, name = pictures(notebook), path.stem
+    files = {f"notebook-{name}.png": SHOWN[name]} if name in SHOWN else {}
+    files |= dict([ON_PAGES[name]]) if name in ON_PAGES else {}
+    return {DOCS / file: all_of_it[number] for file, number in files.items()}
 
 
 def without_views(notebook: NotebookNode) -> NotebookNode:

@@ -1,11 +1,11 @@
-"""``python -m tests.notebooks [NAME…]``: execute the notebooks, write them back, and the gallery's pictures of them."""
+"""``python -m tests.notebooks [NAME…]``: execute the notebooks, write them back, and the pages' pictures of them."""
 
 from __future__ import annotations
 
 import sys
 import time
 import nbformat
-from tests.notebooks import DOCS, FOLDER, NOTEBOOKS, SHOWN, executed, kept, pictures
+from tests.notebooks import FOLDER, NOTEBOOKS, executed, kept, picture_files
 
 
 def main(names: list[str]) -> None:
@@ -14,8 +14,8 @@ def main(names: list[str]) -> None:
         start = time.perf_counter()
         notebook = kept(executed(path, FOLDER))
         nbformat.write(notebook, path)
-        if path.stem in SHOWN:
-            (DOCS / f"notebook-{path.stem}.png").write_bytes(pictures(notebook)[SHOWN[path.stem]])
+        for file, picture in picture_files(path, notebook).items():
+            file.write_bytes(picture)
         print(f"{path.name}: {time.perf_counter() - start:.1f} s, {path.stat().st_size / 1000:.0f} kB")
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import nbformat
 import pytest
 from nbformat import NotebookNode
-from tests.notebooks import DOCS, FOLDER, NOTEBOOKS, SHOWN, executed, pictures, texts, views, without_views
+from tests.notebooks import FOLDER, NOTEBOOKS, SHOWN, executed, picture_files, pictures, texts, views, without_views
 
 
 LARGEST_BYTES, LARGEST_VIEW_BYTES = 400_000, 1_200_000
@@ -54,10 +54,9 @@ class TestKeptOutputs:
     def test_the_viewer_shows_once_at_most(self, notebook):
         assert views(notebook) <= 1
 
-    def test_the_picture_of_the_gallery_is_one_of_them(self, notebook, path):
-        if path.stem not in SHOWN:
-            pytest.skip("the gallery takes its first picture")
-        assert (DOCS / f"notebook-{path.stem}.png").read_bytes() == pictures(notebook)[SHOWN[path.stem]]
+    def test_the_pages_have_its_pictures(self, notebook, path):
+        for file, picture in picture_files(path, notebook).items():
+            assert file.read_bytes() == picture
 
     def test_what_is_not_known_is_said(self, notebook, path):
         if path.stem not in SHOWN:

@@ -10,7 +10,7 @@ from scipy import signal
 from scipy.spatial.transform import Rotation
 
 from adcs import quaternion
-from adcs.complementary.explicit import Gains, explicit_error, explicit_track, high_pass, low_pass, steps
+from adcs.complementary.explicit import Gains, explicit_error, explicit_track, steps
 from adcs.complementary.gauss_newton import MeasuredQuaternion, gauss_newton_track
 from adcs.complementary.names import RULES
 from adcs.complementary.outage import Substitution
@@ -46,6 +46,16 @@ def short_record(n=60, seed=0, runs=2, missing=()):
         second_reference=rng.standard_normal((1, n, 3)),
         frame_rate_rad_s=0.1 * rng.standard_normal((1, n, 3)),
     )
+
+
+def low_pass(k, s):
+    """G_a(s) = k/(s + k), what the filter passes of the vectors' angle."""
+    return k / (s + k)
+
+
+def high_pass(k, s):
+    """G_g(s) = s/(s + k), what it passes of the gyro's integral."""
+    return s / (s + k)
 
 
 class TestPrinciple:

@@ -15,13 +15,13 @@ from scipy import linalg
 from scipy.integrate import solve_ivp
 
 from adcs.ellipsoids import roll_yaw
-from adcs.ellipsoids.ellipsoid import quadratic_form
-from adcs.ellipsoids.observer import EllipsoidObserver, correct, predict
+from adcs.ellipsoids.ellipsoid import Ellipsoid, quadratic_form
+from adcs.ellipsoids.observer import BoundedSystem, EllipsoidObserver, correct, predict
 from adcs.ellipsoids.roll_yaw import (
     ORBITAL_RATE,
+    STEP_S,
     YAW,
     AttitudeLoop,
-    constant_shift_system,
     first_set,
     input_matrix,
     kalman_track,
@@ -302,6 +302,19 @@ class TestKalman:
 def outside_3_sigma(track, states):
     sigma = np.sqrt(track.covariances[1:, YAW, YAW])
     return np.mean(np.abs(track.means[1:, YAW] - states[:, YAW]) > 3.0 * sigma)
+
+
+def constant_shift_system(noise_rad, drift_rad_s):
+    """The system with the gyro's shift as a third state that stays as it is, and the set of its first state.
+
+    The third state is 3 c · shift / drift_rad_s, so that the states have comparable sizes. The first set is the least
+    ellipsoid of its kind around a circle of radius 3 c times all shifts within the bound.
+    """
+    A = np.eye(3)
+    A[:2, :2] = transition()
+    A[:2, 2] = input_matrix()[:, YAW] * STEP_S * drift_rad_s / (3.0 * noise_rad)
+    system = BoundedSystem(A, np.zeros((3, 3)), np.array([[1.0, 0.0, 0.0]]), np.array([noise_rad]))
+    return system, Ellipsoid(np.zeros(3), 2.0 * (3.0 * noise_rad) ** 2 * np.eye(3))
 
 
 class TestConstantShift:
