@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from adcs import quaternion
+from adcs.complementary.filters import inertial_magnetic_filter
 from adcs.complementary.inertial_magnetic import (
     InertialMagneticRecord,
     inertial_magnetic_track,
@@ -103,6 +104,31 @@ class TestParts:
         left_out = np.isnan(undisturbed(prepare(record))[:, 0])
         assert left_out[: round(20.0 / DT)].mean() < 0.01
         assert left_out[round(20.0 / DT) :].mean() > 0.7
+
+
+class TestDoor:
+    def test_is_made_of_the_parts(self):
+        record, _, _ = motion(magnet=np.array([0.0, 0.0, 30e-6]))
+        prepared = prepare(record)
+        time_s = 5.0 + DT * np.arange(len(record))
+        readings = record.rate_rad_s, record.acceleration_m_s2, record.field_T
+        for magnet, field in (
+            ("kept", prepared.field_T),
+            ("rejected", undisturbed(prepared)),
+            ("subtracted", prepared.field_T - sensor_fixed_field(prepared)),
+        ):
+            track = inertial_magnetic_filter(time_s, *readings, magnet=magnet)
+            np.testing.assert_allclose(track.q, inertial_magnetic_track(prepared, field), atol=1e-9)
+            np.testing.assert_allclose(track.states["rate"] + track.states["gyro-bias"], record.rate_rad_s, atol=1e-12)
+            assert np.array_equal(track.seen["magnetometer"], np.isfinite(field).all(axis=1))
+            assert np.array_equal(track.time_s, time_s)
+
+    def test_refusals(self):
+        time_s, ones = DT * np.arange(200), np.ones((200, 3))
+        with pytest.raises(ValueError, match=r"magnet must be one of .*; instead received 'left'"):
+            inertial_magnetic_filter(time_s, ones, ones, ones, magnet="left")
+        with pytest.raises(ValueError, match="time_s must ascend in equal steps"):
+            inertial_magnetic_filter(time_s**2, ones, ones, ones)
 
 
 class TestErrors:
