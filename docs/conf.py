@@ -34,6 +34,8 @@ myst_heading_anchors = 3
 # Notebooks are kept with their outputs, and executed by the tests.
 nb_execution_mode = "off"
 nb_merge_streams = True
+# Otherwise tables that a cell displays show as text.
+nb_render_markdown_format = "myst"
 nb_code_prompt_show = "Show the code that draws this"
 nb_code_prompt_hide = "Hide the code that draws this"
 
