@@ -90,11 +90,8 @@ def load(name: str) -> Dataset | ImuDataset:
     path = beside.with_name(f"{name}.csv")
     truth = Rotation.from_quat(read_table(beside, "qx, qy, qz and qw").complete(("qx", "qy", "qz", "qw")))
     if name == "imu":
-        table = read_table(path, "columns of an inertial unit")
-        gyro, acceleration, field = (
-            table.complete([f"{kind}_{axis}_{unit}" for axis in "xyz"])
-            for kind, unit in (("gyro", "rad_s"), ("acceleration", "m_s2"), ("field", "nT"))
-        )
-        return ImuDataset(table.complete(["time_s"])[:, 0], gyro, acceleration, 1e-9 * field, truth, path)
+        table = read_table(path, "time and three times three readings")
+        values = table.complete(table.header)
+        return ImuDataset(values[:, 0], values[:, 1:4], values[:, 4:7], 1e-9 * values[:, 7:], truth, path)
     satellite = read_scenario(str(path.with_name(f"{name}-scenario.toml"))).satellite
     return Dataset(read_telemetry(path), satellite, truth, path)
