@@ -57,7 +57,7 @@ html_show_sourcelink = False
 html_sidebars = {"index": [], "install": [], "quickstart": [], "glossary": []}
 html_theme_options = {
     "logo": {"text": "magloc"},
-    "header_links_before_dropdown": 6,
+    "header_links_before_dropdown": 7,
     "navbar_end": ["theme-switcher"],
     "footer_start": ["copyright"],
     "footer_end": [],
