@@ -34,6 +34,8 @@ PICTURES = {
     "convergence-paper.png": ["magloc.convergence_map", "magloc.plots.convergence"],
     "view-dipole.png": ["magloc.view", "arrays.mesh_of"],
     "view-map.png": ["magloc.source_map"],
+    "view-array.png": ["arrays.SensorArray", "arrays.tetrahedron", "arrays.read_array"],
+    "residuals-faulty.png": ["magloc.plots.residuals"],
     "attitude-track.png": ["adcs.estimate", "adcs.AttitudeTrack"],
     "attitude-complementary.png": ["adcs.complementary_filter"],
     "view-mockup.png": ["adcs.mockup.fuse", "adcs.mockup.DelayedFilter"],
