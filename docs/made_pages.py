@@ -123,7 +123,8 @@ def illustrated(app: Sphinx, what: str, name: str, obj: object, options: object,
     for picture, names in PICTURES.items():
         if name in names:
             lines += ["", f".. image:: /{picture}", f"   :alt: What {name} finds or draws", "   :width: 75%"]
-    users = [page for page, text in texts().items() if re.search(rf"\b{re.escape(name)}\b(?!\.\w)", text)]
+    uses = {page: len(re.findall(rf"\b{re.escape(name)}\b(?!\.\w)", text)) for page, text in texts().items()}
+    users = sorted((page for page, count in uses.items() if count), key=lambda page: -uses[page])
     if users and what in ("function", "class"):
         lines += ["", ".. rubric:: See also", "", *(f"- :doc:`/{page}`" for page in users[:MOST_PAGES]), ""]
 

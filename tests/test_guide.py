@@ -106,5 +106,18 @@ def test_the_reference_has_every_public_name(package: str) -> None:
     assert sorted(public - named) == []
 
 
+def test_the_guide_leads_to_each_of_its_pages_by_a_question() -> None:
+    questions = (DOCS / "guide" / "index.md").read_text(encoding="utf-8").partition("```{toctree}")[0]
+    named = set(re.findall(r"\]\(([\w-]+)\.md", questions))
+    assert {page.stem for page in GUIDE} - {"index"} - named == set()
+
+
+def test_links_of_the_readme_lead_somewhere() -> None:
+    """The site's are held by its build."""
+    links = re.findall(r"\]\(([^)#]+)[^)]*\)", (REPOSITORY / "README.md").read_text(encoding="utf-8"))
+    assert len(links) > 20
+    assert [link for link in links if not link.startswith("http") and not (REPOSITORY / link).exists()] == []
+
+
 def test_the_readme_is_short() -> None:
     assert len((REPOSITORY / "README.md").read_text(encoding="utf-8").splitlines()) <= 130
