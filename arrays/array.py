@@ -50,6 +50,15 @@ class SensorArray:
     ------
     ValueError
         Any of this does not hold.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> low = arrays.Sensor("low", "scalar", (0.0, 0.0, 0.0), noise_T=1e-11)
+    >>> high = arrays.Sensor("high", "scalar", (0.0, 0.0, 0.5), noise_T=1e-11)
+    >>> array = arrays.SensorArray((low, high))
+    >>> array.channel_names, array.circumradius
+    (('low', 'high'), 0.25)
     """
 
     sensors: tuple[Sensor, ...]

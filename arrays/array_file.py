@@ -142,6 +142,13 @@ def read_array(path: str | PathLike[str]) -> SensorArray:
     ------
     InputError
         The file cannot be read, or does not describe an array; the text says where and why.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> arrays.write_array("array.toml", arrays.square(0.4))
+    >>> arrays.read_array("array.toml") == arrays.square(0.4)
+    True
     """
     array = read_sensors(path)
     if array.n_sensors < 2:
@@ -150,7 +157,16 @@ def read_array(path: str | PathLike[str]) -> SensorArray:
 
 
 def read_sensors(path: str | PathLike[str]) -> SensorArray:
-    """Array from its TOML file as :func:`read_array`, which may also be a single sensor, to be calibrated."""
+    """Array from its TOML file as :func:`read_array`, which may also be a single sensor, to be calibrated.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> one = arrays.SensorArray([arrays.Sensor("s1", "vector", (0.0, 0.0, 0.0), 1e-9)])
+    >>> arrays.write_array("sensor.toml", one)
+    >>> arrays.read_sensors("sensor.toml").ids
+    ('s1',)
+    """
     return array_of_table(str(path), read_toml(path, "a TOML file of an array"))
 
 
@@ -180,12 +196,24 @@ def write_array(path: str | PathLike[str], array: SensorArray) -> None:
     ------
     OSError
         The file cannot be written.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> arrays.write_array("board.toml", arrays.grid(2, 2, 0.05))
     """
     write_text(array_toml(array), path)
 
 
 def array_toml(array: SensorArray) -> str:
-    """Text of an array's TOML file, sensor by sensor."""
+    """Text of an array's TOML file, sensor by sensor.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> print(arrays.array_toml(arrays.axial(0.5, "scalar")).splitlines()[1])
+    name = "axial"
+    """
     lines = [f"format_version = {FORMAT_VERSION}"]
     if array.name:
         lines.append(f"name = {_quoted(array.name)}")

@@ -31,6 +31,13 @@ def tetrahedron(edge_m: float, kind: SensorKind = "vector", noise_T: float = 1e-
         Kind of the sensors.
     noise_T : float
         Standard deviation of a reading [T].
+
+    Examples
+    --------
+    >>> import arrays
+    >>> array = arrays.tetrahedron(1.5, noise_T=1e-10)
+    >>> array.ids, round(array.circumradius, 3)
+    (('s1', 's2', 's3', 's4'), 0.919)
     """
     edge = _size("edge_m", edge_m)
     base = _ring(3, edge / np.sqrt(3.0))
@@ -50,6 +57,12 @@ def square(edge_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9) ->
         Kind of the sensors.
     noise_T : float
         Standard deviation of a reading [T].
+
+    Examples
+    --------
+    >>> import arrays
+    >>> arrays.square(2.0).positions[0]
+    array([1., 1., 0.])
     """
     half = _size("edge_m", edge_m) / 2.0
     return _array("square", half * np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]), kind, noise_T)
@@ -66,6 +79,12 @@ def cross(arm_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9) -> S
         Kind of the sensors.
     noise_T : float
         Standard deviation of a reading [T].
+
+    Examples
+    --------
+    >>> import arrays
+    >>> arrays.cross(0.5, "scalar", noise_T=1e-11).positions[0]
+    array([0.5, 0. , 0. ])
     """
     arm = _size("arm_m", arm_m)
     return _array("cross", arm * np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]]), kind, noise_T)
@@ -82,6 +101,13 @@ def cube(edge_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9) -> S
         Kind of the sensors.
     noise_T : float
         Standard deviation of a reading [T].
+
+    Examples
+    --------
+    >>> import arrays
+    >>> arrays.cube(2.0).positions[:2]
+    array([[-1., -1., -1.],
+           [-1., -1.,  1.]])
     """
     half = _size("edge_m", edge_m) / 2.0
     signs = (-1, 1)
@@ -99,6 +125,12 @@ def hexagon(radius_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9)
         Kind of the sensors.
     noise_T : float
         Standard deviation of a reading [T].
+
+    Examples
+    --------
+    >>> import arrays
+    >>> arrays.hexagon(0.3).ids
+    ('s1', 's2', 's3', 's4', 's5', 's6')
     """
     return _array("hexagon", _ring(6, _size("radius_m", radius_m)), kind, noise_T)
 
@@ -114,6 +146,13 @@ def axial(baseline_m: float, kind: SensorKind = "vector", noise_T: float = 1e-9)
         Kind of the sensors.
     noise_T : float
         Standard deviation of a reading [T].
+
+    Examples
+    --------
+    >>> import arrays
+    >>> arrays.axial(0.5).positions
+    array([[ 0.  ,  0.  ,  0.25],
+           [ 0.  ,  0.  , -0.25]])
     """
     half = _size("baseline_m", baseline_m) / 2.0
     return _array("axial", half * np.array([[0, 0, 1], [0, 0, -1]]), kind, noise_T)
@@ -132,6 +171,13 @@ def grid(nx: int, ny: int, pitch_m: float, kind: SensorKind = "vector", noise_T:
         Kind of the sensors.
     noise_T : float
         Standard deviation of a reading [T].
+
+    Examples
+    --------
+    >>> import arrays
+    >>> board = arrays.grid(5, 6, 0.016, noise_T=15e-9)
+    >>> board.n_sensors, board.n_channels
+    (30, 90)
     """
     if min(nx, ny) < 1 or nx * ny < 2:
         raise ValueError(f"Inputs nx and ny must be at least 1, together at least 2; instead received {nx} and {ny}.")

@@ -55,6 +55,12 @@ def mesh_of(array: SensorArray, size_m: float | None = None) -> trimesh.Trimesh:
     -------
     trimesh.Trimesh
         In the array's frame [m], watertight.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> arrays.mesh_of(arrays.tetrahedron(1.5)).is_watertight
+    True
     """
     size = glyph_size(array) if size_m is None else size_m
     return _joined([sensor_mesh(sensor, size) for sensor in array.sensors])

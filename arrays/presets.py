@@ -31,6 +31,13 @@ class SensorPreset:
         Spectral density of white noise [nT/√Hz], for sensors whose readings may come at any rate.
     saturation_nT : float, optional
         Largest field that is measured [nT].
+
+    Examples
+    --------
+    >>> import arrays
+    >>> preset = arrays.SENSOR_PRESETS["rm3100"]
+    >>> preset.kind, preset.noise_of_reading_nT(rate_Hz=10.0)
+    ('vector', 15.0)
     """
 
     kind: SensorKind

@@ -42,6 +42,12 @@ class Calibration:
     ------
     ValueError
         The shapes do not agree, a number is not finite, or ``scale`` is singular.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> arrays.Calibration.of("vector", [1.01, 1.0, 0.99], offset_T=2e-9).scale[0]
+    (1.01, 0.0, 0.0)
     """
 
     scale: tuple[tuple[float, ...], ...]
@@ -126,6 +132,13 @@ class Sensor:
         A number is not finite, a shape is wrong, the noise or the saturation is not positive, the misalignment or the
         gain's uncertainty is negative or not below 1, one of the last three is negative, a scalar sensor has a
         misalignment, the quaternion's norm differs from 1 by more than 1e-6, or the id cannot name a column.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> sensor = arrays.Sensor("s1", "vector", (0.0, 0.0, 0.1), noise_T=1e-9)
+    >>> sensor.channel_names
+    ('s1_x', 's1_y', 's1_z')
     """
 
     id: str

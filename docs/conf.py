@@ -56,10 +56,10 @@ html_static_path = ["static"]
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False
-html_sidebars = {"index": [], "quickstart": [], "glossary": []}
+html_sidebars = {"index": [], "install": [], "quickstart": [], "glossary": []}
 html_theme_options = {
     "logo": {"text": "magloc"},
-    "header_links_before_dropdown": 6,
+    "header_links_before_dropdown": 7,
     "navbar_end": ["theme-switcher"],
     "footer_start": ["copyright"],
     "footer_end": [],

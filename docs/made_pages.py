@@ -23,6 +23,25 @@ NOTEBOOKS = HERE.parent / "notebooks"
 PAGE = re.compile(r"docs/theory/([\w-]+)\.md")
 # A link of a command's page to a heading that is on another page now.
 LINK = re.compile(r"^(\* )\[(`[\w-]+`)\]\(#[\w-]+\)", re.MULTILINE)
+# The picture of what a function finds or draws, on the function's page.
+PICTURES = {
+    "notebook-01-first-fix.png": ["magloc.locate", "magloc.Fixes", "magloc.Fix", "magloc.plots.fixes"],
+    "notebook-09-several-sources.png": ["magloc.Solution"],
+    "track-weaving.png": ["magloc.track", "magloc.Track", "magloc.Tracker", "magloc.plots.track"],
+    "notebook-08-calibration.png": ["magloc.calibrate", "magloc.Calibration", "magloc.plots.calibration"],
+    "bounds-reach.png": ["magloc.cramer_rao_bounds", "magloc.Bounds", "magloc.bound_map", "magloc.plots.bound_reach"],
+    "notebook-06-which-array.png": ["magloc.design_array", "magloc.Design"],
+    "convergence-paper.png": ["magloc.convergence_map", "magloc.plots.convergence"],
+    "view-dipole.png": ["magloc.view", "arrays.mesh_of"],
+    "view-map.png": ["magloc.source_map"],
+    "view-array.png": ["arrays.SensorArray", "arrays.tetrahedron", "arrays.read_array"],
+    "residuals-faulty.png": ["magloc.plots.residuals"],
+    "attitude-track.png": ["adcs.estimate", "adcs.AttitudeTrack"],
+    "attitude-complementary.png": ["adcs.complementary_filter"],
+    "view-mockup.png": ["adcs.mockup.fuse", "adcs.mockup.DelayedFilter"],
+}
+# Pages that a function's page names at most.
+MOST_PAGES = 6
 # What a bar stands in: literal text and formulas keep it, elsewhere it would be a substitution.
 BAR = re.compile(r"(``.*?``|:math:`[^`]*`)|\\?\|")
 
@@ -33,6 +52,8 @@ def setup(app: Sphinx) -> dict[str, bool]:
     app.connect("builder-inited", make_all, priority=100)
     # Before numpydoc, which makes other lines of them.
     app.connect("autodoc-process-docstring", readable, priority=100)
+    # After numpydoc, which would take it for a part of the last section.
+    app.connect("autodoc-process-docstring", illustrated, priority=900)
     app.connect("doctree-read", link_names)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
 
@@ -96,6 +117,29 @@ def readable(app: Sphinx, what: str, name: str, obj: object, options: object, li
     if what == "module":
         text = text.replace("References\n----------\n", ".. rubric:: References\n\n")
     lines[:] = text.split("\n")
+
+
+def illustrated(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    """Add the picture of a public name, and the pages where it is used."""
+    for picture, names in PICTURES.items():
+        if name in names:
+            lines += ["", f".. image:: /{picture}", f"   :alt: What {name} finds or draws", "   :width: 75%"]
+    uses = {page: len(re.findall(rf"\b{re.escape(name)}\b(?!\.\w)", text)) for page, text in texts().items()}
+    users = sorted((page for page, count in uses.items() if count), key=lambda page: -uses[page])
+    if users and what in ("function", "class"):
+        lines += ["", ".. rubric:: See also", "", *(f"- :doc:`/{page}`" for page in users[:MOST_PAGES]), ""]
+
+
+@cache
+def texts() -> dict[str, str]:
+    """What the pages of guide, theory and gallery say, by the name of the page."""
+    pages = [*sorted((HERE / "guide").glob("*.md")), *sorted((HERE / "theory").glob("*.md"))]
+    notebooks = sorted((HERE / "gallery" / "notebooks").glob("*.ipynb"))
+    found = {page: page.read_text(encoding="utf-8") for page in pages if page.stem != "index"}
+    for page in notebooks:
+        cells = json.loads(page.read_text(encoding="utf-8"))["cells"]
+        found[page] = "\n".join("".join(cell["source"]) for cell in cells)
+    return {str(page.relative_to(HERE).with_suffix("")): text for page, text in found.items()}
 
 
 def link_names(app: Sphinx, doctree: nodes.document) -> None:

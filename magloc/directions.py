@@ -43,6 +43,12 @@ def moments_on_sphere(moment_Am2: float, n: int = 50, *, half: bool = False) -> 
     ------
     ValueError
         n is less than 1.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> magloc.moments_on_sphere(2.0, 100).shape
+    (100, 3)
     """
     if n < 1:
         raise ValueError(f"Input n must be at least 1; instead received {n}.")

@@ -275,6 +275,16 @@ class IteratedExtendedKalmanFilter:
         Of the last update.
     x_prior, P_prior, x_post, P_post : ndarray
         Copies after the last `predict` and the last `update`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import magloc
+    >>> kf = magloc.IteratedExtendedKalmanFilter(dim_x=1, dim_z=1, tolerance=1e-9)
+    >>> kf.x, kf.P, kf.R = np.array([2.0]), np.eye(1), 1e-4 * np.eye(1)
+    >>> kf.update([9.0], lambda x: np.array([2.0 * x]), lambda x: x**2)
+    >>> kf.x.round(3), kf.converged
+    (array([3.]), True)
     """
 
     def __init__(self, dim_x: int, dim_z: int, *, tolerance: float, max_iterations: int = 50) -> None:

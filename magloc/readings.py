@@ -66,6 +66,19 @@ class Readings:
     ------
     ValueError
         The shapes do not fit, or a position comes without a rotation or the other way round.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import arrays
+    >>> import magloc
+    >>> readings = magloc.Readings(np.zeros((3, 12)), time_s=[0.0, 0.1, 0.2])
+    >>> len(readings), len(readings[readings.time_s > 0.05])
+    (3, 2)
+    >>> array = arrays.axial(1.0, "scalar")
+    >>> columns = {"time_s": [0.0], "s1_nT": [48e3], "s2_nT": [48.1e3]}
+    >>> magloc.Readings.from_columns(columns, array).values_T
+    array([[4.80e-05, 4.81e-05]])
     """
 
     values_T: FloatArray
@@ -219,6 +232,13 @@ def read_readings(
     ------
     InputError
         The file cannot be read, or is not a readings file of this array.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> magloc.read_readings(board.path, board.array).values_T.shape
+    (101, 90)
     """
     table = read_table(path, _EXPECTED_HEADER)
     readings = _readings_of_table(table, array, sensors)

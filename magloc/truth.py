@@ -36,6 +36,13 @@ class Truth:
         Moment of the source [A·m²].
     name : str
         What errors call it: the file that it was read from.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> truth = magloc.datasets.load("board").truth
+    >>> truth.position_m.shape, truth.moment_Am2.shape
+    ((101, 3), (101, 3))
     """
 
     time_s: FloatArray
@@ -51,6 +58,13 @@ def read_truth(path: str | PathLike[str]) -> Truth:
     ------
     InputError
         The file cannot be read, or is not a truth file.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> magloc.read_truth(board.path.with_name("board-truth.csv")).position_m.shape
+    (101, 3)
     """
     table = read_table(path, "a header with time_s, x_m and y_m")
     known = ("time_s", *TRUE_POSITION_COLUMNS, *TRUE_MOMENT_COLUMNS)

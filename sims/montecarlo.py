@@ -74,6 +74,18 @@ def run_many(
     ------
     ValueError
         There are no seeds or one comes twice, ``processes`` is not positive, or the estimator cannot be pickled.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> import sims
+    >>> from dataclasses import replace
+    >>> scenario = replace(sims.read_scenario("weaving"), duration_s=5.0)
+    >>> def solved(array, readings):
+    ...     return {"solved": magloc.locate(array, readings).solved.sum()}
+    >>> runs = sims.run_many(scenario, solved, seeds=range(2), processes=1)
+    >>> runs.solved.values
+    array([11., 11.])
     """
     numbers = [int(seed) for seed in seeds]
     work = partial(_one, scenario, estimator, judge or against_truth)

@@ -33,6 +33,14 @@ def read_scenario(name_or_path: str) -> MagneticScenario | AttitudeScenario:
     ------
     InputError
         The file cannot be read or does not describe a scenario; the text says where and why.
+
+    Examples
+    --------
+    >>> import sims
+    >>> sims.read_scenario("weaving").rate_Hz
+    2.0
+    >>> sims.read_scenario("tabletsat").satellite.field_model
+    'IGRF-14'
     """
     if name_or_path not in built_in_scenarios() and _is_of_a_satellite(name_or_path):
         return simulation_of(read_satellite(name_or_path))
@@ -64,6 +72,15 @@ def simulate(scenario: MagneticScenario | AttitudeScenario, seed: int | Sequence
     ------
     ValueError
         A sensor comes too near to a source, or a satellite's start conditions hold at no time.
+
+    Examples
+    --------
+    >>> import sims
+    >>> from dataclasses import replace
+    >>> scenario = replace(sims.read_scenario("weaving"), duration_s=5.0)
+    >>> simulation = sims.simulate(scenario, seed=0)
+    >>> simulation.readings.values_T.shape
+    (11, 12)
     """
     if isinstance(scenario, AttitudeScenario):
         return simulate_attitude(scenario, [seed] if isinstance(seed, int) else seed)

@@ -1,8 +1,10 @@
-"""Pages that users read: Python blocks run, commands accept what is shown of them, every public name has a page."""
+"""What users read: Python of pages and docstrings runs, commands accept what is shown, every public name has a page."""
 
 from __future__ import annotations
 
+import doctest
 import importlib
+import inspect
 import re
 import shlex
 from pathlib import Path
@@ -21,6 +23,14 @@ PAGES = [REPOSITORY / "README.md", DOCS / "quickstart.md", *GUIDE]
 BLOCKS = re.compile(r"<!-- (?:before|after) the page:\n(.*?)-->|```python\n(.*?)```", re.DOTALL)
 APPS = {"magloc": magloc.cli.app.app, "adcs": adcs.cli.app.app}
 COMMAND = re.compile(r"^(?:    |\$ )((?:magloc|adcs) .*)$|`((?:magloc|adcs) [a-z]+ [^`…]*)`", re.MULTILINE)
+CONTINUED = re.compile(r" \\\n +")
+# All pages but those that are made of commands and notebooks when the site is built.
+WRITTEN = [REPOSITORY / "README.md", *(page for page in sorted(DOCS.rglob("*.md")) if "commands" not in page.parts)]
+# A block of code with its language, or a line of commands, of a page's text.
+CODE = re.compile(r"^```[a-z]+\n(.*?)^```|^    ([^\n]*)$", re.DOTALL | re.MULTILINE)
+HIDDEN = re.compile(r"<!--.*?-->", re.DOTALL)
+# What a page of the site shows of a line of code at desktop width without a scroll bar.
+WIDEST = 88
 # A public name on a page of the reference, in a list of autosummary or by itself.
 NAMED = re.compile(r"\b(?:arrays|magloc|adcs|sims)(?:\.\w+)+")
 
@@ -31,11 +41,10 @@ def with_python(page: Path) -> bool:
 
 def command_lines() -> list[tuple[str, bool]]:
     """Command lines of all pages, without comments, and whether they are whole; those in a sentence may be a part."""
-    pages = [page for page in DOCS.rglob("*.md") if "commands" not in page.parts]
     found = {
         ((shown or inline).partition(" #")[0].partition(" > ")[0].strip(), bool(shown))
-        for page in [REPOSITORY / "README.md", *pages]
-        for shown, inline in COMMAND.findall(page.read_text(encoding="utf-8"))
+        for page in WRITTEN
+        for shown, inline in COMMAND.findall(CONTINUED.sub(" ", page.read_text(encoding="utf-8")))
     }
     return sorted(found)
 
@@ -52,6 +61,28 @@ def test_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     names: dict[str, object] = {}
     for hidden, shown in BLOCKS.findall(page.read_text(encoding="utf-8")):
         exec(compile(hidden or shown, str(page), "exec"), names)
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=lambda page: str(page.relative_to(REPOSITORY)))
+def test_no_line_of_code_scrolls(page: Path) -> None:
+    blocks = CODE.findall(HIDDEN.sub("", page.read_text(encoding="utf-8")))
+    lines = [line for block in blocks for code in block for line in code.splitlines()]
+    assert [line for line in lines if len(line) > WIDEST] == []
+
+
+@pytest.mark.parametrize("package", ["arrays", "magloc", "adcs", "sims"])
+def test_examples_of_public_names(package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every public class and function has some, and they print what they say."""
+    matplotlib.use("agg")
+    monkeypatch.chdir(tmp_path)
+    module, runner, said = importlib.import_module(package), doctest.DocTestRunner(verbose=False), []
+    public = {name: getattr(module, name) for name in module.__all__}
+    for name, thing in public.items():
+        if inspect.isclass(thing) or inspect.isfunction(thing):
+            test = doctest.DocTestParser().get_doctest(inspect.getdoc(thing) or "", {}, f"{package}.{name}", None, None)
+            assert test.examples, name
+            runner.run(test, out=said.append)
+    assert runner.failures == 0, "".join(said)
 
 
 @pytest.mark.parametrize(("line", "whole"), command_lines())
@@ -73,6 +104,19 @@ def test_the_reference_has_every_public_name(package: str) -> None:
     named = {name for text in pages for name in NAMED.findall(text)}
     public = {f"{package}.{name}" for name in importlib.import_module(package).__all__}
     assert sorted(public - named) == []
+
+
+def test_the_guide_leads_to_each_of_its_pages_by_a_question() -> None:
+    questions = (DOCS / "guide" / "index.md").read_text(encoding="utf-8").partition("```{toctree}")[0]
+    named = set(re.findall(r"\]\(([\w-]+)\.md", questions))
+    assert {page.stem for page in GUIDE} - {"index"} - named == set()
+
+
+def test_links_of_the_readme_lead_somewhere() -> None:
+    """The site's are held by its build."""
+    links = re.findall(r"\]\(([^)#]+)[^)]*\)", (REPOSITORY / "README.md").read_text(encoding="utf-8"))
+    assert len(links) > 20
+    assert [link for link in links if not link.startswith("http") and not (REPOSITORY / link).exists()] == []
 
 
 def test_the_readme_is_short() -> None:

@@ -67,6 +67,17 @@ def complementary_filter(
     ------
     ValueError
         A shape does not match, the steps differ, a vector is zero, or the filter would be unstable.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> import numpy as np
+    >>> up, field = [0.0, 0.0, 1.0], [0.0, 20e-6, -43e-6]
+    >>> at_rest = [np.tile(up, (50, 1)), np.tile(field, (50, 1))]
+    >>> time_s, gyro_rad_s = np.arange(50) / 10.0, np.zeros((50, 3))
+    >>> attitude = adcs.complementary_filter(time_s, gyro_rad_s, at_rest, [up, field])
+    >>> bool(attitude.rotation[-1].magnitude() < 1e-6)
+    True
     """
     if method not in METHODS:
         raise ValueError(f"Input method must be one of {', '.join(METHODS)}; instead received {method!r}.")

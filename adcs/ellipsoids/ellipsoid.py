@@ -39,6 +39,13 @@ class Ellipsoid:
     ------
     ValueError
         The sizes do not match, a number is not finite, or the shape is not symmetric positive semidefinite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import adcs
+    >>> adcs.Ellipsoid(np.zeros(2), np.diag([4.0, 9.0])).trace
+    13.0
     """
 
     centre: FloatArray

@@ -169,6 +169,18 @@ class EllipsoidObserver:
     ------
     ValueError
         The sizes do not match, the reinflation is not positive semidefinite, or there is no such rule.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import adcs
+    >>> from adcs.ellipsoids.observer import BoundedSystem
+    >>> system = BoundedSystem(np.eye(1), 0.01 * np.eye(1), np.eye(1), np.array([0.1]))
+    >>> observer = adcs.EllipsoidObserver(system, adcs.Ellipsoid(np.zeros(1), np.eye(1)))
+    >>> observer.predict()
+    >>> observer.correct([[0.5]])
+    >>> observer.centres.round(1)
+    array([[0.5]])
     """
 
     def __init__(

@@ -126,6 +126,15 @@ def circular_orbit(
     ------
     ValueError
         The node is given twice, the altitude is not positive, or a number is not finite.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> orbit = adcs.circular_orbit(
+    ...     altitude_m=550e3, inclination_deg=97.6, epoch="2026-11-21"
+    ... )
+    >>> round(orbit.radius_m / 1e3, 1)
+    6928.1
     """
     if node_deg is not None and local_time_h is not None:
         raise ValueError("Inputs node_deg and local_time_h must not both be given; instead received both.")

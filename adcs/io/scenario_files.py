@@ -79,6 +79,12 @@ def read_scenario(name_or_path: str) -> AttitudeFile:
     ------
     InputError
         The file cannot be read or does not describe a scenario; the text says where and why.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> adcs.read_scenario("tabletsat").satellite.field_model
+    'IGRF-14'
     """
     return scenario_of(*_FILES.read(name_or_path))
 

@@ -52,6 +52,13 @@ def read_telemetry(path: str | PathLike[str], step_s: float | None = None) -> Te
     InputError
         The file cannot be read, a column is unknown or missing, or a time is not a multiple of the step after the
         first.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> log = adcs.datasets.load("satellite")
+    >>> adcs.read_telemetry(log.path).star.shape
+    (201, 4)
     """
     table = read_table(path, f"a header with {TIME} and columns of sensors")
     known = [TIME, *(name for group in GROUPS for name in group)]

@@ -47,6 +47,12 @@ class EstimatorSettings:
         Of the parallel filter of the disturbance.
     closed_loop_F : bool
         The source paper's Jacobian.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> adcs.EstimatorSettings.of("st+gyro", states=["gyro-bias"], filter="smoother").in_words
+    'st+gyro, estimating gyro-bias; filter smoother'
     """
 
     settings: FilterSettings
@@ -108,6 +114,16 @@ def estimate(
     ValueError
         The sensors cannot observe attitude or have no reading, a date is outside of the model of the field, or the
         filter fails.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> log = adcs.datasets.load("satellite")
+    >>> sensors, states = "st+gyro", ["gyro-bias"]
+    >>> attitude = adcs.estimate(log.telemetry, log.satellite, sensors=sensors, states=states)
+    >>> error = (attitude.rotation[-1] * log.truth[-1].inv()).magnitude()
+    >>> bool(error < 1e-3)
+    True
     """
     chosen = EstimatorSettings.of(sensors, states, filter) if isinstance(sensors, str) else sensors
     used = chosen.settings.sensors

@@ -47,6 +47,14 @@ class AttitudeTrack:
         Orbital frame from body.
     warnings : tuple of str
         What is degraded or cannot be observed, and for how long.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> log = adcs.datasets.load("satellite")
+    >>> attitude = adcs.estimate(log.telemetry, log.satellite, sensors="st+gyro")
+    >>> attitude.q.shape, sorted(attitude.sigma)
+    ((201, 4), ['attitude', 'rate'])
     """
 
     title: str

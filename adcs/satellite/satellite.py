@@ -41,6 +41,17 @@ class Satellite:
     ------
     ValueError
         No body has this inertia.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> import numpy as np
+    >>> orbit = adcs.circular_orbit(
+    ...     altitude_m=550e3, inclination_deg=97.6, epoch="2026-11-21"
+    ... )
+    >>> satellite = adcs.Satellite(inertia_kgm2=np.diag([0.05, 0.06, 0.03]), orbit=orbit)
+    >>> satellite.start
+    np.datetime64('2026-11-21T00:00:00.000000')
     """
 
     inertia_kgm2: ArrayLike

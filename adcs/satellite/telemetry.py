@@ -126,6 +126,14 @@ class Telemetry:
     ------
     ValueError
         A shape does not match, a direction has no length, or the times are no ascending multiples of the step.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> import numpy as np
+    >>> telemetry = adcs.Telemetry([0.0, 0.5, 1.5], gyro_rad_s=np.zeros((3, 3)))
+    >>> telemetry.step_s, telemetry.rows
+    (0.5, array([0, 1, 3]))
     """
 
     time_s: FloatArray

@@ -373,6 +373,15 @@ def identify_stars(
         Standard deviation of a star's place, per axis.
     progress : callable, optional
         Called with 1 after every image.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> from adcs.stars.files import read_star_catalogue, read_star_frames
+    >>> camera, frames = read_star_frames("frames")  # doctest: +SKIP
+    >>> catalogue = read_star_catalogue("stars.csv")  # doctest: +SKIP
+    >>> images = [(frame.points_px, frame.magnitudes) for frame in frames]  # doctest: +SKIP
+    >>> adcs.identify_stars(catalogue, camera, images)  # doctest: +SKIP
     """
     matcher = StarMatcher.of(catalogue, camera, noise_px)
     fixes = []

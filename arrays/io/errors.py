@@ -21,6 +21,15 @@ class InputError(ValueError):
 
     The text is one sentence that names the file, the line or key, what was found and what was expected, fit to be shown
     to a user as it is.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> try:
+    ...     arrays.read_array("nowhere.toml")
+    ... except arrays.InputError as error:
+    ...     print(error)
+    nowhere.toml does not exist, expected a TOML file of an array.
     """
 
 

@@ -44,6 +44,16 @@ class Bounds:
         Roots of the sum of the variances of the three components.
     rank : ndarray of int, shape (...)
         Independent combinations of the six parameters that are estimable.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> import magloc
+    >>> places = [[4.0, 0.0, 0.5], [6.0, 0.0, 0.5]]
+    >>> array = arrays.tetrahedron(1.5)
+    >>> bounds = magloc.cramer_rao_bounds(array, places, [0.0, 0.0, 100.0])
+    >>> bounds.sigma_position_m.round(2), bounds.covariance.shape
+    (array([0.08, 0.89]), (2, 6, 6))
     """
 
     position_m: FloatArray
@@ -113,6 +123,15 @@ def cramer_rao_bounds(
     ------
     ValueError
         A shape is wrong, or the uncertainty is negative or not finite.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> import magloc
+    >>> array = arrays.tetrahedron(1.5)
+    >>> bounds = magloc.cramer_rao_bounds(array, [5.0, 0.0, 0.5], [0.0, 0.0, 100.0])
+    >>> round(float(bounds.sigma_position_m), 2)
+    0.3
     """
     check_magnitudes(array)
     p, m = _sources(position_m, moment_Am2)

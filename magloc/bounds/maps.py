@@ -244,6 +244,15 @@ def bound_map(
     ------
     ValueError
         An input is out of range.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> import magloc
+    >>> array = arrays.tetrahedron(1.5)
+    >>> bounds = magloc.bound_map(array, (0.0, 0.0, 100.0), n=5, n_moments=5)
+    >>> sorted(bounds.sizes)
+    ['x', 'y', 'z']
     """
     mx, my, mz = np.asarray(moment_Am2, dtype=np.float64).tolist()
     half_width_m = check_half_width(edge_m)

@@ -53,6 +53,13 @@ class CalibrationPrior:
     ------
     ValueError
         A standard deviation is not positive, or nothing of that name can be estimated.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> prior = magloc.CalibrationPrior(gain=0.02, estimate=("gains", "offsets"))
+    >>> prior.gain
+    0.02
     """
 
     position_m: float = 5e-3

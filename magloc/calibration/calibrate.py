@@ -63,6 +63,16 @@ def calibrate(
     ValueError
         The shapes do not agree, the array has scalar sensors (with `modulus_T`: no vector sensor), no time of the truth
         is one of the readings, no row can be located with the nominal array, or there are fewer readings than unknowns.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> prior = magloc.CalibrationPrior(estimate=("offsets",), offset_T=1e-6)
+    >>> rows = board.readings[::10]
+    >>> calibration = magloc.calibrate(board.array, rows, truth=board.truth, prior=prior)
+    >>> calibration.converged, calibration.sigma.shape
+    (True, (30, 15))
     """
     check_magnitudes(array)
     rows = without_saturated(readings, array)

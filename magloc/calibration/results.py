@@ -38,6 +38,17 @@ class Calibration:
         tell.
     unobservable : tuple of Unobservable
         What the readings do not tell: there the nominal array speaks alone.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> import magloc
+    >>> from scipy.spatial.transform import Rotation
+    >>> sensor = arrays.SensorArray([arrays.Sensor("s1", "vector", (0.0, 0.0, 0.0), 1e-9)])
+    >>> turned = magloc.Readings(1.02 * Rotation.random(100, 0).apply([0.0, 20e-6, -43e-6]))
+    >>> calibration = magloc.calibrate(sensor, turned, modulus_T=47.424e-6)
+    >>> calibration.converged, round(calibration.array.sensors[0].calibration.scale[0][0], 3)
+    (True, 1.02)
     """
 
     nominal: SensorArray

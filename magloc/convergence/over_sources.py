@@ -350,6 +350,14 @@ def source_map(
     ------
     ValueError
         The array has scalar sensors or too few of them, or an input is out of range.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> import magloc
+    >>> found = magloc.source_map(arrays.tetrahedron(1.5), n=3)
+    >>> sorted(found.sizes)
+    ['x', 'y', 'z']
     """
     scenario = SourcesScenario(array, check_half_width(edge_m), nearest_m, farthest_m, moment_Am2, seed)
     return computed_map(SourcesMap(scenario, n), out, scheduler, progress)

@@ -281,6 +281,15 @@ def convergence_map(
     ValueError
         The array has scalar sensors or too few of them, its readings have no unique best fit, or an input is out of
         range.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> import magloc
+    >>> source = magloc.Source([5.0, 0.0, 0.3], [100.0, 0.0, 0.0])
+    >>> ends = magloc.convergence_map(arrays.tetrahedron(0.45), source, edge_m=20.0, n=5)
+    >>> int((ends.status == 0).sum()), ends.status.size
+    (58, 125)
     """
     if isinstance(method, str) and method not in FILTERS:
         raise ValueError(f"Input method must be one of {', '.join(FILTERS)}; instead received {method!r}.")

@@ -54,6 +54,13 @@ class Design:
         The design first, then the best of its starts, then the references.
     worst_m : float
         Largest σ of the range that a search over sources found for the design.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> task = magloc.DesignTask.read("half-space-2m")
+    >>> design = magloc.design_array(task, starts=2)  # doctest: +SKIP
+    >>> design.array, design.gain  # doctest: +SKIP
     """
 
     task: DesignTask
@@ -116,6 +123,13 @@ def design_array(
     ------
     ValueError
         No start leaves the sensors their least spacing, or determines the range of the sources.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> task = magloc.DesignTask.read("half-space-2m")
+    >>> design = magloc.design_array(task, starts=2)  # doctest: +SKIP
+    >>> design.plot()  # doctest: +SKIP
     """
     search = task.search if starts is None else replace(task.search, n_starts=starts)
     step_done = progress or (lambda _: None)

@@ -186,6 +186,13 @@ class DesignTask:
     ------
     ValueError
         The sensors give fewer than six differences, or are scalar without an ambient field.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> task = magloc.DesignTask.read("half-space-2m")
+    >>> task.n_sensors, task.kind
+    (4, 'vector')
     """
 
     name: str

@@ -58,6 +58,13 @@ def detection_range(
     ValueError
         The array gives fewer than six differences or has scalar sensors without an ambient field, or an input is out of
         range.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> import magloc
+    >>> round(magloc.detection_range(arrays.tetrahedron(1.5), 100.0, false_alarm_rate=0.01))
+    10
     """
     detector = MatchedFilterDetector.of(
         array, false_alarm_rate, n_draws=round(_EXCEEDANCES / false_alarm_rate), seed=seed

@@ -37,6 +37,15 @@ class MatchedFilterDetector:
         Standard error of the threshold, from the order statistics beside it.
     seed : int
         Of the draws for the threshold and for required energies.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> import magloc
+    >>> array = arrays.tetrahedron(1.5)
+    >>> detector = magloc.MatchedFilterDetector.of(array, 0.01, n_draws=2000)
+    >>> detector.false_alarm_rate
+    0.01
     """
 
     filter: DipoleFilter

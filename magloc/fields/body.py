@@ -122,6 +122,14 @@ def equivalent_dipole(
     ------
     ValueError
         The mesh is not closed or has no volume, or a number is not finite or out of bounds.
+
+    Examples
+    --------
+    >>> import trimesh
+    >>> import magloc
+    >>> body = trimesh.creation.icosphere(radius=0.1)
+    >>> magloc.equivalent_dipole(body, 1000.0, [0.0, 0.0, 50e-6]).moment_Am2.round(2)
+    array([0.  , 0.  , 0.49])
     """
     if not mesh.is_volume:
         raise ValueError("Input mesh must be a closed surface with outward normals; instead received one that is not.")

@@ -45,6 +45,15 @@ class SourceLine:
         Readings minus unknowns.
     converged : bool
         Whether the iteration ended at an optimum; else nothing here is a result.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import magloc
+    >>> start_m, along, moment_Am2 = np.array([0.2, 0.0, 0.1]), np.eye(3)[0], np.eye(3)[2]
+    >>> line = magloc.SourceLine(start_m, along, moment_Am2, 0.0, 0.0, 0, True)
+    >>> line.field([0.0, 0.1]).shape
+    (2, 3)
     """
 
     start_m: FloatArray
@@ -91,6 +100,17 @@ def fit_source_line(
     ValueError
         The shapes do not agree, a number is not finite, the noise is not positive, or there are fewer readings than
         unknowns.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import magloc
+    >>> start_m, along, moment_Am2 = np.array([0.2, 0.0, 0.1]), np.eye(3)[0], np.eye(3)[2]
+    >>> truth = magloc.SourceLine(start_m, along, moment_Am2, 0.0, 0.0, 0, True)
+    >>> distance_m = np.arange(0.0, 0.5, 0.05)
+    >>> line = magloc.fit_source_line(distance_m, truth.field(distance_m), 1e-9)
+    >>> round(float(np.linalg.norm(line.moment_Am2)), 3), line.converged
+    (1.0, True)
     """
     distance, field, sigma = _checked(distance_m, field_T, noise_T, noise_fraction)
     starts = _starts(distance, field)
@@ -129,6 +149,18 @@ def distance_along_line(
     ------
     ValueError
         The shapes do not agree, or the bounds are none.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import magloc
+    >>> start_m, along, moment_Am2 = np.array([0.2, 0.0, 0.1]), np.eye(3)[0], np.eye(3)[2]
+    >>> line = magloc.SourceLine(start_m, along, moment_Am2, 0.0, 0.0, 0, True)
+    >>> field_T = line.field([0.1, 0.3])
+    >>> found = magloc.distance_along_line(line, field_T, 1e-9, within_m=(0.0, 1.0))
+    >>> distance_m, sigma_m = found
+    >>> distance_m.round(3)
+    array([0.1, 0.3])
     """
     field = _vectors("field_T", field_T)
     low, high = within_m

@@ -61,6 +61,14 @@ class Locator:
     ------
     ValueError
         The array cannot tell that many sources, the prior leaves nothing, or the position is no place for a source.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> locator = magloc.Locator(board.array)
+    >>> locator.fit(board.readings.values_T[0]).best.position_m.round(3)
+    array([-0.06, -0.05,  0.12])
     """
 
     def __init__(
@@ -281,6 +289,16 @@ def locate(
         Rows that cannot be averaged.
     ValueError
         As of :class:`Locator`.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> fixes = magloc.locate(board.array, board.readings[:3])
+    >>> fixes.position_m.round(3)
+    array([[-0.06 , -0.05 ,  0.12 ],
+           [-0.054, -0.049,  0.119],
+           [-0.049, -0.048,  0.118]])
     """
     measured = as_readings(readings)
     n_complete = int(complete_rows(without_saturated(measured, array)).sum()) if average else 0

@@ -126,6 +126,13 @@ class RandomWalk:
         Characteristic unknown speed V along each axis.
     turn_rad_s : float
         Characteristic unknown rate W, about each axis.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> motion = magloc.RandomWalk(speed_m_s=0.5, turn_rad_s=0.1)
+    >>> motion.n_states
+    6
     """
 
     speed_m_s: float
@@ -172,6 +179,13 @@ class OrnsteinUhlenbeck:
         Correlation time τ; by default 1/W, the time in which a course changes that turns at the rate W.
     moment_change : float
         How much the moment changes otherwise, relative to its modulus, in the root of a second [1/√s].
+
+    Examples
+    --------
+    >>> import magloc
+    >>> motion = magloc.OrnsteinUhlenbeck(speed_m_s=0.1, turn_rad_s=0.02, correlation_s=10.0)
+    >>> motion.n_states
+    12
     """
 
     speed_m_s: float
@@ -274,6 +288,13 @@ class CoordinatedTurn:
         The same for the turn rate [rad/s/√s].
     moment_change : float
         The same for the moment, relative to its modulus [1/√s].
+
+    Examples
+    --------
+    >>> import magloc
+    >>> motion = magloc.CoordinatedTurn(speed_m_s=2.0, turn_rad_s=0.1)
+    >>> motion.n_states
+    10
     """
 
     speed_m_s: float

@@ -54,6 +54,14 @@ class Track(Sequence[TrackPoint]):
         That found them.
     is_smoothed : bool
         Whether later rows were used too.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> diver = magloc.datasets.load("diver")
+    >>> track = magloc.track(diver.array, diver.readings)
+    >>> int(track.tracked.sum()), len(track), track.status[-1], track.frame
+    (75, 141, 'tracked', 'world')
     """
 
     points: tuple[TrackPoint, ...]
@@ -224,6 +232,15 @@ def track(
     ------
     ValueError
         Time does not increase from row to row, or the array has too few sensors for the prior.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> diver = magloc.datasets.load("diver")
+    >>> motion = magloc.RandomWalk(speed_m_s=1e-3, turn_rad_s=1e-3)
+    >>> track = magloc.track(diver.array, diver.readings, motion=motion)
+    >>> round(float(track.position_m[-1, 2]), 1)
+    -0.6
     """
     used = without_saturated(as_readings(readings), array)
     if motion is None:

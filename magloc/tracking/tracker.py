@@ -87,6 +87,15 @@ class Tracker:
         The lasting errors of the array's sensors, whose states follow those of the motion.
     steps : list of Step
         Of all tracks so far, if `keep_steps`.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> diver = magloc.datasets.load("diver")
+    >>> motion = magloc.RandomWalk(speed_m_s=0.1, turn_rad_s=0.01)
+    >>> tracker = magloc.Tracker(diver.array, motion)
+    >>> tracker.update(diver.readings[0]).status
+    'not acquired: the range is not observable'
     """
 
     def __init__(

@@ -131,6 +131,12 @@ def view(
         The result is none that can be seen, or an argument is missing or too many.
     InputError
         A file cannot be written, or Chromium is not there.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> import magloc
+    >>> view = magloc.view(arrays.grid(3, 3, 0.1), html="board.html", title="board")
     """
     check_outputs(html, png)
     static = html is not None or png is not None or _in_notebook()

@@ -59,6 +59,14 @@ class AttitudeScenario:
     ------
     ValueError
         A duration or step is not positive, or a size is negative.
+
+    Examples
+    --------
+    >>> import sims
+    >>> from dataclasses import replace
+    >>> scenario = replace(sims.read_scenario("tabletsat"), duration_s=60.0)
+    >>> scenario.satellite.field_model
+    'IGRF-14'
     """
 
     satellite: Satellite

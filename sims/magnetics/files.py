@@ -62,6 +62,15 @@ def write_simulation(simulation: Simulation, readings: str | PathLike[str]) -> S
         There is no such folder, or a folder stands where a file should.
     OSError
         The files cannot be written.
+
+    Examples
+    --------
+    >>> import sims
+    >>> from dataclasses import replace
+    >>> scenario = replace(sims.read_scenario("weaving"), duration_s=5.0)
+    >>> simulation = sims.simulate(scenario, seed=0)
+    >>> sims.write_simulation(simulation, "weaving.csv").array.name
+    'weaving-array.toml'
     """
     files = files_beside(readings, len(simulation.truths))
     folder = files.readings.absolute().parent

@@ -127,6 +127,13 @@ class MagneticScenario:
     ValueError
         The models are not those of the array's sensors, or the times are not positive and finite or give more than five
         million rows.
+
+    Examples
+    --------
+    >>> import sims
+    >>> scenario = sims.read_scenario("weaving")
+    >>> scenario.array.n_sensors, scenario.rate_Hz
+    (4, 2.0)
     """
 
     array: SensorArray

@@ -39,6 +39,14 @@ class Fixes(Sequence[Fix]):
     reason : list of str
     dropped_sensors, saturated_channels : list of tuple of str
     failed_starts : ndarray of int, shape (n,)
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> fixes = magloc.locate(board.array, board.readings[:5])
+    >>> fixes.position_m.shape, fixes.covariance.shape, fixes.frame
+    ((5, 3), (5, 6, 6), 'array')
     """
 
     solutions: Solutions

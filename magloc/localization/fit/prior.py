@@ -29,6 +29,16 @@ class SourcePrior:
     ------
     ValueError
         The bounds leave nothing.
+
+    Examples
+    --------
+    >>> import math
+    >>> import magloc
+    >>> low_m = (-math.inf, -math.inf, 0.0)
+    >>> above = magloc.SourcePrior(low_m, largest_moment_Am2=500.0)
+    >>> board = magloc.datasets.load("board")
+    >>> magloc.locate(board.array, board.readings[0], prior=above)[0].best.position_m.round(3)
+    array([-0.06, -0.05,  0.12])
     """
 
     low_m: tuple[float, float, float] = (-math.inf, -math.inf, -math.inf)

@@ -43,6 +43,12 @@ class Source:
         a weight to speak of, σ of position and moment are small, and χ² is one of noise and rises as a Gaussian's.
     merged : bool
         Whether it stands for two sources that the array does not tell apart.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> magloc.Source([0.1, 0.0, 0.2], [0.0, 0.0, 1.0])
+    Source(position_m=[0.1, 0. , 0.2], moment_Am2=[0., 0., 1.])
     """
 
     position_m: FloatArray
@@ -88,6 +94,14 @@ class Solution:
         How likely the solution is among those of the fix; they add up to one.
     iterations : int
         Linearisations that led here.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> solution = magloc.locate(board.array, board.readings[:1])[0].best
+    >>> solution.weight, solution.dof, solution.covariance.shape
+    (1.0, 81, (6, 6))
     """
 
     sources: tuple[Source, ...]
@@ -155,6 +169,14 @@ class Fix:
     failed_starts : int
         Starts of the search that ended without an optimum.
     time_s : float
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> fix = magloc.locate(board.array, board.readings[:1])[0]
+    >>> fix.detected, fix.misfit, len(fix.solutions)
+    (True, False, 1)
     """
 
     solutions: tuple[Solution, ...]
@@ -176,7 +198,7 @@ class Fix:
     @property
     def misfit(self) -> bool:
         """Whether χ² is far beyond noise: then neither the position nor its standard deviations are to be trusted."""
-        return bool(self.solutions) and is_misfit(self.solutions[0].chi2, self.solutions[0].dof)
+        return bool(self.solutions) and bool(is_misfit(self.solutions[0].chi2, self.solutions[0].dof))
 
     def __repr__(self) -> str:
         if not self.solutions:
