@@ -45,6 +45,12 @@ class Gains:
     ------
     ValueError
         A number is negative or NaN.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> adcs.Gains(0.2, 0.01).ki_per_s2
+    0.01
     """
 
     kp_per_s: float = 0.02

@@ -146,6 +146,15 @@ def inertial_magnetic_filter(
     ------
     ValueError
         A shape does not match, the steps differ, a value is missing, or a vector is zero.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> imu = adcs.datasets.load("imu")
+    >>> readings = imu.gyro_rad_s, imu.acceleration_m_s2, imu.field_T
+    >>> track = adcs.inertial_magnetic_filter(imu.time_s, *readings)
+    >>> bool((track.rotation.inv() * imu.truth).magnitude().max() < 0.1)
+    True
     """
     if magnet not in MAGNETS:
         raise ValueError(f"Input magnet must be one of {', '.join(MAGNETS)}; instead received {magnet!r}.")

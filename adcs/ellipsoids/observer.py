@@ -48,6 +48,16 @@ class BoundedSystem:
     ------
     ValueError
         The sizes do not match, Q is not positive semidefinite, a direction has no length or a bound is not positive.
+
+    Examples
+    --------
+    A number that changes by 0.1 in a step at most, and is read with an error of 0.1 at most:
+
+    >>> import numpy as np
+    >>> import adcs
+    >>> system = adcs.BoundedSystem(np.eye(1), 0.01 * np.eye(1), np.eye(1), np.array([0.1]))
+    >>> system.bounds
+    array([0.1])
     """
 
     A: FloatArray
@@ -174,8 +184,7 @@ class EllipsoidObserver:
     --------
     >>> import numpy as np
     >>> import adcs
-    >>> from adcs.ellipsoids.observer import BoundedSystem
-    >>> system = BoundedSystem(np.eye(1), 0.01 * np.eye(1), np.eye(1), np.array([0.1]))
+    >>> system = adcs.BoundedSystem(np.eye(1), 0.01 * np.eye(1), np.eye(1), np.array([0.1]))
     >>> observer = adcs.EllipsoidObserver(system, adcs.Ellipsoid(np.zeros(1), np.eye(1)))
     >>> observer.predict()
     >>> observer.correct([[0.5]])

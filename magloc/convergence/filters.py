@@ -78,6 +78,15 @@ class RepeatedFilter(_LikelihoodFilter):
         Stop when the predicted differences change by less than this between passes [T].
     max_iterations : int
         Passes at most.
+
+    Examples
+    --------
+    >>> import arrays, magloc
+    >>> board, source = arrays.tetrahedron(1.5), magloc.Source((2.0, 0.0, 0.0), (30.0, 0.0, 0.0))
+    >>> cautious = magloc.RepeatedFilter(position_step_m=0.01)
+    >>> dataset = magloc.convergence_map(board, source, method=cautious, edge_m=4.0, n=3)
+    >>> dataset["status"].shape
+    (3, 3, 3)
     """
 
     name: ClassVar[str] = "repeated"

@@ -109,6 +109,16 @@ def rendered_frame(
         Velocity and turn rate meanwhile; at rest by default.
     quality : FrameQuality
         Noise, lights that are dark, spurious ones, hot pixels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sims
+    >>> from adcs import mockup
+    >>> camera, pose = mockup.camera_of_footprint(0.9), mockup.Pose(0.0, 0.0, 0.3)
+    >>> frame = sims.rendered_frame(mockup.led_sky(), camera, pose, np.random.default_rng(0))
+    >>> frame.image.shape
+    (480, 640)
     """
     shining = np.flatnonzero(rng.random(len(sky)) >= quality.lost)
     size = np.array([camera.width_px, camera.height_px])

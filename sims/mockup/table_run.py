@@ -89,6 +89,12 @@ class CameraErrors:
     ------
     ValueError
         A fraction is none.
+
+    Examples
+    --------
+    >>> import sims
+    >>> sims.CameraErrors(failed=0.1).failed
+    0.1
     """
 
     period_s: float = 0.6
@@ -124,6 +130,12 @@ class TableScenario:
     ------
     ValueError
         The drive is unknown, or a time is not positive.
+
+    Examples
+    --------
+    >>> import sims
+    >>> sims.TableScenario(duration_s=20.0).n_samples
+    2000
     """
 
     drive: DriveName = "perimeter"
@@ -182,6 +194,13 @@ def table_run(scenario: TableScenario, seed: int) -> TableRun:
         The drive, and the errors of the sensors.
     seed : int
         Of all random numbers.
+
+    Examples
+    --------
+    >>> import sims
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> run.truth.position_m.shape
+    (500, 2)
     """
     camera, n, polls = scenario.camera, scenario.n_samples, scenario.polls
     drive = perimeter_drive if scenario.drive == "perimeter" else two_firings_drive
