@@ -23,6 +23,8 @@ from arrays.io.errors import InputError
 BINARIES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 # WebGL in software: without both of these the canvas stays blank on a machine without a graphics card.
 _SOFTWARE_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+# Ends the browser and removes its folder if this process is killed, which closes the guard's stdin.
+_GUARD = 'read pid; cat; [ -z "$pid" ] || kill -9 "-$pid"; while ! rm -rf "$0"; do sleep 0.1; done'
 _POLL_S = 0.05
 _REPLY_S = 60.0
 
@@ -75,8 +77,11 @@ class Chromium(Closing):
         self._profile = tempfile.mkdtemp(prefix="magloc-chromium-")
         self._socket: ClientConnection | None = None
         self._process: subprocess.Popen[bytes] | None = None
+        self._guard = _guarded(self._profile)
         try:
             self._process = _started(find_chromium(), self._profile, size)
+            if self._guard is not None and self._guard.stdin is not None:
+                self._guard.stdin.write(b"%d\n" % self._process.pid)
             self._socket = connect(self._page_address(timeout_s), max_size=None, proxy=None, ping_interval=None)
             for domain in ("Network", "Page", "Runtime"):
                 self.call(f"{domain}.enable")
@@ -101,6 +106,10 @@ class Chromium(Closing):
                 self._process.kill()
                 self._process.wait()
             self._process = None
+        if self._guard is not None:
+            self._guard.kill()
+            self._guard.communicate()
+            self._guard = None
         shutil.rmtree(self._profile, ignore_errors=True)
 
     def open(self, url: str) -> None:
@@ -268,6 +277,21 @@ class Chromium(Closing):
         raise BrowserError(f"Chromium did not start within {timeout_s:g} s.")
 
 
+def _guarded(folder: str) -> subprocess.Popen[bytes] | None:
+    """The guard of a folder, in a session of its own, which no Ctrl-C reaches; None where there is no shell."""
+    shell = shutil.which("sh") if os.name == "posix" else None
+    if shell is None:
+        return None
+    return subprocess.Popen(
+        [shell, "-c", _GUARD, folder],
+        bufsize=0,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+
+
 def _started(binary: str, profile: str, size: tuple[int, int]) -> subprocess.Popen[bytes]:
     flags = [
         "--headless=new",
@@ -283,7 +307,12 @@ def _started(binary: str, profile: str, size: tuple[int, int]) -> subprocess.Pop
     ]
     if hasattr(os, "geteuid") and os.geteuid() == 0:
         flags.append("--no-sandbox")  # root has none
-    return subprocess.Popen([binary, *flags, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return subprocess.Popen(
+        [binary, *flags, "about:blank"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        process_group=0 if os.name == "posix" else None,
+    )
 
 
 def exception_text(details: dict[str, Any]) -> str:

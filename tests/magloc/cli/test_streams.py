@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -66,8 +67,9 @@ sys.exit(main())
         assert (done.returncode, done.stderr) == (130, f"{program}: interrupted\n")
 
     @needs_chromium
-    def test_terminated_with_a_browser(self, tmp_path: Path) -> None:
-        """Browser, its folder and the unfinished picture are gone."""
+    @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+    def test_ended_with_a_browser(self, number: signal.Signals, tmp_path: Path) -> None:
+        """Browser, its folder and the unfinished picture are gone, whatever ends the command."""
         write_array(tmp_path / "array.toml", tetrahedron(1.0))
         command = [sys.executable, "-m", "magloc.cli", "view", "array.toml", "--png", "out.png"]
         with TemporaryDirectory(prefix="m") as short:  # Chromium makes a socket in it, whose path must not be long
@@ -75,8 +77,22 @@ sys.exit(main())
             with subprocess.Popen(command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True) as process:
                 there = Path(short).glob
                 wait_for(lambda: any(there("magloc-chromium-*/DevToolsActivePort")) or process.poll() is not None)
-                process.send_signal(signal.SIGTERM)
+                process.send_signal(number)
                 _, err = process.communicate(timeout=WAIT_S)
-            assert (process.returncode, err) == (143, "magloc: terminated\n")
+            terminated = number == signal.SIGTERM
+            assert (process.returncode, err) == ((143, "magloc: terminated\n") if terminated else (-9, ""))
+            if not terminated:
+                wait_for(lambda: not list(there("magloc-*")) and not processes_with(short))
             assert not list(there("magloc-*"))
+            assert not processes_with(short)
         assert [path.name for path in tmp_path.iterdir()] == ["array.toml"]
+
+
+def processes_with(word: str) -> list[int]:
+    """Processes whose command line has a word; none where the system has no such list."""
+    found = []
+    for line in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError):  # gone meanwhile
+            if word.encode() in line.read_bytes():
+                found.append(int(line.parent.name))
+    return found
