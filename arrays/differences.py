@@ -20,6 +20,8 @@ from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
 
 _EQUAL_NOISE_RTOL = 1e-12
+_LOST = 1e-13
+"""A deviation less than this part of the largest is what rounding made."""
 
 
 def contrasts(n_sensors: int, base: int = -1) -> FloatArray:
@@ -30,13 +32,6 @@ def contrasts(n_sensors: int, base: int = -1) -> FloatArray:
     rows = np.delete(np.eye(n_sensors), base, axis=0)
     rows[:, base] = -1.0
     return rows
-
-
-def difference_covariance(noise: FloatArray, base: int = -1) -> FloatArray:
-    """Covariance ``diag(noise_i²) + noise_base² 1 1ᵀ`` [T²] of these differences, equation (13) for any noise (N,)."""
-    noise = np.asarray(noise, dtype=np.float64)
-    d = contrasts(noise.size, base)
-    return (d * noise**2) @ d.T
 
 
 def helmert_decorrelation(n_differences: int) -> FloatArray:
@@ -52,12 +47,15 @@ def helmert_decorrelation(n_differences: int) -> FloatArray:
     return t
 
 
-def eigen_decorrelation(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Orthonormal T and variances, largest first, with ``T R Tᵀ = diag(variance)``, for any covariance R (n, n)."""
-    # LAPACK's tolerances are absolute in the largest entry: field variances in T² need scaling to keep their digits.
-    scale = float(np.max(np.abs(np.diagonal(covariance))))
-    eigenvalue, eigenvector = np.linalg.eigh(covariance / scale)
-    return eigenvector.T[::-1].copy(), eigenvalue[::-1] * scale
+def eigen_decorrelation(root: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Orthonormal T and variances, largest first, with ``T R Tᵀ = diag(variance)``, for ``R = root rootᵀ`` (n, m).
+
+    R itself, rounded, may have lost its smallest variances: those of sensors 1e8 times as good as others.
+    """
+    vectors, deviations, _ = np.linalg.svd(root, full_matrices=False)
+    if not deviations[-1] > _LOST * deviations[0]:
+        raise ValueError("Input array must have noise, and a common field, within a factor of 1e13 of each other.")
+    return vectors.T, deviations**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +174,7 @@ def _closed_form(
         t = helmert_decorrelation(sensors.size - 1)
         variance = sigma[0] ** 2 * np.concatenate([[float(sensors.size)], np.ones(sensors.size - 2)])
     else:
-        t, variance = eigen_decorrelation(difference_covariance(sigma, base))
+        t, variance = eigen_decorrelation(d * sigma)
     w: FloatArray = np.kron(t @ d, np.eye(width)) @ block_diag(*uncalibrate)
     return w, np.repeat(variance, width)
 
@@ -186,12 +184,14 @@ def _numerical_form(
 ) -> tuple[FloatArray, FloatArray]:
     """Combinations of channels that are free of the common field, decorrelated by their eigenvectors."""
     common = _common_field(array, group, array.channel_gain)
-    covariance = covariance_T2[np.ix_(group, group)]
+    try:
+        root = np.linalg.cholesky(covariance_T2[np.ix_(group, group)])
+    except np.linalg.LinAlgError:
+        raise ValueError("Input covariance_T2 must be positive definite; instead received one that is not.") from None
     if array.common_field_T is not None:
-        t, variance = eigen_decorrelation(covariance + array.common_field_T**2 * common @ common.T)
-        return t, variance
+        return eigen_decorrelation(np.hstack([root, array.common_field_T * common]))
     d: FloatArray = null_space(common.T).T
     if d.shape[0] == 0:
         return np.zeros((0, group.size)), np.zeros(0)
-    t, variance = eigen_decorrelation(d @ covariance @ d.T)
+    t, variance = eigen_decorrelation(d @ root)
     return t @ d, variance

@@ -1,17 +1,13 @@
-"""The program ``adcs``, and ``python -m adcs.cli``: Ctrl-C ends it in order while it still loads, too."""
+"""The program ``adcs``, and ``python -m adcs.cli``."""
 
 import sys
+
+from magloc.cli.entry import entered
 
 
 def main() -> int:
     """Run one command; its exit status."""
-    try:
-        from adcs.cli import app
-
-        return app.main()
-    except KeyboardInterrupt:
-        print("adcs: interrupted", file=sys.stderr)
-        return 130
+    return entered("adcs")
 
 
 if __name__ == "__main__":

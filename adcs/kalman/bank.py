@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -136,8 +136,8 @@ def estimate(
             )
     first = first_told(record, used, with_gyro=chosen.filter == "reduced")
     record = part(record, np.array([0]), slice(first, None))
-    tracks = estimated(record, chosen, any_start(record, chosen.settings))
-    if not np.isfinite(tracks.q).all():
+    tracks = estimated(record, chosen, any_start)
+    if not (np.isfinite(tracks.q).all() and tracks.definite.all()):
         raise ValueError("Input found readings that no attitude explains: the filter has failed.")
     return _track(telemetry, first, record, chosen, tracks)
 
@@ -162,22 +162,22 @@ def _track(
     )
 
 
-def start_of(record: Record, chosen: EstimatorSettings) -> Start:
-    """Where the filter starts when it is told nothing: from the readings."""
-    start = vector_start if chosen.start == "vectors" else any_start
-    return start(record, chosen.settings)
-
-
-def estimated(record: Record, chosen: EstimatorSettings, start: Start) -> AttitudeTracks:
-    """Tracks of the filter that is wanted."""
-    try:
-        with naming(f"filter {chosen.filter}"):
-            return _estimated(record, chosen, start)
-    except np.linalg.LinAlgError:
-        raise InputError(
-            f"filter {chosen.filter}: found a covariance that grows without end, expected a shorter duration or "
-            "another filter: a constant gain holds only near the geometry that it was computed for."
-        ) from None
+def estimated(
+    record: Record, chosen: EstimatorSettings, start: Start | Callable[[Record, FilterSettings], Start] | None = None
+) -> AttitudeTracks:
+    """Tracks of the filter that is wanted, from a start or what finds one; by default as the settings say."""
+    start = start or (vector_start if chosen.start == "vectors" else any_start)
+    with naming(f"filter {chosen.filter}"):
+        try:
+            # What leaves double precision is not finite in the end, which is for the caller to tell.
+            with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+                first = start if isinstance(start, Start) else start(record, chosen.settings)
+                return _estimated(record, chosen, first)
+        except np.linalg.LinAlgError:
+            raise InputError(
+                f"filter {chosen.filter}: found a covariance that is not positive definite any more, expected noise of "
+                "the size of the readings' errors, a shorter duration or another filter."
+            ) from None
 
 
 def _estimated(record: Record, chosen: EstimatorSettings, start: Start) -> AttitudeTracks:

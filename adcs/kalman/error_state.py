@@ -15,7 +15,7 @@ import numpy as np
 
 from adcs.satellite.sensors import SENSORS
 from arrays.io.errors import check_not_negative, check_positive
-from arrays.typing import FloatArray
+from arrays.typing import BoolArray, FloatArray
 
 ATTRIBUTES = {"field-bias": "field_bias_T", "gyro-bias": "gyro_bias_rad_s", "disturbance": "disturbance_s2"}
 """Optional states in the order of the error state, and what they are called in :class:`State` and its like."""
@@ -304,6 +304,12 @@ class AttitudeTracks:
     def sigma(self) -> FloatArray:
         """Standard deviations of the error state, shape (runs, n, N)."""
         return np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+
+    @property
+    def definite(self) -> BoolArray:
+        """Whether every variance of a run is positive, shape (runs,): a filter that lost one has diverged."""
+        variances = np.diagonal(self.covariance, axis1=-2, axis2=-1)
+        return np.asarray((variances > 0.0).all(axis=(1, 2)))
 
     @property
     def states(self) -> dict[str, FloatArray]:

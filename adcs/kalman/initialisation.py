@@ -10,6 +10,7 @@ innovations are smallest is taken (:func:`any_start`).
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -147,5 +148,7 @@ def _aligned(orbital: FloatArray, body: FloatArray, weights: FloatArray) -> Floa
         # The shortest turn from one to the other: about one direction every turn is as good.
         rotation, _ = Rotation.align_vectors(orbital[0], body[0])
     else:
-        rotation, _ = Rotation.align_vectors(orbital, body, weights=weights / weights.max())
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of directions on one line, which the covariance knows
+            rotation, _ = Rotation.align_vectors(orbital, body, weights=weights / weights.max())
     return quaternion.from_rotation(rotation)

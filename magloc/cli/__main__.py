@@ -1,17 +1,13 @@
-"""The program ``magloc``, and ``python -m magloc.cli``: Ctrl-C ends it in order while it still loads, too."""
+"""The program ``magloc``, and ``python -m magloc.cli``."""
 
 import sys
+
+from magloc.cli.entry import entered
 
 
 def main() -> int:
     """Run one command; its exit status."""
-    try:
-        from magloc.cli import app
-
-        return app.main()
-    except KeyboardInterrupt:
-        print("magloc: interrupted", file=sys.stderr)
-        return 130
+    return entered("magloc")
 
 
 if __name__ == "__main__":

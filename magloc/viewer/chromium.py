@@ -309,6 +309,8 @@ def _started(binary: str, profile: str, size: tuple[int, int]) -> subprocess.Pop
         flags.append("--no-sandbox")  # root has none
     return subprocess.Popen(
         [binary, *flags, "about:blank"],
+        # Its socket, whose path must not be long, goes with the folder.
+        env={**os.environ, "TMPDIR": profile} if len(profile) < 50 else None,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         process_group=0 if os.name == "posix" else None,

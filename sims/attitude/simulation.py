@@ -132,6 +132,7 @@ def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
     )
 
 
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def simulate(scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
     """Truth and readings of one run for every seed, with a control that sees the true state."""
     from adcs.satellite import dynamics_compiled as rigid_body
@@ -152,6 +153,8 @@ def simulate(scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
         rigid_body.Surroundings(around.orbital_rate_rad_s, around.gravity_s2, prepared.true_field_orbital_T),
         scenario.dt_s,
     )
+    if not (np.isfinite(q).all() and np.isfinite(w).all()):
+        raise ValueError("Input found a motion beyond double precision, expected smaller torques, dipoles and rates.")
     return AttitudeRuns.of(prepared, q, w, momentum, wheel_torque)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adcs.io.scenario_files import AttitudeFile
-from adcs.kalman.bank import EstimatorSettings, estimated, start_of
+from adcs.kalman.bank import EstimatorSettings, estimated
 from adcs.kalman.diagnostics import warnings_of
 from adcs.kalman.error_state import AttitudeTracks, start_near
 from adcs.kalman.results import by_state, in_units
@@ -104,7 +104,7 @@ def parts_of(file: AttitudeFile, estimate: EstimatorSettings, seeds: Sequence[in
             errors = estimate.start_attitude_rad, estimate.start_rate_rad_s
             start = start_near(*start_estimates(runs.prepared, *errors), *errors)
         else:
-            start = start_of(runs, estimate)
+            start = None
         yield Part(runs, estimated(runs, estimate, start))
 
 
@@ -122,6 +122,7 @@ def _simulated(file: AttitudeFile, scenario: AttitudeScenario, seeds: Sequence[i
         raise InputError(f"{file.path}: {text}") from None
 
 
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")  # a run that leaves double precision has diverged
 def run_scenario(
     file: AttitudeFile,
     estimate: EstimatorSettings,
@@ -174,7 +175,7 @@ def outcome_of(part: Part) -> Outcome:
         nees=accuracy.normalised_error_squared(runs, estimates) / size,
         nis=estimates.nis,
         error_deg=error_deg,
-        diverged=np.any(~(error_deg[:, late] <= accuracy.DIVERGED_DEG), axis=1),
+        diverged=np.any(~(error_deg[:, late] <= accuracy.DIVERGED_DEG), axis=1) | ~estimates.definite,
         size=size,
         late=late,
         warnings=[list(texts) for texts in warnings_of(runs, estimates)],

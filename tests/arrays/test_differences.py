@@ -25,7 +25,6 @@ from arrays.array import SensorArray
 from arrays.differences import (
     contrasts,
     decorrelated_differences,
-    difference_covariance,
     eigen_decorrelation,
     helmert_decorrelation,
 )
@@ -35,6 +34,11 @@ from arrays.sensor import Calibration, Sensor
 from arrays.whitening import whitening, whitenings
 
 SEEDS = st.integers(0, 2**32 - 1)
+
+
+def difference_covariance(noise):
+    """``diag(noise_i²) + noise_base² 1 1ᵀ`` for the last as base, equation (13) for any noise."""
+    return np.diag(noise[:-1] ** 2) + noise[-1] ** 2
 
 
 def random_array(seed, n=5, *, kinds=("vector",), equal=False, common_field_T=None, uncertain=False):
@@ -144,11 +148,29 @@ class TestDecorrelation:
     @given(SEEDS, st.integers(2, 20))
     @settings(deadline=None)
     def test_eigenvectors_diagonalise_unequal_noise(self, seed, n):
-        R = difference_covariance(1e-9 * np.random.default_rng(seed).uniform(0.1, 10, n))
-        T, variance = eigen_decorrelation(R)
+        noise = 1e-9 * np.random.default_rng(seed).uniform(0.1, 10, n)
+        R = difference_covariance(noise)
+        T, variance = eigen_decorrelation(contrasts(n) * noise)
         assert_allclose(T @ T.T, np.eye(n - 1), atol=1e-12)
         assert_allclose(T @ R @ T.T, np.diag(variance), rtol=1e-10, atol=1e-12 * variance[0])
         assert (np.diff(variance) <= 0).all()
+
+    @pytest.mark.parametrize("kinds", [("vector",), ("scalar",), ("vector", "scalar")])
+    def test_a_sensor_that_is_all_noise_counts_as_none(self, kinds):
+        """With 1e12 times the noise of others, whose variances are lost in a covariance of both; a base or not."""
+        good = random_array(0, 6, kinds=kinds)
+        channels = 1e-9 * np.random.default_rng(1).normal(size=good.n_channels)
+        for lost in (0, 1, 4, 5):
+            sensors = [replace(s, noise_T=1e3) if i == lost else s for i, s in enumerate(good.sensors)]
+            chi2 = chi2_of_differences(decorrelated_differences(replace(good, sensors=tuple(sensors))), channels)
+            without = decorrelated_differences(good, good.channel_sensor != lost)
+            assert chi2 == pytest.approx(chi2_of_differences(without, channels), rel=1e-3)
+
+    def test_noise_beyond_double_precision_is_refused(self):
+        array = random_array(0, 5)
+        array = replace(array, sensors=(replace(array.sensors[0], noise_T=1e8), *array.sensors[1:]))
+        with pytest.raises(ValueError, match="within a factor of 1e13 of each other"):
+            decorrelated_differences(array)
 
     @pytest.mark.parametrize("case", ["equal", "unequal", "mixed", "prior"])
     def test_noise_of_decorrelated_differences_by_monte_carlo(self, case):

@@ -19,6 +19,7 @@ from typing import NamedTuple
 from adcs.mockup.vision.sky import AmbiguousSkyWarning
 from tests.command_line import refuse_constant
 from tests.fuzz.cases import LINES, MAINS, SELDOM, STREAM, commands
+from tests.fuzz.extremes import Extreme
 from tests.fuzz.mangle import mangle_names, mangled_arguments, mangled_file
 
 LONGEST_S = 20.0  # of the processor's time: a loaded machine is no hang
@@ -54,7 +55,6 @@ def made_case(seed: int, files: Path, folder: Path) -> Case:
     shutil.copytree(files, folder)
     names = sorted(LINES)
     command = rng.choices(names, [0.1 if name in SELDOM else 1.0 for name in names])[0]
-    program, *name = command.split()
     words = rng.choice(LINES[command]).split()
     stdin = (folder / STREAM).read_bytes()
     read = [word for word in words if (folder / word).exists()]
@@ -70,10 +70,25 @@ def made_case(seed: int, files: Path, folder: Path) -> Case:
         mangle_names(folder, rng)
     else:
         words = mangled_arguments(words, _OPTIONS[command], rng)
+    return _case(command, words, stdin)
+
+
+def extreme_case(extreme: Extreme, files: Path, folder: Path) -> Case:
+    """The case of one number at an end of what it can be."""
+    shutil.copytree(files, folder)
+    if extreme.file:
+        text = (folder / extreme.file).read_text(encoding="utf-8")
+        text = text[: extreme.at.start] + extreme.value + text[extreme.at.stop :]
+        (folder / extreme.file).write_text(text, encoding="utf-8")
+    return _case(extreme.command, extreme.words, (folder / STREAM).read_bytes())
+
+
+def _case(command: str, words: Sequence[str], stdin: bytes) -> Case:
+    program, *name = command.split()
     if any(_asks_for_much(words)):
         words = words[:1]
     if "view" in name and not any(word.startswith("--html") for word in words):
-        words += ["--html", "out.html"]  # a server would wait for its reader
+        words = [*words, "--html", "out.html"]  # a server would wait for its reader
     return Case(program, [*name, *(word for word in words if word not in ("--view", "--open"))], stdin)
 
 
@@ -129,12 +144,17 @@ def faults(case: Case, ended: Ended, before: set[str], folder: Path) -> Iterator
 def verdict(seed: int, files: Path, folder: Path) -> tuple[Case, Ended, list[str]]:
     """One case from its seed to what is wrong with it; the folder is left as it is then."""
     case = made_case(seed, files, folder)
+    return case, *judged(case, folder)
+
+
+def judged(case: Case, folder: Path) -> tuple[Ended, list[str]]:
+    """How a case ends, and what is wrong with that."""
     before = {str(file.relative_to(folder)) for file in folder.rglob("*")}
     ended = run_case(case, folder)
-    return case, ended, list(faults(case, ended, before, folder))
+    return ended, list(faults(case, ended, before, folder))
 
 
-def report(seed: int, case: Case, ended: Ended, wrong: Sequence[str]) -> str:
+def report(seed: object, case: Case, ended: Ended, wrong: Sequence[str]) -> str:
     """What a person needs to see one fault again."""
     end = ended.trace or ended.err
     return f"seed {seed}: {'; '.join(wrong)}\n  {case.program} {case.arguments}\n  status {ended.status}\n{end[-1500:]}"

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import random
 import shutil
 
 import pytest
 
 from tests.fuzz.cases import LINES, STREAM, commands, write_files
-from tests.fuzz.runner import Case, report, run_case, verdict
+from tests.fuzz.extremes import extremes
+from tests.fuzz.runner import Case, extreme_case, judged, report, run_case, verdict
 
 QUICK, FULL = 300, 10_000
 CHUNK = 100
+PARTS = 250  # of all numbers that files and options take; the first one is quick
 
 
 @pytest.fixture(scope="module")
@@ -43,4 +46,18 @@ def test_mangled(first, files, tmp_path):
         case, ended, wrong = verdict(seed, files, tmp_path / str(seed))
         if wrong:
             found.append(report(seed, case, ended, wrong))
+    assert not found, "\n\n".join(found)
+
+
+@pytest.mark.parametrize("part", [pytest.param(i, marks=[pytest.mark.slow] if i else []) for i in range(PARTS)])
+def test_extremes(part, files, tmp_path):
+    """Each number of each file, and each option, at 1e30, 1e-30, 0, -1, NaN and infinity."""
+    every = list(extremes(files))
+    random.Random(0).shuffle(every)
+    found = []
+    for i, extreme in enumerate(every[part::PARTS]):
+        case = extreme_case(extreme, files, tmp_path / str(i))
+        ended, wrong = judged(case, tmp_path / str(i))
+        if wrong:
+            found.append(report(extreme, case, ended, wrong))
     assert not found, "\n\n".join(found)

@@ -66,6 +66,28 @@ sys.exit(main())
         done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
         assert (done.returncode, done.stderr) == (130, f"{program}: interrupted\n")
 
+    @pytest.mark.parametrize("program", ["magloc", "adcs"])
+    def test_interrupted_where_nothing_can_be_raised(self, program: str) -> None:
+        """As in a callback of the collector, which swallows it; the interruption comes again."""
+        code = f"""
+import sys, time
+class Hand:
+    def find_spec(self, name, *_):
+        if name == "cyclopts":
+            Deleted()
+            for _ in range(30_000):
+                time.sleep(0.01)
+class Deleted:
+    def __del__(self):
+        raise KeyboardInterrupt
+sys.meta_path.insert(0, Hand())
+from {program}.cli.__main__ import main
+sys.exit(main())
+"""
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
+        assert (done.returncode, done.stderr) == (130, f"{program}: interrupted\n")
+
     @needs_chromium
     @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
     def test_ended_with_a_browser(self, number: signal.Signals, tmp_path: Path) -> None:

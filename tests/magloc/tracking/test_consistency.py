@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from arrays import geometries
-from arrays.differences import contrasts, difference_covariance
+from arrays.differences import contrasts
 from magloc.chi_square import mean_bounds
 from magloc.readings import Readings
 from magloc.tracking.consistency import consistency, nees_of
@@ -177,7 +177,7 @@ class TestCounting:
 def information_of(state: FloatArray, rotation: FloatArray, origin: FloatArray) -> FloatArray:
     """Information of one row of the tetrahedron: (6, 6)."""
     H = jacobian_of(state, rotation, origin)
-    R = np.kron(difference_covariance(np.full(4, 2e-10)), np.eye(3))
+    R = np.kron(2e-10**2 * (np.eye(3) + 1.0), np.eye(3))
     return np.asarray(H.T @ np.linalg.solve(R, H))
 
 
@@ -262,7 +262,7 @@ class TestPosteriorBound(MovingArray):
         rows, rotations, origin = self.rows(t)
         still_p = np.tile(p[0], (self.N_ROWS, 1))
         bounds = posterior_bound(Tracker(fields, RandomWalk(1e-9, 1e-9)), rows, still_p, m)
-        D, R = np.kron(contrasts(4), np.eye(3)), np.kron(difference_covariance(np.full(4, 2e-10)), np.eye(3))
+        D, R = np.kron(contrasts(4), np.eye(3)), np.kron(2e-10**2 * (np.eye(3) + 1.0), np.eye(3))
         J = np.diag(np.repeat([0.0, 1.0 / 5e-10**2], [6, 12]))
         expected = []
         for rotation, place in zip(rotations, origin, strict=True):

@@ -70,6 +70,11 @@ class TestTruth:
         assert not (has_star & above).any()
         assert has_star[:, -1].all()
 
+    @pytest.mark.parametrize("torque_Nm", [1e30, 1e250])
+    def test_motion_beyond_double_precision_is_refused(self, torque_Nm: float) -> None:
+        with pytest.raises(ValueError, match="motion beyond double precision"):
+            simulate(replace(tabletsat(), torque_Nm=torque_Nm), [0])
+
 
 class TestReadings:
     def test_are_the_truth_with_noise_of_the_given_size(self, runs: AttitudeRuns) -> None:
