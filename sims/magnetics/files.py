@@ -77,8 +77,9 @@ def write_simulation(simulation: Simulation, readings: str | PathLike[str]) -> S
     if not folder.is_dir():
         raise InputError(f"{readings}: found no folder {folder}, expected one.")
     for path in files.all:
-        if path.is_dir():
-            raise InputError(f"{path} is a directory, expected a file that can be written.")
+        if path.exists() and not path.is_file():
+            found = "directory" if path.is_dir() else "device or a pipe"
+            raise InputError(f"{path} is a {found}, expected a file that can be written.")
     with tempfile.TemporaryDirectory(dir=folder, prefix=".magloc-") as name:
         hidden = Path(name)
         write_readings(hidden / files.readings.name, simulation.readings, simulation.array)
