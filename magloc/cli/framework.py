@@ -13,9 +13,7 @@ import io
 import logging
 import os
 import shlex
-import signal
 import sys
-import threading
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -27,12 +25,11 @@ from cyclopts import App, CycloptsError, MissingArgumentError, Parameter, Unknow
 from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import InputError
 from arrays.io.outputs import make_folder
+from magloc.cli.entry import INTERRUPTED
 
 DONE = 0
 BAD_INPUT = 2
-INTERRUPTED = 130
 BROKEN_PIPE = 141
-TERMINATED = 143
 _COMPILATION = "magloc.compilation"
 _LONGEST_WORD = 200
 _PACKAGES = ("arrays", "magloc", "adcs", "sims")
@@ -95,7 +92,7 @@ def run(app: App, arguments: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        Exit status: 0 done, 2 bad input, 130 interrupted, 141 the reader of the output is gone, 143 terminated.
+        Exit status: 0 done, 2 bad input, 130 interrupted, 141 the reader of the output is gone.
     """
     program = app.name[0]
     tokens = sys.argv[1:] if arguments is None else list(arguments)
@@ -105,12 +102,6 @@ def run(app: App, arguments: Sequence[str] | None = None) -> int:
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))  # noqa: SIM115
-    with _terminations() as terminations:
-        status = _status(app, tokens, program)
-    return TERMINATED if terminations else status
-
-
-def _status(app: App, tokens: Sequence[str], program: str) -> int:
     try:
         with _one_line_warnings(program), _notes_of_the_library(program):
             call(app, tokens)
@@ -142,26 +133,6 @@ def _status(app: App, tokens: Sequence[str], program: str) -> int:
 def _give_up_stdout() -> None:
     """The interpreter flushes stdout once more when it exits, which must not fail again."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-@contextmanager
-def _terminations() -> Iterator[list[int]]:
-    """Let SIGTERM interrupt as Ctrl-C does, once, so that what is half done is taken away; those that came."""
-    came: list[int] = []
-
-    def interrupt(number: int, _: object) -> None:
-        came.append(number)
-        if len(came) == 1:
-            raise KeyboardInterrupt("terminated")
-
-    if threading.current_thread() is not threading.main_thread():
-        yield came  # no signal comes here
-        return
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield came
-    finally:
-        signal.signal(signal.SIGTERM, before or signal.SIG_DFL)
 
 
 def call(app: App, tokens: Sequence[str]) -> None:

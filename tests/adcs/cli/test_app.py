@@ -67,7 +67,7 @@ class TestExitStatus:
 
         monkeypatch.setattr(framework, "call", interrupted)
         outcome = adcs("tables")
-        assert (outcome.status, outcome.err) == (framework.INTERRUPTED, "adcs: interrupted\n")
+        assert (outcome.status, outcome.err) == (130, "adcs: interrupted\n")
 
     def test_disk(self, adcs, monkeypatch):
         def full(*_):

@@ -51,20 +51,25 @@ class TestStreams:
 
 class TestSignals:
     @pytest.mark.parametrize("program", ["magloc", "adcs"])
-    def test_interrupted_while_it_loads(self, program: str) -> None:
+    @pytest.mark.parametrize(("number", "word"), [("SIGINT", "interrupted"), ("SIGTERM", "terminated")])
+    @pytest.mark.parametrize("seen_as", ["KeyboardInterrupt", "ImportError"])  # by an extension that is half loaded
+    def test_ended_while_it_loads(self, program: str, number: str, word: str, seen_as: str) -> None:
         code = f"""
-import sys
+import signal, sys
 class Hand:
     def find_spec(self, name, *_):
         if name == "cyclopts":
-            raise KeyboardInterrupt
+            try:
+                signal.raise_signal(signal.{number})
+            except KeyboardInterrupt:
+                raise {seen_as}
 sys.meta_path.insert(0, Hand())
 from {program}.cli.__main__ import main
 sys.exit(main())
 """
         command = [sys.executable, "-c", code]
         done = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
-        assert (done.returncode, done.stderr) == (130, f"{program}: interrupted\n")
+        assert (done.returncode, done.stderr) == (128 + signal.Signals[number], f"{program}: {word}\n")
 
     @pytest.mark.parametrize("program", ["magloc", "adcs"])
     def test_interrupted_where_nothing_can_be_raised(self, program: str) -> None:
