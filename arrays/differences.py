@@ -184,10 +184,7 @@ def _numerical_form(
 ) -> tuple[FloatArray, FloatArray]:
     """Combinations of channels that are free of the common field, decorrelated by their eigenvectors."""
     common = _common_field(array, group, array.channel_gain)
-    try:
-        root = np.linalg.cholesky(covariance_T2[np.ix_(group, group)])
-    except np.linalg.LinAlgError:
-        raise ValueError("Input covariance_T2 must be positive definite; instead received one that is not.") from None
+    root = np.linalg.cholesky(covariance_T2[np.ix_(group, group)])
     if array.common_field_T is not None:
         return eigen_decorrelation(np.hstack([root, array.common_field_T * common]))
     d: FloatArray = null_space(common.T).T

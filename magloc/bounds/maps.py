@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
+from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 from magloc.bounds.over_moments import table_and_spreads
 from magloc.directions import moments_on_sphere
@@ -90,9 +91,7 @@ class BoundScenario:
 
     def __post_init__(self) -> None:
         check_magnitudes(self.array)
-        for name in ("half_width_m", "accuracy_m"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ValueError(f"Input {name} must be positive; instead received {getattr(self, name)}.")
+        check_positive(half_width_m=self.half_width_m, accuracy_m=self.accuracy_m)
         if np.shape(self.moment_Am2) != (3,) or not 0.0 < np.linalg.norm(self.moment_Am2) < np.inf:
             raise ValueError(f"Input moment_Am2 must be 3 numbers, not all zero; instead received {self.moment_Am2}.")
         if self.n_moments < 1:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
+from arrays.io.errors import check_positive
 from arrays.noise import proportional_noise
 from arrays.typing import BoolArray, FloatArray
 from magloc.calibration import continuation as calibration_steps
@@ -71,9 +72,7 @@ class CalibrationPrior:
     trusted_scales: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for name in ("position_m", "gain", "axes_rad", "offset_T"):
-            if not 0.0 < getattr(self, name) < np.inf:
-                raise ValueError(f"Input {name} must be positive and finite; instead received {getattr(self, name)}.")
+        check_positive(position_m=self.position_m, gain=self.gain, axes_rad=self.axes_rad, offset_T=self.offset_T)
         for quantity in self.estimate:
             if quantity not in QUANTITIES:
                 raise ValueError(

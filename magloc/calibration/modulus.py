@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
+from arrays.io.errors import check_positive
 from arrays.sensor import Calibration
 from arrays.typing import FloatArray
 from magloc.measurement.rows import checked_rows
@@ -205,8 +206,7 @@ def _checked(readings_T: ArrayLike, modulus_T: ArrayLike, noise_T: float) -> tup
         raise ValueError(
             f"Input modulus_T must be positive and finite; instead received {modulus.min(initial=np.inf)}."
         )
-    if not 0.0 < noise_T < np.inf:
-        raise ValueError(f"Input noise_T must be positive and finite; instead received {noise_T}.")
+    check_positive(noise_T=noise_T)
     complete = np.isfinite(readings).all(axis=1)
     return readings[complete], np.broadcast_to(modulus, len(readings))[complete]
 

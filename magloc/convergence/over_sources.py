@@ -18,6 +18,7 @@ import numpy as np
 
 from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
+from arrays.io.errors import check_positive
 from arrays.noise import reading_errors
 from arrays.typing import FloatArray
 from arrays.whitening import whitening
@@ -90,8 +91,7 @@ class SourcesScenario:
     def __post_init__(self) -> None:
         if not 0.0 <= self.nearest_m < self.farthest_m:
             raise ValueError(f"Input nearest_m must be between 0 and farthest_m; instead received {self.nearest_m}.")
-        if not 0.0 < self.moment_Am2 < np.inf:
-            raise ValueError(f"Input moment_Am2 must be positive and finite; instead received {self.moment_Am2}.")
+        check_positive(moment_Am2=self.moment_Am2)
 
 
 _NO_YES = {"flag_values": np.array([-1, 0, 1], dtype=np.int8), "flag_meanings": "left_out no yes"}

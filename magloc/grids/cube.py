@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from arrays.array import SensorArray
 from arrays.array_file import array_toml
+from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 
 if TYPE_CHECKING:
@@ -312,8 +313,7 @@ def coordinates(cube: CubeMap) -> dict[str, tuple[FloatArray, dict[str, str]]]:
 
 def check_half_width(edge_m: float) -> float:
     """Half of a cube's edge."""
-    if not 0.0 < edge_m < np.inf:
-        raise ValueError(f"Input edge_m must be positive and finite; instead received {edge_m}.")
+    check_positive(edge_m=edge_m)
     return 0.5 * edge_m
 
 

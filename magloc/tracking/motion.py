@@ -204,7 +204,9 @@ class OrnsteinUhlenbeck:
 
     def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """As :class:`MotionModel`."""
-        correlation_s = 1.0 / self.turn_rad_s if self.correlation_s is None else self.correlation_s
+        correlation_s = self.correlation_s
+        if correlation_s is None:
+            correlation_s = 1.0 / self.turn_rad_s if self.turn_rad_s > 0.0 else math.inf
         moved, kept, root = _wandering_step(correlation_s, dt_s)
         p, m, v, rate = x[:3], x[3:6], x[6:9], x[9:]
         turn = rotation_matrix(moved * rate)
@@ -264,11 +266,10 @@ def _wandering_step(correlation_s: float, dt_s: float) -> tuple[float, float, Fl
     from filterpy.common import van_loan_discretization  # it brings matplotlib and scipy.stats
 
     drift = np.array([[0.0, 1.0], [0.0, -1.0 / correlation_s]])
-    noise = np.array([[0.0], [math.sqrt(2.0 / correlation_s)]])
-    F, Q = van_loan_discretization(drift, noise, dt_s)
+    F, Q = van_loan_discretization(drift, np.array([[0.0], [1.0]]), dt_s)
     # The value's own noise grows with Δt³: the factorisation must not see it cancel.
     scale = np.sqrt(np.diagonal(Q))
-    root = scale[:, None] * np.linalg.cholesky(Q / np.outer(scale, scale))
+    root = math.sqrt(2.0 / correlation_s) * scale[:, None] * np.linalg.cholesky(Q / np.outer(scale, scale))
     return float(F[0, 1]), float(F[1, 1]), root
 
 

@@ -23,8 +23,8 @@ from arrays.io.errors import InputError
 BINARIES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 # WebGL in software: without both of these the canvas stays blank on a machine without a graphics card.
 _SOFTWARE_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-# Ends the browser and removes its folder if this process is killed, which closes the guard's stdin.
-_GUARD = 'read pid; cat; [ -z "$pid" ] || kill -9 "-$pid"; while ! rm -rf "$0"; do sleep 0.1; done'
+# Ends the browser and removes its folder if this process is killed, which closes stdin.
+_GUARD = 'exec >/dev/null 2>&1; read pid; cat; [ -z "$pid" ] || kill -9 "-$pid"; until rm -rf "$0"; do sleep 0.1; done'
 _POLL_S = 0.05
 _REPLY_S = 60.0
 
@@ -77,10 +77,13 @@ class Chromium(Closing):
         self._profile = tempfile.mkdtemp(prefix="magloc-chromium-")
         self._socket: ClientConnection | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._guard = _guarded(self._profile)
+        self._guard: subprocess.Popen[bytes] | None = None
+        if os.name == "posix":
+            guard = ["sh", "-c", _GUARD, self._profile]
+            self._guard = subprocess.Popen(guard, bufsize=0, stdin=subprocess.PIPE, start_new_session=True)
         try:
             self._process = _started(find_chromium(), self._profile, size)
-            if self._guard is not None and self._guard.stdin is not None:
+            if self._guard and self._guard.stdin:
                 self._guard.stdin.write(b"%d\n" % self._process.pid)
             self._socket = connect(self._page_address(timeout_s), max_size=None, proxy=None, ping_interval=None)
             for domain in ("Network", "Page", "Runtime"):
@@ -275,21 +278,6 @@ class Chromium(Closing):
                             return address
             time.sleep(_POLL_S)
         raise BrowserError(f"Chromium did not start within {timeout_s:g} s.")
-
-
-def _guarded(folder: str) -> subprocess.Popen[bytes] | None:
-    """The guard of a folder, in a session of its own, which no Ctrl-C reaches; None where there is no shell."""
-    shell = shutil.which("sh") if os.name == "posix" else None
-    if shell is None:
-        return None
-    return subprocess.Popen(
-        [shell, "-c", _GUARD, folder],
-        bufsize=0,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
 
 
 def _started(binary: str, profile: str, size: tuple[int, int]) -> subprocess.Popen[bytes]:

@@ -19,6 +19,7 @@ from adcs.mockup.vision.centroids import NoLightsError, Stars, find_stars
 from adcs.mockup.vision.paper_matcher import CameraFix, Matcher
 from adcs.mockup.vision.sky import LedSky
 from adcs.stars.identification import NoFix
+from arrays.io.errors import check_not_negative
 from arrays.typing import BoolArray, ByteArray, FloatArray
 from sims.mockup.frames import Frame, FrameQuality, Motion, rendered_frame
 
@@ -67,9 +68,7 @@ class SkySetup(FrameQuality):
         most = Camera.width_px * Camera.height_px
         if not 0 <= self.hot_pixels <= most:
             raise ValueError(f"Input hot_pixels must be 0 to {most}; instead received {self.hot_pixels}.")
-        for name in ("speed_m_s", "turn_rate_rad_s"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"Input {name} must not be negative; instead received {getattr(self, name)}.")
+        check_not_negative(speed_m_s=self.speed_m_s, turn_rate_rad_s=self.turn_rate_rad_s)
 
     @property
     def camera(self) -> Camera:

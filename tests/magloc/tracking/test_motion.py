@@ -294,6 +294,17 @@ class TestWanderingMotion:
         _, F, _ = OrnsteinUhlenbeck(0.5, 0.3, correlation_s=1e7).step(np.ones(12), 2.0)
         np.testing.assert_allclose(F[np.ix_([0, 6], [0, 6])], expm(np.array([[0.0, 2.0], [0.0, 0.0]])), atol=1e-6)
 
+    @pytest.mark.parametrize("turn_rad_s", [0.0, 1e-310, 1e-200])
+    def test_without_a_turn_nothing_is_forgotten(self, turn_rad_s: float) -> None:
+        """And nothing added, however long the correlation time is in double precision."""
+        x = np.arange(12.0)
+        moved, F, S = OrnsteinUhlenbeck(2.0, turn_rad_s).step(x, 0.5)
+        np.testing.assert_allclose(moved[:3], x[:3] + 0.5 * x[6:9], rtol=1e-14)
+        np.testing.assert_allclose(moved[6:], x[6:], rtol=1e-14)
+        assert np.isfinite(F).all()
+        of_rates = np.delete(np.arange(12), [3, 4, 5])
+        np.testing.assert_allclose(S[of_rates], 0.0, rtol=0, atol=1e-90)
+
     def test_noise_of_the_moment_is_across_it(self) -> None:
         """Along the moment only what changes its strength is left; across it the turn comes in as well."""
         motion = OrnsteinUhlenbeck(0.1, 0.2, correlation_s=5.0)
