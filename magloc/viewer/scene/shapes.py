@@ -85,13 +85,15 @@ def dipole_body(size_m: float, thickness_m: float | None = None) -> Surface:
     -------
     Surface
     """
-    thickness = 0.26 * size_m if thickness_m is None else thickness_m
-    neck = size_m - 1.23 * thickness
-    head = trimesh.creation.cone(0.46 * thickness, size_m - neck, sections=24)
+    # Made of the length 1: the library merges vertices by an absolute tolerance, in whole numbers.
+    thickness = 0.26 if thickness_m is None else thickness_m / size_m
+    neck = 1.0 - 1.23 * thickness
+    head = trimesh.creation.cone(0.46 * thickness, 1.0 - neck, sections=24)
     head.apply_translation([0.0, 0.0, neck])
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.5 * thickness)
     shaft = trimesh.creation.cylinder(0.17 * thickness, sections=16, segment=[[0.0, 0.0, 0.0], [0.0, 0.0, neck]])
-    return surface_of(ball, shaft, head)
+    body = surface_of(ball, shaft, head)
+    return Surface(size_m * body.vertices, body.faces)
 
 
 def box_edges(corner_m: ArrayLike, opposite_m: ArrayLike) -> FloatArray:

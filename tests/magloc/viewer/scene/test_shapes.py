@@ -272,9 +272,14 @@ class TestIsoSurface:
 class TestBody:
     """The body of a dipole is of the size that was asked for."""
 
-    def test_arrow_is_as_long_as_asked(self) -> None:
+    @pytest.mark.parametrize("size_m", [1e-30, 2.0, 5e29])
+    def test_arrow_is_as_long_as_asked(self, size_m: float) -> None:
+        body = shapes.dipole_body(size_m)
+        assert body.vertices[:, 2].max() == pytest.approx(size_m, rel=1e-12)
+        assert len(body.faces) == len(shapes.dipole_body(1.0).faces)
+
+    def test_ball_shaft_and_head_are_closed(self) -> None:
         body = shapes.dipole_body(2.0)
-        assert body.vertices[:, 2].max() == pytest.approx(2.0)
         assert len(mesh_of(body).split(only_watertight=True)) == 3
 
     def test_joined_surfaces_keep_their_faces(self) -> None:
