@@ -40,7 +40,7 @@ from magloc.localization.fit.results import Fix
 from magloc.localization.locator import Locator
 from magloc.localization.search.single_source import N_UNKNOWNS
 from magloc.measurement.differences import predicted_channels
-from magloc.measurement.rows import whitenings_of
+from magloc.measurement.rows import check_magnitudes, whitenings_of
 from magloc.measurement.whitened import WhitenedModel
 
 if TYPE_CHECKING:
@@ -89,6 +89,7 @@ class SourcesScenario:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        check_magnitudes(self.array)  # before a store is made for it
         if not 0.0 <= self.nearest_m < self.farthest_m:
             raise ValueError(f"Input nearest_m must be between 0 and farthest_m; instead received {self.nearest_m}.")
         check_positive(moment_Am2=self.moment_Am2)

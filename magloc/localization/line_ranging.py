@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares, minimize_scalar
 
-from arrays.io.errors import _vectors
+from arrays.io.errors import _vectors, check_positive
 from arrays.typing import FloatArray
 from magloc.directions import hemisphere
 from magloc.fields import dipole
@@ -196,8 +196,7 @@ def _checked(
         )
     if not (np.isfinite(distance).all() and np.isfinite(field).all() and field.any(axis=1).all()):
         raise ValueError("Inputs distance_m and field_T must be finite, and no field zero; instead received others.")
-    if not noise_T > 0.0:
-        raise ValueError(f"Input noise_T must be positive; instead received {noise_T}.")
+    check_positive(noise_T=noise_T)
     if field.size < _N_UNKNOWNS:
         raise ValueError(
             f"Input field_T must have more numbers than the {_N_UNKNOWNS} unknowns; instead received {field.size}."

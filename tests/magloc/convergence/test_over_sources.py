@@ -104,6 +104,7 @@ class TestRefused:
         [
             (PAPER.array, 1, "Input grid must be at least 2"),
             (tetrahedron(1.5, kind="scalar", noise_T=1e-9), 5, "vector sensors only"),
+            (tetrahedron(1.5, noise_T=1e140), 5, "must have a noise between 1e-11 and 1e12 nT"),
             (axial(1.0, noise_T=1e-9), 5, "3 independent differences, 6 are needed"),
         ],
     )
