@@ -8,7 +8,7 @@ export OPENBLAS_NUM_THREADS ?= 1
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 MAKE_VENV = $(PYTHON) -m venv --clear
 
-.PHONY: map test test-full test-oldest mutation licences bench docs notebooks chromium lint clean
+.PHONY: map test test-full test-oldest mutation licences sbom audit wheel bench docs notebooks chromium lint clean
 
 map: .venv/installed
 	$(BIN)/magloc map
@@ -32,6 +32,19 @@ mutation: .venv/installed-test
 # The licences of all that is installed; fails where one of the base is copyleft.
 licences: .venv/installed-test
 	$(BIN)/python -m tests.licences
+
+# What is needed when it runs, as installed, as CycloneDX JSON: dist/magloc.cdx.json.
+sbom: .venv/installed-test
+	@mkdir -p dist
+	$(BIN)/python -m tests.sbom > dist/magloc.cdx.json
+
+# Known weaknesses of all versions that are pinned; fails, too, where the registry does not know one of them.
+audit: .venv-supply/installed
+	.venv-supply/bin/pip-audit --strict --disable-pip --no-deps --requirement constraints.txt
+
+# Wheel and sdist in dist; what they must hold is looked at by tests/test_wheel.py.
+wheel: .venv-supply/installed
+	.venv-supply/bin/python -m build --outdir dist
 
 bench: .venv/installed-bench
 	$(BIN)/python -m tests.bench
@@ -87,6 +100,11 @@ test-oldest: .venv-oldest/installed chromium
 	.venv-oldest/bin/python -m pip --disable-pip-version-check --quiet install --constraint constraints-oldest.txt --editable '.[test]'
 	@touch $@
 
+.venv-supply/installed: constraints.txt
+	$(MAKE_VENV) .venv-supply
+	.venv-supply/bin/python -m pip --disable-pip-version-check --quiet install --constraint constraints.txt build pip-audit
+	@touch $@
+
 clean:
-	rm -rf .venv .venv-oldest build dist *.egg-info docs/_build docs/gallery/notebooks docs/reference/commands docs/reference/names
+	rm -rf .venv .venv-oldest .venv-supply build dist *.egg-info docs/_build docs/gallery/notebooks docs/reference/commands docs/reference/names
 	find . -name __pycache__ -prune -exec rm -rf {} +

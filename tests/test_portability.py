@@ -176,7 +176,10 @@ class TestRules:
 def names() -> list[str]:
     """All files of the tree, but for what is made from them."""
     made = re.compile(r"\.(?!github)|_build$|__pycache__$|build$|dist$|.*\.egg-info$|map-")
-    made_pages = {Path(REPOSITORY, "docs", *place) for place in (("reference", "names"), ("reference", "commands"))}
+    made_pages = {
+        Path(REPOSITORY, "docs", *place)
+        for place in (("reference", "names"), ("reference", "commands"), ("gallery", "notebooks"))
+    }
     found = []
     for folder, folders, files in os.walk(REPOSITORY):
         folders[:] = [name for name in folders if not made.match(name) and Path(folder, name) not in made_pages]
