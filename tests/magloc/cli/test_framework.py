@@ -107,9 +107,9 @@ class TestSentence:
         assert_refused(run("view", "\x1b[31m"), r"magloc: \x1b[31m does not exist")
 
     def test_without_a_word_that_does_not_end(self, run: Run) -> None:
-        outcome = run("view", "9" * 400)
+        outcome = run("view", "9" * 240)
         assert_refused(outcome, "99999…99999")
-        assert len(outcome.err) < 300
+        assert len(outcome.err) < 240
 
 
 class TestMissingExtra:
