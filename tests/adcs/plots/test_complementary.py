@@ -33,3 +33,13 @@ def test_errors_are_drawn_by_axis_and_by_their_length() -> None:
     errors = {"explicit": np.tile([3.0, 4.0, 12.0], (50, 1))}
     axes = complementary_figure(ComplementaryPicture("title", ORBITS, errors, 9.0)).axes
     assert [np.unique(ax.get_lines()[0].get_ydata()).tolist() for ax in axes] == [[3.0], [4.0], [12.0], [13.0]]
+
+
+def test_words() -> None:
+    figure = complementary_figure(picture(0.5, 1.5))
+    assert figure.get_suptitle() == "title"
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["explicit", "adaptive error-state"]
+    assert [(text.get_text(), text.get_position()[0]) for text in figure.axes[0].texts] == [
+        ("bias steps by 0.02 °/s", 0.5),
+        ("without Sun sensor", 1.75),
+    ]
