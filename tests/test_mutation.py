@@ -62,6 +62,7 @@ def test_all_changes_of_a_small_file() -> None:
         ("if x:\n    return y", {("condition", "(not x)"), ("return", "pass")}),
         ("ax.plot(x, lw=1.5, color=c)", {("statement", "pass")}),
         ("_LOG.info(1 + 2)", set()),
+        ("class A(B, kw_only=True):\n    pass", set()),
         ("def __repr__(self):\n    return 1", set()),
         ("zip(x, y, strict=True)", {("statement", "pass"), ("arguments", "(zip(y, x, strict=True))")}),
     ],
