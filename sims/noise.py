@@ -63,8 +63,7 @@ def coloured_noise(
     f = fft.rfftfreq(2 * n, 1.0 / rate_Hz)
     shape = np.zeros_like(f)
     shape[1:] = np.sqrt((1.0 + corner_Hz / f[1:]) / (1.0 + (f[1:] / bandwidth_Hz) ** 2))
-    result: FloatArray = fft.irfft(fft.rfft(white, axis=0) * shape[:, None], 2 * n, axis=0)[:n]
-    return result
+    return fft.irfft(fft.rfft(white, axis=0) * shape[:, None], 2 * n, axis=0)[:n]
 
 
 def white_sigma(rate_Hz: float, density: float, bandwidth_Hz: float) -> float:
@@ -114,5 +113,4 @@ def low_passed(values: FloatArray, rate_Hz: float, bandwidth_Hz: float) -> Float
     decay = math.exp(-step)
     mean = -math.expm1(-step) / step
     rest = mean * values[:1]  # the filter's state after a long time at the first value
-    result: FloatArray = lfilter([1.0 - mean, mean - decay], [1.0, -decay], values, axis=0, zi=rest)[0]
-    return result
+    return lfilter([1.0 - mean, mean - decay], [1.0, -decay], values, axis=0, zi=rest)[0]

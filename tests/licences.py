@@ -19,12 +19,17 @@ def required(names: set[str]) -> set[str]:
     found: set[str] = set()
     while names:
         found |= names
-        needed = (line for name in names for line in metadata.requires(name) or [] if "extra ==" not in line)
-        names = {_installed(re.match(r"[\w.-]+", line)[0]) for line in needed} - found - {""}
+        names = {needed for name in names for needed in needs(name)} - found
     return found
 
 
-def _installed(name: str) -> str:
+def needs(name: str) -> set[str]:
+    """What a distribution needs itself, as far as it is installed."""
+    needed = (line for line in metadata.requires(name) or [] if "extra ==" not in line)
+    return {installed(re.match(r"[\w.-]+", line)[0]) for line in needed} - {""}
+
+
+def installed(name: str) -> str:
     """Its name in lower case, or nothing: a marker may say that this machine has no need of it."""
     try:
         return metadata.distribution(name).name.lower().replace("_", "-")
@@ -49,8 +54,8 @@ def copyleft(names: set[str]) -> list[str]:
 
 def main() -> int:
     """List them."""
-    base = required({_installed(name) for name in declared(PROJECT["dependencies"])})
-    of_extras = {_installed(name) for extra in EXTRAS.values() for name in declared(extra)} - {""}
+    base = required({installed(name) for name in declared(PROJECT["dependencies"])})
+    of_extras = {installed(name) for extra in EXTRAS.values() for name in declared(extra)} - {""}
     for title, names in (("base", base), ("extras", required(of_extras) - base)):
         print(f"{title}:")
         for name in sorted(names):

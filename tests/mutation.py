@@ -1,8 +1,9 @@
 """``python -m tests.mutation``: one change at a time in lines drawn at random, and whether the tests see it.
 
 Nothing is changed in place: the tree is copied, and the tests run there. A change is killed by the first test file that
-fails or hangs among those nearest to it: its mirror first, then those that reach it by the fewest imports. What is
-found goes to a file line by line, and the same seed goes on where it was stopped.
+fails or hangs among those nearest to it: its mirror first, then those that reach it by the fewest imports. All lines
+are drawn before any is tried; those with little to compile are tried first. What is found goes to a file line by line,
+and the same seed goes on where it was stopped.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import copy
 import difflib
 import json
 import os
+import queue
 import random
 import re
 import shutil
@@ -20,9 +22,11 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -54,9 +58,26 @@ OPPOSITE: dict[type[ast.AST], type[ast.AST]] = {
 }
 # Of numbers that count, 1 is at the edge; for all others only the opposite says something.
 EDGE: dict[type[ast.AST], type[ast.AST]] = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt}
+# How a figure looks, what a linter wants to be said, how an object is printed: no property that a test could hold.
+LOOKS = re.compile(
+    r"alpha|lw|ls|ms|mew|e?linewidths?|(font|label)size|(label|handletext|border)?pad|columnspacing|zorder|figsize|dpi|rotation"
+    r"|shrink|frameon|rasterized|depthshade|arrow_length_ratio|bbox_to_anchor|xytext|arrowprops|(width|height)_ratios|opacity"
+    r"|(cast|receive)_shadow|strict|repr|kw_only"
+)
+# A change of type, which counts only where types are told apart.
+CONVERSION = re.compile(
+    r"float|int|bool|str|tuple|list|set|frozenset|dict|iter|own|runtime_int|(np\.)?(as\w+|float64|int64)|[A-Z].*"
+)
+# Of a tolerance, a small power of ten, the order alone means something; so does that of a choice, which has a name.
+TOLERANCE = 1e-4
 # A hang: longer than this, with kernels to compile or without, and than some times what the file takes unchanged.
 LONGEST_S, LONGEST_COMPILED_S, SLOWER = 60.0, 300.0, 4.0
+HANGS = "hangs"
 UNTESTED = "untested"  # no test file reaches it, or none in time: no part of the score
+
+
+class StoppedError(Exception):
+    """The tests of a change were ended from outside: nothing is known of it."""
 
 
 class Mutant(NamedTuple):
@@ -68,6 +89,7 @@ class Mutant(NamedTuple):
     begin: int
     end: int
     text: str
+    in_function: bool = True
 
     @property
     def name(self) -> str:
@@ -90,20 +112,30 @@ def mutants(path: str, source: bytes) -> Iterator[Mutant]:
     starts = [0]
     for line in source.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
-    for node, kind, new in _changes(ast.parse(source), ast.Module(body=[], type_ignores=[])):
+    tree = ast.parse(source)
+    functions = [body for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) for body in node.body]
+    inside = {node for body in functions for node in ast.walk(body)}
+    for node, kind, new in _changes(tree, ast.Module(body=[], type_ignores=[])):
         begin, end = starts[node.lineno - 1] + node.col_offset, starts[node.end_lineno - 1] + node.end_col_offset
         text = new if isinstance(new, str) else f"({ast.unparse(new)})"
-        yield Mutant(path, node.lineno, kind, begin, end, text)
+        yield Mutant(path, node.lineno, kind, begin, end, text, node in inside)
 
 
 def _changes(node: ast.AST, parent: ast.AST) -> Iterator[tuple[Any, str, ast.AST | str]]:
-    if isinstance(node, ast.JoinedStr | ast.Import | ast.ImportFrom):
+    if isinstance(node, ast.JoinedStr | ast.Import | ast.ImportFrom) or _is_look(node):
+        return
+    if isinstance(node, ast.FunctionDef) and node.name in {"__repr__", "__str__"}:
         return
     if isinstance(node, ast.If) and ast.unparse(node.test) in {"TYPE_CHECKING", "__name__ == '__main__'"}:
         return
     if isinstance(node, ast.Assign) and isinstance(parent, ast.Module) and _is_type(node.value):
         return
-    yield from _changes_here(node)
+    if isinstance(node, ast.AnnAssign) and ast.unparse(node.annotation) == "Colour":
+        return
+    chosen = isinstance(parent, ast.Assign | ast.AnnAssign | ast.arguments)
+    yield from _changes_here(node, chosen)
+    if isinstance(node, ast.Return) and isinstance(parent, ast.If):
+        yield node, "return", "pass"
     for field, value in ast.iter_fields(node):
         if field in {"annotation", "returns", "decorator_list", "exc", "bases"}:
             continue
@@ -114,7 +146,7 @@ def _changes(node: ast.AST, parent: ast.AST) -> Iterator[tuple[Any, str, ast.AST
                 yield from _changes(child, node)
 
 
-def _changes_here(node: ast.AST) -> Iterator[tuple[Any, str, ast.AST | str]]:
+def _changes_here(node: ast.AST, chosen: bool) -> Iterator[tuple[Any, str, ast.AST | str]]:
     match node:
         case ast.Compare(ops=[op], comparators=[right]):
             yield node, "comparison", _with(node, ops=[OPPOSITE[type(op)]()])
@@ -131,7 +163,8 @@ def _changes_here(node: ast.AST) -> Iterator[tuple[Any, str, ast.AST | str]]:
         case ast.Constant(value=int() as value):
             yield node, "constant", repr(value + 1 if value < 10 else 2 * value)
         case ast.Constant(value=float() as value):
-            yield node, "constant", repr(10.0 * value if value else 1.0)
+            tolerance = value <= TOLERANCE and f"{value:e}".startswith("1.000000")
+            yield node, "constant", repr((10.0 if tolerance or chosen else 1.01) * value if value else 1.0)
         case ast.If(test=test) | ast.IfExp(test=test) if isinstance(test, ast.Name | ast.Attribute | ast.Call):
             yield test, "condition", ast.UnaryOp(ast.Not(), test)
         case ast.AugAssign(op=op, target=target, value=value):
@@ -140,8 +173,16 @@ def _changes_here(node: ast.AST) -> Iterator[tuple[Any, str, ast.AST | str]]:
                 yield node, "operator", ast.unparse(ast.AugAssign(target, OPPOSITE[type(op)](), value))
         case ast.Assign(targets=[ast.Subscript() | ast.Attribute()]):
             yield node, "statement", "pass"
+        case ast.Expr(value=ast.Call() as call) if _is_words(call):
+            return
         case ast.Raise() | ast.Continue() | ast.Break() | ast.Expr(value=ast.Call()):
             yield node, "statement", "pass"
+        case ast.Subscript(slice=ast.Name() | ast.BinOp() as index, ctx=ast.Load()) if _is_index(node):
+            yield index, "index", f"{ast.unparse(index)} - 1"
+        case ast.Call(args=[ast.Name() | ast.BinOp() | ast.Call() | ast.Attribute() as one], keywords=[]) if not (
+            _is_words(node) or CONVERSION.fullmatch(ast.unparse(node.func))
+        ):
+            yield node, "call", one
         case ast.Call(args=[first, second, *rest]) if not _is_words(node):
             if not isinstance(first, ast.Starred) and not isinstance(second, ast.Starred) and _differ(first, second):
                 yield node, "arguments", _with(node, args=[second, first, *rest])
@@ -165,6 +206,15 @@ def _counts(node: ast.AST) -> bool:
     return bool(re.search(r"\b(len\(.*\)|size|ndim|shape\[\d\]|n_\w+)$", ast.unparse(node)))
 
 
+def _is_look(node: ast.AST) -> bool:
+    return isinstance(node, ast.keyword) and node.arg is not None and bool(LOOKS.fullmatch(node.arg))
+
+
+def _is_index(node: ast.Subscript) -> bool:
+    """Whether something is taken by its number, by the looks of that: a short name of no type, or a sum."""
+    return bool(re.fullmatch(r"[i-n]|\w*(index|row)|.* [+-] .*", ast.unparse(node.slice)))
+
+
 def _is_type(node: ast.AST) -> bool:
     """Whether a value at the top of a module looks like a type."""
     return bool(
@@ -173,8 +223,13 @@ def _is_type(node: ast.AST) -> bool:
 
 
 def _is_words(node: ast.Call) -> bool:
-    """Whether a call only says something or names a type."""
-    return bool(re.match(r"(_LOG\.|warnings\.warn|log\w*\.|cast$|TypeVar$|NewType$)", ast.unparse(node.func)))
+    """Whether a call only says something, names a type, or is a matter of looks."""
+    return bool(
+        re.match(
+            r"(.*\.(grid|tick_params|margins|tight_layout|set_facecolor)$|_LOG\.|warnings\.warn|log\w*\.|cast$|TypeVar$|NewType$)",
+            ast.unparse(node.func),
+        )
+    )
 
 
 class Reach:
@@ -240,78 +295,110 @@ def _names(module: str, tree: ast.Module) -> Iterator[str]:
 class Laboratory:
     """A copy of the tree in which changes are tried, with what numba has compiled for it."""
 
-    def __init__(self, folder: Path, reach: Reach) -> None:
-        self.root, self.reach, self.seconds = folder / "tree", reach, dict[str, float]()
-        left_out = shutil.ignore_patterns(".git", ".venv*", ".artefacts", "_build", ".*_cache")
-        shutil.copytree(REPOSITORY, self.root, ignore=left_out)
+    def __init__(self, root: Path, unchanged: Path, reach: Reach, seconds: dict[str, float]) -> None:
+        self.root, self.unchanged, self.reach, self.seconds = root, unchanged, reach, seconds
+        self.process: subprocess.Popen[str] | None = None
+        self.stopped = False
+        copied(unchanged, root)
+
+    def inside(self, mutant: Mutant) -> list[str]:
+        """Modules whose compiled code may hold what is changed, which numba does not look at.
+
+        Compiled callers hold what they called and all numbers of modules; no module computes one of these by a function
+        of the product.
+        """
+        if mutant.in_function and "\n@compiled" not in (self.unchanged / mutant.path).read_text(encoding="utf-8"):
+            return []
+        return [name for name in self.reach.from_module(mutant.path) if not name.startswith("tests.")]
 
     def verdict(self, mutant: Mutant, most_files: int, most_s: float) -> str:
         """What killed a change; empty where it survives."""
         file = self.root / mutant.path
         source, times = file.read_bytes(), file.stat()
-        # A compiled caller holds what it called, and numba does not look whether that is still the same.
-        inside = [name for name in self.reach.from_module(mutant.path) if not name.startswith("tests.")]
-        left, tried = most_s, 0
-        for test in self.reach.tests(mutant.path)[:most_files]:
-            unchanged = self._unchanged(test, most_s)
-            if unchanged > left:
-                continue
-            left, tried = left - unchanged, tried + 1
-            try:
-                compiled = sum(self._forget(name) for name in inside)
-                file.write_bytes(mutant.applied(source))
-                killed = self._run(test, max(LONGEST_COMPILED_S if compiled else LONGEST_S, SLOWER * unchanged))
-            finally:
-                file.write_bytes(source)
-                os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
-                for name in inside:
-                    self._recall(name)
-            if killed:
-                return killed
+        inside, left, tried = self.inside(mutant), most_s, 0
+        limit_s = LONGEST_COMPILED_S if sum(self._forget(name) for name in inside) else LONGEST_S
+        try:
+            file.write_bytes(mutant.applied(source))
+            for test in self.reach.tests(mutant.path)[:most_files]:
+                if self.seconds.get(test, 0.0) >= left:
+                    continue
+                begin = time.monotonic()
+                killed = self._run(self.root, test, max(limit_s, SLOWER * self.seconds.get(test, 0.0)))
+                took = time.monotonic() - begin
+                left -= took
+                if killed and self._unchanged(killed, limit_s):
+                    return killed
+                if not killed:
+                    self.seconds.setdefault(test, took)
+                    tried += 1
+        finally:
+            file.write_bytes(source)
+            os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
+            for name in {*inside, mutant.path.removesuffix(".py").replace("/", ".")}:
+                self._recall(name)
         return "" if tried else UNTESTED
 
-    def _unchanged(self, test: str, most_s: float) -> float:
-        """Seconds that a test file takes as the tree is; infinite where it fails, or takes longer than some."""
+    def stop(self) -> None:
+        """End the tests that run."""
+        self.stopped = True
+        if self.process and self.process.poll() is None:
+            os.killpg(self.process.pid, signal.SIGKILL)
+
+    def _unchanged(self, killed: str, limit_s: float) -> bool:
+        """Whether what failed does not fail in the tree as it is, nor takes as long."""
+        test = killed.removesuffix(f": {HANGS}")
         if test not in self.seconds:
             begin = time.monotonic()
-            failed = self._run(test, most_s)
-            self.seconds[test] = float("inf") if failed else time.monotonic() - begin
-        return self.seconds[test]
+            failed = self._run(self.unchanged, test.partition(": status")[0], limit_s)
+            fails = failed and not failed.endswith(HANGS)
+            self.seconds[test] = float("inf") if fails else time.monotonic() - begin
+        return self.seconds[test] < (limit_s / SLOWER if killed.endswith(HANGS) else float("inf"))
 
-    def _run(self, test: str, most_s: float) -> str:
+    def _run(self, root: Path, test: str, most_s: float) -> str:
         """What fails first in a test file, or that it hangs; empty where all is well."""
+        if self.stopped:
+            raise StoppedError
         command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", test]
-        variables = os.environ | {"PYTHONPATH": str(self.root), "PYTHONDONTWRITEBYTECODE": "1"}
+        variables = os.environ | {"PYTHONPATH": str(root), "PYTHONDONTWRITEBYTECODE": "1"}
         pipe = subprocess.PIPE
         with subprocess.Popen(
-            command, cwd=self.root, env=variables, stdout=pipe, stderr=pipe, text=True, start_new_session=True
-        ) as process:
+            command, cwd=root, env=variables, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+        ) as self.process:
             try:
-                out, _ = process.communicate(timeout=most_s)
+                out, _ = self.process.communicate(timeout=most_s)
             except subprocess.TimeoutExpired:
-                return f"{test}: hangs"
+                return f"{test}: {HANGS}"
             finally:
-                if process.poll() is None:
-                    os.killpg(process.pid, signal.SIGKILL)
-        if process.returncode in {0, 5}:  # 5: all of its tests are slow
+                if self.process.poll() is None:
+                    os.killpg(self.process.pid, signal.SIGKILL)
+        if self.stopped:
+            raise StoppedError
+        if self.process.returncode in {0, 5}:  # 5: all of its tests are slow
             return ""
-        failed = re.search(r"^(?:FAILED|ERROR) (\S+)", out, re.MULTILINE)
-        return failed[1] if failed else f"{test}: status {process.returncode}"
-
-    def _caches(self, root: Path, module: str) -> list[Path]:
-        path = root / module.replace(".", "/")
-        return [file for end in ("nbi", "nbc") for file in (path.parent / "__pycache__").glob(f"{path.name}.*.{end}")]
+        failed = re.search(r"^(?:FAILED|ERROR) ([^\s[]+)", out, re.MULTILINE)
+        return failed[1] if failed else f"{test}: status {self.process.returncode}"
 
     def _forget(self, module: str) -> int:
-        files = self._caches(self.root, module)
+        files = _caches(self.root, module)
         for file in files:
             file.unlink()
         return len(files)
 
     def _recall(self, module: str) -> None:
         self._forget(module)
-        for file in self._caches(REPOSITORY, module):
-            shutil.copy2(file, self.root / file.relative_to(REPOSITORY))
+        for file in _caches(self.unchanged, module):
+            shutil.copy2(file, self.root / file.relative_to(self.unchanged))
+
+
+def copied(tree: Path, place: Path) -> None:
+    """The tree as it is, and what numba has compiled for it."""
+    left_out = shutil.ignore_patterns(".git", ".venv*", ".artefacts", "_build", ".*_cache")
+    shutil.copytree(tree, place, ignore=left_out)
+
+
+def _caches(root: Path, module: str) -> list[Path]:
+    path = root / module.replace(".", "/")
+    return [file for end in ("nbi", "nbc") for file in (path.parent / "__pycache__").glob(f"{path.name}.*.{end}")]
 
 
 def drawn(n_lines: int, seed: int, packages: tuple[str, ...]) -> list[Mutant]:
@@ -326,26 +413,29 @@ def drawn(n_lines: int, seed: int, packages: tuple[str, ...]) -> list[Mutant]:
     return [rng.choice(lines[line]) for line in rng.sample(sorted(lines), min(n_lines, len(lines)))]
 
 
-def table(found: list[dict[str, str]]) -> str:
+def table(found: list[dict[str, str]], n_drawn: int) -> str:
     """Score of every package and kind, and the diff of every survivor."""
-    n_untested = len(found)
-    found = [one for one in found if one["killed"] != UNTESTED]
-    n_untested -= len(found)
-    lines = [f"{one['diff']}\n" for one in found if not one["killed"]]
+    tried = [one for one in found if one["killed"] != UNTESTED]
+    lines = [f"{one['diff']}\n" for one in tried if not one["killed"]]
     for by in ("package", "kind"):
-        total = Counter(one[by] for one in found)
-        killed = Counter(one[by] for one in found if one["killed"])
+        total = Counter(one[by] for one in tried)
+        killed = Counter(one[by] for one in tried if one["killed"])
         lines += [f"{name:12s}{killed[name]:5d} of {n:4d} killed" for name, n in sorted(total.items())]
-    n_killed = sum(bool(one["killed"]) for one in found)
-    score = f"{n_killed} of {len(found)} killed, {100.0 * n_killed / max(len(found), 1):.0f} %; {n_untested} not tried"
-    return "\n".join([*lines, score])
+    n_killed = sum(bool(one["killed"]) for one in tried)
+    n_hang = sum(one["killed"].endswith(HANGS) for one in tried)
+    lines += [
+        f"{n_killed} of {len(tried)} killed, {100.0 * n_killed / max(len(tried), 1):.1f} %, {n_hang} of them by a hang",
+        f"{len(found) - len(tried)} that no test file reaches in time, {n_drawn - len(found)} of {n_drawn} left to try",
+    ]
+    return "\n".join(lines)
 
 
 def main() -> int:
     """Draw, try, and say what survives."""
     parser = argparse.ArgumentParser(prog="python -m tests.mutation", description=__doc__)
-    parser.add_argument("--lines", type=int, default=300)
+    parser.add_argument("--count", type=int, default=300, help="lines to draw")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1, help="changes at a time, each in a copy of its own")
     parser.add_argument("--package", choices=PACKAGES, action="append")
     parser.add_argument("--files", type=int, default=6, help="test files at most for a change")
     parser.add_argument("--limit-s", type=float, default=180.0, help="seconds at most that these take unchanged")
@@ -356,20 +446,42 @@ def main() -> int:
     out.parent.mkdir(parents=True, exist_ok=True)
     lines = out.read_text(encoding="utf-8").splitlines() if out.exists() else []
     known = {one["name"]: one for one in map(json.loads, lines)}
-    found = []
+    chosen = drawn(arguments.count, arguments.seed, tuple(arguments.package or PACKAGES))
+    lock, free = threading.Lock(), queue.SimpleQueue[Laboratory]()
     with tempfile.TemporaryDirectory(prefix="mutation-") as folder, out.open("a", encoding="utf-8") as stream:
-        laboratory = Laboratory(Path(folder), Reach())
-        for mutant in drawn(arguments.lines, arguments.seed, tuple(arguments.package or PACKAGES)):
-            if mutant.name not in known:
+        unchanged, reach, seconds = Path(folder, "unchanged"), Reach(), dict[str, float]()
+        copied(REPOSITORY, unchanged)
+        laboratories = [Laboratory(Path(folder, str(i)), unchanged, reach, seconds) for i in range(arguments.jobs)]
+        for laboratory in laboratories:
+            free.put(laboratory)
+
+        def compiles(mutant: Mutant) -> int:
+            return sum(len(_caches(unchanged, name)) for name in laboratories[0].inside(mutant))
+
+        def tried(mutant: Mutant) -> None:
+            laboratory = free.get()
+            try:
                 killed = laboratory.verdict(mutant, arguments.files, arguments.limit_s)
-                diff = mutant.diff((laboratory.root / mutant.path).read_bytes())
-                package = mutant.path.partition("/")[0]
-                one = {"name": mutant.name, "package": package, "kind": mutant.kind, "killed": killed, "diff": diff}
+            finally:
+                free.put(laboratory)
+            package, diff = mutant.path.partition("/")[0], mutant.diff((unchanged / mutant.path).read_bytes())
+            one = {"name": mutant.name, "package": package, "kind": mutant.kind, "killed": killed, "diff": diff}
+            with lock:
                 print(json.dumps(one, ensure_ascii=False), file=stream, flush=True)
                 print(f"{mutant.path}:{mutant.line} {mutant.kind}: {killed or 'SURVIVES'}", flush=True)
                 known[mutant.name] = one
-            found.append(known[mutant.name])
-    print(table(found))
+
+        with ThreadPoolExecutor(arguments.jobs) as pool:
+            left = sorted((mutant for mutant in chosen if mutant.name not in known), key=compiles)
+            futures = [pool.submit(tried, mutant) for mutant in left]
+            try:
+                for future in futures:
+                    future.result()
+            finally:
+                pool.shutdown(wait=False, cancel_futures=True)
+                for laboratory in laboratories:
+                    laboratory.stop()
+    print(table([known[mutant.name] for mutant in chosen if mutant.name in known], len(chosen)))
     return 0
 
 

@@ -17,6 +17,7 @@ PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["project"]
 EXTRAS = PROJECT["optional-dependencies"]
 # Modules that are named otherwise than their distribution.
 DISTRIBUTIONS = {
+    "IPython": "ipython",
     "PIL": "pillow",
     "erfa": "pyerfa",
     "skimage": "scikit-image",

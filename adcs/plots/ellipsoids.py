@@ -65,8 +65,7 @@ def outline(centre: FloatArray, shape: FloatArray, n_points: int = 181) -> Float
     eigenvalue, eigenvector = np.linalg.eigh(shape)
     angle = np.linspace(0.0, 2.0 * np.pi, n_points)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    points: FloatArray = centre + circle @ (eigenvector * np.sqrt(np.maximum(eigenvalue, 0.0))).T
-    return points
+    return centre + circle @ (eigenvector * np.sqrt(np.maximum(eigenvalue, 0.0))).T
 
 
 def _plane(ax: Axes, picture: RollYawPicture) -> None:

@@ -101,7 +101,12 @@ def run(app: App, arguments: Sequence[str] | None = None) -> int:
     # None where the shell closed it. In this order the first file that is opened does not become one of the others.
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))  # noqa: SIM115
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w", encoding="utf-8"))  # noqa: SIM115
+    # As all files, what comes in is UTF-8, whatever the system; what an output has no character for is escaped.
+    if isinstance(sys.stdin, io.TextIOWrapper):
+        sys.stdin.reconfigure(encoding="utf-8")
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         with _one_line_warnings(program), _notes_of_the_library(program):
             call(app, tokens)

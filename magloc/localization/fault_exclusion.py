@@ -220,7 +220,7 @@ class _Examination:
         without = self.problem.whitened(self.raw) - self.problem.predicted(np.zeros_like(self.problem.ambient))
         energy = np.einsum("bc,bc->b", without, without)
         alone = np.array([fix.reason == NOISE_ALONE for fix in plain], dtype=bool)
-        return alone & (energy <= energy_threshold(self.n_differences))
+        return alone & (energy <= energy_threshold(max(1, self.n_differences)))
 
     def _by_count(self, fixes: Sequence[tuple[int, Fix]]) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
         """Rows, and best solutions (f, K, …), of fixes of equally many sources."""

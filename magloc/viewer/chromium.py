@@ -269,7 +269,7 @@ class Chromium(Closing):
         while time.monotonic() < deadline:
             if self._process.poll() is not None:
                 raise BrowserError(f"Chromium ended at once, with status {self._process.returncode}.")
-            lines = port_file.read_text().split() if port_file.exists() else []
+            lines = port_file.read_text(encoding="utf-8").split() if port_file.exists() else []
             if len(lines) == 2:
                 with direct.open(f"http://127.0.0.1:{lines[0]}/json/list", timeout=timeout_s) as reply:
                     for target in json.load(reply):

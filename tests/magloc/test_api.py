@@ -64,6 +64,7 @@ class TestFirstMinute:
         assert fixes.detected.all()
         assert fixes.dropped_sensors == [()] * N_ROWS
         assert f"… {N_ROWS} rows" in str(fixes)
+        assert "…" not in str(magloc.locate(array, readings[:2]))
         assert fixes.table() + "\n" == run("locate", log, "--array", board).out
 
     def test_as_many_sources_as_there_are(self, board: Path, log: Path) -> None:

@@ -19,8 +19,7 @@ VelocityRule = Callable[[Fix, Fix, ImuRecord], FloatArray]
 
 def finite_difference(first: Fix, second: Fix, imu: ImuRecord) -> FloatArray:
     """The source's velocity, (p₂ - p₁)/(t₂ - t₁), which is that of the middle between both."""
-    velocity: FloatArray = (second.position_m - first.position_m) / (second.time_s - first.time_s)
-    return velocity
+    return (second.position_m - first.position_m) / (second.time_s - first.time_s)
 
 
 def corrected_velocity(first: Fix, second: Fix, imu: ImuRecord) -> FloatArray:

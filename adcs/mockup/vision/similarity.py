@@ -21,8 +21,7 @@ def complex_points(points: ArrayLike, name: str = "points") -> ComplexArray:
         return np.empty(0, dtype=np.complex128)
     if pairs.ndim != 2 or pairs.shape[1] != 2 or not np.isfinite(pairs).all():
         raise ValueError(f"Input {name} must be finite numbers of shape (n, 2); instead received shape {pairs.shape}.")
-    plane: ComplexArray = pairs[:, 0] + 1j * pairs[:, 1]
-    return plane
+    return pairs[:, 0] + 1j * pairs[:, 1]
 
 
 def mirrored_image(points_px: ArrayLike) -> ComplexArray:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
+import numba
 import pytest
 
 from arrays import read_array
@@ -28,6 +29,8 @@ COMMANDS = (
     "warm-up",
 )
 HEAVY = {"numpy", "scipy", "numba", "matplotlib", "filterpy", "pandas", "xarray", "zarr", "trimesh", "viser", "msgspec"}
+
+MOST = numba.config.NUMBA_NUM_THREADS
 
 
 def modules_after(program: str) -> set[str]:
@@ -107,9 +110,9 @@ class TestSentence:
         assert_refused(run("view", "\x1b[31m"), r"magloc: \x1b[31m does not exist")
 
     def test_without_a_word_that_does_not_end(self, run: Run) -> None:
-        outcome = run("view", "9" * 400)
+        outcome = run("view", "9" * 240)
         assert_refused(outcome, "99999…99999")
-        assert len(outcome.err) < 300
+        assert len(outcome.err) < 240
 
 
 class TestMissingExtra:
@@ -142,6 +145,32 @@ class TestMissingExtra:
     def test_a_fix_needs_none(self, recording: tuple[Path, Path]) -> None:
         readings, array = recording
         assert without(list(EXTRAS), "locate", readings, "--array", array, "--quiet").status == 0
+
+
+class TestCommonOptions:
+    @pytest.mark.parametrize(("threads", "used"), [((), []), (("--threads", "1"), [1]), (("--threads", "999"), [MOST])])
+    def test_threads_are_those_of_compiled_code(
+        self,
+        threads: tuple[str, ...],
+        used: list[int],
+        recording: tuple[Path, Path],
+        run: Run,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        set_to: list[int] = []
+        monkeypatch.setattr(numba, "set_num_threads", set_to.append)
+        readings, array = recording
+        assert run("locate", readings, "--array", array, *threads).status == 0
+        assert set_to == used
+
+    @pytest.mark.parametrize("quiet", [False, True])
+    def test_quiet_says_nothing_of_what_is_written(
+        self, quiet: bool, recording: tuple[Path, Path], tmp_path: Path, run: Run
+    ) -> None:
+        readings, array = recording
+        outcome = run("locate", readings, "--array", array, "--out", tmp_path, *(["--quiet"] if quiet else []))
+        assert outcome.status == 0
+        assert (outcome.err == "") is quiet
 
 
 @pytest.fixture(scope="module")

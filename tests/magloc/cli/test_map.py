@@ -9,16 +9,19 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
 
 from magloc.cli.app import main
+from magloc.cli.map import _how_done
 from magloc.convergence.filters import IekfFilter
 from magloc.convergence.over_sources import SourcesScenario
 from magloc.convergence.over_starts import StartsScenario
 from magloc.convergence.scenario_files import built_in_scenarios, read_sources_scenario, read_starts_scenario
+from magloc.grids.cube import Summary
 from magloc.grids.store import open_map
 from magloc.plots import style
 from tests.conftest import REPOSITORY
@@ -332,3 +335,17 @@ class TestBadInput:
         assert main(["map", "--grid", "3", "--out", str(tmp_path / "file")]) == 2
         assert "found a file, expected a folder" in capsys.readouterr().err
         assert (tmp_path / "file").read_text() == "kept"
+
+
+@pytest.mark.parametrize(
+    ("iterations", "before", "said"),
+    [
+        (400_000, 0, "400000 iterations in 2.00 s (5 µs each); wrote out/"),
+        (400_000, 3, "400000 iterations in 2.00 s (5 µs each); wrote out/, 3 of 8 chunks were there before"),
+        (400_000, 8, "out/ was complete, nothing was computed again; 400000 iterations in 2.00 s (5 µs each)"),
+        (0, 0, "0 iterations in 2.00 s (2e+06 µs each); wrote out/"),
+    ],
+)
+def test_what_was_done(iterations: int, before: int, said: str) -> None:
+    counts = Summary(10, 9, 0.9, 40.0, iterations, 2.0)
+    assert _how_done(before, 8, counts, Path("out")) == said

@@ -210,8 +210,11 @@ class TestDescent:
     def test_simplex_search_finds_no_better_place_nearby(self):
         """Of scipy's Nelder-Mead, from the end of a descent that converged, on the same sample."""
         sample = sobol_sample(TASK, 9, rng(23))
-        found = descend(TASK, sample, starts_of(TASK, 4, rng(24))[0], max_iterations=400)
+        steps: list[int] = []
+        start = starts_of(TASK, 4, rng(24))[0]
+        found = descend(TASK, sample, start, max_iterations=400, step_done=steps.append)
         assert found.converged
+        assert sum(steps) == 400  # those that were not needed count as done
         again = minimize(
             lambda x: np.log(sample.value(TASK, BALL.nearest(x.reshape(4, 3)))),
             found.sensors.ravel(),

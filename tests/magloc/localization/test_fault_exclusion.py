@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -25,11 +26,12 @@ from arrays.sensor import Sensor
 from magloc.chi_square import energy_threshold
 from magloc.fields import dipole
 from magloc.localization.fault_exclusion import weighted
-from magloc.localization.locator import Locator
+from magloc.localization.locator import Locator, locate
 from magloc.measurement.differences import predicted_channels
 from magloc.measurement.rows import whitened_model, whitened_rows, whitenings_of
-from magloc.readings import read_readings
+from magloc.readings import Readings, read_readings
 from magloc.truth import read_truth
+from tests.passing_source import readings_of
 from tests.plain_locator import plain_locator
 
 AMBIENT = np.array([2e-5, 0.0, 4.5e-5])
@@ -383,3 +385,20 @@ class TestNoiseAlone:
         fix = Locator(CUBE, sources="auto").fit_rows(unit_signal * np.sqrt(energy))[0]
         assert not fix.detected
         assert_allclose(fix.best.position_m, [0.3, 1.4, -0.8], rtol=1e-3)
+
+
+@pytest.mark.parametrize("n_readings", range(7))
+@pytest.mark.parametrize("sources", [1, "auto"])
+def test_a_row_of_too_few_readings_has_no_fix_and_leaves_the_others(
+    n_readings: int, sources: Literal[1, "auto"]
+) -> None:
+    """Down to none at all, or those of one sensor, which make no difference."""
+    array = tetrahedron(1.0)
+    readings = readings_of(array, np.tile([3.0, 1.0, -0.5], (3, 1)), np.tile([0.0, 20.0, 90.0], (3, 1)))
+    readings[1, n_readings:] = np.nan
+    fixes = locate(array, Readings(readings), sources=sources)
+    n_differences = max(0, n_readings - 3)
+    reason = f"{n_readings} readings give {n_differences} independent differences, 6 are needed"
+    assert fixes.reason == ["", reason, ""]
+    others = locate(array, Readings(readings[[0, 2]]), sources=sources)
+    assert_array_equal(fixes.position_m[[0, 2]], others.position_m)

@@ -271,6 +271,7 @@ class TestFixRecord:
             ({"arrival_s": [0.6, 0.6], "time_s": [0.0, 0.7]}, "received 0.6 s for an exposure at 0.7 s .fix 1."),
             ({"position_m": np.zeros((2, 3))}, r"position_m must have shape \(2, 2\)"),
             ({"time_s": 1.0}, r"time_s must have shape \(k,\)"),
+            ({"time_s": np.zeros(0)}, r"arrival_s must have shape \(0,\)"),
             ({"heading_rad": [0.0, math.inf]}, "heading_rad must be finite"),
         ],
     )

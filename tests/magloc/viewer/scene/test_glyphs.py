@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -111,6 +112,27 @@ class TestFirstCamera:
     @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.full((4, 3), 2.0), np.full((2, 3), np.nan)])
     def test_one_place_or_none_is_given_a_metre(self, points: FloatArray) -> None:
         assert framing.extent_of(points).radius_m == 1.0
+
+
+class TestFloor:
+    @pytest.mark.parametrize("size", [0.03, 1.5, 30.0])
+    def test_reaches_beyond_the_points_and_lies_below_them(
+        self, server: viser.ViserServer, size: float, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        floors: list[dict[str, Any]] = []
+        monkeypatch.setattr(server.scene, "add_grid", lambda name, **how: floors.append({"name": name, **how}))
+        points = size * (np.array([7.0, -3.0, 2.0]) + np.random.default_rng(5).uniform(-1.0, 1.0, (30, 3)))
+        cell = framing.prepare(server, framing.extent_of(points))
+        (floor,) = floors
+        assert floor["name"] == "/floor"
+        assert floor["cell_size"] == cell
+        assert floor["section_size"] == pytest.approx(5.0 * cell)
+        x, y, z = floor["position"]
+        for half, places, middle in ((floor["width"] / 2.0, points[:, 0], x), (floor["height"] / 2.0, points[:, 1], y)):
+            assert np.abs(places - middle).max() < half
+            for line in (half, middle):  # lines of the floor are at multiples of a square
+                assert line / cell == pytest.approx(round(line / cell), abs=1e-6)
+        assert z < np.median(points[:, 2])
 
 
 class TestLengths:
@@ -274,6 +296,23 @@ class TestTrack:
         track = scene.TrackGlyph(server.scene, "/t", np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)), size_m=0.1)
         assert track.regions is not None
         assert len(track.regions.batched_positions) <= 40
+
+    def test_first_and_last_tracked_point_have_their_times(
+        self, server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        written: dict[str, FloatArray] = {}
+        monkeypatch.setattr(
+            pages, "screen_label", lambda _, name, text, place: written.update({f"{name} {text}": place})
+        )
+        begin, end = (TrackPoint(time_s, status="not acquired") for time_s in (-1.0, 99.0))
+        points = (begin, *(TrackPoint(2.0 * i, p) for i, p in enumerate(self.POSITIONS)), end)
+        page = pages.track_page(server, TrackResult(points, is_truth=False), None, None)
+        n = len(self.POSITIONS)
+        assert list(written) == ["/times/1 0 s", f"/times/{n} {2 * (n - 1)} s"]
+        for place, position in zip(written.values(), (self.POSITIONS[0], self.POSITIONS[-1]), strict=True):
+            np.testing.assert_allclose(place[:2], position[:2])
+            assert place[2] < position[2]
+        page.close()
 
     def test_page_of_a_track_and_of_a_truth(self, server: viser.ViserServer) -> None:
         tracked = [

@@ -1,0 +1,99 @@
+"""What the wheel holds: all of the packages and their data, no tests, and the same when it is made from the sdist."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tarfile
+import zipfile
+from email.parser import Parser
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import REPOSITORY
+from tests.test_house import PACKAGES
+from tests.test_packaging import PROJECT
+from tests.test_portability import names
+from tests.waiting import WAIT_S
+
+pytest.importorskip("hatchling", reason="needs hatchling, of the extra test")
+
+
+def made(kind: str, tree: Path, place: Path) -> Path:
+    """A wheel or an sdist of a tree, as pip has it made."""
+    code = f"from hatchling.build import build_{kind} as build; print(build({str(place)!r}))"
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tree, stdout=subprocess.PIPE, encoding="utf-8", timeout=WAIT_S, check=True)
+    return place / done.stdout.split()[-1]
+
+
+def contents(wheel: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(wheel) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    return contents(made("wheel", REPOSITORY, tmp_path_factory.mktemp("wheel")))
+
+
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of an sdist."""
+    place = tmp_path_factory.mktemp("sdist")
+    with tarfile.open(made("sdist", REPOSITORY, place)) as archive:
+        archive.extractall(place, filter="data")
+    return next(path for path in place.iterdir() if path.is_dir())
+
+
+def metadata_of(wheel: dict[str, bytes]) -> str:
+    return next(data for name, data in wheel.items() if name.endswith(".dist-info/METADATA")).decode()
+
+
+class TestWheel:
+    def test_has_every_file_of_the_packages(self, wheel: dict[str, bytes]) -> None:
+        wanted = {name for name in names() if name.startswith(tuple(f"{package}/" for package in PACKAGES))}
+        assert {Path(name).suffix for name in wanted} == {".py", ".pyi", ".toml", ".csv", ".obj", ".typed"}
+        assert {name for name in wheel if ".dist-info/" not in name} == wanted
+        for name in wanted:
+            assert wheel[name] == (REPOSITORY / name).read_bytes(), name
+
+    def test_says_what_it_is(self, wheel: dict[str, bytes]) -> None:
+        told = Parser().parsestr(metadata_of(wheel))
+        assert (told["Name"], told["Version"]) == (PROJECT["name"], PROJECT["version"])
+        assert (told["License-Expression"], told["Requires-Python"]) == (PROJECT["license"], ">=3.11")
+        extras = set(PROJECT["optional-dependencies"])
+        assert set(told.get_all("Provides-Extra")) == extras
+        base = [line for line in told.get_all("Requires-Dist") if "extra ==" not in line]
+        assert sorted(base) == sorted(PROJECT["dependencies"])
+
+    def test_has_the_commands_and_the_licence(self, wheel: dict[str, bytes]) -> None:
+        inside = {name.partition(".dist-info/")[2]: data for name, data in wheel.items() if ".dist-info/" in name}
+        assert inside["licenses/LICENSE"] == (REPOSITORY / "LICENSE").read_bytes()
+        lines = inside["entry_points.txt"].decode().split("\n")
+        assert {f"{name} = {place}" for name, place in PROJECT["scripts"].items()} <= set(lines)
+
+    def test_is_for_every_system_and_python(self, wheel: dict[str, bytes]) -> None:
+        told = next(data for name, data in wheel.items() if name.endswith(".dist-info/WHEEL")).decode()
+        assert "Root-Is-Purelib: true" in told
+        assert "Tag: py3-none-any" in told
+
+
+class TestSdist:
+    def test_gives_the_same_wheel(self, unpacked: Path, wheel: dict[str, bytes], tmp_path: Path) -> None:
+        assert contents(made("wheel", unpacked, tmp_path)) == wheel
+
+    def test_has_the_tests_and_the_pages(self, unpacked: Path) -> None:
+        there = {path.relative_to(unpacked).as_posix() for path in unpacked.rglob("*") if path.is_file()}
+        wanted = {name for name in names() if not name.startswith(".") and "/." not in name}
+        assert {
+            "pyproject.toml",
+            "LICENSE",
+            "Makefile",
+            "constraints.txt",
+            "tests/conftest.py",
+            "docs/conf.py",
+        } <= wanted
+        assert wanted <= there
+        assert not [name for name in there if "__pycache__" in name or name.endswith((".pyc", ".nbi", ".nbc"))]
