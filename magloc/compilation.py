@@ -1,4 +1,4 @@
-"""Compiled hot loops. Each has a readable NumPy twin beside it, and a test that the two agree.
+"""Compiled hot loops, each held by a test to a readable twin or an oracle: docs/development/index.md says which.
 
 This module holds the one set of compiler options that all kernels share:
 

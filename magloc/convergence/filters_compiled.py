@@ -1,4 +1,4 @@
-"""Compiled filters of the convergence map, many starts at once; :mod:`magloc.convergence.over_starts` has the twins.
+"""Compiled filters of the convergence map, many starts at once; :mod:`magloc.convergence.filters` has the twins.
 
 A start is a lane, 32 of them a block: ``w[ROW + i]`` for lane i, in information form and units of the prior. How, and
 what that costs in digits: docs/theory/lanes.md.

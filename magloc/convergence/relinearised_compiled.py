@@ -1,6 +1,6 @@
-"""Compiled filter of the convergence map that linearises before every scalar; its twin.
+"""Compiled filter of the convergence map that linearises before every scalar.
 
-:mod:`magloc.convergence.over_starts`.
+The readable twin is ``run_one`` of :mod:`magloc.convergence.filters`.
 
 It has to go through the scalars in turn; the filters that do not are in :mod:`magloc.convergence.filters_compiled`.
 

@@ -1,4 +1,4 @@
-"""The tracker's steps over many rows: :meth:`magloc.tracking.tracker.Tracker.advance` where nothing has to be acquired.
+"""The tracker's steps over many rows, the twin of :meth:`magloc.tracking.tracker.Tracker.update` between acquisitions.
 
 A state of n numbers begins with position and moment. Every row has a transition F, and a square root of its noise in
 two parts, ``S_q = A + |m| B``; its readings are whitened differences, padded to k with rows that are zero.

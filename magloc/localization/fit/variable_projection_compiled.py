@@ -1,6 +1,6 @@
 """Compiled variable projection: the moment is linear and eliminated, so a fit is a search over the position.
 
-Coordinates and layout are those of :mod:`magloc.measurement.whitened_compiled`.
+The readable twin is ``tests/variable_projection.py``; coordinates are :mod:`magloc.measurement.whitened_compiled`'s.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Compiled covariances of optima of one dipole."""
+"""Compiled covariances of optima of one dipole; tests hold them to the inverse information of ``tests/oracles.py``."""
 
 from __future__ import annotations
 
