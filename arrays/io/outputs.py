@@ -48,7 +48,7 @@ def refuse_one_for_two(outputs: Mapping[str, Path | None]) -> None:
 def _refuse_closed(folder: Path, wanted: Path, option: str, prefix: str = ".") -> None:
     """Refuse a folder in which no file can be made: only an attempt tells, of whatever user and file system."""
     try:
-        with tempfile.TemporaryFile(dir=folder, prefix=prefix, suffix=".tmp"):  # where it can, without a name
+        with tempfile.NamedTemporaryFile(dir=folder, prefix=prefix, suffix=".tmp"):  # a name, which may be too long
             pass
     except OSError as error:
         raise InputError(
