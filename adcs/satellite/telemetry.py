@@ -22,6 +22,7 @@ from arrays.typing import BoolArray, FloatArray
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
+_MOST_STEPS = 2.0**53  # whole numbers in double precision
 _STEP_TOLERANCE = 1e-3
 MOST_INSTANTS = 500_000
 """Of a log, with those of its gaps."""
@@ -245,8 +246,9 @@ def _columns(name: str, given: ArrayLike | None, n: int) -> FloatArray:
 
 def steps_of(time_s: FloatArray, step_s: float) -> tuple[NDArray[np.int64], BoolArray, BoolArray]:
     """Steps (n,) since the first time, which times are no multiple of the step, and which do not ascend."""
-    steps = (time_s - time_s[0]) / step_s
-    rows = np.round(steps).astype(np.int64)
+    with np.errstate(over="ignore"):
+        steps = (time_s - time_s[0]) / step_s
+    rows = np.round(np.clip(steps, -_MOST_STEPS, _MOST_STEPS)).astype(np.int64)
     return rows, np.abs(steps - rows) > _STEP_TOLERANCE, np.diff(rows, prepend=-1) <= 0
 
 

@@ -50,6 +50,7 @@ UNREADABLE = (
     OSError,
     RuntimeError,
     TypeError,
+    UserWarning,
     ValueError,
 )
 
@@ -153,7 +154,9 @@ def open_map(path: str | os.PathLike[str]) -> xr.Dataset:
     """Map in a store, loaded piece by piece; NaN, or the smallest integer there is, where a chunk is not done."""
     import xarray as xr
 
-    dataset = xr.open_zarr(path, chunks=None, consolidated=False)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", ".*not recognized as a component")  # an array whose description is damaged
+        dataset = xr.open_zarr(path, chunks=None, consolidated=False)
     seconds = float(dataset[SECONDS_OF_CHUNK].sum())
     dataset = dataset.drop_vars(SECONDS_OF_CHUNK).assign_attrs(seconds=seconds)
     for variable in dataset.data_vars.values():

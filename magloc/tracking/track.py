@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
@@ -156,7 +157,10 @@ class Track(Sequence[TrackPoint]):
         if moment_Am2 is not None and np.isfinite(position_m).all() and np.isfinite(moment_Am2).all():
             # Later rows make less error possible.
             bound_of = smoothing_bound if self.is_smoothed else posterior_bound
-            bound = bound_of(self.tracker, self._rows, position_m, moment_Am2)
+            with suppress(np.linalg.LinAlgError), np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+                bound = bound_of(self.tracker, self._rows, position_m, moment_Am2)
+            if bound is not None and np.isnan(bound).any():  # the truth leads out of double precision
+                bound = None
         return consistency(self, self.tracker, self._rows, position_m, moment_Am2, bound)
 
     def table(self) -> str:

@@ -13,7 +13,7 @@ from sims.magnetics.paths import Attitude, Path, Steered, Vector
 from sims.magnetics.sensors import SensorModel, nominal_array
 
 Matrix = tuple[Vector, Vector, Vector]
-MOST_ROWS = 5_000_000
+MOST_ROWS = 1_000_000
 _ZERO: Vector = (0.0, 0.0, 0.0)
 
 

@@ -9,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 import tomllib
 from collections.abc import Iterator
@@ -54,8 +55,11 @@ def faults(case: Case, files: Path, folder: Path) -> Iterator[str]:
     """What is wrong with how a case ends."""
     shutil.copytree(files, folder)
     before = names_in(folder)
-    temporary = folder.with_name("t")  # Chromium makes a socket in it, whose path must not be long
-    temporary.mkdir()
+    with tempfile.TemporaryDirectory() as short:  # Chromium makes a socket in it, whose path must not be long
+        yield from _faults(case, folder, before, Path(short))
+
+
+def _faults(case: Case, folder: Path, before: set[str], temporary: Path) -> Iterator[str]:
     status, err = ended(case, folder, temporary)
     wanted = 128 + case.number
     if status not in (0, wanted):
