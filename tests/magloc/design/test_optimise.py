@@ -26,6 +26,7 @@ from scipy.differentiate import jacobian
 from scipy.optimize import minimize
 from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
+from scipy.stats import qmc
 from scipy.stats.mstats import hdquantiles
 
 from arrays.geometries import cube, tetrahedron
@@ -204,6 +205,17 @@ class TestVolumes:
         assert is_spaced(task, apart)
         assert pdist(apart).min() >= 0.3 * (1.0 - 1e-6)
         np.testing.assert_allclose(volume.nearest(apart), apart, atol=1e-9)
+
+
+class TestBlock:
+    def test_sources_fill_it_and_point_everywhere(self):
+        """Mean of 4096 points of a Sobol sequence, and of a unit vector's squares: to a per cent."""
+        task = replace(TASK, region=Block((1.0, 2.0, 3.0), (2.0, 4.0, 7.0)))
+        positions, moments = task.sources(qmc.Sobol(5, seed=3).random(4096))
+        np.testing.assert_allclose(positions.mean(axis=0), [1.5, 3.0, 5.0], rtol=0.01)
+        np.testing.assert_allclose(np.ptp(positions, axis=0), [1.0, 2.0, 4.0], rtol=0.01)
+        np.testing.assert_allclose(np.linalg.norm(moments, axis=1), TASK.moment_Am2)
+        np.testing.assert_allclose((moments**2).mean(axis=0), TASK.moment_Am2**2 / 3.0, rtol=0.01)
 
 
 class TestDescent:
