@@ -19,6 +19,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from arrays.io.closing import Closing
 from arrays.io.errors import InputError
+from magloc.grids.cube import uninterrupted
 
 BINARIES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 # WebGL in software: without both of these the canvas stays blank on a machine without a graphics card.
@@ -74,17 +75,19 @@ class Chromium(Closing):
 
     def __init__(self, url: str, size: tuple[int, int] = (1280, 800), timeout_s: float = 60.0) -> None:
         self._numbers = itertools.count(1)
-        self._profile = tempfile.mkdtemp(prefix="magloc-chromium-")
+        self._profile = ""
         self._socket: ClientConnection | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._guard: subprocess.Popen[bytes] | None = None
-        if os.name == "posix":
-            guard = ["sh", "-c", _GUARD, self._profile]
-            self._guard = subprocess.Popen(guard, bufsize=0, stdin=subprocess.PIPE, start_new_session=True)
         try:
-            self._process = _started(find_chromium(), self._profile, size)
-            if self._guard and self._guard.stdin:
-                self._guard.stdin.write(b"%d\n" % self._process.pid)
+            with uninterrupted():  # or something was made that nobody knows of
+                self._profile = tempfile.mkdtemp(prefix="magloc-chromium-")
+                if os.name == "posix":
+                    guard = ["sh", "-c", _GUARD, self._profile]
+                    self._guard = subprocess.Popen(guard, bufsize=0, stdin=subprocess.PIPE, start_new_session=True)
+                self._process = _started(find_chromium(), self._profile, size)
+                if self._guard and self._guard.stdin:
+                    self._guard.stdin.write(b"%d\n" % self._process.pid)
             self._socket = connect(self._page_address(timeout_s), max_size=None, proxy=None, ping_interval=None)
             for domain in ("Network", "Page", "Runtime"):
                 self.call(f"{domain}.enable")
@@ -109,11 +112,12 @@ class Chromium(Closing):
                 self._process.kill()
                 self._process.wait()
             self._process = None
-        if self._guard is not None:
+        if self._profile:
+            shutil.rmtree(self._profile, ignore_errors=True)
+        if self._guard is not None:  # until here it would do the same
             self._guard.kill()
             self._guard.communicate()
             self._guard = None
-        shutil.rmtree(self._profile, ignore_errors=True)
 
     def open(self, url: str) -> None:
         """Open another page.
