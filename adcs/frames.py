@@ -92,8 +92,7 @@ def terrestrial_dates(utc: Instants) -> tuple[FloatArray, FloatArray]:
         # Beyond the table of leap seconds, and before UTC began in 1960, the nearest entry is used.
         warnings.simplefilter("ignore", erfa.ErfaWarning)
         day, fraction = erfa.utctai(*julian_dates(utc))
-    terrestrial: tuple[FloatArray, FloatArray] = erfa.taitt(day, fraction)
-    return terrestrial
+    return erfa.taitt(day, fraction)
 
 
 def R_ecef_from_eci(utc: Instants) -> FloatArray:

@@ -72,8 +72,7 @@ def _glyph(sensor: Sensor, size_m: float) -> trimesh.Trimesh:
         raise ValueError(f"Input size_m must be a positive finite number; instead received {size_m}.")
     if sensor.kind == "scalar":
         radius = _SPHERE_RADIUS * size_m
-        sphere: trimesh.Trimesh = trimesh.creation.icosphere(subdivisions=3, radius=radius, face_colors=BODY_COLOUR)
-        return sphere
+        return trimesh.creation.icosphere(subdivisions=3, radius=radius, face_colors=BODY_COLOUR)
     body = trimesh.creation.box(extents=[_CUBE_SIDE * size_m] * 3, face_colors=BODY_COLOUR)
     return _joined([body, *(_rod(axis, size_m) for axis in range(3))])
 

@@ -42,8 +42,7 @@ def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray
         moduli = (readings_T[..., scalar] - array.channel_offset_T[scalar]) / array.channel_gain[scalar, 0]
         modulus[..., scalar] = np.abs(moduli - _mean_of_finite(moduli, axis=-1))
     gain = np.linalg.norm(array.channel_gain, axis=1)
-    result: FloatArray = np.hypot(noise, array.noise_fraction * gain * np.nan_to_num(modulus))
-    return result
+    return np.hypot(noise, array.noise_fraction * gain * np.nan_to_num(modulus))
 
 
 def reading_covariance(array: SensorArray, readings_T: FloatArray) -> FloatArray:
@@ -112,8 +111,7 @@ def calibration_errors(array: SensorArray, readings_T: FloatArray) -> FloatArray
         scale[i, : sensor.n_channels, : sensor.n_channels] = sensor.calibration.scale
     b = _fields_in_sensor_axes(array, readings_T, scale)
     turned = np.swapaxes(np.cross(np.eye(3), b[..., None, :]), -1, -2)  # column k is e_k × b
-    derivative: FloatArray = scale @ np.concatenate([turned, b[..., None] * np.eye(3)], axis=-1)
-    return derivative
+    return scale @ np.concatenate([turned, b[..., None] * np.eye(3)], axis=-1)
 
 
 def _fields_in_sensor_axes(array: SensorArray, readings_T: FloatArray, scale: FloatArray) -> FloatArray:
@@ -128,8 +126,7 @@ def _fields_in_sensor_axes(array: SensorArray, readings_T: FloatArray, scale: Fl
             elsewhere = _mean_of_finite(array.calibrated_field(readings_T), axis=-2)
         in_axes = np.einsum("nji,...nj->...ni", array.rotation_matrices, elsewhere + np.zeros((array.n_sensors, 1)))
         response = np.where(missing, np.einsum("nij,...nj->...ni", scale, in_axes), response)
-    field: FloatArray = np.einsum("nij,...nj->...ni", np.linalg.inv(scale), response)
-    return field
+    return np.einsum("nij,...nj->...ni", np.linalg.inv(scale), response)
 
 
 def _deviations(array: SensorArray, readings_T: FloatArray) -> FloatArray:
@@ -158,8 +155,7 @@ def _deviations(array: SensorArray, readings_T: FloatArray) -> FloatArray:
 def _mean_of_finite(values: FloatArray, axis: int) -> FloatArray:
     finite = np.isfinite(values)
     count = np.maximum(finite.sum(axis=axis, keepdims=True), 1)
-    mean: FloatArray = np.where(finite, values, 0.0).sum(axis=axis, keepdims=True) / count
-    return mean
+    return np.where(finite, values, 0.0).sum(axis=axis, keepdims=True) / count
 
 
 def _block_diagonal(array: SensorArray, blocks: FloatArray, present: BoolArray) -> FloatArray:

@@ -44,8 +44,7 @@ class Whitening:
         count.
         """
         e = channels @ self.root.T
-        w: FloatArray = e - ((e @ self.basis) * self.shrinkage) @ self.basis.T
-        return w
+        return e - ((e @ self.basis) * self.shrinkage) @ self.basis.T
 
 
 def whitening(

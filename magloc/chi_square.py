@@ -82,8 +82,7 @@ class ChiSquareDetector:
     def probability(self, signal_energy: ArrayLike) -> FloatArray:
         """Probability of detection: noncentral χ² beyond the threshold, for energies in units of the noise."""
         energy = np.asarray(signal_energy, dtype=np.float64)
-        found: FloatArray = 1.0 - chndtr(self.threshold, float(self.n_dimensions), energy)
-        return found
+        return 1.0 - chndtr(self.threshold, float(self.n_dimensions), energy)
 
     def required_energy(self, probability: float) -> float:
         """Energy, in units of the noise, of a signal that is found with a probability above the false-alarm rate."""

@@ -240,8 +240,7 @@ def estimability(S: FloatArray, S_predicted: FloatArray) -> FloatArray:
     -------
     ndarray, shape (..., n)
     """
-    measure: FloatArray = 1.0 - np.linalg.norm(S, axis=-1) / np.linalg.norm(S_predicted, axis=-1)
-    return measure
+    return 1.0 - np.linalg.norm(S, axis=-1) / np.linalg.norm(S_predicted, axis=-1)
 
 
 class IteratedExtendedKalmanFilter:

@@ -275,5 +275,4 @@ def _attitude(up: FloatArray, north: FloatArray) -> FloatArray:
 
 def _across(v: FloatArray) -> FloatArray:
     """Some axis that is not along v."""
-    axis: FloatArray = np.eye(3)[np.argmin(np.abs(v))]
-    return axis
+    return np.eye(3)[np.argmin(np.abs(v))]

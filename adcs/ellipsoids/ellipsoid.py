@@ -94,8 +94,7 @@ class Ellipsoid:
 
     def contains(self, points: ArrayLike, tolerance: float = 1e-9) -> BoolArray:
         """Whether the form of points, shape (..., n), is at most 1 + tolerance."""
-        inside: BoolArray = self.form(points) <= 1.0 + tolerance
-        return inside
+        return self.form(points) <= 1.0 + tolerance
 
 
 def quadratic_form(centres: ArrayLike, shapes: ArrayLike, points: ArrayLike) -> FloatArray:
@@ -112,8 +111,7 @@ def quadratic_form(centres: ArrayLike, shapes: ArrayLike, points: ArrayLike) -> 
     regular = shapes + margin[..., None, None] * np.eye(shapes.shape[-1])
     solved = np.linalg.solve(regular, offset[..., None])[..., 0]
     form = np.sum(offset * solved, axis=-1)
-    value: FloatArray = np.where(is_point & (form > 0.0), np.inf, form)
-    return value
+    return np.where(is_point & (form > 0.0), np.inf, form)
 
 
 def transformed(ellipsoid: Ellipsoid, A: ArrayLike, offset: ArrayLike = 0.0) -> Ellipsoid:
@@ -296,8 +294,7 @@ def unit_direction(direction: ArrayLike, n: int) -> FloatArray:
     """Direction of length 1, checked as :func:`measurement_direction`."""
     h = measurement_direction(direction, n)
     h = h / np.abs(h).max()
-    unit: FloatArray = h / np.linalg.norm(h)
-    return unit
+    return h / np.linalg.norm(h)
 
 
 def _around_rounded(shape: FloatArray, size: FloatArray) -> FloatArray:

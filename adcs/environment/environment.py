@@ -105,5 +105,4 @@ def _at(seconds: FloatArray, knots_s: FloatArray, values: FloatArray) -> FloatAr
 
     if knots_s is seconds:
         return values
-    interpolated: FloatArray = CubicSpline(knots_s, values, axis=-2)(seconds)
-    return interpolated
+    return CubicSpline(knots_s, values, axis=-2)(seconds)

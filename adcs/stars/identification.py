@@ -144,8 +144,7 @@ class StarCamera:
             )
         offset = (points - 0.5 * np.array([self.width_px, self.height_px])) * math.tan(self.rad_per_px)
         outward = np.concatenate([offset, np.full((len(offset), 1), -1.0)], axis=1)
-        directions: FloatArray = outward / np.linalg.norm(outward, axis=1, keepdims=True)
-        return directions
+        return outward / np.linalg.norm(outward, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -397,8 +396,7 @@ def rotation_between(seen: FloatArray, there: FloatArray) -> FloatArray:
     U, _, Vt = np.linalg.svd(np.swapaxes(there, -1, -2) @ seen)
     sign = np.ones(U.shape[:-1])
     sign[..., 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    R: FloatArray = (U * sign[..., None, :]) @ Vt
-    return R
+    return (U * sign[..., None, :]) @ Vt
 
 
 @dataclass(frozen=True)

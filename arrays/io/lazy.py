@@ -32,5 +32,4 @@ def lazy_names(
 def by_name(where: str) -> Callable[..., Any]:
     """A function named as ``module:function``: for what stands on a higher floor, such as the figure of a result."""
     module, _, name = where.partition(":")
-    function: Callable[..., Any] = getattr(import_module(module), name)
-    return function
+    return getattr(import_module(module), name)

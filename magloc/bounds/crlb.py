@@ -228,16 +228,14 @@ def _marginalised(W: FloatArray, nuisance: FloatArray, sigma: float) -> FloatArr
 
 def _sum_of_squares(rows: FloatArray, which: BoolArray) -> FloatArray:
     """Over the last axis (..., r, n), of those entries that count (..., n): (..., r)."""
-    total: FloatArray = np.sum(np.where(which[..., None, :], rows, 0.0) ** 2, axis=-1)
-    return total
+    return np.sum(np.where(which[..., None, :], rows, 0.0) ** 2, axis=-1)
 
 
 def _root_of_sum(rows: FloatArray, inverse: FloatArray, lost: BoolArray) -> FloatArray:
     """σ of quantities by their parts (..., r, n) in the singular vectors; infinite with a part in a lost one."""
     sigma = np.sqrt(np.sum((rows * inverse[..., None, :]) ** 2, axis=(-2, -1)))
     hidden = np.sum(_sum_of_squares(rows, lost), axis=-1) > LOST**2
-    result: FloatArray = np.where(hidden, np.inf, sigma)
-    return result
+    return np.where(hidden, np.inf, sigma)
 
 
 def _sources(position_m: ArrayLike, moment_Am2: ArrayLike) -> tuple[FloatArray, FloatArray]:

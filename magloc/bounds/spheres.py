@@ -119,8 +119,7 @@ def _crossing(low: FloatArray, at_low: FloatArray, high: FloatArray, at_high: Fl
     rise = np.where(present, at_high - at_low, 1.0)
     share = np.where(np.isfinite(rise) & (rise > 0.0), -at_low / np.where(rise > 0.0, rise, 1.0), 0.0)
     ratio = np.where(present, high, 1.0) / np.where(present, low, 1.0)
-    result: FloatArray = low * ratio ** np.clip(share, 0.0, 1.0)
-    return result
+    return low * ratio ** np.clip(share, 0.0, 1.0)
 
 
 def sphere_grid(elevation_deg: FloatArray, azimuth_deg: FloatArray) -> FloatArray:

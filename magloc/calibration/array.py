@@ -205,8 +205,7 @@ def _problem(
 
 def _usable(problem: Problem) -> BoolArray:
     """Rows with more readings than unknowns of their own."""
-    usable: BoolArray = np.isfinite(problem.readings_T).sum(axis=1) > problem.n_row_unknowns
-    return usable
+    return np.isfinite(problem.readings_T).sum(axis=1) > problem.n_row_unknowns
 
 
 def _of_rows(problem: Problem, rows: BoolArray) -> Problem:

@@ -106,8 +106,7 @@ def information_of_sensors(problem: Problem, state: State) -> FloatArray:
     n = int(problem.free.sum())
     cross, own = information[:n, n:], information[n:, n:]
     # A constant of the source that no reading shows has no information to eliminate.
-    result: FloatArray = information[:n, :n] - cross @ np.linalg.pinv(own, hermitian=True) @ cross.T
-    return result
+    return information[:n, :n] - cross @ np.linalg.pinv(own, hermitian=True) @ cross.T
 
 
 def minimised(

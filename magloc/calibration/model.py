@@ -129,8 +129,7 @@ class Linearisation:
 
 def responses(problem: Problem, state: State) -> FloatArray:
     """(I + E) K of every sensor, shape (N, 3, 3): from fields in the array's frame to readings."""
-    result: FloatArray = response_factors(state.sensors) @ problem.array.channel_gain.reshape(-1, 3, 3)
-    return result
+    return response_factors(state.sensors) @ problem.array.channel_gain.reshape(-1, 3, 3)
 
 
 def response_factors(sensors: FloatArray) -> FloatArray:

@@ -328,8 +328,7 @@ def _nearest(points: FloatArray, semi_axes: FloatArray) -> FloatArray:
         t = t + step
         if np.all(np.abs(step) <= 1e-12 * square.min(axis=1)):
             break
-    result: FloatArray = semi_axes * product / (square + t[:, None])
-    return result
+    return semi_axes * product / (square + t[:, None])
 
 
 def _least_radius_of_curvature(problem: _Problem, fit: _Fit) -> float:

@@ -62,8 +62,7 @@ class Calibration:
 
     def plot(self) -> Figure:
         """What is left of the readings before and after, and what the calibration changes."""
-        figure: Figure = by_name("magloc.plots.calibrations:calibration")(self)
-        return figure
+        return by_name("magloc.plots.calibrations:calibration")(self)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -158,5 +157,4 @@ def residual_rms(
         residual[i] = of_row - gain @ common
     squares = (residual**2).reshape(len(residual), -1, 3)
     counts = np.isfinite(squares).sum(axis=(0, 2))
-    result: FloatArray = np.sqrt(np.nansum(squares, axis=(0, 2)) / np.maximum(counts, 1))
-    return result
+    return np.sqrt(np.nansum(squares, axis=(0, 2)) / np.maximum(counts, 1))

@@ -162,8 +162,7 @@ def fits(task: DesignTask, array: SensorArray) -> bool:
 
 def _at(sources: Sample, distance: float) -> FloatArray:
     """Positions of sources moved to one distance from the origin."""
-    moved: FloatArray = distance * sources.positions / np.linalg.norm(sources.positions, axis=1, keepdims=True)
-    return moved
+    return distance * sources.positions / np.linalg.norm(sources.positions, axis=1, keepdims=True)
 
 
 def range_spread(task: DesignTask, array: SensorArray, sources: Sample, distance_m: FloatArray) -> RangeSpread:

@@ -94,8 +94,7 @@ class Design:
 
     def plot(self, seed: int = 0) -> Figure:
         """The sensors in their volume, and the range's σ over the distance; `seed` of the sources it is drawn from."""
-        figure: Figure = by_name("magloc.plots.designs:design")(self, seed)
-        return figure
+        return by_name("magloc.plots.designs:design")(self, seed)
 
 
 def design_array(

@@ -98,8 +98,7 @@ class Quantile:
     def weights(self, n: int) -> FloatArray:
         """Harrell and Davis' weights of the order statistics (Biometrika 69, 1982), in which the quantile is smooth."""
         edges = np.arange(n + 1) / n
-        weights: FloatArray = np.diff(betainc((n + 1) * self.level, (n + 1) * (1.0 - self.level), edges))
-        return weights
+        return np.diff(betainc((n + 1) * self.level, (n + 1) * (1.0 - self.level), edges))
 
     def of(self, deviations: FloatArray) -> float:
         """Order statistic: an infinite neighbour does not spoil it."""

@@ -100,8 +100,7 @@ class Box(_Solid):
     def nearest(self, points: FloatArray) -> FloatArray:
         """The nearest points of the box to points (n, 3) [m]."""
         half = 0.5 * np.array(self.size_m)
-        nearest: FloatArray = np.clip(points, self.centre - half, self.centre + half)
-        return nearest
+        return np.clip(points, self.centre - half, self.centre + half)
 
     def random(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Evenly distributed points (n, 3) [m]."""

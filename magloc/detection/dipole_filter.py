@@ -81,13 +81,11 @@ class DipoleFilter:
         w = self.whitening
         unknown = w.basis[:, w.shrinkage == 1.0]
         draws = rng.normal(size=(n, self.array.n_channels))
-        free: FloatArray = draws - draws @ unknown @ unknown.T
-        return free
+        return draws - draws @ unknown @ unknown.T
 
     def signal(self, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
         """Whitened signals of sources (..., 3), noise-free: (..., C)."""
-        signal: FloatArray = np.einsum("...cj,...j->...c", self.unit_signals(position_m), np.asarray(moment_Am2))
-        return signal
+        return np.einsum("...cj,...j->...c", self.unit_signals(position_m), np.asarray(moment_Am2))
 
     def unit_signals(self, position_m: ArrayLike) -> FloatArray:
         """Whitened signals (..., C, 3) [1/(A·m²)] of the three unit moments at positions (..., 3) [m].
@@ -99,13 +97,11 @@ class DipoleFilter:
         fields = dipole.field_matrix(self.array.positions, position)[..., self.array.channel_sensor, :, :]
         rows = np.einsum("cj,...cjk->...ck", self._gain, fields)
         w = self.whitening
-        free: FloatArray = rows - (w.basis * w.shrinkage) @ (w.basis.T @ rows)
-        return free
+        return rows - (w.basis * w.shrinkage) @ (w.basis.T @ rows)
 
     def energy(self, whitened: FloatArray) -> FloatArray:
         """Energy of whitened readings (n, C), χ² without a source: (n,)."""
-        energy: FloatArray = np.einsum("nc,nc->n", whitened, whitened)
-        return energy
+        return np.einsum("nc,nc->n", whitened, whitened)
 
     def candidate_energy(self, whitened: FloatArray) -> FloatArray:
         """Energy of whitened readings (n, C) that the best of the candidate positions explains: (n,).
@@ -139,5 +135,4 @@ class DipoleFilter:
             Ends(q, mu, chi2, np.empty((n, _N_STARTS), dtype=np.int64), np.zeros((n, 3), dtype=np.int64)),
         )
         # A candidate is a source too, where none of the refinements converged.
-        best: FloatArray = np.maximum(self.energy(y) - chi2.min(axis=1), self.candidate_energy(y))
-        return best
+        return np.maximum(self.energy(y) - chi2.min(axis=1), self.candidate_energy(y))

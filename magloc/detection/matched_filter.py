@@ -91,8 +91,7 @@ class MatchedFilterDetector:
 
     def detects(self, readings_T: ArrayLike) -> NDArray[np.bool_]:
         """Whether there is a source in each set of raw readings (n, C) [T]: (n,)."""
-        above: NDArray[np.bool_] = self.filter.largest_energy(self.filter.whitened(readings_T)) > self.threshold
-        return above
+        return self.filter.largest_energy(self.filter.whitened(readings_T)) > self.threshold
 
     def probability(self, signals: FloatArray, rng: np.random.Generator) -> float:
         """Share of whitened signals (n, C) that are detected in noise, one draw of noise each."""

@@ -82,8 +82,7 @@ def demagnetising_factors(semi_axes_m: ArrayLike) -> FloatArray:
     square = axes**2
     others = [(1, 2), (2, 0), (0, 1)]
     integrals = [elliprd(square[..., j], square[..., k], square[..., i]) for i, (j, k) in enumerate(others)]
-    factors: FloatArray = np.prod(axes, axis=-1)[..., None] / 3.0 * np.stack(integrals, axis=-1)
-    return factors
+    return np.prod(axes, axis=-1)[..., None] / 3.0 * np.stack(integrals, axis=-1)
 
 
 def equivalent_dipole(

@@ -60,5 +60,4 @@ def loop_field(points_m: ArrayLike, centre_m: ArrayLike, moment_Am2: ArrayLike, 
     d = elliprd(0.0, complement, 1.0) / 3.0
     c = np.where(parameter > _ON_AXIS, (2.0 * d - first) / np.maximum(parameter, _ON_AXIS), np.pi / 16.0)
     outwards = common * z * 8.0 * radius_m**2 / alpha2 * (d - c)
-    result: FloatArray = along * axis + outwards * across
-    return result
+    return along * axis + outwards * across

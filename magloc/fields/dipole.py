@@ -310,8 +310,7 @@ def _unit(vectors: Array) -> tuple[Array, Array]:
 
 def _dot(a: Array, b: Array) -> Array:
     """Scalar products a.b, shape (...)."""
-    product: Array = np.vecdot(a, b)
-    return product
+    return np.vecdot(a, b)
 
 
 def _outer(a: Array, b: Array) -> Array:

@@ -50,8 +50,7 @@ def multipole_field_matrix(points_m: ArrayLike, source_m: ArrayLike, order: int)
         )
     along = np.einsum("...si,...i->...s", contracted, n)
     pattern = (2 * order + 1) * along[..., None] * n[..., None, :] - order * contracted
-    field: FloatArray = MU0_OVER_4PI * np.swapaxes(pattern / r[..., None] ** (order + 2), -1, -2)
-    return field
+    return MU0_OVER_4PI * np.swapaxes(pattern / r[..., None] ** (order + 2), -1, -2)
 
 
 @cache

@@ -175,8 +175,7 @@ def chunk_seconds(path: str | os.PathLike[str]) -> FloatArray:
 
 def _as_json(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """Attributes as they come back from a store."""
-    parsed: dict[str, Any] = json.loads(json.dumps(dict(attributes), default=lambda value: value.tolist()))
-    return parsed
+    return json.loads(json.dumps(dict(attributes), default=lambda value: value.tolist()))
 
 
 def _make_store(cube: CubeMap, path: Path) -> None:

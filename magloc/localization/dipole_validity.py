@@ -216,8 +216,7 @@ def _orthonormal(columns: FloatArray, known: FloatArray) -> FloatArray:
     unit = columns / np.where(length > 0.0, length, 1.0)
     new = unit - known @ (known.T @ unit)
     basis, size, _ = np.linalg.svd(new, full_matrices=False)
-    result: FloatArray = basis[:, size > _UNSEEN_RTOL]
-    return result
+    return basis[:, size > _UNSEEN_RTOL]
 
 
 def too_near(

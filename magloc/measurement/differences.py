@@ -40,8 +40,7 @@ def channel_jacobian(array: SensorArray, position_m: ArrayLike, moment_Am2: Arra
     m = np.asarray(moment_Am2, dtype=np.float64)[..., None, :]
     jacobian = dipole.field_jacobian(array.positions, p, m)
     rows = array.linear_gain(fields_at_sensors(array, position_m, moment_Am2))
-    result: FloatArray = np.einsum("...ci,...cij->...cj", rows, jacobian[..., array.channel_sensor, :, :])
-    return result
+    return np.einsum("...ci,...cij->...cj", rows, jacobian[..., array.channel_sensor, :, :])
 
 
 def fields_at_sensors(array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
@@ -83,15 +82,12 @@ class DifferenceMeasurement:
         transform = self.differences.transform
         used = np.any(transform != 0.0, axis=0)
         channels = np.asarray(readings_T, dtype=np.float64) - self.array.channel_offset_T
-        result: FloatArray = channels[..., used] @ transform[:, used].T
-        return result
+        return channels[..., used] @ transform[:, used].T
 
     def predicted(self, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
         """Predicted decorrelated differences (..., k) [T] of a source in the array's frame (ForwardMT, ForwardMV)."""
-        result: FloatArray = predicted_channels(self.array, position_m, moment_Am2) @ self.differences.transform.T
-        return result
+        return predicted_channels(self.array, position_m, moment_Am2) @ self.differences.transform.T
 
     def jacobian(self, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
         """Jacobian (..., k, 6) of :meth:`predicted` (JacobianH), columns (p, m): [T/m] and [T/(A·m²)]."""
-        result: FloatArray = self.differences.transform @ channel_jacobian(self.array, position_m, moment_Am2)
-        return result
+        return self.differences.transform @ channel_jacobian(self.array, position_m, moment_Am2)

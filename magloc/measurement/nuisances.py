@@ -114,8 +114,7 @@ class SensorErrors:
 def _of_fields(array: SensorArray) -> FloatArray:
     """Derivative (N, 3, 3) of readings by a field in the array's frame; a modulus sees it along the ambient field."""
     rows = np.nan_to_num(array.linear_gain(array.ambient_fields))
-    derivative: FloatArray = np.where(array.sensor_channels[..., None] >= 0, rows[array.sensor_channels], 0.0)
-    return derivative
+    return np.where(array.sensor_channels[..., None] >= 0, rows[array.sensor_channels], 0.0)
 
 
 def without_lasting_errors(array: SensorArray) -> SensorArray:

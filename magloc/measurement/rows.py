@@ -66,8 +66,7 @@ class WhitenedRows:
         without = self.y
         if self.model.channel_is_scalar.any():
             without = without - self.model.predicted(np.zeros_like(self.model.ambient))
-        energy: FloatArray = np.einsum("bc,bc->b", without, without)
-        return energy
+        return np.einsum("bc,bc->b", without, without)
 
 
 def whitened_rows(
@@ -128,8 +127,7 @@ def channels_above_ambient(
     """
     vector = ~array.channel_is_scalar
     ambient = np.einsum("ncj,cj->nc", ambient_T[:, array.channel_sensor], array.channel_gain) * vector
-    channels: FloatArray = np.where(mask, readings_T - array.channel_offset_T - ambient, 0.0)
-    return channels
+    return np.where(mask, readings_T - array.channel_offset_T - ambient, 0.0)
 
 
 def whitened_model(

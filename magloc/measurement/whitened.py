@@ -43,8 +43,7 @@ class ScaledSensors:
         """Homogeneous coordinates (..., 4), of unit norm and s > 0, of positions (..., 3) [m]."""
         rho = (np.asarray(position_m, dtype=np.float64) - self.centroid) / self.radius
         q = np.concatenate([rho, np.ones_like(rho[..., :1])], axis=-1)
-        unit: FloatArray = q / np.linalg.norm(q, axis=-1, keepdims=True)
-        return unit
+        return q / np.linalg.norm(q, axis=-1, keepdims=True)
 
     def position(self, q: FloatArray) -> FloatArray:
         """Positions (..., 3) [m] of homogeneous coordinates (..., 4); not finite at s = 0."""
@@ -60,8 +59,7 @@ class ScaledSensors:
 
     def scaled_moment(self, q: FloatArray, moment_Am2: ArrayLike) -> FloatArray:
         """The inverse of :meth:`moment`."""
-        mu: FloatArray = np.asarray(moment_Am2) * (MU0_OVER_4PI / self.radius**3) * np.abs(q[..., 3:]) ** 3
-        return mu
+        return np.asarray(moment_Am2) * (MU0_OVER_4PI / self.radius**3) * np.abs(q[..., 3:]) ** 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,8 +153,7 @@ class WhitenedModel(ScaledSensors):
         """Field of all sources (b, K, ...) at the sensors: (b, N, 3) [T]."""
         n, inverse3 = self._directions(q)
         along = np.sum(n * mu[:, :, None], axis=-1, keepdims=True)
-        fields: FloatArray = np.sum((3.0 * along * n - mu[:, :, None]) * inverse3, axis=1)
-        return fields
+        return np.sum((3.0 * along * n - mu[:, :, None]) * inverse3, axis=1)
 
     def _directions(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Unit vectors from the sources to the sensors (b, K, N, 3) and the inverse cubes of the distances."""

@@ -248,8 +248,7 @@ def _palette() -> list[int]:
     greys = np.repeat(np.linspace(0.0, 1.0, 24)[:, None], 3, axis=1)
     accents = np.linspace(np.array(to_rgb(style.ORANGE)), 1.0, 8)
     colours = colormaps[_COLOURS](np.linspace(0.0, 1.0, 224))[:, :3]
-    palette: list[int] = np.rint(255.0 * np.concatenate([greys, accents, colours])).astype(int).ravel().tolist()
-    return palette
+    return np.rint(255.0 * np.concatenate([greys, accents, colours])).astype(int).ravel().tolist()
 
 
 def _norm(values: FloatArray, most: float) -> LogNorm:

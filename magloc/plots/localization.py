@@ -115,8 +115,7 @@ def _sensors_of(fixes: Fixes, array: SensorArray, rows: Readings | None) -> Floa
     pose = None if rows is None else rows.pose
     if pose is None:
         return np.broadcast_to(array.positions, (len(fixes), *array.positions.shape))
-    result: FloatArray = np.einsum("nab,sb->nsa", pose[1].as_matrix(), array.positions) + pose[0][:, None]
-    return result
+    return np.einsum("nab,sb->nsa", pose[1].as_matrix(), array.positions) + pose[0][:, None]
 
 
 _PLANES = ((0, 1), (0, 2), (1, 2))

@@ -68,8 +68,7 @@ class RowMeasurement:
 
     def predicted(self, state: FloatArray) -> FloatArray:
         """Predicted differences (k,) of a state (n,)."""
-        result: FloatArray = self.of_source(state[:N_SOURCE]) + self.effect @ state[self.n_motion :]
-        return result
+        return self.of_source(state[:N_SOURCE]) + self.effect @ state[self.n_motion :]
 
     def jacobian(self, state: FloatArray) -> FloatArray:
         """Their Jacobian (k, n)."""

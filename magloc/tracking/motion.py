@@ -28,8 +28,7 @@ N_SOURCE = 6
 def cross_matrix(vector: ArrayLike) -> FloatArray:
     """Matrix ``[a]×`` with ``[a]× b = a × b``, equation (18): (..., 3, 3) of (..., 3)."""
     a = np.asarray(vector, dtype=np.float64)
-    matrix: FloatArray = np.cross(a[..., None, :], -np.eye(3))
-    return matrix
+    return np.cross(a[..., None, :], -np.eye(3))
 
 
 def array_axes_transition(
@@ -233,8 +232,7 @@ def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
     first = math.sin(angle) / angle if angle > 1e-8 else 1.0
     half = 0.5 * angle
     second = 0.5 * (math.sin(half) / half) ** 2 if angle > 1e-8 else 0.5
-    matrix: FloatArray = np.eye(3) + first * K + second * (K @ K)
-    return matrix
+    return np.eye(3) + first * K + second * (K @ K)
 
 
 def _turn_of_change(rotation_vector: FloatArray) -> FloatArray:
@@ -247,8 +245,7 @@ def _turn_of_change(rotation_vector: FloatArray) -> FloatArray:
         first, second = 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
     else:
         first, second = (1.0 - math.cos(angle)) / square, (angle - math.sin(angle)) / (square * angle)
-    matrix: FloatArray = np.eye(3) + first * K + second * (K @ K)
-    return matrix
+    return np.eye(3) + first * K + second * (K @ K)
 
 
 @lru_cache(maxsize=64)
@@ -370,5 +367,4 @@ def induced_and_permanent_moment(
     R = np.asarray(R_world_from_body, dtype=np.float64)
     field_body = np.swapaxes(R, -1, -2) @ np.asarray(ambient_T, dtype=np.float64)[..., None]
     moment_body = np.asarray(permanent_Am2, dtype=np.float64)[..., None] + np.asarray(polarisability_Am2_T) @ field_body
-    moment: FloatArray = (R @ moment_body)[..., 0]
-    return moment
+    return (R @ moment_body)[..., 0]

@@ -169,8 +169,7 @@ class Track(Sequence[TrackPoint]):
 
     def plot(self) -> Figure:
         """The track from above with 95 % ellipses, and its coordinates and its strength through time."""
-        figure: Figure = by_name("magloc.plots.tracks:track_figure")(self, None, self.readings.array_position_m)
-        return figure
+        return by_name("magloc.plots.tracks:track_figure")(self, None, self.readings.array_position_m)
 
     def to_xarray(self) -> xr.Dataset:
         """Columns with units and names, along `row`."""

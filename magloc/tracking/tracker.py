@@ -336,8 +336,7 @@ class Tracker:
 
     def centroid(self, row: Row) -> FloatArray:
         """Of the sensors in the world frame, shape (3,)."""
-        place: FloatArray = row.origin_m + row.R_world_from_array @ self.array.centroid
-        return place
+        return row.origin_m + row.R_world_from_array @ self.array.centroid
 
     def _lost(
         self, row: Row, reason: str, rivals: tuple[Solution, ...] = (), nis: float = math.nan, nis_dof: int = 0

@@ -167,8 +167,7 @@ class Chromium(Closing):
             raise BrowserError(f"Chromium did not answer {method} ({type(error).__name__}).") from None
         if "error" in message:
             raise BrowserError(f"{method}: {message['error'].get('message', message['error'])}")
-        result: dict[str, Any] = message["result"]
-        return result
+        return message["result"]
 
     def evaluate(self, expression: str) -> Any:
         """Value of a JavaScript expression in the page; promises are awaited.
@@ -278,8 +277,7 @@ class Chromium(Closing):
                 with direct.open(f"http://127.0.0.1:{lines[0]}/json/list", timeout=timeout_s) as reply:
                     for target in json.load(reply):
                         if target["type"] == "page":
-                            address: str = target["webSocketDebuggerUrl"]
-                            return address
+                            return target["webSocketDebuggerUrl"]
             time.sleep(_POLL_S)
         raise BrowserError(f"Chromium did not start within {timeout_s:g} s.")
 

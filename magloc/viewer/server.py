@@ -55,8 +55,7 @@ def free_port(wanted: int) -> int:
                 probe.bind((HOST, port))
             except OSError:
                 continue
-            found: int = probe.getsockname()[1]
-            return found
+            return probe.getsockname()[1]
     raise InputError(f"Input port: found the ports {wanted} to {last} in use, expected a free one.")
 
 

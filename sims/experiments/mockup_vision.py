@@ -143,8 +143,7 @@ class SkyRun:
     def good(self) -> BoolArray:
         """Fixes within 20 mm and 2° of the truth, shape (n,)."""
         near = self.position_errors_m <= FALSE_POSITION_M
-        good: BoolArray = near & (np.abs(self.heading_errors_rad) <= FALSE_HEADING_RAD)
-        return good
+        return near & (np.abs(self.heading_errors_rad) <= FALSE_HEADING_RAD)
 
     @property
     def false_fixes(self) -> BoolArray:

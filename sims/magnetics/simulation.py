@@ -121,8 +121,7 @@ def _moments(source: Source, rotation: Rotation, ambient_T: FloatArray) -> Float
     """Moments in the world frame (n, 3): permanent and induced."""
     ambient_in_body = rotation.inv().apply(ambient_T)
     induced = ambient_in_body @ np.array(source.polarisability_m3).T / MU0
-    moments: FloatArray = rotation.apply(induced + source.moment_Am2)
-    return moments
+    return rotation.apply(induced + source.moment_Am2)
 
 
 def _refuse_contact(scenario: MagneticScenario, number: int, time_s: FloatArray, offset_m: FloatArray) -> None:
@@ -229,5 +228,4 @@ def _rows(values: FloatArray | None, rows: NDArray[np.bool_]) -> FloatArray | No
 
 def _applied(rotation: Rotation, vectors: FloatArray) -> FloatArray:
     """The vectors (n, N, 3) of every instant, or (1, N, 3) of all of them, turned by its rotation."""
-    turned: FloatArray = np.einsum("tij,tkj->tki", rotation.as_matrix(), vectors)
-    return turned
+    return np.einsum("tij,tkj->tki", rotation.as_matrix(), vectors)

@@ -30,8 +30,7 @@ def turned(heading_rad: ArrayLike, vector_body: ArrayLike) -> FloatArray:
 
 def wrapped(angle_rad: ArrayLike) -> FloatArray:
     """Angle in (-π, π], any shape."""
-    angle: FloatArray = math.pi - np.mod(math.pi - np.asarray(angle_rad, dtype=np.float64), 2.0 * math.pi)
-    return angle
+    return math.pi - np.mod(math.pi - np.asarray(angle_rad, dtype=np.float64), 2.0 * math.pi)
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,8 +40,7 @@ def double_integral(begin_s: float, time_s: ArrayLike, values: ArrayLike, at_s: 
     speed = np.concatenate([lead, np.cumsum(gained, axis=-1)], axis=-1)
     moment = np.concatenate([lead, np.cumsum(gained * 0.5 * (edges[1:] + edges[:-1]), axis=-1)], axis=-1)
     row = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, t.size - 1)
-    part: ComplexArray = at * speed[..., row] - moment[..., row] + 0.5 * u[..., row] * (at - edges[row]) ** 2
-    return part
+    return at * speed[..., row] - moment[..., row] + 0.5 * u[..., row] * (at - edges[row]) ** 2
 
 
 def heading_from_fixes(imu: ImuRecord, fixes: FixRecord) -> tuple[FloatArray, float]:

@@ -122,8 +122,7 @@ def table_from_centred(camera: Camera, pose: Pose, points_px: ArrayLike) -> Floa
     body = np.asarray(points_px, dtype=np.float64) * [camera.m_per_px, -camera.m_per_px]
     cos, sin = np.cos(pose.heading_rad)[..., None], np.sin(pose.heading_rad)[..., None]
     turned = np.stack([cos * body[..., 0] - sin * body[..., 1], sin * body[..., 0] + cos * body[..., 1]], axis=-1)
-    place: FloatArray = turned + pose.position_m[..., None, :]
-    return place
+    return turned + pose.position_m[..., None, :]
 
 
 def distorted(camera: Camera, points_px: ArrayLike) -> FloatArray:
@@ -135,8 +134,7 @@ def distorted(camera: Camera, points_px: ArrayLike) -> FloatArray:
     points = np.asarray(points_px, dtype=np.float64)
     squared = np.sum(points**2, axis=-1, keepdims=True) / REFERENCE_RADIUS_PX**2
     moved = points * np.where(1.0 + 3.0 * camera.k1 * squared > 0.0, 1.0 + camera.k1 * squared, np.nan)
-    image: FloatArray = moved * [1.0, -1.0] + camera.centre
-    return image
+    return moved * [1.0, -1.0] + camera.centre
 
 
 def undistorted(camera: Camera, image_px: ArrayLike) -> FloatArray:
@@ -165,8 +163,7 @@ def undistorted(camera: Camera, image_px: ArrayLike) -> FloatArray:
         rho = A * np.sin(np.arcsin(np.where(inside, 3.0 * d / A, np.nan)) / 3.0)
     else:
         rho = A * np.sinh(np.arcsinh(3.0 * d / A) / 3.0)
-    inner: FloatArray = points * np.divide(rho, d, out=np.ones_like(d), where=d > 0.0)
-    return inner
+    return points * np.divide(rho, d, out=np.ones_like(d), where=d > 0.0)
 
 
 def image_from_table(camera: Camera, pose: Pose, points_m: ArrayLike) -> FloatArray:
@@ -192,8 +189,7 @@ def in_frame(camera: Camera, image_px: ArrayLike, margin_px: float = 0.0) -> Boo
     """Whether pixels, shape (..., 2), are within the frame, by a margin; no for NaN."""
     points = np.asarray(image_px, dtype=np.float64)
     last = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
-    inside: BoolArray = np.all((points >= margin_px) & (points <= last - margin_px), axis=-1)
-    return inside
+    return np.all((points >= margin_px) & (points <= last - margin_px), axis=-1)
 
 
 def footprint(camera: Camera, pose: Pose, points_per_side: int = 1) -> FloatArray:

@@ -52,8 +52,7 @@ class LightMap:
     def misses(self, points: ComplexArray, limit_m: float) -> FloatArray:
         """Sum over the last axis of points of the squared distance to the nearest light, at most the limit² each."""
         offset = points - self.plane[self.lights_near(points)]
-        summed: FloatArray = np.minimum(offset.real**2 + offset.imag**2, limit_m**2).sum(axis=-1)
-        return summed
+        return np.minimum(offset.real**2 + offset.imag**2, limit_m**2).sum(axis=-1)
 
     def misses_of_poses(self, image: ComplexArray, a: ComplexArray, b: ComplexArray, limit_m: float) -> FloatArray:
         """:meth:`misses` of an image under poses (h,), compiled; see :mod:`adcs.mockup.vision.similarity`."""

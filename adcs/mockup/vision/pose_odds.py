@@ -182,11 +182,9 @@ class PoseOdds:
         seen = np.conj((self.catalogue.plane - poses.b[:, None]) / poses.a[:, None])
         expected = in_frame(self.camera, distorted(self.camera, pairs_of(seen)), self.border_px)
         found = np.take_along_axis(expected, poses.lights, axis=1) & poses.matched
-        missing: IntArray = expected.sum(axis=1) - found.sum(axis=1)
-        return missing
+        return expected.sum(axis=1) - found.sum(axis=1)
 
 
 def _squared(plane: ComplexArray) -> FloatArray:
     """Squared modulus."""
-    squared: FloatArray = plane.real**2 + plane.imag**2
-    return squared
+    return plane.real**2 + plane.imag**2

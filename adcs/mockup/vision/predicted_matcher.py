@@ -139,8 +139,7 @@ class LightTracker:
         factor = np.linalg.cholesky(blurred)
         whitened = np.linalg.solve(factor, error)
         log_evidence_volume = 1.5 * math.log(2.0 * math.pi) + float(np.log(np.diagonal(factor)).sum())
-        density: FloatArray = -0.5 * (whitened**2).sum(axis=0) - log_evidence_volume + 2.0 * math.log(s)
-        return density
+        return -0.5 * (whitened**2).sum(axis=0) - log_evidence_volume + 2.0 * math.log(s)
 
 
 def _fit_of(camera: Camera, pose: Pose) -> tuple[complex, complex]:

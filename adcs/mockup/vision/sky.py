@@ -129,8 +129,7 @@ class LedSky:
         triangle, corner = np.nonzero(neighbours > np.arange(len(corners))[:, None])  # each edge once
         other = neighbours[triangle, corner]
         back = np.argmax(neighbours[other] == triangle[:, None], axis=1)
-        margins: FloatArray = math.pi - angles[triangle, corner] - angles[other, back]
-        return margins
+        return math.pi - angles[triangle, corner] - angles[other, back]
 
     def _doubt(self) -> str:
         margins = self.cocircular_margins_rad
@@ -160,8 +159,7 @@ def interior_angles(triangles: FloatArray) -> FloatArray:
     s = np.roll(triangles, -1, axis=-2) - triangles
     t = np.roll(triangles, 1, axis=-2) - triangles
     across = s[..., 0] * t[..., 1] - s[..., 1] * t[..., 0]
-    angles: FloatArray = np.arctan2(np.abs(across), np.sum(s * t, axis=-1))
-    return angles
+    return np.arctan2(np.abs(across), np.sum(s * t, axis=-1))
 
 
 def led_sky(seed: int = 0) -> LedSky:
@@ -194,8 +192,7 @@ def _border(half: FloatArray, rng: np.random.Generator) -> FloatArray:
     corners = half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
     ends = np.concatenate([[0.0], np.cumsum(lengths)])
     straight = np.stack([np.interp(along, ends, corners[:, axis]) for axis in range(2)], axis=1)
-    curved: FloatArray = straight * (1.0 - _BULGE * (straight / half)[:, ::-1] ** 2)
-    return curved
+    return straight * (1.0 - _BULGE * (straight / half)[:, ::-1] ** 2)
 
 
 class _SkyFile(File, kw_only=True):

@@ -229,8 +229,7 @@ class Fixes(Sequence[Fix]):
 
     def plot(self) -> Figure:
         """Fixes in three planes with 95 % ellipses, their standard deviations and their χ²."""
-        figure: Figure = by_name("magloc.plots.localization:fixes")(self)
-        return figure
+        return by_name("magloc.plots.localization:fixes")(self)
 
     def to_xarray(self, which: Literal["best", "all"] = "best") -> xr.Dataset:
         """Columns with units and names, along `row`, for "all" also along `solution`, and along `source`.

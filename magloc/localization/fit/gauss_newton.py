@@ -250,8 +250,7 @@ def refine(
 
 
 def _squares(residual: FloatArray) -> FloatArray:
-    squares: FloatArray = np.sum(residual * residual, axis=-1)
-    return squares
+    return np.sum(residual * residual, axis=-1)
 
 
 def _moved(

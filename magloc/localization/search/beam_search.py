@@ -61,8 +61,7 @@ def _same_sources(q: FloatArray, mu: FloatArray, other_q: FloatArray, other_mu: 
     angle = np.abs(np.einsum("...kd,...ld->...kl", q, other_q)) > np.cos(_SAME_RAD)
     apart = np.linalg.norm(mu[..., :, None, :] - other_mu[..., None, :, :], axis=-1)
     near = angle & (apart < _SAME_MOMENT * np.linalg.norm(mu, axis=-1)[..., None])
-    same: NDArray[np.bool_] = near.any(axis=-1).all(axis=-1) & near.any(axis=-2).all(axis=-1)
-    return same
+    return near.any(axis=-1).all(axis=-1) & near.any(axis=-2).all(axis=-1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -40,8 +40,7 @@ def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates:
         ModelRow.of(problem, gain, problem.basis[row], problem.shrinkage[row]),
         bases,
     )
-    single: SingleArray = bases.transpose(2, 1, 0).astype(np.float32, order="C").reshape(gain.shape[0], -1)
-    return single
+    return bases.transpose(2, 1, 0).astype(np.float32, order="C").reshape(gain.shape[0], -1)
 
 
 def linear_scores(bases: SingleArray, residual: FloatArray) -> FloatArray:

@@ -131,5 +131,4 @@ def _is_even(problem: WhitenedModel) -> NDArray[np.bool_]:
     """Whether the readings (b,) stay as they are if the moment is reversed: moduli alone, without an ambient field."""
     silent = ~np.any(problem.gain, axis=-1)
     lone = problem.channel_is_scalar & ~np.any(problem.ambient, axis=-1)[:, problem.channel_sensor]
-    even: NDArray[np.bool_] = np.all(silent | lone, axis=-1)
-    return even
+    return np.all(silent | lone, axis=-1)

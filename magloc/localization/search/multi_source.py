@@ -336,5 +336,4 @@ def _squared_ratio(values: FloatArray, covariance: FloatArray) -> FloatArray:
     safe = np.where(known[:, None], scale, 1.0)
     correlation = np.where(known[:, None, None], covariance / (safe[:, :, None] * safe[:, None]), np.eye(3))
     unit = np.where(known[:, None], values / safe, 0.0)
-    ratio: FloatArray = np.sum(unit * (np.linalg.pinv(correlation) @ unit[..., None])[..., 0], axis=-1)
-    return ratio
+    return np.sum(unit * (np.linalg.pinv(correlation) @ unit[..., None])[..., 0], axis=-1)

@@ -49,8 +49,7 @@ def weights(chi2: ArrayLike, volume: ArrayLike) -> FloatArray:
     values = np.asarray(volume, dtype=np.float64) - 0.5 * np.asarray(chi2, dtype=np.float64)
     best = values.max(axis=-1, keepdims=True)
     relative = np.exp(values - np.where(np.isfinite(best), best, 0.0))
-    result: FloatArray = relative / np.maximum(relative.sum(axis=-1, keepdims=True), 1e-300)
-    return result
+    return relative / np.maximum(relative.sum(axis=-1, keepdims=True), 1e-300)
 
 
 def relative_sigma(covariance: FloatArray, offset_m: FloatArray, moment: FloatArray) -> FloatArray:
@@ -61,16 +60,14 @@ def relative_sigma(covariance: FloatArray, offset_m: FloatArray, moment: FloatAr
             np.sqrt(np.sum(of_vector, axis=-1) / np.sum(vector * vector, axis=-1))
             for of_vector, vector in ((variance[..., :3], offset_m), (variance[..., 3:6], moment))
         ]
-    larger: FloatArray = np.maximum(*parts)
-    return larger
+    return np.maximum(*parts)
 
 
 def longest_axes(covariance: FloatArray, offset_m: FloatArray, moment: FloatArray) -> FloatArray:
     """Longest half axes (..., 6 K) of ellipsoids of one σ, lengths being in units of ranges and moments."""
     unit = _units(offset_m, moment)
     variance, axis = np.linalg.eigh(covariance / (unit[..., :, None] * unit[..., None, :]))
-    longest: FloatArray = unit * axis[..., -1] * np.sqrt(np.maximum(variance[..., -1:], 0.0))
-    return longest
+    return unit * axis[..., -1] * np.sqrt(np.maximum(variance[..., -1:], 0.0))
 
 
 def widened(
@@ -90,8 +87,7 @@ def widened(
         following = np.einsum("...ij,...j->...i", covariance[..., place], offset_m / distance[..., None])
         variance = np.sum(following[..., place] * offset_m, axis=-1) / distance
         missing = np.nan_to_num(np.maximum(wanted**2 - variance, 0.0) / variance**2, nan=0.0, posinf=0.0)
-    result: FloatArray = covariance + missing[..., None, None] * following[..., :, None] * following[..., None, :]
-    return result
+    return covariance + missing[..., None, None] * following[..., :, None] * following[..., None, :]
 
 
 @dataclass(frozen=True, eq=False)

@@ -195,5 +195,4 @@ def _weights_of_rows(of_row: IntArray, chi2: FloatArray, volume: FloatArray) -> 
     shape, at = _places(of_row, int(of_row.max(initial=-1)) + 1)
     of_table, volumes = np.full(shape, np.inf), np.zeros(shape)
     of_table[at], volumes[at] = chi2, volume
-    weight: FloatArray = weights(of_table, volumes)[at]
-    return weight
+    return weights(of_table, volumes)[at]

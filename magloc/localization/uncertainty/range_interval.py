@@ -47,8 +47,7 @@ def rise(energy: ArrayLike, chi2: ArrayLike, n_differences: int, level: ArrayLik
     weakest = np.interp(wanted, left[::-1], strength[::-1])
     raised = explained - weakest * weakest
     raised = np.where(best > strength[-1], wanted_rise, np.maximum(raised, wanted_rise))
-    result: FloatArray = np.where(is_detected(of_energy, n_differences), raised, np.inf)
-    return result
+    return np.where(is_detected(of_energy, n_differences), raised, np.inf)
 
 
 @lru_cache(maxsize=64)

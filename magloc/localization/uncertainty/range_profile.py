@@ -67,8 +67,7 @@ def profile_stretches(
         outside, f_outside = np.where(higher, middle, outside), np.where(higher, f, f_outside)
         inside, f_inside = np.where(higher, inside, middle), np.where(higher, f_inside, f)
     end = np.where(f_outside - allowed < allowed - f_inside, outside, inside)
-    stretches: FloatArray = np.where(found, end, sign * 0.5 * np.pi).reshape(2, n).T
-    return stretches
+    return np.where(found, end, sign * 0.5 * np.pi).reshape(2, n).T
 
 
 def ranges_within(
@@ -104,5 +103,4 @@ def _rises(
     profile = refine(problem.rows(row), y[row], q, mu, free=free, max_iterations=40)
     # A refinement that did not end says nothing of the profile: the points beyond it decide.
     chi2 = np.where(profile.converged, profile.chi2, -np.inf)
-    rise: FloatArray = chi2.reshape(n, n_grid) - fits.chi2[rows, None]
-    return rise
+    return chi2.reshape(n, n_grid) - fits.chi2[rows, None]

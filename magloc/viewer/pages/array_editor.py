@@ -187,8 +187,7 @@ class ArrayEditor:
         self._position.show((x, y, z))
 
     def _place_of(self, sensor_id: str) -> FloatArray:
-        place: FloatArray = self.array.positions[self.array.ids.index(sensor_id)]
-        return place
+        return self.array.positions[self.array.ids.index(sensor_id)]
 
 
 def moved(array: SensorArray, sensor_id: str, position_m: ArrayLike) -> SensorArray:

@@ -153,8 +153,7 @@ def field_lines(
         np.cos(azimuth)[:, None, None] * axes[0] + np.sin(azimuth)[:, None, None] * axes[1]
     )
     along = (r * np.cos(theta))[..., None] * axes[2]
-    lines: FloatArray = np.asarray(position_m, dtype=np.float64) + (across + along).reshape(-1, points, 3)
-    return lines
+    return np.asarray(position_m, dtype=np.float64) + (across + along).reshape(-1, points, 3)
 
 
 def line_segments(lines: ArrayLike) -> FloatArray:
