@@ -65,7 +65,8 @@ html_sidebars = {"index": [], "install": [], "quickstart": [], "glossary": []}
 html_theme_options = {
     "logo": {"text": "magloc"},
     "header_links_before_dropdown": 7,
-    "navbar_end": ["release", "theme-switcher"],
+    "navbar_start": ["navbar-logo", "release"],
+    "navbar_end": ["theme-switcher"],
     "footer_start": ["copyright"],
     "footer_end": ["release"],
     # All but notebooks, whose lines take its width.
