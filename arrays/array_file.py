@@ -133,6 +133,11 @@ class _SensorsFile(_Header, kw_only=True):
 def read_array(path: str | PathLike[str]) -> SensorArray:
     """Array from its TOML file.
 
+    Parameters
+    ----------
+    path : str or path-like
+        An array file (TOML); it gives lengths in m and fields in nT.
+
     Returns
     -------
     SensorArray
@@ -158,6 +163,11 @@ def read_array(path: str | PathLike[str]) -> SensorArray:
 
 def read_sensors(path: str | PathLike[str]) -> SensorArray:
     """Array from its TOML file as :func:`read_array`, which may also be a single sensor, to be calibrated.
+
+    Parameters
+    ----------
+    path : str or path-like
+        An array file (TOML).
 
     Examples
     --------
@@ -191,6 +201,7 @@ def write_array(path: str | PathLike[str], array: SensorArray) -> None:
     ----------
     path : path-like
         Replaced if it exists, in one step: nobody sees half a file.
+    array : SensorArray
 
     Raises
     ------
@@ -207,6 +218,11 @@ def write_array(path: str | PathLike[str], array: SensorArray) -> None:
 
 def array_toml(array: SensorArray) -> str:
     """Text of an array's TOML file, sensor by sensor.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Any; its sensors are written one by one, with their calibration.
 
     Examples
     --------

@@ -92,20 +92,11 @@ def decorrelated_differences(
     form (the paper's T for four sensors, Helmert's for any number), other cases numerical eigenvectors. With
     ``array.common_field_T`` the common field is not removed but marginalised with that prior.
 
-    Parameters
-    ----------
-    available : ndarray of bool, shape (C,), optional
-        Channels that have a reading; all by default.
-    base : int
-        Base sensor among the complete sensors of a kind. It changes the differences, never their likelihood.
-    covariance_T2 : ndarray, shape (C, C), optional
-        Covariance of the channels' noise in place of the array's own [T²], as one of :func:`reading_covariance`:
-        block-diagonal by sensor. What it holds of channels without a reading does not count.
-
-    Returns
-    -------
-    Differences
-        With k = channels - rank of the common field; k = channels under a prior.
+    ``available`` (C,): channels that have a reading; all by default. ``base``: base sensor among the complete
+    sensors of a kind. It changes the differences, never their likelihood. ``covariance_T2`` (C, C): covariance of
+    the channels' noise in place of the array's own [T²], as one of :func:`reading_covariance`: block-diagonal by
+    sensor. What it holds of channels without a reading does not count. Returns: with k = channels - rank of the
+    common field; k = channels under a prior.
     """
     mask, covariance = _channels(array, available, covariance_T2)
     transforms: list[FloatArray] = []

@@ -48,6 +48,7 @@ def mesh_of(array: SensorArray, size_m: float | None = None) -> trimesh.Trimesh:
 
     Parameters
     ----------
+    array : SensorArray
     size_m : float, optional
         Size of the glyphs [m], :func:`glyph_size` by default.
 

@@ -18,16 +18,9 @@ def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray
     (vector sensors), or the deviation of the modulus from the mean modulus (scalar sensors). The noise is in the
     readings' units, so |B| is multiplied by the channel's gain.
 
-    Parameters
-    ----------
-    readings_T : ndarray, shape (..., C)
-        Raw readings [T], NaN where missing.
-
-    Returns
-    -------
-    ndarray, shape (..., C)
-        Standard deviations [T], in the units of the readings. Of a sensor whose reading is incomplete the known axes
-        stand for the missing ones, and the largest |B| of a complete sensor is the least it is given.
+    ``readings_T`` (..., C): raw readings [T], NaN where missing. Returns (..., C): standard deviations [T], in the
+    units of the readings. Of a sensor whose reading is incomplete the known axes stand for the missing ones, and
+    the largest |B| of a complete sensor is the least it is given.
     """
     readings_T = np.asarray(readings_T, dtype=np.float64)
     noise = np.broadcast_to(array.channel_noise_T, readings_T.shape)
@@ -57,16 +50,9 @@ def reading_covariance(array: SensorArray, readings_T: FloatArray) -> FloatArray
     sensor is :math:`σ² + σ_g² (reading - offset)²`. The rotations and gains are constant, so that the errors of one
     sensor's rows are not independent of each other: this is their covariance within one row.
 
-    Parameters
-    ----------
-    readings_T : ndarray, shape (..., C)
-        Raw readings of the whole field [T], NaN where missing. For a missing axis of b stands the known ambient field,
-        else the mean of the other sensors' fields, else zero.
-
-    Returns
-    -------
-    ndarray, shape (..., C, C)
-        Block-diagonal by sensor, in the units of the readings [T²]. Entries of missing channels are finite.
+    ``readings_T`` (..., C): raw readings of the whole field [T], NaN where missing. For a missing axis of b stands
+    the known ambient field, else the mean of the other sensors' fields, else zero. Returns (..., C, C):
+    block-diagonal by sensor, in the units of the readings [T²]. Entries of missing channels are finite.
     """
     return _block_diagonal(array, _covariance_blocks(array, readings_T), array.sensor_channels >= 0)
 

@@ -19,6 +19,7 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
     "numpydoc",
     "myst_nb",
     "sphinx_design",
@@ -52,20 +53,24 @@ numpydoc_xref_param_type = False
 mathjax_path = "mathjax.js"
 mathjax3_config = {"svg": {"fontCache": "global"}, "options": {"enableMenu": False}}
 
+WITH_CONTENTS = ("development/**", "guide/**", "reference/**", "theory/**", "validation/**", "install", "quickstart")
 html_theme = "pydata_sphinx_theme"
 html_title = "magloc"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
+html_js_files = ["copy.js"]
 html_copy_source = False
 html_show_sourcelink = False
 html_sidebars = {"index": [], "install": [], "quickstart": [], "glossary": []}
 html_theme_options = {
     "logo": {"text": "magloc"},
     "header_links_before_dropdown": 7,
+    "navbar_start": ["navbar-logo", "release"],
     "navbar_end": ["theme-switcher"],
     "footer_start": ["copyright"],
-    "footer_end": [],
-    "secondary_sidebar_items": ["page-toc"],
-    "show_prev_next": False,
+    "footer_end": ["release"],
+    # All but notebooks, whose lines take its width.
+    "secondary_sidebar_items": {part: ["page-toc"] for part in WITH_CONTENTS},
+    "show_prev_next": True,
     "show_toc_level": 2,
 }

@@ -19,6 +19,8 @@ from sphinx.application import Sphinx
 
 HERE = Path(__file__).parent
 NOTEBOOKS = HERE.parent / "notebooks"
+# As a page of the gallery names that folder.
+ORIGINALS = "../../../notebooks"
 # How a docstring names a page of the theory.
 PAGE = re.compile(r"docs/theory/([\w-]+)\.md")
 # A link of a command's page to a heading that is on another page now.
@@ -40,8 +42,40 @@ PICTURES = {
     "attitude-complementary.png": ["adcs.complementary_filter"],
     "view-mockup.png": ["adcs.mockup.fuse", "adcs.mockup.DelayedFilter"],
 }
-# Pages that a function's page names at most.
-MOST_PAGES = 6
+# The page of the guide on which a name, or all of a module, is explained; the other names of the page are related.
+EXPLAINED = {
+    "array-design": "magloc.design_array magloc.Design magloc.DesignTask",
+    "array-files": "arrays.SensorArray arrays.Sensor arrays.Calibration arrays.SensorPreset arrays.read_array"
+    " arrays.read_sensors arrays.write_array arrays.array_toml arrays.mesh_of arrays.tetrahedron arrays.square"
+    " arrays.cross arrays.cube arrays.hexagon arrays.axial arrays.grid",
+    "attitude": "adcs.estimate adcs.EstimatorSettings adcs.Telemetry adcs.read_telemetry adcs.Satellite"
+    " adcs.circular_orbit adcs.read_scenario adcs.AttitudeTrack adcs.EllipsoidObserver adcs.BoundedSystem"
+    " adcs.Ellipsoid sims.AttitudeScenario sims.experiments.run_scenario sims.experiments.compared_with_paper",
+    "calibration": "magloc.calibrate magloc.Calibration magloc.CalibrationPrior magloc.plots.calibration",
+    "convergence-maps": "magloc.convergence_map magloc.source_map magloc.RepeatedFilter magloc.moments_on_sphere"
+    " magloc.plots.convergence magloc.plots.sources",
+    "detection-range-and-bounds": "magloc.cramer_rao_bounds magloc.Bounds magloc.bound_map magloc.detection_range"
+    " magloc.MatchedFilterDetector magloc.plots.bound_reach magloc.plots.bound_slices magloc.plots.bound_sphere",
+    "dipole-moment": "magloc.equivalent_dipole",
+    "exporting": "magloc.plots.save magloc.plots.write",
+    "figures-and-viewer": "magloc.view magloc.plots.design",
+    "inertial-unit": "adcs.complementary_filter adcs.inertial_magnetic_filter adcs.Gains",
+    "iterated-kalman-filter": "magloc.IteratedExtendedKalmanFilter",
+    "localization": "magloc.locate magloc.Locator magloc.Fixes magloc.Fix magloc.Solution magloc.Source"
+    " magloc.SourcePrior magloc.plots.fixes",
+    "monte-carlo": "sims.run_many sims.simulate sims.read_scenario sims.MagneticScenario sims.write_simulation",
+    "reading-data": "magloc.read_readings magloc.Readings magloc.read_truth magloc.Truth arrays.InputError",
+    "sensor-faults": "magloc.plots.residuals",
+    "single-sensor-ranging": "magloc.SourceLine magloc.fit_source_line magloc.distance_along_line",
+    "star-identification": "adcs.identify_stars",
+    "table-top-satellite": "adcs.mockup sims.table_run sims.TableScenario sims.CameraErrors sims.rendered_frame"
+    " sims.experiments.sky_run sims.experiments.identified_files sims.experiments.fused_runs"
+    " sims.experiments.fused_record sims.experiments.zeros_run",
+    "tracking": "magloc.track magloc.Track magloc.Tracker magloc.RandomWalk magloc.OrnsteinUhlenbeck"
+    " magloc.CoordinatedTurn magloc.plots.track magloc.plots.consistency",
+}
+# Other pages that a function's page names at most of each folder, in this order.
+MOST_PAGES = {"guide": 3, "theory": 2, "gallery": 2}
 # What a bar stands in: literal text and formulas keep it, elsewhere it would be a substitution.
 BAR = re.compile(r"(``.*?``|:math:`[^`]*`)|\\?\|")
 
@@ -70,6 +104,7 @@ def make_all(app: Sphinx) -> None:
         for cell in drawing:
             if "plt." in "".join(cell["source"]):  # what the library or a command draws takes a line or two
                 cell["metadata"]["tags"] = ["hide-input"]
+        notebook["cells"][0]["source"] += [f"\n\n{{download}}`Download this notebook <{ORIGINALS}/{path.name}>`"]
         (notebooks / path.name).write_text(json.dumps(notebook), encoding="utf-8")
         (notebooks / f"{path.stem}.png").write_bytes(pictures(drawing)[0])
     app.config.html_static_path.append(str(mathjax(fresh(HERE / "_build" / "mathjax"))))
@@ -124,10 +159,20 @@ def illustrated(app: Sphinx, what: str, name: str, obj: object, options: object,
     for picture, names in PICTURES.items():
         if name in names:
             lines += ["", f".. image:: /{picture}", f"   :alt: What {name} finds or draws", "   :width: 75%"]
+    pages, related = see_also(name) if what in ("function", "class") else ([], [])
+    if pages:
+        lines += ["", ".. rubric:: See also", "", *(f"- :doc:`/{page}`" for page in pages)]
+        lines += ["- " + ", ".join(f":py:obj:`{other}`" for other in related), ""] if related else [""]
+
+
+def see_also(name: str) -> tuple[list[str], list[str]]:
+    """Pages for a public name, that of its explanation first, and the names that are explained there too."""
+    explained = {f"guide/{page}": names.split() for page, names in EXPLAINED.items()}
+    own = {page: names for page, names in explained.items() if {name, name.rpartition(".")[0]} & {*names}}
     uses = {page: len(re.findall(rf"\b{re.escape(name)}\b(?!\.\w)", text)) for page, text in texts().items()}
-    users = sorted((page for page, count in uses.items() if count), key=lambda page: -uses[page])
-    if users and what in ("function", "class"):
-        lines += ["", ".. rubric:: See also", "", *(f"- :doc:`/{page}`" for page in users[:MOST_PAGES]), ""]
+    others = sorted((page for page, count in uses.items() if count and page not in own), key=lambda page: -uses[page])
+    pages = [page for folder, most in MOST_PAGES.items() for page in [o for o in others if o.startswith(folder)][:most]]
+    return [*own, *pages], [other for names in own.values() for other in names if other != name]
 
 
 @cache

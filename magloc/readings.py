@@ -213,6 +213,8 @@ def read_readings(
 
     Parameters
     ----------
+    path : str or path-like
+        A readings file (CSV): fields in nT, times in s.
     array : SensorArray
         Whose sensors the file must have, with a column for each channel.
     sensors : sequence of str, optional

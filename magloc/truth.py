@@ -54,6 +54,11 @@ class Truth:
 def read_truth(path: str | PathLike[str]) -> Truth:
     """True positions, and moments where they are known, from a CSV file.
 
+    Parameters
+    ----------
+    path : str or path-like
+        A truth file (CSV): ``time_s``, ``x_m`` and ``y_m``, and what else is known.
+
     Raises
     ------
     InputError

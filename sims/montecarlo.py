@@ -49,6 +49,8 @@ def run_many(
 
     Parameters
     ----------
+    scenario : MagneticScenario or AttitudeScenario
+        Of :func:`sims.read_scenario`, or made in Python.
     estimator : callable
         Takes an array and its readings, or a :class:`adcs.Telemetry` and its :class:`adcs.Satellite`. What it returns
         is kept as ``judge`` says.

@@ -39,23 +39,9 @@ def coloured_noise(
 ) -> FloatArray:
     """Noise with a white and a 1/f part behind a first-order low-pass.
 
-    Parameters
-    ----------
-    n, channels : int
-        Samples, and independent channels.
-    rate_Hz : float
-        Sampling rate.
-    density : float
-        N, square root of the one-sided spectral density of the white part [unit/√Hz].
-    corner_Hz : float
-        f_c, where both parts are equal; 0 = none.
-    bandwidth_Hz : float
-        f_b, infinite = none.
-
-    Returns
-    -------
-    ndarray, shape (n, channels)
-        [unit]
+    ``n``, ``channels``: samples, and independent channels. ``rate_Hz``: sampling rate. ``density``: N, square root
+    of the one-sided spectral density of the white part [unit/√Hz]. ``corner_Hz``: f_c, where both parts are equal;
+    0 = none. ``bandwidth_Hz``: f_b, infinite = none. Returns (n, channels): [unit].
     """
     white = rng.standard_normal((2 * n, channels)) * (density * math.sqrt(rate_Hz / 2.0))
     if corner_Hz == 0.0 and math.isinf(bandwidth_Hz):

@@ -65,8 +65,15 @@ def simulate(scenario: MagneticScenario | AttitudeScenario, seed: int | Sequence
 
     Parameters
     ----------
+    scenario : MagneticScenario or AttitudeScenario
+        Of :func:`read_scenario`, or made in Python.
     seed : int
         Of all random numbers; of a satellite also several, one for every run.
+
+    Returns
+    -------
+    Simulation or AttitudeRuns
+        Readings and truth; of a satellite also its telemetry, for all seeds.
 
     Raises
     ------

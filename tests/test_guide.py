@@ -31,6 +31,9 @@ CODE = re.compile(r"^```[a-z]+\n(.*?)^```|^    ([^\n]*)$", re.DOTALL | re.MULTIL
 HIDDEN = re.compile(r"<!--.*?-->", re.DOTALL)
 # What a page of the site shows of a line of code at desktop width without a scroll bar.
 WIDEST = 88
+PACKAGES = ["arrays", "magloc", "adcs", "sims", "magloc.plots", "adcs.mockup", "sims.experiments"]
+# What a docstring says of its parameters: the heading's entries up to the next heading or the end.
+STATED = re.compile(r"^(?:Parameters|Attributes)\n-+\n(.*?)(?=^\S[^\n]*\n-|\Z)", re.DOTALL | re.MULTILINE)
 # A public name on a page of the reference, in a list of autosummary or by itself.
 NAMED = re.compile(r"\b(?:arrays|magloc|adcs|sims)(?:\.\w+)+")
 
@@ -70,18 +73,36 @@ def test_no_line_of_code_scrolls(page: Path) -> None:
     assert [line for line in lines if len(line) > WIDEST] == []
 
 
-@pytest.mark.parametrize("package", ["arrays", "magloc", "adcs", "sims"])
+def documented(package: str) -> dict[str, object]:
+    """Public classes and functions of a package."""
+    module = importlib.import_module(package)
+    public = {name: getattr(module, name) for name in module.__all__}
+    return {name: thing for name, thing in public.items() if inspect.isclass(thing) or inspect.isfunction(thing)}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_parameters_of_public_names_are_explained(package: str) -> None:
+    missing = []
+    for name, thing in documented(package).items():
+        if inspect.isclass(thing) and issubclass(thing, Exception):
+            continue
+        text = "\n".join(STATED.findall(inspect.getdoc(thing) or ""))
+        entries = re.findall(r"^(\S[^:\n]*)", text, re.MULTILINE)
+        stated = {part.strip(" *") for entry in entries for part in entry.split(",")}
+        missing += [f"{name}: {taken}" for taken in inspect.signature(thing).parameters if taken not in stated]
+    assert missing == []
+
+
+@pytest.mark.parametrize("package", PACKAGES)
 def test_examples_of_public_names(package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every public class and function has some, and they print what they say."""
     matplotlib.use("agg")
     monkeypatch.chdir(tmp_path)
-    module, runner, said = importlib.import_module(package), doctest.DocTestRunner(verbose=False), []
-    public = {name: getattr(module, name) for name in module.__all__}
-    for name, thing in public.items():
-        if inspect.isclass(thing) or inspect.isfunction(thing):
-            test = doctest.DocTestParser().get_doctest(inspect.getdoc(thing) or "", {}, f"{package}.{name}", None, None)
-            assert test.examples, name
-            runner.run(test, out=said.append)
+    runner, said = doctest.DocTestRunner(verbose=False), []
+    for name, thing in documented(package).items():
+        test = doctest.DocTestParser().get_doctest(inspect.getdoc(thing) or "", {}, f"{package}.{name}", None, None)
+        assert test.examples, name
+        runner.run(test, out=said.append)
     assert runner.failures == 0, "".join(said)
 
 
@@ -96,9 +117,7 @@ def test_command_line_is_accepted(line: str, whole: bool) -> None:
             pytest.fail(f"{line}: {error}")
 
 
-@pytest.mark.parametrize(
-    "package", ["arrays", "magloc", "adcs", "sims", "magloc.plots", "adcs.mockup", "sims.experiments"]
-)
+@pytest.mark.parametrize("package", PACKAGES)
 def test_the_reference_has_every_public_name(package: str) -> None:
     pages = (path.read_text(encoding="utf-8") for path in (DOCS / "reference").glob("*.md"))
     named = {name for text in pages for name in NAMED.findall(text)}

@@ -96,15 +96,7 @@ def adaptive_track(
 ) -> AdaptiveTrack:
     """The adaptive filter over whole records, compiled.
 
-    Parameters
-    ----------
-    q_start : array_like, shape (4,) or (R, 4)
-        First estimate.
-
-    Raises
-    ------
-    ValueError
-        The first estimate has no length.
+    ``q_start`` (4,): first estimate. Raises ValueError: the first estimate has no length.
     """
     from adcs.complementary.filters_compiled import Record, adaptive
 

@@ -139,17 +139,8 @@ def explicit_track(
 ) -> ComplementaryTrack:
     """The explicit filter over whole records, compiled.
 
-    Parameters
-    ----------
-    q_start : array_like, shape (4,) or (R, 4)
-        First estimate.
-    substitution : Substitution
-        In place of a second vector that is missing.
-
-    Raises
-    ------
-    ValueError
-        The gains are beyond the stability limit, or the first estimate has no length.
+    ``q_start`` (4,): first estimate. ``substitution``: in place of a second vector that is missing. Raises
+    ValueError: the gains are beyond the stability limit, or the first estimate has no length.
     """
     from adcs.complementary.filters_compiled import EXPLICIT
 

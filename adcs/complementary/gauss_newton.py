@@ -84,19 +84,9 @@ def gauss_newton_track(
 ) -> ComplementaryTrack:
     """The filter with the measured quaternion over whole records, compiled; weights of the gains are not used.
 
-    Parameters
-    ----------
-    q_start : array_like, shape (4,) or (R, 4)
-        First estimate, and where the first measured quaternion starts.
-    substitution : Substitution
-        In place of a second vector that is missing.
-    mu : float
-        Added to the normal equations.
-
-    Raises
-    ------
-    ValueError
-        The gains are beyond the stability limit.
+    ``q_start`` (4,): first estimate, and where the first measured quaternion starts. ``substitution``: in place of
+    a second vector that is missing. ``mu``: added to the normal equations. Raises ValueError: the gains are beyond
+    the stability limit.
     """
     from adcs.complementary.filters_compiled import GAUSS_NEWTON
 

@@ -39,17 +39,8 @@ def locate_standing_magnet(prepared: Prepared, q: FloatArray, position_m: FloatA
     Its moment follows linearly from its position, which is searched from six sides of where the difference is largest.
     Differences larger than a microtesla count less than by their squares.
 
-    Parameters
-    ----------
-    q : ndarray, shape (n, 4)
-        East, north, up from body.
-    position_m : ndarray, shape (n, 3)
-        Of the magnetometer, NaN where unknown.
-
-    Raises
-    ------
-    ValueError
-        There are fewer than 100 known positions, or no dipole within 0.5 m of the largest difference.
+    ``q`` (n, 4): east, north, up from body. ``position_m`` (n, 3): of the magnetometer, NaN where unknown. Raises
+    ValueError: there are fewer than 100 known positions, or no dipole within 0.5 m of the largest difference.
     """
     from scipy.optimize import least_squares
 

@@ -158,6 +158,7 @@ class EllipsoidObserver:
 
     Parameters
     ----------
+    system : BoundedSystem
     start : Ellipsoid
         Set of the first state.
     n_runs : int

@@ -121,6 +121,8 @@ def circular_orbit(
         UTC at which the satellite is at ``latitude_argument_deg`` from the ascending node.
     node_deg, local_time_h : float, optional
         Right ascension of the ascending node, by default 0; or mean solar time there at the epoch.
+    latitude_argument_deg : float
+        Angle from the ascending node to the satellite at the epoch.
 
     Raises
     ------

@@ -44,6 +44,8 @@ def read_telemetry(path: str | PathLike[str], step_s: float | None = None) -> Te
 
     Parameters
     ----------
+    path : str or path-like
+        A log (CSV); see the file formats.
     step_s : float, optional
         Time between readings, such as that of the scenario file; by default the shortest between two rows.
 

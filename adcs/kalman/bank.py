@@ -94,6 +94,10 @@ def estimate(
 
     Parameters
     ----------
+    telemetry : Telemetry
+        The log: of :func:`adcs.read_telemetry`, or of arrays.
+    satellite : Satellite
+        Inertia, orbit, sensors and their noise, as its user knows them.
     sensors : str or EstimatorSettings
         Sensors in use, ``st``, ``gyro``, ``mag`` and ``sun`` with + between them, such as ``"mag+sun+gyro"``; or
         everything that a filter may be told, in place of states and filter too.

@@ -242,17 +242,9 @@ def check_start(record: Record, start: Start) -> None:
 def run_filter(record: Record, settings: FilterSettings, start: Start) -> AttitudeTracks:
     """Filter of whole runs, compiled; runs are shared out among the threads of numba.
 
-    Parameters
-    ----------
-    record : Record
-        Of any number of runs, such as :class:`sims.attitude.simulation.AttitudeRuns`.
-    start : Start
-        One for every run: :func:`start_near`, or :mod:`adcs.kalman.initialisation`.
-
-    Raises
-    ------
-    ValueError
-        The start does not have as many runs as the record.
+    ``record``: of any number of runs, such as :class:`sims.attitude.simulation.AttitudeRuns`. ``start``: one for
+    every run: :func:`start_near`, or :mod:`adcs.kalman.initialisation`. Raises ValueError: the start does not have
+    as many runs as the record.
     """
     from adcs.kalman import mekf_compiled as kernel
     from adcs.satellite import dynamics_compiled

@@ -131,18 +131,8 @@ def absolute_rate(q: ArrayLike, w_relative: ArrayLike, orbital_rate_rad_s: Array
 def environment_torque(body: RigidBody, q: ArrayLike, gravity_s2: ArrayLike, b_orbital_T: ArrayLike) -> FloatArray:
     """Torque of the gravity gradient, 3(μ/r³) η×Jη, and of the residual dipole, m×B, body axes [N·m].
 
-    Parameters
-    ----------
-    q : array_like, shape (..., 4)
-        Attitude, orbital from body.
-    gravity_s2 : array_like, shape (...)
-        μ/r³.
-    b_orbital_T : array_like, shape (..., 3)
-        Field in the orbital frame.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
+    ``q`` (..., 4): attitude, orbital from body. ``gravity_s2`` (...): μ/r³. ``b_orbital_T`` (..., 3): field in the
+    orbital frame. Returns (..., 3).
     """
     eta = rotate_back(q, _E3)
     gradient = 3.0 * np.asarray(gravity_s2)[..., None] * np.cross(eta, eta @ body.inertia_kgm2)
@@ -154,18 +144,8 @@ def angular_acceleration(
 ) -> FloatArray:
     r"""Acceleration :math:`\dot\omega = J^{-1}(M - \dot k - \omega\times(J\omega + k))`, body axes [rad/s²].
 
-    Parameters
-    ----------
-    w : array_like, shape (..., 3)
-        ω [rad/s].
-    momentum_Nms, wheel_torque_Nm : array_like, shape (..., 3)
-        k and its rate of change.
-    torque_Nm : array_like, shape (..., 3)
-        M, all torques from outside.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
+    ``w`` (..., 3): ω [rad/s]. ``momentum_Nms``, ``wheel_torque_Nm`` (..., 3): k and its rate of change.
+    ``torque_Nm`` (..., 3): M, all torques from outside. Returns (..., 3).
     """
     w = np.asarray(w, dtype=np.float64)
     gyroscopic = np.cross(w, w @ body.inertia_kgm2 + np.asarray(momentum_Nms, dtype=np.float64))
@@ -231,22 +211,9 @@ def commanded_torque(
     λ is the vector part of :math:`q_r^*\circ q`, with the sign of the shorter way, for a reference that rests in the
     orbital frame. The torque is limited, and then the momentum after the step.
 
-    Parameters
-    ----------
-    q, w : array_like, shape (..., 4), (..., 3)
-        Attitude and rate as the controller knows them: the estimate.
-    momentum_Nms : array_like, shape (..., 3)
-        k.
-    q_reference : array_like, shape (..., 4)
-        Wanted attitude, orbital from body.
-    orbital_rate_rad_s : array_like, shape (...)
-    dt_s : float
-        How long the torque will be held.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        [N·m]
+    ``q``, ``w`` (..., 4), (..., 3): attitude and rate as the controller knows them: the estimate.
+    ``momentum_Nms`` (..., 3): k. ``q_reference`` (..., 4): wanted attitude, orbital from body.
+    ``orbital_rate_rad_s`` (...). ``dt_s``: how long the torque will be held. Returns (..., 3): [N·m].
     """
     k = np.asarray(momentum_Nms, dtype=np.float64)
     w = np.asarray(w, dtype=np.float64)
@@ -274,11 +241,7 @@ def error_jacobian(
     δq is defined by :func:`adcs.quaternion.error_vector`. ω in F11 is the rate against inertial space, although q is
     against the orbital frame.
 
-    Parameters
-    ----------
-    q, w, momentum_Nms : array_like, shape (..., 4), (..., 3), (..., 3)
-    gravity_s2 : array_like, shape (...)
-    b_orbital_T : array_like, shape (..., 3)
+    ``q`` (..., 4). ``w``, ``momentum_Nms`` (..., 3). ``gravity_s2`` (...). ``b_orbital_T`` (..., 3).
     """
     w = np.asarray(w, dtype=np.float64)
     J = body.inertia_kgm2
@@ -305,16 +268,8 @@ def closed_loop_error_jacobian(
     an estimate's error, and filters with it are overconfident; even as the Jacobian of the closed loop it lacks
     :math:`2J^{-1}K_\omega W(A\omega_o)` in F21. It is here to reproduce the paper; see :func:`error_jacobian`.
 
-    Parameters
-    ----------
-    q, w : array_like, shape (..., 4), (..., 3)
-    q_reference : array_like, shape (..., 4)
-        Wanted attitude, orbital from body.
-    gravity_s2 : array_like, shape (...)
-
-    Returns
-    -------
-    ndarray, shape (..., 6, 6)
+    ``q`` (..., 4). ``w`` (..., 3). ``q_reference`` (..., 4): wanted attitude, orbital from body. ``gravity_s2`` (...).
+    Returns (..., 6, 6).
     """
     relative = quaternion.multiply(quaternion.conjugate(q_reference), q)
     relative = np.where(relative[..., :1] < 0.0, -relative, relative)

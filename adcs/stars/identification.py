@@ -366,12 +366,19 @@ def identify_stars(
     ----------
     catalogue : StarCatalogue
         At the date of the images.
+    camera : StarCamera
+        Its scale and its size in pixels.
     frames : iterable of (array_like, array_like)
         Points (f, 2), y up, and magnitudes (f,) of each image; see :meth:`StarMatcher.identify`.
     noise_px : float
         Standard deviation of a star's place, per axis.
     progress : callable, optional
         Called with 1 after every image.
+
+    Returns
+    -------
+    list of StarFix or NoFix
+        One for every image: attitude and names of the stars, or why there are none.
 
     Examples
     --------

@@ -94,17 +94,7 @@ def _text(x: float, y: float, text: str, anchor: str) -> str:
 
 
 def words_of(drive: Drive, row: int) -> Sequence[str]:
-    """What is known in a row, as lines of HTML.
-
-    Parameters
-    ----------
-    drive : Drive
-    row : int
-
-    Returns
-    -------
-    sequence of str
-    """
+    """What is known in a row, as lines of HTML."""
     track, now = drive.track, float(drive.truth.time_s[row])
     error_mm = 1e3 * float(np.hypot(*drive.errors_m[row]))
     turn = float(np.degrees(wrapped(track.heading_rad[row] - drive.truth.heading_rad[row])))

@@ -27,13 +27,7 @@ def named_stars(frame: SeenFrame) -> IntArray:
 def marked_image(frame: SeenFrame) -> ByteArray:
     """The frame, brightened, with a ring around each star: green where it is identified, else orange.
 
-    Parameters
-    ----------
-    frame : SeenFrame
-
-    Returns
-    -------
-    ndarray of uint8, shape (height, width, 3)
+    Returns (height, width, 3).
     """
     bright = np.minimum(frame.image * _BRIGHTER, 255.0).astype(np.uint8)
     picture = Image.fromarray(bright).convert("RGB")
@@ -44,14 +38,7 @@ def marked_image(frame: SeenFrame) -> ByteArray:
 def ceiling_sheet(frame: SeenFrame) -> ByteArray:
     """The frame as a translucent sheet: dark, with the stars and their rings.
 
-    Parameters
-    ----------
-    frame : SeenFrame
-
-    Returns
-    -------
-    ndarray of uint8, shape (height / 2, width / 2, 4)
-        Red, green, blue and opacity.
+    Returns (height / 2, width / 2, 4): red, green, blue and opacity.
     """
     height, width = (size // _SHEET_STEP * _SHEET_STEP for size in frame.image.shape)
     blocks = frame.image[:height, :width].reshape(height // _SHEET_STEP, _SHEET_STEP, width // _SHEET_STEP, -1)

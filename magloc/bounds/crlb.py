@@ -109,6 +109,8 @@ def cramer_rao_bounds(
 
     Parameters
     ----------
+    array : SensorArray
+        Whose noise and uncertainties count.
     position_m, moment_Am2 : array_like, shape (..., 3)
         Source in the array's frame [m], its moment [A·m²].
     ambient_uncertainty_T : float

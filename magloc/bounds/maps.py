@@ -217,6 +217,8 @@ def bound_map(
 
     Parameters
     ----------
+    array : SensorArray
+        Whose noise and uncertainties count.
     moment_Am2 : tuple of 3 floats
         Moment of the source; its size is that of the moments of other directions, too [A·m²].
     edge_m : float

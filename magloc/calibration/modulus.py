@@ -96,25 +96,11 @@ class _Fit:
 def ellipsoid_calibration(readings_T: ArrayLike, modulus_T: ArrayLike, noise_T: float) -> EllipsoidCalibration:
     """Calibrate a vector sensor that was turned in a field of known modulus.
 
-    Parameters
-    ----------
-    readings_T : array_like, shape (n, 3)
-        Raw readings [T]; rows with a NaN are left out.
-    modulus_T : array_like, shape () or (n,)
-        Modulus of the field in every row [T].
-    noise_T : float
-        Standard deviation of the readings per axis [T].
-
-    Returns
-    -------
-    EllipsoidCalibration
-        Not converged where there are fewer than nine complete readings, or where they do not determine all nine
-        parameters: readings in one plane, in one small cap or along a few directions.
-
-    Raises
-    ------
-    ValueError
-        The shapes do not agree, or a modulus or the noise is not positive and finite.
+    ``readings_T`` (n, 3): raw readings [T]; rows with a NaN are left out. ``modulus_T`` () or (n,): modulus of
+    the field in every row [T]. ``noise_T``: standard deviation of the readings per axis [T].
+    Not converged where there are fewer than nine complete readings, or where they do not determine all nine
+    parameters: readings in one plane, in one small cap or along a few directions. Raises ValueError: the shapes do not
+    agree, or a modulus or the noise is not positive and finite.
     """
     readings, modulus = _checked(readings_T, modulus_T, noise_T)
     if len(readings) < N_PARAMETERS:
@@ -155,26 +141,10 @@ def calibrated_in_modulus(
     because the readings do not tell how the sensor's axes are turned. What is not known of that belongs into the
     sensor's ``misalignment_rad``.
 
-    Parameters
-    ----------
-    array : SensorArray
-        Its noise is that of the readings.
-    readings_T : array_like, shape (n, C)
-        Raw readings in channel order [T]; NaN where missing.
-    modulus_T : array_like, shape () or (n,)
-        Modulus of the field in every row, the same at all sensors [T].
-
-    Returns
-    -------
-    array : SensorArray
-        With the calibrations of the sensors whose fit converged; the other sensors as they were.
-    results : dict
-        The fit of every vector sensor, by its id.
-
-    Raises
-    ------
-    ValueError
-        The shapes do not agree, a modulus is not positive and finite, or the array has no vector sensor.
+    ``array``: its noise is that of the readings. ``readings_T`` (n, C): raw readings in channel order [T]; NaN
+    where missing. ``modulus_T`` () or (n,): modulus of the field in every row, the same at all sensors [T].
+    Returns the array with the calibrations of the sensors whose fit converged, and the fits by the sensors' ids.
+    Raises ValueError: the shapes do not agree, a modulus is not positive and finite, or the array has no vector sensor.
     """
     readings = checked_rows(array, readings_T)
     if array.channel_is_scalar.all():

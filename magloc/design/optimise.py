@@ -44,6 +44,10 @@ class Design:
 
     Attributes
     ----------
+    task : DesignTask
+        What it was designed for.
+    array : SensorArray
+        The design.
     fitted_m, start_m : float
         Criterion on the large sample: of the design, and of the best of its starts.
     converged : bool
@@ -109,6 +113,8 @@ def design_array(
 
     Parameters
     ----------
+    task : DesignTask
+        Sensors and their noise, where they may stand, and the sources; :meth:`DesignTask.read` reads one.
     starts : int, optional
         Shapes and random places to start from, in place of those of ``task.search``.
     seed : int
@@ -117,6 +123,11 @@ def design_array(
         Called with steps done, of ``task.search.n_steps``.
     better : callable, optional
         Called with every array that is better, on the large sample, than all before.
+
+    Returns
+    -------
+    Design
+        The array, and its σ of the range [m] beside those of its starts and of the references.
 
     Raises
     ------

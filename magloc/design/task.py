@@ -162,6 +162,9 @@ class DesignTask:
 
     Attributes
     ----------
+    name : str
+        Of the task, and of the array.
+    n_sensors : int
     kind : {"vector", "scalar"}
         Scalar sensors need an ambient field.
     noise_T : float

@@ -37,6 +37,8 @@ def detection_range(
 
     Parameters
     ----------
+    array : SensorArray
+        Whose noise counts.
     moment_Am2 : float
         Size of the moment [A·m²].
     probability : float
@@ -84,29 +86,13 @@ def detection_ranges(
 ) -> FloatArray:
     """Largest distance at which a source is detected with a probability, along given directions.
 
-    Parameters
-    ----------
-    directions : array_like, shape (d, 3)
-        From the sensors' centroid, array frame, of any length.
-    moments_Am2 : array_like, shape (n, 3)
-        Moments that the source may have [A·m²]: :func:`magloc.directions.moments_on_sphere`, say.
-    detector : Detector
-        With its false-alarm rate: :class:`magloc.chi_square.ChiSquareDetector` or
-        :class:`magloc.detection.matched_filter.MatchedFilterDetector`.
-    probability : float
-        Of detection.
-
-    Returns
-    -------
-    ndarray, shape (d, n)
-        Distance from the sensors' centroid [m], for every moment; its quantiles over the last axis are what to expect
-        of a moment of unknown direction. Zero where the source is not even detected beside the array, at 1.1
-        circumradii from the centroid.
-
-    Raises
-    ------
-    ValueError
-        A direction has no length, or an input is out of range.
+    ``directions`` (d, 3): from the sensors' centroid, array frame, of any length. ``moments_Am2`` (n, 3): moments
+    that the source may have [A·m²]: :func:`magloc.directions.moments_on_sphere`, say. ``detector``: with its
+    false-alarm rate: :class:`magloc.chi_square.ChiSquareDetector` or
+    :class:`magloc.detection.matched_filter.MatchedFilterDetector`. ``probability``: of detection. Returns (d, n):
+    distance from the sensors' centroid [m], for every moment; its quantiles over the last axis are what to expect
+    of a moment of unknown direction. Zero where the source is not even detected beside the array, at 1.1
+    circumradii from the centroid. Raises ValueError: a direction has no length, or an input is out of range.
     """
     towards = np.asarray(directions, dtype=np.float64)
     lengths = np.linalg.norm(towards, axis=-1, keepdims=True)

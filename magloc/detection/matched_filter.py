@@ -33,8 +33,14 @@ class MatchedFilterDetector:
 
     Attributes
     ----------
+    filter : DipoleFilter
+        The matched filter of the array.
+    threshold : float
+        Of its energy [1]: what is larger is a source.
     threshold_error : float
         Standard error of the threshold, from the order statistics beside it.
+    false_alarm_rate : float
+        Share of rows of noise alone whose energy is larger.
     seed : int
         Of the draws for the threshold and for required energies.
 

@@ -92,22 +92,9 @@ def dipole_validity(distance_m: ArrayLike, body_length_m: ArrayLike) -> BoolArra
     dipole by 0.3 % at most, that of a cylinder as long as it is wide by 1.3 %, of a flat brick by 5 % and of a thin rod
     by 6 %, on whose axis the ratio of the two is ``1/(1 - (L/2r)²)²``.
 
-    Parameters
-    ----------
-    distance_m : array_like
-        From the body's centre to the sensors [m].
-    body_length_m : array_like
-        Greatest extent of the body [m].
-
-    Returns
-    -------
-    ndarray of bool
-        Their shapes broadcast; False where either is NaN.
-
-    Raises
-    ------
-    ValueError
-        A distance or a length is negative.
+    ``distance_m``: from the body's centre to the sensors [m]. ``body_length_m``: greatest extent of the body [m].
+    Returns: their shapes broadcast; False where either is NaN. Raises ValueError: a distance or a length is
+    negative.
     """
     distance, length = np.asarray(distance_m, dtype=np.float64), np.asarray(body_length_m, dtype=np.float64)
     for name, values in (("distance_m", distance), ("body_length_m", length)):
@@ -131,21 +118,10 @@ def nearness_test(
     The octupole is left out where it would leave no degree of freedom. That χ² itself is too large is a finding too.
     Each of the three tests has a third of the rate of false alarms.
 
-    Parameters
-    ----------
-    array : SensorArray
-        Its noise decides what is significant.
-    position_m, moment_Am2 : array_like, shape (3,)
-        Solution of a fix, in the array's frame [m], [A·m²].
-    readings_T : array_like, shape (C,)
-        The readings of that fix [T]; NaN where missing.
-    false_alarm : float
-        Probability at most of any finding for a dipole with noise of the stated size.
-
-    Raises
-    ------
-    ValueError
-        The shapes do not agree, or the rate of false alarms is not between 0 and 1.
+    ``array``: its noise decides what is significant. ``position_m``, ``moment_Am2`` (3,): solution of a fix, in the
+    array's frame [m], [A·m²]. ``readings_T`` (C,): the readings of that fix [T]; NaN where missing.
+    ``false_alarm``: probability at most of any finding for a dipole with noise of the stated size. Raises
+    ValueError: the shapes do not agree, or the rate of false alarms is not between 0 and 1.
     """
     position, moment = _vector("position_m", position_m), _vector("moment_Am2", moment_Am2)
     readings = np.asarray(readings_T, dtype=np.float64)

@@ -131,6 +131,8 @@ def distance_along_line(
 
     Parameters
     ----------
+    line : SourceLine
+        Of :func:`fit_source_line`.
     field_T : array_like, shape (..., 3)
         Field of the source alone, in the sensor's axes [T].
     noise_T, noise_fraction

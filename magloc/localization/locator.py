@@ -44,6 +44,8 @@ class Locator:
 
     Parameters
     ----------
+    array : SensorArray
+        Vector sensors, scalar ones, or both, with six differences at least.
     sources : int or "auto"
         How many sources there are in every row; "auto": as many as the readings support, five at most.
     position_m : array_like, shape (3,) or (n, 3), optional
@@ -265,6 +267,8 @@ def locate(
 
     Parameters
     ----------
+    array : SensorArray
+        As its user knows it: places, noise and calibration of the sensors.
     readings : Readings or array_like, shape (n, C) or (C,)
         Raw readings [T], NaN where missing. Those that saturate are not used, and named.
     sources, prior, body_length_m, exclude_faulty, seed

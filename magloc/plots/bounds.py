@@ -42,6 +42,9 @@ _FRAME_DPI = 110
 def bound_slices(dataset: xr.Dataset, scenario: BoundScenario) -> Figure:
     """Bounds on three planes through the array, on logarithmic colours with labelled contours.
 
+    Rows: σ of the range for the given moment and for 95 % of the moments, σ of the bearing for 95 % of them. The thick
+    line is the required accuracy.
+
     Parameters
     ----------
     dataset : xarray.Dataset
@@ -49,11 +52,13 @@ def bound_slices(dataset: xr.Dataset, scenario: BoundScenario) -> Figure:
     scenario : BoundScenario
         That it was made for.
 
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Rows: σ of the range for the given moment and for 95 % of the moments, σ of the bearing for 95 % of them. The
-        thick line is the required accuracy.
+    Examples
+    --------
+    >>> import magloc
+    >>> from magloc.bounds import maps
+    >>> scenario = maps.BoundScenario(moment_Am2=(60.0, 50.0, 60.0), n_moments=5)
+    >>> bounds = maps.bound_slices(scenario, grid=11)
+    >>> figure = magloc.plots.bound_slices(bounds, scenario)
     """
     # Places by hand: a layout engine draws everything twice.
     figure = style.new_figure(6.2, layout=None)
@@ -83,6 +88,8 @@ def bound_slices(dataset: xr.Dataset, scenario: BoundScenario) -> Figure:
 def bound_sphere(dataset: xr.Dataset, scenario: BoundScenario, range_m: float) -> Figure:
     """Bounds on a sphere about the array, in Mollweide's equal-area projection.
 
+    σ of the range and of the bearing, for the given moment and for 95 % of the moments.
+
     Parameters
     ----------
     dataset : xarray.Dataset
@@ -92,10 +99,13 @@ def bound_sphere(dataset: xr.Dataset, scenario: BoundScenario, range_m: float) -
     range_m : float
         Which one of its spheres; the nearest.
 
-    Returns
-    -------
-    matplotlib.figure.Figure
-        σ of the range and of the bearing, for the given moment and for 95 % of the moments.
+    Examples
+    --------
+    >>> import magloc
+    >>> from magloc.bounds import maps, spheres
+    >>> scenario = maps.BoundScenario(moment_Am2=(60.0, 50.0, 60.0), n_moments=5)
+    >>> bounds = spheres.bound_spheres(scenario, [5.0, 10.0], step_deg=30.0)
+    >>> figure = magloc.plots.bound_sphere(bounds, scenario, 5.0)
     """
     sphere = dataset.sel(range=range_m, method="nearest")
     figure = style.new_figure(4.3, layout=None)
@@ -125,6 +135,8 @@ def bound_sphere(dataset: xr.Dataset, scenario: BoundScenario, range_m: float) -
 def bound_reach(dataset: xr.Dataset, scenario: BoundScenario) -> Figure:
     """How far away the range is known as well as required, and how far a source is found, in three planes.
 
+    Polar curves for the given moment, and for the median, 95 % and the worst of the moments.
+
     Parameters
     ----------
     dataset : xarray.Dataset
@@ -133,10 +145,13 @@ def bound_reach(dataset: xr.Dataset, scenario: BoundScenario) -> Figure:
     scenario : BoundScenario
         That it was made for.
 
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Polar curves for the given moment, and for the median, 95 % and the worst of the moments.
+    Examples
+    --------
+    >>> import magloc
+    >>> from magloc.bounds import maps, spheres
+    >>> scenario = maps.BoundScenario(moment_Am2=(60.0, 50.0, 60.0), n_moments=5)
+    >>> bounds = spheres.bound_spheres(scenario, [5.0, 10.0], step_deg=30.0)
+    >>> figure = magloc.plots.bound_reach(bounds, scenario)
     """
     rows = {"accuracy_range": f"range known: σ ≤ {scenario.accuracy_m:g} m"}
     if "detection_range" in dataset:
@@ -196,15 +211,8 @@ def write_bound_animation(
 ) -> None:
     """Animation (GIF) of σ of the range on spheres, from the nearest to the farthest.
 
-    Parameters
-    ----------
-    dataset : xarray.Dataset
-        Made by :func:`magloc.bounds.spheres.bound_spheres`.
-    scenario : BoundScenario
-        That it was made for.
-    path : Path
-    progress : callable, optional
-        Called with the number of pictures finished since the last call.
+    ``dataset``: made by :func:`magloc.bounds.spheres.bound_spheres`. ``scenario``: that it was made for.
+    ``progress``: called with the number of pictures finished since the last call.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image

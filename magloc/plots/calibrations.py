@@ -20,7 +20,22 @@ _T_IN_nT = 1e9
 
 
 def calibration(result: SourceCalibration | TurningCalibration) -> Figure:
-    """The figure that suits a calibration."""
+    """The figure that suits a calibration.
+
+    Parameters
+    ----------
+    result : Calibration
+        From a source on a path, or from turning.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> prior = magloc.CalibrationPrior(estimate=("offsets",), offset_T=1e-6)
+    >>> rows = board.readings[::10]
+    >>> calibration = magloc.calibrate(board.array, rows, truth=board.truth, prior=prior)
+    >>> figure = magloc.plots.calibration(calibration)
+    """
     return turning_figure(result) if isinstance(result, TurningCalibration) else calibration_figure(result)
 
 

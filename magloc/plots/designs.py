@@ -43,9 +43,12 @@ def design(result: Design, seed: int = 0) -> Figure:
     seed : int
         Of the sources that the curves are drawn from.
 
-    Returns
-    -------
-    matplotlib.figure.Figure
+    Examples
+    --------
+    >>> import magloc
+    >>> task = magloc.DesignTask.read("half-space-2m")
+    >>> found = magloc.design_array(task, starts=2)  # doctest: +SKIP
+    >>> figure = magloc.plots.design(found)  # doctest: +SKIP
     """
     figure = style.new_figure(3.3, layout=None)
     scene = figure.add_axes((0.0, 0.06, 0.375, 0.84), projection="3d")

@@ -46,6 +46,13 @@ def fixes(
         That they were found in, for the poses of an array that moves.
     truth_m : ndarray, shape (n, 3), optional
         True positions in the frame of the fixes [m], NaN where they are not known.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> fixes = magloc.locate(board.array, board.readings[:10])
+    >>> figure = magloc.plots.fixes(fixes, board.array)
     """
     sensors_m = np.zeros((len(fixes), 0, 3)) if array is None else _sensors_of(fixes, array, readings)
     return fix_figure(fix_columns(fixes), sensors_m, truth_m)
@@ -65,6 +72,13 @@ def residuals(array: SensorArray, readings: Readings, fixes: Fixes, *, ambient_T
         In either frame.
     ambient_T : ndarray, shape (n, 3), optional
         Ambient field of every row in the array's frame [T], in place of the array's.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> fixes = magloc.locate(board.array, board.readings[:10])
+    >>> figure = magloc.plots.residuals(board.array, board.readings[:10], fixes)
     """
     left = _residuals_of(array, readings, fixes, ambient_T)
     return residual_figure(left, array.channel_names, array.ids, array.channel_sensor)

@@ -41,17 +41,22 @@ _SOURCES_COLOURS = ListedColormap([colour for colour, _, _ in _SOURCE_ENDS.value
 def convergence(dataset: xr.Dataset) -> Figure:
     """Iterations to convergence on three slices through the source, as in the source paper.
 
+    Starts that did not converge are white and hatched; the dashed line is the plane through the array, orthogonal to
+    the direction of the source.
+
     Parameters
     ----------
     dataset : xarray.Dataset
         A map made by :func:`magloc.convergence.over_starts.convergence_map`, or one opened by
         :func:`magloc.grids.store.open_map`: only its slices are in memory at once.
 
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Starts that did not converge are white and hatched; the dashed line is the plane through the array, orthogonal
-        to the direction of the source.
+    Examples
+    --------
+    >>> import arrays
+    >>> import magloc
+    >>> source = magloc.Source([5.0, 0.0, 0.3], [100.0, 0.0, 0.0])
+    >>> ends = magloc.convergence_map(arrays.tetrahedron(0.45), source, edge_m=20.0, n=5)
+    >>> figure = magloc.plots.convergence(ends)
     """
     counts = summary(dataset)
     source = np.atleast_1d(dataset.attrs["position_m"])
@@ -93,9 +98,12 @@ def sources(dataset: xr.Dataset) -> Figure:
         A map made by :func:`magloc.convergence.over_sources.source_map`, or one opened by
         :func:`magloc.grids.store.open_map`: only its slices are in memory at once.
 
-    Returns
-    -------
-    matplotlib.figure.Figure
+    Examples
+    --------
+    >>> import arrays
+    >>> import magloc
+    >>> found = magloc.source_map(arrays.tetrahedron(1.5), n=3)
+    >>> figure = magloc.plots.sources(found)
     """
     counts = source_summary(dataset)
     figure = style.new_figure(4.9, layout="compressed")

@@ -62,12 +62,45 @@ def new_figure(height_in: float, *, layout: str | None = "constrained") -> House
 
 
 def save(figure: Figure, path: str | Path, dpi: int = DPI) -> None:
-    """Write a figure as PNG, fine enough for print, whole or not at all."""
+    """Write a figure as PNG, fine enough for print, whole or not at all.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+    path : str or path-like
+        Replaced if it exists.
+    dpi : int
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> fixes = magloc.locate(board.array, board.readings[:10])
+    >>> magloc.plots.save(fixes.plot(), "fixes.png")
+    """
     replace_file(path, lambda place: figure.savefig(place, format="png", dpi=dpi, pil_kwargs={"compress_level": 3}))
 
 
 def write(figure: Figure, path: Path, columns: Mapping[str, Column] | None = None) -> None:
-    """Write a figure as PNG, whole or not at all, and the data behind it beside it as CSV."""
+    """Write a figure as PNG, whole or not at all, and the data behind it beside it as CSV.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+    path : Path
+        Of the PNG.
+    columns : mapping of str to array
+        Of the CSV, by their headings.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> fixes = magloc.locate(board.array, board.readings[:10])
+    >>> columns = {"x_m": fixes.position_m[:, 0]}
+    >>> magloc.plots.write(fixes.plot(), Path("fixes.png"), columns)
+    """
     save(figure, path)
     if columns is not None:
         write_columns(columns, path.with_suffix(".csv"))
@@ -174,17 +207,8 @@ def limits_of(
 ) -> tuple[float, float]:
     """Limits of an axis that show this share of the values, and all of them if that takes no more than twice as much.
 
-    Parameters
-    ----------
-    values, always : sequence of ndarray
-        Finite ones count; of `always` all are shown.
-    share : float
-    margin : float
-        Added on either side, of the width.
-
-    Returns
-    -------
-    tuple of (low, high)
+    ``values``, ``always``: finite ones count; of `always` all are shown. ``margin``: added on either side, of the
+    width.
     """
     every, sure = (_finite(part) for part in (values, always))
     ends = [sure.min(), sure.max()] if sure.size else []
@@ -247,13 +271,8 @@ def dot_size(n: int) -> float:
 def squares_panel(ax: Axes, time_s: FloatArray, squares: FloatArray, dof: NDArray[np.int64], name: str) -> None:
     """A normalised square of every row over its degrees of freedom, with the 99 % bounds of χ² and the share within.
 
-    Parameters
-    ----------
-    ax : Axes
-    time_s, squares, dof : ndarray, shape (n,)
-        NaN, or no degrees of freedom, where there is none.
-    name : str
-        What is drawn.
+    ``time_s``, ``squares``, ``dof`` (n,): naN, or no degrees of freedom, where there is none. ``name``: what is
+    drawn.
     """
     low, high = bounds99(dof)
     ratio = np.where(dof > 0, squares / np.maximum(dof, 1), np.nan)

@@ -34,24 +34,10 @@ def write_picture(
 ) -> None:
     """Write track.png and consistency.png, and track.csv with the data behind both.
 
-    Parameters
-    ----------
-    points : sequence of TrackPoint
-    truth_m : ndarray, shape (n, 3), optional
-        True positions [m], NaN where they are not known.
-    folder : Path
-        Made if it is not there.
-    nees : tuple of ndarray, shape (n,), optional
-        Normalised estimation error squared of every row, and its degrees of freedom.
-    bound_m : ndarray, shape (n,), optional
-        Posterior Cramér-Rao bound of the distance from the truth.
-    array_m : ndarray, shape (n, 3), optional
-        Origin of the array's frame in every row.
-
-    Raises
-    ------
-    InputError
-        The folder cannot be written.
+    ``truth_m`` (n, 3): true positions [m], NaN where they are not known. ``folder``: made if it is not there.
+    ``nees`` (n,): normalised estimation error squared of every row, and its degrees of freedom. ``bound_m`` (n,):
+    posterior Cramér-Rao bound of the distance from the truth. ``array_m`` (n, 3): origin of the array's frame in
+    every row. Raises InputError: the folder cannot be written.
     """
     make_folder(folder, "--out")
     time, position, moment, covariance = _columns_of(points)
@@ -96,9 +82,12 @@ def track_figure(
     array_m : ndarray, shape (n, 3), optional
         Origin of the array's frame in every row [m]; without it the array stands at the origin.
 
-    Returns
-    -------
-    matplotlib.figure.Figure
+    Examples
+    --------
+    >>> import magloc
+    >>> diver = magloc.datasets.load("diver")
+    >>> track = magloc.track(diver.array, diver.readings)
+    >>> figure = magloc.plots.track(track.points, diver.truth.position_m)
     """
     time, position, moment, covariance = _columns_of(points)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
@@ -168,9 +157,12 @@ def consistency_figure(
     bound_m : ndarray, shape (n,), optional
         Posterior Cramér-Rao bound of the distance from the truth [m].
 
-    Returns
-    -------
-    matplotlib.figure.Figure
+    Examples
+    --------
+    >>> import magloc
+    >>> diver = magloc.datasets.load("diver")
+    >>> track = magloc.track(diver.array, diver.readings)
+    >>> figure = magloc.plots.consistency(track.points)
     """
     time, position, _, covariance = _columns_of(points)
     n_panels = 5 if truth_m is not None and nees is not None else 3

@@ -125,6 +125,8 @@ class RandomWalk:
         Characteristic unknown speed V along each axis.
     turn_rad_s : float
         Characteristic unknown rate W, about each axis.
+    n_states : int
+        6: position and moment; not to be changed.
 
     Examples
     --------
@@ -178,6 +180,8 @@ class OrnsteinUhlenbeck:
         Correlation time τ; by default 1/W, the time in which a course changes that turns at the rate W.
     moment_change : float
         How much the moment changes otherwise, relative to its modulus, in the root of a second [1/√s].
+    n_states : int
+        12: position, moment, velocity and turn rates; not to be changed.
 
     Examples
     --------
@@ -286,6 +290,8 @@ class CoordinatedTurn:
         The same for the turn rate [rad/s/√s].
     moment_change : float
         The same for the moment, relative to its modulus [1/√s].
+    n_states : int
+        10: position, moment, velocity and turn rate; not to be changed.
 
     Examples
     --------

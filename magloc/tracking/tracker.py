@@ -80,6 +80,8 @@ class Tracker:
     motion : MotionModel
     prior : SourcePrior
         Bounds for the fixes that start a track, in the array's frame.
+    keep_steps : bool
+        Keep what a smoother needs, in `steps`.
 
     Attributes
     ----------

@@ -37,14 +37,7 @@ class BrowserError(RuntimeError):
 def find_chromium() -> str:
     """Path of Chromium or Chrome.
 
-    Returns
-    -------
-    str
-
-    Raises
-    ------
-    InputError
-        None is on the PATH.
+    Raises InputError: none is on the PATH.
     """
     for name in BINARIES:
         found = shutil.which(name)

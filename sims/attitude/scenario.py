@@ -42,6 +42,8 @@ class AttitudeScenario:
     ----------
     satellite : Satellite
         Runs start within the 24 hours from its start; its control sees the true state.
+    conditions : StartConditions
+        Of Sun and field, which hold throughout a run.
     duration_s, dt_s : float
         Of a run, and between its instants. Readings are taken and torques set at every instant.
     torque_Nm : float

@@ -135,6 +135,12 @@ def run_scenario(
 
     Parameters
     ----------
+    file : AttitudeFile
+        Of :func:`adcs.read_scenario`.
+    estimate : EstimatorSettings
+        What estimates.
+    seeds : sequence of int
+        One for each run.
     look : callable, optional
         Called with every part of the runs.
     advance : callable, optional
@@ -144,6 +150,15 @@ def run_scenario(
     ------
     InputError
         As :func:`parts_of`.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> from sims import experiments
+    >>> file = adcs.read_scenario("tabletsat").changed({"duration_s": 70.0})
+    >>> outcome = experiments.run_scenario(file, file.estimator(file.path), seeds=[0])
+    >>> int(outcome.diverged.sum())
+    0
     """
     outcomes = []
     for part in parts_of(file, estimate, seeds):

@@ -108,8 +108,11 @@ def fused_runs(
 
     Parameters
     ----------
+    method : {'paper', 'velocity-corrected', 'ekf', 'camera', 'imu'}
     scenario : TableScenario
         Longer than 10 s.
+    seeds : sequence of int
+        One for each run.
     progress : callable, optional
         Called with 1 after every run.
 
@@ -117,6 +120,14 @@ def fused_runs(
     ------
     ValueError
         An argument is out of range.
+
+    Examples
+    --------
+    >>> import sims
+    >>> from sims import experiments
+    >>> scenario = sims.TableScenario(duration_s=12.0)
+    >>> experiments.fused_runs("imu", scenario, seeds=[0]).summary()["runs"]
+    1
     """
     from adcs.mockup.navigation.fixes import fuse
 
@@ -212,6 +223,8 @@ def zeros_run(
     ----------
     unknowns : {'two', 'six', 'drift'}
         Constant zeros; these and the start; these, the start, and slopes of the zeros in time.
+    seeds : sequence of int
+        One for each run.
     duration_s : float
         Up to 20 s the run with two firings, else a drive around the table.
     start_fixes : int
@@ -223,6 +236,12 @@ def zeros_run(
     ------
     ValueError
         An argument is out of range.
+
+    Examples
+    --------
+    >>> from sims import experiments
+    >>> experiments.zeros_run("two", seeds=[0]).summary()["runs"]
+    1
     """
     from sims.mockup.table_run import ImuErrors, TableScenario
 

@@ -74,11 +74,19 @@ def fused_record(samples: Path, fixes: Path, method: Method) -> RecordRun:
     ----------
     samples, fixes : Path
         CSV files; see :func:`read_samples` and :func:`read_fixes`.
+    method : {'paper', 'velocity-corrected', 'ekf', 'camera', 'imu'}
 
     Raises
     ------
     InputError
         A file is not what it should be, or no fix is within the samples.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from sims import experiments
+    >>> files = Path("samples.csv"), Path("fixes.csv")
+    >>> run = experiments.fused_record(*files, "ekf")  # doctest: +SKIP
     """
     recorded, record = read_samples(samples), read_fixes(fixes)
     imu = recorded.with_gaps_filled()
@@ -117,16 +125,9 @@ def _gap_warnings(path: Path, imu: ImuRecord, method: Method) -> tuple[str, ...]
 def read_samples(path: Path) -> ImuRecord:
     """Samples from a CSV file with the columns of :data:`SAMPLE_COLUMNS`; others are left out.
 
-    Parameters
-    ----------
-    path : Path
-        A time is when the interval of its sample ends; an empty cell is a missing reading.
-
-    Raises
-    ------
-    InputError
-        It is no such file, has fewer than two rows, its times go back, a gap is too long to go through it in steps, or
-        a column has no reading that is believed.
+    ``path``: A time is when the interval of its sample ends; an empty cell is a missing reading. Raises InputError:
+    it is no such file, has fewer than two rows, its times go back, a gap is too long to go through it in steps, or
+    a column has no reading that is believed.
     """
     table = _table_with(path, SAMPLE_COLUMNS)
     time_s = table.complete(["time_s"], math.inf)[:, 0]

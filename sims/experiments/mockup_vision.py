@@ -205,9 +205,30 @@ def sky_run(
 ) -> SkyRun:
     """Render frames at random poses, find the lights, identify them, and compare with the truth.
 
-    ``matcher``: for the catalogue of that sky, and a camera of that footprint. ``seeds``: of all frames, one after the
-    other; each frame has random numbers of its own, whatever the others do. ``progress``: called with the number of
-    frames finished since the last call. ``finder``: of :mod:`adcs.mockup.vision.centroids`.
+    Parameters
+    ----------
+    sky : LedSky
+    matcher : Matcher
+        For the catalogue of that sky and a camera of that footprint, such as :func:`adcs.mockup.odds_matcher`.
+    setup : SkySetup
+        Frames, and what is believed of the camera.
+    seeds : sequence of int
+        Of all frames, one after the other; each frame has random numbers of its own, whatever the others do.
+    progress : callable, optional
+        Called with the number of frames finished since the last call.
+    finder : callable
+        Of :mod:`adcs.mockup.vision.centroids`.
+
+    Examples
+    --------
+    >>> from adcs import mockup
+    >>> from sims import experiments
+    >>> from sims.experiments.mockup_vision import SkySetup
+    >>> sky, setup = mockup.led_sky(), SkySetup(poses=3)
+    >>> catalogue = mockup.TriangleCatalogue.of(sky.positions_m)
+    >>> matcher = mockup.odds_matcher(catalogue, setup.camera)
+    >>> experiments.sky_run(sky, matcher, setup).summary()["false_fixes"]
+    0
     """
     truth, results = [], []
     for seed, row in product(seeds, range(setup.poses)):
@@ -235,9 +256,24 @@ def random_frame(sky: LedSky, setup: SkySetup, seed: int, row: int) -> tuple[Pos
 def identified_files(
     paths: Iterable[Path], camera: Camera, matcher: Matcher, finder: Finder = find_stars
 ) -> dict[Path, FrameResult]:
-    """Fixes of frames in PNG files.
+    """Fixes of frames in PNG files, by their paths.
 
-    ``camera``: as it is believed to be; the frames must have its size. ``finder``: of
-    :mod:`adcs.mockup.vision.centroids`. Returns: from path to result, in the order of the paths.
+    Parameters
+    ----------
+    paths : iterable of Path
+    camera : Camera
+        As it is believed to be; the frames must have its size.
+    matcher, finder
+        As of :func:`sky_run`.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from adcs import mockup
+    >>> from sims import experiments
+    >>> camera, paths = mockup.Camera(), sorted(Path("frames").glob("*.png"))
+    >>> catalogue = mockup.TriangleCatalogue.of(mockup.led_sky().positions_m)
+    >>> matcher = mockup.odds_matcher(catalogue, camera)
+    >>> found = experiments.identified_files(paths, camera, matcher)
     """
     return {path: frame_result(read_frame(path, camera), camera, matcher, finder) for path in paths}

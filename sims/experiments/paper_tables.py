@@ -95,7 +95,23 @@ class Comparison:
 
 
 def compared_with_paper(row: PaperRow, seeds: Sequence[int], duration_s: float | None = None) -> list[Comparison]:
-    """Numbers of a row of the paper and ours; the duration is the row's unless given."""
+    """Numbers of a row of the paper and ours; the duration is the row's unless given.
+
+    Parameters
+    ----------
+    row : PaperRow
+        One of :data:`PAPER_ROWS`.
+    seeds : sequence of int
+        One for each run.
+    duration_s : float, optional
+
+    Examples
+    --------
+    >>> from sims import experiments
+    >>> row = experiments.PAPER_ROWS[0]
+    >>> experiments.compared_with_paper(row, seeds=[0], duration_s=70.0)[0].quantity
+    'attitude'
+    """
     file = read_scenario("tabletsat")
     sensors = dict(file.tables["sensors"])
     sensors["star_tracker"] = {**sensors["star_tracker"], "noise_deg": 0.002}

@@ -53,6 +53,8 @@ def write_simulation(simulation: Simulation, readings: str | PathLike[str]) -> S
 
     Parameters
     ----------
+    simulation : Simulation
+        Of :func:`sims.simulate`.
     readings : path-like
         Of the readings file; the others are written beside it (:func:`files_beside`). Existing files are replaced.
 

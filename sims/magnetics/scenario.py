@@ -121,6 +121,13 @@ class MagneticScenario:
         None is allowed: a recording of noise.
     ambient_T : tuple, shape (3,), optional
         Geomagnetic field, world frame. None: there is none, and the readings have no columns for it.
+    pulsations : tuple of Pulsation
+        Sinusoids in the ambient field.
+    platform : Platform
+        Noise of what carries the array.
+    missing : Missing
+        Readings that are not there.
+    name : str
 
     Raises
     ------

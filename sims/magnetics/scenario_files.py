@@ -42,15 +42,8 @@ built_in_scenarios = _FILES.names
 def read_scenario(name_or_path: str) -> MagneticScenario:
     """Scenario of a simulation.
 
-    Parameters
-    ----------
-    name_or_path : str
-        A built-in scenario's name, or a TOML file; ``diver.toml`` beside this module documents the keys.
-
-    Raises
-    ------
-    InputError
-        The file cannot be read or does not describe a scenario; the text says where and why.
+    ``name_or_path``: a built-in scenario's name, or a TOML file; ``diver.toml`` beside this module documents the
+    keys. Raises InputError: the file cannot be read or does not describe a scenario; the text says where and why.
     """
     path, table = _FILES.read(name_or_path)
     file = section_of(path, table, FileTable)

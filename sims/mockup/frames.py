@@ -103,8 +103,12 @@ def rendered_frame(
 
     Parameters
     ----------
+    sky : LedSky
+        Such as :func:`adcs.mockup.led_sky`.
+    camera : Camera
     pose : Pose
         In the middle of the exposure.
+    rng : numpy.random.Generator
     motion : Motion
         Velocity and turn rate meanwhile; at rest by default.
     quality : FrameQuality

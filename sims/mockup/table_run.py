@@ -123,8 +123,13 @@ class TableScenario:
     Attributes
     ----------
     drive : {'perimeter', 'two-firings'}
+    duration_s : float
     sample_s : float
         Between samples of the inertial unit, a multiple of :data:`POLL_S`.
+    imu : ImuErrors
+        Of the inertial unit.
+    camera : CameraErrors
+        Of its fixes.
 
     Raises
     ------

@@ -18,7 +18,7 @@ MOST_IMPORTS = 3
 MOST_DRAWN = 11
 PLACE = re.compile(r"^\*Notebook (\d+) of (\d+) · (\d+) minutes · [^*]+\*$", re.MULTILINE)
 CARD = re.compile(
-    r":::\{grid-item-card\} (\d+)\. [^\n]+\n:link: notebooks/([\w-]+)\n(?:[^\n]+\n)*?[^\n]*\*(\d+) min\.\*\n:::"
+    r":::\{grid-item-card\} ((\d+)\. [^\n]+)\n:link: notebooks/([\w-]+)\n(?:[^\n]+\n)*?[^\n]*\*(\d+) min\.\*\n:::"
 )
 
 
@@ -158,15 +158,16 @@ plt.show()
 def test_they_say_their_place_as_the_gallery_does() -> None:
     said = {}
     for path in NOTEBOOKS:
-        found = PLACE.findall(nbformat.read(path, as_version=4).cells[0].source)
+        first = nbformat.read(path, as_version=4).cells[0].source
+        found = PLACE.findall(first)
         assert len(found) == 1, path.name
         number, of, minutes = found[0]
         assert int(of) == len(NOTEBOOKS)
-        said[path.stem] = (number, minutes)
+        said[path.stem] = (first.splitlines()[0].removeprefix("# "), number, minutes)
     cards = CARD.findall((DOCS / "gallery" / "index.md").read_text(encoding="utf-8"))
-    assert {name: (number, minutes) for number, name, minutes in cards} == said
-    assert sorted(int(number) for number, _ in said.values()) == list(range(1, len(NOTEBOOKS) + 1))
+    assert {name: (title, number, minutes) for title, number, name, minutes in cards} == said
+    assert sorted(int(number) for _, number, _ in said.values()) == list(range(1, len(NOTEBOOKS) + 1))
     listed = re.findall(
         r"^notebooks/([\w-]+)$", (DOCS / "gallery" / "index.md").read_text(encoding="utf-8"), re.MULTILINE
     )
-    assert listed == sorted(said, key=lambda name: int(said[name][0]))
+    assert listed == sorted(said, key=lambda name: int(said[name][1]))

@@ -219,6 +219,8 @@ class DelayedFilter:
         At ``begin_s``.
     begin_s : float
         Where the first samples begin.
+    settings : FilterSettings
+        Noises and rules.
     sigma : StartSigma
         How well the start is known. The zeros and their drifts start at 0.
 
@@ -228,6 +230,15 @@ class DelayedFilter:
         Estimate and covariance at the last sample; ``state`` is the same without zeros and drifts.
     nis : list of float
         Normalised innovation squared of every fix that came and could be taken, when it was first taken.
+
+    Examples
+    --------
+    >>> import sims
+    >>> from adcs import mockup
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> method = mockup.DelayedFilter(run.start, run.imu.begin_s)
+    >>> len(mockup.fuse(method, run.imu, run.fixes).track)
+    500
     """
 
     def __init__(

@@ -195,6 +195,16 @@ def fuse(fusion: Fusion, imu: ImuRecord, fixes: FixRecord) -> Fused:
     -------
     Fused
         Its track is of the kind that the method returns.
+
+    Examples
+    --------
+    >>> import sims
+    >>> from adcs import mockup
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> method = mockup.DelayedFilter(run.start, run.imu.begin_s)
+    >>> fused = mockup.fuse(method, run.imu, run.fixes)
+    >>> fused.track.position_m.shape
+    (500, 2)
     """
     tracks: list[PlanarTrack] = []
     outcomes: list[Outcome] = []

@@ -75,6 +75,15 @@ def camera_latency(
     ------
     ValueError
         The range is empty, a noise is not positive, or there are missing readings.
+
+    Examples
+    --------
+    >>> import sims
+    >>> from adcs import mockup
+    >>> camera = sims.CameraErrors(latency_s=0.1)
+    >>> run = sims.table_run(sims.TableScenario(duration_s=60.0, camera=camera), seed=0)
+    >>> round(mockup.camera_latency(run.imu, run.fixes).latency_s, 1)
+    0.1
     """
     if not lowest_s < highest_s:
         raise ValueError(f"Input lowest_s must be below highest_s; instead received {lowest_s} and {highest_s}.")

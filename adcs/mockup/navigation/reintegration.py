@@ -18,7 +18,24 @@ VelocityRule = Callable[[Fix, Fix, ImuRecord], FloatArray]
 
 
 def finite_difference(first: Fix, second: Fix, imu: ImuRecord) -> FloatArray:
-    """The source's velocity, (p₂ - p₁)/(t₂ - t₁), which is that of the middle between both."""
+    """The source's velocity, (p₂ - p₁)/(t₂ - t₁), which is that of the middle between both.
+
+    Parameters
+    ----------
+    first, second : Fix
+    imu : ImuRecord
+        Samples between both.
+
+    Examples
+    --------
+    >>> import sims
+    >>> from adcs import mockup
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> first, second = run.fixes[0], run.fixes[1]
+    >>> imu = run.imu.between(first.time_s, second.time_s)
+    >>> mockup.finite_difference(first, second, imu).shape
+    (2,)
+    """
     return (second.position_m - first.position_m) / (second.time_s - first.time_s)
 
 
@@ -26,6 +43,22 @@ def corrected_velocity(first: Fix, second: Fix, imu: ImuRecord) -> FloatArray:
     r"""Velocity at the second exposure, :math:`(p_2 - p_1 - Δp_{imu})/(t_2 - t_1) + Δv_{imu}`.
 
     Δp and Δv are what the samples make of rest at the first fix's heading.
+
+    Parameters
+    ----------
+    first, second : Fix
+    imu : ImuRecord
+        Samples between both.
+
+    Examples
+    --------
+    >>> import sims
+    >>> from adcs import mockup
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> first, second = run.fixes[0], run.fixes[1]
+    >>> imu = run.imu.between(first.time_s, second.time_s)
+    >>> mockup.corrected_velocity(first, second, imu).shape
+    (2,)
     """
     moved = strapdown(imu, PlanarState(np.zeros(2), np.zeros(2), first.heading_rad))
     mean: FloatArray = (second.position_m - first.position_m - moved.position_m[-1]) / (second.time_s - first.time_s)
@@ -52,11 +85,22 @@ class Reintegration:
         Of the samples.
     longest_gap_s : float
         Between two fixes that tell a velocity; the source's slowest fix is 2.7 s late.
+    buffer_s : float
+        How long samples are kept.
 
     Attributes
     ----------
     state : PlanarState
         Estimate at the last sample.
+
+    Examples
+    --------
+    >>> import sims
+    >>> from adcs import mockup
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> method = mockup.Reintegration(run.start, run.imu.begin_s)
+    >>> len(mockup.fuse(method, run.imu, run.fixes).track)
+    500
     """
 
     def __init__(
@@ -142,6 +186,15 @@ class CameraOnly:
     ----------
     start : PlanarState
         Until the first fix.
+
+    Examples
+    --------
+    >>> import sims
+    >>> from adcs import mockup
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> method = mockup.CameraOnly(run.start)
+    >>> len(mockup.fuse(method, run.imu, run.fixes).track)
+    500
     """
 
     def __init__(self, start: PlanarState) -> None:
@@ -172,8 +225,19 @@ class ImuOnly:
 
     Parameters
     ----------
+    start : PlanarState
+        At the first sample.
     gate : Gate
         Of the samples.
+
+    Examples
+    --------
+    >>> import sims
+    >>> from adcs import mockup
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> method = mockup.ImuOnly(run.start)
+    >>> len(mockup.fuse(method, run.imu, run.fixes).track)
+    500
     """
 
     def __init__(self, start: PlanarState, gate: Gate = Gate()) -> None:  # noqa: B008 - frozen

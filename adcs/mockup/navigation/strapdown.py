@@ -29,7 +29,18 @@ def turned(heading_rad: ArrayLike, vector_body: ArrayLike) -> FloatArray:
 
 
 def wrapped(angle_rad: ArrayLike) -> FloatArray:
-    """Angle in (-π, π], any shape."""
+    """Angle in (-π, π], any shape.
+
+    Parameters
+    ----------
+    angle_rad : array_like, any shape
+
+    Examples
+    --------
+    >>> from adcs import mockup
+    >>> mockup.wrapped([0.0, 4.0]).round(3)
+    array([ 0.   , -2.283])
+    """
     return math.pi - np.mod(math.pi - np.asarray(angle_rad, dtype=np.float64), 2.0 * math.pi)
 
 
@@ -332,6 +343,14 @@ def strapdown(imu: ImuRecord, start: PlanarState) -> PlanarTrack:
         All readings there, zeros taken off: see :func:`held`. NaN stays NaN from there on.
     start : PlanarState
         At ``imu.begin_s``.
+
+    Examples
+    --------
+    >>> import sims
+    >>> from adcs import mockup
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> mockup.strapdown(run.imu, run.start).position_m.shape
+    (500, 2)
     """
     dt = imu.steps_s
     angle = imu.rate_rad_s * dt

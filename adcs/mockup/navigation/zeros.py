@@ -64,6 +64,15 @@ def heading_from_fixes(imu: ImuRecord, fixes: FixRecord) -> tuple[FloatArray, fl
     ------
     ValueError
         There are fewer than two fixes.
+
+    Examples
+    --------
+    >>> import sims
+    >>> from adcs import mockup
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> heading_rad, zero_rad_s = mockup.heading_from_fixes(run.imu, run.fixes)
+    >>> heading_rad.shape
+    (500,)
     """
     if len(fixes) < 2:
         raise ValueError(f"Input fixes must be two at least; instead received {len(fixes)}.")
@@ -93,6 +102,16 @@ class ZeroProblem:
         D[s e^{iφ}] for each course s of a zero [s²]; the first one is constant.
     measured : ndarray of complex, shape (k,)
         Positions of the fixes [m].
+
+    Examples
+    --------
+    >>> import sims
+    >>> from adcs import mockup
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> heading_rad, _ = mockup.heading_from_fixes(run.imu, run.fixes)
+    >>> problem = mockup.zero_problem(run.imu, heading_rad, run.fixes)
+    >>> len(problem.time_s) == len(run.fixes)
+    True
     """
 
     time_s: FloatArray
@@ -121,6 +140,16 @@ def zero_problem(
     ------
     ValueError
         The shapes do not match, there are missing readings, or an exposure is outside of the record.
+
+    Examples
+    --------
+    >>> import sims
+    >>> from adcs import mockup
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> heading_rad, _ = mockup.heading_from_fixes(run.imu, run.fixes)
+    >>> problem = mockup.zero_problem(run.imu, heading_rad, run.fixes)
+    >>> len(problem.time_s) == len(run.fixes)
+    True
     """
     n = len(imu)
     heading = np.asarray(heading_rad, dtype=np.float64)
@@ -213,6 +242,8 @@ def zeros_and_start(problem: ZeroProblem, sigma_m: float = SIGMA_M) -> ZeroFit:
 
     Parameters
     ----------
+    problem : ZeroProblem
+        Of :func:`zero_problem`.
     sigma_m : float
         Noise of a fix, each axis, for the covariance.
 
@@ -220,6 +251,16 @@ def zeros_and_start(problem: ZeroProblem, sigma_m: float = SIGMA_M) -> ZeroFit:
     ------
     ValueError
         The fixes do not determine the unknowns: too few, or too close in time.
+
+    Examples
+    --------
+    >>> import sims
+    >>> from adcs import mockup
+    >>> run = sims.table_run(sims.TableScenario(duration_s=5.0), seed=0)
+    >>> heading_rad, _ = mockup.heading_from_fixes(run.imu, run.fixes)
+    >>> problem = mockup.zero_problem(run.imu, heading_rad, run.fixes)
+    >>> mockup.zeros_and_start(problem).zero_m_s2.shape
+    (2,)
     """
     t, m = problem.time_s, len(problem.by_zero)
     A = np.stack([*(-problem.by_zero), np.ones(t.size, dtype=np.complex128), t.astype(np.complex128)], axis=1)

@@ -28,6 +28,12 @@ class Pose:
         Of the optical axis, where it meets the ceiling, in the table's frame [m].
     heading_rad : float or ndarray
         Counter-clockwise seen from above, from the table's X to the body's x [rad].
+
+    Examples
+    --------
+    >>> from adcs import mockup
+    >>> mockup.Pose(0.1, 0.2, heading_rad=0.3).position_m
+    array([0.1, 0.2])
     """
 
     x_m: float | FloatArray
@@ -46,6 +52,8 @@ class Camera:
 
     Attributes
     ----------
+    width_px : int
+    height_px : int
     m_per_px : float
         Size of a pixel on the ceiling, at the optical centre [m].
     centre_px : tuple, shape (2,), optional
@@ -59,6 +67,12 @@ class Camera:
     ------
     ValueError
         A size is not positive, a number is not finite, or the lens folds the image onto itself within the frame.
+
+    Examples
+    --------
+    >>> from adcs import mockup
+    >>> mockup.Camera(m_per_px=0.001).footprint_m
+    (0.64, 0.48)
     """
 
     width_px: int = 640
@@ -97,7 +111,21 @@ class Camera:
 
 
 def camera_of_footprint(width_m: float, k1: float = 0.0) -> Camera:
-    """Camera of 640 × 480 px that sees a width of the ceiling."""
+    """Camera of 640 × 480 px that sees a width of the ceiling.
+
+    Parameters
+    ----------
+    width_m : float
+        Of what it sees.
+    k1 : float
+        Radial distortion at 320 px, relative.
+
+    Examples
+    --------
+    >>> from adcs import mockup
+    >>> mockup.camera_of_footprint(0.64).m_per_px
+    0.001
+    """
     return Camera(m_per_px=width_m / 640, k1=k1)
 
 
@@ -145,6 +173,7 @@ def undistorted(camera: Camera, image_px: ArrayLike) -> FloatArray:
 
     Parameters
     ----------
+    camera : Camera
     image_px : array_like, shape (..., 2)
         Column and row.
 
@@ -152,6 +181,12 @@ def undistorted(camera: Camera, image_px: ArrayLike) -> FloatArray:
     -------
     ndarray, shape (..., 2)
         Centred, y up. NaN where the lens shows nothing.
+
+    Examples
+    --------
+    >>> from adcs import mockup
+    >>> mockup.undistorted(mockup.Camera(), [[320.5, 238.5]])
+    array([[1., 1.]])
     """
     points: FloatArray = (np.asarray(image_px, dtype=np.float64) - camera.centre) * [1.0, -1.0]
     if abs(camera.k1) < _NO_LENS:
@@ -197,6 +232,7 @@ def footprint(camera: Camera, pose: Pose, points_per_side: int = 1) -> FloatArra
 
     Parameters
     ----------
+    camera : Camera
     pose : Pose
         Numbers, or arrays of shape (...).
     points_per_side : int
@@ -206,6 +242,12 @@ def footprint(camera: Camera, pose: Pose, points_per_side: int = 1) -> FloatArra
     -------
     ndarray, shape (..., 4 points_per_side, 2)
         In the table's frame [m], beginning at the image's upper left.
+
+    Examples
+    --------
+    >>> from adcs import mockup
+    >>> mockup.footprint(mockup.Camera(), mockup.Pose(0.0, 0.0, 0.0)).shape
+    (4, 2)
     """
     right, bottom = camera.width_px - 0.5, camera.height_px - 0.5
     corners = np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom], [-0.5, -0.5]])

@@ -31,8 +31,20 @@ class KnownFrame:
 
     Attributes
     ----------
+    pose : Pose
+        In the middle of the exposure.
     positions_px : ndarray, shape (n, 2)
         Column and row.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sims
+    >>> from adcs import mockup
+    >>> sky, camera, pose = mockup.led_sky(), mockup.Camera(), mockup.Pose(0.1, 0.2, 0.3)
+    >>> frame = sims.rendered_frame(sky, camera, pose, np.random.default_rng(0))
+    >>> stars = mockup.find_stars(frame.image)
+    >>> known = mockup.KnownFrame(pose, stars.positions_px)
     """
 
     pose: Pose
@@ -83,16 +95,37 @@ def calibrated_camera(
 
     Parameters
     ----------
+    sky : LedSky
+    frames : sequence of KnownFrame
+        Eight lights at least in all.
     camera : Camera
         To start from: the scale to some percent, the lens to some hundredths.
     position_sigma_m, heading_sigma_rad : float
         Standard deviations of X, Y and heading of the poses, independent from frame to frame.
+
+    Returns
+    -------
+    CameraCalibration
+        The camera, and the covariance of its scale, distortion and centre.
 
     Raises
     ------
     ValueError
         A standard deviation is negative, too few lights are where the poses predict them, or they do not determine the
         camera.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sims
+    >>> from adcs import mockup
+    >>> sky, camera, pose = mockup.led_sky(), mockup.Camera(), mockup.Pose(0.1, 0.2, 0.3)
+    >>> frame = sims.rendered_frame(sky, camera, pose, np.random.default_rng(0))
+    >>> stars = mockup.find_stars(frame.image)
+    >>> known = mockup.KnownFrame(pose, stars.positions_px)
+    >>> found = mockup.calibrated_camera(sky, [known], mockup.camera_of_footprint(0.91))
+    >>> round(float(found.camera.footprint_m[0]), 2)
+    0.9
     """
     sigmas = np.array([position_sigma_m, position_sigma_m, heading_sigma_rad])
     if not ((sigmas >= 0.0) & np.isfinite(sigmas)).all():

@@ -74,6 +74,17 @@ def find_stars(frame: ArrayLike) -> Stars:
         It is black, saturated or of one value throughout.
     ValueError
         This is no grey image of bytes.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sims
+    >>> from adcs import mockup
+    >>> sky, camera, pose = mockup.led_sky(), mockup.Camera(), mockup.Pose(0.1, 0.2, 0.3)
+    >>> frame = sims.rendered_frame(sky, camera, pose, np.random.default_rng(0))
+    >>> stars = mockup.find_stars(frame.image)
+    >>> stars.positions_px.shape == (len(stars), 2)
+    True
     """
     image = checked_frame(frame)
     background, sigma = _background(image)

@@ -181,8 +181,22 @@ def odds_matcher(catalogue: TriangleCatalogue, camera: Camera) -> FirstFix:
 
     Parameters
     ----------
+    catalogue : TriangleCatalogue
     camera : Camera
         As well calibrated as it is.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sims
+    >>> from adcs import mockup
+    >>> sky, camera, pose = mockup.led_sky(), mockup.Camera(), mockup.Pose(0.1, 0.2, 0.3)
+    >>> frame = sims.rendered_frame(sky, camera, pose, np.random.default_rng(0))
+    >>> stars = mockup.find_stars(frame.image)
+    >>> points_px = mockup.undistorted(camera, stars.positions_px)
+    >>> catalogue = mockup.TriangleCatalogue.of(sky.positions_m)
+    >>> mockup.odds_matcher(catalogue, camera).identify(points_px).position_m.round(2)
+    array([0.1, 0.2])
     """
     precise = OddsMatcher.of(catalogue, camera)
     return FirstFix((precise, precise.rough()))

@@ -39,6 +39,15 @@ class CameraFix:
         What spoke for the fix: triangles that agree for the paper's matcher, stars for the others.
     m_per_px : float
         Scale of the image on the ceiling, as fitted [m/px].
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from adcs import mockup
+    >>> stars = np.array([[0, 17], [1, 4]])
+    >>> fix = mockup.CameraFix(np.zeros(2), 0.3, stars, rms_m=1e-4, votes=2, m_per_px=1.4e-3)
+    >>> round(np.degrees(fix.heading_rad))
+    17
     """
 
     position_m: FloatArray
@@ -63,6 +72,7 @@ class PaperMatcher:
 
     Attributes
     ----------
+    catalogue : TriangleCatalogue
     tolerance_rad : float
         Largest difference of either angle of two triangles that match [rad].
     closeness_m : float
@@ -72,6 +82,13 @@ class PaperMatcher:
     opposite_handedness : bool
         Whether a triangle of the image must go round the other way than the catalogue's, as the image of a camera that
         looks up does. The paper does not ask it, and so doubles its false matches.
+
+    Examples
+    --------
+    >>> from adcs import mockup
+    >>> catalogue = mockup.TriangleCatalogue.of(mockup.led_sky().positions_m)
+    >>> mockup.PaperMatcher(catalogue).identify([[0.0, 0.0], [50.0, 0.0]]).reason
+    'no triangle between 2 stars'
     """
 
     catalogue: TriangleCatalogue

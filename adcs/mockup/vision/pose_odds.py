@@ -47,8 +47,11 @@ class PoseOdds:
 
     Attributes
     ----------
+    catalogue : TriangleCatalogue
     camera : Camera
         Calibrated: its scale and its lens are used.
+    light_map : LightMap
+        The light nearest to every place of the ceiling.
     gate_px : float
         A star farther from a light is another one [px].
     scale_sigma : float
@@ -59,6 +62,13 @@ class PoseOdds:
         A light nearer to the image's border may or may not be found [px].
     noise_px : tuple of floats
         Noise of centroids, each taken to be equally likely [px].
+
+    Examples
+    --------
+    >>> from adcs import mockup
+    >>> catalogue = mockup.TriangleCatalogue.of(mockup.led_sky().positions_m)
+    >>> mockup.PoseOdds.of(catalogue, mockup.Camera()).gate_px
+    3.0
     """
 
     catalogue: TriangleCatalogue

@@ -69,6 +69,7 @@ class LightTracker:
 
     Attributes
     ----------
+    odds : PoseOdds
     sigmas : float
         Radius of search, in standard deviations.
     least_radius_px : float
@@ -79,6 +80,20 @@ class LightTracker:
         Of a fix against all others and "all clutter"; by default a thousand to one.
     minimum_stars : int
         That a fix must explain.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sims
+    >>> from adcs import mockup
+    >>> sky, camera, pose = mockup.led_sky(), mockup.Camera(), mockup.Pose(0.1, 0.2, 0.3)
+    >>> frame = sims.rendered_frame(sky, camera, pose, np.random.default_rng(0))
+    >>> stars = mockup.find_stars(frame.image)
+    >>> points_px = mockup.undistorted(camera, stars.positions_px)
+    >>> catalogue = mockup.TriangleCatalogue.of(sky.positions_m)
+    >>> tracker = mockup.LightTracker(mockup.PoseOdds.of(catalogue, camera))
+    >>> tracker.identify_near(points_px, pose, 1e-4 * np.eye(3)).position_m.round(2)
+    array([0.1, 0.2])
     """
 
     odds: PoseOdds

@@ -29,6 +29,7 @@ class RobustMatcher:
 
     Attributes
     ----------
+    catalogue : TriangleCatalogue
     m_per_px : float
         Nominal scale of the image on the ceiling [m/px].
     radius_rad : float
@@ -50,6 +51,14 @@ class RobustMatcher:
     most_chance : float
         Hypotheses in one image, on average, that may fit as well by chance. Far below what is wanted: the fit moves the
         pose and the scale so that chance fits better than it would.
+
+    Examples
+    --------
+    >>> from adcs import mockup
+    >>> catalogue = mockup.TriangleCatalogue.of(mockup.led_sky().positions_m)
+    >>> matcher = mockup.RobustMatcher(catalogue, m_per_px=0.0014)
+    >>> matcher.identify([[0.0, 0.0], [50.0, 0.0]]).reason
+    '2 stars, 5 needed'
     """
 
     catalogue: TriangleCatalogue

@@ -167,6 +167,16 @@ def led_sky(seed: int = 0) -> LedSky:
 
     A triangulation of n points, h of them on the hull, has 2n - 2 - h triangles. A random rectangle has about 15 on its
     hull; here 36 are on a border that bulges by 1.5 %, so that each is a corner of the hull beyond doubt.
+
+    Parameters
+    ----------
+    seed : int
+
+    Examples
+    --------
+    >>> from adcs import mockup
+    >>> len(mockup.led_sky())
+    180
     """
     rng = np.random.default_rng(seed)
     half = 0.5 * np.array(SKY_SIZE_M)

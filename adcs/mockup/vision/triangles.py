@@ -74,6 +74,13 @@ class TriangleCatalogue:
         Lights in the table frame [m].
     triangles : Triangles
         Delaunay's, of all lights.
+
+    Examples
+    --------
+    >>> from adcs import mockup
+    >>> catalogue = mockup.TriangleCatalogue.of(mockup.led_sky().positions_m)
+    >>> catalogue.n_stars, len(catalogue.triangles)
+    (180, 322)
     """
 
     positions_m: FloatArray

@@ -193,21 +193,8 @@ class ArrayEditor:
 def moved(array: SensorArray, sensor_id: str, position_m: ArrayLike) -> SensorArray:
     """The array with one sensor at another place.
 
-    Parameters
-    ----------
-    array : SensorArray
-    sensor_id : str
-    position_m : array-like, shape (3,)
-        In the array's frame [m].
-
-    Returns
-    -------
-    SensorArray
-
-    Raises
-    ------
-    ValueError
-        Another sensor of the same kind stands there, or this is no array.
+    ``position_m`` (3,): in the array's frame [m]. Raises ValueError: another sensor of the same kind stands there,
+    or this is no array.
     """
     place = tuple(np.asarray(position_m, dtype=np.float64).tolist())
     sensors = tuple(replace(sensor, position_m=place) if sensor.id == sensor_id else sensor for sensor in array.sensors)

@@ -86,15 +86,7 @@ def panel(lines: Iterable[str], *, warning: bool = False) -> str:
 def readings_table(array: SensorArray, readings_T: FloatArray, signal_T: FloatArray) -> str:
     """Readings of all channels as an HTML table: one row for each sensor, what the dipole adds, and the noise, in nT.
 
-    Parameters
-    ----------
-    array : SensorArray
-    readings_T, signal_T : ndarray, shape (C,)
-        Whole readings, shown on hovering, and what the dipole adds to them [T].
-
-    Returns
-    -------
-    str
+    ``readings_T``, ``signal_T`` (C,): whole readings, shown on hovering, and what the dipole adds to them [T].
     """
     largest = float(np.nanmax(np.abs(signal_T), initial=0.0))
     kinds = {sensor.kind for sensor in array.sensors}

@@ -166,16 +166,8 @@ def channels_of(array: SensorArray) -> list[Channel]:
 def differences_from_mean(array: SensorArray, readings_T: FloatArray) -> FloatArray:
     """What every channel sees beyond the mean of the sensors of its kind, calibration undone.
 
-    Parameters
-    ----------
-    array : SensorArray
-    readings_T : ndarray, shape (n, C)
-        NaN where missing [T].
-
-    Returns
-    -------
-    ndarray, shape (n, C)
-        Of vector sensors the components along the array's axes; NaN where a reading of the sensor is missing [T].
+    ``readings_T`` (n, C): NaN where missing [T]. Returns (n, C): of vector sensors the components along the array's
+    axes; NaN where a reading of the sensor is missing [T].
     """
     fields = array.calibrated_field(readings_T)
     result = np.full(readings_T.shape, np.nan)
@@ -194,20 +186,8 @@ def differences_from_mean(array: SensorArray, readings_T: FloatArray) -> FloatAr
 def thinned(time_s: FloatArray, values: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
     """No more points than a plot can show: the least and the greatest value of every stretch of time.
 
-    Parameters
-    ----------
-    time_s : ndarray, shape (n,)
-        Ascending [s].
-    values : ndarray, shape (n, C)
-        NaN where missing.
-    most : int
-        Points at most, of every channel.
-
-    Returns
-    -------
-    time_s : ndarray, shape (k,)
-    values : ndarray, shape (k, C)
-        All of them if there are no more than that. An extreme value is never lost.
+    ``time_s`` (n,): ascending [s]. ``values`` (n, C): NaN where missing. ``most``: points at most, of every
+    channel. Returns times (k,) and values (k, C), all if there are no more than that. An extreme value is never lost.
     """
     if len(time_s) <= most:
         return time_s, values
@@ -222,19 +202,8 @@ def with_mark(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Lines, and a mark that is 1 at one time and 0 elsewhere: three points are put in there.
 
-    Parameters
-    ----------
-    time_s : ndarray, shape (k,)
-    values : ndarray, shape (k, C)
-    at_s : float
-    values_there : ndarray, shape (C,)
-        Values of the lines at that time.
-
-    Returns
-    -------
-    time_s : ndarray, shape (k + 3,)
-    values : ndarray, shape (k + 3, C)
-    mark : ndarray, shape (k + 3,)
+    ``time_s`` (k,). ``values`` (k, C). ``values_there`` (C,): values of the lines at that time. Returns times,
+    values and the mark, of k + 3 rows each.
     """
     place = int(np.searchsorted(time_s, at_s, side="right"))
     mark = np.zeros(len(time_s) + 3)

@@ -45,15 +45,8 @@ class Extent(NamedTuple):
 def extent_of(*points_m: ArrayLike) -> Extent:
     """Extent of points.
 
-    Parameters
-    ----------
-    *points_m : array-like, shape (..., 3)
-        Those that are not finite do not count [m].
-
-    Returns
-    -------
-    Extent
-        With a radius of 1 m if there is no point, or only one place.
+    ``*points_m`` (..., 3): those that are not finite do not count [m]. Returns: with a radius of 1 m if there is no
+    point, or only one place.
     """
     points = np.concatenate([np.asarray(some, dtype=np.float64).reshape(-1, 3) for some in points_m])
     points = points[np.isfinite(points).all(axis=1)]
@@ -75,16 +68,7 @@ def corners_of(centre_m: ArrayLike, half_side_m: float) -> FloatArray:
 def prepare(server: viser.ViserServer, extent: Extent) -> float:
     """Up direction, light, floor and the first camera.
 
-    Parameters
-    ----------
-    server : viser.ViserServer
-    extent : Extent
-        What should be in view.
-
-    Returns
-    -------
-    float
-        Side of the floor's squares [m].
+    ``extent``: what should be in view. Returns: side of the floor's squares [m].
     """
     scene, centre, radius = server.scene, extent.centre_m, extent.radius_m
     scene.set_up_direction("+z")
@@ -120,13 +104,7 @@ def _light(scene: viser.SceneApi) -> None:
 
 
 def aim(server: viser.ViserServer, extent: Extent) -> None:
-    """Point the first camera, and what "Reset View" returns to, so that all points are just in view.
-
-    Parameters
-    ----------
-    server : viser.ViserServer
-    extent : Extent
-    """
+    """Point the first camera, and what "Reset View" returns to, so that all points are just in view."""
     back = _TOWARDS_CAMERA / np.linalg.norm(_TOWARDS_CAMERA)
     right = np.cross([0.0, 0.0, 1.0], back)
     right /= np.linalg.norm(right)

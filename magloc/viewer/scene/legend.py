@@ -50,16 +50,7 @@ Entry = Swatch | ColourScale
 def legend_html(entries: Sequence[Entry], notes: Sequence[str] = ()) -> str:
     """Legend as HTML.
 
-    Parameters
-    ----------
-    entries : sequence of Swatch or ColourScale
-    notes : sequence of str
-        Sentences below.
-
-    Returns
-    -------
-    str
-        One ``div``; all texts are escaped.
+    ``notes``: sentences below. Returns: one ``div``; all texts are escaped.
     """
     rows = [_row(entry) for entry in entries]
     rows += [f'<div style="margin-top:.35em;opacity:.8">{escape(note)}</div>' for note in notes]

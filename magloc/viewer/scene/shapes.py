@@ -46,16 +46,7 @@ NOTHING = Surface(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
 
 
 def joined(surfaces: Iterable[Surface]) -> Surface:
-    """Several surfaces as one.
-
-    Parameters
-    ----------
-    surfaces : iterable of Surface
-
-    Returns
-    -------
-    Surface
-    """
+    """Several surfaces as one."""
     vertices, faces = [NOTHING.vertices], [NOTHING.faces]
     before = 0
     for surface in surfaces:
@@ -73,17 +64,8 @@ def surface_of(*meshes: trimesh.Trimesh) -> Surface:
 def dipole_body(size_m: float, thickness_m: float | None = None) -> Surface:
     """A ball at the origin and an arrow from it along z, which stand for a dipole.
 
-    Parameters
-    ----------
-    size_m : float
-        Length of the arrow [m].
-    thickness_m : float, optional
-        Diameter of the ball, by which the arrow's shaft and head are sized too; by default a quarter of the length,
-        about [m].
-
-    Returns
-    -------
-    Surface
+    ``size_m``: length of the arrow [m]. ``thickness_m``: diameter of the ball, by which the arrow's shaft and head
+    are sized too; by default a quarter of the length, about [m].
     """
     # Made of the length 1: the library merges vertices by an absolute tolerance, in whole numbers.
     thickness = 0.26 if thickness_m is None else thickness_m / size_m
@@ -99,15 +81,7 @@ def dipole_body(size_m: float, thickness_m: float | None = None) -> Surface:
 def box_edges(corner_m: ArrayLike, opposite_m: ArrayLike) -> FloatArray:
     """The twelve edges of a box between two opposite corners.
 
-    Parameters
-    ----------
-    corner_m, opposite_m : array-like, shape (3,)
-        [m].
-
-    Returns
-    -------
-    ndarray, shape (12, 2, 3)
-        [m].
+    ``corner_m``, ``opposite_m`` (3,): [m]. Returns (12, 2, 3): [m].
     """
     ends = np.array([corner_m, opposite_m], dtype=np.float64)
     corners = np.array(list(itertools.product(*ends.T)))
@@ -126,23 +100,10 @@ def field_lines(
 ) -> FloatArray:
     r"""Field lines of one dipole: :math:`r = L \sin^2 θ` with θ from the moment, in planes through it.
 
-    Parameters
-    ----------
-    position_m, moment_Am2 : array-like, shape (3,)
-        Source [m] and moment [A·m²].
-    reach_m : float
-        Largest L: where the outermost lines cross the equator of the dipole [m].
-    shells : int
-        Different L, which grow as the square of 1, 2, 3, …
-    meridians : int
-        Planes' halves, evenly around the moment.
-    points : int
-        On every line, evenly in θ, from the source back to the source.
-
-    Returns
-    -------
-    ndarray, shape (shells · meridians, points, 3)
-        [m]; NaN where there is no moment.
+    ``position_m``, ``moment_Am2`` (3,): source [m] and moment [A·m²]. ``reach_m``: largest L: where the outermost
+    lines cross the equator of the dipole [m]. ``shells``: different L, which grow as the square of 1, 2, 3, ….
+    ``meridians``: planes' halves, evenly around the moment. ``points``: on every line, evenly in θ, from the source
+    back to the source. Returns (shells · meridians, points, 3): [m]; NaN where there is no moment.
     """
     axes = _axes_along(np.asarray(moment_Am2, dtype=np.float64))
     theta = np.linspace(0.0, np.pi, points)
@@ -159,15 +120,7 @@ def field_lines(
 def line_segments(lines: ArrayLike) -> FloatArray:
     """Polylines as separate segments, without those that have an end which is not finite.
 
-    Parameters
-    ----------
-    lines : array-like, shape (..., n, 3)
-        [m].
-
-    Returns
-    -------
-    ndarray, shape (segments, 2, 3)
-        [m].
+    ``lines`` (..., n, 3): [m]. Returns (segments, 2, 3): [m].
     """
     points = np.asarray(lines, dtype=np.float64)
     segments = np.stack([points[..., :-1, :], points[..., 1:, :]], axis=-2).reshape(-1, 2, 3)
@@ -209,16 +162,7 @@ def frame_edges(positions_m: ArrayLike) -> FloatArray:
 def ellipsoid(centre_m: ArrayLike, covariance_m2: ArrayLike) -> Surface:
     """95 % ellipsoid of a position (χ² of three degrees of freedom).
 
-    Parameters
-    ----------
-    centre_m : array-like, shape (3,)
-        [m].
-    covariance_m2 : array-like, shape (3, 3)
-        [m²].
-
-    Returns
-    -------
-    Surface
+    ``centre_m`` (3,): [m]. ``covariance_m2`` (3, 3): [m²].
     """
     centre, covariance = np.asarray(centre_m, dtype=np.float64), np.asarray(covariance_m2, dtype=np.float64)
     if not (np.isfinite(centre).all() and np.isfinite(covariance).all()):
@@ -233,16 +177,8 @@ def ellipsoid(centre_m: ArrayLike, covariance_m2: ArrayLike) -> Surface:
 def ellipsoid_axes(covariance_m2: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Rotations and semi-axes of 95 % ellipsoids, for many that share one mesh.
 
-    Parameters
-    ----------
-    covariance_m2 : array-like, shape (..., 3, 3)
-        [m²], finite.
-
-    Returns
-    -------
-    rotation : ndarray, shape (..., 3, 3)
-        From the axes of the ellipsoid; proper.
-    semi_axes_m : ndarray, shape (..., 3)
+    ``covariance_m2`` (..., 3, 3): [m²], finite. Returns the rotation from the axes of the ellipsoid
+    (..., 3, 3), proper, and the semi-axes (..., 3) [m].
     """
     values, vectors = np.linalg.eigh(np.asarray(covariance_m2, dtype=np.float64))
     vectors[..., 0] *= np.sign(np.linalg.det(vectors))[..., None]
@@ -264,23 +200,10 @@ def range_region(
 
     .. math:: t \mid w \sim N\left(C_{tw} (w - w_0) / C_{ww},\; C_{tt} - C_{tw} C_{wt} / C_{ww}\right).
 
-    Parameters
-    ----------
-    position_m : array-like, shape (3,)
-        Estimate [m].
-    covariance_m2 : array-like, shape (3, 3)
-        Of the position, by linearisation [m²].
-    centroid_m : array-like, shape (3,)
-        Where the range is counted from [m].
-    interval_m : tuple of (low, high)
-        95 % interval of the range [m]; high is None where it is open.
-    farthest_m : float
-        Where an open interval is cut [m]; at twice the estimated range at least.
-
-    Returns
-    -------
-    Surface
-        Closed.
+    ``position_m`` (3,): estimate [m]. ``covariance_m2`` (3, 3): of the position, by linearisation [m²].
+    ``centroid_m`` (3,): where the range is counted from [m]. ``interval_m``: 95 % interval of the range [m]; high
+    is None where it is open. ``farthest_m``: where an open interval is cut [m]; at twice the estimated range at
+    least. Returns: closed.
     """
     centroid, covariance = np.asarray(centroid_m, dtype=np.float64), np.asarray(covariance_m2, dtype=np.float64)
     offset = np.asarray(position_m, dtype=np.float64) - centroid
@@ -322,23 +245,9 @@ def uncertainty(
 ) -> Surface:
     """Where the source of a fix may be: the 95 % ellipsoid if its range is observable, else the long region.
 
-    Parameters
-    ----------
-    position_m : array-like, shape (3,)
-        [m].
-    covariance : array-like, shape (k, k)
-        Of the position, or with the position first [m²].
-    centroid_m : array-like, shape (3,)
-        Of the sensors [m].
-    range_observable : bool
-    range_interval_m : iterable of (low, high)
-        As in :class:`magloc.localization.fit.results.Solution`.
-    farthest_m : float
-        Where an open interval is cut [m].
-
-    Returns
-    -------
-    Surface
+    ``position_m`` (3,): [m]. ``covariance`` (k, k): of the position, or with the position first [m²].
+    ``centroid_m`` (3,): of the sensors [m]. ``range_interval_m``: as in
+    :class:`magloc.localization.fit.results.Solution`. ``farthest_m``: where an open interval is cut [m].
     """
     of_position = np.asarray(covariance, dtype=np.float64)[:3, :3]
     if range_observable:
@@ -351,20 +260,9 @@ def uncertainty(
 def iso_surface(axis_m: ArrayLike, values: ArrayLike, level: float) -> Surface:
     """Closed surface around those points of a cube whose value is at most a level (marching cubes).
 
-    Parameters
-    ----------
-    axis_m : array-like, shape (n,)
-        Evenly spaced coordinates of the points, the same along all axes [m].
-    values : array-like, shape (n, n, n)
-        Positive; NaN is above every level.
-    level : float
-        Positive.
-
-    Returns
-    -------
-    Surface
-        Half a spacing beyond the points where they are at the border of the cube; :data:`NOTHING` if no value is low
-        enough.
+    ``axis_m`` (n,): evenly spaced coordinates of the points, the same along all axes [m]. ``values`` (n, n, n):
+    positive; NaN is above every level. ``level``: positive. Returns: half a spacing beyond the points where they
+    are at the border of the cube; :data:`NOTHING` if no value is low enough.
     """
     with of_extra("view", "a surface"):
         from skimage.measure import marching_cubes
