@@ -32,7 +32,7 @@ PICTURES = {
     "track-weaving.png": ["magloc.track", "magloc.Track", "magloc.Tracker", "magloc.plots.track"],
     "notebook-08-calibration.png": ["magloc.calibrate", "magloc.Calibration", "magloc.plots.calibration"],
     "bounds-reach.png": ["magloc.cramer_rao_bounds", "magloc.Bounds", "magloc.bound_map", "magloc.plots.bound_reach"],
-    "notebook-06-which-array.png": ["magloc.design_array", "magloc.Design"],
+    "design-half-space.png": ["magloc.design_array", "magloc.Design"],
     "convergence-paper.png": ["magloc.convergence_map", "magloc.plots.convergence"],
     "view-dipole.png": ["magloc.view", "arrays.mesh_of"],
     "view-map.png": ["magloc.source_map"],
