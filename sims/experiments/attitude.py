@@ -99,13 +99,15 @@ def parts_of(file: AttitudeFile, estimate: EstimatorSettings, seeds: Sequence[in
     scenario = simulation_of(file)
     at_once = max(1, _NUMBERS_AT_ONCE // (scenario.n_instants * estimate.settings.sensors.size**2))
     for begin in range(0, len(seeds), at_once):
-        runs = _simulated(file, scenario, seeds[begin : begin + at_once])
-        if estimate.start == "near":
-            errors = estimate.start_attitude_rad, estimate.start_rate_rad_s
-            start = start_near(*start_estimates(runs.prepared, *errors), *errors)
-        else:
-            start = None
-        yield Part(runs, estimated(runs, estimate, start))
+        yield _part(file, estimate, scenario, seeds[begin : begin + at_once])
+
+
+def _part(file: AttitudeFile, estimate: EstimatorSettings, scenario: AttitudeScenario, seeds: Sequence[int]) -> Part:
+    runs, start = _simulated(file, scenario, seeds), None
+    if estimate.start == "near":
+        errors = estimate.start_attitude_rad, estimate.start_rate_rad_s
+        start = start_near(*start_estimates(runs.prepared, *errors), *errors)
+    return Part(runs, estimated(runs, estimate, start))
 
 
 def _simulated(file: AttitudeFile, scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
@@ -167,6 +169,7 @@ def run_scenario(
             look(part)
         if advance is not None:
             advance(len(outcomes[-1].seeds))
+        del part  # or two would be in memory while the next one is made
     of_runs = ("seeds", "axis_rms", "nees", "nis", "error_deg", "diverged")
     joined: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in outcomes]) for name in of_runs}
     return replace(outcomes[0], **joined, warnings=[texts for one in outcomes for texts in one.warnings])

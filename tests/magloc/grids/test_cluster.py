@@ -213,9 +213,9 @@ def marks_of(path):
 
 def test_commands_in_pages_listen_to_this_machine_or_ask_for_certificates():
     pages = [REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md")]
-    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages).replace("\\\n", "")
     commands = re.findall(r"^ {4}dask (?:scheduler|worker) .*$", text, re.MULTILINE)
-    assert len(commands) == 4
+    assert len(commands) >= 4  # scheduler and worker, on one machine and on several
     for command in commands:
         assert "--host 127.0.0.1 " in command or "--protocol tls " in command, command
         assert "--dashboard-address 127.0.0.1:" in command, command

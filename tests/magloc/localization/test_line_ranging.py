@@ -110,7 +110,7 @@ class TestSimulatedLines:
         [
             (STAGE, np.ones((80, 3)), 1e-9, r"must have shapes \(n,\) and \(n, 3\)"),
             (STAGE, np.zeros((81, 3)), 1e-9, "must be finite, and no field zero"),
-            (STAGE, np.ones((81, 3)), 0.0, r"Input noise_T must be positive; instead received 0\.0\."),
+            (STAGE, np.ones((81, 3)), 0.0, r"Input noise_T must be positive and finite; instead received 0\.0\."),
             (STAGE[:2], np.ones((2, 3)), 1e-9, "more numbers than the 8 unknowns; instead received 6"),
         ],
     )
