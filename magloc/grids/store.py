@@ -43,6 +43,7 @@ _SOMETHING_ELSE = "{}: found something else than a map, expected a map or nothin
 # What zarr and xarray raise for a store that is cut short or damaged depends on the place and the codec.
 UNREADABLE = (
     ArithmeticError,
+    AssertionError,
     AttributeError,
     EOFError,
     LookupError,
