@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -89,10 +90,12 @@ def view(
         if not common.quiet:
             print_note(f"wrote {', '.join(written)}")
         return
-    print(scene.address, flush=True)
-    if not common.quiet:
-        print_note("open this address in a browser; Ctrl-C ends the viewer")
-    scene.wait()
+    with suppress(KeyboardInterrupt):  # who has the address may press Ctrl-C before the waiting begins
+        if not common.quiet:
+            print_note("open this address in a browser; Ctrl-C ends the viewer")
+        print(scene.address, flush=True)
+        scene.wait()
+    scene.close()
 
 
 def _with_track(

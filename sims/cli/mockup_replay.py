@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -52,10 +53,11 @@ def show_replay(runs: FusionRuns, replay: ReplayOptions, *, quiet: bool) -> None
             if not quiet:
                 print_note(f"wrote {', '.join(str(file) for file in (replay.html, replay.png) if file is not None)}")
             return
-        print(address(server), flush=True)
-        if not quiet:
-            print_note("open this address in a browser; Ctrl-C ends the viewer")
-        wait_for_interruption()
+        with suppress(KeyboardInterrupt):  # who has the address may press Ctrl-C before the waiting begins
+            if not quiet:
+                print_note("open this address in a browser; Ctrl-C ends the viewer")
+            print(address(server), flush=True)
+            wait_for_interruption()
         page.close()
 
 

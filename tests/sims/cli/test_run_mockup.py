@@ -354,7 +354,7 @@ class TestReplay:
                 _, err = process.communicate(timeout=30.0)
             finally:
                 process.kill()
-        assert process.returncode == 0
+        assert process.returncode == 0, err
         assert err.count("\n") == 1
         assert "Ctrl-C ends the viewer" in err
 
