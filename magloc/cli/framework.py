@@ -96,8 +96,6 @@ def run(app: App, arguments: Sequence[str] | None = None) -> int:
     """
     program = app.name[0]
     tokens = sys.argv[1:] if arguments is None else list(arguments)
-    # Before numpy is loaded: threads of linear algebra only wait for each other over matrices as small as ours.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # None where the shell closed it. In this order the first file that is opened does not become one of the others.
     for name in ("stdin", "stdout", "stderr"):
         if getattr(sys, name) is None:

@@ -17,6 +17,7 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray, IntArray
 from magloc.averages import average as averaged
 from magloc.averages import averaging_array, complete_rows
+from magloc.blas_threads import one_blas_thread
 from magloc.localization.dipole_validity import too_near
 from magloc.localization.fault_exclusion import without_faulty_sensors
 from magloc.localization.fit.columns import Solutions, in_stable_order
@@ -106,6 +107,7 @@ class Locator:
         ambient = None if ambient_T is None else np.asarray(ambient_T, dtype=np.float64)[None]
         return self.fit_rows(np.asarray(readings_T, dtype=np.float64)[None], ambient)[0]
 
+    @one_blas_thread
     def fit_rows(
         self,
         readings_T: ArrayLike,
@@ -222,6 +224,7 @@ class _Rows:
         )
 
 
+@one_blas_thread
 def fit_at_rest(
     array: SensorArray,
     readings_T: FloatArray,
@@ -249,6 +252,7 @@ def fit_at_rest(
     return found.fixes()[0]
 
 
+@one_blas_thread
 def locate(
     array: SensorArray,
     readings: Readings | ArrayLike,

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.io.lazy import by_name
 from arrays.typing import BoolArray, FloatArray, IntArray, Vector
+from magloc.blas_threads import one_blas_thread
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import EVERYWHERE, Intervals
 from magloc.readings import Readings, as_readings, without_saturated
@@ -144,6 +145,7 @@ class Track(Sequence[TrackPoint]):
     def _rows(self) -> list[Row]:
         return list(rows_of(self.readings))
 
+    @one_blas_thread
     def consistency(self, truth: Truth) -> Consistency:
         """Errors of the track, its NEES and its NIS, and the least error that is possible where the moment is known.
 
@@ -197,6 +199,7 @@ class Track(Sequence[TrackPoint]):
         return f"<pre>{escape(repr(self))}</pre>"
 
 
+@one_blas_thread
 def track(
     array: SensorArray,
     readings: Readings | ArrayLike,

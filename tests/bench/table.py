@@ -12,7 +12,7 @@ from pathlib import Path
 import numba
 import numpy as np
 
-from tests.bench.timing import Timing, installed, version_of
+from tests.bench.timing import Timing, version_of
 
 PEERS = ("scipy", "choclo", "harmonica", "magpylib", "filterpy", "stonesoup")
 COLUMNS = ("what", "ours", "peer", "ratio", "note")
@@ -78,10 +78,9 @@ def table(groups: Sequence[tuple[str, Sequence[Row]]]) -> str:
 
 def header() -> str:
     """When, on what, and with which versions."""
-    blas = "" if installed("threadpoolctl") else " (those of BLAS not limited: threadpoolctl is not installed)"
     lines = [
         f"{datetime.datetime.now().astimezone():%Y-%m-%d %H:%M %z}, {_cpu_model()}, "
-        f"{numba.get_num_threads()} threads{blas}, load {_load()} before the run",
+        f"{numba.get_num_threads()} threads, load {_load()} before the run",
         f"Python {platform.python_version()}, numpy {np.__version__}, numba {numba.__version__}, "
         + ", ".join(f"{peer} {version_of(peer)}" for peer in PEERS),
         *LEGEND,

@@ -10,6 +10,7 @@ from importlib.util import find_spec
 
 import numba
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 # A sample is the shortest of the calls that begin within this time [s]: what else runs disturbs few of them.
 SAMPLE_S = 0.05
@@ -95,10 +96,7 @@ def _shortest(run: Callable[[], object]) -> float:
 def _use_threads(threads: int) -> None:
     """Limit numba's threads, and those of the BLAS libraries that are loaded by now."""
     numba.set_num_threads(threads)
-    if installed("threadpoolctl"):
-        from threadpoolctl import ThreadpoolController
-
-        ThreadpoolController().limit(limits=threads, user_api="blas")
+    ThreadpoolController().limit(limits=threads, user_api="blas")
 
 
 def installed(package: str) -> bool:
