@@ -98,7 +98,7 @@ class TaskOptions:
 
 
 def bounds(
-    scenario: str = "paper",
+    scenario: str = "wide",
     /,
     *,
     of: SourceOptions = SourceOptions(),
@@ -118,8 +118,8 @@ def bounds(
     Parameters
     ----------
     scenario : str
-        Built-in scenario or scenario file (TOML) of magloc map, for its array and source. "paper" is
-        that of Pavlov, Karshakov and Goldin.
+        Built-in scenario or scenario file (TOML) of magloc map, for its array and source: "wide", or "paper", that of
+        Pavlov, Karshakov and Goldin.
     of : SourceOptions
         Array and source.
     task : TaskOptions

@@ -29,7 +29,7 @@ Over = Literal["starts", "sources"]
 
 
 def map_(
-    scenario: str = "paper",
+    scenario: str | None = None,
     /,
     *,
     over: Over = "starts",
@@ -50,7 +50,8 @@ def map_(
     Parameters
     ----------
     scenario : str
-        Built-in scenario or scenario file (TOML). "paper" is the figure of the source paper.
+        Built-in scenario or scenario file (TOML): by default over starts "paper", the figure of the source paper, and
+        over sources "wide", its source before an array that is wide enough to know the range.
     over : str
         starts: one source, a filter from every start. sources: every source with a random moment and noise, drawn with
         --seed, fixed once without a start.
@@ -74,6 +75,7 @@ def map_(
     from magloc.grids.store import chunk_seconds
 
     n = (41 if over == "starts" else 21) if grid is None else grid
+    scenario = scenario or ("paper" if over == "starts" else "wide")
     if over == "starts":
         name, compute = _over_starts(scenario, method, common.seed if noise else None)
     else:
@@ -103,7 +105,17 @@ def map_(
 
 # Keys of every map, in this order; null where a map has no such number.
 _KEYS = dict.fromkeys(
-    ("starts", "converged", "fraction", "front_fraction", "back_fraction", "median_iterations", "iterations_total")
+    (
+        "starts",
+        "converged",
+        "fraction",
+        "front_fraction",
+        "back_fraction",
+        "front_within_13m_fraction",
+        "beyond_20m_fraction",
+        "median_iterations",
+        "iterations_total",
+    )
 )
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import partial
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -79,7 +80,7 @@ class StartsScenario:
         Of one realisation of the sensors' noise that all starts share; noise-free readings without it.
     """
 
-    array: SensorArray = field(default_factory=lambda: tetrahedron(1.5, noise_T=1e-9))
+    array: SensorArray = field(default_factory=lambda: tetrahedron(0.45, noise_T=1e-9))
     position_m: tuple[float, float, float] = (5.0, 0.0, 0.306)
     moment_Am2: tuple[float, float, float] = (100.0, 0.0, 0.0)
     half_width_m: float = 20.0
@@ -207,32 +208,52 @@ class StartsMap(CubeMap):
 
 @dataclass(frozen=True)
 class StartsSummary(Summary):
-    """Counts of a map over starts, with the fractions in front of the plane through the array and behind it."""
+    """Counts of a map over starts, with the fractions of its parts that converged; NaN of a part without a start.
+
+    Attributes
+    ----------
+    front_fraction, back_fraction : float
+        In front of the plane through the array, and behind it.
+    front_within_13m_fraction, beyond_20m_fraction : float
+        By the distance from the array's centroid: the published figure is a half ball.
+    """
 
     front_fraction: float
     back_fraction: float
+    front_within_13m_fraction: float
+    beyond_20m_fraction: float
 
     def lines(self) -> list[str]:
         """The counts in words."""
+        fractions = {
+            "front half": self.front_fraction,
+            "back half": self.back_fraction,
+            "in front within 13 m": self.front_within_13m_fraction,
+            "beyond 20 m": self.beyond_20m_fraction,
+        }
+        parts = [f"{part} {fraction:.1%}" for part, fraction in fractions.items() if not np.isnan(fraction)]
         return [
-            f"{self.converged} of {self.starts} starts converged ({self.fraction:.1%}): "
-            f"front half {self.front_fraction:.1%}, back half {self.back_fraction:.1%}, "
+            f"{self.converged} of {self.starts} starts converged ({self.fraction:.1%}): {', '.join(parts)}, "
             f"median {self.median_iterations:.0f} passes"
         ]
 
 
-def _tally(values: Values) -> Tally:
-    """Counts of ``status``, ``half`` and ``iterations`` of a part of a map over starts."""
+def _tally(centroid_m: FloatArray, values: Values) -> Tally:
+    """Counts of a part of a map over starts."""
     converged = values["status"] == Status.CONVERGED
-    front, back = values["half"] == 1, values["half"] == -1
-    points = {
-        "starts": np.ones_like(converged),
-        "converged": converged,
+    front = values["half"] == 1
+    offsets = np.meshgrid(
+        *(values[name] - centre for name, centre in zip("xyz", centroid_m, strict=True)), indexing="ij"
+    )
+    distance = np.linalg.norm(offsets, axis=0)
+    parts = {
         "front": front,
-        "converged front": converged & front,
-        "back": back,
-        "converged back": converged & back,
+        "back": values["half"] == -1,
+        "front within 13 m": front & (distance <= 13.0),
+        "beyond 20 m": distance > 20.0,
     }
+    points = {"starts": np.ones_like(converged), "converged": converged, **parts}
+    points |= {f"converged {name}": converged & part for name, part in parts.items()}
     return Tally.of(points, values["iterations"])
 
 
@@ -311,9 +332,12 @@ def _attribute(value: Any) -> Any:
 
 def summary(dataset: xr.Dataset) -> StartsSummary:
     """Counts of a map made by :func:`convergence_map`, which need not fit into memory."""
-    tally = tallied(dataset, ("status", "half", "iterations"), _tally)
+    centroid_m = np.asarray(dataset.attrs["centroid_m"])
+    tally = tallied(dataset, ("status", "half", "iterations", "x", "y", "z"), partial(_tally, centroid_m))
     return StartsSummary(
         **common_counts(dataset, tally),
         front_fraction=tally.fraction("converged front", "front"),
         back_fraction=tally.fraction("converged back", "back"),
+        front_within_13m_fraction=tally.fraction("converged front within 13 m", "front within 13 m"),
+        beyond_20m_fraction=tally.fraction("converged beyond 20 m", "beyond 20 m"),
     )

@@ -8,6 +8,7 @@ import numba
 import numpy as np
 from numba import prange
 
+from arrays.geometries import tetrahedron
 from magloc.compilation import compiled, compiled_parallel
 from magloc.convergence.filters import DampedFilter, IekfFilter, RepeatedFilter
 from magloc.convergence.over_starts import StartsScenario, simulated_measurement
@@ -25,7 +26,7 @@ FLOPS_PER_THREAD = 2 * 8 * LANES * REPEATS
 
 def rows(size: Size) -> Iterator[Row]:
     """The peer is the time that the operations would take as fused multiply-adds alone: a ratio of 1 is ideal."""
-    scenario = StartsScenario()
+    scenario = StartsScenario(array=tetrahedron(1.5, noise_T=1e-9))
     _, measurement, z = simulated_measurement(scenario)
     starts = starts_of(scenario, size.grid)
     methods = {method.name: method for method in (IekfFilter(), RepeatedFilter(), DampedFilter())}

@@ -8,6 +8,7 @@ from functools import partial
 import numba
 import numpy as np
 
+from arrays.geometries import tetrahedron
 from magloc.convergence.filters import IekfFilter, RepeatedFilter
 from magloc.convergence.filters_compiled import Ends
 from magloc.convergence.over_starts import StartsScenario, simulated_measurement
@@ -39,7 +40,7 @@ def rows_of(
     method: RepeatedFilter | IekfFilter, size: Size, peers: dict[str, tuple[str, Callable[..., Loop]]]
 ) -> Iterator[Row]:
     """One filter, against its twin, its peers (package and loop by name) and scipy."""
-    scenario = StartsScenario()
+    scenario = StartsScenario(array=tetrahedron(1.5, noise_T=1e-9))
     readings, measurement, z = simulated_measurement(scenario)
     optimum = plain_locator(scenario.array).fit(readings).solutions[0]
     starts = starts_of(scenario, size.grid)

@@ -96,7 +96,7 @@ class TestResult:
     @pytest.mark.usefixtures("coarse")
     def test_files_and_table(self, tmp_path, capsys):
         out = tmp_path / "out"
-        assert main(["bounds", "paper", *QUICK, "--gif", "--out", str(out), "--quiet"]) == 0
+        assert main(["bounds", "wide", *QUICK, "--gif", "--out", str(out), "--quiet"]) == 0
         names = sorted(path.name for path in out.iterdir())
         assert names == [
             "bounds-reach.png",
@@ -147,7 +147,7 @@ class TestResult:
         for options in ([], ["--array", "mine.toml"], ["--moment-Am2", "0", "-0.5", "3"]):
             assert main(["bounds", *QUICK, "--quiet", *options]) == 0
         found = {path.name for path in tmp_path.iterdir()}
-        assert found == {"bounds-paper-3", "bounds-mine-3", "bounds-paper-3-0_-0.5_3", "mine.toml"}
+        assert found == {"bounds-wide-3", "bounds-mine-3", "bounds-wide-3-0_-0.5_3", "mine.toml"}
 
 
 class TestArrays:

@@ -26,11 +26,17 @@ from magloc.plots.maps import convergence
 from tests.arrays.test_differences import random_array
 
 PAPER = StartsScenario()
+WIDE = replace(PAPER, array=tetrahedron(1.5, noise_T=1e-9))
 
 
 @pytest.fixture(scope="module")
 def paper_map():
-    return computed_map(StartsMap.of(PAPER, 21))
+    return computed_map(StartsMap.of(PAPER, 41))
+
+
+@pytest.fixture(scope="module")
+def wide_map():
+    return computed_map(StartsMap.of(WIDE, 21))
 
 
 def fractions(scenario):
@@ -44,20 +50,25 @@ def fractions(scenario):
 
 
 class TestThePapersFigure:
-    """Statements (a) and (b), by the first row of the specification's table."""
+    """Its half ball: statements (a), (b) and (c), by the specification's shells around the array's centroid."""
 
-    def test_front_half_converges(self, paper_map):
-        assert summary(paper_map).front_fraction >= 0.95
+    def test_the_parts_of_the_summary(self, paper_map):
+        counts = summary(paper_map)
+        assert counts.front_within_13m_fraction >= 0.98
+        assert counts.beyond_20m_fraction <= 0.03
+        assert counts.back_fraction <= 0.01
 
-    def test_front_half_converges_within_15_m(self, paper_map):
-        assert fractions(PAPER)[1] == pytest.approx(1.0, abs=0.08)
-
-    def test_back_half_does_not(self, paper_map):
-        assert summary(paper_map).back_fraction <= 0.12
-
-    def test_converged_starts_are_at_the_source(self, paper_map):
+    @pytest.mark.parametrize(
+        ("inner_m", "outer_m", "share"), [(14, 15, 0.93), (15, 16, 0.65), (16, 17, 0.39), (18, 20, 0.02)]
+    )
+    def test_its_surface(self, inner_m, outer_m, share, paper_map):
+        r = np.sqrt(paper_map.x**2 + paper_map.y**2 + paper_map.z**2)
+        shell = (paper_map.half == 1) & (r > inner_m) & (r <= outer_m)
         converged = paper_map.status == Status.CONVERGED
-        assert float(paper_map.distance.where(converged).max()) < 0.1
+        assert float(converged.where(shell).mean()) == pytest.approx(share, abs=0.02)
+
+    def test_converged_starts_are_at_the_optimum(self, paper_map):
+        converged = paper_map.status == Status.CONVERGED
         assert float(paper_map.chi2.where(converged).max()) < 0.05
 
     def test_what_does_not_converge_is_flagged(self, paper_map):
@@ -65,15 +76,37 @@ class TestThePapersFigure:
         not_stopped = paper_map.status == Status.NOT_STOPPED
         assert bool((paper_map.iterations.where(not_stopped) == PAPER.method.max_iterations).where(not_stopped).all())
 
+    def test_parts_without_a_start_have_no_share(self):
+        counts = summary(computed_map(StartsMap.of(replace(PAPER, half_width_m=4.0), 3)))
+        assert np.isnan(counts.beyond_20m_fraction)
+        assert "20 m" not in counts.lines()[0]
+
+
+class TestAWideArray:
+    """The same before an edge of 1.5 m: half a cube, by the first row of the specification's table."""
+
+    def test_front_half_converges(self, wide_map):
+        assert summary(wide_map).front_fraction >= 0.95
+
+    def test_front_half_converges_within_15_m(self):
+        assert fractions(WIDE)[1] == pytest.approx(1.0, abs=0.08)
+
+    def test_back_half_does_not(self, wide_map):
+        assert summary(wide_map).back_fraction <= 0.12
+
+    def test_converged_starts_are_at_the_source(self, wide_map):
+        converged = wide_map.status == Status.CONVERGED
+        assert float(wide_map.distance.where(converged).max()) < 0.1
+
     def test_with_noise_the_same(self):
-        counts = summary(computed_map(StartsMap.of(replace(PAPER, noise_seed=0), 11)))
+        counts = summary(computed_map(StartsMap.of(replace(WIDE, noise_seed=0), 11)))
         assert counts.front_fraction >= 0.95
         assert counts.back_fraction <= 0.12
 
 
 class TestProportionalNoise:
     def test_filters_and_optimum_use_the_same_noise(self):
-        array = SensorArray(PAPER.array.sensors, noise_fraction=0.02)
+        array = SensorArray(WIDE.array.sensors, noise_fraction=0.02)
         counts = summary(computed_map(StartsMap.of(replace(PAPER, array=array, noise_seed=3), 7)))
         assert counts.front_fraction > 0.5
 
@@ -99,7 +132,7 @@ class TestOtherRowsOfTheTable:
         ],
     )
     def test_fractions(self, method, moment, front, near, back):
-        measured = fractions(replace(PAPER, method=method, moment_Am2=moment))
+        measured = fractions(replace(WIDE, method=method, moment_Am2=moment))
         assert_allclose(measured[:3], [front, near, back], atol=0.08)
 
 
@@ -161,8 +194,8 @@ class TestReadableTwins:
 
 
 class TestDataset:
-    def test_written_and_read(self, paper_map, tmp_path):
-        paper_map.to_netcdf(tmp_path / "map.nc")
+    def test_written_and_read(self, wide_map, tmp_path):
+        wide_map.to_netcdf(tmp_path / "map.nc")
         with xr.open_dataset(tmp_path / "map.nc") as again:
             assert dict(again.sizes) == {"x": 21, "y": 21, "z": 21}
             assert again.status.attrs["flag_meanings"].split() == [
@@ -171,22 +204,22 @@ class TestDataset:
                 "not_stopped",
                 "diverged",
             ]
-            assert summary(again) == summary(paper_map)
+            assert summary(again) == summary(wide_map)
             assert again.attrs["method_position_step_m"] == 0.1
 
-    def test_attributes_reproduce_the_run(self, paper_map, tmp_path):
+    def test_attributes_reproduce_the_run(self, wide_map, tmp_path):
         from arrays.array_file import read_array
 
-        (tmp_path / "array.toml").write_text(paper_map.attrs["array"])
+        (tmp_path / "array.toml").write_text(wide_map.attrs["array"])
         array = read_array(tmp_path / "array.toml")
-        assert array.sensors == PAPER.array.sensors
-        again = computed_map(StartsMap.of(replace(PAPER, array=array), 5))
-        xr.testing.assert_equal(again.status, paper_map.status[::5, ::5, ::5].assign_coords(again.coords))
+        assert array.sensors == WIDE.array.sensors
+        again = computed_map(StartsMap.of(replace(WIDE, array=array), 5))
+        xr.testing.assert_equal(again.status, wide_map.status[::5, ::5, ::5].assign_coords(again.coords))
 
-    def test_halves(self, paper_map):
-        x, z = paper_map.x.to_numpy()[:, None, None], paper_map.z.to_numpy()[None, None, :]
-        depth = np.broadcast_to(5.0 * x + 0.306 * z, paper_map.half.shape)
-        assert_allclose(paper_map.half, np.sign(np.where(abs(depth) < 1e-6, 0, depth)))
+    def test_halves(self, wide_map):
+        x, z = wide_map.x.to_numpy()[:, None, None], wide_map.z.to_numpy()[None, None, :]
+        depth = np.broadcast_to(5.0 * x + 0.306 * z, wide_map.half.shape)
+        assert_allclose(wide_map.half, np.sign(np.where(abs(depth) < 1e-6, 0, depth)))
 
     def test_progress_counts_every_start(self):
         counted = []
@@ -201,9 +234,9 @@ class TestDataset:
 
 
 class TestFigure:
-    def test_fractions_in_the_title_and_units_on_the_axes(self, paper_map):
-        figure = convergence(paper_map)
-        counts = summary(paper_map)
+    def test_fractions_in_the_title_and_units_on_the_axes(self, wide_map):
+        figure = convergence(wide_map)
+        counts = summary(wide_map)
         title = figure.get_suptitle()
         assert f"front half {100 * counts.front_fraction:.1f} %" in title
         assert f"back half {100 * counts.back_fraction:.1f} %" in title
