@@ -37,6 +37,7 @@ PICTURES = {
     "view-dipole.png": ["magloc.view", "arrays.mesh_of"],
     "view-map.png": ["magloc.source_map"],
     "view-array.png": ["arrays.SensorArray", "arrays.tetrahedron", "arrays.read_array"],
+    "gradient-tensor.png": ["magloc.fit_gradient_tensor", "magloc.GradientTensor"],
     "residuals-faulty.png": ["magloc.plots.residuals"],
     "attitude-track.png": ["adcs.estimate", "adcs.AttitudeTrack"],
     "attitude-complementary.png": ["adcs.complementary_filter"],
@@ -59,6 +60,7 @@ EXPLAINED = {
     "dipole-moment": "magloc.equivalent_dipole",
     "exporting": "magloc.plots.save magloc.plots.write",
     "figures-and-viewer": "magloc.view magloc.plots.design",
+    "gradient-tensor": "magloc.fit_gradient_tensor magloc.GradientTensor",
     "inertial-unit": "adcs.complementary_filter adcs.inertial_magnetic_filter adcs.Gains",
     "iterated-kalman-filter": "magloc.IteratedExtendedKalmanFilter",
     "localization": "magloc.locate magloc.Locator magloc.Fixes magloc.Fix magloc.Solution magloc.Source"

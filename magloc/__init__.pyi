@@ -24,6 +24,8 @@ from magloc.localization.fit.prior import SourcePrior as SourcePrior
 from magloc.localization.fit.results import Fix as Fix
 from magloc.localization.fit.results import Solution as Solution
 from magloc.localization.fit.results import Source as Source
+from magloc.localization.gradient_tensor import GradientTensor as GradientTensor
+from magloc.localization.gradient_tensor import fit_gradient_tensor as fit_gradient_tensor
 from magloc.localization.line_ranging import SourceLine as SourceLine
 from magloc.localization.line_ranging import distance_along_line as distance_along_line
 from magloc.localization.line_ranging import fit_source_line as fit_source_line
