@@ -142,8 +142,8 @@ def track(
     array : Path
         Array file (TOML).
     truth : Path
-        Truth file (CSV): errors, NEES and NIS with their 99 % bounds, and the least error that is possible on average
-        over the motions that the options allow: a source that moves less may be found better.
+        Truth file (CSV): errors, NEES, NIS with its 99 % bounds, and the least error that is possible on average over
+        the motions that the options allow: a source that moves less may be found better.
     smooth : bool
         Use later rows too (fixed-interval smoother).
     json : bool

@@ -226,7 +226,7 @@ class TestTruth:
         report = outcome.out.splitlines()[1 + N_ROWS :]
         assert f"{N_ROWS - N_EMPTY} of {N_ROWS} rows" in report[0]
         for line, words in zip(
-            report[1:], (("rms", "Cramér-Rao", "ratio"), ("NEES", "99 %"), ("NIS", "99 %")), strict=True
+            report[1:], (("rms", "Cramér-Rao", "ratio"), ("NEES", "many records"), ("NIS", "99 %")), strict=True
         ):
             assert all(word in line for word in words)
 

@@ -91,6 +91,12 @@ class TestNees:
         assert result.nees_bounds[0] < result.nees_per_dimension < result.nees_bounds[1]
         assert result.nis_bounds[0] < result.nis_per_dimension < result.nis_bounds[1]
 
+    def test_bounds_are_printed_of_what_is_independent(self) -> None:
+        """Innovations are, errors of a track's rows are not."""
+        points = [point_of(np.ones(3), np.ones(3), np.eye(6), 9.0)] * 4
+        lines = consistency(points, TRACKER, blank_rows(4), np.zeros((4, 3)), np.zeros((4, 3))).lines()
+        assert ["bounds" in line for line in lines if "per dimension" in line] == [False, True]
+
 
 class TestNeesOfACurvedEstimate:
     """Six differences of a weak source: their noise is χ² of six numbers, and so is NEES in their coordinates."""
