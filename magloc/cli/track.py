@@ -163,6 +163,8 @@ def track(
     common : CommonOptions
         Common options.
     """
+    from magloc.blas_threads import one_blas_thread
+
     if json and jsonl:
         raise InputError("--json: found it together with --jsonl, expected one of them.")
     if out is not None:
@@ -180,7 +182,7 @@ def track(
         if whole or conditioning != ConditioningOptions():
             raise InputError("READINGS -: found an option that needs the whole record, expected a stream of --jsonl.")
         with naming(str(array)):
-            _stream(used, known, model, where)
+            one_blas_thread(_stream)(used, known, model, where)
         return
     rows = magloc.read_readings(readings, used, sensors=known.ids, ordered=True)
     rows, used = conditioning.apply(rows, used, readings)
@@ -188,8 +190,8 @@ def track(
     with progress(len(rows), "rows", quiet=common.quiet) as advance, naming(str(array)):
         if jsonl and not smooth:
             tracker = magloc.Tracker(used, model, prior=prior)
-            points = [_printed(point) for point in tracker.run(rows, advance)]
-            found = magloc.Track(tuple(points), rows, tracker)
+            points = one_blas_thread(lambda: tuple(map(_printed, tracker.run(rows, advance))))()
+            found = magloc.Track(points, rows, tracker)
         else:
             found = magloc.track(used, rows, motion=model, smooth=smooth, prior=prior, progress=advance)
     printed = jsonl and not smooth
