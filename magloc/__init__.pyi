@@ -33,6 +33,13 @@ from magloc.localization.locator import Locator as Locator
 from magloc.localization.locator import locate as locate
 from magloc.readings import Readings as Readings
 from magloc.readings import read_readings as read_readings
+from magloc.signature.moment_track import MomentTrack as MomentTrack
+from magloc.signature.moment_track import track_moment as track_moment
+from magloc.signature.path import ObjectPath as ObjectPath
+from magloc.signature.path import PathError as PathError
+from magloc.signature.path import read_object_path as read_object_path
+from magloc.signature.signature import Signature as Signature
+from magloc.signature.signature import fit_signature as fit_signature
 from magloc.tracking.motion import CoordinatedTurn as CoordinatedTurn
 from magloc.tracking.motion import OrnsteinUhlenbeck as OrnsteinUhlenbeck
 from magloc.tracking.motion import RandomWalk as RandomWalk

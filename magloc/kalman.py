@@ -220,8 +220,43 @@ def iterated_update(
 
 def normalised_innovation_squared(S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray) -> float:
     """Innovation squared in units of its covariance ``H S Sᵀ Hᵀ + R``: a χ² of k numbers for a right prediction."""
-    HS = H @ S
-    return float(innovation @ np.linalg.solve(HS @ HS.T + np.diag(variance), innovation))
+    sigma = np.sqrt(variance)
+    # As in block_update, so that a prediction that is hardly known does not swallow the noise.
+    phi = (H / sigma[:, None]) @ S
+    upper = np.asarray(np.linalg.qr(np.concatenate([np.eye(sigma.size), phi.T]), mode="r"))
+    whitened = np.linalg.solve(upper.T, innovation / sigma)
+    return float(whitened @ whitened)
+
+
+def smoothing_gain(S: FloatArray, F: FloatArray, S_q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    r"""Gain of a fixed-interval smoother over one step, and what it leaves unknown.
+
+    With the filtered covariance :math:`S S^T` before a step, the next state tells of this one
+    :math:`x_{j|n} = x_j + G (x_{j+1|n} - x_{j+1|j})` and
+    :math:`P_{j|n} = D D^T + G P_{j+1|n} G^T`, sums of squares alone.
+
+    Parameters
+    ----------
+    S : ndarray, shape (n, n)
+        Square root of the filtered covariance.
+    F : ndarray, shape (n, n)
+        Transition matrix.
+    S_q : ndarray, shape (n, m)
+        Square root of the noise of the step.
+
+    Returns
+    -------
+    G, D : ndarray, shape (n, n)
+
+    Notes
+    -----
+    Rauch, Tung and Striebel's smoother in an array form: P. Park and T. Kailath, "New square-root smoothing
+    algorithms", IEEE Transactions on Automatic Control 41 (1996) 727.
+    """
+    n = len(S)
+    rows = np.block([[S.T @ F.T, S.T], [S_q.T, np.zeros((S_q.shape[1], n))]])
+    upper = np.asarray(np.linalg.qr(rows, mode="r"))
+    return np.linalg.solve(upper[:n, :n], upper[:n, n:]).T, upper[n:, n:].T.copy()
 
 
 def estimability(S: FloatArray, S_predicted: FloatArray) -> FloatArray:

@@ -270,7 +270,7 @@ def _readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] 
     time_s = table.complete_and_distinct("time_s")
     position_m = rotation = ambient_T = None
     if table.has_group(POSITION_COLUMNS + ROTATION_COLUMNS):
-        position_m, rotation = table.complete(POSITION_COLUMNS), _rotation(table)
+        position_m, rotation = table.complete(POSITION_COLUMNS), unit_rotation(table)
     if table.has_group(AMBIENT_COLUMNS):
         ambient_T = table.complete(AMBIENT_COLUMNS) / _T_IN_nT
     values_nT = table.finite_or_missing(channels)
@@ -393,16 +393,17 @@ def _listed(ids: Sequence[str], most: int = 6) -> str:
     return ", ".join(ids) if len(ids) <= most else f"{', '.join(ids[: most - 1])} … {ids[-1]}"
 
 
-def _rotation(table: Table) -> Rotation:
+def unit_rotation(table: Table, columns: Sequence[str] = ROTATION_COLUMNS) -> Rotation:
+    """Rotations of a table's columns of unit quaternions, scalar last."""
     from scipy.spatial.transform import Rotation
 
-    quaternion = table.complete(ROTATION_COLUMNS)
+    quaternion = table.complete(columns)
     norm = np.linalg.norm(quaternion, axis=1)
     wrong = np.abs(norm - 1.0) > _UNIT_QUATERNION_ATOL
     if wrong.any():
         row = int(wrong.argmax())
         raise InputError(
-            f"{table.row_place(row)}, columns array_qx to array_qw: "
+            f"{table.row_place(row)}, columns {columns[0]} to {columns[-1]}: "
             f"found a quaternion of norm {norm[row]:.6g}, expected norm 1."
         )
     return Rotation.from_quat(quaternion / norm[:, None])

@@ -36,6 +36,11 @@ for _name, _where, _help in (
     ),
     ("track", "magloc.cli.track:track", "Follow one source through time."),
     (
+        "signature",
+        "magloc.cli.moments.signature:signature",
+        "Separate the permanent and the induced moment of a ship that passes on known courses.",
+    ),
+    (
         "bounds",
         "magloc.cli.bounds:bounds",
         "Tell how well an array can know a source at best (Cramér-Rao bounds), and how far it reaches.",

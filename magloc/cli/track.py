@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -17,13 +17,21 @@ from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import refuse_file, refuse_one_for_two, refuse_unwritable
 from arrays.io.text import write_text
+from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, print_json, progress
+from magloc.cli.moments.known_path import (
+    MomentOutputs,
+    PathErrorOptions,
+    refuse_bounds,
+    write_moment_track,
+)
 from magloc.cli.options import KnownOptions, ambient_field, print_note, refuse_not_positive
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
     from magloc.ambient import Place
     from magloc.readings import Readings
+    from magloc.signature.path import ObjectPath
     from magloc.tracking.consistency import Consistency
     from magloc.tracking.motion import MotionModel
     from magloc.tracking.results import TrackPoint
@@ -51,12 +59,34 @@ class MotionOptions:
         the vertical. By default unknown, and with --smooth wandering.
     correlation_s : float
         How long a speed lasts, for wandering; by default as long as a turn at the characteristic rate.
+    position : tuple of 3 floats
+        Where the source is, at rest, in the frame of the results [m]: only its moment is followed.
+    object_path : Path
+        Path file (CSV) of the source: time_s,x_m,y_m,z_m and optionally its attitude qx,qy,qz,qw, in the frame of the
+        results; only its moment is followed, and turns with the attitude. Rows outside the path are left out.
+    error : PathErrorOptions
+        How wrong a known path may be.
     """
 
     speed_m_s: float = 0.5
     turn_deg_s: float = 5.0
     motion: Literal["unknown", "wandering", "turn"] | None = None
     correlation_s: float | None = None
+    position: Vector | None = None
+    object_path: Path | None = None
+    error: PathErrorOptions = field(default_factory=PathErrorOptions)
+
+    def known_path(self) -> ObjectPath | Vector | None:
+        """Where the source is known to be, None where that is to be found."""
+        if self.position is None and self.object_path is None:
+            if self.error != PathErrorOptions():
+                raise InputError("--path-sigma-m: found neither --position nor --object-path, expected one of them.")
+            return None
+        if self.position is not None and self.object_path is not None:
+            raise InputError("--position: found it together with --object-path, expected one of them.")
+        if self.motion not in (None, "unknown"):
+            raise InputError(f"--motion: found {self.motion} with a known position, expected unknown.")
+        return self.position if self.object_path is None else magloc.read_object_path(self.object_path)
 
     def model(self, *, smooth: bool) -> MotionModel:
         """The motion model that the options name."""
@@ -133,7 +163,8 @@ def track(
 
     The track starts by itself from the first row whose fix is certain, is updated by every row, and ends where the
     readings contradict it three times in a row or its range is no longer known; then it starts anew. Rows where the
-    source is not tracked are null.
+    source is not tracked are null. With --position or --object-path the source is where they say, and its moment alone
+    is followed from the first row that determines it.
 
     Parameters
     ----------
@@ -177,8 +208,11 @@ def track(
     # A place without a date may be there for the map alone.
     where = None if known.place is not None and known.date is None else known.where
     used, model, prior = known.array(array), motion.model(smooth=smooth), known.prior
+    path = motion.known_path()
+    if path is not None:
+        refuse_bounds(known)
     if str(readings) == STREAM:
-        whole = smooth or json or any(option is not None for option in (truth, out, geojson))
+        whole = smooth or json or any(option is not None for option in (truth, out, geojson, path))
         if whole or conditioning != ConditioningOptions():
             raise InputError("READINGS -: found an option that needs the whole record, expected a stream of --jsonl.")
         with naming(str(array)):
@@ -187,6 +221,18 @@ def track(
     rows = magloc.read_readings(readings, used, sensors=known.ids, ordered=True)
     rows, used = conditioning.apply(rows, used, readings)
     used, rows = _in_ambient_field(used, rows, where)
+    if path is not None:
+        with naming(str(array)):
+            moments = magloc.track_moment(
+                used,
+                rows,
+                path,
+                turn_rad_s=math.radians(motion.turn_deg_s),
+                path_error=motion.error.path_error(),
+                smooth=smooth,
+            )
+        write_moment_track(moments, readings, known, MomentOutputs(json, jsonl, geojson, out, truth, common.quiet))
+        return
     with progress(len(rows), "rows", quiet=common.quiet) as advance, naming(str(array)):
         if jsonl and not smooth:
             tracker = magloc.Tracker(used, model, prior=prior)

@@ -21,13 +21,15 @@ def simulate(
     """Simulate the readings of an array.
 
     Beside READINGS.csv are written READINGS-truth.csv, with the position and the moment of the source in the world
-    frame (READINGS-truth-2.csv and so on of further sources), and READINGS-array.toml, with what the user of the array
-    knows of it: noise of one sample, saturation, and how uncertain axes and gains are.
+    frame (READINGS-truth-2.csv and so on of further sources), READINGS-path.csv, with its position and its attitude,
+    and READINGS-array.toml, with what the user of the array knows of it: noise of one sample, saturation, and how
+    uncertain axes and gains are.
 
     Parameters
     ----------
     scenario : str
-        Scenario file (TOML), or a built-in scenario: diver, drone, hand-magnet, paper, ship or weaving.
+        Scenario file (TOML), or a built-in scenario: diver, drone, hand-magnet, paper, ship,
+        ship-headings or weaving.
     out : Path
         Readings file (CSV) to write. Existing files are replaced.
     json : bool
@@ -58,6 +60,7 @@ def simulate(
             "readings": str(files.readings),
             "array": str(files.array),
             "truths": [str(path) for path in files.truths],
+            "paths": [str(path) for path in files.paths],
         }
         print_json(report)
     if not (json or common.quiet):

@@ -14,6 +14,7 @@ from arrays.array_file import write_array
 from arrays.io.errors import InputError
 from arrays.io.text import write_text
 from magloc.readings import write_readings
+from magloc.signature.path import write_object_path
 from magloc.truth import TRUE_MOMENT_COLUMNS, TRUE_POSITION_COLUMNS, Truth
 from sims.magnetics.simulation import Simulation
 
@@ -23,29 +24,33 @@ class SimulationFiles(NamedTuple):
 
     Attributes
     ----------
-    truths : tuple of Path
+    truths, paths : tuple of Path
         One for each source.
     """
 
     readings: Path
     array: Path
     truths: tuple[Path, ...]
+    paths: tuple[Path, ...]
 
     @property
     def all(self) -> tuple[Path, ...]:
         """Every file."""
-        return (self.readings, self.array, *self.truths)
+        return (self.readings, self.array, *self.truths, *self.paths)
 
 
 def files_beside(readings: str | PathLike[str], n_sources: int) -> SimulationFiles:
     """Paths of the files of a simulation, from that of the readings.
 
-    Returns: READINGS-array.toml, READINGS-truth.csv, READINGS-truth-2.csv and so on beside READINGS.csv.
+    Returns: READINGS-array.toml, READINGS-truth.csv, READINGS-truth-2.csv and so on beside READINGS.csv, and the same
+    of READINGS-path.csv.
     """
     path = Path(readings)
-    names = ["truth", *(f"truth-{number}" for number in range(2, n_sources + 1))][:n_sources]
-    truths = tuple(path.with_name(f"{path.stem}-{name}.csv") for name in names)
-    return SimulationFiles(path, path.with_name(f"{path.stem}-array.toml"), truths)
+    numbers = ["", *(f"-{number}" for number in range(2, n_sources + 1))][:n_sources]
+    truths, paths = (
+        tuple(path.with_name(f"{path.stem}-{name}{number}.csv") for number in numbers) for name in ("truth", "path")
+    )
+    return SimulationFiles(path, path.with_name(f"{path.stem}-array.toml"), truths, paths)
 
 
 def write_simulation(simulation: Simulation, readings: str | PathLike[str]) -> SimulationFiles:
@@ -88,6 +93,8 @@ def write_simulation(simulation: Simulation, readings: str | PathLike[str]) -> S
         write_array(hidden / files.array.name, simulation.array)
         for path, truth in zip(files.truths, simulation.truths, strict=True):
             write_truth(truth, hidden / path.name)
+        for path, known in zip(files.paths, simulation.paths, strict=True):
+            write_object_path(hidden / path.name, known)
         for path in files.all:
             os.replace(hidden / path.name, path)
     return files

@@ -9,6 +9,7 @@ import numpy as np
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
+from magloc.signature.path import PathError
 from sims.magnetics.paths import Attitude, Path, Steered, Vector
 from sims.magnetics.sensors import SensorModel, nominal_array
 
@@ -50,12 +51,15 @@ class Source:
         α: volume times susceptibility, demagnetisation included; 4π a³ for a sphere of iron of radius a.
     radius_m : float
         Size of the body: no sensor may come nearer.
+    path_error : PathError
+        Of what is known of its path and its attitude.
     """
 
     carrier: Carrier = field(default_factory=Carrier)
     moment_Am2: Vector = _ZERO
     polarisability_m3: Matrix = (_ZERO, _ZERO, _ZERO)
     radius_m: float = 0.0
+    path_error: PathError = field(default_factory=PathError)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ from arrays.array import SensorArray
 from arrays.array_file import array_of_table, read_array
 from arrays.io.errors import InputError, naming
 from arrays.io.toml import BuiltIn, in_si, named_section, section_of
+from magloc.signature.path import PathError
 from sims.magnetics.paths import Attitude, Path, Steered, Vector
 from sims.magnetics.scenario import Carrier, MagneticScenario, Matrix, Missing, Platform, Pulsation, Source
 from sims.magnetics.scenario_tables import (
@@ -161,7 +162,13 @@ def _source(place: str, table: SourceTable) -> Source:
     polarisability = _matrix(f"{place}, key polarisability_m3", table.polarisability_m3)
     if not (any(table.moment_Am2) or np.any(polarisability)):
         raise InputError(f"{place}: found neither moment_Am2 nor polarisability_m3, expected one of them.")
-    return Source(_carrier(place, table), table.moment_Am2, polarisability, table.radius_m)
+    error = PathError(
+        table.path_sigma_m,
+        table.path_correlation_s,
+        math.radians(table.attitude_sigma_deg),
+        table.attitude_correlation_s,
+    )
+    return Source(_carrier(place, table), table.moment_Am2, polarisability, table.radius_m, error)
 
 
 def _matrix(place: str, value: float | list[float | list[float]]) -> Matrix:

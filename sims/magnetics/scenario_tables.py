@@ -75,6 +75,10 @@ class SourceTable(CarrierTable, kw_only=True):
     moment_Am2: Vector = _ORIGIN
     polarisability_m3: float | list[float | list[float]] = 0.0
     radius_m: NotNegative = 0.0
+    path_sigma_m: NotNegative = 0.0
+    path_correlation_s: Annotated[NotNegative, MAY_BE_INFINITE] = math.inf
+    attitude_sigma_deg: NotNegative = 0.0
+    attitude_correlation_s: Annotated[NotNegative, MAY_BE_INFINITE] = math.inf
 
 
 class AmbientTable(Table, kw_only=True):
@@ -175,9 +179,9 @@ class LinePath(PathTable, kw_only=True):
 
 
 class CoursePath(LinePath, kw_only=True):
-    """Constant speed, and a course that turns."""
+    """Constant speed, and a course that turns, if it does."""
 
-    turn_deg_s: float
+    turn_deg_s: float = 0.0
 
     def path(self) -> Steered:
         """The path that the table describes."""

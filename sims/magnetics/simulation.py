@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
@@ -14,6 +15,7 @@ from arrays.sensor import Calibration
 from arrays.typing import FloatArray
 from magloc.fields.dipole import MU0_OVER_4PI, field
 from magloc.readings import Readings
+from magloc.signature.path import ObjectPath
 from magloc.truth import Truth
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
 from sims.magnetics.sensors import SensorModel
@@ -36,6 +38,8 @@ class Simulation:
         With the pose of the array unless its frame is the world's, and with the ambient field if there is one.
     truths : tuple of Truth
         Position and moment of every source at the times of the readings, world frame.
+    paths : tuple of ObjectPath
+        Position and attitude of every source, as whoever steers it knows them.
     true_array : SensorArray
         The array with its true calibration: misalignments and errors of the gains are part of it.
     """
@@ -45,6 +49,7 @@ class Simulation:
     array: SensorArray
     readings: Readings
     truths: tuple[Truth, ...]
+    paths: tuple[ObjectPath, ...]
     true_array: SensorArray
 
     @property
@@ -83,13 +88,14 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
     sensors_m = array_pose.position_m[:, None, :] + _applied(array_pose.rotation, scenario.array.positions[None])
     ambient_T = np.zeros(3) if scenario.ambient_T is None else np.array(scenario.ambient_T)
     fields_T = np.zeros_like(sensors_m) + (ambient_T + _pulsations(scenario, time_s, seed))[:, None, :]
-    truths = []
+    truths, poses = [], []
     for number, source in enumerate(scenario.sources, start=1):
         pose = _pose(source.carrier, time_s, seed, f"source {number}")
         moment_Am2 = _moments(source, pose.rotation, ambient_T)
         _refuse_contact(scenario, number, time_s, sensors_m - pose.position_m[:, None, :])
         fields_T += field(sensors_m, pose.position_m[:, None, :], moment_Am2[:, None, :])
         truths.append(Truth(time_s, pose.position_m, moment_Am2))
+        poses.append(pose)
     fields_T = _applied(array_pose.rotation.inv(), fields_T) + _platform_fields(scenario, time_s, seed)
     fields_T += _stray_fields(scenario, seed)
     true_array = _true_array(scenario, seed)
@@ -108,13 +114,31 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
         ambient_T=None if scenario.ambient_T is None else array_pose.rotation.inv().apply(ambient_T)[present],
     )
     kept = tuple(Truth(t.time_s[present], t.position_m[present], _rows(t.moment_Am2, present)) for t in truths)
-    return Simulation(scenario, seed, scenario.nominal_array, readings, kept, true_array)
+    paths = tuple(_known_path(scenario, i, time_s, pose, seed) for i, pose in enumerate(poses))
+    return Simulation(scenario, seed, scenario.nominal_array, readings, kept, paths, true_array)
 
 
 def _pose(carrier: Carrier, time_s: FloatArray, seed: int, owner: str) -> _Pose:
     motion = carrier.path.at(time_s)
     phase = stream(seed, "wobble", owner).uniform(0.0, 2.0 * math.pi, 3)
     return _Pose(motion.position_m, carrier.attitude.at(time_s, motion.course_rad, phase))
+
+
+def _known_path(scenario: MagneticScenario, number: int, time_s: FloatArray, pose: _Pose, seed: int) -> ObjectPath:
+    """Path of a source as it is known, with its errors."""
+    error = scenario.sources[number].path_error
+    if not error.sigma.size:
+        return ObjectPath(time_s, pose.position_m, pose.rotation)
+    random = stream(seed, "path error", f"source {number + 1}").standard_normal((len(time_s), 2, 3))
+    walks = []
+    for k, (sigma, lasts_s) in enumerate(
+        ((error.position_m, error.position_correlation_s), (error.attitude_rad, error.attitude_correlation_s))
+    ):
+        decay = math.exp(-1.0 / (scenario.rate_Hz * lasts_s)) if lasts_s else 0.0
+        added = random[:, k] * math.sqrt(1.0 - decay**2)
+        added[0] = random[0, k]
+        walks.append(sigma * lfilter([1.0], [1.0, -decay], added, axis=0))
+    return ObjectPath(time_s, pose.position_m + walks[0], Rotation.from_rotvec(walks[1]) * pose.rotation)
 
 
 def _moments(source: Source, rotation: Rotation, ambient_T: FloatArray) -> FloatArray:

@@ -27,7 +27,7 @@ from sims.magnetics.simulation import simulate
 from tests.conftest import REPOSITORY
 from tests.sims.magnetics.white_noise import with_white_noise_only
 
-NAMES = ("diver", "drone", "hand-magnet", "paper", "ship", "weaving")
+NAMES = ("diver", "drone", "hand-magnet", "paper", "ship", "ship-headings", "weaving")
 FILES = REPOSITORY / "sims" / "magnetics" / "scenarios"
 PLAIN = """
 duration_s = 10.0
@@ -141,6 +141,10 @@ class TestReading:
             (
                 'kind = "course", start_m = [1, 2, 3], course_deg = 180, speed_m_s = 2, turn_deg_s = 90',
                 Steered((1.0, 2.0, 3.0), math.pi, 2.0, turn_rad_s=math.pi / 2),
+            ),
+            (
+                'kind = "course", start_m = [1, 2, 3], course_deg = 180, speed_m_s = 2',
+                Steered((1.0, 2.0, 3.0), math.pi, 2.0),
             ),
             (
                 'kind = "weaving", start_m = [1, 2, 3], course_deg = 0, speed_m_s = 2, weave_deg = 30, '

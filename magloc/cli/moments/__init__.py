@@ -1,0 +1,1 @@
+"""Commands for an object whose path is known."""

@@ -1,0 +1,121 @@
+"""``magloc track`` with ``--position`` or ``--object-path``: the moment alone through time."""
+
+from __future__ import annotations
+
+import math
+import sys
+from dataclasses import asdict, dataclass
+from json import dumps
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cyclopts import Parameter
+
+from arrays.io.errors import LARGEST, InputError
+from arrays.io.text import write_text
+from magloc.cli.framework import print_json
+from magloc.cli.options import KnownOptions, print_note
+
+if TYPE_CHECKING:
+    from magloc.signature.moment_track import MomentTrack
+    from magloc.signature.path import PathError
+
+
+@dataclass(frozen=True)
+class MomentOutputs:
+    """Where the moment through time goes; see :func:`magloc.cli.track.track`."""
+
+    json: bool
+    jsonl: bool
+    geojson: Path | None
+    out: Path | None
+    truth: Path | None
+    quiet: bool
+
+
+def refuse_bounds(known: KnownOptions) -> None:
+    """Refuse bounds of a position that is known, and of a moment that is estimated without them."""
+    for option, value in (("--region", known.region), ("--max-moment-Am2", known.max_moment_Am2)):
+        if value is not None:
+            raise InputError(f"{option}: found it together with a known position, expected no bounds of the source.")
+
+
+@Parameter(name="*", group="Error of the known path")
+@dataclass(frozen=True)
+class PathErrorOptions:
+    """How wrong a known path may be.
+
+    Parameters
+    ----------
+    path_sigma_m : float
+        1 σ of the position along each axis; exact by default.
+    path_correlation_s : float
+        How long its error lasts: 0 for a new one in every row; by default a whole path.
+    attitude_sigma_deg : float
+        1 σ of the attitude about each axis; exact by default.
+    attitude_correlation_s : float
+        How long its error lasts, such as a second of an unknown roll; by default a whole path.
+    """
+
+    path_sigma_m: float = 0.0
+    path_correlation_s: float | None = None
+    attitude_sigma_deg: float = 0.0
+    attitude_correlation_s: float | None = None
+
+    def path_error(self) -> PathError:
+        """The errors that the options state."""
+        from magloc.signature.path import PathError
+
+        for name in ("path_sigma_m", "path_correlation_s", "attitude_sigma_deg", "attitude_correlation_s"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 <= value <= LARGEST:
+                option = name.replace("_", "-")
+                raise InputError(f"--{option}: found {value:g}, expected a number that is not negative.")
+        for sigma, correlation in (
+            ("path-sigma-m", "path-correlation-s"),
+            ("attitude-sigma-deg", "attitude-correlation-s"),
+        ):
+            if getattr(self, correlation.replace("-", "_")) is not None and not getattr(self, sigma.replace("-", "_")):
+                raise InputError(f"--{correlation}: found no --{sigma}, expected it too.")
+        return PathError(
+            self.path_sigma_m,
+            math.inf if self.path_correlation_s is None else self.path_correlation_s,
+            math.radians(self.attitude_sigma_deg),
+            math.inf if self.attitude_correlation_s is None else self.attitude_correlation_s,
+        )
+
+
+def write_moment_track(found: MomentTrack, readings: Path, known: KnownOptions, outputs: MomentOutputs) -> None:
+    """Print it, and write what is asked for."""
+    import magloc
+    from magloc.tracking.files import geojson_of_track, json_entry, json_of_track
+
+    result = None
+    if outputs.truth is not None:
+        result = found.consistency(magloc.read_truth(outputs.truth))
+    if outputs.geojson is not None and known.place is not None:
+        write_text(dumps(geojson_of_track(found, known.place), allow_nan=False) + "\n", outputs.geojson)
+    if outputs.out is not None:
+        from magloc.plots.tracks import write_picture
+
+        write_picture(found, None, outputs.out, array_m=found.readings.array_position_m)
+    if outputs.json:
+        report = json_of_track(found, None) | {"chi2": found.chi2, "dof": found.dof, "misfit": found.misfit}
+        print_json(report if result is None else report | {"consistency": asdict(result)})
+    elif outputs.jsonl:
+        for point in found:
+            print_json(json_entry(point))
+    else:
+        print(found.table())
+    if result is not None and not outputs.json:
+        print("\n".join(result.lines()), file=sys.stderr if outputs.jsonl else sys.stdout)
+    if not outputs.quiet:
+        if found.misfit:
+            print_note(
+                f"misfit: χ² {found.chi2:.0f} of {found.dof}; no dipole on this path explains the readings (path,"
+                " clock, another source, a body too near, or noise that is understated)"
+            )
+        if not (outputs.json or outputs.jsonl):
+            print_note(f"{found.tracked.sum()} of {len(found)} rows with a moment")
+    if not found.tracked.any():
+        raise InputError(f"{readings}: found no row that determines the moment, expected rows nearer to the object.")

@@ -1,0 +1,104 @@
+"""``magloc signature``: permanent and induced moment of a ship that passes on known courses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+import magloc
+from arrays.io.arguments import Flag
+from arrays.io.errors import LARGEST, InputError, naming
+from magloc.cli.framework import CommonOptions, print_result
+from magloc.cli.moments.known_path import PathErrorOptions, refuse_bounds
+from magloc.cli.options import KnownOptions, ambient_field, print_note
+
+if TYPE_CHECKING:
+    from magloc.readings import Readings
+
+
+def signature(
+    *readings: Path,
+    array: Path,
+    object_path: Annotated[list[Path], Parameter(consume_multiple=True)],
+    induced: Literal["diagonal", "symmetric", "none"] = "diagonal",
+    eddy: Flag = False,
+    depth_m: Annotated[list[float] | None, Parameter(consume_multiple=True)] = None,
+    json: Flag = False,
+    known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
+    error: PathErrorOptions = PathErrorOptions(),  # noqa: B008 - frozen
+    common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Separate the permanent and the induced moment of a ship that passes on known courses.
+
+    In its axes forward, left, up (x, y, z) the moment is a permanent one, what the ambient field induces, and what eddy
+    currents make of its rate while the ship turns. What the headings do not tell apart is said; that the model does not
+    explain the readings is said too.
+
+    Parameters
+    ----------
+    readings : Path
+        Readings files (CSV), one for every pass, of one clock and in the order of time; or one of all passes.
+    array : Path
+        Array file (TOML). Lasting errors of the sensors that it states are estimated along.
+    object_path : list of Path
+        Path file (CSV) of every pass, or one for all: time_s,x_m,y_m,z_m and optionally the attitude qx,qy,qz,qw from
+        the ship's axes to the frame of the results. Without an attitude the ship is level, its bow along the course.
+    induced : {"diagonal", "symmetric", "none"}
+        Which components of the polarisability are estimated.
+    eddy : bool
+        Estimate eddy currents: needs passes on which the ship turns or rolls.
+    depth_m : list of float
+        Predict the field along the keel at these depths below the path, on four headings.
+    json : bool
+        Print one JSON object in place of the table.
+    known : KnownOptions
+        What is known of the sensors and of the ambient field.
+    error : PathErrorOptions
+        How wrong the paths may be.
+    common : CommonOptions
+        Common options.
+    """
+    from magloc.signature.files import json_of_signature, lines_of_depths
+
+    if not readings:
+        raise InputError("READINGS is missing.")
+    if len(object_path) not in (1, len(readings)):
+        raise InputError(
+            f"--object-path: found {len(object_path)} files, expected one, or {len(readings)} as READINGS."
+        )
+    depths = depth_m or []
+    for depth in depths:
+        if not 0.0 < depth <= LARGEST:
+            raise InputError(f"--depth-m: found {depth:g}, expected a positive number.")
+    refuse_bounds(known)
+    nominal, used = known.array(array), None
+    passes: list[Readings] = []
+    for path in readings:
+        rows = magloc.read_readings(path, nominal, sensors=known.ids, ordered=True)
+        used, ambient_T = ambient_field(nominal, rows, known.where)
+        if ambient_T is None and used.ambient_T is None and (eddy or induced != "none"):
+            raise InputError(
+                f"{path}: found no ambient field, expected columns ambient_x_nT and so on, ambient_nT in the array"
+                " file, --place and --date, or --induced none."
+            )
+        passes.append(replace(rows, ambient_T=ambient_T))
+    paths = [magloc.read_object_path(path) for path in object_path]
+    with naming(str(array)):
+        result = magloc.fit_signature(
+            used or nominal,
+            passes,
+            paths if len(paths) > 1 else paths[0],
+            induced=induced,
+            eddy=eddy,
+            path_error=error.path_error(),
+        )
+    lines = [*result.table().splitlines(), *lines_of_depths(result, depths)]
+    print_result(json_of_signature(result, depths), lines, as_json=json)
+    if result.misfit and not common.quiet:
+        print_note(
+            f"misfit: χ² {result.chi2:.0f} of {result.dof}; no such moment on these paths explains the readings (path,"
+            " attitude, clock, another source, a body too near, or noise that is understated)"
+        )

@@ -1,0 +1,1 @@
+"""An object whose path is known: its moment through time, and what of it is permanent, induced or of eddy currents."""

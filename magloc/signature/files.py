@@ -1,0 +1,88 @@
+"""A signature as a table for people, and as JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from arrays.typing import FloatArray
+
+if TYPE_CHECKING:
+    from magloc.signature.signature import Signature
+
+HEADINGS = {"north": 0.0, "east": 90.0, "south": 180.0, "west": 270.0}
+# Along the keel, in depths to either side.
+_REACH = 3.0
+_POINTS = 61
+
+
+def lines_of_signature(signature: Signature) -> list[str]:
+    """Parameters with their σ, what is not determined, and how well all of it fits."""
+    determined = signature.determined
+    cells = [["part", "A·m²", "σ"]]
+    for name, value, sigma in zip(signature.names, determined, signature.sigma_Am2, strict=True):
+        known = np.isfinite(value)
+        cells.append([name, f"{value:.1f}" if known else "-", f"{sigma:.2g}" if known else "-"])
+    widths = [max(len(row[i]) for row in cells) for i in range(3)]
+    lines = [f"{a.ljust(widths[0])}  {b.rjust(widths[1])}  {c.rjust(widths[2])}" for a, b, c in cells]
+    if signature.components.induced != "none":
+        lines.append(f"induced at {1e9 * signature.components.ambient_T:.0f} nT")
+    if signature.components.eddy:
+        lines.append(f"eddy at {1e9 * signature.components.rate_T_s:.3g} nT/s")
+    lines += [f"not determined by these headings: {what}" for what in signature.undetermined]
+    lines.append(
+        f"χ² {signature.chi2:.0f} of {signature.dof} in {signature.rows} rows" + (", misfit" * signature.misfit)
+    )
+    return lines
+
+
+def along_keel(signature: Signature, depth_m: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Places along the keel (k,) [m], field (4, k, 3) there below the object on four headings, and its covariance."""
+    x = depth_m * np.linspace(-_REACH, _REACH, _POINTS)
+    offset = np.stack([x, np.zeros_like(x), np.full_like(x, -depth_m)], axis=-1)
+    headings = np.tile(np.array(list(HEADINGS.values()))[:, None], (1, _POINTS))
+    return x, *signature.field(np.broadcast_to(offset, (len(HEADINGS), *offset.shape)), headings)
+
+
+def lines_of_depths(signature: Signature, depths_m: Sequence[float]) -> list[str]:
+    """The largest field below the object at some depths, on four headings."""
+    lines = ["depth_m  heading  largest_nT     σ_nT  forward_m"] if depths_m else []
+    for depth in depths_m:
+        x, field, covariance = along_keel(signature, depth)
+        for heading, of_field, of_covariance in zip(HEADINGS, field, covariance, strict=True):
+            modulus = np.linalg.norm(of_field, axis=1)
+            k = int(np.argmax(modulus))
+            direction = of_field[k] / modulus[k]
+            sigma = math.sqrt(float(direction @ of_covariance[k] @ direction))
+            lines.append(f"{depth:7g}  {heading:>7}  {1e9 * modulus[k]:10.1f}  {1e9 * sigma:7.2g}  {x[k]:9.1f}")
+    return lines
+
+
+def json_of_signature(signature: Signature, depths_m: Sequence[float]) -> dict[str, object]:
+    """What ``magloc signature --json`` prints."""
+    predicted = []
+    for depth in depths_m:
+        x, field, covariance = along_keel(signature, depth)
+        sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        for i, heading in enumerate(HEADINGS.values()):
+            of_heading = {"depth_m": depth, "heading_deg": heading, "forward_m": x}
+            predicted.append(of_heading | {"field_nT": 1e9 * field[i], "sigma_nT": 1e9 * sigma[i]})
+    return {
+        "permanent_Am2": signature.permanent_Am2,
+        "polarisability_m3": signature.polarisability_m3,
+        "eddy_m3_s": signature.eddy_m3_s if signature.components.eddy else None,
+        "parameters": list(signature.names),
+        "parameters_Am2": signature.determined,
+        "sigma_Am2": np.where(np.isfinite(signature.determined), signature.sigma_Am2, np.nan),
+        "covariance": signature.covariance,
+        "ambient_nT": 1e9 * signature.ambient_T,
+        "undetermined": list(signature.undetermined),
+        "chi2": signature.chi2,
+        "dof": signature.dof,
+        "misfit": signature.misfit,
+        "rows": signature.rows,
+        "predicted": predicted,
+    }

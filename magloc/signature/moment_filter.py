@@ -1,0 +1,306 @@
+r"""A Kalman filter of the moment alone, of an object whose path is known: MotionMV and MeasureS of the source paper.
+
+The moment is linear in a few parameters, :math:`m_j = M_j θ`: those of the object's axes (M turns with it, equation
+(29) with its known rate), or permanent and induced parts. With the path exact and vector sensors the readings are
+linear in θ, so that the filter is the linear one; an uncertain path adds its error as a state, a first-order Markov
+process, and sensors the lasting errors that their array states.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.special import chdtri
+
+from arrays.array import SensorArray
+from arrays.differences import Differences, decorrelated_differences
+from arrays.noise import reading_covariance
+from arrays.typing import BoolArray, FloatArray
+from magloc.kalman import (
+    IteratedUpdate,
+    block_update,
+    iterated_update,
+    normalised_innovation_squared,
+    predict_square_root,
+    smoothing_gain,
+)
+from magloc.levels import CONTRADICTION
+from magloc.measurement.differences import DifferenceMeasurement
+from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
+from magloc.readings import Readings
+from magloc.signature.path import PathError
+from magloc.tracking.measurement import RowMeasurement
+from magloc.tracking.motion import N_SOURCE
+from magloc.tracking.results import rows_of
+
+UNKNOWN = 1e3
+"""How little is known of a moment before the first row: σ over what the strongest row can tell."""
+ROWS_TO_START_ANEW = 3
+"""Contradicting rows in a row after which the moment is taken to have changed at once."""
+_TOLERANCE = 1e-4
+_SHRINK = 0.5
+_MOST_ITERATIONS = 50
+# How often a record is linearised anew, until its last state moves by less than a share of its σ.
+_MOST_PASSES = 20
+_SETTLED = 1e-2
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """What the moment is in its parameters, in every row.
+
+    Attributes
+    ----------
+    M : ndarray, shape (n, 3, q)
+        Moment in the frame of the results per parameter.
+    by_turn : ndarray, shape (n, 3, 3, q)
+        Its change by a turn of the object about each axis (the second) of that frame.
+    """
+
+    M: FloatArray
+    by_turn: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class MomentModel:
+    """What the rows of a record say of an object on a known path.
+
+    The state is the path's error (position and attitude, none of what is exact), θ (q), and the lasting errors of the
+    sensors.
+
+    Attributes
+    ----------
+    rows : tuple of RowMeasurement
+    position_m : ndarray, shape (n, 3)
+        Of the object, in the frame of the results.
+    basis : Basis
+    errors : SensorErrors
+    path_error : PathError
+    turn_rad_s : float
+        Characteristic rate at which θ changes, by its modulus: S_q.
+    begins : ndarray of bool, shape (n,)
+        Rows at which a path begins, with an error of its own.
+    """
+
+    rows: tuple[RowMeasurement, ...]
+    position_m: FloatArray
+    basis: Basis
+    errors: SensorErrors
+    path_error: PathError
+    turn_rad_s: float
+    begins: BoolArray
+
+    @property
+    def n_parameters(self) -> int:
+        """Number q of parameters."""
+        return int(self.basis.M.shape[2])
+
+    @cached_property
+    def moment(self) -> slice:
+        """Where θ is in the state."""
+        first = self.path_error.sigma.size
+        return slice(first, first + self.n_parameters)
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether the readings are linear in the state."""
+        return not (self.path_error.sigma.size or self.rows[0].model.array.channel_is_scalar.any())
+
+    @cached_property
+    def scale(self) -> float:
+        """Size of the parameters that the largest signal asks for at the object's nearest."""
+        at_rest = np.zeros(self.moment.stop + self.errors.n_states)
+        strength = [np.linalg.norm(self.jacobian(i, at_rest)[:, self.moment]) for i in range(len(self.rows))]
+        signal = [np.linalg.norm(row.z - self.predicted(i, at_rest)) for i, row in enumerate(self.rows)]
+        return max(1.0, float(np.max(signal))) / float(np.max(strength))
+
+    def source(self, i: int, x: FloatArray) -> FloatArray:
+        """Position and moment (6,) of a state in row i."""
+        p, M = self.position_m[i], self._turned(i, x)
+        return np.concatenate([p + x[:3] if self.path_error.position_m else p, M @ x[self.moment]])
+
+    def source_of_state(self, i: int, x: FloatArray) -> FloatArray:
+        """Its derivative (6, n) by the state."""
+        J = np.zeros((N_SOURCE, x.size))
+        J[3:, self.moment] = self._turned(i, x)
+        if self.path_error.position_m:
+            J[:3, :3] = np.eye(3)
+        if self.path_error.attitude_rad:
+            J[3:, self.moment.start - 3 : self.moment.start] = (self.basis.by_turn[i] @ x[self.moment]).T
+        return J
+
+    def _turned(self, i: int, x: FloatArray) -> FloatArray:
+        """M (3, q) with the attitude's error."""
+        M: FloatArray = self.basis.M[i]
+        if self.path_error.attitude_rad:
+            M = M + np.einsum("k,kij->ij", x[self.moment.start - 3 : self.moment.start], self.basis.by_turn[i])
+        return M
+
+    def predicted(self, i: int, x: FloatArray) -> FloatArray:
+        """Differences (k,) of row i in units of their noise."""
+        return self.rows[i].of_source(self.source(i, x)) + self.rows[i].effect @ x[self.moment.stop :]
+
+    def jacobian(self, i: int, x: FloatArray) -> FloatArray:
+        """Their Jacobian (k, n)."""
+        H = self.rows[i].source_jacobian(self.source(i, x)) @ self.source_of_state(i, x)
+        H[:, self.moment.stop :] = self.rows[i].effect
+        return H
+
+    def start(self) -> tuple[FloatArray, FloatArray]:
+        """State (n,) before the first row, and the square root of its covariance."""
+        unknown = np.full(self.n_parameters, UNKNOWN * self.scale)
+        sigma = np.concatenate([self.path_error.sigma, unknown, self.errors.sigma])
+        return np.zeros(sigma.size), np.diag(sigma)
+
+    def step(self, x: FloatArray, i: int) -> tuple[FloatArray, FloatArray]:
+        """Diagonal F of the step to row i, and square root S_q of its noise."""
+        dt_s = self.rows[i].row.time_s - self.rows[i - 1].row.time_s
+        kept_path = np.zeros(self.moment.start) if self.begins[i] else self.path_error.kept(dt_s)
+        kept_errors, added = self.errors.step(dt_s)
+        theta = x[self.moment]
+        change = self.turn_rad_s * dt_s * math.sqrt(float(theta @ theta))
+        F = np.concatenate([kept_path, np.ones(theta.size), kept_errors])
+        of_path = self.path_error.sigma * np.sqrt(1.0 - kept_path**2)
+        sigma = np.concatenate([of_path, np.full(theta.size, change), added])
+        noisy = np.flatnonzero(sigma)
+        S_q = np.zeros((x.size, noisy.size))
+        S_q[noisy, np.arange(noisy.size)] = sigma[noisy]
+        return F, S_q
+
+
+@dataclass(frozen=True, eq=False)
+class MomentStep:
+    """One row of a filter.
+
+    Attributes
+    ----------
+    x_predicted, S_predicted, x, S : ndarray
+        State and square root of its covariance before and after the row's readings.
+    F, S_q : ndarray
+        Diagonal of the transition that led here, and square root of its noise.
+    nis : float
+        Normalised innovation squared of the row.
+    status : str
+        As of a :class:`magloc.tracking.results.TrackPoint`.
+    """
+
+    x_predicted: FloatArray
+    S_predicted: FloatArray
+    x: FloatArray
+    S: FloatArray
+    F: FloatArray
+    S_q: FloatArray
+    nis: float
+    status: str
+    iterations: int
+
+
+def row_measurements(array: SensorArray, readings: Readings, errors: SensorErrors) -> tuple[RowMeasurement, ...]:
+    """What every row measures; noise that lasts is in the errors."""
+    noisy = without_lasting_errors(array)
+    shared: dict[bytes, Differences] = {}
+    rows = []
+    for row in rows_of(readings):
+        of_row = noisy
+        if row.ambient_T is not None:
+            x, y, z = row.ambient_T.tolist()
+            of_row = replace(noisy, ambient_T=(x, y, z))
+        available = np.isfinite(row.readings_T)
+        if noisy.noise_depends_on_reading:
+            covariance = reading_covariance(noisy, row.readings_T)
+            differences = decorrelated_differences(noisy, available, covariance_T2=covariance)
+        else:
+            key = available.tobytes()
+            if key not in shared:
+                shared[key] = decorrelated_differences(noisy, available)
+            differences = shared[key]
+        sigma = np.sqrt(differences.variance)
+        effect = differences.transform @ errors.effect(of_row, row.readings_T) / sigma[:, None]
+        rows.append(RowMeasurement(DifferenceMeasurement(of_row, differences), sigma, row, N_SOURCE, effect))
+    return tuple(rows)
+
+
+def filtered(model: MomentModel, *, at: Sequence[FloatArray] | None = None, gate: bool = True) -> list[MomentStep]:
+    """The filter's steps over all rows.
+
+    ``at``: states that the rows are linearised at; without them each is iterated. ``gate``: rows that contradict the
+    prediction are not used, but the third in a row is, of a moment that has changed at once.
+    """
+    steps: list[MomentStep] = []
+    x, S = model.start()
+    scale, contradictions = UNKNOWN * model.scale, 0
+    for i, row in enumerate(model.rows):
+        F, S_q = model.step(x, i) if i else (np.ones(x.size), np.zeros((x.size, 0)))
+        x, S = F * x, predict_square_root(S, np.diag(F), S_q)
+        if not row.z.size:
+            steps.append(MomentStep(x, S, x, S, F, S_q, math.nan, "predicted", 0))
+            continue
+        update = _updated(model, i, x, S, None if at is None else at[i])
+        status = "tracked"
+        if gate and not (update.converged and update.nis < chdtri(row.z.size, CONTRADICTION)):
+            contradictions, status = contradictions + 1, "outlier"
+            if contradictions == ROWS_TO_START_ANEW:
+                unknown = np.zeros((x.size, model.n_parameters))
+                unknown[model.moment] = scale * np.eye(model.n_parameters)
+                S_q = np.concatenate([S_q, unknown], axis=1)
+                S = predict_square_root(S, np.eye(x.size), unknown)
+                update, status = _updated(model, i, x, S, None if at is None else at[i]), "acquired"
+        if status == "outlier":
+            steps.append(MomentStep(x, S, x, S, F, S_q, update.nis, status, 0))
+            continue
+        contradictions = 0
+        steps.append(MomentStep(x, S, update.x, update.S, F, S_q, update.nis, status, update.iterations))
+        x, S = update.x, update.S
+    return steps
+
+
+def _updated(model: MomentModel, i: int, x: FloatArray, S: FloatArray, at: FloatArray | None) -> IteratedUpdate:
+    """A row's update, linearised where it leads, or at a state."""
+    z = model.rows[i].z
+    ones = np.ones(z.size)
+    if at is None:
+        return iterated_update(
+            x,
+            S,
+            z,
+            ones,
+            lambda state: model.predicted(i, state),
+            lambda state: model.jacobian(i, state),
+            tolerance=_TOLERANCE,
+            max_iterations=_MOST_ITERATIONS,
+            shrink=_SHRINK,
+        )
+    H = model.jacobian(i, at)
+    innovation = z - model.predicted(i, at) - H @ (x - at)
+    nis = normalised_innovation_squared(S, H, innovation, ones)
+    return IteratedUpdate(*block_update(x, S, H, innovation, ones), 1, True, innovation, nis)
+
+
+def smoothed(steps: Sequence[MomentStep]) -> list[tuple[FloatArray, FloatArray]]:
+    """State of every row with what all rows tell, and the square root of its covariance."""
+    x, S = steps[-1].x, steps[-1].S
+    found = [(x, S)]
+    for step, after in zip(reversed(steps[:-1]), reversed(steps[1:]), strict=True):
+        G, D = smoothing_gain(step.S, np.diag(after.F), after.S_q)
+        x = step.x + G @ (x - after.x_predicted)
+        S = predict_square_root(S, G, D)
+        found.append((x, S))
+    return found[::-1]
+
+
+def settled(model: MomentModel, *, gate: bool) -> list[MomentStep]:
+    """Steps of a filter whose rows are linearised at what all rows tell: Gauss-Newton over the whole record."""
+    steps = filtered(model, gate=gate)
+    if model.is_linear:
+        return steps
+    for _ in range(_MOST_PASSES):
+        states = smoothed(steps)
+        steps = filtered(model, at=[x for x, _ in states], gate=gate)
+        change, S = steps[-1].x - states[-1][0], states[-1][1]
+        if np.all(np.abs(change) < _SETTLED * np.linalg.norm(S, axis=1)):
+            break
+    return steps

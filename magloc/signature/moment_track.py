@@ -1,0 +1,364 @@
+"""The one door to the moment of an object whose path is known, through the rows of readings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import chdtrc
+
+from arrays.array import SensorArray
+from arrays.io.errors import InputError
+from arrays.typing import BoolArray, FloatArray
+from magloc.chi_square import mean_bounds, normalised_square
+from magloc.kalman import estimability
+from magloc.levels import MISFIT
+from magloc.measurement.nuisances import SensorErrors
+from magloc.readings import Readings, as_readings, without_saturated
+from magloc.signature.moment_filter import (
+    Basis,
+    MomentModel,
+    MomentStep,
+    filtered,
+    row_measurements,
+    settled,
+    smoothed,
+)
+from magloc.signature.path import ObjectPath, PathError
+from magloc.tracking.files import lines_of_track
+from magloc.tracking.motion import cross_matrix
+from magloc.tracking.results import TrackPoint, stacked
+from magloc.tracking.track import TURN_RAD_S
+from magloc.truth import Truth, truth_of_rows
+
+EXACT = PathError()
+"""A path without errors."""
+_UNDETERMINED = 0.1
+"""A moment is not yet known while a direction of it is less certain than this share of what was known before."""
+_SIGN_UNKNOWN = (
+    "Input array must have a vector sensor, or an ambient field for its scalar ones; instead received moduli alone,"
+    " which leave the sign of the moment open."
+)
+
+
+@dataclass(frozen=True)
+class MomentConsistency:
+    """A moment through time against the truth.
+
+    Attributes
+    ----------
+    rows : int
+        Rows with a moment and a true one.
+    moment_rms_Am2, moment_bound_Am2 : float
+        Root of the mean squared distance from the true moment, and the least that is possible (posterior Cramér-Rao
+        bound, of a smoother where later rows are used).
+    nees_per_dimension, nis_per_dimension : float
+        1 if the covariance is right, and if the readings are those of the model.
+    nees_bounds, nis_bounds : tuple of 2 floats
+        Two-sided 99 % bounds for independent rows.
+    """
+
+    rows: int
+    moment_rms_Am2: float
+    moment_bound_Am2: float
+    nees_per_dimension: float
+    nees_bounds: tuple[float, float]
+    nis_per_dimension: float
+    nis_bounds: tuple[float, float]
+
+    def lines(self) -> list[str]:
+        """Errors against the truth, and what they should be."""
+        lines = [
+            f"against the truth, {self.rows} rows:",
+            f"  moment rms {self.moment_rms_Am2:.4g} A·m², least possible {self.moment_bound_Am2:.4g} A·m² (posterior"
+            " Cramér-Rao bound)",
+        ]
+        for name, value, (low, high) in (
+            ("NEES", self.nees_per_dimension, self.nees_bounds),
+            ("NIS", self.nis_per_dimension, self.nis_bounds),
+        ):
+            lines.append(
+                f"  {name} per dimension {value:.3f}, 99 % bounds for independent rows {low:.3f} to {high:.3f}"
+            )
+        return lines
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MomentTrack(Sequence[TrackPoint]):
+    """The moment of an object on a known path: columns first, a :class:`TrackPoint` where one row is asked for.
+
+    Attributes
+    ----------
+    points : tuple of TrackPoint
+        Of every row; their positions are the path's, corrected where it is uncertain.
+    readings : Readings
+        That they were found from.
+    model : MomentModel
+        What the rows say of the moment.
+    chi2 : float
+        Sum of the normalised innovations squared of all rows, also of those that were not used.
+    dof : int
+        Its degrees of freedom.
+    is_smoothed : bool
+        Whether later rows were used too.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> ship = magloc.datasets.load("ship")
+    >>> path = magloc.ObjectPath(ship.truth.time_s, ship.truth.position_m)
+    >>> track = magloc.track_moment(ship.array, ship.readings, path, smooth=True)
+    >>> len(track), track.misfit, track.frame
+    (121, False, 'array')
+    """
+
+    points: tuple[TrackPoint, ...]
+    readings: Readings
+    model: MomentModel
+    chi2: float
+    dof: int
+    is_smoothed: bool = False
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @overload
+    def __getitem__(self, row: int) -> TrackPoint: ...
+    @overload
+    def __getitem__(self, row: slice) -> tuple[TrackPoint, ...]: ...
+    def __getitem__(self, row: int | slice) -> TrackPoint | tuple[TrackPoint, ...]:
+        return self.points[row]
+
+    @property
+    def frame(self) -> Literal["array", "world"]:
+        """Of positions, moments and covariances."""
+        return "array" if self.readings.array_position_m is None else "world"
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Instants (n,) [s]."""
+        return self.readings.time_s
+
+    @cached_property
+    def position_m(self) -> FloatArray:
+        """Positions (n, 3) [m]."""
+        return stacked(self, "position_m", 3)
+
+    @cached_property
+    def moment_Am2(self) -> FloatArray:
+        """Moments (n, 3) [A·m²], NaN where the readings so far do not determine them."""
+        return stacked(self, "moment_Am2", 3)
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariances (n, 6, 6) of position and moment."""
+        return stacked(self, "covariance", 6, 6)
+
+    @property
+    def status(self) -> list[str]:
+        """How every row was used, or why there is no moment."""
+        return [point.status for point in self]
+
+    @property
+    def tracked(self) -> BoolArray:
+        """Whether the moment is known (n,)."""
+        return np.array([point.moment_Am2 is not None for point in self], dtype=bool)
+
+    @property
+    def misfit(self) -> bool:
+        """Whether no dipole on this path explains the readings: χ² is beyond noise by one in a million."""
+        return bool(self.dof > 0 and chdtrc(self.dof, self.chi2) < MISFIT)
+
+    def consistency(self, truth: Truth) -> MomentConsistency:
+        """Errors of the moment, their NEES and NIS, and the least error that is possible.
+
+        Raises
+        ------
+        InputError
+            The truth has none of the times of the readings, or no moments.
+        """
+        if truth.moment_Am2 is None:
+            raise InputError(f"{truth.name}: found no moment, expected columns mx_Am2, my_Am2 and mz_Am2.")
+        _, moment_Am2 = truth_of_rows(self.readings, truth)
+        true = np.full_like(self.moment_Am2, np.nan) if moment_Am2 is None else moment_Am2
+        known = self.tracked & np.isfinite(true).all(axis=1)
+        error, covariance = (self.moment_Am2 - true)[known], self.covariance[known][:, 3:, 3:]
+        nees, dof = float(np.sum(normalised_square(error, covariance))), 3 * int(known.sum())
+        used = [point for point in self if point.status == "tracked" and math.isfinite(point.nis)]
+        nis_dof = sum(point.nis_dof for point in used)
+        bound = _covariances_at(self.model, true, smooth=self.is_smoothed)[known]
+        return MomentConsistency(
+            rows=int(known.sum()),
+            moment_rms_Am2=math.sqrt(float(np.mean(np.sum(error**2, axis=1)))) if known.any() else math.nan,
+            moment_bound_Am2=math.sqrt(float(np.mean(np.trace(bound, axis1=1, axis2=2)))) if known.any() else math.nan,
+            nees_per_dimension=nees / dof if dof else math.nan,
+            nees_bounds=mean_bounds(dof),
+            nis_per_dimension=sum(point.nis for point in used) / nis_dof if nis_dof else math.nan,
+            nis_bounds=mean_bounds(nis_dof),
+        )
+
+    def table(self) -> str:
+        """The table that ``magloc track`` prints."""
+        return "\n".join(lines_of_track(self))
+
+    def __repr__(self) -> str:
+        return "\n".join(lines_of_track(self, most=10))
+
+
+def track_moment(
+    array: SensorArray,
+    readings: Readings | ArrayLike,
+    path: ObjectPath | ArrayLike,
+    *,
+    turn_rad_s: float = TURN_RAD_S,
+    path_error: PathError = EXACT,
+    smooth: bool = False,
+) -> MomentTrack:
+    """Follow the moment of an object whose path is known: equation (29), MotionMV of Pavlov et al.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Three independent differences are enough.
+    readings : Readings or array_like, shape (n, C)
+        Raw readings [T], NaN where missing, in the order of time. Those that saturate are not used.
+    path : ObjectPath or array_like, shape (3,) or (n, 3)
+        Where the object is, in the frame of the results [m]: at rest, in every row, or a path whose times enclose those
+        of the readings; rows outside it are left out. Where it has the attitude, the moment turns with it.
+    turn_rad_s : float
+        Characteristic rate at which the moment turns or changes otherwise.
+    path_error : PathError
+        How wrong the path may be; exact by default.
+    smooth : bool
+        Use later rows too: a fixed-interval smoother.
+
+    Returns
+    -------
+    MomentTrack
+        In the world frame where the readings have the array's pose, else in the array's.
+
+    Raises
+    ------
+    ValueError
+        Time does not increase from row to row, the path has no position, or moduli alone leave the sign open.
+    InputError
+        The path has none of the times of the readings.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> import magloc
+    >>> array = arrays.tetrahedron(1.5, noise_T=1e-10)
+    >>> field_T = magloc.dipole.field(array.positions, [5.0, 0.0, 0.3], [0.0, 10.0, 300.0])
+    >>> readings_T = [array.readings_of(field_T)] * 20
+    >>> magloc.track_moment(array, readings_T, [5.0, 0.0, 0.3]).moment_Am2[-1, 1:].round(1)
+    array([ 10., 300.])
+    """
+    used = without_saturated(as_readings(readings), array)
+    position_m, rotations, used = known_rows(used, path)
+    if array.channel_is_scalar.all() and used.ambient_T is None and array.ambient_T is None:
+        raise ValueError(_SIGN_UNKNOWN)
+    basis = turning_basis(np.broadcast_to(np.eye(3), (len(used), 3, 3)) if rotations is None else rotations)
+    model = moment_model(array, [used], [position_m], basis, path_error, turn_rad_s)
+    steps = settled(model, gate=True) if smooth else filtered(model)
+    points = _points(model, steps, smooth=smooth)
+    return MomentTrack(tuple(points), used, model, *goodness(model, steps), smooth)
+
+
+def known_rows(readings: Readings, path: ObjectPath | ArrayLike) -> tuple[FloatArray, FloatArray | None, Readings]:
+    """Positions of the object (n, 3), its rotations (n, 3, 3) if known, and the readings, of the rows on the path."""
+    if isinstance(path, ObjectPath):
+        position_m, rotations = path.at(readings.time_s)
+        on = np.flatnonzero(np.isfinite(position_m).all(axis=1))
+        return position_m[on], None if rotations is None else rotations[on], readings[on]
+    given = np.asarray(path, dtype=np.float64)
+    if given.shape not in ((3,), (len(readings), 3)) or not np.isfinite(given).all():
+        raise ValueError(f"Input path must have finite positions (3,) or (n, 3); instead received shape {given.shape}.")
+    return np.broadcast_to(given, (len(readings), 3)), None, readings
+
+
+def turning_basis(M: FloatArray) -> Basis:
+    """Basis of a moment that turns with the object as a whole: M (n, 3, q)."""
+    return Basis(M, np.einsum("kij,njq->nkiq", cross_matrix(np.eye(3)), M))
+
+
+def moment_model(
+    array: SensorArray,
+    passes: Sequence[Readings],
+    positions_m: Sequence[FloatArray],
+    basis: Basis,
+    path_error: PathError,
+    turn_rad_s: float,
+) -> MomentModel:
+    """Model of records that follow each other in time, each with a path of its own."""
+    errors = SensorErrors.of(array)
+    rows = tuple(row for of_pass in passes for row in row_measurements(array, of_pass, errors))
+    times = np.array([row.row.time_s for row in rows])
+    if not (np.diff(times) > 0.0).all():
+        late = int(np.argmax(np.diff(times) <= 0.0))
+        raise ValueError(
+            f"Input time_s must increase from row to row; instead {times[late + 1]:.15g} s follows"
+            f" {times[late]:.15g} s."
+        )
+    begins = np.concatenate([np.arange(len(of_pass)) == 0 for of_pass in passes])
+    return MomentModel(rows, np.concatenate(positions_m), basis, errors, path_error, turn_rad_s, begins)
+
+
+def goodness(model: MomentModel, steps: Sequence[MomentStep]) -> tuple[float, int]:
+    """χ² of all rows that a moment was predicted for, and its degrees of freedom."""
+    judged = [(step.nis, row.z.size) for step, row in zip(steps, model.rows, strict=True) if step.status != "acquired"]
+    chi2 = sum(nis for nis, _ in judged if math.isfinite(nis))
+    return chi2, sum(size for nis, size in judged if math.isfinite(nis)) - model.n_parameters
+
+
+def _points(model: MomentModel, steps: Sequence[MomentStep], *, smooth: bool) -> list[TrackPoint]:
+    """Points of a track, from the filter or from the smoother."""
+    states = smoothed(steps) if smooth else [(step.x, step.S) for step in steps]
+    array = model.rows[0].model.array
+    # S_0, the covariance that is propagated without any measurement from the start, of which MeasureS is the share.
+    x_0, open_loop = model.start()
+    unknown = float(open_loop[model.moment.start, model.moment.start])
+    points = []
+    for i, (step, (x, S)) in enumerate(zip(steps, states, strict=True)):
+        if i:
+            F, S_q = model.step(x_0, i)
+            open_loop = np.diag(np.linalg.norm(np.concatenate([np.diag(F) @ open_loop, S_q], axis=1), axis=1))
+        row, J = model.rows[i].row, model.source_of_state(i, x)
+        source, root = model.source(i, x), J @ S
+        known = np.linalg.norm(root[3:], ord=2) < _UNDETERMINED * unknown
+        with np.errstate(invalid="ignore"):
+            learned = np.nan_to_num(estimability(root, J @ open_loop))
+        points.append(
+            TrackPoint(
+                row.time_s,
+                source[:3] if known else None,
+                source[3:] if known else None,
+                root @ root.T if known else None,
+                learned if known else None,
+                step.iterations,
+                nis=step.nis,
+                nis_dof=model.rows[i].z.size,
+                status=step.status if known else "not determined: the readings so far do not tell the whole moment",
+                centroid_m=row.origin_m + row.R_world_from_array @ array.centroid,
+                radius_m=array.circumradius,
+            )
+        )
+    return points
+
+
+def _covariances_at(model: MomentModel, moment_Am2: FloatArray, *, smooth: bool) -> FloatArray:
+    """Covariances (n, 3, 3) of the moment of a filter or a smoother that linearises at the true moments."""
+    at = []
+    for i, moment in enumerate(np.nan_to_num(moment_Am2)):
+        state = np.zeros(model.moment.stop + model.errors.n_states)
+        state[model.moment] = np.linalg.lstsq(model.basis.M[i], moment, rcond=None)[0]
+        at.append(state)
+    steps = filtered(model, at=at, gate=False)
+    states = smoothed(steps) if smooth else [(step.x, step.S) for step in steps]
+    roots = [(model.source_of_state(i, x) @ S)[3:] for i, (x, S) in enumerate(states)]
+    return np.array([root @ root.T for root in roots])

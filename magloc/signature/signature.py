@@ -1,0 +1,391 @@
+r"""The signature of a ship on a known course: permanent, induced and eddy-current moment, from several headings.
+
+In the axes of the body (forward, left, up) the moment is
+
+.. math:: R^T m = m_p + α B_b - β \dot B_b, \qquad B_b = R^T B_a
+
+with the ambient field B_a. All of it is linear in m_p, α and β, so that a constant θ of them is estimated over all
+rows of all passes by :mod:`magloc.signature.moment_filter`. What the headings do not tell apart stays as little known
+as before: on a level keel the vertical permanent moment and the vertical induced one are a single number.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import chdtrc
+
+from arrays.array import SensorArray
+from arrays.io.errors import InputError
+from arrays.typing import FloatArray
+from magloc.fields import dipole
+from magloc.levels import MISFIT
+from magloc.readings import Readings, as_readings, without_saturated
+from magloc.signature.files import lines_of_signature
+from magloc.signature.moment_filter import Basis, settled
+from magloc.signature.moment_track import EXACT, goodness, known_rows, moment_model, turning_basis
+from magloc.signature.path import ObjectPath, PathError
+
+Induced = Literal["none", "diagonal", "symmetric"]
+AXES = {"none": (), "diagonal": ("xx", "yy", "zz"), "symmetric": ("xx", "yy", "zz", "yz", "xz", "xy")}
+"""Components of α that are estimated."""
+MU0 = 4.0 * math.pi * dipole.MU0_OVER_4PI
+LEAST_KNOWN = 0.5
+"""σ of a combination of parameters, as a share of the object's moment, above which it counts as not determined."""
+# Share of the largest component of such a combination below which one is not named.
+_NAMED = 0.1
+# An ambient field that does not change is divided by this in place of its rate [T/s].
+_NO_RATE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """What the moment is made of.
+
+    Attributes
+    ----------
+    induced : {"none", "diagonal", "symmetric"}
+    eddy : bool
+    ambient_T, rate_T_s : float
+        Modulus of the ambient field, and largest of its rates in the body, that parameters are counted at: all of
+        them are in A·m².
+    """
+
+    induced: Induced
+    eddy: bool
+    ambient_T: float
+    rate_T_s: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all parameters."""
+        eddies = ("eddy xx", "eddy yy", "eddy zz") if self.eddy else ()
+        return ("permanent x", "permanent y", "permanent z", *(f"induced {a}" for a in AXES[self.induced]), *eddies)
+
+    def moment_matrix(self, R: FloatArray, field_T: FloatArray, rate_T_s: FloatArray) -> FloatArray:
+        """Moment per parameter (n, 3, q) in the frame of the results.
+
+        R (n, 3, 3): from the body to that frame; field and its rate (n, 3) in the body's axes.
+        """
+        columns = [np.broadcast_to(np.eye(3), R.shape), self._induced(field_T)]
+        if self.eddy:
+            columns.append(-rate_T_s[:, :, None] * np.eye(3) / self.rate_T_s)
+        return R @ np.concatenate(columns, axis=2)
+
+    def basis(self, R: FloatArray, field_T: FloatArray, rate_T_s: FloatArray) -> Basis:
+        """The same, and its change by a turn, which turns the ambient field the other way in the body."""
+        turning = turning_basis(self.moment_matrix(R, field_T, rate_T_s))
+        axes = np.swapaxes(R, 1, 2)  # of the frame, in the body, as columns
+        for k in range(3):
+            turned = -np.cross(axes[:, :, k], field_T)
+            turning.by_turn[:, k, :, self.induced_columns] += R @ self._induced(turned)
+        return turning
+
+    @property
+    def induced_columns(self) -> slice:
+        """Where the induced parameters are."""
+        return slice(3, 3 + len(AXES[self.induced]))
+
+    def _induced(self, field_T: FloatArray) -> FloatArray:
+        """Induced moment per parameter (n, 3, a) in the body's axes."""
+        matrix = np.zeros((len(field_T), 3, len(AXES[self.induced])))
+        for column, (i, j) in enumerate(_indices(self.induced)):
+            matrix[:, i, column] = field_T[:, j]
+            matrix[:, j, column] = field_T[:, i]
+        return matrix / self.ambient_T
+
+
+def _indices(induced: Induced) -> list[tuple[int, int]]:
+    """Row and column in α of every component that is estimated."""
+    return [("xyz".index(axes[0]), "xyz".index(axes[1])) for axes in AXES[induced]]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Signature:
+    """Permanent, induced and eddy-current moment of an object, with what is not known of them.
+
+    Attributes
+    ----------
+    components : Components
+        What the parameters are.
+    parameters_Am2 : ndarray, shape (q,)
+        Of which combinations that are not determined are as near to zero as the others allow.
+    covariance : ndarray, shape (q, q)
+        [(A·m²)²]
+    ambient_T : ndarray, shape (3,)
+        Mean ambient field [T], in the frame of the results.
+    moment_rms_Am2 : float
+        Root of the mean square of the moment over the rows.
+    rows : int
+        Rows that were used.
+    chi2 : float
+        Of what is left of the readings.
+    dof : int
+        Its degrees of freedom.
+    undetermined : tuple of str
+        What the headings leave open, in words: parameters, or several of which only a combination is known.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> ship = magloc.datasets.load("ship")
+    >>> path = magloc.ObjectPath(ship.truth.time_s, ship.truth.position_m)
+    >>> signature = magloc.fit_signature(ship.array, ship.readings, path)
+    >>> signature.undetermined
+    ('permanent z against induced zz',)
+    """
+
+    components: Components
+    parameters_Am2: FloatArray
+    covariance: FloatArray
+    ambient_T: FloatArray
+    moment_rms_Am2: float
+    rows: int
+    chi2: float
+    dof: int
+    undetermined: tuple[str, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all parameters: part and axes of the body, x forward, y left, z up."""
+        return self.components.names
+
+    @property
+    def sigma_Am2(self) -> FloatArray:
+        """Standard deviations (q,) [A·m²]."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def determined(self) -> FloatArray:
+        """Parameters (q,) [A·m²], NaN where they are not known."""
+        return np.where(self.sigma_Am2 > LEAST_KNOWN * self.moment_rms_Am2, np.nan, self.parameters_Am2)
+
+    @property
+    def permanent_Am2(self) -> FloatArray:
+        """Permanent moment (3,) in the body's axes [A·m²], NaN where it is not determined."""
+        return self.determined[:3]
+
+    @property
+    def polarisability_m3(self) -> FloatArray:
+        """Induced moment per ambient field, times µ0, body axes (3, 3) [m³]; NaN where it is not determined."""
+        alpha = np.zeros((3, 3))
+        values = self.determined[self.components.induced_columns]
+        for (i, j), value in zip(_indices(self.components.induced), values, strict=True):
+            alpha[i, j] = alpha[j, i] = MU0 * value / self.components.ambient_T
+        return alpha
+
+    @property
+    def eddy_m3_s(self) -> FloatArray:
+        """Eddy-current moment per rate of the ambient field, times -µ0, in the body's axes (3,) [m³·s]."""
+        own = self.determined[-3:] if self.components.eddy else np.zeros(3)
+        return MU0 * own / self.components.rate_T_s
+
+    @property
+    def misfit(self) -> bool:
+        """Whether no such moment on these paths explains the readings: χ² is beyond noise by one in a million."""
+        return bool(self.dof > 0 and chdtrc(self.dof, self.chi2) < MISFIT)
+
+    def moment(self, heading_deg: ArrayLike, ambient_T: ArrayLike | None = None) -> tuple[FloatArray, FloatArray]:
+        """Moment on a level keel and a steady course, and its covariance.
+
+        Parameters
+        ----------
+        heading_deg : array_like, shape (...)
+            Clockwise from the frame's y axis, which is north where the frame is east, north, up.
+        ambient_T : array_like, shape (3,), optional
+            Ambient field in that frame [T]; by default that of the passes.
+
+        Returns
+        -------
+        moment_Am2 : ndarray, shape (..., 3)
+        covariance : ndarray, shape (..., 3, 3)
+        """
+        M = self._level_basis(heading_deg, ambient_T)
+        return M @ self.parameters_Am2, M @ self.covariance @ np.swapaxes(M, -1, -2)
+
+    def field(
+        self, offset_m: ArrayLike, heading_deg: ArrayLike = 0.0, ambient_T: ArrayLike | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Field of the object on a level keel and a steady course, and its covariance.
+
+        That of a dipole: nearer than some three lengths of the body it is another one.
+
+        Parameters
+        ----------
+        offset_m : array_like, shape (..., 3)
+            From the object to where the field is wanted, along its axes forward, left, up [m].
+        heading_deg : array_like, shape (...)
+            As of :meth:`moment`.
+        ambient_T : array_like, shape (3,), optional
+            As there.
+
+        Returns
+        -------
+        field_T : ndarray, shape (..., 3)
+            In the frame of the results.
+        covariance : ndarray, shape (..., 3, 3)
+        """
+        offset = _level_rotation(heading_deg) @ np.asarray(offset_m, dtype=np.float64)[..., None]
+        M = self._level_basis(heading_deg, ambient_T)
+        J = dipole.field_matrix(offset[..., 0], np.zeros(3)) @ M
+        return J @ self.parameters_Am2, J @ self.covariance @ np.swapaxes(J, -1, -2)
+
+    def _level_basis(self, heading_deg: ArrayLike, ambient_T: ArrayLike | None) -> FloatArray:
+        R = _level_rotation(heading_deg)
+        ambient = self.ambient_T if ambient_T is None else np.asarray(ambient_T, dtype=np.float64)
+        flat = R.reshape(-1, 3, 3)
+        field_body = np.swapaxes(flat, 1, 2) @ ambient
+        M = self.components.moment_matrix(flat, field_body, np.zeros_like(field_body))
+        return M.reshape(*R.shape[:-1], -1)
+
+    def table(self) -> str:
+        """The table that ``magloc signature`` prints."""
+        return "\n".join(lines_of_signature(self))
+
+    def __repr__(self) -> str:
+        return self.table()
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
+
+
+def fit_signature(
+    array: SensorArray,
+    readings: Readings | Sequence[Readings],
+    path: ObjectPath | Sequence[ObjectPath],
+    *,
+    induced: Induced = "diagonal",
+    eddy: bool = False,
+    path_error: PathError = EXACT,
+    ambient_T: ArrayLike | None = None,
+) -> Signature:
+    r"""Permanent and induced moment of an object that passes an array on known courses.
+
+    .. math:: m = R (m_p + α R^T B_a - β \frac{d}{dt} R^T B_a)
+
+    Parameters
+    ----------
+    array : SensorArray
+        Three independent differences are enough. The lasting errors that it states are estimated along.
+    readings : Readings, or a sequence of them
+        Of every pass, of one clock and in the order of time. Those that saturate are not used.
+    path : ObjectPath, or a sequence of them
+        Of every pass, or one for all. Without an attitude the object is level, its bow along the course.
+    induced : {"diagonal", "symmetric", "none"}
+        Which components of α are estimated.
+    eddy : bool
+        Estimate β, diagonal: it needs passes on which the object turns.
+    path_error : PathError
+        How wrong the path of every pass may be; exact by default. An attitude is taken as exact.
+    ambient_T : array_like, shape (3,), optional
+        Ambient field in the frame of the results [T], where the readings and the array do not have it.
+
+    Returns
+    -------
+    Signature
+
+    Raises
+    ------
+    InputError
+        The ambient field is not known, or a path has none of the times of its readings.
+    ValueError
+        Time does not increase from row to row, or there are not as many paths as passes.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> ship = magloc.datasets.load("ship")
+    >>> path = magloc.ObjectPath(ship.truth.time_s, ship.truth.position_m)
+    >>> signature = magloc.fit_signature(ship.array, ship.readings, path)
+    >>> field_T, covariance = signature.field([0.0, 0.0, -9.0], heading_deg=80.0)
+    >>> bool(1e9 * abs(field_T[2]) > 1000.0)
+    True
+    """
+    passes = [readings] if isinstance(readings, Readings) else [as_readings(part) for part in readings]
+    paths = [path] * len(passes) if isinstance(path, ObjectPath) else list(path)
+    if len(paths) != len(passes) or not passes:
+        raise ValueError(f"Input path must be one, or one for each of {len(passes)} passes; instead: {len(paths)}.")
+    if len({part.array_position_m is None for part in passes}) > 1:
+        raise ValueError("Input readings must all have the array's pose, or none; instead some have it.")
+    used, positions, rotations, fields, rates = [], [], [], [], []
+    for part, of_part in zip(passes, paths, strict=True):
+        position, rotation, rows = known_rows(without_saturated(part, array), of_part.along_course())
+        if rotation is None:
+            raise ValueError("Input path must have an attitude; instead it has none.")  # along_course gives one
+        field = np.einsum("nij,ni->nj", rotation, _ambient(array, rows, ambient_T, needed=induced != "none" or eddy))
+        used.append(rows)
+        positions.append(position)
+        rotations.append(rotation)
+        fields.append(field)
+        rates.append(np.gradient(field, rows.time_s, axis=0) if len(rows) > 1 else np.zeros_like(field))
+    R, field, rate = np.concatenate(rotations), np.concatenate(fields), np.concatenate(rates)
+    modulus = float(np.linalg.norm(field, axis=1).mean()) or 1.0
+    components = Components(induced, eddy, modulus, max(_NO_RATE, float(np.linalg.norm(rate, axis=1).max())))
+    model = moment_model(array, used, positions, components.basis(R, field, rate), path_error, 0.0)
+    steps = settled(model, gate=False)
+    theta, root = steps[-1].x[model.moment], steps[-1].S[model.moment]
+    moment_rms = math.sqrt(float(np.mean(np.sum((model.basis.M @ theta) ** 2, axis=1))))
+    open_ = _undetermined(components.names, root, LEAST_KNOWN * moment_rms)
+    chi2, dof = goodness(model, steps)
+    return Signature(
+        components,
+        theta,
+        root @ root.T,
+        np.einsum("nij,nj->ni", R, field).mean(axis=0),
+        moment_rms,
+        len(model.rows),
+        chi2,
+        dof + len(open_),  # what is not determined took no degree of freedom
+        open_,
+    )
+
+
+def _undetermined(names: Sequence[str], root: FloatArray, limit: float) -> tuple[str, ...]:
+    """Combinations of parameters whose σ is beyond a limit, by the square root (q, n) of their covariance."""
+    vectors, sigma, _ = np.linalg.svd(root, full_matrices=False)
+    words = []
+    for direction in _simplest(vectors[:, sigma > limit].T):
+        share = np.abs(direction) / np.abs(direction).max()
+        words.append(" against ".join(name for name, part in zip(names, share, strict=True) if part > _NAMED))
+    return tuple(words)
+
+
+def _ambient(array: SensorArray, readings: Readings, ambient_T: ArrayLike | None, *, needed: bool) -> FloatArray:
+    """Ambient field (n, 3) in the frame of the results."""
+    n = len(readings)
+    if ambient_T is not None:
+        return np.broadcast_to(np.asarray(ambient_T, dtype=np.float64), (n, 3))
+    of_rows = readings.ambient_T
+    if of_rows is None and array.ambient_T is not None:
+        of_rows = np.broadcast_to(np.asarray(array.ambient_T), (n, 3))
+    if of_rows is None:
+        if needed:
+            raise InputError("Input ambient_T: found no ambient field, expected one for the induced moment.")
+        return np.zeros((n, 3))
+    return of_rows if readings.array_rotation is None else readings.array_rotation.apply(of_rows)
+
+
+def _level_rotation(heading_deg: ArrayLike) -> FloatArray:
+    """Rotations (..., 3, 3) from the axes forward, left, up to the frame, on a level keel."""
+    yaw = np.radians(90.0 - np.asarray(heading_deg, dtype=np.float64))
+    sine, cosine, zero, one = np.sin(yaw), np.cos(yaw), np.zeros_like(yaw), np.ones_like(yaw)
+    rows = [[cosine, -sine, zero], [sine, cosine, zero], [zero, zero, one]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _simplest(directions: FloatArray) -> FloatArray:
+    """Directions (d, q) that span the same, with as many zeros as possible: the reduced row echelon form."""
+    rows = directions.copy()
+    for k in range(len(rows)):
+        i, j = np.unravel_index(int(np.argmax(np.abs(rows[k:]))), rows[k:].shape)
+        rows[[k, k + int(i)]] = rows[[k + int(i), k]]
+        rows[k] /= rows[k, j]
+        others = np.arange(len(rows)) != k
+        rows[others] -= rows[others, j][:, None] * rows[k]
+    return rows
