@@ -65,6 +65,7 @@ EXPLAINED = {
     "iterated-kalman-filter": "magloc.IteratedExtendedKalmanFilter",
     "localization": "magloc.locate magloc.Locator magloc.Fixes magloc.Fix magloc.Solution magloc.Source"
     " magloc.SourcePrior magloc.plots.fixes",
+    "moving-arrays": "magloc.MeasuredMotion magloc.KnownMotion",
     "monte-carlo": "sims.run_many sims.simulate sims.read_scenario sims.MagneticScenario sims.write_simulation",
     "reading-data": "magloc.read_readings magloc.Readings magloc.read_truth magloc.Truth arrays.InputError",
     "sensor-faults": "magloc.plots.residuals",

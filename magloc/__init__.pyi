@@ -31,6 +31,7 @@ from magloc.localization.line_ranging import distance_along_line as distance_alo
 from magloc.localization.line_ranging import fit_source_line as fit_source_line
 from magloc.localization.locator import Locator as Locator
 from magloc.localization.locator import locate as locate
+from magloc.measured_motion import MeasuredMotion as MeasuredMotion
 from magloc.readings import Readings as Readings
 from magloc.readings import read_readings as read_readings
 from magloc.signature.moment_track import MomentTrack as MomentTrack
@@ -41,6 +42,7 @@ from magloc.signature.path import read_object_path as read_object_path
 from magloc.signature.signature import Signature as Signature
 from magloc.signature.signature import fit_signature as fit_signature
 from magloc.tracking.motion import CoordinatedTurn as CoordinatedTurn
+from magloc.tracking.motion import KnownMotion as KnownMotion
 from magloc.tracking.motion import OrnsteinUhlenbeck as OrnsteinUhlenbeck
 from magloc.tracking.motion import RandomWalk as RandomWalk
 from magloc.tracking.track import Track as Track

@@ -3,8 +3,8 @@
 A readings file is CSV with one row per instant: ``time_s``, then ``<id>_x_nT, <id>_y_nT, <id>_z_nT`` for every vector
 sensor and ``<id>_nT`` for every scalar sensor, in any order. An empty cell, or ``nan``, is a missing reading. Optional
 groups of columns, each complete or absent: the pose of a moving array in the world frame (``array_x_m, array_y_m,
-array_z_m, array_qx, array_qy, array_qz, array_qw``) and the ambient field in the array's frame (``ambient_x_nT,
-ambient_y_nT, ambient_z_nT``).
+array_z_m, array_qx, array_qy, array_qz, array_qw``), the ambient field in the array's frame (``ambient_x_nT,
+ambient_y_nT, ambient_z_nT``), and velocities and rates (:mod:`magloc.measured_motion`).
 
 Whatever is wrong with a file is an :class:`arrays.io.errors.InputError` of one sentence: the file, the line as an
 editor counts it, the column, what was found and what was expected.
@@ -28,6 +28,7 @@ from arrays.io.errors import InputError
 from arrays.io.text import write_text
 from arrays.sensor import Sensor
 from arrays.typing import FloatArray, IntArray
+from magloc.measured_motion import MOTION_COLUMNS, MeasuredMotion, motion_columns, motion_of_table
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -61,6 +62,8 @@ class Readings:
         From the array's frame to the world frame.
     ambient_T : ndarray, shape (n, 3), optional
         Ambient field in the array's frame [T].
+    motion : MeasuredMotion of n, optional
+        Measured velocities and rates of array and object.
 
     Raises
     ------
@@ -87,6 +90,7 @@ class Readings:
     array_position_m: FloatArray | None = None
     array_rotation: Rotation | None = None
     ambient_T: FloatArray | None = None
+    motion: MeasuredMotion | None = None
 
     def __post_init__(self) -> None:
         for name in ("values_T", "time_s", "array_position_m", "ambient_T"):
@@ -109,6 +113,8 @@ class Readings:
         if self.array_rotation is not None and np.shape(self.array_rotation.as_quat()) != (n, 4):
             received = 1 if self.array_rotation.single else len(self.array_rotation)
             raise ValueError(f"Input array_rotation must have {n} rotations; instead received {received}.")
+        if self.motion is not None and len(self.motion) != n:
+            raise ValueError(f"Input motion must have {n} rows; instead received {len(self.motion)}.")
 
     @classmethod
     def from_columns(cls, columns: Columns, array: SensorArray) -> Readings:
@@ -145,6 +151,7 @@ class Readings:
             array_position_m=chosen(self.array_position_m),
             array_rotation=None if self.array_rotation is None else self.array_rotation[rows],
             ambient_T=chosen(self.ambient_T),
+            motion=None if self.motion is None else self.motion.of_rows(rows),
         )
 
     def __iter__(self) -> Iterator[Readings]:
@@ -273,6 +280,7 @@ def _readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] 
         position_m, rotation = table.complete(POSITION_COLUMNS), unit_rotation(table)
     if table.has_group(AMBIENT_COLUMNS):
         ambient_T = table.complete(AMBIENT_COLUMNS) / _T_IN_nT
+    motion = motion_of_table(table, posed=position_m is not None)
     values_nT = table.finite_or_missing(channels)
     table.refuse(np.abs(values_nT) > _LARGEST_nT, channels, f"found a field above {_LARGEST_nT:g} nT, expected less")
     return Readings(
@@ -281,6 +289,7 @@ def _readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] 
         array_position_m=position_m,
         array_rotation=rotation,
         ambient_T=ambient_T,
+        motion=motion,
     )
 
 
@@ -300,6 +309,10 @@ def write_readings(path: str | PathLike[str], readings: Readings, array: SensorA
     if readings.pose is not None:
         header += POSITION_COLUMNS + ROTATION_COLUMNS
         plain += [readings.pose[0], readings.pose[1].as_quat()]
+    if readings.motion is not None:
+        names, numbers_of_motion = motion_columns(readings.motion)
+        header += names
+        plain.append(numbers_of_motion)
     fields_nT = (np.hstack(fields) * _T_IN_nT).tolist()
     numbers = np.hstack(plain).tolist() if plain else [[]] * len(readings)
     lines = [",".join(header)]
@@ -345,7 +358,7 @@ def _check_channels(readings: Readings, array: SensorArray) -> None:
 
 
 def _check_sensor_columns(table: Table, array: SensorArray, channels: Sequence[str], *, ignore_others: bool) -> None:
-    known = ("time_s", *channels, *POSITION_COLUMNS, *ROTATION_COLUMNS, *AMBIENT_COLUMNS)
+    known = ("time_s", *channels, *POSITION_COLUMNS, *ROTATION_COLUMNS, *AMBIENT_COLUMNS, *MOTION_COLUMNS)
     called = f"array {array.name!r}" if array.name else "the array"
     table.require("time_s", known)
     for sensor in array.sensors:
@@ -376,7 +389,8 @@ def _check_sensor_columns(table: Table, array: SensorArray, channels: Sequence[s
             )
         raise InputError(
             f"{table.header_place(name)}: found an unknown column, expected time_s, "
-            "<sensor>_x_nT and so on, and optionally array_x_m and so on (pose) or ambient_x_nT and so on."
+            "<sensor>_x_nT and so on, and optionally array_x_m and so on (pose), array_vx_m_s and so on (motion) or"
+            " ambient_x_nT and so on."
         )
 
 

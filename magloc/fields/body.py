@@ -157,3 +157,31 @@ def equivalent_dipole(
 
 def _greatest_distance(points: FloatArray) -> float:
     return max(float(np.linalg.norm(points - point, axis=1).max()) for point in points)
+
+
+def induced_and_permanent_moment(
+    R_world_from_body: ArrayLike, permanent_Am2: ArrayLike, polarisability_Am2_T: ArrayLike, ambient_T: ArrayLike
+) -> FloatArray:
+    r"""Moment of a turning body in the world frame: what turns with it, and what the ambient field induces in it.
+
+    .. math:: m = R (m_p + α R^T B_a)
+
+    Parameters
+    ----------
+    R_world_from_body : array_like, shape (..., 3, 3)
+    permanent_Am2 : array_like, shape (..., 3)
+        Permanent moment in the body's axes [A·m²].
+    polarisability_Am2_T : array_like, shape (..., 3, 3)
+        Induced moment per field in the body's axes [A·m²/T], as of :func:`equivalent_dipole`.
+    ambient_T : array_like, shape (..., 3)
+        Ambient field in the world frame [T].
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        [A·m²]
+    """
+    R = np.asarray(R_world_from_body, dtype=np.float64)
+    field_body = np.swapaxes(R, -1, -2) @ np.asarray(ambient_T, dtype=np.float64)[..., None]
+    moment_body = np.asarray(permanent_Am2, dtype=np.float64)[..., None] + np.asarray(polarisability_Am2_T) @ field_body
+    return (R @ moment_body)[..., 0]

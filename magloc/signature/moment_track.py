@@ -31,7 +31,7 @@ from magloc.signature.moment_filter import (
 )
 from magloc.signature.path import ObjectPath, PathError
 from magloc.tracking.files import lines_of_track
-from magloc.tracking.motion import cross_matrix
+from magloc.tracking.motion import cross_matrix, rotation_matrix
 from magloc.tracking.results import TrackPoint, stacked
 from magloc.tracking.track import TURN_RAD_S
 from magloc.truth import Truth, truth_of_rows
@@ -229,7 +229,8 @@ def track_moment(
         Raw readings [T], NaN where missing, in the order of time. Those that saturate are not used.
     path : ObjectPath or array_like, shape (3,) or (n, 3)
         Where the object is, in the frame of the results [m]: at rest, in every row, or a path whose times enclose those
-        of the readings; rows outside it are left out. Where it has the attitude, the moment turns with it.
+        of the readings; rows outside it are left out. Where it has the attitude, the moment turns with it, else with
+        the rates that the readings have.
     turn_rad_s : float
         Characteristic rate at which the moment turns or changes otherwise.
     path_error : PathError
@@ -263,7 +264,12 @@ def track_moment(
     position_m, rotations, used = known_rows(used, path)
     if array.channel_is_scalar.all() and used.ambient_T is None and array.ambient_T is None:
         raise ValueError(_SIGN_UNKNOWN)
-    basis = turning_basis(np.broadcast_to(np.eye(3), (len(used), 3, 3)) if rotations is None else rotations)
+    if rotations is None:
+        rotations = _turned(used)
+        if used.motion is not None:
+            rates = used.motion.rate_sigma_rad_s
+            turn_rad_s = math.hypot(turn_rad_s, math.sqrt(float(np.mean(np.sum(rates**2, axis=1)))))
+    basis = turning_basis(rotations)
     model = moment_model(array, [used], [position_m], basis, path_error, turn_rad_s)
     steps = settled(model, gate=True) if smooth else filtered(model)
     points = _points(model, steps, smooth=smooth)
@@ -280,6 +286,18 @@ def known_rows(readings: Readings, path: ObjectPath | ArrayLike) -> tuple[FloatA
     if given.shape not in ((3,), (len(readings), 3)) or not np.isfinite(given).all():
         raise ValueError(f"Input path must have finite positions (3,) or (n, 3); instead received shape {given.shape}.")
     return np.broadcast_to(given, (len(readings), 3)), None, readings
+
+
+def _turned(readings: Readings) -> FloatArray:
+    """Rotations (n, 3, 3) of the object since the first row by measured rates, in the array's axes without its pose."""
+    R = np.tile(np.eye(3), (len(readings), 1, 1))
+    if readings.motion is None:
+        return R
+    rates = readings.motion.of_steps().rate_rad_s
+    by_step = (rates[:, 1] - rates[:, 0]) * np.diff(readings.time_s, prepend=readings.time_s[0])[:, None]
+    for j in range(1, len(R)):
+        R[j] = rotation_matrix(by_step[j]) @ R[j - 1]
+    return R
 
 
 def turning_basis(M: FloatArray) -> Basis:

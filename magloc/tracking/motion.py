@@ -5,8 +5,10 @@ moment come first, whatever follows. With the array's pose known the state is in
 :func:`array_axes_transition` is the source paper's model (17) in the axes of an array whose motion is known.
 
 =============  =============================================================
-MotionMT       :func:`array_axes_transition`, :class:`RandomWalk`
-MotionMV       :func:`array_axes_transition`, its rows of the moment, (29)
+MotionMT       :class:`KnownMotion`, :class:`RandomWalk`
+MotionMV       :mod:`magloc.signature.moment_filter`, the moment alone, (29)
+O              the array's attitude: pose of the readings, or its rates
+σ_R, σ_M       the rows of S_q: what may move p, and what may turn m
 =============  =============================================================
 """
 
@@ -20,9 +22,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from arrays.typing import FloatArray
+from arrays.typing import FloatArray, Vector
+from magloc.measured_motion import MeasuredMotion
 
 N_SOURCE = 6
+_AT_REST: Vector = (0.0, 0.0, 0.0)
 
 
 def cross_matrix(vector: ArrayLike) -> FloatArray:
@@ -228,6 +232,92 @@ class OrnsteinUhlenbeck:
         return np.concatenate([p + moved * v, turned, kept * v, kept * rate]), F, S_q
 
 
+@dataclass(frozen=True)
+class KnownMotion:
+    r"""Position and moment while the velocities and rates of array and object are measured: MotionMT, equation (17).
+
+    .. math:: p_j = p_{j-1} + (v_{object} - v_{array} - ω_{array} × p_{j-1}) Δt, \qquad
+        m_j = m_{j-1} + (ω_{object} - ω_{array}) × m_{j-1} Δt
+
+    exact for constant rates, in the array's axes; where its pose is known, in the world's, with its own at zero. The
+    noise is that of :class:`RandomWalk`, for what is not measured, and that of the measured ones: σ of the velocities
+    moves p, σ of the array's rate turns p and m together, σ of the object's rate turns m.
+
+    Attributes
+    ----------
+    speed_m_s, turn_rad_s : float
+        Characteristic speed and rate of what is not measured, along and about each axis.
+    object_velocity_m_s, object_rate_rad_s, array_velocity_m_s, array_rate_rad_s : tuple of 3 floats
+        Measured.
+    velocity_sigma_m_s, object_rate_sigma_rad_s, array_rate_sigma_rad_s : float
+        Standard deviations of the difference of the velocities, and of the rates, along and about each axis; new in
+        every row.
+    n_states : int
+        6: position and moment; not to be changed.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> motion = magloc.KnownMotion(0.1, 0.01, array_velocity_m_s=(1.0, 0.0, 0.0), array_rate_rad_s=(0.0, 0.0, 0.1))
+    >>> motion.n_states
+    6
+    """
+
+    speed_m_s: float
+    turn_rad_s: float
+    object_velocity_m_s: Vector = _AT_REST
+    object_rate_rad_s: Vector = _AT_REST
+    array_velocity_m_s: Vector = _AT_REST
+    array_rate_rad_s: Vector = _AT_REST
+    velocity_sigma_m_s: float = 0.0
+    object_rate_sigma_rad_s: float = 0.0
+    array_rate_sigma_rad_s: float = 0.0
+    n_states: int = N_SOURCE
+
+    def start(self, source: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """As :class:`MotionModel`."""
+        return source.copy(), S.copy()
+
+    def state_of(self, source: FloatArray, velocity_m_s: FloatArray, rate_rad_s: FloatArray) -> FloatArray:
+        """As :class:`MotionModel`."""
+        return source.copy()
+
+    def step(self, x: FloatArray, dt_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """As :class:`MotionModel`."""
+        F, shift = array_axes_transition(
+            dt_s,
+            object_velocity_m_s=self.object_velocity_m_s,
+            object_rate_rad_s=self.object_rate_rad_s,
+            array_velocity_m_s=self.array_velocity_m_s,
+            array_rate_rad_s=self.array_rate_rad_s,
+        )
+        moved = F @ x + shift
+        strength = math.sqrt(float(x[3:] @ x[3:]))
+        S_q = np.zeros((N_SOURCE, 12))
+        S_q[:3, :3] = math.hypot(self.speed_m_s, self.velocity_sigma_m_s) * dt_s * np.eye(3)
+        S_q[3:, 3:6] = self.turn_rad_s * dt_s * strength * np.eye(3)
+        turned = np.concatenate([cross_matrix(moved[:3]), cross_matrix(moved[3:])])
+        S_q[:, 6:9] = self.array_rate_sigma_rad_s * dt_s * turned
+        S_q[3:, 9:] = self.object_rate_sigma_rad_s * dt_s * turned[3:]
+        return moved, F, S_q
+
+
+def known_motions(measured: MeasuredMotion, unknown: RandomWalk) -> list[KnownMotion]:
+    """Motion of the step to every row, with a random walk for what is not measured."""
+    steps = measured.of_steps()
+    rows = zip(
+        steps.velocity_m_s.tolist(),
+        steps.rate_rad_s.tolist(),
+        np.hypot(*steps.velocity_sigma_m_s.T).tolist(),
+        steps.rate_sigma_rad_s.tolist(),
+        strict=True,
+    )
+    return [
+        KnownMotion(unknown.speed_m_s, unknown.turn_rad_s, v[1], w[1], v[0], w[0], sigma_v, sigma_w[1], sigma_w[0])
+        for v, w, sigma_v, sigma_w in rows
+    ]
+
+
 def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
     """Rotation (3, 3) by a vector (3,), by Rodrigues' formula [rad]."""
     angle = math.sqrt(float(rotation_vector @ rotation_vector))
@@ -346,31 +436,3 @@ class CoordinatedTurn:
         S_q[9, 6] = self.turn_change_rad_s * root
         x_next = np.concatenate([p + dt_s * (path @ v), turn @ m, turn @ v, [rate]])
         return x_next, F, S_q
-
-
-def induced_and_permanent_moment(
-    R_world_from_body: ArrayLike, permanent_Am2: ArrayLike, polarisability_Am2_T: ArrayLike, ambient_T: ArrayLike
-) -> FloatArray:
-    r"""Moment of a turning body in the world frame: what turns with it, and what the ambient field induces in it.
-
-    .. math:: m = R (m_p + α R^T B_a)
-
-    Parameters
-    ----------
-    R_world_from_body : array_like, shape (..., 3, 3)
-    permanent_Am2 : array_like, shape (..., 3)
-        Permanent moment in the body's axes [A·m²].
-    polarisability_Am2_T : array_like, shape (..., 3, 3)
-        Induced moment per field in the body's axes [A·m²/T], as of :func:`magloc.fields.body.equivalent_dipole`.
-    ambient_T : array_like, shape (..., 3)
-        Ambient field in the world frame [T].
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-        [A·m²]
-    """
-    R = np.asarray(R_world_from_body, dtype=np.float64)
-    field_body = np.swapaxes(R, -1, -2) @ np.asarray(ambient_T, dtype=np.float64)[..., None]
-    moment_body = np.asarray(permanent_Am2, dtype=np.float64)[..., None] + np.asarray(polarisability_Am2_T) @ field_body
-    return (R @ moment_body)[..., 0]

@@ -19,11 +19,12 @@ from arrays.typing import BoolArray, FloatArray, IntArray, Vector
 from magloc.blas_threads import one_blas_thread
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import EVERYWHERE, Intervals
+from magloc.measured_motion import MeasuredMotion
 from magloc.readings import Readings, as_readings, without_saturated
 from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import Consistency, consistency
 from magloc.tracking.files import dataset_of_track, geojson_of_track, lines_of_track
-from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
+from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk, known_motions
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import Row, TrackPoint, rows_of, stacked
 from magloc.tracking.smoother import smoothed
@@ -156,7 +157,9 @@ class Track(Sequence[TrackPoint]):
         """
         position_m, moment_Am2 = truth_of_rows(self.readings, truth)
         bound = None
-        if moment_Am2 is not None and np.isfinite(position_m).all() and np.isfinite(moment_Am2).all():
+        # The bound's own walk over the rows knows of one motion alone.
+        known = self.readings.motion is None
+        if known and moment_Am2 is not None and np.isfinite(position_m).all() and np.isfinite(moment_Am2).all():
             # Later rows make less error possible.
             bound_of = smoothing_bound if self.is_smoothed else posterior_bound
             with suppress(np.linalg.LinAlgError), np.errstate(over="ignore", divide="ignore", invalid="ignore"):
@@ -221,7 +224,7 @@ def track(
         Raw readings [T], NaN where missing, in the order of time. Those that saturate are not used.
     motion : MotionModel, optional
         By default :class:`magloc.RandomWalk` of 0.5 m/s and 5°/s; with `smooth` :class:`magloc.OrnsteinUhlenbeck` of
-        the same.
+        the same. Where the readings have measured velocities and rates, a random walk of what is not measured.
     smooth : bool
         Use later rows too: a fixed-interval smoother.
     prior : SourcePrior
@@ -250,7 +253,26 @@ def track(
     """
     used = without_saturated(as_readings(readings), array)
     if motion is None:
-        motion = (OrnsteinUhlenbeck if smooth else RandomWalk)(SPEED_M_S, TURN_RAD_S)
+        motion = (OrnsteinUhlenbeck if smooth and used.motion is None else RandomWalk)(SPEED_M_S, TURN_RAD_S)
     tracker = Tracker(array, motion, prior=prior, keep_steps=smooth)
-    points = track_record(tracker, list(rows_of(used)), progress)
+    if used.motion is None:
+        points = track_record(tracker, list(rows_of(used)), progress)
+    else:
+        points = _of_known_motion(tracker, used, used.motion, progress)
     return Track(tuple(smoothed(points, tracker.steps) if smooth else points), used, tracker, smooth)
+
+
+def _of_known_motion(
+    tracker: Tracker, readings: Readings, measured: MeasuredMotion, progress: Callable[[int], None] | None
+) -> list[TrackPoint]:
+    """Points of a record whose motion is measured: the tracker's motion is that of the step to each row."""
+    if not isinstance(tracker.motion, RandomWalk):
+        raise ValueError(
+            "Input motion must be a RandomWalk, of what is not measured, for readings with measured velocities or"
+            f" rates; instead received {type(tracker.motion).__name__}."
+        )
+    points = []
+    for row, motion in zip(rows_of(readings), known_motions(measured, tracker.motion), strict=True):
+        tracker.motion = motion
+        points += list(tracker.run([row], progress))
+    return points

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from arrays.array import SensorArray
 from arrays.sensor import Calibration
 from arrays.typing import FloatArray
+from magloc.fields.body import induced_and_permanent_moment
 from magloc.fields.dipole import MU0_OVER_4PI, field
 from magloc.readings import Readings
 from magloc.signature.path import ObjectPath
@@ -143,9 +144,8 @@ def _known_path(scenario: MagneticScenario, number: int, time_s: FloatArray, pos
 
 def _moments(source: Source, rotation: Rotation, ambient_T: FloatArray) -> FloatArray:
     """Moments in the world frame (n, 3): permanent and induced."""
-    ambient_in_body = rotation.inv().apply(ambient_T)
-    induced = ambient_in_body @ np.array(source.polarisability_m3).T / MU0
-    return rotation.apply(induced + source.moment_Am2)
+    polarisability = np.array(source.polarisability_m3) / MU0
+    return induced_and_permanent_moment(rotation.as_matrix(), source.moment_Am2, polarisability, ambient_T)
 
 
 def _refuse_contact(scenario: MagneticScenario, number: int, time_s: FloatArray, offset_m: FloatArray) -> None:

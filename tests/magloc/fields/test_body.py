@@ -28,7 +28,7 @@ from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.sensor import Sensor
 from magloc.fields import dipole
-from magloc.fields.body import demagnetising_factors, equivalent_dipole
+from magloc.fields.body import demagnetising_factors, equivalent_dipole, induced_and_permanent_moment
 from magloc.fields.multipole import multipole_field_matrix
 from magloc.localization.dipole_validity import dipole_validity, nearness_test
 from magloc.measurement.differences import predicted_channels
@@ -414,3 +414,38 @@ class TestNearness:
             nearness_test(array, self.SOURCE, self.MOMENT, np.zeros(12), false_alarm=0.0)
         with pytest.raises(ValueError, match=r"Input position_m must be finite and have shape \(3,\)"):
             nearness_test(array, [np.nan, 0.0, 0.0], self.MOMENT, np.zeros(12))
+
+
+class TestInducedAndPermanentMoment:
+    AMBIENT = np.array([1e-5, -2e-5, 4.5e-5])
+
+    def test_a_sphere_is_magnetised_along_the_field(self) -> None:
+        """Closed form: α of a permeable sphere is the same in all attitudes, 3 (μr - 1)/(μr + 2) V/μ0."""
+        mu_r, radius = 100.0, 0.2
+        alpha = 3.0 * (mu_r - 1.0) / (mu_r + 2.0) * (4.0 / 3.0 * math.pi * radius**3) / (4e-7 * math.pi)
+        for R in Rotation.random(4, rng=np.random.default_rng(0)).as_matrix():
+            moment = induced_and_permanent_moment(R, np.zeros(3), alpha * np.eye(3), self.AMBIENT)
+            np.testing.assert_allclose(moment, alpha * self.AMBIENT, rtol=1e-12)
+
+    def test_a_permanent_moment_turns_with_the_body(self) -> None:
+        turn = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
+        moment = induced_and_permanent_moment(turn, [1.0, 2.0, 3.0], np.zeros((3, 3)), self.AMBIENT)
+        np.testing.assert_allclose(moment, [-2.0, 1.0, 3.0], atol=1e-15)
+
+    def test_a_needle_shows_the_field_along_its_axis(self) -> None:
+        """m = α (a·B) a of a body that is magnetised along its axis a only."""
+        R = Rotation.from_rotvec([0.3, -0.8, 0.4]).as_matrix()
+        axis = R[:, 0]
+        moment = induced_and_permanent_moment(R, np.zeros(3), np.diag([5e6, 0.0, 0.0]), self.AMBIENT)
+        np.testing.assert_allclose(moment, 5e6 * (axis @ self.AMBIENT) * axis, rtol=1e-12)
+
+    def test_batches(self) -> None:
+        rng = np.random.default_rng(2)
+        R = Rotation.random(5, rng=rng).as_matrix()
+        permanent, ambient = rng.normal(size=(2, 5, 3))
+        polarisability = rng.normal(size=(5, 3, 3))
+        together = induced_and_permanent_moment(R, permanent, polarisability, ambient)
+        assert together.shape == (5, 3)
+        for i in range(5):
+            alone = induced_and_permanent_moment(R[i], permanent[i], polarisability[i], ambient[i])
+            np.testing.assert_allclose(together[i], alone, rtol=1e-12)

@@ -99,10 +99,10 @@ class TestKalmanFilter:
         np.testing.assert_allclose(smooth.covariance[10:, 3:, 3:], P[10:], rtol=1e-3, atol=1e-3)
 
     def test_bound_and_nees(self) -> None:
-        """Of 60 moments that change as the model says; NEES of the middle rows: one false alarm in 100 each."""
+        """Of 30 moments that change as the model says; NEES of the middle rows: one false alarm in 100 each."""
         errors = {False: [], True: []}
         ratios = []
-        for seed in range(60):
+        for seed in range(30):
             rng = np.random.default_rng(1000 + seed)
             true = CONSTANT.copy()
             for i in range(1, len(true)):
@@ -115,9 +115,9 @@ class TestKalmanFilter:
                 errors[smooth].append(float(normalised_square(error, track.covariance[middle, 3:, 3:])))
                 result = track.consistency(truth)
                 ratios.append(result.moment_rms_Am2 / result.moment_bound_Am2)
-        low, high = mean_bounds(180)
-        assert low < np.sum(errors[False]) / 180 < high
-        assert low < np.sum(errors[True]) / 180 < high
+        low, high = mean_bounds(90)
+        assert low < np.sum(errors[False]) / 90 < high
+        assert low < np.sum(errors[True]) / 90 < high
         assert 0.9 < np.mean(ratios) < 1.1
 
 
@@ -147,11 +147,11 @@ class TestKnownAttitude:
 class TestUncertainPath:
     @pytest.mark.parametrize("correlation_s", [np.inf, 20.0, 0.0])
     def test_nees(self, correlation_s: float) -> None:
-        """Of the last moment over 60 draws of the path's error: one false alarm in 100."""
+        """Of the last moment over 30 draws of the path's error: one false alarm in 100."""
         error = magloc.PathError(position_m=1.0, position_correlation_s=correlation_s)
         kept = error.kept(1.0)
         squares = []
-        for seed in range(60):
+        for seed in range(30):
             rng = np.random.default_rng(2000 + seed)
             walk = np.zeros_like(CONSTANT)
             walk[0] = rng.normal(size=3)
@@ -162,8 +162,8 @@ class TestUncertainPath:
                 ARRAY, readings_of(PASS, CONSTANT, seed), path, turn_rad_s=0.0, path_error=error, smooth=True
             )
             squares.append(float(normalised_square(track.moment_Am2[-1] - CONSTANT[-1], track.covariance[-1, 3:, 3:])))
-        low, high = mean_bounds(180)
-        assert low < np.sum(squares) / 180 < high
+        low, high = mean_bounds(90)
+        assert low < np.sum(squares) / 90 < high
 
     def test_the_paths_error_is_found(self) -> None:
         """A lasting offset of metres, within 5 σ of each number."""

@@ -16,15 +16,17 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from magloc.measured_motion import MeasuredMotion
 from magloc.tracking.motion import (
     CoordinatedTurn,
+    KnownMotion,
     LinearMotion,
     MotionModel,
     OrnsteinUhlenbeck,
     RandomWalk,
     array_axes_transition,
     cross_matrix,
-    induced_and_permanent_moment,
+    known_motions,
     rotation_matrix,
 )
 from tests.oracles import derivative
@@ -36,6 +38,7 @@ MODELS: list[MotionModel] = [
     OrnsteinUhlenbeck(0.1, 0.02),
     OrnsteinUhlenbeck(0.5, 0.3, correlation_s=4.0),
     CoordinatedTurn(0.5, 0.1),
+    KnownMotion(0.1, 0.02, (0.3, -0.2, 0.1), (0.0, 0.05, -0.1), (1.0, 0.4, -0.2), (0.1, -0.2, 0.3), 0.05, 0.03, 0.01),
 ]
 
 
@@ -400,36 +403,77 @@ class TestConstantTurn:
         assert Q[3, 4] == 0.0
 
 
-class TestInducedAndPermanentMoment:
-    AMBIENT = np.array([1e-5, -2e-5, 4.5e-5])
+class TestKnownMotion:
+    """Equation (17) with measured velocities and rates, MotionMT."""
 
-    def test_a_sphere_is_magnetised_along_the_field(self) -> None:
-        """Closed form: α of a permeable sphere is the same in all attitudes, 3 (μr - 1)/(μr + 2) V/μ0."""
-        mu_r, radius = 100.0, 0.2
-        alpha = 3.0 * (mu_r - 1.0) / (mu_r + 2.0) * (4.0 / 3.0 * math.pi * radius**3) / (4e-7 * math.pi)
-        for R in Rotation.random(4, rng=np.random.default_rng(0)).as_matrix():
-            moment = induced_and_permanent_moment(R, np.zeros(3), alpha * np.eye(3), self.AMBIENT)
-            np.testing.assert_allclose(moment, alpha * self.AMBIENT, rtol=1e-12)
+    MOTION = KnownMotion(
+        0.1,
+        0.02,
+        object_velocity_m_s=(0.3, -0.2, 0.1),
+        object_rate_rad_s=(0.0, 0.05, -0.1),
+        array_velocity_m_s=(1.0, 0.4, -0.2),
+        array_rate_rad_s=(0.1, -0.2, 0.3),
+        velocity_sigma_m_s=0.05,
+        object_rate_sigma_rad_s=0.03,
+        array_rate_sigma_rad_s=0.01,
+    )
+    X = np.array([5.0, -3.0, 2.0, 120.0, -60.0, 80.0])
 
-    def test_a_permanent_moment_turns_with_the_body(self) -> None:
-        turn = Rotation.from_euler("z", 90.0, degrees=True).as_matrix()
-        moment = induced_and_permanent_moment(turn, [1.0, 2.0, 3.0], np.zeros((3, 3)), self.AMBIENT)
-        np.testing.assert_allclose(moment, [-2.0, 1.0, 3.0], atol=1e-15)
+    def test_solves_the_equation(self) -> None:
+        def rate(_: float, x: FloatArray) -> FloatArray:
+            p, m = x[:3], x[3:]
+            dp = np.subtract(self.MOTION.object_velocity_m_s, self.MOTION.array_velocity_m_s)
+            relative = np.subtract(self.MOTION.object_rate_rad_s, self.MOTION.array_rate_rad_s)
+            return np.concatenate([dp - np.cross(self.MOTION.array_rate_rad_s, p), np.cross(relative, m)])
 
-    def test_a_needle_shows_the_field_along_its_axis(self) -> None:
-        """m = α (a·B) a of a body that is magnetised along its axis a only."""
-        R = Rotation.from_rotvec([0.3, -0.8, 0.4]).as_matrix()
-        axis = R[:, 0]
-        moment = induced_and_permanent_moment(R, np.zeros(3), np.diag([5e6, 0.0, 0.0]), self.AMBIENT)
-        np.testing.assert_allclose(moment, 5e6 * (axis @ self.AMBIENT) * axis, rtol=1e-12)
+        expected = solve_ivp(rate, (0.0, 0.7), self.X, rtol=1e-10, atol=1e-10).y[:, -1]
+        moved, F, _ = self.MOTION.step(self.X, 0.7)
+        np.testing.assert_allclose(moved, expected, rtol=1e-7)
+        np.testing.assert_allclose(F, step_derivative(self.MOTION, self.X, 0.7), atol=1e-6)
 
-    def test_batches(self) -> None:
-        rng = np.random.default_rng(2)
-        R = Rotation.random(5, rng=rng).as_matrix()
-        permanent, ambient = rng.normal(size=(2, 5, 3))
-        polarisability = rng.normal(size=(5, 3, 3))
-        together = induced_and_permanent_moment(R, permanent, polarisability, ambient)
-        assert together.shape == (5, 3)
-        for i in range(5):
-            alone = induced_and_permanent_moment(R[i], permanent[i], polarisability[i], ambient[i])
-            np.testing.assert_allclose(together[i], alone, rtol=1e-12)
+    def test_the_papers_step_is_its_first_order(self) -> None:
+        """As printed, with the ω × p that it leaves out: 0.1 rad/s at 5 m and 0.5 s is 0.25 m."""
+        dt_s = 1e-4
+        moved, _, _ = self.MOTION.step(self.X, dt_s)
+        relative = np.subtract(self.MOTION.object_velocity_m_s, self.MOTION.array_velocity_m_s)
+        omega = np.array(self.MOTION.array_rate_rad_s)
+        printed = self.X[:3] + (relative - np.cross(omega, self.X[:3])) * dt_s
+        np.testing.assert_allclose(moved[:3], printed, atol=1e-6)
+        left_out = KnownMotion(0.1, 0.02, array_rate_rad_s=(0.0, 0.0, 0.1))
+        moved, _, _ = left_out.step(np.array([5.0, 0.0, 0.0, 1.0, 0.0, 0.0]), 0.5)
+        assert np.linalg.norm(moved[:3] - [5.0, 0.0, 0.0]) == pytest.approx(0.25, rel=1e-3)
+
+    def test_noise_is_the_scatter_of_wrong_measurements(self) -> None:
+        """3,000 steps with measured velocities and rates that are wrong by their σ: entries to 0.1, some 5 σ."""
+        rng = np.random.default_rng(8)
+        n, dt_s = 3_000, 0.2
+        exact = replace(self.MOTION, speed_m_s=0.0, turn_rad_s=0.0)
+        steps = []
+        for _ in range(n):
+            wrong = replace(
+                exact,
+                object_velocity_m_s=tuple(exact.object_velocity_m_s + 0.05 * rng.normal(size=3)),
+                object_rate_rad_s=tuple(exact.object_rate_rad_s + 0.03 * rng.normal(size=3)),
+                array_rate_rad_s=tuple(exact.array_rate_rad_s + 0.01 * rng.normal(size=3)),
+            )
+            steps.append(wrong.step(self.X, dt_s)[0])
+        _, _, S_q = exact.step(self.X, dt_s)
+        Q, scatter = S_q @ S_q.T, np.cov(np.array(steps).T)
+        sigma = np.sqrt(np.diagonal(Q))
+        np.testing.assert_allclose(scatter / np.outer(sigma, sigma), Q / np.outer(sigma, sigma), atol=0.1)
+
+    def test_of_a_random_walk_nothing_is_measured(self) -> None:
+        walk, known = RandomWalk(0.1, 0.02), KnownMotion(0.1, 0.02)
+        for one, other in zip(walk.step(self.X, 0.5), known.step(self.X, 0.5), strict=True):
+            np.testing.assert_allclose(one @ one.T if one.ndim > 1 else one, other @ other.T if one.ndim > 1 else other)
+
+    def test_of_steps(self) -> None:
+        """The mean of both ends; the first row has no end before it."""
+        velocity = np.arange(18.0).reshape(3, 2, 3)
+        sigma = np.array([[0.1, 0.2], [0.3, 0.2], [0.1, 0.2]])
+        motions = known_motions(MeasuredMotion(velocity, velocity / 10.0, sigma, sigma), RandomWalk(0.1, 0.02))
+        assert motions[0].array_velocity_m_s == [0.0, 1.0, 2.0]
+        assert motions[1].object_velocity_m_s == [6.0, 7.0, 8.0]
+        assert motions[2].array_rate_rad_s == pytest.approx([0.9, 1.0, 1.1])
+        assert motions[2].object_rate_sigma_rad_s == pytest.approx(0.2)
+        assert motions[1].array_rate_sigma_rad_s == pytest.approx(np.sqrt(0.05))
