@@ -40,6 +40,8 @@ EXACT = PathError()
 """A path without errors."""
 _UNDETERMINED = 0.1
 """A moment is not yet known while a direction of it is less certain than this share of what was known before."""
+# Distance from a sensor, in radii of the array, at which an object is in it.
+_TOUCHING = 1e-9
 _SIGN_UNKNOWN = (
     "Input array must have a vector sensor, or an ambient field for its scalar ones; instead received moduli alone,"
     " which leave the sign of the moment open."
@@ -323,6 +325,10 @@ def moment_model(
             f"Input time_s must increase from row to row; instead {times[late + 1]:.15g} s follows"
             f" {times[late]:.15g} s."
         )
+    for row, p in zip(rows, np.concatenate(positions_m), strict=True):
+        offset = row.row.R_world_from_array.T @ (p - row.row.origin_m) - array.positions
+        if np.linalg.norm(offset, axis=1).min() <= _TOUCHING * array.circumradius:
+            raise ValueError(f"Input path must keep off the sensors; instead it has a place of a sensor: {p.tolist()}.")
     begins = np.concatenate([np.arange(len(of_pass)) == 0 for of_pass in passes])
     return MomentModel(rows, np.concatenate(positions_m), basis, errors, path_error, turn_rad_s, begins)
 
