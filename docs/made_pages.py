@@ -35,6 +35,7 @@ PICTURES = {
     "design-half-space.png": ["magloc.design_array", "magloc.Design"],
     "convergence-paper.png": ["magloc.convergence_map", "magloc.plots.convergence"],
     "view-dipole.png": ["magloc.view", "arrays.mesh_of"],
+    "notebook-10-ship.png": ["magloc.fit_signature", "magloc.Signature"],
     "view-map.png": ["magloc.source_map"],
     "view-array.png": ["arrays.SensorArray", "arrays.tetrahedron", "arrays.read_array"],
     "gradient-tensor.png": ["magloc.fit_gradient_tensor", "magloc.GradientTensor"],

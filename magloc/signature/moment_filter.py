@@ -75,6 +75,9 @@ class MomentModel:
     Attributes
     ----------
     rows : tuple of RowMeasurement
+        Without the sensors' errors.
+    effects : tuple of ndarray, shapes (k, n_errors)
+        Of those on the differences of every row, in units of their noise.
     position_m : ndarray, shape (n, 3)
         Of the object, in the frame of the results.
     basis : Basis
@@ -87,6 +90,7 @@ class MomentModel:
     """
 
     rows: tuple[RowMeasurement, ...]
+    effects: tuple[FloatArray, ...]
     position_m: FloatArray
     basis: Basis
     errors: SensorErrors
@@ -142,12 +146,12 @@ class MomentModel:
 
     def predicted(self, i: int, x: FloatArray) -> FloatArray:
         """Differences (k,) of row i in units of their noise."""
-        return self.rows[i].of_source(self.source(i, x)) + self.rows[i].effect @ x[self.moment.stop :]
+        return self.rows[i].of_source(self.source(i, x)) + self.effects[i] @ x[self.moment.stop :]
 
     def jacobian(self, i: int, x: FloatArray) -> FloatArray:
         """Their Jacobian (k, n)."""
         H = self.rows[i].source_jacobian(self.source(i, x)) @ self.source_of_state(i, x)
-        H[:, self.moment.stop :] = self.rows[i].effect
+        H[:, self.moment.stop :] = self.effects[i]
         return H
 
     def start(self) -> tuple[FloatArray, FloatArray]:
@@ -199,8 +203,10 @@ class MomentStep:
     iterations: int
 
 
-def row_measurements(array: SensorArray, readings: Readings, errors: SensorErrors) -> tuple[RowMeasurement, ...]:
-    """What every row measures; noise that lasts is in the errors."""
+def row_measurements(
+    array: SensorArray, readings: Readings, errors: SensorErrors
+) -> list[tuple[RowMeasurement, FloatArray]]:
+    """What every row measures, without noise that lasts, and the effect of that on its differences."""
     noisy = without_lasting_errors(array)
     shared: dict[bytes, Differences] = {}
     rows = []
@@ -220,8 +226,9 @@ def row_measurements(array: SensorArray, readings: Readings, errors: SensorError
             differences = shared[key]
         sigma = np.sqrt(differences.variance)
         effect = differences.transform @ errors.effect(of_row, row.readings_T) / sigma[:, None]
-        rows.append(RowMeasurement(DifferenceMeasurement(of_row, differences), sigma, row, N_SOURCE, effect))
-    return tuple(rows)
+        model = DifferenceMeasurement(of_row, differences)
+        rows.append((RowMeasurement(model, sigma, row, N_SOURCE, np.zeros((len(sigma), 0))), effect))
+    return rows
 
 
 def filtered(model: MomentModel, *, at: Sequence[FloatArray] | None = None, gate: bool = True) -> list[MomentStep]:

@@ -317,7 +317,8 @@ def moment_model(
 ) -> MomentModel:
     """Model of records that follow each other in time, each with a path of its own."""
     errors = SensorErrors.of(array)
-    rows = tuple(row for of_pass in passes for row in row_measurements(array, of_pass, errors))
+    measured = [row for of_pass in passes for row in row_measurements(array, of_pass, errors)]
+    rows, effects = tuple(row for row, _ in measured), tuple(effect for _, effect in measured)
     times = np.array([row.row.time_s for row in rows])
     if not (np.diff(times) > 0.0).all():
         late = int(np.argmax(np.diff(times) <= 0.0))
@@ -330,7 +331,7 @@ def moment_model(
         if np.linalg.norm(offset, axis=1).min() <= _TOUCHING * array.circumradius:
             raise ValueError(f"Input path must keep off the sensors; instead it has a place of a sensor: {p.tolist()}.")
     begins = np.concatenate([np.arange(len(of_pass)) == 0 for of_pass in passes])
-    return MomentModel(rows, np.concatenate(positions_m), basis, errors, path_error, turn_rad_s, begins)
+    return MomentModel(rows, effects, np.concatenate(positions_m), basis, errors, path_error, turn_rad_s, begins)
 
 
 def goodness(model: MomentModel, steps: Sequence[MomentStep]) -> tuple[float, int]:

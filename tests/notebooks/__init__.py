@@ -32,6 +32,7 @@ SHOWN = {
     "07-own-csv": 1,
     "08-calibration": 1,
     "09-several-sources": 1,
+    "10-ship": 1,
 }
 # Another page's picture of a notebook.
 ON_PAGES = {"kalman-bank": ("attitude-track.png", 0)}
