@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Literal, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +12,7 @@ from scipy.special import chdtrc
 
 from arrays.array import SensorArray
 from arrays.io.errors import InputError
-from arrays.typing import BoolArray, FloatArray
+from arrays.typing import FloatArray
 from magloc.chi_square import mean_bounds, normalised_square
 from magloc.kalman import estimability
 from magloc.levels import MISFIT
@@ -30,10 +28,9 @@ from magloc.signature.moment_filter import (
     smoothed,
 )
 from magloc.signature.path import ObjectPath, PathError
-from magloc.tracking.files import lines_of_track
 from magloc.tracking.motion import cross_matrix, rotation_matrix
-from magloc.tracking.results import TrackPoint, stacked
-from magloc.tracking.track import TURN_RAD_S
+from magloc.tracking.results import TrackPoint
+from magloc.tracking.track import TURN_RAD_S, TrackColumns
 from magloc.truth import Truth, truth_of_rows
 
 EXACT = PathError()
@@ -91,7 +88,7 @@ class MomentConsistency:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MomentTrack(Sequence[TrackPoint]):
+class MomentTrack(TrackColumns):
     """The moment of an object on a known path: columns first, a :class:`TrackPoint` where one row is asked for.
 
     Attributes
@@ -126,51 +123,6 @@ class MomentTrack(Sequence[TrackPoint]):
     dof: int
     is_smoothed: bool = False
 
-    def __len__(self) -> int:
-        return len(self.points)
-
-    @overload
-    def __getitem__(self, row: int) -> TrackPoint: ...
-    @overload
-    def __getitem__(self, row: slice) -> tuple[TrackPoint, ...]: ...
-    def __getitem__(self, row: int | slice) -> TrackPoint | tuple[TrackPoint, ...]:
-        return self.points[row]
-
-    @property
-    def frame(self) -> Literal["array", "world"]:
-        """Of positions, moments and covariances."""
-        return "array" if self.readings.array_position_m is None else "world"
-
-    @property
-    def time_s(self) -> FloatArray:
-        """Instants (n,) [s]."""
-        return self.readings.time_s
-
-    @cached_property
-    def position_m(self) -> FloatArray:
-        """Positions (n, 3) [m]."""
-        return stacked(self, "position_m", 3)
-
-    @cached_property
-    def moment_Am2(self) -> FloatArray:
-        """Moments (n, 3) [A·m²], NaN where the readings so far do not determine them."""
-        return stacked(self, "moment_Am2", 3)
-
-    @cached_property
-    def covariance(self) -> FloatArray:
-        """Covariances (n, 6, 6) of position and moment."""
-        return stacked(self, "covariance", 6, 6)
-
-    @property
-    def status(self) -> list[str]:
-        """How every row was used, or why there is no moment."""
-        return [point.status for point in self]
-
-    @property
-    def tracked(self) -> BoolArray:
-        """Whether the moment is known (n,)."""
-        return np.array([point.moment_Am2 is not None for point in self], dtype=bool)
-
     @property
     def misfit(self) -> bool:
         """Whether no dipole on this path explains the readings: χ² is beyond noise by one in a million."""
@@ -203,13 +155,6 @@ class MomentTrack(Sequence[TrackPoint]):
             nis_per_dimension=sum(point.nis for point in used) / nis_dof if nis_dof else math.nan,
             nis_bounds=mean_bounds(nis_dof),
         )
-
-    def table(self) -> str:
-        """The table that ``magloc track`` prints."""
-        return "\n".join(lines_of_track(self))
-
-    def __repr__(self) -> str:
-        return "\n".join(lines_of_track(self, most=10))
 
 
 def track_moment(

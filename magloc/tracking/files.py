@@ -20,7 +20,7 @@ from magloc.tracking.results import TrackPoint, TrackResult
 if TYPE_CHECKING:
     import xarray as xr
 
-    from magloc.tracking.track import Track
+    from magloc.tracking.track import TrackColumns
 
 _RIVAL_KEYS = ("position_m", "moment_Am2", "chi2", "dof", "weight")
 _CONSISTENCY_KEYS = (
@@ -111,7 +111,7 @@ def json_of_track(points: Sequence[TrackPoint], consistency: Consistency | None)
 
 
 def geojson_of_track(points: Sequence[TrackPoint], origin: Vector) -> dict[str, Any]:
-    """:meth:`magloc.tracking.track.Track.to_geojson`."""
+    """:meth:`magloc.tracking.track.TrackColumns.to_geojson`."""
     from pymap3d import enu2geodetic
 
     features: list[dict[str, object]] = []
@@ -149,8 +149,8 @@ def geojson_of_track(points: Sequence[TrackPoint], origin: Vector) -> dict[str, 
     return {"type": "FeatureCollection", "features": features}
 
 
-def dataset_of_track(track: Track) -> xr.Dataset:
-    """:meth:`magloc.tracking.track.Track.to_xarray`."""
+def dataset_of_track(track: TrackColumns) -> xr.Dataset:
+    """:meth:`magloc.tracking.track.TrackColumns.to_xarray`."""
     import xarray as xr
 
     dataset = xr.Dataset(coords={"time_s": ("row", track.time_s), "axis": list("xyz")})

@@ -41,36 +41,11 @@ TURN_RAD_S = math.radians(5.0)
 """Characteristic rate at which its moment turns."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Track(Sequence[TrackPoint]):
-    """A source through time: columns first, a :class:`TrackPoint` where one row is asked for.
-
-    Columns are NaN where the source is not tracked.
-
-    Attributes
-    ----------
-    points : tuple of TrackPoint
-        Of every row.
-    readings : Readings
-        That they were found from.
-    tracker : Tracker
-        That found them.
-    is_smoothed : bool
-        Whether later rows were used too.
-
-    Examples
-    --------
-    >>> import magloc
-    >>> diver = magloc.datasets.load("diver")
-    >>> track = magloc.track(diver.array, diver.readings)
-    >>> int(track.tracked.sum()), len(track), track.status[-1], track.frame
-    (75, 141, 'tracked', 'world')
-    """
+class TrackColumns(Sequence[TrackPoint]):
+    """Columns of the points of a record, NaN where the source is not tracked, and what is made of them."""
 
     points: tuple[TrackPoint, ...]
     readings: Readings
-    tracker: Tracker
-    is_smoothed: bool = False
 
     def __len__(self) -> int:
         return len(self.points)
@@ -142,32 +117,6 @@ class Track(Sequence[TrackPoint]):
         """Whether the source is tracked (n,)."""
         return np.array([point.position_m is not None for point in self], dtype=bool)
 
-    @cached_property
-    def _rows(self) -> list[Row]:
-        return list(rows_of(self.readings))
-
-    @one_blas_thread
-    def consistency(self, truth: Truth) -> Consistency:
-        """Errors of the track, its NEES and its NIS, and the least error that is possible where the moment is known.
-
-        Raises
-        ------
-        InputError
-            The truth has none of the times of the readings.
-        """
-        position_m, moment_Am2 = truth_of_rows(self.readings, truth)
-        bound = None
-        # The bound's own walk over the rows knows of one motion alone.
-        known = self.readings.motion is None
-        if known and moment_Am2 is not None and np.isfinite(position_m).all() and np.isfinite(moment_Am2).all():
-            # Later rows make less error possible.
-            bound_of = smoothing_bound if self.is_smoothed else posterior_bound
-            with suppress(np.linalg.LinAlgError), np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-                bound = bound_of(self.tracker, self._rows, position_m, moment_Am2)
-            if bound is not None and np.isnan(bound).any():  # the truth leads out of double precision
-                bound = None
-        return consistency(self, self.tracker, self._rows, position_m, moment_Am2, bound)
-
     def table(self) -> str:
         """The table that ``magloc track`` prints."""
         return "\n".join(lines_of_track(self))
@@ -200,6 +149,64 @@ class Track(Sequence[TrackPoint]):
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(repr(self))}</pre>"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Track(TrackColumns):
+    """A source through time: columns first, a :class:`TrackPoint` where one row is asked for.
+
+    Columns are NaN where the source is not tracked.
+
+    Attributes
+    ----------
+    points : tuple of TrackPoint
+        Of every row.
+    readings : Readings
+        That they were found from.
+    tracker : Tracker
+        That found them.
+    is_smoothed : bool
+        Whether later rows were used too.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> diver = magloc.datasets.load("diver")
+    >>> track = magloc.track(diver.array, diver.readings)
+    >>> int(track.tracked.sum()), len(track), track.status[-1], track.frame
+    (75, 141, 'tracked', 'world')
+    """
+
+    points: tuple[TrackPoint, ...]
+    readings: Readings
+    tracker: Tracker
+    is_smoothed: bool = False
+
+    @cached_property
+    def _rows(self) -> list[Row]:
+        return list(rows_of(self.readings))
+
+    @one_blas_thread
+    def consistency(self, truth: Truth) -> Consistency:
+        """Errors of the track, its NEES and its NIS, and the least error that is possible where the moment is known.
+
+        Raises
+        ------
+        InputError
+            The truth has none of the times of the readings.
+        """
+        position_m, moment_Am2 = truth_of_rows(self.readings, truth)
+        bound = None
+        # The bound's own walk over the rows knows of one motion alone.
+        known = self.readings.motion is None
+        if known and moment_Am2 is not None and np.isfinite(position_m).all() and np.isfinite(moment_Am2).all():
+            # Later rows make less error possible.
+            bound_of = smoothing_bound if self.is_smoothed else posterior_bound
+            with suppress(np.linalg.LinAlgError), np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+                bound = bound_of(self.tracker, self._rows, position_m, moment_Am2)
+            if bound is not None and np.isnan(bound).any():  # the truth leads out of double precision
+                bound = None
+        return consistency(self, self.tracker, self._rows, position_m, moment_Am2, bound)
 
 
 @one_blas_thread

@@ -88,13 +88,13 @@ class PathErrorOptions:
 def write_moment_track(found: MomentTrack, readings: Path, known: KnownOptions, outputs: MomentOutputs) -> None:
     """Print it, and write what is asked for."""
     import magloc
-    from magloc.tracking.files import geojson_of_track, json_entry, json_of_track
+    from magloc.tracking.files import json_entry, json_of_track
 
     result = None
     if outputs.truth is not None:
         result = found.consistency(magloc.read_truth(outputs.truth))
     if outputs.geojson is not None and known.place is not None:
-        write_text(dumps(geojson_of_track(found, known.place), allow_nan=False) + "\n", outputs.geojson)
+        write_text(dumps(found.to_geojson(known.place), allow_nan=False) + "\n", outputs.geojson)
     if outputs.out is not None:
         from magloc.plots.tracks import write_picture
 

@@ -279,3 +279,13 @@ def test_induced_moments_are_not_constant() -> None:
     track = magloc.track_moment(ARRAY, readings_of(rolling, true, 3), rolling.path, turn_rad_s=0.02, smooth=True)
     result = track.consistency(magloc.Truth(rolling.time_s, rolling.position_m, true))
     assert result.moment_rms_Am2 < 2.0 * result.moment_bound_Am2 < 0.02 * np.linalg.norm(PERMANENT_AM2)
+
+
+def test_it_is_drawn_and_exported_as_any_track() -> None:
+    track = magloc.track_moment(ARRAY, readings_of(PASS, CONSTANT), UNTURNED)
+    dataset = track.to_xarray()
+    np.testing.assert_array_equal(dataset.moment_Am2, track.moment_Am2)
+    assert dataset.sizes["row"] == len(track)
+    assert track.to_geojson((54.4, 10.2, 0.0))["features"][0]["geometry"]["type"] == "LineString"
+    assert len(track.plot().axes) > 1
+    assert repr(track).splitlines()[0].split()[0] == "time_s"
