@@ -49,6 +49,9 @@ _MOST_PASSES = 20
 _SETTLED = 1e-2
 
 
+_OVERFLOW = "Input readings must be of a size that double precision squares; instead the filter's covariance overflows."
+
+
 @dataclass(frozen=True, eq=False)
 class Basis:
     """What the moment is in its parameters, in every row.
@@ -260,6 +263,8 @@ def filtered(model: MomentModel, *, at: Sequence[FloatArray] | None = None, gate
             steps.append(MomentStep(x, S, x, S, F, S_q, update.nis, status, 0))
             continue
         contradictions = 0
+        if not np.isfinite(update.S).all():
+            raise ValueError(_OVERFLOW)
         steps.append(MomentStep(x, S, update.x, update.S, F, S_q, update.nis, status, update.iterations))
         x, S = update.x, update.S
     return steps

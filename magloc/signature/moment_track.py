@@ -128,6 +128,7 @@ class MomentTrack(TrackColumns):
         """Whether no dipole on this path explains the readings: χ² is beyond noise by one in a million."""
         return bool(self.dof > 0 and chdtrc(self.dof, self.chi2) < MISFIT)
 
+    @np.errstate(over="ignore", divide="ignore", invalid="ignore")
     def consistency(self, truth: Truth) -> MomentConsistency:
         """Errors of the moment, their NEES and NIS, and the least error that is possible.
 
@@ -157,6 +158,7 @@ class MomentTrack(TrackColumns):
         )
 
 
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def track_moment(
     array: SensorArray,
     readings: Readings | ArrayLike,

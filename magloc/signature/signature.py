@@ -255,6 +255,7 @@ class Signature:
         return f"<pre>{escape(repr(self))}</pre>"
 
 
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def fit_signature(
     array: SensorArray,
     readings: Readings | Sequence[Readings],

@@ -38,6 +38,12 @@ LINES: dict[str, tuple[str, ...]] = {
         "readings.csv --array array.toml --json",
         "moving.csv --array moving-array.toml --truth moving-truth.csv --smooth",
         "- --array array.toml --jsonl",
+        "passing.csv --array passing-array.toml --object-path passing-path.csv --path-sigma-m 1 --smooth --json",
+        "readings.csv --array array.toml --position 3 0.5 0.306 --truth readings-truth.csv",
+    ),
+    "magloc signature": (
+        "passing.csv --array passing-array.toml --object-path passing-path.csv --depth-m 2 --json",
+        "passing.csv --array passing-array.toml --object-path passing-path.csv --eddy --attitude-sigma-deg 1",
     ),
     "magloc calibrate": ("readings.csv --array array.toml --truth readings-truth.csv --out out.toml --json",),
     "magloc map": (
@@ -117,6 +123,23 @@ speed_m_s = 0.5
 moment_Am2 = [12.0, -5.0, 9.0]
 path = { kind = "fixed", position_m = [0.0, 0.0, -0.6] }
 """,
+    "passing.toml": """format_version = 1
+duration_s = 8.0
+rate_Hz = 1.0
+[array]
+geometry = "tetrahedron"
+edge_m = 1.5
+kind = "vector"
+noise_nT = 1.0
+[ambient]
+field_nT = [1000.0, 18000.0, -45000.0]
+[[source]]
+attitude = "course"
+moment_Am2 = [100.0, 20.0, -50.0]
+polarisability_m3 = [2.0, 1.0, 1.0]
+path = { kind = "course", start_m = [-4.0, 1.0, 4.0], course_deg = 80.0, speed_m_s = 1.0, turn_deg_s = 5.0 }
+path_sigma_m = 0.1
+""",
     "scalar.toml": """format_version = 1
 geometry = "cube"
 edge_m = 1.0
@@ -193,6 +216,7 @@ def write_files(folder: Path) -> None:
     run("magloc", "simulate simulate.toml --out readings.csv")
     (folder / "readings-array.toml").rename(folder / "array.toml")
     run("magloc", "simulate moving.toml --out moving.csv")
+    run("magloc", "simulate passing.toml --out passing.csv")
     run("magloc", "map paper --grid 3 --out map")
     run("adcs", "run tabletsat --duration 20 --seeds 1 --out sat")
     run("adcs", "run mockup --part sky --poses 1 --out sky")

@@ -20,6 +20,7 @@ COMMANDS = (
     "locate",
     "map",
     "track",
+    "signature",
     "bounds",
     "design",
     "new-array",
