@@ -24,6 +24,7 @@ from scipy.special import chdtrc
 from arrays.array import SensorArray
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
+from magloc.blas_threads import one_blas_thread
 from magloc.fields import dipole
 from magloc.levels import MISFIT
 from magloc.readings import Readings, as_readings, without_saturated
@@ -255,6 +256,7 @@ class Signature:
         return f"<pre>{escape(repr(self))}</pre>"
 
 
+@one_blas_thread
 @np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def fit_signature(
     array: SensorArray,
