@@ -18,7 +18,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "KnownMotion": "magloc.tracking.motion",
         "Locator": "magloc.localization.locator",
         "MatchedFilterDetector": "magloc.detection.matched_filter",
-        "MeasuredMotion": "magloc.measured_motion",
+        "MeasuredMotion": "magloc.navigation.measured_motion",
         "MomentTrack": "magloc.signature.moment_track",
         "ObjectPath": "magloc.signature.path",
         "OrnsteinUhlenbeck": "magloc.tracking.motion",

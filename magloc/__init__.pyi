@@ -31,7 +31,7 @@ from magloc.localization.line_ranging import distance_along_line as distance_alo
 from magloc.localization.line_ranging import fit_source_line as fit_source_line
 from magloc.localization.locator import Locator as Locator
 from magloc.localization.locator import locate as locate
-from magloc.measured_motion import MeasuredMotion as MeasuredMotion
+from magloc.navigation.measured_motion import MeasuredMotion as MeasuredMotion
 from magloc.readings import Readings as Readings
 from magloc.readings import read_readings as read_readings
 from magloc.signature.moment_track import MomentTrack as MomentTrack

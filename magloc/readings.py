@@ -4,7 +4,7 @@ A readings file is CSV with one row per instant: ``time_s``, then ``<id>_x_nT, <
 sensor and ``<id>_nT`` for every scalar sensor, in any order. An empty cell, or ``nan``, is a missing reading. Optional
 groups of columns, each complete or absent: the pose of a moving array in the world frame (``array_x_m, array_y_m,
 array_z_m, array_qx, array_qy, array_qz, array_qw``), the ambient field in the array's frame (``ambient_x_nT,
-ambient_y_nT, ambient_z_nT``), and velocities and rates (:mod:`magloc.measured_motion`).
+ambient_y_nT, ambient_z_nT``), and velocities and rates (:mod:`magloc.navigation.measured_motion`).
 
 Whatever is wrong with a file is an :class:`arrays.io.errors.InputError` of one sentence: the file, the line as an
 editor counts it, the column, what was found and what was expected.
@@ -28,7 +28,7 @@ from arrays.io.errors import InputError
 from arrays.io.text import write_text
 from arrays.sensor import Sensor
 from arrays.typing import FloatArray, IntArray
-from magloc.measured_motion import MOTION_COLUMNS, MeasuredMotion, motion_columns, motion_of_table
+from magloc.navigation.measured_motion import MOTION_COLUMNS, MeasuredMotion, motion_columns, motion_of_table
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.typing import FloatArray, Vector
-from magloc.measured_motion import MeasuredMotion
+from magloc.navigation.measured_motion import MeasuredMotion
 
 N_SOURCE = 6
 _AT_REST: Vector = (0.0, 0.0, 0.0)

@@ -19,7 +19,7 @@ from arrays.typing import BoolArray, FloatArray, IntArray, Vector
 from magloc.blas_threads import one_blas_thread
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import EVERYWHERE, Intervals
-from magloc.measured_motion import MeasuredMotion
+from magloc.navigation.measured_motion import MeasuredMotion
 from magloc.readings import Readings, as_readings, without_saturated
 from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import Consistency, consistency

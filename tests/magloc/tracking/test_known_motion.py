@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 import magloc
 from arrays.io.errors import InputError
 from magloc.chi_square import mean_bounds, normalised_square
-from magloc.measured_motion import MOTION_COLUMNS
+from magloc.navigation.measured_motion import MOTION_COLUMNS
 from magloc.readings import POSITION_COLUMNS, ROTATION_COLUMNS, write_readings
 from tests.passing_source import ARRAY, MOMENT, readings_of
 

@@ -16,7 +16,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from magloc.measured_motion import MeasuredMotion
+from magloc.navigation.measured_motion import MeasuredMotion
 from magloc.tracking.motion import (
     CoordinatedTurn,
     KnownMotion,

@@ -1,0 +1,1 @@
+"""What navigation measures beside the readings."""
