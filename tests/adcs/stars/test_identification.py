@@ -372,14 +372,20 @@ class TestCommand:
         outcome = adcs("stars", tmp_path, "--catalogue", sky_files / "sky.csv")
         assert_refused(outcome, name, *fragments)
 
-    @pytest.mark.parametrize("label", ["1e30", "-2"])
-    def test_labels_that_are_no_numbers_of_stars(self, adcs, sky_files, tmp_path, label):
+    @pytest.mark.parametrize(
+        ("label", "sentence"),
+        [
+            ("1e30", f"found {1e30:.15g}, expected numbers of stars"),
+            ("-2", "found -2, expected numbers of stars"),
+            ("0.5", "found a fraction, expected whole numbers"),
+        ],
+    )
+    def test_labels_that_are_no_numbers_of_stars(self, adcs, sky_files, tmp_path, label, sentence):
         for name in ("calibration.txt", "input.csv", "result.csv"):
             (tmp_path / name).write_text((sky_files / "frames" / name).read_text())
         labels = (tmp_path / "result.csv").read_text()
         (tmp_path / "result.csv").write_text(labels.replace(labels.split(",")[0], label, 1))
-        found = f"result.csv, line 1: found {float(label):.15g}, expected numbers of stars"
-        assert_refused(adcs("stars", tmp_path, "--catalogue", sky_files / "sky.csv"), found)
+        assert_refused(adcs("stars", tmp_path, "--catalogue", sky_files / "sky.csv"), f"result.csv, line 1: {sentence}")
 
     def test_no_such_folder(self, adcs, sky_files, tmp_path):
         assert_refused(adcs("stars", tmp_path / "none", "--catalogue", sky_files / "sky.csv"), "does not exist")

@@ -50,6 +50,24 @@ class TestStreams:
 
 
 class TestSignals:
+    def test_what_cannot_be_raised_elsewhere_is_still_said(self) -> None:
+        """The hook that brings an interruption back swallows nothing else."""
+        code = """
+import sys, magloc.cli.app
+class Broken:
+    def __del__(self):
+        raise RuntimeError("in a destructor")
+def main():
+    Broken()
+    return 0
+magloc.cli.app.main = main
+from magloc.cli.entry import entered
+sys.exit(entered("magloc"))
+"""
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=WAIT_S, check=False)
+        assert done.returncode == 0
+        assert "RuntimeError: in a destructor" in done.stderr
+
     @pytest.mark.parametrize("program", ["magloc", "adcs"])
     @pytest.mark.parametrize(("number", "word"), [("SIGINT", "interrupted"), ("SIGTERM", "terminated")])
     @pytest.mark.parametrize("seen_as", ["KeyboardInterrupt", "ImportError"])  # by an extension that is half loaded
