@@ -49,7 +49,8 @@ def estimate(
 
     if out is not None:
         refuse_file(out, "--out")
-    scenario = adcs.read_scenario(str(config)).changed({"estimate": options.estimate})
+    scenario = adcs.read_scenario(str(config))
+    scenario = scenario.changed({"estimate": options.estimate(scenario.estimate.states)})
     settings = scenario.estimator(f"{config}, table estimate")
     record = adcs.read_telemetry(telemetry, scenario.step_s)
     with naming(str(telemetry)):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 import adcs
+from adcs.kalman.error_state import MEASURED_BY
 from adcs.kalman.names import Filter, Noise, StartKind
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
@@ -47,6 +48,7 @@ class EstimateOptions:
         Sensors in use: any of st, gyro, mag and sun that observe attitude, in any order.
     states : str
         What is estimated besides attitude and rate: any of gyro-bias, field-bias and disturbance with commas, or none.
+        With other sensors the scenario's own states stay, but for the bias of a sensor that is not in use.
     filter : str
         As of `adcs run tabletsat`.
     """
@@ -55,12 +57,11 @@ class EstimateOptions:
     states: str | None = None
     filter: Filter | None = None
 
-    @property
-    def estimate(self) -> dict[str, Any]:
-        """Keys of the table ``estimate``, and what replaces them."""
+    def estimate(self, own: Sequence[str]) -> dict[str, Any]:
+        """Keys of the table ``estimate``, and what replaces them; of its own states those stay that sensors measure."""
         given = {"sensors": self.sensors, "states": _names(self.states), "filter": self.filter}
         if self.sensors is not None and self.states is None:
-            given["states"] = []  # those of the file belong to its sensors
+            given["states"] = [state for state in own if MEASURED_BY.get(state, self.sensors) in self.sensors]
         return {key: value for key, value in given.items() if value is not None}
 
 
@@ -75,6 +76,7 @@ class ScenarioOptions(EstimateOptions):
         Sensors in use: any of st, gyro, mag and sun that observe attitude, in any order, as in st+gyro+mag+sun.
     states : str
         What is estimated besides attitude and rate: any of gyro-bias, field-bias and disturbance with commas, or none.
+        With other sensors the scenario's own states stay, but for the bias of a sensor that is not in use.
     filter : str
         Error-state Kalman filter ("mekf"); with its converged gain ("constant-gain"); with a filter of the disturbance
         beside it ("parallel-disturbance"); of attitude and gyro bias alone ("reduced"); with a smoother of the whole
@@ -104,8 +106,8 @@ class ScenarioOptions(EstimateOptions):
     start_error_deg: float | None = None
     closed_loop_F: Annotated[Flag, Parameter(name="--closed-loop-F")] = False
 
-    def changes(self, duration_s: float | None) -> dict[str, Any]:
-        """Keys of the scenario file, and what replaces them."""
+    def changes(self, duration_s: float | None, own: Sequence[str]) -> dict[str, Any]:
+        """Keys of the scenario file with states of its own, and what replaces them."""
         estimate = {
             "process_noise": self.process_noise,
             "start": self.start,
@@ -113,7 +115,7 @@ class ScenarioOptions(EstimateOptions):
             "closed_loop_F": self.closed_loop_F or None,
         }
         changes: dict[str, Any] = {
-            "estimate": self.estimate | {key: value for key, value in estimate.items() if value is not None}
+            "estimate": self.estimate(own) | {key: value for key, value in estimate.items() if value is not None}
         }
         if self.field_error_nT is not None:
             changes["disturbance"] = {"field_error_nT": self.field_error_nT}

@@ -20,7 +20,7 @@ from arrays.typing import BoolArray, FloatArray
 _PSD_RTOL = 1e-9
 # A direction along which the ellipsoid is thinner than this much of its trace is not seen by a reading.
 UNSEEN_RTOL = 1e-12
-# Addition to a shape, in units of its trace, with which points are tested against a flat one.
+# Least eigenvalue of a shape, in units of its trace, with which points are tested against a flat one.
 _FLAT_RTOL = 1e-13
 EPS = float(np.finfo(np.float64).eps)
 
@@ -98,7 +98,7 @@ class Ellipsoid:
 
 
 def quadratic_form(centres: ArrayLike, shapes: ArrayLike, points: ArrayLike) -> FloatArray:
-    """(x - x̃)ᵀ (H + 1e-13 tr(H) I)⁻¹ (x - x̃): the addition keeps flat ellipsoids invertible.
+    """(x - x̃)ᵀ H⁻¹ (x - x̃), eigenvalues of H taken as 1e-13 tr(H) at least: that keeps flat ellipsoids invertible.
 
     Shapes ``centres`` (..., n), ``shapes`` (..., n, n), ``points`` (..., n). Returns (...): of an ellipsoid that is a
     point: 0 there and infinite elsewhere.
@@ -107,10 +107,11 @@ def quadratic_form(centres: ArrayLike, shapes: ArrayLike, points: ArrayLike) -> 
     offset = np.asarray(points, dtype=np.float64) - np.asarray(centres, dtype=np.float64)
     trace = np.trace(shapes, axis1=-2, axis2=-1)
     is_point = trace == 0.0
-    margin = np.where(is_point, 1.0, _FLAT_RTOL * trace)
-    regular = shapes + margin[..., None, None] * np.eye(shapes.shape[-1])
-    solved = np.linalg.solve(regular, offset[..., None])[..., 0]
-    form = np.sum(offset * solved, axis=-1)
+    least = np.where(is_point, 1.0, _FLAT_RTOL * trace)
+    # Raised one by one: an addition to all of them would be an error of the thin, not only of the flat ones.
+    eigenvalues, axes = np.linalg.eigh(shapes)
+    along = (axes.mT @ offset[..., None])[..., 0]
+    form = np.sum(along**2 / np.maximum(eigenvalues, least[..., None]), axis=-1)
     return np.where(is_point & (form > 0.0), np.inf, form)
 
 

@@ -7,6 +7,7 @@ tells how much, except where the model itself is wrong: there the readings must 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -15,16 +16,26 @@ from adcs.kalman.error_state import AttitudeTracks, SensorSet
 from adcs.kalman.mekf import deviations
 from adcs.satellite.sensors import NIS_SIZES
 from adcs.satellite.telemetry import Record, is_read
-from arrays.typing import BoolArray
+from arrays.typing import BoolArray, FloatArray
 
+COLLINEAR = "Sun and field on one line"
 COLLINEAR_RAD = math.radians(20.0)
 """Sun and field nearer to one line than this leave the turn about it badly known: its noise is three times as large."""
+GROWS = 1.5
+"""Growth of the attitude's deviation, with one direction left, of which it is worth while to speak."""
 FALSE_ALARM = 1e-6
 """Probability with which readings that fit their model are called wrong."""
 
 
-def warnings_of(record: Record, estimates: AttitudeTracks) -> tuple[tuple[str, ...], ...]:
-    """Sentences about every run, in the order of the list below; none where nothing is wrong.
+class Problem(NamedTuple):
+    """What is degraded or cannot be observed, and the instants (n,) at which it is."""
+
+    text: str
+    rows: BoolArray
+
+
+def problems_of(record: Record, estimates: AttitudeTracks) -> tuple[tuple[Problem, ...], ...]:
+    """Problems of every run, in the order of the list below; none where nothing is wrong.
 
     - eclipse, no star tracker reading (over-rate or blinded),
     - Sun and field on one line,
@@ -33,61 +44,76 @@ def warnings_of(record: Record, estimates: AttitudeTracks) -> tuple[tuple[str, .
     - innovations that the covariance does not explain.
     """
     used = estimates.settings.sensors
+    always = np.ones(estimates.q.shape[1], dtype=np.bool_)
     return tuple(
         (
             *_lost_sun(record, used, run),
             *_lost_stars(record, estimates, run),
             *_collinear(record, used, run),
-            *_one_vector(record, used, run),
-            *_field_model(record, estimates, run),
-            *_innovations(estimates, run),
+            *_one_vector(record, estimates, run),
+            *(Problem(text, always) for text in _field_model(record, estimates, run)),
+            *(Problem(text, always) for text in _innovations(estimates, run)),
         )
         for run in range(len(estimates.q))
     )
 
 
-def _lost_sun(record: Record, used: SensorSet, run: int) -> list[str]:
+def warnings_of(record: Record, estimates: AttitudeTracks) -> tuple[tuple[str, ...], ...]:
+    """Sentences of the problems of every run."""
+    return tuple(tuple(problem.text for problem in of_run) for of_run in problems_of(record, estimates))
+
+
+def collinear_rows(record: Record, used: SensorSet, run: int) -> BoolArray:
+    """Where Sun and field, which alone tell the attitude, are on one line, shape (n,)."""
+    if used.star or not (used.magnetometer and used.sun):
+        return np.zeros(record.momentum_Nms.shape[1], dtype=np.bool_)
+    near = record.environment.separation_rad[run] < COLLINEAR_RAD
+    return np.asarray(near & is_read(record.readings.sun[run]))
+
+
+def _lost_sun(record: Record, used: SensorSet, run: int) -> list[Problem]:
     if not used.sun:
         return []
     missing = ~is_read(record.readings.sun[run])
     dark = missing & ~record.environment.sunlit[run]
-    sentences = []
+    problems = []
     if dark.any():
-        sentences.append(f"eclipse: no Sun for {_seconds(dark, record)}; attitude is degraded")
+        problems.append(Problem(f"eclipse: no Sun for {_seconds(dark, record)}; attitude is degraded", dark))
     if (missing & ~dark).any():
-        sentences.append(f"Sun outside of all heads' fields for {_seconds(missing & ~dark, record)}")
-    return sentences
+        outside = missing & ~dark
+        problems.append(Problem(f"Sun outside of all heads' fields for {_seconds(outside, record)}", outside))
+    return problems
 
 
-def _lost_stars(record: Record, estimates: AttitudeTracks, run: int) -> list[str]:
+def _lost_stars(record: Record, estimates: AttitudeTracks, run: int) -> list[Problem]:
     if not estimates.settings.sensors.star:
         return []
     missing = ~is_read(record.readings.star[run])
     limit = record.satellite.star_tracker.rate_limit_rad_s
     fast = missing & (np.linalg.norm(estimates.w[run], axis=-1) > limit)
-    sentences = []
+    blind = missing & ~fast
+    problems = []
     if fast.any():
-        sentences.append(f"star tracker over-rate: above {math.degrees(limit):g}°/s for {_seconds(fast, record)}")
-    if (missing & ~fast).any():
-        sentences.append(f"star tracker blinded by Sun or Earth for {_seconds(missing & ~fast, record)}")
-    return sentences
+        text = f"star tracker over-rate: above {math.degrees(limit):g}°/s for {_seconds(fast, record)}"
+        problems.append(Problem(text, fast))
+    if blind.any():
+        problems.append(Problem(f"star tracker blinded by Sun or Earth for {_seconds(blind, record)}", blind))
+    return problems
 
 
-def _collinear(record: Record, used: SensorSet, run: int) -> list[str]:
-    if used.star or not (used.magnetometer and used.sun):
-        return []
-    separation_rad = record.environment.separation_rad[run]
-    near = (separation_rad < COLLINEAR_RAD) & is_read(record.readings.sun[run])
+def _collinear(record: Record, used: SensorSet, run: int) -> list[Problem]:
+    near = collinear_rows(record, used, run)
     if not near.any():
         return []
-    least = math.degrees(float(separation_rad[near].min()))
-    return [
-        f"Sun and field on one line within {least:.0f}° for {_seconds(near, record)}: the turn about it is "
-        + ("known by the gyro only" if used.gyro else "not observable there")
-    ]
+    least = math.degrees(float(record.environment.separation_rad[run, near].min()))
+    known = "known by the gyro only" if used.gyro else "not observable there"
+    text = f"{COLLINEAR} within {least:.0f}° for {_seconds(near, record)}: the turn about it is {known}"
+    return [Problem(text, near)]
 
 
-def _one_vector(record: Record, used: SensorSet, run: int) -> list[str]:
+def _one_vector(record: Record, estimates: AttitudeTracks, run: int) -> list[Problem]:
+    """Compare the deviation of the attitude where one direction is left with that before, if its bias is a state."""
+    used = estimates.settings.sensors
     if used.star or not used.gyro:
         return []
     readings = record.readings
@@ -99,8 +125,23 @@ def _one_vector(record: Record, used: SensorSet, run: int) -> list[str]:
     alone = seen < 2
     if not alone.any():
         return []
-    cannot = "its bias about that direction is not observable" if used.gyro_bias else "a bias is not in the state"
-    return [f"one direction and a gyro for {_seconds(alone, record)}: {cannot}, the error accumulates"]
+    begins = f"one direction and a gyro for {_seconds(alone, record)}"
+    if not used.gyro_bias:
+        return [Problem(f"{begins}: a bias of the gyro is not in the state and would accumulate", alone)]
+    sigma_deg = np.degrees(2.0 * estimates.sigma[run, :, :3].max(axis=-1))
+    firsts = np.flatnonzero(alone & ~np.concatenate([[False], alone[:-1]]))
+    growth = [(_next_largest(sigma_deg, alone, first), sigma_deg[max(first - 1, 0)]) for first in firsts.tolist()]
+    largest, before = max(growth, key=lambda pair: pair[0] / pair[1])
+    if largest < GROWS * before:
+        return []
+    text = f"{begins}: the turn about it is known by the gyro only, 1σ grows from {before:.2g}° to {largest:.2g}°"
+    return [Problem(text, alone)]
+
+
+def _next_largest(sigma: FloatArray, alone: BoolArray, first: int) -> float:
+    """Largest deviation from an instant to the last of its gap."""
+    ends = np.flatnonzero(~alone[first:])
+    return float(sigma[first : first + ends[0] if ends.size else None].max())
 
 
 def _field_model(record: Record, estimates: AttitudeTracks, run: int) -> list[str]:

@@ -13,13 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from adcs.satellite.sensors import SENSORS
+from adcs.satellite.sensors import SENSOR_WORDS, SENSORS
 from arrays.io.errors import check_not_negative, check_positive
 from arrays.typing import BoolArray, FloatArray
 
 ATTRIBUTES = {"field-bias": "field_bias_T", "gyro-bias": "gyro_bias_rad_s", "disturbance": "disturbance_s2"}
 """Optional states in the order of the error state, and what they are called in :class:`State` and its like."""
 STATES = tuple(ATTRIBUTES)
+MEASURED_BY = {"field-bias": "mag", "gyro-bias": "gyro"}
+"""States that belong to a sensor: without it they cannot be estimated."""
 ALWAYS = 6
 """Numbers of attitude and rate, which every filter has."""
 
@@ -95,10 +97,12 @@ def check_observable(used: SensorSet) -> None:
     the Sun stays where it is, so that no time helps there. A magnetometer alone, with the known motion, finds attitude
     to a degree after a whole orbit; it is refused as well.
     """
-    if used.gyro_bias and not used.gyro:
-        raise ValueError("Input states must not have gyro-bias without a gyro; add gyro to the sensors.")
-    if used.field_bias and not used.magnetometer:
-        raise ValueError("Input states must not have field-bias without a magnetometer; add mag to the sensors.")
+    for state in used.states:
+        sensor = MEASURED_BY.get(state)
+        if sensor is not None and sensor not in used.sensors.split("+"):
+            raise ValueError(
+                f"Input states must not have {state} without a {SENSOR_WORDS[sensor]}; add {sensor} to the sensors."
+            )
     if used.star or (used.magnetometer and (used.sun or used.gyro)):
         return
     seen, missing = "nothing measures attitude", "a star tracker (st), or mag with sun or gyro"

@@ -42,9 +42,13 @@ class StatesPicture:
     gaps: Sequence[tuple[str, BoolArray]] = ()  # (n,): what was missing, and whether it was there
 
 
-def sensor_gaps(seen: Mapping[str, BoolArray], used: Iterable[str]) -> list[tuple[str, BoolArray]]:
-    """Sensors in use that have no reading at times, in words, and where they have."""
-    return [(f"no {SENSOR_WORDS.get(name, name)}", seen[name]) for name in used if not seen[name].all()]
+def gaps_of(
+    seen: Mapping[str, BoolArray], used: Iterable[str], degraded: Mapping[str, BoolArray]
+) -> list[tuple[str, BoolArray]]:
+    """Sensors in use that have no reading at times, and what else is degraded, in words, and where all is well."""
+    gaps = [(f"no {SENSOR_WORDS.get(name, name)}", seen[name]) for name in used]
+    gaps += [(words, ~rows) for words, rows in degraded.items()]
+    return [(words, well) for words, well in gaps if not well.all()]
 
 
 def track_figure(track: AttitudeTrack, name: str = "") -> Figure:
@@ -52,7 +56,7 @@ def track_figure(track: AttitudeTrack, name: str = "") -> Figure:
     attitude = quaternion.log(track.q if track.q_orbital is None else track.q_orbital)
     values = in_units({"attitude": attitude} | dict(track.states))
     sigma = in_units(track.sigma) if track.sigma else np.full_like(values, np.nan)
-    gaps = sensor_gaps(track.seen, track.used)
+    gaps = gaps_of(track.seen, track.used, track.degraded)
     title = f"{name}: {track.title}" if name else track.title
     return states_figure(StatesPicture(title, track.time_s, values, sigma, are_errors=False, gaps=gaps))
 
@@ -105,10 +109,10 @@ def states_figure(picture: StatesPicture) -> Figure:
                     va="top",
                     fontsize=style.SMALL_LETTERS,
                 )
-            # The band at rest fills half of the panel; what happens at the start may leave it.
             ax.axhline(0.0, color=style.GREY, lw=0.5, zorder=1.5)
-        inside = [(middle - wide)[settled], (middle + wide)[settled], values[settled]]
-        low, high = style.limits_of(inside, share=1.0, margin=0.25)
+        # The band at rest fills half of the panel; errors and bands at the start may leave it, an estimate never.
+        inside = [(middle - wide)[settled], (middle + wide)[settled], values[settled] if picture.are_errors else values]
+        low, high = style.limits_of(inside, share=1.0, margin=0.25 if picture.are_errors else 0.05)
         across[0].set_ylim(low, high)
     for ax in axes[-1]:
         ax.set_xlabel("time [s]", fontsize=style.LETTERS)

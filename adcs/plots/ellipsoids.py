@@ -146,7 +146,9 @@ def _bounds(ax: Axes, picture: RollYawPicture) -> None:
     ax.plot(picture.time_s, roll.mean(axis=0), color=_SET, lw=1.2, label="guaranteed half-width of roll, mean")
     ax.legend(loc="upper right", frameon=False, fontsize=8, ncols=3)
     ax.set(ylabel="roll [°]")
-    ax.set_ylim(0.0, 1.4 * ax.get_ylim()[1])
+    # The first set is wide for seconds only.
+    settled = roll[:, roll.shape[1] // 4 :]
+    ax.set_ylim(0.0, 1.4 * max(float(bounds.max()), float(settled.max())))
 
 
 def _attitude(ax: Axes, picture: RollYawPicture) -> None:

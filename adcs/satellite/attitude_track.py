@@ -47,6 +47,8 @@ class AttitudeTrack:
         Orbital frame from body.
     warnings : tuple of str
         What is degraded or cannot be observed, and for how long.
+    degraded : mapping of str to ndarray of bool, shape (n,)
+        What is there and yet of little use, in words, and where.
 
     Examples
     --------
@@ -68,6 +70,7 @@ class AttitudeTrack:
     nis: Mapping[str, FloatArray] = field(default_factory=dict)
     q_orbital: FloatArray | None = None
     warnings: tuple[str, ...] = ()
+    degraded: Mapping[str, BoolArray] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Return the number of instants."""

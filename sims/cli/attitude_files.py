@@ -11,6 +11,7 @@ import numpy as np
 from adcs.io.scenario_files import AttitudeFile, scenario_text
 from adcs.io.telemetry_files import telemetry_columns
 from adcs.kalman.bank import EstimatorSettings
+from adcs.kalman.diagnostics import COLLINEAR, collinear_rows
 from adcs.satellite.sensors import SENSORS
 from adcs.satellite.telemetry import Telemetry
 from arrays.io.csv import write_columns
@@ -27,7 +28,7 @@ def write_attitude_files(
     out: Path, file: AttitudeFile, estimate: EstimatorSettings, parts: Sequence[Part], outcome: Outcome
 ) -> list[str]:
     """Write everything of some runs into a folder."""
-    from adcs.plots.attitude import ConsistencyPicture, StatesPicture, consistency_figure, sensor_gaps, states_figure
+    from adcs.plots.attitude import ConsistencyPicture, StatesPicture, consistency_figure, gaps_of, states_figure
     from magloc.plots import style
 
     first = parts[0]
@@ -37,7 +38,9 @@ def write_attitude_files(
     sigma = in_units(sigma_by_state(first.estimates))[0]
     title = f"{name}: {estimate.in_words}"
     seen = {name: there[0] for name, there in first.runs.readings.seen.items()}
-    gaps = sensor_gaps(seen, estimate.settings.sensors.sensors.split("+"))
+    used = estimate.settings.sensors
+    degraded = {COLLINEAR: collinear_rows(first.runs, used, 0)}
+    gaps = gaps_of(seen, used.sensors.split("+"), degraded)
     seed = int(outcome.seeds[0])
     picture = StatesPicture(f"{title}; seed {seed}", time_s, errors, sigma, are_errors=True, gaps=gaps)
     style.save(states_figure(picture), out / f"{name}-errors.png")

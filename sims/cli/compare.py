@@ -138,6 +138,7 @@ def compare(
 
 _COLUMNS = (
     ("angle_rms_deg", "angle [°]"),
+    ("worst_deg", "worst [°]"),
     ("rate_rms_deg_s", "rate [°/s]"),
     ("gyro_bias_rms_deg_s", "Δω [°/s]"),
     ("field_bias_rms_nT", "Δb [nT]"),

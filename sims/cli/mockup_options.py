@@ -119,10 +119,11 @@ class MockupOptions:
         fusion: from the exposure to the fix [s]; 0.6.
     outage : float, optional
         fusion: from when to when there are no frames [s].
-    samples, fixes : Path, optional
-        fusion: CSV files of a recording, in place of simulated drives: time_s, acceleration_x_m_s2,
-        acceleration_y_m_s2 and rate_deg_s of every sample; exposure_s, arrival_s, x_m, y_m and heading_deg of every
-        fix.
+    samples : Path, optional
+        fusion: CSV file of a recording, in place of simulated drives: time_s, acceleration_x_m_s2, acceleration_y_m_s2
+        and rate_deg_s of every sample; needs --fixes.
+    fixes : Path, optional
+        fusion: CSV file of its fixes: exposure_s, arrival_s, x_m, y_m and heading_deg of each; needs --samples.
     unknowns : str, optional
         zeros: zeros alone ("two"), with the start ("six", the default), or also their slopes ("drift").
     start_fixes : int, optional

@@ -57,7 +57,7 @@ def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) ->
     from adcs.io.scenario_tables import MOST_STEPS
 
     file = adcs.read_scenario(scenario)
-    changes = options.changes(duration_s)
+    changes = options.changes(duration_s, file.estimate.states)
     if duration_s is not None and not 1.0 <= duration_s / file.step_s <= MOST_STEPS:
         longest_s = MOST_STEPS * file.step_s
         raise InputError(f"--duration: found {duration_s:g} s, expected {file.step_s:g} to {longest_s:g} s.")
@@ -86,9 +86,10 @@ def run_attitude(
 ) -> None:
     """Simulate a satellite, estimate its attitude with a Kalman filter, and say how good that is.
 
-    Errors are those of the last minute: the rms of every axis, its mean over the runs, of these the worst axis. A run
-    that is more than 10° off then has diverged. Beside the figures, --out writes telemetry.csv and scenario.toml, with
-    which `adcs estimate` does the same.
+    Errors are those of the last minute: the rms of every axis, its mean over the runs, of these the worst axis. A
+    run that is more than 10° off then has diverged. The largest error while something is degraded or not observable
+    (an eclipse, Sun and field on one line) is of all runs, after their first minute. Beside the figures, --out
+    writes telemetry.csv and scenario.toml, with which `adcs estimate` does the same.
 
     Parameters
     ----------
@@ -152,6 +153,8 @@ def summary_lines(file: AttitudeFile, estimate: EstimatorSettings, numbers: dict
         if number is not None:
             words = "angle, rms of the last minute" if state == "attitude" else shown.words
             lines.append(f"{words:34s}{number:.3g} {shown.unit}")
+    if numbers["worst_deg"] is not None:
+        lines.append(f"{'angle, largest while degraded':34s}{numbers['worst_deg']:.3g} °")
     lines.append(f"{'NEES / numbers (1 is consistent)':34s}{numbers['nees_per_dimension']:.3g}")
     lines.append(f"{'diverged runs':34s}{numbers['diverged_runs']}")
     return lines

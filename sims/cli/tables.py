@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -51,7 +52,8 @@ def tables(
 
     Process noise and noise of the star tracker are as printed, as far as they can be read. Ours is the standard
     deviation that the filter gives at the end, worst axis, the mean of the runs, and beside it the rms of its errors in
-    the last minute. The attitude is half of the angle, as there.
+    the last minute. The attitude is half of the angle, as there. A number of ours that is more than three times off has
+    a star, and below it is why.
 
     Parameters
     ----------
@@ -90,14 +92,18 @@ _TITLES = {3: "Table 3", 4: "Table 4, disturbance in the state", 5: "Table 5, co
 def table_lines(compared: list[Comparison]) -> list[str]:
     """The comparison as text."""
     lines: list[str] = []
-    table, label = 0, ""
-    for one in compared:
-        if one.table != table:
-            table, label = one.table, ""
+    table = 0
+    for (of_table, label), rows in groupby(compared, lambda one: (one.table, one.set)):
+        if of_table != table:
+            table = of_table
             lines += ["", _TITLES[table]] if lines else [_TITLES[table]]
             lines.append(f"{'set':20s}{'':18s}{'paper':>16s}{'ours':>10s}{'ratio':>9s}{'ours, rms':>11s}")
-        shown = one.set if one.set != label else ""
-        label = one.set
-        quantity = f"{one.quantity} [{one.unit}]"
-        lines.append(f"{shown:20s}{quantity:20s}{one.paper_text:>14s}{one.ours:10.2g}{one.ratio:9.3g}{one.rms:11.2g}")
+        shown, notes = label, []
+        for one in rows:
+            quantity, far = f"{one.quantity} [{one.unit}]", " *" if one.note else ""
+            numbers = f"{one.paper_text:>14s}{one.ours:10.2g}{one.ratio:9.3g}{one.rms:11.2g}{far}"
+            lines.append(f"{shown:20s}{quantity:20s}{numbers}")
+            shown = ""
+            notes += [one.note] if one.note and one.note not in notes else []
+        lines += [f"{'':20s}* {note}" for note in notes]
     return lines

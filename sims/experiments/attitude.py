@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from adcs.io.scenario_files import AttitudeFile
 from adcs.kalman.bank import EstimatorSettings, estimated
-from adcs.kalman.diagnostics import warnings_of
+from adcs.kalman.diagnostics import Problem, problems_of
 from adcs.kalman.error_state import AttitudeTracks, start_near
 from adcs.kalman.results import by_state, in_units
 from arrays.io.errors import InputError
@@ -56,6 +56,9 @@ class Outcome:
         Numbers of the error state.
     late : slice
         Instants of the last minute.
+    worst_deg : ndarray, shape (runs,)
+        Largest error while something is degraded or not observable, but for the first minute, which is the start's;
+        NaN where nothing is.
     warnings : list of list of str
         What can be told of every run without the truth: what is degraded or not observable.
     """
@@ -68,6 +71,7 @@ class Outcome:
     diverged: NDArray[np.bool_]
     size: int
     late: slice
+    worst_deg: FloatArray
     warnings: list[list[str]]
 
     def warning_lines(self) -> list[str]:
@@ -91,6 +95,7 @@ class Outcome:
             "nees_per_dimension": float(self.nees[:, self.late].mean()),
             "diverged_runs": int(self.diverged.sum()),
             "runs": len(self.seeds),
+            "worst_deg": None if np.isnan(self.worst_deg).all() else float(np.nanmax(self.worst_deg)),
         }
 
 
@@ -170,7 +175,7 @@ def run_scenario(
         if advance is not None:
             advance(len(outcomes[-1].seeds))
         del part  # or two would be in memory while the next one is made
-    of_runs = ("seeds", "axis_rms", "nees", "nis", "error_deg", "diverged")
+    of_runs = ("seeds", "axis_rms", "nees", "nis", "error_deg", "diverged", "worst_deg")
     joined: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in outcomes]) for name in of_runs}
     return replace(outcomes[0], **joined, warnings=[texts for one in outcomes for texts in one.warnings])
 
@@ -187,6 +192,7 @@ def outcome_of(part: Part) -> Outcome:
     error_deg = accuracy.error_norm_deg(runs, estimates)
     errors = errors_in_units(part)
     size = estimates.settings.sensors.size
+    problems, first = problems_of(runs, estimates), round(accuracy.LAST_S / runs.dt_s)
     return Outcome(
         seeds=np.array(runs.prepared.seeds),
         axis_rms=np.sqrt(np.mean(errors[:, late] ** 2, axis=1)),
@@ -196,5 +202,15 @@ def outcome_of(part: Part) -> Outcome:
         diverged=np.any(~(error_deg[:, late] <= accuracy.DIVERGED_DEG), axis=1) | ~estimates.definite,
         size=size,
         late=late,
-        warnings=[list(texts) for texts in warnings_of(runs, estimates)],
+        worst_deg=np.array([_worst(*of_run, first) for of_run in zip(error_deg, problems, strict=True)]),
+        warnings=[[problem.text for problem in of_run] for of_run in problems],
     )
+
+
+def _worst(error_deg: FloatArray, problems: Sequence[Problem], first: int) -> float:
+    """Largest error at the instants of some problems, from the instant ``first`` on; NaN where there are none."""
+    rows = np.zeros(len(error_deg), dtype=np.bool_)
+    for problem in problems:
+        rows |= problem.rows
+    rows[:first] = False
+    return float(error_deg[rows].max()) if rows.any() else math.nan

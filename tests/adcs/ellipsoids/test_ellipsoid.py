@@ -74,13 +74,13 @@ def points_of(root, rng, n_points, *, boundary=False):
 def form_rtol(ellipsoid, size, box=0.0):
     """Largest error of the form 1 of a point that is a sum of terms up to size (n,).
 
-    A shape H that is off by D changes the form by |D| / λ_min(H) at most. D is 1e-13 tr H, which keeps flat ellipsoids
-    invertible, 16 n eps max(tr H, box) of rounding, where H is a sum of terms up to box, and 16 n eps |size| √tr H,
-    which covers a rounded centre; rounding of the point itself counts for less than that.
+    A shape H that is off by D changes the form by |D| / λ_min(H) at most, where these are above 1e-13 tr H.
+    D is 16 n eps max(tr H, box) of rounding, where H is a sum of terms up to box, and 16 n eps |size| √tr H, which
+    covers a rounded centre; rounding of the point itself counts for less than that.
     """
     eps, trace = np.finfo(np.float64).eps, ellipsoid.trace
     rounding = 16.0 * ellipsoid.n * eps * (max(trace, box) + np.linalg.norm(size) * math.sqrt(trace))
-    return (1e-13 * trace + rounding) / np.linalg.eigvalsh(ellipsoid.shape)[0]
+    return rounding / np.linalg.eigvalsh(ellipsoid.shape)[0]
 
 
 class TestEllipsoid:
@@ -110,6 +110,15 @@ class TestEllipsoid:
         across = linalg.null_space(root.T)[:, 0]
         assert not ellipsoid.contains(1e-3 * across)
         assert support(ellipsoid, across) == pytest.approx(0.0, abs=1e-7)
+
+    def test_form_of_a_thin_one(self):
+        """Ratio of the squared semi-axes 1e-8: known to rounding, 1e8 eps."""
+        rng = np.random.default_rng(0)
+        for _ in range(50):
+            axes = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+            root = axes * np.sqrt([1.0, 1e-4, 1e-8])
+            ellipsoid = Ellipsoid(np.zeros(3), root @ root.T)
+            np.testing.assert_allclose(ellipsoid.form(root.T), 1.0, rtol=2e-7)
 
     def test_a_point(self):
         point = Ellipsoid(np.ones(2), np.zeros((2, 2)))

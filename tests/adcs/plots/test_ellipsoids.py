@@ -43,6 +43,11 @@ def test_words() -> None:
     assert words == ["0 s", "10 s", "20 s", "30 s", "40 s", "Kalman filter (white noise), 3σ", "truth"]
 
 
+def test_the_roll_panel_is_not_scaled_to_the_first_set() -> None:
+    """Its first set has 0.57°, the bound is 0.11° and the later sets have less than 0.3°."""
+    assert 0.2 < roll_yaw_figure(picture()).axes[3].get_ylim()[1] < 0.6
+
+
 class TestSets:
     def test_an_outline_is_the_edge_of_the_set(self) -> None:
         root = np.random.default_rng(0).standard_normal((2, 2))

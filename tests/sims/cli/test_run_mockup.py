@@ -407,3 +407,10 @@ def test_a_file_in_place_of_the_folder(adcs, tmp_path):
     for part in ("sky", "fusion", "zeros"):
         outcome = adcs("run", "mockup", "--part", part, "--out", tmp_path / "out")
         assert_refused(outcome, "found a file, expected a folder")
+
+
+def test_every_option_has_its_own_help(adcs):
+    """What a group of options is called is not the help of one of them."""
+    text = adcs("run", "mockup", "--help").out
+    assert "What is run." not in text
+    assert text.count("CSV file") == 2

@@ -28,6 +28,7 @@ KEYS = [
     "nees_per_dimension",
     "diverged_runs",
     "runs",
+    "worst_deg",
 ]
 
 
@@ -41,7 +42,7 @@ def numbers(outcome):
 class TestNumbers:
     def test_keys_and_nulls(self, adcs):
         found = numbers(adcs("run", "tabletsat", "--json", "--seeds", "2", "--sensors", "st"))
-        assert [key for key in KEYS if found[key] is None] == KEYS[2:5]
+        assert [key for key in KEYS if found[key] is None] == [*KEYS[2:5], "worst_deg"]
         assert (found["runs"], found["diverged_runs"]) == (2, 0)
 
     def test_runs_is_seeds_and_they_count_from_seed(self, adcs):
@@ -125,6 +126,7 @@ class TestNumbers:
             "nees_per_dimension": nees,
             "diverged_runs": 0,
             "runs": 3,
+            "worst_deg": None,
         }
         found = run_scenario(file, estimate, range(3)).numbers()
         assert list(found) == list(expected)
@@ -165,6 +167,35 @@ class TestNamedProblems:
         assert any(line.startswith("adcs: warning: ") and words in line for line in outcome.err.splitlines())
         assert "warning" not in outcome.out
         assert adcs("run", name, "--seeds", "4", "--quiet").err == ""
+
+    def test_the_worst_is_told(self, adcs):
+        """The last minute comes long after the problem: 0.273° and 0.015° in the shadow and after it."""
+        found = numbers(adcs("run", "eclipse", "--json", "--quiet", "--seeds", "5"))
+        file = read_scenario("eclipse")
+        outcome = run_scenario(file, file.estimator("x"), range(5))
+        (part,) = parts_of(file, file.estimator("x"), range(5))
+        dark = ~part.runs.readings.seen["sun"]
+        assert found["worst_deg"] == pytest.approx(outcome.error_deg[dark].max())
+        assert found["worst_deg"] > 5.0 * found["angle_rms_deg"]
+
+    @pytest.mark.parametrize(
+        ("sensors", "states"), [("mag+sun+gyro", "gyro-bias, disturbance"), ("mag+sun", "disturbance")]
+    )
+    def test_other_sensors_leave_the_states(self, adcs, sensors, states):
+        """The states of the scenario stay, but for the bias of a sensor that is gone."""
+        outcome = adcs("run", "eclipse", "--seeds", "1", "--duration", "700", "--sensors", sensors)
+        assert f", estimating {states}; filter mekf" in outcome.out
+        rows = json.loads(
+            adcs("compare", "eclipse", "--seeds", "1", "--duration", "700", "--sensors", sensors, "--json").out
+        )["rows"]
+        assert rows[0]["states"] == states.split(", ")
+
+    def test_states_that_are_named_are_all(self, adcs):
+        outcome = adcs(
+            "run", "eclipse", "--seeds", "1", "--duration", "700", "--sensors", "mag+sun", "--states", "none"
+        )
+        assert "gyro+mag+sun" not in outcome.out
+        assert "estimating" not in outcome.out
 
     def test_nothing_to_warn_of(self, adcs):
         assert adcs("run", "tabletsat", "--seeds", "4").err == ""
