@@ -87,6 +87,8 @@ class ScenarioOptions(EstimateOptions):
         The star tracker's 0.001° are the noise of its angle ("angle"), or of its quaternion's components ("paper").
     field_error_nT : float
         True field minus its model.
+    share : float
+        Share of the readings of every sensor that are wild, 0 to 1.
     eclipse : bool
         The satellite enters the Earth's shadow at 600 s.
     start : str
@@ -101,6 +103,7 @@ class ScenarioOptions(EstimateOptions):
     process_noise: Noise | None = None
     star_noise: Literal["angle", "paper"] | None = None
     field_error_nT: Annotated[float | None, Parameter(name="--field-error-nT")] = None
+    share: float | None = None
     eclipse: Flag = False
     start: StartKind | None = None
     start_error_deg: float | None = None
@@ -117,8 +120,9 @@ class ScenarioOptions(EstimateOptions):
         changes: dict[str, Any] = {
             "estimate": self.estimate(own) | {key: value for key, value in estimate.items() if value is not None}
         }
-        if self.field_error_nT is not None:
-            changes["disturbance"] = {"field_error_nT": self.field_error_nT}
+        given = {"field_error_nT": self.field_error_nT, "wild_share": self.share}
+        if disturbance := {key: value for key, value in given.items() if value is not None}:
+            changes["disturbance"] = disturbance
         if self.eclipse:
             eclipse = adcs.read_scenario("eclipse").tables
             changes |= {key: eclipse[key] for key in ("start", "duration_s")}

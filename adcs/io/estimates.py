@@ -28,6 +28,8 @@ def estimate_columns(track: AttitudeTrack) -> dict[str, Any]:
     for sensor, nis in track.nis.items():
         if not np.isnan(nis).all():
             columns[f"nis_{_NAMES[sensor]}"] = nis
+            if sensor in track.gated:
+                columns[f"rejected_{_NAMES[sensor]}"] = track.gated[sensor]
     return {name: values[track.rows] for name, values in columns.items()}
 
 
@@ -53,6 +55,9 @@ def summary_lines(track: AttitudeTrack) -> list[str]:
     for sensor, name in _NAMES.items():
         numbers = NIS_SIZES[sensor]
         if f"nis_{name}" in columns:
-            nis = float(np.nanmean(columns[f"nis_{name}"])) / numbers
-            lines.append(f"NIS of {name} / {numbers} (1 is consistent){'':3s}{nis:.3g}")
+            rejected = columns.get(f"rejected_{name}", np.zeros(len(track.rows), dtype=np.bool_))
+            kept = columns[f"nis_{name}"][~rejected & ~np.isnan(columns[f"nis_{name}"])]
+            nis = f"{kept.mean() / numbers:.3g}" if kept.size else "none is used"
+            told = f", {rejected.sum()} rejected" if rejected.any() else ""
+            lines.append(f"NIS of {name} / {numbers} (1 is consistent){'':3s}{nis}{told}")
     return lines

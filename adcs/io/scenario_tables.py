@@ -23,11 +23,13 @@ from arrays.io.toml import (
 )
 from arrays.typing import Vector
 from magloc.fields.geomagnetic import MODELS
+from magloc.levels import CONTRADICTION
 
 MOST_STEPS = 200_000
 """Of a run: its covariances are held together, 230 MB of them."""
 _ZERO: Vector = (0.0, 0.0, 0.0)
 _RIGHT_ANGLE = Rule(lambda value: 0.0 <= value <= 90.0, "0 to 90")
+_SHARE = Rule(lambda value: 0.0 <= value < 1.0, "0 to less than 1")
 _NAME = Rule(lambda value: bool(re.fullmatch(r"[\w.-]+", value)), "letters, digits, dots and dashes")
 
 
@@ -88,6 +90,7 @@ class DisturbanceTable(Table, kw_only=True):
     gyro_bias_deg_s: NotNegative = 0.0
     field_bias_nT: NotNegative = 0.0
     field_error_nT: NotNegative = 0.0
+    wild_share: Annotated[float, _SHARE] = 0.0
 
 
 class StarTrackerTable(Table, kw_only=True):
@@ -174,6 +177,7 @@ class EstimateTable(Table, kw_only=True):
     filter: str = "mekf"
     process_noise: str | dict[str, Any] = "tuned"
     field_model_error_nT: NotNegative = 0.0
+    gate: Annotated[float, _SHARE] = CONTRADICTION
     start: str = "near"
     start_error_deg: Positive = 5.0
     start_rate_error_deg_s: Positive = 0.1

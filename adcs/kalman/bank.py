@@ -163,6 +163,7 @@ def _track(
         nis=dict(zip(SENSORS, tracks.nis[0].T, strict=True)),
         q_orbital=q,
         warnings=warnings_of(record, tracks)[0],
+        gated=dict(zip(SENSORS, tracks.rejected[0].T, strict=True)),
         degraded={COLLINEAR: collinear_rows(record, used, 0)},
     )
 

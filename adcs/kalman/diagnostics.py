@@ -14,7 +14,7 @@ from scipy.stats import chi2
 
 from adcs.kalman.error_state import AttitudeTracks, SensorSet
 from adcs.kalman.mekf import deviations
-from adcs.satellite.sensors import NIS_SIZES
+from adcs.satellite.sensors import NIS_SIZES, SENSOR_WORDS
 from adcs.satellite.telemetry import Record, is_read
 from arrays.typing import BoolArray, FloatArray
 
@@ -40,6 +40,7 @@ def problems_of(record: Record, estimates: AttitudeTracks) -> tuple[tuple[Proble
     - eclipse, no star tracker reading (over-rate or blinded),
     - Sun and field on one line,
     - one direction with a biased gyro,
+    - readings that contradict the rest,
     - a field that does not fit its model: an error of the model, or the satellite's own field,
     - innovations that the covariance does not explain.
     """
@@ -51,6 +52,8 @@ def problems_of(record: Record, estimates: AttitudeTracks) -> tuple[tuple[Proble
             *_lost_stars(record, estimates, run),
             *_collinear(record, used, run),
             *_one_vector(record, estimates, run),
+            # The estimate is none the worse for a reading that is left out.
+            *(Problem(text, ~always) for text in _rejected(estimates, run)),
             *(Problem(text, always) for text in _field_model(record, estimates, run)),
             *(Problem(text, always) for text in _innovations(estimates, run)),
         )
@@ -144,6 +147,17 @@ def _next_largest(sigma: FloatArray, alone: BoolArray, first: int) -> float:
     return float(sigma[first : first + ends[0] if ends.size else None].max())
 
 
+def _rejected(estimates: AttitudeTracks, run: int) -> list[str]:
+    sentences = []
+    for rejected, nis, word in zip(estimates.rejected[run].T, estimates.nis[run].T, SENSOR_WORDS.values(), strict=True):
+        if rejected.any():
+            of_all = int(np.isfinite(nis).sum())
+            sentences.append(
+                f"{rejected.sum()} of {of_all} readings of the {word} contradict the rest and are not used"
+            )
+    return sentences
+
+
 def _field_model(record: Record, estimates: AttitudeTracks, run: int) -> list[str]:
     """Compare what does not depend on the attitude: the field's modulus, and its angle with the Sun."""
     settings = estimates.settings
@@ -152,13 +166,16 @@ def _field_model(record: Record, estimates: AttitudeTracks, run: int) -> list[st
         return []
     around, readings = record.environment, record.readings
     sigma = deviations(record, settings)
-    b, model = readings.field_T[run], around.b_orbital_T[run]
+    rejected = estimates.rejected[run, :, 2:]
+    b = np.where(rejected[:, :1], np.nan, readings.field_T[run])
+    sun = np.where(rejected[:, 1:], np.nan, readings.sun[run])
+    model = around.b_orbital_T[run]
     length_T = np.linalg.norm(model, axis=-1)
     checks = [(np.linalg.norm(b, axis=-1) - length_T, np.full(len(b), sigma[2]))]
     if used.sun:
         along = np.sum(model * around.sun_orbital[run], axis=-1)
         across_T = np.sqrt(np.maximum(length_T**2 - along**2, 0.0))
-        checks.append((np.sum(b * readings.sun[run], axis=-1) - along, np.hypot(sigma[2], sigma[3] * across_T)))
+        checks.append((np.sum(b * sun, axis=-1) - along, np.hypot(sigma[2], sigma[3] * across_T)))
     total, numbers, largest_T = 0.0, 0, 0.0
     for residual, deviation in checks:
         seen = np.isfinite(residual)
@@ -177,8 +194,9 @@ def _field_model(record: Record, estimates: AttitudeTracks, run: int) -> list[st
 
 
 def _innovations(estimates: AttitudeTracks, run: int) -> list[str]:
-    """Compare the sum of NIS over the second half of the run, after the start, with its χ²."""
-    nis = estimates.nis[run, estimates.nis.shape[1] // 2 :]
+    """Compare the sum of NIS of what is used over the second half of the run, after the start, with its χ²."""
+    used = np.where(estimates.rejected[run], np.nan, estimates.nis[run])
+    nis = used[len(used) // 2 :]
     numbers = int((np.isfinite(nis) * list(NIS_SIZES.values())).sum())
     total = float(np.nansum(nis))
     if numbers == 0 or total <= chi2.isf(FALSE_ALARM, numbers):

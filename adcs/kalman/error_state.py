@@ -7,21 +7,28 @@ then reaches.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtri
 
 from adcs.satellite.sensors import SENSOR_WORDS, SENSORS
 from arrays.io.errors import check_not_negative, check_positive
 from arrays.typing import BoolArray, FloatArray
+from magloc.levels import CONTRADICTION
 
 ATTRIBUTES = {"field-bias": "field_bias_T", "gyro-bias": "gyro_bias_rad_s", "disturbance": "disturbance_s2"}
 """Optional states in the order of the error state, and what they are called in :class:`State` and its like."""
 STATES = tuple(ATTRIBUTES)
 MEASURED_BY = {"field-bias": "mag", "gyro-bias": "gyro"}
 """States that belong to a sensor: without it they cannot be estimated."""
+OPEN_RAD = 2.0
+"""Standard deviation of an axis of which nothing is known, about that of a uniform turn."""
+RATE_RAD_S = math.radians(0.5)
+"""Standard deviation of the rate against the orbital frame, where there is no gyro."""
 ALWAYS = 6
 """Numbers of attitude and rate, which every filter has."""
 
@@ -206,6 +213,9 @@ class FilterSettings:
         Standard deviation of each component of the field model's error, added to the magnetometer's noise.
     field_bias_sigma_T, gyro_bias_sigma_rad_s, disturbance_sigma_s2 : float
         Standard deviations of those states at the start, where they are zero.
+    gate : float
+        Probability with which a good reading is taken for one that contradicts the filter, which is then not used; with
+        0 all readings are used.
     """
 
     sensors: SensorSet
@@ -214,9 +224,12 @@ class FilterSettings:
     field_bias_sigma_T: float = 1000e-9
     gyro_bias_sigma_rad_s: float = 1e-3
     disturbance_sigma_s2: float = 2e-6
+    gate: float = CONTRADICTION
 
     def __post_init__(self) -> None:
         check_not_negative(field_error_T=self.field_error_T)
+        if not 0.0 <= self.gate < 1.0:
+            raise ValueError(f"Input gate must be a probability below 1; instead received {self.gate}.")
         check_positive(
             field_bias_sigma_T=self.field_bias_sigma_T,
             gyro_bias_sigma_rad_s=self.gyro_bias_sigma_rad_s,
@@ -238,6 +251,16 @@ class FilterSettings:
             "disturbance": self.disturbance_sigma_s2,
         }
         return np.repeat(np.square([by_state[state] for state in self.sensors.states]), 3)
+
+    @property
+    def open_variance(self) -> FloatArray:
+        """Variances of an error state of which nothing is known, shape (N,)."""
+        return np.concatenate([np.repeat(np.square([0.5 * OPEN_RAD, RATE_RAD_S]), 3), self.start_variance])
+
+    @property
+    def gate_limit(self) -> float:
+        """Largest NIS of a reading that is used, by a χ² of three numbers."""
+        return float(chdtri(3, self.gate)) if self.gate > 0.0 else math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -293,6 +316,8 @@ class AttitudeTracks:
     nis : ndarray, shape (runs, n, 4)
         Normalised innovation squared of star tracker, gyro, magnetometer and Sun sensor, each given those before it;
         NaN where there was no reading. It is a χ² of 3 numbers, of 2 for the Sun sensor.
+    rejected : ndarray of bool, shape (runs, n, 4)
+        Readings that contradicted the estimate and were not used; none of a filter without a gate.
     """
 
     settings: FilterSettings
@@ -303,6 +328,7 @@ class AttitudeTracks:
     disturbance_s2: FloatArray
     covariance: FloatArray
     nis: FloatArray
+    rejected: BoolArray
 
     @property
     def sigma(self) -> FloatArray:

@@ -17,21 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adcs import quaternion
-from adcs.kalman.error_state import FilterSettings, SensorSet, Start
+from adcs.kalman.error_state import OPEN_RAD, RATE_RAD_S, FilterSettings, SensorSet, Start
 from adcs.kalman.mekf import deviations, run_filter
 from adcs.quaternion import cross_matrix, rotate_back
 from adcs.satellite.dynamics import absolute_rate
 from adcs.satellite.telemetry import Record, is_read, part
 from arrays.typing import FloatArray
 
-RATE_RAD_S = math.radians(0.5)
-"""Standard deviation of the rate against the orbital frame, where there is no gyro."""
 AGAIN = 10.0
 """Standard deviations of a start are those of its readings times this: the filter takes the same readings again."""
 KNOWN_RAD = math.radians(75.0)
 """An attitude is known where no axis of its start has a larger standard deviation: 10° by the readings themselves."""
-_OPEN_RAD = 2.0
-"""Standard deviation of an axis of which nothing is known, about that of a uniform turn."""
 
 
 def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = RATE_RAD_S) -> Start:
@@ -57,7 +53,7 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
         q[run] = _aligned(orbital[seen], body[seen], weights[seen])
     seen_star = is_read(readings.star[:, 0]) & used.star
     q[seen_star] = readings.star[seen_star, 0]
-    information = np.tile(np.eye(3) * (2.0 / _OPEN_RAD) ** 2, (runs, 1, 1))
+    information = np.tile(np.eye(3) * (2.0 / OPEN_RAD) ** 2, (runs, 1, 1))
     for seen, v, noise in (
         (seen_field, rotate_back(q, b_orbital), sigma[2]),
         (seen_sun, rotate_back(q, around.sun_orbital[:, 0]), sigma[3]),
@@ -123,7 +119,8 @@ def any_start(
     hypotheses = replace(
         hypotheses, q=quaternion.multiply(start.q[open_runs, None], turn).reshape(-1, 4), w=start.w[repeated]
     )
-    tried = run_filter(part(record, repeated, slice(n)), settings, hypotheses)
+    # Without a gate: how badly a wrong turn fits is what tells it.
+    tried = run_filter(part(record, repeated, slice(n)), replace(settings, gate=0.0), hypotheses)
     best = np.nansum(tried.nis, axis=(1, 2)).reshape(-1, turns).argmin(axis=-1) + turns * np.arange(len(open_runs))
     q, w, covariance = start.q.copy(), start.w.copy(), start.covariance.copy()
     q[open_runs], w[open_runs] = hypotheses.q[best], hypotheses.w[best]

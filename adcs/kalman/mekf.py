@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,11 +24,12 @@ from adcs.kalman.error_state import (
     State,
     optional_of,
 )
+from adcs.kalman.gate.contest import FIELD, GYRO, SUN, Contest, Fit, begun, eased, patience
 from adcs.quaternion import cross_matrix, rotate_back
 from adcs.satellite import dynamics
 from adcs.satellite.sensors import SENSORS
-from adcs.satellite.telemetry import Record, is_read
-from arrays.typing import FloatArray
+from adcs.satellite.telemetry import Record, is_read, part
+from arrays.typing import BoolArray, FloatArray
 
 Jacobian = Callable[[Record, int, FloatArray, FloatArray], FloatArray]
 """F (runs, 6, 6) of attitude and rate from record, row, q (runs, 4) and w (runs, 3)."""
@@ -185,7 +187,7 @@ def joseph_update(P: FloatArray, H: FloatArray, residual: FloatArray) -> tuple[F
 
 
 def corrected(record: Record, row: int, state: State, settings: FilterSettings) -> tuple[State, FloatArray]:
-    """State with the readings of instant ``row``, and NIS (runs, 4); all sensors are linearised at ``state``."""
+    """State with all readings of instant ``row``, without a gate, and NIS (runs, 4); linearised at ``state``."""
     H, residual = stacked_residuals(record, row, state, settings)
     nis = nis_of(H @ state.P @ H.mT + np.eye(H.shape[1]), H, residual, settings.sensors)
     dx, P = joseph_update(state.P, H, residual)
@@ -202,6 +204,108 @@ def with_error(state: State, dx: FloatArray, used: SensorSet) -> State:
     return replace(state, q=quaternion.normalised(q), w=state.w + dx[:, 3:6], **optional)
 
 
+class Hypothesis(NamedTuple):
+    """A state of one run, predicted, with the covariance after some of the readings, and the correction (1, N) by them.
+
+    All readings of an instant are linearised at the predicted state.
+    """
+
+    state: State
+    dx: FloatArray
+    attitude_variance: float  # trace of that of δq, as predicted
+
+    @classmethod
+    def of(cls, state: State, dx: FloatArray) -> Hypothesis:
+        """Hypothesis before the readings of an instant, or before some of them."""
+        return cls(state, dx, float(np.trace(state.P[0, :3, :3])))
+
+    def with_reading(
+        self, record: Record, row: int, settings: FilterSettings, sensor: int
+    ) -> tuple[Hypothesis, Fit] | None:
+        """The hypothesis with one more reading, and how that fits; None where there is no reading."""
+        parts = residuals(record, row, self.state, settings.sensors)
+        residual, rows = next((residual, rows) for place, residual, rows in parts if place == sensor)
+        if not is_read(residual).all():
+            return None
+        sigma = deviations(record, settings)[sensor]
+        H = rows / sigma
+        nu = residual / sigma - (H @ self.dx[..., None])[..., 0]
+        S = H @ self.state.P @ H.mT + np.eye(3)
+        nis = float((nu @ np.linalg.solve(S[0], nu[0]))[0])
+        dx, P = joseph_update(self.state.P, H, nu)
+        around = record.environment
+        model = {FIELD: around.b_orbital_T, SUN: around.sun_orbital}.get(sensor)
+        length = 0.0 if model is None else float(np.linalg.norm(model[0, row]))
+        fit = Fit(nis, eased(nis, sigma**2, length, self.attitude_variance), float(np.linalg.slogdet(S[0])[1]))
+        return self._replace(state=replace(self.state, P=P), dx=self.dx + dx), fit
+
+    def corrected(self, used: SensorSet) -> State:
+        """State with the correction in it."""
+        return with_error(self.state, self.dx, used)
+
+
+class _Readable:
+    """Filter of one run with its gate, instant by instant."""
+
+    def __init__(self, record: Record, settings: FilterSettings, start: Start, jacobian: Jacobian) -> None:
+        self.record, self.settings, self.jacobian = record, settings, jacobian
+        self.main, self.second = first_state(settings, start), None
+        self.contest = Contest(settings, record.dt_s)
+        n = record.momentum_Nms.shape[1]
+        self.nis, self.rejected = np.full((1, n, len(SENSORS)), np.nan), np.zeros((1, n, len(SENSORS)), dtype=np.bool_)
+
+    second: State | None
+
+    def state_of(self, row: int) -> State:
+        """State after the readings of an instant, from that of the instant before."""
+        if row:
+            ahead = self.record, row - 1
+            self.main = predicted(*ahead, self.main, self.settings, self.jacobian)[0]
+            if self.second is not None:
+                self.second = predicted(*ahead, self.second, self.settings, self.jacobian)[0]
+        self._correct(row)
+        return self.main
+
+    def _correct(self, row: int) -> None:
+        settings, used, contest = self.settings, self.settings.sensors, self.contest
+        contest.row = row
+        zero = np.zeros((1, used.size))
+        main = Hypothesis.of(self.main, zero)
+        second = None if self.second is None else Hypothesis.of(self.second, zero)
+        for name in used.sensors.split("+"):
+            sensor = SENSORS.index(name)
+            tried = main.with_reading(self.record, row, settings, sensor)
+            if tried is None:
+                continue
+            with_it, fits = tried
+            other = None if second is None else second.with_reading(self.record, row, settings, sensor)
+            use, use_second = contest.decided(sensor, fits, None if other is None else other[1])
+            self.nis[0, row, sensor], self.rejected[0, row, sensor] = fits.nis, not use
+            if not use and contest.may_begin(sensor, both=self._both(row)):
+                state = begun(self.record, row, main.state, settings, sensor)
+                first = Hypothesis.of(state, main.dx if sensor == GYRO else zero)
+                other, use_second = first.with_reading(self.record, row, settings, sensor), True
+                contest.begin(sensor)
+            contest.read(sensor)
+            main = with_it if use else main
+            second = other[0] if use_second and other is not None else second
+        self.main = main.corrected(used)
+        self.second = None if second is None else second.corrected(used)
+        if self.second is not None:
+            verdict = contest.verdict()
+            if verdict:
+                self.main = self.second
+            if verdict is not None:
+                contest.end(believed=verdict)
+                self.second = None
+
+    def _both(self, row: int) -> bool:
+        """Whether field and Sun are in use, and read at an instant."""
+        used, readings = self.settings.sensors, self.record.readings
+        read = is_read(readings.field_T[0, row]) and is_read(readings.sun[0, row])
+        return used.magnetometer and used.sun and bool(read)
+
+
 def run_readable(
     record: Record,
     settings: FilterSettings,
@@ -213,21 +317,28 @@ def run_readable(
     ``jacobian``: :func:`known_torque_jacobian`, or :func:`closed_loop_jacobian` to reproduce the source paper.
     """
     check_start(record, start)
-    state, nis = corrected(record, 0, first_state(settings, start), settings)
-    states, innovations = [state], [nis]
-    for row in range(record.momentum_Nms.shape[1] - 1):
-        state, _ = predicted(record, row, state, settings, jacobian)
-        state, nis = corrected(record, row + 1, state, settings)
-        states.append(state)
-        innovations.append(nis)
-    return collected(settings, states, np.stack(innovations, axis=1))
+    tracks = []
+    for run in range(len(start.q)):
+        only = np.array([run])
+        begins = Start(start.q[only], start.w[only], start.covariance[only])
+        one = _Readable(part(record, only), settings, begins, jacobian)
+        states = [one.state_of(row) for row in range(record.momentum_Nms.shape[1])]
+        tracks.append(collected(settings, states, one.nis, one.rejected))
+    of_runs = [field.name for field in fields(AttitudeTracks) if field.name != "settings"]
+    joined: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in tracks]) for name in of_runs}
+    return AttitudeTracks(settings, **joined)
 
 
-def collected(settings: FilterSettings, states: list[State], nis: FloatArray) -> AttitudeTracks:
-    """Estimates of the states of all instants."""
-    # A state has the fields of a track, in their order.
-    stacked = [np.stack([getattr(state, one.name) for state in states], axis=1) for one in fields(State)]
-    return AttitudeTracks(settings, *[*stacked, nis])
+def collected(
+    settings: FilterSettings, states: list[State], nis: FloatArray, rejected: BoolArray | None = None
+) -> AttitudeTracks:
+    """Estimates of the states of all instants; a filter without a gate rejects nothing."""
+    tracks: dict[str, Any] = {
+        one.name: np.stack([getattr(state, one.name) for state in states], axis=1) for one in fields(State)
+    }
+    tracks["covariance"] = tracks.pop("P")
+    none = np.zeros(nis.shape, dtype=np.bool_)
+    return AttitudeTracks(settings, **tracks, nis=nis, rejected=none if rejected is None else rejected)
 
 
 def check_start(record: Record, start: Start) -> None:
@@ -253,8 +364,9 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
     check_start(record, start)
     used, first, around = settings.sensors, first_state(settings, start), record.environment
     runs, n = record.momentum_Nms.shape[:2]
-    q, w, optional = np.empty((runs, n, 4)), np.empty((runs, n, 3)), np.zeros((3, runs, n, 3))
+    q, w, optional = np.empty((runs, n, 4)), np.empty((runs, n, 3)), np.zeros((len(STATES), runs, n, 3))
     covariance, nis = np.empty((runs, n, used.size, used.size)), np.full((runs, n, len(SENSORS)), np.nan)
+    rejected = np.zeros(nis.shape, dtype=np.bool_)
     readings = record.readings
     wheels = (record.momentum_Nms, record.wheel_torque_Nm)
     read = (readings.star, readings.gyro_rad_s, readings.field_T, readings.sun, around.sun_orbital)
@@ -262,7 +374,7 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
     over_rows(
         kernel.run,
         runs,
-        kernel.Estimated(q, w, optional, covariance, nis),
+        kernel.Estimated(q, w, optional, covariance, nis, rejected),
         kernel.First(np.ascontiguousarray(first.q), np.ascontiguousarray(first.w), first.P),
         dynamics_compiled.Body.of(record.satellite.body),
         # One layout in memory, for which the kernel is compiled.
@@ -273,7 +385,10 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
             deviations(record, settings),
             np.array([used.first_of(state) for state in STATES]),
             settings.process_variance,
+            settings.open_variance,
+            settings.gate_limit,
+            np.array([patience(sensor, record.dt_s) for sensor in range(len(SENSORS))]),
         ),
         record.dt_s,
     )
-    return AttitudeTracks(settings, q, w, optional[0], optional[1], optional[2], covariance, nis)
+    return AttitudeTracks(settings, q, w, optional[0], optional[1], optional[2], covariance, nis, rejected)

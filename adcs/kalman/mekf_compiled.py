@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adcs.kalman.covariance_compiled import scalar, spread, transition
+from adcs.kalman.gate import contest_compiled as gate
 from adcs.satellite.dynamics_compiled import (
     Body,
     Quaternion,
@@ -29,17 +31,17 @@ from adcs.satellite.dynamics_compiled import (
 from magloc.compilation import compiled
 
 Array = NDArray[np.float64]
-_ALWAYS = 6
 
 
 class Estimated(NamedTuple):
-    """Outputs (R, n, …), optional (3, R, n, 3): biases of field and gyro, disturbance; nis (R, n, 4) at readings."""
+    """Outputs (R, n, …), optional (K, R, n, 3): states of ``STATES``; nis and rejected (R, n, 4) at readings."""
 
     q: Array
     w: Array
     optional: Array
     covariance: Array
     nis: Array
+    rejected: NDArray[np.bool_]
 
 
 class First(NamedTuple):
@@ -63,135 +65,109 @@ class Record(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """Which of star tracker, gyro, magnetometer and Sun sensor are used, and their deviations, (4,) both.
+    """Which of star tracker, gyro, magnetometer and Sun sensor are used, their deviations and patience, (4,).
 
     Biases of field and gyro and the disturbance begin at ``firsts`` in the error state, -1 where there are none.
+    ``variance`` and ``open_variance`` (N,): that a step adds, and of an error state of which nothing is known.
     """
 
     used: NDArray[np.bool_]
     sigma: Array
     firsts: NDArray[np.int64]
     variance: Array
+    open_variance: Array
+    limit: float
+    patience: NDArray[np.int64]
 
 
-@compiled
-def _transition(F: Array, F2: Array, F3: Array, dt: float, Phi: Array, G: Array) -> None:
-    """Φ (6, 6) of attitude and rate and G (6, 3) by a disturbance, from F; ``F2`` and ``F3`` are for work."""
-    for i in range(6):
-        for j in range(6):
-            total = 0.0
-            for k in range(6):
-                total += F[i, k] * F[k, j]
-            F2[i, j] = total
-    for i in range(6):
-        for j in range(6):
-            total = 0.0
-            for k in range(6):
-                total += F2[i, k] * F[k, j]
-            F3[i, j] = total
-    half, sixth = dt * dt / 2.0, dt * dt * dt / 6.0
-    for i in range(6):
-        for j in range(6):
-            one = 1.0 if i == j else 0.0
-            Phi[i, j] = one + dt * F[i, j] + half * F2[i, j] + sixth * F3[i, j]
-        for j in range(3):
-            one = 1.0 if i == 3 + j else 0.0
-            G[i, j] = dt * one + half * F[i, 3 + j] + sixth * F2[i, 3 + j]
+class Hypothesis(NamedTuple):
+    """State (7 + 3K,): attitude, rate and optional states; its covariance (N, N), and the correction by readings (N,).
 
-
-@compiled
-def _spread(Phi: Array, G: Array, d: int, variance: Array, P: Array, T: Array) -> None:
-    """P becomes Φ P Φᵀ + Q; only the first six rows of Φ differ from those of the unit matrix. ``d``: -1 without."""
-    n = P.shape[0]
-    for i in range(_ALWAYS):
-        for j in range(n):
-            T[i, j] = 0.0
-        for k in range(_ALWAYS):
-            factor = Phi[i, k]
-            for j in range(n):
-                T[i, j] += factor * P[k, j]
-        if d >= 0:
-            for k in range(3):
-                factor = G[i, k]
-                for j in range(n):
-                    T[i, j] += factor * P[d + k, j]
-    for i in range(_ALWAYS):
-        for j in range(i + 1):
-            total = 0.0
-            for k in range(_ALWAYS):
-                total += T[i, k] * Phi[j, k]
-            if d >= 0:
-                for k in range(3):
-                    total += T[i, d + k] * G[j, k]
-            P[i, j] = total
-            P[j, i] = total
-        for j in range(_ALWAYS, n):
-            P[i, j] = T[i, j]
-            P[j, i] = T[i, j]
-    for i in range(n):
-        P[i, i] += variance[i]
-
-
-@compiled
-def _scalar(
-    P: Array, dx: Array, a: Vector, first: int, unit: int, residual: float, r: float, u: Array, A: Array
-) -> float:
-    """Update by one scalar whose row has ``a`` from column ``first`` and 1 in column ``unit``; its NIS.
-
-    ``residual`` is that at the predicted state, before any scalar of the instant. ``unit`` is -1 where there is none;
-    ``u`` (n,) and ``A`` (n, n) are for work.
+    ``attitude_variance`` (1,) is the trace of that of δq, as predicted.
+    Readings of an instant are all linearised at the state that was predicted for it.
     """
-    n = P.shape[0]
-    for i in range(n):
-        u[i] = P[first, i] * a[0] + P[first + 1, i] * a[1] + P[first + 2, i] * a[2]
-    s = r
-    nu = residual - a[0] * dx[first] - a[1] * dx[first + 1] - a[2] * dx[first + 2]
-    if unit >= 0:
-        for i in range(n):
-            u[i] += P[unit, i]
-        s += u[unit]
-        nu -= dx[unit]
-    s += a[0] * u[first] + a[1] * u[first + 1] + a[2] * u[first + 2]
-    inverse = 1.0 / s
-    gain = nu * inverse
-    for i in range(n):
-        dx[i] += u[i] * gain
-    # A = (E - Kh) P with K = u/s, then A (E - Kh)ᵀ + K r Kᵀ = A - (A hᵀ - K r) Kᵀ: what is left of a direction that
-    # the reading fixes is not the difference of large numbers.
-    for i in range(n):
-        K = u[i] * inverse
-        for j in range(n):
-            A[i, j] = P[i, j] - K * u[j]
-    for i in range(n):
-        rest = a[0] * A[i, first] + a[1] * A[i, first + 1] + a[2] * A[i, first + 2] - r * u[i] * inverse
-        if unit >= 0:
-            rest += A[i, unit]
-        rest *= inverse
-        for j in range(i + 1):
-            value = A[i, j] - rest * u[j]
-            P[i, j] = value
-            P[j, i] = value
-    return nu * nu * inverse
+
+    x: Array
+    P: Array
+    dx: Array
+    attitude_variance: Array
+
+
+class Work(NamedTuple):
+    """Room of a reading: a row, A (N, N), u (N,), covariance and correction before it, columns of the row."""
+
+    h: Array
+    A: Array
+    u: Array
+    P: Array
+    dx: Array
+    columns: NDArray[np.int64]
+
+
+class Steps(NamedTuple):
+    """Room of a step: matrices (6, 6), G (6, 3) and T (6, N)."""
+
+    F: Array
+    F_after: Array
+    F2: Array
+    F3: Array
+    Phi: Array
+    G: Array
+    T: Array
 
 
 @compiled
-def _three(P: Array, dx: Array, v: Vector, bias: int, residual: Vector, r: float, u: Array, A: Array) -> float:
-    """Update by a direction with rows 2W(v) for the attitude and 1 for its bias; NIS."""
-    nis = _scalar(P, dx, (0.0, -2.0 * v[2], 2.0 * v[1]), 0, bias, residual[0], r, u, A)
-    unit = bias + 1 if bias >= 0 else -1
-    nis += _scalar(P, dx, (2.0 * v[2], 0.0, -2.0 * v[0]), 0, unit, residual[1], r, u, A)
-    unit = bias + 2 if bias >= 0 else -1
-    return nis + _scalar(P, dx, (-2.0 * v[1], 2.0 * v[0], 0.0), 0, unit, residual[2], r, u, A)
+def _copied(P: Array, dx: Array, P_to: Array, dx_to: Array) -> None:
+    for i in range(len(dx)):
+        dx_to[i] = dx[i]
+        for j in range(len(dx)):
+            P_to[i, j] = P[i, j]
 
 
 @compiled
-def _ones(P: Array, dx: Array, first: int, bias: int, residual: Vector, r: float, u: Array, A: Array) -> float:
-    """Update by three components of the state themselves, and of their bias; NIS."""
-    nis = _scalar(P, dx, (1.0, 0.0, 0.0), first, bias, residual[0], r, u, A)
-    unit = bias + 1 if bias >= 0 else -1
-    nis += _scalar(P, dx, (0.0, 1.0, 0.0), first, unit, residual[1], r, u, A)
-    unit = bias + 2 if bias >= 0 else -1
-    return nis + _scalar(P, dx, (0.0, 0.0, 1.0), first, unit, residual[2], r, u, A)
+def _at(x: Array, first: int) -> Vector:
+    return x[first], x[first + 1], x[first + 2]
+
+
+@compiled
+def _with_reading(
+    one: Hypothesis, sensor: int, reading: Array, model: Vector, firsts: NDArray[np.int64], r: float, work: Work
+) -> gate.Fit:
+    """Take a reading into covariance and correction, and keep in ``work`` what they were; how it fits."""
+    x, h, columns = one.x, work.h, work.columns
+    _copied(one.P, one.dx, work.P, work.dx)
+    q, bias, v = quaternion_at(x), -1, model
+    if sensor == 0:
+        residual = error_vector(q, quaternion_at(reading))
+    elif sensor == 1:
+        residual, bias = _minus(_minus(vector_at(reading), _at(x, 4)), _at(x, 10)), firsts[1]
+    else:
+        v = rotate_back(q, model)
+        residual = _minus(vector_at(reading), v)
+        if sensor == 2:
+            residual, bias = _minus(residual, _at(x, 7)), firsts[0]
+    nis, determinant = 0.0, 1.0
+    for j in range(3):
+        if sensor < 2:
+            columns[0], h[0], m = 3 * sensor + j, 1.0, 1
+        else:
+            # Row j of 2W(v).
+            one_on, two_on = (j + 1) % 3, (j + 2) % 3
+            columns[0], h[0] = one_on, -2.0 * v[two_on]
+            columns[1], h[1], m = two_on, 2.0 * v[one_on], 2
+        if bias >= 0:
+            columns[m], h[m] = bias + j, 1.0
+            m += 1
+        squared, s = scalar(one.P, one.dx, h, columns, m, residual[j], r, work.u, work.A)
+        nis, determinant = nis + squared, determinant * (s / r)
+    length = 0.0 if sensor < 2 else np.sqrt(gate.dot(v, v))
+    return nis, gate.eased(nis, r, length, one.attitude_variance[0]), np.log(determinant)
+
+
+@compiled
+def _without_reading(one: Hypothesis, work: Work) -> None:
+    """Undo the last reading."""
+    _copied(work.P, work.dx, one.P, one.dx)
 
 
 @compiled
@@ -200,18 +176,147 @@ def _minus(a: Vector, b: Vector) -> Vector:
 
 
 @compiled
-def _plus(v: Vector, dx: Array, first: int) -> Vector:
-    if first < 0:
-        return v
-    return v[0] + dx[first], v[1] + dx[first + 1], v[2] + dx[first + 2]
+def _put(x: Array, q: Quaternion) -> None:
+    x[0], x[1], x[2], x[3] = q
 
 
 @compiled
-def _with_error(q: Quaternion, dx: Array) -> Quaternion:
+def _correct(one: Hypothesis, firsts: NDArray[np.int64]) -> None:
+    """Put the correction into the state."""
+    x, dx = one.x, one.dx
     squared = dx[0] * dx[0] + dx[1] * dx[1] + dx[2] * dx[2]
     inverse = 1.0 / np.sqrt(max(squared, 1.0))
     delta = (np.sqrt(max(1.0 - squared, 0.0)), dx[0] * inverse, dx[1] * inverse, dx[2] * inverse)
-    return normalised(multiply(q, delta))
+    _put(x, normalised(multiply(quaternion_at(x), delta)))
+    for j in range(3):
+        x[4 + j] += dx[3 + j]
+        for k in range(len(firsts)):
+            if firsts[k] >= 0:
+                x[7 + 3 * k + j] += dx[firsts[k] + j]
+    dx[:] = 0.0
+
+
+@compiled
+def _advance(
+    one: Hypothesis,
+    body: Body,
+    record: Record,
+    around: Surroundings,
+    settings: Settings,
+    place: tuple[int, int],
+    dt: float,
+    work: Steps,
+) -> None:
+    """State and covariance of the instant after ``place``, a run and an instant."""
+    run, i = place
+    x, F, F_after = one.x, work.F, work.F_after
+    q, w = quaternion_at(x), _at(x, 4)
+    k, b_o = vector_at(record.momentum[run, i]), vector_at(around.b_orbital[run, i])
+    error_jacobian(body, q, w, k, around.gravity[run, i], b_o, F)
+    u_k, torque = vector_at(record.wheel_torque[run, i]), applied(body.J, _at(x, 13))
+    orbital_rate, gravity = around.orbital_rate[run, i], around.gravity[run, i]
+    q, w, _ = step(body, q, w, k, u_k, torque, orbital_rate, gravity, b_o, dt)
+    k, b_o = vector_at(record.momentum[run, i + 1]), vector_at(around.b_orbital[run, i + 1])
+    error_jacobian(body, q, w, k, around.gravity[run, i + 1], b_o, F_after)
+    for row in range(6):
+        for column in range(6):
+            F[row, column] = 0.5 * (F[row, column] + F_after[row, column])
+    transition(F, work.F2, work.F3, dt, work.Phi, work.G)
+    spread(work.Phi, work.G, settings.firsts[2], settings.variance, one.P, work.T)
+    _put(x, q)
+    x[4], x[5], x[6] = w
+
+
+@compiled
+def _begin(main: Hypothesis, second: Hypothesis, sensor: int, q: Quaternion, settings: Settings) -> None:
+    """Make the second hypothesis one in which a reading is right, before it."""
+    firsts, variance = settings.firsts, settings.open_variance
+    second.x[:] = main.x
+    _put(second.x, q)
+    if sensor == 1:
+        second.P[:], second.dx[:] = main.P, main.dx
+        for j in range(firsts[1], firsts[1] + 3):
+            second.P[j, :] = 0.0
+            second.P[:, j] = 0.0
+            second.P[j, j] = variance[j]
+    else:
+        second.P[:], second.dx[:] = 0.0, 0.0
+        for j in range(len(variance)):
+            second.P[j, j] = variance[j]
+    _ready(second)
+
+
+@compiled
+def _ready(one: Hypothesis) -> None:
+    """Keep what the attitude's variance is before readings."""
+    one.attitude_variance[0] = one.P[0, 0] + one.P[1, 1] + one.P[2, 2]
+
+
+@compiled
+def _copy(source: Hypothesis, target: Hypothesis) -> None:
+    target.x[:], target.P[:] = source.x, source.P
+
+
+@compiled
+def _reading_of(record: Record, sensor: int, run: int, i: int) -> Array:
+    if sensor == 0:
+        return record.star[run, i]
+    if sensor == 1:
+        return record.gyro[run, i]
+    return record.field[run, i] if sensor == 2 else record.sun[run, i]
+
+
+@compiled
+def _direction(values: Array, used: bool) -> Vector:
+    """A reading, NaN of a sensor that is not in use."""
+    return vector_at(values) if used else (np.nan, np.nan, np.nan)
+
+
+@compiled
+def _take_readings(
+    main: Hypothesis,
+    second: Hypothesis,
+    contest: gate.Contest,
+    record: Record,
+    settings: Settings,
+    models: tuple[Vector, Vector],
+    place: tuple[int, int],
+    out: Estimated,
+    work: Work,
+) -> None:
+    """Readings of an instant, each by whom it belongs to."""
+    run, i = place
+    used, firsts = settings.used, settings.firsts
+    for sensor in range(4):
+        reading = _reading_of(record, sensor, run, i)
+        if not (used[sensor] and np.isfinite(reading[0])):
+            continue
+        model, r = models[1 if sensor == 3 else 0], settings.sigma[sensor] ** 2
+        fit_second = (np.nan, np.nan, np.nan)
+        there = contest.counts[gate.BEGAN] >= 0
+        fit = _with_reading(main, sensor, reading, model, firsts, r, work)
+        out.nis[run, i, sensor] = fit[0]
+        if there:
+            # Decided before it is taken, for there is room to undo one reading only.
+            _without_reading(main, work)
+            fit_second = _with_reading(second, sensor, reading, model, firsts, r, work)
+        use, use_second = gate.decided(contest, sensor, settings.limit, fit, fit_second)
+        if there:
+            if not use_second:
+                _without_reading(second, work)
+            if use:
+                _with_reading(main, sensor, reading, model, firsts, r, work)
+        elif not use:
+            _without_reading(main, work)
+        out.rejected[run, i, sensor] = not use
+        field, sun = _direction(record.field[run, i], used[2]), _direction(record.sun[run, i], used[3])
+        both = np.isfinite(field[0]) and np.isfinite(sun[0])
+        if not use and gate.may_begin(contest, sensor, firsts[1] >= 0, both):
+            star = quaternion_at(record.star[run, i])
+            _begin(main, second, sensor, gate.begun(quaternion_at(main.x), sensor, star, field, sun, *models), settings)
+            _with_reading(second, sensor, reading, model, firsts, r, work)
+            gate.begin(contest, sensor)
+        gate.read(contest, sensor)
 
 
 @compiled
@@ -227,55 +332,35 @@ def run(
     dt: float,
 ) -> None:
     """Filter runs begin to end."""
-    q_out, w_out, optional_out, covariance, nis = out
-    momentum, wheel_torque, star, gyro, field, sun, sun_orbital = record
-    orbital_rate, gravity, b_orbital = around
-    used, sigma, firsts, variance = settings
-    n_rows, N = q_out.shape[1], first.P.shape[1]
-    b_first, g_first, d_first = firsts[0], firsts[1], firsts[2]
-    r_star, r_gyro = sigma[0] * sigma[0], sigma[1] * sigma[1]
-    r_field, r_sun = sigma[2] * sigma[2], sigma[3] * sigma[3]
-    P, T = np.empty((N, N)), np.empty((6, N))
-    F, F_after, F2, F3, Phi = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
-    G, A, dx, u = np.empty((6, 3)), np.empty((N, N)), np.empty(N), np.empty(N)
+    n_rows, N, K = out.q.shape[1], first.P.shape[1], len(settings.firsts)
+    main = Hypothesis(np.empty(7 + 3 * K), np.empty((N, N)), np.empty(N), np.empty(1))
+    second = Hypothesis(np.empty(7 + 3 * K), np.empty((N, N)), np.empty(N), np.empty(1))
+    six = np.empty((5, 6, 6))
+    square, line = np.empty((2, N, N)), np.empty((3, N))
+    steps = Steps(six[0], six[1], six[2], six[3], six[4], np.empty((6, 3)), np.empty((6, N)))
+    work = Work(line[2], square[0], line[0], square[1], line[1], np.empty(N, np.int64))
+    contest = gate.Contest(np.empty(6, np.int64), np.empty((5, 4), np.int64), settings.patience, np.empty(1))
     for run in range(begin, end):
-        q, w = quaternion_at(first.q[run]), vector_at(first.w[run])
-        b_bias, g_bias, d = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
-        P[:] = first.P[run]
+        main.x[:] = 0.0
+        main.x[:4], main.x[4:7], main.P[:] = first.q[run], first.w[run], first.P[run]
+        gate.reset(contest)
         for i in range(n_rows):
             if i > 0:
-                k = vector_at(momentum[run, i - 1])
-                b_o = vector_at(b_orbital[run, i - 1])
-                error_jacobian(body, q, w, k, gravity[run, i - 1], b_o, F)
-                u_k, torque = vector_at(wheel_torque[run, i - 1]), applied(body.J, d)
-                q, w, _ = step(body, q, w, k, u_k, torque, orbital_rate[run, i - 1], gravity[run, i - 1], b_o, dt)
-                k, b_o = vector_at(momentum[run, i]), vector_at(b_orbital[run, i])
-                error_jacobian(body, q, w, k, gravity[run, i], b_o, F_after)
-                for row in range(6):
-                    for column in range(6):
-                        F[row, column] = 0.5 * (F[row, column] + F_after[row, column])
-                _transition(F, F2, F3, dt, Phi, G)
-                _spread(Phi, G, d_first, variance, P, T)
-            dx[:] = 0.0
-            if used[0] and np.isfinite(star[run, i, 0]):
-                residual = error_vector(q, quaternion_at(star[run, i]))
-                nis[run, i, 0] = _ones(P, dx, 0, -1, residual, r_star, u, A)
-            if used[1] and np.isfinite(gyro[run, i, 0]):
-                residual = _minus(_minus(vector_at(gyro[run, i]), w), g_bias)
-                nis[run, i, 1] = _ones(P, dx, 3, g_first, residual, r_gyro, u, A)
-            if used[2] and np.isfinite(field[run, i, 0]):
-                v = rotate_back(q, vector_at(b_orbital[run, i]))
-                residual = _minus(_minus(vector_at(field[run, i]), v), b_bias)
-                nis[run, i, 2] = _three(P, dx, v, b_first, residual, r_field, u, A)
-            if used[3] and np.isfinite(sun[run, i, 0]):
-                v = rotate_back(q, vector_at(sun_orbital[run, i]))
-                nis[run, i, 3] = _three(P, dx, v, -1, _minus(vector_at(sun[run, i]), v), r_sun, u, A)
-            q = _with_error(q, dx)
-            w = _plus(w, dx, 3)
-            b_bias, g_bias, d = _plus(b_bias, dx, b_first), _plus(g_bias, dx, g_first), _plus(d, dx, d_first)
-            q_out[run, i, 0], q_out[run, i, 1], q_out[run, i, 2], q_out[run, i, 3] = q
-            w_out[run, i, 0], w_out[run, i, 1], w_out[run, i, 2] = w
-            optional_out[0, run, i, 0], optional_out[0, run, i, 1], optional_out[0, run, i, 2] = b_bias
-            optional_out[1, run, i, 0], optional_out[1, run, i, 1], optional_out[1, run, i, 2] = g_bias
-            optional_out[2, run, i, 0], optional_out[2, run, i, 1], optional_out[2, run, i, 2] = d
-            covariance[run, i] = P
+                _advance(main, body, record, around, settings, (run, i - 1), dt, steps)
+                if contest.counts[gate.BEGAN] >= 0:
+                    _advance(second, body, record, around, settings, (run, i - 1), dt, steps)
+            contest.counts[gate.ROW] = i
+            models = vector_at(around.b_orbital[run, i]), vector_at(record.sun_orbital[run, i])
+            main.dx[:] = 0.0
+            second.dx[:] = 0.0
+            _ready(main)
+            _ready(second)
+            _take_readings(main, second, contest, record, settings, models, (run, i), out, work)
+            _correct(main, settings.firsts)
+            if contest.counts[gate.BEGAN] >= 0:
+                _correct(second, settings.firsts)
+                if gate.verdict(contest) > 0:
+                    _copy(second, main)
+            out.q[run, i], out.w[run, i], out.covariance[run, i] = main.x[:4], main.x[4:7], main.P
+            for k in range(K):
+                out.optional[k, run, i] = main.x[7 + 3 * k : 10 + 3 * k]

@@ -36,7 +36,7 @@ def smoothed(record: Record, estimates: AttitudeTracks, jacobian: Jacobian = kno
         P = state.P + C @ (later.P - ahead.P) @ C.mT
         later = replace(with_error(state, dx, settings.sensors), P=0.5 * (P + P.mT))
         states.append(later)
-    return collected(settings, states[::-1], estimates.nis)
+    return collected(settings, states[::-1], estimates.nis, estimates.rejected)
 
 
 def difference(state: State, other: State, used: SensorSet) -> FloatArray:

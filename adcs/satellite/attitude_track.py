@@ -47,6 +47,8 @@ class AttitudeTrack:
         Orbital frame from body.
     warnings : tuple of str
         What is degraded or cannot be observed, and for how long.
+    gated : mapping of str to ndarray of bool, shape (n,)
+        Readings of each sensor that contradicted the estimate and were not used; empty for a filter without a gate.
     degraded : mapping of str to ndarray of bool, shape (n,)
         What is there and yet of little use, in words, and where.
 
@@ -70,6 +72,7 @@ class AttitudeTrack:
     nis: Mapping[str, FloatArray] = field(default_factory=dict)
     q_orbital: FloatArray | None = None
     warnings: tuple[str, ...] = ()
+    gated: Mapping[str, BoolArray] = field(default_factory=dict)
     degraded: Mapping[str, BoolArray] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -88,8 +91,11 @@ class AttitudeTrack:
 
     @property
     def rejected(self) -> dict[str, BoolArray]:
-        """Readings that were not used, by sensor, shape (n,): no filter has a gate, so all of sensors not in use."""
-        return {name: seen & (name not in self.used) for name, seen in self.seen.items()}
+        """Readings that were not used, by sensor, shape (n,): those of sensors not in use, and those of the gate."""
+        return {
+            name: seen & (self.gated[name] if name in self.gated and name in self.used else name not in self.used)
+            for name, seen in self.seen.items()
+        }
 
     def __repr__(self) -> str:
         """What ``adcs estimate`` prints, then the warnings."""

@@ -54,6 +54,8 @@ class AttitudeScenario:
         Sizes of the biases at the start.
     field_error_T : float
         Size of the difference between the true field and its model, constant in the orbital frame.
+    wild_share : float
+        Share of the readings of every sensor that are anything at all.
     start_attitude_rad, start_rate_rad_s : float
         Standard deviations, per axis, of attitude and rate from those of the orbital frame.
 
@@ -80,6 +82,7 @@ class AttitudeScenario:
     gyro_bias_rad_s: float = 0.0
     field_bias_T: float = 0.0
     field_error_T: float = 0.0
+    wild_share: float = 0.0
     start_attitude_rad: float = math.radians(1.0)
     start_rate_rad_s: float = math.radians(0.01)
 
@@ -89,6 +92,8 @@ class AttitudeScenario:
                 raise ValueError(f"Input {name} must be positive; instead received {getattr(self, name)}.")
         if not self.dt_s <= self.duration_s < math.inf:
             raise ValueError(f"Input duration_s must be dt_s or more and finite; instead received {self.duration_s}.")
+        if not 0.0 <= self.wild_share <= 1.0:
+            raise ValueError(f"Input wild_share must be 0 to 1; instead received {self.wild_share}.")
         check_not_negative(
             torque_Nm=self.torque_Nm,
             gyro_bias_rad_s=self.gyro_bias_rad_s,

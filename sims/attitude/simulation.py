@@ -18,12 +18,15 @@ from adcs.environment.environment import Environment, environment
 from adcs.environment.orbit import EARTH_RADIUS_M
 from adcs.satellite import dynamics, sensors
 from adcs.satellite.attitude_track import AttitudeTrack
-from adcs.satellite.telemetry import Readings, Record, orbital_from_eci
-from arrays.typing import FloatArray
+from adcs.satellite.telemetry import Readings, Record, is_read, orbital_from_eci
+from arrays.typing import BoolArray, FloatArray
 from sims.attitude.scenario import AttitudeScenario
 from sims.attitude.starts import starts
 from sims.noise import HOUR_S, random_walk, stream
 
+_SENSORS = ("star", "gyro", "field", "sun")
+_WILD_RAD_S, _WILD_T = math.radians(2.0), 30e-6
+"""Standard deviations of a wild reading of a component, of gyro and magnetometer."""
 State = tuple[FloatArray, FloatArray, FloatArray]
 
 
@@ -44,6 +47,7 @@ class Prepared:
     torque_Nm: FloatArray  # (runs, n, 3): disturbing torque in body axes, held from each instant to the next
     gyro_bias_rad_s: FloatArray  # (runs, n, 3)
     field_bias_T: FloatArray  # (runs, n, 3)
+    wild: dict[str, BoolArray]  # (runs, n): readings of ``star``, ``gyro``, ``field`` and ``sun`` that are anything
     noise: dict[str, FloatArray]  # (runs, n, 3): standard normal numbers for ``star``, ``gyro``, ``field`` and ``sun``
 
 
@@ -128,7 +132,8 @@ def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
         torque_Nm=scenario.torque_Nm * _directions(numbers, "torque")[:, None] * wave[:, None],
         gyro_bias_rad_s=_bias(scenario, numbers, "gyro", scenario.gyro_bias_rad_s, satellite.gyro.bias_walk_rad_s),
         field_bias_T=_bias(scenario, numbers, "field", scenario.field_bias_T, satellite.magnetometer.bias_walk_T),
-        noise={name: _normal(numbers, f"{name} noise", n) for name in ("star", "gyro", "field", "sun")},
+        wild={name: _wild(numbers, name, n, scenario.wild_share) for name in _SENSORS},
+        noise={name: _normal(numbers, f"{name} noise", n) for name in _SENSORS},
     )
 
 
@@ -168,13 +173,38 @@ def sense(prepared: Prepared, q: FloatArray, w: FloatArray, rows: slice = slice(
     earth_radius = np.arcsin(np.minimum(1.0, EARTH_RADIUS_M / np.linalg.norm(around.position_eci_m[:, rows], axis=-1)))
     b_body = quaternion.rotate_back(q, prepared.true_field_orbital_T[:, rows])
     noise = {name: numbers[:, rows] for name, numbers in prepared.noise.items()}
-    return Readings(
+    good = Readings(
         star=sensors.star_tracker_readings(satellite.star_tracker, q, w, sun_orbital, earth_radius, lit, noise["star"]),
         gyro_rad_s=sensors.gyro_readings(satellite.gyro, w, prepared.gyro_bias_rad_s[:, rows], noise["gyro"]),
         field_T=sensors.magnetometer_readings(
             satellite.magnetometer, b_body, prepared.field_bias_T[:, rows], noise["field"]
         ),
         sun=sensors.sun_readings(satellite.sun_sensor, quaternion.rotate_back(q, sun_orbital), lit, noise["sun"]),
+    )
+    return _with_wild(prepared, good, rows)
+
+
+def _with_wild(prepared: Prepared, good: Readings, rows: slice) -> Readings:
+    """Readings some of which are anything: any attitude, any direction, any field and rate of a usual size."""
+    if not any(wild.any() for wild in prepared.wild.values()):
+        return good
+
+    def mixed(name: str, values: FloatArray, scale: float | None) -> FloatArray:
+        anything = np.stack(
+            [
+                stream(seed, f"{name} wild reading").standard_normal((prepared.torque_Nm.shape[1], values.shape[-1]))
+                for seed in prepared.seeds
+            ]
+        )[:, rows]
+        anything = anything / np.linalg.norm(anything, axis=-1, keepdims=True) if scale is None else scale * anything
+        replaced = prepared.wild[name][:, rows] & is_read(values)
+        return np.where(replaced[..., None], anything, values)
+
+    return Readings(
+        star=mixed("star", good.star, None),
+        gyro_rad_s=mixed("gyro", good.gyro_rad_s, _WILD_RAD_S),
+        field_T=mixed("field", good.field_T, _WILD_T),
+        sun=mixed("sun", good.sun, None),
     )
 
 
@@ -220,6 +250,11 @@ def _bias(scenario: AttitudeScenario, seeds: list[int], sensor: str, size: float
 def _normal(seeds: list[int], feature: str, n: int) -> FloatArray:
     """Standard normal numbers (runs, n, 3)."""
     return np.stack([stream(seed, feature).standard_normal((n, 3)) for seed in seeds])
+
+
+def _wild(seeds: list[int], sensor: str, n: int, share: float) -> BoolArray:
+    """Which readings (runs, n) are anything."""
+    return np.stack([stream(seed, f"{sensor} wild").random(n) < share for seed in seeds])
 
 
 def _directions(seeds: list[int], feature: str) -> FloatArray:

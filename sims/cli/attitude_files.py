@@ -112,6 +112,7 @@ def dataset_of(parts: Sequence[Part], estimate: EstimatorSettings, title: str) -
     rate, true_rate, sigma_rate = of("rate")
     sigma_attitude = joined(lambda part: sigma_by_state(part.estimates)["attitude"])
     nis = joined(lambda part: part.estimates.nis)
+    rejected = joined(lambda part: part.estimates.rejected.astype(np.float64))
     listed: list[tuple[str, tuple[str, ...], FloatArray, str, str]] = [
         ("q", component, joined(lambda part: part.estimates.q), "1", "attitude, orbital from body"),
         ("q_true", component, joined(lambda part: part.runs.q), "1", "true attitude"),
@@ -120,6 +121,7 @@ def dataset_of(parts: Sequence[Part], estimate: EstimatorSettings, title: str) -
         ("sigma_attitude", axis, sigma_attitude, "rad", "standard deviation of the angle"),
         ("sigma_rate", axis, sigma_rate, "rad/s", "standard deviation of the rate"),
         ("nis", ("run", "time", "sensor"), nis, "1", "normalised innovation squared"),
+        ("rejected", ("run", "time", "sensor"), rejected, "1", "whether a reading contradicted the rest, not used"),
     ]
     for state, units in (("gyro-bias", "rad/s"), ("field-bias", "T"), ("disturbance", "s-2")):
         if state in estimate.settings.sensors.states:

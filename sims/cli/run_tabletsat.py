@@ -65,6 +65,8 @@ def wanted(scenario: str, options: ScenarioOptions, duration_s: float | None) ->
         raise InputError(f"--start-error-deg: found {options.start_error_deg:g}, expected more than 0 and at most 180.")
     if options.field_error_nT is not None and not 0.0 <= options.field_error_nT <= 1e9:
         raise InputError(f"--field-error-nT: found {options.field_error_nT:g}, expected 0 to 1e9.")
+    if options.share is not None and not 0.0 <= options.share < 1.0:
+        raise InputError(f"--share: found {options.share:g}, expected 0 to less than 1.")
     file = file.changed(changes)
     if options.star_noise is not None:
         tables = {**file.tables.get("sensors", {})}
@@ -94,8 +96,8 @@ def run_attitude(
     Parameters
     ----------
     scenario : str
-        Scenario file (TOML), or a built-in scenario: tabletsat, collinearity, eclipse, field-error, one-vector or
-        star-blinded.
+        Scenario file (TOML), or a built-in scenario: tabletsat, collinearity, eclipse, field-error, one-vector,
+        outliers or star-blinded.
     options : ScenarioOptions
         What differs from the scenario file.
     runs : RunOptions
@@ -155,6 +157,9 @@ def summary_lines(file: AttitudeFile, estimate: EstimatorSettings, numbers: dict
             lines.append(f"{words:34s}{number:.3g} {shown.unit}")
     if numbers["worst_deg"] is not None:
         lines.append(f"{'angle, largest while degraded':34s}{numbers['worst_deg']:.3g} °")
+    if numbers["rejected"]:
+        good = f"{numbers['rejected_good']} of them good"
+        lines.append(f"{'readings that are not used':34s}{numbers['rejected']}, {good}")
     lines.append(f"{'NEES / numbers (1 is consistent)':34s}{numbers['nees_per_dimension']:.3g}")
     lines.append(f"{'diverged runs':34s}{numbers['diverged_runs']}")
     return lines

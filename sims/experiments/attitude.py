@@ -59,6 +59,8 @@ class Outcome:
     worst_deg : ndarray, shape (runs,)
         Largest error while something is degraded or not observable, but for the first minute, which is the start's;
         NaN where nothing is.
+    rejected, rejected_good : ndarray of int, shape (runs,)
+        Readings that the filter did not use, and those of them that are not wild.
     warnings : list of list of str
         What can be told of every run without the truth: what is degraded or not observable.
     """
@@ -72,6 +74,8 @@ class Outcome:
     size: int
     late: slice
     worst_deg: FloatArray
+    rejected: NDArray[np.int64]
+    rejected_good: NDArray[np.int64]
     warnings: list[list[str]]
 
     def warning_lines(self) -> list[str]:
@@ -96,6 +100,8 @@ class Outcome:
             "diverged_runs": int(self.diverged.sum()),
             "runs": len(self.seeds),
             "worst_deg": None if np.isnan(self.worst_deg).all() else float(np.nanmax(self.worst_deg)),
+            "rejected": int(self.rejected.sum()),
+            "rejected_good": int(self.rejected_good.sum()),
         }
 
 
@@ -175,7 +181,7 @@ def run_scenario(
         if advance is not None:
             advance(len(outcomes[-1].seeds))
         del part  # or two would be in memory while the next one is made
-    of_runs = ("seeds", "axis_rms", "nees", "nis", "error_deg", "diverged", "worst_deg")
+    of_runs = ("seeds", "axis_rms", "nees", "nis", "error_deg", "diverged", "worst_deg", "rejected", "rejected_good")
     joined: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in outcomes]) for name in of_runs}
     return replace(outcomes[0], **joined, warnings=[texts for one in outcomes for texts in one.warnings])
 
@@ -192,6 +198,7 @@ def outcome_of(part: Part) -> Outcome:
     error_deg = accuracy.error_norm_deg(runs, estimates)
     errors = errors_in_units(part)
     size = estimates.settings.sensors.size
+    wild = np.stack(list(runs.prepared.wild.values()), axis=-1)
     problems, first = problems_of(runs, estimates), round(accuracy.LAST_S / runs.dt_s)
     return Outcome(
         seeds=np.array(runs.prepared.seeds),
@@ -203,6 +210,8 @@ def outcome_of(part: Part) -> Outcome:
         size=size,
         late=late,
         worst_deg=np.array([_worst(*of_run, first) for of_run in zip(error_deg, problems, strict=True)]),
+        rejected=estimates.rejected.sum(axis=(1, 2)),
+        rejected_good=(estimates.rejected & ~wild).sum(axis=(1, 2)),
         warnings=[[problem.text for problem in of_run] for of_run in problems],
     )
 

@@ -52,6 +52,7 @@ class TestBuiltIn:
             "eclipse",
             "field-error",
             "one-vector",
+            "outliers",
             "star-blinded",
             "tabletsat",
         )

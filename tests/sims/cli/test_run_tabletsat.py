@@ -29,6 +29,8 @@ KEYS = [
     "diverged_runs",
     "runs",
     "worst_deg",
+    "rejected",
+    "rejected_good",
 ]
 
 
@@ -127,6 +129,8 @@ class TestNumbers:
             "diverged_runs": 0,
             "runs": 3,
             "worst_deg": None,
+            "rejected": 0,
+            "rejected_good": 0,
         }
         found = run_scenario(file, estimate, range(3)).numbers()
         assert list(found) == list(expected)
@@ -159,6 +163,7 @@ class TestNamedProblems:
             ("star-blinded", "star tracker over-rate"),
             ("star-blinded", "star tracker blinded"),
             ("field-error", "field differs from its model"),
+            ("outliers", "contradict the rest and are not used"),
         ],
     )
     def test_warning(self, adcs, name, words):
@@ -177,6 +182,15 @@ class TestNamedProblems:
         dark = ~part.runs.readings.seen["sun"]
         assert found["worst_deg"] == pytest.approx(outcome.error_deg[dark].max())
         assert found["worst_deg"] > 5.0 * found["angle_rms_deg"]
+
+    def test_wild_readings_are_counted(self, adcs):
+        found = numbers(adcs("run", "outliers", "--json", "--quiet", "--seeds", "2", "--share", "0.1"))
+        file = read_scenario("outliers").changed({"disturbance": {"wild_share": 0.1}})
+        (part,) = parts_of(file, file.estimator("x"), range(2))
+        wild = np.stack(list(part.runs.prepared.wild.values()), axis=-1) & np.isfinite(part.estimates.nis)
+        assert wild.sum() > 300
+        assert found["rejected_good"] == 0
+        assert found["rejected"] == wild.sum()
 
     @pytest.mark.parametrize(
         ("sensors", "states"), [("mag+sun+gyro", "gyro-bias, disturbance"), ("mag+sun", "disturbance")]
@@ -314,6 +328,8 @@ class TestOwnScenario:
             (["--states", "wind"], ["wind", "gyro-bias"]),
             (["--start-error-deg", "-1"], ["--start-error-deg"]),
             (["--field-error-nT", "-1"], ["--field-error-nT"]),
+            (["--share", "1.5"], ["--share", "0 to less than 1"]),
+            (["--share", "nan"], ["--share"]),
             (["--duration", "-5"], ["--duration"]),
             (["--duration", "nan"], ["--duration"]),
         ],

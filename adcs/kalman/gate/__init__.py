@@ -1,0 +1,1 @@
+"""Readings that contradict a filter, and the second hypothesis that they begin."""
