@@ -176,6 +176,7 @@ def _estimator(place: str, table: EstimateTable) -> EstimatorSettings:
                 field_bias_sigma_T=1e-9 * table.field_bias_nT,
                 gyro_bias_sigma_rad_s=math.radians(table.gyro_bias_deg_s),
                 disturbance_sigma_s2=table.disturbance_s2,
+                field_correlation_s=table.field_model_correlation_s,
                 gate=table.gate,
             ),
             filter=table.filter,  # type: ignore[arg-type]

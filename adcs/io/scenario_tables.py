@@ -90,6 +90,7 @@ class DisturbanceTable(Table, kw_only=True):
     gyro_bias_deg_s: NotNegative = 0.0
     field_bias_nT: NotNegative = 0.0
     field_error_nT: NotNegative = 0.0
+    field_error_correlation_s: Annotated[Positive, MAY_BE_INFINITE] = math.inf
     wild_share: Annotated[float, _SHARE] = 0.0
 
 
@@ -177,6 +178,7 @@ class EstimateTable(Table, kw_only=True):
     filter: str = "mekf"
     process_noise: str | dict[str, Any] = "tuned"
     field_model_error_nT: NotNegative = 0.0
+    field_model_correlation_s: Positive = 132.0
     gate: Annotated[float, _SHARE] = CONTRADICTION
     start: str = "near"
     start_error_deg: Positive = 5.0

@@ -102,7 +102,8 @@ def estimate(
         Sensors in use, ``st``, ``gyro``, ``mag`` and ``sun`` with + between them, such as ``"mag+sun+gyro"``; or
         everything that a filter may be told, in place of states and filter too.
     states : iterable of str
-        What is estimated besides attitude and rate: ``gyro-bias``, ``field-bias``, ``disturbance``.
+        What is estimated besides attitude and rate: ``gyro-bias``, ``field-bias``, ``disturbance``,
+        ``field-model``.
     filter : str
         ``mekf``; with its converged gain (``constant-gain``); with a filter of the disturbance beside it
         (``parallel-disturbance``); of attitude and gyro bias alone (``reduced``); with a smoother after it

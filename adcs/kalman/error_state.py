@@ -20,11 +20,18 @@ from arrays.io.errors import check_not_negative, check_positive
 from arrays.typing import BoolArray, FloatArray
 from magloc.levels import CONTRADICTION
 
-ATTRIBUTES = {"field-bias": "field_bias_T", "gyro-bias": "gyro_bias_rad_s", "disturbance": "disturbance_s2"}
+ATTRIBUTES = {
+    "field-bias": "field_bias_T",
+    "gyro-bias": "gyro_bias_rad_s",
+    "disturbance": "disturbance_s2",
+    "field-model": "field_model_T",
+}
 """Optional states in the order of the error state, and what they are called in :class:`State` and its like."""
 STATES = tuple(ATTRIBUTES)
-MEASURED_BY = {"field-bias": "mag", "gyro-bias": "gyro"}
+MEASURED_BY = {"field-bias": "mag", "gyro-bias": "gyro", "field-model": "mag"}
 """States that belong to a sensor: without it they cannot be estimated."""
+FIELD_ERROR_T = 150e-9
+"""Error of a component of a model of the core's field: crust, currents around the Earth, and the model's own."""
 OPEN_RAD = 2.0
 """Standard deviation of an axis of which nothing is known, about that of a uniform turn."""
 RATE_RAD_S = math.radians(0.5)
@@ -37,7 +44,8 @@ ALWAYS = 6
 class SensorSet:
     """Sensors in use and optional states; made by :func:`sensor_set`, which checks them.
 
-    ``star``, ``gyro``, ``magnetometer``, ``sun``: sensors. ``field_bias``, ``gyro_bias``, ``disturbance``: states.
+    ``star``, ``gyro``, ``magnetometer``, ``sun``: sensors. ``field_bias``, ``gyro_bias``, ``disturbance``,
+    ``field_model``: states.
     """
 
     star: bool = False
@@ -47,6 +55,7 @@ class SensorSet:
     field_bias: bool = False
     gyro_bias: bool = False
     disturbance: bool = False
+    field_model: bool = False
 
     @property
     def sensors(self) -> str:
@@ -57,7 +66,7 @@ class SensorSet:
     @property
     def states(self) -> tuple[str, ...]:
         """Names of the optional states."""
-        used = (self.field_bias, self.gyro_bias, self.disturbance)
+        used = (self.field_bias, self.gyro_bias, self.disturbance, self.field_model)
         return tuple(name for name, one in zip(STATES, used, strict=True) if one)
 
     @property
@@ -92,6 +101,7 @@ def sensor_set(sensors: str, states: Iterable[str] = ()) -> SensorSet:
         field_bias="field-bias" in optional,
         gyro_bias="gyro-bias" in optional,
         disturbance="disturbance" in optional,
+        field_model="field-model" in optional,
     )
     check_observable(used)
     return used
@@ -210,7 +220,10 @@ class FilterSettings:
     Attributes
     ----------
     field_error_T : float
-        Standard deviation of each component of the field model's error, added to the magnetometer's noise.
+        Standard deviation of each component of the field model's error: added to the magnetometer's noise, or that of
+        the state ``field-model``, for which :data:`FIELD_ERROR_T` stands in place of 0.
+    field_correlation_s : float
+        Time constant of the state ``field-model``; 1,000 km of a low orbit.
     field_bias_sigma_T, gyro_bias_sigma_rad_s, disturbance_sigma_s2 : float
         Standard deviations of those states at the start, where they are zero.
     gate : float
@@ -224,6 +237,7 @@ class FilterSettings:
     field_bias_sigma_T: float = 1000e-9
     gyro_bias_sigma_rad_s: float = 1e-3
     disturbance_sigma_s2: float = 2e-6
+    field_correlation_s: float = 132.0
     gate: float = CONTRADICTION
 
     def __post_init__(self) -> None:
@@ -234,13 +248,25 @@ class FilterSettings:
             field_bias_sigma_T=self.field_bias_sigma_T,
             gyro_bias_sigma_rad_s=self.gyro_bias_sigma_rad_s,
             disturbance_sigma_s2=self.disturbance_sigma_s2,
+            field_correlation_s=self.field_correlation_s,
         )
 
     @property
-    def process_variance(self) -> FloatArray:
-        """Diagonal of Q, shape (N,)."""
+    def field_model_sigma_T(self) -> float:
+        """Standard deviation of the state ``field-model``."""
+        return self.field_error_T or FIELD_ERROR_T
+
+    def field_decay(self, dt_s: float) -> float:
+        """What a step leaves of the state ``field-model``, an Ornstein-Uhlenbeck process."""
+        return math.exp(-dt_s / self.field_correlation_s)
+
+    def process_variance(self, dt_s: float) -> FloatArray:
+        """Diagonal of Q of a step, shape (N,)."""
         always = [self.noise.attitude, self.noise.rate_rad_s]
-        return np.repeat(np.square([*always, *optional_of(self.noise, self.sensors).values()]), 3)
+        walks = [getattr(self.noise, ATTRIBUTES[state]) for state in self.sensors.states if state != "field-model"]
+        if self.sensors.field_model:
+            walks.append(self.field_model_sigma_T * math.sqrt(1.0 - self.field_decay(dt_s) ** 2))
+        return np.repeat(np.square([*always, *walks]), 3)
 
     @property
     def start_variance(self) -> FloatArray:
@@ -249,6 +275,7 @@ class FilterSettings:
             "field-bias": self.field_bias_sigma_T,
             "gyro-bias": self.gyro_bias_sigma_rad_s,
             "disturbance": self.disturbance_sigma_s2,
+            "field-model": self.field_model_sigma_T,
         }
         return np.repeat(np.square([by_state[state] for state in self.sensors.states]), 3)
 
@@ -287,7 +314,7 @@ class State:
     """Estimate of all runs at one instant.
 
     ``q`` (runs, 4), ``w`` (runs, 3), ``field_bias_T`` (runs, 3), ``gyro_bias_rad_s`` (runs, 3), ``disturbance_s2``
-    (runs, 3): a state that the filter does not have is zero.
+    (runs, 3), ``field_model_T`` (runs, 3, orbital frame): a state that the filter does not have is zero.
     """
 
     q: FloatArray
@@ -295,10 +322,11 @@ class State:
     field_bias_T: FloatArray
     gyro_bias_rad_s: FloatArray
     disturbance_s2: FloatArray
+    field_model_T: FloatArray
     P: FloatArray  # (runs, N, N): covariance of the error state
 
 
-def optional_of(owner: ProcessNoise | State | AttitudeTracks, used: SensorSet) -> dict[str, Any]:
+def optional_of(owner: State | AttitudeTracks, used: SensorSet) -> dict[str, Any]:
     """What belongs to the optional states of a set, by their names."""
     return {state: getattr(owner, ATTRIBUTES[state]) for state in used.states}
 
@@ -309,7 +337,7 @@ class AttitudeTracks:
 
     Attributes
     ----------
-    q, w, field_bias_T, gyro_bias_rad_s, disturbance_s2 : ndarray, shape (runs, n, 4), then (runs, n, 3)
+    q, w, field_bias_T, gyro_bias_rad_s, disturbance_s2, field_model_T : ndarray, shape (runs, n, 4), then (runs, n, 3)
         Attitude (orbital from body), rate against inertial space; a state that the filter does not have is zero.
     covariance : ndarray, shape (runs, n, N, N)
         Of the error state, see :mod:`adcs.kalman.error_state`; δq is half of the angle.
@@ -326,6 +354,7 @@ class AttitudeTracks:
     field_bias_T: FloatArray
     gyro_bias_rad_s: FloatArray
     disturbance_s2: FloatArray
+    field_model_T: FloatArray
     covariance: FloatArray
     nis: FloatArray
     rejected: BoolArray
@@ -354,5 +383,6 @@ class AttitudeTracks:
             self.field_bias_T[:, row],
             self.gyro_bias_rad_s[:, row],
             self.disturbance_s2[:, row],
+            self.field_model_T[:, row],
             self.covariance[:, row],
         )

@@ -49,7 +49,7 @@ def run_reduced(record: Record, settings: FilterSettings, start: Start) -> Attit
             w = 0.5 * (rates[:, row - 1] + rates[:, row]) - bias
             q, Phi = _moved(q, w, record.environment.orbital_rate_rad_s[:, row - 1], h)
             P = Phi @ P @ Phi.mT + Q
-        state = State(q, rates[:, row] - bias, zero, zero, zero, P)
+        state = State(q, rates[:, row] - bias, zero, zero, zero, zero, P)
         H, residual = stacked_residuals(record, row, state, others)
         noise = H @ P @ H.mT + np.eye(H.shape[1])
         nis.append(nis_of(noise, H, residual, others.sensors))

@@ -38,7 +38,8 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
     rad about it. Elsewhere it is wider than the readings by :data:`AGAIN`.
     """
     used, readings, around = settings.sensors, record.readings, record.environment
-    sigma = deviations(record, settings)
+    # An error that is a state of the filter is noise of one instant.
+    sigma = deviations(record, replace(settings, sensors=replace(settings.sensors, field_model=False)))
     b_orbital, b = around.b_orbital_T[:, 0], readings.field_T[:, 0]
     length_T = np.linalg.norm(b_orbital, axis=-1)
     runs = len(b)

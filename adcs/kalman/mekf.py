@@ -42,7 +42,7 @@ def first_state(settings: FilterSettings, start: Start) -> State:
     P[:, :ALWAYS, :ALWAYS] = start.covariance
     P[:, range(ALWAYS, size), range(ALWAYS, size)] = settings.start_variance
     zero = np.zeros((runs, 3))
-    return State(start.q, start.w, zero, zero, zero, P)
+    return State(start.q, start.w, zero, zero, zero, zero, P)
 
 
 def known_torque_jacobian(record: Record, row: int, q: FloatArray, w: FloatArray) -> FloatArray:
@@ -67,8 +67,9 @@ def closed_loop_jacobian(record: Record, row: int, q: FloatArray, w: FloatArray)
     )
 
 
-def transition(F: FloatArray, used: SensorSet, dt_s: float) -> FloatArray:
+def transition(F: FloatArray, settings: FilterSettings, dt_s: float) -> FloatArray:
     """Φ (runs, N, N) of the error state from F (runs, 6, 6) of attitude and rate, to the third order of the step."""
+    used = settings.sensors
     full = np.zeros((len(F), used.size, used.size))
     full[:, :ALWAYS, :ALWAYS] = F
     if used.disturbance:
@@ -76,7 +77,11 @@ def transition(F: FloatArray, used: SensorSet, dt_s: float) -> FloatArray:
         full[:, 3:6, first : first + 3] = np.eye(3)
     step = full * dt_s
     squared = step @ step
-    return np.eye(used.size) + step + squared / 2.0 + squared @ step / 6.0
+    Phi = np.eye(used.size) + step + squared / 2.0 + squared @ step / 6.0
+    if used.field_model:
+        last = range(used.first_of("field-model"), used.first_of("field-model") + 3)
+        Phi[:, last, last] = settings.field_decay(dt_s)
+    return np.asarray(Phi)
 
 
 def moved(record: Record, row: int, state: State) -> tuple[FloatArray, FloatArray]:
@@ -103,19 +108,21 @@ def predicted(
     """State one step after instant ``row`` before its readings, and Φ (runs, N, N)."""
     q, w = moved(record, row, state)
     F = 0.5 * (jacobian(record, row, state.q, state.w) + jacobian(record, row + 1, q, w))
-    Phi = transition(F, settings.sensors, record.dt_s)
-    P = Phi @ state.P @ Phi.mT + np.diag(settings.process_variance)
-    return replace(state, q=q, w=w, P=0.5 * (P + P.mT)), Phi
+    Phi = transition(F, settings, record.dt_s)
+    P = Phi @ state.P @ Phi.mT + np.diag(settings.process_variance(record.dt_s))
+    error_T = settings.field_decay(record.dt_s) * state.field_model_T
+    return replace(state, q=q, w=w, field_model_T=error_T, P=0.5 * (P + P.mT)), Phi
 
 
 def deviations(record: Record, settings: FilterSettings) -> FloatArray:
     """Noise of one component of the readings of star tracker, gyro, magnetometer and Sun sensor, shape (4,)."""
     satellite = record.satellite
+    error_T = 0.0 if settings.sensors.field_model else settings.field_error_T
     return np.array(
         [
             satellite.star_tracker.sigma_rad,
             satellite.gyro.sigma_rad_s,
-            np.hypot(satellite.magnetometer.sigma_T, settings.field_error_T),
+            np.hypot(satellite.magnetometer.sigma_T, error_T),
             satellite.sun_sensor.sigma_rad,
         ]
     )
@@ -143,9 +150,13 @@ def residuals(record: Record, row: int, state: State, used: SensorSet) -> list[t
         residual = readings.gyro_rad_s[:, row] - state.w - state.gyro_bias_rad_s
         parts.append((1, residual, rows(3, np.eye(3), "gyro-bias")))
     if used.magnetometer:
-        b = rotate_back(state.q, around.b_orbital_T[:, row])
+        b = rotate_back(state.q, around.b_orbital_T[:, row] + state.field_model_T)
         residual = readings.field_T[:, row] - b - state.field_bias_T
-        parts.append((2, residual, rows(0, 2.0 * cross_matrix(b), "field-bias")))
+        H = rows(0, 2.0 * cross_matrix(b), "field-bias")
+        if used.field_model:
+            first = used.first_of("field-model")
+            H[..., first : first + 3] = quaternion.matrix(state.q).mT
+        parts.append((2, residual, H))
     if used.sun:
         s = rotate_back(state.q, around.sun_orbital[:, row])
         parts.append((3, readings.sun[:, row] - s, rows(0, 2.0 * cross_matrix(s))))
@@ -384,11 +395,12 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
             np.array([used.star, used.gyro, used.magnetometer, used.sun]),
             deviations(record, settings),
             np.array([used.first_of(state) for state in STATES]),
-            settings.process_variance,
+            settings.process_variance(record.dt_s),
             settings.open_variance,
+            settings.field_decay(record.dt_s),
             settings.gate_limit,
             np.array([patience(sensor, record.dt_s) for sensor in range(len(SENSORS))]),
         ),
         record.dt_s,
     )
-    return AttitudeTracks(settings, q, w, optional[0], optional[1], optional[2], covariance, nis, rejected)
+    return AttitudeTracks(settings, q, w, optional[0], optional[1], optional[2], optional[3], covariance, nis, rejected)

@@ -67,8 +67,9 @@ class Record(NamedTuple):
 class Settings(NamedTuple):
     """Which of star tracker, gyro, magnetometer and Sun sensor are used, their deviations and patience, (4,).
 
-    Biases of field and gyro and the disturbance begin at ``firsts`` in the error state, -1 where there are none.
-    ``variance`` and ``open_variance`` (N,): that a step adds, and of an error state of which nothing is known.
+    Biases of field and gyro, the disturbance and the error of the field model begin at ``firsts`` in the error state,
+    -1 where there are none. ``variance`` and ``open_variance`` (N,): that a step adds, and of an error state of which
+    nothing is known. ``decay``: what a step leaves of the error of the field model.
     """
 
     used: NDArray[np.bool_]
@@ -76,6 +77,7 @@ class Settings(NamedTuple):
     firsts: NDArray[np.int64]
     variance: Array
     open_variance: Array
+    decay: float
     limit: float
     patience: NDArray[np.int64]
 
@@ -137,6 +139,10 @@ def _with_reading(
     x, h, columns = one.x, work.h, work.columns
     _copied(one.P, one.dx, work.P, work.dx)
     q, bias, v = quaternion_at(x), -1, model
+    e = firsts[3] if sensor == 2 else -1
+    if e >= 0:
+        model = model[0] + x[16], model[1] + x[17], model[2] + x[18]
+        axes = rotate_back(q, (1.0, 0.0, 0.0)), rotate_back(q, (0.0, 1.0, 0.0)), rotate_back(q, (0.0, 0.0, 1.0))
     if sensor == 0:
         residual = error_vector(q, quaternion_at(reading))
     elif sensor == 1:
@@ -158,6 +164,10 @@ def _with_reading(
         if bias >= 0:
             columns[m], h[m] = bias + j, 1.0
             m += 1
+        if e >= 0:
+            for k in range(3):
+                columns[m + k], h[m + k] = e + k, axes[k][j]
+            m += 3
         squared, s = scalar(one.P, one.dx, h, columns, m, residual[j], r, work.u, work.A)
         nis, determinant = nis + squared, determinant * (s / r)
     length = 0.0 if sensor < 2 else np.sqrt(gate.dot(v, v))
@@ -222,6 +232,14 @@ def _advance(
         for column in range(6):
             F[row, column] = 0.5 * (F[row, column] + F_after[row, column])
     transition(F, work.F2, work.F3, dt, work.Phi, work.G)
+    e, N = settings.firsts[3], one.P.shape[0]
+    if e >= 0:
+        for j in range(e, e + 3):
+            for column in range(N):
+                one.P[j, column] *= settings.decay
+            for row in range(N):
+                one.P[row, j] *= settings.decay
+            x[16 + j - e] *= settings.decay
     spread(work.Phi, work.G, settings.firsts[2], settings.variance, one.P, work.T)
     _put(x, q)
     x[4], x[5], x[6] = w

@@ -30,14 +30,14 @@ _SENSOR_STYLES = ((style.BLACK, "-"), (style.BLUE, "--"), (style.ORANGE, "-."), 
 class StatesPicture:
     """One run through time.
 
-    ``values`` (n, 15): errors (estimate minus truth) or estimates, in the units of ``adcs``' files; NaN of a state that
+    ``values`` (n, 18): errors (estimate minus truth) or estimates, in the units of ``adcs``' files; NaN of a state that
     is not there.
     """
 
     title: str
     time_s: FloatArray  # (n,)
     values: FloatArray
-    sigma: FloatArray  # (n, 15): standard deviations that the filter gives
+    sigma: FloatArray  # (n, 18): standard deviations that the filter gives
     are_errors: bool  # whether values are errors: their band is around zero
     gaps: Sequence[tuple[str, BoolArray]] = ()  # (n,): what was missing, and whether it was there
 

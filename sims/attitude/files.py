@@ -32,6 +32,7 @@ def simulation_of(file: AttitudeFile) -> AttitudeScenario:
             gyro_bias_rad_s=math.radians(disturbance.gyro_bias_deg_s),
             field_bias_T=1e-9 * disturbance.field_bias_nT,
             field_error_T=1e-9 * disturbance.field_error_nT,
+            field_error_correlation_s=disturbance.field_error_correlation_s,
             wild_share=disturbance.wild_share,
             start_attitude_rad=math.radians(start.attitude_deg),
             start_rate_rad_s=math.radians(start.rate_deg_s),

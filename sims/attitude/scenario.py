@@ -54,6 +54,9 @@ class AttitudeScenario:
         Sizes of the biases at the start.
     field_error_T : float
         Size of the difference between the true field and its model, constant in the orbital frame.
+    field_error_correlation_s : float
+        Time constant with which each component of that difference goes to and fro, ``field_error_T`` then being its
+        standard deviation; infinite = constant.
     wild_share : float
         Share of the readings of every sensor that are anything at all.
     start_attitude_rad, start_rate_rad_s : float
@@ -82,12 +85,13 @@ class AttitudeScenario:
     gyro_bias_rad_s: float = 0.0
     field_bias_T: float = 0.0
     field_error_T: float = 0.0
+    field_error_correlation_s: float = math.inf
     wild_share: float = 0.0
     start_attitude_rad: float = math.radians(1.0)
     start_rate_rad_s: float = math.radians(0.01)
 
     def __post_init__(self) -> None:
-        for name in ("dt_s", "torque_period_s"):
+        for name in ("dt_s", "torque_period_s", "field_error_correlation_s"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"Input {name} must be positive; instead received {getattr(self, name)}.")
         if not self.dt_s <= self.duration_s < math.inf:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import signal
 
 from adcs import quaternion
 from adcs.environment.environment import Environment, environment
@@ -89,6 +90,7 @@ class AttitudeRuns(Record):
             "field-bias": self.prepared.field_bias_T,
             "gyro-bias": self.prepared.gyro_bias_rad_s,
             "disturbance": self.prepared.torque_Nm @ self.satellite.body.inverse,
+            "field-model": self.prepared.true_field_orbital_T - self.environment.b_orbital_T,
         }
 
     def error_deg(self, track: AttitudeTrack) -> FloatArray:
@@ -117,7 +119,6 @@ def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
     time_s = scenario.dt_s * np.arange(n)
     satellite = scenario.satellite
     around = environment(satellite.orbit, starts(scenario, numbers), time_s, model=satellite.field_model)
-    error_T = scenario.field_error_T * _directions(numbers, "field error")
     q = quaternion.exp(scenario.start_attitude_rad * _normal(numbers, "start attitude", 1)[:, 0])
     w_relative = scenario.start_rate_rad_s * _normal(numbers, "start rate", 1)[:, 0]
     wave = np.cos(2.0 * math.pi * time_s / scenario.torque_period_s)
@@ -125,7 +126,7 @@ def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
         scenario=scenario,
         seeds=tuple(numbers),
         environment=around,
-        true_field_orbital_T=around.b_orbital_T + error_T[:, None],
+        true_field_orbital_T=around.b_orbital_T + _field_error(scenario, numbers),
         q=q,
         w=dynamics.absolute_rate(q, w_relative, around.orbital_rate_rad_s[:, 0]),
         momentum_Nms=np.zeros((len(numbers), 3)),
@@ -250,6 +251,18 @@ def _bias(scenario: AttitudeScenario, seeds: list[int], sensor: str, size: float
 def _normal(seeds: list[int], feature: str, n: int) -> FloatArray:
     """Standard normal numbers (runs, n, 3)."""
     return np.stack([stream(seed, feature).standard_normal((n, 3)) for seed in seeds])
+
+
+def _field_error(scenario: AttitudeScenario, seeds: list[int]) -> FloatArray:
+    """True field minus its model (runs, n, 3), orbital frame: constant, or an Ornstein-Uhlenbeck process."""
+    if math.isinf(scenario.field_error_correlation_s):
+        return np.repeat(
+            scenario.field_error_T * _directions(seeds, "field error")[:, None], scenario.n_instants, axis=1
+        )
+    decay = math.exp(-scenario.dt_s / scenario.field_error_correlation_s)
+    noise = _normal(seeds, "field error", scenario.n_instants)
+    noise[:, 1:] *= math.sqrt(1.0 - decay**2)
+    return scenario.field_error_T * np.asarray(signal.lfilter([1.0], [1.0, -decay], noise, axis=1))
 
 
 def _wild(seeds: list[int], sensor: str, n: int, share: float) -> BoolArray:

@@ -143,6 +143,7 @@ _COLUMNS = (
     ("gyro_bias_rms_deg_s", "Δω [°/s]"),
     ("field_bias_rms_nT", "Δb [nT]"),
     ("disturbance_rms_s2", "d [1/s²]"),
+    ("field_model_rms_nT", "e [nT]"),
     ("nees_per_dimension", "NEES/n"),
     ("diverged_runs", "diverged"),
 )

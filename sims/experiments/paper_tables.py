@@ -68,7 +68,7 @@ def _paper_rows() -> Iterator[PaperRow]:
                 label=row["set"],
                 sensors=row["sensors"],
                 states=tuple(row["states"].split("+")) if row["states"] else (),
-                numbers={quantity: printed(row[quantity]) for quantity in QUANTITIES.values() if row[quantity]},
+                numbers={quantity: printed(row[quantity]) for quantity in QUANTITIES.values() if row.get(quantity)},
                 filter=cast(Filter, row["filter"]),
                 duration_s=float(row["duration_s"]),
                 note=row["note"],
@@ -134,8 +134,8 @@ def compared_with_paper(row: PaperRow, seeds: Sequence[int], duration_s: float |
         last.append(in_units(sigma_by_state(part.estimates))[:, -1])
 
     outcome = run_scenario(file, file.estimator(file.path), seeds, look=look)
-    sigma = np.concatenate(last).reshape(-1, 5, 3).max(axis=2).mean(axis=0)
-    rms = outcome.axis_rms.mean(axis=0).reshape(5, 3).max(axis=1)
+    sigma = np.concatenate(last).reshape(len(seeds), -1, 3).max(axis=2).mean(axis=0)
+    rms = outcome.axis_rms.mean(axis=0).reshape(-1, 3).max(axis=1)
     found = []
     for place, (state, shown) in enumerate(SHOWN.items()):
         quantity = QUANTITIES[state]

@@ -39,6 +39,7 @@ from adcs.kalman.mekf import (
 from adcs.kalman.smoother import difference
 from adcs.satellite import dynamics
 from adcs.satellite.sensors import StarTracker
+from magloc.chi_square import normalised_square
 from magloc.kalman import sequential_update, symmetric_square_root
 from sims.attitude.scenario import AttitudeScenario, StartConditions
 from sims.attitude.simulation import AttitudeRuns, advance, prepare, sense, simulate
@@ -62,6 +63,7 @@ from tests.calls import calls_of
 Array = NDArray[np.float64]
 Update = Callable[[Array, Array, Array], tuple[Array, Array]]
 ALL = ("st+gyro+mag+sun", ("field-bias", "gyro-bias", "disturbance"))
+EVERYTHING = (ALL[0], (*ALL[1], "field-model"))
 
 
 def filtered(sensors: str, states: tuple[str, ...], duration_s: float) -> tuple[AttitudeRuns, AttitudeTracks]:
@@ -83,7 +85,7 @@ def runs() -> AttitudeRuns:
 def state(runs: AttitudeRuns) -> State:
     rng = np.random.default_rng(2)
     return replace(
-        first_state(settings(*ALL), start_of(runs)),
+        first_state(settings(*EVERYTHING), start_of(runs)),
         q=random_attitudes(6, rng),
         w=0.02 * rng.standard_normal((6, 3)),
         disturbance_s2=1e-6 * rng.standard_normal((6, 3)),
@@ -94,10 +96,10 @@ class TestJacobians:
     """Central differences at a random state, step 1e-4."""
 
     STEP = 1e-4
-    CHOSEN = settings(*ALL)
+    CHOSEN = settings(*EVERYTHING)
 
     def perturbed(self, state: State, column: int, sign: float, size: float) -> State:
-        dx = np.zeros((6, 15))
+        dx = np.zeros((6, 18))
         dx[:, column] = sign * size
         return with_error(state, dx, self.CHOSEN.sensors)
 
@@ -107,8 +109,8 @@ class TestJacobians:
         runs = replace(runs, readings=replace(runs.readings, star=star))
         # Angles and rates in steps of 1e-4, the field's bias in steps of 1e-9 T.
         for sensor, _, H in residuals(runs, 3, state, self.CHOSEN.sensors):
-            for column in range(15):
-                size = 1e-9 if 6 <= column < 9 else self.STEP
+            for column in range(18):
+                size = 1e-9 if 6 <= column < 9 or column >= 15 else self.STEP
                 at = [
                     residuals(runs, 3, self.perturbed(state, column, sign, size), self.CHOSEN.sensors)
                     for sign in (1.0, -1.0)
@@ -132,22 +134,23 @@ class TestJacobians:
         third power: its difference to scipy's exponential is less than the fourth.
         """
         ahead, Phi = predicted(runs, 3, state, self.CHOSEN)
-        ends = np.zeros((2, 6, 15, 15))
+        ends = np.zeros((2, 6, 18, 18))
+        ends[:, :, 15:, 15:] = -np.eye(3) / self.CHOSEN.field_correlation_s
         ends[0, :, :6, :6] = known_torque_jacobian(runs, 3, state.q, state.w)
         ends[1, :, :6, :6] = known_torque_jacobian(runs, 4, ahead.q, ahead.w)
-        ends[:, :, 3:6, 12:] = np.eye(3)
+        ends[:, :, 3:6, 12:15] = np.eye(3)
         mean = 0.5 * (ends[0] + ends[1])
         fourth = np.linalg.matrix_power(np.abs(mean), 4).max() / 24.0
         np.testing.assert_allclose(Phi, expm(mean), rtol=0, atol=1.1 * fourth)
         exact = expm(mean + (ends[1] @ ends[0] - ends[0] @ ends[1]) / 12.0)
-        for column in range(15):
+        for column in range(18):
             one, other = (self.after(runs, self.perturbed(state, column, sign, self.STEP)) for sign in (1.0, -1.0))
             measured = (self.error(ahead, one) - self.error(ahead, other)) / (2.0 * self.STEP)
             np.testing.assert_allclose(measured, exact[..., column], rtol=0, atol=3e-6)
 
     def after(self, runs: AttitudeRuns, state: State) -> State:
         q, w = moved(runs, 3, state)
-        return replace(state, q=q, w=w)
+        return replace(state, q=q, w=w, field_model_T=self.CHOSEN.field_decay(runs.dt_s) * state.field_model_T)
 
     def error(self, state: State, other: State) -> Array:
         return difference(other, state, self.CHOSEN.sensors)
@@ -207,7 +210,7 @@ class TestUpdates:
 
 
 class TestCompiledTwin:
-    @pytest.mark.parametrize(("sensors", "states"), [*TABLE_3, ALL])
+    @pytest.mark.parametrize(("sensors", "states"), [*TABLE_3, ALL, EVERYTHING])
     def test_agrees(self, sensors: str, states: tuple[str, ...]) -> None:
         chosen = settings(sensors, states)
         runs, start = runs_for(chosen.sensors, 60.0, range(3))
@@ -216,7 +219,13 @@ class TestCompiledTwin:
             getattr(runs.readings, name)[:, 10 + i : 40 : 7] = np.nan
         fast, slow = run_filter(runs, chosen, start), run_readable(runs, chosen, start)
         np.testing.assert_allclose(fast.q, slow.q, rtol=0, atol=1e-13)
-        for name, scale in (("w", 1e-3), ("field_bias_T", 1e-6), ("gyro_bias_rad_s", 1e-3), ("disturbance_s2", 1e-6)):
+        for name, scale in (
+            ("w", 1e-3),
+            ("field_bias_T", 1e-6),
+            ("gyro_bias_rad_s", 1e-3),
+            ("disturbance_s2", 1e-6),
+            ("field_model_T", 1e-6),
+        ):
             np.testing.assert_allclose(getattr(fast, name), getattr(slow, name), rtol=0, atol=1e-10 * scale)
         by_deviations = slow.sigma[..., :, None] * slow.sigma[..., None, :]
         np.testing.assert_allclose(fast.covariance / by_deviations, slow.covariance / by_deviations, rtol=0, atol=1e-9)
@@ -429,6 +438,48 @@ class TestConsistency:
         self.check(sensors, states, range(100))
 
 
+class TestFieldModel:
+    """An error of the field model that lasts: a state, not noise."""
+
+    STATES = ("gyro-bias", "disturbance", "field-model")
+
+    def runs(self, field_error_T: float) -> AttitudeRuns:
+        scenario = replace(tabletsat(4000.0), conditions=ANY_START, gyro_bias_rad_s=GYRO_BIAS_RAD_S)
+        return simulate(replace(scenario, field_error_T=field_error_T, field_error_correlation_s=132.0), SEEDS)
+
+    def attitude_nees(self, runs: AttitudeRuns, chosen: FilterSettings) -> float:
+        estimates = run_filter(runs, chosen, start_of(runs))
+        covariance = estimates.covariance[:, 1000:, :3, :3]
+        error = quaternion.error_vector(estimates.q, runs.q)[:, 1000:]
+        return float(normalised_square(error, covariance).mean() / 3.0)
+
+    @pytest.mark.parametrize("field_error_T", [150e-9, 400e-9])
+    def test_sigma_is_honest(self, field_error_T: float) -> None:
+        """Even where its size or its time constant is half or twice what the filter believes."""
+        runs = self.runs(field_error_T)
+        right = replace(settings("mag+sun+gyro", self.STATES), field_error_T=field_error_T)
+        assert 0.7 < self.attitude_nees(runs, right) < 1.4
+        for factor in (0.5, 2.0):
+            assert 0.6 < self.attitude_nees(runs, replace(right, field_correlation_s=132.0 * factor)) < 1.6
+        ignored = settings("mag+sun+gyro", self.STATES[:2])
+        for wrong in (ignored, replace(ignored, field_error_T=field_error_T)):
+            assert self.attitude_nees(runs, wrong) > 4.0
+
+    def test_nothing_is_lost_where_there_is_none(self) -> None:
+        runs = self.runs(0.0)
+        chosen = replace(settings("mag+sun+gyro", self.STATES), field_error_T=1e-12)
+        assert 0.7 < self.attitude_nees(runs, chosen) < 1.4
+
+    def test_transition(self, runs: AttitudeRuns) -> None:
+        """The variance stays what it is, and the state decays."""
+        chosen = replace(settings("mag+sun", ["field-model"]), field_error_T=2e-7, field_correlation_s=50.0)
+        state = replace(first_state(chosen, start_of(runs)), field_model_T=np.full((6, 3), 1e-7))
+        after, Phi = predicted(runs, 0, state, chosen)
+        np.testing.assert_allclose(after.field_model_T, 1e-7 * math.exp(-1.0 / 50.0))
+        np.testing.assert_allclose(np.diagonal(after.P[:, 6:, 6:], axis1=1, axis2=2), 4e-14)
+        np.testing.assert_allclose(Phi[:, 6:, 6:], np.tile(math.exp(-1.0 / 50.0) * np.eye(3), (6, 1, 1)))
+
+
 class TestProblems:
     def test_nothing_is_wrong(self) -> None:
         for sensors in ("st+gyro", "mag+sun+gyro", "mag+sun"):
@@ -529,6 +580,7 @@ class TestAccuracy:
             runs.w - 1e-4,
             zero,
             runs.prepared.gyro_bias_rad_s,
+            zero,
             zero,
             covariance,
             np.zeros((3, 101, 4)),

@@ -25,6 +25,7 @@ KEYS = [
     "gyro_bias_rms_deg_s",
     "field_bias_rms_nT",
     "disturbance_rms_s2",
+    "field_model_rms_nT",
     "nees_per_dimension",
     "diverged_runs",
     "runs",
@@ -44,7 +45,7 @@ def numbers(outcome):
 class TestNumbers:
     def test_keys_and_nulls(self, adcs):
         found = numbers(adcs("run", "tabletsat", "--json", "--seeds", "2", "--sensors", "st"))
-        assert [key for key in KEYS if found[key] is None] == [*KEYS[2:5], "worst_deg"]
+        assert [key for key in KEYS if found[key] is None] == [*KEYS[2:6], "worst_deg"]
         assert (found["runs"], found["diverged_runs"]) == (2, 0)
 
     def test_runs_is_seeds_and_they_count_from_seed(self, adcs):
@@ -125,6 +126,7 @@ class TestNumbers:
             "gyro_bias_rms_deg_s": worst[2],
             "field_bias_rms_nT": None,
             "disturbance_rms_s2": None,
+            "field_model_rms_nT": None,
             "nees_per_dimension": nees,
             "diverged_runs": 0,
             "runs": 3,
