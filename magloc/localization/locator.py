@@ -95,7 +95,7 @@ class Locator:
         self._search: SingleSourceSearch | MultiSourceSearch | MomentSearch
         if position_m is not None:
             self._search, self._fewest = MomentSearch(array, position_m, prior=prior), 3
-        elif sources == 1 and not array.channel_is_scalar.any():
+        elif sources == 1 and not array.channel_is_scalar.any() and prior.known_moment_Am2 is None:
             self._search, self._fewest = SingleSourceSearch(array, prior=prior), 6
         else:
             number = None if sources == "auto" else int(sources)

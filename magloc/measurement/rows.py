@@ -12,6 +12,7 @@ from arrays.array import SensorArray
 from arrays.noise import reading_covariance
 from arrays.typing import BoolArray, FloatArray, IntArray
 from arrays.whitening import Whitening, whitening, whitenings
+from magloc.measurement.known_moment import KnownMoment
 from magloc.measurement.whitened import WhitenedModel
 
 NO_SIGNAL = "the sensors' readings do not differ: no signal"
@@ -54,6 +55,10 @@ class WhitenedRows:
             model=self.model.rows(at),
             y=self.y[at],
         )
+
+    def knowing(self, moment: KnownMoment | None) -> WhitenedRows:
+        """The same where the moment of every source is known."""
+        return replace(self, model=replace(self.model, known=moment)) if moment is not None else self
 
     @property
     def silent(self) -> BoolArray:

@@ -161,7 +161,9 @@ class Fixes(Sequence[Fix]):
         """Whether χ² is far beyond noise (n,)."""
         result = np.zeros(len(self), dtype=bool)
         begin = self._edges[:-1][self.solved]
-        result[self.solved] = is_misfit(self.solutions.chi2[begin], self.solutions.dof[begin])
+        every = self.solutions
+        chi2, dof = every.chi2 + every.known_chi2, every.dof + every.n_known
+        result[self.solved] = is_misfit(chi2[begin], dof[begin])
         return result
 
     @classmethod

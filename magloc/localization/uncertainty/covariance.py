@@ -34,6 +34,7 @@ from magloc.localization.uncertainty.moment_covariance import moment_covariances
 from magloc.localization.uncertainty.range_interval import relative_range_sigma, union
 from magloc.localization.uncertainty.range_profile import profile_stretches, ranges_within
 from magloc.localization.uncertainty.range_profile_compiled import profile_rows
+from magloc.measurement.whitened import WhitenedModel
 from magloc.measurement.whitened_compiled import ModelRows
 
 # By how much the rise of χ² at one standard deviation may differ from one where errors are Gaussian.
@@ -62,19 +63,23 @@ def solutions_of(optima: Optima, energy: FloatArray, detected: BoolArray) -> Sol
         known = _of_one(optima, energy)
     else:
         known = _of_several(optima, detected)
+    moments = model.known.residual(moment) if model.known is not None else np.empty((n_fits, 0))
+    of_moments = np.sum(moments**2, axis=1)
     every = Solutions(
         of_row=of_row,
         n_sources=np.full(n_fits, n_sources),
         position_m=position,
         moment_Am2=moment,
         covariance=known.covariance,
-        chi2=fits.chi2,
+        chi2=fits.chi2 - of_moments,
         dof=np.full(n_fits, optima.dof),
         weight=known.weight,
         iterations=fits.iterations,
         ranges=known.ranges,
         gaussian=known.gaussian,
         merged=np.full((n_fits, n_sources), optima.merged),
+        known_chi2=of_moments,
+        n_known=np.full(n_fits, moments.shape[1]),
     )
     determined = np.asarray(np.isfinite(known.covariance).all(axis=(1, 2)))
     return every if determined.all() else every.chosen(determined)
@@ -87,14 +92,15 @@ def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray)
     axis, to either side: not where the errors follow a curve. With no degrees of freedom every χ² is as it must be.
     """
     fits, of_row = optima.fits.rows(which), optima.of_row[which]
-    problem, y, dof = optima.rows.model.rows(of_row), optima.rows.y[of_row], optima.dof
+    problem, y = optima.rows.model.rows(of_row), optima.rows.y[of_row]
+    dof = optima.dof + (0 if problem.known is None else fits.n_sources * problem.known.n_known)
     position, moment = problem.position(fits.q), problem.moment(fits.q, fits.mu)
     axis = longest_axes(covariance, position - problem.centroid, moment).reshape(*position.shape[:2], 2, 3)
     described = chdtrc(dof, fits.chi2) >= MISFIT if dof > 0 else np.ones(len(y), dtype=bool)
     for side in (axis, -axis):
         q = problem.homogeneous(position + side[:, :, 0])
         mu = problem.scaled_moment(q, moment + side[:, :, 1])
-        residual = y - problem.predicted(problem.source_fields(q, mu))
+        residual = problem.residual(y, q, mu, problem.source_fields(q, mu))
         described &= np.abs(np.sum(residual**2, axis=1) - fits.chi2 - 1.0) <= _BEND
     return np.asarray(described)
 
@@ -112,7 +118,7 @@ def _of_one(optima: Optima, energy: FloatArray) -> _Known:
 
     q, mu, chi2 = table(fits.q[:, 0], np.nan), table(fits.mu[:, 0], np.nan), table(fits.chi2, np.inf)
     offset, moment = model.position(q) - model.centroid, model.moment(q, mu)
-    compiled = not model.channel_is_scalar.any()
+    compiled = not model.channel_is_scalar.any() and model.known is None
     if compiled:
         counts = np.bincount(of_row, minlength=n_rows)[:, None]
         scaled = np.full((*shape, 6, 6), np.nan)
@@ -121,7 +127,7 @@ def _of_one(optima: Optima, energy: FloatArray) -> _Known:
         covariance = scaled * np.outer(unit, unit)
     else:
         covariance = table(covariances(model.rows(of_row), fits), np.nan)
-    rivals = Rivals.of(chi2, covariance, offset, moment, energy, rows.n_differences)
+    rivals = Rivals.of(chi2, covariance, offset, moment, energy, rows.n_differences, _scale_m(model))
     alpha = np.full((*shape, 2), np.nan)
     if compiled:
         over_rows(profile_rows, n_rows, rows.y, rivals.rise, ModelRows.of(model), q, chi2, counts, scaled, alpha)
@@ -138,6 +144,11 @@ def _of_one(optima: Optima, energy: FloatArray) -> _Known:
     if claimed.size:
         gaussian[claimed] = covariance_is_valid(optima, covariance[at][claimed], claimed)
     return _Known([(ranges.sets[row],) for row in of_row], ranges.covariance[at], gaussian[:, None], rivals.weight[at])
+
+
+def _scale_m(model: WhitenedModel) -> float | None:
+    """A length in whose units positions are uniform, where the moment is known and gives one."""
+    return model.radius if model.known is not None else None
 
 
 def _of_several(optima: Optima, detected: BoolArray) -> _Known:
@@ -162,7 +173,7 @@ def _of_several(optima: Optima, detected: BoolArray) -> _Known:
         for of_fit, intervals in zip(sets, of_source, strict=True):
             of_fit.append(intervals)
     chi2 = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2, np.inf)
-    weight = _weights_of_rows(of_row, chi2, log_evidence_volume(covariance, moment, offset))
+    weight = _weights_of_rows(of_row, chi2, log_evidence_volume(covariance, moment, offset, scale_m=_scale_m(model)))
     gaussian &= (weight >= CERTAIN_WEIGHT)[:, None]
     claimed = np.flatnonzero(gaussian.any(axis=1))
     gaussian[claimed] &= covariance_is_valid(optima, covariance[claimed], claimed)[:, None]
