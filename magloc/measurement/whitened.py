@@ -153,6 +153,22 @@ class WhitenedModel(ScaledSensors):
         free: FloatArray = columns - self.basis @ common
         return free if channels.ndim == 3 else free[..., 0]
 
+    def marginalised(self, columns: FloatArray) -> WhitenedModel:
+        """The same where errors of unit variance along columns (b, C, n), in units of the noise, count as noise."""
+        flat = self.shrinkage >= 1.0
+        unknown = self.basis * flat[:, None]
+        with np.errstate(divide="ignore"):
+            variance = np.where(flat, 0.0, 1.0 / (1.0 - self.shrinkage) ** 2 - 1.0)
+        known = self.basis * np.sqrt(variance)[:, None]
+        free = columns - unknown @ (unknown.transpose(0, 2, 1) @ columns)
+        every = free if flat.all() else np.concatenate([known, free], axis=2)
+        basis, singular, _ = np.linalg.svd(every, full_matrices=False)
+        return replace(
+            self,
+            basis=np.concatenate([unknown, basis], axis=2),
+            shrinkage=np.concatenate([flat.astype(np.float64), 1.0 - 1.0 / np.sqrt(1.0 + singular**2)], axis=1),
+        )
+
     def source_fields(self, q: FloatArray, mu: FloatArray) -> FloatArray:
         """Field of all sources (b, K, ...) at the sensors: (b, N, 3) [T]."""
         n, inverse3 = self._directions(q)

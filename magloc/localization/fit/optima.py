@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.localization.fit.gauss_newton import JointFits
@@ -38,6 +40,20 @@ class Optima:
     failed_starts: IntArray | int = 0
     position_m: FloatArray | None = None
     undetermined: str = UNDETERMINED
+
+    def chosen(self, which: BoolArray) -> Optima:
+        """Those of some of the rows (b,)."""
+        kept = which[self.of_row]
+        return replace(
+            self,
+            rows=self.rows.chosen(which),
+            fits=self.fits.rows(kept),
+            of_row=(np.cumsum(which) - 1)[self.of_row[kept]],
+            reason=[reason for reason, chosen in zip(self.reason, which, strict=True) if chosen],
+            merged=np.broadcast_to(self.merged, self.fits.mu.shape[:2])[kept],
+            failed_starts=np.broadcast_to(self.failed_starts, which.shape)[which],
+            position_m=None if self.position_m is None else self.position_m[which],
+        )
 
     @property
     def dof(self) -> int:

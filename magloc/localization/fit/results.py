@@ -180,6 +180,8 @@ class Fix:
     failed_starts : int
         Starts of the search that ended without an optimum.
     time_s : float
+    body_length_m : float
+        Length of the object that was taken into account, said or assumed [m]; 0 for a point.
 
     Examples
     --------
@@ -198,6 +200,7 @@ class Fix:
     too_near: bool = False
     failed_starts: int = 0
     time_s: float = math.nan
+    body_length_m: float = 0.0
 
     @property
     def best(self) -> Solution:

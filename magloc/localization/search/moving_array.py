@@ -78,6 +78,7 @@ def stacked_rows(
         available.ravel(),
         readings_T.reshape(1, -1),
         model,
+        raw[None],
         model.whitened(raw[None]),
         sum(w.n_differences for w in whitenings),
     )

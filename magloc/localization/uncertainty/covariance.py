@@ -15,11 +15,11 @@ from scipy.special import chdtrc
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.compilation import over_rows
 from magloc.fields.dipole import MU0_OVER_4PI
-from magloc.levels import CERTAIN_WEIGHT, MISFIT
+from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95, MISFIT
 from magloc.localization.fit.columns import Solutions
 from magloc.localization.fit.gauss_newton import covariances
 from magloc.localization.fit.optima import Optima
-from magloc.localization.fit.results import EVERYWHERE, Intervals, is_observable_set, span
+from magloc.localization.fit.results import EVERYWHERE, Intervals, is_misfit, is_observable_set, span
 from magloc.localization.uncertainty.ambiguity import (
     LARGEST_GAUSSIAN_SIGMA,
     Rivals,
@@ -64,7 +64,7 @@ def solutions_of(optima: Optima, energy: FloatArray, detected: BoolArray) -> Sol
     else:
         known = _of_several(optima, detected)
     moments = model.known.residual(moment) if model.known is not None else np.empty((n_fits, 0))
-    of_moments = np.sum(moments**2, axis=1)
+    of_moments = np.einsum("fk,fk->f", moments, moments)
     every = Solutions(
         of_row=of_row,
         n_sources=np.full(n_fits, n_sources),
@@ -127,12 +127,23 @@ def _of_one(optima: Optima, energy: FloatArray) -> _Known:
         covariance = scaled * np.outer(unit, unit)
     else:
         covariance = table(covariances(model.rows(of_row), fits), np.nan)
-    rivals = Rivals.of(chi2, covariance, offset, moment, energy, rows.n_differences, _scale_m(model))
+    understated = _understated(chi2[:, 0], optima)
+    covariance *= understated[:, None, None, None]
+    rivals = Rivals.of(
+        chi2 / understated[:, None],
+        covariance,
+        offset,
+        moment,
+        energy / understated,
+        rows.n_differences,
+        _scale_m(model),
+    )
+    rise = rivals.rise * understated
     alpha = np.full((*shape, 2), np.nan)
     if compiled:
-        over_rows(profile_rows, n_rows, rows.y, rivals.rise, ModelRows.of(model), q, chi2, counts, scaled, alpha)
+        over_rows(profile_rows, n_rows, rows.y, rise, ModelRows.of(model), q, chi2, counts, scaled, alpha)
     else:
-        left = rivals.rise[of_row] - (fits.chi2 - chi2[of_row, 0])
+        left = rise[of_row] - (fits.chi2 - chi2[of_row, 0])
         inside = np.flatnonzero((left > 0.0) & np.isfinite(left))
         sigma = relative_range_sigma(covariance[at], offset[at])
         alpha[of_row[inside], at[1][inside]] = profile_stretches(
@@ -146,6 +157,15 @@ def _of_one(optima: Optima, energy: FloatArray) -> _Known:
     return _Known([(ranges.sets[row],) for row in of_row], ranges.covariance[at], gaussian[:, None], rivals.weight[at])
 
 
+def _understated(chi2: FloatArray, optima: Optima) -> FloatArray:
+    """By how much the variance of noise is understated (b,): χ² per degree of freedom of rows that are misfits, else 1.
+
+    What a wrong model leaves is no noise, but σ that knew only the noise would be worse.
+    """
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isfinite(chi2) & is_misfit(chi2, optima.dof), chi2 / max(optima.dof, 1), 1.0)
+
+
 def _scale_m(model: WhitenedModel) -> float | None:
     """A length in whose units positions are uniform, where the moment is known and gives one."""
     return model.radius if model.known is not None else None
@@ -155,14 +175,15 @@ def _of_several(optima: Optima, detected: BoolArray) -> _Known:
     """What is known of several sources: every one has a range of its own in every solution."""
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
     model, y = rows.model.rows(of_row), rows.y[of_row]
-    covariance = covariances(model, fits)
+    understated = _understated(fits.chi2[np.searchsorted(of_row, of_row)], optima)
+    covariance = covariances(model, fits) * understated[:, None, None]
     offset, moment = model.position(fits.q) - model.centroid, model.moment(fits.q, fits.mu)
     n_fits, n_sources = offset.shape[:2]
     wide = covariance.copy()
     sets: list[list[Intervals]] = [[] for _ in range(n_fits)]
     gaussian = np.zeros((n_fits, n_sources), dtype=bool)
     for k in range(n_sources):
-        ends = ranges_within(model, y, fits, k, covariance).tolist()
+        ends = ranges_within(model, y, fits, k, covariance, DELTA_CHI2_95 * understated).tolist()
         of_source = [union([pair]) if seen else EVERYWHERE for pair, seen in zip(ends, detected[of_row], strict=True)]
         low, high = np.array([span(intervals) for intervals in of_source]).reshape(-1, 2).T
         observable = np.array([is_observable_set(intervals) for intervals in of_source], dtype=bool)
@@ -172,7 +193,7 @@ def _of_several(optima: Optima, detected: BoolArray) -> _Known:
         wide[blurred] = widened(wide[blurred], offset[blurred, k], low[blurred], high[blurred], k)
         for of_fit, intervals in zip(sets, of_source, strict=True):
             of_fit.append(intervals)
-    chi2 = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2, np.inf)
+    chi2 = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2 / understated, np.inf)
     weight = _weights_of_rows(of_row, chi2, log_evidence_volume(covariance, moment, offset, scale_m=_scale_m(model)))
     gaussian &= (weight >= CERTAIN_WEIGHT)[:, None]
     claimed = np.flatnonzero(gaussian.any(axis=1))
