@@ -93,6 +93,7 @@ def whitened_jacobian(
     """
     p, m = _sources(position_m, moment_Am2)
     check_uncertainty(ambient_uncertainty_T, known_moment_sigma_Am2)
+    ambient_uncertainty_T = ambient_uncertainty_T or array.ambient_uncertainty_T
     W = channel_jacobian(array, p, m)
     root = _inverse_root(array, p, m)
     with np.errstate(invalid="ignore"):
@@ -132,7 +133,8 @@ def cramer_rao_bounds(
     position_m, moment_Am2 : array_like, shape (..., 3)
         Source in the array's frame [m], its moment [A·m²].
     ambient_uncertainty_T : float
-        Standard deviation, per axis, of the error of ``array.ambient_T``, the same for all sensors [T].
+        Standard deviation, per axis, of the error of ``array.ambient_T``, the same for all sensors, in place of the
+        array's own [T].
     known_moment_sigma_Am2 : float
         Standard deviation of what is known beforehand of the moment's modulus [A·m²]; nothing is by default.
 

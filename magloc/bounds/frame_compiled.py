@@ -80,7 +80,7 @@ class BoundModel(NamedTuple):
         common = math.inf if array.common_field_T is None else array.common_field_T
         deviation = 3 * [0.0 if scalar.all() else common]
         deviation += [common if scalar.any() else 0.0]
-        deviation += 3 * [ambient_uncertainty_T if scalar.any() else 0.0]
+        deviation += 3 * [(ambient_uncertainty_T or array.ambient_uncertainty_T) if scalar.any() else 0.0]
         nuisances = np.flatnonzero(deviation)
         return cls(
             centroid=read_only(array.centroid),

@@ -64,15 +64,17 @@ def finite_body_fields(separation_m: FloatArray, moment_Am2: FloatArray, rank: i
     r = np.linalg.norm(separation_m, axis=-1)[..., None, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         n = separation_m[..., None, :] / r
-    contracted = [_traceless_basis(rank)]
-    for left in range(rank - 1, -1, -1):
-        contracted.append(np.sum(contracted[-1] * n.reshape(*n.shape[:-1], *(1,) * left, 3), axis=-1))
-    matrix, vector, number = contracted[-3:]
+    # Contracted with n but for two indices, for one, for none.
+    basis = _traceless_basis(rank).reshape(2 * rank + 1, 3, 3, -1)
+    powers = np.ones_like(r[..., 0]) if rank == 2 else (n.mT * n).reshape(*n.shape[:-2], 9)
+    matrix = (powers @ basis.reshape(-1, basis.shape[-1]).T).reshape(*n.shape[:-2], *basis.shape[:3])
+    vector = (matrix @ n[..., None])[..., 0]
+    number = np.sum(vector * n, axis=-1, keepdims=True)
     m = moment_Am2[..., None, :]
-    n_m, a = np.sum(n * m, axis=-1, keepdims=True), 2 * rank + 1
-    v_m, number = np.sum(vector * m, axis=-1, keepdims=True), number[..., None]
+    n_m, v_m = np.sum(n * m, axis=-1, keepdims=True), np.sum(vector * m, axis=-1, keepdims=True)
+    a = 2 * rank + 1
     # The second derivatives of T·xⁿ/r^(2n+1) along the moment.
-    pattern = rank * (rank - 1) * np.sum(matrix * m[..., None, :], axis=-1) - rank * a * (vector * n_m + v_m * n)
+    pattern = rank * (rank - 1) * (matrix @ m[..., None])[..., 0] - rank * a * (vector * n_m + v_m * n)
     pattern += a * number * ((a + 2) * n_m * n - m)
     scale = MU0_OVER_4PI * prod(range(1, a, 2)) / factorial(rank)
     with np.errstate(invalid="ignore", divide="ignore"):

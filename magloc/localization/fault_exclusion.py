@@ -20,9 +20,9 @@ from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.chi_square import energy_threshold
 from magloc.levels import CREDIBLE_ROW, SENSOR_FALSE_ALARM
-from magloc.localization.fit.finite_body import body_errors
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.gauss_newton import refine
+from magloc.localization.fit.model_errors import model_errors
 from magloc.localization.fit.results import Fix
 from magloc.localization.search.multi_source import NOISE_ALONE
 from magloc.measurement.rows import (
@@ -84,7 +84,7 @@ def without_faulty_sensors(
             ambient = None if ambient_T is None else ambient_T[block]
             examination = _Examination(array, refit, mask, block, readings_T[block], ambient, free_position)
             plain = [fixes[row] for row in block]
-            examination.allow_for_bodies(plain)
+            examination.allow_for_model_errors(plain)
             found += examination.fixes(examination.without_lonely_sources(plain))
             examined.append(block)
     if not examined:
@@ -157,14 +157,16 @@ class _Examination:
         level = 1.0 - SENSOR_FALSE_ALARM / array.n_sensors
         self.limits = np.array(chdtri(np.maximum(self.count, 1), 1.0 - level), dtype=np.float64)
 
-    def allow_for_bodies(self, plain: Sequence[Fix]) -> None:
-        """Count as noise what the bodies of the fixes add to their dipoles: no sensor is to be accused of it."""
+    def allow_for_model_errors(self, plain: Sequence[Fix]) -> None:
+        """Count as noise what bodies and the ambient field add to the fixes: no sensor is to be accused of it."""
         errors = []
+        sigma_T = self.array.ambient_uncertainty_T if self.array.channel_is_scalar.any() else 0.0
         for row, fix in enumerate(plain):
-            if fix.solutions and fix.body_length_m > 0.0:
+            if fix.solutions and (fix.body_length_m > 0.0 or sigma_T):
                 q, mu = self._scaled(fix)
                 lengths = np.full((1, len(q)), fix.body_length_m)
-                errors.append((row, body_errors(self.problem.rows(np.array([row])), q[None], mu[None], lengths)[0]))
+                at = self.problem.rows(np.array([row]))
+                errors.append((row, model_errors(at, q[None], mu[None], lengths, sigma_T)[0]))
         if errors:
             widest = max(columns.shape[1] for _, columns in errors)
             every = np.zeros((len(plain), self.raw.shape[1], widest))

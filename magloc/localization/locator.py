@@ -21,8 +21,8 @@ from magloc.blas_threads import one_blas_thread
 from magloc.localization.dipole_validity import too_near
 from magloc.localization.fault_exclusion import without_faulty_sensors
 from magloc.localization.fit.columns import Solutions, in_stable_order
-from magloc.localization.fit.finite_body import as_finite_bodies
 from magloc.localization.fit.fixes import Fixes
+from magloc.localization.fit.model_errors import with_model_errors
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import Fix
@@ -171,7 +171,7 @@ class Locator:
         if isinstance(search, MomentSearch):
             search = search.of_rows(index)
         at_once = _ROWS_AT_ONCE if isinstance(search, SingleSourceSearch) else _ROWS_OF_SEVERAL
-        found = _Rows(len(readings), self.body_length_m)
+        found = _Rows(len(readings), self.body_length_m, self.array.ambient_uncertainty_T)
         for rows in whitened_rows(self.array, readings, ambient, at_once):
             if rows.n_differences < self._fewest:
                 found.refuse(
@@ -187,8 +187,8 @@ class Locator:
 class _Rows:
     """Collects what is found of n rows, block by block."""
 
-    def __init__(self, n: int, body_length_m: float | None = 0.0) -> None:
-        self.body_length_m = body_length_m
+    def __init__(self, n: int, body_length_m: float | None = 0.0, ambient_sigma_T: float = 0.0) -> None:
+        self.body_length_m, self.ambient_sigma_T = body_length_m, ambient_sigma_T
         self.assumed_length_m = np.zeros(n)
         self.detected = np.zeros(n, dtype=bool)
         self.reason = [""] * n
@@ -210,11 +210,15 @@ class _Rows:
         energy = np.zeros(len(self.reason))
         energy[loud.index] = loud.energy
         self.detected[loud.index] = is_detected(energy[loud.index], loud.n_differences)
-        pieces = [piece for optima in search(loud) for piece in as_finite_bodies(optima, self.body_length_m)]
+        pieces = [
+            piece
+            for optima in search(loud)
+            for piece in with_model_errors(optima, self.body_length_m, self.ambient_sigma_T)
+        ]
         for optima, lengths in pieces:
             of_all = optima.rows.index
             self.assumed_length_m[of_all] = lengths
-            known = optima.rows.energy if lengths.any() else energy[of_all]
+            known = optima.rows.energy if lengths.any() or self.ambient_sigma_T else energy[of_all]
             found = solutions_of(optima, known, self.detected[of_all])
             solved = np.bincount(found.of_row, minlength=len(of_all)) > 0
             for row, reason, has in zip(of_all.tolist(), optima.reason, solved.tolist(), strict=True):

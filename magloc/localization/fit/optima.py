@@ -30,6 +30,8 @@ class Optima:
         Places of the sources where they are known: then the unknowns are the moments alone.
     undetermined : str
         Why a row has no solution if its optima have no finite covariance.
+    bent : ndarray of bool, shape (f,)
+        Whether errors beyond noise follow a curve.
     """
 
     rows: WhitenedRows
@@ -40,6 +42,7 @@ class Optima:
     failed_starts: IntArray | int = 0
     position_m: FloatArray | None = None
     undetermined: str = UNDETERMINED
+    bent: BoolArray | bool = False
 
     def chosen(self, which: BoolArray) -> Optima:
         """Those of some of the rows (b,)."""
@@ -52,6 +55,7 @@ class Optima:
             reason=[reason for reason, chosen in zip(self.reason, which, strict=True) if chosen],
             merged=np.broadcast_to(self.merged, self.fits.mu.shape[:2])[kept],
             failed_starts=np.broadcast_to(self.failed_starts, which.shape)[which],
+            bent=np.broadcast_to(self.bent, self.of_row.shape)[kept],
             position_m=None if self.position_m is None else self.position_m[which],
         )
 

@@ -76,7 +76,7 @@ def solutions_of(optima: Optima, energy: FloatArray, detected: BoolArray) -> Sol
         weight=known.weight,
         iterations=fits.iterations,
         ranges=known.ranges,
-        gaussian=known.gaussian,
+        gaussian=known.gaussian & ~np.broadcast_to(optima.bent, of_row.shape)[:, None],
         merged=np.full((n_fits, n_sources), optima.merged),
         known_chi2=of_moments,
         n_known=np.full(n_fits, moments.shape[1]),
