@@ -220,7 +220,7 @@ def _notes(fixes: Fixes, *, assumed: bool) -> Iterator[str]:
     if fixes.misfit.any():
         yield (
             f"warning: in {fixes.misfit.sum()} of {n} rows χ² is far beyond noise: the noise is understated, or the"
-            " model does not hold, and the standard deviations say too little"
+            " model does not hold; the standard deviations, enlarged by √(χ²/dof), are a guess"
         )
     weak = fixes.solved & ~fixes.detected
     if weak.any():
