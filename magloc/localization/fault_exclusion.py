@@ -19,7 +19,7 @@ from scipy.special import chdtri, fdtri
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.chi_square import energy_threshold
-from magloc.levels import CREDIBLE_ROW, SENSOR_FALSE_ALARM
+from magloc.levels import CREDIBLE_ROW, MISFIT, SENSOR_FALSE_ALARM
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.gauss_newton import refine
 from magloc.localization.fit.model_errors import model_errors
@@ -109,7 +109,9 @@ def _explains(fix: Fix) -> bool:
 
 def _is_credible(fix: Fix) -> bool:
     best = fix.solutions[0]
-    return best.dof <= 0 or bool(best.chi2 <= chdtri(best.dof, 1.0 - CREDIBLE_ROW))
+    # The prior of a body's shape is a coarse one, and no fault of a sensor.
+    level = MISFIT if fix.body_length_m > 0.0 else 1.0 - CREDIBLE_ROW
+    return best.dof <= 0 or bool(best.chi2 <= chdtri(best.dof, level))
 
 
 def _is_worth_dropping_for(fix: Fix, plain: Fix) -> bool:
