@@ -45,6 +45,8 @@ class SensorArray:
     ambient_gradient_T_m : tuple of tuples, shape (3, 3), optional
         Known gradient tensor dB_i/dx_j of the ambient field in the array's frame [T/m]: symmetric and traceless, as
         that of any field whose sources are elsewhere. None stands for a uniform field.
+    ambient_uncertainty_T : float
+        Standard deviation, per axis, of the error of the ambient field, one for all sensors [T].
 
     Raises
     ------
@@ -67,12 +69,13 @@ class SensorArray:
     common_field_T: float | None = None
     ambient_T: tuple[float, float, float] | None = None
     ambient_gradient_T_m: tuple[tuple[float, float, float], ...] | None = None
+    ambient_uncertainty_T: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sensors", tuple(self.sensors))
         if not (isinstance(self.name, str) and self.name.isprintable()):
             raise ValueError(f"Input name must be one line of printable text; instead received {self.name!r}.")
-        for name in ("noise_fraction", "common_field_T"):
+        for name in ("noise_fraction", "common_field_T", "ambient_uncertainty_T"):
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, _finite_number(name, value))

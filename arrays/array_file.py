@@ -36,8 +36,8 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
     noise_nT = 1.0
 
 Both may have ``noise_fraction``, ``common_field_nT``, ``ambient_nT = [x, y, z]``, the gradient of that field
-``ambient_gradient_nT_m = [[…], […], […]]`` (symmetric and traceless) and ``format_version = 1``; see
-:class:`arrays.array.SensorArray` for what they mean.
+``ambient_gradient_nT_m = [[…], […], […]]`` (symmetric and traceless), ``ambient_uncertainty_nT`` and
+``format_version = 1``; see :class:`arrays.array.SensorArray` for what they mean.
 """
 
 from __future__ import annotations
@@ -90,6 +90,7 @@ class _Header(File, kw_only=True):
     common_field_nT: _NotNegative | None = None
     ambient_nT: _NumberVector | None = None
     ambient_gradient_nT_m: tuple[_NumberVector, _NumberVector, _NumberVector] | None = None
+    ambient_uncertainty_nT: _NotNegative = 0
 
 
 class _Quality(Table, kw_only=True):
@@ -242,6 +243,8 @@ def array_toml(array: SensorArray) -> str:
     if array.ambient_gradient_T_m is not None:
         rows = ", ".join(map(_nanotesla_list, array.ambient_gradient_T_m))
         lines.append(f"ambient_gradient_nT_m = [{rows}]")
+    if array.ambient_uncertainty_T:
+        lines.append(f"ambient_uncertainty_nT = {_nanotesla(array.ambient_uncertainty_T)}")
     for sensor in array.sensors:
         lines += ["", "[[sensor]]", f"id = {_quoted(sensor.id)}", f'kind = "{sensor.kind}"']
         lines.append(f"position_m = {list(sensor.position_m)}")
@@ -368,7 +371,8 @@ def _with_header(path: str, array: SensorArray, header: _Header) -> SensorArray:
         gradient_T_m = tuple(_tesla_vector(place, row) for row in header.ambient_gradient_nT_m)
     name = array.name if header.name is None else header.name
     with naming(path):
-        return SensorArray(array.sensors, name, header.noise_fraction, common_T, ambient_T, gradient_T_m)
+        uncertainty_T = _tesla(f"{path}, key ambient_uncertainty_nT", header.ambient_uncertainty_nT)
+        return SensorArray(array.sensors, name, header.noise_fraction, common_T, ambient_T, gradient_T_m, uncertainty_T)
 
 
 def _quality(place: str, table: _Quality) -> dict[str, Any]:

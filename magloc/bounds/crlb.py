@@ -78,14 +78,22 @@ class Bounds:
 
 
 def whitened_jacobian(
-    array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, *, ambient_uncertainty_T: float = 0.0
+    array: SensorArray,
+    position_m: ArrayLike,
+    moment_Am2: ArrayLike,
+    *,
+    ambient_uncertainty_T: float = 0.0,
+    known_moment_sigma_Am2: float = np.inf,
 ) -> FloatArray:
     """Jacobian W (..., C, 6) of readings freed of all nuisances, of unit variance: the information is ``Wᵀ W``.
+
+    A known modulus of the moment is one row more.
 
     Columns (p, m) in 1/m and 1/(A·m²); NaN for a source on a sensor. Parameters are those of :func:`cramer_rao_bounds`.
     """
     p, m = _sources(position_m, moment_Am2)
-    check_uncertainty(ambient_uncertainty_T)
+    check_uncertainty(ambient_uncertainty_T, known_moment_sigma_Am2)
+    ambient_uncertainty_T = ambient_uncertainty_T or array.ambient_uncertainty_T
     W = channel_jacobian(array, p, m)
     root = _inverse_root(array, p, m)
     with np.errstate(invalid="ignore"):
@@ -99,11 +107,22 @@ def whitened_jacobian(
         W = _marginalised(W, part, prior)
         if ambient is not None:
             ambient = _marginalised(ambient, part, prior)
-    return W if ambient is None else _marginalised(W, ambient, ambient_uncertainty_T)
+    W = W if ambient is None else _marginalised(W, ambient, ambient_uncertainty_T)
+    if known_moment_sigma_Am2 == np.inf:
+        return W
+    with np.errstate(invalid="ignore"):
+        along = m / (np.linalg.norm(m, axis=-1, keepdims=True) * known_moment_sigma_Am2)
+    row = np.broadcast_to(np.concatenate([np.zeros_like(along), np.nan_to_num(along)], axis=-1), (*W.shape[:-2], 6))
+    return np.concatenate([W, row[..., None, :]], axis=-2)
 
 
 def cramer_rao_bounds(
-    array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, *, ambient_uncertainty_T: float = 0.0
+    array: SensorArray,
+    position_m: ArrayLike,
+    moment_Am2: ArrayLike,
+    *,
+    ambient_uncertainty_T: float = 0.0,
+    known_moment_sigma_Am2: float = np.inf,
 ) -> Bounds:
     """Cramér-Rao bounds of a source, or of many over leading axes.
 
@@ -114,7 +133,10 @@ def cramer_rao_bounds(
     position_m, moment_Am2 : array_like, shape (..., 3)
         Source in the array's frame [m], its moment [A·m²].
     ambient_uncertainty_T : float
-        Standard deviation, per axis, of the error of ``array.ambient_T``, the same for all sensors [T].
+        Standard deviation, per axis, of the error of ``array.ambient_T``, the same for all sensors, in place of the
+        array's own [T].
+    known_moment_sigma_Am2 : float
+        Standard deviation of what is known beforehand of the moment's modulus [A·m²]; nothing is by default.
 
     Returns
     -------
@@ -124,7 +146,7 @@ def cramer_rao_bounds(
     Raises
     ------
     ValueError
-        A shape is wrong, or the uncertainty is negative or not finite.
+        A shape is wrong, or an uncertainty is out of range.
 
     Examples
     --------
@@ -137,7 +159,9 @@ def cramer_rao_bounds(
     """
     check_magnitudes(array)
     p, m = _sources(position_m, moment_Am2)
-    W = whitened_jacobian(array, p, m, ambient_uncertainty_T=ambient_uncertainty_T)
+    W = whitened_jacobian(
+        array, p, m, ambient_uncertainty_T=ambient_uncertainty_T, known_moment_sigma_Am2=known_moment_sigma_Am2
+    )
     line = p - array.centroid
     distance = np.linalg.norm(line, axis=-1)
     known: BoolArray = np.all(np.isfinite(W), axis=(-2, -1))
@@ -245,9 +269,11 @@ def _sources(position_m: ArrayLike, moment_Am2: ArrayLike) -> tuple[FloatArray, 
     return p, m
 
 
-def check_uncertainty(ambient_uncertainty_T: float) -> None:
-    """Raise ValueError for an uncertainty of the ambient field that is none."""
+def check_uncertainty(ambient_uncertainty_T: float, known_moment_sigma_Am2: float = np.inf) -> None:
+    """Raise ValueError for uncertainties of the ambient field and of the moment's modulus that are none."""
     if not 0.0 <= ambient_uncertainty_T < np.inf:
         raise ValueError(
             f"Input ambient_uncertainty_T must be finite and not negative; instead received {ambient_uncertainty_T}."
         )
+    if not known_moment_sigma_Am2 > 0.0:
+        raise ValueError(f"Input known_moment_sigma_Am2 must be positive; instead received {known_moment_sigma_Am2}.")

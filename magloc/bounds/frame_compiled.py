@@ -46,8 +46,10 @@ class BoundModel(NamedTuple):
         Which ones there are.
     prior : ndarray, shape (q,)
         Their inverse standard deviations, 0 if nothing is known [1/T].
+    modulus_prior : float
+        Inverse standard deviation of what is known of the moment's modulus, 0 if nothing is [1/(A·m²)].
     varies : bool
-        Whether axes or noise depend on the moment.
+        Whether axes, noise or what is known depend on the moment.
     """
 
     centroid: FloatArray
@@ -63,11 +65,14 @@ class BoundModel(NamedTuple):
     noise_fraction: float
     nuisances: NDArray[np.intp]
     prior: FloatArray
+    modulus_prior: float
     varies: bool
 
     @classmethod
-    def of(cls, array: SensorArray, ambient_uncertainty_T: float = 0.0) -> BoundModel:
-        """Model of an array whose ambient field is known to a standard deviation [T] per axis."""
+    def of(
+        cls, array: SensorArray, ambient_uncertainty_T: float = 0.0, known_moment_sigma_Am2: float = math.inf
+    ) -> BoundModel:
+        """Model of an array, its ambient field known to a σ [T] per axis and the moment's modulus to another."""
         scales = np.tile(np.eye(3), (array.n_sensors, 1, 1))
         for scale, sensor in zip(scales, array.sensors, strict=True):
             scale[: sensor.n_channels, : sensor.n_channels] = sensor.calibration.scale
@@ -75,7 +80,7 @@ class BoundModel(NamedTuple):
         common = math.inf if array.common_field_T is None else array.common_field_T
         deviation = 3 * [0.0 if scalar.all() else common]
         deviation += [common if scalar.any() else 0.0]
-        deviation += 3 * [ambient_uncertainty_T if scalar.any() else 0.0]
+        deviation += 3 * [(ambient_uncertainty_T or array.ambient_uncertainty_T) if scalar.any() else 0.0]
         nuisances = np.flatnonzero(deviation)
         return cls(
             centroid=read_only(array.centroid),
@@ -91,7 +96,8 @@ class BoundModel(NamedTuple):
             noise_fraction=float(array.noise_fraction),
             nuisances=read_only(nuisances),
             prior=read_only(1.0 / np.array(deviation)[nuisances]),
-            varies=bool(scalar.any() or array.noise_depends_on_reading),
+            modulus_prior=1.0 / known_moment_sigma_Am2,
+            varies=bool(scalar.any() or array.noise_depends_on_reading or known_moment_sigma_Am2 < math.inf),
         )
 
 

@@ -42,7 +42,7 @@ class Block(NamedTuple):
     w, fields : ndarray
         Flat.
     columns : ndarray, shape (rows, q + 6, lanes in use)
-        A row stands for a channel, or for the prior of a nuisance that has one.
+        A row stands for a channel, or for a prior of a nuisance or of the moment's modulus.
     factors : ndarray, shape (q + 6, lanes in use)
         Of the columns in a projection.
     squares : ndarray, shape (3, lanes in use)
@@ -68,6 +68,7 @@ def new_block(model: BoundModel, n_moments: int) -> Block:
     n_rows, n_columns = model.noise.size, model.nuisances.size + 6
     for prior in model.prior:
         n_rows += 1 if prior > 0.0 else 0
+    n_rows += 1 if model.modulus_prior > 0.0 else 0
     n_blocks = (n_moments - 1) // LANES + 1
     n_lanes = (n_moments - 1) // n_blocks + 1
     return Block(
@@ -193,6 +194,13 @@ def _fill_columns(model: BoundModel, block: Block) -> None:
         if model.prior[q] > 0.0:
             columns[row, q] = model.prior[q]
             row += 1
+    if model.modulus_prior > 0.0:
+        for i in range(n_lanes):
+            u, v, n = w[MOMENT + i], w[MOMENT + LANES + i], w[MOMENT + 2 * LANES + i]
+            along = model.modulus_prior / math.sqrt(u * u + v * v + n * n)
+            columns[row, n_nuisances, i] = along * u
+            columns[row, n_nuisances + 1, i] = along * v
+            columns[row, n_nuisances + 2, i] = along * n
 
 
 @compiled

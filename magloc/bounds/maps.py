@@ -73,7 +73,7 @@ class BoundScenario:
         Required σ of the range.
     n_moments : int
         Directions of the moment.
-    ambient_uncertainty_T : float
+    ambient_uncertainty_T, known_moment_sigma_Am2 : float
         See :func:`magloc.bounds.crlb.cramer_rao_bounds`.
 
     Raises
@@ -88,6 +88,7 @@ class BoundScenario:
     accuracy_m: float = 0.5
     n_moments: int = 50
     ambient_uncertainty_T: float = 0.0
+    known_moment_sigma_Am2: float = np.inf
 
     def __post_init__(self) -> None:
         check_magnitudes(self.array)
@@ -106,11 +107,13 @@ class BoundScenario:
     @property
     def settings(self) -> dict[str, Any]:
         """What determines the bounds beside the array, for a dataset."""
+        known = {"known_moment_sigma_Am2": self.known_moment_sigma_Am2}
         return {
             "moment_Am2": np.asarray(self.moment_Am2, dtype=np.float64),
             "n_moments": self.n_moments,
             "accuracy_m": self.accuracy_m,
             "ambient_uncertainty_nT": 1e9 * self.ambient_uncertainty_T,
+            **(known if self.known_moment_sigma_Am2 < np.inf else {}),
         }
 
     @property
@@ -129,6 +132,7 @@ def bounds_at(scenario: BoundScenario, positions_m: ArrayLike) -> dict[str, Floa
         [scenario.moment_Am2],
         scenario.moments_Am2,
         ambient_uncertainty_T=scenario.ambient_uncertainty_T,
+        known_moment_sigma_Am2=scenario.known_moment_sigma_Am2,
     )
     values = {}
     for name, one, spread in zip(_UNITS, given, spreads, strict=True):
@@ -209,6 +213,7 @@ def bound_map(
     accuracy_m: float = BoundScenario.accuracy_m,
     n_moments: int = BoundScenario.n_moments,
     ambient_uncertainty_T: float = 0.0,
+    known_moment_sigma_Am2: float = np.inf,
     out: str | PathLike[str] | None = None,
     scheduler: str | None = None,
     progress: Callable[[int], None] | None = None,
@@ -229,7 +234,7 @@ def bound_map(
         Required standard deviation of the range [m].
     n_moments : int
         Directions of the moment.
-    ambient_uncertainty_T : float
+    ambient_uncertainty_T, known_moment_sigma_Am2 : float
         See :func:`magloc.bounds.crlb.cramer_rao_bounds`.
     out, scheduler, progress
         See :func:`magloc.grids.computed.computed_map`: a zarr folder that streams and resumes, the address of a dask
@@ -257,7 +262,9 @@ def bound_map(
     """
     mx, my, mz = np.asarray(moment_Am2, dtype=np.float64).tolist()
     half_width_m = check_half_width(edge_m)
-    scenario = BoundScenario(array, (mx, my, mz), half_width_m, accuracy_m, n_moments, ambient_uncertainty_T)
+    scenario = BoundScenario(
+        array, (mx, my, mz), half_width_m, accuracy_m, n_moments, ambient_uncertainty_T, known_moment_sigma_Am2
+    )
     return computed_map(BoundMap(scenario, n), out, scheduler, progress)
 
 

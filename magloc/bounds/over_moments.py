@@ -48,14 +48,15 @@ def bounds_over_moments(
     moments_Am2: ArrayLike,
     *,
     ambient_uncertainty_T: float = 0.0,
+    known_moment_sigma_Am2: float = np.inf,
 ) -> MomentBounds:
     """Mean, median, 95 % quantile and worst (P,) of the bounds of positions (P, 3) over moments (M, 3) [A·m²].
 
     The other parameters are those of :func:`magloc.bounds.crlb.cramer_rao_bounds`.
     """
     none = np.empty((0, 3))
-    _, spreads = table_and_spreads(array, positions_m, none, moments_Am2, ambient_uncertainty_T=ambient_uncertainty_T)
-    return spreads
+    uncertain = {"ambient_uncertainty_T": ambient_uncertainty_T, "known_moment_sigma_Am2": known_moment_sigma_Am2}
+    return table_and_spreads(array, positions_m, none, moments_Am2, **uncertain)[1]
 
 
 def table_and_spreads(
@@ -65,6 +66,7 @@ def table_and_spreads(
     moments_Am2: ArrayLike,
     *,
     ambient_uncertainty_T: float = 0.0,
+    known_moment_sigma_Am2: float = np.inf,
 ) -> tuple[SigmaTable, MomentBounds]:
     """:func:`sigma_table` (P, K) of some moments and :func:`bounds_over_moments` (P,) of others, in one pass."""
     from magloc.bounds import table_compiled as bounds
@@ -72,14 +74,19 @@ def table_and_spreads(
 
     positions, alone = _rows("positions_m", positions_m, least=1), _rows("alone_Am2", alone_Am2)
     moments = _rows("moments_Am2", moments_Am2, least=0 if len(alone) else 1)
-    check_uncertainty(ambient_uncertainty_T)
-    model = BoundModel.of(array, ambient_uncertainty_T)
+    check_uncertainty(ambient_uncertainty_T, known_moment_sigma_Am2)
+    model = BoundModel.of(array, ambient_uncertainty_T, known_moment_sigma_Am2)
     table, spreads = bounds.table_and_spreads(model, positions, alone, moments, np.array(TYPICAL_AND_BAD))
     return SigmaTable(*table), MomentBounds(*(Spread(*spreads[:, i].T) for i in range(3)))
 
 
 def sigma_table(
-    array: SensorArray, positions_m: ArrayLike, moments_Am2: ArrayLike, *, ambient_uncertainty_T: float = 0.0
+    array: SensorArray,
+    positions_m: ArrayLike,
+    moments_Am2: ArrayLike,
+    *,
+    ambient_uncertainty_T: float = 0.0,
+    known_moment_sigma_Am2: float = np.inf,
 ) -> SigmaTable:
     """Bounds (P, M) of range, bearing and position for every pair of positions (P, 3) and moments (M, 3).
 
@@ -87,7 +94,8 @@ def sigma_table(
     singular, NaN where :class:`magloc.bounds.crlb.Bounds` is.
     """
     moments, none = _rows("moments_Am2", moments_Am2, least=1), np.empty((0, 3))
-    return table_and_spreads(array, positions_m, moments, none, ambient_uncertainty_T=ambient_uncertainty_T)[0]
+    uncertain = {"ambient_uncertainty_T": ambient_uncertainty_T, "known_moment_sigma_Am2": known_moment_sigma_Am2}
+    return table_and_spreads(array, positions_m, moments, none, **uncertain)[0]
 
 
 def spread_over(sigma: ArrayLike) -> Spread:

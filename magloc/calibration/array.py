@@ -143,7 +143,7 @@ def self_calibrate(
     problem = _problem(array, readings, attitude, prior, True, False, moment)
     nowhere = np.zeros((len(readings), 3))
     doubtful = calibration_steps.with_doubted_fields(problem, calibration_steps.untouched(problem, nowhere, nowhere))
-    fixes = Locator(doubtful, exclude_faulty=False).fit_rows(readings)
+    fixes = Locator(doubtful, body_length_m=0.0, exclude_faulty=False).fit_rows(readings)
     rows = fixes.solved & _usable(problem)
     if not rows.any():
         raise ValueError(

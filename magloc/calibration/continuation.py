@@ -84,7 +84,7 @@ def looked_for_again(problem: Problem, state: State, rows: BoolArray, share: flo
     """A state with some rows at that solution of a new fix whose moment is nearest to the median moment."""
     median = np.median(state.moment_Am2, axis=0)
     position, moment = state.position_m.copy(), state.moment_Am2.copy()
-    locator = Locator(with_doubted_fields(problem, state, share), exclude_faulty=False)
+    locator = Locator(with_doubted_fields(problem, state, share), body_length_m=0.0, exclude_faulty=False)
     fixes = locator.fit_rows(problem.readings_T[rows])
     for t, fix in zip(np.flatnonzero(rows), fixes, strict=True):
         if fix.solutions:

@@ -57,12 +57,15 @@ class SourceOptions:
         Its moment [A·m²], in place of the scenario's.
     ambient_uncertainty_nT : float
         Standard deviation per axis of the ambient field that the array file states, for scalar sensors [nT].
+    known_moment_sigma_Am2 : float
+        Standard deviation of what is known beforehand of the moment's modulus [A·m²]. Nothing is by default.
     """
 
     array: Path | None = None
     position: Vector | None = None
     moment_Am2: Annotated[Vector | None, Parameter(name="--moment-Am2")] = None
     ambient_uncertainty_nT: Annotated[float, Parameter(name="--ambient-uncertainty-nT")] = 0.0
+    known_moment_sigma_Am2: Annotated[float | None, Parameter(name="--known-moment-sigma-Am2")] = None
 
 
 @Parameter(name="*", group="What is required, and where")
@@ -155,9 +158,12 @@ def bounds(
     wanted = _scenario(array, source.moment_Am2 if of.moment_Am2 is None else of.moment_Am2, radius, of, task)
     if array.channel_is_scalar.any() and array.ambient_T is None:
         print_note("warning: the array has scalar sensors and no ambient_nT, the ambient field is taken to be zero")
-    ambient = {"ambient_uncertainty_T": wanted.ambient_uncertainty_T}
-    of_source = magloc.cramer_rao_bounds(array, place, wanted.moment_Am2, **ambient)
-    over_moments = bounds_over_moments(array, place[None], wanted.moments_Am2, **ambient)
+    uncertain = {
+        "ambient_uncertainty_T": wanted.ambient_uncertainty_T,
+        "known_moment_sigma_Am2": wanted.known_moment_sigma_Am2,
+    }
+    of_source = magloc.cramer_rao_bounds(array, place, wanted.moment_Am2, **uncertain)
+    over_moments = bounds_over_moments(array, place[None], wanted.moments_Am2, **uncertain)
     name = Path(scenario).stem if of.array is None else of.array.stem
     moment = "" if of.moment_Am2 is None else "-" + "_".join(f"{value:g}" for value in of.moment_Am2)
     folder = Path(f"bounds-{name}-{task.grid}{moment}") if out is None else out
@@ -197,6 +203,7 @@ def _checked(array: SensorArray, place: FloatArray, of: SourceOptions, task: Tas
         raise InputError(f"--probability: found {task.probability:g}, expected it between the false-alarm rate and 1.")
     if not 0.0 <= of.ambient_uncertainty_nT < math.inf:
         raise InputError(f"--ambient-uncertainty-nT: found {of.ambient_uncertainty_nT:g}, expected zero or more.")
+    refuse_not_positive(of, "known_moment_sigma_Am2")
     _check_place(array, place)
     radius = float(np.linalg.norm(place - array.centroid)) if task.range_m is None else task.range_m
     nearest_m, farthest_m = (factor * array.circumradius for factor in _REACH)
@@ -250,6 +257,7 @@ def _scenario(
             accuracy_m=task.accuracy_m,
             n_moments=task.moments,
             ambient_uncertainty_T=1e-9 * of.ambient_uncertainty_nT,
+            known_moment_sigma_Am2=math.inf if of.known_moment_sigma_Am2 is None else of.known_moment_sigma_Am2,
         )
 
 
@@ -277,6 +285,7 @@ def _cube(task: BoundScenario, grid: int, folder: Path, *, quiet: bool) -> Bound
             accuracy_m=task.accuracy_m,
             n_moments=task.n_moments,
             ambient_uncertainty_T=task.ambient_uncertainty_T,
+            known_moment_sigma_Am2=task.known_moment_sigma_Am2,
             out=folder / "map.zarr",
             progress=advance,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -43,7 +44,9 @@ class FixOptions:
     ambient_gradient : bool
         Take the gradient of the geomagnetic field into account too (tens of pT/m).
     body_length_m : float
-        Length of the object; flags fixes that are nearer than three lengths, where it is no dipole.
+        Length of the object: what a dipole leaves out of its field counts as noise, and fixes that are nearer than
+        three lengths are flagged. By default a quarter of its distance, where four sensors are nearer than 0.6 of the
+        array's circumradius; 0 for a point.
     keep_sensors : bool
         Use all sensors, also those that contradict the others.
     """
@@ -119,8 +122,8 @@ def locate(
 
     where, prior, n_sources = known.where, known.prior, wanted.n_sources
     length_m, position, joint = wanted.body_length_m, wanted.position, wanted.sources is not None
-    if length_m is not None and not length_m > 0.0:
-        raise InputError(f"--body-length-m: found {length_m:g}, expected a positive length.")
+    if length_m is not None and not 0.0 <= length_m < math.inf:
+        raise InputError(f"--body-length-m: found {length_m:g}, expected a length, or 0 for a point.")
     if position is not None and (joint or known.region is not None):
         raise InputError(
             f"--position: found it together with {'--sources' if joint else '--region'}, expected one of them."
@@ -174,7 +177,7 @@ def locate(
         return
     if not json:
         print_note(f"{n_solved} of {len(fixes)} rows solved" + (f"; not solved: {reasons}" if reasons else ""))
-    for note in _notes(fixes):
+    for note in _notes(fixes, assumed=length_m is None):
         print_note(note)
 
 
@@ -205,7 +208,7 @@ def _advice(sentence: str, array: SensorArray) -> str:
     return ""
 
 
-def _notes(fixes: Fixes) -> Iterator[str]:
+def _notes(fixes: Fixes, *, assumed: bool) -> Iterator[str]:
     """What is wrong with the sensors and with the sources."""
     n = len(fixes)
     dropped = Counter(name for names in fixes.dropped_sensors for name in names)
@@ -217,7 +220,7 @@ def _notes(fixes: Fixes) -> Iterator[str]:
     if fixes.misfit.any():
         yield (
             f"warning: in {fixes.misfit.sum()} of {n} rows χ² is far beyond noise: the noise is understated, or the"
-            " model does not hold, and the standard deviations say too little"
+            " model does not hold; the standard deviations, enlarged by √(χ²/dof), are a guess"
         )
     weak = fixes.solved & ~fixes.detected
     if weak.any():
@@ -228,6 +231,12 @@ def _notes(fixes: Fixes) -> Iterator[str]:
     lost = Counter(name for names in fixes.saturated_channels for name in names)
     if lost:
         yield f"warning: saturated readings are not used: {_rows_of(lost)}"
+    bodies = fixes.body_length_m > 0.0
+    if assumed and bodies.any():
+        yield (
+            f"note: in {bodies.sum()} of {n} rows the source is so near that its size matters: a length of a quarter of"
+            " its distance is assumed, --body-length-m says it, 0 a point"
+        )
     if fixes.too_near.any():
         yield (
             f"warning: in {fixes.too_near.sum()} of {n} rows the source is too near, or too large, for a dipole: what"

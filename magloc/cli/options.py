@@ -67,7 +67,7 @@ def naming_options(*names: str) -> Iterator[None]:
     """Say of an option what the library says of the argument of that name."""
     try:
         yield
-    except InputError as error:
+    except ValueError as error:
         said = re.match(r"Input (\w+)", str(error))
         if said is None or said[1] not in names:
             raise
@@ -113,6 +113,10 @@ class KnownOptions:
         left out.
     max_moment_Am2 : float
         Largest moment that the source can have [A·m²]; solutions with a larger one are left out.
+    known_moment_Am2 : float
+        What the modulus of the moment is known to be [A·m²]: counts as one more measurement.
+    known_moment_sigma_Am2 : float
+        1 σ of that [A·m²]; a tenth of the modulus by default.
     place : tuple of 3 floats
         Latitude, longitude [deg] and height [m] of the origin of the world frame, or of the array if the readings have
         no pose, for the ambient field of scalar sensors. That frame is then east, north, up.
@@ -125,6 +129,8 @@ class KnownOptions:
     sensors: str | None = None
     region: Annotated[str | None, Parameter(allow_leading_hyphen=True)] = None
     max_moment_Am2: Annotated[float | None, Parameter(name="--max-moment-Am2")] = None
+    known_moment_Am2: Annotated[float | None, Parameter(name="--known-moment-Am2")] = None
+    known_moment_sigma_Am2: Annotated[float | None, Parameter(name="--known-moment-sigma-Am2")] = None
     place: Vector | None = None
     date: str | None = None
     geomagnetic_model: str | None = None
@@ -167,11 +173,14 @@ class KnownOptions:
                 )
         if self.max_moment_Am2 is not None and not self.max_moment_Am2 > 0.0:
             raise InputError(f"--max-moment-Am2: found {self.max_moment_Am2:g}, expected a positive number.")
-        return magloc.SourcePrior(
-            (low[0], low[1], low[2]),
-            (high[0], high[1], high[2]),
-            math.inf if self.max_moment_Am2 is None else self.max_moment_Am2,
-        )
+        with naming_options("known_moment_Am2", "known_moment_sigma_Am2"):
+            return magloc.SourcePrior(
+                (low[0], low[1], low[2]),
+                (high[0], high[1], high[2]),
+                math.inf if self.max_moment_Am2 is None else self.max_moment_Am2,
+                self.known_moment_Am2,
+                self.known_moment_sigma_Am2,
+            )
 
     @property
     def where(self) -> Place | None:

@@ -155,7 +155,7 @@ class SourcesMap(CubeMap):
 
     @cached_property
     def _locator(self) -> Locator:
-        return Locator(self.scenario.array, exclude_faulty=False)
+        return Locator(self.scenario.array, body_length_m=0.0, exclude_faulty=False)
 
     @cached_property
     def _model(self) -> WhitenedModel:

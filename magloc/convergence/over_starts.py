@@ -148,7 +148,7 @@ class StartsMap(CubeMap):
         """Map of a scenario; the errors of :func:`convergence_map`."""
         if scenario.array.channel_is_scalar.any():
             raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
-        locator = Locator(scenario.array, exclude_faulty=False)
+        locator = Locator(scenario.array, body_length_m=0.0, exclude_faulty=False)
         readings, measurement, z = simulated_measurement(scenario)
         fix = locator.fit(readings)
         if not fix.solutions:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from itertools import combinations_with_replacement, permutations
+from math import factorial, prod
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -51,6 +52,34 @@ def multipole_field_matrix(points_m: ArrayLike, source_m: ArrayLike, order: int)
     along = np.einsum("...si,...i->...s", contracted, n)
     pattern = (2 * order + 1) * along[..., None] * n[..., None, :] - order * contracted
     return MU0_OVER_4PI * np.swapaxes(pattern / r[..., None] ** (order + 2), -1, -2)
+
+
+def finite_body_fields(separation_m: FloatArray, moment_Am2: FloatArray, rank: int) -> FloatArray:
+    r"""How the field of a body differs from its dipole's: (..., 3, 2 n + 1) by the components of its n-th moments.
+
+    The traceless moment T of even rank n, 2 or 4, of the density of magnetisation adds
+    :math:`T \cdot \nabla^n B / n!` to the field: by orthonormal components of T, in tesla per m^n. Separations (..., 3)
+    are from the body's centre to the points.
+    """
+    r = np.linalg.norm(separation_m, axis=-1)[..., None, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        n = separation_m[..., None, :] / r
+    # Contracted with n but for two indices, for one, for none.
+    basis = _traceless_basis(rank).reshape(2 * rank + 1, 3, 3, -1)
+    powers = np.ones_like(r[..., 0]) if rank == 2 else (n.mT * n).reshape(*n.shape[:-2], 9)
+    matrix = (powers @ basis.reshape(-1, basis.shape[-1]).T).reshape(*n.shape[:-2], *basis.shape[:3])
+    vector = (matrix @ n[..., None])[..., 0]
+    number = np.sum(vector * n, axis=-1, keepdims=True)
+    m = moment_Am2[..., None, :]
+    n_m, v_m = np.sum(n * m, axis=-1, keepdims=True), np.sum(vector * m, axis=-1, keepdims=True)
+    a = 2 * rank + 1
+    # The second derivatives of T·xⁿ/r^(2n+1) along the moment.
+    pattern = rank * (rank - 1) * (matrix @ m[..., None])[..., 0] - rank * a * (vector * n_m + v_m * n)
+    pattern += a * number * ((a + 2) * n_m * n - m)
+    scale = MU0_OVER_4PI * prod(range(1, a, 2)) / factorial(rank)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        fields: FloatArray = np.swapaxes(scale * pattern / r ** (rank + 3), -1, -2)
+    return fields
 
 
 @cache

@@ -210,7 +210,7 @@ def too_near(
         if solutions.n_sources[best] > 1:
             continue
         place, moment = solutions.position_m[best, 0], solutions.moment_Am2[best, 0]
-        if body_length_m is not None:
+        if body_length_m:
             nearest = np.linalg.norm(array.positions - place, axis=1).min()
             near[row] = not dipole_validity(nearest, body_length_m)
         dof = int(solutions.dof[best])

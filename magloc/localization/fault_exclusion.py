@@ -19,9 +19,10 @@ from scipy.special import chdtri, fdtri
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.chi_square import energy_threshold
-from magloc.levels import CREDIBLE_ROW, SENSOR_FALSE_ALARM
+from magloc.levels import CREDIBLE_ROW, MISFIT, SENSOR_FALSE_ALARM
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.gauss_newton import refine
+from magloc.localization.fit.model_errors import model_errors
 from magloc.localization.fit.results import Fix
 from magloc.localization.search.multi_source import NOISE_ALONE
 from magloc.measurement.rows import (
@@ -46,6 +47,8 @@ _MOST_LEFT_OUT = 8
 _LEAST_WEIGHT = 1e-16
 # Share of a source's energy in one sensor above which no other sensor sees it.
 _LONELY = 0.9
+# Columns of the common field that are smaller than this against the largest are none.
+_UNSEEN = 1e-13
 # Median of χ²/n of three degrees of freedom.
 _MEDIAN_RATIO = 0.789
 _ROWS_AT_ONCE = 64
@@ -80,7 +83,9 @@ def without_faulty_sensors(
             block = of_mask[start : start + _ROWS_AT_ONCE]
             ambient = None if ambient_T is None else ambient_T[block]
             examination = _Examination(array, refit, mask, block, readings_T[block], ambient, free_position)
-            found += examination.fixes(examination.without_lonely_sources([fixes[row] for row in block]))
+            plain = [fixes[row] for row in block]
+            examination.allow_for_model_errors(plain)
+            found += examination.fixes(examination.without_lonely_sources(plain))
             examined.append(block)
     if not examined:
         return fixes
@@ -104,7 +109,9 @@ def _explains(fix: Fix) -> bool:
 
 def _is_credible(fix: Fix) -> bool:
     best = fix.solutions[0]
-    return best.dof <= 0 or bool(best.chi2 <= chdtri(best.dof, 1.0 - CREDIBLE_ROW))
+    # The prior of a body's shape is a coarse one, and no fault of a sensor.
+    level = MISFIT if fix.body_length_m > 0.0 else 1.0 - CREDIBLE_ROW
+    return best.dof <= 0 or bool(best.chi2 <= chdtri(best.dof, level))
 
 
 def _is_worth_dropping_for(fix: Fix, plain: Fix) -> bool:
@@ -151,6 +158,23 @@ class _Examination:
         self.count = np.bincount(array.channel_sensor[mask], minlength=array.n_sensors)
         level = 1.0 - SENSOR_FALSE_ALARM / array.n_sensors
         self.limits = np.array(chdtri(np.maximum(self.count, 1), 1.0 - level), dtype=np.float64)
+
+    def allow_for_model_errors(self, plain: Sequence[Fix]) -> None:
+        """Count as noise what bodies and the ambient field add to the fixes: no sensor is to be accused of it."""
+        errors = []
+        sigma_T = self.array.ambient_uncertainty_T if self.array.channel_is_scalar.any() else 0.0
+        for row, fix in enumerate(plain):
+            if fix.solutions and (fix.body_length_m > 0.0 or sigma_T):
+                q, mu = self._scaled(fix)
+                lengths = np.full((1, len(q)), fix.body_length_m)
+                at = self.problem.rows(np.array([row]))
+                errors.append((row, model_errors(at, q[None], mu[None], lengths, sigma_T)[0]))
+        if errors:
+            widest = max(columns.shape[1] for _, columns in errors)
+            every = np.zeros((len(plain), self.raw.shape[1], widest))
+            for row, columns in errors:
+                every[row, :, : columns.shape[1]] = columns
+            self.problem = self.problem.marginalised(every)
 
     def without_lonely_sources(self, plain: Sequence[Fix]) -> list[Fix]:
         """Fixes without sources that a single sensor sees: nothing tells such a source from a fault of the sensor."""
@@ -347,11 +371,14 @@ class _Examination:
 
 def weighted(problem: WhitenedModel, raw: FloatArray, weight: FloatArray) -> tuple[WhitenedModel, FloatArray]:
     """A problem and its raw readings (b, C) with the variance of every channel divided by a weight (b, C)."""
-    root = np.sqrt(weight)
+    root = np.sqrt(weight)[..., None]
     flat = problem.shrinkage >= 1.0
-    # The prior variance of the common field along each column of the basis; a flat one needs only the columns' span.
-    with np.errstate(divide="ignore"):
-        deviation = np.where(flat, 1.0, np.sqrt(np.maximum(1.0 / (1.0 - problem.shrinkage) ** 2 - 1.0, 0.0)))
-    basis, singular, _ = np.linalg.svd(root[..., None] * problem.basis * deviation[:, None], full_matrices=False)
-    shrinkage = np.where(flat, 1.0, 1.0 - 1.0 / np.sqrt(1.0 + singular**2))
-    return replace(problem, gain=root[..., None] * problem.gain, basis=basis, shrinkage=shrinkage), root * raw
+    # A flat prior needs only the span of its columns; of the others the variance along each of them counts.
+    span, size, _ = np.linalg.svd(root * problem.basis * flat[:, None], full_matrices=False)
+    seen = size > _UNSEEN * size[:, :1]
+    lighter = replace(problem, gain=root * problem.gain, basis=span, shrinkage=seen.astype(np.float64))
+    if not flat.all():
+        with np.errstate(divide="ignore"):
+            deviation = np.where(flat, 0.0, np.sqrt(1.0 / (1.0 - problem.shrinkage) ** 2 - 1.0))
+        lighter = lighter.marginalised(root * problem.basis * deviation[:, None])
+    return lighter, root[..., 0] * raw

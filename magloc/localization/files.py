@@ -23,6 +23,7 @@ def _entry(fix: Fix, joint: bool) -> dict[str, object]:
         "saturated_channels": fix.saturated_channels,
         "too_near": fix.too_near,
         "misfit": fix.misfit,
+        "body_length_m": fix.body_length_m,
     }
     return entry | {name: value for name, value in flags.items() if value}
 

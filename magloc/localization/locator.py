@@ -22,6 +22,7 @@ from magloc.localization.dipole_validity import too_near
 from magloc.localization.fault_exclusion import without_faulty_sensors
 from magloc.localization.fit.columns import Solutions, in_stable_order
 from magloc.localization.fit.fixes import Fixes
+from magloc.localization.fit.model_errors import with_model_errors
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import Fix
@@ -54,7 +55,9 @@ class Locator:
     prior : SourcePrior
         Bounds of position and moment that hold for every source; solutions that contradict them are left out.
     body_length_m : float, optional
-        Length of the object: fixes nearer than three lengths are flagged `too_near`, where it is no dipole.
+        Length of the object: what a dipole leaves out of its field counts as noise, and fixes nearer than three lengths
+        are flagged `too_near`. By default a quarter of its distance, where four sensors are nearer than 0.6 of the
+        array's circumradius; 0 for a point.
     exclude_faulty : bool
         Leave out, and name, sensors that contradict all others.
     seed : int
@@ -85,8 +88,8 @@ class Locator:
         exclude_faulty: bool = True,
         seed: int = 0,
     ) -> None:
-        if body_length_m is not None and not body_length_m > 0.0:
-            raise ValueError(f"Input body_length_m must be positive; instead received {body_length_m:g}.")
+        if body_length_m is not None and not 0.0 <= body_length_m < np.inf:
+            raise ValueError(f"Input body_length_m must not be negative; instead received {body_length_m:g}.")
         if position_m is not None and sources != 1:
             raise ValueError(f"Input sources must be 1 where position_m is known; instead received {sources}.")
         self.array = array
@@ -95,7 +98,7 @@ class Locator:
         self._search: SingleSourceSearch | MultiSourceSearch | MomentSearch
         if position_m is not None:
             self._search, self._fewest = MomentSearch(array, position_m, prior=prior), 3
-        elif sources == 1 and not array.channel_is_scalar.any():
+        elif sources == 1 and not array.channel_is_scalar.any() and prior.known_moment_Am2 is None:
             self._search, self._fewest = SingleSourceSearch(array, prior=prior), 6
         else:
             number = None if sources == "auto" else int(sources)
@@ -168,7 +171,7 @@ class Locator:
         if isinstance(search, MomentSearch):
             search = search.of_rows(index)
         at_once = _ROWS_AT_ONCE if isinstance(search, SingleSourceSearch) else _ROWS_OF_SEVERAL
-        found = _Rows(len(readings))
+        found = _Rows(len(readings), self.body_length_m, self.array.ambient_uncertainty_T)
         for rows in whitened_rows(self.array, readings, ambient, at_once):
             if rows.n_differences < self._fewest:
                 found.refuse(
@@ -184,7 +187,9 @@ class Locator:
 class _Rows:
     """Collects what is found of n rows, block by block."""
 
-    def __init__(self, n: int) -> None:
+    def __init__(self, n: int, body_length_m: float | None = 0.0, ambient_sigma_T: float = 0.0) -> None:
+        self.body_length_m, self.ambient_sigma_T = body_length_m, ambient_sigma_T
+        self.assumed_length_m = np.zeros(n)
         self.detected = np.zeros(n, dtype=bool)
         self.reason = [""] * n
         self.failed_starts = np.zeros(n, dtype=np.intp)
@@ -205,9 +210,16 @@ class _Rows:
         energy = np.zeros(len(self.reason))
         energy[loud.index] = loud.energy
         self.detected[loud.index] = is_detected(energy[loud.index], loud.n_differences)
-        for optima in search(loud):
+        pieces = [
+            piece
+            for optima in search(loud)
+            for piece in with_model_errors(optima, self.body_length_m, self.ambient_sigma_T)
+        ]
+        for optima, lengths in pieces:
             of_all = optima.rows.index
-            found = solutions_of(optima, energy[of_all], self.detected[of_all])
+            self.assumed_length_m[of_all] = lengths
+            known = optima.rows.energy if lengths.any() or self.ambient_sigma_T else energy[of_all]
+            found = solutions_of(optima, known, self.detected[of_all])
             solved = np.bincount(found.of_row, minlength=len(of_all)) > 0
             for row, reason, has in zip(of_all.tolist(), optima.reason, solved.tolist(), strict=True):
                 self.reason[row] = reason or ("" if has else optima.undetermined)
@@ -220,7 +232,13 @@ class _Rows:
         n = len(self.reason)
         solutions = Solutions.joined(self.parts)
         return Fixes(
-            solutions, np.arange(n, dtype=np.float64), self.detected, self.reason, self.failed_starts, [()] * n
+            solutions,
+            np.arange(n, dtype=np.float64),
+            self.detected,
+            self.reason,
+            self.failed_starts,
+            [()] * n,
+            body_length_m=self.assumed_length_m,
         )
 
 

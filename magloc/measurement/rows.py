@@ -12,6 +12,7 @@ from arrays.array import SensorArray
 from arrays.noise import reading_covariance
 from arrays.typing import BoolArray, FloatArray, IntArray
 from arrays.whitening import Whitening, whitening, whitenings
+from magloc.measurement.known_moment import KnownMoment
 from magloc.measurement.whitened import WhitenedModel
 
 NO_SIGNAL = "the sensors' readings do not differ: no signal"
@@ -30,14 +31,17 @@ class WhitenedRows:
     mask : ndarray of bool, shape (C,)
         Channels that have a reading.
     readings_T : ndarray, shape (b, C)
+    raw : ndarray, shape (b, C)
+        Of unit noise.
     y : ndarray, shape (b, C)
-        Of unit noise, free of the common field.
+        Free of the common field, too.
     """
 
     index: IntArray
     mask: BoolArray
     readings_T: FloatArray
     model: WhitenedModel
+    raw: FloatArray
     y: FloatArray
     n_differences: int
 
@@ -52,8 +56,18 @@ class WhitenedRows:
             index=self.index[at],
             readings_T=self.readings_T[at],
             model=self.model.rows(at),
+            raw=self.raw[at],
             y=self.y[at],
         )
+
+    def marginalised(self, columns: FloatArray) -> WhitenedRows:
+        """The same where errors of unit variance along columns (b, C, n), in units of the noise, count as noise."""
+        model = self.model.marginalised(columns)
+        return replace(self, model=model, y=model.whitened(self.raw))
+
+    def knowing(self, moment: KnownMoment | None) -> WhitenedRows:
+        """The same where the moment of every source is known."""
+        return replace(self, model=replace(self.model, known=moment)) if moment is not None else self
 
     @property
     def silent(self) -> BoolArray:
@@ -79,7 +93,7 @@ def whitened_rows(
             readings, ambient = readings_T[index], None if ambient_T is None else ambient_T[index]
             of_rows = whitenings_of(array, mask, readings)
             model, raw = whitened_model(array, mask, readings, of_rows, ambient)
-            yield WhitenedRows(index, mask, readings, model, model.whitened(raw), of_rows[0].n_differences)
+            yield WhitenedRows(index, mask, readings, model, raw, model.whitened(raw), of_rows[0].n_differences)
 
 
 def checked_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:

@@ -16,6 +16,7 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from arrays.whitening import Whitening
 from magloc.fields.dipole import MU0_OVER_4PI
+from magloc.measurement.known_moment import KnownMoment
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +77,8 @@ class WhitenedModel(ScaledSensors):
     basis : ndarray, shape (b, C, c)
         Orthonormal common field of the whitening.
     shrinkage : ndarray, shape (b, c)
+    known : KnownMoment, optional
+        What is known of every source's moment: more numbers of unit variance that a fit explains.
     """
 
     channel_is_scalar: NDArray[np.bool_]
@@ -83,6 +86,7 @@ class WhitenedModel(ScaledSensors):
     ambient: FloatArray
     basis: FloatArray
     shrinkage: FloatArray
+    known: KnownMoment | None = None
 
     @classmethod
     def of(cls, array: SensorArray, whitenings: list[Whitening], ambient_T: FloatArray) -> WhitenedModel:
@@ -149,6 +153,22 @@ class WhitenedModel(ScaledSensors):
         free: FloatArray = columns - self.basis @ common
         return free if channels.ndim == 3 else free[..., 0]
 
+    def marginalised(self, columns: FloatArray) -> WhitenedModel:
+        """The same where errors of unit variance along columns (b, C, n), in units of the noise, count as noise."""
+        flat = self.shrinkage >= 1.0
+        unknown = self.basis * flat[:, None]
+        with np.errstate(divide="ignore"):
+            variance = np.where(flat, 0.0, 1.0 / (1.0 - self.shrinkage) ** 2 - 1.0)
+        known = self.basis * np.sqrt(variance)[:, None]
+        free = columns - unknown @ (unknown.transpose(0, 2, 1) @ columns)
+        every = free if flat.all() else np.concatenate([known, free], axis=2)
+        basis, singular, _ = np.linalg.svd(every, full_matrices=False)
+        return replace(
+            self,
+            basis=np.concatenate([unknown, basis], axis=2),
+            shrinkage=np.concatenate([flat.astype(np.float64), 1.0 - 1.0 / np.sqrt(1.0 + singular**2)], axis=1),
+        )
+
     def source_fields(self, q: FloatArray, mu: FloatArray) -> FloatArray:
         """Field of all sources (b, K, ...) at the sensors: (b, N, 3) [T]."""
         n, inverse3 = self._directions(q)
@@ -171,6 +191,30 @@ class WhitenedModel(ScaledSensors):
             total = source_fields[:, owner] + self.ambient[:, owner]
             channels[:, scalar] = self.gain[:, scalar, 0] * np.sqrt(np.sum(total * total, axis=-1))
         return self.whitened(channels)
+
+    def residual(self, y: FloatArray, q: FloatArray, mu: FloatArray, source_fields: FloatArray) -> FloatArray:
+        """What sources leave of whitened readings (b, C), and behind them of what is known of their moments."""
+        of_readings = y - self.predicted(source_fields)
+        if self.known is None:
+            return of_readings
+        return np.concatenate([of_readings, self.known.residual(self.moment(q, mu))], axis=1)
+
+    def known_jacobian(self, q: FloatArray, mu: FloatArray, tangent: FloatArray | None = None) -> FloatArray:
+        """Derivative of what is known of the moments by μ, or along tangents (b, K, 4, 3) of q: (b, K k, 3 K)."""
+        if self.known is None:
+            return np.empty((len(q), 0, 3 * q.shape[1]))
+        moment = self.moment(q, mu)
+        of_moment = self.known.jacobian(moment)
+        if tangent is None:
+            columns = of_moment * self.moment(q, np.ones_like(mu))[..., None, :]
+        else:
+            along = np.sum(of_moment * moment[..., None, :], axis=-1, keepdims=True)
+            columns = along * (-3.0 / q[..., 3:] * tangent[..., 3, :])[..., None, :]
+        n_fits, n_sources, n_known, _ = columns.shape
+        every = np.zeros((n_fits, n_sources, n_known, n_sources, 3))
+        own = np.arange(n_sources)
+        every[:, own, :, own] = columns.transpose(1, 0, 2, 3)
+        return every.reshape(n_fits, n_sources * n_known, 3 * n_sources)
 
     def linear_gain(self, source_fields: FloatArray) -> FloatArray:
         """What every channel reads of a small change of the field: (b, C, 3), the direction of the sum for moduli."""

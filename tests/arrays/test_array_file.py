@@ -136,7 +136,7 @@ class TestGeometryForm:
 
     def test_header(self, write: WriteFile) -> None:
         header = 'name = "Turm №1"\nnoise_fraction = 0.01\ncommon_field_nT = 50\nambient_nT = [1, 2.5, -3]\n'
-        header += "ambient_gradient_nT_m = [[1, 2, 0], [2, -1.5, 0.3], [0, 0.3, 0.5]]\n"
+        header += "ambient_gradient_nT_m = [[1, 2, 0], [2, -1.5, 0.3], [0, 0.3, 0.5]]\nambient_uncertainty_nT = 50.0\n"
         assert read_array(write(f"format_version = 1\n{header}{GEOMETRY}")) == replace(
             tetrahedron(1.5),
             name="Turm №1",
@@ -144,6 +144,7 @@ class TestGeometryForm:
             common_field_T=5e-8,
             ambient_T=(1e-9, 2.5e-9, -3e-9),
             ambient_gradient_T_m=((1e-9, 2e-9, 0.0), (2e-9, -1.5e-9, 0.3e-9), (0.0, 0.3e-9, 0.5e-9)),
+            ambient_uncertainty_T=5e-8,
         )
 
     def test_quality_of_all_sensors(self, write: WriteFile) -> None:

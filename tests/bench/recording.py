@@ -25,7 +25,7 @@ def rows(size: Size) -> Iterator[Row]:
         return
     array = read_array(folder / "array.toml")
     readings = read_readings(folder / "readings.csv", array).values_T[: size.rows]
-    locator = plain_locator(array)
+    locator = plain_locator(array, body_length_m=0.0)
     threads = numba.get_num_threads()
     contestants = {n: Contestant(lambda: locator.fit_rows(readings), n, len(readings)) for n in {1, threads}}
     for n, timing in sorted(interleaved(contestants, size.rounds).items()):

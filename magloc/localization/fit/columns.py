@@ -11,6 +11,8 @@ import numpy as np
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.localization.fit.results import Intervals, Solution, Source
 
+_NUMBERS = ("of_row", "n_sources", "chi2", "dof", "weight", "iterations", "known_chi2", "n_known")
+
 
 @dataclass(frozen=True, eq=False)
 class Solutions:
@@ -18,11 +20,11 @@ class Solutions:
 
     Attributes
     ----------
-    of_row, n_sources, dof, iterations : ndarray of int, shape (f,)
+    of_row, n_sources, dof, iterations, n_known : ndarray of int, shape (f,)
     position_m, moment_Am2 : ndarray, shape (f, K, 3)
         NaN beyond the sources of a solution.
     covariance : ndarray, shape (f, 6 K, 6 K) or (f, 3, 3)
-    chi2, weight : ndarray, shape (f,)
+    chi2, weight, known_chi2 : ndarray, shape (f,)
     ranges : list of tuple of Intervals
         Of every source of every solution.
     gaussian, merged : ndarray of bool, shape (f, K)
@@ -40,6 +42,8 @@ class Solutions:
     ranges: list[tuple[Intervals, ...]]
     gaussian: BoolArray
     merged: BoolArray
+    known_chi2: FloatArray
+    n_known: IntArray
 
     def __len__(self) -> int:
         return len(self.of_row)
@@ -49,7 +53,22 @@ class Solutions:
         """No solution of any row."""
         whole, number = np.zeros(0, dtype=np.intp), np.zeros(0)
         flags, vectors = np.zeros((0, 1), dtype=bool), np.zeros((0, 1, 3))
-        return cls(whole, whole, vectors, vectors, np.zeros((0, 6, 6)), number, whole, number, whole, [], flags, flags)
+        return cls(
+            whole,
+            whole,
+            vectors,
+            vectors,
+            np.zeros((0, 6, 6)),
+            number,
+            whole,
+            number,
+            whole,
+            [],
+            flags,
+            flags,
+            number,
+            whole,
+        )
 
     @classmethod
     def of(cls, solutions: Sequence[tuple[int, Solution]]) -> Solutions:
@@ -72,6 +91,8 @@ class Solutions:
             ranges=[tuple(source.range_interval_m for source in sources)],
             gaussian=np.array([[source.gaussian for source in sources]]),
             merged=np.array([[source.merged for source in sources]]),
+            known_chi2=np.array([solution.known_chi2]),
+            n_known=np.array([solution.n_known]),
         )
 
     @classmethod
@@ -95,7 +116,7 @@ class Solutions:
 
         ranges = [intervals for part in filled for intervals in part.ranges]
         return cls(
-            **{name: stacked(name, (), 0) for name in ("of_row", "n_sources", "chi2", "dof", "weight", "iterations")},
+            **{name: stacked(name, (), 0) for name in _NUMBERS},
             **{name: stacked(name, (most, 3), np.nan) for name in ("position_m", "moment_Am2")},
             **{name: stacked(name, (most,), False) for name in ("gaussian", "merged")},
             covariance=stacked("covariance", (size, size), np.nan),
@@ -126,7 +147,14 @@ class Solutions:
         )
         covariance = self.covariance[i] if known else self.covariance[i, : 6 * n, : 6 * n]
         return Solution(
-            sources, covariance, float(self.chi2[i]), int(self.dof[i]), float(self.weight[i]), int(self.iterations[i])
+            sources,
+            covariance,
+            float(self.chi2[i]),
+            int(self.dof[i]),
+            float(self.weight[i]),
+            int(self.iterations[i]),
+            float(self.known_chi2[i]),
+            int(self.n_known[i]),
         )
 
 

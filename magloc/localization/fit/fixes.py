@@ -39,6 +39,8 @@ class Fixes(Sequence[Fix]):
     reason : list of str
     dropped_sensors, saturated_channels : list of tuple of str
     failed_starts : ndarray of int, shape (n,)
+    body_length_m : ndarray, shape (n,)
+        Length of the object that was taken into account, said or assumed [m]; 0 for a point.
 
     Examples
     --------
@@ -58,10 +60,13 @@ class Fixes(Sequence[Fix]):
     saturated_channels: list[tuple[str, ...]] = field(default_factory=list)
     too_near: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
     frame: Literal["array", "world"] = "array"
+    body_length_m: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         if not len(self.too_near):
             object.__setattr__(self, "too_near", np.zeros(len(self), dtype=bool))
+        if not len(self.body_length_m):
+            object.__setattr__(self, "body_length_m", np.zeros(len(self)))
         if not self.saturated_channels:
             object.__setattr__(self, "saturated_channels", [()] * len(self))
 
@@ -86,6 +91,7 @@ class Fixes(Sequence[Fix]):
             bool(self.too_near[i]),
             int(self.failed_starts[i]),
             float(self.time_s[i]),
+            float(self.body_length_m[i]),
         )
 
     @cached_property
@@ -161,7 +167,9 @@ class Fixes(Sequence[Fix]):
         """Whether χ² is far beyond noise (n,)."""
         result = np.zeros(len(self), dtype=bool)
         begin = self._edges[:-1][self.solved]
-        result[self.solved] = is_misfit(self.solutions.chi2[begin], self.solutions.dof[begin])
+        every = self.solutions
+        chi2, dof = every.chi2 + every.known_chi2, every.dof + every.n_known
+        result[self.solved] = is_misfit(chi2[begin], dof[begin])
         return result
 
     @classmethod
@@ -188,6 +196,7 @@ class Fixes(Sequence[Fix]):
             [reason for part in parts for reason in part.reason],
             np.concatenate([np.zeros(0, dtype=np.intp), *(part.failed_starts for part in parts)]),
             [names for part in parts for names in part.dropped_sensors],
+            body_length_m=np.concatenate([np.zeros(0), *(part.body_length_m for part in parts)]),
         )
 
     def moved(self, position_m: FloatArray, rotation: Rotation, *, frame: Literal["array", "world"]) -> Fixes:
@@ -217,7 +226,7 @@ class Fixes(Sequence[Fix]):
             [(int(row), solution) for row, fix in zip(rows, fixes, strict=True) for solution in fix.solutions]
         )
         columns: dict[str, Any] = {}
-        for name in ("detected", "failed_starts", "reason", "dropped_sensors"):
+        for name in ("detected", "failed_starts", "reason", "dropped_sensors", "body_length_m"):
             columns[name] = getattr(self, name).copy()
             for row, fix in zip(rows, fixes, strict=True):
                 columns[name][row] = getattr(fix, name)

@@ -116,6 +116,24 @@ def fit_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> FloatAr
     return _moment_step(problem.moment_jacobian(q, gain), y - problem.predicted(np.zeros_like(problem.ambient)))
 
 
+def _by_position(
+    problem: WhitenedModel, q: FloatArray, mu: FloatArray, gain: FloatArray, tangent: FloatArray
+) -> FloatArray:
+    """Derivative of the predictions, and of what is known of the moments, along tangents of q."""
+    of_readings = problem.position_jacobian(q, mu, gain, tangent)
+    if problem.known is None:
+        return of_readings
+    return np.concatenate([of_readings, problem.known_jacobian(q, mu, tangent)], axis=1)
+
+
+def _by_moment(problem: WhitenedModel, q: FloatArray, mu: FloatArray, gain: FloatArray) -> FloatArray:
+    """Derivative of the predictions, and of what is known of the moments, by μ."""
+    of_readings = problem.moment_jacobian(q, gain)
+    if problem.known is None:
+        return of_readings
+    return np.concatenate([of_readings, problem.known_jacobian(q, mu)], axis=1)
+
+
 def _moment_step(jacobian: FloatArray, residual: FloatArray) -> FloatArray:
     step, _ = _NormalEquations.of(jacobian, residual).step()
     return step.reshape(len(residual), -1, 3)
@@ -181,10 +199,10 @@ def refine(
     live = np.arange(n_fits)
     damping = np.full(n_fits, 1e-3)
     fields = problem.source_fields(q, mu)
-    residual = y - problem.predicted(fields)
+    residual = problem.residual(y, q, mu, fields)
     current = _squares(residual)
     fresh = np.ones(n_fits, dtype=bool)
-    jacobian = np.empty((n_fits, y.shape[1], damped.size))
+    jacobian = np.empty((n_fits, residual.shape[1], damped.size))
     tangent = np.empty((n_fits, n_sources, 4, 3))
     sub = problem
     for _ in range(max_iterations):
@@ -195,21 +213,21 @@ def refine(
             at = sub if new.size == live.size else sub.rows(new)
             gain = at.linear_gain(fields[new])
             tangent[new] = tangents(q[live[new]])
-            along = at.position_jacobian(q[live[new]], mu[live[new]], gain, tangent[new])[..., columns]
-            jacobian[new] = np.concatenate([along, at.moment_jacobian(q[live[new]], gain)], axis=-1)
+            along = _by_position(at, q[live[new]], mu[live[new]], gain, tangent[new])[..., columns]
+            jacobian[new] = np.concatenate([along, _by_moment(at, q[live[new]], mu[live[new]], gain)], axis=-1)
             iterations[live[new]] += 1
         normal = _NormalEquations.of(jacobian, residual)
         step, promised = normal.step(damping[:, None] * damped)
         _, reachable = normal.step()
         new_q, new_mu, step_share = _moved(q[live], mu[live], step, tangent, columns)
         new_fields = sub.source_fields(new_q, new_mu)
-        new_residual = y[live] - sub.predicted(new_fields)
+        new_residual = sub.residual(y[live], new_q, new_mu, new_fields)
         new_chi2 = _squares(new_residual)
         if columns.size:
             gain = sub.linear_gain(new_fields)
-            better_mu = new_mu + _moment_step(sub.moment_jacobian(new_q, gain), new_residual)
+            better_mu = new_mu + _moment_step(_by_moment(sub, new_q, new_mu, gain), new_residual)
             better_fields = sub.source_fields(new_q, better_mu)
-            better_residual = y[live] - sub.predicted(better_fields)
+            better_residual = sub.residual(y[live], new_q, better_mu, better_fields)
             better_chi2 = _squares(better_residual)
             better = better_chi2 < new_chi2
             new_mu = np.where(better[:, None, None], better_mu, new_mu)
@@ -284,8 +302,8 @@ def covariances(problem: WhitenedModel, fits: JointFits) -> FloatArray:
     mu = fits.mu / np.abs(s) ** 3
     gain = problem.linear_gain(problem.source_fields(rho, mu))
     along = np.broadcast_to(np.eye(4)[:, :3], (n_fits, n_sources, 4, 3))
-    by_position = problem.position_jacobian(rho, mu, gain, along).reshape(n_fits, -1, n_sources, 3)
-    by_moment = problem.moment_jacobian(rho, gain).reshape(n_fits, -1, n_sources, 3)
+    by_position = _by_position(problem, rho, mu, gain, along).reshape(n_fits, -1, n_sources, 3)
+    by_moment = _by_moment(problem, rho, mu, gain).reshape(n_fits, -1, n_sources, 3)
     jacobian = np.concatenate([by_position, by_moment], axis=-1).reshape(n_fits, -1, 6 * n_sources)
     unit = np.tile(np.repeat([problem.radius, problem.radius**3 / MU0_OVER_4PI], 3), n_sources)
     return inverse_information(jacobian) * np.outer(unit, unit)

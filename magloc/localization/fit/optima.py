@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.localization.fit.gauss_newton import JointFits
@@ -28,6 +30,8 @@ class Optima:
         Places of the sources where they are known: then the unknowns are the moments alone.
     undetermined : str
         Why a row has no solution if its optima have no finite covariance.
+    bent : ndarray of bool, shape (f,)
+        Whether errors beyond noise follow a curve.
     """
 
     rows: WhitenedRows
@@ -38,6 +42,22 @@ class Optima:
     failed_starts: IntArray | int = 0
     position_m: FloatArray | None = None
     undetermined: str = UNDETERMINED
+    bent: BoolArray | bool = False
+
+    def chosen(self, which: BoolArray) -> Optima:
+        """Those of some of the rows (b,)."""
+        kept = which[self.of_row]
+        return replace(
+            self,
+            rows=self.rows.chosen(which),
+            fits=self.fits.rows(kept),
+            of_row=(np.cumsum(which) - 1)[self.of_row[kept]],
+            reason=[reason for reason, chosen in zip(self.reason, which, strict=True) if chosen],
+            merged=np.broadcast_to(self.merged, self.fits.mu.shape[:2])[kept],
+            failed_starts=np.broadcast_to(self.failed_starts, which.shape)[which],
+            bent=np.broadcast_to(self.bent, self.of_row.shape)[kept],
+            position_m=None if self.position_m is None else self.position_m[which],
+        )
 
     @property
     def dof(self) -> int:

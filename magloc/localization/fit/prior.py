@@ -9,9 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray
+from magloc.measurement.known_moment import KnownMoment
 
 if TYPE_CHECKING:
     from magloc.measurement.whitened import ScaledSensors
+
+# Of the strength of a magnet that somebody states: a share of it.
+_DEFAULT_SIGMA = 0.1
 
 
 @dataclass(frozen=True)
@@ -24,11 +28,16 @@ class SourcePrior:
         Bounds of the position in the array's frame [m], infinite where there is none: a box, a slab or a half-space.
     largest_moment_Am2 : float
         Bound of the moment's modulus [A·m²].
+    known_moment_Am2 : float or tuple of 3 floats, optional
+        What the moment is known to be: its modulus, or its components in the array's frame [A·m²]. Counts as one more
+        measurement, or as three.
+    known_moment_sigma_Am2 : float, optional
+        1 σ of that, of every component; a tenth of the modulus by default.
 
     Raises
     ------
     ValueError
-        The bounds leave nothing.
+        The bounds leave nothing, or a known moment or its σ is not positive.
 
     Examples
     --------
@@ -44,6 +53,8 @@ class SourcePrior:
     low_m: tuple[float, float, float] = (-math.inf, -math.inf, -math.inf)
     high_m: tuple[float, float, float] = (math.inf, math.inf, math.inf)
     largest_moment_Am2: float = math.inf
+    known_moment_Am2: float | tuple[float, float, float] | None = None
+    known_moment_sigma_Am2: float | None = None
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.low_m, self.high_m, strict=True)):
@@ -52,6 +63,32 @@ class SourcePrior:
             )
         if not self.largest_moment_Am2 > 0.0:
             raise ValueError(f"Input largest_moment_Am2 must be positive; instead received {self.largest_moment_Am2}.")
+        if self.known_moment_Am2 is None:
+            if self.known_moment_sigma_Am2 is not None:
+                raise ValueError("Input known_moment_sigma_Am2 must come with known_moment_Am2; instead it came alone.")
+            return
+        value = np.atleast_1d(np.asarray(self.known_moment_Am2, dtype=np.float64))
+        if (
+            value.shape not in ((1,), (3,))
+            or not 0.0 < np.linalg.norm(value) < math.inf
+            or value[0] <= 0.0 == value.size - 1
+        ):
+            raise ValueError(
+                "Input known_moment_Am2 must be a positive number or three numbers, not all zero; instead received"
+                f" {self.known_moment_Am2}."
+            )
+        sigma = self.known_moment_sigma_Am2
+        if sigma is not None and not 0.0 < sigma < math.inf:
+            raise ValueError(f"Input known_moment_sigma_Am2 must be positive and finite; instead received {sigma}.")
+
+    @property
+    def known_moment(self) -> KnownMoment | None:
+        """The known moment as a measurement."""
+        if self.known_moment_Am2 is None:
+            return None
+        value = tuple(np.atleast_1d(self.known_moment_Am2).tolist())
+        sigma = self.known_moment_sigma_Am2
+        return KnownMoment(value, _DEFAULT_SIGMA * float(np.linalg.norm(value)) if sigma is None else sigma)
 
     def allows_position(self, position_m: FloatArray) -> Any:
         """Whether positions (..., 3) lie within the bounds."""

@@ -94,6 +94,10 @@ class Solution:
         How likely the solution is among those of the fix; they add up to one.
     iterations : int
         Linearisations that led here.
+    known_chi2 : float
+        What the moments add to χ² by differing from what is known of them; not part of `chi2`.
+    n_known : int
+        Numbers that are known of them.
 
     Examples
     --------
@@ -110,6 +114,13 @@ class Solution:
     dof: int
     weight: float = 1.0
     iterations: int = 0
+    known_chi2: float = 0.0
+    n_known: int = 0
+
+    @property
+    def misfit(self) -> bool:
+        """Whether χ², with what is known of the moments, is far beyond noise."""
+        return bool(is_misfit(self.chi2 + self.known_chi2, self.dof + self.n_known))
 
     @property
     def source(self) -> Source:
@@ -169,6 +180,8 @@ class Fix:
     failed_starts : int
         Starts of the search that ended without an optimum.
     time_s : float
+    body_length_m : float
+        Length of the object that was taken into account, said or assumed [m]; 0 for a point.
 
     Examples
     --------
@@ -187,6 +200,7 @@ class Fix:
     too_near: bool = False
     failed_starts: int = 0
     time_s: float = math.nan
+    body_length_m: float = 0.0
 
     @property
     def best(self) -> Solution:
@@ -198,7 +212,7 @@ class Fix:
     @property
     def misfit(self) -> bool:
         """Whether χ² is far beyond noise: then neither the position nor its standard deviations are to be trusted."""
-        return bool(self.solutions) and bool(is_misfit(self.solutions[0].chi2, self.solutions[0].dof))
+        return bool(self.solutions) and self.solutions[0].misfit
 
     def __repr__(self) -> str:
         if not self.solutions:

@@ -22,6 +22,7 @@ from magloc.localization.search.candidates import (
     modulus_templates,
     rows_of_equal_gain,
 )
+from magloc.localization.search.known_moment import starts_of_known_moment
 from magloc.measurement.whitened import WhitenedModel
 
 Allowed = Callable[[FloatArray, FloatArray], NDArray[np.bool_]]
@@ -100,6 +101,12 @@ class Search:
             row = np.repeat(np.arange(len(y)), self.n_starts)
             mu = fit_moments(problem.rows(row), y[row], q.reshape(-1, 1, 4))
             starts.append((q, mu.reshape(len(y), self.n_starts, 3)))
+            if problem.known is not None:
+                starts.append(
+                    starts_of_known_moment(
+                        problem, problem.known, residual, self.candidates, self.n_starts, self.apart_rad
+                    )
+                )
         if self._needs_templates(problem, y):
             starts.append(self._template_starts(problem, y))
         q, mu = (np.concatenate(parts, axis=1) for parts in zip(*starts, strict=True))

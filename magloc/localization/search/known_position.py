@@ -39,7 +39,7 @@ class MomentSearch:
     position_m : array_like, shape (3,) or (n, 3)
         The source in the array's frame [m]: in all rows, or in every one of an array that moves.
     prior : SourcePrior
-        Of which only the bound of the moment is used.
+        Of which only what it says of the moment is used.
 
     Raises
     ------
@@ -70,6 +70,7 @@ class MomentSearch:
 
     def optima(self, rows: WhitenedRows) -> list[Optima]:
         """Every distinct optimum of every row."""
+        rows = rows.knowing(self.prior.known_moment)
         model, place = rows.model, self.position_m if self.position_m.ndim == 1 else self.position_m[rows.index]
         position = np.broadcast_to(place, (len(rows), 3))
         q = model.homogeneous(position)[:, None]
@@ -118,7 +119,8 @@ def _distinct(problem: WhitenedModel, y: FloatArray, q: FloatArray, fits: JointF
         kept.put((rows, k), every.rows((rows, best)))
         opposite = even[:, None] & (np.sum(mu * kept.mu[:, k], axis=-1) < 0.0)
         halfway = 0.5 * (np.where(opposite[..., None], -mu, mu) + kept.mu[:, k])
-        residual = y[row] - each.predicted(each.source_fields(q[row], halfway.reshape(-1, 1, 3)))
+        halfway = halfway.reshape(-1, 1, 3)
+        residual = each.residual(y[row], q[row], halfway, each.source_fields(q[row], halfway))
         between = np.sum(residual**2, axis=-1).reshape(n, -1)
         chi2[between < np.where(np.isfinite(chi2), chi2, 0.0) + _BARRIER] = np.inf
         chi2[rows, best] = np.inf

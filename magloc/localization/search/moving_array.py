@@ -29,6 +29,7 @@ _UNSEEN = "the rows together do not determine the source"
 
 def optima_at_rest(rows: WhitenedRows, prior: SourcePrior = NOTHING_KNOWN) -> Optima:
     """Distinct optima of a source at rest by :func:`stacked_rows`; `prior` bounds its position in the world frame."""
+    rows = rows.knowing(prior.known_moment)
     model, allowed = rows.model, partial(prior.allows, rows.model)
     beam = Search(model.homogeneous(_candidates(model)), allowed, width=_WIDTH).first(model, rows.y)
     fits = beam.rows(0)
@@ -77,6 +78,7 @@ def stacked_rows(
         available.ravel(),
         readings_T.reshape(1, -1),
         model,
+        raw[None],
         model.whitened(raw[None]),
         sum(w.n_differences for w in whitenings),
     )

@@ -96,7 +96,7 @@ class MultiSourceSearch:
 
     def optima(self, rows: WhitenedRows) -> list[Optima]:
         """Distinct optima with the chosen number of sources: one entry for every number."""
-        return _Levels(self, rows).optima()
+        return _Levels(self, rows.knowing(self.prior.known_moment)).optima()
 
     def threshold_of(self, levels: _Levels, first: JointFits) -> float:
         """The threshold for another source, drawn once for every number of differences."""

@@ -17,15 +17,20 @@ LARGEST_GAUSSIAN_SIGMA = 0.04
 """Standard deviations of position and moment, over range and moment, up to which their errors are Gaussian."""
 
 
-def log_evidence_volume(covariance: FloatArray, moment: FloatArray, offset_m: FloatArray | None = None) -> FloatArray:
+def log_evidence_volume(
+    covariance: FloatArray, moment: FloatArray, offset_m: FloatArray | None = None, *, scale_m: float | None = None
+) -> FloatArray:
     r"""Logarithm of how much of what may be thought of beforehand a solution stands for, up to a constant: (...).
 
     Nothing is known beforehand of the scale: direction, orientation and the logarithms of range and moment are uniform,
     a density :math:`\propto r^{-3} |m|^{-3}` of position and moment. By Laplace's method a solution then stands for the
     root of the determinant of its covariance (..., 6 K, 6 K), or (..., 3, 3) of a moment alone, in units of r and |m|.
     The logarithm of the range counts with a standard deviation of one at most: χ² is no parabola over more than that.
+    A known moment gives a scale: positions are then uniform in space, in units of any length.
     """
     unit = _units(*([moment] if offset_m is None else [offset_m, moment]))
+    if scale_m is not None and offset_m is not None:
+        unit = np.broadcast_to(np.tile(np.repeat([scale_m, 1.0], 3), offset_m.shape[-2]), unit.shape)
     with np.errstate(invalid="ignore", divide="ignore"):
         relative = covariance / (unit[..., :, None] * unit[..., None, :])
     known = np.asarray(np.isfinite(relative).all(axis=(-2, -1)))
@@ -123,11 +128,14 @@ class Rivals:
         moment: FloatArray,
         energy: FloatArray,
         n_differences: int,
+        scale_m: float | None = None,
     ) -> Rivals:
         """From solutions, best first, and the energy (b,) of the rows' differences as they are without a source."""
         determined = np.isfinite(covariance).all(axis=(-2, -1))
         listed = np.where(determined, chi2, np.inf)
-        weight = weights(listed, log_evidence_volume(covariance, moment[..., None, :], offset_m[..., None, :]))
+        weight = weights(
+            listed, log_evidence_volume(covariance, moment[..., None, :], offset_m[..., None, :], scale_m=scale_m)
+        )
         raised = rise(energy, chi2[:, 0], n_differences, levels(listed, weight))
         return cls(listed, covariance, offset_m, moment, weight, raised)
 

@@ -15,11 +15,11 @@ from scipy.special import chdtrc
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.compilation import over_rows
 from magloc.fields.dipole import MU0_OVER_4PI
-from magloc.levels import CERTAIN_WEIGHT, MISFIT
+from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95, MISFIT
 from magloc.localization.fit.columns import Solutions
 from magloc.localization.fit.gauss_newton import covariances
 from magloc.localization.fit.optima import Optima
-from magloc.localization.fit.results import EVERYWHERE, Intervals, is_observable_set, span
+from magloc.localization.fit.results import EVERYWHERE, Intervals, is_misfit, is_observable_set, span
 from magloc.localization.uncertainty.ambiguity import (
     LARGEST_GAUSSIAN_SIGMA,
     Rivals,
@@ -34,6 +34,7 @@ from magloc.localization.uncertainty.moment_covariance import moment_covariances
 from magloc.localization.uncertainty.range_interval import relative_range_sigma, union
 from magloc.localization.uncertainty.range_profile import profile_stretches, ranges_within
 from magloc.localization.uncertainty.range_profile_compiled import profile_rows
+from magloc.measurement.whitened import WhitenedModel
 from magloc.measurement.whitened_compiled import ModelRows
 
 # By how much the rise of χ² at one standard deviation may differ from one where errors are Gaussian.
@@ -62,19 +63,23 @@ def solutions_of(optima: Optima, energy: FloatArray, detected: BoolArray) -> Sol
         known = _of_one(optima, energy)
     else:
         known = _of_several(optima, detected)
+    moments = model.known.residual(moment) if model.known is not None else np.empty((n_fits, 0))
+    of_moments = np.einsum("fk,fk->f", moments, moments)
     every = Solutions(
         of_row=of_row,
         n_sources=np.full(n_fits, n_sources),
         position_m=position,
         moment_Am2=moment,
         covariance=known.covariance,
-        chi2=fits.chi2,
+        chi2=fits.chi2 - of_moments,
         dof=np.full(n_fits, optima.dof),
         weight=known.weight,
         iterations=fits.iterations,
         ranges=known.ranges,
-        gaussian=known.gaussian,
+        gaussian=known.gaussian & ~np.broadcast_to(optima.bent, of_row.shape)[:, None],
         merged=np.full((n_fits, n_sources), optima.merged),
+        known_chi2=of_moments,
+        n_known=np.full(n_fits, moments.shape[1]),
     )
     determined = np.asarray(np.isfinite(known.covariance).all(axis=(1, 2)))
     return every if determined.all() else every.chosen(determined)
@@ -87,14 +92,15 @@ def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray)
     axis, to either side: not where the errors follow a curve. With no degrees of freedom every χ² is as it must be.
     """
     fits, of_row = optima.fits.rows(which), optima.of_row[which]
-    problem, y, dof = optima.rows.model.rows(of_row), optima.rows.y[of_row], optima.dof
+    problem, y = optima.rows.model.rows(of_row), optima.rows.y[of_row]
+    dof = optima.dof + (0 if problem.known is None else fits.n_sources * problem.known.n_known)
     position, moment = problem.position(fits.q), problem.moment(fits.q, fits.mu)
     axis = longest_axes(covariance, position - problem.centroid, moment).reshape(*position.shape[:2], 2, 3)
     described = chdtrc(dof, fits.chi2) >= MISFIT if dof > 0 else np.ones(len(y), dtype=bool)
     for side in (axis, -axis):
         q = problem.homogeneous(position + side[:, :, 0])
         mu = problem.scaled_moment(q, moment + side[:, :, 1])
-        residual = y - problem.predicted(problem.source_fields(q, mu))
+        residual = problem.residual(y, q, mu, problem.source_fields(q, mu))
         described &= np.abs(np.sum(residual**2, axis=1) - fits.chi2 - 1.0) <= _BEND
     return np.asarray(described)
 
@@ -112,7 +118,7 @@ def _of_one(optima: Optima, energy: FloatArray) -> _Known:
 
     q, mu, chi2 = table(fits.q[:, 0], np.nan), table(fits.mu[:, 0], np.nan), table(fits.chi2, np.inf)
     offset, moment = model.position(q) - model.centroid, model.moment(q, mu)
-    compiled = not model.channel_is_scalar.any()
+    compiled = not model.channel_is_scalar.any() and model.known is None
     if compiled:
         counts = np.bincount(of_row, minlength=n_rows)[:, None]
         scaled = np.full((*shape, 6, 6), np.nan)
@@ -121,12 +127,23 @@ def _of_one(optima: Optima, energy: FloatArray) -> _Known:
         covariance = scaled * np.outer(unit, unit)
     else:
         covariance = table(covariances(model.rows(of_row), fits), np.nan)
-    rivals = Rivals.of(chi2, covariance, offset, moment, energy, rows.n_differences)
+    understated = _understated(chi2[:, 0], optima)
+    covariance *= understated[:, None, None, None]
+    rivals = Rivals.of(
+        chi2 / understated[:, None],
+        covariance,
+        offset,
+        moment,
+        energy / understated,
+        rows.n_differences,
+        _scale_m(model),
+    )
+    rise = rivals.rise * understated
     alpha = np.full((*shape, 2), np.nan)
     if compiled:
-        over_rows(profile_rows, n_rows, rows.y, rivals.rise, ModelRows.of(model), q, chi2, counts, scaled, alpha)
+        over_rows(profile_rows, n_rows, rows.y, rise, ModelRows.of(model), q, chi2, counts, scaled, alpha)
     else:
-        left = rivals.rise[of_row] - (fits.chi2 - chi2[of_row, 0])
+        left = rise[of_row] - (fits.chi2 - chi2[of_row, 0])
         inside = np.flatnonzero((left > 0.0) & np.isfinite(left))
         sigma = relative_range_sigma(covariance[at], offset[at])
         alpha[of_row[inside], at[1][inside]] = profile_stretches(
@@ -140,18 +157,33 @@ def _of_one(optima: Optima, energy: FloatArray) -> _Known:
     return _Known([(ranges.sets[row],) for row in of_row], ranges.covariance[at], gaussian[:, None], rivals.weight[at])
 
 
+def _understated(chi2: FloatArray, optima: Optima) -> FloatArray:
+    """By how much the variance of noise is understated (b,): χ² per degree of freedom of rows that are misfits, else 1.
+
+    What a wrong model leaves is no noise, but σ that knew only the noise would be worse.
+    """
+    with np.errstate(invalid="ignore"):
+        return np.where(np.isfinite(chi2) & is_misfit(chi2, optima.dof), chi2 / max(optima.dof, 1), 1.0)
+
+
+def _scale_m(model: WhitenedModel) -> float | None:
+    """A length in whose units positions are uniform, where the moment is known and gives one."""
+    return model.radius if model.known is not None else None
+
+
 def _of_several(optima: Optima, detected: BoolArray) -> _Known:
     """What is known of several sources: every one has a range of its own in every solution."""
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
     model, y = rows.model.rows(of_row), rows.y[of_row]
-    covariance = covariances(model, fits)
+    understated = _understated(fits.chi2[np.searchsorted(of_row, of_row)], optima)
+    covariance = covariances(model, fits) * understated[:, None, None]
     offset, moment = model.position(fits.q) - model.centroid, model.moment(fits.q, fits.mu)
     n_fits, n_sources = offset.shape[:2]
     wide = covariance.copy()
     sets: list[list[Intervals]] = [[] for _ in range(n_fits)]
     gaussian = np.zeros((n_fits, n_sources), dtype=bool)
     for k in range(n_sources):
-        ends = ranges_within(model, y, fits, k, covariance).tolist()
+        ends = ranges_within(model, y, fits, k, covariance, DELTA_CHI2_95 * understated).tolist()
         of_source = [union([pair]) if seen else EVERYWHERE for pair, seen in zip(ends, detected[of_row], strict=True)]
         low, high = np.array([span(intervals) for intervals in of_source]).reshape(-1, 2).T
         observable = np.array([is_observable_set(intervals) for intervals in of_source], dtype=bool)
@@ -161,8 +193,8 @@ def _of_several(optima: Optima, detected: BoolArray) -> _Known:
         wide[blurred] = widened(wide[blurred], offset[blurred, k], low[blurred], high[blurred], k)
         for of_fit, intervals in zip(sets, of_source, strict=True):
             of_fit.append(intervals)
-    chi2 = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2, np.inf)
-    weight = _weights_of_rows(of_row, chi2, log_evidence_volume(covariance, moment, offset))
+    chi2 = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2 / understated, np.inf)
+    weight = _weights_of_rows(of_row, chi2, log_evidence_volume(covariance, moment, offset, scale_m=_scale_m(model)))
     gaussian &= (weight >= CERTAIN_WEIGHT)[:, None]
     claimed = np.flatnonzero(gaussian.any(axis=1))
     gaussian[claimed] &= covariance_is_valid(optima, covariance[claimed], claimed)[:, None]

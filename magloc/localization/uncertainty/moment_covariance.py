@@ -35,6 +35,10 @@ def moment_covariances(problem: WhitenedModel, y: FloatArray, fits: JointFits) -
             across = matrix - direction[..., None] * (direction[..., None, :] @ matrix)
             weight = residual * problem.gain[:, scalar, 0] / modulus[..., 0]
             information = information - np.einsum("bc,bcji,bcjk->bik", weight, across, across)
+    if problem.known is not None:
+        unit_Am2 = problem.moment(fits.q, np.ones_like(fits.mu))[:, 0, :1, None]
+        moment = problem.moment(fits.q, fits.mu)
+        information = information + problem.known.information(moment[:, 0]) * unit_Am2**2
     length = np.sqrt(np.abs(np.diagonal(information, axis1=1, axis2=2)))
     scale = length[:, :, None] * length[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):

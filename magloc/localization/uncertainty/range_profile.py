@@ -76,11 +76,12 @@ def ranges_within(
     fits: JointFits,
     source: int,
     covariance: FloatArray,
+    rise: FloatArray | float = DELTA_CHI2_95,
 ) -> FloatArray:
-    """Ends (b, 2) of the ranges [m] of one source in which χ² stays within 3.84 of each fit."""
+    """Ends (b, 2) of the ranges [m] of one source in which χ² stays within a rise (b,) of each fit."""
     offset = problem.position(fits.q)[:, source] - problem.centroid
     sigma = relative_range_sigma(covariance[:, 6 * source :, 6 * source :], offset)
-    return ranges_of(profile_stretches(problem, y, fits, source, sigma, np.full(len(y), DELTA_CHI2_95)), problem.radius)
+    return ranges_of(profile_stretches(problem, y, fits, source, sigma, np.broadcast_to(rise, len(y))), problem.radius)
 
 
 def _rises(

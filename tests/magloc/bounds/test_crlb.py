@@ -409,6 +409,33 @@ def places(array, n=40):
     return array.centroid + directions * np.geomspace(1.3 * array.circumradius, 30.0 * array.circumradius, n)[:, None]
 
 
+class TestKnownModulus:
+    """What is known of the moment's modulus adds the information of one more measurement."""
+
+    @each_array
+    def test_adds_its_information(self, array):
+        position, moment = random_source(4)
+        W, sigma = whitened_jacobian(array, position, moment), 3.0
+        along = np.concatenate([np.zeros(3), moment / np.linalg.norm(moment)])
+        expected = np.linalg.inv(W.T @ W + np.outer(along, along) / sigma**2)
+        bounds = cramer_rao_bounds(array, position, moment, known_moment_sigma_Am2=sigma)
+        unit = np.sqrt(np.diagonal(expected))
+        assert_allclose(bounds.covariance / unit / unit[:, None], expected / unit / unit[:, None], atol=1e-7)
+
+    @each_array
+    def test_compiled_table(self, array):
+        positions, moments = places(array, 6), moments_over(array, 5)
+        table = sigma_table(array, positions, moments, known_moment_sigma_Am2=5.0)
+        twin = cramer_rao_bounds(array, positions[:, None], moments, known_moment_sigma_Am2=5.0)
+        assert_allclose(table.range_m, twin.sigma_range_m, rtol=1e-8)
+        assert_allclose(table.bearing_rad, twin.sigma_bearing_rad, rtol=1e-8)
+        assert (table.range_m < sigma_table(array, positions, moments).range_m).all()
+
+    def test_a_sigma_of_nothing_is_refused(self):
+        with pytest.raises(ValueError, match="known_moment_sigma_Am2 must be positive"):
+            cramer_rao_bounds(TETRAHEDRON, SOURCE, (0.0, 0.0, 100.0), known_moment_sigma_Am2=0.0)
+
+
 class TestTable:
     """Compiled tables are cramer_rao_bounds, and spreads those of the table."""
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
 from arrays.array_file import write_array
-from arrays.geometries import tetrahedron
+from arrays.geometries import grid, tetrahedron
 from arrays.sensor import Sensor
 from magloc.fields.geomagnetic import field_enu
 from magloc.readings import Readings, write_readings
@@ -330,6 +330,17 @@ class TestTooNear:
         assert all(row["too_near"] for row in near)
         assert not any("too_near" in row for row in far)
         assert "too near" in run(*command, "--body-length-m", "0.5").err
+
+    def test_a_quarter_of_the_distance_is_assumed_and_said(self, run: Run, files: Files) -> None:
+        close = (np.array([0.05, 0.0, -0.3]), np.array([0.0, 0.0, 1.0]))
+        board = grid(7, 7, 0.15)
+        command = files.write(board, readings_of(board, [close]))
+        assert all(0.07 < row["body_length_m"] < 0.08 for row in results_of(run(*command, "--json")))
+        assert "a length of a quarter of its distance is assumed" in run(*command).err
+        point = run(*command, "--json", "--body-length-m", "0")
+        assert not any("body_length_m" in row for row in results_of(point))
+        assert "assumed" not in point.err
+        assert_refused(run(*command, "--body-length-m", "-1"), "--body-length-m", "-1")
 
     def test_pattern_of_two_poles(self, run: Run, files: Files) -> None:
         """A bar a metre long at a metre's distance, as two dipoles at its ends: no dipole, and said so."""

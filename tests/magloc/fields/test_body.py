@@ -29,7 +29,7 @@ from arrays.geometries import tetrahedron
 from arrays.sensor import Sensor
 from magloc.fields import dipole
 from magloc.fields.body import demagnetising_factors, equivalent_dipole, induced_and_permanent_moment
-from magloc.fields.multipole import multipole_field_matrix
+from magloc.fields.multipole import _traceless_basis, finite_body_fields, multipole_field_matrix
 from magloc.localization.dipole_validity import dipole_validity, nearness_test
 from magloc.measurement.differences import predicted_channels
 from tests import oracles
@@ -121,6 +121,35 @@ def spheroid_factor(ratio):
     if ratio > 1.0:
         return (1.0 - ratio / math.sqrt(-x) * math.acosh(ratio)) / x
     return (1.0 - ratio / math.sqrt(x) * math.acos(ratio)) / x
+
+
+class TestFiniteBodyFields:
+    """What a cuboid adds to its dipole, by its second and fourth moments; the oracle is magpylib's exact field."""
+
+    SIDES = np.array([0.2, 0.3, 0.5])
+    POINTS = np.array([[1.5, 0.4, 0.9], [0.2, 1.2, 1.0], [0.0, 0.0, 1.5]])
+
+    def moments(self, rank):
+        """Mean of xⁿ over the cuboid in the orthonormal traceless basis, by a fine midpoint rule."""
+        axis = (np.arange(60) + 0.5) / 60.0 - 0.5
+        x = np.stack(np.meshgrid(*(axis * side for side in self.SIDES), indexing="ij"), axis=-1).reshape(-1, 3)
+        tensor = x
+        for _ in range(rank - 1):
+            tensor = np.einsum("n...,ni->n...i", tensor, x)
+        return np.tensordot(_traceless_basis(rank), tensor.mean(axis=0), rank)
+
+    def test_each_order_takes_most_of_what_is_left(self):
+        cuboid = magpylib.magnet.Cuboid(polarization=(0.3, 0.0, 1.0), dimension=self.SIDES)
+        exact = cuboid.getB(self.POINTS)
+        moment = np.array([0.3, 0.0, 1.0]) * np.prod(self.SIDES) / (4e-7 * np.pi)
+        predicted = dipole.field(self.POINTS, ORIGIN, moment)
+        left = [np.linalg.norm(exact - predicted, axis=1)]
+        for rank in (2, 4):
+            predicted = predicted + finite_body_fields(self.POINTS, moment, rank) @ self.moments(rank)
+            left.append(np.linalg.norm(exact - predicted, axis=1))
+        assert (left[1] < 0.1 * left[0]).all()
+        assert (left[2] < 0.4 * left[1]).all()
+        assert (left[2] < 1e-4 * np.linalg.norm(exact, axis=1)).all()
 
 
 class TestDemagnetisingFactors:

@@ -1,0 +1,148 @@
+r"""Errors of the model that a fit allows for: bodies that are no points, and an ambient field that is not exact.
+
+What they add to the readings at the fit counts as noise, and the fit is refined with it held. A modulus sees an error
+of the ambient field along the field at its sensor: differences keep what the source turns there. A body's second and
+fourth moments of magnetisation are unknown, with standard deviations that grow with its length L: :math:`0.025 L^2` and
+:math:`0.0015 L^4` for each of 5 and 9 orthonormal components, those of bars, discs and cuboids. Their field has rank 14
+for every source: docs/theory/extended-sources.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.fields.multipole import finite_body_fields
+from magloc.localization.fit.gauss_newton import JointFits, refine
+from magloc.localization.fit.optima import Optima
+from magloc.measurement.whitened import WhitenedModel
+
+DEFAULT_LENGTH = 0.25
+"""Length over the distance from the nearest sensor that is assumed of a body of which nothing is said."""
+# Standard deviations of a component of the moments of rank 2 and 4, over L² and L⁴.
+_SIGMA = {2: 0.025, 4: 0.0015}
+# Sensors that are nearer than this, in circumradii of the array, where a body of default length is assumed. A source
+# that a single sensor is near to may be a fault of it.
+_NEAR, _N_NEAR = 0.6, 4
+# Variance of what a dipole leaves out, summed over the channels in units of the noise, that does not matter.
+_NEGLIGIBLE = 0.1
+_ROUNDS = 3
+# Second order of an error of the ambient field, in σ of a reading, from which errors are no Gaussian's.
+_BENT = 0.3
+
+
+def body_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, length_m: FloatArray) -> FloatArray:
+    """What bodies (b, K) of some lengths add to the readings, of one σ: (b, C, 14 K) in units of the noise."""
+    sensors = model.centroid + model.radius * model.sensors
+    separation = sensors - model.position(q)[:, :, None]
+    moment = np.broadcast_to(model.moment(q, mu)[:, :, None], separation.shape)
+    length = length_m[..., None, None, None]
+    fields = np.concatenate(
+        [sigma * length**rank * finite_body_fields(separation, moment, rank) for rank, sigma in _SIGMA.items()], axis=-1
+    )
+    gain = model.linear_gain(model.source_fields(q, mu))
+    columns = np.einsum("bcj,bkcjn->bckn", gain, fields[:, :, model.channel_sensor], optimize=True)
+    return columns.reshape(*gain.shape[:2], columns.shape[2] * columns.shape[3])
+
+
+def assumed_lengths(model: WhitenedModel, q: FloatArray, body_length_m: float | None) -> FloatArray:
+    """Lengths (b, K) of the bodies at q (b, K, 4): what is said, else a share of the distance near the array."""
+    if body_length_m is not None:
+        return np.full(q.shape[:2], body_length_m)
+    sensors = model.centroid + model.radius * model.sensors
+    distance = np.linalg.norm(model.position(q)[:, :, None] - sensors, axis=-1)
+    last = min(_N_NEAR, len(sensors)) - 1
+    ordered = np.partition(distance, [0, last], axis=-1)
+    return np.where(ordered[..., last] < _NEAR * model.radius, DEFAULT_LENGTH * ordered[..., 0], 0.0)
+
+
+def ambient_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, sigma_T: float) -> FloatArray:
+    """What an error of the ambient field, of one σ per axis, adds to moduli: (b, C, 3) in units of the noise."""
+    gain = model.linear_gain(model.source_fields(q, mu))
+    return sigma_T * np.where(model.channel_is_scalar[:, None], gain, 0.0)
+
+
+def with_model_errors(
+    optima: Optima, body_length_m: float | None, ambient_sigma_T: float = 0.0
+) -> list[tuple[Optima, FloatArray]]:
+    """Optima refined with the errors that matter, and the lengths (b,) of their rows' bodies, 0 where none does."""
+    rows, none = optima.rows, np.zeros(len(optima.rows))
+    point = body_length_m == 0.0 or (body_length_m is None and _all_far(optima.fits.q))
+    ambient_sigma_T = ambient_sigma_T if rows.model.channel_is_scalar.any() else 0.0
+    if (point and not ambient_sigma_T) or optima.position_m is not None or not len(optima.of_row):
+        return [(optima, none)]
+    first = np.searchsorted(optima.of_row, np.arange(len(rows)))
+    solved = np.flatnonzero(np.bincount(optima.of_row, minlength=len(rows)))
+    best, model = optima.fits.rows(first[solved]), rows.model.rows(solved)
+    lengths = np.zeros((len(rows), optima.fits.n_sources))
+    if not point:
+        lengths[solved] = assumed_lengths(rows.model, best.q, body_length_m)
+        near = np.flatnonzero(lengths[solved].any(axis=1))
+        errors = body_errors(model.rows(near), best.q[near], best.mu[near], lengths[solved[near]])
+        negligible = np.sum(model.rows(near).whitened(errors) ** 2, axis=(1, 2)) <= _NEGLIGIBLE
+        lengths[solved[near[negligible]]] = 0.0
+    matters: BoolArray = np.asarray(lengths.any(axis=1))
+    matters[solved] |= ambient_sigma_T > 0.0
+    if not matters.any():
+        return [(optima, none)]
+    refined = _refined(optima.chosen(matters), lengths[matters], ambient_sigma_T)
+    # A row of which no fit converged again stays that of a point in a known field.
+    lost = np.bincount(refined.of_row, minlength=len(refined.rows)) == 0
+    matters[np.flatnonzero(matters)[lost]] = False
+    result = [(refined.chosen(~lost), lengths[matters].max(axis=1))] if matters.any() else []
+    if not matters.all():
+        result.append((optima.chosen(~matters), none[~matters]))
+    return result
+
+
+def _all_far(q: FloatArray) -> bool:
+    """Whether all sources are so far from the centroid that they are near to no sensor: most of them, cheaply."""
+    u = q[..., :3]
+    return bool(np.all(np.sum(u * u, axis=-1) > ((1.0 + _NEAR) * q[..., 3]) ** 2))
+
+
+def _refined(optima: Optima, lengths: FloatArray, ambient_sigma_T: float) -> Optima:
+    """Optima with errors linearised at the best fit of every row, refined, linearised there again."""
+    fits, rows = optima.fits, optima.rows
+    merged = np.broadcast_to(optima.merged, fits.mu.shape[:2])
+    for _ in range(_ROUNDS):
+        best = fits.rows(np.searchsorted(optima.of_row, np.arange(len(rows))))
+        rows = optima.rows.marginalised(model_errors(optima.rows.model, best.q, best.mu, lengths, ambient_sigma_T))
+        start = fits
+        fits = refine(rows.model.rows(optima.of_row), rows.y[optima.of_row], start.q, start.mu)
+        fits = replace(fits, iterations=fits.iterations + start.iterations)
+        order = np.lexsort((fits.chi2, optima.of_row))
+        fits, merged = fits.rows(order), merged[order]
+    kept = fits.converged
+    return replace(
+        optima,
+        rows=rows,
+        fits=fits.rows(kept),
+        of_row=optima.of_row[kept],
+        merged=merged[kept],
+        bent=_is_bent(rows.model, fits, optima.of_row, ambient_sigma_T)[kept],
+    )
+
+
+def model_errors(
+    model: WhitenedModel, q: FloatArray, mu: FloatArray, length_m: FloatArray, ambient_sigma_T: float
+) -> FloatArray:
+    """Both kinds of errors together: (b, C, n) in units of the noise."""
+    parts = [body_errors(model, q, mu, length_m)] if length_m.any() else []
+    if ambient_sigma_T:
+        parts.append(ambient_errors(model, q, mu, ambient_sigma_T))
+    return np.concatenate(parts, axis=-1)
+
+
+def _is_bent(model: WhitenedModel, fits: JointFits, of_row: IntArray, ambient_sigma_T: float) -> BoolArray:
+    """Whether moduli follow an error of the ambient field along a curve: second order beyond noise, (f,)."""
+    if not ambient_sigma_T:
+        return np.zeros(len(of_row), dtype=bool)
+    at = model.rows(of_row)
+    fields = at.source_fields(fits.q, fits.mu)
+    share = np.linalg.norm(fields, axis=-1) / np.sum((fields + at.ambient) ** 2, axis=-1)
+    return np.asarray(
+        np.max(share[:, at.channel_sensor] * np.abs(at.gain[..., 0]), axis=1) * ambient_sigma_T**2 > _BENT
+    )

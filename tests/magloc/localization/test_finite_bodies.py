@@ -1,0 +1,145 @@
+"""Magnets that are not small against their distance: magpylib's cuboids and cylinders of every aspect.
+
+| what | oracle |
+|---|---|
+| readings | magpylib: exact fields of uniformly magnetised bodies |
+| NEES | their true centre and moment |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import magpylib
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import magloc
+from arrays.array import SensorArray
+from arrays.geometries import grid
+from magloc.measurement.differences import DifferenceMeasurement
+from tests.oracles import fisher_information
+
+LENGTH_M = 0.02
+ASPECTS = (0.2, 0.5, 1.0, 2.0, 5.0)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A magnet over twelve sensors that are 0.8 lengths apart, and what they read."""
+
+    shape: tuple[str, float]
+    array: SensorArray
+    readings_T: np.ndarray
+    position_m: np.ndarray
+    moment_Am2: np.ndarray
+
+
+def magnet(kind: str, aspect: float, polarization: np.ndarray):
+    """A body whose longest edge is one length, and its volume: height over width is the aspect."""
+    width, height = (LENGTH_M, LENGTH_M * aspect) if aspect <= 1.0 else (LENGTH_M / aspect, LENGTH_M)
+    if kind == "cuboid":
+        body = magpylib.magnet.Cuboid(polarization=polarization, dimension=(width, width, height))
+        return body, width * width * height
+    return magpylib.magnet.Cylinder(polarization=polarization, dimension=(width, height)), np.pi / 4 * width**2 * height
+
+
+def cases(lengths: float, relative_noise: float, of_each: int, seed: int = 0) -> list[Case]:
+    """Magnets of every shape at some lengths above the sensors, turned at random."""
+    rng = np.random.default_rng(seed)
+    places = grid(4, 3, 0.8 * LENGTH_M).positions
+    result = []
+    for shape in [(kind, aspect) for aspect in ASPECTS for kind in ("cuboid", "cylinder")]:
+        for _ in range(of_each):
+            direction = Rotation.random(rng=rng).apply([0.0, 0.0, 1.0]) if rng.random() < 0.5 else np.array([0.0, 0, 1])
+            body, volume = magnet(*shape, direction)
+            position = LENGTH_M * np.array([*rng.uniform(-0.8, 0.8, 2), lengths])
+            body.position, body.orientation = position, Rotation.random(rng=rng)
+            fields = body.getB(places)
+            noise_T = relative_noise * float(np.linalg.norm(fields, axis=1).max())
+            readings = fields.ravel() + noise_T * rng.normal(size=fields.size)
+            moment = body.orientation.apply(direction) * volume / (4e-7 * np.pi)
+            result.append(Case(shape, grid(4, 3, 0.8 * LENGTH_M, noise_T=noise_T), readings, position, moment))
+    return result
+
+
+def nees(case: Case, body_length_m: float | None) -> tuple[float, magloc.Fixes]:
+    """NEES per dimension of a fix, and the fix."""
+    fixes = magloc.locate(case.array, case.readings_T, body_length_m=body_length_m)
+    off = np.concatenate([fixes.position_m[0] - case.position_m, fixes.moment_Am2[0] - case.moment_Am2])
+    return float(off @ np.linalg.solve(fixes.covariance[0], off)) / 6.0, fixes
+
+
+class TestKnownLength:
+    @pytest.mark.parametrize("of_each", [1, pytest.param(40, marks=pytest.mark.slow)])
+    def test_errors_are_those_of_the_covariance(self, of_each):
+        """Shapes are what they are, no random draw of the prior: 0.7 to 1.4 on average, 3 for the worst of them."""
+        few = of_each < 10
+        dropped = n = 0
+        for lengths, relative_noise in [(d, noise) for d in (2.0, 3.0, 4.5, 6.0) for noise in (1e-3, 1e-4)]:
+            of_shape: dict[tuple[str, float], list[float]] = {}
+            for case in cases(lengths, relative_noise, of_each):
+                value, fixes = nees(case, LENGTH_M)
+                of_shape.setdefault(case.shape, []).append(value)
+                dropped += bool(fixes.dropped_sensors[0])
+                n += 1
+            means = [np.mean(values) for values in of_shape.values()]
+            # Of ten single fixes the mean is known to a fifth, and one of them may be anything.
+            assert 0.7 - 0.3 * few <= np.mean(means) <= 1.4 + 0.6 * few
+            assert few or max(means) <= 3.0
+        assert dropped <= 1e-3 * n
+
+    def test_double_the_length_is_consistent(self):
+        for case in cases(3.0, 1e-3, 1):
+            value, fixes = nees(case, 2.0 * LENGTH_M)
+            assert value < 3.0
+            assert not fixes.dropped_sensors[0]
+
+    def test_half_the_length_claims_a_quarter_of_the_error_at_worst(self):
+        """χ² does not see it: the shift of a dipole looks alike. The model error goes with the square of the length."""
+        values = [nees(case, 0.5 * LENGTH_M)[0] for case in cases(3.0, 1e-3, 2)]
+        assert np.mean(values) < 16.0 * 1.4
+
+    def test_a_point_of_that_length_costs_accuracy_and_no_honesty(self):
+        rng = np.random.default_rng(5)
+        array, position, moment = grid(4, 3, 0.016, noise_T=1e-7), np.array([0.01, 0.0, 0.05]), np.array([0, 0.1, 0.2])
+        exact = magloc.dipole.field(array.positions, position, moment).ravel()
+        readings = exact + 1e-7 * rng.normal(size=(40, exact.size))
+        point, body = (magloc.locate(array, readings, body_length_m=length) for length in (0.0, 0.02))
+        trace = [np.trace(fixes.covariance[:, :3, :3], axis1=1, axis2=2) for fixes in (point, body)]
+        assert (trace[1] > trace[0]).all()
+        off = body.position_m - position
+        assert np.einsum("ni,nij,nj->n", off, np.linalg.inv(body.covariance[:, :3, :3]), off).mean() / 3.0 < 1.2
+
+
+class TestNothingSaid:
+    def test_near_the_array_a_quarter_of_the_distance_is_assumed(self):
+        array, moment = grid(6, 5, 0.016, noise_T=1e-7), np.array([0.0, 0.1, 0.2])
+        lengths = []
+        for height in (0.02, 2.0):
+            exact = magloc.dipole.field(array.positions, np.array([0.0, 0.0, height]), moment * (height / 0.02) ** 3)
+            fixes = magloc.locate(array, exact.ravel())
+            lengths.append(fixes.body_length_m[0])
+        nearest = np.linalg.norm(array.positions - [0.0, 0.0, 0.02], axis=1).min()
+        assert lengths[0] == pytest.approx(0.25 * nearest, rel=0.02)
+        assert lengths[1] == 0.0
+
+    def test_said_to_be_a_point(self):
+        case = cases(2.0, 1e-3, 1)[0]
+        assert magloc.locate(case.array, case.readings_T, body_length_m=0.0).body_length_m[0] == 0.0
+
+
+class TestMisfit:
+    def test_sigma_knows_of_chi2(self):
+        """A row that no model explains: χ² per degree of freedom is a guess of the variance, noise alone is none."""
+        case = cases(2.0, 1e-4, 1)[0]
+        fixes = magloc.locate(case.array, case.readings_T, body_length_m=0.0, exclude_faulty=False)
+        assert fixes.misfit[0]
+        measurement = DifferenceMeasurement.of(case.array)
+        noise_alone = np.linalg.inv(fisher_information(measurement, fixes.position_m[0], fixes.moment_Am2[0]))
+        expected = noise_alone * fixes.chi2[0] / fixes.dof[0]
+        unit = np.sqrt(np.diagonal(expected))
+        np.testing.assert_allclose(
+            fixes.covariance[0] / unit / unit[:, None], expected / unit / unit[:, None], atol=1e-5
+        )
