@@ -18,9 +18,7 @@ import numpy as np
 
 from arrays.typing import FloatArray, IntArray
 from magloc.chi_square import mean_bounds, normalised_square
-from magloc.tracking.measurement import RowMeasurement
-from magloc.tracking.results import Row, TrackPoint
-from magloc.tracking.tracker import Tracker
+from magloc.tracking.results import TrackPoint
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +89,6 @@ class Consistency:
 
 def consistency(
     points: Sequence[TrackPoint],
-    tracker: Tracker,
-    rows: Sequence[Row],
     position_m: FloatArray,
     moment_Am2: FloatArray | None,
     bound_m: FloatArray | None = None,
@@ -110,7 +106,10 @@ def consistency(
             squares.append(float(error @ error))
             if bound_m is not None:
                 bounds.append(float(bound_m[i]))
-    of_rows, dof_of_rows = _nees_of_rows(points, tracker, rows, position_m, moment_Am2)
+    moments = np.full_like(position_m, np.nan) if moment_Am2 is None else moment_Am2
+    squares_of_rows = [nees_of(*of_row) for of_row in zip(points, np.hstack([position_m, moments]), strict=True)]
+    of_rows = np.array([square for square, _ in squares_of_rows])
+    dof_of_rows = np.array([dof for _, dof in squares_of_rows], dtype=np.intp)
     nees, nees_dof = float(np.nansum(of_rows)), int(dof_of_rows.sum())
     return Consistency(
         rows=int(np.isfinite(position_m).any(axis=1).sum()),
@@ -128,38 +127,22 @@ def consistency(
     )
 
 
-def _nees_of_rows(
-    points: Sequence[TrackPoint],
-    tracker: Tracker,
-    rows: Sequence[Row],
-    position_m: FloatArray,
-    moment_Am2: FloatArray | None,
-) -> tuple[FloatArray, IntArray]:
-    """Normalised estimation error squared of every row (n,), NaN where it has none, and its degrees of freedom (n,)."""
-    moments = np.full_like(position_m, np.nan) if moment_Am2 is None else moment_Am2
-    truth = np.concatenate([position_m, moments], axis=1)
-    nees, dof = np.full(len(points), np.nan), np.zeros(len(points), dtype=np.intp)
-    for i, point in enumerate(points):
-        if point.position_m is None or point.moment_Am2 is None or point.covariance is None:
-            continue
-        if np.isfinite(truth[i]).any():
-            estimate = np.concatenate([point.position_m, point.moment_Am2])
-            nees[i], dof[i] = nees_of(tracker.measurement(rows[i]), estimate, point.covariance, truth[i])
-    return nees, dof
+def nees_of(point: TrackPoint, truth: FloatArray) -> tuple[float, int]:
+    """Normalised estimation error squared of a point, and how many numbers it is of.
 
-
-def nees_of(
-    measurement: RowMeasurement, estimate: FloatArray, covariance: FloatArray, truth: FloatArray
-) -> tuple[float, int]:
-    """Normalised estimation error squared of one estimate, and how many numbers it is of.
-
-    It is that of what is known of the truth (6,), NaN elsewhere. If all of it is, the error is counted in the
-    coordinates of :mod:`magloc.tracking.measurement`, in which it is Gaussian.
+    It is that of what is known of the truth (6,), NaN elsewhere. Where that is the position, or all, the error is
+    counted in the coordinates of :mod:`magloc.tracking.chart`, in which it is Gaussian.
     """
+    if point.position_m is None or point.moment_Am2 is None or point.covariance is None:
+        return math.nan, 0
     known = np.isfinite(truth)
     known[3:] &= known[3:].all()
-    error = truth - estimate
-    if known.all():
-        error, _ = measurement.coordinates(estimate, np.sqrt(np.diagonal(covariance))).at(truth)
-    error, covariance = error[known], covariance[np.ix_(known, known)]
-    return float(normalised_square(error, covariance)), int(known.sum())
+    if known[:3].all() and point.mixture is not None:
+        source = point.mixture.matched()
+        error = source.chart.coordinates(np.where(known, truth, source.x[0])[None])[0]
+        covariance = source.S[0] @ source.S[0].T
+    else:
+        error, covariance = truth - np.concatenate([point.position_m, point.moment_Am2]), point.covariance
+    if not known.any():
+        return math.nan, 0
+    return float(normalised_square(error[known], covariance[np.ix_(known, known)])), int(known.sum())
