@@ -16,7 +16,7 @@ from magloc.tracking.mixture import Mixture
 from magloc.tracking.motion import LinearMotion
 from magloc.tracking.results import Row, Step, TrackPoint
 from magloc.tracking.tracker import LARGEST_GROWTH, LARGEST_WIDTH, ROWS_TO_LOSE, Tracker, track_point
-from magloc.tracking.update import LEAST_SINGULAR, MOST_ITERATIONS, ROUNDING, TOLERANCE
+from magloc.tracking.update import LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
 
 _STATUS = {kernels.TRACKED: "tracked", kernels.PREDICTED: "predicted", kernels.OUTLIER: "outlier"}
 
@@ -87,7 +87,7 @@ class _CompiledSteps:
             tolerance=TOLERANCE,
             max_iterations=MOST_ITERATIONS,
             rounding=ROUNDING,
-            least_singular=LEAST_SINGULAR,
+            least_share=LEAST_SHARE,
             largest_growth=LARGEST_GROWTH,
             rows_to_lose=ROWS_TO_LOSE,
             largest_width=LARGEST_WIDTH,

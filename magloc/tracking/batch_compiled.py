@@ -62,7 +62,7 @@ class Rules(NamedTuple):
     tolerance: float
     max_iterations: int
     rounding: float
-    least_singular: float
+    least_share: float
     largest_growth: float
     rows_to_lose: int
     largest_width: float
@@ -157,32 +157,6 @@ def _predicted(
 
 
 @compiled
-def _left_inverse(H: FloatArray, unit: FloatArray, least_singular: float, M: FloatArray) -> bool:
-    """M (6, k) with M H = I, by Gram and Schmidt on H's columns in units of what is known; whether there is one."""
-    k = H.shape[0]
-    Q, R = np.empty((6, k)), np.zeros((6, 6))
-    for i in range(6):
-        for j in range(k):
-            Q[i, j] = H[j, i] * unit[i]
-    orthonormalise(Q, R)
-    smallest, largest = math.inf, 0.0
-    for i in range(6):
-        smallest, largest = min(smallest, R[i, i]), max(largest, R[i, i])
-    if not smallest > least_singular * largest:
-        return False
-    for i in range(5, -1, -1):
-        for j in range(k):
-            t = Q[i, j]
-            for c in range(i + 1, 6):
-                t -= R[i, c] * M[c, j]
-            M[i, j] = t / R[i, i]
-    for i in range(6):
-        for j in range(k):
-            M[i, j] *= unit[i]
-    return True
-
-
-@compiled
 def _frame(x: FloatArray, centroid: FloatArray, radius: float, frame: FloatArray) -> float:
     """Tangents and direction of the chart about a state as rows, and its length."""
     offset = np.empty(3)
@@ -266,18 +240,6 @@ def _product(A: FloatArray, B: FloatArray, AB: FloatArray) -> None:
 
 
 @compiled
-def _solve_lower(S: FloatArray, right: FloatArray) -> None:
-    """S⁻¹ right (n, m), in place, for a lower S."""
-    n, m = right.shape
-    for c in range(m):
-        for i in range(n):
-            t = right[i, c]
-            for j in range(i):
-                t -= S[i, j] * right[j, c]
-            right[i, c] = t / S[i, i]
-
-
-@compiled
 def _widest(S: FloatArray) -> float:
     """Larger one of the standard deviations of log-range and direction."""
     widest = 0.0
@@ -290,17 +252,16 @@ def _widest(S: FloatArray) -> float:
 
 
 @compiled
-def _grows(S: FloatArray, predicted_S: FloatArray, largest_growth: float, unit: FloatArray) -> bool:
-    """Whether a standard deviation of position and moment has grown by more than a factor; they are put into unit."""
-    grows = False
+def _grows(S: FloatArray, predicted_S: FloatArray, largest_growth: float) -> bool:
+    """Whether a standard deviation of position and moment has grown by more than a factor."""
     for i in range(6):
         before, after = 0.0, 0.0
         for c in range(S.shape[1]):
             before += S[i, c] * S[i, c]
             after += predicted_S[i, c] * predicted_S[i, c]
-        unit[i] = math.sqrt(after)
-        grows |= unit[i] > largest_growth * math.sqrt(before)
-    return grows
+        if after > largest_growth * largest_growth * before:
+            return True
+    return False
 
 
 @compiled
@@ -327,10 +288,10 @@ def follow(
     frame, frame_there, centroid_there = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     x_before, S_before, L = np.empty(n), np.empty((n, n)), np.empty((n, n))
     zero, e, zeta, step = np.zeros(n), np.empty(n), np.empty(n), np.empty(n)
-    unit, M, bend = np.empty(6), np.empty((6, k)), np.empty((n, 1 + n))
+    M, bent = np.empty((n, k)), np.empty(k)
     H, h, h_first, h_there = np.empty((k, 6)), np.empty(k), np.empty(k), np.empty(k)
     channels, slopes = np.empty(n_channels), np.empty((n_channels, 6))
-    J_e, J_first = np.empty((k, n)), np.empty((k, 6))
+    J_e, J_first = np.empty((k, n)), np.empty((k, n))
     residual, residual_there = np.empty(k + n), np.empty(k + n)
     columns, triangle = np.empty((n + 1, k + n)), np.zeros((n + 1, n + 1))
     there, here, solution = np.empty(n), np.empty(n), np.empty((n, n))
@@ -378,15 +339,13 @@ def follow(
             _predicted(here, origin, R, ambient, array, transform, channels, slopes, h, H)
             put(h_first, h)
             _moved(x_before, e, frame, length, here, L)
-            bends = given.n_differences[row] >= 6 and not _grows(S, S_before, rules.largest_growth, unit)
+            bends = not _grows(S, S_before, rules.largest_growth)
             if bends:
+                _derivatives(H, L, S_before, J_e, columns)
                 for j in range(k):
-                    for i in range(6):
-                        t = 0.0
-                        for c in range(6):
-                            t += H[j, c] * L[c, i]
-                        J_first[j, i] = t
-                bends = _left_inverse(J_first, unit, rules.least_singular, M)
+                    for i in range(n):
+                        J_first[j, i] = columns[i, j]
+                _damped_inverse(columns, triangle, rules.least_share, M)
             cost = 0.0
             for j in range(k):
                 residual[j] = given.z[row, j] - h[j]
@@ -396,7 +355,7 @@ def follow(
             is_stale, converged, share = True, False, 1.0
             while iterations < rules.max_iterations and not converged:
                 if is_stale:
-                    _linearised(H, L, S_before, M, bends, J_e, columns, bend)
+                    _linearised(H, L, S_before, M, J_first, bends, J_e, columns)
                     for c in range(k + n):
                         columns[n, c] = residual[c]
                     orthonormalise(columns, triangle)
@@ -419,16 +378,14 @@ def follow(
                 for i in range(n):
                     residual_there[k + i] = -solution[i, 0]
                 if bends:
+                    for j in range(k):
+                        t = h_there[j] - h_first[j]
+                        for i in range(n):
+                            t -= J_first[j, i] * solution[i, 0]
+                        bent[j] = t
                     for i in range(n):
-                        bend[i, 0] = 0.0
-                    for i in range(6):
-                        t = -e[i]
                         for j in range(k):
-                            t += M[i, j] * (h_there[j] - h_first[j])
-                        bend[i, 0] = t
-                    _solve_lower(S_before, bend[:, :1])
-                    for i in range(n):
-                        residual_there[k + i] -= bend[i, 0]
+                            residual_there[k + i] -= M[i, j] * bent[j]
                 cost_there, change = 0.0, 0.0
                 for j in range(k):
                     residual_there[j] = given.z[row, j] - h_there[j]
@@ -491,17 +448,8 @@ def follow(
 
 
 @compiled
-def _linearised(
-    H: FloatArray,
-    L: FloatArray,
-    S: FloatArray,
-    M: FloatArray,
-    bends: bool,
-    J_e: FloatArray,
-    columns: FloatArray,
-    bend: FloatArray,
-) -> None:
-    """Derivatives of the misfits of readings and prediction by standard numbers, as the first n rows of columns."""
+def _derivatives(H: FloatArray, L: FloatArray, S: FloatArray, J_e: FloatArray, columns: FloatArray) -> None:
+    """Derivatives of the readings by standard numbers, as rows (n, k) of columns."""
     k, n = J_e.shape
     for j in range(k):
         for i in range(n):
@@ -515,17 +463,42 @@ def _linearised(
             for c in range(i, n):
                 t += J_e[j, c] * S[c, i]
             columns[i, j] = t
+
+
+@compiled
+def _damped_inverse(columns: FloatArray, triangle: FloatArray, least_share: float, M: FloatArray) -> None:
+    """The twin of :func:`magloc.tracking.update.damped_inverse`; columns are spoilt."""
+    n, k = M.shape
     for i in range(n):
         for c in range(n):
-            bend[i, 1 + c] = S[i, c]
-    if bends:
-        for i in range(6):
-            for c in range(n):
-                t = 0.0
+            columns[i, k + c] = least_share if i == c else 0.0
+    orthonormalise(columns[:n], triangle)
+    for j in range(k):
+        for i in range(n - 1, -1, -1):
+            t = columns[i, j]
+            for c in range(i + 1, n):
+                t -= triangle[i, c] * M[c, j]
+            M[i, j] = t / triangle[i, i]
+
+
+@compiled
+def _linearised(
+    H: FloatArray,
+    L: FloatArray,
+    S: FloatArray,
+    M: FloatArray,
+    J_first: FloatArray,
+    bends: bool,
+    J_e: FloatArray,
+    columns: FloatArray,
+) -> None:
+    """Derivatives of the misfits of readings and prediction by standard numbers, as the first n rows of columns."""
+    k, n = J_e.shape
+    _derivatives(H, L, S, J_e, columns)
+    for i in range(n):
+        for c in range(n):
+            t = 1.0 if i == c else 0.0
+            if bends:
                 for j in range(k):
-                    t += M[i, j] * columns[c, j]
-                bend[i, 1 + c] = t
-    _solve_lower(S, bend[:, 1:])
-    for i in range(n):
-        for c in range(n):
-            columns[i, k + c] = bend[c, 1 + i]
+                    t += M[c, j] * (columns[i, j] - J_first[j, i])
+            columns[i, k + c] = t

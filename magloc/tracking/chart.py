@@ -156,3 +156,27 @@ def _tangents(u: FloatArray) -> FloatArray:
 def source_root(chart: Chart, sigma: FloatArray) -> FloatArray:
     """Root (..., 6, 6) of a Cartesian covariance from standard deviations (..., 6) of a source's coordinates."""
     return chart.jacobian(np.zeros_like(chart.x))[..., :N_SOURCE, :N_SOURCE] * sigma[..., None, :]
+
+
+def mirrored(x: FloatArray, centroid_m: FloatArray) -> FloatArray:
+    r"""The states (4, K, n) whose gradient tensor at the sensors' centroid is that of states (K, n); the first are they.
+
+    A far source shows little but its gradient tensor, and that belongs to four sources at one range: with u at the angle
+    0 and m at β in their common plane, u' stands at :math:`\mathrm{atan2}(s, -\tfrac32 c)` and m' at -β from it, where
+    :math:`(c, s) = |m| (\cos β, \sin β)`; and both may be turned round.
+    """
+    offset, m = x[:, :3] - centroid_m, x[:, 3:6]
+    r = np.linalg.norm(offset, axis=1, keepdims=True)
+    u = offset / np.maximum(r, 1e-300)
+    c = np.sum(u * m, axis=1, keepdims=True)
+    across = m - c * u
+    s = np.linalg.norm(across, axis=1, keepdims=True)
+    w = across / np.maximum(s, 1e-300)
+    angle = np.arctan2(s, -1.5 * c)
+    u_other = np.cos(angle) * u + np.sin(angle) * w
+    w_other = -np.sin(angle) * u + np.cos(angle) * w
+    m_other = c * u_other - s * w_other
+    states = np.tile(x, (4, 1, 1))
+    for i, (direction, moment) in enumerate(((u, m), (-u, -m), (u_other, m_other), (-u_other, -m_other))):
+        states[i, :, :3], states[i, :, 3:6] = centroid_m + r * direction, moment
+    return states

@@ -20,6 +20,8 @@ NEAREST, FARTHEST = 0.6, 60.0
 """Ranges between which a source is looked for, in radii of the array. A set that reaches there is open, unless it is
 narrow."""
 _OUTSIDE = 0.025
+# Standard deviation of the log-range beyond which the mean range tells of the prior alone.
+_WIDEST = 1.0
 _N_BISECTIONS = 60
 
 
@@ -76,9 +78,7 @@ class Mixture:
 
     def of_source(self) -> Mixture:
         """Position and moment alone."""
-        S = self.S[:, :N_SOURCE]
-        P = S @ np.swapaxes(S, -1, -2)
-        return replace(self, x=self.x[:, :N_SOURCE], S=np.linalg.cholesky(P), n_motion=N_SOURCE)
+        return replace(self, x=self.x[:, :N_SOURCE], S=root_of(self.S[:, :N_SOURCE]), n_motion=N_SOURCE)
 
     def reduced(self) -> Mixture:
         """Without components of no weight, and those that are as good as one merged."""
@@ -117,7 +117,7 @@ class Mixture:
         e = np.zeros((len(self), self.n_motion))
         L = chart.jacobian(e)[:, :N_SOURCE, :N_SOURCE]
         mean = self.x[:, :N_SOURCE].copy()
-        by_range = np.expm1(0.5 * np.sum(S[:, 0] ** 2, axis=1))
+        by_range = np.expm1(0.5 * np.minimum(np.sum(S[:, 0] ** 2, axis=1), _WIDEST**2))
         mean[:, :3] += (by_range * chart.length)[:, None] * chart.u
         root = L @ S
         covariance = root @ np.swapaxes(root, -1, -2)
@@ -160,6 +160,11 @@ def _in_chart(about: Chart, mixture: Mixture) -> tuple[FloatArray, FloatArray]:
     turn = np.linalg.solve(chart.jacobian(offset[:, :n]), mixture.chart.jacobian(np.zeros((K, n))))
     roots[:, :n] = turn @ roots[:, :n]
     return offset, roots
+
+
+def root_of(rows: FloatArray) -> FloatArray:
+    """Lower root (..., n, n) of ``rows rowsᵀ``, by an orthogonal factorisation of rows (..., n, m), m ≥ n."""
+    return np.swapaxes(np.linalg.qr(np.swapaxes(rows, -1, -2), mode="r"), -1, -2)
 
 
 def _block_root(rows: FloatArray, n: int) -> FloatArray:

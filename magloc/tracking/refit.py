@@ -8,6 +8,7 @@ trajectory, until that stays.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,12 +18,13 @@ from magloc.measurement.nuisances import SensorErrors
 from magloc.tracking.chart import Chart
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.mixture import Mixture
-from magloc.tracking.motion import MotionModel
+from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.start import first_root
 
-_MOST_PASSES = 15
+_MOST_PASSES = 25
 # Change of the last state, in its standard deviations, below which the trajectory stays.
-_TOLERANCE = 0.02
+_TOLERANCE = 0.05
+_SWINGS = 0.8
 # Longest step of log-range and direction in a pass.
 _LONGEST = 0.5
 
@@ -37,14 +39,19 @@ def refitted(
     rows = _Rows(measurements, motion, errors)
     track = rows.backwards(mixture.x)
     converged = np.zeros(len(mixture), dtype=bool)
+    share, change = np.ones(len(mixture)), np.full(len(mixture), np.inf)
     for _ in range(_MOST_PASSES):
         found = rows.passed(track)
         largest = np.abs(found.offset[:, :, :3]).max(axis=(0, 2))
         length = np.minimum(1.0, _LONGEST / np.maximum(largest, _LONGEST))
         sigma = np.sqrt(np.diagonal(found.P, axis1=1, axis2=2))[:, : rows.n]
-        converged = np.max(np.abs(found.offset[-1]) / sigma, axis=1) < _TOLERANCE
-        track = rows.moved(track, length[:, None] * found.offset)
-        if converged.all():
+        before, change = change, np.max(np.abs(found.offset[-1]) / sigma, axis=1)
+        alive = np.isfinite(found.log_evidence) & np.isfinite(change)
+        converged = (change < _TOLERANCE) & alive
+        # Steps that swing are made shorter.
+        share = np.where(change > _SWINGS * before, 0.5 * share, np.minimum(1.0, 1.5 * share))
+        track = rows.moved(track, np.where(alive, share * length, 0.0)[:, None] * np.nan_to_num(found.offset))
+        if converged[alive].all():
             break
     n = rows.n
     x = np.concatenate([track[-1], found.errors], axis=1)
@@ -100,48 +107,53 @@ class _Rows:
         return np.array([self._chart(track, row).retracted(offset[row]) for row in range(len(track))])
 
     def passed(self, track: FloatArray) -> _Passed:
-        """A filter and a smoother that linearise along trajectories (rows, K, n)."""
+        """A filter and a smoother that linearise along trajectories (rows, K, n).
+
+        The smoother is Bryson and Frazier's: it carries the gradient of what later rows cost, and inverts nothing.
+        """
         n, n_errors, K = self.n, self.errors.n_states, track.shape[1]
         N = n + n_errors
         chart = self._chart(track, 0)
-        root = np.zeros((K, N, N))
-        root[:, :n, :n] = chart.inverse_jacobian() @ first_root(chart, self.motion)
-        root[:, np.arange(n, N), np.arange(n, N)] = self.errors.sigma
-        mean, P = np.zeros((K, N)), root @ _T(root)
+        root = chart.inverse_jacobian() @ first_root(chart, self.motion)
+        mean, P = np.zeros((K, N)), np.zeros((K, N, N))
+        P[:, :n, :n] = root @ _T(root)
+        P[:, np.arange(n, N), np.arange(n, N)] = self.errors.sigma**2
         nis, log_evidence = np.zeros(K), np.zeros(K)
-        means, covariances, predictions, transitions = [], [], [], []
+        steps: list[_FilteredRow] = []
+        transition = np.zeros((K, n, n))
         for row, measurement in enumerate(self.measurements):
             if row:
                 mean, P, transition = self._step(track, row, mean, P)
-                transitions.append(transition)
-            predictions.append((mean, P))
+            source = track[row][:, :N_SOURCE]
             chart = self._chart(track, row)
-            L = chart.jacobian(np.zeros_like(chart.x))[:, :6]
-            J = np.concatenate(
-                [
-                    measurement.source_jacobian(track[row][:, :6]) @ L,
-                    np.broadcast_to(measurement.effect, (K, *measurement.effect.shape)),
-                ],
-                axis=2,
-            )
-            left = measurement.z - measurement.of_source(track[row][:, :6]) - (J @ mean[..., None])[..., 0]
+            L = chart.jacobian(np.zeros_like(chart.x))[:, :N_SOURCE]
+            effect = np.broadcast_to(measurement.effect, (K, *measurement.effect.shape))
+            J = np.concatenate([measurement.source_jacobian(source) @ L, effect], axis=2)
+            left = (measurement.z - measurement.of_source(source))[..., None] - J @ mean[..., None]
             PJ = P @ _T(J)
-            L_S = np.linalg.cholesky(np.eye(J.shape[1]) + J @ PJ)
-            white = np.linalg.solve(L_S, np.concatenate([_T(PJ), left[..., None]], axis=2))
-            nis = nis + np.sum(white[..., -1] ** 2, axis=1)
-            log_det = 2.0 * np.sum(np.log(np.diagonal(L_S, axis1=1, axis2=2)), axis=1)
-            log_evidence = log_evidence - 0.5 * (np.sum(white[..., -1] ** 2, axis=1) + log_det)
-            mean = mean + (_T(white[..., :-1]) @ white[..., -1:])[..., 0]
-            P = P - _T(white[..., :-1]) @ white[..., :-1]
-            means.append(mean)
-            covariances.append(P)
-        smoothed, offsets = mean, [mean[:, :n]]
-        for row in range(len(self.measurements) - 1, 0, -1):
-            predicted, predicted_P = predictions[row]
-            change = _solved(predicted_P, smoothed - predicted)
-            smoothed = means[row - 1] + (covariances[row - 1] @ (_T(transitions[row - 1]) @ change))[..., 0]
-            offsets.append(smoothed[:, :n])
-        return _Passed(np.array(offsets[::-1]), mean[:, n:], P, nis, log_evidence)
+            L_S, sound = _roots(np.eye(J.shape[1]) + J @ PJ)
+            log_evidence[~sound] = -np.inf
+            white = np.linalg.solve(L_S, np.concatenate([J, _T(PJ), left], axis=2))
+            J, gain, left = white[..., :N], white[..., N:-1], white[..., -1:]
+            steps.append(_FilteredRow(mean, P[:, :n], transition, J, gain, left))
+            square = np.sum(left[..., 0] ** 2, axis=1)
+            nis = nis + square
+            log_evidence -= 0.5 * square + np.sum(np.log(np.diagonal(L_S, axis1=1, axis2=2)), axis=1)
+            mean = mean + (_T(gain) @ left)[..., 0]
+            P = P - _T(gain) @ gain
+        return _Passed(self._offsets(steps), mean[:, n:], P, nis, log_evidence)
+
+    def _offsets(self, steps: Sequence[_FilteredRow]) -> FloatArray:
+        """Smoothed offsets (rows, K, n)."""
+        n = self.n
+        offsets, slope = [], np.zeros((*steps[0].mean.shape, 1))
+        for row in range(len(steps) - 1, -1, -1):
+            step = steps[row]
+            slope = slope - _T(step.J) @ (step.left + step.gain @ slope)
+            offsets.append(step.mean[:, :n] - (step.P @ slope)[..., 0])
+            kept, _ = self.errors.step(self._dt_s(row) if row else 0.0)
+            slope = np.concatenate([_T(step.transition) @ slope[:, :n], kept[:, None] * slope[:, n:]], axis=1)
+        return np.array(offsets[::-1])
 
     def _step(
         self, track: FloatArray, row: int, mean: FloatArray, P: FloatArray
@@ -151,26 +163,41 @@ class _Rows:
         steps = [self.motion.step(state, self._dt_s(row)) for state in track[row - 1]]
         F, S_q = np.stack([step[1] for step in steps]), np.stack([step[2] for step in steps])
         kept, added = self.errors.step(self._dt_s(row))
-        transition = np.zeros_like(P)
-        transition[:, n:, n:] = np.diag(kept)
         inverse = after.inverse_jacobian()
-        transition[:, :n, :n] = inverse @ F @ before.jacobian(np.zeros_like(before.x))
-        noise = inverse @ S_q
-        mean = (transition @ mean[..., None])[..., 0]
-        mean[:, :n] += after.coordinates(np.stack([step[0] for step in steps]))
-        P = transition @ P @ _T(transition)
-        P[:, :n, :n] += noise @ _T(noise)
-        P[:, np.arange(n, P.shape[1]), np.arange(n, P.shape[1])] += added**2
-        return mean, 0.5 * (P + _T(P)), transition
+        A, noise = inverse @ F @ before.jacobian(np.zeros_like(before.x)), inverse @ S_q
+        moved = np.empty_like(mean)
+        moved[:, :n] = (A @ mean[:, :n, None])[..., 0] + after.coordinates(np.stack([step[0] for step in steps]))
+        moved[:, n:] = kept * mean[:, n:]
+        predicted = P.copy()
+        predicted[:, :n, :n] = A @ P[:, :n, :n] @ _T(A) + noise @ _T(noise)
+        predicted[:, :n, n:] = (A @ P[:, :n, n:]) * kept
+        predicted[:, n:, :n] = _T(predicted[:, :n, n:])
+        predicted[:, n:, n:] = P[:, n:, n:] * np.outer(kept, kept) + np.diag(added**2)
+        return moved, predicted, A
 
 
-def _solved(P: FloatArray, right: FloatArray) -> FloatArray:
-    """P⁻¹ right (K, N, 1), by the correlations: states are of mixed units, and some are known for certain."""
-    scale = np.sqrt(np.diagonal(P, axis1=1, axis2=2))
-    scale = np.where(scale > 0.0, scale, 1.0)
-    correlation = P / (scale[:, :, None] * scale[:, None, :])
-    solved = np.linalg.pinv(correlation, rcond=1e-13, hermitian=True) @ (right / scale)[..., None]
-    return solved / scale[..., None]
+@dataclass(frozen=True, eq=False)
+class _FilteredRow:
+    """Mean and covariance (K, n, N) before a row, the source's transition that led there, and what the row adds, whitened."""
+
+    mean: FloatArray
+    P: FloatArray
+    transition: FloatArray
+    J: FloatArray
+    gain: FloatArray
+    left: FloatArray
+
+
+def _roots(C: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Lower roots of (K, k, k), and which of them there are: a trajectory may lead through a sensor."""
+    try:
+        return np.linalg.cholesky(C), np.ones(len(C), dtype=bool)
+    except np.linalg.LinAlgError:
+        roots, sound = np.tile(np.eye(C.shape[1]), (len(C), 1, 1)), np.zeros(len(C), dtype=bool)
+        for k, of_one in enumerate(C):
+            with suppress(np.linalg.LinAlgError):
+                roots[k], sound[k] = np.linalg.cholesky(of_one), True
+        return roots, sound
 
 
 def _T(matrices: FloatArray) -> FloatArray:

@@ -23,12 +23,13 @@ from arrays.array import SensorArray
 from arrays.differences import Differences, decorrelated_differences
 from arrays.noise import reading_covariance
 from arrays.typing import FloatArray
-from magloc.levels import CONTRADICTION
+from magloc.levels import CONTRADICTION, DISAGREEMENT
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
+from magloc.localization.locator import fit_at_rest
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
 from magloc.readings import Readings, without_saturated
-from magloc.tracking.chart import Chart
+from magloc.tracking.chart import Chart, mirrored
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.mixture import Mixture
 from magloc.tracking.motion import N_SOURCE, MotionModel
@@ -42,6 +43,11 @@ ROWS_TO_LOSE = 3
 LARGEST_GROWTH = 1.5
 """A prediction bends as the readings do while no standard deviation grows by more in the step: beyond that it is the
 motion that it is uncertain of, which does not."""
+LARGEST_ALONE_WIDTH = 0.03
+"""The same of a component with which a track goes on whose rows do not determine a source one by one: their posterior
+is bent beyond that."""
+LARGEST_REFIT_WIDTH = 0.25
+"""The same of a component that is fitted to all rows of a young track."""
 MOST_YOUNG_ROWS = 240
 """Rows up to which a track is fitted anew as a whole."""
 LARGEST_WIDTH = 0.4
@@ -59,6 +65,11 @@ class Known:
         Cartesian covariance of source and motion had no readings been taken since the track began.
     contradictions : int
         Contradicting rows before the next one.
+    young : tuple of RowMeasurement
+        Rows of a track that are still fitted together, and `next_refit`, after how many of them.
+    alone : bool
+        Whether no row determines a source, nor all of them so far: then what is known is what the last row says;
+        `proposed` is what all of them said at the last attempt: a wrong optimum seldom stays as rows come in.
     """
 
     mixture: Mixture
@@ -66,6 +77,8 @@ class Known:
     contradictions: int = 0
     young: tuple[RowMeasurement, ...] = ()
     next_refit: int = 3
+    alone: bool = False
+    proposed: Mixture | None = None
 
 
 class Tracker:
@@ -151,6 +164,8 @@ class Tracker:
                 step = self.predicted(before.mixture.matched(), dt_s, measurement)
         if not measurement.z.size:
             return self._kept(measurement, known, step, status="predicted")
+        if before.alone:
+            return self._kept(measurement, self._with_row_alone(known, measurement), step, status="tracked")
         wide = predicted.widths > LARGEST_WIDTH
         if wide[np.argmax(predicted.log_weight)]:
             # The prediction says too little for an iteration to start from it.
@@ -248,31 +263,83 @@ class Tracker:
         """A new track, if the row shows a source."""
         mixture, reason = self._start.mixture(measurement)
         if mixture is None:
-            return TrackPoint(
-                measurement.row.time_s,
-                status=reason,
-                centroid_m=measurement.centroid_m,
-                radius_m=measurement.radius_m,
-            )
+            return _nothing_known(measurement, reason)
         if near is not None:
             mixture = _near(mixture, near).reduced()
         n = mixture.n_motion
         single = mixture.matched()
         chart = Chart.at(single.x[0, :n], single.centroid_m, single.radius_m)
         root = prior_root(chart, self.motion)
-        return self._kept(measurement, Known(mixture, root @ root.T, young=(measurement,)), None, status="acquired")
+        known = Known(mixture, root @ root.T, young=(measurement,), alone=measurement.z.size < N_SOURCE)
+        return self._kept(measurement, known, None, status="acquired")
+
+    def _with_row_alone(self, known: Known, measurement: RowMeasurement) -> Known:
+        """What is known after a row that does not determine a source, until all rows together do."""
+        rows = (*known.young, measurement)[-MOST_YOUNG_ROWS:]
+        mixture, _ = self._start.mixture(measurement)
+        known = replace(known, young=rows, mixture=known.mixture if mixture is None else mixture)
+        if len(rows) < known.next_refit:
+            return known
+        known = replace(known, next_refit=len(rows) + max(2, len(rows) // 8))
+        seeds = self._at_rest(rows)
+        if seeds is None:
+            return known
+        found, nis = refitted(seeds, rows, self.motion, self.errors)
+        if not self._believed(found, nis, rows):
+            return replace(known, proposed=None)
+        found = found.take(once(found, np.zeros((len(found), 2), dtype=np.intp))).reduced()
+        before = known.proposed
+        known = replace(known, proposed=found)
+        if len(found) > 1 or found.widths[0] > LARGEST_ALONE_WIDTH or before is None or not _agree(before, found):
+            return known
+        return replace(known, mixture=found, alone=False, proposed=None)
+
+    def _at_rest(self, rows: Sequence[RowMeasurement]) -> Mixture | None:
+        """Sources at rest that explain several rows together, as seeds."""
+        chosen = [m.row for m in rows[-64:]]
+        chosen = chosen[:: -max(1, len(chosen) // 16)]
+        known = [row.ambient_T for row in chosen if row.ambient_T is not None]
+        fix = fit_at_rest(
+            self.array,
+            np.stack([row.readings_T for row in chosen]),
+            np.stack([row.origin_m for row in chosen]),
+            np.stack([row.R_world_from_array for row in chosen]),
+            np.stack(known) if len(known) == len(chosen) else None,
+        )
+        if not fix.solutions:
+            return None
+        n, n_errors = self.motion.n_states, self.errors.n_states
+        x = np.zeros((len(fix.solutions), n + n_errors))
+        x[:, :n] = [
+            self.motion.start(np.hstack([s.position_m, s.moment_Am2]), np.zeros((6, 6)))[0] for s in fix.solutions
+        ]
+        last = rows[-1]
+        S = np.zeros((len(x), n + n_errors, n + n_errors))
+        return Mixture(x, S, np.zeros(len(x)), n, last.centroid_m, last.radius_m)
+
+    def _believed(self, found: Mixture, nis: FloatArray, rows: Sequence[RowMeasurement]) -> bool:
+        """Whether sources that were fitted to rows explain them, and are determined by them."""
+        if not len(found):
+            return False
+        dof = sum(m.z.size for m in rows) - N_SOURCE
+        best = int(np.argmax(found.log_weight))
+        return bool(
+            dof > 0 and nis[best] <= chdtri(dof, CONTRADICTION) and found.widths[best] < LARGEST_REFIT_WIDTH
+        )
 
     def _refitted(self, known: Known) -> Known:
         """What is known when all rows of a young track are fitted together."""
         mixture, n_rows = known.mixture, len(known.young)
         if n_rows > MOST_YOUNG_ROWS:
             return replace(known, young=())
-        if n_rows < known.next_refit or len(mixture) > 12 or mixture.widths.max() > 0.25:
+        if n_rows < known.next_refit or mixture.widths.max() > LARGEST_REFIT_WIDTH:
             return known
         known = replace(known, next_refit=max(n_rows + 2, int(1.5 * n_rows)))
-        found, nis = refitted(mixture, known.young, self.motion, self.errors)
-        dof = sum(m.z.size for m in known.young) - N_SOURCE
-        if not len(found) or (dof > 0 and nis.min() > chdtri(dof, CONTRADICTION)):
+        seeds = mixture.take(once(mixture, np.zeros((len(mixture), 2), dtype=np.intp))[:6])
+        x = mirrored(seeds.x, seeds.centroid_m).reshape(-1, seeds.x.shape[1])
+        seeds = replace(seeds, x=x, S=np.tile(seeds.S, (4, 1, 1)), log_weight=np.zeros(len(x)))
+        found, nis = refitted(seeds, known.young, self.motion, self.errors)
+        if not self._believed(found, nis, known.young):
             return known
         found = found.take(once(found, np.zeros((len(found), 2), dtype=np.intp))).reduced()
         if len(found) == 1 and len(mixture) == 1:
@@ -304,20 +371,19 @@ class Tracker:
         mixture = known.mixture
         if status != "acquired" and mixture.widths[np.argmax(mixture.log_weight)] > LARGEST_WIDTH:
             self._known = None
-            return TrackPoint(
-                measurement.row.time_s,
-                nis=nis,
-                nis_dof=nis_dof,
-                status="lost: the place is no longer known",
-                centroid_m=measurement.centroid_m,
-                radius_m=measurement.radius_m,
-            )
+            return replace(_nothing_known(measurement, "lost: the place is no longer known"), nis=nis, nis_dof=nis_dof)
         self._known = known
         if self.keep_steps:
             prediction, transition = (None, None) if step is None else (step[0], step[1][0])
             self.steps.append(Step(self._n_rows - 1, mixture.matched(), prediction, transition))
         point = track_point(measurement.row.time_s, mixture, np.diagonal(known.open_loop))
         return replace(point, status=status, nis=nis, nis_dof=nis_dof, iterations=iterations)
+
+
+def _nothing_known(measurement: RowMeasurement, status: str) -> TrackPoint:
+    return TrackPoint(
+        measurement.row.time_s, status=status, centroid_m=measurement.centroid_m, radius_m=measurement.radius_m
+    )
 
 
 def track_point(time_s: float, mixture: Mixture, open_loop: FloatArray) -> TrackPoint:
@@ -335,6 +401,13 @@ def track_point(time_s: float, mixture: Mixture, open_loop: FloatArray) -> Track
         radius_m=source.radius_m,
         mixture=source,
     )
+
+
+def _agree(before: Mixture, after: Mixture) -> bool:
+    """Whether two single sources stand at one place."""
+    (mean, covariance), (mean_after, covariance_after) = before.moments(), after.moments()
+    offset, both = (mean_after - mean)[:3], (covariance + covariance_after)[:3, :3]
+    return bool(offset @ np.linalg.solve(both, offset) < chdtri(3, DISAGREEMENT))
 
 
 def _near(mixture: Mixture, prediction: Mixture) -> Mixture:

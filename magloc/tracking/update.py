@@ -18,6 +18,7 @@ import numpy as np
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.tracking.chart import Chart
 from magloc.tracking.measurement import RowMeasurement
+from magloc.tracking.mixture import root_of
 from magloc.tracking.motion import N_SOURCE
 
 TOLERANCE = 1e-4
@@ -25,8 +26,9 @@ TOLERANCE = 1e-4
 MOST_ITERATIONS = 50
 # Steps that make the fit worse by more than rounding are halved.
 ROUNDING = 1e-9
-LEAST_SINGULAR = 1e-6
-"""A row has no coordinates of its own if a column of its Jacobian, in units of what is known, is so near to others."""
+LEAST_SHARE = 0.02
+"""A prediction bends as a row's readings do along what the row tells, in standard deviations of the prediction, more
+than this: of less the other rows told, which may bend otherwise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,11 +39,6 @@ class Move:
     S_q: FloatArray
     kept: FloatArray
     added: FloatArray
-
-
-def root_of(rows: FloatArray) -> FloatArray:
-    """Lower root (..., n, n) of ``rows rowsᵀ``, by an orthogonal factorisation of rows (..., n, m), m ≥ n."""
-    return np.swapaxes(np.linalg.qr(np.swapaxes(rows, -1, -2), mode="r"), -1, -2)
 
 
 def predicted_root(before: Chart, after: Chart, S: FloatArray, move: Move) -> tuple[FloatArray, FloatArray]:
@@ -138,6 +135,13 @@ def updated(x: FloatArray, S: FloatArray, measurement: RowMeasurement, bends: Bo
     return Updated(x_after, S_after, cost, chi2, -0.5 * (cost + log_N + problem.log_C), iterations, converged)
 
 
+def damped_inverse(J: FloatArray) -> FloatArray:
+    """M (K, n, k) with M J = 1 along what J (K, k, n) measures well enough, and 0 where it measures next to nothing."""
+    n = J.shape[2]
+    Q, R = np.linalg.qr(np.concatenate([J, np.broadcast_to(LEAST_SHARE * np.eye(n), (len(J), n, n))], axis=1))
+    return np.asarray(np.linalg.solve(R, _T(Q[:, : J.shape[1]])))
+
+
 def _whole_step(J: FloatArray, residual: FloatArray) -> FloatArray:
     """Gauss and Newton's step (K, n) towards the least |residual - J step|²."""
     R = np.linalg.qr(np.concatenate([J, residual[..., None]], axis=2), mode="r")
@@ -159,7 +163,7 @@ class _Problem:
     of_errors: FloatArray
     log_C: FloatArray
     M: FloatArray | None = None
-    is_bent: BoolArray | None = None
+    J: FloatArray | None = None
     h: FloatArray | None = None
 
     @classmethod
@@ -195,7 +199,7 @@ class _Problem:
             of_errors=self.of_errors[index],
             log_C=self.log_C[index],
             M=None if self.M is None else self.M[index],
-            is_bent=None if self.is_bent is None else self.is_bent[index],
+            J=None if self.J is None else self.J[index],
             h=None if self.h is None else self.h[index],
         )
 
@@ -205,16 +209,12 @@ class _Problem:
 
     def bent(self, bends: BoolArray) -> _Problem:
         """The same, the prediction being Gaussian in what the row measures where it bends so: see :func:`updated`."""
-        if not bends.any() or self.z.shape[1] < N_SOURCE:
+        if not bends.any():
             return self
-        J = self._whitened(self.of_coordinates(np.zeros_like(self.chart.x))[..., :N_SOURCE])
-        unit = np.linalg.norm(self.U[:, :N_SOURCE], axis=2)
-        Q, R = np.linalg.qr(J * unit[:, None, :])
-        diagonal = np.abs(np.diagonal(R, axis1=1, axis2=2))
-        sound = bends & (diagonal.min(axis=1) > LEAST_SINGULAR * diagonal.max(axis=1))
-        M = np.zeros((len(J), N_SOURCE, J.shape[1]))
-        M[sound] = unit[sound][:, :, None] * np.linalg.solve(R[sound], _T(Q[sound]))
-        return replace(self, M=M, is_bent=sound, h=self._h(np.zeros_like(self.chart.x)))
+        J = self._whitened(self.of_coordinates(np.zeros_like(self.chart.x))) @ self.U
+        M = damped_inverse(J)
+        M[~bends] = 0.0
+        return replace(self, M=M, J=J, h=self._h(np.zeros_like(self.chart.x)))
 
     def _whitened(self, values: FloatArray) -> FloatArray:
         return values if self.whiten is None else self.whiten @ values
@@ -226,13 +226,9 @@ class _Problem:
 
     def residual(self, zeta: FloatArray) -> FloatArray:
         """Whitened misfits of the readings and of the prediction (K, k + n)."""
-        e = self.e(zeta)
-        h, standard = self._h(e), zeta
+        h, standard = self._h(self.e(zeta)), zeta
         if self.M is not None:
-            bend = np.zeros_like(e)
-            bend[:, :N_SOURCE] = (self.M @ (h - self.h)[..., None])[..., 0] - e[:, :N_SOURCE]
-            bend[~self.is_bent] = 0.0
-            standard = zeta + np.linalg.solve(self.U, bend[..., None])[..., 0]
+            standard = zeta + (self.M @ ((h - self.h)[..., None] - self.J @ zeta[..., None]))[..., 0]
         left = self.z - h
         if self.whiten is not None:
             left = left - (self.of_errors @ standard[..., None])[..., 0]
@@ -240,20 +236,16 @@ class _Problem:
 
     def jacobian(self, zeta: FloatArray) -> FloatArray:
         """Minus its derivative (K, k + n, n) by ζ."""
-        J_e = self._whitened(self.of_coordinates(self.e(zeta)))
-        standard = np.linalg.solve(self.U, self.bending(J_e) @ self.U)
-        J = J_e @ self.U
+        J = self._whitened(self.of_coordinates(self.e(zeta))) @ self.U
+        standard = self.bending(J)
         if self.whiten is not None:
             J = J + self.of_errors @ standard
         return np.concatenate([J, standard], axis=1)
 
-    def bending(self, J_e: FloatArray) -> FloatArray:
-        """Derivative (K, n, n), by e, of the coordinates in which the prediction is Gaussian."""
-        n = J_e.shape[-1]
-        bending = np.tile(np.eye(n), (len(J_e), 1, 1))
-        if self.M is not None:
-            bending[self.is_bent, :N_SOURCE] = (self.M @ J_e)[self.is_bent]
-        return bending
+    def bending(self, J: FloatArray) -> FloatArray:
+        """Derivative (K, n, n), by ζ, of the numbers in which the prediction is standard, from J of the readings."""
+        one = np.broadcast_to(np.eye(J.shape[2]), (len(J), J.shape[2], J.shape[2]))
+        return one if self.M is None else one + self.M @ (J - self.J)
 
     def of_coordinates(self, e: FloatArray) -> FloatArray:
         """Derivative (K, k, n) of the source's differences, in units of their noise, by its coordinates."""
@@ -286,7 +278,8 @@ class _Problem:
         x[:, n:] += (D @ (_T(share) @ of_source + _T(phi) @ left))[..., 0]
         H = self.of_coordinates(e)
         # The prediction's root, as it looks there.
-        AB = np.linalg.pinv(self.bending(self.whiten @ H)) @ self.S[:, :n]
+        bending = self.U @ self.bending(self.whiten @ H @ self.U) @ np.linalg.inv(self.U)
+        AB = np.linalg.solve(bending, self.S[:, :n])
         A, B = AB[..., :n], AB[..., n:]
         HA, one = H @ A, np.eye(k)
         R = np.linalg.qr(np.concatenate([HA, np.broadcast_to(np.eye(n), A.shape)], axis=1), mode="r")
