@@ -112,7 +112,7 @@ class _CompiledSteps:
         assert known is not None
         mixture = known.mixture
         state = kernels.State(
-            mixture.x[0].copy(), np.ascontiguousarray(mixture.S[0]), mixture.centroid_m.copy(), known.open_loop.copy()
+            mixture.x[0].copy(), mixture.S[0].copy(), mixture.centroid_m.copy(), known.open_loop.copy()
         )
         end, contradictions = kernels.follow(
             begin,

@@ -7,11 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.kalman import symmetric_square_root
 from magloc.tracking.chart import Chart
 from magloc.tracking.mixture import Mixture
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Step, TrackPoint
+
+
+# Of correlations: see :func:`_root`.
+_LEAST_VARIANCE = 1e-12
 
 
 def smoothed(points: list[TrackPoint], steps: list[Step]) -> list[TrackPoint]:
@@ -27,7 +30,7 @@ def smoothed(points: list[TrackPoint], steps: list[Step]) -> list[TrackPoint]:
         later = step
         point, known = points[step.row], step.known
         if point.position_m is not None:
-            S = symmetric_square_root(P[:N_SOURCE, :N_SOURCE])
+            S = _root(P[:N_SOURCE, :N_SOURCE])
             source = replace(known, x=x[None, :N_SOURCE], S=S[None], n_motion=N_SOURCE)
             mean, covariance = source.moments()
             result[step.row] = replace(
@@ -54,6 +57,13 @@ def _with_later(step: Step, later: Step | None, x_later: FloatArray, P_later: Fl
     x = known.x[0] + e
     x[:n] = known.chart.retracted(e[None, :n])[0]
     return x, _turned(0.5 * (P + P.T), known.chart, e[:n], _chart_about(x, known), np.zeros(n))
+
+
+def _root(P: FloatArray) -> FloatArray:
+    """Root of a covariance that rounding, and what two charts differ by, may have left a little less than positive."""
+    scale = np.sqrt(np.maximum(np.diagonal(P), 1e-300))
+    variance, axes = np.linalg.eigh(P / np.outer(scale, scale))
+    return np.asarray(scale[:, None] * axes * np.sqrt(np.maximum(variance, _LEAST_VARIANCE)))
 
 
 def _chart_about(x: FloatArray, like: Mixture) -> Chart:

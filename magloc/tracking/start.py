@@ -143,7 +143,7 @@ class Start:
         row = measurement.row
         position = (found.x[:, :3] - row.origin_m) @ row.R_world_from_array
         sound = self.prior.allows_position(position) & self.prior.allows_moment(found.x[:, 3:6])
-        sound &= np.isfinite(found.log_evidence)
+        sound &= np.isfinite(found.log_evidence) & found.converged
         if not sound.any():
             return None, NOT_ALLOWED
         dof = measurement.z.size - N_SOURCE
@@ -213,7 +213,7 @@ def _centred(seeds: _Seeds, found: Updated, measurement: RowMeasurement) -> _See
     length = np.maximum(r, measurement.radius_m)
     cell = np.where(narrow, -1, seeds.cell)
     # A best fit has no cell whose share it could stand for.
-    sound = np.isfinite(found.log_evidence) & ((seeds.cell >= 0) | narrow).all(axis=1)
+    sound = np.isfinite(found.log_evidence) & found.converged & ((seeds.cell >= 0) | narrow).all(axis=1)
     return _Seeds(
         (measurement.centroid_m + r[:, None] * offset)[sound], (seen * length[:, None] ** 4)[sound], cell[sound]
     )

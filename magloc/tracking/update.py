@@ -61,7 +61,9 @@ def predicted_root(before: Chart, after: Chart, S: FloatArray, move: Move) -> tu
             columns.append(wide - B @ np.swapaxes(Q, -1, -2))
         moved[..., :n, n:], moved[..., n:, n:] = B, D
     moved[..., :n, :n] = root_of(np.concatenate(columns, axis=-1))
-    return moved, transition
+    whole = np.zeros_like(S)
+    whole[..., :n, :n], whole[..., n:, n:] = transition, np.diag(move.kept)
+    return moved, whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +133,9 @@ def updated(x: FloatArray, S: FloatArray, measurement: RowMeasurement, bends: Bo
     R = np.linalg.qr(J, mode="r")
     log_N = 2.0 * np.sum(np.log(np.abs(np.diagonal(R, axis1=-2, axis2=-1))), axis=1)
     x_after, S_after = problem.posterior(zeta, R)
+    # A start that leads nowhere may end where nothing is a number.
+    with np.errstate(all="ignore"):
+        converged &= np.isfinite(S_after).all(axis=(1, 2)) & (np.abs(np.linalg.det(S_after[:, :n, :n])) > 0.0)
     chi2 = np.sum(residual[:, :k] ** 2, axis=1)
     return Updated(x_after, S_after, cost, chi2, -0.5 * (cost + log_N + problem.log_C), iterations, converged)
 

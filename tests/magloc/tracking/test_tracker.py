@@ -19,6 +19,7 @@ from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
 from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import consistency
+from magloc.tracking.mixture import Mixture
 from magloc.tracking.motion import CoordinatedTurn, MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
 from magloc.tracking.smoother import smoothed
@@ -30,6 +31,7 @@ from tests.passing_source import (
     POSITION,
     SLOW,
     followed,
+    known_of,
     moving_source,
     positions,
     readings_of,
@@ -78,8 +80,11 @@ def drawn_state(rng: np.random.Generator, motion: MotionModel, deviation: FloatA
     """A true state, drawn from the prior of a tracker that begins with it at time 0."""
     x, S = motion.start(np.concatenate([POSITION, MOMENT]), np.diag(deviation))
     tracker = Tracker(ARRAY, motion, keep_steps=True)
-    tracker.resume(x, S, 0.0, 0, [])
-    return x + S @ rng.normal(size=x.size), tracker
+    known = known_of(tracker, x, S)
+    tracker.resume(known, 0.0, 0)
+    # Drawn in the chart, in which the tracker takes it to be Gaussian.
+    state = known.mixture.chart.retracted((known.mixture.S @ rng.normal(size=x.size)))[0]
+    return state, tracker
 
 
 def drawn_run(
@@ -125,8 +130,10 @@ class TestMatchedModel:
             assert statuses(points) == ["tracked"] * self.N_ROWS
             nis += sum(point.nis for point in points)
             nis_dof += sum(point.nis_dof for point in points)
-            x, S, _ = tracker.state()
-            nees += float(np.sum(np.linalg.lstsq(S, x - truth[-1], rcond=None)[0] ** 2))
+            assert tracker.known is not None
+            mixture = tracker.known.mixture
+            error = mixture.chart.coordinates(truth[-1:])[0]
+            nees += float(np.sum(np.linalg.solve(mixture.S[0], error) ** 2))
             before += float(np.sum((positions(points) - truth[:, :3]) ** 2))
             after += float(np.sum((positions(smoothed(points, tracker.steps)) - truth[:, :3]) ** 2))
         assert nis_dof == 9 * self.N_ROWS * n_runs
@@ -344,50 +351,54 @@ class TestTime:
         assert set(statuses(points[1:])) == {"tracked"}
         for before, step in zip(tracker.steps[:-1], tracker.steps[1:], strict=True):
             assert step.prediction is not None
-            P = before.S @ before.S.T
             dt_s = time_s[step.row] - time_s[before.row]
-            growth = np.diagonal(step.prediction.S @ step.prediction.S.T - P)[:3]
-            np.testing.assert_allclose(growth, (0.1 * dt_s) ** 2, rtol=1e-6)
+            after, at_first = (cartesian(mixture) for mixture in (step.prediction, before.known))
+            np.testing.assert_allclose(np.diagonal(after - at_first)[:3], (0.1 * dt_s) ** 2, rtol=1e-6)
+
+
+def cartesian(mixture: Mixture) -> FloatArray:
+    """Covariance (6, 6) of a single component, to first order."""
+    root = mixture.chart.jacobian(np.zeros((1, 6)))[0] @ mixture.S[0]
+    return root @ root.T
 
 
 class TestEstimability:
-    """Spec: 0 where nothing was learned, 1 where all was."""
+    """Spec: 0 where nothing was learned, 1 where all was; the reference is the start's prior, moved on without rows."""
 
-    def test_between_0_and_1(self) -> None:
-        time_s, p, m = moving_source(40)
-        points = followed(Tracker(ARRAY, SLOW), rows_from(time_s, readings_of(ARRAY, p, m)))
-        for point in points:
+    def test_grows_towards_1_at_rest(self) -> None:
+        """Monotone but for what the estimate itself moves the σ of later rows by."""
+        n = 60
+        p, m = np.tile(POSITION, (n, 1)), np.tile(MOMENT, (n, 1))
+        points = followed(Tracker(ARRAY, RandomWalk(1e-9, 1e-9)), rows_from(np.arange(float(n)), readings_of(ARRAY, p, m)))
+        learned = np.array([point.estimability for point in points])
+        assert (learned >= 0.0).all()
+        assert (learned <= 1.0).all()
+        assert (np.diff(learned, axis=0) > -1e-3).all()
+        assert (learned[-1] > 0.99).all()
+
+    def test_is_one_minus_the_ratio_of_standard_deviations(self) -> None:
+        """σ of 1 % of the open-loop σ: 0.99. Open loop, a random walk adds its noise of every row."""
+        time_s, p, m = moving_source(20)
+        points = followed(tracker := Tracker(ARRAY, SLOW), rows_from(time_s, readings_of(ARRAY, p, m)))
+        first, last = points[0], points[-1]
+        assert tracker.known is not None
+        for point, rows in ((first, 0), (last, 19)):
             assert point.estimability is not None
-            assert (point.estimability >= 0.0).all()
-            assert (point.estimability <= 1.0).all()
-        assert points[0].estimability is not None
-        np.testing.assert_array_equal(points[0].estimability, 1.0)
+            assert point.covariance is not None
+            open_loop = np.sqrt(np.diagonal(point.covariance)) / (1.0 - point.estimability)
+            if rows:
+                added = open_loop[:3] ** 2 - start[:3] ** 2
+                np.testing.assert_allclose(added, rows * (0.1 * 0.5) ** 2, rtol=1e-6)
+            start = open_loop
+        np.testing.assert_allclose(start**2, np.diagonal(tracker.known.open_loop), rtol=1e-9)
 
-    def test_is_zero_for_what_a_row_does_not_see(self) -> None:
-        """Of a source and a moment on a line of sensors, components along it say nothing of what is across it."""
-        line = SensorArray(
-            tuple(Sensor(f"s{i}", kind="vector", position_m=(0.5 * i, 0.0, 0.0), noise_T=1e-10) for i in range(4))
-        )
-        tracker = Tracker(line, SLOW)
-        source = np.array([4.0, 0.0, 0.0, 100.0, 0.0, 0.0])
-        tracker.resume(source, np.diag(np.repeat([0.05, 5.0], 3)), 0.0, 0, [])
-        readings = predicted_channels(line, source[:3], source[3:])
-        readings[np.arange(12) % 3 != 0] = np.nan
-        point = tracker.update(Row(0.5, readings))
-        assert point.status == "tracked"
-        assert point.nis_dof == 3
-        assert point.estimability is not None
-        np.testing.assert_allclose(point.estimability[[1, 2, 4, 5]], 0.0, atol=1e-12)
-        assert (point.estimability[[0, 3]] > 0.1).all()
-
-    def test_is_one_for_what_was_unknown(self) -> None:
-        """A prior that is more than 1e4 times as wide as what a row tells: all but 1e-4 of it is learned."""
-        tracker = Tracker(ARRAY, SLOW)
-        source = np.concatenate([POSITION, MOMENT])
-        tracker.resume(source, np.diag([0.3] * 3 + [1e5] * 3), 0.0, 0, [])
-        point = tracker.update(Row(0.5, predicted_channels(ARRAY, POSITION, MOMENT)))
-        assert point.estimability is not None
-        assert (point.estimability[3:] > 0.9999).all()
+    def test_without_readings_it_falls(self) -> None:
+        time_s, p, m = moving_source(20)
+        readings = readings_of(ARRAY, p, m)
+        readings[10:] = np.nan
+        points = followed(Tracker(ARRAY, SLOW), rows_from(time_s, readings))
+        learned = np.array([point.estimability for point in points[9:]])
+        assert (np.diff(learned[:, :3], axis=0) < 0.0).all()
 
 
 class TestFrames:
