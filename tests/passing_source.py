@@ -12,8 +12,8 @@ from arrays import geometries
 from arrays.array import SensorArray
 from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
-from magloc.tracking.chart import Chart
-from magloc.tracking.mixture import Mixture, root_of
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.mixture import Mixture, root_of
 from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
 from magloc.tracking.tracker import Known, Tracker

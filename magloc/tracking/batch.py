@@ -8,15 +8,16 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import chdtri
 
+from arrays.typing import FloatArray
 from magloc.compilation import own
 from magloc.levels import CONTRADICTION
 from magloc.measurement.rows import ambient_fields
 from magloc.tracking import batch_compiled as kernels
-from magloc.tracking.mixture import Mixture
+from magloc.tracking.chart.mixture import Mixture
+from magloc.tracking.chart.update import LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
 from magloc.tracking.motion import LinearMotion
 from magloc.tracking.results import Row, Step, TrackPoint
 from magloc.tracking.tracker import LARGEST_GROWTH, LARGEST_WIDTH, ROWS_TO_LOSE, Tracker, track_point
-from magloc.tracking.update import LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
 
 _STATUS = {kernels.TRACKED: "tracked", kernels.PREDICTED: "predicted", kernels.OUTLIER: "outlier"}
 
@@ -129,7 +130,7 @@ class _CompiledSteps:
             return []
         centroids = given.origins + given.rotations @ tracker.array.centroid
 
-        def single(row: int, x: object, S: object) -> Mixture:
+        def single(row: int, x: FloatArray, S: FloatArray) -> Mixture:
             return replace(mixture, x=x[row][None], S=S[row][None], centroid_m=centroids[row])
 
         points, steps = [], []

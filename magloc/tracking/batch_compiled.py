@@ -1,8 +1,8 @@
 """The tracker's steps over many rows, the twin of :meth:`magloc.tracking.tracker.Tracker.update` for one component.
 
 A state of n numbers begins with position and moment, and the velocity where there is one. Every row has a transition F,
-and a square root of its noise in two parts, ``S_q = A + |m| B``; its readings are whitened differences, padded to k with
-rows that are zero.
+and a square root of its noise in two parts, ``S_q = A + |m| B``; its readings are whitened differences, padded to k
+with rows that are zero.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from arrays.typing import FloatArray
 from magloc.compilation import compiled
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.kalman_compiled import triangular_root
-from magloc.linalg_compiled import fill_frame, orthonormalise, put, put_rows
+from magloc.linalg_compiled import orthonormalise, put, put_rows
+from magloc.tracking.chart.coordinates_compiled import fill_chart, into_chart, move
 
 IntArray = NDArray[np.int64]
 TRACKED, PREDICTED, OUTLIER = 0, 1, 2
@@ -56,7 +57,7 @@ class Steps(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """When an update has converged, and when it is believed; see :mod:`magloc.tracking.update` and `.tracker`."""
+    """When an update has converged, and when it is believed; see :mod:`magloc.tracking.chart.update` and `.tracker`."""
 
     nis_limits: FloatArray
     tolerance: float
@@ -157,78 +158,6 @@ def _predicted(
 
 
 @compiled
-def _frame(x: FloatArray, centroid: FloatArray, radius: float, frame: FloatArray) -> float:
-    """Tangents and direction of the chart about a state as rows, and its length."""
-    offset = np.empty(3)
-    square = 0.0
-    for i in range(3):
-        offset[i] = x[i] - centroid[i]
-        square += offset[i] * offset[i]
-    if square == 0.0:
-        offset[2] = 1.0
-    r = fill_frame(offset, frame)
-    if square == 0.0:
-        r = 0.0
-    return max(r, radius)
-
-
-@compiled
-def _moved(x: FloatArray, e: FloatArray, frame: FloatArray, length: float, there: FloatArray, L: FloatArray) -> None:
-    """The state at coordinates e about x, and the derivative L (n, n): the twin of :class:`magloc.tracking.chart`."""
-    n = x.size
-    growth = math.exp(e[0])
-    b, u = np.empty(3), np.empty(3)
-    square = 0.0
-    for i in range(3):
-        b[i] = frame[2, i] + frame[0, i] * e[1] + frame[1, i] * e[2]
-        square += b[i] * b[i]
-    norm = math.sqrt(square)
-    for i in range(3):
-        u[i] = b[i] / norm
-    reach = growth * length
-    for i in range(n):
-        there[i] = x[i] + e[i]
-        for j in range(n):
-            L[i, j] = 1.0 if i == j else 0.0
-    scale, unit = growth * growth * growth * growth, length * length * length * length
-    far = reach * reach * reach * reach
-    for i in range(3):
-        there[i] = x[i] + length * (growth * u[i] - frame[2, i])
-        there[3 + i] = scale * (x[3 + i] + unit * e[3 + i])
-        L[i, i] = 0.0
-        L[i, 0] = reach * u[i]
-        L[3 + i, 0] = 4.0 * there[3 + i]
-        L[3 + i, 3 + i] = far
-    for a in range(2):
-        along = u[0] * frame[a, 0] + u[1] * frame[a, 1] + u[2] * frame[a, 2]
-        for i in range(3):
-            L[i, 1 + a] = reach * (frame[a, i] - u[i] * along) / norm
-    if n >= 9:
-        for i in range(6, 9):
-            there[i] = growth * (x[i] + length * e[i])
-            L[i, 0] = there[i]
-            L[i, i] = reach
-
-
-@compiled
-def _into_chart(x: FloatArray, frame: FloatArray, length: float, rows: FloatArray) -> None:
-    """Multiply rows (n, m) by the inverse of the chart's L at x, in place."""
-    n, m = rows.shape
-    unit = length * length * length * length
-    for c in range(m):
-        r0, r1, r2 = rows[0, c], rows[1, c], rows[2, c]
-        along = (frame[2, 0] * r0 + frame[2, 1] * r1 + frame[2, 2] * r2) / length
-        rows[0, c] = along
-        rows[1, c] = (frame[0, 0] * r0 + frame[0, 1] * r1 + frame[0, 2] * r2) / length
-        rows[2, c] = (frame[1, 0] * r0 + frame[1, 1] * r1 + frame[1, 2] * r2) / length
-        for i in range(3, 6):
-            rows[i, c] = (rows[i, c] - 4.0 * x[i] * along) / unit
-        if n >= 9:
-            for i in range(6, 9):
-                rows[i, c] = (rows[i, c] - x[i] * along) / length
-
-
-@compiled
 def _product(A: FloatArray, B: FloatArray, AB: FloatArray) -> None:
     """AB (n, m) = A (n, p) B (p, m)."""
     for i in range(A.shape[0]):
@@ -305,8 +234,8 @@ def follow(
             centroid_there[i] = t
         # Prediction.
         strength = math.sqrt(x[3] * x[3] + x[4] * x[4] + x[5] * x[5])
-        length = _frame(x, centroid, rules.radius, frame)
-        _moved(x, zero, frame, length, here, L)
+        length = fill_chart(x, centroid, rules.radius, frame)
+        move(x, zero, frame, length, here, L)
         _product(steps.F[s], L, out.transition[row])
         for i in range(n):
             t = 0.0
@@ -315,15 +244,15 @@ def follow(
             x_before[i] = t
             for c in range(n_noise):
                 noise[i, c] = steps.A[s, i, c] + strength * steps.B[s, i, c]
-        length = _frame(x_before, centroid_there, rules.radius, frame)
-        _into_chart(x_before, frame, length, out.transition[row])
+        length = fill_chart(x_before, centroid_there, rules.radius, frame)
+        into_chart(x_before, frame, length, out.transition[row])
         _product(out.transition[row], S, product)
         for i in range(n):
             for c in range(n):
                 rows[i, c] = product[i, c]
             for c in range(n_noise):
                 rows[i, n + c] = noise[i, c]
-        _into_chart(x_before, frame, length, rows[:, n:])
+        into_chart(x_before, frame, length, rows[:, n:])
         triangular_root(rows, S_before)
         status, nis, iterations = TRACKED, math.nan, 0
         if given.n_differences[row] == 0:
@@ -338,7 +267,7 @@ def follow(
             put(e, zero)
             _predicted(here, origin, R, ambient, array, transform, channels, slopes, h, H)
             put(h_first, h)
-            _moved(x_before, e, frame, length, here, L)
+            move(x_before, e, frame, length, here, L)
             bends = not _grows(S, S_before, rules.largest_growth)
             if bends:
                 _derivatives(H, L, S_before, J_e, columns)
@@ -373,7 +302,7 @@ def follow(
                     for j in range(i + 1):
                         t += S_before[i, j] * solution[j, 0]
                     e[i] = t
-                _moved(x_before, e, frame, length, there, L)
+                move(x_before, e, frame, length, there, L)
                 _predicted(there, origin, R, ambient, array, transform, channels, slopes, h_there, H)
                 for i in range(n):
                     residual_there[k + i] = -solution[i, 0]
@@ -419,8 +348,8 @@ def follow(
                         t -= solution[i, j] * triangle[j, c]
                     solution[i, c] = t / triangle[c, c]
             _product(L, solution, product)
-            length = _frame(here, centroid_there, rules.radius, frame_there)
-            _into_chart(here, frame_there, length, product)
+            length = fill_chart(here, centroid_there, rules.radius, frame_there)
+            into_chart(here, frame_there, length, product)
         else:
             put(here, x_before)
             put_rows(product, S_before)
@@ -467,7 +396,7 @@ def _derivatives(H: FloatArray, L: FloatArray, S: FloatArray, J_e: FloatArray, c
 
 @compiled
 def _damped_inverse(columns: FloatArray, triangle: FloatArray, least_share: float, M: FloatArray) -> None:
-    """The twin of :func:`magloc.tracking.update.damped_inverse`; columns are spoilt."""
+    """The twin of :func:`magloc.tracking.chart.update.damped_inverse`; columns are spoilt."""
     n, k = M.shape
     for i in range(n):
         for c in range(n):

@@ -18,12 +18,12 @@ import numpy as np
 
 from arrays.typing import FloatArray, IntArray
 from magloc.chi_square import mean_bounds, normalised_square
+from magloc.tracking.chart.mixture import Mixture
+from magloc.tracking.chart.update import damped_inverse
 from magloc.tracking.measurement import RowMeasurement
-from magloc.tracking.mixture import Mixture
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row, TrackPoint
 from magloc.tracking.tracker import Tracker
-from magloc.tracking.update import damped_inverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +116,7 @@ def consistency(
     moments = np.full_like(position_m, np.nan) if moment_Am2 is None else moment_Am2
     truth = np.hstack([position_m, moments])
     squares_of_rows = [
-        nees_of(point, of_row, tracker.measurement(row))
-        for point, of_row, row in zip(points, truth, rows, strict=True)
+        nees_of(point, of_row, tracker.measurement(row)) for point, of_row, row in zip(points, truth, rows, strict=True)
     ]
     of_rows = np.array([square for square, _ in squares_of_rows])
     dof_of_rows = np.array([dof for _, dof in squares_of_rows], dtype=np.intp)

@@ -10,10 +10,10 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.kalman import block_update, predict_square_root
-from magloc.tracking.chart import Chart
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.start import prior_root
 from magloc.tracking.results import Row
 from magloc.tracking.smoother import smoother_gain
-from magloc.tracking.start import prior_root
 from magloc.tracking.tracker import Tracker
 
 
@@ -23,9 +23,9 @@ def posterior_bound(
     """Posterior Cramér-Rao bound of the distance from the truth, for every row, from this row and those before.
 
     It begins with the first row that shows a source; before it no more is known than what a tracker starts with
-    (:func:`magloc.tracking.start.prior_root`), and the standard deviations of the sensors' lasting errors, which count
-    as unknowns of their own. Speed and turn rate are those of the truth. The root of the trace of the position's bound
-    (n,) [m] is infinite before that row.
+    (:func:`magloc.tracking.chart.start.prior_root`), and the standard deviations of the sensors' lasting errors, which
+    count as unknowns of their own. Speed and turn rate are those of the truth. The root of the trace of the position's
+    bound (n,) [m] is infinite before that row.
     """
     bounds = np.full(len(rows), np.inf)
     for step in _steps_at_truth(tracker, rows, position_m, moment_Am2):

@@ -13,7 +13,7 @@ from magloc.localization.fit.results import EVERYWHERE, Intervals, Solution, is_
 from magloc.localization.uncertainty.ambiguity import LARGEST_GAUSSIAN_SIGMA, relative_sigma
 from magloc.localization.uncertainty.range_interval import gaussian_ranges, union
 from magloc.readings import Readings
-from magloc.tracking.mixture import Mixture
+from magloc.tracking.chart.mixture import Mixture
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class TrackPoint:
     covariance : ndarray, shape (6, 6)
         Of (position, moment).
     estimability : ndarray, shape (6,)
-        What the row's readings taught of every component: 1 - σ after / σ predicted without them.
+        What the readings taught of every component since the track began: 1 - σ / σ without any of them.
     iterations : int
         Linearisations.
     nis : float

@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.tracking.chart import Chart
-from magloc.tracking.mixture import Mixture
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Step, TrackPoint
-
 
 # Of correlations: see :func:`_root`.
 _LEAST_VARIANCE = 1e-12
@@ -39,7 +38,9 @@ def smoothed(points: list[TrackPoint], steps: list[Step]) -> list[TrackPoint]:
     return result
 
 
-def _with_later(step: Step, later: Step | None, x_later: FloatArray, P_later: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _with_later(
+    step: Step, later: Step | None, x_later: FloatArray, P_later: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """State and covariance, in the chart about it, at a step, from those at the next one of the same track."""
     known = step.known
     P = known.S[0] @ known.S[0].T

@@ -1,11 +1,12 @@
 r"""One dipole through time: an iterated extended Kalman filter from the first row in which the source is seen.
 
-What is known of the source is a mixture of Gaussians in the coordinates of :mod:`magloc.tracking.chart`. The first row
-makes it (:mod:`magloc.tracking.start`); every later one moves its components by a
-:class:`magloc.tracking.motion.MotionModel`, updates them (:mod:`magloc.tracking.update`), and leaves fewer of them, soon
-a single one. A track ends when the readings contradict it or its place is no longer known; then it starts anew. The
-state is in the world frame where the array's pose is known, else in the array's. Behind the states of the motion stand
-the lasting errors that the array states of its sensors (:mod:`magloc.measurement.nuisances`).
+What is known of the source is a mixture of Gaussians in the coordinates of :mod:`magloc.tracking.chart.coordinates`.
+The first row makes it (:mod:`magloc.tracking.chart.start`); every later one moves its components by a
+:class:`magloc.tracking.motion.MotionModel`, updates them (:mod:`magloc.tracking.chart.update`), and leaves fewer of
+them, soon a single one; while the track is young, all its rows are fitted together now and then
+(:mod:`magloc.tracking.chart.refit`). A track ends when the readings contradict it or its place is no longer known; then
+it starts anew. The state is in the world frame where the array's pose is known, else in the array's. Behind the states
+of the motion stand the lasting errors that the array states of its sensors (:mod:`magloc.measurement.nuisances`).
 
 This module is the readable form; :mod:`magloc.tracking.batch` steps long records, and a test holds the two together.
 """
@@ -29,20 +30,24 @@ from magloc.localization.locator import fit_at_rest
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
 from magloc.readings import Readings, without_saturated
-from magloc.tracking.chart import Chart, mirrored
+from magloc.tracking.chart.coordinates import Chart, mirrored
+from magloc.tracking.chart.mixture import Mixture, root_of
+from magloc.tracking.chart.refit import refitted
+from magloc.tracking.chart.start import Start, once, prior_root
+from magloc.tracking.chart.update import Move, predicted_root, updated
 from magloc.tracking.measurement import RowMeasurement
-from magloc.tracking.mixture import Mixture
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.results import Row, Step, TrackPoint, rows_of
-from magloc.tracking.refit import refitted
-from magloc.tracking.start import Start, once, prior_root
-from magloc.tracking.update import Move, predicted_root, updated
 
 ROWS_TO_LOSE = 3
 """Contradicting rows in a row that end a track."""
 LARGEST_GROWTH = 1.5
 """A prediction bends as the readings do while no standard deviation grows by more in the step: beyond that it is the
 motion that it is uncertain of, which does not."""
+SETTLED = 0.05
+"""A young track is old when fitting it as a whole changes its state by less, in squares of σ per number."""
+SEEDS = 6
+"""Components of a young track that are fitted anew, each with its mirror images."""
 LARGEST_ALONE_WIDTH = 0.03
 """The same of a component with which a track goes on whose rows do not determine a source one by one: their posterior
 is bent beyond that."""
@@ -165,7 +170,7 @@ class Tracker:
         if not measurement.z.size:
             return self._kept(measurement, known, step, status="predicted")
         if before.alone:
-            return self._kept(measurement, self._with_row_alone(known, measurement), step, status="tracked")
+            return self._kept(measurement, self._with_row_alone(known, measurement), step, status="acquired")
         wide = predicted.widths > LARGEST_WIDTH
         if wide[np.argmax(predicted.log_weight)]:
             # The prediction says too little for an iteration to start from it.
@@ -284,7 +289,7 @@ class Tracker:
         seeds = self._at_rest(rows)
         if seeds is None:
             return known
-        found, nis = refitted(seeds, rows, self.motion, self.errors)
+        found, nis, _ = refitted(seeds, rows, self.motion, self.errors)
         if not self._believed(found, nis, rows):
             return replace(known, proposed=None)
         found = found.take(once(found, np.zeros((len(found), 2), dtype=np.intp))).reduced()
@@ -323,9 +328,7 @@ class Tracker:
             return False
         dof = sum(m.z.size for m in rows) - N_SOURCE
         best = int(np.argmax(found.log_weight))
-        return bool(
-            dof > 0 and nis[best] <= chdtri(dof, CONTRADICTION) and found.widths[best] < LARGEST_REFIT_WIDTH
-        )
+        return bool(dof > 0 and nis[best] <= chdtri(dof, CONTRADICTION) and found.widths[best] < LARGEST_REFIT_WIDTH)
 
     def _refitted(self, known: Known) -> Known:
         """What is known when all rows of a young track are fitted together."""
@@ -335,18 +338,19 @@ class Tracker:
         if n_rows < known.next_refit or mixture.widths.max() > LARGEST_REFIT_WIDTH:
             return known
         known = replace(known, next_refit=max(n_rows + 2, int(1.5 * n_rows)))
-        seeds = mixture.take(once(mixture, np.zeros((len(mixture), 2), dtype=np.intp))[:6])
+        seeds = mixture.take(once(mixture, np.zeros((len(mixture), 2), dtype=np.intp))[:SEEDS])
+        n_seeds = len(seeds)
         x = mirrored(seeds.x, seeds.centroid_m).reshape(-1, seeds.x.shape[1])
         seeds = replace(seeds, x=x, S=np.tile(seeds.S, (4, 1, 1)), log_weight=np.zeros(len(x)))
-        found, nis = refitted(seeds, known.young, self.motion, self.errors)
-        if not self._believed(found, nis, known.young):
+        found, nis, kept = refitted(seeds, known.young, self.motion, self.errors)
+        # A component that is not fitted to its end may be the true one: then the filter goes on with all of them.
+        if not np.isin(np.arange(n_seeds), kept).all() or not self._believed(found, nis, known.young):
             return known
         found = found.take(once(found, np.zeros((len(found), 2), dtype=np.intp))).reduced()
         if len(found) == 1 and len(mixture) == 1:
             n = mixture.n_motion
             e = mixture.chart.coordinates(found.x[:, :n])[0]
-            A = np.linalg.qr(mixture.S[0, :n].T, mode="r").T
-            if np.sum(np.linalg.solve(A, e) ** 2) < 0.05 * n:
+            if np.sum(np.linalg.solve(root_of(mixture.S[0, :n]), e) ** 2) < SETTLED * n:
                 known = replace(known, young=())
         return replace(known, mixture=found)
 

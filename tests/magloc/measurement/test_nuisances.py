@@ -25,13 +25,12 @@ from arrays.array import SensorArray
 from arrays.sensor import Calibration, Sensor
 from magloc.measurement.differences import predicted_channels
 from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
-from magloc.readings import Readings
 from magloc.tracking.batch import track_record
-from magloc.tracking.chart import Chart
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.update import updated
 from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import Row, rows_of
 from magloc.tracking.tracker import Tracker
-from magloc.tracking.update import updated
 from sims.magnetics.paths import Attitude, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
 from sims.magnetics.sensors import SensorModel
@@ -232,7 +231,7 @@ def uncalibrated(array: SensorArray, rng: np.random.Generator) -> tuple[FloatArr
 
 class TestUpdate:
     def test_is_the_best_fit_of_source_and_errors_together(self) -> None:
-        """scipy's minimum of the residuals, and of source and errors in units of their σ, and the inverse information."""
+        """scipy's minimum of residuals, source and errors in units of their σ, and the inverse information there."""
         rng = np.random.default_rng(7)
         array = replace(with_errors(geometries.tetrahedron(1.5, "vector", 2e-10), **LASTING), ambient_T=AMBIENT_T)
         _, true = uncalibrated(array, rng)

@@ -14,7 +14,6 @@ from arrays import geometries
 from arrays.array import SensorArray
 from magloc.readings import Readings
 from magloc.tracking.batch import track_record
-
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
 from magloc.tracking.smoother import smoothed

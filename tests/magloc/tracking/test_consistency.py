@@ -17,10 +17,10 @@ from arrays.differences import contrasts
 from magloc.chi_square import mean_bounds
 from magloc.kalman import symmetric_square_root
 from magloc.readings import Readings
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.consistency import consistency, nees_of
-from magloc.tracking.chart import Chart
 from magloc.tracking.measurement import RowMeasurement
-from magloc.tracking.mixture import Mixture
 from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import Row, TrackPoint, rows_of
@@ -246,9 +246,7 @@ class MovingArray:
 
         origin = np.outer(t, [0.1, -0.1, 0.0])
         rotation = Rotation.from_rotvec(np.outer(t, [0.1, 0.0, -0.2]))
-        rows = list(
-            rows_of(Readings(shown(self.N_ROWS), time_s=t, array_position_m=origin, array_rotation=rotation))
-        )
+        rows = list(rows_of(Readings(shown(self.N_ROWS), time_s=t, array_position_m=origin, array_rotation=rotation)))
         return rows, rotation.as_matrix(), origin
 
 

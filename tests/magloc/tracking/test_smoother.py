@@ -7,8 +7,8 @@ from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
 from magloc.tracking.batch import track_record
-from magloc.tracking.chart import Chart
-from magloc.tracking.mixture import Mixture
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.motion import OrnsteinUhlenbeck
 from magloc.tracking.results import Step, TrackPoint
 from magloc.tracking.smoother import smoothed

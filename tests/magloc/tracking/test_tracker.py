@@ -13,13 +13,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import sims
-from arrays.array import SensorArray
-from arrays.sensor import Sensor
 from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
 from magloc.tracking.batch import track_record
+from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.consistency import consistency
-from magloc.tracking.mixture import Mixture
 from magloc.tracking.motion import CoordinatedTurn, MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
 from magloc.tracking.smoother import smoothed
@@ -83,7 +81,7 @@ def drawn_state(rng: np.random.Generator, motion: MotionModel, deviation: FloatA
     known = known_of(tracker, x, S)
     tracker.resume(known, 0.0, 0)
     # Drawn in the chart, in which the tracker takes it to be Gaussian.
-    state = known.mixture.chart.retracted((known.mixture.S @ rng.normal(size=x.size)))[0]
+    state = known.mixture.chart.retracted(known.mixture.S @ rng.normal(size=x.size))[0]
     return state, tracker
 
 
@@ -372,7 +370,9 @@ class TestEstimability:
         """Monotone but for what the estimate itself moves the σ of later rows by."""
         n = 60
         p, m = np.tile(POSITION, (n, 1)), np.tile(MOMENT, (n, 1))
-        points = followed(Tracker(ARRAY, RandomWalk(1e-9, 1e-9)), rows_from(np.arange(float(n)), readings_of(ARRAY, p, m)))
+        points = followed(
+            Tracker(ARRAY, RandomWalk(1e-9, 1e-9)), rows_from(np.arange(float(n)), readings_of(ARRAY, p, m))
+        )
         learned = np.array([point.estimability for point in points])
         assert (learned >= 0.0).all()
         assert (learned <= 1.0).all()
@@ -383,17 +383,14 @@ class TestEstimability:
         """σ of 1 % of the open-loop σ: 0.99. Open loop, a random walk adds its noise of every row."""
         time_s, p, m = moving_source(20)
         points = followed(tracker := Tracker(ARRAY, SLOW), rows_from(time_s, readings_of(ARRAY, p, m)))
-        first, last = points[0], points[-1]
         assert tracker.known is not None
-        for point, rows in ((first, 0), (last, 19)):
+        open_loop = []
+        for point in (points[0], points[-1]):
             assert point.estimability is not None
             assert point.covariance is not None
-            open_loop = np.sqrt(np.diagonal(point.covariance)) / (1.0 - point.estimability)
-            if rows:
-                added = open_loop[:3] ** 2 - start[:3] ** 2
-                np.testing.assert_allclose(added, rows * (0.1 * 0.5) ** 2, rtol=1e-6)
-            start = open_loop
-        np.testing.assert_allclose(start**2, np.diagonal(tracker.known.open_loop), rtol=1e-9)
+            open_loop.append(np.diagonal(point.covariance) / (1.0 - point.estimability) ** 2)
+        np.testing.assert_allclose((open_loop[1] - open_loop[0])[:3], 19 * (0.1 * 0.5) ** 2, rtol=1e-6)
+        np.testing.assert_allclose(open_loop[1], np.diagonal(tracker.known.open_loop), rtol=1e-9)
 
     def test_without_readings_it_falls(self) -> None:
         time_s, p, m = moving_source(20)

@@ -26,11 +26,11 @@ from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.locator import Locator
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.rows import check_magnitudes
-from magloc.tracking.chart import Chart
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.mixture import FARTHEST, NEAREST, Mixture
+from magloc.tracking.chart.update import Updated, updated
 from magloc.tracking.measurement import RowMeasurement
-from magloc.tracking.mixture import FARTHEST, NEAREST, Mixture
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.update import Updated, updated
 
 _N_DIRECTIONS, _N_RANGES = 100, 14
 _PITCH = math.log(FARTHEST / NEAREST) / (_N_RANGES - 1)
@@ -161,11 +161,11 @@ class Start:
         left, whiten = measurement.without_source, measurement.whitening(self.errors.sigma)
         if whiten is not None:
             columns, left = whiten @ columns, whiten @ left
-        moment = (np.linalg.pinv(columns, rcond=1e-6) @ left[:, None])[..., 0]
-        explained = np.sum((columns @ moment[..., None])[..., 0] ** 2, axis=1)
+        moments = (np.linalg.pinv(columns, rcond=1e-6) @ left[:, None])[..., 0]
+        explained = np.sum((columns @ moments[..., None])[..., 0] ** 2, axis=1)
         explained[~self.prior.allows_position(cells) | ~(explained > 0.0)] = -np.inf
         chosen = np.flatnonzero(self._grid.chosen(explained))
-        position, moment = [world[chosen]], [moment[chosen]]
+        position, moment = [world[chosen]], [moments[chosen]]
         cell = [np.stack(np.divmod(chosen, _N_DIRECTIONS), axis=1)]
         if self._locator is not None and measurement.z.size >= N_SOURCE:
             for solution in self._locator.fit(row.readings_T, row.ambient_T).solutions:
@@ -191,9 +191,7 @@ class Start:
 
 
 def _mixture(found: Updated, log_weight: FloatArray, measurement: RowMeasurement) -> Mixture:
-    return Mixture(
-        found.x, found.S, log_weight, measurement.n_motion, measurement.centroid_m, measurement.radius_m
-    )
+    return Mixture(found.x, found.S, log_weight, measurement.n_motion, measurement.centroid_m, measurement.radius_m)
 
 
 def _centred(seeds: _Seeds, found: Updated, measurement: RowMeasurement) -> _Seeds:
@@ -201,14 +199,10 @@ def _centred(seeds: _Seeds, found: Updated, measurement: RowMeasurement) -> _See
     sigma = np.sqrt(np.sum(found.S[:, :3] ** 2, axis=2))
     narrow = sigma < _NARROW * _CELL
     narrow = np.stack([narrow[:, 0], narrow[:, 1] & narrow[:, 2]], axis=1)
-    old, new = (
-        Chart.at(x, measurement.centroid_m, measurement.radius_m) for x in (seeds.position_m, found.x[:, :3])
-    )
+    old, new = (Chart.at(x, measurement.centroid_m, measurement.radius_m) for x in (seeds.position_m, found.x[:, :3]))
     seen = found.x[:, 3:6] / new.length[:, None] ** 4
     offset = np.where(narrow[:, 1:], new.u, old.u)
-    range_old, range_new = (
-        np.linalg.norm(chart.x[:, :3] - measurement.centroid_m, axis=1) for chart in (old, new)
-    )
+    range_old, range_new = (np.linalg.norm(chart.x[:, :3] - measurement.centroid_m, axis=1) for chart in (old, new))
     r = np.where(narrow[:, 0], range_new, range_old)
     length = np.maximum(r, measurement.radius_m)
     cell = np.where(narrow, -1, seeds.cell)

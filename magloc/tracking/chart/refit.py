@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from arrays.typing import BoolArray, FloatArray
+from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.measurement.nuisances import SensorErrors
-from magloc.tracking.chart import Chart
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.mixture import Mixture
+from magloc.tracking.chart.start import first_root
 from magloc.tracking.measurement import RowMeasurement
-from magloc.tracking.mixture import Mixture
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.start import first_root
 
 _MOST_PASSES = 25
 # Change of the last state, in its standard deviations, below which the trajectory stays.
@@ -31,10 +31,10 @@ _LONGEST = 0.5
 
 def refitted(
     mixture: Mixture, measurements: Sequence[RowMeasurement], motion: MotionModel, errors: SensorErrors
-) -> tuple[Mixture, FloatArray]:
-    """Components after the last of the rows, not yet weighed against each other, and the χ² (K,) of all rows.
+) -> tuple[Mixture, FloatArray, IntArray]:
+    """Components after the last of the rows, not yet weighed against each other, the χ² (K,) of all rows, and whose.
 
-    Components that do not converge are left out.
+    Components that do not converge are left out: the indices (K,) say which are left.
     """
     rows = _Rows(measurements, motion, errors)
     track = rows.backwards(mixture.x)
@@ -61,7 +61,7 @@ def refitted(
     last = measurements[-1]
     after = Mixture(x, S, found.log_evidence, n, last.centroid_m, last.radius_m)
     kept = np.flatnonzero(converged)
-    return replace(after, x=x[kept], S=S[kept], log_weight=found.log_evidence[kept]), found.nis[kept]
+    return replace(after, x=x[kept], S=S[kept], log_weight=found.log_evidence[kept]), found.nis[kept], kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,9 @@ class _Rows:
         track = [x[:, : self.n]]
         for row in range(len(self.measurements) - 1, 0, -1):
             steps = [self.motion.step(state, self._dt_s(row)) for state in track[-1]]
-            back = [state - np.linalg.solve(step[1], step[0] - state) for state, step in zip(track[-1], steps, strict=True)]
+            back = [
+                state - np.linalg.solve(step[1], step[0] - state) for state, step in zip(track[-1], steps, strict=True)
+            ]
             track.append(np.array(back))
         return np.array(track[::-1])
 
@@ -178,7 +180,7 @@ class _Rows:
 
 @dataclass(frozen=True, eq=False)
 class _FilteredRow:
-    """Mean and covariance (K, n, N) before a row, the source's transition that led there, and what the row adds, whitened."""
+    """Mean and covariance (K, n, N) before a row, the source's transition that led there, and what it adds."""
 
     mean: FloatArray
     P: FloatArray
@@ -191,9 +193,9 @@ class _FilteredRow:
 def _roots(C: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Lower roots of (K, k, k), and which of them there are: a trajectory may lead through a sensor."""
     try:
-        return np.linalg.cholesky(C), np.ones(len(C), dtype=bool)
+        return np.asarray(np.linalg.cholesky(C)), np.ones(len(C), dtype=np.bool_)
     except np.linalg.LinAlgError:
-        roots, sound = np.tile(np.eye(C.shape[1]), (len(C), 1, 1)), np.zeros(len(C), dtype=bool)
+        roots, sound = np.tile(np.eye(C.shape[1]), (len(C), 1, 1)), np.zeros(len(C), dtype=np.bool_)
         for k, of_one in enumerate(C):
             with suppress(np.linalg.LinAlgError):
                 roots[k], sound[k] = np.linalg.cholesky(of_one), True

@@ -1,4 +1,4 @@
-r"""One step of the filter in the coordinates of :mod:`magloc.tracking.chart`, of many states side by side.
+r"""One step of the filter in the coordinates of :mod:`magloc.tracking.chart.coordinates`, of many states side by side.
 
 The root of a covariance is block-triangular: the states of the source and its motion first, behind them the sensors'
 lasting errors,
@@ -16,9 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.tracking.chart import Chart
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.mixture import root_of
 from magloc.tracking.measurement import RowMeasurement
-from magloc.tracking.mixture import root_of
 from magloc.tracking.motion import N_SOURCE
 
 TOLERANCE = 1e-4
@@ -33,7 +33,7 @@ than this: of less the other rows told, which may bend otherwise."""
 
 @dataclass(frozen=True, eq=False)
 class Move:
-    """A step in Cartesian states: transition (K, n, n) and root of its noise (K, n, m), and the same of the errors (N,)."""
+    """A step in Cartesian states: transition (K, n, n), root of its noise (K, n, m), and both of the errors (N,)."""
 
     F: FloatArray
     S_q: FloatArray
@@ -130,7 +130,7 @@ def updated(x: FloatArray, S: FloatArray, measurement: RowMeasurement, bends: Bo
         stale[moved] = True
         converged[live] = better & (change < TOLERANCE)
         live = live[~converged[live]]
-    R = np.linalg.qr(J, mode="r")
+    R = np.asarray(np.linalg.qr(J, mode="r"))
     log_N = 2.0 * np.sum(np.log(np.abs(np.diagonal(R, axis1=-2, axis2=-1))), axis=1)
     x_after, S_after = problem.posterior(zeta, R)
     # A start that leads nowhere may end where nothing is a number.
@@ -149,7 +149,7 @@ def damped_inverse(J: FloatArray) -> FloatArray:
 
 def _whole_step(J: FloatArray, residual: FloatArray) -> FloatArray:
     """Gauss and Newton's step (K, n) towards the least |residual - J step|²."""
-    R = np.linalg.qr(np.concatenate([J, residual[..., None]], axis=2), mode="r")
+    R = np.asarray(np.linalg.qr(np.concatenate([J, residual[..., None]], axis=2), mode="r"))
     n = J.shape[-1]
     return np.asarray(np.linalg.solve(R[:, :n, :n], R[:, :n, n:])[..., 0])
 
@@ -167,16 +167,17 @@ class _Problem:
     whiten: FloatArray | None
     of_errors: FloatArray
     log_C: FloatArray
-    M: FloatArray | None = None
-    J: FloatArray | None = None
-    h: FloatArray | None = None
+    M: FloatArray
+    J: FloatArray
+    h: FloatArray
 
     @classmethod
     def of(cls, chart: Chart, x: FloatArray, S: FloatArray, measurement: RowMeasurement) -> _Problem:
         n, k, K = measurement.n_motion, measurement.z.size, len(x)
         z = np.broadcast_to(measurement.z, (K, k))
+        straight = np.zeros((K, n, k)), np.zeros((K, k, n)), np.zeros((K, k))
         if not measurement.effect.shape[1]:
-            return cls(chart, x, S, measurement, S, z, None, np.zeros((K, k, 0)), np.zeros(K))
+            return cls(chart, x, S, measurement, S, z, None, np.zeros((K, k, 0)), np.zeros(K), *straight)
         U = root_of(S[:, :n])
         phi = measurement.effect_on(S[:, n:, n:])
         psi = phi @ np.swapaxes(np.linalg.solve(U, S[:, :n, n:]), -1, -2)
@@ -185,7 +186,7 @@ class _Problem:
         whiten = np.linalg.inv(root)
         log_C = 2.0 * np.sum(np.log(np.diagonal(root, axis1=-2, axis2=-1)), axis=1)
         z = (whiten @ (z - x[:, n:] @ measurement.effect.T)[..., None])[..., 0]
-        return cls(chart, x, S, measurement, U, z, whiten, whiten @ psi, log_C)
+        return cls(chart, x, S, measurement, U, z, whiten, whiten @ psi, log_C, *straight)
 
     def take(self, index: IntArray) -> _Problem:
         """Some of the states."""
@@ -203,9 +204,9 @@ class _Problem:
             whiten=whiten,
             of_errors=self.of_errors[index],
             log_C=self.log_C[index],
-            M=None if self.M is None else self.M[index],
-            J=None if self.J is None else self.J[index],
-            h=None if self.h is None else self.h[index],
+            M=self.M[index],
+            J=self.J[index],
+            h=self.h[index],
         )
 
     def e(self, zeta: FloatArray) -> FloatArray:
@@ -231,9 +232,8 @@ class _Problem:
 
     def residual(self, zeta: FloatArray) -> FloatArray:
         """Whitened misfits of the readings and of the prediction (K, k + n)."""
-        h, standard = self._h(self.e(zeta)), zeta
-        if self.M is not None:
-            standard = zeta + (self.M @ ((h - self.h)[..., None] - self.J @ zeta[..., None]))[..., 0]
+        h = self._h(self.e(zeta))
+        standard = zeta + (self.M @ ((h - self.h)[..., None] - self.J @ zeta[..., None]))[..., 0]
         left = self.z - h
         if self.whiten is not None:
             left = left - (self.of_errors @ standard[..., None])[..., 0]
@@ -249,8 +249,7 @@ class _Problem:
 
     def bending(self, J: FloatArray) -> FloatArray:
         """Derivative (K, n, n), by ζ, of the numbers in which the prediction is standard, from J of the readings."""
-        one = np.broadcast_to(np.eye(J.shape[2]), (len(J), J.shape[2], J.shape[2]))
-        return one if self.M is None else one + self.M @ (J - self.J)
+        return np.eye(J.shape[2]) + self.M @ (J - self.J)
 
     def of_coordinates(self, e: FloatArray) -> FloatArray:
         """Derivative (K, k, n) of the source's differences, in units of their noise, by its coordinates."""
@@ -276,7 +275,7 @@ class _Problem:
         assert self.whiten is not None
         D = self.S[:, n:, n:]
         phi = self.measurement.effect_on(D)
-        share = np.linalg.solve(self.U, self.S[:, :n, n:])
+        share = np.asarray(np.linalg.solve(self.U, self.S[:, :n, n:]))
         residual = self.residual(zeta)
         left, standard = _T(self.whiten) @ residual[:, :k, None], -residual[:, k:, None]
         of_source = standard - share @ (_T(phi) @ left)
@@ -284,15 +283,15 @@ class _Problem:
         H = self.of_coordinates(e)
         # The prediction's root, as it looks there.
         bending = self.U @ self.bending(self.whiten @ H @ self.U) @ np.linalg.inv(self.U)
-        AB = np.linalg.solve(bending, self.S[:, :n])
+        AB = np.asarray(np.linalg.solve(bending, self.S[:, :n]))
         A, B = AB[..., :n], AB[..., n:]
         HA, one = H @ A, np.eye(k)
-        R = np.linalg.qr(np.concatenate([HA, np.broadcast_to(np.eye(n), A.shape)], axis=1), mode="r")
-        A_after = _T(np.linalg.solve(_T(R), _T(A)))
+        R = np.asarray(np.linalg.qr(np.concatenate([HA, np.broadcast_to(np.eye(n), A.shape)], axis=1), mode="r"))
+        A_after = _T(np.asarray(np.linalg.solve(_T(R), _T(A))))
         seen = H @ B + phi
         # Where the source is not known by itself, its share of the readings is noise to the errors.
-        theta = np.linalg.solve(np.linalg.cholesky(one + HA @ _T(HA)), seen)
-        root = np.linalg.cholesky(one + theta @ _T(theta))
+        theta = np.asarray(np.linalg.solve(np.linalg.cholesky(one + HA @ _T(HA)), seen))
+        root = np.asarray(np.linalg.cholesky(one + theta @ _T(theta)))
         back = np.linalg.solve(_T(root), np.linalg.solve(root + one, theta))
         B = B - A_after @ (_T(A_after) @ (_T(H) @ seen))
         S = np.zeros_like(self.S)

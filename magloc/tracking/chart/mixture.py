@@ -9,7 +9,7 @@ from scipy.special import ndtr
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.localization.fit.results import Intervals
-from magloc.tracking.chart import Chart
+from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.motion import N_SOURCE
 
 MERGED_BELOW = 0.02
@@ -170,7 +170,7 @@ def root_of(rows: FloatArray) -> FloatArray:
 def _block_root(rows: FloatArray, n: int) -> FloatArray:
     """Block-triangular root (N, N) of ``rows rowsᵀ`` whose first n rows are full."""
     # The lower root of the rows in reverse order is an upper one.
-    lower = np.linalg.qr(rows[::-1].T, mode="r").T
+    lower = root_of(rows[::-1])
     return lower[::-1, ::-1]
 
 

@@ -159,11 +159,11 @@ def source_root(chart: Chart, sigma: FloatArray) -> FloatArray:
 
 
 def mirrored(x: FloatArray, centroid_m: FloatArray) -> FloatArray:
-    r"""The states (4, K, n) whose gradient tensor at the sensors' centroid is that of states (K, n); the first are they.
+    r"""States (4, K, n) whose gradient tensor at the sensors' centroid is that of states (K, n); the first are they.
 
-    A far source shows little but its gradient tensor, and that belongs to four sources at one range: with u at the angle
-    0 and m at β in their common plane, u' stands at :math:`\mathrm{atan2}(s, -\tfrac32 c)` and m' at -β from it, where
-    :math:`(c, s) = |m| (\cos β, \sin β)`; and both may be turned round.
+    A far source shows little but its gradient tensor, and that belongs to four sources at one range: with u at the
+    angle 0 and m at β in their common plane, u' stands at :math:`\mathrm{atan2}(s, -\tfrac32 c)` and m' at -β from it,
+    where :math:`(c, s) = |m| (\cos β, \sin β)`; and both may be turned round.
     """
     offset, m = x[:, :3] - centroid_m, x[:, 3:6]
     r = np.linalg.norm(offset, axis=1, keepdims=True)
