@@ -174,7 +174,7 @@ class Track(TrackColumns):
     >>> diver = magloc.datasets.load("diver")
     >>> track = magloc.track(diver.array, diver.readings)
     >>> int(track.tracked.sum()), len(track), track.status[-1], track.frame
-    (75, 141, 'tracked', 'world')
+    (120, 141, 'tracked', 'world')
     """
 
     points: tuple[TrackPoint, ...]
