@@ -13,6 +13,7 @@ from magloc.compilation import own
 from magloc.levels import CONTRADICTION
 from magloc.measurement.rows import ambient_fields
 from magloc.tracking import batch_compiled as kernels
+from magloc.tracking.chart.coordinates import FIRM
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.update import LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
 from magloc.tracking.motion import LinearMotion
@@ -89,6 +90,7 @@ class _CompiledSteps:
             max_iterations=MOST_ITERATIONS,
             rounding=ROUNDING,
             least_share=LEAST_SHARE,
+            firm=FIRM,
             largest_growth=LARGEST_GROWTH,
             rows_to_lose=ROWS_TO_LOSE,
             largest_width=LARGEST_WIDTH,

@@ -18,7 +18,7 @@ from magloc.compilation import compiled
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.kalman_compiled import triangular_root
 from magloc.linalg_compiled import orthonormalise, put, put_rows
-from magloc.tracking.chart.coordinates_compiled import fill_chart, into_chart, move
+from magloc.tracking.chart.coordinates_compiled import fill_chart, into_chart, is_firm, move
 
 IntArray = NDArray[np.int64]
 TRACKED, PREDICTED, OUTLIER = 0, 1, 2
@@ -64,6 +64,7 @@ class Rules(NamedTuple):
     max_iterations: int
     rounding: float
     least_share: float
+    firm: float
     largest_growth: float
     rows_to_lose: int
     largest_width: float
@@ -235,7 +236,7 @@ def follow(
         # Prediction.
         strength = math.sqrt(x[3] * x[3] + x[4] * x[4] + x[5] * x[5])
         length = fill_chart(x, centroid, rules.radius, frame)
-        move(x, zero, frame, length, here, L)
+        move(x, zero, frame, length, False, here, L)
         _product(steps.F[s], L, out.transition[row])
         for i in range(n):
             t = 0.0
@@ -267,7 +268,8 @@ def follow(
             put(e, zero)
             _predicted(here, origin, R, ambient, array, transform, channels, slopes, h, H)
             put(h_first, h)
-            move(x_before, e, frame, length, here, L)
+            firm = is_firm(x_before, S_before, length, rules.firm)
+            move(x_before, e, frame, length, firm, here, L)
             bends = not _grows(S, S_before, rules.largest_growth)
             if bends:
                 _derivatives(H, L, S_before, J_e, columns)
@@ -302,7 +304,7 @@ def follow(
                     for j in range(i + 1):
                         t += S_before[i, j] * solution[j, 0]
                     e[i] = t
-                move(x_before, e, frame, length, there, L)
+                move(x_before, e, frame, length, firm, there, L)
                 _predicted(there, origin, R, ambient, array, transform, channels, slopes, h_there, H)
                 for i in range(n):
                     residual_there[k + i] = -solution[i, 0]

@@ -20,15 +20,17 @@ All functions take leading axes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from arrays.typing import FloatArray
+from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.tracking.motion import N_SOURCE
 
 MOMENT_POWER = 4.0
 """How differences fall with the range."""
+FIRM = 0.2
+"""σ of a moment as it is seen, over its size, below which its error is one of strength and direction."""
 # Directions at right angles to the chart's own lie at infinity: they are taken as this near to it.
 _LEAST_COSINE = 0.05
 _VELOCITY = slice(6, 9)
@@ -48,12 +50,15 @@ class Chart:
         Direction from the origin.
     E : ndarray, shape (..., 3, 2)
         At right angles to it.
+    firm : ndarray of bool, shape (...)
+        Whose moment is moved by its strength and its direction: see :meth:`firmly`.
     """
 
     x: FloatArray
     length: FloatArray
     u: FloatArray
     E: FloatArray
+    firm: BoolArray
 
     @classmethod
     def at(cls, x: FloatArray, centroid_m: FloatArray, radius_m: float) -> Chart:
@@ -62,7 +67,23 @@ class Chart:
         r = np.sqrt(np.sum(offset * offset, axis=-1))
         safe = np.where(r > 0.0, r, 1.0)[..., None]
         u = np.where(r[..., None] > 0.0, offset / safe, np.array([0.0, 0.0, 1.0]))
-        return cls(x, np.maximum(r, radius_m), u, _tangents(u))
+        return cls(x, np.maximum(r, radius_m), u, _tangents(u), np.zeros(r.shape, dtype=bool))
+
+    def firmly(self, S: FloatArray) -> Chart:
+        r"""The same where the roots (..., n, m) leave little of the moment open: with :math:`n = \delta\mu/|\mu|`,
+
+        .. math:: m' = (r'/r)^4 |m| e^{\hat m \cdot n} b/|b|, \qquad b = \hat m + (1 - \hat m \hat m^T) n.
+
+        The derivative at e = 0 is the same. A moment that stays what it is while its range wanders is a straight line
+        here, while :math:`r'^4 (\mu + \delta\mu)` loses the square of each step.
+        """
+        size = np.linalg.norm(self.x[..., 3:6], axis=-1) / self.length**MOMENT_POWER
+        sigma = np.sqrt(np.sum(S[..., 3:6, :] ** 2, axis=(-2, -1)))
+        return replace(self, firm=sigma < FIRM * size)
+
+    def take(self, index: IntArray | BoolArray) -> Chart:
+        """About some of the states."""
+        return Chart(*(getattr(self, part.name)[index] for part in fields(self)))
 
     @property
     def has_velocity(self) -> bool:
@@ -84,6 +105,8 @@ class Chart:
         L[..., :3, 1:3] = reach[..., None, None] * slope
         L[..., 3:6, 0] = MOMENT_POWER * x[..., 3:6]
         L[..., 3:6, 3:6] = (reach**MOMENT_POWER)[..., None, None] * np.eye(3)
+        if self.firm.any():
+            L[self.firm, 3:6, 3:6] = self._of_strength(e)[1] * (reach[self.firm] ** MOMENT_POWER)[..., None, None]
         if self.has_velocity:
             L[..., _VELOCITY, 0] = x[..., _VELOCITY]
             L[..., _VELOCITY, _VELOCITY] = reach[..., None, None] * np.eye(3)
@@ -100,13 +123,32 @@ class Chart:
         x[..., :3] = self.x[..., :3] + length[..., None] * (growth[..., None] * u - self.u)
         scale, unit = growth**MOMENT_POWER, length**MOMENT_POWER
         x[..., 3:6] = scale[..., None] * (self.x[..., 3:6] + unit[..., None] * e[..., 3:6])
+        if self.firm.any():
+            x[self.firm, 3:6] = scale[self.firm, None] * self._of_strength(e)[0]
         if self.has_velocity:
             of_unit = self.x[..., _VELOCITY] + length[..., None] * e[..., _VELOCITY]
             x[..., _VELOCITY] = growth[..., None] * of_unit
         return x, growth, u, slope
 
+    def _of_strength(self, e: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Firm moments at r' = r (f, 3), and their derivative by r⁴ δμ."""
+        m = self.x[self.firm, 3:6]
+        size = np.linalg.norm(m, axis=-1, keepdims=True)
+        along = m / size
+        change = (self.length[self.firm] ** MOMENT_POWER)[:, None] * e[self.firm, 3:6] / size
+        nu = np.sum(along * change, axis=-1, keepdims=True)
+        b = along + change - nu * along
+        norm = np.linalg.norm(b, axis=-1, keepdims=True)
+        b /= norm
+        strength = size * np.exp(nu)
+        moved: FloatArray = strength * b
+        one = np.eye(3)
+        across = (one - b[:, :, None] * b[:, None, :]) @ (one - along[:, :, None] * along[:, None, :])
+        derivative = (moved[:, :, None] * along[:, None, :] + (strength / norm)[..., None] * across) / size[..., None]
+        return moved, derivative
+
     def coordinates(self, x: FloatArray) -> FloatArray:
-        """Coordinates (..., n) of states (..., n): the inverse of :meth:`retracted`."""
+        """Coordinates (..., n) of states (..., n): the inverse of :meth:`retracted`, for moments that are not firm."""
         length = self.length[..., None]
         offset = x[..., :3] - self.x[..., :3] + length * self.u
         r = np.sqrt(np.sum(offset * offset, axis=-1))

@@ -28,7 +28,47 @@ def fill_chart(x: FloatArray, centroid: FloatArray, radius: float, frame: FloatA
 
 
 @compiled
-def move(x: FloatArray, e: FloatArray, frame: FloatArray, length: float, there: FloatArray, L: FloatArray) -> None:
+def is_firm(x: FloatArray, S: FloatArray, length: float, limit: float) -> bool:
+    """Whether a root S (n, n) leaves so little of the moment open that it is moved by strength and direction."""
+    square, variance = 0.0, 0.0
+    for i in range(3, 6):
+        square += x[i] * x[i]
+        for c in range(S.shape[1]):
+            variance += S[i, c] * S[i, c]
+    unit = length * length * length * length
+    return variance * unit * unit < limit * limit * square
+
+
+@compiled
+def _move_firmly(x: FloatArray, e: FloatArray, scale: float, unit: float, there: FloatArray, L: FloatArray) -> None:
+    """The moment at coordinates e about x by strength and direction, and its derivative by δμ, in place."""
+    square, nu = 0.0, 0.0
+    for i in range(3, 6):
+        square += x[i] * x[i]
+        nu += x[i] * e[i]
+    nu *= unit / square
+    size = math.sqrt(square)
+    b, norm = np.empty(3), 0.0
+    for i in range(3):
+        b[i] = x[3 + i] * (1.0 - nu) / size + unit * e[3 + i] / size
+        norm += b[i] * b[i]
+    norm = math.sqrt(norm)
+    strength, along = scale * size * math.exp(nu), 0.0
+    for i in range(3):
+        b[i] /= norm
+        along += b[i] * x[3 + i] / size
+    for i in range(3):
+        there[3 + i] = strength * b[i]
+        for j in range(3):
+            mine = x[3 + j] / size
+            across = ((1.0 if i == j else 0.0) - x[3 + i] / size * mine - b[i] * b[j] + along * b[i] * mine) / norm
+            L[3 + i, 3 + j] = strength * unit / size * (b[i] * mine + across)
+
+
+@compiled
+def move(
+    x: FloatArray, e: FloatArray, frame: FloatArray, length: float, firm: bool, there: FloatArray, L: FloatArray
+) -> None:
     """The state at coordinates e about x, and the derivative L (n, n): the twin of :class:`magloc.tracking.chart`."""
     n = x.size
     growth = math.exp(e[0])
@@ -47,13 +87,16 @@ def move(x: FloatArray, e: FloatArray, frame: FloatArray, length: float, there: 
             L[i, j] = 1.0 if i == j else 0.0
     scale, unit = growth * growth * growth * growth, length * length * length * length
     far = reach * reach * reach * reach
+    if firm:
+        _move_firmly(x, e, scale, unit, there, L)
     for i in range(3):
         there[i] = x[i] + length * (growth * u[i] - frame[2, i])
-        there[3 + i] = scale * (x[3 + i] + unit * e[3 + i])
         L[i, i] = 0.0
         L[i, 0] = reach * u[i]
+        if not firm:
+            there[3 + i] = scale * (x[3 + i] + unit * e[3 + i])
+            L[3 + i, 3 + i] = far
         L[3 + i, 0] = 4.0 * there[3 + i]
-        L[3 + i, 3 + i] = far
     for a in range(2):
         along = u[0] * frame[a, 0] + u[1] * frame[a, 1] + u[2] * frame[a, 2]
         for i in range(3):

@@ -152,7 +152,7 @@ class Mixture:
 def _in_chart(about: Chart, mixture: Mixture) -> tuple[FloatArray, FloatArray]:
     """Means (K, N) and roots (K, N, N) of components in the chart of one."""
     n, K = mixture.n_motion, len(mixture)
-    chart = Chart(*(np.repeat(values, K, axis=0) for values in (about.x, about.length, about.u, about.E)))
+    chart = about.take(np.zeros(K, dtype=np.intp))
     offset, roots = np.zeros_like(mixture.x), mixture.S.copy()
     best = int(np.argmax(mixture.log_weight))
     offset[:, n:] = mixture.x[:, n:] - mixture.x[best, n:]

@@ -222,7 +222,7 @@ def once(mixture: Mixture, cell: IntArray) -> IntArray:
         first, others = left[0], left[1:]
         kept.append(first)
         same = others[(cell[others] == cell[first]).all(axis=1)]
-        about = Chart(*(values[same] for values in (chart.x, chart.length, chart.u, chart.E)))
+        about = chart.take(same)
         e = about.coordinates(np.repeat(source.x[first][None], len(same), axis=0))
         square = np.sum(np.linalg.solve(source.S[same], e[..., None])[..., 0] ** 2, axis=1)
         left = others[~np.isin(others, same[square < limit])]

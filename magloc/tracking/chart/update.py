@@ -100,7 +100,7 @@ def updated(x: FloatArray, S: FloatArray, measurement: RowMeasurement, bends: Bo
     .. math:: \min_e |C^{-1/2}(z - h(x \oplus e) - \ldots)|^2 + e^T P^{-1} e.
     """
     n = measurement.n_motion
-    chart = Chart.at(x[:, :n], measurement.centroid_m, measurement.radius_m)
+    chart = Chart.at(x[:, :n], measurement.centroid_m, measurement.radius_m).firmly(S)
     problem = _Problem.of(chart, x, S, measurement).bent(bends)
     K, k = len(x), measurement.z.size
     zeta = np.zeros((K, n))
@@ -192,11 +192,10 @@ class _Problem:
         """Some of the states."""
         if len(index) == len(self.x):
             return self
-        chart = Chart(*(values[index] for values in (self.chart.x, self.chart.length, self.chart.u, self.chart.E)))
         whiten = None if self.whiten is None else self.whiten[index]
         return replace(
             self,
-            chart=chart,
+            chart=self.chart.take(index),
             x=self.x[index],
             S=self.S[index],
             U=self.U[index],
