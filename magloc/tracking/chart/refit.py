@@ -41,7 +41,8 @@ def refitted(
     converged = np.zeros(len(mixture), dtype=bool)
     share, change = np.ones(len(mixture)), np.full(len(mixture), np.inf)
     for _ in range(_MOST_PASSES):
-        found = rows.passed(track)
+        with np.errstate(all="ignore"):  # a trajectory may lead out of double precision: it is not kept
+            found = rows.passed(track)
         largest = np.abs(found.offset[:, :, :3]).max(axis=(0, 2))
         length = np.minimum(1.0, _LONGEST / np.maximum(largest, _LONGEST))
         sigma = np.sqrt(np.diagonal(found.P, axis1=1, axis2=2))[:, : rows.n]
