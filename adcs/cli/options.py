@@ -11,8 +11,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 import adcs
-from adcs.kalman.error_state import MEASURED_BY
-from adcs.kalman.names import Filter, Noise, StartKind
+from adcs.kalman.names import MEASURED_BY, Filter, Noise, StartKind
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
 from magloc.cli import framework

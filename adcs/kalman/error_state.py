@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
+from adcs.kalman.names import MEASURED_BY
 from adcs.satellite.sensors import SENSOR_WORDS, SENSORS
 from arrays.io.errors import check_not_negative, check_positive
 from arrays.typing import BoolArray, FloatArray
@@ -28,8 +29,6 @@ ATTRIBUTES = {
 }
 """Optional states in the order of the error state, and what they are called in :class:`State` and its like."""
 STATES = tuple(ATTRIBUTES)
-MEASURED_BY = {"field-bias": "mag", "gyro-bias": "gyro", "field-model": "mag"}
-"""States that belong to a sensor: without it they cannot be estimated."""
 FIELD_ERROR_T = 150e-9
 """Error of a component of a model of the core's field: crust, currents around the Earth, and the model's own."""
 OPEN_RAD = 2.0
