@@ -1,1 +1,0 @@
-"""What is known of a tracked source: coordinates, mixtures of Gaussians in them, and how rows change these."""
