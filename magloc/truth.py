@@ -75,11 +75,7 @@ def read_truth(path: str | PathLike[str]) -> Truth:
     known = ("time_s", *TRUE_POSITION_COLUMNS, *TRUE_MOMENT_COLUMNS)
     for name in ("time_s", "x_m", "y_m"):
         table.require(name, known)
-    for name in table.header:
-        if name not in known:
-            raise InputError(
-                f"{table.header_place(name)}: found an unknown column, expected one of {', '.join(known)}."
-            )
+    table.refuse_unknown(known)
     time_s = table.complete_and_distinct("time_s")
     position_m = np.full((len(time_s), 3), np.nan)
     columns = TRUE_POSITION_COLUMNS if "z_m" in table.header else TRUE_POSITION_COLUMNS[:2]

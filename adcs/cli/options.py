@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 import adcs
-from adcs.kalman.names import MEASURED_BY, Filter, Noise, StartKind
+from adcs.kalman.names import Filter, Noise, StartKind, is_measured
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
 from magloc.cli import framework
@@ -61,7 +61,7 @@ class EstimateOptions:
         """Keys of the table ``estimate``, and what replaces them; of its own states those stay that sensors measure."""
         given = {"sensors": self.sensors, "states": _names(self.states), "filter": self.filter}
         if self.sensors is not None and self.states is None:
-            given["states"] = [state for state in own if MEASURED_BY.get(state, self.sensors) in self.sensors]
+            given["states"] = [state for state in own if is_measured(state, self.sensors)]
         return {key: value for key, value in given.items() if value is not None}
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtri
 
-from adcs.kalman.names import MEASURED_BY
+from adcs.kalman.names import MEASURED_BY, is_measured
 from adcs.satellite.sensors import SENSOR_WORDS, SENSORS
 from arrays.io.errors import check_not_negative, check_positive
 from arrays.typing import BoolArray, FloatArray
@@ -114,8 +114,8 @@ def check_observable(used: SensorSet) -> None:
     to a degree after a whole orbit; it is refused as well.
     """
     for state in used.states:
-        sensor = MEASURED_BY.get(state)
-        if sensor is not None and sensor not in used.sensors.split("+"):
+        if not is_measured(state, used.sensors):
+            sensor = MEASURED_BY[state]
             raise ValueError(
                 f"Input states must not have {state} without a {SENSOR_WORDS[sensor]}; add {sensor} to the sensors."
             )

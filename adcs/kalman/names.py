@@ -12,3 +12,8 @@ NOISES: tuple[str, ...] = get_args(Noise)
 STARTS: tuple[str, ...] = get_args(StartKind)
 MEASURED_BY = {"field-bias": "mag", "gyro-bias": "gyro", "field-model": "mag"}
 """States that belong to a sensor: without it they cannot be estimated."""
+
+
+def is_measured(state: str, sensors: str) -> bool:
+    """Whether sensors, joined by plus signs, have the one that measures a state, if it is one's own."""
+    return state not in MEASURED_BY or MEASURED_BY[state] in sensors.split("+")

@@ -71,6 +71,14 @@ class Table:
         there = ", ".join(self.header if len(self.header) < 9 else [*self.header[:6], "…", self.header[-1]])
         raise InputError(f"{self.header_place(column)}: found no such column{hint}, expected it beside {there}.")
 
+    def refuse_unknown(self, known: Sequence[str]) -> None:
+        """Raise an InputError with the first column that is not a known one."""
+        for name in self.header:
+            if name not in known:
+                raise InputError(
+                    f"{self.header_place(name)}: found an unknown column, expected one of {', '.join(known)}."
+                )
+
     def has_group(self, columns: Sequence[str]) -> bool:
         """Whether the file has these columns; some of them without the others are an InputError."""
         present = [name for name in columns if name in self.header]

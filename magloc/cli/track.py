@@ -194,8 +194,6 @@ def track(
     common : CommonOptions
         Common options.
     """
-    from magloc.blas_threads import one_blas_thread
-
     if json and jsonl:
         raise InputError("--json: found it together with --jsonl, expected one of them.")
     if out is not None:
@@ -216,7 +214,7 @@ def track(
         if whole or conditioning != ConditioningOptions():
             raise InputError("READINGS -: found an option that needs the whole record, expected a stream of --jsonl.")
         with naming(str(array)):
-            one_blas_thread(_stream)(used, known, model, where)
+            _stream(used, known, model, where)
         return
     rows = magloc.read_readings(readings, used, sensors=known.ids, ordered=True)
     rows, used = conditioning.apply(rows, used, readings)
@@ -236,7 +234,7 @@ def track(
     with progress(len(rows), "rows", quiet=common.quiet) as advance, naming(str(array)):
         if jsonl and not smooth:
             tracker = magloc.Tracker(used, model, prior=prior)
-            points = one_blas_thread(lambda: tuple(map(_printed, tracker.run(rows, advance))))()
+            points = tuple(map(_printed, tracker.run(rows, advance)))
             found = magloc.Track(points, rows, tracker)
         else:
             found = magloc.track(used, rows, motion=model, smooth=smooth, prior=prior, progress=advance)

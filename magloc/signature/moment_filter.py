@@ -10,15 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from scipy.special import chdtri
 
-from arrays.array import SensorArray
-from arrays.differences import Differences, decorrelated_differences
-from arrays.noise import reading_covariance
 from arrays.typing import BoolArray, FloatArray
 from magloc.kalman import (
     IteratedUpdate,
@@ -29,13 +26,10 @@ from magloc.kalman import (
     smoothing_gain,
 )
 from magloc.levels import CONTRADICTION
-from magloc.measurement.differences import DifferenceMeasurement
-from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
-from magloc.readings import Readings
+from magloc.measurement.nuisances import SensorErrors
 from magloc.signature.path import PathError
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import rows_of
 
 UNKNOWN = 1e3
 """How little is known of a moment before the first row: σ over what the strongest row can tell."""
@@ -78,9 +72,6 @@ class MomentModel:
     Attributes
     ----------
     rows : tuple of RowMeasurement
-        Without the sensors' errors.
-    effects : tuple of ndarray, shapes (k, n_errors)
-        Of those on the differences of every row, in units of their noise.
     position_m : ndarray, shape (n, 3)
         Of the object, in the frame of the results.
     basis : Basis
@@ -93,7 +84,6 @@ class MomentModel:
     """
 
     rows: tuple[RowMeasurement, ...]
-    effects: tuple[FloatArray, ...]
     position_m: FloatArray
     basis: Basis
     errors: SensorErrors
@@ -149,12 +139,12 @@ class MomentModel:
 
     def predicted(self, i: int, x: FloatArray) -> FloatArray:
         """Differences (k,) of row i in units of their noise."""
-        return self.rows[i].of_source(self.source(i, x)) + self.effects[i] @ x[self.moment.stop :]
+        return self.rows[i].of_source(self.source(i, x)) + self.rows[i].effect @ x[self.moment.stop :]
 
     def jacobian(self, i: int, x: FloatArray) -> FloatArray:
         """Their Jacobian (k, n)."""
         H = self.rows[i].source_jacobian(self.source(i, x)) @ self.source_of_state(i, x)
-        H[:, self.moment.stop :] = self.effects[i]
+        H[:, self.moment.stop :] = self.rows[i].effect
         return H
 
     def start(self) -> tuple[FloatArray, FloatArray]:
@@ -204,34 +194,6 @@ class MomentStep:
     nis: float
     status: str
     iterations: int
-
-
-def row_measurements(
-    array: SensorArray, readings: Readings, errors: SensorErrors
-) -> list[tuple[RowMeasurement, FloatArray]]:
-    """What every row measures, without noise that lasts, and the effect of that on its differences."""
-    noisy = without_lasting_errors(array)
-    shared: dict[bytes, Differences] = {}
-    rows = []
-    for row in rows_of(readings):
-        of_row = noisy
-        if row.ambient_T is not None:
-            x, y, z = row.ambient_T.tolist()
-            of_row = replace(noisy, ambient_T=(x, y, z))
-        available = np.isfinite(row.readings_T)
-        if noisy.noise_depends_on_reading:
-            covariance = reading_covariance(noisy, row.readings_T)
-            differences = decorrelated_differences(noisy, available, covariance_T2=covariance)
-        else:
-            key = available.tobytes()
-            if key not in shared:
-                shared[key] = decorrelated_differences(noisy, available)
-            differences = shared[key]
-        sigma = np.sqrt(differences.variance)
-        effect = differences.transform @ errors.effect(of_row, row.readings_T) / sigma[:, None]
-        model = DifferenceMeasurement(of_row, differences)
-        rows.append((RowMeasurement(model, sigma, row, N_SOURCE, np.zeros((len(sigma), 0))), effect))
-    return rows
 
 
 def filtered(model: MomentModel, *, at: Sequence[FloatArray] | None = None, gate: bool = True) -> list[MomentStep]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtrc
 
 from arrays.array import SensorArray
 from arrays.io.errors import InputError
@@ -16,21 +15,21 @@ from arrays.typing import FloatArray
 from magloc.blas_threads import one_blas_thread
 from magloc.chi_square import mean_bounds, normalised_square
 from magloc.kalman import estimability
-from magloc.levels import MISFIT
-from magloc.measurement.nuisances import SensorErrors
+from magloc.localization.fit.results import is_misfit
 from magloc.readings import Readings, as_readings, without_saturated
 from magloc.signature.moment_filter import (
     Basis,
     MomentModel,
     MomentStep,
     filtered,
-    row_measurements,
     settled,
     smoothed,
 )
 from magloc.signature.path import ObjectPath, PathError
-from magloc.tracking.motion import cross_matrix, rotation_matrix
-from magloc.tracking.results import TrackPoint
+from magloc.tracking.consistency import consistency_lines
+from magloc.tracking.measurement import RowMeasurements
+from magloc.tracking.motion import N_SOURCE, cross_matrix, rotation_matrix
+from magloc.tracking.results import TrackPoint, rows_of
 from magloc.tracking.track import TURN_RAD_S, TrackColumns
 from magloc.truth import Truth, truth_of_rows
 
@@ -72,17 +71,12 @@ class MomentConsistency:
 
     def lines(self) -> list[str]:
         """Errors against the truth, and what they should be."""
-        lines = [
+        return [
             f"against the truth, {self.rows} rows:",
             f"  moment rms {self.moment_rms_Am2:.4g} A·m², least possible {self.moment_bound_Am2:.4g} A·m² (posterior"
             " Cramér-Rao bound)",
+            *consistency_lines(self.nees_per_dimension, self.nis_per_dimension, self.nis_bounds),
         ]
-        low, high = self.nis_bounds
-        lines.append(
-            f"  NEES per dimension {self.nees_per_dimension:.3f}, 1 on average over many records of a right filter"
-        )
-        lines.append(f"  NIS per dimension {self.nis_per_dimension:.3f}, 99 % bounds {low:.3f} to {high:.3f}")
-        return lines
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -124,7 +118,7 @@ class MomentTrack(TrackColumns):
     @property
     def misfit(self) -> bool:
         """Whether no dipole on this path explains the readings: χ² is beyond noise by one in a million."""
-        return bool(self.dof > 0 and chdtrc(self.dof, self.chi2) < MISFIT)
+        return bool(is_misfit(self.chi2, self.dof))
 
     @one_blas_thread
     @np.errstate(over="ignore", divide="ignore", invalid="ignore")
@@ -262,9 +256,8 @@ def moment_model(
     turn_rad_s: float,
 ) -> MomentModel:
     """Model of records that follow each other in time, each with a path of its own."""
-    errors = SensorErrors.of(array)
-    measured = [row for of_pass in passes for row in row_measurements(array, of_pass, errors)]
-    rows, effects = tuple(row for row, _ in measured), tuple(effect for _, effect in measured)
+    measurements = RowMeasurements(array, N_SOURCE)
+    rows = tuple(measurements.of(row) for of_pass in passes for row in rows_of(of_pass))
     times = np.array([row.row.time_s for row in rows])
     if not (np.diff(times) > 0.0).all():
         late = int(np.argmax(np.diff(times) <= 0.0))
@@ -277,7 +270,7 @@ def moment_model(
         if np.linalg.norm(offset, axis=1).min() <= _TOUCHING * array.circumradius:
             raise ValueError(f"Input path must keep off the sensors; instead it has a place of a sensor: {p.tolist()}.")
     begins = np.concatenate([np.arange(len(of_pass)) == 0 for of_pass in passes])
-    return MomentModel(rows, effects, np.concatenate(positions_m), basis, errors, path_error, turn_rad_s, begins)
+    return MomentModel(rows, np.concatenate(positions_m), basis, measurements.errors, path_error, turn_rad_s, begins)
 
 
 def goodness(model: MomentModel, steps: Sequence[MomentStep]) -> tuple[float, int]:

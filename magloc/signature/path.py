@@ -175,11 +175,7 @@ def read_object_path(path: str | PathLike[str]) -> ObjectPath:
     known = ("time_s", *TRUE_POSITION_COLUMNS, *PATH_ROTATION_COLUMNS)
     for name in known[:4]:
         table.require(name, known)
-    for name in table.header:
-        if name not in known:
-            raise InputError(
-                f"{table.header_place(name)}: found an unknown column, expected one of {', '.join(known)}."
-            )
+    table.refuse_unknown(known)
     time_s = table.complete_and_distinct("time_s")
     rotation = unit_rotation(table, PATH_ROTATION_COLUMNS) if table.has_group(PATH_ROTATION_COLUMNS) else None
     return ObjectPath(time_s, table.complete(TRUE_POSITION_COLUMNS), rotation, str(path))

@@ -19,14 +19,13 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtrc
 
 from arrays.array import SensorArray
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
 from magloc.blas_threads import one_blas_thread
 from magloc.fields import dipole
-from magloc.levels import MISFIT
+from magloc.localization.fit.results import is_misfit
 from magloc.readings import Readings, as_readings, without_saturated
 from magloc.signature.files import lines_of_signature
 from magloc.signature.moment_filter import Basis, settled
@@ -190,7 +189,7 @@ class Signature:
     @property
     def misfit(self) -> bool:
         """Whether no such moment on these paths explains the readings: χ² is beyond noise by one in a million."""
-        return bool(self.dof > 0 and chdtrc(self.dof, self.chi2) < MISFIT)
+        return bool(is_misfit(self.chi2, self.dof))
 
     def moment(self, heading_deg: ArrayLike, ambient_T: ArrayLike | None = None) -> tuple[FloatArray, FloatArray]:
         """Moment on a level keel and a steady course, and its covariance.

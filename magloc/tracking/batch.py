@@ -58,7 +58,7 @@ class _CompiledSteps:
         array = tracker.array
         self.tracker = tracker
         self.times = [row.time_s for row in rows]
-        differences = [tracker.differences_of(row) for row in rows]
+        differences = [tracker.measurements.differences(row) for row in rows]
         distinct = {id(of_row): of_row for of_row in differences}
         index = {key: i for i, key in enumerate(distinct)}
         k = max(1, *(of_row.n_differences for of_row in distinct.values()))

@@ -80,13 +80,17 @@ class Consistency:
                 f", least possible {self.position_bound_m:.4g} m on average over such motions (posterior Cramér-Rao"
                 f" bound), ratio {ratio:.2f}"
             )
-        low, high = self.nis_bounds
-        return [
-            *lines,
-            # Errors of neighbouring rows are alike: how far from 1 one record may be by chance, many seeds tell.
-            f"  NEES per dimension {self.nees_per_dimension:.3f}, 1 on average over many records of a right filter",
-            f"  NIS per dimension {self.nis_per_dimension:.3f}, 99 % bounds {low:.3f} to {high:.3f}",
-        ]
+        return [*lines, *consistency_lines(self.nees_per_dimension, self.nis_per_dimension, self.nis_bounds)]
+
+
+def consistency_lines(nees: float, nis: float, nis_bounds: tuple[float, float]) -> list[str]:
+    """Mean NEES and NIS per dimension of a filter, and what they should be."""
+    low, high = nis_bounds
+    return [
+        # Errors of neighbouring rows are alike: how far from 1 one record may be by chance, many seeds tell.
+        f"  NEES per dimension {nees:.3f}, 1 on average over many records of a right filter",
+        f"  NIS per dimension {nis:.3f}, 99 % bounds {low:.3f} to {high:.3f}",
+    ]
 
 
 def consistency(
@@ -144,7 +148,7 @@ def _nees_of_rows(
             continue
         if np.isfinite(truth[i]).any():
             estimate = np.concatenate([point.position_m, point.moment_Am2])
-            nees[i], dof[i] = nees_of(tracker.measurement(rows[i]), estimate, point.covariance, truth[i])
+            nees[i], dof[i] = nees_of(tracker.measurements.of(rows[i]), estimate, point.covariance, truth[i])
     return nees, dof
 
 

@@ -14,13 +14,17 @@ Cartesian coordinates believes itself too much while it learns of a source at re
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from arrays.array import SensorArray
+from arrays.differences import Differences, decorrelated_differences
+from arrays.noise import reading_covariance
 from arrays.typing import FloatArray
 from magloc.measurement.differences import DifferenceMeasurement
+from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row
 
@@ -111,6 +115,50 @@ class RowMeasurement:
     def _in_array(self, source: FloatArray) -> tuple[FloatArray, FloatArray]:
         R = self.row.R_world_from_array
         return R.T @ (source[:3] - self.row.origin_m), R.T @ source[3:]
+
+
+class RowMeasurements:
+    """What the rows of an array measure, without the noise that lasts: that is the states behind those of the motion.
+
+    Parameters
+    ----------
+    array : SensorArray
+    n_motion : int
+        States of the motion.
+
+    Attributes
+    ----------
+    errors : SensorErrors
+        The lasting errors of the array's sensors.
+    """
+
+    def __init__(self, array: SensorArray, n_motion: int) -> None:
+        self.errors = SensorErrors.of(array)
+        self._array = without_lasting_errors(array)
+        self._n_motion = n_motion
+        self._differences: dict[bytes, Differences] = {}
+
+    def of(self, row: Row) -> RowMeasurement:
+        """What a row's readings say of the state."""
+        array = self._array
+        if row.ambient_T is not None:
+            x, y, z = row.ambient_T.tolist()
+            array = replace(array, ambient_T=(x, y, z))
+        differences = self.differences(row)
+        sigma = np.sqrt(differences.variance)
+        effect = differences.transform @ self.errors.effect(array, row.readings_T) / sigma[:, None]
+        return RowMeasurement(DifferenceMeasurement(array, differences), sigma, row, self._n_motion, effect)
+
+    def differences(self, row: Row) -> Differences:
+        """The independent differences that a row's readings give."""
+        available = np.isfinite(row.readings_T)
+        if self._array.noise_depends_on_reading:
+            covariance = reading_covariance(self._array, row.readings_T)
+            return decorrelated_differences(self._array, available, covariance_T2=covariance)
+        key = available.tobytes()
+        if key not in self._differences:
+            self._differences[key] = decorrelated_differences(self._array, available)
+        return self._differences[key]
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,7 +69,7 @@ def _steps_at_truth(
     seen: list[FloatArray] = []
     measurements: list[RowMeasurement] = []
     for i, row in enumerate(rows):
-        measurement = tracker.measurement(row)
+        measurement = tracker.measurements.of(row)
         before = max(i - 1, 0)
         prediction = None
         if S is not None:

@@ -19,9 +19,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from arrays.array import SensorArray
-from arrays.differences import Differences, decorrelated_differences
-from arrays.noise import reading_covariance
 from arrays.typing import FloatArray
+from magloc.blas_threads import one_blas_thread
 from magloc.kalman import (
     block_update,
     estimability,
@@ -33,11 +32,9 @@ from magloc.kalman import (
 from magloc.levels import CONTRADICTION
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import Solution
-from magloc.measurement.differences import DifferenceMeasurement
-from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
 from magloc.readings import Readings, without_saturated
 from magloc.tracking.acquisition import CONFIRMED_RANGE_ERROR, STACKED_POSITION_ERROR, Acquisition
-from magloc.tracking.measurement import RowMeasurement
+from magloc.tracking.measurement import RowMeasurement, RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.results import Prediction, Row, Step, TrackPoint, rows_of
 
@@ -85,6 +82,8 @@ class Tracker:
 
     Attributes
     ----------
+    measurements : RowMeasurements
+        What rows say of the state.
     errors : SensorErrors
         The lasting errors of the array's sensors, whose states follow those of the motion.
     steps : list of Step
@@ -110,12 +109,11 @@ class Tracker:
     ) -> None:
         self.array = array
         self.motion = motion
-        self.errors = SensorErrors.of(array)
+        self.measurements = RowMeasurements(array, motion.n_states)
+        self.errors = self.measurements.errors
         self.keep_steps = keep_steps
         self.steps: list[Step] = []
-        self._noisy_array = without_lasting_errors(array)
         self._acquisition = Acquisition(array, prior, motion.speed_m_s)
-        self._differences: dict[bytes, Differences] = {}
         self._x: FloatArray | None = None
         self._S: FloatArray = np.zeros((0, 0))
         self._time_s = math.nan
@@ -123,6 +121,7 @@ class Tracker:
         self._n_rows = 0
         self._weight = math.nan
 
+    @one_blas_thread
     def update(self, row: Row | Readings) -> TrackPoint:
         """What is known of the source after one more row.
 
@@ -148,7 +147,7 @@ class Tracker:
             return self._acquired(row, index)
         prediction = self.predicted(self._x, self._S, dt_s)
         x, S = prediction.x, prediction.S
-        measurement = self.measurement(row)
+        measurement = self.measurements.of(row)
         if not measurement.z.size:
             return self._kept(row, index, x, S, prediction, status="predicted")
         if self._range_error(x, S, row) > REFIX_RANGE_ERROR:
@@ -234,28 +233,6 @@ class Tracker:
         S_q[n + noisy, S_q_motion.shape[1] + np.arange(noisy.size)] = added[noisy]
         return Prediction(np.concatenate([moved, kept * x[n:]]), predict_square_root(S, F, S_q), F)
 
-    def measurement(self, row: Row) -> RowMeasurement:
-        """What a row's readings say of the state."""
-        array = self._noisy_array
-        if row.ambient_T is not None:
-            x, y, z = row.ambient_T.tolist()
-            array = replace(array, ambient_T=(x, y, z))
-        differences = self.differences_of(row)
-        sigma = np.sqrt(differences.variance)
-        effect = differences.transform @ self.errors.effect(array, row.readings_T) / sigma[:, None]
-        return RowMeasurement(DifferenceMeasurement(array, differences), sigma, row, self.motion.n_states, effect)
-
-    def differences_of(self, row: Row) -> Differences:
-        """The independent differences that a row's readings give, without the lasting errors."""
-        available, array = np.isfinite(row.readings_T), self._noisy_array
-        if array.noise_depends_on_reading:
-            covariance = reading_covariance(array, row.readings_T)
-            return decorrelated_differences(array, available, covariance_T2=covariance)
-        key = available.tobytes()
-        if key not in self._differences:
-            self._differences[key] = decorrelated_differences(array, available)
-        return self._differences[key]
-
     def start(self, source: FloatArray, covariance: FloatArray, rows: Sequence[Row]) -> FilteredStart | None:
         """State at the last of the rows that a source (6,) was found from, as if at rest, with a covariance (6, 6).
 
@@ -265,7 +242,7 @@ class Tracker:
         """
         if len(rows) == 1 and not self.errors.n_states:
             return FilteredStart(*self.motion.start(source, symmetric_square_root(covariance)), 0.0)
-        measurements = [self.measurement(row) for row in rows]
+        measurements = [self.measurements.of(row) for row in rows]
         dof = sum(measurement.z.size for measurement in measurements) - N_SOURCE
         centre = source
         for _ in range(_MOST_START_STEPS):

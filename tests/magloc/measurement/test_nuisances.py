@@ -232,7 +232,7 @@ class TestWithoutLastingErrors:
         for row, step, point in zip(rows[1:], tracker.steps[1:], points[1:], strict=True):
             x, F, S_q = motion.step(x, 0.5)
             S = predict_square_root(S, F, S_q)
-            measurement = tracker.measurement(row)
+            measurement = tracker.measurements.of(row)
             update = iterated_update(
                 x,
                 S,
@@ -271,7 +271,7 @@ class TestStart:
         readings = predicted_channels(true, SOURCE[:3], SOURCE[3:]) + 2e-10 * rng.normal(size=(6, 12))
         rows = list(rows_of(Readings(readings)))
         tracker = Tracker(array, RandomWalk(1e-6, 1e-6))
-        measurements = [tracker.measurement(row) for row in rows]
+        measurements = [tracker.measurements.of(row) for row in rows]
         scale = np.concatenate([UNIT, tracker.errors.sigma])
 
         def residuals(y: FloatArray) -> FloatArray:
@@ -305,7 +305,7 @@ class TestStart:
         found = tracker.start(source, covariance, rows)
         assert found is not None
         x, S = found.x, found.S
-        again = tracker.filtered_start(x[:6], covariance, [tracker.measurement(row) for row in rows])
+        again = tracker.filtered_start(x[:6], covariance, [tracker.measurements.of(row) for row in rows])
         end, S_end = again.x, again.S
         deviation = np.linalg.norm(S_end, axis=1)
         np.testing.assert_allclose((x - end) / deviation, 0.0, atol=0.1)

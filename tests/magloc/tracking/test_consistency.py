@@ -110,7 +110,7 @@ class TestNeesOfACurvedEstimate:
         rng = np.random.default_rng(3)
         array = replace(self.THREE, sensors=tuple(replace(s, noise_T=6e-9) for s in self.THREE.sensors))
         tracker = Tracker(array, RandomWalk(0.1, 0.1))
-        measurement = tracker.measurement(Row(0.0, np.zeros(9)))
+        measurement = tracker.measurements.of(Row(0.0, np.zeros(9)))
         expected, found, cartesian = [], [], []
         for _ in range(200):
             noise = rng.normal(size=6)
@@ -139,7 +139,7 @@ class TestNeesOfACurvedEstimate:
         return np.asarray(fit.x * self.UNIT) if np.abs(fit.fun).max() < 1e-7 else None
 
     def test_what_is_known_in_part_is_counted_in_cartesian_coordinates(self) -> None:
-        measurement = Tracker(ARRAY, RandomWalk(0.1, 0.1)).measurement(Row(0.0, np.zeros(12)))
+        measurement = Tracker(ARRAY, RandomWalk(0.1, 0.1)).measurements.of(Row(0.0, np.zeros(12)))
         truth = self.TRUTH.copy()
         truth[2] = np.nan
         square, dof = nees_of(measurement, self.TRUTH + 0.1 * self.UNIT, np.diag(self.UNIT**2), truth)
@@ -323,7 +323,7 @@ class TestSmoothingBound(MovingArray):
         J = np.zeros((12 * self.N_ROWS,) * 2)
         J[6:12, 6:12] = np.diag(np.repeat([0.2, 0.05], 3) ** -2)
         for i, (row, state) in enumerate(zip(rows, states, strict=True)):
-            H = tracker.measurement(row).jacobian(state)
+            H = tracker.measurements.of(row).jacobian(state)
             here = slice(12 * i, 12 * i + 12)
             J[here, here] += H.T @ H
             if i:

@@ -38,7 +38,7 @@ REST = RandomWalk(1e-9, 1e-9)
 def measurement_of(readings_T: FloatArray, array: SensorArray = ARRAY) -> RowMeasurement:
     """In a world where the array is turned and elsewhere."""
     R = Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix()
-    return Tracker(array, REST).measurement(Row(0.0, readings_T, np.array([0.5, -0.2, 0.1]), R))
+    return Tracker(array, REST).measurements.of(Row(0.0, readings_T, np.array([0.5, -0.2, 0.1]), R))
 
 
 @pytest.fixture
@@ -156,7 +156,7 @@ class TestCurvedPrior:
         array = ARRAY.subset(["s1", "s2", "s3"])
         clean = predicted_channels(array, SOURCE[:3], SOURCE[3:])
         readings = clean + 3e-9 * np.random.default_rng(4).normal(size=(n, 9))  # 15 times the stated noise
-        rows = [Tracker(array, REST).measurement(Row(0.0, values)) for values in readings]
+        rows = [Tracker(array, REST).measurements.of(Row(0.0, values)) for values in readings]
         x = _solved(rows[0], rows[0].z)
         S = np.linalg.inv(rows[0].source_jacobian(x))
         for row in rows[1:]:
@@ -211,7 +211,7 @@ class TestSourceAtRest:
         first = tracker.steps[0]
         x, S = first.x, first.S
         for row in rows[first.row + 1 :]:
-            prediction, measurement = tracker.predicted(x, S, 1.0), tracker.measurement(row)
+            prediction, measurement = tracker.predicted(x, S, 1.0), tracker.measurements.of(row)
             update = iterated_update(
                 prediction.x,
                 prediction.S,
