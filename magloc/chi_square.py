@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -53,6 +54,7 @@ class Detector(Protocol):
         """Energy of a signal, in units of the noise's variance, that is found with a probability."""
 
 
+@lru_cache(maxsize=256)
 def energy_threshold(n_differences: int, false_alarm_rate: float = FALSE_ALARM) -> float:
     r"""Quantile of :math:`\|z'\|^2 \sim \chi^2_k`: energy of k whitened differences that noise exceeds at a rate."""
     if n_differences < 1:

@@ -149,10 +149,12 @@ class Rivals:
         single = np.array([len(intervals) == 1 for intervals in sets], dtype=bool)
         sharp = relative_sigma(self.covariance, self.offset_m, self.moment) <= LARGEST_GAUSSIAN_SIGMA
         sharp &= self.weight >= CERTAIN_WEIGHT
-        covariance, blurred = self.covariance.copy(), ~observable
-        covariance[blurred] = widened(
-            covariance[blurred], self.offset_m[blurred], low[blurred, None], high[blurred, None]
-        )
+        covariance, blurred = self.covariance, ~observable
+        if blurred.any():
+            covariance = covariance.copy()
+            covariance[blurred] = widened(
+                covariance[blurred], self.offset_m[blurred], low[blurred, None], high[blurred, None]
+            )
         return RowRanges(sets, observable, covariance, (observable & single)[:, None] & sharp)
 
 

@@ -63,8 +63,10 @@ def solutions_of(optima: Optima, energy: FloatArray, detected: BoolArray) -> Sol
         known = _of_one(optima, energy)
     else:
         known = _of_several(optima, detected)
-    moments = model.known.residual(moment) if model.known is not None else np.empty((n_fits, 0))
-    of_moments = np.einsum("fk,fk->f", moments, moments)
+    of_moments, n_known = np.zeros(n_fits), 0
+    if model.known is not None:
+        moments = model.known.residual(moment)
+        of_moments, n_known = np.sum(moments**2, axis=1), moments.shape[1]
     every = Solutions(
         of_row=of_row,
         n_sources=np.full(n_fits, n_sources),
@@ -76,10 +78,10 @@ def solutions_of(optima: Optima, energy: FloatArray, detected: BoolArray) -> Sol
         weight=known.weight,
         iterations=fits.iterations,
         ranges=known.ranges,
-        gaussian=known.gaussian & ~np.broadcast_to(optima.bent, of_row.shape)[:, None],
+        gaussian=known.gaussian & ~np.asarray(optima.bent)[..., None],
         merged=np.full((n_fits, n_sources), optima.merged),
         known_chi2=of_moments,
-        n_known=np.full(n_fits, moments.shape[1]),
+        n_known=np.full(n_fits, n_known),
     )
     determined = np.asarray(np.isfinite(known.covariance).all(axis=(1, 2)))
     return every if determined.all() else every.chosen(determined)
@@ -162,8 +164,7 @@ def _understated(chi2: FloatArray, optima: Optima) -> FloatArray:
 
     What a wrong model leaves is no noise, but σ that knew only the noise would be worse.
     """
-    with np.errstate(invalid="ignore"):
-        return np.where(np.isfinite(chi2) & is_misfit(chi2, optima.dof), chi2 / max(optima.dof, 1), 1.0)
+    return np.where(np.isfinite(chi2) & is_misfit(chi2, optima.dof), chi2 / max(optima.dof, 1), 1.0)
 
 
 def _scale_m(model: WhitenedModel) -> float | None:
