@@ -20,21 +20,22 @@ if TYPE_CHECKING:
     from adcs.mockup.vision.camera import Camera
     from adcs.mockup.vision.paper_matcher import Matcher
     from adcs.mockup.vision.sky import LedSky
+    from sims.experiments.mockup_camera import TableCamera
     from sims.experiments.mockup_vision import Finder, SkySetup
     from sims.mockup.table_run import TableScenario
 
-Part = Literal["sky", "fusion", "zeros"]
+Part = Literal["sky", "fusion", "zeros", "all"]
 MatcherName = Literal["paper", "robust", "odds"]
 StarFinder = Literal["bright", "faint", "level"]
 FusionName = Literal[Method, "all"]
 Number0 = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0))]
 Port = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, lte=65535))]
 _EVERYWHERE = {"part", "seeds", "seed"}
+_OF_THE_CAMERA = (
+    *("matcher", "lost", "spurious", "hot_pixels", "noise_dn", "footprint_m", "k1", "believed_k1", "stars", "sky"),
+)
 _BELONGS: dict[str, tuple[str, ...]] = {
-    "sky": (
-        *("poses", "matcher", "lost", "spurious", "hot_pixels", "noise_dn", "speed_m_s", "turn_deg_s"),
-        *("footprint_m", "k1", "believed_k1", "stars", "sky", "frames"),
-    ),
+    "sky": (*_OF_THE_CAMERA, "poses", "speed_m_s", "turn_deg_s", "frames"),
     "fusion": (
         "fusion",
         "duration",
@@ -48,6 +49,7 @@ _BELONGS: dict[str, tuple[str, ...]] = {
         "fixes",
     ),
     "zeros": ("unknowns", "start_fixes", "duration"),
+    "all": (*_OF_THE_CAMERA, "fusion", "duration", "delay_s", "outage"),
 }
 _OF_FRAMES = ("part", "frames", "sky", "matcher", "footprint_m", "believed_k1", "stars")
 """What counts for frames that are read: all else is about frames that are simulated."""
@@ -65,8 +67,8 @@ class MockupOptions:
     Parameters
     ----------
     part : str
-        Frames of the camera, rendered and identified ("sky"), drives with late fixes ("fusion"), or zeros of the
-        accelerometer from short runs ("zeros").
+        Frames of the camera, rendered and identified ("sky"), drives with late fixes ("fusion"), zeros of the
+        accelerometer from short runs ("zeros"), or drives with the fixes of rendered frames ("all").
     seeds : int, optional
         Number of runs: 6; of "sky" 1.
     seed : int
@@ -74,39 +76,39 @@ class MockupOptions:
     poses : int, optional
         sky: frames of a run, at random places and headings; 120.
     matcher : str, optional
-        sky: the source's triangles ("paper"), triangles checked by all stars ("robust", the default), or pairs of stars
-        weighed by odds ("odds").
+        sky, all: the source's triangles ("paper"), triangles checked by all stars ("robust", the default), or pairs of
+        stars weighed by odds ("odds").
     lost : float, optional
-        sky: part of the lights that are dark, 0 to 1; none.
+        sky, all: part of the lights that are dark, 0 to 1; none.
     spurious : int, optional
-        sky: lights in view that are in no catalogue; 0.
+        sky, all: lights in view that are in no catalogue; 0.
     hot_pixels : int, optional
-        sky: pixels that are white always; 0.
+        sky, all: pixels that are white always; 0.
     noise_dn : float, optional
-        sky: of a pixel, of 255; 4.
+        sky, all: of a pixel, of 255; 4.
     speed_m_s : float, optional
         sky: during the exposure of 1/30 s [m/s]; at rest.
     turn_deg_s : float, optional
         sky: during the exposure [°/s]; at rest.
     footprint_m : float, optional
-        sky: width of the seen part of the ceiling [m]; 0.9.
+        sky, all: width of the seen part of the ceiling [m]; 0.9.
     k1 : float, optional
-        sky: radial distortion of the lens at 320 px from its centre, such as -0.05; 0.
+        sky, all: radial distortion of the lens at 320 px from its centre, such as -0.05; 0.
     believed_k1 : float, optional
-        sky: what the calibration says of it; 0.
+        sky, all: what the calibration says of it; 0.
     stars : str, optional
-        sky: pixels far above the background ("bright", the default), sums of pixels for faint and smeared lights
+        sky, all: pixels far above the background ("bright", the default), sums of pixels for faint and smeared lights
         ("faint"), or the source's level between the darkest and the brightest pixel ("level").
     sky : Path, optional
-        sky: TOML file of the lights' places; by default 180 random ones.
+        sky, all: TOML file of the lights' places; by default 180 random ones.
     frames : Path, optional
         sky: PNG file, or folder of them, to be identified in place of simulated frames; needs --sky.
     fusion : str, optional
-        fusion: integration from the exposure of each fix ("paper"), the same with the velocity corrected
+        fusion, all: integration from the exposure of each fix ("paper"), the same with the velocity corrected
         ("velocity-corrected"), the delayed error-state filter ("ekf", the default), fixes alone, held and late
         ("camera"), samples alone ("imu"), or each of these ("all").
     duration : float, optional
-        fusion, zeros: seconds; 180, of "zeros" 15. Runs of zeros of up to 20 s are the one with two firings.
+        fusion, zeros, all: seconds; 180, of "zeros" 15. Runs of zeros of up to 20 s are the one with two firings.
     false_fixes : float, optional
         fusion: part of the fixes that are anywhere; none.
     failed : float, optional
@@ -116,9 +118,9 @@ class MockupOptions:
     repeated : float, optional
         fusion: part of the fixes that arrive twice; none.
     delay_s : float, optional
-        fusion: from the exposure to the fix [s]; 0.6.
+        fusion, all: from the exposure to the fix [s]; 0.6, of "all" what identifying it takes on this machine.
     outage : float, optional
-        fusion: from when to when there are no frames [s].
+        fusion, all: from when to when there are no frames [s].
     samples : Path, optional
         fusion: CSV file of a recording, in place of simulated drives: time_s, acceleration_x_m_s2, acceleration_y_m_s2
         and rate_deg_s of every sample; needs --fixes.
@@ -278,6 +280,12 @@ class MockupOptions:
             with naming(option):
                 getattr(setup, camera)
         return setup
+
+    def table_camera(self) -> TableCamera:
+        """What takes the frames of a drive, and finds their places."""
+        from sims.experiments.mockup_camera import TableCamera
+
+        return TableCamera(self.led_sky, self.sky_setup(), self.sky_matcher(), self.finder(), self.delay_s)
 
     def _known(self, *names: str, **more: Any) -> dict[str, Any]:
         """Options by their names, and more, without those that are not given."""

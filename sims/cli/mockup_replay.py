@@ -1,14 +1,12 @@
-"""The replay of ``adcs run mockup --part fusion``: --view, --html and --png."""
+"""The replay of ``adcs run mockup --part fusion`` and ``--part all``: --view, --html and --png."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 from cyclopts import Parameter
 
 from adcs.cli.options import print_note
@@ -19,7 +17,8 @@ from sims.cli.mockup_options import MockupOptions, Port
 from sims.experiments.mockup_settings import METHOD_WORDS
 
 if TYPE_CHECKING:
-    from adcs.viewer.drive import Drive, SeenFrame
+    from adcs.viewer.drive import Drive
+    from sims.experiments.mockup_camera import TableCamera
     from sims.experiments.mockup_navigation import FusionResult, FusionRuns
 
 
@@ -31,12 +30,12 @@ def check_places(replay: ReplayOptions) -> None:
         check_outputs(replay.html, replay.png)
 
 
-def show_replay(runs: FusionRuns, replay: ReplayOptions, *, quiet: bool) -> None:
+def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions, *, quiet: bool) -> None:
     """Show the first drive until Ctrl-C, or write it."""
     from adcs.viewer.drive_page import drive_page, write_playing_page
     from magloc.viewer.server import address, free_port, opened, wait_for_interruption, write_picture
 
-    drive = drive_of(runs.results[0], runs.method)
+    drive = drive_of(runs.results[0], runs.method, camera)
     at_s = 0.5 * drive.duration_s if replay.at is None else replay.at
     with naming_outputs():
         used = free_port(replay.port) if replay.view else 0
@@ -61,59 +60,37 @@ def show_replay(runs: FusionRuns, replay: ReplayOptions, *, quiet: bool) -> None
         page.close()
 
 
-def drive_of(result: FusionResult, method: str) -> Drive:
-    """What a replay shows of a run."""
+def drive_of(result: FusionResult, method: str, camera: TableCamera) -> Drive:
+    """What a replay shows of a run, with frames where the satellite truly was."""
     from adcs.mockup.navigation.delayed_ekf import FilterTrack
-    from adcs.mockup.vision.camera import Camera
-    from adcs.mockup.vision.sky import led_sky
-    from adcs.viewer.drive import Drive
+    from adcs.viewer.drive import Drive, SeenFrame
 
     run, track = result.run, result.fused.track
-    sky, camera = led_sky(), Camera()
+
+    def frame_of(fix: int) -> SeenFrame:
+        # One image for a fix that comes twice.
+        frame, found = camera.look(run.truth, float(run.exposure_s[fix]), result.seed)
+        return SeenFrame(frame.image, found.stars.positions_px, found.fix)
+
     arrived = slice(len(result.fused.outcomes))
     return Drive(
         title=f"Table-top satellite: {METHOD_WORDS[method]}",
-        lights_m=sky.positions_m,
-        camera=camera,
+        lights_m=camera.sky.positions_m,
+        camera=camera.setup.camera,
         truth=run.truth,
         track=track,
         fixes=run.fixes.rows(arrived),
         exposure_s=run.exposure_s[arrived],
         outcomes=result.fused.outcomes,
         sigma_m=track.sigma[:, :2] if isinstance(track, FilterTrack) else None,
-        frame_of=_frames_of(result),
+        frame_of=frame_of,
     )
-
-
-def _frames_of(result: FusionResult) -> Callable[[int], SeenFrame]:
-    """Frames of a run's fixes, rendered where the satellite truly was, and identified."""
-    from adcs.mockup.vision.camera import Camera, undistorted
-    from adcs.mockup.vision.centroids import find_stars
-    from adcs.mockup.vision.robust_matcher import RobustMatcher
-    from adcs.mockup.vision.sky import led_sky
-    from adcs.mockup.vision.triangles import TriangleCatalogue
-    from adcs.viewer.drive import SeenFrame
-    from sims.mockup.frames import pose_and_motion, rendered_frame
-
-    sky, camera = led_sky(), Camera()
-    matcher = RobustMatcher(TriangleCatalogue.of(sky.positions_m), camera.m_per_px)
-
-    def frame_of(fix: int) -> SeenFrame:
-        at_s = result.run.exposure_s[fix]
-        # One image for a fix that comes twice.
-        rng = np.random.default_rng([result.seed, round(1e3 * at_s)])
-        pose, motion = pose_and_motion(result.run.truth, at_s)
-        frame = rendered_frame(sky, camera, pose, rng, motion)
-        stars = find_stars(frame.image)
-        return SeenFrame(frame.image, stars.positions_px, matcher.identify(undistorted(camera, stars.positions_px)))
-
-    return frame_of
 
 
 @Parameter(name="*", group="Replay")
 @dataclass(frozen=True)
 class ReplayOptions:
-    """Replay of the first drive, with --part fusion.
+    """Replay of the first drive, with --part fusion or all.
 
     Parameters
     ----------
@@ -148,8 +125,8 @@ class ReplayOptions:
                     raise InputError(f"{name}: found it without a replay, expected --view, --html or --png too.")
             return
         option = "--view" if self.view else "--html" if self.html is not None else "--png"
-        if options.part != "fusion":
-            raise InputError(f"{option}: found it with --part {options.part}, expected it with --part fusion.")
+        if options.part not in ("fusion", "all"):
+            raise InputError(f"{option}: found it with --part {options.part}, expected it with --part fusion or all.")
         if options.samples is not None:
             raise InputError(
                 f"{option}: found it with --samples, expected it with simulated drives, whose truth it shows."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -92,6 +93,7 @@ def fusion_lines(runs: FusionRuns, duration_s: float) -> list[str]:
         f" {result['position_max_mm']:.2f}",
         f"velocity, rms [mm/s]                 {result['velocity_rms_mm_s']:.2f}",
         f"heading, rms [°]                     {result['heading_rms_deg']:.4f}",
+        f"exposure to fix, median [ms]         {_number(result['delay_ms_median'], 1)}",
         f"fixes                                {result['fixes']}:"
         f" {counts_in_words(result['used_fixes'], result['unused_fixes'])}; {result['false_fixes']} of them false",
     ]
@@ -170,7 +172,8 @@ def mockup(
     elif options.samples is not None and options.fixes is not None:
         told = _recording(options.samples, options.fixes, options, quiet=common.quiet)
     else:
-        told = {"sky": _sky, "zeros": _zeros, "fusion": _drives}[options.part](options, common.quiet)
+        kinds = {"sky": _sky, "zeros": _zeros, "fusion": _drives, "all": _drives}
+        told = kinds[options.part](options, common.quiet)
     written = []
     if out is not None:
         from sims.cli.mockup_files import write_files
@@ -180,7 +183,7 @@ def mockup(
     if written and not common.quiet:
         print_note(f"wrote {', '.join(written)} into {out}")
     if replay.wanted:
-        show_replay(told.run[0], replay, quiet=common.quiet)
+        show_replay(told.run[0], options.table_camera(), replay, quiet=common.quiet)
 
 
 class Told(NamedTuple):
@@ -234,7 +237,8 @@ def _drives(options: MockupOptions, quiet: bool) -> Told:
     wanted = value_or(options.fusion, "ekf")
     methods: tuple[Method, ...] = METHODS if wanted == "all" else (wanted,)
     with progress(len(seeds) * len(methods), "runs", quiet=quiet) as advance:
-        every = [sims.experiments.fused_runs(method, scenario, seeds, advance) for method in methods]
+        simulate = lru_cache(maxsize=len(seeds))(options.table_camera().run) if options.part == "all" else None
+        every = [sims.experiments.fused_runs(method, scenario, seeds, advance, simulate) for method in methods]
     if wanted == "all":
         result = {str(one.method): one.summary() for one in every}
         return Told(every, result, methods_lines(every, options.duration_s))

@@ -82,12 +82,14 @@ class FusionRuns:
         errors = [result.errors for result in self.results]
         outcomes = [outcome for result in self.results for outcome in result.fused.outcomes]
         used = sum(int(result.fused.used.sum()) for result in self.results)
+        delays_s = np.concatenate([result.run.fixes.arrival_s - result.run.exposure_s for result in self.results])
         return {
             "position_rms_mm": float(np.mean([error.position_rms_mm for error in errors])),
             "position_p95_mm": float(np.mean([error.position_p95_mm for error in errors])),
             "position_max_mm": max(error.position_max_mm for error in errors),
             "velocity_rms_mm_s": float(np.mean([error.velocity_rms_mm_s for error in errors])),
             "heading_rms_deg": float(np.mean([error.heading_rms_deg for error in errors])),
+            "delay_ms_median": None if not delays_s.size else 1e3 * float(np.median(delays_s)),
             "fixes": len(outcomes),
             "used_fixes": used,
             "rejected_fixes": outcomes.count(Outcome.REJECTED),
@@ -103,6 +105,7 @@ def fused_runs(
     scenario: TableScenario,
     seeds: Sequence[int],
     progress: Callable[[int], None] | None = None,
+    simulate: Callable[[TableScenario, int], TableRun] | None = None,
 ) -> FusionRuns:
     """Drive around the table, seed by seed, and estimate by one method.
 
@@ -115,6 +118,9 @@ def fused_runs(
         One for each run.
     progress : callable, optional
         Called with 1 after every run.
+    simulate : callable, optional
+        What makes a run of a scenario and a seed, such as :meth:`sims.experiments.mockup_camera.TableCamera.run`; by
+        default :func:`sims.table_run`.
 
     Raises
     ------
@@ -134,7 +140,7 @@ def fused_runs(
     _check("method", method, METHODS, seeds, scenario.duration_s)
     results = []
     for seed in seeds:
-        run = _table_run(scenario, seed)
+        run = (simulate or _table_run)(scenario, seed)
         fused = fuse(fusion_of(method, run.start, run.imu.begin_s), run.imu, run.fixes)
         results.append(FusionResult(seed, run, fused, track_errors(fused.track, run.truth)))
         if progress is not None:

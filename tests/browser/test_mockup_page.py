@@ -19,6 +19,7 @@ from adcs.viewer.frame_image import IDENTIFIED_COLOUR
 from adcs.viewer.table_scene import CEILING_M, ESTIMATE_COLOUR, FIX_COLOUR, VIEW_COLOUR
 from magloc.viewer.pages.pages import Page
 from magloc.viewer.server import opened
+from sims.cli.mockup_options import MockupOptions
 from sims.cli.mockup_replay import drive_of
 from sims.experiments.mockup_navigation import fused_runs
 from sims.mockup.table_run import TableScenario
@@ -38,7 +39,8 @@ class Open(NamedTuple):
 @pytest.fixture(scope="module")
 def replay(screen: Screen) -> Iterator[Open]:
     """The page of a drive, open in the browser."""
-    drive = drive_of(fused_runs("ekf", TableScenario(duration_s=DURATION_S), [0]).results[0], "ekf")
+    result = fused_runs("ekf", TableScenario(duration_s=DURATION_S), [0]).results[0]
+    drive = drive_of(result, "ekf", MockupOptions().table_camera())
     with opened(0, "drive") as server:
         page, player = drive_page(server, drive, 15.0)
         screen.open_server(server)

@@ -245,6 +245,16 @@ class TestFusion:
         assert one == every["ekf"]
         assert one["position_rms_mm"] < every["paper"]["position_rms_mm"] < every["camera"]["position_rms_mm"]
 
+    def test_with_the_fixes_of_rendered_frames(self, printed):
+        whole = ("--part", "all", "--seeds", "1", "--duration", "20", "--delay-s", "0.1")
+        result = printed(*whole)
+        assert result.keys() == printed(*SHORT).keys()
+        assert result["delay_ms_median"] == pytest.approx(100.0)
+        assert result["false_fixes"] == 0 < result["used_fixes"] == result["fixes"]
+        assert result["position_rms_mm"] < 5.0
+        assert printed(*whole, "--fusion", "all")["ekf"] == result
+        assert printed(*whole, "--lost", "0.9")["fixes"] < result["fixes"]
+
     def test_a_method_alone(self, printed):
         assert printed(*SHORT, "--fusion", "camera", "--seed", "2")["heading_rms_deg"] > 5.0
 
@@ -344,7 +354,7 @@ class TestReplay:
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
             try:
                 assert process.stdout is not None
-                lines = [process.stdout.readline() for _ in range(6)]
+                lines = [process.stdout.readline() for _ in range(7)]
                 assert lines[0].startswith("1 run of 20 s")
                 address = lines[-1].strip()
                 assert address.startswith("http://127.0.0.1:")
@@ -362,9 +372,15 @@ class TestReplay:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (("--part", "fusion", "--lost", "0.2"), "--lost: found it with --part fusion, expected it with --part sky."),
+        (
+            ("--part", "fusion", "--lost", "0.2"),
+            "--lost: found it with --part fusion, expected it with --part sky or --part all.",
+        ),
         (("--part", "zeros", "--fusion", "ekf"), "--fusion: found it with --part zeros, expected it with"),
-        (("--duration", "20"), "--duration: found it with --part sky, expected it with --part fusion or --part zeros."),
+        (
+            ("--duration", "20"),
+            "--duration: found it with --part sky, expected it with --part fusion or --part zeros or --part all.",
+        ),
         (("--lost", "1.5"), "--lost: found 1.5, expected a fraction between 0 and 1."),
         (("--lost", "nan"), "--lost: found nan, expected a fraction between 0 and 1."),
         (("--noise-dn", "-1"), "--noise-dn: found -1, expected 0 or more."),
@@ -388,7 +404,7 @@ class TestReplay:
         (("--part", "fusion", "--delay-s", "11"), "--delay-s: found 11, expected 0 to 10 s"),
         (("--part", "fusion", "--outage", "9", "3"), "--outage: found 9 to 3 s, expected a time and a later one."),
         (("--part", "zeros", "--start-fixes", "3"), "--start-fixes: found it without --unknowns two"),
-        (("--part", "sky", "--view"), "--view: found it with --part sky, expected it with --part fusion."),
+        (("--part", "sky", "--view"), "--view: found it with --part sky, expected it with --part fusion or all."),
         (("--part", "fusion", "--at", "3"), "--at: found it without a replay, expected --view, --html or --png too."),
         (("--part", "fusion", "--port", "3"), "--port: found it without a replay, expected --view"),
         (("--part", "fusion", "--html", "x", "--at", "181"), "--at: found 181 s, expected 0 to 180 s."),

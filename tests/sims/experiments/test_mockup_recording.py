@@ -32,6 +32,7 @@ from adcs.viewer.frame_image import IDENTIFIED_COLOUR, OTHER_STAR_COLOUR, ceilin
 from adcs.viewer.table_scene import CEILING_M, LIGHT_COLOUR, suitable_enlargement
 from magloc.viewer.panels.inputs import set_value
 from magloc.viewer.server import opened
+from sims.cli.mockup_options import MockupOptions
 from sims.cli.mockup_replay import drive_of
 from sims.experiments.mockup_navigation import fused_runs
 from sims.mockup.table_run import CameraErrors, TableScenario
@@ -43,7 +44,7 @@ DURATION_S = 20.0
 @pytest.fixture(scope="module")
 def drive() -> Drive:
     scenario = TableScenario(duration_s=DURATION_S, camera=CameraErrors(false=0.15))
-    drive = drive_of(fused_runs("ekf", scenario, [0]).results[0], "ekf")
+    drive = drive_of(fused_runs("ekf", scenario, [0]).results[0], "ekf", MockupOptions().table_camera())
     assert Outcome.REJECTED in drive.outcomes
     return drive
 
@@ -264,7 +265,7 @@ class TestErrorDial:
 class TestPages:
     def test_methods_without_sigma(self, server):
         runs = fused_runs("camera", TableScenario(duration_s=12.0), [1])
-        page, player = drive_page(server, drive_of(runs.results[0], "camera"), 6.0)
+        page, player = drive_page(server, drive_of(runs.results[0], "camera", MockupOptions().table_camera()), 6.0)
         assert not node(server, "/ellipse").visible
         assert player.enlarge_dropdown.value == "1 ×"
         assert "fix that was rejected" not in str(page.entries)
