@@ -30,7 +30,7 @@ for profile, derandomize in (("fixed", True), ("random", False)):
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 
 # The notebooks that `make test` executes; all others take more than some seconds and are left to `make test-full`.
-QUICK_NOTEBOOKS = {"01-first-fix", "04-scalar-sign", "07-own-csv", "ellipsoid"}
+QUICK_NOTEBOOKS = {"01-first-fix", "04-scalar-sign", "07-own-csv"}
 
 
 def pytest_configure() -> None:

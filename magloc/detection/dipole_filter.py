@@ -26,7 +26,7 @@ from magloc.measurement.whitened_compiled import ModelRows
 
 # As Locator searches: starts of every refinement, least angle between them, linearisations at most.
 _N_STARTS, _APART_RAD, _MOST_ITERATIONS = 6, 0.3, 100
-_ROWS_AT_ONCE = 4096
+_ROWS_AT_ONCE = 512
 
 
 class DipoleFilter:

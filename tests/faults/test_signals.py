@@ -23,7 +23,7 @@ from tests.conftest import REPOSITORY
 from tests.fuzz.cases import LINES, SELDOM, STREAM, write_files
 from tests.waiting import WAIT_S, wait_for
 
-QUICK, FULL = 6, 200
+QUICK, FULL = 6, 3 * len(LINES)  # at the end, each command has met each signal
 CHUNK = 10
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
 # The moment is one of our program, not of the interpreter's own start.
@@ -143,13 +143,18 @@ def is_whole(path: Path) -> bool:
     return data.endswith(b"\n")
 
 
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("files")
+    write_files(folder)
+    return folder
+
+
 @pytest.mark.skipif(os.name != "posix", reason="needs signals")
 @pytest.mark.parametrize(
     "first", [0, *(pytest.param(i, marks=pytest.mark.slow) for i in range(QUICK, QUICK + FULL, CHUNK))]
 )
-def test_ended_at_any_moment(first, tmp_path):
-    (files := tmp_path / "files").mkdir()
-    write_files(files)
+def test_ended_at_any_moment(first, files, tmp_path):
     found = []
     for seed in range(first, first + (CHUNK if first else QUICK)):
         (place := tmp_path / str(seed)).mkdir()

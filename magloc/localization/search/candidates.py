@@ -45,9 +45,11 @@ def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates:
 
 def linear_scores(bases: SingleArray, residual: FloatArray) -> FloatArray:
     """Energy of whitened residuals (b, C) that every candidate's moments explain: (b, n)."""
-    components = (residual.astype(np.float32) @ bases).reshape(len(residual), 3, -1)
-    scores: FloatArray = np.sum(components * components, axis=1, dtype=np.float64)
-    return np.nan_to_num(scores, nan=-1.0)
+    components = residual.astype(np.float32) @ bases
+    x, y, z = np.square(components, out=components).reshape(len(residual), 3, -1).swapaxes(0, 1)
+    scores: FloatArray = np.add(x, y, dtype=np.float64)
+    scores += z
+    return np.nan_to_num(scores, copy=False, nan=-1.0)
 
 
 def rows_of_equal_gain(gain: FloatArray) -> Iterator[NDArray[np.intp]]:
