@@ -176,6 +176,7 @@ def _estimator(place: str, table: EstimateTable) -> EstimatorSettings:
                 field_bias_sigma_T=1e-9 * table.field_bias_nT,
                 gyro_bias_sigma_rad_s=math.radians(table.gyro_bias_deg_s),
                 disturbance_sigma_s2=table.disturbance_s2,
+                dipole_sigma_Am2=table.dipole_Am2,
                 field_correlation_s=table.field_model_correlation_s,
                 gate=table.gate,
             ),
@@ -204,6 +205,7 @@ def _process_noise(place: str, wanted: str | dict[str, Any], used: SensorSet) ->
         field_bias_T=1e-9 * given["field_bias_nT"] if "field_bias_nT" in given else tuned.field_bias_T,
         gyro_bias_rad_s=given.get("gyro_bias_rad_s", tuned.gyro_bias_rad_s),
         disturbance_s2=given.get("disturbance_s2", tuned.disturbance_s2),
+        dipole_Am2=given.get("dipole_Am2", tuned.dipole_Am2),
     )
 
 

@@ -87,6 +87,7 @@ class DisturbanceTable(Table, kw_only=True):
 
     torque_Nm: NotNegative = 8e-7
     torque_period_s: Annotated[Positive, MAY_BE_INFINITE] = math.inf
+    dipole_Am2: Vector = _ZERO
     gyro_bias_deg_s: NotNegative = 0.0
     field_bias_nT: NotNegative = 0.0
     field_error_nT: NotNegative = 0.0
@@ -186,6 +187,7 @@ class EstimateTable(Table, kw_only=True):
     gyro_bias_deg_s: Positive = 0.06
     field_bias_nT: Positive = 1000.0
     disturbance_s2: Positive = 2e-6
+    dipole_Am2: Positive = 0.1
     forgetting: float = 0.99
     closed_loop_F: bool = False
 
@@ -201,6 +203,7 @@ class ProcessNoiseTable(Table, kw_only=True):
     field_bias_nT: NotNegative | None = None
     gyro_bias_rad_s: NotNegative | None = None
     disturbance_s2: NotNegative | None = None
+    dipole_Am2: NotNegative | None = None
 
 
 SENSOR_TABLES: dict[str, Any] = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from adcs.satellite.dynamics_compiled import Body, Vector, applied, cross
 from magloc.compilation import compiled
 
 Array = NDArray[np.float64]
@@ -37,8 +38,21 @@ def transition(F: Array, F2: Array, F3: Array, dt: float, Phi: Array, G: Array) 
 
 
 @compiled
-def spread(Phi: Array, G: Array, d: int, variance: Array, P: Array, T: Array) -> None:
-    """P becomes Φ P Φᵀ + Q; only the first six rows of Φ differ from those of the unit matrix. ``d``: -1 without."""
+def by_dipole(G: Array, body: Body, b: Vector, by: Array) -> None:
+    """Into ``by`` (6, 3) what a dipole does in a field b in body axes: G (6, 3) of a disturbance times -J⁻¹W(b)."""
+    for j in range(3):
+        e = (1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0)
+        acceleration = applied(body.J_inverse, cross(e, b))
+        for i in range(6):
+            by[i, j] = G[i, 0] * acceleration[0] + G[i, 1] * acceleration[1] + G[i, 2] * acceleration[2]
+
+
+@compiled
+def spread(Phi: Array, G: Array, firsts: tuple[int, int], variance: Array, P: Array, T: Array) -> None:
+    """P becomes Φ P Φᵀ + Q; only the first six rows of Φ differ from those of the unit matrix.
+
+    ``G`` (2, 6, 3): by disturbance and dipole, which begin at ``firsts`` in the error state, -1 without.
+    """
     n = P.shape[0]
     for i in range(_ALWAYS):
         for j in range(n):
@@ -47,19 +61,21 @@ def spread(Phi: Array, G: Array, d: int, variance: Array, P: Array, T: Array) ->
             factor = Phi[i, k]
             for j in range(n):
                 T[i, j] += factor * P[k, j]
-        if d >= 0:
-            for k in range(3):
-                factor = G[i, k]
-                for j in range(n):
-                    T[i, j] += factor * P[d + k, j]
+        for s in range(2):
+            if firsts[s] >= 0:
+                for k in range(3):
+                    factor = G[s, i, k]
+                    for j in range(n):
+                        T[i, j] += factor * P[firsts[s] + k, j]
     for i in range(_ALWAYS):
         for j in range(i + 1):
             total = 0.0
             for k in range(_ALWAYS):
                 total += T[i, k] * Phi[j, k]
-            if d >= 0:
-                for k in range(3):
-                    total += T[i, d + k] * G[j, k]
+            for s in range(2):
+                if firsts[s] >= 0:
+                    for k in range(3):
+                        total += T[i, firsts[s] + k] * G[s, j, k]
             P[i, j] = total
             P[j, i] = total
         for j in range(_ALWAYS, n):

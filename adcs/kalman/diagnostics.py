@@ -129,7 +129,7 @@ def _one_vector(record: Record, estimates: AttitudeTracks, run: int) -> list[Pro
     if not alone.any():
         return []
     begins = f"one direction and a gyro for {_seconds(alone, record)}"
-    if not used.gyro_bias:
+    if "gyro-bias" not in used.states:
         return [Problem(f"{begins}: a bias of the gyro is not in the state and would accumulate", alone)]
     sigma_deg = np.degrees(2.0 * estimates.sigma[run, :, :3].max(axis=-1))
     firsts = np.flatnonzero(alone & ~np.concatenate([[False], alone[:-1]]))
@@ -162,7 +162,7 @@ def _field_model(record: Record, estimates: AttitudeTracks, run: int) -> list[st
     """Compare what does not depend on the attitude: the field's modulus, and its angle with the Sun."""
     settings = estimates.settings
     used = settings.sensors
-    if not used.magnetometer or used.field_bias or used.field_model:
+    if not used.magnetometer or {"field-bias", "field-model"} & set(used.states):
         return []
     around, readings = record.environment, record.readings
     sigma = deviations(record, settings)

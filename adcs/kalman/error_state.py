@@ -8,9 +8,8 @@ then reaches.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtri
@@ -21,14 +20,9 @@ from arrays.io.errors import check_not_negative, check_positive
 from arrays.typing import BoolArray, FloatArray
 from magloc.levels import CONTRADICTION
 
-ATTRIBUTES = {
-    "field-bias": "field_bias_T",
-    "gyro-bias": "gyro_bias_rad_s",
-    "disturbance": "disturbance_s2",
-    "field-model": "field_model_T",
-}
-"""Optional states in the order of the error state, and what they are called in :class:`State` and its like."""
-STATES = tuple(ATTRIBUTES)
+SIZES = {"field-bias": 3, "gyro-bias": 3, "disturbance": 3, "field-model": 3, "dipole": 3}
+"""Optional states in the order of the error state, and how many numbers they have."""
+STATES = tuple(SIZES)
 FIELD_ERROR_T = 150e-9
 """Error of a component of a model of the core's field: crust, currents around the Earth, and the model's own."""
 OPEN_RAD = 2.0
@@ -43,18 +37,15 @@ ALWAYS = 6
 class SensorSet:
     """Sensors in use and optional states; made by :func:`sensor_set`, which checks them.
 
-    ``star``, ``gyro``, ``magnetometer``, ``sun``: sensors. ``field_bias``, ``gyro_bias``, ``disturbance``,
-    ``field_model``: states.
+    ``star``, ``gyro``, ``magnetometer``, ``sun``: sensors. ``states``: names of the optional states, in the order of
+    :data:`STATES`.
     """
 
     star: bool = False
     gyro: bool = False
     magnetometer: bool = False
     sun: bool = False
-    field_bias: bool = False
-    gyro_bias: bool = False
-    disturbance: bool = False
-    field_model: bool = False
+    states: tuple[str, ...] = ()
 
     @property
     def sensors(self) -> str:
@@ -63,19 +54,19 @@ class SensorSet:
         return "+".join(name for name, one in zip(SENSORS, used, strict=True) if one)
 
     @property
-    def states(self) -> tuple[str, ...]:
-        """Names of the optional states."""
-        used = (self.field_bias, self.gyro_bias, self.disturbance, self.field_model)
-        return tuple(name for name, one in zip(STATES, used, strict=True) if one)
-
-    @property
     def size(self) -> int:
         """Numbers of the error state."""
-        return ALWAYS + 3 * len(self.states)
+        return ALWAYS + sum(SIZES[state] for state in self.states)
 
-    def first_of(self, state: str) -> int:
-        """Where an optional state begins in the error state; -1 where the set does not have it."""
-        return ALWAYS + 3 * self.states.index(state) if state in self.states else -1
+    def place(self, state: str) -> slice:
+        """Where an optional state of the set stands in the error state."""
+        before = self.states[: self.states.index(state)]
+        first = ALWAYS + sum(SIZES[name] for name in before)
+        return slice(first, first + SIZES[state])
+
+    def without(self, state: str) -> SensorSet:
+        """The set without an optional state."""
+        return replace(self, states=tuple(name for name in self.states if name != state))
 
 
 def sensor_set(sensors: str, states: Iterable[str] = ()) -> SensorSet:
@@ -97,10 +88,7 @@ def sensor_set(sensors: str, states: Iterable[str] = ()) -> SensorSet:
         gyro="gyro" in names,
         magnetometer="mag" in names,
         sun="sun" in names,
-        field_bias="field-bias" in optional,
-        gyro_bias="gyro-bias" in optional,
-        disturbance="disturbance" in optional,
-        field_model="field-model" in optional,
+        states=tuple(state for state in STATES if state in optional),
     )
     check_observable(used)
     return used
@@ -149,6 +137,8 @@ class ProcessNoise:
         q_g.
     disturbance_s2 : float
         q_d.
+    dipole_Am2 : float
+        q_m.
 
     Raises
     ------
@@ -161,16 +151,25 @@ class ProcessNoise:
     field_bias_T: float = 1e-9
     gyro_bias_rad_s: float = 1e-8
     disturbance_s2: float = 1e-8
+    dipole_Am2: float = 1e-7
 
     def __post_init__(self) -> None:
         check_not_negative(**vars(self))
 
 
 def tuned_noise(used: SensorSet) -> ProcessNoise:
-    """Process noise with which the filter is accurate and its covariance true, for a constant torque of 8e-7 N·m."""
-    if used.disturbance:
+    """Process noise with which the filter is accurate and its covariance true, for a constant torque of 8e-7 N·m.
+
+    With the state ``dipole`` and without ``disturbance`` it is for constant torques up to 1e-8 N·m besides.
+    """
+    if "dipole" in used.states:
+        # A dipole is told from other torques by orbits: what is not white must not be as large as tells it.
+        if "disturbance" in used.states:
+            return ProcessNoise(1e-8, 1e-8, disturbance_s2=3e-10)
+        return ProcessNoise(1e-8, 3e-7)
+    if "disturbance" in used.states:
         # The torque is in the state: what is left for the rate is almost nothing.
-        if used.star and not used.gyro_bias:
+        if used.star and "gyro-bias" not in used.states:
             return ProcessNoise(1e-8, 1e-8, disturbance_s2=3e-8)
         return ProcessNoise(1e-8, 1e-7, disturbance_s2=1e-8)
     # The torque moves the rate by up to 1.5e-6 rad/s a step. A star tracker sees that within seconds; vectors average
@@ -223,8 +222,9 @@ class FilterSettings:
         the state ``field-model``, for which :data:`FIELD_ERROR_T` stands in place of 0.
     field_correlation_s : float
         Time constant of the state ``field-model``; 1,000 km of a low orbit.
-    field_bias_sigma_T, gyro_bias_sigma_rad_s, disturbance_sigma_s2 : float
-        Standard deviations of those states at the start, where they are zero.
+    field_bias_sigma_T, gyro_bias_sigma_rad_s, disturbance_sigma_s2, dipole_sigma_Am2 : float
+        Standard deviations of those states at the start, where they are zero: the dipole is that besides the residual
+        dipole which the satellite is known to have.
     gate : float
         Probability with which a good reading is taken for one that contradicts the filter, which is then not used; with
         0 all readings are used.
@@ -236,6 +236,7 @@ class FilterSettings:
     field_bias_sigma_T: float = 1000e-9
     gyro_bias_sigma_rad_s: float = 1e-3
     disturbance_sigma_s2: float = 2e-6
+    dipole_sigma_Am2: float = 0.1
     field_correlation_s: float = 132.0
     gate: float = CONTRADICTION
 
@@ -247,6 +248,7 @@ class FilterSettings:
             field_bias_sigma_T=self.field_bias_sigma_T,
             gyro_bias_sigma_rad_s=self.gyro_bias_sigma_rad_s,
             disturbance_sigma_s2=self.disturbance_sigma_s2,
+            dipole_sigma_Am2=self.dipole_sigma_Am2,
             field_correlation_s=self.field_correlation_s,
         )
 
@@ -261,22 +263,34 @@ class FilterSettings:
 
     def process_variance(self, dt_s: float) -> FloatArray:
         """Diagonal of Q of a step, shape (N,)."""
-        always = [self.noise.attitude, self.noise.rate_rad_s]
-        walks = [getattr(self.noise, ATTRIBUTES[state]) for state in self.sensors.states if state != "field-model"]
-        if self.sensors.field_model:
-            walks.append(self.field_model_sigma_T * math.sqrt(1.0 - self.field_decay(dt_s) ** 2))
-        return np.repeat(np.square([*always, *walks]), 3)
+        noise = self.noise
+        walks = {
+            "field-bias": noise.field_bias_T,
+            "gyro-bias": noise.gyro_bias_rad_s,
+            "disturbance": noise.disturbance_s2,
+            "field-model": self.field_model_sigma_T * math.sqrt(1.0 - self.field_decay(dt_s) ** 2),
+            "dipole": noise.dipole_Am2,
+        }
+        always = np.repeat(np.square([noise.attitude, noise.rate_rad_s]), 3)
+        return np.concatenate([always, self._variances(walks)])
 
     @property
     def start_variance(self) -> FloatArray:
         """Variances of the optional states at the start, shape (N - 6,)."""
-        by_state = {
-            "field-bias": self.field_bias_sigma_T,
-            "gyro-bias": self.gyro_bias_sigma_rad_s,
-            "disturbance": self.disturbance_sigma_s2,
-            "field-model": self.field_model_sigma_T,
-        }
-        return np.repeat(np.square([by_state[state] for state in self.sensors.states]), 3)
+        return self._variances(
+            {
+                "field-bias": self.field_bias_sigma_T,
+                "gyro-bias": self.gyro_bias_sigma_rad_s,
+                "disturbance": self.disturbance_sigma_s2,
+                "field-model": self.field_model_sigma_T,
+                "dipole": self.dipole_sigma_Am2,
+            }
+        )
+
+    def _variances(self, deviation: dict[str, float]) -> FloatArray:
+        """Variances of the numbers of the optional states, from one deviation for each state."""
+        states = self.sensors.states
+        return np.repeat(np.square([deviation[state] for state in states]), [SIZES[state] for state in states])
 
     @property
     def open_variance(self) -> FloatArray:
@@ -312,22 +326,17 @@ def start_near(q: FloatArray, w: FloatArray, attitude_rad: float, rate_rad_s: fl
 class State:
     """Estimate of all runs at one instant.
 
-    ``q`` (runs, 4), ``w`` (runs, 3), ``field_bias_T`` (runs, 3), ``gyro_bias_rad_s`` (runs, 3), ``disturbance_s2``
-    (runs, 3), ``field_model_T`` (runs, 3, orbital frame): a state that the filter does not have is zero.
+    ``q`` (runs, 4), ``w`` (runs, 3), ``optional``: the optional states of the filter by their names, (runs, k).
     """
 
     q: FloatArray
     w: FloatArray
-    field_bias_T: FloatArray
-    gyro_bias_rad_s: FloatArray
-    disturbance_s2: FloatArray
-    field_model_T: FloatArray
+    optional: Mapping[str, FloatArray]
     P: FloatArray  # (runs, N, N): covariance of the error state
 
-
-def optional_of(owner: State | AttitudeTracks, used: SensorSet) -> dict[str, Any]:
-    """What belongs to the optional states of a set, by their names."""
-    return {state: getattr(owner, ATTRIBUTES[state]) for state in used.states}
+    def of(self, state: str) -> FloatArray:
+        """An optional state (runs, k); zero of one that the filter does not have."""
+        return self.optional[state] if state in self.optional else np.zeros((len(self.q), SIZES[state]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -336,8 +345,10 @@ class AttitudeTracks:
 
     Attributes
     ----------
-    q, w, field_bias_T, gyro_bias_rad_s, disturbance_s2, field_model_T : ndarray, shape (runs, n, 4), then (runs, n, 3)
-        Attitude (orbital from body), rate against inertial space; a state that the filter does not have is zero.
+    q, w : ndarray, shape (runs, n, 4), (runs, n, 3)
+        Attitude (orbital from body), rate against inertial space.
+    optional : mapping of str to ndarray, shape (runs, n, k)
+        The optional states of the filter by their names.
     covariance : ndarray, shape (runs, n, N, N)
         Of the error state, see :mod:`adcs.kalman.error_state`; δq is half of the angle.
     nis : ndarray, shape (runs, n, 4)
@@ -350,10 +361,7 @@ class AttitudeTracks:
     settings: FilterSettings
     q: FloatArray
     w: FloatArray
-    field_bias_T: FloatArray
-    gyro_bias_rad_s: FloatArray
-    disturbance_s2: FloatArray
-    field_model_T: FloatArray
+    optional: Mapping[str, FloatArray]
     covariance: FloatArray
     nis: FloatArray
     rejected: BoolArray
@@ -371,17 +379,10 @@ class AttitudeTracks:
 
     @property
     def states(self) -> dict[str, FloatArray]:
-        """Rate [rad/s] and the optional states that there are, by their names, shape (runs, n, 3)."""
-        return {"rate": self.w} | optional_of(self, self.settings.sensors)
+        """Rate [rad/s] and the optional states that there are, by their names, shape (runs, n, k)."""
+        return {"rate": self.w, **self.optional}
 
     def at(self, row: int) -> State:
         """Estimate of all runs at one instant."""
-        return State(
-            self.q[:, row],
-            self.w[:, row],
-            self.field_bias_T[:, row],
-            self.gyro_bias_rad_s[:, row],
-            self.disturbance_s2[:, row],
-            self.field_model_T[:, row],
-            self.covariance[:, row],
-        )
+        optional = {state: values[:, row] for state, values in self.optional.items()}
+        return State(self.q[:, row], self.w[:, row], optional, self.covariance[:, row])

@@ -39,17 +39,17 @@ def run_reduced(record: Record, settings: FilterSettings, start: Start) -> Attit
     Q = np.diag(
         np.repeat([settings.noise.attitude**2 + (0.5 * gyro_rad_s * h) ** 2, settings.noise.gyro_bias_rad_s**2], 3)
     )
-    others = replace(settings, sensors=replace(used, gyro=False, gyro_bias=False))
+    others = replace(settings, sensors=replace(used, gyro=False, states=()))
     P = np.zeros((runs, 6, 6))
     P[:, :3, :3], P[:, 3:, 3:] = start.covariance[:, :3, :3], settings.gyro_bias_sigma_rad_s**2 * np.eye(3)
-    q, bias, zero = start.q, np.zeros((runs, 3)), np.zeros((runs, 3))
+    q, bias = start.q, np.zeros((runs, 3))
     states, nis = [], []
     for row in range(n):
         if row:
             w = 0.5 * (rates[:, row - 1] + rates[:, row]) - bias
             q, Phi = _moved(q, w, record.environment.orbital_rate_rad_s[:, row - 1], h)
             P = Phi @ P @ Phi.mT + Q
-        state = State(q, rates[:, row] - bias, zero, zero, zero, zero, P)
+        state = State(q, rates[:, row] - bias, {}, P)
         H, residual = stacked_residuals(record, row, state, others)
         noise = H @ P @ H.mT + np.eye(H.shape[1])
         nis.append(nis_of(noise, H, residual, others.sensors))
@@ -57,7 +57,7 @@ def run_reduced(record: Record, settings: FilterSettings, start: Start) -> Attit
         q = quaternion.normalised(quaternion.multiply(q, quaternion.from_error_vector(dx[:, :3])))
         bias = bias + dx[:, 3:]
         whole = _with_rate(P, gyro_rad_s)
-        states.append(replace(state, q=q, w=rates[:, row] - bias, gyro_bias_rad_s=bias, P=whole))
+        states.append(replace(state, q=q, w=rates[:, row] - bias, optional={"gyro-bias": bias}, P=whole))
     return collected(settings, states, np.stack(nis, axis=1))
 
 

@@ -39,7 +39,7 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
     """
     used, readings, around = settings.sensors, record.readings, record.environment
     # An error that is a state of the filter is noise of one instant.
-    sigma = deviations(record, replace(settings, sensors=replace(settings.sensors, field_model=False)))
+    sigma = deviations(record, replace(settings, sensors=settings.sensors.without("field-model")))
     b_orbital, b = around.b_orbital_T[:, 0], readings.field_T[:, 0]
     length_T = np.linalg.norm(b_orbital, axis=-1)
     runs = len(b)
@@ -67,7 +67,7 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
     if used.gyro:
         read = is_read(readings.gyro_rad_s[:, 0])
         w[read] = readings.gyro_rad_s[read, 0]
-        bias_rad_s = settings.gyro_bias_sigma_rad_s if used.gyro_bias else 0.0
+        bias_rad_s = settings.gyro_bias_sigma_rad_s if "gyro-bias" in used.states else 0.0
         rate_variance[read] = (AGAIN * sigma[1]) ** 2 + bias_rad_s**2
     covariance = np.zeros((runs, 6, 6))
     covariance[:, :3, :3] = np.linalg.inv(information)

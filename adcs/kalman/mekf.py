@@ -7,22 +7,21 @@ See docs/theory/attitude-kalman-filters.md. Source: Ivanov, Ivlev, Karpenko, Ovc
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from adcs import quaternion
 from adcs.kalman.error_state import (
     ALWAYS,
-    ATTRIBUTES,
+    SIZES,
     STATES,
     AttitudeTracks,
     FilterSettings,
     SensorSet,
     Start,
     State,
-    optional_of,
 )
 from adcs.kalman.gate.contest import FIELD, GYRO, SUN, Contest, Fit, begun, eased, patience
 from adcs.quaternion import cross_matrix, rotate_back
@@ -31,8 +30,8 @@ from adcs.satellite.sensors import SENSORS
 from adcs.satellite.telemetry import Record, is_read, part
 from arrays.typing import BoolArray, FloatArray
 
-Jacobian = Callable[[Record, int, FloatArray, FloatArray], FloatArray]
-"""F (runs, 6, 6) of attitude and rate from record, row, q (runs, 4) and w (runs, 3)."""
+Jacobian = Callable[[Record, int, State], FloatArray]
+"""F (runs, 6, 6) of attitude and rate from record, row and state."""
 
 
 def first_state(settings: FilterSettings, start: Start) -> State:
@@ -41,46 +40,65 @@ def first_state(settings: FilterSettings, start: Start) -> State:
     P = np.zeros((runs, size, size))
     P[:, :ALWAYS, :ALWAYS] = start.covariance
     P[:, range(ALWAYS, size), range(ALWAYS, size)] = settings.start_variance
-    zero = np.zeros((runs, 3))
-    return State(start.q, start.w, zero, zero, zero, zero, P)
+    return State(start.q, start.w, {state: np.zeros((runs, SIZES[state])) for state in settings.sensors.states}, P)
 
 
-def known_torque_jacobian(record: Record, row: int, q: FloatArray, w: FloatArray) -> FloatArray:
+def known_torque_jacobian(record: Record, row: int, state: State) -> FloatArray:
     """F (runs, 6, 6) of a filter that is told the wheels' torque.
 
     See :func:`adcs.satellite.dynamics.error_jacobian`.
     """
     around = record.environment
     return dynamics.error_jacobian(
-        record.satellite.body, q, w, record.momentum_Nms[:, row], around.gravity_s2[:, row], around.b_orbital_T[:, row]
+        record.satellite.body,
+        state.q,
+        state.w,
+        record.momentum_Nms[:, row],
+        around.gravity_s2[:, row],
+        around.b_orbital_T[:, row],
+        state.of("dipole"),
     )
 
 
-def closed_loop_jacobian(record: Record, row: int, q: FloatArray, w: FloatArray) -> FloatArray:
+def closed_loop_jacobian(record: Record, row: int, state: State) -> FloatArray:
     """F of the source paper (``closed_loop_F``), wrong.
 
     See :func:`adcs.satellite.dynamics.closed_loop_error_jacobian`.
     """
     satellite = record.satellite
     return dynamics.closed_loop_error_jacobian(
-        satellite.body, satellite.control, q, w, quaternion.IDENTITY, record.environment.gravity_s2[:, row]
+        satellite.body,
+        satellite.control,
+        state.q,
+        state.w,
+        quaternion.IDENTITY,
+        record.environment.gravity_s2[:, row],
     )
 
 
-def transition(F: FloatArray, settings: FilterSettings, dt_s: float) -> FloatArray:
-    """Φ (runs, N, N) of the error state from F (runs, 6, 6) of attitude and rate, to the third order of the step."""
+def acceleration_by_dipole(record: Record, row: int, state: State) -> FloatArray:
+    """What a dipole [A·m²] adds to dω/dt, -J⁻¹W(AB), shape (runs, 3, 3)."""
+    b_body = rotate_back(state.q, record.environment.b_orbital_T[:, row])
+    return -record.satellite.body.inverse @ cross_matrix(b_body)
+
+
+def transition(F: FloatArray, by_dipole: FloatArray, settings: FilterSettings, dt_s: float) -> FloatArray:
+    """Φ (runs, N, N) of the error state to the third order of the step.
+
+    ``F`` (runs, 6, 6): of attitude and rate. ``by_dipole`` (runs, 3, 3): of :func:`acceleration_by_dipole`.
+    """
     used = settings.sensors
     full = np.zeros((len(F), used.size, used.size))
     full[:, :ALWAYS, :ALWAYS] = F
-    if used.disturbance:
-        first = used.first_of("disturbance")
-        full[:, 3:6, first : first + 3] = np.eye(3)
+    for state, acceleration in (("disturbance", np.eye(3)), ("dipole", by_dipole)):
+        if state in used.states:
+            full[:, 3:6, used.place(state)] = acceleration
     step = full * dt_s
     squared = step @ step
     Phi = np.eye(used.size) + step + squared / 2.0 + squared @ step / 6.0
-    if used.field_model:
-        last = range(used.first_of("field-model"), used.first_of("field-model") + 3)
-        Phi[:, last, last] = settings.field_decay(dt_s)
+    if "field-model" in used.states:
+        place = used.place("field-model")
+        Phi[:, place, place] = settings.field_decay(dt_s) * np.eye(3)
     return np.asarray(Phi)
 
 
@@ -93,11 +111,12 @@ def moved(record: Record, row: int, state: State) -> tuple[FloatArray, FloatArra
         state.w,
         record.momentum_Nms[:, row],
         record.wheel_torque_Nm[:, row],
-        state.disturbance_s2 @ satellite.body.inertia_kgm2,
+        state.of("disturbance") @ satellite.body.inertia_kgm2,
         around.orbital_rate_rad_s[:, row],
         around.gravity_s2[:, row],
         around.b_orbital_T[:, row],
         record.dt_s,
+        state.of("dipole"),
     )
     return q, w
 
@@ -107,17 +126,21 @@ def predicted(
 ) -> tuple[State, FloatArray]:
     """State one step after instant ``row`` before its readings, and Φ (runs, N, N)."""
     q, w = moved(record, row, state)
-    F = 0.5 * (jacobian(record, row, state.q, state.w) + jacobian(record, row + 1, q, w))
-    Phi = transition(F, settings, record.dt_s)
+    ahead = replace(state, q=q, w=w)
+    F = 0.5 * (jacobian(record, row, state) + jacobian(record, row + 1, ahead))
+    by_dipole = 0.5 * (acceleration_by_dipole(record, row, state) + acceleration_by_dipole(record, row + 1, ahead))
+    Phi = transition(F, by_dipole, settings, record.dt_s)
     P = Phi @ state.P @ Phi.mT + np.diag(settings.process_variance(record.dt_s))
-    error_T = settings.field_decay(record.dt_s) * state.field_model_T
-    return replace(state, q=q, w=w, field_model_T=error_T, P=0.5 * (P + P.mT)), Phi
+    optional = dict(state.optional)
+    if "field-model" in optional:
+        optional["field-model"] = settings.field_decay(record.dt_s) * optional["field-model"]
+    return replace(ahead, optional=optional, P=0.5 * (P + P.mT)), Phi
 
 
 def deviations(record: Record, settings: FilterSettings) -> FloatArray:
     """Noise of one component of the readings of star tracker, gyro, magnetometer and Sun sensor, shape (4,)."""
     satellite = record.satellite
-    error_T = 0.0 if settings.sensors.field_model else settings.field_error_T
+    error_T = 0.0 if "field-model" in settings.sensors.states else settings.field_error_T
     return np.array(
         [
             satellite.star_tracker.sigma_rad,
@@ -140,22 +163,21 @@ def residuals(record: Record, row: int, state: State, used: SensorSet) -> list[t
         H = np.zeros((len(state.q), 3, used.size))
         H[..., first : first + 3] = part
         if bias in used.states:
-            H[..., used.first_of(bias) : used.first_of(bias) + 3] = np.eye(3)
+            H[..., used.place(bias)] = np.eye(3)
         return H
 
     parts: list[tuple[int, FloatArray, FloatArray]] = []
     if used.star:
         parts.append((0, quaternion.error_vector(state.q, readings.star[:, row]), rows(0, np.eye(3))))
     if used.gyro:
-        residual = readings.gyro_rad_s[:, row] - state.w - state.gyro_bias_rad_s
+        residual = readings.gyro_rad_s[:, row] - state.w - state.of("gyro-bias")
         parts.append((1, residual, rows(3, np.eye(3), "gyro-bias")))
     if used.magnetometer:
-        b = rotate_back(state.q, around.b_orbital_T[:, row] + state.field_model_T)
-        residual = readings.field_T[:, row] - b - state.field_bias_T
+        b = rotate_back(state.q, around.b_orbital_T[:, row] + state.of("field-model"))
+        residual = readings.field_T[:, row] - b - state.of("field-bias")
         H = rows(0, 2.0 * cross_matrix(b), "field-bias")
-        if used.field_model:
-            first = used.first_of("field-model")
-            H[..., first : first + 3] = quaternion.matrix(state.q).mT
+        if "field-model" in used.states:
+            H[..., used.place("field-model")] = quaternion.matrix(state.q).mT
         parts.append((2, residual, H))
     if used.sun:
         s = rotate_back(state.q, around.sun_orbital[:, row])
@@ -208,11 +230,8 @@ def corrected(record: Record, row: int, state: State, settings: FilterSettings) 
 def with_error(state: State, dx: FloatArray, used: SensorSet) -> State:
     """State into which an error (runs, N) is put."""
     q = quaternion.multiply(state.q, quaternion.from_error_vector(dx[:, :3]))
-    optional = {}
-    for name, values in optional_of(state, used).items():
-        first = used.first_of(name)
-        optional[ATTRIBUTES[name]] = values + dx[:, first : first + 3]
-    return replace(state, q=quaternion.normalised(q), w=state.w + dx[:, 3:6], **optional)
+    optional = {**state.optional, **{name: state.of(name) + dx[:, used.place(name)] for name in used.states}}
+    return replace(state, q=quaternion.normalised(q), w=state.w + dx[:, 3:6], optional=optional)
 
 
 class Hypothesis(NamedTuple):
@@ -335,21 +354,30 @@ def run_readable(
         one = _Readable(part(record, only), settings, begins, jacobian)
         states = [one.state_of(row) for row in range(record.momentum_Nms.shape[1])]
         tracks.append(collected(settings, states, one.nis, one.rejected))
-    of_runs = [field.name for field in fields(AttitudeTracks) if field.name != "settings"]
-    joined: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in tracks]) for name in of_runs}
-    return AttitudeTracks(settings, **joined)
+    return AttitudeTracks(
+        settings,
+        np.concatenate([one.q for one in tracks]),
+        np.concatenate([one.w for one in tracks]),
+        {name: np.concatenate([one.optional[name] for one in tracks]) for name in settings.sensors.states},
+        np.concatenate([one.covariance for one in tracks]),
+        np.concatenate([one.nis for one in tracks]),
+        np.concatenate([one.rejected for one in tracks]),
+    )
 
 
 def collected(
     settings: FilterSettings, states: list[State], nis: FloatArray, rejected: BoolArray | None = None
 ) -> AttitudeTracks:
     """Estimates of the states of all instants; a filter without a gate rejects nothing."""
-    tracks: dict[str, Any] = {
-        one.name: np.stack([getattr(state, one.name) for state in states], axis=1) for one in fields(State)
-    }
-    tracks["covariance"] = tracks.pop("P")
-    none = np.zeros(nis.shape, dtype=np.bool_)
-    return AttitudeTracks(settings, **tracks, nis=nis, rejected=none if rejected is None else rejected)
+    return AttitudeTracks(
+        settings,
+        np.stack([state.q for state in states], axis=1),
+        np.stack([state.w for state in states], axis=1),
+        {name: np.stack([state.of(name) for state in states], axis=1) for name in settings.sensors.states},
+        np.stack([state.P for state in states], axis=1),
+        nis,
+        np.zeros(nis.shape, dtype=np.bool_) if rejected is None else rejected,
+    )
 
 
 def check_start(record: Record, start: Start) -> None:
@@ -375,7 +403,7 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
     check_start(record, start)
     used, first, around = settings.sensors, first_state(settings, start), record.environment
     runs, n = record.momentum_Nms.shape[:2]
-    q, w, optional = np.empty((runs, n, 4)), np.empty((runs, n, 3)), np.zeros((len(STATES), runs, n, 3))
+    q, w, optional = np.empty((runs, n, 4)), np.empty((runs, n, 3)), np.empty((runs, n, used.size - ALWAYS))
     covariance, nis = np.empty((runs, n, used.size, used.size)), np.full((runs, n, len(SENSORS)), np.nan)
     rejected = np.zeros(nis.shape, dtype=np.bool_)
     readings = record.readings
@@ -394,7 +422,7 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
         kernel.Settings(
             np.array([used.star, used.gyro, used.magnetometer, used.sun]),
             deviations(record, settings),
-            np.array([used.first_of(state) for state in STATES]),
+            np.array([used.place(state).start if state in used.states else -1 for state in STATES]),
             settings.process_variance(record.dt_s),
             settings.open_variance,
             settings.field_decay(record.dt_s),
@@ -403,4 +431,5 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
         ),
         record.dt_s,
     )
-    return AttitudeTracks(settings, q, w, optional[0], optional[1], optional[2], optional[3], covariance, nis, rejected)
+    parts = np.split(optional, np.cumsum([SIZES[state] for state in used.states]), axis=-1)
+    return AttitudeTracks(settings, q, w, dict(zip(used.states, parts, strict=False)), covariance, nis, rejected)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adcs.kalman.covariance_compiled import scalar, spread, transition
+from adcs.kalman.covariance_compiled import by_dipole, scalar, spread, transition
 from adcs.kalman.gate import contest_compiled as gate
 from adcs.satellite.dynamics_compiled import (
     Body,
@@ -27,6 +27,7 @@ from adcs.satellite.dynamics_compiled import (
     rotate_back,
     step,
     vector_at,
+    with_dipole,
 )
 from magloc.compilation import compiled
 
@@ -34,7 +35,7 @@ Array = NDArray[np.float64]
 
 
 class Estimated(NamedTuple):
-    """Outputs (R, n, …), optional (K, R, n, 3): states of ``STATES``; nis and rejected (R, n, 4) at readings."""
+    """Outputs (R, n, …); optional (R, n, N - 6): the states that there are; nis and rejected (R, n, 4) at readings."""
 
     q: Array
     w: Array
@@ -67,9 +68,9 @@ class Record(NamedTuple):
 class Settings(NamedTuple):
     """Which of star tracker, gyro, magnetometer and Sun sensor are used, their deviations and patience, (4,).
 
-    Biases of field and gyro, the disturbance and the error of the field model begin at ``firsts`` in the error state,
-    -1 where there are none. ``variance`` and ``open_variance`` (N,): that a step adds, and of an error state of which
-    nothing is known. ``decay``: what a step leaves of the error of the field model.
+    Biases of field and gyro, the disturbance, the error of the field model and the dipole begin at ``firsts`` in the
+    error state, -1 where there are none. ``variance`` and ``open_variance`` (N,): that a step adds, and of an error
+    state of which nothing is known. ``decay``: what a step leaves of the error of the field model.
     """
 
     used: NDArray[np.bool_]
@@ -107,7 +108,7 @@ class Work(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Room of a step: matrices (6, 6), G (6, 3) and T (6, N)."""
+    """Room of a step: matrices (6, 6), G (2, 6, 3) by disturbance and dipole, and T (6, N)."""
 
     F: Array
     F_after: Array
@@ -222,6 +223,8 @@ def _advance(
     x, F, F_after = one.x, work.F, work.F_after
     q, w = quaternion_at(x), _at(x, 4)
     k, b_o = vector_at(record.momentum[run, i]), vector_at(around.b_orbital[run, i])
+    body = with_dipole(body, _at(x, 19))
+    b = rotate_back(q, b_o)
     error_jacobian(body, q, w, k, around.gravity[run, i], b_o, F)
     u_k, torque = vector_at(record.wheel_torque[run, i]), applied(body.J, _at(x, 13))
     orbital_rate, gravity = around.orbital_rate[run, i], around.gravity[run, i]
@@ -231,7 +234,12 @@ def _advance(
     for row in range(6):
         for column in range(6):
             F[row, column] = 0.5 * (F[row, column] + F_after[row, column])
-    transition(F, work.F2, work.F3, dt, work.Phi, work.G)
+    transition(F, work.F2, work.F3, dt, work.Phi, work.G[0])
+    if settings.firsts[4] >= 0:
+        # The mean over the step, as of F: all else of it is held.
+        b_after = rotate_back(q, b_o)
+        mean = (0.5 * (b[0] + b_after[0]), 0.5 * (b[1] + b_after[1]), 0.5 * (b[2] + b_after[2]))
+        by_dipole(work.G[0], body, mean, work.G[1])
     e, N = settings.firsts[3], one.P.shape[0]
     if e >= 0:
         for j in range(e, e + 3):
@@ -240,7 +248,7 @@ def _advance(
             for row in range(N):
                 one.P[row, j] *= settings.decay
             x[16 + j - e] *= settings.decay
-    spread(work.Phi, work.G, settings.firsts[2], settings.variance, one.P, work.T)
+    spread(work.Phi, work.G, (settings.firsts[2], settings.firsts[4]), settings.variance, one.P, work.T)
     _put(x, q)
     x[4], x[5], x[6] = w
 
@@ -355,7 +363,7 @@ def run(
     second = Hypothesis(np.empty(7 + 3 * K), np.empty((N, N)), np.empty(N), np.empty(1))
     six = np.empty((5, 6, 6))
     square, line = np.empty((2, N, N)), np.empty((3, N))
-    steps = Steps(six[0], six[1], six[2], six[3], six[4], np.empty((6, 3)), np.empty((6, N)))
+    steps = Steps(six[0], six[1], six[2], six[3], six[4], np.empty((2, 6, 3)), np.empty((6, N)))
     work = Work(line[2], square[0], line[0], square[1], line[1], np.empty(N, np.int64))
     contest = gate.Contest(np.empty(6, np.int64), np.empty((5, 4), np.int64), settings.patience, np.empty(1))
     for run in range(begin, end):
@@ -381,4 +389,6 @@ def run(
                     _copy(second, main)
             out.q[run, i], out.w[run, i], out.covariance[run, i] = main.x[:4], main.x[4:7], main.P
             for k in range(K):
-                out.optional[k, run, i] = main.x[7 + 3 * k : 10 + 3 * k]
+                if settings.firsts[k] >= 0:
+                    for j in range(3):
+                        out.optional[run, i, settings.firsts[k] - 6 + j] = main.x[7 + 3 * k + j]

@@ -27,6 +27,7 @@ SHOWN = {
     "field-bias": Shown("field_bias_{}_nT", 1e9, "nT", "bias of the magnetometer"),
     "disturbance": Shown("disturbance_{}_s2", 1.0, "1/s²", "disturbing acceleration"),
     "field-model": Shown("field_model_{}_nT", 1e9, "nT", "error of the field's model"),
+    "dipole": Shown("dipole_{}_Am2", 1.0, "A·m²", "residual dipole"),
 }
 STATE_COLUMNS = tuple(shown.column.format(axis) for shown in SHOWN.values() for axis in "xyz")
 
@@ -43,6 +44,6 @@ def sigma_by_state(tracks: AttitudeTracks) -> dict[str, FloatArray]:
 
 
 def in_units(states: Mapping[str, FloatArray]) -> FloatArray:
-    """States (..., 3) as (..., 18) in the order and units of :data:`STATE_COLUMNS`; NaN of one that is not there."""
+    """States (..., 3) as (..., 21) in the order and units of :data:`STATE_COLUMNS`; NaN of one that is not there."""
     missing = np.full_like(next(iter(states.values())), np.nan)
     return np.concatenate([shown.scale * states.get(state, missing) for state, shown in SHOWN.items()], axis=-1)

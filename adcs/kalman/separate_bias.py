@@ -28,12 +28,12 @@ def run_parallel(record: Record, settings: FilterSettings, start: Start, forgett
     place. ``forgetting``: λ, above 0 and up to 1. Returns: of the set with the disturbance; its
     covariance is that of the whole.
     """
-    if not settings.sensors.disturbance:
+    if "disturbance" not in settings.sensors.states:
         raise ValueError("Input settings must have the state disturbance; instead received a set without it.")
     if not 0.0 < forgetting <= 1.0:
         raise ValueError(f"Input forgetting must be above 0 and up to 1; instead received {forgetting}.")
     check_start(record, start)
-    inner = replace(settings, sensors=replace(settings.sensors, disturbance=False))
+    inner = replace(settings, sensors=settings.sensors.without("disturbance"))
     state = first_state(inner, start)
     runs, n = record.momentum_Nms.shape[:2]
     size, h = inner.sensors.size, record.dt_s
@@ -63,7 +63,8 @@ def run_parallel(record: Record, settings: FilterSettings, start: Start, forgett
         change = (K_d @ residual[..., None])[..., 0]
         dx = (K @ residual[..., None])[..., 0] + by_sensitivity(S, change)
         state = with_error(state, dx, inner.sensors)
-        state = replace(state, disturbance_s2=state.disturbance_s2 + change, P=P)
+        optional = {**state.optional, "disturbance": state.of("disturbance") + change}
+        state = replace(state, optional=optional, P=P)
         states.append(replace(state, P=_whole(P, S, P_d)))
     return collected(settings, states, np.stack(nis, axis=1))
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from adcs import quaternion
-from adcs.kalman.error_state import AttitudeTracks, SensorSet, State, optional_of
+from adcs.kalman.error_state import AttitudeTracks, SensorSet, State
 from adcs.kalman.mekf import Jacobian, collected, known_torque_jacobian, predicted, with_error
 from adcs.satellite.telemetry import Record
 from arrays.typing import FloatArray
@@ -41,6 +41,5 @@ def smoothed(record: Record, estimates: AttitudeTracks, jacobian: Jacobian = kno
 
 def difference(state: State, other: State, used: SensorSet) -> FloatArray:
     """Error state (runs, N) that :func:`adcs.kalman.mekf.with_error` puts into ``other`` to make it ``state``."""
-    pairs = zip(optional_of(state, used).values(), optional_of(other, used).values(), strict=True)
     always = [quaternion.error_vector(other.q, state.q), state.w - other.w]
-    return np.concatenate([*always, *(one - two for one, two in pairs)], axis=-1)
+    return np.concatenate([*always, *(state.of(name) - other.of(name) for name in used.states)], axis=-1)

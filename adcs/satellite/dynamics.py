@@ -18,6 +18,7 @@ from arrays.typing import FloatArray
 
 _E2 = np.array([0.0, 1.0, 0.0])
 _E3 = np.array([0.0, 0.0, 1.0])
+ZERO = np.zeros(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,15 +129,17 @@ def absolute_rate(q: ArrayLike, w_relative: ArrayLike, orbital_rate_rad_s: Array
     return np.asarray(w_relative, dtype=np.float64) + rotate_back(q, np.asarray(orbital_rate_rad_s)[..., None] * _E2)
 
 
-def environment_torque(body: RigidBody, q: ArrayLike, gravity_s2: ArrayLike, b_orbital_T: ArrayLike) -> FloatArray:
-    """Torque of the gravity gradient, 3(μ/r³) η×Jη, and of the residual dipole, m×B, body axes [N·m].
+def environment_torque(
+    body: RigidBody, q: ArrayLike, gravity_s2: ArrayLike, b_orbital_T: ArrayLike, dipole_Am2: ArrayLike = ZERO
+) -> FloatArray:
+    """Torque of the gravity gradient, 3(μ/r³) η×Jη, and of the magnetic dipole, m×B, body axes [N·m].
 
     ``q`` (..., 4): attitude, orbital from body. ``gravity_s2`` (...): μ/r³. ``b_orbital_T`` (..., 3): field in the
-    orbital frame. Returns (..., 3).
+    orbital frame. ``dipole_Am2`` (..., 3): besides the residual dipole of the body. Returns (..., 3).
     """
     eta = rotate_back(q, _E3)
     gradient = 3.0 * np.asarray(gravity_s2)[..., None] * np.cross(eta, eta @ body.inertia_kgm2)
-    return gradient + np.cross(body.residual_dipole_Am2, rotate_back(q, b_orbital_T))
+    return gradient + np.cross(body.residual_dipole_Am2 + np.asarray(dipole_Am2), rotate_back(q, b_orbital_T))
 
 
 def angular_acceleration(
@@ -164,6 +167,7 @@ def step(
     gravity_s2: ArrayLike,
     b_orbital_T: ArrayLike,
     dt_s: float,
+    dipole_Am2: ArrayLike = ZERO,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """State after one step of the classical Runge-Kutta method of order four.
 
@@ -172,13 +176,13 @@ def step(
     Shape ``orbital_rate_rad_s``, ``gravity_s2`` (...). ``q`` (..., 4), ``w`` (..., 3), ``momentum_Nms`` (..., 3):
     attitude (orbital from body), rate against inertial space [rad/s], momentum of the wheels, body axes.
     ``wheel_torque_Nm``, ``torque_Nm`` (..., 3): rate of change of that momentum, and the torque of the disturbances,
-    body axes. ``b_orbital_T`` (..., 3): field that the residual dipole feels.
+    body axes. ``b_orbital_T`` (..., 3): field that dipoles feel. ``dipole_Am2`` (..., 3): besides the residual dipole.
     """
     q, w, k = (np.asarray(one, dtype=np.float64) for one in (q, w, momentum_Nms))
     k_dot, disturbance = (np.asarray(one, dtype=np.float64) for one in (wheel_torque_Nm, torque_Nm))
 
     def slope(q_at: FloatArray, w_at: FloatArray, after_s: float) -> tuple[FloatArray, FloatArray]:
-        outside = disturbance + environment_torque(body, q_at, gravity_s2, b_orbital_T)
+        outside = disturbance + environment_torque(body, q_at, gravity_s2, b_orbital_T, dipole_Am2)
         return (
             quaternion.derivative(q_at, relative_rate(q_at, w_at, orbital_rate_rad_s)),
             angular_acceleration(body, w_at, k + k_dot * after_s, k_dot, outside),
@@ -228,7 +232,13 @@ def commanded_torque(
 
 
 def error_jacobian(
-    body: RigidBody, q: ArrayLike, w: ArrayLike, momentum_Nms: ArrayLike, gravity_s2: ArrayLike, b_orbital_T: ArrayLike
+    body: RigidBody,
+    q: ArrayLike,
+    w: ArrayLike,
+    momentum_Nms: ArrayLike,
+    gravity_s2: ArrayLike,
+    b_orbital_T: ArrayLike,
+    dipole_Am2: ArrayLike = ZERO,
 ) -> FloatArray:
     r"""F of the error (δq, δω) for a known wheel torque: d/dt (δq, δω) = F (δq, δω), shape (..., 6, 6).
 
@@ -242,11 +252,12 @@ def error_jacobian(
     against the orbital frame.
 
     ``q`` (..., 4). ``w``, ``momentum_Nms`` (..., 3). ``gravity_s2`` (...). ``b_orbital_T`` (..., 3).
+    ``dipole_Am2`` (..., 3): besides the residual dipole of the body.
     """
     w = np.asarray(w, dtype=np.float64)
     J = body.inertia_kgm2
     b_body = rotate_back(q, b_orbital_T)
-    dipole: FloatArray = 2.0 * cross_matrix(body.residual_dipole_Am2) @ cross_matrix(b_body)
+    dipole: FloatArray = 2.0 * cross_matrix(body.residual_dipole_Am2 + np.asarray(dipole_Am2)) @ cross_matrix(b_body)
     by_attitude = body.inverse @ (_gradient_part(body, q, gravity_s2) + dipole)
     total = w @ J + np.asarray(momentum_Nms, dtype=np.float64)
     return _error_matrix(w, by_attitude, body.inverse @ (cross_matrix(total) - cross_matrix(w) @ J))

@@ -109,6 +109,12 @@ def applied(M: Matrix, v: Vector) -> Vector:
 
 
 @compiled
+def with_dipole(body: Body, dipole: Vector) -> Body:
+    """Body with a dipole besides its residual one."""
+    return Body(body.J, body.J_inverse, combined(body.dipole, 1.0, dipole))
+
+
+@compiled
 def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
     """Hamilton product p∘q."""
     return (
@@ -301,14 +307,15 @@ def run(
     body: Body,
     control: Control,
     torque: Array,
+    dipole: Array,
     around: Surroundings,
     dt: float,
 ) -> None:
     """Runs begin to end under control that sees the true state, from their first rows on.
 
     The first rows of the motion hold the start of attitude, rate and momentum, and the others are filled; the wheels'
-    torque is what is held from each instant to the next (the last row: what would be). ``torque`` (R, n, 3) is held
-    likewise; surroundings are those at the start of every step.
+    torque is what is held from each instant to the next (the last row: what would be). ``torque`` and ``dipole``
+    (R, n, 3), besides the residual one, are held likewise; surroundings are those at the start of every step.
     """
     q, w, momentum, wheel_torque = motion
     n = q.shape[1]
@@ -326,4 +333,5 @@ def run(
             if i == n - 1:
                 break
             outside, b_orbital = vector_at(torque[r, i]), vector_at(around.b_orbital[r, i])
-            q_now, w_now, k_now = step(body, q_now, w_now, k_now, u, outside, rate, around.gravity[r, i], b_orbital, dt)
+            now, gravity = with_dipole(body, vector_at(dipole[r, i])), around.gravity[r, i]
+            q_now, w_now, k_now = step(now, q_now, w_now, k_now, u, outside, rate, gravity, b_orbital, dt)

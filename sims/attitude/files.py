@@ -33,6 +33,7 @@ def simulation_of(file: AttitudeFile) -> AttitudeScenario:
             field_bias_T=1e-9 * disturbance.field_bias_nT,
             field_error_T=1e-9 * disturbance.field_error_nT,
             field_error_correlation_s=disturbance.field_error_correlation_s,
+            dipole_Am2=disturbance.dipole_Am2,
             wild_share=disturbance.wild_share,
             start_attitude_rad=math.radians(start.attitude_deg),
             start_rate_rad_s=math.radians(start.rate_deg_s),

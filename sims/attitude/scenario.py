@@ -57,6 +57,8 @@ class AttitudeScenario:
     field_error_correlation_s : float
         Time constant with which each component of that difference goes to and fro, ``field_error_T`` then being its
         standard deviation; infinite = constant.
+    dipole_Am2 : tuple of 3 floats
+        Magnetic dipole in the body that filters are not told, besides the residual one of the satellite.
     wild_share : float
         Share of the readings of every sensor that are anything at all.
     start_attitude_rad, start_rate_rad_s : float
@@ -86,6 +88,7 @@ class AttitudeScenario:
     field_bias_T: float = 0.0
     field_error_T: float = 0.0
     field_error_correlation_s: float = math.inf
+    dipole_Am2: tuple[float, float, float] = (0.0, 0.0, 0.0)
     wild_share: float = 0.0
     start_attitude_rad: float = math.radians(1.0)
     start_rate_rad_s: float = math.radians(0.01)

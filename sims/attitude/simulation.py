@@ -46,6 +46,7 @@ class Prepared:
     w: FloatArray
     momentum_Nms: FloatArray
     torque_Nm: FloatArray  # (runs, n, 3): disturbing torque in body axes, held from each instant to the next
+    dipole_Am2: FloatArray  # (runs, n, 3): besides the residual dipole of the satellite, held likewise
     gyro_bias_rad_s: FloatArray  # (runs, n, 3)
     field_bias_T: FloatArray  # (runs, n, 3)
     wild: dict[str, BoolArray]  # (runs, n): readings of ``star``, ``gyro``, ``field`` and ``sun`` that are anything
@@ -91,6 +92,7 @@ class AttitudeRuns(Record):
             "gyro-bias": self.prepared.gyro_bias_rad_s,
             "disturbance": self.prepared.torque_Nm @ self.satellite.body.inverse,
             "field-model": self.prepared.true_field_orbital_T - self.environment.b_orbital_T,
+            "dipole": self.prepared.dipole_Am2,
         }
 
     def error_deg(self, track: AttitudeTrack) -> FloatArray:
@@ -131,6 +133,7 @@ def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
         w=dynamics.absolute_rate(q, w_relative, around.orbital_rate_rad_s[:, 0]),
         momentum_Nms=np.zeros((len(numbers), 3)),
         torque_Nm=scenario.torque_Nm * _directions(numbers, "torque")[:, None] * wave[:, None],
+        dipole_Am2=np.tile(np.array(scenario.dipole_Am2, dtype=np.float64), (len(numbers), n, 1)),
         gyro_bias_rad_s=_bias(scenario, numbers, "gyro", scenario.gyro_bias_rad_s, satellite.gyro.bias_walk_rad_s),
         field_bias_T=_bias(scenario, numbers, "field", scenario.field_bias_T, satellite.magnetometer.bias_walk_T),
         wild={name: _wild(numbers, name, n, scenario.wild_share) for name in _SENSORS},
@@ -156,6 +159,7 @@ def simulate(scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
         rigid_body.Body.of(scenario.satellite.body),
         rigid_body.Control.of(scenario.satellite.control, quaternion.IDENTITY),
         prepared.torque_Nm,
+        prepared.dipole_Am2,
         rigid_body.Surroundings(around.orbital_rate_rad_s, around.gravity_s2, prepared.true_field_orbital_T),
         scenario.dt_s,
     )
@@ -225,6 +229,7 @@ def advance(prepared: Prepared, state: State, wheel_torque_Nm: FloatArray, row: 
         around.gravity_s2[:, row],
         prepared.true_field_orbital_T[:, row],
         prepared.scenario.dt_s,
+        prepared.dipole_Am2[:, row],
     )
 
 

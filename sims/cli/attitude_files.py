@@ -123,7 +123,8 @@ def dataset_of(parts: Sequence[Part], estimate: EstimatorSettings, title: str) -
         ("nis", ("run", "time", "sensor"), nis, "1", "normalised innovation squared"),
         ("rejected", ("run", "time", "sensor"), rejected, "1", "whether a reading contradicted the rest, not used"),
     ]
-    for state, units in (("gyro-bias", "rad/s"), ("field-bias", "T"), ("disturbance", "s-2"), ("field-model", "T")):
+    of_states = {"gyro-bias": "rad/s", "field-bias": "T", "disturbance": "s-2", "field-model": "T", "dipole": "A m2"}
+    for state, units in of_states.items():
         if state in estimate.settings.sensors.states:
             name, (values, true, sigma) = state.replace("-", "_"), of(state)
             listed += [

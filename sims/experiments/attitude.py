@@ -42,9 +42,9 @@ class Outcome:
     Attributes
     ----------
     seeds : ndarray of int, shape (runs,)
-    axis_rms : ndarray, shape (runs, 18)
+    axis_rms : ndarray, shape (runs, 21)
         Rms over the last minute of the angle [°], the rate [°/s], the gyro's bias [°/s], the field's bias [nT], the
-        disturbance [1/s²] and the error of the field's model [nT], three axes each; NaN of a state
+        disturbance [1/s²], the error of the field's model [nT] and the dipole [A·m²], three axes each; NaN of a state
         that the filter does not have.
     nees : ndarray, shape (runs, n)
         Normalised error squared, over its numbers.
@@ -96,7 +96,7 @@ class Outcome:
         mean = self.axis_rms.mean(axis=0).reshape(-1, 3).max(axis=1)
         names = (
             *("angle_rms_deg", "rate_rms_deg_s", "gyro_bias_rms_deg_s"),
-            *("field_bias_rms_nT", "disturbance_rms_s2", "field_model_rms_nT"),
+            *("field_bias_rms_nT", "disturbance_rms_s2", "field_model_rms_nT", "dipole_rms_Am2"),
         )
         return {
             **{name: None if math.isnan(value) else float(value) for name, value in zip(names, mean, strict=True)},
@@ -191,7 +191,7 @@ def run_scenario(
 
 
 def errors_in_units(part: Part) -> FloatArray:
-    """Truth minus estimate, shape (runs, n, 18), in the order and units of :attr:`Outcome.axis_rms`."""
+    """Truth minus estimate, shape (runs, n, 21), in the order and units of :attr:`Outcome.axis_rms`."""
     return in_units(by_state(accuracy.errors(part.runs, part.estimates), part.estimates.settings.sensors))
 
 

@@ -61,8 +61,8 @@ def scenario_for(used: SensorSet, duration_s: float) -> AttitudeScenario:
     """A bias is there where the filter estimates it."""
     return replace(
         tabletsat(duration_s),
-        gyro_bias_rad_s=GYRO_BIAS_RAD_S if used.gyro_bias else 0.0,
-        field_bias_T=FIELD_BIAS_T if used.field_bias else 0.0,
+        gyro_bias_rad_s=GYRO_BIAS_RAD_S if "gyro-bias" in used.states else 0.0,
+        field_bias_T=FIELD_BIAS_T if "field-bias" in used.states else 0.0,
     )
 
 
@@ -104,6 +104,7 @@ def followed(prepared: Prepared) -> AttitudeRuns:
                     around.gravity_s2[:, row],
                     prepared.true_field_orbital_T[:, row],
                     prepared.scenario.dt_s,
+                    prepared.dipole_Am2[:, row],
                 )
             )
     q, w, momentum = (np.stack(part, axis=1) for part in zip(*states, strict=True))
@@ -125,12 +126,14 @@ def believed_runs(filter_settings: FilterSettings, duration_s: float, seeds: ran
 
     body, dt_s = prepared.scenario.satellite.body, prepared.scenario.dt_s
     acceleration = noise.rate_rad_s / dt_s * rng.standard_normal(shape)
-    if used.disturbance:
+    if "disturbance" in used.states:
         acceleration = acceleration + walk(filter_settings.disturbance_sigma_s2, noise.disturbance_s2)
     changed = replace(prepared, torque_Nm=acceleration @ body.inertia_kgm2)
-    if used.gyro_bias:
+    if "dipole" in used.states:
+        changed = replace(changed, dipole_Am2=walk(filter_settings.dipole_sigma_Am2, noise.dipole_Am2))
+    if "gyro-bias" in used.states:
         changed = replace(changed, gyro_bias_rad_s=walk(filter_settings.gyro_bias_sigma_rad_s, noise.gyro_bias_rad_s))
-    if used.field_bias:
+    if "field-bias" in used.states:
         changed = replace(changed, field_bias_T=walk(filter_settings.field_bias_sigma_T, noise.field_bias_T))
     return followed(changed)
 

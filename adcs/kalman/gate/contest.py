@@ -108,7 +108,7 @@ class Contest:
         That of a gyro can if it may have a bias. One direction leaves a turn open, which would fit too much: it does so
         only where the main hypothesis has waited in vain.
         """
-        if self.began >= 0 or (sensor == GYRO and not self.settings.sensors.gyro_bias):
+        if self.began >= 0 or (sensor == GYRO and "gyro-bias" not in self.settings.sensors.states):
             return False
         return sensor in (STAR, GYRO) or both or self._waited(sensor)
 
@@ -162,7 +162,7 @@ def begun(record: Record, row: int, state: State, settings: FilterSettings, sens
     used, variance = settings.sensors, settings.open_variance
     if sensor == GYRO:
         P = state.P.copy()
-        of_bias = slice(used.first_of("gyro-bias"), used.first_of("gyro-bias") + 3)
+        of_bias = used.place("gyro-bias")
         P[:, of_bias], P[:, :, of_bias] = 0.0, 0.0
         P[:, of_bias, of_bias] = np.diag(variance[of_bias])
         return replace(state, P=P)

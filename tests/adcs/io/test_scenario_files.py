@@ -53,6 +53,7 @@ class TestBuiltIn:
             "field-error",
             "one-vector",
             "outliers",
+            "residual-dipole",
             "star-blinded",
             "tabletsat",
         )

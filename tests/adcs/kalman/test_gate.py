@@ -209,7 +209,7 @@ class TestWrongEstimates:
         assert tracks.rejected[..., 1].sum() <= 10 * len(runs.q)
         assert not tracks.rejected[..., 0].any()
         true = runs.prepared.gyro_bias_rad_s[:, -1] + np.radians(degrees_s)
-        assert np.degrees(np.abs(tracks.gyro_bias_rad_s[:, -1] - true).max()) < 2e-3
+        assert np.degrees(np.abs(tracks.optional["gyro-bias"][:, -1] - true).max()) < 2e-3
         assert error_norm_deg(jumped, tracks)[:, 300:].max() < 0.01
 
     def test_a_gap_after_which_the_estimate_is_wrong(self) -> None:

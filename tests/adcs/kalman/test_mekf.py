@@ -63,7 +63,8 @@ from tests.calls import calls_of
 Array = NDArray[np.float64]
 Update = Callable[[Array, Array, Array], tuple[Array, Array]]
 ALL = ("st+gyro+mag+sun", ("field-bias", "gyro-bias", "disturbance"))
-EVERYTHING = (ALL[0], (*ALL[1], "field-model"))
+EVERYTHING = (ALL[0], (*ALL[1], "field-model", "dipole"))
+SIZE = settings(*EVERYTHING).sensors.size
 
 
 def filtered(sensors: str, states: tuple[str, ...], duration_s: float) -> tuple[AttitudeRuns, AttitudeTracks]:
@@ -84,11 +85,14 @@ def runs() -> AttitudeRuns:
 @pytest.fixture(scope="module")
 def state(runs: AttitudeRuns) -> State:
     rng = np.random.default_rng(2)
+    first = first_state(settings(*EVERYTHING), start_of(runs))
+    sizes = {"disturbance": 1e-6, "dipole": 0.05, "field-model": 2e-7}
+    optional = {state: size * rng.standard_normal((6, 3)) for state, size in sizes.items()}
     return replace(
-        first_state(settings(*EVERYTHING), start_of(runs)),
+        first,
         q=random_attitudes(6, rng),
         w=0.02 * rng.standard_normal((6, 3)),
-        disturbance_s2=1e-6 * rng.standard_normal((6, 3)),
+        optional={**first.optional, **optional},
     )
 
 
@@ -99,7 +103,7 @@ class TestJacobians:
     CHOSEN = settings(*EVERYTHING)
 
     def perturbed(self, state: State, column: int, sign: float, size: float) -> State:
-        dx = np.zeros((6, 18))
+        dx = np.zeros((6, SIZE))
         dx[:, column] = sign * size
         return with_error(state, dx, self.CHOSEN.sensors)
 
@@ -109,8 +113,8 @@ class TestJacobians:
         runs = replace(runs, readings=replace(runs.readings, star=star))
         # Angles and rates in steps of 1e-4, the field's bias in steps of 1e-9 T.
         for sensor, _, H in residuals(runs, 3, state, self.CHOSEN.sensors):
-            for column in range(18):
-                size = 1e-9 if 6 <= column < 9 or column >= 15 else self.STEP
+            for column in range(SIZE):
+                size = 1e-9 if 6 <= column < 9 or 15 <= column < 18 else self.STEP
                 at = [
                     residuals(runs, 3, self.perturbed(state, column, sign, size), self.CHOSEN.sensors)
                     for sign in (1.0, -1.0)
@@ -134,23 +138,29 @@ class TestJacobians:
         third power: its difference to scipy's exponential is less than the fourth.
         """
         ahead, Phi = predicted(runs, 3, state, self.CHOSEN)
-        ends = np.zeros((2, 6, 18, 18))
-        ends[:, :, 15:, 15:] = -np.eye(3) / self.CHOSEN.field_correlation_s
-        ends[0, :, :6, :6] = known_torque_jacobian(runs, 3, state.q, state.w)
-        ends[1, :, :6, :6] = known_torque_jacobian(runs, 4, ahead.q, ahead.w)
+        ends = np.zeros((2, 6, SIZE, SIZE))
+        ends[:, :, 15:18, 15:18] = -np.eye(3) / self.CHOSEN.field_correlation_s
+        for end, row, at in ((0, 3, state), (1, 4, ahead)):
+            ends[end, :, :6, :6] = known_torque_jacobian(runs, row, at)
+            b_body = quaternion.rotate_back(at.q, runs.environment.b_orbital_T[:, row])
+            # Column by column: the acceleration by a dipole of 1 A·m² along an axis.
+            for column, axis in enumerate(np.eye(3)):
+                acceleration = np.cross(axis, b_body) @ runs.satellite.body.inverse
+                ends[end, :, 3:6, 18 + column] = acceleration
         ends[:, :, 3:6, 12:15] = np.eye(3)
         mean = 0.5 * (ends[0] + ends[1])
         fourth = np.linalg.matrix_power(np.abs(mean), 4).max() / 24.0
         np.testing.assert_allclose(Phi, expm(mean), rtol=0, atol=1.1 * fourth)
         exact = expm(mean + (ends[1] @ ends[0] - ends[0] @ ends[1]) / 12.0)
-        for column in range(18):
+        for column in range(SIZE):
             one, other = (self.after(runs, self.perturbed(state, column, sign, self.STEP)) for sign in (1.0, -1.0))
             measured = (self.error(ahead, one) - self.error(ahead, other)) / (2.0 * self.STEP)
             np.testing.assert_allclose(measured, exact[..., column], rtol=0, atol=3e-6)
 
     def after(self, runs: AttitudeRuns, state: State) -> State:
         q, w = moved(runs, 3, state)
-        return replace(state, q=q, w=w, field_model_T=self.CHOSEN.field_decay(runs.dt_s) * state.field_model_T)
+        model = {"field-model": self.CHOSEN.field_decay(runs.dt_s) * state.of("field-model")}
+        return replace(state, q=q, w=w, optional={**state.optional, **model})
 
     def error(self, state: State, other: State) -> Array:
         return difference(other, state, self.CHOSEN.sensors)
@@ -219,14 +229,11 @@ class TestCompiledTwin:
             getattr(runs.readings, name)[:, 10 + i : 40 : 7] = np.nan
         fast, slow = run_filter(runs, chosen, start), run_readable(runs, chosen, start)
         np.testing.assert_allclose(fast.q, slow.q, rtol=0, atol=1e-13)
-        for name, scale in (
-            ("w", 1e-3),
-            ("field_bias_T", 1e-6),
-            ("gyro_bias_rad_s", 1e-3),
-            ("disturbance_s2", 1e-6),
-            ("field_model_T", 1e-6),
-        ):
-            np.testing.assert_allclose(getattr(fast, name), getattr(slow, name), rtol=0, atol=1e-10 * scale)
+        scales = {"field-bias": 1e-6, "disturbance": 1e-6, "field-model": 1e-6, "dipole": 0.1}
+        for name, values in slow.states.items():
+            atol = 1e-10 * scales.get(name, 1e-3)
+            np.testing.assert_allclose(fast.states[name], values, rtol=0, atol=atol)
+        assert list(fast.states) == list(slow.states)
         by_deviations = slow.sigma[..., :, None] * slow.sigma[..., None, :]
         np.testing.assert_allclose(fast.covariance / by_deviations, slow.covariance / by_deviations, rtol=0, atol=1e-9)
         np.testing.assert_allclose(fast.nis, slow.nis, rtol=1e-7, atol=1e-7)
@@ -419,6 +426,7 @@ class TestConsistency:
         ("st", ("disturbance",)),
         ("mag+sun", ("disturbance",)),
         ("mag+sun+gyro", ("gyro-bias", "disturbance")),
+        ("mag+sun", ("disturbance", "dipole")),
     )
 
     def check(self, sensors: str, states: tuple[str, ...], seeds: range) -> None:
@@ -473,9 +481,9 @@ class TestFieldModel:
     def test_transition(self, runs: AttitudeRuns) -> None:
         """The variance stays what it is, and the state decays."""
         chosen = replace(settings("mag+sun", ["field-model"]), field_error_T=2e-7, field_correlation_s=50.0)
-        state = replace(first_state(chosen, start_of(runs)), field_model_T=np.full((6, 3), 1e-7))
+        state = replace(first_state(chosen, start_of(runs)), optional={"field-model": np.full((6, 3), 1e-7)})
         after, Phi = predicted(runs, 0, state, chosen)
-        np.testing.assert_allclose(after.field_model_T, 1e-7 * math.exp(-1.0 / 50.0))
+        np.testing.assert_allclose(after.optional["field-model"], 1e-7 * math.exp(-1.0 / 50.0))
         np.testing.assert_allclose(np.diagonal(after.P[:, 6:, 6:], axis1=1, axis2=2), 4e-14)
         np.testing.assert_allclose(Phi[:, 6:, 6:], np.tile(math.exp(-1.0 / 50.0) * np.eye(3), (6, 1, 1)))
 
@@ -572,16 +580,12 @@ class TestAccuracy:
         runs, _ = runs_for(chosen.sensors, 100.0, range(3))
         error = np.array([1e-3, -2e-3, 3e-3])
         q = quaternion.multiply(runs.q, quaternion.conjugate(quaternion.from_error_vector(error)))
-        zero = np.zeros_like(runs.w)
         covariance = np.tile(np.diag(np.repeat([1e-6, 1e-8, 1e-8], 3)), (3, 101, 1, 1))
         estimates = AttitudeTracks(
             chosen,
             q,
             runs.w - 1e-4,
-            zero,
-            runs.prepared.gyro_bias_rad_s,
-            zero,
-            zero,
+            {"gyro-bias": runs.prepared.gyro_bias_rad_s},
             covariance,
             np.zeros((3, 101, 4)),
             np.zeros((3, 101, 4), dtype=np.bool_),

@@ -57,7 +57,7 @@ class TestParallelFilter:
         apart, together = run_parallel(runs, chosen, start, forgetting=1.0), run_filter(runs, chosen, start)
         scale = together.sigma[:, 20:]
         np.testing.assert_allclose(apart.sigma[:, 20:], scale, rtol=1e-3)
-        difference = np.abs(apart.disturbance_s2 - together.disturbance_s2)[:, 20:]
+        difference = np.abs(apart.optional["disturbance"] - together.optional["disturbance"])[:, 20:]
         assert (difference < 0.02 * scale[..., 6:]).all()
 
     def test_covariance_has_the_disturbance_in_it(self) -> None:

@@ -354,6 +354,28 @@ class TestKernels:
             for one, twin in zip(compiled, expected, strict=True):
                 np.testing.assert_allclose(one, twin[i], rtol=0, atol=1e-15)
 
+    def test_a_dipole_besides_the_residual_one(self) -> None:
+        """Of torque, step and Jacobian: the same as a body with the sum of both."""
+        rng = np.random.default_rng(18)
+        q, w, k = random_state(rng)
+        extra = np.array([0.01, -0.02, 0.03])
+        both = dynamics.RigidBody(MAGNETIC.inertia_kgm2, MAGNETIC.residual_dipole_Am2 + extra)
+        around = GRAVITY, B
+        for one, other in (
+            (dynamics.environment_torque(MAGNETIC, q, *around, extra), dynamics.environment_torque(both, q, *around)),
+            (
+                dynamics.error_jacobian(MAGNETIC, q, w, k, *around, extra),
+                dynamics.error_jacobian(both, q, w, k, *around),
+            ),
+            (
+                dynamics.step(MAGNETIC, q, w, k, ZERO, ZERO, RATE, *around, 1.0, extra)[1],
+                dynamics.step(both, q, w, k, ZERO, ZERO, RATE, *around, 1.0)[1],
+            ),
+        ):
+            np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-16)
+        compiled = rigid_body.with_dipole(rigid_body.Body.of(MAGNETIC), tuple(extra))
+        np.testing.assert_allclose(compiled.dipole, both.residual_dipole_Am2, rtol=1e-15)
+
     @pytest.mark.parametrize("limits", [(5e-3, 0.17), (1e-4, 5e-3)])
     def test_control_agrees_with_its_twin(self, limits: tuple[float, float]) -> None:
         control = replace(CONTROL, torque_limit_Nm=limits[0], momentum_limit_Nms=limits[1])

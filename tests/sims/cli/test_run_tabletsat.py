@@ -26,6 +26,7 @@ KEYS = [
     "field_bias_rms_nT",
     "disturbance_rms_s2",
     "field_model_rms_nT",
+    "dipole_rms_Am2",
     "nees_per_dimension",
     "diverged_runs",
     "runs",
@@ -45,7 +46,7 @@ def numbers(outcome):
 class TestNumbers:
     def test_keys_and_nulls(self, adcs):
         found = numbers(adcs("run", "tabletsat", "--json", "--seeds", "2", "--sensors", "st"))
-        assert [key for key in KEYS if found[key] is None] == [*KEYS[2:6], "worst_deg"]
+        assert [key for key in KEYS if found[key] is None] == [*KEYS[2:7], "worst_deg"]
         assert (found["runs"], found["diverged_runs"]) == (2, 0)
 
     def test_runs_is_seeds_and_they_count_from_seed(self, adcs):
@@ -116,7 +117,7 @@ class TestNumbers:
         runs, estimates = part.runs, part.estimates
         late, true_bias = slice(-60, None), runs.prepared.gyro_bias_rad_s
         angle = 2.0 * quaternion.error_vector(estimates.q, runs.q)
-        differences = angle, runs.w - estimates.w, true_bias - estimates.gyro_bias_rad_s
+        differences = angle, runs.w - estimates.w, true_bias - estimates.optional["gyro-bias"]
         worst = [np.degrees(np.sqrt(np.mean(one[:, late] ** 2, axis=1)).mean(axis=0).max()) for one in differences]
         whole = np.concatenate([0.5 * angle, *differences[1:]], axis=-1)[:, late, :, None]
         nees = (whole.mT @ np.linalg.inv(estimates.covariance[:, late]) @ whole).mean() / 9.0
@@ -127,6 +128,7 @@ class TestNumbers:
             "field_bias_rms_nT": None,
             "disturbance_rms_s2": None,
             "field_model_rms_nT": None,
+            "dipole_rms_Am2": None,
             "nees_per_dimension": nees,
             "diverged_runs": 0,
             "runs": 3,
