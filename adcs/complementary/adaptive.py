@@ -32,13 +32,13 @@ class AdaptiveTuning:
     second_sigma_rad : float
         Of the direction of the second one.
     attitude_noise_rad, bias_noise_rad_s : float
-        Growth of the errors of attitude and bias in a step.
+        Growth of the errors of attitude and bias in a usual step; a longer one has more, as a random walk has.
     memory : float
         Of the smoothed NIS.
     threshold : float
         Smoothed NIS for each degree of freedom, 1 on average, above which the bias is taken to change.
     growth_rad_s : float
-        By which the bias's standard deviation then grows in a step, in the root of the sum of squares.
+        By which the bias's standard deviation then grows in a usual step, in the root of the sum of squares.
     start_attitude_rad, start_bias_rad_s : float
         Standard deviations at the start, each axis.
 
@@ -111,8 +111,8 @@ def adaptive_track(
         record.n_runs,
         Record.of(record),
         np.array([tuning.first_sigma, tuning.second_sigma_rad]),
-        np.array([tuning.attitude_noise_rad, tuning.bias_noise_rad_s]),
-        np.array([tuning.memory, tuning.threshold, tuning.growth_rad_s]),
+        np.square([tuning.attitude_noise_rad, tuning.bias_noise_rad_s]) / record.usual_dt_s,
+        np.array([tuning.memory, tuning.threshold, tuning.growth_rad_s**2 / record.usual_dt_s]),
         track.q,
         track.bias_rad_s,
         track.covariance,
@@ -132,10 +132,18 @@ def adaptive_steps(
 
     Yields ``q`` (4,), ``bias`` (3,), ``covariance`` (6, 6).
     """
-    h = record.dt_s
     shared = 0 if record.first_reference.shape[0] == 1 else run
-    q, bias, P, smoothed = first_attitude(q_start), np.zeros(3), tuning.start_covariance, 1.0
+    q, bias, P, smoothed, growth = first_attitude(q_start), np.zeros(3), tuning.start_covariance, 1.0, 0.0
     for i in range(len(record)):
+        if i > 0:
+            h = float(record.dt_s[i])
+            w = record.rate_rad_s[run, i] - bias
+            Phi = np.eye(6)
+            Phi[:3, :3] = quaternion.matrix(quaternion.exp(w * h)).T
+            Phi[:3, 3:] = -h * np.eye(3)
+            noise = np.repeat([tuning.attitude_noise_rad**2, tuning.bias_noise_rad_s**2 + growth**2], 3)
+            P = Phi @ P @ Phi.T + np.diag(noise) * h / record.usual_dt_s
+            q = turned(q, w * h, record.frame_rate_rad_s[shared, i] * h)
         rows, residuals, variances = [], [], []
         first, second = record.first_body[run, i], record.second_body[run, i]
         for measured, reference, sigma in (
@@ -161,14 +169,6 @@ def adaptive_steps(
             bias = bias + x[3:]
             nis = float(nu @ np.linalg.solve(S, nu)) / len(nu)
             smoothed = tuning.memory * smoothed + (1.0 - tuning.memory) * nis
-        yield q, bias, P
-        w = record.rate_rad_s[run, i] - bias
-        Phi = np.eye(6)
-        Phi[:3, :3] = quaternion.matrix(quaternion.exp(w * h)).T
-        Phi[:3, 3:] = -h * np.eye(3)
         # Only readings show that the bias changes.
         growth = tuning.growth_rad_s if rows and smoothed > tuning.threshold else 0.0
-        P = Phi @ P @ Phi.T + np.diag(
-            np.repeat([tuning.attitude_noise_rad**2, tuning.bias_noise_rad_s**2 + growth**2], 3)
-        )
-        q = turned(q, w * h, record.frame_rate_rad_s[shared, i] * h)
+        yield q, bias, P

@@ -106,7 +106,7 @@ BEST_GAINS = Gains()
 
 @dataclass(frozen=True, eq=False)
 class ComplementaryTrack:
-    """Estimates of every run at every instant, before its readings."""
+    """Estimates of every run at every instant, with its readings."""
 
     q: FloatArray  # (R, n, 4): reference from body
     integral_rad_s: FloatArray  # (R, n, 3): I; minus the bias of the gyro
@@ -156,7 +156,7 @@ def compiled_track(
     """
     from adcs.complementary.filters_compiled import Outage, Record, Weights, complementary
 
-    gains.check(record.dt_s)
+    gains.check(record.usual_dt_s)
     shape = (record.n_runs, len(record))
     q, integral, measured = np.empty((*shape, 4)), np.zeros((*shape, 3)), np.full((*shape, 4), np.nan)
     if len(record) == 0:
@@ -172,13 +172,20 @@ def compiled_track(
             np.array([gains.boost, gains.boost_level_rad, gains.boost_memory]),
         ),
         method,
-        Outage(substitute_code(substitution), delay_steps(substitution, record.dt_s)),
+        counted_s(record, gains),
+        Outage(substitute_code(substitution), delay_steps(substitution, record.usual_dt_s)),
         mu,
         q,
         integral,
         measured,
     )
     return ComplementaryTrack(q, integral, measured)
+
+
+def counted_s(record: VectorRecord, gains: Gains) -> FloatArray:
+    """How long the vectors of each instant count, (n,): the step before it, after a gap what makes K_P·h·2 = 1."""
+    after_gap = 0.5 / gains.largest_kp_per_s if gains.largest_kp_per_s else math.inf
+    return np.minimum(record.dt_s, max(record.usual_dt_s, after_gap))
 
 
 def first_attitude(q_start: ArrayLike) -> FloatArray:
@@ -207,12 +214,16 @@ def steps(
     :class:`adcs.complementary.gauss_newton.MeasuredQuaternion`. ``gains``, ``q_start``, ``substitution``: as
     :func:`explicit_track`. Yields ``q`` (4,), ``integral`` (3,).
     """
-    h = record.dt_s
     shared = 0 if record.first_reference.shape[0] == 1 else run
     q, integral, smooth = first_attitude(q_start), np.zeros(3), np.zeros(3)
-    line = Substitute(substitution, delay_steps(substitution, h))
+    line = Substitute(substitution, delay_steps(substitution, record.usual_dt_s))
+    counted = counted_s(record, gains)
     for i in range(len(record)):
-        yield q, integral
+        if i > 0:
+            body_rad = (record.rate_rad_s[run, i] + integral) * record.dt_s[i]
+            frame_rad = record.frame_rate_rad_s[shared, i] * record.dt_s[i]
+            line.turn(body_rad, frame_rad)
+            q = turned(q, body_rad, frame_rad)
         first = _unit(record.first_body[run, i]), _unit(record.first_reference[shared, i])
         second = _unit(record.second_body[run, i]), _unit(record.second_reference[shared, i])
         outage = bool(np.isnan(second[0]).any())
@@ -221,11 +232,10 @@ def steps(
         smooth = gains.boost_memory * smooth + (1.0 - gains.boost_memory) * e
         if np.linalg.norm(smooth) > gains.boost_level_rad:
             ki *= gains.boost
-        integral = integral + ki * h * e
-        w = record.rate_rad_s[run, i] + integral
-        frame = record.frame_rate_rad_s[shared, i]
-        line.turn(first, w * h, frame * h)
-        q = turned(q, (w + kp * e) * h, frame * h)
+        integral = integral + ki * counted[i] * e
+        line.store(first)
+        q = quaternion.normalised(quaternion.multiply(q, quaternion.exp(kp * counted[i] * e)))
+        yield q, integral
 
 
 def turned(q: FloatArray, body_rad: FloatArray, frame_rad: FloatArray) -> FloatArray:

@@ -22,10 +22,9 @@ from adcs.complementary.inertial_magnetic import (
 from adcs.complementary.names import MAGNETS, METHODS, Magnet, Method
 from adcs.satellite.attitude_track import AttitudeTrack
 from adcs.satellite.telemetry import is_read
-from adcs.satellite.vector_record import VectorRecord
+from adcs.satellite.vector_record import GyroSamples, VectorRecord, step_rates, steps_s
 from arrays.typing import FloatArray
 
-_STEP_TOLERANCE = 1e-2
 _NAMES = ("first vector", "second vector")
 
 
@@ -37,17 +36,18 @@ def complementary_filter(
     *,
     method: Method = "explicit",
     settings: Gains | AdaptiveTuning | None = None,
+    gyro_samples: GyroSamples = "mean",
 ) -> AttitudeTrack:
     """Attitude from a gyro and two vectors, such as those of an IMU, in a frame that does not turn.
 
-    It starts where the first readings of both vectors put it.
+    It starts where the first readings of both vectors put it, and has used all that was read up to each instant.
 
     Parameters
     ----------
     time_s : array_like, shape (n,)
-        In equal steps.
+        Ascending, in any steps.
     gyro_rad_s : array_like, shape (n, 3)
-        Rate, body axes.
+        Rate, body axes; where NaN, the last one is held, and the next one makes up for it.
     body_vectors : two array_like, shape (n, 3)
         What is measured, of any length, such as acceleration and field; NaN where missing.
     frame_vectors : two array_like, shape (3,) or (n, 3)
@@ -57,16 +57,19 @@ def complementary_filter(
         that lets the bias change where its innovations grow: its first vector is to be a field in tesla.
     settings : Gains or AdaptiveTuning, optional
         By default those of a satellite with a magnetometer of 1000 nT, which forget the start in a minute.
+    gyro_samples : str
+        A sample is the ``mean`` rate since the one before, as of a gyro that integrates or filters, or the rate at its
+        ``point`` in time.
 
     Returns
     -------
     AttitudeTrack
-        Frame from body; with gains, the estimate before the readings of each instant.
+        Frame from body.
 
     Raises
     ------
     ValueError
-        A shape does not match, the steps differ, a vector is zero, or the filter would be unstable.
+        A shape does not match, the times do not ascend, a vector is zero, or the filter would be unstable.
 
     Examples
     --------
@@ -82,7 +85,7 @@ def complementary_filter(
     if method not in METHODS:
         raise ValueError(f"Input method must be one of {', '.join(METHODS)}; instead received {method!r}.")
     times = np.asarray(time_s, dtype=np.float64)
-    step_s = _step_s(times)
+    dt_s = steps_s(times)
     for name, vectors in (("body_vectors", body_vectors), ("frame_vectors", frame_vectors)):
         if len(vectors) != 2:
             raise ValueError(f"Input {name} must be two vectors; instead received {len(vectors)}.")
@@ -90,7 +93,7 @@ def complementary_filter(
     body = [np.asarray(v, dtype=np.float64) for v in body_vectors]
     frame = [np.broadcast_to(np.asarray(v, dtype=np.float64), (len(times), 3)) for v in frame_vectors]
     vectors = body[0], body[1], frame[0], frame[1]
-    record = VectorRecord(step_s, rate, *vectors, np.zeros_like(rate))
+    record = VectorRecord(dt_s, step_rates(rate, dt_s, gyro_samples), *vectors, np.zeros_like(rate))
     start = _first_attitude(body, frame)
     sigma: dict[str, FloatArray] = {}
     if method == "adaptive":
@@ -121,6 +124,7 @@ def inertial_magnetic_filter(
     field_T: ArrayLike,
     *,
     magnet: Magnet = "subtracted",
+    gyro_samples: GyroSamples = "mean",
 ) -> AttitudeTrack:
     """Attitude of an inertial unit with a magnetometer that is moved by hand, with magnets near it or not.
 
@@ -130,12 +134,14 @@ def inertial_magnetic_filter(
     Parameters
     ----------
     time_s : array_like, shape (n,)
-        In equal steps.
+        Ascending, in any steps.
     gyro_rad_s, acceleration_m_s2, field_T : array_like, shape (n, 3)
-        Body axes; at rest the acceleration is upwards.
+        Body axes; at rest the acceleration is upwards. NaN where a sensor has no reading.
     magnet : str
         A field that moves with the sensor is ``subtracted`` as it is estimated beside the heading; or readings of an
         unusual length or dip are ``rejected``; or all are ``kept``.
+    gyro_samples : str
+        As of :func:`adcs.complementary_filter`.
 
     Returns
     -------
@@ -145,7 +151,7 @@ def inertial_magnetic_filter(
     Raises
     ------
     ValueError
-        A shape does not match, the steps differ, a value is missing, or a vector is zero.
+        A shape does not match, the times do not ascend, a sensor has no first reading, or a vector is zero.
 
     Examples
     --------
@@ -161,7 +167,7 @@ def inertial_magnetic_filter(
     times, rate, acceleration, field = (
         np.asarray(values, dtype=np.float64) for values in (time_s, gyro_rad_s, acceleration_m_s2, field_T)
     )
-    prepared = prepare(InertialMagneticRecord(_step_s(times), rate, acceleration, field))
+    prepared = prepare(InertialMagneticRecord(times, rate, acceleration, field, gyro_samples))
     used = prepared.field_T
     if magnet == "subtracted":
         used = used - sensor_fixed_field(prepared)
@@ -172,17 +178,10 @@ def inertial_magnetic_filter(
         time_s=times,
         rows=np.arange(len(times)),
         q=inertial_magnetic_track(prepared, used),
-        states={"rate": prepared.rate_rad_s, "gyro-bias": rate - prepared.rate_rad_s},
+        states={"rate": prepared.rate_rad_s, "gyro-bias": prepared.bias_rad_s},
         used=("accelerometer", "magnetometer"),
-        seen={"accelerometer": np.ones(len(times), dtype=np.bool_), "magnetometer": is_read(used)},
+        seen={"accelerometer": is_read(acceleration), "magnetometer": is_read(used)},
     )
-
-
-def _step_s(times: FloatArray) -> float:
-    steps = np.diff(times)
-    if times.ndim != 1 or len(times) < 2 or not np.ptp(steps) <= _STEP_TOLERANCE * steps.mean():
-        raise ValueError("Input time_s must ascend in equal steps; instead received others.")
-    return float(steps.mean())
 
 
 _Settings = TypeVar("_Settings", Gains, AdaptiveTuning)

@@ -36,7 +36,7 @@ _NONE: Vector = (0.0, 0.0, 0.0)
 
 
 class Record(NamedTuple):
-    """Rates, vectors and references (R or 1, n, 3), and what the frame turns by to the next instant (R or 1, n, 4)."""
+    """Rates, vectors, references (R or 1, n, 3), turns of the frame (R or 1, n, 4) in the steps (n,) that end now."""
 
     rate: Array
     first: Array
@@ -44,7 +44,7 @@ class Record(NamedTuple):
     first_reference: Array
     second_reference: Array
     frame_turn: Array
-    dt: float
+    dt: Array
 
     @classmethod
     def of(cls, record: VectorRecord) -> Record:
@@ -55,7 +55,7 @@ class Record(NamedTuple):
             record.second_body,
             record.first_reference,
             record.second_reference,
-            quaternion.exp(record.frame_rate_rad_s * record.dt_s),
+            quaternion.exp(record.frame_rate_rad_s * record.dt_s[:, None]),
             record.dt_s,
         )
 
@@ -156,6 +156,7 @@ def complementary(
     record: Record,
     weighting: Weights,
     method: int,
+    counted: Array,
     outage: Outage,
     mu: float,
     q: Array,
@@ -164,7 +165,8 @@ def complementary(
 ) -> None:
     """Runs begin to end of a complementary filter, from the first rows of ``q`` (R, n, 4) and ``integral`` (R, n, 3).
 
-    ``q_measured`` (R, n, 4) gets the measured quaternions of the filter that has them.
+    ``counted`` (n,) is how long the vectors of each instant count. ``q_measured`` (R, n, 4) gets the measured
+    quaternions of the filter that has them.
     """
     rate, first, second, first_reference, second_reference, frame_turn, dt = record
     weights, gains, boost = weighting
@@ -181,8 +183,14 @@ def complementary(
         p: Quaternion = (1.0, 0.0, 0.0, 0.0)
         c: Quaternion = (1.0, 0.0, 0.0, 0.0)
         for i in range(n):
-            q[r, i, 0], q[r, i, 1], q[r, i, 2], q[r, i, 3] = q_now
-            integral[r, i, 0], integral[r, i, 1], integral[r, i, 2] = total
+            if i > 0:
+                w = combined(vector_at(rate[r, i]), 1.0, total)
+                turn = exp((w[0] * dt[i], w[1] * dt[i], w[2] * dt[i]))
+                frame = quaternion_at(frame_turn[k, i])
+                if substitute == TRANSPORTED:
+                    p = normalised(multiply(p, turn))
+                    c = normalised(multiply(c, frame))
+                q_now = normalised(multiply(multiply(conjugate(frame), q_now), turn))
             b, b_reference = unit(vector_at(first[r, i])), unit(vector_at(first_reference[k, i]))
             s, s_reference = unit(vector_at(second[r, i])), unit(vector_at(second_reference[k, i]))
             in_outage = not is_there(s)
@@ -218,15 +226,11 @@ def complementary(
             smooth = combined((boost[2] * smooth[0], boost[2] * smooth[1], boost[2] * smooth[2]), 1.0 - boost[2], e)
             if dot(smooth, smooth) > boost[1] * boost[1]:
                 ki *= boost[0]
-            total = combined(total, ki * dt, e)
-            w = combined(vector_at(rate[r, i]), 1.0, total)
-            frame = quaternion_at(frame_turn[k, i])
-            if substitute == TRANSPORTED:
-                p = normalised(multiply(p, exp((w[0] * dt, w[1] * dt, w[2] * dt))))
-                c = normalised(multiply(c, frame))
-            w = combined(w, kp, e)
-            turned = multiply(multiply(conjugate(frame), q_now), exp((w[0] * dt, w[1] * dt, w[2] * dt)))
-            q_now = normalised(turned)
+            total = combined(total, ki * counted[i], e)
+            angle = kp * counted[i]
+            q_now = normalised(multiply(q_now, exp((angle * e[0], angle * e[1], angle * e[2]))))
+            q[r, i, 0], q[r, i, 1], q[r, i, 2], q[r, i, 3] = q_now
+            integral[r, i, 0], integral[r, i, 1], integral[r, i, 2] = total
 
 
 @compiled
@@ -308,8 +312,8 @@ def adaptive(
 ) -> None:
     """Runs begin to end of the adaptive error-state filter from the first rows of ``q``, ``bias`` and ``covariance``.
 
-    ``sigmas`` are those of the first vector (in its unit) and of the unit second one, ``noises`` the growth of attitude
-    and bias in a step, ``adaptation`` (memory, threshold, growth of the bias above it).
+    ``sigmas`` are those of the first vector (in its unit) and of the unit second one, ``noises`` the growth in a second
+    of the variances of attitude and bias, ``adaptation`` (memory, threshold, that of the bias above it).
     """
     rate, first, second, first_reference, second_reference, frame_turn, dt = record
     n = rate.shape[1]
@@ -321,8 +325,13 @@ def adaptive(
         b_now = vector_at(bias[r, 0])
         P[:] = covariance[r, 0]
         smooth = 1.0
+        extra = 0.0
         for i in range(n):
-            # The estimate at an instant has seen its readings, unlike that of the complementary filters.
+            if i > 0:
+                w = combined(vector_at(rate[r, i]), -1.0, b_now)
+                _predict(P, w, dt[i], noises[0] * dt[i], (noises[1] + extra) * dt[i], M)
+                turn = exp((w[0] * dt[i], w[1] * dt[i], w[2] * dt[i]))
+                q_now = normalised(multiply(multiply(conjugate(quaternion_at(frame_turn[k, i])), q_now), turn))
             x[:] = 0.0
             nis = 0.0
             dof = 0.0
@@ -344,12 +353,8 @@ def adaptive(
             if dof > 0.0:
                 smooth = adaptation[0] * smooth + (1.0 - adaptation[0]) * nis / dof
                 if smooth > adaptation[1]:
-                    extra = adaptation[2] ** 2
+                    extra = adaptation[2]
             q[r, i, 0], q[r, i, 1], q[r, i, 2], q[r, i, 3] = q_now
             bias[r, i, 0], bias[r, i, 1], bias[r, i, 2] = b_now
             covariance[r, i] = P
             smoothed_nis[r, i] = smooth
-            w = combined(vector_at(rate[r, i]), -1.0, b_now)
-            _predict(P, w, dt, noises[0] ** 2, noises[1] ** 2 + extra, M)
-            turn = exp((w[0] * dt, w[1] * dt, w[2] * dt))
-            q_now = normalised(multiply(multiply(conjugate(quaternion_at(frame_turn[k, i])), q_now), turn))

@@ -9,15 +9,15 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adcs import quaternion
 from adcs.complementary.explicit import Gains, explicit_track
-from adcs.satellite.vector_record import VectorRecord
-from arrays.io.errors import check_positive
-from arrays.typing import FloatArray
+from adcs.satellite.vector_record import GyroSamples, VectorRecord, step_rates, steps_s
+from arrays.typing import BoolArray, FloatArray
 
-GRAVITY_TIME_S = 2.0
-"""Time constant of the low-pass of the acceleration."""
+GRAVITY_TIME_S = 3.0
+"""Time constant of the low-pass of the acceleration, as published for VQF."""
 HEADING_TIME_S = 5.0
 """Time constant with which the heading follows the field."""
 _UP_STEP = 0.15  # part of the tilt's error that a step corrects: the direction up is smooth already
@@ -30,40 +30,58 @@ _LONGEST_LAG_S = 0.04
 
 @dataclass(frozen=True, eq=False)
 class InertialMagneticRecord:
-    """Readings of one sensor at n instants.
+    """Readings of one sensor at n instants, NaN where one has none.
 
     Attributes
     ----------
+    time_s : ndarray, shape (n,)
+        Ascending, in any steps.
     rate_rad_s, acceleration_m_s2, field_T : ndarray, shape (n, 3)
         The acceleration is 9.8 m/s² upwards at rest.
+    gyro_samples : str
+        What a sample of the gyro is: see :func:`adcs.satellite.vector_record.step_rates`.
 
     Raises
     ------
     ValueError
-        The shapes do not match, a value is not finite, a vector is zero, or there is less than a second.
+        The times do not ascend, the shapes do not match, a value is infinite, a sensor is not read at the start, a
+        vector is zero, or there is less than a second.
     """
 
-    dt_s: float
+    time_s: FloatArray
     rate_rad_s: FloatArray
     acceleration_m_s2: FloatArray
     field_T: FloatArray
+    gyro_samples: GyroSamples = "mean"
 
     def __post_init__(self) -> None:
-        check_positive(dt_s=self.dt_s)
-        shape = np.shape(self.rate_rad_s)
-        if len(shape) != 2 or shape[1] != 3 or shape[0] * self.dt_s < 1.0:
-            raise ValueError(f"Input rate_rad_s must be rows of 3 for a second at least; instead received {shape}.")
+        object.__setattr__(self, "time_s", np.asarray(self.time_s, dtype=np.float64))
+        shape = (len(steps_s(self.time_s)), 3)
+        if np.ptp(self.time_s) < 1.0:
+            raise ValueError(f"Input time_s must last a second at least; instead received {np.ptp(self.time_s):g} s.")
         for name in ("rate_rad_s", "acceleration_m_s2", "field_T"):
             values = np.asarray(getattr(self, name), dtype=np.float64)
-            if values.shape != shape or not np.isfinite(values).all():
+            if values.shape != shape or np.isinf(values).any():
                 raise ValueError(f"Input {name} must be finite, of shape {shape}; instead received {values.shape}.")
+            if not np.isfinite(values[self.starting]).all(axis=1).any():
+                raise ValueError(f"Input {name} must have a reading within the first second; instead received none.")
             if name != "rate_rad_s" and (values == 0.0).all(axis=1).any():
                 raise ValueError(f"Input {name} must have a length; instead received a zero vector.")
             object.__setattr__(self, name, values)
 
+    @property
+    def dt_s(self) -> FloatArray:
+        """Steps (n,) that end at each instant."""
+        return steps_s(self.time_s)
+
+    @property
+    def starting(self) -> BoolArray:
+        """Which instants are within the first second (n,)."""
+        return self.time_s < self.time_s[0] + 1.0
+
     def __len__(self) -> int:
         """Return the number of instants."""
-        return len(self.rate_rad_s)
+        return len(self.time_s)
 
 
 def rest_bias(record: InertialMagneticRecord) -> FloatArray:
@@ -71,20 +89,30 @@ def rest_bias(record: InertialMagneticRecord) -> FloatArray:
 
     Returns (n, 3): zero where the sensor never rests [rad/s].
     """
-    window = max(2, round(_REST_S / record.dt_s))
-    count = len(record) // window
-    rates = record.rate_rad_s[: count * window].reshape(count, window, 3)
-    accelerations = record.acceleration_m_s2[: count * window].reshape(count, window, 3)
-    rest = (rates.std(axis=1).max(axis=1) < _REST_RATE_RAD_S) & (
-        accelerations.std(axis=1).max(axis=1) < _REST_ACCELERATION_M_S2
-    )
-    found = rates[rest].mean(axis=1)
+    window = np.floor((record.time_s - record.time_s[0]) / _REST_S * (1.0 + 1e-9)).astype(np.intp)
+    rate, scatter = _by_window(record.rate_rad_s, window)
+    rest = (scatter < _REST_RATE_RAD_S) & (_by_window(record.acceleration_m_s2, window)[1] < _REST_ACCELERATION_M_S2)
+    found = rate[rest]
     if len(found) == 0:
         return np.zeros((len(record), 3))
     means = np.array([found[max(0, i - 19) : i + 1].mean(axis=0) for i in range(len(found))])
     # A rest is known at its end.
-    latest = np.maximum(np.cumsum(np.concatenate([[False], rest])) - 1, 0)
-    return means[latest[np.minimum(np.arange(len(record)) // window, count)]]
+    latest = np.maximum(np.cumsum(np.concatenate([[False], rest[:-1]])) - 1, 0)
+    return means[latest[window]]
+
+
+def _by_window(values: FloatArray, window: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+    """Means (k, 3) and the largest standard deviation (k,) of each window's readings; inf where half of them miss."""
+    seen = np.isfinite(values).all(axis=1)
+    counts = np.bincount(window[seen], minlength=window[-1] + 1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        means, squares = (
+            np.stack([np.bincount(window[seen], column[seen], window[-1] + 1) / counts for column in array.T], axis=1)
+            for array in (values, (values - values[seen].mean(axis=0)) ** 2)
+        )
+        variance = squares - (means - values[seen].mean(axis=0)) ** 2
+    scatter = np.sqrt(np.maximum(variance, 0.0).max(axis=1))
+    return means, np.where(2 * counts < np.median(counts), np.inf, scatter)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,12 +123,18 @@ class Prepared:
     unknown start.
     """
 
-    dt_s: float
-    rate_rad_s: FloatArray  # (n, 3): less the bias
+    time_s: FloatArray  # (n,)
+    rate_rad_s: FloatArray  # (n, 3): less the bias, the mean over the step that ends at each instant
+    bias_rad_s: FloatArray  # (n, 3)
     up: FloatArray  # (n, 3): unit vector, body axes
     field_T: FloatArray  # (n, 3): turned by the gyro to where it would be without the magnetometer's lag
     q_level: FloatArray
     lag_s: float  # of the magnetometer behind the gyro
+
+    @property
+    def starting(self) -> BoolArray:
+        """Which instants are within the first second (n,)."""
+        return self.time_s < self.time_s[0] + 1.0
 
 
 def prepare(record: InertialMagneticRecord) -> Prepared:
@@ -108,15 +142,17 @@ def prepare(record: InertialMagneticRecord) -> Prepared:
 
     Everything but the lag, for which the whole record is used, is what can be known at the time.
     """
-    rate = record.rate_rad_s - rest_bias(record)
-    q_gyro = _integrated(rate, record.dt_s)
+    bias = rest_bias(record)
+    rate = step_rates(record.rate_rad_s - bias, record.dt_s, record.gyro_samples)
+    missing = np.full_like(rate, np.nan)
+    gyro_alone = _vector_record(record.time_s, rate, missing, missing)
+    q_gyro = explicit_track(gyro_alone, Gains(0.0, 0.0)).q[0]
     up = _up(q_gyro, record)
-    lag = _lag_samples(q_gyro, record)
-    field_T = _without_lag(q_gyro, record.field_T, round(lag))
-    missing = np.full_like(up, np.nan)
-    vectors = _vector_record(record.dt_s, rate, missing, up)
-    q_level = explicit_track(vectors, _gains(record.dt_s), q_start=_attitude(up[0], _across(up[0]))).q[0]
-    return Prepared(record.dt_s, rate, up, field_T, q_level, lag * record.dt_s)
+    lag = _lag_s(q_gyro, record)
+    field_T = _without_lag(q_gyro, record.time_s, record.field_T, lag)
+    vectors = _vector_record(record.time_s, rate, missing, up)
+    q_level = explicit_track(vectors, _gains(vectors), q_start=_attitude(up[0], _across(up[0]))).q[0]
+    return Prepared(record.time_s, rate, bias, up, field_T, q_level, lag)
 
 
 def inertial_magnetic_track(prepared: Prepared, field_T: FloatArray) -> FloatArray:
@@ -126,13 +162,12 @@ def inertial_magnetic_track(prepared: Prepared, field_T: FloatArray) -> FloatArr
     north, up from body.
     """
     horizontal = field_T - np.sum(field_T * prepared.up, axis=1, keepdims=True) * prepared.up
-    first = horizontal[: round(1.0 / prepared.dt_s)]
+    first = horizontal[prepared.starting]
     first = first[np.isfinite(first).all(axis=1)]
     if len(first) == 0:
         raise ValueError("Input field_T must be there within the first second; instead received none.")
-    vectors = _vector_record(prepared.dt_s, prepared.rate_rad_s, horizontal, prepared.up)
-    gains = _gains(prepared.dt_s)
-    return explicit_track(vectors, gains, q_start=_attitude(prepared.up[0], first.mean(axis=0))).q[0]
+    vectors = _vector_record(prepared.time_s, prepared.rate_rad_s, horizontal, prepared.up)
+    return explicit_track(vectors, _gains(vectors), q_start=_attitude(prepared.up[0], first.mean(axis=0))).q[0]
 
 
 def undisturbed(prepared: Prepared, *, length: float = 0.1, dip_rad: float = math.radians(5.0)) -> FloatArray:
@@ -140,11 +175,10 @@ def undisturbed(prepared: Prepared, *, length: float = 0.1, dip_rad: float = mat
 
     ``length``: largest relative difference. ``dip_rad``: largest difference. Returns (n, 3) [T].
     """
-    n_first = round(1.0 / prepared.dt_s)
     lengths = np.linalg.norm(prepared.field_T, axis=1)
     dips = np.arcsin(np.clip(np.sum(prepared.field_T * prepared.up, axis=1) / lengths, -1.0, 1.0))
-    usual = np.median(lengths[:n_first])
-    good = (np.abs(lengths - usual) < length * usual) & (np.abs(dips - np.median(dips[:n_first])) < dip_rad)
+    usual, usual_dip = np.nanmedian(lengths[prepared.starting]), np.nanmedian(dips[prepared.starting])
+    good = (np.abs(lengths - usual) < length * usual) & (np.abs(dips - usual_dip) < dip_rad)
     return np.where(good[:, None], prepared.field_T, np.nan)
 
 
@@ -181,23 +215,26 @@ def sensor_fixed_field(prepared: Prepared, tuning: MagnetTuning = MagnetTuning()
         Body axes [T]; constant within blocks, zero before the end of the first.
     """
     size = tuning.block
-    count = len(prepared.field_T) // size
-    level = quaternion.rotate(prepared.q_level, prepared.field_T)
+    rows = np.flatnonzero(np.isfinite(prepared.field_T).all(axis=1))
+    count = len(rows) // size
+    of_block = rows[: count * size].reshape(count, size)
+    level = quaternion.rotate(prepared.q_level[rows], prepared.field_T[rows])
     blocks = level[: count * size].reshape(count, size, 3).mean(axis=1)
-    R_level = quaternion.matrix(prepared.q_level[size // 2 :: size][:count])
-    start = blocks[: max(1, round(1.0 / (prepared.dt_s * size)))].mean(axis=0)
+    R_level = quaternion.matrix(prepared.q_level[of_block[:, size // 2]])
+    start = level[prepared.starting[rows]].mean(axis=0)
     horizontal = math.hypot(start[0], start[1])
-    h = size * prepared.dt_s
+    ends_s = prepared.time_s[of_block[:, -1]]
+    steps = np.diff(ends_s, prepend=prepared.time_s[0])
     x = np.array([math.atan2(-start[0], start[1]), 0.0, 0.0, 0.0, 0.0])
     start_sigmas = [tuning.start_heading_rad, tuning.heading_rate_rad_s, *[tuning.start_T] * 3]
     P = np.diag(np.square(start_sigmas))
     F = np.eye(5)
-    F[0, 1] = h
-    Q = np.diag([1e-10, 1e-10 * h, *[tuning.walk_T**2 * h] * 3])
     R = tuning.sigma_T**2 * np.eye(3)
     H = np.zeros((3, 5))
     offsets, smoothed = np.zeros((count + 1, 3)), 1.0
-    for i in range(count):
+    for i, h in enumerate(steps):
+        F[0, 1] = h
+        Q = np.diag([1e-10, 1e-10 * h, *[tuning.walk_T**2 * h] * 3])
         x, P = F @ x, F @ P @ F.T + Q
         c, s = math.cos(x[0]), math.sin(x[0])
         H[:, 0] = -horizontal * c, -horizontal * s, 0.0
@@ -212,56 +249,57 @@ def sensor_fixed_field(prepared: Prepared, tuning: MagnetTuning = MagnetTuning()
         x, P = x + K @ nu, P - K @ S @ K.T
         P = 0.5 * (P + P.T)
         offsets[i + 1] = x[2:]
-    return offsets[np.minimum(np.arange(len(prepared.field_T)) // size, count)]
+    return offsets[np.searchsorted(ends_s, prepared.time_s, side="right")]
 
 
-def _gains(dt_s: float) -> Gains:
-    return Gains(1.0 / HEADING_TIME_S, 0.0, second_weight=_UP_STEP * HEADING_TIME_S / dt_s)
+def _gains(vectors: VectorRecord) -> Gains:
+    return Gains(1.0 / HEADING_TIME_S, 0.0, second_weight=_UP_STEP * HEADING_TIME_S / vectors.usual_dt_s)
 
 
-def _vector_record(dt_s: float, rate: FloatArray, first: FloatArray, up: FloatArray) -> VectorRecord:
+def _vector_record(time_s: FloatArray, rate: FloatArray, first: FloatArray, up: FloatArray) -> VectorRecord:
     north, zenith = (np.tile(axis, (len(rate), 1)) for axis in ([0.0, 1.0, 0.0], [0.0, 0.0, 1.0]))
-    return VectorRecord(dt_s, rate, first, up, north, zenith, np.zeros_like(rate))
-
-
-def _integrated(rate: FloatArray, dt_s: float) -> FloatArray:
-    """Attitude (n, 4) of the gyro alone, from the identity on."""
-    missing = np.full_like(rate, np.nan)
-    return explicit_track(_vector_record(dt_s, rate, missing, missing), Gains(0.0, 0.0)).q[0]
+    return VectorRecord(steps_s(time_s), rate, first, up, north, zenith, np.zeros_like(rate))
 
 
 def _up(q_gyro: FloatArray, record: InertialMagneticRecord) -> FloatArray:
-    from scipy.signal import butter, sosfilt, sosfilt_zi
+    from adcs.complementary.inertial_magnetic_compiled import low_pass
 
-    # A Butterworth filter of second order rises to 1 - 1/e within the time constant at this frequency.
-    cutoff_Hz = math.sqrt(2.0) / (2.0 * math.pi * GRAVITY_TIME_S)
-    sections = butter(2, 2.0 * record.dt_s * cutoff_Hz, output="sos")
     steady = quaternion.rotate(q_gyro, record.acceleration_m_s2)
-    first = steady[: max(1, round(min(GRAVITY_TIME_S, 1.0) / record.dt_s))].mean(axis=0)
-    start = sosfilt_zi(sections)[..., None] * first
-    smooth, _ = sosfilt(sections, steady, axis=0, zi=start)
+    start = np.nanmean(steady[record.starting], axis=0)
+    smooth = low_pass(steady, record.dt_s, GRAVITY_TIME_S, start)
     up = quaternion.rotate_back(q_gyro, smooth)
     return up / np.linalg.norm(up, axis=1, keepdims=True)
 
 
-def _lag_samples(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
+def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
     """Lag at which the field changes least within a fifth of a second, seen from a frame that does not turn."""
-    apart = max(1, round(_LAG_WINDOW_S / record.dt_s))
-    most = round(_LONGEST_LAG_S / record.dt_s)
+    rows = np.flatnonzero(np.isfinite(record.field_T).all(axis=1))
+    time_s, values = record.time_s[rows], record.field_T[rows]
+    step = float(np.median(record.dt_s))
+    apart = max(1, round(_LAG_WINDOW_S / float(np.median(np.diff(time_s)))))
+    most = round(_LONGEST_LAG_S / step)
     changes = []
     for lag in range(most + 1):
-        field_T = quaternion.rotate(q_gyro, _without_lag(q_gyro, record.field_T, lag))
+        then = _at_times(q_gyro, record.time_s, time_s - lag * step)
+        field_T = quaternion.rotate(then, values)
         changes.append(float(np.mean((field_T[apart:] - field_T[:-apart]) ** 2)))
     least = int(np.argmin(changes))
     if not 0 < least < most:
-        return float(least)
+        return least * step
     a, b, c = changes[least - 1 : least + 2]
-    return least + 0.5 * (a - c) / (a - 2.0 * b + c)
+    return (least + 0.5 * (a - c) / (a - 2.0 * b + c)) * step
 
 
-def _without_lag(q_gyro: FloatArray, field_T: FloatArray, lag: int) -> FloatArray:
-    then = q_gyro[np.maximum(np.arange(len(q_gyro)) - lag, 0)]
+def _without_lag(q_gyro: FloatArray, time_s: FloatArray, field_T: FloatArray, lag_s: float) -> FloatArray:
+    then = _at_times(q_gyro, time_s, time_s - lag_s)
     return quaternion.rotate_back(q_gyro, quaternion.rotate(then, field_T))
+
+
+def _at_times(q: FloatArray, time_s: FloatArray, wanted_s: FloatArray) -> FloatArray:
+    """Attitudes at other times, on straight lines between two quaternions; the first one before all."""
+    row = np.clip(np.searchsorted(time_s, wanted_s, side="right") - 1, 0, len(time_s) - 2)
+    part = np.clip((wanted_s - time_s[row]) / (time_s[row + 1] - time_s[row]), 0.0, 1.0)[:, None]
+    return quaternion.normalised((1.0 - part) * q[row] + part * q[row + 1])
 
 
 def _attitude(up: FloatArray, north: FloatArray) -> FloatArray:

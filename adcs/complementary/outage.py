@@ -84,8 +84,11 @@ class Substitute:
             quaternion.rotate_back(quaternion.multiply(quaternion.conjugate(c_then), self._c), reference),
         )
 
-    def turn(self, first: Pair, body_rad: FloatArray, frame_rad: FloatArray) -> None:
-        """Store this instant's first vector, and go on to the next one by the rotations of body and frame [rad]."""
+    def store(self, first: Pair) -> None:
+        """Store this instant's first vector."""
         self._line.append((first, self._p, self._c))
+
+    def turn(self, body_rad: FloatArray, frame_rad: FloatArray) -> None:
+        """Go on to the next instant by the rotations of body and frame [rad]."""
         self._p = quaternion.normalised(quaternion.multiply(self._p, quaternion.exp(body_rad)))
         self._c = quaternion.normalised(quaternion.multiply(self._c, quaternion.exp(frame_rad)))

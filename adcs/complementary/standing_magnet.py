@@ -45,7 +45,7 @@ def locate_standing_magnet(prepared: Prepared, q: FloatArray, position_m: FloatA
     from scipy.optimize import least_squares
 
     reference = quaternion.rotate(q, prepared.field_T)
-    difference = reference - reference[: round(1.0 / prepared.dt_s)].mean(axis=0)
+    difference = reference - reference[prepared.starting].mean(axis=0)
     known = np.flatnonzero(np.isfinite(position_m).all(axis=1))[::_EVERY]
     if len(known) < 100:
         raise ValueError(f"Input position_m must have 100 known positions; instead received {len(known)}.")

@@ -3,11 +3,50 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 
-from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
+
+GyroSamples = Literal["mean", "point"]
+GYRO_SAMPLES: tuple[GyroSamples, ...] = get_args(GyroSamples)
+GAP_STEPS = 2.5
+"""A step is a gap where it is longer than so many usual ones."""
+
+
+def steps_s(time_s: FloatArray) -> FloatArray:
+    """Steps (n,) that end at each of n ascending times; the first is the usual one, the median."""
+    steps = np.diff(time_s)
+    if time_s.ndim != 1 or len(time_s) < 2 or not (np.isfinite(steps) & (steps > 0.0)).all():
+        raise ValueError("Input time_s must ascend, two instants or more; instead received others.")
+    return np.concatenate([[np.median(steps)], steps])
+
+
+def step_rates(rate_rad_s: FloatArray, dt_s: FloatArray, samples: GyroSamples = "mean") -> FloatArray:
+    """Mean rates (n, 3) over the steps that end at each instant, of a gyro's samples (n, 3), NaN where it has none.
+
+    A sample is the ``mean`` rate since the one before, or the rate at its ``point`` in time; two points make the mean
+    of what is between them. Without a sample the last one is held, and the next one makes up for it, so that no turn is
+    lost and nothing is used before it is read. Across a gap the rate is the mean of both ends.
+    """
+    if samples not in GYRO_SAMPLES:
+        raise ValueError(f"Input samples must be one of {', '.join(GYRO_SAMPLES)}; instead received {samples!r}.")
+    rows = np.flatnonzero(np.isfinite(rate_rad_s).all(axis=1))
+    if not len(rows) or rows[0] != 0:
+        raise ValueError("Input gyro_rad_s must have a reading at the first instant; instead received none.")
+    read = rate_rad_s[rows]
+    until = np.cumsum(dt_s)
+    span = np.diff(until[rows], prepend=until[0] - dt_s[0])
+    means = read.copy()
+    between = np.ones(len(rows), dtype=np.bool_) if samples == "point" else span > GAP_STEPS * np.median(span)
+    means[1:][between[1:]] = 0.5 * (read[:-1] + read[1:])[between[1:]]
+    last = np.searchsorted(rows, np.arange(len(rate_rad_s)), side="right") - 1
+    found = read[last]
+    held = span - dt_s[rows]
+    made_up = (means[1:] * span[1:, None] - read[:-1] * held[1:, None]) / dt_s[rows[1:], None]
+    found[rows[0]], found[rows[1:]] = means[0], made_up
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,16 +55,17 @@ class VectorRecord:
 
     Attributes
     ----------
-    dt_s : float
-        Between instants.
+    dt_s : ndarray, shape (n,)
+        From the instant before to each, :func:`steps_s`. The first has no instant before: it only says how long its
+        readings count.
     rate_rad_s : ndarray, shape (R, n, 3)
-        Gyro, from each instant to the next.
+        Gyro, the mean over the step that ends at each instant: see :func:`step_rates`.
     first_body, second_body : ndarray, shape (R, n, 3)
         Measured vectors, such as the field and the Sun, of any length.
     first_reference, second_reference : ndarray, shape (R or 1, n, 3)
         The same in the reference frame.
     frame_rate_rad_s : ndarray, shape (R or 1, n, 3)
-        Rate of the reference frame against inertial space, in its own axes.
+        Rate of the reference frame against inertial space, in its own axes, over the step that ends at each instant.
 
     Raises
     ------
@@ -33,7 +73,7 @@ class VectorRecord:
         The shapes do not match, the step is not positive, a rate or reference is not finite, or a vector is zero.
     """
 
-    dt_s: float
+    dt_s: FloatArray
     rate_rad_s: FloatArray
     first_body: FloatArray
     second_body: FloatArray
@@ -42,13 +82,16 @@ class VectorRecord:
     frame_rate_rad_s: FloatArray
 
     def __post_init__(self) -> None:
-        check_positive(dt_s=self.dt_s)
         for name in ("rate_rad_s", *_OF_RUNS, *_OF_FRAME):
             values = np.ascontiguousarray(getattr(self, name), dtype=np.float64)
             if values.ndim not in (2, 3):
                 raise ValueError(f"Input {name} must have shape (R, n, 3) or (n, 3); instead received {values.shape}.")
             object.__setattr__(self, name, values[None] if values.ndim == 2 else values)
         n_runs, n = self.rate_rad_s.shape[:2]
+        given = np.asarray(self.dt_s, dtype=np.float64)
+        if given.shape != (n,) or not ((given > 0.0) & (given < np.inf)).all():
+            raise ValueError(f"Input dt_s must be positive and finite, of shape ({n},); instead received others.")
+        object.__setattr__(self, "dt_s", given)
         for name in ("rate_rad_s", *_OF_RUNS, *_OF_FRAME):
             values = getattr(self, name)
             shape = (n_runs if name not in _OF_FRAME else self.first_reference.shape[0], n, 3)
@@ -67,6 +110,11 @@ class VectorRecord:
     def n_runs(self) -> int:
         """R."""
         return self.rate_rad_s.shape[0]
+
+    @property
+    def usual_dt_s(self) -> float:
+        """Median step; of no instants at all, 1."""
+        return float(np.median(self.dt_s)) if len(self) else 1.0
 
     def __len__(self) -> int:
         """Return the number of instants."""

@@ -68,8 +68,7 @@ class SatelliteRuns:
 def satellite_runs(scenario: SatelliteScenario, seeds: Sequence[int]) -> SatelliteRuns:
     """Simulate one run for each seed; a run is the same whatever runs are beside it.
 
-    The gyro gives the rate at each instant, plus its bias: filters that hold it to the next one are wrong by what it
-    changes in between.
+    The gyro gives the mean rate over the step that ends at each instant, plus its bias.
     """
     time_s, h = scenario.time_s, scenario.dt_s
     field_T = _field_orbital(len(time_s), h)
@@ -77,10 +76,9 @@ def satellite_runs(scenario: SatelliteScenario, seeds: Sequence[int]) -> Satelli
     noise = np.stack([stream(seed, "magnetometer").standard_normal((len(time_s), 3)) for seed in seeds])
     q = attitude(phases, scenario.amplitude_rad, time_s)
     frame_turn = np.array([0.0, ORBIT.rate_rad_s * h, 0.0])
-    before = attitude(phases, scenario.amplitude_rad, time_s - 0.5 * h)
-    after = attitude(phases, scenario.amplitude_rad, time_s + 0.5 * h)
-    # Body against inertial space: q(before)* ∘ (turn of the frame) ∘ q(after).
-    inertial = quaternion.multiply(quaternion.multiply(quaternion.conjugate(before), quaternion.exp(frame_turn)), after)
+    before = attitude(phases, scenario.amplitude_rad, time_s - h)
+    # Body against inertial space: q(before)* ∘ (turn of the frame) ∘ q.
+    inertial = quaternion.multiply(quaternion.multiply(quaternion.conjugate(before), quaternion.exp(frame_turn)), q)
     bias = np.where(scenario.orbits >= scenario.step_orbits, scenario.drift_rad_s, 0.0)
     sun = np.broadcast_to([0.0, 1.0, 0.0], (len(time_s), 3))
     sun_body = quaternion.rotate_back(q, sun)
@@ -88,7 +86,7 @@ def satellite_runs(scenario: SatelliteScenario, seeds: Sequence[int]) -> Satelli
         out = (scenario.orbits >= scenario.outage_orbits) & (scenario.orbits < scenario.outage_end_orbits)
         sun_body[:, out] = np.nan
     record = VectorRecord(
-        dt_s=h,
+        dt_s=np.full(len(time_s), h),
         rate_rad_s=quaternion.log(inertial) / h + bias[:, None],
         first_body=quaternion.rotate_back(q, field_T) + scenario.sigma_T * noise,
         second_body=sun_body,

@@ -56,7 +56,6 @@ def read_broad(path: Path) -> Trial:
     from scipy.io import loadmat
 
     content = loadmat(path)
-    record = InertialMagneticRecord(
-        1.0 / float(content["sampling_rate"].item()), content["imu_gyr"], content["imu_acc"], 1e-6 * content["imu_mag"]
-    )
+    time_s = np.arange(len(content["imu_gyr"])) / float(content["sampling_rate"].item())
+    record = InertialMagneticRecord(time_s, content["imu_gyr"], content["imu_acc"], 1e-6 * content["imu_mag"])
     return Trial(record, content["opt_quat"], content["opt_pos"], content["movement"].ravel().astype(bool))
