@@ -74,7 +74,8 @@ class TableCamera:
         row = np.flatnonzero(seen.found)
         row = row[np.argsort(arrival_s[row], kind="stable")]
         x, y, heading = seen.estimates[row].T
-        fixes = FixRecord(stamp_s[row], arrival_s[row], np.column_stack([x, y]), heading)
+        sigma = np.array([result.sigma for result in results])[row]
+        fixes = FixRecord(stamp_s[row], arrival_s[row], np.column_stack([x, y]), heading, sigma)
         return replace(run, fixes=fixes, exposure_s=exposure_s[row], false=seen.false_fixes[row])
 
     def _delay_s(self, result: FrameResult) -> float:

@@ -101,6 +101,12 @@ class FrameResult:
         )
 
     @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations of the pose, shape (3,); NaN without a fix."""
+        fix = self.fix
+        return np.array([fix.sigma_m, fix.sigma_m, fix.sigma_rad] if isinstance(fix, CameraFix) else [np.nan] * 3)
+
+    @property
     def matched(self) -> int:
         """Number of the stars that the fix names."""
         return len(self.fix.stars) if isinstance(self.fix, CameraFix) else 0

@@ -51,7 +51,7 @@ class FilterSettings:
         Walk of the drifts: 7e-6 m/s³ in 200 s, for a sensor whose warming levels off within minutes. If it does so
         within one minute, errors of zeros and drifts are 1.1 and 1.4 of their standard deviations.
     fix_m, fix_rad : float
-        Noise of a fix, each axis.
+        Noise of a fix, each axis, where it does not say its own.
     fix_gate : float
         Largest normalised innovation squared of a fix, a χ² of 3 numbers: 25 rejects one good fix in 65,000.
     reacquire_after : int
@@ -346,7 +346,7 @@ class DelayedFilter:
         fix, x = taken.fix, self._x[row]
         taken.heading_rad = float(x[4])
         innovation = np.append(fix.position_m - x[0:2], wrapped(fix.heading_rad - x[4]))
-        variance = np.square([s.fix_m, s.fix_m, s.fix_rad])
+        variance = np.square([s.fix_m, s.fix_m, s.fix_rad] if fix.sigma is None else fix.sigma)
         S = symmetric_square_root(self._P[row])
         nis = normalised_innovation_squared(S, H_FIX, innovation, variance)
         taken.outcome = Outcome.USED

@@ -10,7 +10,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +30,14 @@ class Fix:
     position_m : ndarray, shape (2,)
     heading_rad : float
         Counter-clockwise, of any number of turns.
+    sigma : ndarray, shape (3,), optional
+        Standard deviations of X, Y [m] and heading [rad], where they are known.
     """
 
     time_s: float
     position_m: FloatArray
     heading_rad: float
+    sigma: FloatArray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,21 +52,26 @@ class FixRecord:
         Not before the exposure.
     position_m : ndarray, shape (k, 2)
     heading_rad : ndarray, shape (k,)
+    sigma : ndarray, shape (k, 3), optional
+        Standard deviations of X, Y [m] and heading [rad] of every fix, where they are known.
 
     Raises
     ------
     ValueError
-        The shapes do not match, a number is not finite, arrivals go back, or a fix arrives before its exposure.
+        The shapes do not match, a number is not finite, a standard deviation is not positive, arrivals go back, or a
+        fix arrives before its exposure.
     """
 
     time_s: FloatArray
     arrival_s: FloatArray
     position_m: FloatArray
     heading_rad: FloatArray
+    sigma: FloatArray | None = None
 
     def __post_init__(self) -> None:
         k = np.shape(self.time_s)[0] if np.ndim(self.time_s) else -1
-        for name, shape in (("time_s", (k,)), ("arrival_s", (k,)), ("position_m", (k, 2)), ("heading_rad", (k,))):
+        shapes = {"time_s": (k,), "arrival_s": (k,), "position_m": (k, 2), "heading_rad": (k,)}
+        for name, shape in (shapes if self.sigma is None else shapes | {"sigma": (k, 3)}).items():
             values = np.asarray(getattr(self, name), dtype=np.float64)
             if values.shape != shape:
                 expected = "(k,)" if k < 0 else str(shape)
@@ -71,6 +79,8 @@ class FixRecord:
             if not np.isfinite(values).all():
                 raise ValueError(f"Input {name} must be finite; instead received a number that is not.")
             object.__setattr__(self, name, values)
+        if self.sigma is not None and not (self.sigma > 0.0).all():
+            raise ValueError(f"Input sigma must be positive; instead received {self.sigma.min():.6g}.")
         back = np.flatnonzero(np.diff(self.arrival_s) < 0.0)
         if back.size:
             before, after = self.arrival_s[back[0]], self.arrival_s[back[0] + 1]
@@ -91,17 +101,20 @@ class FixRecord:
 
     def __getitem__(self, row: int) -> Fix:
         """One fix."""
-        return Fix(float(self.time_s[row]), self.position_m[row], float(self.heading_rad[row]))
+        sigma = None if self.sigma is None else self.sigma[row]
+        return Fix(float(self.time_s[row]), self.position_m[row], float(self.heading_rad[row]), sigma)
 
     def rows(self, rows: slice | BoolArray | NDArray[np.intp]) -> FixRecord:
         """Some of the fixes."""
-        return FixRecord(self.time_s[rows], self.arrival_s[rows], self.position_m[rows], self.heading_rad[rows])
+        return FixRecord(**self._columns(rows))
+
+    def _columns(self, rows: slice | BoolArray | NDArray[np.intp]) -> dict[str, Any]:
+        return {name: None if values is None else values[rows] for name, values in vars(self).items()}
 
     def in_time_order(self) -> FixRecord:
         """The fixes sorted by exposure, arriving at it: as if there were no delay."""
-        order = np.argsort(self.time_s, kind="stable")
-        time_s = self.time_s[order]
-        return FixRecord(time_s, time_s, self.position_m[order], self.heading_rad[order])
+        columns = self._columns(np.argsort(self.time_s, kind="stable"))
+        return FixRecord(**columns | {"arrival_s": columns["time_s"]})
 
     def earlier(self, latency_s: float) -> FixRecord:
         """The fixes with time stamps put back by the camera's latency."""

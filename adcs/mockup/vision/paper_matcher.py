@@ -20,6 +20,10 @@ from arrays.typing import ComplexArray, FloatArray, IntArray
 SLIVER_RAD = math.radians(3.0)
 """A triangle of an image with a smaller angle is not looked for: noise changes its angles most."""
 
+# What a centroid is wrong by along each axis, before its distance from the catalogue's place is known, and how many
+# numbers that knowledge counts for.
+_USUAL_PX, _USUAL_NUMBERS = 0.1, 4
+
 
 @dataclass(frozen=True, eq=False)
 class CameraFix:
@@ -39,6 +43,8 @@ class CameraFix:
         What spoke for the fix: triangles that agree for the paper's matcher, stars for the others.
     m_per_px : float
         Scale of the image on the ceiling, as fitted [m/px].
+    sigma_m, sigma_rad : float
+        Standard deviations of the position, each axis, and of the heading, from the distances of the stars.
 
     Examples
     --------
@@ -56,6 +62,8 @@ class CameraFix:
     rms_m: float
     votes: int
     m_per_px: float
+    sigma_m: float = math.nan
+    sigma_rad: float = math.nan
 
 
 class Matcher(Protocol):
@@ -161,9 +169,24 @@ def camera_fix(
     may repeat.
     """
     pairs = np.unique(stars, axis=0)
-    residual = a * image[pairs[:, 0]] + b - catalogue.plane[pairs[:, 1]]
-    rms = float(np.sqrt(np.mean(residual.real**2 + residual.imag**2)))
-    return CameraFix(np.array([b.real, b.imag]), float(np.angle(a)), pairs, rms, votes, abs(a))
+    points = image[pairs[:, 0]]
+    residual = a * points + b - catalogue.plane[pairs[:, 1]]
+    squares, k = float(np.sum(residual.real**2 + residual.imag**2)), len(points)
+    # Two numbers of every star less the four of the fit, and what is known of any star's centroid.
+    known = _USUAL_NUMBERS * (_USUAL_PX * abs(a)) ** 2
+    sigma_m = math.sqrt((known + squares) / (_USUAL_NUMBERS + 2 * k - 4))
+    middle = points.mean()
+    spread_px = max(float(np.linalg.norm(points - middle)), _USUAL_PX)
+    return CameraFix(
+        np.array([b.real, b.imag]),
+        float(np.angle(a)),
+        pairs,
+        math.sqrt(squares / k),
+        votes,
+        abs(a),
+        sigma_m * math.hypot(1.0 / math.sqrt(k), abs(middle) / spread_px),
+        sigma_m / (abs(a) * spread_px),
+    )
 
 
 def longest_close_subset(points: ComplexArray, closeness: float) -> IntArray:

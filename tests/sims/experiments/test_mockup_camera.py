@@ -10,6 +10,8 @@ import pytest
 from adcs.mockup.navigation.strapdown import wrapped
 from adcs.mockup.vision.camera import undistorted
 from adcs.mockup.vision.centroids import find_stars
+from adcs.mockup.vision.paper_matcher import camera_fix
+from adcs.mockup.vision.triangles import TriangleCatalogue
 from sims.cli.mockup_options import MockupOptions
 from sims.experiments.mockup_camera import TableCamera
 from sims.experiments.mockup_navigation import fused_runs
@@ -66,6 +68,52 @@ class TestFixes:
         wrong = replace(camera, setup=replace(camera.setup, k1=-0.05))
         exact, bent = camera.run(SCENARIO, SEED), wrong.run(SCENARIO, SEED)
         assert _rms_m(bent) > 1.5 * _rms_m(exact)
+
+
+class TestSigma:
+    """What a fix says of its own errors."""
+
+    def test_it_is_that_of_the_fit(self):
+        """Least squares of a similarity, by numerical derivatives of all its unknowns."""
+        rng = np.random.default_rng(1)
+        catalogue = TriangleCatalogue.of(rng.uniform(-0.4, 0.4, (12, 2)))
+        image = rng.uniform(-300.0, 300.0, 12) + 1j * rng.uniform(-200.0, 200.0, 12)
+        a, b = 1.4e-3 * np.exp(0.4j), 0.3 - 0.2j
+        pairs = np.column_stack([np.arange(12), np.arange(12)])
+        fix = camera_fix(catalogue, image, pairs, a, b, 12)
+
+        def places(unknowns):
+            x, y, heading, scale = unknowns
+            at = scale * np.exp(1j * heading) * image + (x + 1j * y)
+            return np.concatenate([at.real, at.imag])
+
+        at = np.array([b.real, b.imag, 0.4, 1.4e-3])
+        steps = np.diag(1e-6 * np.array([1.0, 1.0, 1.0, 1e-3]))
+        J = np.column_stack([(places(at + step) - places(at - step)) / (2.0 * step.sum()) for step in steps])
+        of_unit_noise = np.sqrt(np.diagonal(np.linalg.inv(J.T @ J)))
+        assert fix.sigma_rad / fix.sigma_m == pytest.approx(of_unit_noise[2] / of_unit_noise[0], rel=1e-6)
+        noise_m = fix.sigma_m / of_unit_noise[0]
+        # With 20 numbers to spare it is nearly what the stars' distances say: half of their squares along each axis.
+        assert noise_m == pytest.approx(fix.rms_m * np.sqrt(12 / 20), rel=0.2)
+
+    def test_it_is_right(self, camera):
+        """Three numbers of each of 60 fixes or so: mean squares over variances, 1 in 10,000 outside of 0.4 to 1.7."""
+        runs = [camera.run(TableScenario(duration_s=18.0), seed) for seed in (60, 61)]
+        errors = []
+        for run in runs:
+            true = run.truth.at(run.exposure_s)
+            heading = wrapped(run.fixes.heading_rad - true.heading_rad)
+            errors.append(np.column_stack([run.fixes.position_m - true.position_m, heading]) / run.fixes.sigma)
+        assert 0.4 < np.mean(np.concatenate(errors) ** 2) < 1.7
+
+    def test_the_filter_uses_it(self, camera):
+        run = camera.run(SCENARIO, SEED)
+        silent = replace(run, fixes=replace(run.fixes, sigma=None))
+        errors = [
+            fused_runs("ekf", SCENARIO, [SEED], simulate=lambda _, __, run=run: run).summary()["position_rms_mm"]
+            for run in (run, silent)
+        ]
+        assert errors[0] < 0.5 * errors[1]
 
 
 class TestDelay:

@@ -273,6 +273,8 @@ class TestFixRecord:
             ({"time_s": 1.0}, r"time_s must have shape \(k,\)"),
             ({"time_s": np.zeros(0)}, r"arrival_s must have shape \(0,\)"),
             ({"heading_rad": [0.0, math.inf]}, "heading_rad must be finite"),
+            ({"sigma": np.ones((2, 2))}, r"sigma must have shape \(2, 3\)"),
+            ({"sigma": [[1e-3, 1e-3, 1e-2], [1e-3, 0.0, 1e-2]]}, "sigma must be positive; instead received 0"),
         ],
     )
     def test_what_is_not_one_is_refused(self, changes, text: str) -> None:
@@ -280,7 +282,10 @@ class TestFixRecord:
             self.record(**changes)
 
     def test_exposures_may_be_out_of_order(self) -> None:
-        fixes = self.record(time_s=[0.5, 0.1], heading_rad=[5.0, 1.0]).in_time_order()
+        sigma = [[5e-3, 5e-3, 0.05], [1e-3, 1e-3, 0.01]]
+        fixes = self.record(time_s=[0.5, 0.1], heading_rad=[5.0, 1.0], sigma=sigma).in_time_order()
+        np.testing.assert_array_equal(fixes.sigma, sigma[::-1])
+        np.testing.assert_array_equal(fixes[0].sigma, sigma[1])
         np.testing.assert_array_equal(fixes.time_s, [0.1, 0.5])
         np.testing.assert_array_equal(fixes.arrival_s, [0.1, 0.5])
         np.testing.assert_array_equal(fixes.heading_rad, [1.0, 5.0])
