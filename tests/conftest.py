@@ -22,10 +22,11 @@ if TYPE_CHECKING:
 
 REPOSITORY = Path(__file__).parents[1]
 
-# The same examples in every run of `make test`, new ones in every run of `make test-full`. Neither asks the clock.
-for profile, derandomize in (("fixed", True), ("random", False)):
+# The same examples in every run of `make test`; new ones, and more, in every run of `make test-full`. Neither asks the
+# clock.
+for profile, derandomize, n in (("fixed", True, 40), ("random", False, 100)):
     settings.register_profile(
-        profile, derandomize=derandomize, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+        profile, derandomize=derandomize, max_examples=n, deadline=None, suppress_health_check=[HealthCheck.too_slow]
     )
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 

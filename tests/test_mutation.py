@@ -122,9 +122,8 @@ class TestVerdict:
             laboratory.verdict(Mutant("code_.py", 2, "constant", 26, 27, "3"), 6, 60.0)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_a_change_is_one_that_can_be_read_and_differs(seed: int) -> None:
-    chosen = drawn(100, seed, PACKAGES)
+def test_a_change_is_one_that_can_be_read_and_differs() -> None:
+    chosen = drawn(100, 0, PACKAGES)
     assert len({(one.path, one.line) for one in chosen}) == 100
     for one in chosen:
         source = (REPOSITORY / one.path).read_bytes()

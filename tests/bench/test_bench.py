@@ -111,6 +111,7 @@ class TestPeersHaveTheSameProblem:
 @pytest.mark.parametrize("group", GROUPS)
 def test_group_runs(group, monkeypatch):
     monkeypatch.setattr("tests.bench.timing.SAMPLE_S", 1e-9)
+    monkeypatch.setattr("tests.bench.attitude.N_RUNS", 2)
     lines = report([group], TINY).splitlines()
     assert any(line.startswith(f"-- {GROUPS[group].TITLE}") for line in lines)
     assert "|" in lines[-1]

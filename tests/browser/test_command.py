@@ -39,7 +39,7 @@ class TestProcess:
             port = taken.getsockname()[1]
             with viewer_started(array_file, "--port", str(port)) as (process, address):
                 screen.open(address)
-                screen.until(lambda: "Predicted readings" in screen.text(), "the panel")
+                screen.until(lambda: "found at" in screen.text(), "the whole panel; no button moves any more")
                 screen.browser.click(*screen.button("Another draw of the noise"))
                 screen.until(lambda: screen.numbers("Seed of the noise") == [1.0], "another draw")
                 screen.leave()

@@ -7,7 +7,7 @@ import shutil
 
 import pytest
 
-from tests.fuzz.cases import LINES, STREAM, commands, write_files
+from tests.fuzz.cases import LINES, SELDOM, STREAM, commands, write_files
 from tests.fuzz.extremes import extremes
 from tests.fuzz.runner import Case, extreme_case, judged, report, run_case, verdict
 
@@ -27,7 +27,14 @@ def test_every_command_has_a_line():
     assert sorted(LINES) == sorted(name for name, _ in commands())
 
 
-@pytest.mark.parametrize(("command", "line"), [(command, line) for command in LINES for line in LINES[command]])
+@pytest.mark.parametrize(
+    ("command", "line"),
+    [
+        pytest.param(command, line, marks=[pytest.mark.slow] if command in SELDOM else [])
+        for command in LINES
+        for line in LINES[command]
+    ],
+)
 def test_the_lines_are_good(command, line, files, tmp_path):
     """A mutation of what is refused anyway would test nothing."""
     program, *name = command.split()
