@@ -53,7 +53,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             return 0
         if item.path.is_relative_to(REPOSITORY / "tests" / "adcs"):
             return 1
-        return 2 if item.path.suffix == ".ipynb" else 3
+        return 2 if item.path.suffix == ".ipynb" or item.path.stem == "test_guide" else 3
 
     for item in items:
         if item.path.suffix == ".ipynb" and item.path.stem not in QUICK_NOTEBOOKS:

@@ -52,13 +52,21 @@ def elsewhere() -> Iterator[int]:
         other.shutdown()
 
 
-@pytest.fixture
-def server(screen: Screen) -> Iterator[viser.ViserServer]:
+@pytest.fixture(scope="module")
+def only_server(screen: Screen) -> Iterator[viser.ViserServer]:
+    """Stopped once: it waits some seconds for what the browser has connected ahead and never used."""
     with opened(0, "array") as server:
         page = array_page(server, tetrahedron(1.0), live=True)
         yield server
-        screen.leave()
         page.close()
+
+
+@pytest.fixture
+def server(screen: Screen, only_server: viser.ViserServer) -> Iterator[viser.ViserServer]:
+    """Without a page that speaks to it."""
+    yield only_server
+    screen.leave()
+    screen.until(lambda: not only_server.get_clients(), "the page has left")
 
 
 @contextmanager
