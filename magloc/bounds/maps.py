@@ -169,6 +169,11 @@ class BoundMap(CubeMap):
     scenario: BoundScenario
 
     @property
+    def point_s(self) -> float:
+        """Seconds of one core that the bounds of a point with all moments take, roughly."""
+        return 3e-7 * self.scenario.n_moments
+
+    @property
     def settings(self) -> Mapping[str, Any]:
         """Moment, and what is required."""
         return self.scenario.settings

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import signal
 import sys
@@ -45,6 +46,7 @@ def entered(program: str) -> int:
         if not came and isinstance(error, Exception):
             raise
         print(f"{program}: {'terminated' if signal.SIGTERM in came else 'interrupted'}", file=sys.stderr)
+    gc.freeze()  # the interpreter looks for circles as it ends: half a second over all that numba holds
     if signal.SIGTERM in came:
         return TERMINATED
     return INTERRUPTED if came and status else status

@@ -20,6 +20,7 @@ from magloc.measurement.differences import DifferenceMeasurement
 CHI2_REACHED = 0.05
 # Distance from the maximum-likelihood position that a filter with a prior may keep.
 PRIOR_REACHED_M = 0.5
+_PASS_S = 4e-8
 
 
 class Filter(Protocol):
@@ -28,6 +29,14 @@ class Filter(Protocol):
     @property
     def name(self) -> str:
         """Name on the command line."""
+
+    @property
+    def max_iterations(self) -> int:
+        """Passes at most."""
+
+    @property
+    def pass_s(self) -> float:
+        """Seconds of one core that a pass takes, roughly, for the nine differences of four vector sensors."""
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """End of every start (n, 6) for the decorrelated differences z (k,)."""
@@ -50,6 +59,7 @@ class _PriorFilter:
 
     position_sigma_m: float = 3.0
     moment_sigma_Am2: float = 300.0
+    pass_s: ClassVar[float] = _PASS_S
 
     @property
     def s_0(self) -> FloatArray:
@@ -96,6 +106,11 @@ class RepeatedFilter(_LikelihoodFilter):
     relinearise_every_scalar: bool = False
     tolerance_T: float = 1e-12
     max_iterations: int = 200
+
+    @property
+    def pass_s(self) -> float:
+        """Seconds of one core that a pass takes, roughly, for the nine differences of four vector sensors."""
+        return 2e-6 if self.relinearise_every_scalar else _PASS_S
 
     @property
     def s_q(self) -> FloatArray:
@@ -256,6 +271,7 @@ class GlobalFilter(_LikelihoodFilter):
 
     name: ClassVar[str] = "global"
     max_iterations: int = 100
+    pass_s: ClassVar[float] = 5e-7
 
     def run(self, measurement: DifferenceMeasurement, z: FloatArray, starts: FloatArray) -> Ends:
         """Best end of every start (n, 6), compiled.

@@ -50,7 +50,6 @@ from magloc.measurement.whitened_compiled import ModelRow
 
 # χ² above that of the optimum searched from the truth within which a fix has found it.
 CHI2_FOUND = 0.05
-_EDGE = 16
 _MAX_ITERATIONS = 200
 
 
@@ -163,9 +162,9 @@ class SourcesMap(CubeMap):
         return WhitenedModel.of(array, [whitening(array)], array.ambient_fields[None])
 
     @property
-    def edge(self) -> int:
-        """Sources along the edges of a box; a fix takes the time of many starts, so boxes are smaller than theirs."""
-        return _EDGE
+    def point_s(self) -> float:
+        """Seconds of one core that a fix takes, roughly."""
+        return 2.4e-4
 
     @property
     def settings(self) -> Mapping[str, Any]:

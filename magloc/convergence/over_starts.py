@@ -156,11 +156,10 @@ class StartsMap(CubeMap):
         return cls(scenario, grid, measurement, z, fix.solutions[0])
 
     @property
-    def edge(self) -> int:
-        """Starts along the edges of a box."""
-        if self.grid <= 48:  # a second's work at most: a chunk would cost more to write than to compute
-            return self.grid
-        return 32 if self.grid <= 128 else 64
+    def point_s(self) -> float:
+        """Seconds of one core that a start takes which never stops, roughly."""
+        method = self.scenario.method
+        return method.pass_s * method.max_iterations * self.z.size / 9
 
     @property
     def settings(self) -> Mapping[str, Any]:

@@ -56,8 +56,8 @@ def _write(sweep: Sweep, chunks: Iterable[Chunk], progress: Callable[[int], None
 
     try:
         sweep.write(chunks, progress)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"interrupted: {kept()}") from None
+    except KeyboardInterrupt as interruption:
+        raise KeyboardInterrupt(f"{str(interruption) or 'interrupted'}: {kept()}") from None
     except InputError as error:
         raise type(error)(f"{str(error).rstrip('.')}; {kept()}.") from None
     except OSError as error:

@@ -32,8 +32,10 @@ if TYPE_CHECKING:
 
 Values = Mapping[str, NDArray[Any]]
 DIMENSIONS = ("x", "y", "z")
-_UNINTERRUPTED_S = 0.5
-_PART = 64  # points along the edges of the parts that are counted at once
+# An interruption throws away what is done of a box, and waits for a part of it.
+_BOX_S, _PARTS = 1.0, 3
+_EDGES = (8, 64)
+_COUNTED = 64  # points along the edges of the parts that are counted at once
 
 
 class Box(NamedTuple):
@@ -198,8 +200,9 @@ class CubeMap(ABC):
 
     @property
     def edge(self) -> int:
-        """Points along the edges of a box."""
-        return 32
+        """Points along the edges of a box, which takes about a second."""
+        smallest, largest = _EDGES
+        return min(max(smallest, int(np.cbrt(_BOX_S / self.point_s))), largest)
 
     @property
     def axis(self) -> FloatArray:
@@ -227,6 +230,11 @@ class CubeMap(ABC):
 
     @property
     @abstractmethod
+    def point_s(self) -> float:
+        """Seconds of one core that a slow point takes, roughly."""
+
+    @property
+    @abstractmethod
     def settings(self) -> Mapping[str, Any]:
         """What determines the values beside the array and the cube."""
 
@@ -249,10 +257,11 @@ class Chunk(NamedTuple):
 
 def boxes(cube: CubeMap) -> Iterator[Box]:
     """Boxes that tile a cube."""
-    return _tiles(cube.grid, cube.edge)
+    return tiles(cube.grid, cube.edge)
 
 
-def _tiles(grid: int, edge: int) -> Iterator[Box]:
+def tiles(grid: int, edge: int) -> Iterator[Box]:
+    """Boxes of some points along their edges that tile a cube."""
     parts = [slice(i, min(i + edge, grid)) for i in range(0, grid, edge)]
     n = len(parts)
     for i, j, k in np.ndindex(n, n, n):
@@ -260,20 +269,15 @@ def _tiles(grid: int, edge: int) -> Iterator[Box]:
 
 
 def computed(cube: CubeMap, box: Box) -> Chunk:
-    """Values of one box, with their time; compiling is not part of it. Ctrl-C waits half a second, not for the box."""
-    with uninterrupted():
-        cube.warm_up()
+    """Values of one box, with their time; compiling is not part of it. Ctrl-C waits for a part of the box."""
+    cube.warm_up()
     began = time.perf_counter()
     x, y, z = box.region
+    layers = -(-(x.stop - x.start) // _PARTS)
     parts: list[Values] = []
-    begin, layers = x.start, 1
-    while begin < x.stop:
-        since, end = time.perf_counter(), min(begin + layers, x.stop)
+    for begin in range(x.start, x.stop, layers):
         with uninterrupted():
-            parts.append(cube.values(Box(box.place, (slice(begin, end), y, z))))
-        per_layer_s = (time.perf_counter() - since) / (end - begin)
-        layers = max(1, int(_UNINTERRUPTED_S / max(per_layer_s, 1e-6)))
-        begin = end
+            parts.append(cube.values(Box(box.place, (slice(begin, min(begin + layers, x.stop)), y, z))))
     values = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return Chunk(box, values, time.perf_counter() - began)
 
@@ -320,7 +324,7 @@ def check_half_width(edge_m: float) -> float:
 def tallied(dataset: xr.Dataset, names: Sequence[str], tally: Callable[[Values], Tally]) -> Tally:
     """Tally of some variables of a map, part by part: the map need not fit into memory."""
     total = Tally()
-    for box in _tiles(dataset.sizes[DIMENSIONS[0]], _PART):
+    for box in tiles(dataset.sizes[DIMENSIONS[0]], _COUNTED):
         part = dataset[list(names)].isel(dict(zip(DIMENSIONS, box.region, strict=True)))
         total += tally({name: part[name].to_numpy() for name in names})
     return total

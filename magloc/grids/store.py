@@ -28,8 +28,8 @@ from magloc.grids.cube import (
     Chunk,
     CubeMap,
     Values,
-    boxes,
     coordinates,
+    tiles,
     uninterrupted,
 )
 
@@ -92,6 +92,7 @@ class Sweep(Closing):
             self._arrays = _arrays_of_same_map(cube, self._group, self.path)
             self._marks = self._arrays.pop(SECONDS_OF_CHUNK)
             self._seconds = _readable_marks(self._marks)
+            self._edge = _edge(self._arrays, self._seconds, self.path)
             self._count_done()
         except BaseException:
             self.close()
@@ -115,7 +116,7 @@ class Sweep(Closing):
 
     def unfinished(self) -> Iterator[Box]:
         """Boxes that are not done."""
-        return (box for box in boxes(self.cube) if np.isnan(self._seconds[box.place]))
+        return (box for box in self._boxes() if np.isnan(self._seconds[box.place]))
 
     def write(self, chunks: Iterable[Chunk], progress: Callable[[int], None] | None = None) -> None:
         """Write chunks as they come; where one cannot be written, those before it are done."""
@@ -128,12 +129,15 @@ class Sweep(Closing):
             if progress is not None:
                 progress(chunk.box.size)
 
+    def _boxes(self) -> Iterator[Box]:
+        return tiles(self.cube.grid, self._edge)
+
     def _count(self, box: Box, seconds: float) -> None:
         self._seconds[box.place] = seconds
         self.points_done += box.size
 
     def _count_done(self) -> None:
-        for box in boxes(self.cube):
+        for box in self._boxes():
             if np.isnan(self._seconds[box.place]):
                 continue
             try:
@@ -258,6 +262,14 @@ def _arrays_of_same_map(cube: CubeMap, group: zarr.Group, path: Path) -> dict[st
             f"{path}: found a map of which a part is missing: remove it, or choose another folder."
         ) from None
     return arrays
+
+
+def _edge(arrays: Mapping[str, Any], marks: FloatArray, path: Path) -> int:
+    """Points along the edges of the chunks, which are those of the store, whatever a new one would have."""
+    (shape, chunks), *others = {(array.shape, array.chunks) for array in arrays.values()}
+    if others or len({*shape}) != 1 or len({*chunks}) != 1 or marks.shape != (-(-shape[0] // chunks[0]),) * 3:
+        raise InputError(f"{path}: found chunks that are not those of a map: remove it, or choose another folder.")
+    return int(chunks[0])
 
 
 def _in_words(key: str, found: Any, wanted: Any) -> str:

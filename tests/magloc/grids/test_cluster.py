@@ -19,7 +19,7 @@ import xarray as xr
 
 from arrays.io.errors import InputError
 from magloc.cli.app import main
-from magloc.convergence.filters import IekfFilter
+from magloc.convergence.filters import DampedFilter, IekfFilter
 from magloc.convergence.over_starts import StartsMap, StartsScenario
 from magloc.grids.cluster import check_address, computed_by
 from magloc.grids.cube import boxes, computed_here, in_memory
@@ -29,7 +29,7 @@ from tests.conftest import REPOSITORY
 pytest.importorskip("distributed")
 dask = pytest.importorskip("dask")
 ROLES = ("client", "scheduler", "worker")
-CUBE = StartsMap.of(StartsScenario(method=IekfFilter(max_iterations=5)), 70)  # 27 chunks
+CUBE = StartsMap.of(StartsScenario(method=DampedFilter(max_iterations=6000)), 40)  # 27 chunks
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,14 @@
 
 from __future__ import annotations
 
+import itertools
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -152,19 +154,25 @@ class TestStore:
 
 
 class TestInterruption:
-    def test_waits_for_a_layer_of_a_box_and_not_for_the_box(self, waves, monkeypatch):
-        """However long a layer takes, no second one is begun."""
-        layers = []
+    def test_waits_for_a_part_of_a_box_and_not_for_the_box(self, waves, monkeypatch):
+        parts = []
 
         def values(_, box):
-            layers.append(box.shape)
+            parts.append(box.shape)
             signal.raise_signal(signal.SIGINT)
             return {}
 
         monkeypatch.setattr(Waves, "values", values)
         with pytest.raises(KeyboardInterrupt):
             next(computed_here(waves, boxes(waves)))
-        assert layers == [(1, 16, 16)]
+        assert parts == [(6, 16, 16)]
+
+    @pytest.mark.parametrize("passes", [100, 500])
+    def test_starts_that_may_take_eight_times_as_long_have_boxes_of_half_the_edge(self, passes):
+        edges = [
+            StartsMap.of(StartsScenario(method=IekfFilter(max_iterations=times * passes)), 100).edge for times in (1, 8)
+        ]
+        assert edges[0] // 2 == edges[1]
 
 
 class TestResume:
@@ -215,6 +223,13 @@ class TestResume:
         assert len(computed_boxes(waves)) <= 28
         assert len(before) - len(done) / 3 <= 1
         assert set(map(str, (box.place for box in boxes(waves)))) == set(computed_boxes(waves))
+        assert_same(tmp_path / "map.zarr", in_memory(waves))
+
+    def test_a_store_with_other_chunks(self, waves, tmp_path):
+        """How large new chunks are may change; a store goes on with its own."""
+        with Sweep(waves, tmp_path / "map.zarr") as sweep:
+            sweep.write(itertools.islice(computed_here(waves, sweep.unfinished()), 5))
+        assert run(replace(waves, edge=20), tmp_path / "map.zarr").chunks_done == 27
         assert_same(tmp_path / "map.zarr", in_memory(waves))
 
     def test_written_without_its_mark(self, waves, tmp_path):
@@ -290,6 +305,13 @@ class TestRefused:
         run(waves, tmp_path / "map.zarr")
         (tmp_path / "map.zarr/height/zarr.json").unlink()
         with pytest.raises(InputError, match="a part is missing"):
+            Sweep(waves, tmp_path / "map.zarr")
+
+    def test_marks_of_other_chunks(self, waves, tmp_path):
+        run(waves, tmp_path / "map.zarr")
+        path = tmp_path / "map.zarr/seconds_of_chunk/zarr.json"
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"shape": [2, 2, 2]}))
+        with pytest.raises(InputError, match="found chunks that are not those of a map"):
             Sweep(waves, tmp_path / "map.zarr")
 
     @pytest.mark.skipif(sys.platform == "win32", reason="needs file locks")
