@@ -103,7 +103,7 @@ def estimate(
         everything that a filter may be told, in place of states and filter too.
     states : iterable of str
         What is estimated besides attitude and rate: ``gyro-bias``, ``field-bias``, ``disturbance``,
-        ``field-model``, ``dipole``.
+        ``field-model``, ``dipole``, ``field-gain``.
     filter : str
         ``mekf``; with its converged gain (``constant-gain``); with a filter of the disturbance beside it
         (``parallel-disturbance``); of attitude and gyro bias alone (``reduced``); with a smoother after it

@@ -38,8 +38,9 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
     rad about it. Elsewhere it is wider than the readings by :data:`AGAIN`.
     """
     used, readings, around = settings.sensors, record.readings, record.environment
-    # An error that is a state of the filter is noise of one instant.
+    # An error that is a state of the filter is noise of one instant, but no more where it is constant.
     sigma = deviations(record, replace(settings, sensors=settings.sensors.without("field-model")))
+    constant_T = _calibration_deviation(settings, np.linalg.norm(record.environment.b_orbital_T[:, 0], axis=-1))
     b_orbital, b = around.b_orbital_T[:, 0], readings.field_T[:, 0]
     length_T = np.linalg.norm(b_orbital, axis=-1)
     runs = len(b)
@@ -49,17 +50,17 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
     for run in np.flatnonzero(seen_field | seen_sun):
         orbital = np.stack([b_orbital[run] / length_T[run], around.sun_orbital[run, 0]])
         body = np.stack([b[run] / np.linalg.norm(b[run]), readings.sun[run, 0]])
-        weights = np.array([(length_T[run] / sigma[2]) ** 2, 1.0 / sigma[3] ** 2])
+        weights = np.array([length_T[run] ** 2 / (sigma[2] ** 2 + constant_T[run] ** 2), 1.0 / sigma[3] ** 2])
         seen = np.array([seen_field[run], seen_sun[run]])
         q[run] = _aligned(orbital[seen], body[seen], weights[seen])
     seen_star = is_read(readings.star[:, 0]) & used.star
     q[seen_star] = readings.star[seen_star, 0]
     information = np.tile(np.eye(3) * (2.0 / OPEN_RAD) ** 2, (runs, 1, 1))
     for seen, v, noise in (
-        (seen_field, rotate_back(q, b_orbital), sigma[2]),
-        (seen_sun, rotate_back(q, around.sun_orbital[:, 0]), sigma[3]),
+        (seen_field, rotate_back(q, b_orbital), np.hypot(AGAIN * sigma[2], constant_T)),
+        (seen_sun, rotate_back(q, around.sun_orbital[:, 0]), np.full(runs, AGAIN * sigma[3])),
     ):
-        H = 2.0 * cross_matrix(v) / (AGAIN * noise)
+        H = 2.0 * cross_matrix(v) / noise[:, None, None]
         information[seen] += (H.mT @ H)[seen]
     information[seen_star] += np.eye(3) / (AGAIN * sigma[0]) ** 2
     w = absolute_rate(q, np.zeros((runs, 3)), around.orbital_rate_rad_s[:, 0])
@@ -73,6 +74,14 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
     covariance[:, :3, :3] = np.linalg.inv(information)
     covariance[:, 3:, 3:] = rate_variance[:, None, None] * np.eye(3)
     return Start(quaternion.normalised(q), w, covariance)
+
+
+def _calibration_deviation(settings: FilterSettings, length_T: FloatArray) -> FloatArray:
+    """Standard deviation of what the states of the magnetometer may add to a component of fields of some lengths."""
+    states = settings.sensors.states
+    bias_T = settings.field_bias_sigma_T if "field-bias" in states else 0.0
+    gain = np.hypot(settings.field_gain_sigma, settings.field_axes_sigma_rad) if "field-gain" in states else 0.0
+    return np.hypot(bias_T, gain * length_T)
 
 
 def first_told(record: Record, used: SensorSet, *, with_gyro: bool) -> int:
