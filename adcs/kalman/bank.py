@@ -90,7 +90,7 @@ def estimate(
     """Attitude and rate of a satellite from its log, by an error-state Kalman filter.
 
     Field and Sun are computed along the orbit. The filter starts from the first readings; where they leave a turn
-    open, from the turn that fits the readings of five minutes.
+    open, from the turn that fits the readings of five minutes, or fifty of a magnetometer alone.
 
     Parameters
     ----------

@@ -98,9 +98,8 @@ def sensor_set(sensors: str, states: Iterable[str] = ()) -> SensorSet:
 def check_observable(used: SensorSet) -> None:
     """Raise where a set cannot observe attitude, or a state that it has.
 
-    A direction leaves the rotation about it open. The field turns along the orbit, and with a gyro that closes the gap;
-    the Sun stays where it is, so that no time helps there. A magnetometer alone, with the known motion, finds attitude
-    to a degree after a whole orbit; it is refused as well.
+    A direction leaves the rotation about it open. The field turns along the orbit, and the motion, by a gyro or by the
+    equations of motion alone, closes the gap; the Sun stays where it is, so that no time helps there.
     """
     for state in used.states:
         sensor = MEASURED_BY.get(state)
@@ -108,17 +107,12 @@ def check_observable(used: SensorSet) -> None:
             raise ValueError(
                 f"Input states must not have {state} without a {SENSOR_WORDS[sensor]}; add {sensor} to the sensors."
             )
-    if used.star or (used.magnetometer and (used.sun or used.gyro)):
+    if used.star or used.magnetometer:
         return
-    seen, missing = "nothing measures attitude", "a star tracker (st), or mag with sun or gyro"
-    if used.sun:
-        seen = "the Sun sensor leaves the rotation about the Sun open"
-        missing = "a star tracker (st) or a magnetometer (mag)"
-    elif used.magnetometer:
-        seen = "the magnetometer leaves the rotation about the field open for an orbit"
-        missing = "a star tracker (st), a Sun sensor (sun) or a gyro"
+    seen = "the Sun sensor leaves the rotation about the Sun open" if used.sun else "nothing measures attitude"
     raise ValueError(
-        f"Input sensors must observe attitude; instead received {used.sensors!r}: {seen}; missing is {missing}."
+        f"Input sensors must observe attitude; instead received {used.sensors!r}: {seen}; missing is a star tracker "
+        "(st) or a magnetometer (mag)."
     )
 
 
@@ -170,7 +164,7 @@ def tuned_noise(used: SensorSet) -> ProcessNoise:
         # A dipole is told from other torques by orbits: what is not white must not be as large as tells it.
         if "disturbance" in used.states:
             return ProcessNoise(1e-8, 1e-8, disturbance_s2=3e-10)
-        return ProcessNoise(1e-8, 3e-7)
+        return ProcessNoise(1e-8, 2e-7)
     if "disturbance" in used.states:
         # The torque is in the state: what is left for the rate is almost nothing.
         if used.star and "gyro-bias" not in used.states:

@@ -26,6 +26,9 @@ from arrays.typing import FloatArray
 
 AGAIN = 10.0
 """Standard deviations of a start are those of its readings times this: the filter takes the same readings again."""
+WINDOW_S, ALONE_S = 300.0, 3000.0
+"""How much of a record tells which turn about the first direction is right, and with a magnetometer alone, for which
+the field must turn along the orbit."""
 KNOWN_RAD = math.radians(75.0)
 """An attitude is known where no axis of its start has a larger standard deviation: 10° by the readings themselves."""
 
@@ -103,14 +106,13 @@ def any_start(
     record: Record,
     settings: FilterSettings,
     turns: int = 36,
-    window_s: float = 300.0,
     rate_rad_s: float = RATE_RAD_S,
 ) -> Start:
     """Start from any attitude: :func:`vector_start`, and where it leaves a turn open the best of several hypotheses.
 
-    ``turns``: hypotheses, at equal angles about the axis that is left open. ``window_s``: how much of the record
-    decides between them. ``rate_rad_s``: as :func:`vector_start`. Returns: where a hypothesis was chosen, the deviation
-    about the open axis is the distance between hypotheses.
+    ``turns``: hypotheses, at equal angles about the axis that is left open; :data:`WINDOW_S` or :data:`ALONE_S` of the
+    record decide between them. ``rate_rad_s``: as :func:`vector_start`. Returns: where a hypothesis was chosen, the
+    deviation about the open axis is the distance between hypotheses.
     """
     start = vector_start(record, settings, rate_rad_s)
     open_runs = np.flatnonzero(largest_deviation_rad(start) > KNOWN_RAD)
@@ -120,21 +122,22 @@ def any_start(
     variances, axes = np.linalg.eigh(start.covariance[open_runs, :3, :3])
     if (2.0 * np.sqrt(variances[:, 1]) > KNOWN_RAD).any():
         raise ValueError("Input record must have a direction at the first instant of every run; one has none.")
+    used = settings.sensors
+    window_s = WINDOW_S if used.sun or used.gyro else ALONE_S
     n = 1 + round(min(window_s / record.dt_s, record.momentum_Nms.shape[1] - 1))
     spacing = 2.0 * math.pi / turns
     angles = spacing * np.arange(turns)
-    repeated = np.repeat(open_runs, turns)
-    turn = quaternion.exp(angles[None, :, None] * axes[:, None, :, 2])
-    hypotheses = _narrowed(start, repeated, np.repeat(axes[..., 2], turns, axis=0), spacing)
-    hypotheses = replace(
-        hypotheses, q=quaternion.multiply(start.q[open_runs, None], turn).reshape(-1, 4), w=start.w[repeated]
-    )
-    # Without a gate: how badly a wrong turn fits is what tells it.
-    tried = run_filter(part(record, repeated, slice(n)), replace(settings, gate=0.0), hypotheses)
-    best = np.nansum(tried.nis, axis=(1, 2)).reshape(-1, turns).argmin(axis=-1) + turns * np.arange(len(open_runs))
     q, w, covariance = start.q.copy(), start.w.copy(), start.covariance.copy()
-    q[open_runs], w[open_runs] = hypotheses.q[best], hypotheses.w[best]
-    covariance[open_runs] = hypotheses.covariance[best]
+    # One run after the other: the covariances of all hypotheses are held.
+    for run, across in zip(open_runs, axes, strict=True):
+        repeated, axis = np.full(turns, run), across[:, 2]
+        narrow = _narrowed(start, repeated, np.tile(axis, (turns, 1)), spacing)
+        turned = quaternion.multiply(start.q[run], quaternion.exp(angles[:, None] * axis))
+        hypotheses = replace(narrow, q=turned)
+        # Without a gate: how badly a wrong turn fits is what tells it.
+        tried = run_filter(part(record, repeated, slice(n)), replace(settings, gate=0.0), hypotheses)
+        best = int(np.nansum(tried.nis, axis=(1, 2)).argmin())
+        q[run], w[run], covariance[run] = hypotheses.q[best], hypotheses.w[best], hypotheses.covariance[best]
     return Start(q, w, covariance)
 
 

@@ -329,7 +329,6 @@ class TestOwnScenario:
         ("arguments", "fragments"),
         [
             (["--sensors", "sun+gyro"], ["--sensors", "must observe attitude", "missing is"]),
-            (["--sensors", "mag"], ["must observe attitude", "missing is"]),
             (["--sensors", "st", "--states", "gyro-bias"], ["without a gyro"]),
             (["--states", "wind"], ["wind", "gyro-bias"]),
             (["--start-error-deg", "-1"], ["--start-error-deg"]),
