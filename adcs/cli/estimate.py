@@ -26,7 +26,8 @@ def estimate(
     """Estimate attitude and rate from telemetry, with the filters of `adcs run`.
 
     The filter starts from the first readings; where they leave a turn open, from the turn that fits the readings of
-    five minutes. `adcs run tabletsat --out DIR` writes an example: DIR/telemetry.csv with DIR/scenario.toml.
+    five minutes, or fifty of a magnetometer alone. `adcs run tabletsat --out DIR` writes an example: DIR/telemetry.csv
+    with DIR/scenario.toml.
 
     Parameters
     ----------

@@ -21,10 +21,10 @@ def estimate_columns(track: AttitudeTrack) -> dict[str, Any]:
         if q is not None:
             columns |= dict(zip((f"{prefix}q{part}" for part in "wxyz"), q.T, strict=True))
     for state, shown in SHOWN.items():
-        for i, axis in enumerate("xyz"):
+        for i, name in enumerate(shown.columns):
             for prefix, values in (("", track.states), ("sigma_", track.sigma)):
                 if state in values:
-                    columns[prefix + shown.column.format(axis)] = shown.scale * values[state][:, i]
+                    columns[prefix + name] = shown.scale * values[state][:, i]
     for sensor, nis in track.nis.items():
         if not np.isnan(nis).all():
             columns[f"nis_{_NAMES[sensor]}"] = nis
@@ -43,7 +43,7 @@ def summary_lines(track: AttitudeTrack) -> list[str]:
     q = ", ".join(f"{columns[f'{prefix}q{part}'][-1]:.6f}" for part in "wxyz")
     lines.append(f"attitude at the end, {frame} from body (w, x, y, z)   {q}")
     for state, shown in SHOWN.items():
-        names = [shown.column.format(axis) for axis in "xyz"]
+        names = shown.columns
         if state not in track.sigma:
             continue
         sigma = max(float(columns[f"sigma_{name}"][-1]) for name in names)

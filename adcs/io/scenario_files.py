@@ -177,6 +177,8 @@ def _estimator(place: str, table: EstimateTable) -> EstimatorSettings:
                 gyro_bias_sigma_rad_s=math.radians(table.gyro_bias_deg_s),
                 disturbance_sigma_s2=table.disturbance_s2,
                 dipole_sigma_Am2=table.dipole_Am2,
+                field_gain_sigma=table.field_gain,
+                field_axes_sigma_rad=math.radians(table.field_axes_deg),
                 field_correlation_s=table.field_model_correlation_s,
                 gate=table.gate,
             ),
@@ -206,6 +208,7 @@ def _process_noise(place: str, wanted: str | dict[str, Any], used: SensorSet) ->
         gyro_bias_rad_s=given.get("gyro_bias_rad_s", tuned.gyro_bias_rad_s),
         disturbance_s2=given.get("disturbance_s2", tuned.disturbance_s2),
         dipole_Am2=given.get("dipole_Am2", tuned.dipole_Am2),
+        field_gain=given.get("field_gain", tuned.field_gain),
     )
 
 

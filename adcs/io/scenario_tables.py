@@ -90,6 +90,8 @@ class DisturbanceTable(Table, kw_only=True):
     dipole_Am2: Vector = _ZERO
     gyro_bias_deg_s: NotNegative = 0.0
     field_bias_nT: NotNegative = 0.0
+    field_gain: NotNegative = 0.0
+    field_axes_deg: NotNegative = 0.0
     field_error_nT: NotNegative = 0.0
     field_error_correlation_s: Annotated[Positive, MAY_BE_INFINITE] = math.inf
     wild_share: Annotated[float, _SHARE] = 0.0
@@ -186,6 +188,8 @@ class EstimateTable(Table, kw_only=True):
     start_rate_error_deg_s: Positive = 0.1
     gyro_bias_deg_s: Positive = 0.06
     field_bias_nT: Positive = 1000.0
+    field_gain: Positive = 0.05
+    field_axes_deg: Positive = 1.0
     disturbance_s2: Positive = 2e-6
     dipole_Am2: Positive = 0.1
     forgetting: float = 0.99
@@ -204,6 +208,7 @@ class ProcessNoiseTable(Table, kw_only=True):
     gyro_bias_rad_s: NotNegative | None = None
     disturbance_s2: NotNegative | None = None
     dipole_Am2: NotNegative | None = None
+    field_gain: NotNegative | None = None
 
 
 SENSOR_TABLES: dict[str, Any] = {

@@ -90,7 +90,7 @@ def estimate(
     """Attitude and rate of a satellite from its log, by an error-state Kalman filter.
 
     Field and Sun are computed along the orbit. The filter starts from the first readings; where they leave a turn
-    open, from the turn that fits the readings of five minutes.
+    open, from the turn that fits the readings of five minutes, or fifty of a magnetometer alone.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def estimate(
         everything that a filter may be told, in place of states and filter too.
     states : iterable of str
         What is estimated besides attitude and rate: ``gyro-bias``, ``field-bias``, ``disturbance``,
-        ``field-model``, ``dipole``.
+        ``field-model``, ``dipole``, ``field-gain``.
     filter : str
         ``mekf``; with its converged gain (``constant-gain``); with a filter of the disturbance beside it
         (``parallel-disturbance``); of attitude and gyro bias alone (``reduced``); with a smoother after it

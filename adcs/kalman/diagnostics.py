@@ -162,7 +162,7 @@ def _field_model(record: Record, estimates: AttitudeTracks, run: int) -> list[st
     """Compare what does not depend on the attitude: the field's modulus, and its angle with the Sun."""
     settings = estimates.settings
     used = settings.sensors
-    if not used.magnetometer or {"field-bias", "field-model"} & set(used.states):
+    if not used.magnetometer or {"field-bias", "field-model", "field-gain"} & set(used.states):
         return []
     around, readings = record.environment, record.readings
     sigma = deviations(record, settings)

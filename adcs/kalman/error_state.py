@@ -12,6 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
 from adcs.kalman.names import MEASURED_BY, is_measured
@@ -20,7 +21,7 @@ from arrays.io.errors import check_not_negative, check_positive
 from arrays.typing import BoolArray, FloatArray
 from magloc.levels import CONTRADICTION
 
-SIZES = {"field-bias": 3, "gyro-bias": 3, "disturbance": 3, "field-model": 3, "dipole": 3}
+SIZES = {"field-bias": 3, "gyro-bias": 3, "disturbance": 3, "field-model": 3, "dipole": 3, "field-gain": 9}
 """Optional states in the order of the error state, and how many numbers they have."""
 STATES = tuple(SIZES)
 FIELD_ERROR_T = 150e-9
@@ -97,9 +98,8 @@ def sensor_set(sensors: str, states: Iterable[str] = ()) -> SensorSet:
 def check_observable(used: SensorSet) -> None:
     """Raise where a set cannot observe attitude, or a state that it has.
 
-    A direction leaves the rotation about it open. The field turns along the orbit, and with a gyro that closes the gap;
-    the Sun stays where it is, so that no time helps there. A magnetometer alone, with the known motion, finds attitude
-    to a degree after a whole orbit; it is refused as well.
+    A direction leaves the rotation about it open. The field turns along the orbit, and the motion, by a gyro or by the
+    equations of motion alone, closes the gap; the Sun stays where it is, so that no time helps there.
     """
     for state in used.states:
         if not is_measured(state, used.sensors):
@@ -107,17 +107,12 @@ def check_observable(used: SensorSet) -> None:
             raise ValueError(
                 f"Input states must not have {state} without a {SENSOR_WORDS[sensor]}; add {sensor} to the sensors."
             )
-    if used.star or (used.magnetometer and (used.sun or used.gyro)):
+    if used.star or used.magnetometer:
         return
-    seen, missing = "nothing measures attitude", "a star tracker (st), or mag with sun or gyro"
-    if used.sun:
-        seen = "the Sun sensor leaves the rotation about the Sun open"
-        missing = "a star tracker (st) or a magnetometer (mag)"
-    elif used.magnetometer:
-        seen = "the magnetometer leaves the rotation about the field open for an orbit"
-        missing = "a star tracker (st), a Sun sensor (sun) or a gyro"
+    seen = "the Sun sensor leaves the rotation about the Sun open" if used.sun else "nothing measures attitude"
     raise ValueError(
-        f"Input sensors must observe attitude; instead received {used.sensors!r}: {seen}; missing is {missing}."
+        f"Input sensors must observe attitude; instead received {used.sensors!r}: {seen}; missing is a star tracker "
+        "(st) or a magnetometer (mag)."
     )
 
 
@@ -139,6 +134,8 @@ class ProcessNoise:
         q_d.
     dipole_Am2 : float
         q_m.
+    field_gain : float
+        q_D, of each of the nine numbers.
 
     Raises
     ------
@@ -152,6 +149,7 @@ class ProcessNoise:
     gyro_bias_rad_s: float = 1e-8
     disturbance_s2: float = 1e-8
     dipole_Am2: float = 1e-7
+    field_gain: float = 1e-8
 
     def __post_init__(self) -> None:
         check_not_negative(**vars(self))
@@ -166,7 +164,7 @@ def tuned_noise(used: SensorSet) -> ProcessNoise:
         # A dipole is told from other torques by orbits: what is not white must not be as large as tells it.
         if "disturbance" in used.states:
             return ProcessNoise(1e-8, 1e-8, disturbance_s2=3e-10)
-        return ProcessNoise(1e-8, 3e-7)
+        return ProcessNoise(1e-8, 2e-7)
     if "disturbance" in used.states:
         # The torque is in the state: what is left for the rate is almost nothing.
         if used.star and "gyro-bias" not in used.states:
@@ -225,6 +223,8 @@ class FilterSettings:
     field_bias_sigma_T, gyro_bias_sigma_rad_s, disturbance_sigma_s2, dipole_sigma_Am2 : float
         Standard deviations of those states at the start, where they are zero: the dipole is that besides the residual
         dipole which the satellite is known to have.
+    field_gain_sigma, field_axes_sigma_rad : float
+        The same of the magnetometer's gains, and of the angles by which its axes are off; state ``field-gain``.
     gate : float
         Probability with which a good reading is taken for one that contradicts the filter, which is then not used; with
         0 all readings are used.
@@ -237,6 +237,8 @@ class FilterSettings:
     gyro_bias_sigma_rad_s: float = 1e-3
     disturbance_sigma_s2: float = 2e-6
     dipole_sigma_Am2: float = 0.1
+    field_gain_sigma: float = 0.05
+    field_axes_sigma_rad: float = math.radians(1.0)
     field_correlation_s: float = 132.0
     gate: float = CONTRADICTION
 
@@ -249,6 +251,8 @@ class FilterSettings:
             gyro_bias_sigma_rad_s=self.gyro_bias_sigma_rad_s,
             disturbance_sigma_s2=self.disturbance_sigma_s2,
             dipole_sigma_Am2=self.dipole_sigma_Am2,
+            field_gain_sigma=self.field_gain_sigma,
+            field_axes_sigma_rad=self.field_axes_sigma_rad,
             field_correlation_s=self.field_correlation_s,
         )
 
@@ -270,6 +274,7 @@ class FilterSettings:
             "disturbance": noise.disturbance_s2,
             "field-model": self.field_model_sigma_T * math.sqrt(1.0 - self.field_decay(dt_s) ** 2),
             "dipole": noise.dipole_Am2,
+            "field-gain": noise.field_gain,
         }
         always = np.repeat(np.square([noise.attitude, noise.rate_rad_s]), 3)
         return np.concatenate([always, self._variances(walks)])
@@ -284,13 +289,14 @@ class FilterSettings:
                 "disturbance": self.disturbance_sigma_s2,
                 "field-model": self.field_model_sigma_T,
                 "dipole": self.dipole_sigma_Am2,
+                "field-gain": np.where(np.eye(3), self.field_gain_sigma, self.field_axes_sigma_rad).ravel(),
             }
         )
 
-    def _variances(self, deviation: dict[str, float]) -> FloatArray:
-        """Variances of the numbers of the optional states, from one deviation for each state."""
-        states = self.sensors.states
-        return np.repeat(np.square([deviation[state] for state in states]), [SIZES[state] for state in states])
+    def _variances(self, deviation: Mapping[str, ArrayLike]) -> FloatArray:
+        """Variances of the numbers of the optional states, from the deviations of each state."""
+        each = [np.broadcast_to(deviation[state], SIZES[state]) for state in self.sensors.states]
+        return np.square(np.concatenate([np.zeros(0), *each]))
 
     @property
     def open_variance(self) -> FloatArray:

@@ -26,6 +26,9 @@ from arrays.typing import FloatArray
 
 AGAIN = 10.0
 """Standard deviations of a start are those of its readings times this: the filter takes the same readings again."""
+WINDOW_S, ALONE_S = 300.0, 3000.0
+"""How much of a record tells which turn about the first direction is right, and with a magnetometer alone, for which
+the field must turn along the orbit."""
 KNOWN_RAD = math.radians(75.0)
 """An attitude is known where no axis of its start has a larger standard deviation: 10° by the readings themselves."""
 
@@ -38,8 +41,9 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
     rad about it. Elsewhere it is wider than the readings by :data:`AGAIN`.
     """
     used, readings, around = settings.sensors, record.readings, record.environment
-    # An error that is a state of the filter is noise of one instant.
+    # An error that is a state of the filter is noise of one instant, but no more where it is constant.
     sigma = deviations(record, replace(settings, sensors=settings.sensors.without("field-model")))
+    constant_T = _calibration_deviation(settings, np.linalg.norm(record.environment.b_orbital_T[:, 0], axis=-1))
     b_orbital, b = around.b_orbital_T[:, 0], readings.field_T[:, 0]
     length_T = np.linalg.norm(b_orbital, axis=-1)
     runs = len(b)
@@ -49,17 +53,17 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
     for run in np.flatnonzero(seen_field | seen_sun):
         orbital = np.stack([b_orbital[run] / length_T[run], around.sun_orbital[run, 0]])
         body = np.stack([b[run] / np.linalg.norm(b[run]), readings.sun[run, 0]])
-        weights = np.array([(length_T[run] / sigma[2]) ** 2, 1.0 / sigma[3] ** 2])
+        weights = np.array([length_T[run] ** 2 / (sigma[2] ** 2 + constant_T[run] ** 2), 1.0 / sigma[3] ** 2])
         seen = np.array([seen_field[run], seen_sun[run]])
         q[run] = _aligned(orbital[seen], body[seen], weights[seen])
     seen_star = is_read(readings.star[:, 0]) & used.star
     q[seen_star] = readings.star[seen_star, 0]
     information = np.tile(np.eye(3) * (2.0 / OPEN_RAD) ** 2, (runs, 1, 1))
     for seen, v, noise in (
-        (seen_field, rotate_back(q, b_orbital), sigma[2]),
-        (seen_sun, rotate_back(q, around.sun_orbital[:, 0]), sigma[3]),
+        (seen_field, rotate_back(q, b_orbital), np.hypot(AGAIN * sigma[2], constant_T)),
+        (seen_sun, rotate_back(q, around.sun_orbital[:, 0]), np.full(runs, AGAIN * sigma[3])),
     ):
-        H = 2.0 * cross_matrix(v) / (AGAIN * noise)
+        H = 2.0 * cross_matrix(v) / noise[:, None, None]
         information[seen] += (H.mT @ H)[seen]
     information[seen_star] += np.eye(3) / (AGAIN * sigma[0]) ** 2
     w = absolute_rate(q, np.zeros((runs, 3)), around.orbital_rate_rad_s[:, 0])
@@ -73,6 +77,14 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
     covariance[:, :3, :3] = np.linalg.inv(information)
     covariance[:, 3:, 3:] = rate_variance[:, None, None] * np.eye(3)
     return Start(quaternion.normalised(q), w, covariance)
+
+
+def _calibration_deviation(settings: FilterSettings, length_T: FloatArray) -> FloatArray:
+    """Standard deviation of what the states of the magnetometer may add to a component of fields of some lengths."""
+    states = settings.sensors.states
+    bias_T = settings.field_bias_sigma_T if "field-bias" in states else 0.0
+    gain = np.hypot(settings.field_gain_sigma, settings.field_axes_sigma_rad) if "field-gain" in states else 0.0
+    return np.hypot(bias_T, gain * length_T)
 
 
 def first_told(record: Record, used: SensorSet, *, with_gyro: bool) -> int:
@@ -94,14 +106,13 @@ def any_start(
     record: Record,
     settings: FilterSettings,
     turns: int = 36,
-    window_s: float = 300.0,
     rate_rad_s: float = RATE_RAD_S,
 ) -> Start:
     """Start from any attitude: :func:`vector_start`, and where it leaves a turn open the best of several hypotheses.
 
-    ``turns``: hypotheses, at equal angles about the axis that is left open. ``window_s``: how much of the record
-    decides between them. ``rate_rad_s``: as :func:`vector_start`. Returns: where a hypothesis was chosen, the deviation
-    about the open axis is the distance between hypotheses.
+    ``turns``: hypotheses, at equal angles about the axis that is left open; :data:`WINDOW_S` or :data:`ALONE_S` of the
+    record decide between them. ``rate_rad_s``: as :func:`vector_start`. Returns: where a hypothesis was chosen, the
+    deviation about the open axis is the distance between hypotheses.
     """
     start = vector_start(record, settings, rate_rad_s)
     open_runs = np.flatnonzero(largest_deviation_rad(start) > KNOWN_RAD)
@@ -111,21 +122,22 @@ def any_start(
     variances, axes = np.linalg.eigh(start.covariance[open_runs, :3, :3])
     if (2.0 * np.sqrt(variances[:, 1]) > KNOWN_RAD).any():
         raise ValueError("Input record must have a direction at the first instant of every run; one has none.")
+    used = settings.sensors
+    window_s = WINDOW_S if used.sun or used.gyro else ALONE_S
     n = 1 + round(min(window_s / record.dt_s, record.momentum_Nms.shape[1] - 1))
     spacing = 2.0 * math.pi / turns
     angles = spacing * np.arange(turns)
-    repeated = np.repeat(open_runs, turns)
-    turn = quaternion.exp(angles[None, :, None] * axes[:, None, :, 2])
-    hypotheses = _narrowed(start, repeated, np.repeat(axes[..., 2], turns, axis=0), spacing)
-    hypotheses = replace(
-        hypotheses, q=quaternion.multiply(start.q[open_runs, None], turn).reshape(-1, 4), w=start.w[repeated]
-    )
-    # Without a gate: how badly a wrong turn fits is what tells it.
-    tried = run_filter(part(record, repeated, slice(n)), replace(settings, gate=0.0), hypotheses)
-    best = np.nansum(tried.nis, axis=(1, 2)).reshape(-1, turns).argmin(axis=-1) + turns * np.arange(len(open_runs))
     q, w, covariance = start.q.copy(), start.w.copy(), start.covariance.copy()
-    q[open_runs], w[open_runs] = hypotheses.q[best], hypotheses.w[best]
-    covariance[open_runs] = hypotheses.covariance[best]
+    # One run after the other: the covariances of all hypotheses are held.
+    for run, across in zip(open_runs, axes, strict=True):
+        repeated, axis = np.full(turns, run), across[:, 2]
+        narrow = _narrowed(start, repeated, np.tile(axis, (turns, 1)), spacing)
+        turned = quaternion.multiply(start.q[run], quaternion.exp(angles[:, None] * axis))
+        hypotheses = replace(narrow, q=turned)
+        # Without a gate: how badly a wrong turn fits is what tells it.
+        tried = run_filter(part(record, repeated, slice(n)), replace(settings, gate=0.0), hypotheses)
+        best = int(np.nansum(tried.nis, axis=(1, 2)).argmin())
+        q[run], w[run], covariance[run] = hypotheses.q[best], hypotheses.w[best], hypotheses.covariance[best]
     return Start(q, w, covariance)
 
 

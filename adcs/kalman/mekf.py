@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adcs import quaternion
+from adcs.frames import turned
 from adcs.kalman.error_state import (
     ALWAYS,
     SIZES,
@@ -174,10 +175,14 @@ def residuals(record: Record, row: int, state: State, used: SensorSet) -> list[t
         parts.append((1, residual, rows(3, np.eye(3), "gyro-bias")))
     if used.magnetometer:
         b = rotate_back(state.q, around.b_orbital_T[:, row] + state.of("field-model"))
-        residual = readings.field_T[:, row] - b - state.of("field-bias")
-        H = rows(0, 2.0 * cross_matrix(b), "field-bias")
+        gain = np.eye(3) + state.of("field-gain").reshape(-1, 3, 3)
+        residual = readings.field_T[:, row] - turned(gain, b) - state.of("field-bias")
+        H = rows(0, 2.0 * gain @ cross_matrix(b), "field-bias")
         if "field-model" in used.states:
-            H[..., used.place("field-model")] = quaternion.matrix(state.q).mT
+            H[..., used.place("field-model")] = gain @ quaternion.matrix(state.q).mT
+        if "field-gain" in used.states:
+            # Row i of D meets the whole field and tells component i.
+            H[..., used.place("field-gain")] = np.einsum("ij,rk->rijk", np.eye(3), b).reshape(-1, 3, 9)
         parts.append((2, residual, H))
     if used.sun:
         s = rotate_back(state.q, around.sun_orbital[:, row])
@@ -389,6 +394,11 @@ def check_start(record: Record, start: Start) -> None:
             raise ValueError(f"Input start.{name} must be finite with shape {shape}; instead received {values.shape}.")
 
 
+def _begins(used: SensorSet, state: str, part: int) -> int:
+    """Where three numbers of an optional state begin in the error state; -1 where the set does not have it."""
+    return used.place(state).start + 3 * part if state in used.states else -1
+
+
 def run_filter(record: Record, settings: FilterSettings, start: Start) -> AttitudeTracks:
     """Filter of whole runs, compiled; runs are shared out among the threads of numba.
 
@@ -422,7 +432,7 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
         kernel.Settings(
             np.array([used.star, used.gyro, used.magnetometer, used.sun]),
             deviations(record, settings),
-            np.array([used.place(state).start if state in used.states else -1 for state in STATES]),
+            np.array([_begins(used, state, part) for state in STATES for part in range(SIZES[state] // 3)]),
             settings.process_variance(record.dt_s),
             settings.open_variance,
             settings.field_decay(record.dt_s),

@@ -19,6 +19,7 @@ from adcs.satellite.dynamics_compiled import (
     Surroundings,
     Vector,
     applied,
+    cross,
     error_jacobian,
     error_vector,
     multiply,
@@ -68,9 +69,10 @@ class Record(NamedTuple):
 class Settings(NamedTuple):
     """Which of star tracker, gyro, magnetometer and Sun sensor are used, their deviations and patience, (4,).
 
-    Biases of field and gyro, the disturbance, the error of the field model and the dipole begin at ``firsts`` in the
-    error state, -1 where there are none. ``variance`` and ``open_variance`` (N,): that a step adds, and of an error
-    state of which nothing is known. ``decay``: what a step leaves of the error of the field model.
+    Biases of field and gyro, the disturbance, the error of the field model, the dipole and the three rows of the
+    magnetometer's D begin at ``firsts`` in the error state, -1 where there are none. ``variance`` and ``open_variance``
+    (N,): that a step adds, and of an error state of which nothing is known. ``decay``: what a step leaves of the error
+    of the field model.
     """
 
     used: NDArray[np.bool_]
@@ -140,7 +142,7 @@ def _with_reading(
     x, h, columns = one.x, work.h, work.columns
     _copied(one.P, one.dx, work.P, work.dx)
     q, bias, v = quaternion_at(x), -1, model
-    e = firsts[3] if sensor == 2 else -1
+    e, g = (firsts[3], firsts[5]) if sensor == 2 else (-1, -1)
     if e >= 0:
         model = model[0] + x[16], model[1] + x[17], model[2] + x[18]
         axes = rotate_back(q, (1.0, 0.0, 0.0)), rotate_back(q, (0.0, 1.0, 0.0)), rotate_back(q, (0.0, 0.0, 1.0))
@@ -151,12 +153,22 @@ def _with_reading(
     else:
         v = rotate_back(q, model)
         residual = _minus(vector_at(reading), v)
+        if g >= 0:
+            residual = _minus(residual, (gate.dot(_at(x, 22), v), gate.dot(_at(x, 25), v), gate.dot(_at(x, 28), v)))
         if sensor == 2:
             residual, bias = _minus(residual, _at(x, 7)), firsts[0]
     nis, determinant = 0.0, 1.0
     for j in range(3):
         if sensor < 2:
             columns[0], h[0], m = 3 * sensor + j, 1.0, 1
+        elif g >= 0:
+            # Row j of (E + D)2W(v), and the field itself for that row of D.
+            row = (x[22 + 3 * j] + (j == 0), x[23 + 3 * j] + (j == 1), x[24 + 3 * j] + (j == 2))
+            turned = cross(row, v)
+            for k in range(3):
+                columns[k], h[k] = k, 2.0 * turned[k]
+                columns[3 + k], h[3 + k] = g + 3 * j + k, v[k]
+            m = 6
         else:
             # Row j of 2W(v).
             one_on, two_on = (j + 1) % 3, (j + 2) % 3
@@ -167,7 +179,7 @@ def _with_reading(
             m += 1
         if e >= 0:
             for k in range(3):
-                columns[m + k], h[m + k] = e + k, axes[k][j]
+                columns[m + k], h[m + k] = e + k, gate.dot(row, axes[k]) if g >= 0 else axes[k][j]
             m += 3
         squared, s = scalar(one.P, one.dx, h, columns, m, residual[j], r, work.u, work.A)
         nis, determinant = nis + squared, determinant * (s / r)

@@ -18,8 +18,15 @@ class Shown(NamedTuple):
     scale: float
     unit: str
     words: str
+    axes: tuple[str, ...] = ("x", "y", "z")
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Columns of all axes."""
+        return tuple(self.column.format(axis) for axis in self.axes)
 
 
+_ELEMENTS = tuple(row + column for row in "xyz" for column in "xyz")
 SHOWN = {
     "attitude": Shown("attitude_{}_deg", np.degrees(1.0), "°", "attitude"),
     "rate": Shown("rate_{}_deg_s", np.degrees(1.0), "°/s", "rate"),
@@ -28,22 +35,35 @@ SHOWN = {
     "disturbance": Shown("disturbance_{}_s2", 1.0, "1/s²", "disturbing acceleration"),
     "field-model": Shown("field_model_{}_nT", 1e9, "nT", "error of the field's model"),
     "dipole": Shown("dipole_{}_Am2", 1.0, "A·m²", "residual dipole"),
+    "field-gain": Shown("field_gain_{}_percent", 100.0, "%", "gains of the magnetometer", _ELEMENTS),
 }
-STATE_COLUMNS = tuple(shown.column.format(axis) for shown in SHOWN.values() for axis in "xyz")
+STATE_COLUMNS = tuple(column for shown in SHOWN.values() for column in shown.columns)
 
 
 def by_state(error: FloatArray, used: SensorSet) -> dict[str, FloatArray]:
-    """Errors (..., N) or their standard deviations as (..., 3) of each state; that of the attitude is of the angle."""
-    parts = np.split(error, error.shape[-1] // 3, axis=-1)
-    return dict(zip(("attitude", "rate", *used.states), [2.0 * parts[0], *parts[1:]], strict=True))
+    """Errors (..., N) or their standard deviations as (..., k) of each state; that of the attitude is of the angle."""
+    always = {"attitude": 2.0 * error[..., :3], "rate": error[..., 3:6]}
+    return always | {state: error[..., used.place(state)] for state in used.states}
 
 
 def sigma_by_state(tracks: AttitudeTracks) -> dict[str, FloatArray]:
-    """Standard deviations of the states that there are, shape (runs, n, 3)."""
+    """Standard deviations of the states that there are, shape (runs, n, k)."""
     return by_state(tracks.sigma, tracks.settings.sensors)
 
 
 def in_units(states: Mapping[str, FloatArray]) -> FloatArray:
-    """States (..., 3) as (..., 21) in the order and units of :data:`STATE_COLUMNS`; NaN of one that is not there."""
-    missing = np.full_like(next(iter(states.values())), np.nan)
-    return np.concatenate([shown.scale * states.get(state, missing) for state, shown in SHOWN.items()], axis=-1)
+    """States (..., k) as (..., 30) in the order and units of :data:`STATE_COLUMNS`; NaN of one that is not there."""
+    shape = next(iter(states.values())).shape[:-1]
+    return np.concatenate(
+        [
+            shown.scale * states[state] if state in states else np.full((*shape, len(shown.axes)), np.nan)
+            for state, shown in SHOWN.items()
+        ],
+        axis=-1,
+    )
+
+
+def worst_axis(values: FloatArray) -> FloatArray:
+    """Largest of the numbers of every state of :data:`SHOWN`, (..., 30) as :func:`in_units` -> (..., states)."""
+    begins = np.cumsum([0, *(len(shown.axes) for shown in SHOWN.values())])[:-1]
+    return np.asarray(np.maximum.reduceat(values, begins, axis=-1))

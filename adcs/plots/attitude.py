@@ -30,14 +30,14 @@ _SENSOR_STYLES = ((style.BLACK, "-"), (style.BLUE, "--"), (style.ORANGE, "-."), 
 class StatesPicture:
     """One run through time.
 
-    ``values`` (n, 18): errors (estimate minus truth) or estimates, in the units of ``adcs``' files; NaN of a state that
+    ``values`` (n, 30): errors (estimate minus truth) or estimates, in the units of ``adcs``' files; NaN of a state that
     is not there.
     """
 
     title: str
     time_s: FloatArray  # (n,)
     values: FloatArray
-    sigma: FloatArray  # (n, 18): standard deviations that the filter gives
+    sigma: FloatArray  # (n, 30): standard deviations that the filter gives
     are_errors: bool  # whether values are errors: their band is around zero
     gaps: Sequence[tuple[str, BoolArray]] = ()  # (n,): what was missing, and whether it was there
 
@@ -63,14 +63,17 @@ def track_figure(track: AttitudeTrack, name: str = "") -> Figure:
 
 def states_figure(picture: StatesPicture) -> Figure:
     """Every state's three axes side by side, with the filter's ±3σ."""
-    rows = [row for row in range(len(SHOWN)) if not np.isnan(picture.values[:, 3 * row]).all()]
+    # Nine numbers of one state are three rows.
+    states = [state for state, shown in SHOWN.items() for _ in range(len(shown.axes) // 3)]
+    rows = [row for row in range(len(states)) if not np.isnan(picture.values[:, 3 * row]).all()]
     figure = style.new_figure(1.25 * len(rows) + 0.75)
     axes = figure.subplots(len(rows), 3, sharex=True, sharey="row", squeeze=False)
     settled = picture.time_s >= picture.time_s[0] + _SETTLED * np.ptp(picture.time_s)
     for across, row in zip(axes, rows, strict=True):
-        state, shown = list(SHOWN.items())[row]
+        state, shown = states[row], SHOWN[states[row]]
         scale, unit = (1e6, f"1e-6{shown.unit.removeprefix('1')}") if state == _MILLIONTHS else (1.0, shown.unit)
-        label = f"{state.replace('-', ' ')} [{unit}]"
+        part = f" {'xyz'[row - states.index(state)]}" if states.count(state) > 1 else ""
+        label = f"{state.replace('-', ' ')}{part} [{unit}]"
         columns = slice(3 * row, 3 * row + 3)
         values, wide = scale * picture.values[:, columns], 3.0 * scale * picture.sigma[:, columns]
         middle = np.zeros_like(values) if picture.are_errors else values

@@ -34,7 +34,8 @@ class AttitudeTrack:
         Reference frame from body, scalar first; :attr:`rotation` is scipy's.
     states : mapping of str to ndarray, shape (n, 3)
         ``rate`` against inertial space [rad/s], and of what is estimated ``gyro-bias`` [rad/s], ``field-bias`` [T] and
-        ``disturbance`` [1/s²] and ``dipole`` [A·m²], body axes, and ``field-model`` [T], orbital frame.
+        ``disturbance`` [1/s²] and ``dipole`` [A·m²], body axes, ``field-model`` [T], orbital frame,
+        and ``field-gain``, nine numbers.
     used : tuple of str
         Sensors in use.
     seen : mapping of str to ndarray of bool, shape (n,)

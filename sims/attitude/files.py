@@ -31,6 +31,8 @@ def simulation_of(file: AttitudeFile) -> AttitudeScenario:
             torque_period_s=disturbance.torque_period_s,
             gyro_bias_rad_s=math.radians(disturbance.gyro_bias_deg_s),
             field_bias_T=1e-9 * disturbance.field_bias_nT,
+            field_gain=disturbance.field_gain,
+            field_axes_rad=math.radians(disturbance.field_axes_deg),
             field_error_T=1e-9 * disturbance.field_error_nT,
             field_error_correlation_s=disturbance.field_error_correlation_s,
             dipole_Am2=disturbance.dipole_Am2,

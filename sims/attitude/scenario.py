@@ -52,6 +52,8 @@ class AttitudeScenario:
         Period with which that torque goes to its opposite and back; infinite = constant.
     gyro_bias_rad_s, field_bias_T : float
         Sizes of the biases at the start.
+    field_gain, field_axes_rad : float
+        Standard deviations of the errors of the magnetometer's gains, and of the angles by which its axes are off.
     field_error_T : float
         Size of the difference between the true field and its model, constant in the orbital frame.
     field_error_correlation_s : float
@@ -86,6 +88,8 @@ class AttitudeScenario:
     torque_period_s: float = math.inf
     gyro_bias_rad_s: float = 0.0
     field_bias_T: float = 0.0
+    field_gain: float = 0.0
+    field_axes_rad: float = 0.0
     field_error_T: float = 0.0
     field_error_correlation_s: float = math.inf
     dipole_Am2: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -105,6 +109,8 @@ class AttitudeScenario:
             torque_Nm=self.torque_Nm,
             gyro_bias_rad_s=self.gyro_bias_rad_s,
             field_bias_T=self.field_bias_T,
+            field_gain=self.field_gain,
+            field_axes_rad=self.field_axes_rad,
             field_error_T=self.field_error_T,
             start_attitude_rad=self.start_attitude_rad,
             start_rate_rad_s=self.start_rate_rad_s,

@@ -17,6 +17,7 @@ from scipy import signal
 from adcs import quaternion
 from adcs.environment.environment import Environment, environment
 from adcs.environment.orbit import EARTH_RADIUS_M
+from adcs.frames import turned
 from adcs.satellite import dynamics, sensors
 from adcs.satellite.attitude_track import AttitudeTrack
 from adcs.satellite.telemetry import Readings, Record, is_read, orbital_from_eci
@@ -49,6 +50,7 @@ class Prepared:
     dipole_Am2: FloatArray  # (runs, n, 3): besides the residual dipole of the satellite, held likewise
     gyro_bias_rad_s: FloatArray  # (runs, n, 3)
     field_bias_T: FloatArray  # (runs, n, 3)
+    field_gain: FloatArray  # (runs, 3, 3): D of a magnetometer that reads (E + D) b
     wild: dict[str, BoolArray]  # (runs, n): readings of ``star``, ``gyro``, ``field`` and ``sun`` that are anything
     noise: dict[str, FloatArray]  # (runs, n, 3): standard normal numbers for ``star``, ``gyro``, ``field`` and ``sun``
 
@@ -93,6 +95,7 @@ class AttitudeRuns(Record):
             "disturbance": self.prepared.torque_Nm @ self.satellite.body.inverse,
             "field-model": self.prepared.true_field_orbital_T - self.environment.b_orbital_T,
             "dipole": self.prepared.dipole_Am2,
+            "field-gain": np.repeat(self.prepared.field_gain.reshape(-1, 1, 9), self.q.shape[1], axis=1),
         }
 
     def error_deg(self, track: AttitudeTrack) -> FloatArray:
@@ -136,6 +139,8 @@ def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
         dipole_Am2=np.tile(np.array(scenario.dipole_Am2, dtype=np.float64), (len(numbers), n, 1)),
         gyro_bias_rad_s=_bias(scenario, numbers, "gyro", scenario.gyro_bias_rad_s, satellite.gyro.bias_walk_rad_s),
         field_bias_T=_bias(scenario, numbers, "field", scenario.field_bias_T, satellite.magnetometer.bias_walk_T),
+        field_gain=np.where(np.eye(3), scenario.field_gain, scenario.field_axes_rad)
+        * np.stack([stream(seed, "field gain").standard_normal((3, 3)) for seed in numbers]),
         wild={name: _wild(numbers, name, n, scenario.wild_share) for name in _SENSORS},
         noise={name: _normal(numbers, f"{name} noise", n) for name in _SENSORS},
     )
@@ -177,6 +182,7 @@ def sense(prepared: Prepared, q: FloatArray, w: FloatArray, rows: slice = slice(
     sun_orbital, lit = around.sun_orbital[:, rows], around.illuminated[:, rows]
     earth_radius = np.arcsin(np.minimum(1.0, EARTH_RADIUS_M / np.linalg.norm(around.position_eci_m[:, rows], axis=-1)))
     b_body = quaternion.rotate_back(q, prepared.true_field_orbital_T[:, rows])
+    b_body = b_body + turned(prepared.field_gain[:, None], b_body)
     noise = {name: numbers[:, rows] for name, numbers in prepared.noise.items()}
     good = Readings(
         star=sensors.star_tracker_readings(satellite.star_tracker, q, w, sun_orbital, earth_radius, lit, noise["star"]),

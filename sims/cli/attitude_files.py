@@ -20,7 +20,7 @@ from sims.experiments.attitude import Outcome, Part, errors_in_units
 
 if TYPE_CHECKING:
     import xarray as xr
-from adcs.kalman.results import STATE_COLUMNS, in_units, sigma_by_state
+from adcs.kalman.results import SHOWN, STATE_COLUMNS, in_units, sigma_by_state
 from arrays.typing import FloatArray
 
 
@@ -124,13 +124,15 @@ def dataset_of(parts: Sequence[Part], estimate: EstimatorSettings, title: str) -
         ("rejected", ("run", "time", "sensor"), rejected, "1", "whether a reading contradicted the rest, not used"),
     ]
     of_states = {"gyro-bias": "rad/s", "field-bias": "T", "disturbance": "s-2", "field-model": "T", "dipole": "A m2"}
+    of_states["field-gain"] = "1"
     for state, units in of_states.items():
         if state in estimate.settings.sensors.states:
             name, (values, true, sigma) = state.replace("-", "_"), of(state)
+            axes = ("run", "time", "element") if state == "field-gain" else axis
             listed += [
-                (name, axis, values, units, state.replace("-", " ")),
-                (f"{name}_true", axis, true, units, f"true {name}"),
-                (f"sigma_{name}", axis, sigma, units, "standard deviation"),
+                (name, axes, values, units, state.replace("-", " ")),
+                (f"{name}_true", axes, true, units, f"true {name}"),
+                (f"sigma_{name}", axes, sigma, units, "standard deviation"),
             ]
     seeds = [seed for part in parts for seed in part.runs.prepared.seeds]
     return xr.Dataset(
@@ -139,6 +141,7 @@ def dataset_of(parts: Sequence[Part], estimate: EstimatorSettings, title: str) -
             "run": ("run", seeds, {"long_name": "seed"}),
             "time": ("time", parts[0].runs.time_s, {"units": "s", "long_name": "time since the start of the run"}),
             "axis": ("axis", ["x", "y", "z"]),
+            "element": ("element", list(SHOWN["field-gain"].axes)),
             "component": ("component", ["w", "x", "y", "z"]),
             "sensor": ("sensor", list(SENSORS)),
         },

@@ -15,7 +15,7 @@ from adcs.io.scenario_files import AttitudeFile
 from adcs.kalman.bank import EstimatorSettings, estimated
 from adcs.kalman.diagnostics import Problem, problems_of
 from adcs.kalman.error_state import AttitudeTracks, start_near
-from adcs.kalman.results import by_state, in_units
+from adcs.kalman.results import by_state, in_units, worst_axis
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
 from sims.attitude.files import simulation_of
@@ -42,10 +42,10 @@ class Outcome:
     Attributes
     ----------
     seeds : ndarray of int, shape (runs,)
-    axis_rms : ndarray, shape (runs, 21)
+    axis_rms : ndarray, shape (runs, 30)
         Rms over the last minute of the angle [°], the rate [°/s], the gyro's bias [°/s], the field's bias [nT], the
-        disturbance [1/s²], the error of the field's model [nT] and the dipole [A·m²], three axes each; NaN of a state
-        that the filter does not have.
+        disturbance [1/s²], the error of the field's model [nT] and the dipole [A·m²], three axes each, and nine gains
+        of the magnetometer [%]; NaN of a state that the filter does not have.
     nees : ndarray, shape (runs, n)
         Normalised error squared, over its numbers.
     nis : ndarray, shape (runs, n, 4)
@@ -93,10 +93,16 @@ class Outcome:
 
     def numbers(self) -> dict[str, Any]:
         """What ``--json`` prints: every axis' mean over the runs, and of these the worst axis."""
-        mean = self.axis_rms.mean(axis=0).reshape(-1, 3).max(axis=1)
+        mean = worst_axis(self.axis_rms.mean(axis=0))
         names = (
             *("angle_rms_deg", "rate_rms_deg_s", "gyro_bias_rms_deg_s"),
-            *("field_bias_rms_nT", "disturbance_rms_s2", "field_model_rms_nT", "dipole_rms_Am2"),
+            *(
+                "field_bias_rms_nT",
+                "disturbance_rms_s2",
+                "field_model_rms_nT",
+                "dipole_rms_Am2",
+                "field_gain_rms_percent",
+            ),
         )
         return {
             **{name: None if math.isnan(value) else float(value) for name, value in zip(names, mean, strict=True)},
@@ -191,7 +197,7 @@ def run_scenario(
 
 
 def errors_in_units(part: Part) -> FloatArray:
-    """Truth minus estimate, shape (runs, n, 21), in the order and units of :attr:`Outcome.axis_rms`."""
+    """Truth minus estimate, shape (runs, n, 30), in the order and units of :attr:`Outcome.axis_rms`."""
     return in_units(by_state(accuracy.errors(part.runs, part.estimates), part.estimates.settings.sensors))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from adcs.io.scenario_files import read_scenario
 from adcs.kalman.names import Filter
-from adcs.kalman.results import SHOWN, in_units, sigma_by_state
+from adcs.kalman.results import SHOWN, in_units, sigma_by_state, worst_axis
 from arrays.typing import FloatArray
 from sims.experiments.attitude import Part, run_scenario
 
@@ -134,8 +134,8 @@ def compared_with_paper(row: PaperRow, seeds: Sequence[int], duration_s: float |
         last.append(in_units(sigma_by_state(part.estimates))[:, -1])
 
     outcome = run_scenario(file, file.estimator(file.path), seeds, look=look)
-    sigma = np.concatenate(last).reshape(len(seeds), -1, 3).max(axis=2).mean(axis=0)
-    rms = outcome.axis_rms.mean(axis=0).reshape(-1, 3).max(axis=1)
+    sigma = worst_axis(np.concatenate(last)).mean(axis=0)
+    rms = worst_axis(outcome.axis_rms.mean(axis=0))
     found = []
     for place, (state, shown) in enumerate(SHOWN.items()):
         quantity = QUANTITIES[state]

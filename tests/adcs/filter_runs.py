@@ -131,6 +131,9 @@ def believed_runs(filter_settings: FilterSettings, duration_s: float, seeds: ran
     changed = replace(prepared, torque_Nm=acceleration @ body.inertia_kgm2)
     if "dipole" in used.states:
         changed = replace(changed, dipole_Am2=walk(filter_settings.dipole_sigma_Am2, noise.dipole_Am2))
+    if "field-gain" in used.states:
+        deviation = np.where(np.eye(3), filter_settings.field_gain_sigma, filter_settings.field_axes_sigma_rad)
+        changed = replace(changed, field_gain=deviation * rng.standard_normal((shape[0], 3, 3)))
     if "gyro-bias" in used.states:
         changed = replace(changed, gyro_bias_rad_s=walk(filter_settings.gyro_bias_sigma_rad_s, noise.gyro_bias_rad_s))
     if "field-bias" in used.states:

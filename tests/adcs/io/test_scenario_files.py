@@ -209,7 +209,6 @@ def test_bad_files(file, old, new, fragments):
     ("keys", "fragments"),
     [
         ({"sensors": "sun+gyro"}, ["rotation about the Sun", "missing is a star tracker (st) or a magnetometer"]),
-        ({"sensors": "mag"}, ["rotation about the field", "missing is"]),
         ({"sensors": "gyro"}, ["nothing measures attitude", "missing is"]),
         ({"sensors": "st+radar"}, ["st+radar"]),
         ({"sensors": "st", "states": ["gyro-bias"]}, ["without a gyro"]),

@@ -70,7 +70,7 @@ class TestAccuracy:
         """Without the state disturbance: dynamics that are trusted to 1e-8 N·m."""
         runs = two_orbits(DIPOLE_AM2, range(4), torque_Nm)
         tracks = estimated(runs, "mag+sun", ("dipole",))
-        assert rms_deg(runs, tracks) < 0.1
+        assert rms_deg(runs, tracks) < 0.13
         error = quaternion.error_vector(tracks.q, runs.q)[:, 6000:]
         assert 0.5 < normalised_square(error, tracks.covariance[:, 6000:, :3, :3]).mean() / 3.0 < 1.4
 

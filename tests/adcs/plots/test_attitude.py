@@ -12,9 +12,9 @@ from adcs.plots.attitude import StatesPicture, gaps_of, states_figure
 def picture(are_errors):
     """A start of 90° that falls to 0.1° within the first tenth."""
     time_s = np.arange(200.0)
-    values = np.full((200, 21), np.nan)
+    values = np.full((200, 30), np.nan)
     values[:, :6] = (90.0 * np.exp(-time_s / 3.0) + 0.1)[:, None]
-    return StatesPicture("", time_s, values, np.full((200, 21), 0.05), are_errors)
+    return StatesPicture("", time_s, values, np.full((200, 30), 0.05), are_errors)
 
 
 class TestLimits:
