@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtri
 
-from adcs.kalman.names import MEASURED_BY, is_measured
+from adcs.kalman.names import MEASURED_BY, TOGETHER, is_measured
 from adcs.satellite.sensors import SENSOR_WORDS, SENSORS
 from arrays.io.errors import check_not_negative, check_positive
 from arrays.typing import BoolArray, FloatArray
@@ -74,22 +74,23 @@ def sensor_set(sensors: str, states: Iterable[str] = ()) -> SensorSet:
     """Set of sensors and states by their names.
 
     ``sensors``: names of :data:`SENSORS` in any order with + between them. ``states``: names of :data:`STATES` in any
-    order.
+    order, or of :data:`adcs.kalman.names.TOGETHER`.
     """
     names = [name.strip().lower() for name in sensors.split("+")]
     optional = [state.strip().lower() for state in states]
-    for given, known, what in ((names, SENSORS, "sensors"), (optional, STATES, "states")):
+    for given, known, what in ((names, SENSORS, "sensors"), (optional, (*STATES, *TOGETHER), "states")):
         unknown = [name for name in given if name not in known]
         if unknown or len(set(given)) != len(given):
             raise ValueError(
                 f"Input {what} must be different names of {', '.join(known)}; instead received {'+'.join(given)!r}."
             )
+    wanted = {one for state in optional for one in TOGETHER.get(state, (state,))}
     used = SensorSet(
         star="st" in names,
         gyro="gyro" in names,
         magnetometer="mag" in names,
         sun="sun" in names,
-        states=tuple(state for state in STATES if state in optional),
+        states=tuple(state for state in STATES if state in wanted),
     )
     check_observable(used)
     return used

@@ -10,7 +10,15 @@ StartKind = Literal["near", "vectors", "any"]
 FILTERS: tuple[str, ...] = get_args(Filter)
 NOISES: tuple[str, ...] = get_args(Noise)
 STARTS: tuple[str, ...] = get_args(StartKind)
-MEASURED_BY = {"field-bias": "mag", "gyro-bias": "gyro", "field-model": "mag", "field-gain": "mag"}
+TOGETHER = {"magnetometer": ("field-bias", "field-gain")}
+"""What several states are called together."""
+MEASURED_BY = {
+    "field-bias": "mag",
+    "gyro-bias": "gyro",
+    "field-model": "mag",
+    "field-gain": "mag",
+    "magnetometer": "mag",
+}
 """States that belong to a sensor: without it they cannot be estimated."""
 
 

@@ -124,11 +124,12 @@ def dataset_of(parts: Sequence[Part], estimate: EstimatorSettings, title: str) -
         ("rejected", ("run", "time", "sensor"), rejected, "1", "whether a reading contradicted the rest, not used"),
     ]
     of_states = {"gyro-bias": "rad/s", "field-bias": "T", "disturbance": "s-2", "field-model": "T", "dipole": "A m2"}
-    of_states["field-gain"] = "1"
-    for state, units in of_states.items():
+    elements = {}
+    for state, units in {**of_states, "field-gain": "1"}.items():
         if state in estimate.settings.sensors.states:
-            name, (values, true, sigma) = state.replace("-", "_"), of(state)
-            axes = ("run", "time", "element") if state == "field-gain" else axis
+            name, (values, true, sigma), axes = state.replace("-", "_"), of(state), axis
+            if state == "field-gain":
+                axes, elements = ("run", "time", "element"), {"element": list(SHOWN[state].axes)}
             listed += [
                 (name, axes, values, units, state.replace("-", " ")),
                 (f"{name}_true", axes, true, units, f"true {name}"),
@@ -141,9 +142,9 @@ def dataset_of(parts: Sequence[Part], estimate: EstimatorSettings, title: str) -
             "run": ("run", seeds, {"long_name": "seed"}),
             "time": ("time", parts[0].runs.time_s, {"units": "s", "long_name": "time since the start of the run"}),
             "axis": ("axis", ["x", "y", "z"]),
-            "element": ("element", list(SHOWN["field-gain"].axes)),
             "component": ("component", ["w", "x", "y", "z"]),
             "sensor": ("sensor", list(SENSORS)),
+            **elements,
         },
         attrs={"Conventions": "CF-1.10", "title": title, "source": f"magloc {installed_version()}"},
     )

@@ -144,7 +144,7 @@ _COLUMNS = (
     ("field_bias_rms_nT", "Δb [nT]"),
     ("disturbance_rms_s2", "d [1/s²]"),
     ("field_model_rms_nT", "e [nT]"),
-    ("dipole_rms_Am2", "m [A·m²]"),
+    ("dipole_error_Am2", "m [A·m²]"),
     ("field_gain_rms_percent", "D [%]"),
     ("nees_per_dimension", "NEES/n"),
     ("diverged_runs", "diverged"),

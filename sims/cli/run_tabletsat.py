@@ -97,7 +97,7 @@ def run_attitude(
     ----------
     scenario : str
         Scenario file (TOML), or a built-in scenario: tabletsat, collinearity, eclipse, field-error, one-vector,
-        outliers, residual-dipole or star-blinded.
+        outliers, residual-dipole, star-blinded or uncalibrated-magnetometer.
     options : ScenarioOptions
         What differs from the scenario file.
     runs : RunOptions

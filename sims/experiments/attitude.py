@@ -100,7 +100,7 @@ class Outcome:
                 "field_bias_rms_nT",
                 "disturbance_rms_s2",
                 "field_model_rms_nT",
-                "dipole_rms_Am2",
+                "dipole_error_Am2",
                 "field_gain_rms_percent",
             ),
         )

@@ -56,6 +56,7 @@ class TestBuiltIn:
             "residual-dipole",
             "star-blinded",
             "tabletsat",
+            "uncalibrated-magnetometer",
         )
 
     @pytest.mark.parametrize("name", built_in_scenarios())

@@ -54,7 +54,7 @@ class TestTorque:
 
 class TestAccuracy:
     def test_two_orbits(self) -> None:
-        """Field and Sun alone, with eclipses: the issue's figures, 0.08° and 1e-4 A·m² (rms of an axis)."""
+        """Field and Sun alone, with eclipses: 0.08° and 1e-4 A·m² (rms of an axis)."""
         runs = two_orbits(DIPOLE_AM2, range(6))
         tracks = estimated(runs, "mag+sun", STATES)
         assert rms_deg(runs, tracks) <= 0.08

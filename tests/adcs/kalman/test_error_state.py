@@ -42,6 +42,12 @@ class TestNames:
         with pytest.raises(ValueError, match=r"Input states must be different names of field-bias, .*'torque'"):
             sensor_set("st", ["torque"])
 
+    def test_states_of_one_name(self) -> None:
+        both = sensor_set("mag+sun", ["field-bias", "field-gain"])
+        assert sensor_set("mag+sun", ["magnetometer"]) == sensor_set("mag+sun", ["magnetometer", "field-gain"]) == both
+        with pytest.raises(ValueError, match="must not have field-bias without a magnetometer"):
+            sensor_set("st+gyro", ["magnetometer"])
+
     def test_layout_of_the_error_state(self) -> None:
         used = sensor_set("st+gyro+mag", ["disturbance", "gyro-bias", "field-bias"])
         assert used.states == ("field-bias", "gyro-bias", "disturbance")

@@ -48,7 +48,7 @@ class TestReadings:
 
 class TestAccuracy:
     def test_two_orbits(self) -> None:
-        """The issue's figures: at most 0.2°, where a filter that believes its magnetometer is degrees off."""
+        """At most 0.2°, where a filter that believes its magnetometer is degrees off."""
         runs = uncalibrated(12_000.0, range(6))
         tracks, without = (run_filter(runs, one, start_of(runs)) for one in (chosen(), chosen(())))
         late = slice(6000, None)
