@@ -145,7 +145,7 @@ class MatchedFilterDetector:
         above = self.filter.candidate_energy(whitened) > self.threshold
         open_ = np.flatnonzero(~above & (self.filter.energy(whitened) > self.threshold))
         if open_.size:
-            above[open_] = self.filter.largest_energy(whitened[open_]) > self.threshold
+            above[open_] = self.filter.refined_energy(whitened[open_]) > self.threshold
         return above
 
 
