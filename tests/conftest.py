@@ -15,6 +15,7 @@ from hypothesis import HealthCheck, settings
 from adcs.cli.app import main as adcs_main
 from magloc.cli.app import main
 from tests.command_line import Outcome, Run
+from tests.fuzz.cases import write_files
 
 if TYPE_CHECKING:
     from xdist.remote import Producer
@@ -105,6 +106,14 @@ def data_folder() -> Path:
         if folder.is_dir():
             return folder
     pytest.skip("needs recordings, but neither MAGLOC_DATA nor ../shared/data is a folder")
+
+
+@pytest.fixture(scope="session")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the lines of `tests.fuzz.cases` read: for copies, as it takes seconds to write."""
+    folder = tmp_path_factory.mktemp("files")
+    write_files(folder)
+    return folder
 
 
 @pytest.fixture

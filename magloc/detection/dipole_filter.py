@@ -116,6 +116,11 @@ class DipoleFilter:
 
         The generalised likelihood ratio, χ² without a source less χ² of the best source anywhere.
         """
+        # A candidate is a source too, where none of the refinements converged.
+        return np.maximum(self.refined_energy(whitened), self.candidate_energy(whitened))
+
+    def refined_energy(self, whitened: FloatArray) -> FloatArray:
+        """The same of refined candidates alone: minus infinity where none converged."""
         n = len(whitened)
         problem = self._problem
         y = np.ascontiguousarray(whitened)
@@ -134,5 +139,4 @@ class DipoleFilter:
             rows,
             Ends(q, mu, chi2, np.empty((n, _N_STARTS), dtype=np.int64), np.zeros((n, 3), dtype=np.int64)),
         )
-        # A candidate is a source too, where none of the refinements converged.
-        return np.maximum(self.energy(y) - chi2.min(axis=1), self.candidate_energy(y))
+        return self.energy(y) - chi2.min(axis=1)

@@ -7,6 +7,7 @@ statistic of simulated noise; only the draws that candidates explain most of are
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -129,6 +130,7 @@ class MatchedFilterDetector:
         unit = signals / np.linalg.norm(signals, axis=1, keepdims=True)
         noise = self.filter.noise(n_draws, rng)
 
+        @cache  # brentq asks for both ends once more
         def surplus(amplitude: float) -> float:
             return float(np.mean(self._above(amplitude * unit + noise))) - probability
 
@@ -143,7 +145,7 @@ class MatchedFilterDetector:
         above = self.filter.candidate_energy(whitened) > self.threshold
         open_ = np.flatnonzero(~above & (self.filter.energy(whitened) > self.threshold))
         if open_.size:
-            above[open_] = self.filter.largest_energy(whitened[open_]) > self.threshold
+            above[open_] = self.filter.refined_energy(whitened[open_]) > self.threshold
         return above
 
 

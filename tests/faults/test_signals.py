@@ -20,7 +20,7 @@ import netCDF4
 import pytest
 
 from tests.conftest import REPOSITORY
-from tests.fuzz.cases import LINES, SELDOM, STREAM, write_files
+from tests.fuzz.cases import LINES, SELDOM, STREAM
 from tests.waiting import WAIT_S, wait_for
 
 QUICK, FULL = 6, 3 * len(LINES)  # at the end, each command has met each signal
@@ -141,13 +141,6 @@ def is_whole(path: Path) -> bool:
             netCDF4.Dataset(path).close()  # refuses what is cut short
             return True
     return data.endswith(b"\n")
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("files")
-    write_files(folder)
-    return folder
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs signals")

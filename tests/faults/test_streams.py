@@ -10,18 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.fuzz.cases import LINES, MAINS, SELDOM, STREAM, write_files
+from tests.fuzz.cases import LINES, MAINS, SELDOM, STREAM
 
 FULL = Path("/dev/full")
 COMMANDS = [pytest.param(name, marks=[pytest.mark.slow] if name in SELDOM else []) for name in LINES]
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("files")
-    write_files(folder)
-    return folder
 
 
 @pytest.fixture

@@ -7,20 +7,13 @@ import shutil
 
 import pytest
 
-from tests.fuzz.cases import LINES, SELDOM, STREAM, commands, write_files
+from tests.fuzz.cases import LINES, SELDOM, STREAM, commands
 from tests.fuzz.extremes import extremes
 from tests.fuzz.runner import Case, extreme_case, judged, report, run_case, verdict
 
 CHUNK = 100
 QUICK, NEW = 3, 20  # chunks that are always the same, and chunks that are new in every run
 PARTS = 250  # of all numbers that files and options take; the first one is quick, a tenth of them are tried at all
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("files")
-    write_files(folder)
-    return folder
 
 
 def test_every_command_has_a_line():

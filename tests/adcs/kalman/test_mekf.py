@@ -319,7 +319,7 @@ class TestSpeed:
         assert self.calls(long, chosen) == self.calls(short, chosen)
 
     def test_monte_carlo(self) -> None:
-        few, many = (simulate(tabletsat(), range(n)) for n in (10, 400))
+        few, many = (simulate(tabletsat(), range(n)) for n in (10, 100))
         chosen = settings("mag+sun+gyro")
         assert self.calls(many, chosen) < 1.5 * self.calls(few, chosen)
 
