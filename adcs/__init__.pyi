@@ -13,6 +13,8 @@ from adcs.io.telemetry_files import read_telemetry as read_telemetry
 from adcs.kalman.bank import EstimatorSettings as EstimatorSettings
 from adcs.kalman.bank import estimate as estimate
 from adcs.satellite.attitude_track import AttitudeTrack as AttitudeTrack
+from adcs.satellite.magnetometer_calibration import MagnetometerPrior as MagnetometerPrior
+from adcs.satellite.magnetometer_calibration import calibrate_magnetometer as calibrate_magnetometer
 from adcs.satellite.satellite import Satellite as Satellite
 from adcs.satellite.telemetry import Telemetry as Telemetry
 from adcs.stars.identification import identify_stars as identify_stars

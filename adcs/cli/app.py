@@ -37,6 +37,11 @@ for _name, _where, _help in (
         "adcs.cli.estimate:estimate",
         "Estimate attitude and rate from telemetry, with the filters of `adcs run`.",
     ),
+    (
+        "calibrate",
+        "adcs.cli.calibrate:calibrate",
+        "Calibrate the magnetometer of a log by the field along the orbit.",
+    ),
     ("demo", "adcs.cli.demo:demo", "Estimate the attitude of a simulated satellite, and draw what comes out."),
     (
         "stars",

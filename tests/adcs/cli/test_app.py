@@ -15,7 +15,7 @@ from magloc.cli import framework
 from sims.cli.run import run as run_app
 from tests.adcs.refusals import assert_refused
 
-COMMANDS = ("run", "compare", "tables", "estimate")
+COMMANDS = ("run", "compare", "tables", "estimate", "calibrate")
 SCENARIOS = [name for name in run_app if not name.startswith("-")]
 
 

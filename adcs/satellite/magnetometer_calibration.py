@@ -1,0 +1,409 @@
+r"""Calibration of a magnetometer from a log and the field along the orbit, with or without the attitude.
+
+The magnetometer reads :math:`z = (E + D)\,b + o + n`: D has nine numbers, gains on its diagonal, o is the bias. Without
+an attitude each row tells a modulus, :math:`|(E + D)^{-1}(z - o)| = |b|`, and with one all of b. All numbers have a
+prior, so that what a log does not tell stays there and has its deviation. The field is that of the orbit at the
+time of the row plus a shift, one number more. See docs/theory/attitude-kalman-filters.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import CubicSpline
+
+from adcs.environment.environment import environment
+from adcs.frames import turned
+from adcs.satellite.satellite import Satellite
+from adcs.satellite.telemetry import Telemetry
+from arrays.io.errors import check_not_negative, check_positive
+from arrays.typing import BoolArray, FloatArray
+
+Attitude = Literal["none", "orbital"]
+"""What is known of the attitude: nothing, or that it is constant in the frame of the model's field."""
+NAMES = (
+    *(f"bias_{axis}" for axis in "xyz"),
+    *(f"gain_{row}{column}" for row in "xyz" for column in "xyz"),
+    "time_shift",
+)
+"""Numbers of the calibration, in the order of its covariance."""
+OUTLIER = 5.0
+"""Rows farther off than this times their spread are left out."""
+_ITERATIONS, _ROUNDS, _DECIMATED, _SETTLED, _FEWEST = 60, 10, 1000, 1e-4, 20
+_KNOT_S, _SHIFTS_S = 10.0, 15.0
+"""Between instants at which the field is computed, and between shifts that are tried: it changes over minutes."""
+
+
+@dataclass(frozen=True)
+class MagnetometerPrior:
+    """One standard deviation of everything, before the log is read.
+
+    Attributes
+    ----------
+    noise_T, bias_T : float
+        Of a reading of an axis, and of the bias.
+    gain, axes_rad : float
+        Of the gains, and of the angles by which axes are off.
+    field_error_T, field_correlation_s : float
+        Of a component of the model's error, and its time constant.
+    time_shift_s : float
+        Of the time of the positions against that of the readings; 0 = known.
+
+    Raises
+    ------
+    ValueError
+        A number is not positive; the model's error and the shift may be zero.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> prior = adcs.MagnetometerPrior(bias_T=20e-6, time_shift_s=300.0)
+    >>> prior.gain
+    0.05
+    """
+
+    noise_T: float = 250e-9
+    bias_T: float = 2e-6
+    gain: float = 0.05
+    axes_rad: float = math.radians(1.0)
+    field_error_T: float = 100e-9
+    field_correlation_s: float = 132.0
+    time_shift_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        own = vars(self)
+        may_be_zero = ("field_error_T", "time_shift_s")
+        check_not_negative(**{name: own[name] for name in may_be_zero})
+        check_positive(**{name: value for name, value in own.items() if name not in may_be_zero})
+
+    @property
+    def deviations(self) -> FloatArray:
+        """Of :data:`NAMES`, shape (13,)."""
+        D = np.where(np.eye(3), self.gain, self.axes_rad).ravel()
+        return np.concatenate([np.full(3, self.bias_T), D, [self.time_shift_s]])
+
+
+@dataclass(frozen=True, eq=False)
+class MagnetometerCalibration:
+    """Calibration of a magnetometer.
+
+    Attributes
+    ----------
+    bias_T : ndarray, shape (3,)
+        Reading in zero field, o.
+    gain : ndarray, shape (3, 3)
+        D.
+    time_shift_s : float
+        The field at a row is the model's so much later.
+    covariance : ndarray, shape (13, 13)
+        Of :data:`NAMES`, prior included.
+    prior : MagnetometerPrior
+        What was known before.
+    residual_T : ndarray, shape (n,) or (n, 3)
+        Calibrated modulus, or field, minus the model; NaN of a row that is left out.
+    raw_rms_T : float
+        Rms of the same rows without a calibration; of an unknown attitude that of the modulus.
+    chi2, dof : float, int
+        Of the whitened rows that are used, and their number.
+    used : ndarray of bool, shape (n,)
+        Rows that are there and fit the others.
+    """
+
+    bias_T: FloatArray
+    gain: FloatArray
+    time_shift_s: float
+    covariance: FloatArray
+    prior: MagnetometerPrior
+    residual_T: FloatArray
+    raw_rms_T: float
+    chi2: float
+    dof: int
+    used: BoolArray
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations of :data:`NAMES`, shape (13,)."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def misfit(self) -> float:
+        """Deviations by which χ² is beyond what is expected of rows as they are stated."""
+        return (self.chi2 - self.dof) / math.sqrt(2.0 * self.dof)
+
+    @property
+    def rms_T(self) -> float:
+        """Rms of the residuals that are used."""
+        return float(np.sqrt(np.nanmean(self.residual_T**2)))
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """Numbers of which the log told less than half of the prior's variance."""
+        prior = self.prior.deviations
+        return tuple(
+            name
+            for name, sigma, before in zip(NAMES, self.sigma, prior, strict=True)
+            if before > 0.0 and sigma**2 > 0.5 * before**2
+        )
+
+    def applied(self, readings_T: ArrayLike) -> FloatArray:
+        """Fields (..., 3) of readings (..., 3)."""
+        return turned(np.linalg.inv(np.eye(3) + self.gain), np.asarray(readings_T, dtype=np.float64) - self.bias_T)
+
+
+class _Rows(NamedTuple):
+    """Rows with readings, and the model of the field through time."""
+
+    time_s: FloatArray
+    readings_T: FloatArray
+    model: Callable[[FloatArray], FloatArray]
+    slope: Callable[[FloatArray], FloatArray]
+
+    def some(self, which: BoolArray | slice) -> _Rows:
+        """Some of the rows."""
+        return self._replace(time_s=self.time_s[which], readings_T=self.readings_T[which])
+
+
+_Linearised = Callable[[_Rows, FloatArray, MagnetometerPrior], tuple[FloatArray, FloatArray]]
+"""Residuals (n,) or (n, 3) and their derivatives (..., 13) at parameters (13,)."""
+
+
+def calibrate_magnetometer(
+    telemetry: Telemetry,
+    satellite: Satellite,
+    *,
+    prior: MagnetometerPrior = MagnetometerPrior(),
+    attitude: Attitude = "none",
+) -> MagnetometerCalibration:
+    r"""Calibrate a magnetometer from a log and the field along the orbit: :math:`z = (E + D)\,b + o`.
+
+    Parameters
+    ----------
+    telemetry : Telemetry
+        The log; its magnetometer and its times are used.
+    satellite : Satellite
+        Its orbit, and its model of the field.
+    prior : MagnetometerPrior
+        What is known before: noise, and deviations of bias, gains, axes, the model's error and the time shift.
+    attitude : str
+        ``none``: unknown, the modulus of each row counts. It does not tell how the sensor is turned: compare
+        (E + D)(E + D)ᵀ. ``orbital``: constant in the orbital frame, unknown there.
+
+    Returns
+    -------
+    MagnetometerCalibration
+        With its covariance; what the log does not tell has the deviation of the prior.
+
+    Raises
+    ------
+    ValueError
+        Fewer than 20 rows can be used, or a date is outside of the model of the field.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> log = adcs.datasets.load("satellite")
+    >>> result = adcs.calibrate_magnetometer(log.telemetry, log.satellite)
+    >>> "gain_xx" in result.undetermined  # 200 s tell little
+    True
+    """
+    reach_s = 3.0 * prior.time_shift_s + 2.0 * _KNOT_S
+    first_s, last_s = telemetry.time_s[0] - reach_s, telemetry.time_s[-1] + reach_s
+    since_s = np.linspace(0.0, last_s - first_s, 2 + math.ceil((last_s - first_s) / _KNOT_S))
+    start = satellite.start + np.timedelta64(round(1e6 * first_s), "us")
+    around = environment(satellite.orbit, start, since_s, model=satellite.field_model)
+    along = first_s + since_s, around.b_orbital_T
+    return calibrated(telemetry.time_s, telemetry.field_T, *along, prior=prior, attitude=attitude)
+
+
+def calibrated(
+    time_s: ArrayLike,
+    readings_T: ArrayLike,
+    model_time_s: ArrayLike,
+    model_T: ArrayLike,
+    *,
+    prior: MagnetometerPrior,
+    attitude: Attitude,
+) -> MagnetometerCalibration:
+    """Calibrate readings against a model of the field through time, as :func:`calibrate_magnetometer`.
+
+    ``time_s`` (n,), ``readings_T`` (n, 3): ascending times, rows with a NaN are left out. ``model_time_s`` (m,),
+    ``model_T`` (m, 3): the model's field, of an attitude that is constant in the frame in which that is; it must reach
+    beyond the rows by three deviations of the shift.
+    """
+    times, readings = np.asarray(time_s, dtype=np.float64), np.asarray(readings_T, dtype=np.float64)
+    knots = CubicSpline(np.asarray(model_time_s, dtype=np.float64), np.asarray(model_T, dtype=np.float64))
+    rows = _Rows(times, readings, knots, knots.derivative())
+    used: BoolArray = np.isfinite(readings).all(axis=1)  # type: ignore[assignment]
+    _check_enough(used)
+    linearised = _modulus if attitude == "none" else _OfOrbital(_orbital_frame(rows.some(used), prior))
+    x, H = _started(rows.some(used), prior, linearised), np.eye(13)
+    for _ in range(_ROUNDS):
+        x, H = _fitted(rows.some(used), prior, linearised, x)
+        far = _far(linearised(rows.some(used), x, prior)[0], prior)
+        if not far.any():
+            break
+        used[np.flatnonzero(used)[far]] = False
+        _check_enough(used)
+    kept = rows.some(used)
+    residual = linearised(kept, x, prior)[0]
+    whitened = _whitened(kept.time_s, residual.reshape(len(kept.time_s), -1), prior)
+    all_of = np.full((len(times), *residual.shape[1:]), np.nan)
+    all_of[used] = residual
+    raw = linearised(kept, np.concatenate([np.zeros(12), x[12:]]), prior)[0]
+    deviations = prior.deviations
+    return MagnetometerCalibration(
+        bias_T=x[:3],
+        gain=x[3:12].reshape(3, 3),
+        time_shift_s=float(x[12]),
+        covariance=deviations[:, None] * np.linalg.inv(H + np.eye(13)) * deviations,
+        prior=prior,
+        residual_T=all_of,
+        raw_rms_T=float(np.sqrt(np.mean(raw**2))),
+        chi2=float(np.sum(whitened**2)),
+        dof=whitened.size,
+        used=used,
+    )
+
+
+def _check_enough(used: BoolArray) -> None:
+    """Raise where too few rows are left."""
+    if used.sum() < _FEWEST:
+        raise ValueError(
+            f"Input found {used.sum()} rows of the magnetometer that fit each other, expected {_FEWEST} or more."
+        )
+
+
+def _modulus(rows: _Rows, x: FloatArray, prior: MagnetometerPrior) -> tuple[FloatArray, FloatArray]:
+    """Calibrated modulus minus the model's."""
+    inverse = np.linalg.inv(np.eye(3) + x[3:12].reshape(3, 3))
+    at = rows.time_s + x[12]
+    b, slope = rows.model(at), rows.slope(at)
+    length = np.linalg.norm(b, axis=1)
+    field = (rows.readings_T - x[:3]) @ inverse.T
+    modulus = np.linalg.norm(field, axis=1)
+    n = field / modulus[:, None]
+    across = n @ inverse
+    # At the model's modulus: with that of the readings their noise, squared, feigns knowledge of what they do not tell.
+    by_gain = -(across[:, :, None] * (n * length[:, None])[:, None, :]).reshape(-1, 9)
+    by_shift = -np.sum(b * slope, axis=1) / length
+    # Noise across the field makes it longer.
+    return modulus - length - prior.noise_T**2 / length, np.concatenate([-across, by_gain, by_shift[:, None]], axis=1)
+
+
+class _OfOrbital:
+    """Readings minus those of an attitude that is constant, body from the model's frame."""
+
+    def __init__(self, rotation: FloatArray) -> None:
+        self.rotation = rotation
+
+    def __call__(self, rows: _Rows, x: FloatArray, prior: MagnetometerPrior) -> tuple[FloatArray, FloatArray]:
+        at = rows.time_s + x[12]
+        b, slope = (values @ self.rotation.T for values in (rows.model(at), rows.slope(at)))
+        gain = np.eye(3) + x[3:12].reshape(3, 3)
+        by = np.zeros((len(at), 3, 13))
+        by[:, :, :3] = -np.eye(3)
+        by[:, :, 3:12] = -np.einsum("ij,rk->rijk", np.eye(3), b).reshape(-1, 3, 9)
+        by[:, :, 12] = -slope @ gain.T
+        return rows.readings_T - b @ gain.T - x[:3], by
+
+
+def _orbital_frame(rows: _Rows, prior: MagnetometerPrior) -> FloatArray:
+    """Rotation, body from the model's frame, of the best affine map at any shift of the grid."""
+    best, rotation = math.inf, np.eye(3)
+    for shift in _grid(prior):
+        b = rows.model(rows.time_s + shift)
+        columns = np.column_stack([b, np.ones(len(b))])
+        affine = np.linalg.lstsq(columns, rows.readings_T, rcond=None)[0]
+        misfit = float(np.median(np.linalg.norm(rows.readings_T - columns @ affine, axis=1)))
+        if misfit < best:
+            left, _, right = np.linalg.svd(affine[:3].T)
+            best, rotation = misfit, left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return rotation
+
+
+def _grid(prior: MagnetometerPrior) -> FloatArray:
+    """Shifts within three deviations."""
+    reach = 3.0 * prior.time_shift_s
+    return np.linspace(-reach, reach, 1 + 2 * math.ceil(reach / _SHIFTS_S))
+
+
+def _started(rows: _Rows, prior: MagnetometerPrior, linearised: _Linearised) -> FloatArray:
+    """Parameters at the shift of the grid that fits best; few rows tell."""
+    few = rows.some(slice(None, None, 1 + len(rows.time_s) // _DECIMATED))
+    starts = []
+    for shift in _grid(prior):
+        x = np.concatenate([np.zeros(12), [shift]])
+        x, _ = _fitted(few, replace(prior, time_shift_s=0.0), linearised, x, most=4)
+        residual = np.abs(linearised(few, x, prior)[0])
+        starts.append((float(np.median(residual)), x))
+    return min(starts, key=lambda start: start[0])[1]
+
+
+def _fitted(
+    rows: _Rows, prior: MagnetometerPrior, linearised: _Linearised, x: FloatArray, most: int = _ITERATIONS
+) -> tuple[FloatArray, FloatArray]:
+    """Parameters of the largest posterior by damped Gauss-Newton steps, and the information H (13, 13) of the rows.
+
+    Numbers are in units of their prior's deviations; one that is zero holds its number.
+    """
+    deviations = prior.deviations
+    first = x * (deviations == 0.0)
+
+    def cost_of(x: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        residual, by = linearised(rows, x, prior)
+        n = len(rows.time_s)
+        both = np.concatenate([residual.reshape(n, -1, 1), (by * deviations).reshape(n, -1, 13)], axis=2)
+        white = _whitened(rows.time_s, both.reshape(n, -1), prior).reshape(n, -1, 14).reshape(-1, 14)
+        scaled = np.divide(x - first, deviations, out=np.zeros(13), where=deviations > 0.0)
+        gradient = white[:, 1:].T @ white[:, 0] + scaled
+        return float(white[:, 0] @ white[:, 0] + scaled @ scaled), gradient, white[:, 1:].T @ white[:, 1:]
+
+    cost, gradient, H = cost_of(x)
+    damping = 1e-3
+    for _ in range(most):
+        step = -np.linalg.solve(H + np.eye(13) + damping * np.diag(np.diagonal(H)), gradient)
+        trial = x + deviations * step
+        new_cost, new_gradient, new_H = cost_of(trial)
+        if new_cost <= cost:
+            x, damping = trial, 0.1 * damping
+            settled = cost - new_cost < _SETTLED
+            cost, gradient, H = new_cost, new_gradient, new_H
+            if settled:
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e8:
+                break
+    return x, H
+
+
+def _far(residual: FloatArray, prior: MagnetometerPrior) -> BoolArray:
+    """Rows (n,) that are beyond :data:`OUTLIER` times what is stated, and times what the rows show themselves."""
+    size = np.abs(residual).reshape(len(residual), -1).max(axis=1)
+    spread = 1.4826 * float(np.median(np.abs(residual)))
+    return size > OUTLIER * max(spread, math.hypot(prior.noise_T, prior.field_error_T))
+
+
+def _whitened(time_s: FloatArray, columns: FloatArray, prior: MagnetometerPrior) -> FloatArray:
+    """Columns (n, k), each with white noise and an Ornstein-Uhlenbeck error, as innovations over their deviation.
+
+    A Kalman filter of one number whose gains do not depend on the columns.
+    """
+    decay = np.exp(-np.diff(time_s, prepend=time_s[0]) / prior.field_correlation_s)
+    stationary, noise = prior.field_error_T**2, prior.noise_T**2
+    variance, mean, white = stationary, np.zeros(columns.shape[1]), np.empty_like(columns)
+    for i in range(len(time_s)):
+        mean = decay[i] * mean
+        variance = stationary + decay[i] ** 2 * (variance - stationary)
+        total = variance + noise
+        innovation = columns[i] - mean
+        white[i] = innovation / math.sqrt(total)
+        gain = variance / total
+        mean = mean + gain * innovation
+        variance = (1.0 - gain) * variance
+    return white
