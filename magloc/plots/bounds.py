@@ -343,7 +343,6 @@ def _slice(ax: Axes, dataset: xr.Dataset, values: FloatArray, norm: LogNorm, acc
     lines = _contours(ax, across, up, values, norm, _levels(values, norm, accuracy), accuracy)
     if lines is not None:
         ax.clabel(lines, fontsize=style.SMALL_LETTERS - 1.5, fmt=lambda value: f"{10.0**value:.3g}")
-    ax.set_aspect("equal")
 
 
 def _sensors(ax: Axes, scenario: BoundScenario, plane: str) -> None:

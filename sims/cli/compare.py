@@ -117,9 +117,10 @@ def compare(
     rows = []
     with progress(len(pairs) * runs.seeds, "runs", quiet=common.quiet) as advance:
         for file, estimate in pairs:
-            rows.append(
-                Row(file, estimate, sims.experiments.run_scenario(file, estimate, runs.numbers, advance=advance))
+            outcome = sims.experiments.run_scenario(
+                file, estimate, runs.numbers, through_time=out is not None, advance=advance
             )
+            rows.append(Row(file, estimate, outcome))
     reports = [row.report() for row in rows]
     if out is not None:
         make_folder(out, "--out")

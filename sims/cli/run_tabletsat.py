@@ -128,7 +128,12 @@ def run_attitude(
     parts: list[Part] = []
     with progress(runs.seeds, "runs", quiet=common.quiet) as advance:
         outcome = sims.experiments.run_scenario(
-            file, estimate, runs.numbers, look=None if out is None else parts.append, advance=advance
+            file,
+            estimate,
+            runs.numbers,
+            through_time=out is not None,
+            look=None if out is None else parts.append,
+            advance=advance,
         )
     if not common.quiet:
         for line in outcome.warning_lines():

@@ -47,7 +47,7 @@ class Outcome:
         disturbance [1/s²], the error of the field's model [nT] and the dipole [A·m²], three axes each, and nine gains
         of the magnetometer [%]; NaN of a state that the filter does not have.
     nees : ndarray, shape (runs, n)
-        Normalised error squared, over its numbers.
+        Normalised error squared, over its numbers; at all instants, or at those of the last minute.
     nis : ndarray, shape (runs, n, 4)
         Normalised innovation squared of every sensor, NaN where it has no reading.
     error_deg : ndarray, shape (runs, n)
@@ -56,7 +56,7 @@ class Outcome:
     size : int
         Numbers of the error state.
     late : slice
-        Instants of the last minute.
+        Instants of the last minute among the n.
     worst_deg : ndarray, shape (runs,)
         Largest error while something is degraded or not observable, but for the first minute, which is the start's;
         NaN where nothing is.
@@ -78,6 +78,11 @@ class Outcome:
     rejected: NDArray[np.int64]
     rejected_good: NDArray[np.int64]
     warnings: list[list[str]]
+
+    def last_minute(self) -> Outcome:
+        """The same without the earlier instants, which only a figure through time shows."""
+        late = {name: getattr(self, name)[:, self.late].copy() for name in ("nees", "nis", "error_deg")}
+        return replace(self, **late, late=slice(None))
 
     def warning_lines(self) -> list[str]:
         """One line for every kind of warning: that of the first run which has it, and in how many runs it comes."""
@@ -151,6 +156,7 @@ def run_scenario(
     estimate: EstimatorSettings,
     seeds: Sequence[int],
     *,
+    through_time: bool = True,
     look: Callable[[Part], None] | None = None,
     advance: Callable[[int], None] | None = None,
 ) -> Outcome:
@@ -164,6 +170,8 @@ def run_scenario(
         What estimates.
     seeds : sequence of int
         One for each run.
+    through_time : bool
+        Keep NEES, NIS and error at all instants, six numbers each, and not at those of the last minute alone.
     look : callable, optional
         Called with every part of the runs.
     advance : callable, optional
@@ -185,12 +193,13 @@ def run_scenario(
     """
     outcomes = []
     for part in parts_of(file, estimate, seeds):
-        outcomes.append(outcome_of(part))
+        outcome = outcome_of(part)
+        outcomes.append(outcome if through_time else outcome.last_minute())
         if look is not None:
             look(part)
         if advance is not None:
-            advance(len(outcomes[-1].seeds))
-        del part  # or two would be in memory while the next one is made
+            advance(len(outcome.seeds))
+        del part, outcome  # or two would be in memory while the next one is made
     of_runs = ("seeds", "axis_rms", "nees", "nis", "error_deg", "diverged", "worst_deg", "rejected", "rejected_good")
     joined: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in outcomes]) for name in of_runs}
     return replace(outcomes[0], **joined, warnings=[texts for one in outcomes for texts in one.warnings])

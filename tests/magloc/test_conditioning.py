@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -90,6 +91,16 @@ class TestFiltersRefuse:
         for condition in (high_passed, without_hum):
             with pytest.raises(InputError, match="found rows at unequal intervals, expected equal ones"):
                 condition(uneven, 20.0)
+
+    @pytest.mark.parametrize("relative", [0.0, 5e-4])
+    def test_intervals_are_equal_to_a_thousandth(self, relative: float) -> None:
+        before = sinusoid(1.0, 100)
+        interval = before.time_s[1] - before.time_s[0]
+        for late, refused in ((relative, False), (relative + 2e-3, True)):
+            time_s = before.time_s.copy()
+            time_s[60:] += late * interval
+            with pytest.raises(InputError, match="unequal intervals") if refused else nullcontext():
+                high_passed(readings_of(time_s, before.values_T), 20.0)
 
     def test_missing_readings(self) -> None:
         before = sinusoid(1.0, 100)

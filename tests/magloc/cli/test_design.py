@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ import trimesh
 
 from arrays.array_file import read_array
 from arrays.io.errors import InputError
+from magloc.cli.design import _table
+from magloc.design.optimise import design_array
 from magloc.design.task import Block, Cap, DesignSearch, Mean, Quantile
 from magloc.design.task_files import read_task
 from magloc.design.volumes import Ball, Box, Cylinder
@@ -69,6 +72,11 @@ class TestResult:
         assert head == ["array", "sensors", "distance_m", "q50_m", "q95_m", "mean_m", "bearing_q95_deg"]
         assert "tetrahedron (4 sensors)" in outcome.out
         assert "The worst case is infinite" in outcome.out
+
+    def test_arrays_that_know_no_source_are_not_in_the_table(self, task):
+        result = design_array(read_task(str(task)))
+        blind = replace(result.judged[-1], name="blind", criterion_m=np.inf)
+        assert _table(replace(result, judged=(*result.judged, blind))) == _table(result)
 
     def test_fixes_are_possible(self, run, task, tmp_path):
         """The file is one that the other commands read."""

@@ -55,6 +55,7 @@ def test_questions(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(sys, "stdin", Terminal("grid\n3\n2\n0.05\n\nscalar\n0.2\n"))
     done = run("new-array", tmp_path / "a.toml")
     assert done.status == 0
+    assert done.err.startswith("Shape (tetrahedron, ")
     assert "Distance of neighbours [m]" in done.err
     assert arrays.read_array(tmp_path / "a.toml") == arrays.grid(3, 2, 0.05, "scalar", 2e-10)
 

@@ -32,9 +32,11 @@ from skimage.color import rgb2lab
 
 from arrays.geometries import tetrahedron
 from arrays.sensor import Calibration
+from magloc.bounds.maps import BoundScenario, bound_slices
 from magloc.convergence.over_starts import Status
 from magloc.localization.fit.results import Fix, Solution
 from magloc.plots import style
+from magloc.plots.bounds import bound_slices as bound_slices_figure
 from magloc.plots.calibrations import calibration_figure, turning_figure
 from magloc.plots.localization import distances_from_truth, fix_columns, fix_figure, residual_figure
 from magloc.plots.maps import _SOURCE_ENDS, convergence
@@ -156,8 +158,21 @@ class TestEllipses:
         expected = 2.0 * np.sqrt(np.linalg.eigvalsh(COVARIANCE[:2, :2]) * chi2.ppf(0.95, 2))
         np.testing.assert_allclose(sorted([ellipse.width, ellipse.height]), expected)
 
+    @pytest.mark.parametrize("n", [0, 1, 24, 25, 1000])
+    def test_few_enough_are_drawn_to_be_told_apart(self, n: int) -> None:
+        chosen = style.some_of(np.arange(n))
+        assert min(n, 12) <= len(chosen) <= 24
+        assert len(set(np.diff(chosen))) <= 1
+
 
 class TestBounds:
+    def test_columns_of_a_square_are_named_after_it(self) -> None:
+        dof = np.array([3, 6])
+        for name, of_dof in (("chi2", "dof"), ("nis", "nis_dof")):
+            columns = style.square_columns(name, np.array([2.0, 9.0]), dof)
+            assert list(columns) == [name, of_dof, f"{name}_low99", f"{name}_high99"]
+            np.testing.assert_allclose(columns[f"{name}_high99"], chi2.ppf(0.995, dof))
+
     @pytest.mark.parametrize("dof", [1, 3, 9, 81])
     def test_are_the_quantiles(self, dof: int) -> None:
         low, high = style.bounds99(dof)
@@ -260,6 +275,21 @@ class TestMaps:
         return [(text, handle) for text, handle in pairs if isinstance(handle, Patch)]
 
 
+class TestBoundSlices:
+    def test_bearings_are_in_degrees_and_planes_to_one_scale(self) -> None:
+        scenario = BoundScenario(moment_Am2=(60.0, 50.0, 60.0), n_moments=3)
+        dataset = bound_slices(scenario, 5)
+        axes = bound_slices_figure(dataset, scenario).axes
+        shown = [np.ma.filled(ax.images[0].get_array(), np.nan) for ax in axes[:9]]
+        names = ("sigma_range", "sigma_range_q95", "sigma_bearing_q95")
+        for images, name, unit in zip(np.split(np.array(shown), 3), names, (1.0, 1.0, 180.0 / math.pi), strict=True):
+            values = unit * dataset[name].to_numpy()
+            known = np.isfinite(values)
+            np.testing.assert_allclose(images[known], values[known])
+            assert known.any()
+        assert {ax.get_aspect() for ax in axes[:9]} == {1.0}
+
+
 class TestTrack:
     def test_bands_are_95_percent_and_gaps_are_hatched(self) -> None:
         points = track()
@@ -289,6 +319,11 @@ class TestTrack:
         assert plan.get_aspect() == 1.0
         low, high = plan.get_xlim()
         assert low < -3.0 < 11.0 < high
+
+    def test_a_straight_track_has_a_plan_that_is_not_all_width(self) -> None:
+        plan = track_figure(track(), array_m=np.array([[0.0, 3.0, 0.0]])).axes[0]
+        (left, right), (low, high) = plan.get_xlim(), plan.get_ylim()
+        assert high - low == pytest.approx(0.2 * (right - left))
 
     def test_millimetres_scale_ellipses_too(self) -> None:
         small = [

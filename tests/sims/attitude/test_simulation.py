@@ -12,7 +12,7 @@ from adcs import quaternion
 from adcs.satellite import dynamics
 from adcs.satellite.sensors import Gyro, Magnetometer, StarTracker
 from sims.attitude.scenario import AttitudeScenario, StartConditions
-from sims.attitude.simulation import AttitudeRuns, advance, prepare, sense, simulate, start_estimates
+from sims.attitude.simulation import AttitudeRuns, _field_error, advance, prepare, sense, simulate, start_estimates
 from tests.adcs.filter_runs import ANY_START, tabletsat
 from tests.calls import calls_of
 
@@ -114,6 +114,14 @@ class TestReadings:
         difference = wrong.true_field_orbital_T - wrong.environment.b_orbital_T
         np.testing.assert_allclose(np.linalg.norm(difference, axis=-1), 400e-9, rtol=1e-6)
         np.testing.assert_array_equal(wrong.environment.b_orbital_T, prepare(scenario, SEEDS).environment.b_orbital_T)
+
+    def test_an_error_of_the_field_model_that_wanders_is_forgotten(self, scenario: AttitudeScenario) -> None:
+        """Correlation 1/e after its time, and the same size: 900 components, within 4 σ, a false alarm in 8,000."""
+        wanders = replace(scenario, field_error_T=400e-9, field_error_correlation_s=50.0 * scenario.dt_s)
+        error = _field_error(wanders, list(range(300))) / 400e-9
+        before, after = error[:, 0], error[:, 50]
+        assert np.mean(before * after) == pytest.approx(np.exp(-1.0), abs=4.0 * np.sqrt((1.0 + np.exp(-2.0)) / 900))
+        assert np.mean(after**2) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 900))
 
 
 class TestStarts:

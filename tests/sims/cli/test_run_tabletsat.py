@@ -50,6 +50,12 @@ class TestNumbers:
         assert [key for key in KEYS if found[key] is None] == [*KEYS[2:8], "worst_deg"]
         assert (found["runs"], found["diverged_runs"]) == (2, 0)
 
+    def test_text_tells_every_number_that_there_is(self, adcs):
+        arguments = ("run", "tabletsat", "--seeds", "1", "--sensors", "st+gyro", "--states", "gyro-bias")
+        found, text = numbers(adcs(*arguments, "--json")), adcs(*arguments).out
+        for key in ("angle_rms_deg", "rate_rms_deg_s", "gyro_bias_rms_deg_s"):
+            assert f"{found[key]:.3g} °" in text
+
     def test_runs_is_seeds_and_they_count_from_seed(self, adcs):
         def angle(*arguments):
             return numbers(adcs("run", "tabletsat", "--json", "--sensors", "st", *arguments))["rate_rms_deg_s"]
@@ -142,6 +148,16 @@ class TestNumbers:
         assert list(found) == list(expected)
         for key, value in expected.items():
             assert found[key] == (value if value is None else pytest.approx(value)), key
+
+    def test_the_last_minute_alone_has_the_same_numbers(self):
+        file = read_scenario("tabletsat").changed({"duration_s": 150.0})
+        estimate = file.estimator("tabletsat")
+        whole, late = (run_scenario(file, estimate, range(2), through_time=kept) for kept in (True, False))
+        expected, found = ({k: v for k, v in one.numbers().items() if v is not None} for one in (whole, late))
+        assert found == pytest.approx(expected, rel=1e-12)
+        np.testing.assert_array_equal(late.nis, whole.nis[:, whole.late])
+        assert late.nis.base is None  # what is not kept is let go
+        assert late.nees.shape == late.error_deg.shape == (2, 60)
 
     def test_parts_do_not_change_the_result(self, monkeypatch):
         from sims.experiments import attitude as attitude_runs

@@ -226,6 +226,15 @@ class TestReading:
         assert models[1].noise_T_rtHz == 1e-9
         assert models[2] == SENSOR_KINDS["squid"]
 
+    @pytest.mark.parametrize("unit", ["noise_nT", "noise_nT_rtHz"])
+    def test_noise_of_one_sensor_replaces_that_of_all_in_whatever_unit(self, write, unit: str) -> None:
+        (other,) = {"noise_nT", "noise_nT_rtHz"} - {unit}
+        text = f'{OF_KIND}[sensors]\nkind = "overhauser"\n'
+        own = f"[sensors.of.s2]\n{unit} = 1\n"
+        replaced, alone = (read_scenario(write(text + common + own)) for common in (f"{other} = 7\n", ""))
+        assert replaced.models[1] == alone.models[1]
+        assert replaced.models[0] != alone.models[0]
+
     def test_vector_and_scalar_sensors_may_be_mixed(self, write) -> None:
         text = (
             'duration_s = 1\nrate_Hz = 2\n[sensors]\nkind = "fluxgate"\n[sensors.of.b]\nkind = "opm"\n'
