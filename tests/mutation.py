@@ -61,7 +61,7 @@ EDGE: dict[type[ast.AST], type[ast.AST]] = {ast.Lt: ast.LtE, ast.LtE: ast.Lt, as
 # How a figure looks, what a linter wants to be said, how an object is printed: no property that a test could hold.
 LOOKS = re.compile(
     r"alpha|lw|ls|ms|mew|e?linewidths?|(font|label)size|(label|handletext|border)?pad|columnspacing|zorder|figsize|dpi|rotation"
-    r"|shrink|frameon|rasterized|depthshade|arrow_length_ratio|bbox_to_anchor|xytext|arrowprops|(width|height)_ratios|opacity"
+    r"|aspect|shrink|frameon|rasterized|depthshade|arrow_length_ratio|bbox_to_anchor|xytext|arrowprops|(width|height)_ratios|opacity"
     r"|(cast|receive)_shadow|strict|repr|kw_only"
 )
 # A change of type, which counts only where types are told apart.

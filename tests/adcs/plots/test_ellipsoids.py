@@ -48,6 +48,18 @@ def test_the_roll_panel_is_not_scaled_to_the_first_set() -> None:
     assert 0.2 < roll_yaw_figure(picture()).axes[3].get_ylim()[1] < 0.6
 
 
+def test_what_is_labelled_is_in_a_legend() -> None:
+    for ax in roll_yaw_figure(picture()).axes:
+        if ax.get_legend_handles_labels()[1]:
+            assert ax.get_legend() is not None
+
+
+def test_the_truth_is_at_the_origin_of_the_plane() -> None:
+    plane = roll_yaw_figure(picture()).axes[0]
+    (truth,) = (line for line in plane.get_lines() if line.get_marker() == "+")
+    np.testing.assert_array_equal(truth.get_xydata(), [[0.0, 0.0]])
+
+
 class TestSets:
     def test_an_outline_is_the_edge_of_the_set(self) -> None:
         root = np.random.default_rng(0).standard_normal((2, 2))

@@ -208,6 +208,7 @@ class TestScenario:
             ("moment_Am2", (0.0, 0.0, 0.0)),
             ("moment_Am2", (np.nan, 0.0, 0.0)),
             ("n_moments", 0),
+            ("array", tetrahedron(1.5, noise_T=1e-25)),
         ],
     )
     def test_refuses_nonsense(self, name, value):
