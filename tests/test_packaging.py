@@ -69,6 +69,16 @@ class TestImports:
             for name in declared(EXTRAS[extra])
         }
 
+    @pytest.mark.parametrize("package", PACKAGES)
+    def test_an_extra_that_is_asked_for_brings_what_is_imported(self, package: str) -> None:
+        for path in (REPOSITORY / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if not isinstance(node, ast.With) or "of_extra(" not in (call := ast.unparse(node.items[0])):
+                    continue
+                extra, _ = re.fullmatch(r"of_extra\('(\w+)', (.*)\)", call).groups()
+                names = {name.partition(".")[0] for name in imports_of(ast.unparse(node))} - {*PACKAGES}
+                assert {DISTRIBUTIONS.get(name, name) for name in names} <= set(declared([f"magloc[{extra}]"])), path
+
     @pytest.mark.parametrize("text", ["import a.b", "from a.b import c", "def f():\n    import a"])
     def test_are_found_wherever_they_stand(self, text: str) -> None:
         assert [name.partition(".")[0] for name in imports_of(text)] == ["a"]

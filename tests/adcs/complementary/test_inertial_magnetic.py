@@ -61,6 +61,12 @@ class TestParts:
         )
         assert np.abs(rest_bias(moved)).max() == 0.0
 
+    def test_a_sensor_that_is_shaken_without_turning_does_not_rest(self):
+        record, _, _ = motion()
+        shaken = record.acceleration_m_s2 + np.sin(20.0 * record.time_s)[:, None]
+        moved = InertialMagneticRecord(record.time_s, record.rate_rad_s, shaken, record.field_T)
+        assert np.abs(rest_bias(moved)).max() == 0.0
+
     def test_a_rest_is_known_at_its_end(self):
         record, _, _ = motion()
         changed = record.rate_rad_s.copy()

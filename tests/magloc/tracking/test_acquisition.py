@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from magloc.localization.fit.prior import NOTHING_KNOWN
 from magloc.localization.fit.results import Fix
 from magloc.tracking import acquisition as acquisition_module
-from magloc.tracking.acquisition import Acquisition, Start
+from magloc.tracking.acquisition import Acquisition, Start, _after
 from magloc.tracking.results import Row
 from tests.magloc.localization.search.test_moving_array import N_ROWS, SOURCE, SQUARE, passing
 from tests.passing_source import ARRAY, MOMENT, POSITION, readings_of
@@ -107,6 +107,22 @@ class TestFromSeveralRows:
         assert len(times) > 1
         assert max(times) - min(times) <= 0.01 * 2.5 * 1.1 * float(np.linalg.norm(POSITION)) / 0.02
         assert all(start is None for start, _ in map(Acquisition(ARRAY, NOTHING_KNOWN, 10.0).start, rows[:20]))
+
+
+class TestAfterAPrediction:
+    def test_solutions_are_ranked_and_weighted_by_the_row_and_the_prediction(self) -> None:
+        """One fits better by 1 and is 2 σ from where the source was predicted, which is worse by 3 in all."""
+        far, near = (
+            one_source([x, 0.0, 0.0], np.ones(3), np.eye(6), chi2=chi2, dof=6) for x, chi2 in ((5.0, 5.0), (3.0, 6.0))
+        )
+        found = _after(Fix((far, near)), np.array([3.0, 0.0, 0.0, 1.0, 1.0, 1.0]), np.eye(6))
+        assert [solution.position_m[0] for solution in found.solutions] == [3.0, 5.0]
+        np.testing.assert_allclose(
+            [solution.weight for solution in found.solutions], np.array([1.0, np.exp(-1.5)]) / (1.0 + np.exp(-1.5))
+        )
+
+    def test_a_row_without_a_fix_has_none(self) -> None:
+        assert _after(Fix((), reason="no signal"), np.ones(6), np.eye(6)).solutions == ()
 
 
 Scripted = Callable[[list[float]], list[int]]

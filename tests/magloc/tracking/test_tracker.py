@@ -251,6 +251,17 @@ class TestGapsAndOutliers:
         np.testing.assert_array_equal(gap.estimability, 0.0)
         assert math.isnan(gap.nis)
 
+    @pytest.mark.parametrize(("gap_s", "after"), [(8.0, "predicted"), (30.0, "not acquired")])
+    def test_a_row_without_the_source_after_a_gap(self, gap_s: float, after: str) -> None:
+        """The range is too uncertain to start from; the prediction is kept while it is not so for a track."""
+        time_s, p, m = moving_source(6)
+        readings = readings_of(ARRAY, p, m)
+        time_s[5] = time_s[4] + gap_s
+        readings[5] = 0.0
+        before, last = statuses(followed(Tracker(ARRAY, SLOW), rows_from(time_s, readings)))[-2:]
+        assert before == "tracked"
+        assert last.startswith(after)
+
     def test_one_sensor_alone_measures_no_difference(self) -> None:
         time_s, p, m = moving_source(4)
         readings = readings_of(ARRAY, p, m)
