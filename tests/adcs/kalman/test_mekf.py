@@ -485,11 +485,7 @@ class TestFieldModel:
             assert self.attitude_nees(runs, wrong) > 4.0
 
     def test_claims_what_it_reaches(self) -> None:
-<<<<<<< HEAD
         """At 400 nT, from a start that is linear: 5° off in eclipse is not, and three runs of 80 are the rms."""
-=======
-        """At 400 nT, from a start that is linear: 5° an axis off in eclipse is not."""
->>>>>>> a7ed31b (adcs calibrate: a magnetometer from a log and the field along its orbit, with what the log does not tell left at its prior)
         runs = self.runs(400e-9)
         chosen = replace(settings("mag+sun+gyro", self.STATES), field_error_T=400e-9)
         estimates = run_filter(runs, chosen, start_of(runs, math.radians(1.0)))
