@@ -94,7 +94,8 @@ def _case(command: str, words: Sequence[str], stdin: bytes) -> Case:
 
 def _asks_for_much(words: Sequence[str]) -> Iterator[bool]:
     """Whether a whole number is long work, which is no hang, rather than too much, which is refused."""
-    for option, value in pairwise(words):
+    for option, word in pairwise(words):
+        value = word.replace("_", "")  # 1_000 is a number too
         most = 3000 if option == "--duration" else 100
         yield option.startswith("--") and value.isascii() and value.isdigit() and most < int(value) < 10**7
 
