@@ -16,7 +16,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from arrays.differences import decorrelated_differences
-from arrays.geometries import axial, tetrahedron
+from arrays.geometries import axial, cube, tetrahedron
 from magloc.convergence.over_sources import SourcesMap, SourcesScenario, SourceStatus, summary
 from magloc.grids.computed import computed_map
 from magloc.grids.cube import Box
@@ -67,6 +67,14 @@ class TestFixes:
             assert_array_equal(np.isnan(paper_map[name].to_numpy()), left_out)
         assert (paper_map.truth_listed.to_numpy()[left_out] == -1).all()
         assert summary(paper_map).starts == (~left_out).sum()
+
+    def test_sources_are_where_the_map_says(self):
+        """On the side of the better sensors they are known better than on the other, whatever their moments."""
+        board = cube(1.5)
+        better = [replace(s, noise_T=1e-11 if s.position_m[0] > 0.0 else 1e-9) for s in board.sensors]
+        scenario = SourcesScenario(replace(board, sensors=tuple(better)), half_width_m=2.0, nearest_m=1.9)
+        sigma = computed_map(SourcesMap(scenario, 4)).sigma_range.to_numpy()
+        assert (sigma[-1] < 0.7 * sigma[0]).all()
 
     def test_noise_that_grows_with_the_field(self):
         array = replace(tetrahedron(1.5, noise_T=1e-9), noise_fraction=0.01)
