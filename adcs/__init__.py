@@ -13,6 +13,8 @@ __getattr__, __dir__, __all__ = lazy_names(
         "Gains": "adcs.complementary.explicit",
         "Satellite": "adcs.satellite.satellite",
         "Telemetry": "adcs.satellite.telemetry",
+        "VectorAttitudes": "adcs.satellite.wahba",
+        "attitude_of_vectors": "adcs.satellite.wahba",
         "circular_orbit": "adcs.environment.orbit",
         "complementary_filter": "adcs.complementary.filters",
         "datasets": ":adcs.datasets",
@@ -23,5 +25,6 @@ __getattr__, __dir__, __all__ = lazy_names(
         "mockup": ":adcs.mockup",
         "read_scenario": "adcs.io.scenario_files",
         "read_telemetry": "adcs.io.telemetry_files",
+        "vector_attitude": "adcs.satellite.vectors",
     },
 )

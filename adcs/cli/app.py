@@ -37,6 +37,11 @@ for _name, _where, _help in (
         "adcs.cli.estimate:estimate",
         "Estimate attitude and rate from telemetry, with the filters of `adcs run`.",
     ),
+    (
+        "vectors",
+        "adcs.cli.vectors:vectors",
+        "Attitude of every row of telemetry from field and Sun alone, by TRIAD or QUEST.",
+    ),
     ("demo", "adcs.cli.demo:demo", "Estimate the attitude of a simulated satellite, and draw what comes out."),
     (
         "stars",
