@@ -82,7 +82,8 @@ def check_conventions(telemetry: Telemetry, around: Environment, used: Collectio
         return
     worst, mended = int(np.argmax(as_read)), {}
     for sensor, name, attribute, matrix in _changes():
-        found = _disagreements(_changed(log, attribute, matrix)) if sensor in used else as_read
+        with np.errstate(over="ignore"):
+            found = _disagreements(_changed(log, attribute, matrix)) if sensor in used else as_read
         if found[worst] <= min(as_read[worst] / _MENDED, 1.0) and (found <= np.maximum(as_read, 1.0)).all():
             mended[f"the {SENSOR_WORDS[sensor]}{name}"] = found.sum()
     if mended:
@@ -134,7 +135,7 @@ def _disagreements(log: _Log) -> FloatArray:
     """Contradictions (6,) in units of what is allowed; 0 of those that the log does not allow to see."""
     vectors = attitude_of_vectors([log.sun, log.field], [log.model_sun, log.model_field], [1.0, 1.0], method="triad").q
     vectors[np.sin(_angle(log.sun, log.field)) < _LEAST_SINE] = np.nan
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         found = [
             _median(np.abs(np.log(_lengths(log.field) / _lengths(log.model_field)))) / math.log(_FACTOR),
             _median(np.abs(_angle(log.field, log.sun) - _angle(log.model_field, log.model_sun))) / _ANGLE_RAD,
