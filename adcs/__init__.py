@@ -14,6 +14,8 @@ __getattr__, __dir__, __all__ = lazy_names(
         "MagnetometerPrior": "adcs.satellite.magnetometer_calibration",
         "Satellite": "adcs.satellite.satellite",
         "Telemetry": "adcs.satellite.telemetry",
+        "VectorAttitudes": "adcs.satellite.wahba",
+        "attitude_of_vectors": "adcs.satellite.wahba",
         "calibrate_magnetometer": "adcs.satellite.magnetometer_calibration",
         "circular_orbit": "adcs.environment.orbit",
         "complementary_filter": "adcs.complementary.filters",
@@ -25,5 +27,6 @@ __getattr__, __dir__, __all__ = lazy_names(
         "mockup": ":adcs.mockup",
         "read_scenario": "adcs.io.scenario_files",
         "read_telemetry": "adcs.io.telemetry_files",
+        "vector_attitude": "adcs.satellite.vectors",
     },
 )

@@ -17,4 +17,7 @@ from adcs.satellite.magnetometer_calibration import MagnetometerPrior as Magneto
 from adcs.satellite.magnetometer_calibration import calibrate_magnetometer as calibrate_magnetometer
 from adcs.satellite.satellite import Satellite as Satellite
 from adcs.satellite.telemetry import Telemetry as Telemetry
+from adcs.satellite.vectors import vector_attitude as vector_attitude
+from adcs.satellite.wahba import VectorAttitudes as VectorAttitudes
+from adcs.satellite.wahba import attitude_of_vectors as attitude_of_vectors
 from adcs.stars.identification import identify_stars as identify_stars

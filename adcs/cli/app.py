@@ -42,6 +42,11 @@ for _name, _where, _help in (
         "adcs.cli.calibrate:calibrate",
         "Calibrate the magnetometer of a log by the field along the orbit.",
     ),
+    (
+        "vectors",
+        "adcs.cli.vectors:vectors",
+        "Attitude of every row of telemetry from field and Sun alone, by TRIAD or QUEST.",
+    ),
     ("demo", "adcs.cli.demo:demo", "Estimate the attitude of a simulated satellite, and draw what comes out."),
     (
         "stars",

@@ -36,7 +36,8 @@ def estimate(
         and so on, field_x_nT, sun_x, and the wheels' momentum wheels_x_Nms, in body axes. Empty cells and missing rows
         are missing readings.
     config : Path
-        Scenario file (TOML) of the satellite; time_s counts from its orbit's start.
+        Scenario file (TOML) of the satellite; time_s counts from its orbit's start. Its table log names other columns,
+        UTC times, units, axes and conventions of quaternions.
     options : EstimateOptions
         What differs from the scenario file.
     out : Path, optional
@@ -53,7 +54,7 @@ def estimate(
     scenario = adcs.read_scenario(str(config))
     scenario = scenario.changed({"estimate": options.estimate(scenario.estimate.states)})
     settings = scenario.estimator(f"{config}, table estimate")
-    record = adcs.read_telemetry(telemetry, scenario.step_s)
+    record = adcs.read_telemetry(telemetry, scenario.step_s, layout=scenario.log)
     with naming(str(telemetry)):
         track = adcs.estimate(record, scenario.satellite, sensors=settings)
     columns = estimate_columns(track)

@@ -273,15 +273,15 @@ def _up(q_gyro: FloatArray, record: InertialMagneticRecord) -> FloatArray:
 
 def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
     """Lag at which the field changes least within a fifth of a second, seen from a frame that does not turn."""
+    from adcs.complementary.inertial_magnetic_compiled import without_turns
+
     rows = np.flatnonzero(np.isfinite(record.field_T).all(axis=1))
-    time_s, values = record.time_s[rows], record.field_T[rows]
     step = float(np.median(record.dt_s))
-    apart = max(1, round(_LAG_WINDOW_S / float(np.median(np.diff(time_s)))))
+    apart = max(1, round(_LAG_WINDOW_S / float(np.median(np.diff(record.time_s[rows])))))
     most = round(_LONGEST_LAG_S / step)
     changes = []
     for lag in range(most + 1):
-        then = _at_times(q_gyro, record.time_s, time_s - lag * step)
-        field_T = quaternion.rotate(then, values)
+        field_T = without_turns(q_gyro, record.time_s, rows, record.field_T, lag * step)
         changes.append(float(np.mean((field_T[apart:] - field_T[:-apart]) ** 2)))
     least = int(np.argmin(changes))
     if not 0 < least < most:
@@ -291,15 +291,20 @@ def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
 
 
 def _without_lag(q_gyro: FloatArray, time_s: FloatArray, field_T: FloatArray, lag_s: float) -> FloatArray:
-    then = _at_times(q_gyro, time_s, time_s - lag_s)
-    return quaternion.rotate_back(q_gyro, quaternion.rotate(then, field_T))
+    from adcs.complementary.inertial_magnetic_compiled import without_turns
+
+    return quaternion.rotate_back(q_gyro, without_turns(q_gyro, time_s, np.arange(len(time_s)), field_T, lag_s))
 
 
-def _at_times(q: FloatArray, time_s: FloatArray, wanted_s: FloatArray) -> FloatArray:
-    """Attitudes at other times, on straight lines between two quaternions; the first one before all."""
+def turned_back(
+    q: FloatArray, time_s: FloatArray, rows: NDArray[np.intp], field_T: FloatArray, lag_s: float
+) -> FloatArray:
+    """Readable twin of :func:`adcs.complementary.inertial_magnetic_compiled.without_turns`."""
+    wanted_s = time_s[rows] - lag_s
     row = np.clip(np.searchsorted(time_s, wanted_s, side="right") - 1, 0, len(time_s) - 2)
     part = np.clip((wanted_s - time_s[row]) / (time_s[row + 1] - time_s[row]), 0.0, 1.0)[:, None]
-    return quaternion.normalised((1.0 - part) * q[row] + part * q[row + 1])
+    then = quaternion.normalised((1.0 - part) * q[row] + part * q[row + 1])
+    return quaternion.rotate(then, field_T[rows])
 
 
 def _attitude(up: FloatArray, north: FloatArray) -> FloatArray:

@@ -1,10 +1,11 @@
-"""Compiled loop of :mod:`adcs.complementary.inertial_magnetic`: what it computes is what SciPy's filter does."""
+"""Compiled loops of :mod:`adcs.complementary.inertial_magnetic`: a low-pass, as SciPy's filter, and turns undone."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adcs.satellite.dynamics_compiled import conjugate, normalised, quaternion_at, rotate_back, vector_at
 from magloc.compilation import compiled
 
 Array = NDArray[np.float64]
@@ -31,4 +32,28 @@ def low_pass(values: Array, dt_s: Array, time_s: float, start: Array) -> Array:
                 slope = decay * (slope * c - (slope + 2.0 * s * z) * d)
             found[i, axis] = y
             before = now
+    return found
+
+
+@compiled
+def without_turns(q: Array, time_s: Array, rows: NDArray[np.intp], field_T: Array, lag_s: float) -> Array:
+    """Readings (k, 3) of some rows, in a frame that does not turn, of a sensor that lags behind its attitude (n, 4).
+
+    Attitudes between two rows are on straight lines; :func:`adcs.complementary.inertial_magnetic.turned_back` is the
+    readable twin.
+    """
+    found, j = np.empty((len(rows), 3)), 0
+    for k in range(len(rows)):
+        then = time_s[rows[k]] - lag_s
+        while j < len(time_s) - 2 and time_s[j + 1] <= then:
+            j += 1
+        part = min(max((then - time_s[j]) / (time_s[j + 1] - time_s[j]), 0.0), 1.0)
+        a, b = quaternion_at(q[j]), quaternion_at(q[j + 1])
+        between = (
+            a[0] + part * (b[0] - a[0]),
+            a[1] + part * (b[1] - a[1]),
+            a[2] + part * (b[2] - a[2]),
+            a[3] + part * (b[3] - a[3]),
+        )
+        found[k, 0], found[k, 1], found[k, 2] = rotate_back(conjugate(normalised(between)), vector_at(field_T[rows[k]]))
     return found

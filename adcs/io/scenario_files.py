@@ -18,6 +18,7 @@ import numpy as np
 
 from adcs.environment.orbit import Orbit, Sgp4Orbit, circular_orbit
 from adcs.frames import instants
+from adcs.io.log_layout import LogLayout
 from adcs.io.scenario_tables import (
     SENSOR_TABLES,
     DisturbanceTable,
@@ -54,6 +55,7 @@ class AttitudeFile:
     start: StartTable
     disturbance: DisturbanceTable
     estimate: EstimateTable
+    log: LogLayout | None = None  # of a log with columns of its own
 
     def changed(self, changes: dict[str, Any]) -> AttitudeFile:
         """The scenario with some keys replaced; keys of a table in a table of the changes."""
@@ -154,6 +156,7 @@ def scenario_of(path: str, tables: dict[str, Any]) -> AttitudeFile:
         start=file.start,
         disturbance=file.disturbance,
         estimate=file.estimate,
+        log=None if file.log is None else LogLayout.of(f"{path}, table log", file.log, start_utc),
     )
 
 
@@ -188,6 +191,7 @@ def _estimator(place: str, table: EstimateTable) -> EstimatorSettings:
             start_rate_rad_s=math.radians(table.start_rate_error_deg_s),
             forgetting=table.forgetting,
             closed_loop_F=table.closed_loop_F,
+            longest_gap_s=table.longest_gap_s,
         )
 
 

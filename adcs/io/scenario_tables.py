@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
+from adcs.io.log_layout import LogTable
 from adcs.satellite.sensors import FIVE_HEADS, Gyro, Magnetometer, StarTracker, SunSensor
 from arrays.io.toml import (
     MAY_BE_INFINITE,
@@ -192,6 +193,7 @@ class EstimateTable(Table, kw_only=True):
     field_axes_deg: Positive = 1.0
     disturbance_s2: Positive = 2e-6
     dipole_Am2: Positive = 0.1
+    longest_gap_s: Positive = 600.0
     forgetting: float = 0.99
     closed_loop_F: bool = False
 
@@ -231,6 +233,7 @@ class FileTable(File, kw_only=True):
     disturbance: DisturbanceTable = msgspec.field(default_factory=DisturbanceTable)
     sensors: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
     estimate: EstimateTable = msgspec.field(default_factory=EstimateTable)
+    log: LogTable | None = None
 
     def check(self) -> None:
         """Refuse no step at all, and too many."""

@@ -1,7 +1,7 @@
 """Telemetry of attitude sensors: CSV files with units in the names of their columns.
 
-``time_s`` counts from ``start`` of the scenario file that goes with it, and ascends in whole multiples of its
-``step_s``; rows may be missing, and an empty cell is a missing reading. All other columns are optional, but those of a
+``time_s`` counts from ``start`` of the scenario file that goes with it, and ascends in any steps; rows may be missing,
+and an empty cell is a missing reading. All other columns are optional, but those of a
 sensor come together:
 
 =========================================  ============================================================================
@@ -24,22 +24,21 @@ from os import PathLike
 
 import numpy as np
 
-from adcs.satellite.telemetry import MOST_INSTANTS, Telemetry, steps_of
+from adcs.io.log_layout import STANDARD, LogLayout
+from adcs.satellite.telemetry import MOST_INSTANTS, Telemetry, steps_within, usual_step_s
 from arrays.io.csv import Table, read_table
 from arrays.io.errors import InputError, naming
 from arrays.io.toml import check_keys
 from arrays.typing import FloatArray
 
 TIME = "time_s"
-STAR = ("star_qw", "star_qx", "star_qy", "star_qz")
-GYRO = ("gyro_x_deg_s", "gyro_y_deg_s", "gyro_z_deg_s")
-FIELD = ("field_x_nT", "field_y_nT", "field_z_nT")
-SUN = ("sun_x", "sun_y", "sun_z")
-WHEELS = ("wheels_x_Nms", "wheels_y_Nms", "wheels_z_Nms")
-GROUPS = (STAR, GYRO, FIELD, SUN, WHEELS)
+_UNUSED = np.datetime64(0, "us")
+STAR, GYRO, FIELD, SUN, WHEELS = GROUPS = tuple(one.columns for one in STANDARD.values())
 
 
-def read_telemetry(path: str | PathLike[str], step_s: float | None = None) -> Telemetry:
+def read_telemetry(
+    path: str | PathLike[str], step_s: float | None = None, *, layout: LogLayout | None = None
+) -> Telemetry:
     """Read a log.
 
     Parameters
@@ -47,13 +46,14 @@ def read_telemetry(path: str | PathLike[str], step_s: float | None = None) -> Te
     path : str or path-like
         A log (CSV); see the file formats.
     step_s : float, optional
-        Time between readings, such as that of the scenario file; by default the shortest between two rows.
+        Usual time between readings, such as that of the scenario file; by default the shortest between two rows.
+    layout : LogLayout, optional
+        Of a log with columns, units and conventions of its own: ``log`` of :func:`adcs.read_scenario`.
 
     Raises
     ------
     InputError
-        The file cannot be read, a column is unknown or missing, or a time is not a multiple of the step after the
-        first.
+        The file cannot be read, a column is unknown or missing, or the times do not ascend.
 
     Examples
     --------
@@ -62,41 +62,39 @@ def read_telemetry(path: str | PathLike[str], step_s: float | None = None) -> Te
     >>> adcs.read_telemetry(log.path).star.shape
     (201, 4)
     """
-    table = read_table(path, f"a header with {TIME} and columns of sensors")
-    known = [TIME, *(name for group in GROUPS for name in group)]
-    check_keys(f"{path}, line {table.header_line}", dict.fromkeys(table.header), known, "column")
-    table.require(TIME, known)
-    time_s = table.complete([TIME])[:, 0]
-    if step_s is not None:
-        _refuse_times(table, time_s, step_s)
-    columns = {group: table.finite_or_missing(group) for group in GROUPS if table.has_group(group)}
-    for group in (STAR, SUN):
-        if group in columns:
-            none = (columns[group] == 0.0).all(axis=1)[:, None]
-            table.refuse(none, group[:1], "found a reading of length 0, expected one with a direction")
-    star, gyro_deg_s, field_nT = columns.get(STAR), columns.get(GYRO), columns.get(FIELD)
+    expected = f"a header with {TIME if layout is None else layout.time} and columns of sensors"
+    if layout is None:
+        table = read_table(path, expected)
+        known = [TIME, *(name for group in GROUPS for name in group)]
+        check_keys(f"{path}, line {table.header_line}", dict.fromkeys(table.header), known, "column")
+        layout = LogLayout(_UNUSED, TIME, "seconds", {k: v for k, v in STANDARD.items() if table.has_group(v.columns)})
+    else:
+        names = [layout.time, *(name for one in layout.columns.values() for name in one.columns)]
+        table = read_table(path, expected, only=names, instants=[layout.time] if layout.time_format == "utc" else [])
+        for name in names:
+            table.require(name, names)
+    table.require(layout.time, [layout.time])
+    time_s = layout.seconds(table.complete([layout.time])[:, 0])
+    _refuse_times(table, layout.time, time_s, step_s)
+    columns = {}
+    for name, group in layout.columns.items():
+        values = table.finite_or_missing(group.columns)
+        if name in ("star", "sun"):
+            none = (values == 0.0).all(axis=1)[:, None]
+            table.refuse(none, group.columns[:1], "found a reading of length 0, expected one with a direction")
+        columns[name] = group.of(values)
     with naming(str(path)):
-        return Telemetry(
-            time_s,
-            star=None if star is None else np.roll(star, -1, axis=1),
-            gyro_rad_s=None if gyro_deg_s is None else np.radians(gyro_deg_s),
-            field_T=None if field_nT is None else 1e-9 * field_nT,
-            sun=columns.get(SUN),
-            wheels_Nms=columns.get(WHEELS),
-            step_s=step_s,
-        )
+        return Telemetry(time_s, **columns, step_s=step_s)
 
 
-def _refuse_times(table: Table, time_s: FloatArray, step_s: float) -> None:
+def _refuse_times(table: Table, column: str, time_s: FloatArray, step_s: float | None) -> None:
     """Refuse times that are no instants, with their place."""
-    rows, off, back = steps_of(time_s, step_s)
-    table.refuse(
-        off[:, None], [TIME], f"found a time that is no multiple of step_s = {step_s:g} s after the first, expected one"
-    )
-    table.refuse(back[:, None], [TIME], "found a time that is not after the one before, expected times that ascend")
-    if rows[-1] >= MOST_INSTANTS:
+    table.refuse_back(column, np.diff(time_s) <= 0.0, "times that ascend", "{:.15g} s")
+    steps = steps_within(time_s, step_s or usual_step_s(time_s))
+    if steps >= MOST_INSTANTS:
         raise InputError(
-            f"{table.place(-1, TIME)}: found {rows[-1]} steps after the first row, expected fewer than {MOST_INSTANTS}."
+            f"{table.place(-1, column)}: found {steps:.6g} steps after the first row, "
+            f"expected fewer than {MOST_INSTANTS}."
         )
 
 

@@ -19,7 +19,8 @@ from adcs.kalman.names import FILTERS, Filter, StartKind
 from adcs.kalman.results import sigma_by_state
 from adcs.kalman.separate_bias import run_parallel
 from adcs.kalman.smoother import smoothed
-from adcs.satellite.attitude_track import AttitudeTrack
+from adcs.satellite.attitude_track import AttitudeTrack, joined
+from adcs.satellite.conventions import check_conventions
 from adcs.satellite.satellite import Satellite
 from adcs.satellite.sensors import SENSOR_WORDS, SENSORS
 from adcs.satellite.telemetry import Record, Telemetry, orbital_from_eci, part
@@ -47,6 +48,8 @@ class EstimatorSettings:
         Of the parallel filter of the disturbance.
     closed_loop_F : bool
         The source paper's Jacobian.
+    longest_gap_s : float
+        Through which the filter coasts on the dynamics, where a log has no row; after a longer one it starts anew.
 
     Examples
     --------
@@ -62,6 +65,7 @@ class EstimatorSettings:
     start_rate_rad_s: float = math.radians(0.1)
     forgetting: float = 0.99
     closed_loop_F: bool = False
+    longest_gap_s: float = 600.0
 
     @classmethod
     def of(cls, sensors: str, states: Iterable[str] = (), filter: Filter = "mekf") -> EstimatorSettings:
@@ -90,7 +94,8 @@ def estimate(
     """Attitude and rate of a satellite from its log, by an error-state Kalman filter.
 
     Field and Sun are computed along the orbit. The filter starts from the first readings; where they leave a turn
-    open, from the turn that fits the readings of five minutes, or fifty of a magnetometer alone.
+    open, from the turn that fits the readings of five minutes, or fifty of a magnetometer alone. After a gap of more
+    than ten minutes, or what the settings say, it starts anew.
 
     Parameters
     ----------
@@ -117,8 +122,9 @@ def estimate(
     Raises
     ------
     ValueError
-        The sensors cannot observe attitude or have no reading, a date is outside of the model of the field, or the
-        filter fails.
+        The sensors cannot observe attitude or have no reading, one misreading of a sensor (its unit, axes or
+        quaternion) explains why they contradict each other, a date is outside of the model of the field, or the filter
+        fails.
 
     Examples
     --------
@@ -131,6 +137,24 @@ def estimate(
     True
     """
     chosen = EstimatorSettings.of(sensors, states, filter) if isinstance(sensors, str) else sensors
+    pieces = telemetry.pieces(chosen.longest_gap_s)
+    if len(pieces) == 1:
+        return _estimate(telemetry, satellite, chosen)
+    tracks, reasons = [], []
+    for piece in pieces:
+        try:
+            tracks.append(_estimate(piece, satellite, chosen))
+        except ValueError as error:
+            reasons.append(error)
+    if not tracks:
+        raise reasons[0]
+    told = f"; {len(reasons)} of the {len(pieces)} pieces tell no attitude: {reasons[0]}" if reasons else ""
+    anew = f"{len(pieces) - 1} gaps longer than {chosen.longest_gap_s:g} s: the filter starts anew after each{told}"
+    return joined(tracks, anew)
+
+
+def _estimate(telemetry: Telemetry, satellite: Satellite, chosen: EstimatorSettings) -> AttitudeTrack:
+    """Track of a log without a long gap."""
     used = chosen.settings.sensors
     record = telemetry.record(satellite)
     for name in used.sensors.split("+"):
@@ -139,6 +163,7 @@ def estimate(
                 f"Input found no reading of the {SENSOR_WORDS[name]}, expected some because the sensors in use are "
                 f"{used.sensors}."
             )
+    check_conventions(telemetry, record.environment, used.sensors.split("+"))
     first = first_told(record, used, with_gyro=chosen.filter == "reduced")
     record = part(record, np.array([0]), slice(first, None))
     tracks = estimated(record, chosen, any_start)

@@ -45,6 +45,8 @@ def run_constant_gain(
     ``gain`` (runs, N, k): that of :func:`converged_gain` at the last instant, unless given.
     """
     check_start(record, start)
+    if (record.steps_s != record.dt_s).any():
+        raise ValueError("Input record must have equal steps for a constant gain; instead received others.")
     K = converged_gain(record, settings, start) if gain is None else gain
     state = first_state(settings, start)
     states, nis = [], []

@@ -262,23 +262,27 @@ class FilterSettings:
         """Standard deviation of the state ``field-model``."""
         return self.field_error_T or FIELD_ERROR_T
 
-    def field_decay(self, dt_s: float) -> float:
+    def field_decay(self, step_s: float | FloatArray) -> FloatArray:
         """What a step leaves of the state ``field-model``, an Ornstein-Uhlenbeck process."""
-        return math.exp(-dt_s / self.field_correlation_s)
+        return np.exp(-np.asarray(step_s) / self.field_correlation_s)
 
-    def process_variance(self, dt_s: float) -> FloatArray:
-        """Diagonal of Q of a step, shape (N,)."""
+    def process_variance(self, step_s: float | FloatArray, usual_s: float) -> FloatArray:
+        """Diagonal of Q of steps, (N,), or (k, N) of steps (k, 1); ``noise`` is that of a usual one."""
         noise = self.noise
         walks = {
             "field-bias": noise.field_bias_T,
             "gyro-bias": noise.gyro_bias_rad_s,
             "disturbance": noise.disturbance_s2,
-            "field-model": self.field_model_sigma_T * math.sqrt(1.0 - self.field_decay(dt_s) ** 2),
+            "field-model": 0.0,
             "dipole": noise.dipole_Am2,
             "field-gain": noise.field_gain,
         }
         always = np.repeat(np.square([noise.attitude, noise.rate_rad_s]), 3)
-        return np.concatenate([always, self._variances(walks)])
+        variance = np.concatenate([always, self._variances(walks)]) * (np.asarray(step_s) / usual_s)
+        if "field-model" in self.sensors.states:
+            kept = self.field_decay(step_s)
+            variance[..., self.sensors.place("field-model")] = self.field_model_sigma_T**2 * (1.0 - kept**2)
+        return variance
 
     @property
     def start_variance(self) -> FloatArray:

@@ -34,11 +34,9 @@ def run_reduced(record: Record, settings: FilterSettings, start: Start) -> Attit
         )
     check_start(record, start)
     rates = _filled(record.readings.gyro_rad_s)
-    h, gyro_rad_s = record.dt_s, record.satellite.gyro.sigma_rad_s
+    gyro_rad_s = record.satellite.gyro.sigma_rad_s
     runs, n = rates.shape[:2]
-    Q = np.diag(
-        np.repeat([settings.noise.attitude**2 + (0.5 * gyro_rad_s * h) ** 2, settings.noise.gyro_bias_rad_s**2], 3)
-    )
+    walk = np.square([settings.noise.attitude, settings.noise.gyro_bias_rad_s]) / record.dt_s
     others = replace(settings, sensors=replace(used, gyro=False, states=()))
     P = np.zeros((runs, 6, 6))
     P[:, :3, :3], P[:, 3:, 3:] = start.covariance[:, :3, :3], settings.gyro_bias_sigma_rad_s**2 * np.eye(3)
@@ -46,6 +44,8 @@ def run_reduced(record: Record, settings: FilterSettings, start: Start) -> Attit
     states, nis = [], []
     for row in range(n):
         if row:
+            h = float(record.steps_s[row - 1])
+            Q = np.diag(np.repeat(walk * h + [(0.5 * gyro_rad_s * h) ** 2, 0.0], 3))
             w = 0.5 * (rates[:, row - 1] + rates[:, row]) - bias
             q, Phi = _moved(q, w, record.environment.orbital_rate_rad_s[:, row - 1], h)
             P = Phi @ P @ Phi.mT + Q

@@ -116,7 +116,7 @@ def moved(record: Record, row: int, state: State) -> tuple[FloatArray, FloatArra
         around.orbital_rate_rad_s[:, row],
         around.gravity_s2[:, row],
         around.b_orbital_T[:, row],
-        record.dt_s,
+        float(record.steps_s[row]),
         state.of("dipole"),
     )
     return q, w
@@ -130,11 +130,12 @@ def predicted(
     ahead = replace(state, q=q, w=w)
     F = 0.5 * (jacobian(record, row, state) + jacobian(record, row + 1, ahead))
     by_dipole = 0.5 * (acceleration_by_dipole(record, row, state) + acceleration_by_dipole(record, row + 1, ahead))
-    Phi = transition(F, by_dipole, settings, record.dt_s)
-    P = Phi @ state.P @ Phi.mT + np.diag(settings.process_variance(record.dt_s))
+    step_s = float(record.steps_s[row])
+    Phi = transition(F, by_dipole, settings, step_s)
+    P = Phi @ state.P @ Phi.mT + np.diag(settings.process_variance(step_s, record.dt_s))
     optional = dict(state.optional)
     if "field-model" in optional:
-        optional["field-model"] = settings.field_decay(record.dt_s) * optional["field-model"]
+        optional["field-model"] = settings.field_decay(step_s) * optional["field-model"]
     return replace(ahead, optional=optional, P=0.5 * (P + P.mT)), Phi
 
 
@@ -433,13 +434,13 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
             np.array([used.star, used.gyro, used.magnetometer, used.sun]),
             deviations(record, settings),
             np.array([_begins(used, state, part) for state in STATES for part in range(SIZES[state] // 3)]),
-            settings.process_variance(record.dt_s),
+            settings.process_variance(record.steps_s[:, None], record.dt_s),
             settings.open_variance,
-            settings.field_decay(record.dt_s),
+            settings.field_decay(record.steps_s),
             settings.gate_limit,
             np.array([patience(sensor, record.dt_s) for sensor in range(len(SENSORS))]),
         ),
-        record.dt_s,
+        record.steps_s,
     )
     parts = np.split(optional, np.cumsum([SIZES[state] for state in used.states]), axis=-1)
     return AttitudeTracks(settings, q, w, dict(zip(used.states, parts, strict=False)), covariance, nis, rejected)

@@ -70,9 +70,9 @@ class Settings(NamedTuple):
     """Which of star tracker, gyro, magnetometer and Sun sensor are used, their deviations and patience, (4,).
 
     Biases of field and gyro, the disturbance, the error of the field model, the dipole and the three rows of the
-    magnetometer's D begin at ``firsts`` in the error state, -1 where there are none. ``variance`` and ``open_variance``
-    (N,): that a step adds, and of an error state of which nothing is known. ``decay``: what a step leaves of the error
-    of the field model.
+    magnetometer's D begin at ``firsts`` in the error state, -1 where there are none. ``open_variance`` (N,): of an
+    error state of which nothing is known. ``variance`` (n - 1, N): what each step adds; ``decay`` (n - 1,): what it
+    leaves of the error of the field model.
     """
 
     used: NDArray[np.bool_]
@@ -80,7 +80,7 @@ class Settings(NamedTuple):
     firsts: NDArray[np.int64]
     variance: Array
     open_variance: Array
-    decay: float
+    decay: Array
     limit: float
     patience: NDArray[np.int64]
 
@@ -256,11 +256,11 @@ def _advance(
     if e >= 0:
         for j in range(e, e + 3):
             for column in range(N):
-                one.P[j, column] *= settings.decay
+                one.P[j, column] *= settings.decay[i]
             for row in range(N):
-                one.P[row, j] *= settings.decay
-            x[16 + j - e] *= settings.decay
-    spread(work.Phi, work.G, (settings.firsts[2], settings.firsts[4]), settings.variance, one.P, work.T)
+                one.P[row, j] *= settings.decay[i]
+            x[16 + j - e] *= settings.decay[i]
+    spread(work.Phi, work.G, (settings.firsts[2], settings.firsts[4]), settings.variance[i], one.P, work.T)
     _put(x, q)
     x[4], x[5], x[6] = w
 
@@ -367,7 +367,7 @@ def run(
     record: Record,
     around: Surroundings,
     settings: Settings,
-    dt: float,
+    dt: Array,
 ) -> None:
     """Filter runs begin to end."""
     n_rows, N, K = out.q.shape[1], first.P.shape[1], len(settings.firsts)
@@ -384,9 +384,9 @@ def run(
         gate.reset(contest)
         for i in range(n_rows):
             if i > 0:
-                _advance(main, body, record, around, settings, (run, i - 1), dt, steps)
+                _advance(main, body, record, around, settings, (run, i - 1), dt[i - 1], steps)
                 if contest.counts[gate.BEGAN] >= 0:
-                    _advance(second, body, record, around, settings, (run, i - 1), dt, steps)
+                    _advance(second, body, record, around, settings, (run, i - 1), dt[i - 1], steps)
             contest.counts[gate.ROW] = i
             models = vector_at(around.b_orbital[run, i]), vector_at(record.sun_orbital[run, i])
             main.dx[:] = 0.0

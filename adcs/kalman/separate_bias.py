@@ -36,16 +36,16 @@ def run_parallel(record: Record, settings: FilterSettings, start: Start, forgett
     inner = replace(settings, sensors=settings.sensors.without("disturbance"))
     state = first_state(inner, start)
     runs, n = record.momentum_Nms.shape[:2]
-    size, h = inner.sensors.size, record.dt_s
-    B = np.concatenate([h * h / 4.0 * np.eye(3), h * np.eye(3), np.zeros((size - 6, 3))])
+    size = inner.sensors.size
     S = np.zeros((runs, size, 3))
     P_d = np.tile(settings.disturbance_sigma_s2**2 * np.eye(3), (runs, 1, 1))
     states, nis = [], []
     for row in range(n):
         if row:
             state, Phi = predicted(record, row - 1, state, inner)
-            S = Phi @ S + B
-            P_d = P_d / forgetting
+            h = float(record.steps_s[row - 1])
+            S = Phi @ S + np.concatenate([h * h / 4.0 * np.eye(3), h * np.eye(3), np.zeros((size - 6, 3))])
+            P_d = P_d / forgetting ** (h / record.dt_s)
         H, residual = stacked_residuals(record, row, state, inner)
         HP = H @ state.P
         noise = HP @ H.mT + np.eye(H.shape[1])

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from adcs import quaternion
 from arrays.io.lazy import by_name
 from arrays.typing import BoolArray, FloatArray
+
+_MOST_WARNINGS = 10
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -106,3 +108,25 @@ class AttitudeTrack:
     def plot(self) -> Figure:
         """Every state's three axes side by side, with the filter's ±3σ, and the gaps of its sensors."""
         return by_name("adcs.plots.attitude:track_figure")(self)
+
+
+def joined(tracks: Sequence[AttitudeTrack], warning: str) -> AttitudeTrack:
+    """One track of those of a log's pieces, with a warning before theirs, of which ten are kept."""
+    first = tracks[0]
+    before = np.cumsum([0, *(len(track) for track in tracks[:-1])])
+
+    def of(name: str) -> Any:
+        values = [getattr(track, name) for track in tracks]
+        if isinstance(values[0], Mapping):
+            return {key: np.concatenate([one[key] for one in values]) for key in values[0]}
+        return None if values[0] is None else np.concatenate(values)
+
+    texts = list(dict.fromkeys(text for track in tracks for text in track.warnings))
+    more = (f"and {len(texts) - _MOST_WARNINGS} more like these",) if len(texts) > _MOST_WARNINGS else ()
+    arrays = ("time_s", "q", "states", "seen", "sigma", "nis", "q_orbital", "gated", "degraded")
+    return replace(
+        first,
+        rows=np.concatenate([track.rows + n for track, n in zip(tracks, before, strict=True)]),
+        warnings=(warning, *texts[:_MOST_WARNINGS], *more),
+        **{name: of(name) for name in arrays},
+    )

@@ -7,6 +7,7 @@ one without it. The leading axis of all arrays is the run, the second the instan
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 _MOST_STEPS = 2.0**53  # whole numbers in double precision
 _STEP_TOLERANCE = 1e-3
+_SAME_STEP = 1e-6
 MOST_INSTANTS = 500_000
 """Of a log, with those of its gaps."""
 
@@ -71,9 +73,9 @@ class Record:
     satellite : Satellite
         With its sensors, as its user believes them to be.
     dt_s : float
-        Time between instants.
+        Usual time between instants.
     environment : Environment
-        Leading axis runs.
+        Leading axis runs; has the instants.
     momentum_Nms, wheel_torque_Nm : ndarray, shape (runs, n, 3)
         Momentum of the wheels, and its rate of change from each instant to the next.
     """
@@ -84,6 +86,12 @@ class Record:
     readings: Readings
     momentum_Nms: FloatArray
     wheel_torque_Nm: FloatArray
+
+    @cached_property
+    def steps_s(self) -> FloatArray:
+        """From each instant to the next, shape (n - 1,); exactly the usual one but for more than rounding."""
+        steps = np.diff(self.environment.time_s)
+        return np.where(np.abs(steps - self.dt_s) < _SAME_STEP * self.dt_s, self.dt_s, steps)
 
 
 def part(record: Record, runs: NDArray[np.intp], rows: slice = slice(None)) -> Record:
@@ -109,7 +117,7 @@ class Telemetry:
     Attributes
     ----------
     time_s : ndarray, shape (n,)
-        Since :attr:`adcs.Satellite.start`, ascending in whole multiples of the step; rows may be missing.
+        Since :attr:`adcs.Satellite.start`, ascending in any steps; rows may be missing.
     star : Rotation, or ndarray, shape (n, 4)
         Star tracker: inertial (J2000) from body. As quaternions with the scalar last where some are missing.
     gyro_rad_s : ndarray, shape (n, 3)
@@ -121,12 +129,13 @@ class Telemetry:
     wheels_Nms : ndarray, shape (n, 3)
         Momentum of all wheels together; straight lines go through what is missing.
     step_s : float
-        Time between instants; by default the shortest between two rows.
+        Usual time between instants, which the process noise is for; by default the shortest between two rows, of times
+        that are no multiples of it their median.
 
     Raises
     ------
     ValueError
-        A shape does not match, a direction has no length, or the times are no ascending multiples of the step.
+        A shape does not match, a direction has no length, or the times do not ascend.
 
     Examples
     --------
@@ -159,17 +168,15 @@ class Telemetry:
         times = np.array(time_s, dtype=np.float64)
         if times.ndim != 1 or not times.size or not np.isfinite(times).all():
             raise ValueError(f"Input time_s must be finite with shape (n,); instead received shape {times.shape}.")
+        back = np.diff(times) <= 0.0
+        if back.any():
+            raise ValueError(f"Input time_s must ascend; instead received {times[1:][back][0]:g}.")
         if step_s is None:
-            step_s = float(np.diff(times).min()) if len(times) > 1 else 1.0
+            step_s = usual_step_s(times)
         check_positive(step_s=step_s)
-        rows, off, back = steps_of(times, step_s)
-        if (off | back).any():
-            raise ValueError(
-                f"Input time_s must ascend in multiples of step_s = {step_s:g} s; instead received "
-                f"{times[off | back][0]:g}."
-            )
-        if rows[-1] >= MOST_INSTANTS:
-            raise ValueError(f"Input time_s must have fewer than {MOST_INSTANTS} steps; instead received {rows[-1]}.")
+        steps = steps_within(times, step_s)
+        if steps >= MOST_INSTANTS:
+            raise ValueError(f"Input time_s must have fewer than {MOST_INSTANTS} steps; instead received {steps:.6g}.")
         quaternions = star if star is None or not hasattr(star, "as_quat") else np.atleast_2d(star.as_quat())
         given = {"star": quaternions, "gyro_rad_s": gyro_rad_s, "field_T": field_T, "sun": sun}
         checked = {name: _columns(name, values, len(times)) for name, values in given.items()}
@@ -194,14 +201,29 @@ class Telemetry:
 
     @property
     def rows(self) -> NDArray[np.int64]:
-        """Instant of every row, counted in steps from the first."""
-        return steps_of(self.time_s, self.step_s)[0]
+        """Instant of every row, as a place in :attr:`instants_s`."""
+        return _instants_of(self.time_s, self.step_s)[1]
+
+    def pieces(self, longest_gap_s: float) -> list[Telemetry]:
+        """The log, cut where it has no row for longer than that."""
+        cuts = np.flatnonzero(np.diff(self.time_s) > max(longest_gap_s, self.step_s)) + 1
+        return [
+            Telemetry(
+                self.time_s[rows],
+                star=self.star[rows],
+                gyro_rad_s=self.gyro_rad_s[rows],
+                field_T=self.field_T[rows],
+                sun=self.sun[rows],
+                wheels_Nms=self.wheels_Nms[rows],
+                step_s=self.step_s,
+            )
+            for rows in np.split(np.arange(len(self.time_s)), cuts)
+        ]
 
     def record(self, satellite: Satellite) -> Record:
         """What the filters are given: readings at every instant, field and Sun along the satellite's orbit."""
-        rows, step_s = self.rows, self.step_s
-        n = int(rows[-1]) + 1
-        start_s = self.time_s[0]
+        instants_s, rows = _instants_of(self.time_s, self.step_s)
+        n, start_s = len(instants_s), self.time_s[0]
 
         def spread(values: FloatArray) -> FloatArray:
             """Values at all instants, NaN in gaps."""
@@ -212,12 +234,12 @@ class Telemetry:
         around = environment(
             satellite.orbit,
             np.array([satellite.start + np.timedelta64(round(1e6 * start_s), "us")]),
-            self.instants_s - start_s,
+            instants_s - start_s,
             model=satellite.field_model,
         )
-        momentum = _through_gaps(spread(self.wheels_Nms))
+        momentum = _through_gaps(spread(self.wheels_Nms), instants_s)
         torque = np.zeros_like(momentum)
-        torque[:-1] = np.diff(momentum, axis=0) / step_s
+        torque[:-1] = np.diff(momentum, axis=0) / np.diff(instants_s)[:, None]
         star, sun = spread(self.star[:, [3, 0, 1, 2]]), spread(self.sun)
         readings = Readings(
             star=quaternion.multiply(orbital_from_eci(around)[0], quaternion.normalised(star))[None],
@@ -225,12 +247,12 @@ class Telemetry:
             field_T=spread(self.field_T)[None],
             sun=(sun / np.linalg.norm(sun, axis=1, keepdims=True))[None],
         )
-        return Record(satellite, step_s, around, readings, momentum[None], torque[None])
+        return Record(satellite, self.step_s, around, readings, momentum[None], torque[None])
 
     @property
     def instants_s(self) -> FloatArray:
-        """Time of every instant, with those of missing rows."""
-        return self.time_s[0] + self.step_s * np.arange(int(self.rows[-1]) + 1)
+        """Time of every instant, with those of missing rows: multiples of the step, or steps like it within a gap."""
+        return _instants_of(self.time_s, self.step_s)[0]
 
 
 def _columns(name: str, given: ArrayLike | None, n: int) -> FloatArray:
@@ -252,12 +274,36 @@ def steps_of(time_s: FloatArray, step_s: float) -> tuple[NDArray[np.int64], Bool
     return rows, np.abs(steps - rows) > _STEP_TOLERANCE, np.diff(rows, prepend=-1) <= 0
 
 
-def _through_gaps(momentum: FloatArray) -> FloatArray:
+def steps_within(time_s: FloatArray, step_s: float) -> float:
+    """Steps from the first time to the last, with those of its rows that are closer."""
+    return float(np.clip(np.maximum(np.diff(time_s) / step_s, 1.0).sum(), 0.0, _MOST_STEPS))
+
+
+def usual_step_s(time_s: FloatArray) -> float:
+    """Shortest step of ascending times that are its multiples, the median one of others; 1 of one time alone."""
+    if len(time_s) < 2:
+        return 1.0
+    steps = np.diff(time_s)
+    shortest = float(steps.min())
+    return float(np.median(steps)) if steps_of(time_s, shortest)[1].any() else shortest
+
+
+def _instants_of(time_s: FloatArray, step_s: float) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Instants of a filter, and which of them are the n times."""
+    rows, off, _ = steps_of(time_s, step_s)
+    if not off.any() and (np.diff(rows) > 0).all():
+        return time_s[0] + step_s * np.arange(int(rows[-1]) + 1), rows
+    counts = np.maximum(np.ceil(np.diff(time_s) / step_s - 0.5), 1.0).astype(np.int64)
+    rows = np.concatenate([[0], np.cumsum(counts)])
+    return np.interp(np.arange(rows[-1] + 1), rows, time_s), rows
+
+
+def _through_gaps(momentum: FloatArray, instants_s: FloatArray) -> FloatArray:
     """Momentum at all instants: straight lines through gaps, zero where there is none at all."""
     known = np.flatnonzero(~np.isnan(momentum[:, 0]))
     if not known.size:
         return np.zeros_like(momentum)
-    return np.stack([np.interp(np.arange(len(momentum)), known, column[known]) for column in momentum.T], axis=1)
+    return np.stack([np.interp(instants_s, instants_s[known], column[known]) for column in momentum.T], axis=1)
 
 
 def orbital_from_eci(around: Environment) -> FloatArray:

@@ -7,11 +7,12 @@ any line ends, blank lines and spaces around cells are tolerated.
 from __future__ import annotations
 
 import csv
+import datetime
 import difflib
 import io
 import math
 from array import array as packed
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -136,9 +137,19 @@ class Table:
             raise InputError(f"{self.place(row, column)}: {pair}, expected {expected}.")
 
 
-def read_table(path: str | PathLike[str], expected_header: str) -> Table:
-    """Table, of one row at least, of a CSV file of numbers; `expected_header` says in words what it should have."""
-    return table_of_text(read_text(path, "a CSV file"), str(path), expected_header)
+def read_table(
+    path: str | PathLike[str],
+    expected_header: str,
+    *,
+    only: Collection[str] | None = None,
+    instants: Collection[str] = (),
+) -> Table:
+    """Table, of one row at least, of a CSV file of numbers; `expected_header` says in words what it should have.
+
+    ``only``: columns that are read, others may hold anything. ``instants``: columns of ISO 8601 times, UTC unless they
+    say otherwise, which become seconds since 1970.
+    """
+    return table_of_text(read_text(path, "a CSV file"), str(path), expected_header, only=only, instants=instants)
 
 
 class Columns(Protocol):
@@ -166,7 +177,15 @@ def table_of_columns(columns: Columns, name: str) -> Table:
     return Table(name, header, None, np.stack(values, axis=1), np.arange(1, len(values[0]) + 1))
 
 
-def table_of_text(text: str, name: str, expected_header: str, *, first_line: int | None = None) -> Table:
+def table_of_text(
+    text: str,
+    name: str,
+    expected_header: str,
+    *,
+    first_line: int | None = None,
+    only: Collection[str] | None = None,
+    instants: Collection[str] = (),
+) -> Table:
     """As :func:`read_table`, from text that errors call `name` and whose rows begin at `first_line` of a longer one."""
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     if "\0" in text:
@@ -179,22 +198,39 @@ def table_of_text(text: str, name: str, expected_header: str, *, first_line: int
     header = _checked_header(f"{name}, line {header_line}", cells, expected_header)
     # float() would also take 1_000 and digits of other scripts: only text without them may go through it directly.
     read = float if text.isascii() and "_" not in text[text.find("\n") :] else _number
+    kept = [i for i, column in enumerate(header) if only is None or column in only]
+    chosen = tuple(header[i] for i in kept)
+    timed = [i for i, column in enumerate(chosen) if column in instants]
     values, line_numbers = packed("d"), packed("q")
     shift = 0 if first_line is None else first_line - header_line - 1
     for row_line, cells in rows:
         line = row_line + shift
         if len(cells) != len(header):
             raise InputError(f"{name}, line {line}: found {len(cells)} cells, expected {len(header)} as in the header.")
+        if only is not None:
+            cells = [cells[i] for i in kept]
+        for i in timed:
+            cells[i] = _unix_seconds(f"{name}, line {line}, column {chosen[i]}", cells[i])
         try:
             numbers = [read(cell or "nan") for cell in cells]
         except ValueError:
-            numbers = _careful_numbers(f"{name}, line {line}", header, cells)
+            numbers = _careful_numbers(f"{name}, line {line}", chosen, cells)
         values.extend(numbers)
         line_numbers.append(line)
     if not line_numbers:
         raise InputError(f"{name}, line {header_line}: found a header without rows, expected a row below it.")
-    table = np.array(values).reshape(-1, len(header))
-    return Table(name, header, header_line, table, np.array(line_numbers, dtype=np.int64))
+    table = np.array(values).reshape(-1, len(chosen))
+    return Table(name, chosen, header_line, table, np.array(line_numbers, dtype=np.int64))
+
+
+def _unix_seconds(place: str, cell: str) -> str:
+    """Seconds since 1970 of an instant, as text."""
+    try:
+        instant = datetime.datetime.fromisoformat(cell.strip())
+    except ValueError:
+        found = repr(cell.strip()[:_SHOWN_CHARACTERS])
+        raise InputError(f"{place}: found {found}, expected a time such as 2026-11-21T12:00:00.5 (UTC).") from None
+    return repr((instant if instant.tzinfo else instant.replace(tzinfo=datetime.UTC)).timestamp())
 
 
 def _csv_rows(path: str, text: str) -> Iterator[tuple[int, list[str]]]:

@@ -11,6 +11,7 @@ from matplotlib import image
 
 from adcs import quaternion
 from adcs.cli.app import main
+from arrays.io.csv import write_columns
 from tests.adcs.refusals import assert_refused
 from tests.command_line import refuse_constant
 
@@ -129,3 +130,30 @@ class TestRefusals:
         missing = tmp_path / "none"
         assert_refused(adcs("estimate", missing, "--config", example / "scenario.toml"), f"{missing} does not exist")
         assert_refused(adcs("estimate", example / "telemetry.csv", "--config", missing), f"{missing} does not exist")
+
+
+class TestVectors:
+    def test_rows_with_both(self, adcs, example, tmp_path):
+        files = (example / "telemetry.csv", "--config", example / "scenario.toml")
+        outcome = adcs("vectors", *files, "--out", tmp_path, "--json", "--quiet")
+        columns, truth = table(tmp_path / "vectors.csv"), table(example / "truth.csv")
+        assert len(json.loads(outcome.out, parse_constant=refuse_constant)["results"]) == len(columns["time_s"])
+        rows = np.isin(np.round(truth["time_s"], 6), np.round(columns["time_s"], 6))
+        both = {name: values[rows] for name, values in truth.items()}
+        assert np.median(errors_deg(columns, both)) < 1.0
+        assert adcs("vectors", *files, "--method", "triad").out.startswith(f"{len(columns['time_s'])} rows")
+
+    def test_refusal(self, adcs, example, tmp_path):
+        path = tmp_path / "log.csv"
+        path.write_text("time_s,sun_x,sun_y,sun_z\n0,1,0,0\n")
+        assert_refused(adcs("vectors", path, "--config", example / "scenario.toml"), "both magnetometer and Sun sensor")
+
+
+class TestMisreading:
+    def test_is_one_sentence(self, adcs, example, tmp_path):
+        columns = table(example / "telemetry.csv")
+        for axis in "xyz":
+            columns[f"field_{axis}_nT"] = 1e-3 * columns[f"field_{axis}_nT"]
+        path = tmp_path / "log.csv"
+        write_columns(columns, path)
+        assert_refused(adcs("estimate", path, "--config", example / "scenario.toml"), "magnetometer in µT taken for nT")

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy import signal
 from scipy.spatial.transform import Rotation
 
 from adcs import quaternion
@@ -14,8 +15,10 @@ from adcs.complementary.inertial_magnetic import (
     prepare,
     rest_bias,
     sensor_fixed_field,
+    turned_back,
     undisturbed,
 )
+from adcs.complementary.inertial_magnetic_compiled import low_pass, without_turns
 from tests.adcs.attitudes import random_attitudes
 from tests.adcs.broad import orientation_errors, read_broad
 
@@ -110,6 +113,43 @@ class TestParts:
         left_out = np.isnan(undisturbed(prepare(record))[:, 0])
         assert left_out[: round(20.0 / DT)].mean() < 0.01
         assert left_out[round(20.0 / DT) :].mean() > 0.7
+
+
+class TestCompiled:
+    def test_turns_undone(self):
+        rng = np.random.default_rng(0)
+        time_s = np.cumsum(rng.uniform(0.005, 0.015, 200))
+        q = quaternion.exp(np.cumsum(0.05 * rng.standard_normal((200, 3)), axis=0))
+        rows, field = np.arange(0, 200, 3), rng.standard_normal((200, 3))
+        for lag_s in (0.0, 0.013, 0.3):
+            args = q, time_s, rows, field, lag_s
+            np.testing.assert_allclose(without_turns(*args), turned_back(*args), atol=1e-12)
+
+    def test_low_pass_is_scipys_butterworth(self):
+        """On equal steps, against the bilinear transform, whose error falls with the square of the step."""
+        values = np.random.default_rng(1).standard_normal((4000, 3)).cumsum(axis=0)
+        cutoff_Hz = math.sqrt(2.0) / (2.0 * math.pi * 2.0)
+        sections = signal.butter(2, 2.0 * DT * cutoff_Hz, output="sos")
+        start = signal.sosfilt_zi(sections)[..., None] * values[0]
+        expected, _ = signal.sosfilt(sections, values, axis=0, zi=start)
+        found = low_pass(values, np.full(4000, DT), 2.0, values[0])
+        np.testing.assert_allclose(found, expected, atol=0.01 * np.ptp(values))
+
+    def test_low_pass_in_any_steps(self):
+        """SciPy's simulation of the same equation, the input on straight lines, and NaN as the value before."""
+        rng = np.random.default_rng(2)
+        time_s = np.concatenate([[0.0], np.cumsum(rng.uniform(0.002, 0.02, 2000))])
+        values = np.stack([np.sin(f * time_s) for f in (0.5, 1.0, 3.0)], axis=1)
+        s = 1.0 / 3.0
+        found = low_pass(values, np.diff(time_s, prepend=-0.01), 3.0, values[0])
+        fine = np.linspace(0.0, time_s[-1], 40_001)
+        for axis, f in enumerate((0.5, 1.0, 3.0)):
+            _, expected, _ = signal.lsim(([2.0 * s * s], [1.0, 2.0 * s, 2.0 * s * s]), np.sin(f * fine), fine)
+            np.testing.assert_allclose(found[:, axis], np.interp(time_s, fine, expected), atol=2e-4)
+        missing = values.copy()
+        missing[5:9], values[5:9] = np.nan, values[4]
+        steps = np.diff(time_s, prepend=-0.01)
+        np.testing.assert_array_equal(low_pass(missing, steps, 3.0, values[0]), low_pass(values, steps, 3.0, values[0]))
 
 
 class TestDoor:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from importlib.resources import files
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from adcs import quaternion
 from adcs.io.scenario_files import read_scenario
@@ -105,7 +108,6 @@ class TestGaps:
         ("time_s,gyro_x", ["0,1"], ["line 1, column gyro_x: found an unknown column", "nearest is gyro_x_deg_s"]),
         (",".join(GYRO), ["1,2,3"], ["line 1, column time_s", "expected it beside"]),
         (f"time_s,{GYRO[0]}", ["0,1"], ["line 1", GYRO[1], "all or none"]),
-        (f"time_s,{','.join(FIELD)}", ["0,1,2,3", "1.5,1,2,3"], ["line 3", "time_s", "step_s = 1 s"]),
         (f"time_s,{','.join(FIELD)}", ["0,1,2,3", "0,1,2,3"], ["line 3", "ascend"]),
         (f"time_s,{','.join(FIELD)}", ["0,1,2,3", "9e9,1,2,3"], ["line 3", "fewer than"]),
         (f"time_s,{','.join(FIELD)}", [",1,2,3"], ["line 2", "time_s", "no value"]),
@@ -136,3 +138,101 @@ def test_every_column_says_its_unit_or_has_none():
     units = ("_deg_s", "_nT", "_Nms")
     for group in GROUPS:
         assert group in (STAR, SUN) or all(name.endswith(units) for name in group)
+
+
+LAYOUT = """
+[log]
+time = "when"
+time_format = "utc"
+[log.star_tracker]
+columns = ["i", "j", "k", "s"]
+order = "scalar-last"
+direction = "body-from-inertial"
+mounting = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+[log.gyro]
+columns = ["p", "q", "r"]
+unit = "rad/s"
+[log.magnetometer]
+columns = ["bx", "by", "bz"]
+unit = "uT"
+mounting = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
+"""
+
+
+@pytest.fixture
+def with_layout(tmp_path):
+    """Scenario with a table of the log."""
+
+    def read(text=LAYOUT):
+        path = tmp_path / "own.toml"
+        tables = (files("adcs") / "scenarios" / "tabletsat.toml").read_text()
+        path.write_text(tables + text)
+        return read_scenario(str(path))
+
+    return read
+
+
+class TestLayout:
+    def test_columns_units_and_conventions(self, tmp_path, with_layout):
+        """Each undone by hand from the readings of a log in the standard columns."""
+        scenario, rng = with_layout(), np.random.default_rng(0)
+        q, rate, field = rng.standard_normal((5, 4)), rng.standard_normal((5, 3)), 30.0 * rng.standard_normal((5, 3))
+        seconds = np.array([0.0, 1.02, 1.97, 9.0, 9.5])
+        lines = ["when,note,i,j,k,s,p,q,r,bx,by,bz"]
+        for t, *cells in zip(seconds, q, rate, field, strict=True):
+            moment = str(scenario.satellite.start + np.timedelta64(round(1e6 * t), "us"))
+            lines.append(",".join([moment, "any text", *(repr(float(x)) for part in cells for x in part)]))
+        lines[3] = lines[3].replace(f",{float(rate[2, 1])!r},", ",,")
+        path = tmp_path / "own.csv"
+        path.write_text("\n".join([*lines, ""]))
+        log = read_telemetry(path, 1.0, layout=scenario.log)
+        np.testing.assert_allclose(log.time_s, seconds, atol=2e-6)
+        body_from_star = Rotation.from_matrix([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+        expected = Rotation.from_quat(q).inv() * body_from_star.inv()
+        assert (Rotation.from_quat(log.star) * expected.inv()).magnitude().max() < 1e-7
+        assert np.isnan(log.gyro_rad_s[2]).all()
+        np.testing.assert_allclose(np.delete(log.gyro_rad_s, 2, axis=0), np.delete(rate, 2, axis=0))
+        np.testing.assert_allclose(log.field_T, 1e-6 * field[:, [2, 0, 1]])
+
+    @pytest.mark.parametrize(
+        ("cell", "expected_s"),
+        [("2014-09-01 00:00:10", 10.0), ("2014-09-01T02:00:10.5+02:00", 10.5), ("2014-09-01T00:00:10Z", 10.0)],
+    )
+    def test_instants(self, tmp_path, with_layout, cell, expected_s):
+        path = tmp_path / "own.csv"
+        path.write_text(f"when,p,q,r\n{cell},1,2,3\n")
+        layout = with_layout('[log]\ntime = "when"\ntime_format = "utc"\n[log.gyro]\ncolumns = ["p", "q", "r"]\n').log
+        assert read_telemetry(path, layout=layout).time_s.tolist() == pytest.approx([expected_s], abs=1e-6)
+
+    @pytest.mark.parametrize(
+        ("old", "new", "fragments"),
+        [
+            ("[1, 0, 0], [0, 0, 1]]\n[log.gyro]", "[1, 0, 0], [0, 0, -1]]\n[log.gyro]", ["mounting", "mirror"]),
+            ("[[0, 0, 1], [1, 0, 0], [0, 1, 0]]", "[[0, 0, 1], [1, 0, 0], [0, 2, 0]]", ["mounting", "orthonormal"]),
+            ('"uT"', '"Oe"', ["unit", "'Oe'", "nT, uT"]),
+            ('"scalar-last"', '"last"', ["order", "scalar-first, scalar-last"]),
+            ('"body-from-inertial"', '"inverse"', ["direction", "inertial-from-body"]),
+            ('"utc"', '"gps"', ["time_format", "seconds, utc, unix"]),
+        ],
+    )
+    def test_refusals(self, with_layout, old, new, fragments):
+        with pytest.raises(InputError) as refused:
+            with_layout(LAYOUT.replace(old, new))
+        for fragment in fragments:
+            assert fragment in str(refused.value)
+
+    def test_refusals_of_the_log(self, tmp_path, with_layout):
+        layout = with_layout('[log]\ntime = "when"\ntime_format = "utc"\n[log.gyro]\ncolumns = ["p", "q", "r"]\n').log
+        path = tmp_path / "own.csv"
+        for text, fragments in (
+            ("when,p,q,w\n2014-09-01,1,2,3\n", ["column r: found no such column"]),
+            ("when,p,q,r\n12.5.2014,1,2,3\n", ["line 2, column when", "'12.5.2014'", "2026-11-21T12:00:00.5"]),
+            ("when,p,q,r\n2014-09-02,1,2,3\n2014-09-01,1,2,3\n", ["line 3, column when", "times that ascend"]),
+        ):
+            path.write_text(text)
+            with pytest.raises(InputError) as refused:
+                read_telemetry(path, layout=layout)
+            for fragment in fragments:
+                assert fragment in str(refused.value)
+        with pytest.raises(InputError, match="table log: found no table of a sensor"):
+            with_layout('[log]\ntime = "t"\n')

@@ -41,7 +41,9 @@ class TestConstantGain:
         _, Phi = predicted(runs, 299, state, chosen)
         H, _ = stacked_residuals(runs, 300, state, chosen)
         for run in range(2):
-            P = solve_discrete_are(Phi[run].T, H[run].T, np.diag(chosen.process_variance(runs.dt_s)), np.eye(3))
+            P = solve_discrete_are(
+                Phi[run].T, H[run].T, np.diag(chosen.process_variance(runs.dt_s, runs.dt_s)), np.eye(3)
+            )
             expected = P @ H[run].T @ np.linalg.inv(H[run] @ P @ H[run].T + np.eye(3))
             np.testing.assert_allclose(K[run], expected, rtol=0, atol=2e-3 * np.abs(expected).max())
             np.testing.assert_allclose(np.abs(K[run]).max(axis=1), np.abs(expected).max(axis=1), rtol=2e-3)

@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+import adcs
 from adcs import quaternion
 from adcs.environment.orbit import Sgp4Orbit
 from adcs.environment.sun import illuminated_fraction, sun_position_eci
@@ -20,10 +22,32 @@ from adcs.frames import Instants, instants
 Array = NDArray[np.float64]
 # No elements come with the record. These were fitted to it: mean motion, node and mean anomaly such that no row lies
 # in an eclipse and the eclipses are as long as that allows, for the inclination of a Sun-synchronous orbit.
-ORBIT = Sgp4Orbit(
+ELEMENTS = (
     "1 44878U 19092F   20327.00000000  .00000000  00000-0  10000-4 0    04",
     "2 44878  97.4700 147.8821 0005000   0.0000 203.9517 15.15852310    04",
 )
+ORBIT = Sgp4Orbit(*ELEMENTS)
+CONFIG = f"""
+step_s = 10.0
+[satellite]
+inertia_kgm2 = [[0.04, 0, 0], [0, 0.04, 0], [0, 0, 0.012]]
+[orbit]
+start = "2020-11-15T00:00:00"
+elements = ["{ELEMENTS[0]}", "{ELEMENTS[1]}"]
+[sensors.star_tracker]
+noise_deg = 0.1
+[estimate]
+sensors = "st"
+longest_gap_s = 20.0
+[estimate.process_noise]
+rate_rad_s = 1e-3
+[log]
+time = "TIMESTAMP"
+time_format = "utc"
+[log.star_tracker]
+columns = ["w", "x", "y", "z"]
+direction = "body-from-inertial"
+"""
 LONGEST_GAP_S = 16.0
 FASTEST_RAD_S = np.radians(3.0)
 
@@ -90,3 +114,21 @@ class TestEclipses:
                 found.append(rows[rows < entry + 300.0].max() - entry)
         assert len(found) >= 10
         assert np.median(np.abs(found)) < 60.0
+
+
+class TestLog:
+    """The quaternions as they are: times in UTC, columns of its own, from inertial to body, 72 gaps."""
+
+    def test_every_row_is_read_and_estimated(self, data_folder: Path, tmp_path: Path) -> None:
+        config = tmp_path / "opssat.toml"
+        config.write_text(CONFIG)
+        scenario = adcs.read_scenario(str(config))
+        path = data_folder / "opssat" / "labeled_O_Q_FB_FI_EST.csv"
+        log = adcs.read_telemetry(path, scenario.step_s, layout=scenario.log)
+        assert len(log.time_s) == 4776
+        track = adcs.estimate(log, scenario.satellite, sensors=scenario.estimator())
+        assert len(track.rows) == 4776
+        assert "gaps longer than 20 s" in track.warnings[0]
+        used = track.seen["st"] & ~track.gated["st"]
+        angle = np.degrees((track.rotation[track.rows] * Rotation.from_quat(log.star).inv()).magnitude())
+        assert np.median(angle[used[track.rows]]) < 0.2

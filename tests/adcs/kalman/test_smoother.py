@@ -54,7 +54,7 @@ def least_squares(runs: AttitudeRuns, chosen: FilterSettings, start: Start) -> t
         add({i: H[0]}, residual[0], np.eye(len(residual[0])))
         if i < n - 1:
             _, Phi = predicted(runs, i, at, chosen)
-            root = np.diag(1.0 / np.sqrt(chosen.process_variance(runs.dt_s)))
+            root = np.diag(1.0 / np.sqrt(chosen.process_variance(runs.dt_s, runs.dt_s)))
             add({i: -Phi[0], i + 1: np.eye(size)}, np.zeros(size), root)
     A, b = np.concatenate(rows), np.concatenate(values)
     scale = 1.0 / np.linalg.norm(A, axis=0)

@@ -1,0 +1,62 @@
+"""``adcs vectors``: attitude of every row of a log from field and Sun alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import adcs
+from adcs.cli.options import print_note
+from adcs.satellite.wahba import VectorMethod
+from arrays.io.arguments import Flag
+from arrays.io.errors import naming
+from arrays.io.outputs import make_folder, refuse_file
+from magloc.cli.framework import QuietOptions, print_json
+
+
+def vectors(
+    telemetry: Path,
+    /,
+    *,
+    config: Path,
+    method: VectorMethod = "quest",
+    out: Path | None = None,
+    json: Flag = False,
+    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Attitude of every row that has magnetometer and Sun sensor, each row on its own: TRIAD, or Wahba's problem.
+
+    Parameters
+    ----------
+    telemetry : Path
+        Log, as of `adcs estimate`.
+    config : Path
+        Scenario file, as of `adcs estimate`: its orbit, the noise of both sensors, its table log.
+    method : str
+        Least squares of both vectors ("quest"), or the Sun exactly and the field for the turn around it ("triad").
+    out : Path, optional
+        Folder for vectors.csv.
+    json : bool
+        Print one JSON object with one entry for every such row.
+    common : QuietOptions
+        Common options.
+    """
+    from adcs.io.estimates import estimate_columns, summary_lines
+    from arrays.io.csv import write_columns
+
+    if out is not None:
+        refuse_file(out, "--out")
+    scenario = adcs.read_scenario(str(config))
+    record = adcs.read_telemetry(telemetry, scenario.step_s, layout=scenario.log)
+    with naming(str(telemetry)):
+        track = adcs.vector_attitude(record, scenario.satellite, method=method)
+    columns = estimate_columns(track)
+    if out is not None:
+        make_folder(out, "--out")
+        write_columns(columns, out / "vectors.csv")
+        if not common.quiet:
+            print_note(f"wrote vectors.csv into {out}")
+    if json:
+        rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+        print_json({"results": [dict(zip(columns, row, strict=True)) for row in rows]})
+    else:
+        print("\n".join(summary_lines(track)))

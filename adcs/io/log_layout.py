@@ -1,0 +1,158 @@
+"""The table ``log`` of a scenario file: a log's own columns, units and conventions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from adcs import quaternion
+from arrays.io.errors import InputError
+from arrays.io.toml import RefusalError, Table, one_of
+from arrays.typing import FloatArray, Vector
+
+FIELD_UNITS = {"nT": 1e-9, "uT": 1e-6, "µT": 1e-6, "mT": 1e-3, "T": 1.0, "mG": 1e-7, "G": 1e-4}
+RATE_UNITS = {"deg/s": math.pi / 180.0, "rad/s": 1.0, "mrad/s": 1e-3, "deg/h": math.pi / 648_000.0}
+MOMENTUM_UNITS = {"Nms": 1.0, "mNms": 1e-3}
+TIME_FORMATS = ("seconds", "utc", "unix")
+ORDERS = ("scalar-first", "scalar-last")
+DIRECTIONS = ("inertial-from-body", "body-from-inertial")
+_ALONG: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+Three = tuple[str, str, str]
+
+
+class MountedTable(Table, kw_only=True):
+    """A sensor with axes of its own."""
+
+    mounting: tuple[Vector, Vector, Vector] = _ALONG  # body from sensor
+
+    def check(self) -> None:
+        """Refuse what is no rotation."""
+        matrix = np.array(self.mounting, dtype=np.float64)
+        if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-3:
+            raise RefusalError("mounting", "found rows that are not orthonormal, expected a rotation, body from sensor")
+        if np.linalg.det(matrix) < 0.0:
+            raise RefusalError("mounting", "found a mirror (determinant -1), expected a rotation, body from sensor")
+
+
+class StarColumns(MountedTable, kw_only=True):
+    """Quaternions."""
+
+    columns: tuple[str, str, str, str] = ("star_qw", "star_qx", "star_qy", "star_qz")
+    order: Annotated[str, one_of(ORDERS)] = "scalar-first"
+    direction: Annotated[str, one_of(DIRECTIONS)] = "inertial-from-body"
+
+    def of(self, values: FloatArray) -> FloatArray:
+        """Inertial from body, scalar last, of cells (n, 4)."""
+        q = values if self.order == "scalar-first" else np.roll(values, 1, axis=1)
+        if self.direction == "body-from-inertial":
+            q = quaternion.conjugate(q)
+        from scipy.spatial.transform import Rotation
+
+        body_from_sensor = Rotation.from_matrix(np.array(self.mounting, dtype=np.float64))
+        return np.roll(quaternion.multiply(q, quaternion.from_rotation(body_from_sensor.inv())), -1, axis=1)
+
+
+class GyroColumns(MountedTable, kw_only=True):
+    """Rates."""
+
+    columns: Three = ("gyro_x_deg_s", "gyro_y_deg_s", "gyro_z_deg_s")
+    unit: Annotated[str, one_of(RATE_UNITS)] = "deg/s"
+
+    def of(self, values: FloatArray) -> FloatArray:
+        """[rad/s], body axes, of cells (n, 3)."""
+        return RATE_UNITS[self.unit] * values @ np.array(self.mounting, dtype=np.float64).T
+
+
+class MagnetometerColumns(MountedTable, kw_only=True):
+    """Fields."""
+
+    columns: Three = ("field_x_nT", "field_y_nT", "field_z_nT")
+    unit: Annotated[str, one_of(FIELD_UNITS)] = "nT"
+
+    def of(self, values: FloatArray) -> FloatArray:
+        """[T], body axes, of cells (n, 3)."""
+        return FIELD_UNITS[self.unit] * values @ np.array(self.mounting, dtype=np.float64).T
+
+
+class SunColumns(MountedTable, kw_only=True):
+    """Directions."""
+
+    columns: Three = ("sun_x", "sun_y", "sun_z")
+
+    def of(self, values: FloatArray) -> FloatArray:
+        """Body axes, of cells (n, 3)."""
+        return values @ np.array(self.mounting, dtype=np.float64).T
+
+
+class WheelColumns(MountedTable, kw_only=True):
+    """Momentum of all wheels together."""
+
+    columns: Three = ("wheels_x_Nms", "wheels_y_Nms", "wheels_z_Nms")
+    unit: Annotated[str, one_of(MOMENTUM_UNITS)] = "Nms"
+
+    def of(self, values: FloatArray) -> FloatArray:
+        """[N·m·s], body axes, of cells (n, 3)."""
+        return MOMENTUM_UNITS[self.unit] * values @ np.array(self.mounting, dtype=np.float64).T
+
+
+class LogTable(Table, kw_only=True):
+    """Which columns are read, and as what; the others are not looked at."""
+
+    time: str = "time_s"
+    time_format: Annotated[str, one_of(TIME_FORMATS)] = "seconds"
+    star_tracker: StarColumns | None = None
+    gyro: GyroColumns | None = None
+    magnetometer: MagnetometerColumns | None = None
+    sun_sensor: SunColumns | None = None
+    wheels: WheelColumns | None = None
+
+
+Columns = StarColumns | GyroColumns | MagnetometerColumns | SunColumns | WheelColumns
+STANDARD: dict[str, Columns] = {
+    "star": StarColumns(),
+    "gyro_rad_s": GyroColumns(),
+    "field_T": MagnetometerColumns(),
+    "sun": SunColumns(),
+    "wheels_Nms": WheelColumns(),
+}
+"""Of a log without a layout, by the argument of :class:`adcs.Telemetry` that they become."""
+
+
+@dataclass(frozen=True, eq=False)
+class LogLayout:
+    """A log's own columns, units and conventions, as the table ``log`` of a scenario file states them.
+
+    Attributes
+    ----------
+    start : datetime64
+        From which the log's time counts, UTC.
+    time : str
+        Column of the time.
+    time_format : str
+        ``seconds`` since the start, ``utc`` (ISO 8601) or ``unix`` (seconds since 1970).
+    columns : dict
+        Columns and their conventions by the argument of :class:`adcs.Telemetry` that they become.
+    """
+
+    start: np.datetime64
+    time: str
+    time_format: str
+    columns: dict[str, Columns]
+
+    @classmethod
+    def of(cls, place: str, table: LogTable, start: np.datetime64) -> LogLayout:
+        """Layout that a table describes; it names one sensor at least."""
+        named = (table.star_tracker, table.gyro, table.magnetometer, table.sun_sensor, table.wheels)
+        columns = {name: given for name, given in zip(STANDARD, named, strict=True) if given is not None}
+        if not columns:
+            raise InputError(f"{place}: found no table of a sensor, expected one such as [log.gyro].")
+        return cls(start, table.time, table.time_format, columns)
+
+    def seconds(self, values: FloatArray) -> FloatArray:
+        """Times since the start."""
+        if self.time_format == "seconds":
+            return values
+        return values - (self.start - np.datetime64("1970-01-01", "us")) / np.timedelta64(1, "s")

@@ -1,0 +1,180 @@
+"""Units and conventions that a log was written in but is not read in, named by what one change makes its sensors agree.
+
+Sensors contradict each other, or the model of field and Sun, where one of them is misread: the field's length (units),
+the angle between field and Sun, both against the star tracker's attitude, and the turns of the gyro against those of an
+attitude. Where they do, every change that a misreading makes is tried, and named if it mends all of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from adcs import quaternion
+from adcs.environment.environment import Environment
+from adcs.satellite.sensors import SENSOR_WORDS
+from adcs.satellite.telemetry import Telemetry, orbital_from_eci
+from adcs.satellite.vector_record import step_rates, steps_s
+from adcs.satellite.wahba import attitude_of_vectors
+from arrays.typing import FloatArray
+
+_MOST_ROWS = 3000
+_SUSPICIOUS, _MENDED = 0.25, 4.0
+_LEAST_SINE = 0.3  # of the angle between field and Sun, for an attitude of both
+_FACTOR = 1.4
+_ANGLE_RAD = math.radians(20.0)
+_TURN_RAD = math.radians(45.0)
+_LEAST_TURN_RAD = math.radians(5.0)
+_FIELD_UNITS = {
+    "µT taken for nT": 1e3,
+    "nT taken for µT": 1e-3,
+    "T taken for nT": 1e9,
+    "nT taken for T": 1e-9,
+    "µT taken for T": 1e-6,
+    "mG taken for nT": 1e2,
+    "nT taken for mG": 1e-2,
+    "G taken for nT": 1e5,
+}
+_RATE_UNITS = {"rad/s taken for °/s": 180.0 / math.pi, "°/s taken for rad/s": math.pi / 180.0}
+# Components (w, x, y, z) as read, of columns that are (x, y, z, w), and the other way round.
+_ORDERS = {
+    "scalar last taken for scalar first": [3, 0, 1, 2],
+    "scalar first taken for scalar last": [1, 2, 3, 0],
+}
+
+
+@dataclass(frozen=True, eq=False)
+class _Log:
+    """Readings of some rows in body axes, and what the models say of them in the inertial frame."""
+
+    time_s: FloatArray
+    star: FloatArray  # (n, 4): inertial from body, scalar first
+    gyro: FloatArray
+    field: FloatArray
+    sun: FloatArray
+    model_field: FloatArray
+    model_sun: FloatArray
+
+
+def check_conventions(telemetry: Telemetry, around: Environment, used: Collection[str]) -> None:
+    """Raise ValueError if one misreading of a sensor in use explains why a log contradicts itself or the orbit.
+
+    ``around``: surroundings at the log's instants, of one run. ``used``: names of :data:`SENSORS`.
+    """
+    rows = telemetry.rows
+    chosen = slice(0, _MOST_ROWS)
+    at = rows[chosen]
+    eci_from_orbital = quaternion.conjugate(orbital_from_eci(around)[0, at])
+    log = _Log(
+        telemetry.time_s[chosen],
+        quaternion.normalised(telemetry.star[chosen][:, [3, 0, 1, 2]]),
+        telemetry.gyro_rad_s[chosen],
+        telemetry.field_T[chosen],
+        telemetry.sun[chosen],
+        quaternion.rotate(eci_from_orbital, around.b_orbital_T[0, at]),
+        quaternion.rotate(eci_from_orbital, around.sun_orbital[0, at]),
+    )
+    as_read = _disagreements(log)
+    if as_read.max() < _SUSPICIOUS:
+        return
+    worst, mended = int(np.argmax(as_read)), {}
+    for sensor, name, attribute, matrix in _changes():
+        with np.errstate(over="ignore"):
+            found = _disagreements(_changed(log, attribute, matrix)) if sensor in used else as_read
+        if found[worst] <= min(as_read[worst] / _MENDED, 1.0) and (found <= np.maximum(as_read, 1.0)).all():
+            mended[f"the {SENSOR_WORDS[sensor]}{name}"] = found.sum()
+    if mended:
+        least = min(mended.values())
+        named = [name for name, value in mended.items() if value <= 1.2 * least + 0.01]
+        raise ValueError(
+            "Input telemetry must agree with itself and with the orbit; instead received what agrees if this is "
+            f"undone: {', or '.join(named)}."
+        )
+
+
+def _changes() -> Iterator[tuple[str, str, str, FloatArray]]:
+    """Sensors, names of their misreadings, the attribute of a log, and the matrix that undoes each."""
+    for name, factor in _FIELD_UNITS.items():
+        yield "mag", f" in {name}", "field", factor * np.eye(3)
+    for name, factor in _RATE_UNITS.items():
+        yield "gyro", f" in {name}", "gyro", factor * np.eye(3)
+    about, conjugation = (
+        "body from inertial taken for inertial from body (conjugated)",
+        np.diag([1.0, -1.0, -1.0, -1.0]),
+    )
+    yield "st", f", {about}", "star", conjugation
+    for name, order in _ORDERS.items():
+        ordering = np.eye(4)[:, order]
+        yield "st", f", {name}", "star", ordering
+        yield "st", f", {name} and {about}", "star", ordering @ conjugation
+    for sensor, attribute in (("gyro", "gyro"), ("mag", "field"), ("sun", "sun")):
+        for name, matrix in _axes():
+            yield sensor, name, attribute, matrix
+
+
+def _changed(log: _Log, attribute: str, matrix: FloatArray) -> _Log:
+    return replace(log, **{attribute: getattr(log, attribute) @ matrix})
+
+
+def _axes() -> Iterator[tuple[str, FloatArray]]:
+    """Axes that are reversed or exchanged."""
+    yield ", all its signs reversed", -np.eye(3)
+    for axis, name in enumerate("xyz"):
+        yield f", its axis {name} reversed", np.diag(np.where(np.arange(3) == axis, -1.0, 1.0))
+        yield f", all axes but {name} reversed", np.diag(np.where(np.arange(3) == axis, 1.0, -1.0))
+    for order, pair in (([1, 0, 2], "x and y"), ([2, 1, 0], "x and z"), ([0, 2, 1], "y and z")):
+        yield f", its axes {pair} exchanged", np.eye(3)[order]
+    yield ", its axes in the order y, z, x", np.eye(3)[[1, 2, 0]]
+    yield ", its axes in the order z, x, y", np.eye(3)[[2, 0, 1]]
+
+
+def _disagreements(log: _Log) -> FloatArray:
+    """Contradictions (6,) in units of what is allowed; 0 of those that the log does not allow to see."""
+    vectors = attitude_of_vectors([log.sun, log.field], [log.model_sun, log.model_field], [1.0, 1.0], method="triad").q
+    vectors[np.sin(_angle(log.sun, log.field)) < _LEAST_SINE] = np.nan
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        found = [
+            _median(np.abs(np.log(_lengths(log.field) / _lengths(log.model_field)))) / math.log(_FACTOR),
+            _median(np.abs(_angle(log.field, log.sun) - _angle(log.model_field, log.model_sun))) / _ANGLE_RAD,
+            *(
+                _median(_angle(reading, quaternion.rotate_back(log.star, model))) / _ANGLE_RAD
+                for reading, model in ((log.field, log.model_field), (log.sun, log.model_sun))
+            ),
+            *(_turns(log, q) for q in (log.star, vectors)),
+        ]
+    return np.array(found)
+
+
+def _turns(log: _Log, q: FloatArray) -> float:
+    """Angle between the gyro's turns and an attitude's over windows of large turns, as a part of what may be."""
+    if not np.isfinite(log.gyro[:1]).all() or len(log.gyro) < 3 or not np.isfinite(q).any():
+        return 0.0
+    steps = steps_s(log.time_s)
+    window, of_gyro = 1, quaternion.exp(step_rates(log.gyro, steps, "point") * steps[:, None])[1:]
+    while True:
+        of_q = quaternion.multiply(quaternion.conjugate(q[:-window]), q[window:])
+        turned = _median(quaternion.angle_between(of_q, quaternion.IDENTITY))
+        if turned >= _TURN_RAD or 2 * window >= len(q) - 1:
+            break
+        of_gyro = quaternion.multiply(of_gyro[:-window], of_gyro[window:])
+        window *= 2
+    if turned < _LEAST_TURN_RAD:
+        return 0.0
+    return _median(quaternion.angle_between(of_gyro, of_q)) / (0.3 * turned + math.radians(2.0))
+
+
+def _lengths(v: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.norm(v, axis=-1))
+
+
+def _angle(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.arctan2(_lengths(np.cross(a, b)), np.sum(a * b, axis=-1))
+
+
+def _median(values: FloatArray) -> float:
+    """Of what is there; 0 of nothing."""
+    there = values[np.isfinite(values)]
+    return float(np.median(there)) if there.size else 0.0

@@ -1,0 +1,80 @@
+"""Logs that are misread are named by what they are misread as; those that are right, or just bad, are left alone."""
+
+import math
+
+import numpy as np
+import pytest
+
+import adcs
+from sims.attitude.simulation import simulate
+from tests.adcs.filter_runs import tabletsat
+
+SENSORS = "st+gyro+mag+sun"
+
+
+@pytest.fixture(scope="module")
+def flight():
+    runs = simulate(tabletsat(300.0), [0])
+    return adcs.Telemetry.of(runs, runs.satellite.start), runs.satellite
+
+
+def changed(log, **values):
+    given = {name: getattr(log, name) for name in ("star", "gyro_rad_s", "field_T", "sun", "wheels_Nms", "step_s")}
+    return adcs.Telemetry(log.time_s, **(given | values))
+
+
+MANGLED = {
+    "the star tracker, scalar last taken for scalar first": lambda log: {"star": np.roll(log.star, -1, axis=1)},
+    "the star tracker, scalar first taken for scalar last": lambda log: {"star": np.roll(log.star, 1, axis=1)},
+    "the star tracker, body from inertial taken for inertial from": lambda log: {"star": log.star * [-1, -1, -1, 1]},
+    "the magnetometer in µT taken for nT": lambda log: {"field_T": 1e-3 * log.field_T},
+    "the magnetometer in nT taken for µT": lambda log: {"field_T": 1e3 * log.field_T},
+    "the magnetometer in mG taken for nT": lambda log: {"field_T": 1e-2 * log.field_T},
+    "the gyro in rad/s taken for °/s": lambda log: {"gyro_rad_s": np.radians(log.gyro_rad_s)},
+    "the gyro in °/s taken for rad/s": lambda log: {"gyro_rad_s": np.degrees(log.gyro_rad_s)},
+    "the gyro, all its signs reversed": lambda log: {"gyro_rad_s": -log.gyro_rad_s},
+    "the Sun sensor, all its signs reversed": lambda log: {"sun": -log.sun},
+    "the magnetometer, its axis z reversed": lambda log: {"field_T": log.field_T * [1, 1, -1]},
+    "the magnetometer, its axes x and y exchanged": lambda log: {"field_T": log.field_T[:, [1, 0, 2]]},
+}
+
+
+class TestMangled:
+    @pytest.mark.parametrize("name", MANGLED)
+    def test_is_named(self, flight, name):
+        log, satellite = flight
+        with pytest.raises(ValueError, match="must agree with itself and with the orbit") as refused:
+            adcs.estimate(changed(log, **MANGLED[name](log)), satellite, sensors=SENSORS)
+        assert name in str(refused.value)
+
+    @pytest.mark.parametrize("name", [name for name in MANGLED if "star" not in name])
+    def test_is_named_without_a_star_tracker(self, flight, name):
+        log, satellite = flight
+        with pytest.raises(ValueError, match="must agree") as refused:
+            adcs.estimate(changed(log, **MANGLED[name](log)), satellite, sensors="mag+sun+gyro")
+        assert name in str(refused.value)
+
+    def test_vectors_too(self, flight):
+        log, satellite = flight
+        with pytest.raises(ValueError, match="the Sun sensor, all its signs reversed"):
+            adcs.vector_attitude(changed(log, sun=-log.sun), satellite)
+
+
+class TestLeftAlone:
+    @pytest.mark.parametrize(
+        "values",
+        [
+            lambda log: {},
+            lambda log: {"field_T": 1.1 * log.field_T + 3e-6},
+            lambda log: {"gyro_rad_s": log.gyro_rad_s + math.radians(0.05)},
+            lambda log: {"sun": np.where(np.arange(len(log.sun))[:, None] % 3 == 0, -log.sun, log.sun)},
+        ],
+        ids=["right", "uncalibrated field", "gyro with a bias", "a third of the Sun's readings wild"],
+    )
+    def test_a_log_that_is_only_bad(self, flight, values):
+        log, satellite = flight
+        adcs.estimate(changed(log, **values(log)), satellite, sensors=SENSORS, states=["gyro-bias"])
+
+    def test_a_sensor_that_is_not_used(self, flight):
+        log, satellite = flight
+        adcs.estimate(changed(log, field_T=1e-3 * log.field_T), satellite, sensors="st+gyro")
