@@ -13,6 +13,7 @@ from arrays.geometries import square as square
 from arrays.geometries import tetrahedron as tetrahedron
 from arrays.io.errors import InputError as InputError
 from arrays.meshes import mesh_of as mesh_of
+from arrays.pose import PoseUncertainty as PoseUncertainty
 from arrays.presets import SENSOR_PRESETS as SENSOR_PRESETS
 from arrays.presets import SensorPreset as SensorPreset
 from arrays.sensor import Calibration as Calibration

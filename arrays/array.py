@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from arrays.pose import PoseUncertainty
 from arrays.sensor import Sensor, _finite, _finite_number, _plain
 from arrays.typing import BoolArray, FloatArray, IntArray
 
@@ -47,6 +48,8 @@ class SensorArray:
         that of any field whose sources are elsewhere. None stands for a uniform field.
     ambient_uncertainty_T : float
         Standard deviation, per axis, of the error of the ambient field, one for all sensors [T].
+    pose : PoseUncertainty, optional
+        How wrong the pose in the readings may be; None: it counts as exact.
 
     Raises
     ------
@@ -70,6 +73,7 @@ class SensorArray:
     ambient_T: tuple[float, float, float] | None = None
     ambient_gradient_T_m: tuple[tuple[float, float, float], ...] | None = None
     ambient_uncertainty_T: float = 0.0
+    pose: PoseUncertainty | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sensors", tuple(self.sensors))

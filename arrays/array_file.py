@@ -36,8 +36,8 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
     noise_nT = 1.0
 
 Both may have ``noise_fraction``, ``common_field_nT``, ``ambient_nT = [x, y, z]``, the gradient of that field
-``ambient_gradient_nT_m = [[…], […], […]]`` (symmetric and traceless), ``ambient_uncertainty_nT`` and
-``format_version = 1``; see :class:`arrays.array.SensorArray` for what they mean.
+``ambient_gradient_nT_m = [[…], […], […]]`` (symmetric and traceless), ``ambient_uncertainty_nT``,
+``format_version = 1``, and a table ``[pose]``; see :class:`arrays.array.SensorArray` for what they mean.
 """
 
 from __future__ import annotations
@@ -69,6 +69,7 @@ from arrays.io.toml import (
     read_toml,
     section_of,
 )
+from arrays.pose import PoseTable, pose_toml
 from arrays.sensor import Calibration, Sensor
 from arrays.typing import Vector
 
@@ -91,6 +92,7 @@ class _Header(File, kw_only=True):
     ambient_nT: _NumberVector | None = None
     ambient_gradient_nT_m: tuple[_NumberVector, _NumberVector, _NumberVector] | None = None
     ambient_uncertainty_nT: _NotNegative = 0
+    pose: PoseTable | None = None
 
 
 class _Quality(Table, kw_only=True):
@@ -245,6 +247,8 @@ def array_toml(array: SensorArray) -> str:
         lines.append(f"ambient_gradient_nT_m = [{rows}]")
     if array.ambient_uncertainty_T:
         lines.append(f"ambient_uncertainty_nT = {_nanotesla(array.ambient_uncertainty_T)}")
+    if array.pose is not None:
+        lines += pose_toml(array.pose)
     for sensor in array.sensors:
         lines += ["", "[[sensor]]", f"id = {_quoted(sensor.id)}", f'kind = "{sensor.kind}"']
         lines.append(f"position_m = {list(sensor.position_m)}")
@@ -370,9 +374,11 @@ def _with_header(path: str, array: SensorArray, header: _Header) -> SensorArray:
         place = f"{path}, key ambient_gradient_nT_m"
         gradient_T_m = tuple(_tesla_vector(place, row) for row in header.ambient_gradient_nT_m)
     name = array.name if header.name is None else header.name
+    pose = None if header.pose is None else header.pose.uncertainty(f"{path}, table pose")
     with naming(path):
         uncertainty_T = _tesla(f"{path}, key ambient_uncertainty_nT", header.ambient_uncertainty_nT)
-        return SensorArray(array.sensors, name, header.noise_fraction, common_T, ambient_T, gradient_T_m, uncertainty_T)
+        of_field = (common_T, ambient_T, gradient_T_m, uncertainty_T)
+        return SensorArray(array.sensors, name, header.noise_fraction, *of_field, pose)
 
 
 def _quality(place: str, table: _Quality) -> dict[str, Any]:
@@ -390,9 +396,8 @@ def _tesla(place: str, nanotesla: _Number) -> float:
     return _scaled(place, nanotesla, -9)
 
 
-def _tesla_vector(place: str, nanotesla: _NumberVector) -> Vector:
-    x, y, z = (_tesla(place, component) for component in nanotesla)
-    return (x, y, z)
+def _tesla_vector(place: str, nT: _NumberVector) -> Vector:
+    return (_tesla(place, nT[0]), _tesla(place, nT[1]), _tesla(place, nT[2]))
 
 
 def _scaled(place: str, number: _Number, exponent: int) -> float:

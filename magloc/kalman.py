@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -146,6 +146,9 @@ class IteratedUpdate:
     nis : float
         Normalised innovation squared, of the last linearisation: where the iteration converged it is the smallest sum
         of squares of residual and correction in units of their noise, a χ² of k numbers for curved measurements too.
+    whitened : ndarray, shape (k,)
+        That innovation freed of correlations: its components are independent and of unit variance for a right
+        prediction. Empty where it is not asked for.
     """
 
     x: FloatArray
@@ -154,6 +157,7 @@ class IteratedUpdate:
     converged: bool
     innovation: FloatArray
     nis: float
+    whitened: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 def iterated_update(
@@ -214,17 +218,24 @@ def iterated_update(
         change_before, change = change, float(np.linalg.norm(predicted - before)) / length
         if change >= change_before:
             length *= shrink
-    nis = normalised_innovation_squared(root, H, linearised, variance)
-    return IteratedUpdate(x_k, S_k, iteration, change < tolerance, innovation, nis)
+    whitened = whitened_innovation(root, H, linearised, variance)
+    nis = float(whitened @ whitened)
+    return IteratedUpdate(x_k, S_k, iteration, change < tolerance, innovation, nis, whitened)
 
 
-def normalised_innovation_squared(S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray) -> float:
-    """Innovation squared in units of its covariance ``H S Sᵀ Hᵀ + R``: a χ² of k numbers for a right prediction."""
+def whitened_innovation(S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray) -> FloatArray:
+    """``L⁻¹ ν`` (k,) of an innovation ν with its covariance ``L Lᵀ = H S Sᵀ Hᵀ + R``, L lower triangular."""
     sigma = np.sqrt(variance)
     # As in block_update, so that a prediction that is hardly known does not swallow the noise.
     phi = (H / sigma[:, None]) @ S
     upper = np.asarray(np.linalg.qr(np.concatenate([np.eye(sigma.size), phi.T]), mode="r"))
-    whitened = np.linalg.solve(upper.T, innovation / sigma)
+    L = upper.T * np.sign(np.diagonal(upper))
+    return np.asarray(np.linalg.solve(L, innovation / sigma))
+
+
+def normalised_innovation_squared(S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray) -> float:
+    """Innovation squared in units of its covariance: a χ² of k numbers for a right prediction."""
+    whitened = whitened_innovation(S, H, innovation, variance)
     return float(whitened @ whitened)
 
 

@@ -4,7 +4,8 @@ A readings file is CSV with one row per instant: ``time_s``, then ``<id>_x_nT, <
 sensor and ``<id>_nT`` for every scalar sensor, in any order. An empty cell, or ``nan``, is a missing reading. Optional
 groups of columns, each complete or absent: the pose of a moving array in the world frame (``array_x_m, array_y_m,
 array_z_m, array_qx, array_qy, array_qz, array_qw``), the ambient field in the array's frame (``ambient_x_nT,
-ambient_y_nT, ambient_z_nT``), and velocities and rates (:mod:`magloc.navigation.measured_motion`).
+ambient_y_nT, ambient_z_nT``), velocities and rates (:mod:`magloc.navigation.measured_motion`), and standard deviations
+of the pose (``array_sigma_m, array_sigma_deg``).
 
 Whatever is wrong with a file is an :class:`arrays.io.errors.InputError` of one sentence: the file, the line as an
 editor counts it, the column, what was found and what was expected.
@@ -35,9 +36,11 @@ if TYPE_CHECKING:
 
 POSITION_COLUMNS = ("array_x_m", "array_y_m", "array_z_m")
 ROTATION_COLUMNS = ("array_qx", "array_qy", "array_qz", "array_qw")
+POSE_SIGMA_COLUMNS = ("array_sigma_m", "array_sigma_deg")
 AMBIENT_COLUMNS = tuple(f"{name}_nT" for name in AMBIENT_CHANNELS)
 _EXPECTED_HEADER = "a header with time_s and the sensors' columns"
 _T_IN_nT = 1e9
+_SIGMA_UNITS = np.array([1.0, np.pi / 180.0])  # of a pose's standard deviations, m and degrees
 _SATURATION_RTOL = 1e-12
 _LARGEST_nT = 1e15  # a million tesla: a column of something else, or a broken line
 # Change of the ambient field, relative, within which moduli may be averaged: 50 nT in 50 µT.
@@ -64,6 +67,9 @@ class Readings:
         Ambient field in the array's frame [T].
     motion : MeasuredMotion of n, optional
         Measured velocities and rates of array and object.
+    pose_sigma : ndarray, shape (n, 2), optional
+        Standard deviations of the array's position along each axis [m] and of its attitude about each axis [rad], in
+        place of those of the array's :class:`arrays.PoseUncertainty`.
 
     Raises
     ------
@@ -91,9 +97,10 @@ class Readings:
     array_rotation: Rotation | None = None
     ambient_T: FloatArray | None = None
     motion: MeasuredMotion | None = None
+    pose_sigma: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        for name in ("values_T", "time_s", "array_position_m", "ambient_T"):
+        for name in ("values_T", "time_s", "array_position_m", "ambient_T", "pose_sigma"):
             if getattr(self, name) is not None:
                 object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=np.float64))
         if self.values_T.ndim != 2:
@@ -101,7 +108,7 @@ class Readings:
         n = len(self.values_T)
         if self.time_s is None:
             object.__setattr__(self, "time_s", np.arange(float(n)))
-        shapes = {"time_s": (n,), "array_position_m": (n, 3), "ambient_T": (n, 3)}
+        shapes = {"time_s": (n,), "array_position_m": (n, 3), "ambient_T": (n, 3), "pose_sigma": (n, 2)}
         for name, shape in shapes.items():
             value = getattr(self, name)
             if value is not None and value.shape != shape:
@@ -113,6 +120,8 @@ class Readings:
         if self.array_rotation is not None and np.shape(self.array_rotation.as_quat()) != (n, 4):
             received = 1 if self.array_rotation.single else len(self.array_rotation)
             raise ValueError(f"Input array_rotation must have {n} rotations; instead received {received}.")
+        if self.pose_sigma is not None and self.array_position_m is None:
+            raise ValueError("Input pose_sigma must come with a pose; instead received it without array_position_m.")
         if self.motion is not None and len(self.motion) != n:
             raise ValueError(f"Input motion must have {n} rows; instead received {len(self.motion)}.")
 
@@ -152,6 +161,7 @@ class Readings:
             array_rotation=None if self.array_rotation is None else self.array_rotation[rows],
             ambient_T=chosen(self.ambient_T),
             motion=None if self.motion is None else self.motion.of_rows(rows),
+            pose_sigma=chosen(self.pose_sigma),
         )
 
     def __iter__(self) -> Iterator[Readings]:
@@ -275,9 +285,15 @@ def _readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] 
     channels = [f"{name}_nT" for name in array.channel_names]
     _check_sensor_columns(table, array, channels, ignore_others=sensors is not None)
     time_s = table.complete_and_distinct("time_s")
-    position_m = rotation = ambient_T = None
+    position_m = rotation = ambient_T = pose_sigma = None
     if table.has_group(POSITION_COLUMNS + ROTATION_COLUMNS):
         position_m, rotation = table.complete(POSITION_COLUMNS), unit_rotation(table)
+    if table.has_group(POSE_SIGMA_COLUMNS):
+        if position_m is None:
+            place = table.header_place(POSE_SIGMA_COLUMNS[0])
+            raise InputError(f"{place}: found no pose, expected array_x_m and so on with it.")
+        pose_sigma = table.complete(POSE_SIGMA_COLUMNS) * _SIGMA_UNITS
+        table.refuse(pose_sigma < 0.0, POSE_SIGMA_COLUMNS, "found a number below zero, expected a standard deviation")
     if table.has_group(AMBIENT_COLUMNS):
         ambient_T = table.complete(AMBIENT_COLUMNS) / _T_IN_nT
     motion = motion_of_table(table, posed=position_m is not None)
@@ -290,6 +306,7 @@ def _readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] 
         array_rotation=rotation,
         ambient_T=ambient_T,
         motion=motion,
+        pose_sigma=pose_sigma,
     )
 
 
@@ -309,6 +326,9 @@ def write_readings(path: str | PathLike[str], readings: Readings, array: SensorA
     if readings.pose is not None:
         header += POSITION_COLUMNS + ROTATION_COLUMNS
         plain += [readings.pose[0], readings.pose[1].as_quat()]
+    if readings.pose_sigma is not None:
+        header += POSE_SIGMA_COLUMNS
+        plain.append(readings.pose_sigma / _SIGMA_UNITS)
     if readings.motion is not None:
         names, numbers_of_motion = motion_columns(readings.motion)
         header += names
@@ -358,7 +378,8 @@ def _check_channels(readings: Readings, array: SensorArray) -> None:
 
 
 def _check_sensor_columns(table: Table, array: SensorArray, channels: Sequence[str], *, ignore_others: bool) -> None:
-    known = ("time_s", *channels, *POSITION_COLUMNS, *ROTATION_COLUMNS, *AMBIENT_COLUMNS, *MOTION_COLUMNS)
+    poses = (*POSITION_COLUMNS, *ROTATION_COLUMNS, *POSE_SIGMA_COLUMNS)
+    known = ("time_s", *channels, *poses, *AMBIENT_COLUMNS, *MOTION_COLUMNS)
     called = f"array {array.name!r}" if array.name else "the array"
     table.require("time_s", known)
     for sensor in array.sensors:

@@ -76,6 +76,14 @@ def flicker_sigma(rate_Hz: float, density: float, corner_Hz: float, bandwidth_Hz
     return density * math.sqrt(corner_Hz * math.log(high / low))
 
 
+def lasting(random: FloatArray, correlation_s: float, rate_Hz: float) -> FloatArray:
+    """First-order Markov processes of unit variance from standard normal numbers (n, k); 0 s: white, ∞: constant."""
+    decay = math.exp(-1.0 / (rate_Hz * correlation_s)) if correlation_s else 0.0
+    added = random * math.sqrt(1.0 - decay**2)
+    added[0] = random[0]
+    return np.asarray(lfilter([1.0], [1.0, -decay], added, axis=0))
+
+
 def random_walk(n: int, channels: int, rate_Hz: float, per_root_hour: float, rng: np.random.Generator) -> FloatArray:
     """Drift that starts at zero and whose variance grows by ``per_root_hour²`` in an hour.
 

@@ -17,6 +17,7 @@ from arrays.io.errors import _vectors
 from arrays.noise import reading_covariance
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.measurement.differences import channel_jacobian, fields_at_sensors, predicted_channels
+from magloc.measurement.pose import pose_errors_at_rest
 from magloc.measurement.rows import check_magnitudes
 
 LOST = 1e-6
@@ -100,6 +101,7 @@ def whitened_jacobian(
         W = root @ W
         common = root @ _common_field(array)
         ambient = root @ array.linear_gain(fields_at_sensors(array, p, m)) if ambient_uncertainty_T else None
+        pose = None if array.pose is None else root @ pose_errors_at_rest(array, array.pose, p, m)
     prior = np.inf if array.common_field_T is None else array.common_field_T
     for group in _kinds(array):
         # Written out for every kind: one of them has no effect on the readings of the other.
@@ -107,7 +109,12 @@ def whitened_jacobian(
         W = _marginalised(W, part, prior)
         if ambient is not None:
             ambient = _marginalised(ambient, part, prior)
-    W = W if ambient is None else _marginalised(W, ambient, ambient_uncertainty_T)
+        if pose is not None:
+            pose = _marginalised(pose, part, prior)
+    if ambient is not None:
+        pose = None if pose is None else _marginalised(pose, ambient, ambient_uncertainty_T)
+        W = _marginalised(W, ambient, ambient_uncertainty_T)
+    W = W if pose is None else _marginalised(W, pose, 1.0)
     if known_moment_sigma_Am2 == np.inf:
         return W
     with np.errstate(invalid="ignore"):
@@ -129,7 +136,8 @@ def cramer_rao_bounds(
     Parameters
     ----------
     array : SensorArray
-        Whose noise and uncertainties count.
+        Whose noise and uncertainties count, that of its pose too: the bounds are then those of a source in the world,
+        in axes that stand where the pose says that the array is. It does not move, so that clocks do not matter.
     position_m, moment_Am2 : array_like, shape (..., 3)
         Source in the array's frame [m], its moment [A·m²].
     ambient_uncertainty_T : float

@@ -194,6 +194,9 @@ def track(
     common : CommonOptions
         Common options.
     """
+    from magloc.measurement.pose import with_stated_pose
+    from magloc.tracking.results import rows_of
+
     if json and jsonl:
         raise InputError("--json: found it together with --jsonl, expected one of them.")
     if out is not None:
@@ -233,8 +236,8 @@ def track(
         return
     with progress(len(rows), "rows", quiet=common.quiet) as advance, naming(str(array)):
         if jsonl and not smooth:
-            tracker = magloc.Tracker(used, model, prior=prior)
-            points = tuple(map(_printed, tracker.run(rows, advance)))
+            tracker = magloc.Tracker(with_stated_pose(used, rows), model, prior=prior)
+            points = tuple(map(_printed, tracker.run(rows_of(rows), advance)))
             found = magloc.Track(points, rows, tracker)
         else:
             found = magloc.track(used, rows, motion=model, smooth=smooth, prior=prior, progress=advance)
@@ -261,6 +264,8 @@ def track(
         print("\n".join(result.lines()), file=sys.stderr if jsonl else sys.stdout)
     if not (json or jsonl or common.quiet):
         print_note(f"{found.tracked.sum()} of {len(found)} rows tracked")
+    if jsonl and found.innovations.flagged:
+        print_note(found.innovations.reason)
 
 
 def _in_ambient_field(array: SensorArray, rows: Readings, where: Place | None) -> tuple[SensorArray, Readings]:
@@ -273,7 +278,7 @@ def _print_track(found: Track, result: Consistency | None, *, json: bool, jsonl:
     from magloc.tracking.files import json_of_track
 
     if json:
-        print_json(json_of_track(found, result))
+        print_json(json_of_track(found, result) | {"innovations": found.innovations.json})
     elif not jsonl:
         print(found.table())
     elif not printed:
@@ -297,13 +302,15 @@ def _printed(point: TrackPoint) -> TrackPoint:
 
 def _stream(array: SensorArray, known: KnownOptions, model: MotionModel, where: Place | None) -> None:
     """Answer every row of standard input by one line; none that is tracked is an InputError at its end."""
+    from magloc.measurement.pose import with_stated_pose
+
     tracker: Tracker | None = None
     statuses: set[str] = set()
     is_tracked = False
     for row in _rows_of_stdin(array, known.ids):
         array_here, row_here = _in_ambient_field(array, row, where)
         if tracker is None:
-            tracker = magloc.Tracker(array_here, model, prior=known.prior)
+            tracker = magloc.Tracker(with_stated_pose(array_here, row_here), model, prior=known.prior)
         point = _printed(tracker.update(row_here))
         statuses.add(point.status)
         is_tracked = is_tracked or point.position_m is not None

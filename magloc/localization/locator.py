@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
+from arrays.pose import PoseUncertainty
 from arrays.typing import FloatArray, IntArray
 from magloc.averages import average as averaged
 from magloc.averages import averaging_array, complete_rows
@@ -27,11 +28,13 @@ from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import Fix
 from magloc.localization.search.known_position import MomentSearch
-from magloc.localization.search.moving_array import optima_at_rest, stacked_rows
+from magloc.localization.search.moving_array import optima_at_rest, stacked_errors, stacked_rows
 from magloc.localization.search.multi_source import NOISE_ALONE, MultiSourceSearch
 from magloc.localization.search.single_source import N_UNKNOWNS, SingleSourceSearch
 from magloc.localization.uncertainty.covariance import solutions_of
+from magloc.localization.uncertainty.pose_covariance import pose_covariances
 from magloc.localization.uncertainty.range_interval import is_detected
+from magloc.measurement.pose import PosesOfRows, with_stated_pose
 from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, checked_rows, whitened_rows
 from magloc.readings import Readings, as_readings, saturated_channels, without_saturated
 
@@ -189,6 +192,7 @@ class _Rows:
 
     def __init__(self, n: int, body_length_m: float | None = 0.0, ambient_sigma_T: float = 0.0) -> None:
         self.body_length_m, self.ambient_sigma_T = body_length_m, ambient_sigma_T
+        self.allows_for_more = False
         self.assumed_length_m = np.zeros(n)
         self.detected = np.zeros(n, dtype=bool)
         self.reason = [""] * n
@@ -218,7 +222,8 @@ class _Rows:
         for optima, lengths in pieces:
             of_all = optima.rows.index
             self.assumed_length_m[of_all] = lengths
-            known = optima.rows.energy if lengths.any() or self.ambient_sigma_T else energy[of_all]
+            noisier = lengths.any() or self.ambient_sigma_T or self.allows_for_more
+            known = optima.rows.energy if noisier else energy[of_all]
             found = solutions_of(optima, known, self.detected[of_all])
             solved = np.bincount(found.of_row, minlength=len(of_all)) > 0
             for row, reason, has in zip(of_all.tolist(), optima.reason, solved.tolist(), strict=True):
@@ -251,12 +256,13 @@ def fit_at_rest(
     ambient_T: FloatArray | None = None,
     *,
     prior: SourcePrior = NOTHING_KNOWN,
+    poses: PosesOfRows | None = None,
 ) -> Fix:
     """Fix of one source at rest from several rows of an array that moves, all together, in the world frame.
 
     A few scalar sensors do not locate a source in one row, but they do while they pass it. Every row keeps a common
     field of its own. Parameters are those of :func:`magloc.localization.search.moving_array.stacked_rows`, and a prior
-    in the world frame.
+    in the world frame. `poses`: with their errors, which count as noise.
     """
     rows = stacked_rows(array, readings_T, origins_m, R_world_from_array, ambient_T)
     found = _Rows(1)
@@ -266,7 +272,9 @@ def fit_at_rest(
     elif not is_detected(rows.energy, rows.n_differences).all():
         found.refuse(rows.index, NOISE_ALONE)
     else:
-        found.fill(rows, lambda loud: [optima_at_rest(loud, prior)])
+        errors = None if poses is None else stacked_errors(poses, readings_T, ambient_T)
+        found.allows_for_more = poses is not None
+        found.fill(rows, lambda loud: [optima_at_rest(loud, prior, errors)])
     return found.fixes()[0]
 
 
@@ -336,8 +344,9 @@ def locate(
     pose = rows.pose
     if position_m is not None and pose is not None:
         place = pose[1].inv().apply(np.asarray(position_m, dtype=np.float64) - pose[0])
+    stated = with_stated_pose(array, rows).pose
     locator = Locator(
-        array,
+        array if stated is None else _seeing_turned_field(array, stated, rows, ambient),
         sources=sources,
         position_m=place,
         prior=prior,
@@ -347,7 +356,21 @@ def locate(
     )
     fixes = locator.fit_rows(rows.values_T, ambient, time_s=rows.time_s, progress=progress)
     fixes = replace(fixes, saturated_channels=saturated)
-    return fixes if pose is None else fixes.moved(*pose, frame="world")
+    if pose is None:
+        return fixes
+    added = 0.0 if stated is None else pose_covariances(stated, rows, fixes.solutions)
+    return fixes.moved(*pose, frame="world", added_covariance=added)
+
+
+def _seeing_turned_field(
+    array: SensorArray, pose: PoseUncertainty, rows: Readings, ambient_T: FloatArray | None
+) -> SensorArray:
+    """The array where errors of the attitude, rms over the rows, make the ambient field uncertain for moduli."""
+    attitude_rad = pose.attitude_rad if rows.pose_sigma is None else np.sqrt(np.mean(rows.pose_sigma[:, 1] ** 2))
+    field_T = array.ambient_fields if ambient_T is None else ambient_T
+    size_T = float(np.sqrt(np.mean(np.sum(field_T**2, axis=-1))))
+    turned_T = float(np.hypot(attitude_rad, pose.attitude_constant_rad)) * size_T
+    return replace(array, ambient_uncertainty_T=float(np.hypot(array.ambient_uncertainty_T, turned_T)))
 
 
 def used_rows(

@@ -19,19 +19,25 @@ from arrays.array import SensorArray
 from arrays.differences import Differences, decorrelated_differences
 from arrays.typing import FloatArray
 from magloc.fields import dipole
+from magloc.navigation.rotations import cross_matrix
 
 
-def predicted_channels(array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
+def predicted_channels(
+    array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, ambient_T: FloatArray | None = None
+) -> FloatArray:
     """Noise-free readings (..., C) [T] of a source at (..., 3) in the array's frame, offset removed.
 
     ``a_c · (B_a + B)`` for a component, ``g |B_a + B|`` for a modulus, with the ambient field B_a at each sensor: of
-    ``ambient_T`` and, where it is not uniform, ``ambient_gradient_T_m``, which differences of either kind see.
+    ``ambient_T`` and, where it is not uniform, ``ambient_gradient_T_m``, which differences of either kind see. The
+    argument `ambient_T` (N, 3) stands in their place.
     """
-    fields = fields_at_sensors(array, position_m, moment_Am2)
+    fields = fields_at_sensors(array, position_m, moment_Am2, ambient_T)
     return array.readings_of(fields) - array.channel_offset_T
 
 
-def channel_jacobian(array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
+def channel_jacobian(
+    array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, ambient_T: FloatArray | None = None
+) -> FloatArray:
     """Derivative (..., C, 6) of :func:`predicted_channels` with respect to (p, m) [T/m], [T/(A·m²)].
 
     A modulus has the gradient of its field along the direction of the sum, equation (4).
@@ -39,15 +45,25 @@ def channel_jacobian(array: SensorArray, position_m: ArrayLike, moment_Am2: Arra
     p = np.asarray(position_m, dtype=np.float64)[..., None, :]
     m = np.asarray(moment_Am2, dtype=np.float64)[..., None, :]
     jacobian = dipole.field_jacobian(array.positions, p, m)
-    rows = array.linear_gain(fields_at_sensors(array, position_m, moment_Am2))
+    rows = array.linear_gain(fields_at_sensors(array, position_m, moment_Am2, ambient_T))
     return np.einsum("...ci,...cij->...cj", rows, jacobian[..., array.channel_sensor, :, :])
 
 
-def fields_at_sensors(array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
+def turn_jacobian(
+    array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, ambient_T: FloatArray
+) -> FloatArray:
+    """Derivative (..., C, 3) of :func:`predicted_channels` where the ambient field (N, 3) turns by b × θ [T/rad]."""
+    rows = array.linear_gain(fields_at_sensors(array, position_m, moment_Am2, ambient_T))
+    return np.einsum("...ci,cij->...cj", rows, cross_matrix(ambient_T)[array.channel_sensor])
+
+
+def fields_at_sensors(
+    array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, ambient_T: FloatArray | None = None
+) -> FloatArray:
     """Field at every sensor, the ambient field included: (..., N, 3) [T]."""
     p = np.asarray(position_m, dtype=np.float64)[..., None, :]
     m = np.asarray(moment_Am2, dtype=np.float64)[..., None, :]
-    return dipole.field(array.positions, p, m) + array.ambient_fields
+    return dipole.field(array.positions, p, m) + (array.ambient_fields if ambient_T is None else ambient_T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,10 +100,12 @@ class DifferenceMeasurement:
         channels = np.asarray(readings_T, dtype=np.float64) - self.array.channel_offset_T
         return channels[..., used] @ transform[:, used].T
 
-    def predicted(self, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
+    def predicted(
+        self, position_m: ArrayLike, moment_Am2: ArrayLike, ambient_T: FloatArray | None = None
+    ) -> FloatArray:
         """Predicted decorrelated differences (..., k) [T] of a source in the array's frame (ForwardMT, ForwardMV)."""
-        return predicted_channels(self.array, position_m, moment_Am2) @ self.differences.transform.T
+        return predicted_channels(self.array, position_m, moment_Am2, ambient_T) @ self.differences.transform.T
 
-    def jacobian(self, position_m: ArrayLike, moment_Am2: ArrayLike) -> FloatArray:
+    def jacobian(self, position_m: ArrayLike, moment_Am2: ArrayLike, ambient_T: FloatArray | None = None) -> FloatArray:
         """Jacobian (..., k, 6) of :meth:`predicted` (JacobianH), columns (p, m): [T/m] and [T/(A·m²)]."""
-        return self.differences.transform @ channel_jacobian(self.array, position_m, moment_Am2)
+        return self.differences.transform @ channel_jacobian(self.array, position_m, moment_Am2, ambient_T)

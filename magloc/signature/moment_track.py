@@ -16,6 +16,7 @@ from magloc.blas_threads import one_blas_thread
 from magloc.chi_square import mean_bounds, normalised_square
 from magloc.kalman import estimability
 from magloc.localization.fit.results import is_misfit
+from magloc.navigation.rotations import cross_matrix, rotation_matrix
 from magloc.readings import Readings, as_readings, without_saturated
 from magloc.signature.moment_filter import (
     Basis,
@@ -28,7 +29,7 @@ from magloc.signature.moment_filter import (
 from magloc.signature.path import ObjectPath, PathError
 from magloc.tracking.consistency import consistency_lines
 from magloc.tracking.measurement import RowMeasurements
-from magloc.tracking.motion import N_SOURCE, cross_matrix, rotation_matrix
+from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import TrackPoint, rows_of
 from magloc.tracking.track import TURN_RAD_S, TrackColumns
 from magloc.truth import Truth, truth_of_rows

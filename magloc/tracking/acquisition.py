@@ -18,6 +18,7 @@ from magloc.localization.fit.results import Fix, Solution
 from magloc.localization.locator import Locator, fit_at_rest
 from magloc.localization.uncertainty.ambiguity import weights
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
+from magloc.measurement.pose import N_POSE, PoseErrors, pose_covariance
 from magloc.measurement.rows import check_magnitudes
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row
@@ -69,6 +70,7 @@ class Acquisition:
         self.array = array
         self.speed_m_s = speed_m_s
         self.of_last_row = Fix(())
+        self._pose_errors = PoseErrors.of(array.pose)
         self._locator: Locator | None = None
         if decorrelated_differences(array).n_differences >= N_SOURCE:
             self._locator = Locator(array, prior=prior, body_length_m=0.0, exclude_faulty=False)
@@ -95,13 +97,21 @@ class Acquisition:
             solution, reason = _certain_solution(found, centroid, limit, alone=near is None)
             if solution is not None:
                 range_error = relative_range_sigma(solution.covariance, solution.position_m - centroid)
-                if _agree(last, solution) or range_error < _BEYOND_DOUBT or near is not None:
+                solution_here = self._in_doubt_of_pose(solution, row)
+                if _agree(last, solution_here) or range_error < _BEYOND_DOUBT or near is not None:
                     return Start(solution, [row], found.solutions[1:]), ""
                 if range_error < START_RANGE_ERROR:
-                    self._confirmable = solution
+                    self._confirmable = solution_here
                 reason = "not acquired: the next row is to confirm the source"
         start = self._start_from_recent(row, fix)
         return start, reason if start is None else ""
+
+    def _in_doubt_of_pose(self, solution: Solution, row: Row) -> Solution:
+        """A solution in the world with what errors of the row's pose add to its covariance."""
+        pose = row.pose(np.array(self._pose_errors.uncertainty.lever_arm_m))
+        source = np.concatenate([solution.position_m, solution.moment_Am2])
+        added = pose_covariance(self._pose_errors, pose, pose.in_array(source, np.zeros(N_POSE)), row.pose_sigma)
+        return replace(solution, covariance=solution.covariance + added)
 
     def _start_from_recent(self, row: Row, alone: Fix) -> Start | None:
         """A start from the latest rows together, while the source is as good as at rest in them.
@@ -125,12 +135,19 @@ class Acquisition:
             return None
         chosen = recent[:: -max(1, len(recent) // _STACKED_ROWS)]
         known = [earlier.ambient_T for earlier in chosen if earlier.ambient_T is not None]
+        errors, lever_arm_m = self._pose_errors, np.array(self._pose_errors.uncertainty.lever_arm_m)
         fix = fit_at_rest(
             self.array,
             np.stack([earlier.readings_T for earlier in chosen]),
             np.stack([earlier.origin_m for earlier in chosen]),
             np.stack([earlier.R_world_from_array for earlier in chosen]),
             np.stack(known) if len(known) == len(chosen) else None,
+            poses=errors.of_rows(
+                self.array,
+                np.array([earlier.time_s for earlier in chosen]),
+                [earlier.pose(lever_arm_m) for earlier in chosen],
+                [earlier.pose_sigma for earlier in chosen],
+            ),
         )
         centroid = row.origin_m + row.R_world_from_array @ self.array.centroid
         before, self._proposed = self._proposed, _certain_solution(fix, centroid, START_RANGE_ERROR)[0]

@@ -38,7 +38,7 @@ def track_record(
     """
     points: list[TrackPoint] = []
     motion, compiled = tracker.motion, None
-    if isinstance(motion, LinearMotion) and rows and not tracker.errors.n_states:
+    if isinstance(motion, LinearMotion) and rows and not tracker.n_errors:
         compiled = _CompiledSteps(tracker, motion, rows)
     while len(points) < len(rows):
         before = len(points)
@@ -153,7 +153,7 @@ class _CompiledSteps:
                 int(out.iterations[i]),
                 float(out.nis[i]),
                 int(given.n_differences[i]),
-                _STATUS[int(out.status[i])],
+                status=_STATUS[int(out.status[i])],
                 weight=tracker.weight,
                 centroid_m=centroids[i - begin],
                 radius_m=array.circumradius,

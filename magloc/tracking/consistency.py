@@ -164,6 +164,11 @@ def nees_of(
     known[3:] &= known[3:].all()
     error = truth - estimate
     if known.all():
-        error, _ = measurement.coordinates(estimate, np.sqrt(np.diagonal(covariance))).at(truth)
+        # Where poses have errors, most of the covariance may be of them, which the readings do not bend.
+        posed = measurement.pose_effect.shape[1] > 0
+        coordinates = measurement.coordinates(
+            measurement.without_errors(estimate), np.sqrt(np.diagonal(covariance)), of_readings=not posed
+        )
+        error, _ = coordinates.at(measurement.without_errors(truth))
     error, covariance = error[known], covariance[np.ix_(known, known)]
     return float(normalised_square(error, covariance)), int(known.sum())

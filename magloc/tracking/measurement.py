@@ -23,11 +23,15 @@ from arrays.array import SensorArray
 from arrays.differences import Differences, decorrelated_differences
 from arrays.noise import reading_covariance
 from arrays.typing import FloatArray
-from magloc.measurement.differences import DifferenceMeasurement
+from magloc.kalman import MeasurementFunction
+from magloc.measurement.differences import DifferenceMeasurement, turn_jacobian
 from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
+from magloc.measurement.pose import N_POSE, TURN, ArrayPose, PoseErrors
+from magloc.navigation.rotations import rotation_matrix, turn_of_change
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row
 
+_NO_ERROR = np.zeros(N_POSE)
 LEAST_SINGULAR = 1e-6
 """A row has no coordinates of its own if a column of its Jacobian, in units of what is known, is so near to others."""
 
@@ -44,9 +48,13 @@ class RowMeasurement:
         Standard deviations of the differences [T].
     row : Row
     n_motion : int
-        States of the motion; behind them stand the sensors' errors.
+        States of the motion; behind them stand the sensors' errors, then those of the pose.
     effect : ndarray, shape (k, n_errors)
         Of the sensors' errors on the differences, in units of their noise.
+    pose : ArrayPose
+        As the row states it.
+    pose_effect : ndarray, shape (9, n_pose)
+        Of the pose's errors on it.
     """
 
     model: DifferenceMeasurement
@@ -54,67 +62,134 @@ class RowMeasurement:
     row: Row
     n_motion: int
     effect: FloatArray
+    pose: ArrayPose
+    pose_effect: FloatArray
 
     @cached_property
     def z(self) -> FloatArray:
         """Measured differences, shape (k,)."""
         return self.model.measured(self.row.readings_T) / self.sigma
 
-    def of_source(self, source: FloatArray) -> FloatArray:
-        """Predicted differences (k,) of a source (6,), all sensors being without errors."""
-        return self.model.predicted(*self._in_array(source)) / self.sigma
+    def pose_error(self, state: FloatArray) -> FloatArray:
+        """Error (9,) of the pose that a state (n,) stands for."""
+        return self.pose_effect @ state[self.n_motion + self.effect.shape[1] :]
+
+    def of_source(self, source: FloatArray, error: FloatArray = _NO_ERROR) -> FloatArray:
+        """Predicted differences (k,) of a source (6,) where the pose has an error (9,) and no sensor has any."""
+        in_array = self.pose.in_array(source, error)
+        return self.model.predicted(in_array[:3], in_array[3:], self._ambient_T(error)) / self.sigma
 
     def source_jacobian(self, source: FloatArray) -> FloatArray:
-        """Their Jacobian (k, 6)."""
-        H = self.model.jacobian(*self._in_array(source)) / self.sigma[:, None]
-        R = self.row.R_world_from_array
-        return np.concatenate([H[:, :3] @ R.T, H[:, 3:] @ R.T], axis=1)
+        """Their Jacobian (k, 6) where the pose has no error."""
+        return self._by_source(self._by_array(self.pose.in_array(source, _NO_ERROR), _NO_ERROR), _NO_ERROR)
 
     def predicted(self, state: FloatArray) -> FloatArray:
         """Predicted differences (k,) of a state (n,)."""
-        return self.of_source(state[:N_SOURCE]) + self.effect @ state[self.n_motion :]
+        of_source = self.of_source(state[:N_SOURCE], self.pose_error(state))
+        return of_source + self.effect @ state[self.n_motion : self.n_motion + self.effect.shape[1]]
 
     def jacobian(self, state: FloatArray) -> FloatArray:
         """Their Jacobian (k, n)."""
+        first, behind = self.n_motion, self.n_motion + self.effect.shape[1]
+        error = self.pose_error(state)
+        in_array = self.pose.in_array(state[:N_SOURCE], error)
+        H = self._by_array(in_array, error)
         full = np.zeros((len(self.sigma), state.size))
-        full[:, :N_SOURCE] = self.source_jacobian(state[:N_SOURCE])
-        full[:, self.n_motion :] = self.effect
+        full[:, :N_SOURCE] = self._by_source(H, error)
+        full[:, first:behind] = self.effect
+        if self.pose_effect.shape[1]:
+            by_error = H @ self.pose.error_jacobian(in_array, error)
+            turned = turn_jacobian(self.model.array, in_array[:3], in_array[3:], self._ambient_T(error))
+            turned = self.model.differences.transform @ turned / self.sigma[:, None]
+            by_error[:, TURN] += turned @ turn_of_change(-error[TURN])
+            full[:, behind:] = by_error @ self.pose_effect
         return full
 
-    def coordinates(self, source: FloatArray, unit: FloatArray) -> Coordinates:
-        """Coordinates about a source (6,), where `unit` (6,) is what is known of its components."""
-        H = self.source_jacobian(source)
-        M: FloatArray | None = None
-        if len(H) >= N_SOURCE:
-            Q, R = np.linalg.qr(H * unit)
+    @property
+    def n_states(self) -> int:
+        """Of the motion, of the sensors' errors and of those of the pose."""
+        return self.n_motion + self.effect.shape[1] + self.pose_effect.shape[1]
+
+    def without_errors(self, source: FloatArray) -> FloatArray:
+        """The state (n,) of a source (6,) at rest where nothing has an error."""
+        return np.concatenate([source, np.zeros(self.n_states - N_SOURCE)])
+
+    def coordinates(self, state: FloatArray, unit: FloatArray, *, of_readings: bool = True) -> Coordinates:
+        """Coordinates about a state (n,), where `unit` (6,) is what is known of position and moment.
+
+        They bend as the readings do, if these determine a source; else, or if not `of_readings`, as its place in the
+        array's axes does with the errors of the pose.
+        """
+        if of_readings and len(self.sigma) >= N_SOURCE:
+            G = self.jacobian(state)
+            Q, R = np.linalg.qr(G[:, :N_SOURCE] * unit)
             diagonal = np.abs(np.diagonal(R))
             if diagonal.min() > LEAST_SINGULAR * diagonal.max():
                 M = unit[:, None] * np.linalg.solve(R, Q.T)
-        return Coordinates(self, source, M)
+                return Coordinates(state, self.predicted, self.jacobian, M, self.predicted(state), M @ G)
+        G = self._in_array_jacobian(state)
+        M = G[:, :N_SOURCE].T
+        return Coordinates(state, self._in_array, self._in_array_jacobian, M, self._in_array(state), M @ G)
 
-    def curved_prior(self, x: FloatArray, S: FloatArray) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
+    def with_lasting_errors(self, lasting: FloatArray) -> RowMeasurement:
+        """The row where only some shares (n_pose,) of the pose's errors have an effect."""
+        return replace(self, pose_effect=self.pose_effect * lasting)
+
+    def curved_prior(
+        self, x: FloatArray, S: FloatArray, *, of_readings: bool = True
+    ) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
         """A prediction (x, S) that is Gaussian in the coordinates about it.
 
         It gives, of a state, mean (n,) and square root (n, n) of the Gaussian that looks there as the prediction does.
         """
-        source = slice(0, N_SOURCE)
-        coordinates = self.coordinates(x[source], np.linalg.norm(S[source], axis=1))
+        source, rest = slice(0, N_SOURCE), slice(N_SOURCE, None)
+        coordinates = self.coordinates(x, np.linalg.norm(S[source], axis=1), of_readings=of_readings)
+        at_first = coordinates.J[:, rest]
 
         def prior(state: FloatArray) -> tuple[FloatArray, FloatArray]:
-            c, J = coordinates.at(state[source])
+            c, J = coordinates.at(state)
             mean, root = x.copy(), S.copy()
             try:
-                mean[source] = state[source] - np.linalg.solve(J, c)
-                root[source] = np.linalg.solve(J, S[source])
+                mean[source] = state[source] - np.linalg.solve(J[:, source], c - J[:, rest] @ (state - x)[rest])
+                root[source] = np.linalg.solve(J[:, source], S[source] + (at_first - J[:, rest]) @ S[rest])
             except np.linalg.LinAlgError:
                 return x, S
             return mean, root
 
         return prior
 
-    def _in_array(self, source: FloatArray) -> tuple[FloatArray, FloatArray]:
-        R = self.row.R_world_from_array
-        return R.T @ (source[:3] - self.row.origin_m), R.T @ source[3:]
+    def place_in_array(self, state: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Offset (3,) of the source from the sensors' centroid in the array's axes, and a square root (3, n) of its P.
+
+        An error of the pose moves the source in the world, not from the array.
+        """
+        return self._in_array(state)[:3] - self.model.array.centroid, (self._in_array_jacobian(state) @ S)[:3]
+
+    def _in_array(self, state: FloatArray) -> FloatArray:
+        """Position and moment (6,) of a state in the true axes of the array."""
+        return self.pose.in_array(state[:N_SOURCE], self.pose_error(state))
+
+    def _in_array_jacobian(self, state: FloatArray) -> FloatArray:
+        """Their Jacobian (6, n)."""
+        error = self.pose_error(state)
+        full = np.zeros((N_SOURCE, state.size))
+        full[:, :N_SOURCE] = self._by_source(np.eye(N_SOURCE), error)
+        behind = self.n_motion + self.effect.shape[1]
+        full[:, behind:] = self.pose.error_jacobian(self._in_array(state), error) @ self.pose_effect
+        return full
+
+    def _by_array(self, in_array: FloatArray, error: FloatArray) -> FloatArray:
+        """Jacobian (k, 6) by a source in the array's axes."""
+        return self.model.jacobian(in_array[:3], in_array[3:], self._ambient_T(error)) / self.sigma[:, None]
+
+    def _by_source(self, H: FloatArray, error: FloatArray) -> FloatArray:
+        """That by a source of the world."""
+        R = self.pose.turned(error)
+        return np.concatenate([H[:, :3] @ R.T, H[:, 3:] @ R.T], axis=1)
+
+    def _ambient_T(self, error: FloatArray) -> FloatArray:
+        """Ambient field at the sensors (N, 3) where the pose is turned by an error."""
+        return self.model.array.ambient_fields @ rotation_matrix(error[TURN])
 
 
 class RowMeasurements:
@@ -130,10 +205,14 @@ class RowMeasurements:
     ----------
     errors : SensorErrors
         The lasting errors of the array's sensors.
+    pose_errors : PoseErrors
+        Those of its pose, behind them.
     """
 
     def __init__(self, array: SensorArray, n_motion: int) -> None:
         self.errors = SensorErrors.of(array)
+        self.pose_errors = PoseErrors.of(array.pose)
+        self._lever_arm_m = np.array(self.pose_errors.uncertainty.lever_arm_m)
         self._array = without_lasting_errors(array)
         self._n_motion = n_motion
         self._differences: dict[bytes, Differences] = {}
@@ -147,7 +226,10 @@ class RowMeasurements:
         differences = self.differences(row)
         sigma = np.sqrt(differences.variance)
         effect = differences.transform @ self.errors.effect(array, row.readings_T) / sigma[:, None]
-        return RowMeasurement(DifferenceMeasurement(array, differences), sigma, row, self._n_motion, effect)
+        pose = row.pose(self._lever_arm_m)
+        of_pose = self.pose_errors.effect(pose, row.pose_sigma)
+        model = DifferenceMeasurement(array, differences)
+        return RowMeasurement(model, sigma, row, self._n_motion, effect, pose, of_pose)
 
     def differences(self, row: Row) -> Differences:
         """The independent differences that a row's readings give."""
@@ -163,24 +245,29 @@ class RowMeasurements:
 
 @dataclass(frozen=True, eq=False)
 class Coordinates:
-    """Coordinates of a source in which the readings of a row are linear.
+    """Six coordinates of a state, to first order its position and moment where errors are held; the others stay.
 
     Attributes
     ----------
-    measurement : RowMeasurement
-    centre : ndarray, shape (6,)
-        The source that they are counted from.
-    M : ndarray, shape (6, k), optional
-        None: the row does not determine a source, and they are position and moment.
+    centre : ndarray, shape (n,)
+        The state that they are counted from.
+    function, jacobian : callable
+        What bends as they do: (n,) -> (k,), and its derivative (k, n).
+    M : ndarray, shape (6, k)
+        They are M times its change.
+    value, J : ndarray, shapes (k,) and (6, n)
+        At the centre: of the function, and the derivative of the coordinates.
     """
 
-    measurement: RowMeasurement
     centre: FloatArray
-    M: FloatArray | None
+    function: MeasurementFunction
+    jacobian: MeasurementFunction
+    M: FloatArray
+    value: FloatArray
+    J: FloatArray
 
-    def at(self, source: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Coordinates (6,) of a source (6,), and their derivative (6, 6)."""
-        if self.M is None or np.array_equal(source, self.centre):
-            return source - self.centre, np.eye(N_SOURCE)
-        difference = self.measurement.of_source(source) - self.measurement.of_source(self.centre)
-        return self.M @ difference, self.M @ self.measurement.source_jacobian(source)
+    def at(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Coordinates (6,) of a state (n,), and their derivative (6, n)."""
+        if np.array_equal(state, self.centre):
+            return np.zeros(N_SOURCE), self.J
+        return self.M @ (self.function(state) - self.value), self.M @ self.jacobian(state)

@@ -24,15 +24,10 @@ from numpy.typing import ArrayLike
 
 from arrays.typing import FloatArray, Vector
 from magloc.navigation.measured_motion import MeasuredMotion
+from magloc.navigation.rotations import cross_matrix, rotation_matrix, turn_of_change
 
 N_SOURCE = 6
 _AT_REST: Vector = (0.0, 0.0, 0.0)
-
-
-def cross_matrix(vector: ArrayLike) -> FloatArray:
-    """Matrix ``[a]×`` with ``[a]× b = a × b``, equation (18): (..., 3, 3) of (..., 3)."""
-    a = np.asarray(vector, dtype=np.float64)
-    return np.cross(a[..., None, :], -np.eye(3))
 
 
 def array_axes_transition(
@@ -218,7 +213,7 @@ class OrnsteinUhlenbeck:
         p, m, v, rate = x[:3], x[3:6], x[6:9], x[9:]
         turn = rotation_matrix(moved * rate)
         turned = turn @ m
-        by_rate = -cross_matrix(turned) @ _turn_of_change(moved * rate)
+        by_rate = -cross_matrix(turned) @ turn_of_change(moved * rate)
         F = np.eye(12)
         F[:3, 6:9] = moved * np.eye(3)
         F[3:6, 3:6], F[3:6, 9:] = turn, moved * by_rate
@@ -316,30 +311,6 @@ def known_motions(measured: MeasuredMotion, unknown: RandomWalk) -> list[KnownMo
         KnownMotion(unknown.speed_m_s, unknown.turn_rad_s, v[1], w[1], v[0], w[0], sigma_v, sigma_w[1], sigma_w[0])
         for v, w, sigma_v, sigma_w in rows
     ]
-
-
-def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
-    """Rotation (3, 3) by a vector (3,), by Rodrigues' formula [rad]."""
-    angle = math.sqrt(float(rotation_vector @ rotation_vector))
-    K = cross_matrix(rotation_vector)
-    # sin(a)/a and (1 - cos(a))/a², without cancelling.
-    first = math.sin(angle) / angle if angle > 1e-8 else 1.0
-    half = 0.5 * angle
-    second = 0.5 * (math.sin(half) / half) ** 2 if angle > 1e-8 else 0.5
-    return np.eye(3) + first * K + second * (K @ K)
-
-
-def _turn_of_change(rotation_vector: FloatArray) -> FloatArray:
-    """The small turn J δ (3, 3) that follows a rotation by a vector (3,) when δ is added to the vector."""
-    square = float(rotation_vector @ rotation_vector)
-    angle = math.sqrt(square)
-    K = cross_matrix(rotation_vector)
-    # (1 - cos(a))/a² and (a - sin(a))/a³, by series where they cancel.
-    if angle < 1e-2:
-        first, second = 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
-    else:
-        first, second = (1.0 - math.cos(angle)) / square, (angle - math.sin(angle)) / (square * angle)
-    return np.eye(3) + first * K + second * (K @ K)
 
 
 @lru_cache(maxsize=64)

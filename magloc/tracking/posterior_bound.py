@@ -61,7 +61,7 @@ def _steps_at_truth(
     tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
 ) -> list[Step]:
     """What a filter that linearises at the truth knows at every row, from the first one that determines the source."""
-    motion, n_errors = tracker.motion, tracker.errors.n_states
+    motion, n_errors = tracker.motion, tracker.n_errors
     truth = np.concatenate([position_m, moment_Am2], axis=1)
     velocity, rate = _velocities(np.array([row.time_s for row in rows]), truth)
     steps: list[Step] = []
@@ -80,15 +80,15 @@ def _steps_at_truth(
         if prediction is not None:
             _, S = block_update(state, prediction.S, H, np.zeros(len(H)), np.ones(len(H)))
         else:
-            # Lasting errors of sensors as noise of the row: only to see whether the source is determined, and how well.
-            lasting = H[:, motion.n_states :] * tracker.errors.sigma
+            # Errors of sensors and pose as noise of the row: only to see whether the source is determined, how well.
+            lasting = H[:, motion.n_states :] * tracker.error_sigma
             root = np.linalg.cholesky(np.eye(len(H)) + lasting @ lasting.T)
             seen.append(np.linalg.solve(root, H[:, :N_SOURCE]))
             measurements.append(measurement)
             covariance = inverse_information(np.concatenate(seen)[None], _SINGULAR_RTOL)[0]
             if np.isnan(covariance).any():
                 continue
-            S = tracker.filtered_start(truth[i], covariance, measurements).S
+            S = tracker.filtered_start([state] * len(measurements), covariance, measurements).S
         steps.append(Step(i, prediction, state, S))
     return steps
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from arrays.typing import FloatArray
+from arrays.typing import BoolArray, FloatArray
 from magloc.localization.fit.results import EVERYWHERE, Intervals, Solution, is_observable_set
 from magloc.localization.uncertainty.ambiguity import LARGEST_GAUSSIAN_SIGMA, relative_sigma
 from magloc.localization.uncertainty.range_interval import gaussian_ranges, union
+from magloc.measurement.pose import ArrayPose, rates_of
 from magloc.readings import Readings
 
 
@@ -28,6 +30,10 @@ class Row:
         Pose of the array.
     ambient_T : ndarray, shape (3,), optional
         Ambient field in the array's frame, in place of the array's own.
+    velocity_m_s, rate_rad_s : ndarray, shape (3,), optional
+        Of the array in the world, and about its own axes. None: from the row before.
+    pose_sigma : ndarray, shape (2,), optional
+        Standard deviations of position [m] and attitude [rad], in place of the array's own.
     """
 
     time_s: float
@@ -35,6 +41,45 @@ class Row:
     origin_m: FloatArray = field(default_factory=lambda: np.zeros(3))
     R_world_from_array: FloatArray = field(default_factory=lambda: np.eye(3))
     ambient_T: FloatArray | None = None
+    velocity_m_s: FloatArray | None = None
+    rate_rad_s: FloatArray | None = None
+    pose_sigma: FloatArray | None = None
+
+    @property
+    def available(self) -> BoolArray:
+        """Channels that have a reading (C,)."""
+        return np.isfinite(self.readings_T)
+
+    def pose(self, lever_arm_m: FloatArray) -> ArrayPose:
+        """The array's pose; where nothing is known of its motion it is at rest."""
+        velocity, rate = (np.zeros(3) if value is None else value for value in (self.velocity_m_s, self.rate_rad_s))
+        return ArrayPose(self.origin_m, self.R_world_from_array, velocity, rate, lever_arm_m)
+
+
+def moving(row: Row, before: Row | None) -> Row:
+    """A row with how its array moves, as the row before tells where it does not itself."""
+    if before is None or row.velocity_m_s is not None:
+        return row
+    time_s, origins_m = np.array([before.time_s, row.time_s]), np.stack([before.origin_m, row.origin_m])
+    velocity, rate = rates_of(time_s, origins_m, np.stack([before.R_world_from_array, row.R_world_from_array]))
+    return replace(row, velocity_m_s=velocity[1], rate_rad_s=rate[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Innovation:
+    """Whitened innovations (k,) of a row, and the channels (C,) that it has."""
+
+    available: BoolArray
+    whitened: FloatArray
+
+    def after(self, before: Innovation | None) -> dict[str, Any]:
+        """Its normalised square and its product with the one before, if that is of the same differences."""
+        same = before is not None and np.array_equal(before.available, self.available)
+        return {
+            "nis": float(self.whitened @ self.whitened),
+            "nis_dof": self.whitened.size,
+            "lag1": float(self.whitened @ before.whitened) if before is not None and same else math.nan,
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +98,9 @@ class TrackPoint:
         Linearisations.
     nis : float
         Normalised innovation squared, and `nis_dof` its degrees of freedom. NaN for rows that the track started from.
+    lag1 : float
+        Product of the whitened innovations of this row and of the one before, on average zero for a right model; its
+        variance is `nis_dof`. NaN where there is none before, or of other differences.
     status : str
         "tracked", "acquired" (a new track started here), "predicted" (no readings), "outlier" (readings that contradict
         the track, not used), or why there is no track.
@@ -75,6 +123,7 @@ class TrackPoint:
     iterations: int = 0
     nis: float = math.nan
     nis_dof: int = 0
+    lag1: float = math.nan
     status: str = ""
     weight: float = math.nan
     rivals: tuple[Solution, ...] = ()
@@ -140,12 +189,19 @@ class Step:
 
 def rows_of(readings: Readings) -> Iterator[Row]:
     """Rows of readings for a tracker."""
-    rotations = None if readings.pose is None else readings.pose[1].as_matrix()
+    columns: dict[str, FloatArray] = {}
+    if readings.ambient_T is not None:
+        columns["ambient_T"] = readings.ambient_T
+    if readings.pose_sigma is not None:
+        columns["pose_sigma"] = readings.pose_sigma
+    if readings.pose is not None:
+        position_m, R = readings.pose[0], readings.pose[1].as_matrix()
+        columns |= {"origin_m": position_m, "R_world_from_array": R}
+        if len(readings) > 1:
+            velocity_m_s, rate_rad_s = rates_of(readings.time_s, position_m, R)
+            columns |= {"velocity_m_s": velocity_m_s, "rate_rad_s": rate_rad_s}
     for i, time in enumerate(readings.time_s.tolist()):
-        row = Row(time, readings.values_T[i], ambient_T=None if readings.ambient_T is None else readings.ambient_T[i])
-        if readings.array_position_m is not None and rotations is not None:
-            row = replace(row, origin_m=readings.array_position_m[i], R_world_from_array=rotations[i])
-        yield row
+        yield Row(time, readings.values_T[i], **{name: column[i] for name, column in columns.items()})
 
 
 def stacked(points: Sequence[TrackPoint], name: str, *shape: int) -> FloatArray:

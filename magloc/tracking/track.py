@@ -19,11 +19,13 @@ from arrays.typing import BoolArray, FloatArray, IntArray, Vector
 from magloc.blas_threads import one_blas_thread
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import EVERYWHERE, Intervals
+from magloc.measurement.pose import with_stated_pose
 from magloc.navigation.measured_motion import MeasuredMotion
 from magloc.readings import Readings, as_readings, without_saturated
 from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import Consistency, consistency
 from magloc.tracking.files import dataset_of_track, geojson_of_track, lines_of_track
+from magloc.tracking.innovations import InnovationTest, innovation_test
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk, known_motions
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import Row, TrackPoint, rows_of, stacked
@@ -186,6 +188,16 @@ class Track(TrackColumns):
     def _rows(self) -> list[Row]:
         return list(rows_of(self.readings))
 
+    @cached_property
+    def innovations(self) -> InnovationTest:
+        """Whether the readings agree with what is stated of sensors, pose and motion."""
+        return innovation_test(self)
+
+    def table(self) -> str:
+        """The table that ``magloc track`` prints, and what is wrong with the track."""
+        reason = self.innovations.reason
+        return super().table() + (f"\n{reason}" if reason else "")
+
     @one_blas_thread
     def consistency(self, truth: Truth) -> Consistency:
         """Errors of the track, its NEES and its NIS, and the least error that is possible where the moment is known.
@@ -261,7 +273,7 @@ def track(
     used = without_saturated(as_readings(readings), array)
     if motion is None:
         motion = (OrnsteinUhlenbeck if smooth and used.motion is None else RandomWalk)(SPEED_M_S, TURN_RAD_S)
-    tracker = Tracker(array, motion, prior=prior, keep_steps=smooth)
+    tracker = Tracker(with_stated_pose(array, used), motion, prior=prior, keep_steps=smooth)
     if used.motion is None:
         points = track_record(tracker, list(rows_of(used)), progress)
     else:

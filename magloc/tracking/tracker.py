@@ -4,7 +4,8 @@ A track is acquired from a start-free fix (:mod:`magloc.tracking.acquisition`), 
 :func:`magloc.kalman.iterated_update` with a :class:`magloc.tracking.motion.MotionModel`, and given up when the readings
 contradict it or the range is no longer known; then it is acquired anew. The state is in the world frame where the
 array's pose is known, else in the array's. Behind the states of the motion stand the lasting errors that the array
-states of its sensors (:mod:`magloc.measurement.nuisances`).
+states of its sensors (:mod:`magloc.measurement.nuisances`), and those of its pose (:mod:`magloc.measurement.pose`):
+also those that are new in every row, so that the readings are modelled at the pose that they tell of.
 
 This module is the readable form; :mod:`magloc.tracking.batch` steps long records, and a test holds the two together.
 """
@@ -36,8 +37,9 @@ from magloc.readings import Readings, without_saturated
 from magloc.tracking.acquisition import CONFIRMED_RANGE_ERROR, STACKED_POSITION_ERROR, Acquisition
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import Prediction, Row, Step, TrackPoint, rows_of
+from magloc.tracking.results import Innovation, Prediction, Row, Step, TrackPoint, moving, rows_of
 
+Prior = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 ROWS_TO_LOSE = 3
 """Contradicting rows in a row that end a track."""
 REFIX_RANGE_ERROR = 0.15
@@ -61,11 +63,12 @@ _UNKNOWN = 1e4
 
 @dataclass(frozen=True, eq=False)
 class FilteredStart:
-    """State at the start of a track, square root of its covariance, and χ² of the readings that it was found from."""
+    """State at the start of a track, square root of its covariance, χ² of the rows, and the state at each of them."""
 
     x: FloatArray
     S: FloatArray
     chi2: float
+    of_rows: Sequence[FloatArray] = ()
 
 
 class Tracker:
@@ -86,6 +89,8 @@ class Tracker:
         What rows say of the state.
     errors : SensorErrors
         The lasting errors of the array's sensors, whose states follow those of the motion.
+    pose_errors : PoseErrors
+        Those of its pose, behind them.
     steps : list of Step
         Of all tracks so far, if `keep_steps`.
 
@@ -110,7 +115,7 @@ class Tracker:
         self.array = array
         self.motion = motion
         self.measurements = RowMeasurements(array, motion.n_states)
-        self.errors = self.measurements.errors
+        self.errors, self.pose_errors = self.measurements.errors, self.measurements.pose_errors
         self.keep_steps = keep_steps
         self.steps: list[Step] = []
         self._acquisition = Acquisition(array, prior, motion.speed_m_s)
@@ -120,6 +125,8 @@ class Tracker:
         self._contradictions = 0
         self._n_rows = 0
         self._weight = math.nan
+        self._last: Innovation | None = None
+        self._row_before: Row | None = None
 
     @one_blas_thread
     def update(self, row: Row | Readings) -> TrackPoint:
@@ -141,6 +148,7 @@ class Tracker:
             row = next(rows_of(without_saturated(row, self.array)))
         if row.time_s <= self._time_s:
             raise ValueError(f"Input time_s must increase; instead {row.time_s} s follows {self._time_s} s.")
+        row, self._row_before = moving(row, self._row_before), row
         dt_s, self._time_s = row.time_s - self._time_s, row.time_s
         index, self._n_rows = self._n_rows, self._n_rows + 1
         if self._x is None:
@@ -149,13 +157,13 @@ class Tracker:
         x, S = prediction.x, prediction.S
         measurement = self.measurements.of(row)
         if not measurement.z.size:
-            return self._kept(row, index, x, S, prediction, status="predicted")
-        if self._range_error(x, S, row) > REFIX_RANGE_ERROR:
+            return self._kept(measurement, index, x, S, prediction, status="predicted")
+        if self._range_error(x, S, measurement) > REFIX_RANGE_ERROR:
             # The prediction says too little for an iteration to start from it.
             self._x = None
             point = self._acquired(row, index, near=(x, S))
-            if point.position_m is None and self._range_error(x, S, row) <= LARGEST_RANGE_ERROR:
-                return self._kept(row, index, x, S, prediction, status="predicted")
+            if point.position_m is None and self._range_error(x, S, measurement) <= LARGEST_RANGE_ERROR:
+                return self._kept(measurement, index, x, S, prediction, status="predicted")
             return point
         k = measurement.z.size
         update = iterated_update(
@@ -168,24 +176,24 @@ class Tracker:
             tolerance=TOLERANCE,
             max_iterations=MOST_ITERATIONS,
             shrink=SHRINK,
-            prior=measurement.curved_prior(x, S) if _is_of_readings(self._S, S) else None,
+            prior=self.curved_prior(measurement, x, S, dt_s),
         )
+        innovation = Innovation(row.available, update.whitened)
         if not update.converged or update.nis > chdtri(k, CONTRADICTION):
             self._contradictions += 1
             if self._contradictions >= ROWS_TO_LOSE:
                 self._x = None
                 return self._acquired(row, index)
-            return self._kept(row, index, x, S, prediction, status="outlier", nis=update.nis, nis_dof=k)
+            return self._kept(measurement, index, x, S, prediction, status="outlier", innovation=innovation)
         self._contradictions = 0
         return self._kept(
-            row,
+            measurement,
             index,
             update.x,
             update.S,
             prediction,
             status="tracked",
-            nis=update.nis,
-            nis_dof=k,
+            innovation=innovation,
             iterations=update.iterations,
         )
 
@@ -221,17 +229,44 @@ class Tracker:
         if self.keep_steps:
             self.steps += steps
 
+    @property
+    def n_errors(self) -> int:
+        """States behind those of the motion: errors of sensors and of the pose."""
+        return self.errors.n_states + self.pose_errors.n_states
+
+    @property
+    def error_sigma(self) -> FloatArray:
+        """Their standard deviations before anything is known (n_errors,)."""
+        return np.concatenate([self.errors.sigma, np.ones(self.pose_errors.n_states)])
+
+    def error_step(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
+        """What remains of every error after a step, and the standard deviation of what is added: (n_errors,) each."""
+        of_sensors, of_pose = self.errors.step(dt_s), self.pose_errors.step(dt_s)
+        return np.concatenate([of_sensors[0], of_pose[0]]), np.concatenate([of_sensors[1], of_pose[1]])
+
     def predicted(self, x: FloatArray, S: FloatArray, dt_s: float) -> Prediction:
         """State, square root of its covariance and transition after a step without readings."""
-        n, n_errors = self.motion.n_states, self.errors.n_states
+        n, n_errors = self.motion.n_states, self.n_errors
         moved, F_motion, S_q_motion = self.motion.step(x[:n], dt_s)
-        kept, added = self.errors.step(dt_s)
+        kept, added = self.error_step(dt_s)
         noisy = np.flatnonzero(added)
         F, S_q = np.zeros((n + n_errors,) * 2), np.zeros((n + n_errors, S_q_motion.shape[1] + noisy.size))
         F[:n, :n], S_q[:n, : S_q_motion.shape[1]] = F_motion, S_q_motion
         F[n + np.arange(n_errors), n + np.arange(n_errors)] = kept
         S_q[n + noisy, S_q_motion.shape[1] + np.arange(noisy.size)] = added[noisy]
         return Prediction(np.concatenate([moved, kept * x[n:]]), predict_square_root(S, F, S_q), F)
+
+    def curved_prior(self, measurement: RowMeasurement, x: FloatArray, S: FloatArray, dt_s: float) -> Prior | None:
+        """What a prediction (x, S) is Gaussian in; None: in Cartesian coordinates.
+
+        Errors of the pose bend them by what has lasted of them since the row before: place and moment are known with
+        those, and independently of what is new.
+        """
+        of_readings = _is_of_readings(self._S, S)
+        if not of_readings and not self.pose_errors.n_states:
+            return None
+        lasting = self.pose_errors.step(dt_s)[0] ** 2
+        return measurement.with_lasting_errors(lasting).curved_prior(x, S, of_readings=of_readings)
 
     def start(self, source: FloatArray, covariance: FloatArray, rows: Sequence[Row]) -> FilteredStart | None:
         """State at the last of the rows that a source (6,) was found from, as if at rest, with a covariance (6, 6).
@@ -240,60 +275,67 @@ class Tracker:
         what moves between them, and the errors of sensors that they have in common, are counted as in the rows to come.
         None where that does not converge, or they contradict each other then.
         """
-        if len(rows) == 1 and not self.errors.n_states:
+        if len(rows) == 1 and not self.n_errors:
             return FilteredStart(*self.motion.start(source, symmetric_square_root(covariance)), 0.0)
         measurements = [self.measurements.of(row) for row in rows]
         dof = sum(measurement.z.size for measurement in measurements) - N_SOURCE
-        centre = source
+        n, n_errors = self.motion.n_states, self.n_errors
+        centres = [np.concatenate([source, np.zeros(n - N_SOURCE + n_errors)])] * len(rows)
+        # Errors of the pose that change are linearised as each row knows them, everything else as all rows together.
+        own = np.concatenate([np.zeros(n + self.errors.n_states, dtype=bool), self.pose_errors.changes])
         for _ in range(_MOST_START_STEPS):
-            found = self.filtered_start(centre, covariance, measurements)
-            step = found.x[:N_SOURCE] - centre
-            centre = found.x[:N_SOURCE]
+            found = self.filtered_start(centres, covariance, measurements)
+            step = (found.x - centres[-1])[:N_SOURCE]
+            centres = [np.where(own, of_row, found.x) for of_row in found.of_rows]
             if np.all(np.abs(step) < _START_TOLERANCE * np.linalg.norm(found.S[:N_SOURCE], axis=1)):
                 return found if dof <= 0 or found.chi2 < chdtri(dof, CONTRADICTION) else None
         return None
 
     def filtered_start(
-        self, source: FloatArray, covariance: FloatArray, measurements: Sequence[RowMeasurement]
+        self, centres: Sequence[FloatArray], covariance: FloatArray, measurements: Sequence[RowMeasurement]
     ) -> FilteredStart:
-        """One pass of :meth:`start`, with the readings linearised at a source."""
-        n, n_errors = self.motion.n_states, self.errors.n_states
+        """One pass of :meth:`start`, with the readings of every row linearised at a state (n,)."""
+        n, n_errors = self.motion.n_states, self.n_errors
         x, S = np.zeros(n + n_errors), np.zeros((n + n_errors,) * 2)
-        x[:n], S[:n, :n] = self.motion.start(source, np.diag(_UNKNOWN * np.sqrt(np.diagonal(covariance))))
-        S[n + np.arange(n_errors), n + np.arange(n_errors)] = self.errors.sigma
-        centre = x
-        chi2 = 0.0
-        for before, measurement in zip([measurements[0], *measurements], measurements, strict=False):
-            if measurement is not before:
-                prediction = self.predicted(x, S, measurement.row.time_s - before.row.time_s)
+        unknown = np.diag(_UNKNOWN * np.sqrt(np.diagonal(covariance)))
+        x[:n], S[:n, :n] = self.motion.start(centres[0][:N_SOURCE], unknown)
+        S[n + np.arange(n_errors), n + np.arange(n_errors)] = self.error_sigma
+        chi2, of_rows = 0.0, []
+        for j, (measurement, centre) in enumerate(zip(measurements, centres, strict=True)):
+            if j:
+                prediction = self.predicted(x, S, measurement.row.time_s - measurements[j - 1].row.time_s)
                 x, S = prediction.x, prediction.S
             H, ones = measurement.jacobian(centre), np.ones(measurement.z.size)
             innovation = measurement.z - measurement.predicted(centre) - H @ (x - centre)
             chi2 += normalised_innovation_squared(S, H, innovation, ones)
             x, S = block_update(x, S, H, innovation, ones)
-        return FilteredStart(x, S, chi2)
+            of_rows.append(x)
+        return FilteredStart(x, S, chi2, of_rows)
 
     def _kept(
         self,
-        row: Row,
+        measurement: RowMeasurement,
         index: int,
         x: FloatArray,
         S: FloatArray,
         prediction: Prediction,
         *,
         status: str,
-        nis: float = math.nan,
-        nis_dof: int = 0,
+        innovation: Innovation | None = None,
         iterations: int = 0,
     ) -> TrackPoint:
-        if self._range_error(x, S, row) > LARGEST_RANGE_ERROR:
+        row = measurement.row
+        tracked = status == "tracked"
+        told = {} if innovation is None else innovation.after(self._last if tracked else None)
+        self._last = innovation if tracked else None
+        if self._range_error(x, S, measurement) > LARGEST_RANGE_ERROR:
             self._x = None
-            return self._lost(row, "lost: the range is no longer known", nis=nis, nis_dof=nis_dof)
+            return replace(self._lost(row, "lost: the range is no longer known"), **told)
         self._x, self._S = x, S
         if self.keep_steps:
             self.steps.append(Step(index, prediction, x, S))
         learned = estimability(S, prediction.S)[:N_SOURCE]
-        return replace(self._tracked(row, x, S, learned, iterations, status), nis=nis, nis_dof=nis_dof)
+        return replace(self._tracked(row, x, S, learned, iterations, status), **told)
 
     def _tracked(
         self, row: Row, x: FloatArray, S: FloatArray, learned: FloatArray, iterations: int, status: str
@@ -317,14 +359,10 @@ class Tracker:
         """Of the sensors in the world frame, shape (3,)."""
         return row.origin_m + row.R_world_from_array @ self.array.centroid
 
-    def _lost(
-        self, row: Row, reason: str, rivals: tuple[Solution, ...] = (), nis: float = math.nan, nis_dof: int = 0
-    ) -> TrackPoint:
+    def _lost(self, row: Row, reason: str, rivals: tuple[Solution, ...] = ()) -> TrackPoint:
         """What is known of a row without a track."""
         return TrackPoint(
             row.time_s,
-            nis=nis,
-            nis_dof=nis_dof,
             status=reason,
             rivals=rivals,
             centroid_m=self.centroid(row),
@@ -343,14 +381,15 @@ class Tracker:
         if found is None:
             return self._lost(row, "not acquired: no dipole fits the latest rows together", alone)
         x, S = found.x, found.S
-        certain = self._range_error(x, S, row) <= CONFIRMED_RANGE_ERROR
+        measurement = self.measurements.of(row)
+        certain = self._range_error(x, S, measurement) <= CONFIRMED_RANGE_ERROR
         if len(start.rows) > 1:
-            offset = x[:3] - self.centroid(row)
-            certain = float(np.linalg.norm(S[:3])) <= STACKED_POSITION_ERROR * float(np.linalg.norm(offset))
+            offset, root = measurement.place_in_array(x, S)
+            certain = float(np.linalg.norm(root)) <= STACKED_POSITION_ERROR * float(np.linalg.norm(offset))
         if not certain:
             return self._lost(row, "not acquired: the range is not certain enough", alone)
         self._acquisition.forget()
-        self._x, self._S = x, S
+        self._x, self._S, self._last = x, S, None
         self._contradictions = 0
         self._weight = solution.weight
         if self.keep_steps:
@@ -358,11 +397,11 @@ class Tracker:
         learned = np.ones(N_SOURCE)
         return replace(self._tracked(row, x, S, learned, solution.iterations, "acquired"), rivals=start.rivals)
 
-    def _range_error(self, x: FloatArray, S: FloatArray, row: Row) -> float:
+    def _range_error(self, x: FloatArray, S: FloatArray, measurement: RowMeasurement) -> float:
         """Standard deviation of the range over the range."""
-        offset = x[:3] - self.centroid(row)
+        offset, root = measurement.place_in_array(x, S)
         square = float(offset @ offset)
-        along = offset @ S[:3]
+        along = offset @ root
         return math.sqrt(float(along @ along)) / square if square > 0.0 else math.inf
 
 

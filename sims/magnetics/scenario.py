@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from arrays.array import SensorArray
+from arrays.pose import PoseUncertainty
 from arrays.typing import FloatArray
 from magloc.signature.path import PathError
 from sims.magnetics.paths import Attitude, Path, Steered, Vector
@@ -131,6 +132,8 @@ class MagneticScenario:
         Noise of what carries the array.
     missing : Missing
         Readings that are not there.
+    pose : PoseUncertainty, optional
+        Errors of the pose that the readings state. The nominal array states them too, unless `array` states others.
     name : str
 
     Raises
@@ -157,6 +160,7 @@ class MagneticScenario:
     pulsations: tuple[Pulsation, ...] = ()
     platform: Platform = field(default_factory=Platform)
     missing: Missing = field(default_factory=Missing)
+    pose: PoseUncertainty | None = None
     name: str = ""
 
     def __post_init__(self) -> None:
@@ -189,4 +193,5 @@ class MagneticScenario:
     @property
     def nominal_array(self) -> SensorArray:
         """The array as its user knows it."""
-        return nominal_array(self.array, self.models, self.rate_Hz)
+        array = nominal_array(self.array, self.models, self.rate_Hz)
+        return array if array.pose is not None else replace(array, pose=self.pose)

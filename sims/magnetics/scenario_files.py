@@ -61,6 +61,7 @@ def read_scenario(name_or_path: str) -> MagneticScenario:
             pulsations=tuple(map(_pulsation, file.pulsation)),
             platform=_platform(file.platform),
             missing=Missing(file.missing.dropout, tuple(file.missing.gaps_s)),
+            pose=None if file.pose is None else file.pose.uncertainty(f"{path}, table pose"),
             name=FilePath(path).stem if file.name is None else file.name,
         )
 

@@ -21,12 +21,14 @@ from arrays.io.toml import (
     date_such_as,
     one_of,
 )
+from arrays.pose import PoseTable
 from sims.magnetics.paths import Lawnmower, Path, Steered, Vector, Waypoints, circle
 from sims.magnetics.sensors import SENSOR_KINDS
 
 _ORIGIN: Vector = (0.0, 0.0, 0.0)
 _UNIT_QUATERNION_ATOL = 1e-6
 _BELOW_1 = Rule(lambda value: value < 1.0, "a number below 1")
+_BELOW_30 = Rule(lambda value: value < 30.0, "a number below 30")
 _BELOW_1000 = Rule(lambda value: value < 1000.0, "a number below 1000")
 
 
@@ -133,6 +135,13 @@ class MissingTable(Table, kw_only=True):
                 raise RefusalError("gaps_s", f"found [{start:g}, {end:g}], expected an end after its start")
 
 
+class PoseErrorTable(PoseTable, kw_only=True):
+    """Errors of the pose that the readings state, as in an array file, but none that is not named."""
+
+    position_constant_m: NotNegative = 0.0
+    attitude_constant_deg: Annotated[NotNegative, _BELOW_30] = 0.0
+
+
 class FileTable(File, kw_only=True):
     """The whole file."""
 
@@ -147,6 +156,7 @@ class FileTable(File, kw_only=True):
     pulsation: list[PulsationTable] = msgspec.field(default_factory=list)
     platform: PlatformTable = msgspec.field(default_factory=PlatformTable)
     missing: MissingTable = msgspec.field(default_factory=MissingTable)
+    pose: PoseErrorTable | None = None
 
 
 class PathTable(Table, kw_only=True):

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
+from arrays.pose import PoseUncertainty
 from arrays.sensor import Calibration
 from arrays.typing import FloatArray
 from magloc.fields.body import induced_and_permanent_moment
@@ -20,7 +20,7 @@ from magloc.signature.path import ObjectPath
 from magloc.truth import Truth
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
 from sims.magnetics.sensors import SensorModel
-from sims.noise import coloured_noise, low_passed, random_walk, stream
+from sims.noise import coloured_noise, lasting, low_passed, random_walk, stream
 
 MU0 = 4.0 * math.pi * MU0_OVER_4PI
 NEAREST_M = 1e-3
@@ -36,7 +36,8 @@ class Simulation:
     array : SensorArray
         As its user knows it.
     readings : Readings
-        With the pose of the array unless its frame is the world's, and with the ambient field if there is one.
+        With the pose of the array, and its errors, unless its frame is the world's; and with the ambient field if there
+        is one, as that attitude turns it.
     truths : tuple of Truth
         Position and moment of every source at the times of the readings, world frame.
     paths : tuple of ObjectPath
@@ -106,13 +107,14 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
         present &= ~((time_s >= start) & (time_s <= end))
     if not present.any():
         raise ValueError("Input scenario must leave some rows; instead received gaps_s that leave none.")
-    posed = not scenario.carrier.is_world
+    stated = array_pose if scenario.pose is None else _stated_pose(scenario, scenario.pose, time_s, seed)
+    posed = not scenario.carrier.is_world or scenario.pose is not None
     readings = Readings(
         values_T[present],
         time_s=time_s[present],
-        array_position_m=array_pose.position_m[present] if posed else None,
-        array_rotation=array_pose.rotation[present] if posed else None,
-        ambient_T=None if scenario.ambient_T is None else array_pose.rotation.inv().apply(ambient_T)[present],
+        array_position_m=stated.position_m[present] if posed else None,
+        array_rotation=stated.rotation[present] if posed else None,
+        ambient_T=None if scenario.ambient_T is None else stated.rotation.inv().apply(ambient_T)[present],
     )
     kept = tuple(Truth(t.time_s[present], t.position_m[present], _rows(t.moment_Am2, present)) for t in truths)
     paths = tuple(_known_path(scenario, i, time_s, pose, seed) for i, pose in enumerate(poses))
@@ -125,6 +127,21 @@ def _pose(carrier: Carrier, time_s: FloatArray, seed: int, owner: str) -> _Pose:
     return _Pose(motion.position_m, carrier.attitude.at(time_s, motion.course_rad, phase))
 
 
+def _stated_pose(scenario: MagneticScenario, of: PoseUncertainty, time_s: FloatArray, seed: int) -> _Pose:
+    """Pose of the array with the errors that its readings state it with: see :mod:`magloc.measurement.pose`."""
+    random = stream(seed, "pose error").standard_normal((len(time_s), 7))
+    changing = lasting(random, of.correlation_s, scenario.rate_Hz)
+    constant = stream(seed, "pose constants").standard_normal(7)
+    turn = of.attitude_rad * changing[:, :3] + of.attitude_constant_rad * constant[:3]
+    lever_arm_m = np.array(of.lever_arm_m)
+    true_lever_m = lever_arm_m + of.position_constant_m * constant[3:6]
+    late_s = of.time_s * changing[:, 6] + of.time_constant_s * constant[6]
+    true = _pose(scenario.carrier, time_s - late_s, seed, "array")
+    rotation = true.rotation * Rotation.from_rotvec(-turn)
+    reference_m = true.position_m - true.rotation.apply(true_lever_m) - of.position_m * changing[:, 3:6]
+    return _Pose(reference_m + rotation.apply(lever_arm_m), rotation)
+
+
 def _known_path(scenario: MagneticScenario, number: int, time_s: FloatArray, pose: _Pose, seed: int) -> ObjectPath:
     """Path of a source as it is known, with its errors."""
     error = scenario.sources[number].path_error
@@ -135,10 +152,7 @@ def _known_path(scenario: MagneticScenario, number: int, time_s: FloatArray, pos
     for k, (sigma, lasts_s) in enumerate(
         ((error.position_m, error.position_correlation_s), (error.attitude_rad, error.attitude_correlation_s))
     ):
-        decay = math.exp(-1.0 / (scenario.rate_Hz * lasts_s)) if lasts_s else 0.0
-        added = random[:, k] * math.sqrt(1.0 - decay**2)
-        added[0] = random[0, k]
-        walks.append(sigma * lfilter([1.0], [1.0, -decay], added, axis=0))
+        walks.append(sigma * lasting(random[:, k], lasts_s, scenario.rate_Hz))
     return ObjectPath(time_s, pose.position_m + walks[0], Rotation.from_rotvec(walks[1]) * pose.rotation)
 
 

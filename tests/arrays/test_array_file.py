@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import tomllib
 from collections.abc import Callable
@@ -18,6 +19,7 @@ from arrays.array import SensorArray
 from arrays.array_file import array_of_table, array_toml, read_array, write_array
 from arrays.geometries import GEOMETRIES, tetrahedron
 from arrays.io.errors import InputError
+from arrays.pose import PoseUncertainty
 from arrays.sensor import Calibration, Sensor
 
 GEOMETRY = """\
@@ -146,6 +148,25 @@ class TestGeometryForm:
             ambient_gradient_T_m=((1e-9, 2e-9, 0.0), (2e-9, -1.5e-9, 0.3e-9), (0.0, 0.3e-9, 0.5e-9)),
             ambient_uncertainty_T=5e-8,
         )
+
+    def test_pose(self, write: WriteFile) -> None:
+        """Constants that are left out are those of an ordinary mounting; writing and reading lose nothing."""
+        table = "[pose]\nposition_m = 0.02\nattitude_deg = 0.3\ntime_s = 0.01\nlever_arm_m = [0.1, 0, -2]\n"
+        array = read_array(write(GEOMETRY + table))
+        assert array.pose == PoseUncertainty(0.02, math.radians(0.3), 0.01, lever_arm_m=(0.1, 0.0, -2.0))
+        assert read_array(write(array_toml(replace(array, name="")))).pose == array.pose
+
+    @pytest.mark.parametrize(
+        ("line", "said"),
+        [
+            ("position_m = -1", "position_m: found -1"),
+            ("attitude_deg = 30", "attitude_deg: found 30"),
+            ("sigma_m = 1", "sigma_m: found an unknown key"),
+        ],
+    )
+    def test_a_pose_that_is_none_is_refused(self, write: WriteFile, line: str, said: str) -> None:
+        with pytest.raises(InputError, match=said):
+            read_array(write(f"{GEOMETRY}[pose]\n{line}\n"))
 
     def test_quality_of_all_sensors(self, write: WriteFile) -> None:
         assert read_array(write(GEOMETRY + QUALITY)).sensors == tuple(

@@ -25,6 +25,7 @@ from magloc.readings import Readings, read_readings, without_saturated, write_re
 HEADER = "time_s,s1_x_nT,s1_y_nT,s1_z_nT,s2_x_nT,s2_y_nT,s2_z_nT,s3_nT"
 ROW = "0,1,2,3,4,5,6,7"
 POSE = "array_x_m,array_y_m,array_z_m,array_qx,array_qy,array_qz,array_qw"
+SIGMA = "array_sigma_m,array_sigma_deg"
 HALF_OF_DIGIT_15 = 5e-15 + 4.0 * np.finfo(np.float64).eps  # and the rounding of nT to T and back
 WriteFile = Callable[[str | bytes], Path]
 
@@ -73,6 +74,15 @@ class TestValues:
     def test_missing_cell(self, array: SensorArray, write: WriteFile, cell: str) -> None:
         readings = read_readings(write(f"{HEADER}\n0,1,2,{cell},4,5,6,7\n1,1,2,3,4,5,6,{cell}\n"), array)
         np.testing.assert_array_equal(np.argwhere(np.isnan(readings.values_T)), [[0, 2], [1, 6]])
+
+    def test_pose_sigma(self, array: SensorArray, write: WriteFile, tmp_path: Path) -> None:
+        """Metres and degrees; written and read again they are the same, also row by row."""
+        rows = f"{ROW},1,2,3,0,0,0,1,0.1,18\n1{ROW[1:]},1,2,4,0,0,0,1,0.2,36\n"
+        readings = read_readings(write(f"{HEADER},{POSE},{SIGMA}\n{rows}"), array)
+        np.testing.assert_allclose(readings.pose_sigma, [[0.1, np.pi / 10.0], [0.2, np.pi / 5.0]], rtol=1e-15)
+        write_readings(tmp_path / "again.csv", readings, array)
+        again = read_readings(tmp_path / "again.csv", array)
+        np.testing.assert_allclose(again[1].pose_sigma, readings.pose_sigma[1:], rtol=1e-15)
 
     def test_pose_and_ambient(self, array: SensorArray, write: WriteFile) -> None:
         header = f"{HEADER},{POSE},ambient_x_nT,ambient_y_nT,ambient_z_nT"
@@ -199,6 +209,11 @@ BAD_FILES = {
     "incomplete pose": (f"{HEADER},array_x_m,array_y_m\n{ROW},1,2\n", ["column array_z_m", "array_x_m, array_y_m"]),
     "missing pose": (f"{HEADER},{POSE}\n{ROW},1,2,3,0,0,0,\n", ["line 2", "column array_qw", "no value"]),
     "quaternion not unit": (f"{HEADER},{POSE}\n{ROW},1,2,3,0,0,1,1\n", ["line 2", "array_qx", "norm 1.41421"]),
+    "pose sigma without pose": (f"{HEADER},{SIGMA}\n{ROW},0.1,1\n", ["array_sigma_m", "found no pose"]),
+    "negative pose sigma": (
+        f"{HEADER},{POSE},{SIGMA}\n{ROW},1,2,3,0,0,0,1,0.1,-1\n",
+        ["line 2", "array_sigma_deg", "standard deviation"],
+    ),
     "quaternion zero": (f"{HEADER},{POSE}\n{ROW},1,2,3,0,0,0,0\n", ["line 2", "array_qx", "norm 0"]),
     "incomplete ambient field": (f"{HEADER},ambient_x_nT\n{ROW},1\n", ["column ambient_y_nT", "ambient_x_nT"]),
     "missing ambient field": (

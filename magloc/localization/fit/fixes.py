@@ -199,7 +199,14 @@ class Fixes(Sequence[Fix]):
             body_length_m=np.concatenate([np.zeros(0), *(part.body_length_m for part in parts)]),
         )
 
-    def moved(self, position_m: FloatArray, rotation: Rotation, *, frame: Literal["array", "world"]) -> Fixes:
+    def moved(
+        self,
+        position_m: FloatArray,
+        rotation: Rotation,
+        *,
+        frame: Literal["array", "world"],
+        added_covariance: FloatArray | float = 0.0,
+    ) -> Fixes:
         """The same in another frame: places are turned and moved by the pose (n, 3) of every row, moments turned."""
         row, columns = self.solutions.of_row, self.solutions
         R = rotation.as_matrix()[row]
@@ -210,7 +217,7 @@ class Fixes(Sequence[Fix]):
             columns,
             position_m=position_m[row][:, None] + np.einsum("fab,fkb->fka", R, columns.position_m),
             moment_Am2=np.einsum("fab,fkb->fka", R, columns.moment_Am2),
-            covariance=turned.reshape(columns.covariance.shape),
+            covariance=turned.reshape(columns.covariance.shape) + added_covariance,
         )
         return replace(self, solutions=moved, frame=frame)
 

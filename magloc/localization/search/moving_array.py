@@ -6,6 +6,8 @@ field, so that what changes from row to row in the ambient field does not matter
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -14,28 +16,73 @@ from scipy.linalg import block_diag
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.directions import fibonacci_directions
+from magloc.localization.fit.gauss_newton import refine
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
 from magloc.localization.search.beam_search import Search
+from magloc.measurement.pose import PosesOfRows
 from magloc.measurement.rows import WhitenedRows, ambient_fields, channels_above_ambient, whitenings_of
 from magloc.measurement.whitened import WhitenedModel
 
 _N_DIRECTIONS = 200
 _N_RANGES = 10
 _WIDTH = 8
+# Linearisations of the errors of poses.
+_ROUNDS = 3
 _UNSEEN = "the rows together do not determine the source"
 
 
-def optima_at_rest(rows: WhitenedRows, prior: SourcePrior = NOTHING_KNOWN) -> Optima:
-    """Distinct optima of a source at rest by :func:`stacked_rows`; `prior` bounds its position in the world frame."""
+def optima_at_rest(
+    rows: WhitenedRows, prior: SourcePrior = NOTHING_KNOWN, errors: Callable[[FloatArray], FloatArray] | None = None
+) -> Optima:
+    """Distinct optima of a source at rest by :func:`stacked_rows`; `prior` bounds its position in the world frame.
+
+    `errors`, columns (b, C, n) in units of the noise for a source (6,), count as noise: they are linearised at the best
+    optimum, for a search of its own and then until they stay.
+    """
     rows = rows.knowing(prior.known_moment)
+    optima = _found(rows, prior)
+    for step in range(_ROUNDS if errors is not None else 0):
+        best = optima.fits.rows(np.zeros(1, dtype=np.intp))
+        if errors is None or not np.isfinite(best.chi2).all():
+            break
+        place = [rows.model.position(best.q)[0, 0], rows.model.moment(best.q, best.mu)[0, 0]]
+        noisy = rows.marginalised(errors(np.concatenate(place)))
+        if step == 0:
+            optima = _found(noisy, prior)
+            continue
+        start = optima.fits
+        every = np.zeros(len(start.chi2), dtype=np.intp)
+        fits = refine(noisy.model.rows(every), noisy.y[every], start.q, start.mu)
+        optima = replace(optima, rows=noisy, fits=fits.rows(np.argsort(fits.chi2, kind="stable")))
+    return optima
+
+
+def _found(rows: WhitenedRows, prior: SourcePrior) -> Optima:
+    """The optima of one search."""
     model, allowed = rows.model, partial(prior.allows, rows.model)
     beam = Search(model.homogeneous(_candidates(model)), allowed, width=_WIDTH).first(model, rows.y)
     fits = beam.rows(0)
     listed = np.flatnonzero(np.isfinite(fits.chi2) & (fits.chi2 <= fits.chi2[0] + DISTINCT_WITHIN))
     of_row = np.zeros(len(listed), dtype=np.intp)
     return Optima(rows, fits.rows(listed), of_row, [""], undetermined=_UNSEEN)
+
+
+def stacked_errors(
+    poses: PosesOfRows, readings_T: FloatArray, ambient_T: FloatArray | None
+) -> Callable[[FloatArray], FloatArray]:
+    """What errors of the poses add to :func:`stacked_rows`: columns (1, C n, k) in units of the noise, of a source."""
+    array = poses.array
+    fields = ambient_fields(array, len(readings_T), ambient_T)
+    masks = np.isfinite(readings_T)
+    roots = [whitenings_of(array, mask, row[None])[0].root for mask, row in zip(masks, readings_T, strict=True)]
+
+    def errors(source: FloatArray) -> FloatArray:
+        columns = poses.channel_errors(source, fields)
+        return np.concatenate([root @ of_row for root, of_row in zip(roots, columns, strict=True)])[None]
+
+    return errors
 
 
 def stacked_rows(

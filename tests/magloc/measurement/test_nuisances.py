@@ -305,7 +305,7 @@ class TestStart:
         found = tracker.start(source, covariance, rows)
         assert found is not None
         x, S = found.x, found.S
-        again = tracker.filtered_start(x[:6], covariance, [tracker.measurements.of(row) for row in rows])
+        again = tracker.filtered_start([x] * len(rows), covariance, [tracker.measurements.of(row) for row in rows])
         end, S_end = again.x, again.S
         deviation = np.linalg.norm(S_end, axis=1)
         np.testing.assert_allclose((x - end) / deviation, 0.0, atol=0.1)

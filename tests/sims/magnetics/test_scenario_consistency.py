@@ -69,7 +69,7 @@ def track_statistics(simulation: Simulation, motion: MotionModel) -> dict[str, A
         point = points[i]
         if point.position_m is not None and point.moment_Am2 is not None and point.covariance is not None:
             estimate = np.concatenate([point.position_m, point.moment_Am2])
-            nees[k] = nees_of(tracker.measurement(rows[i]), estimate, point.covariance, source[i])[0]
+            nees[k] = nees_of(tracker.measurements.of(rows[i]), estimate, point.covariance, source[i])[0]
     used = [point for point in points if point.status == "tracked"]
     last = next((point for point in reversed(points) if point.covariance is not None), None)
     end = math.inf
@@ -202,11 +202,11 @@ def linear_filter(simulation: Simulation, _: None) -> dict[str, Any]:
     readings, truth = simulation.readings, simulation.truth
     tracker = Tracker(simulation.array, REST)
     rows = rows_of(readings)
-    measurements = [tracker.measurement(row) for row in rows]
+    measurements = [tracker.measurements.of(row) for row in rows]
     assert truth.moment_Am2 is not None
     source = np.concatenate([truth.position_m[-1], truth.moment_Am2[-1]])
     hardly_known = np.diag(np.repeat([0.01, 0.1], 3)) ** 2  # of position and moment: a filtered start is from far less
-    found = tracker.filtered_start(source, hardly_known, measurements)
+    found = tracker.filtered_start([measurements[0].without_errors(source)] * len(rows), hardly_known, measurements)
     whitened = np.linalg.lstsq(found.S[:6], found.x[:6] - source)[0]
     dof = sum(measurement.z.size for measurement in measurements) - source.size
     return {"nees": whitened @ whitened, "nis": found.chi2, "nis_dof": dof}

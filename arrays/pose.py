@@ -1,0 +1,123 @@
+"""How wrong the pose of an array that moves may be: what its user states, and the table of it in an array file."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+from arrays.io.errors import naming
+from arrays.io.toml import NotNegative, Rule, Table
+from arrays.sensor import _finite, _finite_number
+from arrays.typing import Vector
+
+_LARGEST_RAD = math.radians(30.0)
+_BELOW_30 = Rule(lambda value: 0.0 <= value < 30.0, "a number from 0 to below 30")
+
+
+@dataclass(frozen=True)
+class PoseUncertainty:
+    """Standard deviations of the errors of an array's pose, along or about each axis.
+
+    The true attitude is that of the readings, turned by a small vector in the array's axes; it turns about the pose's
+    reference point. The true place is that of the readings, moved along the axes of the world. Where the clocks differ
+    the pose is that of another time.
+
+    Attributes
+    ----------
+    position_m, attitude_rad, time_s : float
+        Of errors that change from row to row.
+    correlation_s : float
+        How long these last: first-order Markov processes of that time. 0: they are new in every row.
+    position_constant_m : float
+        Of an error of the lever arm, constant in the array's axes.
+    attitude_constant_rad : float
+        Of a constant turn between the array and what its pose is that of: its mounting.
+    time_constant_s : float
+        Of a constant difference of the clocks.
+    lever_arm_m : tuple of 3 floats
+        From the pose's reference point to the origin of the array, in the array's axes: what an error of the attitude
+        moves the sensors about. The pose in the readings is that of the origin.
+
+    Raises
+    ------
+    ValueError
+        A standard deviation is negative or not finite, or one of an angle is 30° or more.
+
+    Examples
+    --------
+    >>> import math
+    >>> import arrays
+    >>> pose = arrays.PoseUncertainty(position_m=0.02, attitude_rad=math.radians(0.3), correlation_s=10.0)
+    >>> array = arrays.SensorArray(arrays.tetrahedron(0.6).sensors, pose=pose)
+    >>> array.pose.position_constant_m
+    0.05
+    """
+
+    position_m: float = 0.0
+    attitude_rad: float = 0.0
+    time_s: float = 0.0
+    correlation_s: float = 0.0
+    position_constant_m: float = 0.05
+    attitude_constant_rad: float = math.radians(0.5)
+    time_constant_s: float = 0.0
+    lever_arm_m: Vector = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for name in _SIGMAS:
+            value = _finite_number(name, getattr(self, name))
+            object.__setattr__(self, name, value)
+            if value < 0.0:
+                raise ValueError(f"Input {name} must not be negative; instead received {value}.")
+            if name.startswith("attitude") and not value < _LARGEST_RAD:
+                raise ValueError(f"Input {name} must be below 30°; instead received {math.degrees(value):g}°.")
+        object.__setattr__(self, "lever_arm_m", tuple(_finite("lever_arm_m", self.lever_arm_m, (3,)).tolist()))
+
+
+_SIGMAS = tuple(name for name in PoseUncertainty.__dataclass_fields__ if name != "lever_arm_m")
+_NOT_SAID = PoseUncertainty()
+
+
+class PoseTable(Table, kw_only=True):
+    """The table ``pose`` of an array file; constants that it leaves out are those of an ordinary mounting."""
+
+    position_m: NotNegative = 0.0
+    attitude_deg: Annotated[float, _BELOW_30] = 0.0
+    time_s: NotNegative = 0.0
+    correlation_s: NotNegative = 0.0
+    position_constant_m: NotNegative = _NOT_SAID.position_constant_m
+    attitude_constant_deg: Annotated[float, _BELOW_30] = 0.5
+    time_constant_s: NotNegative = 0.0
+    lever_arm_m: Vector = _NOT_SAID.lever_arm_m
+
+    def uncertainty(self, place: str) -> PoseUncertainty:
+        """What the table states; `place` is for errors."""
+        with naming(place):
+            return PoseUncertainty(
+                position_m=self.position_m,
+                attitude_rad=math.radians(self.attitude_deg),
+                time_s=self.time_s,
+                correlation_s=self.correlation_s,
+                position_constant_m=self.position_constant_m,
+                attitude_constant_rad=math.radians(self.attitude_constant_deg),
+                time_constant_s=self.time_constant_s,
+                lever_arm_m=self.lever_arm_m,
+            )
+
+
+def pose_toml(pose: PoseUncertainty) -> list[str]:
+    """Lines of the table of an array file, all of its keys."""
+    lines = ["", "[pose]"]
+    for key in PoseTable.__struct_fields__:
+        value = getattr(pose, key.replace("_deg", "_rad"))
+        if key == "lever_arm_m":
+            value = list(value)
+        lines.append(f"{key} = {_degrees(value) if key.endswith('_deg') else value}")
+    return lines
+
+
+def _degrees(angle_rad: float) -> float:
+    """An angle in degrees that is read as it was."""
+    angle = math.degrees(angle_rad)
+    near = (float(f"{angle:.12g}"), angle, math.nextafter(angle, math.inf), math.nextafter(angle, 0.0))
+    return next((value for value in near if math.radians(value) == angle_rad), angle)

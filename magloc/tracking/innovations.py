@@ -1,0 +1,78 @@
+"""Whether the innovations of a track are what they should be: white, and of the size that is stated."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from scipy.special import chdtri
+
+from magloc.levels import CONTRADICTION
+from magloc.tracking.results import TrackPoint
+
+THRESHOLD = 3.3
+"""Standard deviations that a sum may be above its mean: 1 right track in 2,000 is beyond it."""
+
+
+@dataclass(frozen=True)
+class InnovationTest:
+    """Two sums over a track, each in standard deviations from its mean: standard normal numbers of a right model.
+
+    Attributes
+    ----------
+    rows : int
+        With an innovation.
+    z_chi2 : float
+        Of the sum of squares of the whitened innovations: too large, there are errors that are not stated.
+    z_lag1 : float
+        Of the sum of their products with the row before: too large, errors last that are said to be new in every row,
+        or the readings were filtered before.
+    """
+
+    rows: int
+    z_chi2: float
+    z_lag1: float
+
+    @property
+    def flagged(self) -> bool:
+        """Whether one of them is beyond the threshold."""
+        return self.z_chi2 > THRESHOLD or self.z_lag1 > THRESHOLD
+
+    @property
+    def reason(self) -> str:
+        """What is wrong, in a sentence; empty where nothing is."""
+        if not self.flagged:
+            return ""
+        if self.z_lag1 > THRESHOLD:
+            what = f"innovations of successive rows are alike (z = {self.z_lag1:.1f})"
+            why = (
+                "errors that last, of the pose or of sensors, a motion that is not the stated one, or filtered readings"
+            )
+        else:
+            what = f"innovations are larger than is stated (z = {self.z_chi2:.1f})"
+            why = "errors of the pose, noise or a motion that are not stated"
+        return f"{what}: {why}; the standard deviations are too small"
+
+    @property
+    def json(self) -> dict[str, object]:
+        """What ``magloc track --json`` prints of it."""
+        return {**asdict(self), "flagged": self.flagged, "reason": self.reason}
+
+
+def innovation_test(points: Sequence[TrackPoint]) -> InnovationTest:
+    """The test of all rows of a track; a row that contradicts it counts as one at the limit."""
+    nis, dof, lag1 = np.array([(p.nis, p.nis_dof, p.lag1) for p in points], dtype=np.float64).reshape(-1, 3).T
+    known = np.isfinite(nis) & (dof > 0.0)
+    limited = np.minimum(nis[known], chdtri(np.maximum(dof[known], 1.0), CONTRADICTION))
+    paired = np.isfinite(lag1)
+    return InnovationTest(
+        int(known.sum()),
+        _standardised(float(np.sum(limited - dof[known])), 2.0 * float(dof[known].sum())),
+        _standardised(float(lag1[paired].sum()), float(dof[paired].sum())),
+    )
+
+
+def _standardised(total: float, variance: float) -> float:
+    return total / math.sqrt(variance) if variance > 0.0 else 0.0
