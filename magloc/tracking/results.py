@@ -98,9 +98,6 @@ class TrackPoint:
         Linearisations.
     nis : float
         Normalised innovation squared, and `nis_dof` its degrees of freedom. NaN for rows that the track started from.
-    lag1 : float
-        Product of the whitened innovations of this row and of the one before, on average zero for a right model; its
-        variance is `nis_dof`. NaN where there is none before, or of other differences.
     status : str
         "tracked", "acquired" (a new track started here), "predicted" (no readings), "outlier" (readings that contradict
         the track, not used), or why there is no track.
@@ -113,6 +110,9 @@ class TrackPoint:
         Of the sensors, where the range is counted from.
     radius_m : float
         Largest distance of a sensor from it.
+    lag1 : float
+        Product of the whitened innovations of this row and of the one before, on average zero for a right model; its
+        variance is `nis_dof`. NaN where there is none before, or of other differences.
     """
 
     time_s: float
@@ -123,12 +123,12 @@ class TrackPoint:
     iterations: int = 0
     nis: float = math.nan
     nis_dof: int = 0
-    lag1: float = math.nan
     status: str = ""
     weight: float = math.nan
     rivals: tuple[Solution, ...] = ()
     centroid_m: FloatArray | None = None
     radius_m: float = math.nan
+    lag1: float = math.nan
 
     @property
     def range_interval_m(self) -> Intervals | None:
