@@ -286,6 +286,13 @@ class TestDipoleEditor:
         precision = 1e-6 * np.linalg.norm(position) / np.sqrt(np.linalg.eigvalsh(covariance)[0])
         np.testing.assert_allclose(squared, chi2.ppf(0.95, 3), rtol=1e-4 + precision)
 
+    def test_the_first_camera_sees_the_array_and_the_arrow_to_scale(self, server, array):
+        editor = DipoleEditor(server, array)
+        *sensors, position, tip = editor.extent_m
+        np.testing.assert_array_equal(sensors, array.positions)
+        np.testing.assert_array_equal(position, editor.position_m)
+        assert 0.1 < np.linalg.norm(tip - position) / array.circumradius < 10.0
+
     def test_the_last_of_many_drags_wins_and_nothing_queues(self, server, array, monkeypatch):
         editor = DipoleEditor(server, array)
         fixes = []
