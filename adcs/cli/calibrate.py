@@ -71,7 +71,7 @@ def calibrate(
             field_correlation_s=scenario.estimate.field_model_correlation_s,
             time_shift_s=time_shift_s,
         )
-    log = adcs.read_telemetry(telemetry, scenario.step_s)
+    log = adcs.read_telemetry(telemetry, scenario.step_s, layout=scenario.log)
     with naming(str(telemetry)):
         result = adcs.calibrate_magnetometer(log, scenario.satellite, prior=prior, attitude=attitude)
     if out is not None:
