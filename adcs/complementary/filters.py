@@ -123,7 +123,7 @@ def inertial_magnetic_filter(
     acceleration_m_s2: ArrayLike,
     field_T: ArrayLike,
     *,
-    magnet: Magnet = "subtracted",
+    magnet: Magnet = "rejected",
     gyro_samples: GyroSamples = "mean",
 ) -> AttitudeTrack:
     """Attitude of an inertial unit with a magnetometer that is moved by hand, with magnets near it or not.
@@ -138,8 +138,8 @@ def inertial_magnetic_filter(
     gyro_rad_s, acceleration_m_s2, field_T : array_like, shape (n, 3)
         Body axes; at rest the acceleration is upwards. NaN where a sensor has no reading.
     magnet : str
-        A field that moves with the sensor is ``subtracted`` as it is estimated beside the heading; or readings of an
-        unusual length or dip are ``rejected``; or all are ``kept``.
+        Readings of an unusual length or dip are ``rejected``; or a field that moves with the sensor is ``subtracted``
+        as it is estimated beside the heading, for a magnet that comes or goes with it; or all are ``kept``.
     gyro_samples : str
         As of :func:`adcs.complementary_filter`.
 
@@ -158,7 +158,7 @@ def inertial_magnetic_filter(
     >>> import adcs
     >>> imu = adcs.datasets.load("imu")
     >>> readings = imu.gyro_rad_s, imu.acceleration_m_s2, imu.field_T
-    >>> track = adcs.inertial_magnetic_filter(imu.time_s, *readings)
+    >>> track = adcs.inertial_magnetic_filter(imu.time_s, *readings, magnet="subtracted")
     >>> bool((track.rotation.inv() * imu.truth).magnitude().max() < 0.1)
     True
     """
