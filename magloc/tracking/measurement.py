@@ -1,19 +1,7 @@
-r"""What one row measures of a tracked source, and the coordinates in which a prediction of it is Gaussian.
-
-What earlier rows told of a source is nearly Gaussian in what they measured, not in position and moment: of a weak
-source the direction and the moment are known only together, along a curve. Far rows measure nearly the same functions
-of the source as the present one, so the prediction is taken to be Gaussian in
-
-.. math:: c(x) = M (h(x) - h(x_0)), \qquad M H(x_0) = I
-
-with the predicted differences h of the source in units of their noise, their Jacobian H, and the predicted state
-:math:`x_0`: to first order c is position and moment, and to second order it bends as the readings do. A filter in
-Cartesian coordinates believes itself too much while it learns of a source at rest: every row is linearised elsewhere.
-"""
+"""What one row measures of tracked sources."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -23,18 +11,16 @@ from arrays.array import SensorArray
 from arrays.differences import Differences, decorrelated_differences
 from arrays.noise import reading_covariance
 from arrays.typing import FloatArray
+from magloc.chi_square import energy_threshold
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row
 
-LEAST_SINGULAR = 1e-6
-"""A row has no coordinates of its own if a column of its Jacobian, in units of what is known, is so near to others."""
-
 
 @dataclass(frozen=True, eq=False)
 class RowMeasurement:
-    """Differences of one row, in units of their noise, as a function of the state in the world frame.
+    """Differences of one row, in units of their noise, as a function of states in the world frame.
 
     Attributes
     ----------
@@ -45,76 +31,85 @@ class RowMeasurement:
     row : Row
     n_motion : int
         States of the motion; behind them stand the sensors' errors.
-    effect : ndarray, shape (k, n_errors)
-        Of the sensors' errors on the differences, in units of their noise.
+    channel_effect : ndarray, shape (C, n_errors)
+        Of the sensors' errors on the channels [T].
     """
 
     model: DifferenceMeasurement
     sigma: FloatArray
     row: Row
     n_motion: int
-    effect: FloatArray
+    channel_effect: FloatArray
 
     @cached_property
     def z(self) -> FloatArray:
         """Measured differences, shape (k,)."""
         return self.model.measured(self.row.readings_T) / self.sigma
 
+    @cached_property
+    def centroid_m(self) -> FloatArray:
+        """Of the sensors in the world frame, shape (3,)."""
+        return self.row.origin_m + self.row.R_world_from_array @ self.model.array.centroid
+
+    @property
+    def radius_m(self) -> float:
+        """Largest distance of a sensor from it."""
+        return self.model.array.circumradius
+
+    @cached_property
+    def effect(self) -> FloatArray:
+        """Of the sensors' errors on the differences, in units of their noise: (k, n_errors)."""
+        return (self.model.differences.transform / self.sigma[:, None]) @ self.channel_effect
+
+    def effect_on(self, roots: FloatArray) -> FloatArray:
+        """Products ``effect @ roots`` (K, k, m) with matrices (K, n_errors, m): every channel has a few errors only."""
+        from scipy.sparse import csr_array
+
+        sparse, transform = csr_array(self.channel_effect), self.model.differences.transform / self.sigma[:, None]
+        return np.stack([transform @ (sparse @ root) for root in roots])
+
     def of_source(self, source: FloatArray) -> FloatArray:
-        """Predicted differences (k,) of a source (6,), all sensors being without errors."""
+        """Predicted differences (..., k) of sources (..., 6), all sensors being without errors."""
         return self.model.predicted(*self._in_array(source)) / self.sigma
 
     def source_jacobian(self, source: FloatArray) -> FloatArray:
-        """Their Jacobian (k, 6)."""
+        """Their Jacobian (..., k, 6)."""
         H = self.model.jacobian(*self._in_array(source)) / self.sigma[:, None]
-        R = self.row.R_world_from_array
-        return np.concatenate([H[:, :3] @ R.T, H[:, 3:] @ R.T], axis=1)
-
-    def predicted(self, state: FloatArray) -> FloatArray:
-        """Predicted differences (k,) of a state (n,)."""
-        return self.of_source(state[:N_SOURCE]) + self.effect @ state[self.n_motion :]
+        RT = self.row.R_world_from_array.T
+        return np.concatenate([H[..., :3] @ RT, H[..., 3:] @ RT], axis=-1)
 
     def jacobian(self, state: FloatArray) -> FloatArray:
-        """Their Jacobian (k, n)."""
+        """Jacobian (k, n) of all differences by a Cartesian state (n,) with its errors."""
         full = np.zeros((len(self.sigma), state.size))
         full[:, :N_SOURCE] = self.source_jacobian(state[:N_SOURCE])
         full[:, self.n_motion :] = self.effect
         return full
 
-    def coordinates(self, source: FloatArray, unit: FloatArray) -> Coordinates:
-        """Coordinates about a source (6,), where `unit` (6,) is what is known of its components."""
-        H = self.source_jacobian(source)
-        M: FloatArray | None = None
-        if len(H) >= N_SOURCE:
-            Q, R = np.linalg.qr(H * unit)
-            diagonal = np.abs(np.diagonal(R))
-            if diagonal.min() > LEAST_SINGULAR * diagonal.max():
-                M = unit[:, None] * np.linalg.solve(R, Q.T)
-        return Coordinates(self, source, M)
+    @cached_property
+    def without_source(self) -> FloatArray:
+        """What is left of the measured differences (k,) when the ambient field's own are taken out."""
+        array = self.model.array
+        ambient = array.readings_of(array.ambient_fields) - array.channel_offset_T
+        return self.z - (self.model.differences.transform @ ambient) / self.sigma
 
-    def curved_prior(self, x: FloatArray, S: FloatArray) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
-        """A prediction (x, S) that is Gaussian in the coordinates about it.
+    def whitening(self, sigma_errors: FloatArray) -> FloatArray | None:
+        """``C^{-1/2}`` (k, k) of a row whose errors are known by their standard deviations (n_errors,) alone."""
+        if not sigma_errors.size:
+            return None
+        lasting = self.effect * sigma_errors
+        return np.linalg.inv(np.linalg.cholesky(np.eye(len(lasting)) + lasting @ lasting.T))
 
-        It gives, of a state, mean (n,) and square root (n, n) of the Gaussian that looks there as the prediction does.
-        """
-        source = slice(0, N_SOURCE)
-        coordinates = self.coordinates(x[source], np.linalg.norm(S[source], axis=1))
-
-        def prior(state: FloatArray) -> tuple[FloatArray, FloatArray]:
-            c, J = coordinates.at(state[source])
-            mean, root = x.copy(), S.copy()
-            try:
-                mean[source] = state[source] - np.linalg.solve(J, c)
-                root[source] = np.linalg.solve(J, S[source])
-            except np.linalg.LinAlgError:
-                return x, S
-            return mean, root
-
-        return prior
+    def is_detected(self, sigma_errors: FloatArray) -> bool:
+        """Whether the differences stand out of noise and of what the sensors' errors may make of them."""
+        if not self.z.size:
+            return False
+        whiten = self.whitening(sigma_errors)
+        left = self.without_source if whiten is None else whiten @ self.without_source
+        return bool(left @ left > energy_threshold(left.size))
 
     def _in_array(self, source: FloatArray) -> tuple[FloatArray, FloatArray]:
         R = self.row.R_world_from_array
-        return R.T @ (source[:3] - self.row.origin_m), R.T @ source[3:]
+        return (source[..., :3] - self.row.origin_m) @ R, source[..., 3:] @ R
 
 
 class RowMeasurements:
@@ -130,10 +125,13 @@ class RowMeasurements:
     ----------
     errors : SensorErrors
         The lasting errors of the array's sensors.
+    n_differences : int
+        Independent differences of a row whose readings are all there.
     """
 
     def __init__(self, array: SensorArray, n_motion: int) -> None:
         self.errors = SensorErrors.of(array)
+        self.n_differences = decorrelated_differences(array).n_differences
         self._array = without_lasting_errors(array)
         self._n_motion = n_motion
         self._differences: dict[bytes, Differences] = {}
@@ -146,7 +144,7 @@ class RowMeasurements:
             array = replace(array, ambient_T=(x, y, z))
         differences = self.differences(row)
         sigma = np.sqrt(differences.variance)
-        effect = differences.transform @ self.errors.effect(array, row.readings_T) / sigma[:, None]
+        effect = self.errors.effect(array, row.readings_T)
         return RowMeasurement(DifferenceMeasurement(array, differences), sigma, row, self._n_motion, effect)
 
     def differences(self, row: Row) -> Differences:
@@ -159,28 +157,3 @@ class RowMeasurements:
         if key not in self._differences:
             self._differences[key] = decorrelated_differences(self._array, available)
         return self._differences[key]
-
-
-@dataclass(frozen=True, eq=False)
-class Coordinates:
-    """Coordinates of a source in which the readings of a row are linear.
-
-    Attributes
-    ----------
-    measurement : RowMeasurement
-    centre : ndarray, shape (6,)
-        The source that they are counted from.
-    M : ndarray, shape (6, k), optional
-        None: the row does not determine a source, and they are position and moment.
-    """
-
-    measurement: RowMeasurement
-    centre: FloatArray
-    M: FloatArray | None
-
-    def at(self, source: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Coordinates (6,) of a source (6,), and their derivative (6, 6)."""
-        if self.M is None or np.array_equal(source, self.centre):
-            return source - self.centre, np.eye(N_SOURCE)
-        difference = self.measurement.of_source(source) - self.measurement.of_source(self.centre)
-        return self.M @ difference, self.M @ self.measurement.source_jacobian(source)

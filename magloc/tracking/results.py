@@ -13,6 +13,7 @@ from magloc.localization.fit.results import EVERYWHERE, Intervals, Solution, is_
 from magloc.localization.uncertainty.ambiguity import LARGEST_GAUSSIAN_SIGMA, relative_sigma
 from magloc.localization.uncertainty.range_interval import gaussian_ranges, union
 from magloc.readings import Readings
+from magloc.tracking.chart.mixture import Mixture
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +49,7 @@ class TrackPoint:
     covariance : ndarray, shape (6, 6)
         Of (position, moment).
     estimability : ndarray, shape (6,)
-        What the row's readings taught of every component: 1 - σ after / σ predicted without them.
+        What the readings taught of every component since the track began: 1 - σ / σ without any of them.
     iterations : int
         Linearisations.
     nis : float
@@ -65,6 +66,9 @@ class TrackPoint:
         Of the sensors, where the range is counted from.
     radius_m : float
         Largest distance of a sensor from it.
+    mixture : Mixture, optional
+        All that is known of position and moment, in the coordinates in which it is Gaussian; None of a track that is
+        read from a file.
     """
 
     time_s: float
@@ -80,6 +84,7 @@ class TrackPoint:
     rivals: tuple[Solution, ...] = ()
     centroid_m: FloatArray | None = None
     radius_m: float = math.nan
+    mixture: Mixture | None = None
 
     @property
     def range_interval_m(self) -> Intervals | None:
@@ -88,6 +93,8 @@ class TrackPoint:
         Of a track it is :func:`magloc.localization.uncertainty.range_interval.gaussian_ranges` of its covariance;
         without one it is that of the row alone, or every range where the row says nothing.
         """
+        if self.mixture is not None:
+            return self.mixture.range_interval_m()
         if self.position_m is None or self.covariance is None:
             return self.rivals[0].range_interval_m if self.rivals else EVERYWHERE
         if self.centroid_m is None:
@@ -110,15 +117,6 @@ class TrackPoint:
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
-    """State and square root of its covariance before a row's readings, and the transition that led there."""
-
-    x: FloatArray
-    S: FloatArray
-    F: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class Step:
     """One step of a track, for smoothing.
 
@@ -126,16 +124,18 @@ class Step:
     ----------
     row : int
         Which row it belongs to.
-    prediction : Prediction, optional
-        From the step before; None at the first step of a track.
-    x, S : ndarray
-        State and square root of its covariance after the row's readings.
+    known : Mixture
+        After the row's readings, as one Gaussian.
+    prediction : Mixture, optional
+        Before them; None at the first step of a track.
+    transition : ndarray, shape (N, N), optional
+        That led there, in the charts about the two states.
     """
 
     row: int
-    prediction: Prediction | None
-    x: FloatArray
-    S: FloatArray
+    known: Mixture
+    prediction: Mixture | None = None
+    transition: FloatArray | None = None
 
 
 def rows_of(readings: Readings) -> Iterator[Row]:
