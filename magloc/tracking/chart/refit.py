@@ -24,7 +24,8 @@ from magloc.tracking.motion import N_SOURCE, MotionModel
 _MOST_PASSES = 25
 # Change of the last state, in its standard deviations, below which the trajectory stays.
 _TOLERANCE = 0.05
-_SWINGS = 0.8
+# Shortest and longest part of Gauss and Newton's step that is taken.
+_SHARES = (0.1, 4.0)
 # Longest step of log-range and direction in a pass.
 _LONGEST = 0.5
 
@@ -39,18 +40,20 @@ def refitted(
     rows = _Rows(measurements, motion, errors)
     track = rows.backwards(mixture.x)
     converged = np.zeros(len(mixture), dtype=bool)
-    share, change = np.ones(len(mixture)), np.full(len(mixture), np.inf)
+    share, last = np.ones(len(mixture)), np.zeros((len(mixture), rows.n))
     for _ in range(_MOST_PASSES):
         with np.errstate(all="ignore"):  # a trajectory may lead out of double precision: it is not kept
             found = rows.passed(track)
         largest = np.abs(found.offset[:, :, :3]).max(axis=(0, 2))
         length = np.minimum(1.0, _LONGEST / np.maximum(largest, _LONGEST))
         sigma = np.sqrt(np.diagonal(found.P, axis1=1, axis2=2))[:, : rows.n]
-        before, change = change, np.max(np.abs(found.offset[-1]) / sigma, axis=1)
+        before, last = last, found.offset[-1] / sigma
+        change = np.max(np.abs(last), axis=1)
         alive = np.isfinite(found.log_evidence) & np.isfinite(change)
         converged = (change < _TOLERANCE) & alive
-        # Steps that swing are made shorter.
-        share = np.where(change > _SWINGS * before, 0.5 * share, np.minimum(1.0, 1.5 * share))
+        # Barzilai and Borwein's length: steps that lead back are made shorter, those that creep longer.
+        square, bent = np.sum(before * before, axis=1), np.sum(before * (before - last), axis=1)
+        share = np.clip(np.divide(share * square, bent, out=np.ones_like(share), where=bent > 0.0), *_SHARES)
         track = rows.moved(track, np.where(alive, share * length, 0.0)[:, None] * np.nan_to_num(found.offset))
         if converged[alive].all():
             break

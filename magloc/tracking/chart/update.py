@@ -21,8 +21,10 @@ from magloc.tracking.chart.mixture import root_of
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
 
-TOLERANCE = 1e-4
-"""Stop of the iteration, in standard deviations of the differences: equation (19)."""
+TOLERANCE = 1e-3
+"""Stop of the iteration: length of the next step in posterior standard deviations."""
+LEAST_GAIN = 0.25
+"""Of the decrease that a linear problem would show, below which a step is halved: it leads across a valley."""
 MOST_ITERATIONS = 50
 # Steps that make the fit worse by more than rounding are halved.
 ROUNDING = 1e-9
@@ -107,29 +109,29 @@ def updated(x: FloatArray, S: FloatArray, measurement: RowMeasurement, bends: Bo
     residual = problem.residual(zeta)
     cost = np.sum(residual * residual, axis=1)
     J, step = np.zeros((K, k + n, n)), np.zeros((K, n))
-    length, iterations = np.ones(K), np.zeros(K, dtype=np.intp)
+    length, gain, iterations = np.ones(K), np.zeros(K), np.zeros(K, dtype=np.intp)
     converged, stale = np.zeros(K, dtype=bool), np.ones(K, dtype=bool)
     live = np.arange(K)
-    while live.size and iterations.max() < MOST_ITERATIONS:
+    while True:
         fresh = live[stale[live]]
         if fresh.size:
             J[fresh] = problem.take(fresh).jacobian(zeta[fresh])
-            step[fresh] = _whole_step(J[fresh], residual[fresh])
+            step[fresh], gain[fresh] = _whole_step(J[fresh], residual[fresh])
             length[fresh], stale[fresh] = 1.0, False
+            converged[fresh] = gain[fresh] < TOLERANCE**2
+        live = live[~converged[live]]
+        if not live.size or iterations.max() >= MOST_ITERATIONS:
+            break
         iterations[live] += 1
         there = zeta[live] + length[live, None] * step[live]
-        of_live = problem.take(live)
         with np.errstate(all="ignore"):
-            residual_there = of_live.residual(there)
+            residual_there = problem.take(live).residual(there)
             cost_there = np.sum(residual_there**2, axis=1)
-            change = np.linalg.norm((residual_there - residual[live])[:, :k], axis=1) / length[live]
-        better = cost_there <= cost[live] + ROUNDING * (1.0 + cost[live])
+        better = cost_there <= cost[live] - LEAST_GAIN * length[live] * gain[live] + ROUNDING * (1.0 + cost[live])
         length[live[~better]] *= 0.5
         moved = live[better]
         zeta[moved], residual[moved], cost[moved] = there[better], residual_there[better], cost_there[better]
         stale[moved] = True
-        converged[live] = better & (change < TOLERANCE)
-        live = live[~converged[live]]
     R = np.asarray(np.linalg.qr(J, mode="r"))
     log_N = 2.0 * np.sum(np.log(np.abs(np.diagonal(R, axis1=-2, axis2=-1))), axis=1)
     x_after, S_after = problem.posterior(zeta, R)
@@ -150,11 +152,11 @@ def damped_inverse(J: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(R, _T(Q[:, : J.shape[1]])))
 
 
-def _whole_step(J: FloatArray, residual: FloatArray) -> FloatArray:
-    """Gauss and Newton's step (K, n) towards the least |residual - J step|²."""
+def _whole_step(J: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Gauss and Newton's step (K, n) towards the least |residual - J step|², and by how much that is less (K,)."""
     R = np.asarray(np.linalg.qr(np.concatenate([J, residual[..., None]], axis=2), mode="r"))
     n = J.shape[-1]
-    return np.asarray(np.linalg.solve(R[:, :n, :n], R[:, :n, n:])[..., 0])
+    return np.asarray(np.linalg.solve(R[:, :n, :n], R[:, :n, n:])[..., 0]), np.sum(R[:, :n, n] ** 2, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
