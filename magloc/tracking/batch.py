@@ -15,7 +15,7 @@ from magloc.measurement.rows import ambient_fields
 from magloc.tracking import batch_compiled as kernels
 from magloc.tracking.chart.coordinates import FIRM
 from magloc.tracking.chart.mixture import Mixture
-from magloc.tracking.chart.update import LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
+from magloc.tracking.chart.update import LEAST_GAIN, LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
 from magloc.tracking.motion import LinearMotion
 from magloc.tracking.results import Row, Step, TrackPoint
 from magloc.tracking.tracker import LARGEST_GROWTH, LARGEST_WIDTH, ROWS_TO_LOSE, Tracker, track_point
@@ -89,6 +89,7 @@ class _CompiledSteps:
             tolerance=TOLERANCE,
             max_iterations=MOST_ITERATIONS,
             rounding=ROUNDING,
+            least_gain=LEAST_GAIN,
             least_share=LEAST_SHARE,
             firm=FIRM,
             largest_growth=LARGEST_GROWTH,

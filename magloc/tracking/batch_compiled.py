@@ -63,6 +63,7 @@ class Rules(NamedTuple):
     tolerance: float
     max_iterations: int
     rounding: float
+    least_gain: float
     least_share: float
     firm: float
     largest_growth: float
@@ -283,19 +284,24 @@ def follow(
                 cost += residual[j] * residual[j]
             for i in range(n):
                 residual[k + i] = 0.0
-            is_stale, converged, share = True, False, 1.0
-            while iterations < rules.max_iterations and not converged:
+            is_stale, converged, share, gain = True, False, 1.0, 0.0
+            while True:
                 if is_stale:
                     _linearised(H, L, S_before, M, J_first, bends, J_e, columns)
                     for c in range(k + n):
                         columns[n, c] = residual[c]
                     orthonormalise(columns, triangle)
+                    gain = 0.0
                     for i in range(n - 1, -1, -1):
                         t = triangle[i, n]
+                        gain += t * t
                         for j in range(i + 1, n):
                             t -= triangle[i, j] * step[j]
                         step[i] = t / triangle[i, i]
                     is_stale, share = False, 1.0
+                    converged = gain < rules.tolerance * rules.tolerance
+                if converged or iterations >= rules.max_iterations:
+                    break
                 iterations += 1
                 for i in range(n):
                     solution[i, 0] = zeta[i] + share * step[i]
@@ -317,20 +323,17 @@ def follow(
                     for i in range(n):
                         for j in range(k):
                             residual_there[k + i] -= M[i, j] * bent[j]
-                cost_there, change = 0.0, 0.0
+                cost_there = 0.0
                 for j in range(k):
                     residual_there[j] = given.z[row, j] - h_there[j]
-                    change += (residual_there[j] - residual[j]) ** 2
                 for c in range(k + n):
                     cost_there += residual_there[c] * residual_there[c]
-                change = math.sqrt(change) / share
-                if cost_there <= cost + rules.rounding * (1.0 + cost):
+                if cost_there <= cost - rules.least_gain * share * gain + rules.rounding * (1.0 + cost):
                     for i in range(n):
                         zeta[i] = solution[i, 0]
                     put(here, there)
                     put(residual, residual_there)
                     cost, is_stale = cost_there, True
-                    converged = change < rules.tolerance
                 else:
                     share *= 0.5
             nis = cost

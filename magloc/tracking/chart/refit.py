@@ -44,16 +44,16 @@ def refitted(
     for _ in range(_MOST_PASSES):
         with np.errstate(all="ignore"):  # a trajectory may lead out of double precision: it is not kept
             found = rows.passed(track)
-        largest = np.abs(found.offset[:, :, :3]).max(axis=(0, 2))
-        length = np.minimum(1.0, _LONGEST / np.maximum(largest, _LONGEST))
-        sigma = np.sqrt(np.diagonal(found.P, axis1=1, axis2=2))[:, : rows.n]
-        before, last = last, found.offset[-1] / sigma
-        change = np.max(np.abs(last), axis=1)
-        alive = np.isfinite(found.log_evidence) & np.isfinite(change)
-        converged = (change < _TOLERANCE) & alive
-        # Barzilai and Borwein's length: steps that lead back are made shorter, those that creep longer.
-        square, bent = np.sum(before * before, axis=1), np.sum(before * (before - last), axis=1)
-        share = np.clip(np.divide(share * square, bent, out=np.ones_like(share), where=bent > 0.0), *_SHARES)
+            largest = np.abs(found.offset[:, :, :3]).max(axis=(0, 2))
+            length = np.minimum(1.0, _LONGEST / np.maximum(largest, _LONGEST))
+            sigma = np.sqrt(np.diagonal(found.P, axis1=1, axis2=2))[:, : rows.n]
+            before, last = last, found.offset[-1] / sigma
+            change = np.max(np.abs(last), axis=1)
+            alive = np.isfinite(found.log_evidence) & np.isfinite(change)
+            converged = (change < _TOLERANCE) & alive
+            # Barzilai and Borwein's length: steps that lead back are made shorter, those that creep longer.
+            square, bent = np.sum(before * before, axis=1), np.sum(before * (before - last), axis=1)
+            share = np.clip(np.divide(share * square, bent, out=np.ones_like(share), where=bent > 0.0), *_SHARES)
         track = rows.moved(track, np.where(alive, share * length, 0.0)[:, None] * np.nan_to_num(found.offset))
         if converged[alive].all():
             break
@@ -62,8 +62,8 @@ def refitted(
     S = np.zeros_like(found.P)
     for k in np.flatnonzero(converged):
         S[k] = np.linalg.cholesky(found.P[k, ::-1, ::-1])[::-1, ::-1]
-    last = measurements[-1]
-    after = Mixture(x, S, found.log_evidence, n, last.centroid_m, last.radius_m)
+    end = measurements[-1]
+    after = Mixture(x, S, found.log_evidence, n, end.centroid_m, end.radius_m)
     kept = np.flatnonzero(converged)
     return replace(after, x=x[kept], S=S[kept], log_weight=found.log_evidence[kept]), found.nis[kept], kept
 
