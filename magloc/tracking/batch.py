@@ -92,6 +92,7 @@ class _CompiledSteps:
             least_gain=LEAST_GAIN,
             least_share=LEAST_SHARE,
             firm=FIRM,
+            full=tracker.measurements.n_differences,
             largest_growth=LARGEST_GROWTH,
             rows_to_lose=ROWS_TO_LOSE,
             largest_width=LARGEST_WIDTH,

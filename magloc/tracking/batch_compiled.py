@@ -66,6 +66,7 @@ class Rules(NamedTuple):
     least_gain: float
     least_share: float
     firm: float
+    full: int
     largest_growth: float
     rows_to_lose: int
     largest_width: float
@@ -271,7 +272,7 @@ def follow(
             put(h_first, h)
             firm = is_firm(x_before, S_before, length, rules.firm)
             move(x_before, e, frame, length, firm, here, L)
-            bends = not _grows(S, S_before, rules.largest_growth)
+            bends = given.n_differences[row] >= rules.full and not _grows(S, S_before, rules.largest_growth)
             if bends:
                 _derivatives(H, L, S_before, J_e, columns)
                 for j in range(k):

@@ -40,14 +40,16 @@ ROWS_TO_LOSE = 3
 """Contradicting rows in a row that end a track."""
 LARGEST_GROWTH = 1.5
 """A prediction bends as the readings do while no standard deviation grows by more in the step: beyond that it is the
-motion that it is uncertain of, which does not."""
+motion that it is uncertain of, which does not. Nor does it bend as a row does in which readings are missing: the rows
+that made it had them."""
 SETTLED = 0.05
-"""A young track is old when fitting it as a whole changes its state by less, in squares of σ per number."""
+"""A young track is old when fitting it as a whole changes its state by less, in squares of σ per number, and it is
+narrow."""
 SEEDS = 6
 """Components of a young track that are fitted anew, each with its mirror images."""
 LARGEST_ALONE_WIDTH = 0.03
-"""The same of a component with which a track goes on whose rows do not determine a source one by one: their posterior
-is bent beyond that."""
+"""The same of a component with which a track grows old, or begins if its rows do not determine a source one by one:
+the posterior of several rows is bent beyond that."""
 LARGEST_REFIT_WIDTH = 0.25
 """The same of a component that is fitted to all rows of a young track."""
 MOST_YOUNG_ROWS = 240
@@ -179,9 +181,9 @@ class Tracker:
             self._known = None
             return self._started(measurement, near)
         sigma, sigma_before = (np.linalg.norm(m.S[:, :N_SOURCE], axis=2) for m in (predicted, before.mixture))
-        bends = (sigma <= LARGEST_GROWTH * sigma_before).all(axis=1)
-        after = updated(predicted.x, predicted.S, measurement, bends)
         k = measurement.z.size
+        bends = (sigma <= LARGEST_GROWTH * sigma_before).all(axis=1) & (k >= self.measurements.n_differences)
+        after = updated(predicted.x, predicted.S, measurement, bends)
         sound = after.converged & np.isfinite(after.log_evidence)
         nis = float(np.where(sound, after.nis, np.inf).min())
         if not nis <= chdtri(k, CONTRADICTION):
@@ -327,7 +329,8 @@ class Tracker:
         if len(found) == 1 and len(mixture) == 1:
             n = mixture.n_motion
             e = mixture.chart.coordinates(found.x[:, :n])[0]
-            if np.sum(np.linalg.solve(root_of(mixture.S[0, :n]), e) ** 2) < SETTLED * n:
+            change = np.sum(np.linalg.solve(root_of(mixture.S[0, :n]), e) ** 2)
+            if change < SETTLED * n and found.widths[0] < LARGEST_ALONE_WIDTH:
                 known = replace(known, young=())
         return replace(known, mixture=found)
 
