@@ -83,13 +83,17 @@ class Consistency:
                 f", least possible {self.position_bound_m:.4g} m on average over such motions (posterior Cramér-Rao"
                 f" bound), ratio {ratio:.2f}"
             )
-        low, high = self.nis_bounds
-        return [
-            *lines,
-            # Errors of neighbouring rows are alike: how far from 1 one record may be by chance, many seeds tell.
-            f"  NEES per dimension {self.nees_per_dimension:.3f}, 1 on average over many records of a right filter",
-            f"  NIS per dimension {self.nis_per_dimension:.3f}, 99 % bounds {low:.3f} to {high:.3f}",
-        ]
+        return [*lines, *consistency_lines(self.nees_per_dimension, self.nis_per_dimension, self.nis_bounds)]
+
+
+def consistency_lines(nees: float, nis: float, nis_bounds: tuple[float, float]) -> list[str]:
+    """Mean NEES and NIS per dimension of a filter, and what they should be."""
+    low, high = nis_bounds
+    return [
+        # Errors of neighbouring rows are alike: how far from 1 one record may be by chance, many seeds tell.
+        f"  NEES per dimension {nees:.3f}, 1 on average over many records of a right filter",
+        f"  NIS per dimension {nis:.3f}, 99 % bounds {low:.3f} to {high:.3f}",
+    ]
 
 
 def consistency(
@@ -116,7 +120,8 @@ def consistency(
     moments = np.full_like(position_m, np.nan) if moment_Am2 is None else moment_Am2
     truth = np.hstack([position_m, moments])
     squares_of_rows = [
-        nees_of(point, of_row, tracker.measurements.of(row)) for point, of_row, row in zip(points, truth, rows, strict=True)
+        nees_of(point, of_row, tracker.measurements.of(row))
+        for point, of_row, row in zip(points, truth, rows, strict=True)
     ]
     of_rows = np.array([square for square, _ in squares_of_rows])
     dof_of_rows = np.array([dof for _, dof in squares_of_rows], dtype=np.intp)
