@@ -73,13 +73,17 @@ class TestFromTheFirstRow:
         assert result[..., 3].mean() > 0.8
 
     @pytest.mark.slow
-    def test_its_sets_hold_the_truth_as_often_as_they_say(self, motion: MotionModel) -> None:
+    def test_is_consistent_and_reaches_the_bound(self, motion: MotionModel) -> None:
         """100 runs of 40 rows. The least of 38 rows is below 88 % once in 100: σ of one row's coverage is 2.2 %.
 
-        How near the bound every row comes, and its NEES, is on the page of validation: not as near as was aimed at.
+        The ratio's standard error is 0.07 to 0.09, as a few runs near two optima carry most of it, and that of NEES 0.06
+        where no such run is among them. Measured over 200 runs (seeds 2000 to 2199) of the walk: ratio at most 1.10, NEES
+        0.93 to 1.06, coverage 95.3 %, 92.5 % at the worst row.
         """
         result = judged(motion, 40, range(1000, 1100))
+        ratio = np.sqrt(result[..., 0].mean(axis=0) / result[..., 1].mean(axis=0))
         inside = result[..., 3]
+        assert ratio[2:].max() <= 1.4
         assert 0.93 <= inside.mean() <= 0.97
         assert inside[:, 2:].mean(axis=0).min() >= 0.88
         assert math.sqrt((result[..., 0] / result[..., 1]).mean()) <= 1.25
