@@ -72,6 +72,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "--part fusion --duration 12 --seeds 1 --json",
         "--part zeros --duration 12 --seeds 1",
         "--part sky --poses 1 --sky sky.toml --json",
+        "--part all --duration 12 --seeds 1 --delay-s 0.1 --sky sky.toml --json",
     ),
     "adcs compare": ("scenario.toml eclipse --duration 20 --seeds 1 --json",),
     "adcs tables": ("--duration 20 --seeds 1 --json",),
@@ -79,6 +80,11 @@ LINES: dict[str, tuple[str, ...]] = {
         "telemetry.csv --config scenario.toml --json",
         "telemetry.csv --config scenario.toml --sensors mag+sun+gyro --filter smoother --out out",
     ),
+    "adcs vectors": (
+        "telemetry.csv --config scenario.toml --json",
+        "telemetry.csv --config scenario.toml --method triad --out out",
+    ),
+    "adcs calibrate": ("telemetry.csv --config scenario.toml --json --out out.csv",),
     "adcs stars": ("frames --catalogue stars.csv --json",),
 }  # fmt: skip
 SELDOM = (
