@@ -133,13 +133,6 @@ def derivative(q: ArrayLike, w: ArrayLike) -> FloatArray:
     return 0.5 * multiply(q, np.concatenate([np.zeros_like(w[..., :1]), w], axis=-1))
 
 
-def cross_matrix(a: ArrayLike) -> FloatArray:
-    """W(a) with ``W(a) @ b`` = a×b. Shape (..., 3) -> (..., 3, 3)."""
-    a = np.asarray(a, dtype=np.float64)
-    # Row i of this is a×e_i, which is column i of W.
-    return np.cross(a[..., None, :], np.eye(3)).mT
-
-
 def to_rotation(q: ArrayLike) -> Rotation:
     """Rotation of scipy of quaternions (..., 4), with ``Rotation.apply(v)`` = :func:`rotate` (q, v)."""
     from scipy.spatial.transform import Rotation

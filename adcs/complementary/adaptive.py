@@ -19,6 +19,7 @@ from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
 from magloc.chi_square import normalised_square
 from magloc.compilation import over_rows
+from magloc.navigation.rotations import cross_matrix
 
 
 @dataclass(frozen=True)
@@ -155,7 +156,7 @@ def adaptive_steps(
             predicted = quaternion.rotate_back(q, reference / np.linalg.norm(reference))
             # Two axes across the predicted vector.
             across = np.linalg.svd(predicted[None])[2][1:]
-            rows.append(across @ quaternion.cross_matrix(predicted))
+            rows.append(across @ cross_matrix(predicted))
             residuals.append(across @ (measured / np.linalg.norm(measured)))
             variances.append(np.full(2, sigma**2))
         if rows:

@@ -14,6 +14,7 @@ from adcs.complementary.explicit import BEST_GAINS, ComplementaryTrack, Gains, c
 from adcs.complementary.outage import NO_SUBSTITUTE, Substitution
 from adcs.satellite.vector_record import VectorRecord
 from arrays.typing import FloatArray
+from magloc.navigation.rotations import cross_matrix
 
 MU = 1e-6
 """Added to the diagonal of the normal equations."""
@@ -32,10 +33,7 @@ def rotation_derivative(q: ArrayLike, v: ArrayLike) -> FloatArray:
     scalar, p = q[0], q[1:]
     by_scalar = 2.0 * scalar * v + 2.0 * np.cross(p, v)
     by_vector = (
-        -2.0 * np.outer(v, p)
-        + 2.0 * (p @ v) * np.eye(3)
-        + 2.0 * np.outer(p, v)
-        - 2.0 * scalar * quaternion.cross_matrix(v)
+        -2.0 * np.outer(v, p) + 2.0 * (p @ v) * np.eye(3) + 2.0 * np.outer(p, v) - 2.0 * scalar * cross_matrix(v)
     )
     return np.column_stack([by_scalar, by_vector])
 

@@ -13,10 +13,10 @@ import numpy as np
 from adcs import quaternion
 from adcs.kalman.error_state import AttitudeTracks, FilterSettings, Start, State
 from adcs.kalman.mekf import check_start, collected, joseph_update, nis_of, stacked_residuals
-from adcs.quaternion import cross_matrix
 from adcs.satellite.dynamics import relative_rate
 from adcs.satellite.telemetry import Record, is_read
 from arrays.typing import FloatArray
+from magloc.navigation.rotations import cross_matrix
 
 
 def run_reduced(record: Record, settings: FilterSettings, start: Start) -> AttitudeTracks:

@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from adcs import quaternion
 from adcs.kalman.error_state import OPEN_RAD, RATE_RAD_S, FilterSettings, SensorSet, Start
 from adcs.kalman.mekf import deviations, run_filter
-from adcs.quaternion import cross_matrix, rotate_back
+from adcs.quaternion import rotate_back
 from adcs.satellite.dynamics import absolute_rate
 from adcs.satellite.telemetry import Record, is_read, part
 from arrays.typing import FloatArray
+from magloc.navigation.rotations import cross_matrix
 
 AGAIN = 10.0
 """Standard deviations of a start are those of its readings times this: the filter takes the same readings again."""

@@ -25,11 +25,12 @@ from adcs.kalman.error_state import (
     State,
 )
 from adcs.kalman.gate.contest import FIELD, GYRO, SUN, Contest, Fit, begun, eased, patience
-from adcs.quaternion import cross_matrix, rotate_back
+from adcs.quaternion import rotate_back
 from adcs.satellite import dynamics
 from adcs.satellite.sensors import SENSORS
 from adcs.satellite.telemetry import Record, is_read, part
 from arrays.typing import BoolArray, FloatArray
+from magloc.navigation.rotations import cross_matrix
 
 Jacobian = Callable[[Record, int, State], FloatArray]
 """F (runs, 6, 6) of attitude and rate from record, row and state."""

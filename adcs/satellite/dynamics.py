@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike
 
 from adcs import quaternion
 from adcs.frames import turned
-from adcs.quaternion import cross_matrix, rotate_back
+from adcs.quaternion import rotate_back
 from arrays.typing import FloatArray
+from magloc.navigation.rotations import cross_matrix
 
 _E2 = np.array([0.0, 1.0, 0.0])
 _E3 = np.array([0.0, 0.0, 1.0])

@@ -62,15 +62,18 @@ class ArrayPose:
         """Velocity of the reference point in the world."""
         return self.velocity_m_s - self.R_world_from_array @ np.cross(self.rate_rad_s, self.lever_arm_m)
 
-    def turned(self, error: FloatArray) -> FloatArray:
+    def turned(self, error: FloatArray | None = None) -> FloatArray:
         """True attitude, array to world (3, 3), where the pose has an error (9,)."""
-        return self.R_world_from_array @ rotation_matrix(error[TURN])
+        return self.R_world_from_array if error is None else self.R_world_from_array @ rotation_matrix(error[TURN])
 
-    def in_array(self, source: FloatArray, error: FloatArray) -> FloatArray:
+    def in_array(self, source: FloatArray, error: FloatArray | None = None) -> FloatArray:
         """Position and moment (6,) of a source (6,) of the world, in the true axes of the array."""
-        R = self.turned(error)
-        position = R.T @ (source[:3] - self.reference_m - error[SHIFT]) - self.lever_arm_m - error[LEVER]
-        return np.concatenate([position, R.T @ source[3:]])
+        if error is None:
+            R, position = self.R_world_from_array, (source[:3] - self.origin_m) @ self.R_world_from_array
+        else:
+            R = self.turned(error)
+            position = R.T @ (source[:3] - self.reference_m - error[SHIFT]) - self.lever_arm_m - error[LEVER]
+        return np.concatenate([position, source[3:] @ R])
 
     def error_jacobian(self, in_array: FloatArray, error: FloatArray) -> FloatArray:
         """Derivative (6, 9) of :meth:`in_array`, which is given, by the error."""
@@ -160,6 +163,8 @@ class PoseErrors:
 
     def effect(self, pose: ArrayPose, sigma: FloatArray | None = None) -> FloatArray:
         """The error (9, n) of a pose by every state; `sigma` (2,) of place and attitude stands for the array's own."""
+        if not self.n_states:
+            return np.zeros((N_POSE, 0))
         known = self.uncertainty
         position_m, attitude_rad = (known.position_m, known.attitude_rad) if sigma is None else sigma.tolist()
         unit = np.zeros((N_POSE, N_POSE + _N_CLOCK))
@@ -200,7 +205,7 @@ def channel_errors(
 
     The source (6,) stands in the world, the ambient field (N, 3) in the array's axes.
     """
-    in_array = pose.in_array(source, _NO_ERROR)
+    in_array = pose.in_array(source)
     position, moment = in_array[:3], in_array[3:]
     H = channel_jacobian(array, position, moment, ambient_T) @ pose.error_jacobian(in_array, _NO_ERROR)
     H[:, TURN] += turn_jacobian(array, position, moment, ambient_T)

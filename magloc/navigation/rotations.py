@@ -13,12 +13,17 @@ from arrays.typing import FloatArray
 def cross_matrix(vector: ArrayLike) -> FloatArray:
     """Matrix ``[a]×`` with ``[a]× b = a × b``, equation (18): (..., 3, 3) of (..., 3)."""
     a = np.asarray(vector, dtype=np.float64)
-    return np.cross(a[..., None, :], -np.eye(3))
+    K = np.zeros((*a.shape, 3))
+    K[..., 2, 1], K[..., 0, 2], K[..., 1, 0] = a[..., 0], a[..., 1], a[..., 2]
+    K[..., 1, 2], K[..., 2, 0], K[..., 0, 1] = -a[..., 0], -a[..., 1], -a[..., 2]
+    return K
 
 
 def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
     """Rotation (3, 3) by a vector (3,), by Rodrigues' formula [rad]."""
     angle = math.sqrt(float(rotation_vector @ rotation_vector))
+    if angle == 0.0:
+        return np.eye(3)
     K = cross_matrix(rotation_vector)
     # sin(a)/a and (1 - cos(a))/a², without cancelling.
     first = math.sin(angle) / angle if angle > 1e-8 else 1.0

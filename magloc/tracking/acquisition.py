@@ -18,7 +18,7 @@ from magloc.localization.fit.results import Fix, Solution
 from magloc.localization.locator import Locator, fit_at_rest
 from magloc.localization.uncertainty.ambiguity import weights
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
-from magloc.measurement.pose import N_POSE, PoseErrors, pose_covariance
+from magloc.measurement.pose import PoseErrors, pose_covariance
 from magloc.measurement.rows import check_magnitudes
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row
@@ -110,7 +110,7 @@ class Acquisition:
         """A solution in the world with what errors of the row's pose add to its covariance."""
         pose = row.pose(np.array(self._pose_errors.uncertainty.lever_arm_m))
         source = np.concatenate([solution.position_m, solution.moment_Am2])
-        added = pose_covariance(self._pose_errors, pose, pose.in_array(source, np.zeros(N_POSE)), row.pose_sigma)
+        added = pose_covariance(self._pose_errors, pose, pose.in_array(source), row.pose_sigma)
         return replace(solution, covariance=solution.covariance + added)
 
     def _start_from_recent(self, row: Row, alone: Fix) -> Start | None:

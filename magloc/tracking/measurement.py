@@ -26,12 +26,11 @@ from arrays.typing import FloatArray
 from magloc.kalman import MeasurementFunction
 from magloc.measurement.differences import DifferenceMeasurement, turn_jacobian
 from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
-from magloc.measurement.pose import N_POSE, TURN, ArrayPose, PoseErrors
+from magloc.measurement.pose import TURN, ArrayPose, PoseErrors
 from magloc.navigation.rotations import rotation_matrix, turn_of_change
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row
 
-_NO_ERROR = np.zeros(N_POSE)
 LEAST_SINGULAR = 1e-6
 """A row has no coordinates of its own if a column of its Jacobian, in units of what is known, is so near to others."""
 
@@ -70,18 +69,19 @@ class RowMeasurement:
         """Measured differences, shape (k,)."""
         return self.model.measured(self.row.readings_T) / self.sigma
 
-    def pose_error(self, state: FloatArray) -> FloatArray:
-        """Error (9,) of the pose that a state (n,) stands for."""
-        return self.pose_effect @ state[self.n_motion + self.effect.shape[1] :]
+    def pose_error(self, state: FloatArray) -> FloatArray | None:
+        """Error (9,) of the pose that a state (n,) stands for, None where none is stated."""
+        states = state[self.n_motion + self.effect.shape[1] :]
+        return self.pose_effect @ states if states.size else None
 
-    def of_source(self, source: FloatArray, error: FloatArray = _NO_ERROR) -> FloatArray:
+    def of_source(self, source: FloatArray, error: FloatArray | None = None) -> FloatArray:
         """Predicted differences (k,) of a source (6,) where the pose has an error (9,) and no sensor has any."""
         in_array = self.pose.in_array(source, error)
         return self.model.predicted(in_array[:3], in_array[3:], self._ambient_T(error)) / self.sigma
 
     def source_jacobian(self, source: FloatArray) -> FloatArray:
         """Their Jacobian (k, 6) where the pose has no error."""
-        return self._by_source(self._by_array(self.pose.in_array(source, _NO_ERROR), _NO_ERROR), _NO_ERROR)
+        return self._by_source(self._by_array(self.pose.in_array(source)))
 
     def predicted(self, state: FloatArray) -> FloatArray:
         """Predicted differences (k,) of a state (n,)."""
@@ -97,7 +97,7 @@ class RowMeasurement:
         full = np.zeros((len(self.sigma), state.size))
         full[:, :N_SOURCE] = self._by_source(H, error)
         full[:, first:behind] = self.effect
-        if self.pose_effect.shape[1]:
+        if error is not None:
             by_error = H @ self.pose.error_jacobian(in_array, error)
             turned = turn_jacobian(self.model.array, in_array[:3], in_array[3:], self._ambient_T(error))
             turned = self.model.differences.transform @ turned / self.sigma[:, None]
@@ -174,22 +174,23 @@ class RowMeasurement:
         error = self.pose_error(state)
         full = np.zeros((N_SOURCE, state.size))
         full[:, :N_SOURCE] = self._by_source(np.eye(N_SOURCE), error)
-        behind = self.n_motion + self.effect.shape[1]
-        full[:, behind:] = self.pose.error_jacobian(self._in_array(state), error) @ self.pose_effect
+        if error is not None:
+            behind = self.n_motion + self.effect.shape[1]
+            full[:, behind:] = self.pose.error_jacobian(self._in_array(state), error) @ self.pose_effect
         return full
 
-    def _by_array(self, in_array: FloatArray, error: FloatArray) -> FloatArray:
+    def _by_array(self, in_array: FloatArray, error: FloatArray | None = None) -> FloatArray:
         """Jacobian (k, 6) by a source in the array's axes."""
         return self.model.jacobian(in_array[:3], in_array[3:], self._ambient_T(error)) / self.sigma[:, None]
 
-    def _by_source(self, H: FloatArray, error: FloatArray) -> FloatArray:
+    def _by_source(self, H: FloatArray, error: FloatArray | None = None) -> FloatArray:
         """That by a source of the world."""
         R = self.pose.turned(error)
-        return np.concatenate([H[:, :3] @ R.T, H[:, 3:] @ R.T], axis=1)
+        return (H.reshape(-1, 2, 3) @ R.T).reshape(-1, N_SOURCE)
 
-    def _ambient_T(self, error: FloatArray) -> FloatArray:
-        """Ambient field at the sensors (N, 3) where the pose is turned by an error."""
-        return self.model.array.ambient_fields @ rotation_matrix(error[TURN])
+    def _ambient_T(self, error: FloatArray | None) -> FloatArray | None:
+        """Ambient field at the sensors (N, 3) where the pose is turned by an error; None: the array's own."""
+        return None if error is None else self.model.array.ambient_fields @ rotation_matrix(error[TURN])
 
 
 class RowMeasurements:

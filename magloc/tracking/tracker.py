@@ -148,7 +148,8 @@ class Tracker:
             row = next(rows_of(without_saturated(row, self.array)))
         if row.time_s <= self._time_s:
             raise ValueError(f"Input time_s must increase; instead {row.time_s} s follows {self._time_s} s.")
-        row, self._row_before = moving(row, self._row_before), row
+        if self.pose_errors.n_states:
+            row, self._row_before = moving(row, self._row_before), row
         dt_s, self._time_s = row.time_s - self._time_s, row.time_s
         index, self._n_rows = self._n_rows, self._n_rows + 1
         if self._x is None:
@@ -263,10 +264,11 @@ class Tracker:
         those, and independently of what is new.
         """
         of_readings = _is_of_readings(self._S, S)
-        if not of_readings and not self.pose_errors.n_states:
+        if self.pose_errors.n_states:
+            measurement = measurement.with_lasting_errors(self.pose_errors.step(dt_s)[0] ** 2)
+        elif not of_readings:
             return None
-        lasting = self.pose_errors.step(dt_s)[0] ** 2
-        return measurement.with_lasting_errors(lasting).curved_prior(x, S, of_readings=of_readings)
+        return measurement.curved_prior(x, S, of_readings=of_readings)
 
     def start(self, source: FloatArray, covariance: FloatArray, rows: Sequence[Row]) -> FilteredStart | None:
         """State at the last of the rows that a source (6,) was found from, as if at rest, with a covariance (6, 6).

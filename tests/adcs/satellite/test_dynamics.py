@@ -20,6 +20,7 @@ from adcs.frames import turned
 from adcs.satellite import dynamics
 from adcs.satellite import dynamics_compiled as rigid_body
 from adcs.satellite.dynamics import RigidBody, WheelControl, wheel_control
+from magloc.navigation.rotations import cross_matrix
 from tests.adcs.attitudes import random_attitudes
 
 Array = NDArray[np.float64]
@@ -175,7 +176,7 @@ class TestIntegration:
         outside = 3 * GRAVITY * np.cross(eta, J @ eta) + np.cross(m, A @ B) + torque
         w_dot = np.linalg.solve(J, -wheel_torque + outside - np.cross(w, J @ w + k))
         rel = w - A @ [0.0, RATE, 0.0]
-        Omega = np.block([[np.zeros((1, 1)), -rel[None]], [rel[:, None], -quaternion.cross_matrix(rel)]])
+        Omega = np.block([[np.zeros((1, 1)), -rel[None]], [rel[:, None], -cross_matrix(rel)]])
         return np.concatenate([0.5 * Omega @ q, w_dot, wheel_torque])
 
     def test_against_scipy(self) -> None:
@@ -323,7 +324,7 @@ class TestErrorJacobian:
 
         printed = dynamics.closed_loop_error_jacobian(BODY, control, q, w, reference, GRAVITY)
         orbital = quaternion.rotate_back(q, [0.0, RATE, 0.0])
-        missing = 2 * BODY.inverse @ np.diag(control.rate_gain_Nms) @ quaternion.cross_matrix(orbital)
+        missing = 2 * BODY.inverse @ np.diag(control.rate_gain_Nms) @ cross_matrix(orbital)
         measured = self.differences(rate_of)
         assert np.abs(measured - printed)[:, 3:, :3].max() > 1e-5
         printed[:, 3:, :3] += missing
