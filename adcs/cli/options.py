@@ -46,8 +46,8 @@ class EstimateOptions:
     sensors : str
         Sensors in use: any of st, gyro, mag and sun that observe attitude, in any order.
     states : str
-        What is estimated besides attitude and rate: any of gyro-bias, field-bias, field-gain, disturbance,
-        field-model and dipole with commas, or none.
+        What is estimated besides attitude and rate: any of gyro-bias, field-bias, field-gain, magnetometer (both),
+        disturbance, field-model and dipole with commas, or none.
         With other sensors the scenario's own states stay, but for the bias of a sensor that is not in use.
     filter : str
         As of `adcs run tabletsat`.
@@ -75,8 +75,8 @@ class ScenarioOptions(EstimateOptions):
     sensors : str
         Sensors in use: any of st, gyro, mag and sun that observe attitude, in any order, as in st+gyro+mag+sun.
     states : str
-        What is estimated besides attitude and rate: any of gyro-bias, field-bias, field-gain, disturbance,
-        field-model and dipole with commas, or none.
+        What is estimated besides attitude and rate: any of gyro-bias, field-bias, field-gain, magnetometer (both),
+        disturbance, field-model and dipole with commas, or none.
         With other sensors the scenario's own states stay, but for the bias of a sensor that is not in use.
     filter : str
         Error-state Kalman filter ("mekf"); with its converged gain ("constant-gain"); with a filter of the disturbance

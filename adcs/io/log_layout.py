@@ -36,6 +36,15 @@ class MountedTable(Table, kw_only=True):
         if np.linalg.det(matrix) < 0.0:
             raise RefusalError("mounting", "found a mirror (determinant -1), expected a rotation, body from sensor")
 
+    @property
+    def scale(self) -> float:
+        """SI unit in a cell's."""
+        return 1.0
+
+    def of(self, values: FloatArray) -> FloatArray:
+        """In SI, body axes, of cells (n, 3)."""
+        return self.scale * values @ np.array(self.mounting, dtype=np.float64).T
+
 
 class StarColumns(MountedTable, kw_only=True):
     """Quaternions."""
@@ -61,9 +70,10 @@ class GyroColumns(MountedTable, kw_only=True):
     columns: Three = ("gyro_x_deg_s", "gyro_y_deg_s", "gyro_z_deg_s")
     unit: Annotated[str, one_of(RATE_UNITS)] = "deg/s"
 
-    def of(self, values: FloatArray) -> FloatArray:
-        """[rad/s], body axes, of cells (n, 3)."""
-        return RATE_UNITS[self.unit] * values @ np.array(self.mounting, dtype=np.float64).T
+    @property
+    def scale(self) -> float:
+        """[rad/s]."""
+        return RATE_UNITS[self.unit]
 
 
 class MagnetometerColumns(MountedTable, kw_only=True):
@@ -72,19 +82,16 @@ class MagnetometerColumns(MountedTable, kw_only=True):
     columns: Three = ("field_x_nT", "field_y_nT", "field_z_nT")
     unit: Annotated[str, one_of(FIELD_UNITS)] = "nT"
 
-    def of(self, values: FloatArray) -> FloatArray:
-        """[T], body axes, of cells (n, 3)."""
-        return FIELD_UNITS[self.unit] * values @ np.array(self.mounting, dtype=np.float64).T
+    @property
+    def scale(self) -> float:
+        """[T]."""
+        return FIELD_UNITS[self.unit]
 
 
 class SunColumns(MountedTable, kw_only=True):
     """Directions."""
 
     columns: Three = ("sun_x", "sun_y", "sun_z")
-
-    def of(self, values: FloatArray) -> FloatArray:
-        """Body axes, of cells (n, 3)."""
-        return values @ np.array(self.mounting, dtype=np.float64).T
 
 
 class WheelColumns(MountedTable, kw_only=True):
@@ -93,9 +100,10 @@ class WheelColumns(MountedTable, kw_only=True):
     columns: Three = ("wheels_x_Nms", "wheels_y_Nms", "wheels_z_Nms")
     unit: Annotated[str, one_of(MOMENTUM_UNITS)] = "Nms"
 
-    def of(self, values: FloatArray) -> FloatArray:
-        """[N·m·s], body axes, of cells (n, 3)."""
-        return MOMENTUM_UNITS[self.unit] * values @ np.array(self.mounting, dtype=np.float64).T
+    @property
+    def scale(self) -> float:
+        """[N·m·s]."""
+        return MOMENTUM_UNITS[self.unit]
 
 
 class LogTable(Table, kw_only=True):

@@ -358,7 +358,7 @@ def _fitted(
         residual, by = linearised(rows, x, prior)
         n = len(rows.time_s)
         both = np.concatenate([residual.reshape(n, -1, 1), (by * deviations).reshape(n, -1, 13)], axis=2)
-        white = _whitened(rows.time_s, both.reshape(n, -1), prior).reshape(n, -1, 14).reshape(-1, 14)
+        white = _whitened(rows.time_s, both.reshape(n, -1), prior).reshape(-1, 14)
         scaled = np.divide(x - first, deviations, out=np.zeros(13), where=deviations > 0.0)
         gradient = white[:, 1:].T @ white[:, 0] + scaled
         return float(white[:, 0] @ white[:, 0] + scaled @ scaled), gradient, white[:, 1:].T @ white[:, 1:]

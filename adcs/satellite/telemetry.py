@@ -266,12 +266,12 @@ def _columns(name: str, given: ArrayLike | None, n: int) -> FloatArray:
     return np.where(np.isnan(values).any(axis=1, keepdims=True), np.nan, values)
 
 
-def steps_of(time_s: FloatArray, step_s: float) -> tuple[NDArray[np.int64], BoolArray, BoolArray]:
-    """Steps (n,) since the first time, which times are no multiple of the step, and which do not ascend."""
+def steps_of(time_s: FloatArray, step_s: float) -> tuple[NDArray[np.int64], BoolArray]:
+    """Steps (n,) since the first time, and which times are no multiple of the step."""
     with np.errstate(over="ignore"):
         steps = (time_s - time_s[0]) / step_s
     rows = np.round(np.clip(steps, -_MOST_STEPS, _MOST_STEPS)).astype(np.int64)
-    return rows, np.abs(steps - rows) > _STEP_TOLERANCE, np.diff(rows, prepend=-1) <= 0
+    return rows, np.abs(steps - rows) > _STEP_TOLERANCE
 
 
 def steps_within(time_s: FloatArray, step_s: float) -> float:
@@ -290,7 +290,7 @@ def usual_step_s(time_s: FloatArray) -> float:
 
 def _instants_of(time_s: FloatArray, step_s: float) -> tuple[FloatArray, NDArray[np.int64]]:
     """Instants of a filter, and which of them are the n times."""
-    rows, off, _ = steps_of(time_s, step_s)
+    rows, off = steps_of(time_s, step_s)
     if not off.any() and (np.diff(rows) > 0).all():
         return time_s[0] + step_s * np.arange(int(rows[-1]) + 1), rows
     counts = np.maximum(np.ceil(np.diff(time_s) / step_s - 0.5), 1.0).astype(np.int64)

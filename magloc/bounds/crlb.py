@@ -95,26 +95,25 @@ def whitened_jacobian(
     p, m = _sources(position_m, moment_Am2)
     check_uncertainty(ambient_uncertainty_T, known_moment_sigma_Am2)
     ambient_uncertainty_T = ambient_uncertainty_T or array.ambient_uncertainty_T
-    W = channel_jacobian(array, p, m)
     root = _inverse_root(array, p, m)
+    # What the readings depend on, the source first: columns, and what is known of their numbers.
+    columns = [(channel_jacobian(array, p, m), np.inf)]
+    if array.pose is not None:
+        columns.append((pose_errors_at_rest(array, array.pose, p, m), 1.0))
+    if ambient_uncertainty_T:
+        columns.append((array.linear_gain(fields_at_sensors(array, p, m)), ambient_uncertainty_T))
     with np.errstate(invalid="ignore"):
-        W = root @ W
+        left = [(root @ of, sigma) for of, sigma in columns]
         common = root @ _common_field(array)
-        ambient = root @ array.linear_gain(fields_at_sensors(array, p, m)) if ambient_uncertainty_T else None
-        pose = None if array.pose is None else root @ pose_errors_at_rest(array, array.pose, p, m)
     prior = np.inf if array.common_field_T is None else array.common_field_T
     for group in _kinds(array):
         # Written out for every kind: one of them has no effect on the readings of the other.
         part = np.where(group[:, None], common[..., 3:] if array.channel_is_scalar[group][0] else common[..., :3], 0.0)
-        W = _marginalised(W, part, prior)
-        if ambient is not None:
-            ambient = _marginalised(ambient, part, prior)
-        if pose is not None:
-            pose = _marginalised(pose, part, prior)
-    if ambient is not None:
-        pose = None if pose is None else _marginalised(pose, ambient, ambient_uncertainty_T)
-        W = _marginalised(W, ambient, ambient_uncertainty_T)
-    W = W if pose is None else _marginalised(W, pose, 1.0)
+        left = [(_marginalised(of, part, prior), sigma) for of, sigma in left]
+    while len(left) > 1:
+        nuisance, known = left.pop()
+        left = [(_marginalised(of, nuisance, known), sigma) for of, sigma in left]
+    ((W, _),) = left
     if known_moment_sigma_Am2 == np.inf:
         return W
     with np.errstate(invalid="ignore"):
