@@ -125,7 +125,7 @@ def test_group_runs(group, monkeypatch):
     assert "|" in lines[-1]
 
 
-@pytest.mark.parametrize("group", ["fields", "filters", "maps"])
+@pytest.mark.parametrize("group", ["fields", "maps", pytest.param("filters", marks=pytest.mark.slow)])
 def test_group_runs_without_its_peers(group, monkeypatch):
     monkeypatch.setattr("tests.bench.timing.SAMPLE_S", 1e-9)
     monkeypatch.setattr(f"tests.bench.{group}.installed", lambda package: package in {"magloc", "scipy"})

@@ -389,8 +389,9 @@ class TestRows:
         return np.array(sorted(found_positions(fix).tolist()))
 
     def test_alone_or_together(self, together):
+        another = plain_locator(PLATE, sources="auto")
         for i, fix in enumerate(together.fixes[: len(together.p) // 2]):
-            alone = plain_locator(PLATE, sources="auto").fit_rows(together.readings[i : i + 1])[0]
+            alone = another.fit_rows(together.readings[i : i + 1])[0]
             assert_allclose(self.sorted_positions(alone), self.sorted_positions(fix), rtol=1e-4)
             assert alone.solutions[0].chi2 == pytest.approx(fix.solutions[0].chi2, rel=1e-6)
 
