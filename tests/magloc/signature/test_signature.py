@@ -155,6 +155,8 @@ class TestUndetermined:
         assert np.isnan(found.polarisability_m3[2, 2])
         assert found.dof == 9 * found.rows - 5
         assert "not determined by these headings: permanent z against induced zz" in found.table()
+        without = [line.split() for line in found.table().splitlines() if line.endswith(" -")]
+        assert [" ".join(words) for words in without] == ["permanent z - -", "induced zz - -"]
 
     def test_straight_courses_have_no_eddy_currents(self) -> None:
         found = self.of(four_passes(), eddy=True)

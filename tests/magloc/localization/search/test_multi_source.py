@@ -154,6 +154,21 @@ class TestSourcesStandOutWhereASingleOneHasNoFit:
         assert all(errors_of(fix, p[0]).max() < 0.05 for fix in fixes)
 
 
+class TestArraysThatCanTellOne:
+    def test_doubtful_fits_are_searched_again_from_more_places_that_stand_closer(self):
+        """Four of 150 random sources near eight total-field sensors, which the first search does not find."""
+        array = replace(cube(1.0, kind="scalar", noise_T=1e-11), ambient_T=(2e-5, 1e-6, 4.5e-5))
+        rng = np.random.default_rng(5)
+        directions = rng.normal(size=(150, 1, 3))
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        p, m = rng.uniform(0.7, 2.5, (150, 1, 1)) * directions, 10.0 * rng.normal(size=(150, 1, 3))
+        missed = [10, 13, 77, 127]
+        fixes = plain_locator(array).fit_rows(noisy_readings(array, p, m, rng)[missed])
+        for fix, truth in zip(fixes, p[missed], strict=True):
+            assert fix.solutions[0].chi2 < chi2_distribution.ppf(1.0 - 1e-6, fix.solutions[0].dof)
+            assert errors_of(fix, truth).max() < 0.1
+
+
 class TestNumberAsked:
     @pytest.mark.parametrize("n_sources", [1, 2, 3])
     def test_as_many_as_asked_for(self, n_sources):
