@@ -11,14 +11,15 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 MAKE_VENV = $(PYTHON) -m venv --clear
 
 .PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel bench docs notebooks chromium lint clean
+.PHONY: ready compiled-magloc compiled-adcs compiled-tests
 
 map: .venv/installed
 	$(BIN)/magloc map
 
-test: lint chromium
+test: ready chromium
 	$(BIN)/python -m pytest -q -n 2 -m "not slow"
 
-test-full: lint chromium
+test-full: ready chromium
 	HYPOTHESIS_PROFILE=random $(BIN)/python -m pytest -q -n 2
 
 lint: .venv/installed-test
@@ -26,6 +27,17 @@ lint: .venv/installed-test
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache --no-logo
+
+# Kernels and tests are compiled once, beside the linters: left to the tests, both of their processes would do it, and
+# keep the memory that the compiler takes.
+ready: .venv/installed-test
+	@$(MAKE) --no-print-directory --jobs=2 lint compiled-magloc compiled-adcs compiled-tests
+
+compiled-magloc compiled-adcs: compiled-%: .venv/installed-test
+	$(BIN)/$* warm-up --quiet
+
+compiled-tests: .venv/installed-test
+	@$(BIN)/python -m pytest -qq --collect-only >/dev/null
 
 # Whether the tests see a change in 300 lines of the code; hours, and it goes on where it was stopped. Other lines and
 # more processors: `python -m tests.mutation --seed 1 --count 100 --jobs 4`.

@@ -31,8 +31,8 @@ for profile, derandomize, n in (("fixed", True, 40), ("random", False, 100)):
     )
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "fixed"))
 
-# The notebooks that `make test` executes; all others take more than some seconds and are left to `make test-full`.
-QUICK_NOTEBOOKS = {"01-first-fix", "04-scalar-sign", "07-own-csv"}
+# The notebooks that `make test` executes: each takes seconds, and all are executed by `make test-full`.
+QUICK_NOTEBOOKS = {"01-first-fix"}
 
 
 def pytest_configure() -> None:

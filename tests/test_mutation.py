@@ -11,7 +11,6 @@ import pytest
 from tests.mutation import (
     HANGS,
     LONGEST_S,
-    PACKAGES,
     REPOSITORY,
     UNTESTED,
     Laboratory,
@@ -123,7 +122,7 @@ class TestVerdict:
 
 
 def test_a_change_is_one_that_can_be_read_and_differs() -> None:
-    chosen = drawn(100, 0, PACKAGES)
+    chosen = drawn(100, 0, ("arrays", "sims"))
     assert len({(one.path, one.line) for one in chosen}) == 100
     for one in chosen:
         source = (REPOSITORY / one.path).read_bytes()

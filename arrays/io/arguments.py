@@ -18,5 +18,6 @@ def whole_number(_: type, tokens: Sequence[Token]) -> int:
 
 
 Flag = Annotated[bool, Parameter(show_default=False)]
-Count = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1))]
+# Ten million of anything would never end.
+Count = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1, lt=10_000_000))]
 Seed = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0))]

@@ -22,6 +22,7 @@ from magloc.cli.framework import CommonOptions, print_json, progress
 from magloc.cli.moments.known_path import (
     MomentOutputs,
     PathErrorOptions,
+    print_consistency,
     refuse_bounds,
     write_moment_track,
 )
@@ -261,7 +262,7 @@ def track(
         )
     _print_track(found, result, json=json, jsonl=jsonl, printed=printed)
     if result is not None and not json:
-        print("\n".join(result.lines()), file=sys.stderr if jsonl else sys.stdout)
+        print_consistency(result.lines(), jsonl=jsonl)
     if not (json or jsonl or common.quiet):
         print_note(f"{found.tracked.sum()} of {len(found)} rows tracked")
     if jsonl and found.innovations.flagged:

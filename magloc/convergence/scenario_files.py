@@ -10,7 +10,7 @@ import msgspec
 
 from arrays.array import SensorArray
 from arrays.array_file import array_of_table, read_array
-from arrays.io.errors import InputError
+from arrays.io.errors import InputError, naming
 from arrays.io.toml import POSITIVE, BuiltIn, File, RefusalError, Rule, Table, in_si, one_of, section_of
 from arrays.typing import Vector
 from magloc.convergence.filters import FILTERS, Filter
@@ -111,7 +111,8 @@ def read_sources_scenario(name_or_path: str, *, seed: int = 0) -> SourcesScenari
     """Scenario of a map over sources: a scenario file's array, and its table ``sources`` if it has one."""
     path, _, file = _read(name_or_path)
     given = {key: getattr(file.sources, key) for key in _Sources.__struct_fields__}
-    return SourcesScenario(array=_array(path, file.array), seed=seed, **given)
+    with naming(path):
+        return SourcesScenario(array=_array(path, file.array), seed=seed, **given)
 
 
 def _read(name_or_path: str) -> tuple[str, dict[str, Any], Any]:

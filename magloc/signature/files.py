@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -56,7 +55,7 @@ def lines_of_depths(signature: Signature, depths_m: Sequence[float]) -> list[str
             modulus = np.linalg.norm(of_field, axis=1)
             k = int(np.argmax(modulus))
             direction = of_field[k] / modulus[k]
-            sigma = math.sqrt(float(direction @ of_covariance[k] @ direction))
+            sigma = float(_sigma(direction @ of_covariance[k] @ direction))
             lines.append(f"{depth:7g}  {heading:>7}  {1e9 * modulus[k]:10.1f}  {1e9 * sigma:7.2g}  {x[k]:9.1f}")
     return lines
 
@@ -66,7 +65,7 @@ def json_of_signature(signature: Signature, depths_m: Sequence[float]) -> dict[s
     predicted = []
     for depth in depths_m:
         x, field, covariance = along_keel(signature, depth)
-        sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        sigma = _sigma(np.diagonal(covariance, axis1=-2, axis2=-1))
         for i, heading in enumerate(HEADINGS.values()):
             of_heading = {"depth_m": depth, "heading_deg": heading, "forward_m": x}
             predicted.append(of_heading | {"field_nT": 1e9 * field[i], "sigma_nT": 1e9 * sigma[i]})
@@ -86,3 +85,8 @@ def json_of_signature(signature: Signature, depths_m: Sequence[float]) -> dict[s
         "rows": signature.rows,
         "predicted": predicted,
     }
+
+
+def _sigma(variance: FloatArray) -> FloatArray:
+    """Standard deviations, NaN where rounding has left nothing of a variance."""
+    return np.sqrt(np.where(variance >= 0.0, variance, np.nan))

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 
 from adcs.cli.options import print_note
 from adcs.complementary.names import Method, Rule
-from arrays.io.arguments import Flag
+from arrays.io.arguments import Count, Flag
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.outputs import refuse_file
 from magloc.cli.framework import QuietOptions, print_result, progress
@@ -64,7 +64,7 @@ class ComplementaryOptions:
     sigma_nT: Annotated[float, Parameter(name="--sigma-nT")] = 1000.0
     outage: Rule | None = None
     amplitude_deg: float = 5.0
-    seeds: Annotated[int, Parameter(name=["--seeds", "--runs"])] = 1
+    seeds: Annotated[Count, Parameter(name=["--seeds", "--runs"])] = 1
     seed: int = 0
     duration: float | None = None
 

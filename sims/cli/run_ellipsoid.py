@@ -12,7 +12,7 @@ from cyclopts import Parameter
 
 from adcs.cli.options import print_note
 from adcs.ellipsoids.strip import StepRule
-from arrays.io.arguments import Flag
+from arrays.io.arguments import Count, Flag
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.outputs import refuse_file
 from magloc.cli.framework import QuietOptions, print_result, progress
@@ -56,7 +56,7 @@ class EllipsoidOptions:
     step: StepRule = "tightened"
     jump: Annotated[bool, Parameter(negative=(), show_default=False)] = False
     closed_loop: Annotated[bool, Parameter(negative=(), show_default=False)] = False
-    seeds: Annotated[int, Parameter(name=["--seeds", "--runs"])] = 300
+    seeds: Annotated[Count, Parameter(name=["--seeds", "--runs"])] = 300
     seed: int = 0
     duration: float = 5678.0
 

@@ -450,7 +450,9 @@ class TestReadingCovariance:
         expected = np.eye(array.n_channels) * proportional_noise(array, readings)[:, :, None] ** 2
         assert_array_equal(reading_covariance(array, readings), expected)
 
-    @pytest.mark.parametrize("error", ["rotations", "gains", "both"])
+    @pytest.mark.parametrize(
+        "error", ["both", *(pytest.param(one, marks=pytest.mark.slow) for one in ("rotations", "gains"))]
+    )
     def test_of_sensors_with_other_calibrations(self, error):
         """4,000 arrays drawn; terms of second order in the errors are 1e-3 of the noise."""
         rng = np.random.default_rng(8)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -66,18 +67,14 @@ class Timing:
 
 def interleaved(contestants: Mapping[str, Contestant], rounds: int) -> dict[str, Timing]:
     """Timing of every contestant: A B C, A B C, …, after a call of each that compiles and is not counted."""
-    all_threads = numba.get_num_threads()
-    try:
-        for contestant in contestants.values():
-            _use_threads(contestant.threads)
+    for contestant in contestants.values():
+        with _threads(contestant.threads):
             contestant.run()
-        seconds: dict[str, list[float]] = {name: [] for name in contestants}
-        for _ in range(rounds):
-            for name, contestant in contestants.items():
-                _use_threads(contestant.threads)
+    seconds: dict[str, list[float]] = {name: [] for name in contestants}
+    for _ in range(rounds):
+        for name, contestant in contestants.items():
+            with _threads(contestant.threads):
                 seconds[name].append(_shortest(contestant.run) / contestant.count)
-    finally:
-        _use_threads(all_threads)
     return {name: Timing(tuple(values)) for name, values in seconds.items()}
 
 
@@ -93,10 +90,16 @@ def _shortest(run: Callable[[], object]) -> float:
     return shortest
 
 
-def _use_threads(threads: int) -> None:
+@contextmanager
+def _threads(n: int) -> Iterator[None]:
     """Limit numba's threads, and those of the BLAS libraries that are loaded by now."""
-    numba.set_num_threads(threads)
-    ThreadpoolController().limit(limits=threads, user_api="blas")
+    before = numba.get_num_threads()
+    numba.set_num_threads(n)
+    try:
+        with ThreadpoolController().limit(limits=n, user_api="blas"):
+            yield
+    finally:
+        numba.set_num_threads(before)
 
 
 def installed(package: str) -> bool:

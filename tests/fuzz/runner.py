@@ -52,12 +52,11 @@ class Ended(NamedTuple):
 def made_case(seed: int, files: Path, folder: Path) -> Case:
     """The case of a seed: a line, its files in a new folder, and one of stream, files, names or arguments mangled."""
     rng = random.Random(seed)
-    shutil.copytree(files, folder)
     names = sorted(LINES)
-    command = rng.choices(names, [0.1 if name in SELDOM else 1.0 for name in names])[0]
+    command = rng.choices(names, [SELDOM.get(name, 1.0) for name in names])[0]
     words = rng.choice(LINES[command]).split()
-    stdin = (folder / STREAM).read_bytes()
-    read = [word for word in words if (folder / word).exists()]
+    stdin = (files / STREAM).read_bytes()
+    read = read_files(words, files, folder)
     what = rng.random()
     if "-" in words and what < 0.8:
         stdin = mangled_file(stdin, rng)
@@ -75,12 +74,21 @@ def made_case(seed: int, files: Path, folder: Path) -> Case:
 
 def extreme_case(extreme: Extreme, files: Path, folder: Path) -> Case:
     """The case of one number at an end of what it can be."""
-    shutil.copytree(files, folder)
+    read_files(extreme.words, files, folder)
     if extreme.file:
         text = (folder / extreme.file).read_text(encoding="utf-8")
         text = text[: extreme.at.start] + extreme.value + text[extreme.at.stop :]
         (folder / extreme.file).write_text(text, encoding="utf-8")
-    return _case(extreme.command, extreme.words, (folder / STREAM).read_bytes())
+    return _case(extreme.command, extreme.words, (files / STREAM).read_bytes())
+
+
+def read_files(words: Sequence[str], files: Path, folder: Path) -> list[str]:
+    """The words of a line that name what it reads, of which a copy is put into a new folder."""
+    folder.mkdir()
+    read = [word for word in words if (files / word).exists()]
+    for word in read:
+        (shutil.copytree if (files / word).is_dir() else shutil.copyfile)(files / word, folder / word)
+    return read
 
 
 def _case(command: str, words: Sequence[str], stdin: bytes) -> Case:

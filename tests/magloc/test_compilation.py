@@ -67,8 +67,14 @@ def test_kept(kept: Path) -> None:
     assert call(kept) == ("6.0 1", "")
 
 
-@pytest.mark.parametrize("ending", ["nbi", "nbc"])
-@pytest.mark.parametrize("share", [0.0, 0.5])
+@pytest.mark.parametrize(
+    ("ending", "share"),
+    [
+        ("nbi", 0.0),
+        ("nbc", 0.5),
+        *(pytest.param(*other, marks=pytest.mark.slow) for other in [("nbi", 0.5), ("nbc", 0.0)]),
+    ],
+)
 def test_cut_short(kept: Path, ending: str, share: float) -> None:
     for path in (kept / "__pycache__").glob(f"*.{ending}"):
         path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])

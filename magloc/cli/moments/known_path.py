@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-import sys
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from json import dumps
 from pathlib import Path
@@ -108,7 +108,7 @@ def write_moment_track(found: MomentTrack, readings: Path, known: KnownOptions, 
     else:
         print(found.table())
     if result is not None and not outputs.json:
-        print("\n".join(result.lines()), file=sys.stderr if outputs.jsonl else sys.stdout)
+        print_consistency(result.lines(), jsonl=outputs.jsonl)
     if not outputs.quiet:
         if found.misfit:
             print_note(
@@ -119,3 +119,9 @@ def write_moment_track(found: MomentTrack, readings: Path, known: KnownOptions, 
             print_note(f"{found.tracked.sum()} of {len(found)} rows with a moment")
     if not found.tracked.any():
         raise InputError(f"{readings}: found no row that determines the moment, expected rows nearer to the object.")
+
+
+def print_consistency(lines: Iterable[str], *, jsonl: bool) -> None:
+    """Print how good a track is: below its table, or as notes beside its JSON lines."""
+    for line in lines:
+        (print_note if jsonl else print)(line)

@@ -230,7 +230,7 @@ class _Levels:
         """By how much χ² must fall for another source: what noise reaches in one of a thousand rows, or BIC's penalty.
 
         Noise is drawn around the best fit of all rows; only the loudest draws, where a candidate explains most, are
-        searched for a second source.
+        searched for a second source: many more than stay above the threshold, as candidates stand far apart.
         """
         penalty = N_UNKNOWNS * math.log(self.n_differences)
         best = int(np.argmin(beam.chi2[:, 0]))
@@ -246,15 +246,16 @@ class _Levels:
         draws = at.predicted(fields) + problem.whitened(noise)
         bases = linear_bases(at, at.linear_gain(fields)[0], 0, self.search.candidates)
         loudness = np.concatenate([linear_scores(bases, part).max(axis=1) for part in np.array_split(noise, 20)])
-        loud = np.argsort(-loudness)[: int(10 * FALSE_ALARM * _N_DRAWS)]
+        loud = np.argsort(-loudness)[: int(40 * FALSE_ALARM * _N_DRAWS)]
         search = replace(self.search, width=1)
         problem, draws = self.problem.rows(row[loud]), draws[loud]
         one = refine(problem, draws, q[np.zeros(loud.size, dtype=np.intp)], mu[np.zeros(loud.size, dtype=np.intp)])
         first = best_distinct(one, loud.size, 1)
         fall = first.chi2[:, 0] - search.one_more(problem, draws, first).chi2[:, 0]
         fall = np.sort(fall[np.isfinite(fall)])
-        n_above = int(FALSE_ALARM * _N_DRAWS)
-        return max(penalty, float(fall[-n_above - 1])) if fall.size > n_above else penalty
+        # Another draw falls by more than the k-th largest of n with probability k / (n + 1).
+        k = int(FALSE_ALARM * (_N_DRAWS + 1))
+        return max(penalty, float(fall[-k])) if fall.size >= k else penalty
 
     def _has_unresolved_pair(self, rows: IntArray, beam: JointFits) -> BoolArray:
         """Whether a source of the best fit is hardly known beside another one, so that other pairs would do as well.

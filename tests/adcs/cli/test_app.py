@@ -14,6 +14,7 @@ from arrays.io.errors import InputError
 from magloc.cli import framework
 from sims.cli.run import run as run_app
 from tests.adcs.refusals import assert_refused
+from tests.command_line import Run
 
 COMMANDS = ("run", "compare", "tables", "estimate", "calibrate")
 SCENARIOS = [name for name in run_app if not name.startswith("-")]
@@ -122,3 +123,14 @@ class TestMissingExtra:
         monkeypatch.setitem(sys.modules, "sgp4.api", None)
         with pytest.raises(InputError, match='two-line elements needs the extra "satellites"'):
             Sgp4Orbit("1", "2")
+
+
+@pytest.mark.parametrize(
+    "command", ["run tabletsat", "run complementary", "run ellipsoid", "run mockup", "compare tabletsat", "tables"]
+)
+def test_more_runs_than_would_ever_end_are_refused(command: str, adcs: Run) -> None:
+    outcome = adcs(*command.split(), "--seeds", "9" * 30)
+    assert outcome.status == 2
+    (line,) = outcome.err.splitlines()
+    assert "--seeds" in line
+    assert "10000000" in line

@@ -69,11 +69,11 @@ class TestTwins:
     @pytest.mark.parametrize(
         ("sensors", "states"),
         [
-            ("st", []),
-            ("st+gyro", ["gyro-bias", "disturbance"]),
-            ("mag+gyro", []),
             ("mag+sun", ["disturbance"]),
             ("st+gyro+mag+sun", ["field-bias", "gyro-bias", "disturbance"]),
+            pytest.param("st", [], marks=pytest.mark.slow),
+            pytest.param("st+gyro", ["gyro-bias", "disturbance"], marks=pytest.mark.slow),
+            pytest.param("mag+gyro", [], marks=pytest.mark.slow),
         ],
     )
     def test_agree_whatever_happens(self, sensors: str, states: list[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from arrays.geometries import tetrahedron
 from magloc.bounds.maps import CASES, BoundScenario
@@ -14,20 +15,23 @@ SCENARIO = BoundScenario(tetrahedron(1.5, noise_T=1e-9), (30.0, 0.0, 40.0), n_mo
 DETECTOR = ChiSquareDetector(9)
 
 
-class TestDetectionRanges:
-    SPHERES = with_detection_ranges(bound_spheres(SCENARIO, [5.0], 30.0), SCENARIO, DETECTOR, 0.8)
+@pytest.fixture(scope="module")
+def spheres():
+    return with_detection_ranges(bound_spheres(SCENARIO, [5.0], 30.0), SCENARIO, DETECTOR, 0.8)
 
-    def test_where_the_energy_of_the_signal_is_that_required(self):
-        spheres, matched = self.SPHERES, DipoleFilter(SCENARIO.array)
+
+class TestDetectionRanges:
+    def test_where_the_energy_of_the_signal_is_that_required(self, spheres):
+        matched = DipoleFilter(SCENARIO.array)
         directions = sphere_grid(spheres["elevation"].to_numpy(), spheres["azimuth"].to_numpy())
         places = SCENARIO.array.centroid + spheres["detection_range"].to_numpy()[..., None] * directions
         signals = matched.signal(places, SCENARIO.moment_Am2)
         energy = np.einsum("...c,...c->...", signals, signals)
         np.testing.assert_allclose(energy, DETECTOR.required_energy(0.8), rtol=1e-3)
 
-    def test_shares_of_the_moments(self):
+    def test_shares_of_the_moments(self, spheres):
         """At the distance of 95 % of 20 moments 19 are found, at that of a half 10, at that of the worst all."""
-        spheres, matched = self.SPHERES, DipoleFilter(SCENARIO.array)
+        matched = DipoleFilter(SCENARIO.array)
         for case, count in (("_median", 10), ("_q95", 19), ("_worst", 20)):
             distance = float(spheres[f"detection_range{case}"].sel(elevation=30.0, azimuth=30.0))
             direction = sphere_grid(np.array([30.0]), np.array([30.0]))[0, 0]
@@ -37,9 +41,9 @@ class TestDetectionRanges:
                 found = np.einsum("nc,nc->n", signals, signals) > DETECTOR.required_energy(0.8)
                 assert found.sum() == expected
 
-    def test_goes_all_the_way_round_and_says_what_it_is(self):
+    def test_goes_all_the_way_round_and_says_what_it_is(self, spheres):
         for case in CASES:
-            found = self.SPHERES[f"detection_range{case}"]
+            found = spheres[f"detection_range{case}"]
             np.testing.assert_array_equal(found.sel(azimuth=180.0), found.sel(azimuth=-180.0))
             assert found.attrs["units"] == "m"
-        assert self.SPHERES.attrs["detection_probability"] == 0.8
+        assert spheres.attrs["detection_probability"] == 0.8

@@ -161,6 +161,7 @@ class TestOverSources:
             (ARRAY + "[sources]\nmoment_Am2 = 0\n", [], "key sources.moment_Am2: found 0, expected a positive number"),
             (ARRAY + "[sources]\nradius = 1\n", [], "key sources.radius: found an unknown key"),
             (ARRAY.replace("vector", "scalar"), [], "vector sensors only"),
+            (ARRAY.replace("= 1.0", "= 1e-30"), [], "must have a noise between 1e-11 and 1e12 nT"),
             (ARRAY, ["--method", "iekf"], "--method: found 'iekf', expected global"),
             (ARRAY, ["--over", "moments"], "--over"),
         ],

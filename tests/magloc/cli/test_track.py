@@ -262,6 +262,7 @@ class TestTruth:
         outcome = run("track", readings, "--array", array, "--truth", truth, "--jsonl", *MOTION)
         assert len(lines_of(outcome)) == N_ROWS
         assert "NEES per dimension" in outcome.err
+        assert all(line.startswith("magloc: ") for line in outcome.err.splitlines())
 
     def test_without_moment_and_height(self, run: Run, array: Path, readings: Path, tmp_path: Path) -> None:
         t, p, _ = source()

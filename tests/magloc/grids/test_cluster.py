@@ -29,7 +29,12 @@ from tests.conftest import REPOSITORY
 pytest.importorskip("distributed")
 dask = pytest.importorskip("dask")
 ROLES = ("client", "scheduler", "worker")
-CUBE = StartsMap.of(StartsScenario(method=DampedFilter(max_iterations=6000)), 40)  # 27 chunks
+
+
+@pytest.fixture(scope="module")
+def cube():
+    """Of 27 chunks."""
+    return StartsMap.of(StartsScenario(method=DampedFilter(max_iterations=6000)), 40)
 
 
 @pytest.fixture(scope="module")
@@ -103,34 +108,34 @@ class TestCluster:
         ):
             xr.testing.assert_equal(far, here)
 
-    def test_a_worker_that_fails(self, cluster):
+    def test_a_worker_that_fails(self, cluster, cube):
         address, _ = cluster
-        broken = StartsMap(CUBE.scenario, CUBE.grid, None, CUBE.z, CUBE.optimum)
+        broken = StartsMap(cube.scenario, cube.grid, None, cube.z, cube.optimum)
         with pytest.raises(InputError, match=r"a worker failed \(AttributeError: "):
-            list(computed_by(address, broken, boxes(CUBE)))
+            list(computed_by(address, broken, boxes(cube)))
 
-    def test_same_values_and_then_death(self, cluster, tmp_path):
+    def test_same_values_and_then_death(self, cluster, tmp_path, cube):
         """The last one: it ends the scheduler."""
         address, scheduler = cluster
         path = tmp_path / "map.zarr"
 
         def until_the_scheduler_dies():
-            for i, chunk in enumerate(computed_by(address, CUBE, sweep.unfinished())):
+            for i, chunk in enumerate(computed_by(address, cube, sweep.unfinished())):
                 if i == 6:
                     scheduler.kill()
                 yield chunk
 
-        with Sweep(CUBE, path) as sweep:
+        with Sweep(cube, path) as sweep:
             with pytest.raises(InputError, match=f"scheduler {address}: the connection to the scheduler was lost"):
                 sweep.write(until_the_scheduler_dies())
             by_workers = sweep.chunks_done
         assert 7 <= by_workers < 27
         marks = marks_of(path)
         assert len(marks) == by_workers
-        with Sweep(CUBE, path) as sweep:
-            sweep.write(computed_here(CUBE, sweep.unfinished()))
+        with Sweep(cube, path) as sweep:
+            sweep.write(computed_here(cube, sweep.unfinished()))
         assert {mark: written for mark, written in marks_of(path).items() if mark in marks} == marks
-        expected = in_memory(CUBE)
+        expected = in_memory(cube)
         with open_map(path) as stored:
             for name in expected:
                 np.testing.assert_array_equal(stored[name], expected[name])
@@ -148,23 +153,23 @@ class TestTls:
         for name, values in expected.values.items():
             np.testing.assert_array_equal(chunk.values[name], values)
 
-    def test_nobody_without_a_certificate(self, tls_scheduler):
+    def test_nobody_without_a_certificate(self, tls_scheduler, cube):
         with pytest.raises(InputError, match="found no certificates in dask's configuration"):
-            list(computed_by(tls_scheduler, CUBE, boxes(CUBE)))
+            list(computed_by(tls_scheduler, cube, boxes(cube)))
         plain = tls_scheduler.replace("tls:", "tcp:")
         with pytest.raises(InputError, match=f"scheduler {plain}: found (no scheduler|another service) there"):
-            list(computed_by(plain, CUBE, boxes(CUBE), timeout_s=2.0))
+            list(computed_by(plain, cube, boxes(cube), timeout_s=2.0))
 
-    def test_certificates_that_are_not_there(self, tls_scheduler, tls, tmp_path):
+    def test_certificates_that_are_not_there(self, tls_scheduler, tls, tmp_path, cube):
         wrong = tls | {"distributed.comm.tls.ca-file": str(tmp_path / "none.pem")}
         with dask.config.set(wrong), pytest.raises(InputError, match="dask's certificates cannot be read"):
-            list(computed_by(tls_scheduler, CUBE, boxes(CUBE)))
+            list(computed_by(tls_scheduler, cube, boxes(cube)))
 
 
 class TestNoCluster:
-    def test_nobody_there(self, tmp_path):
+    def test_nobody_there(self, cube):
         with pytest.raises(InputError, match=r"scheduler tcp://127\.0\.0\.1:9: found no scheduler there"):
-            list(computed_by("tcp://127.0.0.1:9", CUBE, boxes(CUBE), timeout_s=0.2))
+            list(computed_by("tcp://127.0.0.1:9", cube, boxes(cube), timeout_s=0.2))
 
     @pytest.mark.parametrize("address", ["foo", "nonsense:::", "", "http://x", "tcp://x", "x:0", "x:65536", "a b:1"])
     def test_not_an_address(self, address, tmp_path, capsys):
@@ -181,7 +186,7 @@ class TestNoCluster:
 
     @pytest.mark.parametrize("answer", [b"HTTP/1.0 400 Bad Request\r\n\r\n", b"", None])
     @pytest.mark.filterwarnings("error::pytest.PytestUnraisableExceptionWarning")
-    def test_another_service_there(self, answer):
+    def test_another_service_there(self, answer, cube):
         """It answers, hangs up, or says nothing: one error, and no client that complains when it is deleted."""
         with socket.create_server(("127.0.0.1", 0)) as server:
 
@@ -198,13 +203,13 @@ class TestNoCluster:
                 dask.config.set({f"distributed.comm.timeouts.{name}": "1 day" for name in ("connect", "tcp")}),
                 pytest.raises(InputError, match=f"scheduler {address}: found (no scheduler|another service) there"),
             ):
-                list(computed_by(address, CUBE, boxes(CUBE), timeout_s=0.3))
+                list(computed_by(address, cube, boxes(cube), timeout_s=0.3))
             gc.collect()
 
-    def test_not_installed(self, monkeypatch):
+    def test_not_installed(self, monkeypatch, cube):
         monkeypatch.setitem(sys.modules, "distributed", None)
         with pytest.raises(InputError, match=r'needs the extra "cluster": pip install "magloc\[cluster\]"'):
-            list(computed_by("tcp://127.0.0.1:9", CUBE, boxes(CUBE)))
+            list(computed_by("tcp://127.0.0.1:9", cube, boxes(cube)))
 
 
 def marks_of(path):

@@ -68,7 +68,7 @@ def magnet_array(data_folder: Path) -> Path:
 
 
 class TestNoiseThatGrowsWithTheField:
-    @pytest.mark.parametrize("common_field_T", [None, 1e-6])
+    @pytest.mark.parametrize("common_field_T", [None, pytest.param(1e-6, marks=pytest.mark.slow)])
     def test_all_sensors(self, magnet_array, common_field_T):
         errors = errors_m(magnet_array, noisy_array(magnet_array, common_field_T=common_field_T))
         assert np.median(errors) <= 0.25e-3

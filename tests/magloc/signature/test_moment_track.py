@@ -145,7 +145,7 @@ class TestKnownAttitude:
 
 
 class TestUncertainPath:
-    @pytest.mark.parametrize("correlation_s", [np.inf, 20.0, 0.0])
+    @pytest.mark.parametrize("correlation_s", [20.0, *(pytest.param(s, marks=pytest.mark.slow) for s in (0.0, np.inf))])
     def test_nees(self, correlation_s: float) -> None:
         """Of the last moment over 30 draws of the path's error: one false alarm in 100."""
         error = magloc.PathError(position_m=1.0, position_correlation_s=correlation_s)

@@ -167,6 +167,16 @@ class TestStarts:
         assert np.sqrt(np.mean((2 * quaternion.error_vector(q, prepared.q)) ** 2)) == pytest.approx(0.02, rel=0.12)
         assert np.sqrt(np.mean((w - prepared.w) ** 2)) == pytest.approx(0.001, rel=0.12)
 
+    def test_errors_of_start_estimates_are_in_body_axes(self, scenario: AttitudeScenario) -> None:
+        """The same, seed by seed, whatever the true attitude."""
+        prepared = prepare(scenario, SEEDS)
+        turned = replace(prepared, q=quaternion.multiply(np.array([0.5, 0.5, 0.5, 0.5]), prepared.q))
+        errors = [
+            quaternion.multiply(quaternion.conjugate(one.q), start_estimates(one, 0.02, 0.001)[0])
+            for one in (prepared, turned)
+        ]
+        np.testing.assert_allclose(*errors, atol=1e-14)
+
 
 class TestSeeds:
     def test_a_run_depends_on_its_seed_alone(self, scenario: AttitudeScenario, runs: AttitudeRuns) -> None:

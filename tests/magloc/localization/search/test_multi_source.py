@@ -8,19 +8,20 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 import scipy.optimize
 from numpy.testing import assert_allclose
-from scipy.stats import binom
+from scipy.stats import betabinom
 from scipy.stats import chi2 as chi2_distribution
 
 from arrays.array import SensorArray
 from arrays.geometries import cube, tetrahedron
 from arrays.sensor import Sensor
-from magloc.levels import DELTA_CHI2_95, FALSE_ALARM
+from magloc.levels import DELTA_CHI2_95
 from magloc.localization.fit.columns import in_stable_order
 from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.prior import SourcePrior
@@ -48,6 +49,12 @@ def plate(noise_T=5e-10):
 
 PLATE = plate()
 BY_ITSELF = plain_locator(PLATE, sources="auto")
+
+
+@cache
+def locator_of(n_sources):
+    """One for all rows: the threshold for another source is drawn once for each."""
+    return plain_locator(PLATE, sources=n_sources)
 
 
 def sources_below(rng, n_rows, n_sources):
@@ -112,8 +119,12 @@ class TestSixteenVectorSensors:
 class TestFalseAlarms:
     """One source is seldom taken for two, and noise seldom for a source: at most the stated rate.
 
-    A rate of exactly FALSE_ALARM passes with a probability of 99.99 %.
+    The threshold is the fifth largest of 5,000 draws, so that the rate itself is drawn, from Beta(5, 4996) with a mean
+    of 1e-3. Such a rate passes with a probability of 99.99 %.
     """
+
+    def most(self, n_rows):
+        return betabinom.ppf(0.9999, n_rows, 5, 4996)
 
     @pytest.mark.parametrize("n_rows", [150, pytest.param(5000, marks=pytest.mark.slow)])
     def test_one_source(self, n_rows):
@@ -121,14 +132,14 @@ class TestFalseAlarms:
         p, m = sources_below(rng, n_rows, 1)
         fixes = BY_ITSELF.fit_rows(noisy_readings(PLATE, p, m, rng))
         false_alarms = sum(len(found_positions(fix)) > 1 for fix in fixes)
-        assert false_alarms <= binom.ppf(0.9999, n_rows, FALSE_ALARM)
+        assert false_alarms <= self.most(n_rows)
         assert all(len(found_positions(fix)) for fix in fixes)
 
     @pytest.mark.parametrize("n_rows", [40, pytest.param(2000, marks=pytest.mark.slow)])
     def test_no_source(self, n_rows):
         noise = np.random.default_rng(104).normal(size=(n_rows, 48)) * 5e-10
         fixes = plain_locator(PLATE, sources="auto").fit_rows(noise)
-        assert sum(bool(fix.solutions) for fix in fixes) <= binom.ppf(0.9999, n_rows, FALSE_ALARM)
+        assert sum(bool(fix.solutions) for fix in fixes) <= self.most(n_rows)
         assert {fix.reason for fix in fixes if not fix.solutions} == {
             "noise alone explains the readings: no source stands out of it"
         }
@@ -143,12 +154,27 @@ class TestSourcesStandOutWhereASingleOneHasNoFit:
         assert all(errors_of(fix, p[0]).max() < 0.05 for fix in fixes)
 
 
+class TestArraysThatCanTellOne:
+    def test_doubtful_fits_are_searched_again_from_more_places_that_stand_closer(self):
+        """Four of 150 random sources near eight total-field sensors, which the first search does not find."""
+        array = replace(cube(1.0, kind="scalar", noise_T=1e-11), ambient_T=(2e-5, 1e-6, 4.5e-5))
+        rng = np.random.default_rng(5)
+        directions = rng.normal(size=(150, 1, 3))
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        p, m = rng.uniform(0.7, 2.5, (150, 1, 1)) * directions, 10.0 * rng.normal(size=(150, 1, 3))
+        missed = [10, 13, 77, 127]
+        fixes = plain_locator(array).fit_rows(noisy_readings(array, p, m, rng)[missed])
+        for fix, truth in zip(fixes, p[missed], strict=True):
+            assert fix.solutions[0].chi2 < chi2_distribution.ppf(1.0 - 1e-6, fix.solutions[0].dof)
+            assert errors_of(fix, truth).max() < 0.1
+
+
 class TestNumberAsked:
     @pytest.mark.parametrize("n_sources", [1, 2, 3])
     def test_as_many_as_asked_for(self, n_sources):
         rng = np.random.default_rng(105)
         p, m = sources_below(rng, 5, n_sources)
-        fixes = plain_locator(PLATE, sources=n_sources).fit_rows(noisy_readings(PLATE, p, m, rng))
+        fixes = locator_of(n_sources).fit_rows(noisy_readings(PLATE, p, m, rng))
         for fix, truth in zip(fixes, p, strict=True):
             assert {len(solution.sources) for solution in fix.solutions} == {n_sources}
             assert errors_of(fix, truth).max() < 0.1
@@ -183,7 +209,7 @@ class TestMergedSources:
     def fix(self, distance, n_sources=2, seed=0):
         p = self.middle + 0.5 * distance * np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
         readings = noisy_readings(PLATE, p[None], self.m[None], np.random.default_rng(seed))
-        return p, plain_locator(PLATE, sources=n_sources).fit_rows(readings)[0]
+        return p, locator_of(n_sources).fit_rows(readings)[0]
 
     @pytest.mark.parametrize("seed", range(3))
     def test_two_asked_for(self, seed):
@@ -200,7 +226,7 @@ class TestMergedSources:
         p = np.array([[0.6, 0.5, -1.2], [0.604, 0.5, -1.2], [-0.7, -0.6, -1.1]])
         m = np.array([*self.m, [10.0, 2.0, -3.0]])
         readings = noisy_readings(PLATE, p[None], m[None], np.random.default_rng(1))
-        fix = plain_locator(PLATE, sources=3).fit_rows(readings)[0]
+        fix = locator_of(3).fit_rows(readings)[0]
         first, second = fix.solutions[0].sources
         assert_allclose(first.position_m, p[0], atol=0.02)
         assert_allclose(second.position_m, p[2], atol=0.02)
@@ -242,7 +268,7 @@ class TestMergedSources:
 
     def test_a_single_source_is_not_called_merged(self):
         readings = noisy_readings(PLATE, self.middle[None, None], self.m[None, :1], np.random.default_rng(3))
-        (source,) = plain_locator(PLATE, sources="auto").fit_rows(readings)[0].solutions[0].sources
+        (source,) = BY_ITSELF.fit_rows(readings)[0].solutions[0].sources
         assert not source.merged
 
 
@@ -261,7 +287,7 @@ def pairs_of(seed, n_rows, sources):
     p, m = sources_below(rng, n_rows, 2)
     readings = noisy_readings(PLATE, p, m, rng)
     counts = []
-    fixes = plain_locator(PLATE, sources=sources).fit_rows(readings, progress=counts.append)
+    fixes = locator_of(sources).fit_rows(readings, progress=counts.append)
     return Pairs(p, m, readings, fixes, sum(counts))
 
 
@@ -378,8 +404,9 @@ class TestRows:
         return np.array(sorted(found_positions(fix).tolist()))
 
     def test_alone_or_together(self, together):
+        another = plain_locator(PLATE, sources="auto")
         for i, fix in enumerate(together.fixes[: len(together.p) // 2]):
-            alone = plain_locator(PLATE, sources="auto").fit_rows(together.readings[i : i + 1])[0]
+            alone = another.fit_rows(together.readings[i : i + 1])[0]
             assert_allclose(self.sorted_positions(alone), self.sorted_positions(fix), rtol=1e-4)
             assert alone.solutions[0].chi2 == pytest.approx(fix.solutions[0].chi2, rel=1e-6)
 
