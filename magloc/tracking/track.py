@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.io.lazy import by_name
 from arrays.typing import BoolArray, FloatArray, IntArray, Vector
+from magloc.ambient import in_world_field
 from magloc.blas_threads import one_blas_thread
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import EVERYWHERE, Intervals
@@ -270,7 +271,7 @@ def track(
     >>> round(float(track.position_m[-1, 2]), 1)
     -0.6
     """
-    used = without_saturated(as_readings(readings), array)
+    used = in_world_field(without_saturated(as_readings(readings), array), array)
     if motion is None:
         motion = (OrnsteinUhlenbeck if smooth and used.motion is None else RandomWalk)(SPEED_M_S, TURN_RAD_S)
     tracker = Tracker(with_stated_pose(array, used), motion, prior=prior, keep_steps=smooth)

@@ -21,6 +21,7 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
+from magloc.ambient import in_world_field
 from magloc.blas_threads import one_blas_thread
 from magloc.kalman import (
     block_update,
@@ -145,7 +146,7 @@ class Tracker:
         if isinstance(row, Readings):
             if len(row) != 1:
                 raise ValueError(f"Input row must be readings of length one; instead received {len(row)} rows.")
-            row = next(rows_of(without_saturated(row, self.array)))
+            row = next(rows_of(in_world_field(without_saturated(row, self.array), self.array)))
         if row.time_s <= self._time_s:
             raise ValueError(f"Input time_s must increase; instead {row.time_s} s follows {self._time_s} s.")
         if self.pose_errors.n_states:
