@@ -107,14 +107,14 @@ class MotionOptions:
 @Parameter(name="*", group="Conditioning of the readings")
 @dataclass(frozen=True)
 class ConditioningOptions:
-    """What is done to the readings first, in this order; not for a stream.
+    """What of the readings is no signal, and what is done to them first; not for a stream.
 
     Parameters
     ----------
     detrend : bool
-        Take a straight line out of every channel.
+        Every channel has a straight line through its mean, whose slope is estimated beside the source.
     high_pass_hz : float
-        Take out what changes more slowly.
+        Every channel has an offset and a drift, as large as its noise at this frequency, that are estimated too.
     mains_hz : float
         Take out this frequency and its harmonics.
     window_s : float
@@ -245,14 +245,14 @@ def track(
             )
         write_moment_track(moments, readings, known, outputs)
         return
+    printed = jsonl and not smooth and not rows.background
     with progress(len(rows), "rows", quiet=common.quiet) as advance, naming(str(array)):
-        if jsonl and not smooth:
+        if printed:
             tracker = magloc.Tracker(with_stated_pose(used, rows), model, prior=prior)
             points = tuple(map(_printed, tracker.run(rows_of(rows), advance)))
             found = magloc.Track(points, rows, tracker)
         else:
             found = magloc.track(used, rows, motion=model, smooth=smooth, prior=prior, progress=advance)
-    printed = jsonl and not smooth
     if not found.tracked.any():
         _print_track(found, None, json=json, jsonl=jsonl, printed=printed)
         raise _no_track(str(readings), found.status)

@@ -20,6 +20,7 @@ from magloc.ambient import in_world_field
 from magloc.averages import average as averaged
 from magloc.averages import averaging_array, complete_rows
 from magloc.blas_threads import one_blas_thread
+from magloc.conditioning import NO_BACKGROUND
 from magloc.localization.dipole_validity import too_near
 from magloc.localization.fault_exclusion import without_faulty_sensors
 from magloc.localization.fit.columns import Solutions, in_stable_order
@@ -37,7 +38,7 @@ from magloc.localization.uncertainty.pose_covariance import pose_covariances
 from magloc.localization.uncertainty.range_interval import is_detected
 from magloc.measurement.pose import PosesOfRows, with_stated_pose
 from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, checked_rows, whitened_rows
-from magloc.readings import Readings, as_readings, saturated_channels, without_saturated
+from magloc.readings import Readings, as_readings, without_saturated
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -391,6 +392,16 @@ def used_rows(
 ) -> tuple[Readings, SensorArray, list[tuple[str, ...]]]:
     """Rows that fixes are made of, with the array of their noise, and names of the channels that saturate in each."""
     rows = in_world_field(without_saturated(readings, array), array)
+    if rows.background:
+        _LOG.warning("a row on its own has no background: filters take it out, and with it some of the signal")
+        values_T = rows.background.taken_out(rows.time_s, rows.values_T)
+        rows = replace(rows, values_T=values_T, background=NO_BACKGROUND)
     if not average:
-        return rows, array, saturated_channels(readings, rows, array)
+        return rows, array, _saturated_channels(readings, rows, array)
     return averaged(rows), averaging_array(array, rows), [()]
+
+
+def _saturated_channels(measured: Readings, rows: Readings, array: SensorArray) -> list[tuple[str, ...]]:
+    """Names of the channels that saturate, for every row."""
+    lost = np.isfinite(measured.values_T) & ~np.isfinite(rows.values_T)
+    return [tuple(array.channel_names[channel] for channel in np.flatnonzero(row)) for row in lost]

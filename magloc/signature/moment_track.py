@@ -17,6 +17,7 @@ from magloc.blas_threads import one_blas_thread
 from magloc.chi_square import mean_bounds, normalised_square
 from magloc.kalman import estimability
 from magloc.localization.fit.results import is_misfit
+from magloc.measurement.nuisances import Drift
 from magloc.navigation.rotations import cross_matrix, rotation_matrix
 from magloc.readings import Readings, as_readings, without_saturated
 from magloc.signature.moment_filter import (
@@ -333,7 +334,8 @@ def moment_model(
     turn_rad_s: float,
 ) -> MomentModel:
     """Model of records that follow each other in time, each with places (n, K, 3) of its own."""
-    measurements = RowMeasurements(array, N_SOURCE)
+    background = Drift.of(passes[0].background, np.concatenate([of_pass.time_s for of_pass in passes]))
+    measurements = RowMeasurements(array, N_SOURCE, background)
     rows = tuple(measurements.of(row) for of_pass in passes for row in rows_of(of_pass))
     times = np.array([row.row.time_s for row in rows])
     if not (np.diff(times) > 0.0).all():

@@ -26,7 +26,7 @@ from arrays.typing import FloatArray
 from magloc.fields import dipole
 from magloc.kalman import MeasurementFunction
 from magloc.measurement.differences import DifferenceMeasurement, turn_jacobian
-from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
+from magloc.measurement.nuisances import Drift, SensorErrors, without_lasting_errors
 from magloc.measurement.pose import TURN, ArrayPose, PoseErrors
 from magloc.navigation.rotations import rotation_matrix, turn_of_change
 from magloc.tracking.motion import N_SOURCE
@@ -221,17 +221,19 @@ class RowMeasurements:
     array : SensorArray
     n_motion : int
         States of the motion.
+    background : Drift, optional
+        What all channels have besides.
 
     Attributes
     ----------
     errors : SensorErrors
-        The lasting errors of the array's sensors.
+        The lasting errors of the array's sensors, and the background.
     pose_errors : PoseErrors
         Those of its pose, behind them.
     """
 
-    def __init__(self, array: SensorArray, n_motion: int) -> None:
-        self.errors = SensorErrors.of(array)
+    def __init__(self, array: SensorArray, n_motion: int, background: Drift | None = None) -> None:
+        self.errors = SensorErrors.of(array, background)
         self.pose_errors = PoseErrors.of(array.pose)
         self._lever_arm_m = np.array(self.pose_errors.uncertainty.lever_arm_m)
         self._array = without_lasting_errors(array)
@@ -246,7 +248,7 @@ class RowMeasurements:
             array = replace(array, ambient_T=(x, y, z))
         differences = self.differences(row)
         sigma = np.sqrt(differences.variance)
-        effect = differences.transform @ self.errors.effect(array, row.readings_T) / sigma[:, None]
+        effect = differences.transform @ self.errors.effect(array, row.readings_T, row.time_s) / sigma[:, None]
         pose = row.pose(self._lever_arm_m)
         of_pose = self.pose_errors.effect(pose, row.pose_sigma)
         model = DifferenceMeasurement(array, differences)

@@ -34,6 +34,7 @@ from magloc.kalman import (
 from magloc.levels import CONTRADICTION
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import Solution
+from magloc.measurement.nuisances import Drift
 from magloc.readings import Readings, without_saturated
 from magloc.tracking.acquisition import CONFIRMED_RANGE_ERROR, STACKED_POSITION_ERROR, Acquisition
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements
@@ -83,6 +84,8 @@ class Tracker:
         Bounds for the fixes that start a track, in the array's frame.
     keep_steps : bool
         Keep what a smoother needs, in `steps`.
+    background : Drift, optional
+        States of every channel beside the source; rows do not start a track then, but :func:`magloc.track` does.
 
     Attributes
     ----------
@@ -112,10 +115,13 @@ class Tracker:
         *,
         prior: SourcePrior = NOTHING_KNOWN,
         keep_steps: bool = False,
+        background: Drift | None = None,
     ) -> None:
         self.array = array
         self.motion = motion
-        self.measurements = RowMeasurements(array, motion.n_states)
+        self.prior = prior
+        self.background = background
+        self.measurements = RowMeasurements(array, motion.n_states, background)
         self.errors, self.pose_errors = self.measurements.errors, self.measurements.pose_errors
         self.keep_steps = keep_steps
         self.steps: list[Step] = []
