@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal, overload
@@ -33,6 +33,7 @@ from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import Row, TrackPoint, rows_of, stacked
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import track_on_background
+from magloc.tracking.whole_records.constants import constants_score
 from magloc.tracking.whole_records.smoother import smoothed
 from magloc.truth import Truth, truth_of_rows
 
@@ -194,7 +195,8 @@ class Track(TrackColumns):
     @cached_property
     def innovations(self) -> InnovationTest:
         """Whether the readings agree with what is stated of sensors, pose and motion."""
-        return innovation_test(self)
+        constants = constants_score(self.tracker, self._rows, self.points)
+        return replace(innovation_test(self), z_constants=constants)
 
     def table(self) -> str:
         """The table that ``magloc track`` prints, and what is wrong with the track."""

@@ -121,6 +121,12 @@ def steps_at(tracker: Tracker, rows: Sequence[Row], states: Sequence[FloatArray]
     return _passed(tracker, measurements, 0, states, np.ones(len(rows), dtype=bool)).steps
 
 
+def settled_steps(tracker: Tracker, rows: Sequence[Row], states: Sequence[FloatArray]) -> list[Step] | None:
+    """Steps of the last pass over rows that are linearised where passes lead, from some states; None if nowhere."""
+    passed = _settled(tracker, [tracker.measurements.of(row) for row in rows], 0, states)
+    return None if passed is None else passed.steps
+
+
 def _extended(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _Passed) -> _Passed:
     """The same with the rows before and after, as far as passes settle with them."""
     while len(passed.steps) < len(measurements):
