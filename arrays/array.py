@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -37,17 +38,21 @@ class SensorArray:
     name : str
         One line of text, or empty.
     noise_fraction : float
-        Noise proportional to the field: variance = noise² + (fraction · |B|)².
+        Noise proportional to the field, of sensors that do not state their own: variance = noise² + (fraction · |B|)².
     common_field_T : float, optional
         Standard deviation, per axis, of the field that is common to all sensors [T]. None: nothing is known of it, and
         only differences between sensors carry information.
     ambient_T : tuple, shape (3,), optional
         Known ambient field in the array's frame, at its origin [T].
+    ambient_world_T : tuple, shape (3,), optional
+        The same in the world frame of the readings' pose [T]; it comes first where they have one.
     ambient_gradient_T_m : tuple of tuples, shape (3, 3), optional
         Known gradient tensor dB_i/dx_j of the ambient field in the array's frame [T/m]: symmetric and traceless, as
         that of any field whose sources are elsewhere. None stands for a uniform field.
     ambient_uncertainty_T : float
-        Standard deviation, per axis, of the error of the ambient field, one for all sensors [T].
+        Standard deviation, per axis, of the error of the ambient field, one for all sensors and rows [T].
+    ambient_uncertainty_white_T : float
+        The same of an error that is new in every row [T].
     pose : PoseUncertainty, optional
         How wrong the pose in the readings may be; None: it counts as exact.
 
@@ -74,19 +79,22 @@ class SensorArray:
     ambient_gradient_T_m: tuple[tuple[float, float, float], ...] | None = None
     ambient_uncertainty_T: float = 0.0
     pose: PoseUncertainty | None = None
+    ambient_world_T: tuple[float, float, float] | None = None
+    ambient_uncertainty_white_T: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sensors", tuple(self.sensors))
         if not (isinstance(self.name, str) and self.name.isprintable()):
             raise ValueError(f"Input name must be one line of printable text; instead received {self.name!r}.")
-        for name in ("noise_fraction", "common_field_T", "ambient_uncertainty_T"):
+        for name in ("noise_fraction", "common_field_T", "ambient_uncertainty_T", "ambient_uncertainty_white_T"):
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, _finite_number(name, value))
                 if value < 0.0:
                     raise ValueError(f"Input {name} must not be negative; instead received {value}.")
-        if self.ambient_T is not None:
-            object.__setattr__(self, "ambient_T", tuple(_finite("ambient_T", self.ambient_T, (3,)).tolist()))
+        for name in ("ambient_T", "ambient_world_T"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, tuple(_finite(name, getattr(self, name), (3,)).tolist()))
         if self.ambient_gradient_T_m is not None:
             object.__setattr__(self, "ambient_gradient_T_m", _gradient_tensor(self.ambient_gradient_T_m))
         if not self.sensors:
@@ -176,10 +184,21 @@ class SensorArray:
         return _read_only(np.array(limits)[self.channel_sensor])
 
     @property
+    def row_ambient_uncertainty_T(self) -> float:
+        """Standard deviation, per axis, of the error of the ambient field in one row by itself [T]."""
+        return math.hypot(self.ambient_uncertainty_T, self.ambient_uncertainty_white_T)
+
+    @property
     def noise_depends_on_reading(self) -> bool:
         """Whether the covariance of the readings changes with them; else it is diagonal, with the channels' noise."""
         uncertain = any(sensor.misalignment_rad or sensor.gain_uncertainty for sensor in self.sensors)
-        return bool(self.noise_fraction) or uncertain
+        return bool(self.noise_fractions.any()) or uncertain
+
+    @cached_property
+    def noise_fractions(self) -> FloatArray:
+        """Noise proportional to the field of each sensor, its own or the array's, shape (N,)."""
+        own = [sensor.noise_fraction for sensor in self.sensors]
+        return _read_only(np.array([self.noise_fraction if fraction is None else fraction for fraction in own]))
 
     @cached_property
     def ambient_fields(self) -> FloatArray:
@@ -234,7 +253,7 @@ class SensorArray:
         Parameters
         ----------
         ids : sequence of str
-            Two at least, each once. Their order becomes the order of the sensors.
+            Two at least, or one where a common field has a prior, each once, in the order that the sensors get.
 
         Returns
         -------
@@ -252,8 +271,9 @@ class SensorArray:
                 nearest = difflib.get_close_matches(name, self.ids, n=1)
                 hint = f" (the nearest is {nearest[0]})" if nearest else ""
                 raise ValueError(f"Input ids must be ids of sensors of the array; instead received {name!r}{hint}.")
-        if len(ids) < 2:
-            raise ValueError(f"Input sensors must be at least 2; instead received {len(ids)}.")
+        if not ids or (len(ids) < 2 and self.common_field_T is None):
+            fewest = "1" if self.common_field_T is not None else "2 where no common field is known"
+            raise ValueError(f"Input sensors must be at least {fewest}; instead received {len(ids)}.")
         return replace(self, sensors=tuple(by_id[name] for name in ids))
 
     def readings_of(self, fields: ArrayLike) -> FloatArray:

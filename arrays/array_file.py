@@ -27,6 +27,7 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
     offset_uncertainty_nT = 0.5
     flicker_nT = 0.01
     drift_nT_rth = 0.1
+    noise_fraction = 0.01           # optional, in place of the array's
     [sensor.calibration]            # optional, reading = scale · (field in sensor axes) + offset
     scale = 1.0                     # a number, 3 numbers or a 3×3 matrix
     offset_nT = [0.0, 0.0, 0.0]     # one number for a scalar sensor
@@ -35,18 +36,17 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
     kind = "vector"                 # any key of a sensor but id, position and calibration
     noise_nT = 1.0
 
-Both may have ``noise_fraction``, ``common_field_nT``, ``ambient_nT = [x, y, z]``, the gradient of that field
-``ambient_gradient_nT_m = [[…], […], […]]`` (symmetric and traceless), ``ambient_uncertainty_nT``,
-``format_version = 1``, and a table ``[pose]``; see :class:`arrays.array.SensorArray` for what they mean.
+Both may have ``noise_fraction``, ``common_field_nT``, ``ambient_nT = [x, y, z]`` or ``ambient_world_nT``, the gradient
+of that field ``ambient_gradient_nT_m = [[…], […], […]]`` (symmetric and traceless), ``ambient_uncertainty_nT``,
+``ambient_uncertainty_white_nT``, ``format_version = 1``, and a table ``[pose]``; see
+:class:`arrays.array.SensorArray` for what they mean.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable
 from dataclasses import replace
-from decimal import Context, Decimal
 from os import PathLike
 from typing import Annotated, Any, ClassVar
 
@@ -69,18 +69,15 @@ from arrays.io.toml import (
     read_toml,
     section_of,
 )
+from arrays.io.units import Number, nanotesla_list, nanotesla_text, scaled, shifted_text, tesla
 from arrays.pose import PoseTable, pose_toml
 from arrays.sensor import Calibration, Sensor
 from arrays.typing import Vector
 
-# Units are converted, nT to T and mrad to rad, by shifting the decimal point of what is written, never by a
-# multiplication: 1.0 nT is the number 1e-9 to the last digit, and every float survives the way to a file and back.
-_SHIFT = Context(prec=1000, traps=[])
 _DEFAULTS, _TURNS = "defaults", ("rotation_xyzw", "ypr_deg")
 _NOT_TURNED = (0.0, 0.0, 0.0, 1.0)
-_Number = int | Decimal
-_NotNegative = Annotated[_Number, NOT_NEGATIVE]
-_NumberVector = tuple[_Number, _Number, _Number]
+_NotNegative = Annotated[Number, NOT_NEGATIVE]
+_NumberVector = tuple[Number, Number, Number]
 
 
 class _Header(File, kw_only=True):
@@ -90,17 +87,19 @@ class _Header(File, kw_only=True):
     noise_fraction: float = 0.0
     common_field_nT: _NotNegative | None = None
     ambient_nT: _NumberVector | None = None
+    ambient_world_nT: _NumberVector | None = None
     ambient_gradient_nT_m: tuple[_NumberVector, _NumberVector, _NumberVector] | None = None
     ambient_uncertainty_nT: _NotNegative = 0
+    ambient_uncertainty_white_nT: _NotNegative = 0
     pose: PoseTable | None = None
 
 
 class _Quality(Table, kw_only=True):
     floats_may_be_infinite: ClassVar[bool] = True
 
-    noise_nT: Annotated[_Number, POSITIVE]
-    saturation_nT: Annotated[_Number, POSITIVE] | None = None
-    misalignment_mrad: Annotated[_Number, Rule(lambda value: 0 <= value < 1000, "a number from 0 to below 1000")] = 0
+    noise_nT: Annotated[Number, POSITIVE]
+    saturation_nT: Annotated[Number, POSITIVE] | None = None
+    misalignment_mrad: Annotated[Number, Rule(lambda value: 0 <= value < 1000, "a number from 0 to below 1000")] = 0
     gain_uncertainty: float = 0.0
     offset_uncertainty_nT: _NotNegative = 0
     flicker_nT: _NotNegative = 0
@@ -117,7 +116,7 @@ class _CalibrationTable(Table, kw_only=True):
     floats_may_be_infinite: ClassVar[bool] = True
 
     scale: float | list[float | list[float]] = 1.0
-    offset_nT: _Number | list[_Number] | None = None
+    offset_nT: Number | list[Number] | None = None
 
 
 class _SensorTable(_Quality, kw_only=True):
@@ -126,6 +125,7 @@ class _SensorTable(_Quality, kw_only=True):
     position_m: Vector
     rotation_xyzw: tuple[float, float, float, float] | None = None
     ypr_deg: Vector | None = None
+    noise_fraction: Annotated[float, NOT_NEGATIVE] | None = None
     calibration: _CalibrationTable = msgspec.field(default_factory=_CalibrationTable)
 
 
@@ -159,13 +159,13 @@ def read_array(path: str | PathLike[str]) -> SensorArray:
     True
     """
     array = read_sensors(path)
-    if array.n_sensors < 2:
-        raise InputError(f"{path}: sensors must be at least 2; instead received {array.n_sensors}.")
+    if array.n_sensors < 2 and array.common_field_T is None:
+        raise InputError(f"{path}: sensors must be at least 2, or 1 with a common_field_nT; instead received 1.")
     return array
 
 
 def read_sensors(path: str | PathLike[str]) -> SensorArray:
-    """Array from its TOML file as :func:`read_array`, which may also be a single sensor, to be calibrated.
+    """Array from its TOML file as :func:`read_array`, which may also be a single sensor in any field, to be calibrated.
 
     Parameters
     ----------
@@ -239,14 +239,16 @@ def array_toml(array: SensorArray) -> str:
     if array.noise_fraction:
         lines.append(f"noise_fraction = {array.noise_fraction!r}")
     if array.common_field_T is not None:
-        lines.append(f"common_field_nT = {_nanotesla(array.common_field_T)}")
-    if array.ambient_T is not None:
-        lines.append(f"ambient_nT = {_nanotesla_list(array.ambient_T)}")
+        lines.append(f"common_field_nT = {nanotesla_text(array.common_field_T)}")
+    for key in ("ambient_nT", "ambient_world_nT"):
+        if (field_T := getattr(array, in_si(key)[0])) is not None:
+            lines.append(f"{key} = {nanotesla_list(field_T)}")
     if array.ambient_gradient_T_m is not None:
-        rows = ", ".join(map(_nanotesla_list, array.ambient_gradient_T_m))
+        rows = ", ".join(map(nanotesla_list, array.ambient_gradient_T_m))
         lines.append(f"ambient_gradient_nT_m = [{rows}]")
-    if array.ambient_uncertainty_T:
-        lines.append(f"ambient_uncertainty_nT = {_nanotesla(array.ambient_uncertainty_T)}")
+    for key in ("ambient_uncertainty_nT", "ambient_uncertainty_white_nT"):
+        if uncertainty_T := getattr(array, in_si(key)[0]):
+            lines.append(f"{key} = {nanotesla_text(uncertainty_T)}")
     if array.pose is not None:
         lines += pose_toml(array.pose)
     for sensor in array.sensors:
@@ -258,10 +260,12 @@ def array_toml(array: SensorArray) -> str:
             name, exponent = in_si(key)
             value = getattr(sensor, name)
             if value:
-                lines.append(f"{key} = {_shifted(value, exponent) if exponent else repr(value)}")
+                lines.append(f"{key} = {shifted_text(value, exponent) if exponent else repr(value)}")
+        if sensor.noise_fraction is not None:
+            lines.append(f"noise_fraction = {sensor.noise_fraction!r}")
         if sensor.calibration != Calibration.of(sensor.kind):
             offsets = sensor.calibration.offset_T
-            offset = _nanotesla_list(offsets) if sensor.kind == "vector" else _nanotesla(offsets[0])
+            offset = nanotesla_list(offsets) if sensor.kind == "vector" else nanotesla_text(offsets[0])
             lines += ["[sensor.calibration]", f"scale = {_shortest_scale(sensor.calibration)}"]
             lines.append(f"offset_nT = {offset}")
     return "\n".join(lines) + "\n"
@@ -295,7 +299,7 @@ def _with_defaults(path: str, table: dict[str, Any]) -> dict[str, Any]:
         return table
     if not isinstance(defaults, dict):
         raise InputError(f"{path}, key {_DEFAULTS}: found a value, expected a table.")
-    check_keys(f"{path}, table {_DEFAULTS}", defaults, {"kind", *_TURNS, *_keys(_Quality)})
+    check_keys(f"{path}, table {_DEFAULTS}", defaults, {"kind", *_TURNS, "noise_fraction", *_keys(_Quality)})
     others = {key: value for key, value in table.items() if key != _DEFAULTS}
     return {
         **others,
@@ -331,9 +335,10 @@ def _sensor(place: str, table: _SensorTable) -> Sensor:
             kind=table.kind,  # type: ignore[arg-type]  # checked there
             position_m=table.position_m,
             rotation_xyzw=_rotation(place, table),
+            noise_fraction=table.noise_fraction,
             **quality,
         )
-    offset_nT: list[_Number] = [0] * sensor.n_channels
+    offset_nT: list[Number] = [0] * sensor.n_channels
     if table.calibration.offset_nT is not None:
         given = table.calibration.offset_nT
         offset_nT = given if isinstance(given, list) else [given]
@@ -343,7 +348,7 @@ def _sensor(place: str, table: _SensorTable) -> Sensor:
             f"{key}: found {_count(len(offset_nT))}, expected {_count(sensor.n_channels)} for a {sensor.kind} sensor."
         )
     with naming(place):
-        calibration = Calibration.of(sensor.kind, table.calibration.scale, [_tesla(key, x) for x in offset_nT])
+        calibration = Calibration.of(sensor.kind, table.calibration.scale, [tesla(key, x) for x in offset_nT])
     return replace(sensor, calibration=calibration)
 
 
@@ -365,20 +370,21 @@ def _rotation(place: str, table: _SensorTable) -> tuple[float, float, float, flo
 
 
 def _with_header(path: str, array: SensorArray, header: _Header) -> SensorArray:
-    common_T = ambient_T = gradient_T_m = None
-    if header.common_field_nT is not None:
-        common_T = _tesla(f"{path}, key common_field_nT", header.common_field_nT)
-    if header.ambient_nT is not None:
-        ambient_T = _tesla_vector(f"{path}, key ambient_nT", header.ambient_nT)
+    gradient_T_m = None
     if header.ambient_gradient_nT_m is not None:
         place = f"{path}, key ambient_gradient_nT_m"
         gradient_T_m = tuple(_tesla_vector(place, row) for row in header.ambient_gradient_nT_m)
+    of_field: dict[str, Any] = {"ambient_gradient_T_m": gradient_T_m}
+    for key in ("common_field_nT", "ambient_uncertainty_nT", "ambient_uncertainty_white_nT"):
+        value = getattr(header, key)
+        of_field[in_si(key)[0]] = None if value is None else tesla(f"{path}, key {key}", value)
+    for key in ("ambient_nT", "ambient_world_nT"):
+        value = getattr(header, key)
+        of_field[in_si(key)[0]] = None if value is None else _tesla_vector(f"{path}, key {key}", value)
     name = array.name if header.name is None else header.name
     pose = None if header.pose is None else header.pose.uncertainty(f"{path}, table pose")
     with naming(path):
-        uncertainty_T = _tesla(f"{path}, key ambient_uncertainty_nT", header.ambient_uncertainty_nT)
-        of_field = (common_T, ambient_T, gradient_T_m, uncertainty_T)
-        return SensorArray(array.sensors, name, header.noise_fraction, *of_field, pose)
+        return SensorArray(array.sensors, name, header.noise_fraction, pose=pose, **of_field)
 
 
 def _quality(place: str, table: _Quality) -> dict[str, Any]:
@@ -387,41 +393,12 @@ def _quality(place: str, table: _Quality) -> dict[str, Any]:
     for key in _keys(_Quality):
         name, exponent = in_si(key)
         value = getattr(table, key)
-        result[name] = _scaled(f"{place}, key {key}", value, -exponent) if exponent and value is not None else value
+        result[name] = scaled(f"{place}, key {key}", value, -exponent) if exponent and value is not None else value
     return result
-
-
-def _tesla(place: str, nanotesla: _Number) -> float:
-    """Field in T from a number in nT as it is written."""
-    return _scaled(place, nanotesla, -9)
 
 
 def _tesla_vector(place: str, nT: _NumberVector) -> Vector:
-    return (_tesla(place, nT[0]), _tesla(place, nT[1]), _tesla(place, nT[2]))
-
-
-def _scaled(place: str, number: _Number, exponent: int) -> float:
-    """A number as it is written, times a power of ten."""
-    result = float(Decimal(number).scaleb(exponent, _SHIFT))
-    if not abs(result) < float("inf"):
-        raise InputError(f"{place}: found {number}, expected a finite number.")
-    return result
-
-
-def _nanotesla(tesla: float) -> str:
-    """A field in T as a TOML float in nT."""
-    return _shifted(tesla, 9)
-
-
-def _nanotesla_list(tesla: Iterable[float]) -> str:
-    return f"[{', '.join(map(_nanotesla, tesla))}]"
-
-
-def _shifted(value: float, exponent: int) -> str:
-    """A number times a power of ten as a TOML float."""
-    shifted = Decimal(repr(value)).scaleb(exponent, _SHIFT)
-    text = f"{shifted:f}" if not shifted or -7 < shifted.adjusted() < 16 else str(shifted)
-    return text if set(text) & set(".E") else f"{text}.0"
+    return (tesla(place, nT[0]), tesla(place, nT[1]), tesla(place, nT[2]))
 
 
 def _shortest_scale(calibration: Calibration) -> float | list[float] | list[list[float]]:

@@ -24,7 +24,7 @@ def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray
     """
     readings_T = np.asarray(readings_T, dtype=np.float64)
     noise = np.broadcast_to(array.channel_noise_T, readings_T.shape)
-    if array.noise_fraction == 0.0:
+    if not array.noise_fractions.any():
         return noise.copy()
     vector = ~array.channel_is_scalar
     modulus = np.zeros_like(readings_T)
@@ -35,7 +35,8 @@ def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray
         moduli = (readings_T[..., scalar] - array.channel_offset_T[scalar]) / array.channel_gain[scalar, 0]
         modulus[..., scalar] = np.abs(moduli - _mean_of_finite(moduli, axis=-1))
     gain = np.linalg.norm(array.channel_gain, axis=1)
-    return np.hypot(noise, array.noise_fraction * gain * np.nan_to_num(modulus))
+    fraction = array.noise_fractions[array.channel_sensor]
+    return np.hypot(noise, fraction * gain * np.nan_to_num(modulus))
 
 
 def reading_covariance(array: SensorArray, readings_T: FloatArray) -> FloatArray:

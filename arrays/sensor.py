@@ -125,12 +125,14 @@ class Sensor:
         Standard deviation of what 1/f noise adds in every decade of frequency, per channel [T].
     drift_T_rth : float
         Random walk of the offset, per channel: its standard deviation after an hour [T/√h].
+    noise_fraction : float, optional
+        Noise proportional to the field, in place of the array's: variance = noise² + (fraction · |B|)².
 
     Raises
     ------
     ValueError
         A number is not finite, a shape is wrong, the noise or the saturation is not positive, the misalignment or the
-        gain's uncertainty is negative or not below 1, one of the last three is negative, a scalar sensor has a
+        gain's uncertainty is negative or not below 1, one of the last four is negative, a scalar sensor has a
         misalignment, the quaternion's norm differs from 1 by more than 1e-6, or the id cannot name a column.
 
     Examples
@@ -153,6 +155,7 @@ class Sensor:
     offset_uncertainty_T: float = 0.0
     flicker_T: float = 0.0
     drift_T_rth: float = 0.0
+    noise_fraction: float | None = None
 
     def __post_init__(self) -> None:
         _check_id(self.id)
@@ -168,7 +171,9 @@ class Sensor:
             object.__setattr__(self, name, _finite_number(name, getattr(self, name)))
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise ValueError(f"Input {name} must be from 0 to below 1; instead received {getattr(self, name)}.")
-        for name in ("offset_uncertainty_T", "flicker_T", "drift_T_rth"):
+        for name in ("offset_uncertainty_T", "flicker_T", "drift_T_rth", "noise_fraction"):
+            if getattr(self, name) is None:
+                continue
             object.__setattr__(self, name, _finite_number(name, getattr(self, name)))
             if getattr(self, name) < 0.0:
                 raise ValueError(f"Input {name} must not be negative; instead received {getattr(self, name)}.")

@@ -70,7 +70,7 @@ EXPLAINED = {
     "monte-carlo": "sims.run_many sims.simulate sims.read_scenario sims.MagneticScenario sims.write_simulation",
     "reading-data": "magloc.read_readings magloc.Readings magloc.read_truth magloc.Truth arrays.InputError",
     "sensor-faults": "magloc.plots.residuals",
-    "ship-signature": "magloc.track_moment magloc.MomentTrack magloc.ObjectPath magloc.PathError"
+    "ship-signature": "magloc.track_moment magloc.track_moments magloc.MomentTrack magloc.ObjectPath magloc.PathError"
     " magloc.read_object_path magloc.fit_signature magloc.Signature",
     "single-sensor-ranging": "magloc.SourceLine magloc.fit_source_line magloc.distance_along_line",
     "star-identification": "adcs.identify_stars",

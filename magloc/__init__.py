@@ -57,6 +57,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "source_map": "magloc.convergence.over_sources",
         "track": "magloc.tracking.track",
         "track_moment": "magloc.signature.moment_track",
+        "track_moments": "magloc.signature.moment_track",
         "view": "magloc.viewer.view",
     },
 )

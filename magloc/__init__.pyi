@@ -36,6 +36,7 @@ from magloc.readings import Readings as Readings
 from magloc.readings import read_readings as read_readings
 from magloc.signature.moment_track import MomentTrack as MomentTrack
 from magloc.signature.moment_track import track_moment as track_moment
+from magloc.signature.moment_track import track_moments as track_moments
 from magloc.signature.path import ObjectPath as ObjectPath
 from magloc.signature.path import PathError as PathError
 from magloc.signature.path import read_object_path as read_object_path

@@ -37,6 +37,20 @@ class Place:
     model: str
 
 
+def in_world_field(readings: Readings, array: SensorArray) -> Readings:
+    """Readings with the ambient field of every row where the array states that of the world, and they have none."""
+    if array.ambient_world_T is None or readings.ambient_T is not None:
+        return readings
+    if readings.array_rotation is None:
+        if array.ambient_T is not None:
+            return readings
+        raise InputError(
+            "key ambient_world_nT of the array file: found no pose in the readings, expected columns array_x_m and so"
+            " on."
+        )
+    return replace(readings, ambient_T=readings.array_rotation.inv().apply(array.ambient_world_T))
+
+
 def with_ambient_field(
     array: SensorArray, readings: Readings, place: Place | None, *, gradient: bool
 ) -> tuple[SensorArray, NDArray[np.float64] | None]:
@@ -45,6 +59,7 @@ def with_ambient_field(
     The readings' own columns come first, then the array file, then the geomagnetic model. Its axes, east, north and up,
     are those of the world frame, and of the array if the readings do not have its pose.
     """
+    readings = in_world_field(readings, array)
     model_T = gradient_T_m = None
     if place is not None:
         model_T, gradient_T_m = _of_model(place)
@@ -59,7 +74,7 @@ def with_ambient_field(
     if scalar and readings.ambient_T is None and array.ambient_T is not None and _turns(readings):
         raise InputError(
             "key ambient_nT of the array file: found an array that turns, for which it is not constant; expected"
-            " columns ambient_x_nT and so on in the readings, or place and date without that key."
+            " ambient_world_nT, columns ambient_x_nT and so on in the readings, or place and date."
         )
     if scalar and array.common_field_T is not None:
         _LOG.warning(
@@ -74,8 +89,8 @@ def with_ambient_field(
     if model_T is None:
         if scalar:
             _LOG.warning(
-                "no ambient field is known (ambient_x_nT and so on in the readings, ambient_nT in the array"
-                " file, or place and date): moduli are taken as those of the source alone"
+                "no ambient field is known (ambient_x_nT and so on in the readings, ambient_nT or ambient_world_nT in"
+                " the array file, or place and date): moduli are taken as those of the source alone"
             )
         return array, None
     if scalar:

@@ -77,6 +77,15 @@ def window_averaging_array(array: SensorArray, readings: Readings, window_s: flo
 
 
 def _less_noisy(array: SensorArray, root: float) -> SensorArray:
-    """The array with its white and proportional noise divided by the root of a number of rows."""
-    sensors = tuple(replace(sensor, noise_T=sensor.noise_T / root) for sensor in array.sensors)
-    return replace(array, sensors=sensors, noise_fraction=array.noise_fraction / root)
+    """The array with what is new in every row divided by the root of a number of rows."""
+    own = (None if sensor.noise_fraction is None else sensor.noise_fraction / root for sensor in array.sensors)
+    sensors = tuple(
+        replace(sensor, noise_T=sensor.noise_T / root, noise_fraction=fraction)
+        for sensor, fraction in zip(array.sensors, own, strict=True)
+    )
+    return replace(
+        array,
+        sensors=sensors,
+        noise_fraction=array.noise_fraction / root,
+        ambient_uncertainty_white_T=array.ambient_uncertainty_white_T / root,
+    )

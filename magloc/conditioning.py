@@ -1,4 +1,4 @@
-"""Columns of readings conditioned before they are tracked: trends, mains hum and slow fields taken out.
+"""What of readings is no signal: trends and slow fields, which tracks model, and mains hum, which is taken out.
 
 Filters run forwards and backwards over the whole record, so that nothing is delayed; they need rows at equal intervals
 without gaps. A column with a missing reading is refused, not interpolated. Users call the methods of
@@ -7,8 +7,9 @@ without gaps. A column with a missing reading is refused, not interpolated. User
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
-from scipy.signal import butter, iirnotch, sosfiltfilt, tf2sos
 
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
@@ -16,6 +17,34 @@ from arrays.typing import FloatArray
 _NOTCH_QUALITY = 30.0
 _HIGH_PASS_ORDER = 2
 _EQUAL_INTERVAL_RTOL = 1e-3
+
+
+@dataclass(frozen=True)
+class Background:
+    """What every channel reads besides the source's field.
+
+    Attributes
+    ----------
+    trend_about_s : float, optional
+        There is a straight line that is zero at this time.
+    corner_Hz : float, optional
+        There is an offset, and what changes more slowly than this frequency.
+    """
+
+    trend_about_s: float | None = None
+    corner_Hz: float | None = None
+
+    def __bool__(self) -> bool:
+        return self.trend_about_s is not None or self.corner_Hz is not None
+
+    def taken_out(self, time_s: FloatArray, values_T: FloatArray) -> FloatArray:
+        """Columns without it, and without what of the signal looks like it: to search in, or to look at."""
+        if self.trend_about_s is not None:
+            values_T = detrended(time_s, values_T)
+        return values_T if self.corner_Hz is None else high_passed(time_s, values_T, self.corner_Hz)
+
+
+NO_BACKGROUND = Background()
 
 
 def detrended(time_s: FloatArray, values_T: FloatArray) -> FloatArray:
@@ -35,12 +64,16 @@ def detrended(time_s: FloatArray, values_T: FloatArray) -> FloatArray:
 
 def high_passed(time_s: FloatArray, values_T: FloatArray, corner_Hz: float) -> FloatArray:
     """Columns without what changes more slowly than a corner frequency: a Butterworth filter of second order."""
+    from scipy.signal import butter  # a third of a second to import
+
     rate = _rate_Hz(time_s, values_T, corner_Hz, 1e6)
     return _filtered(values_T, np.asarray(butter(_HIGH_PASS_ORDER, corner_Hz, "highpass", fs=rate, output="sos")))
 
 
 def without_hum(time_s: FloatArray, values_T: FloatArray, mains_Hz: float) -> FloatArray:
     """Columns without the mains frequency and those of its harmonics that the rate of the rows shows."""
+    from scipy.signal import iirnotch, tf2sos
+
     rate = _rate_Hz(time_s, values_T, mains_Hz, 2000.0)
     for harmonic in np.arange(mains_Hz, 0.5 * rate, mains_Hz):
         values_T = _filtered(values_T, np.asarray(tf2sos(*iirnotch(harmonic, _NOTCH_QUALITY, fs=rate))))
@@ -67,6 +100,8 @@ def _rate_Hz(time_s: FloatArray, values_T: FloatArray, frequency_Hz: float, most
 
 
 def _filtered(values_T: FloatArray, sections: FloatArray) -> FloatArray:
+    from scipy.signal import sosfiltfilt
+
     least = 3 * (2 * len(sections) + 1)
     if len(values_T) <= least:
         raise InputError(f"found {len(values_T)} rows, expected more than {least} for a filter.")

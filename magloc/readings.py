@@ -29,6 +29,7 @@ from arrays.io.errors import InputError
 from arrays.io.text import write_text
 from arrays.sensor import Sensor
 from arrays.typing import FloatArray, IntArray
+from magloc.conditioning import NO_BACKGROUND, Background, without_hum
 from magloc.navigation.measured_motion import MOTION_COLUMNS, MeasuredMotion, motion_columns, motion_of_table
 
 if TYPE_CHECKING:
@@ -70,6 +71,8 @@ class Readings:
     pose_sigma : ndarray, shape (n, 2), optional
         Standard deviations of the array's position along each axis [m] and of its attitude about each axis [rad], in
         place of those of the array's :class:`arrays.PoseUncertainty`.
+    background : Background
+        What of the values is said to be no signal, by :meth:`detrended` and :meth:`high_passed`.
 
     Raises
     ------
@@ -98,6 +101,7 @@ class Readings:
     ambient_T: FloatArray | None = None
     motion: MeasuredMotion | None = None
     pose_sigma: FloatArray | None = None
+    background: Background = NO_BACKGROUND
 
     def __post_init__(self) -> None:
         for name in ("values_T", "time_s", "array_position_m", "ambient_T", "pose_sigma"):
@@ -162,36 +166,40 @@ class Readings:
             ambient_T=chosen(self.ambient_T),
             motion=None if self.motion is None else self.motion.of_rows(rows),
             pose_sigma=chosen(self.pose_sigma),
+            background=self.background,
         )
 
     def __iter__(self) -> Iterator[Readings]:
         return (self[row] for row in range(len(self)))
 
     def detrended(self) -> Readings:
-        """Readings without each channel's straight line over the record, its mean kept.
+        """Readings whose channels are said to have straight lines through their means that are no signal.
+
+        Values stay as they are: a track has the slopes as unknowns, a fix of single rows takes the lines out first.
 
         Raises
         ------
         InputError
             A channel has fewer than two readings.
         """
-        from magloc.conditioning import detrended
-
-        return replace(self, values_T=detrended(self.time_s, self.values_T))
+        return self._with(replace(self.background, trend_about_s=float(np.mean(self.time_s))))
 
     def high_passed(self, hz: float) -> Readings:
-        """Readings without what changes more slowly than a corner frequency: a Butterworth filter of second order.
+        """Readings of which it is said that offsets, and what changes more slowly than a corner `hz`, are no signal.
 
-        It runs forwards and backwards over the whole record, so that nothing is delayed.
+        Values stay as they are: a track has an unknown random walk of every channel, as large as its noise at the
+        corner; a fix of single rows filters first, by a Butterworth of second order forwards and backwards.
 
         Raises
         ------
         InputError
             The rows are not at equal intervals without gaps, or the corner is not below half their rate.
         """
-        from magloc.conditioning import high_passed
+        return self._with(replace(self.background, corner_Hz=hz))
 
-        return replace(self, values_T=high_passed(self.time_s, self.values_T, hz))
+    def _with(self, background: Background) -> Readings:
+        background.taken_out(self.time_s, self.values_T)  # or say why no filter could
+        return replace(self, background=background)
 
     def without_hum(self, mains_hz: float) -> Readings:
         """Readings without the mains frequency and those of its harmonics that the rate of the rows shows.
@@ -201,8 +209,6 @@ class Readings:
         InputError
             As of :meth:`high_passed`.
         """
-        from magloc.conditioning import without_hum
-
         return replace(self, values_T=without_hum(self.time_s, self.values_T, mains_hz))
 
     @property
@@ -442,9 +448,3 @@ def unit_rotation(table: Table, columns: Sequence[str] = ROTATION_COLUMNS) -> Ro
             f"found a quaternion of norm {norm[row]:.6g}, expected norm 1."
         )
     return Rotation.from_quat(quaternion / norm[:, None])
-
-
-def saturated_channels(measured: Readings, rows: Readings, array: SensorArray) -> list[tuple[str, ...]]:
-    """Names of the channels that saturate, for every row."""
-    lost = np.isfinite(measured.values_T) & ~np.isfinite(rows.values_T)
-    return [tuple(array.channel_names[channel] for channel in np.flatnonzero(row)) for row in lost]

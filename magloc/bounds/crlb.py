@@ -94,7 +94,7 @@ def whitened_jacobian(
     """
     p, m = _sources(position_m, moment_Am2)
     check_uncertainty(ambient_uncertainty_T, known_moment_sigma_Am2)
-    ambient_uncertainty_T = ambient_uncertainty_T or array.ambient_uncertainty_T
+    ambient_uncertainty_T = ambient_uncertainty_T or array.row_ambient_uncertainty_T
     root = _inverse_root(array, p, m)
     # What the readings depend on, the source first: columns, and what is known of their numbers.
     columns = [(channel_jacobian(array, p, m), np.inf)]

@@ -42,6 +42,7 @@ class BoundModel(NamedTuple):
         [T]
     uncertainty : ndarray, shape (N, 2)
         Standard deviations of turns [rad] and gains.
+    noise_fraction : ndarray, shape (N,)
     nuisances : ndarray, shape (q,)
         Which ones there are.
     prior : ndarray, shape (q,)
@@ -62,7 +63,7 @@ class BoundModel(NamedTuple):
     scales: FloatArray
     noise: FloatArray
     uncertainty: FloatArray
-    noise_fraction: float
+    noise_fraction: FloatArray
     nuisances: NDArray[np.intp]
     prior: FloatArray
     modulus_prior: float
@@ -80,7 +81,7 @@ class BoundModel(NamedTuple):
         common = math.inf if array.common_field_T is None else array.common_field_T
         deviation = 3 * [0.0 if scalar.all() else common]
         deviation += [common if scalar.any() else 0.0]
-        deviation += 3 * [(ambient_uncertainty_T or array.ambient_uncertainty_T) if scalar.any() else 0.0]
+        deviation += 3 * [(ambient_uncertainty_T or array.row_ambient_uncertainty_T) if scalar.any() else 0.0]
         nuisances = np.flatnonzero(deviation)
         return cls(
             centroid=read_only(array.centroid),
@@ -93,7 +94,7 @@ class BoundModel(NamedTuple):
             scales=read_only(scales),
             noise=read_only(array.channel_noise_T),
             uncertainty=read_only(np.array([(s.misalignment_rad, s.gain_uncertainty) for s in array.sensors])),
-            noise_fraction=float(array.noise_fraction),
+            noise_fraction=read_only(array.noise_fractions),
             nuisances=read_only(nuisances),
             prior=read_only(1.0 / np.array(deviation)[nuisances]),
             modulus_prior=1.0 / known_moment_sigma_Am2,

@@ -102,7 +102,7 @@ def fill_entries(
     for begin in range(0, moments.shape[0], n_lanes):
         _fill_moments(moments, begin, n_lanes, frame, block.w)
         _fill_fields(model, block)
-        if model.noise_fraction > 0.0:
+        if model.noise_fraction.any():
             _fill_means(model.scalar, block)
         _fill_columns(model, block)
         _eliminate(block, entries[:, begin : begin + n_lanes])
@@ -236,7 +236,7 @@ def _fill_scalar_axis(model: BoundModel, s: int, block: Block) -> None:
     gain = model.axes[c, 0]
     constant = model.noise[c] ** 2
     by_field = (gain * model.uncertainty[s, 1]) ** 2
-    by_difference = (gain * model.noise_fraction) ** 2
+    by_difference = (gain * model.noise_fraction[s]) ** 2
     for i in range(n_lanes):
         modulus = fields[f + 3 * LANES + i]
         difference = modulus - w[MEAN + 3 * LANES + i]
@@ -258,7 +258,7 @@ def _fill_vector_axes(model: BoundModel, s: int, block: Block) -> None:
     p0, p1, p2 = block.axes[c, 0], block.axes[c, 1], block.axes[c, 2]
     q0, q1, q2 = block.axes[c + 1, 0], block.axes[c + 1, 1], block.axes[c + 1, 2]
     t0, t1, t2 = block.axes[c + 2, 0], block.axes[c + 2, 1], block.axes[c + 2, 2]
-    turn, gain, fraction = model.uncertainty[s, 0], model.uncertainty[s, 1], model.noise_fraction
+    turn, gain, fraction = model.uncertainty[s, 0], model.uncertainty[s, 1], model.noise_fraction[s]
     # Three channels p, q, t: axes p0, p1, p2, errors by turns pu, pv, pn and by gains px, py, pz, covariance qp.
     for i in range(n_lanes):
         x, y, z = fields[f + i], fields[f + LANES + i], fields[f + 2 * LANES + i]

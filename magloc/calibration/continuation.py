@@ -105,8 +105,10 @@ def with_doubted_fields(problem: Problem, state: State, share: float = 1.0) -> S
     deviations = np.where(problem.free, problem.prior, 0.0)
     displaced = 3.0 * deviations[:, POSITION].max() / problem.array.circumradius
     doubt = share * min(_LARGEST_DOUBT, float(np.hypot(deviations[:, GAINS].max(), displaced)))
-    fraction = float(np.hypot(problem.array.noise_fraction, doubt))
-    return replace(calibrated_array(problem.array, state.sensors), noise_fraction=fraction)
+    array = calibrated_array(problem.array, state.sensors)
+    fractions = np.hypot(array.noise_fractions, doubt).tolist()
+    sensors = tuple(replace(s, noise_fraction=f) for s, f in zip(array.sensors, fractions, strict=True))
+    return replace(array, sensors=sensors)
 
 
 def doubted(problem: Problem, state: State, share: float) -> Problem:
@@ -145,7 +147,7 @@ def _mended(problem: Problem, optimum: Optimum, share: float) -> Optimum:
 def fitted(problem: Problem, start: State) -> tuple[Problem, Optimum]:
     """The optimum, and the problem with the noise that belongs to it."""
     state = approached(problem, start)
-    for _ in range(_NOISE_PASSES if problem.array.noise_fraction else 1):
+    for _ in range(_NOISE_PASSES if problem.array.noise_fractions.any() else 1):
         problem = doubted(problem, state, 0.0)
         optimum = source_fit.minimised(problem, state)
         state = optimum.state

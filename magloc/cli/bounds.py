@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-import arrays
 import magloc
 from arrays.io.arguments import Flag, whole_number
 from arrays.io.errors import InputError, naming
@@ -18,7 +17,7 @@ from arrays.io.outputs import refuse_file
 from arrays.io.text import write_netcdf
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, print_json, progress
-from magloc.cli.options import Grid, print_note, refuse_not_positive
+from magloc.cli.options import Grid, array_of_several, print_note, refuse_not_positive
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -241,7 +240,7 @@ def _check_place(array: SensorArray, place: FloatArray) -> None:
 
 
 def _array_of(path: Path) -> SensorArray:
-    array = arrays.read_array(path)
+    array = array_of_several(path)
     # A figure calls an array by its name; one without is called after its file.
     return array if array.name else replace(array, name=path.stem)
 

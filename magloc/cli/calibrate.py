@@ -15,7 +15,7 @@ from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.io.outputs import make_folder, refuse_file, refuse_unwritable
 from magloc.cli.framework import CommonOptions, print_result
-from magloc.cli.options import print_note, refuse_not_positive
+from magloc.cli.options import array_of_several, print_note, refuse_not_positive
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -132,7 +132,7 @@ def calibrate(
         with naming(str(array)):
             result = magloc.calibrate(nominal, rows, modulus_T=1e-9 * modulus_nT)
     else:
-        nominal = arrays.read_array(array)
+        nominal = array_of_several(array)
         prior = _prior(known, nominal, array)
         rows = read_readings(readings, nominal)
         path = _path(rows, truth, height_m, readings)

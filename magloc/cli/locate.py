@@ -38,7 +38,7 @@ class FixOptions:
     sources : str
         Number of sources in every row, or "auto": as many as the readings support, five at most. One by default.
     position : tuple of 3 floats
-        Where the source is [m], in the frame of the results: only its moment is looked for.
+        Where the source is [m], in the frame of the results: only its moment is looked for. More than once: several.
     average : bool
         Average all rows to one fix. The array and the source must stand still.
     ambient_gradient : bool
@@ -52,7 +52,7 @@ class FixOptions:
     """
 
     sources: str | None = None
-    position: Vector | None = None
+    position: list[Vector] | None = None
     average: Flag = False
     ambient_gradient: Flag = False
     body_length_m: float | None = None
@@ -121,13 +121,13 @@ def locate(
     from magloc.truth import truth_of_rows
 
     where, prior, n_sources = known.where, known.prior, wanted.n_sources
-    length_m, position, joint = wanted.body_length_m, wanted.position, wanted.sources is not None
+    length_m, position = wanted.body_length_m, wanted.position
+    joint = wanted.sources is not None or (position is not None and len(position) > 1)
     if length_m is not None and not 0.0 <= length_m < math.inf:
         raise InputError(f"--body-length-m: found {length_m:g}, expected a length, or 0 for a point.")
-    if position is not None and (joint or known.region is not None):
-        raise InputError(
-            f"--position: found it together with {'--sources' if joint else '--region'}, expected one of them."
-        )
+    if position is not None and (wanted.sources is not None or known.region is not None):
+        other = "--sources" if wanted.sources is not None else "--region"
+        raise InputError(f"--position: found it together with {other}, expected one of them.")
     if truth is not None and out is None:
         raise InputError("--truth: found no --out, expected a folder for the figures with it.")
     if out is not None:
@@ -181,12 +181,12 @@ def locate(
         print_note(note)
 
 
-def _refuse_farther(position: Vector, rows: Readings) -> None:
+def _refuse_farther(positions: list[Vector], rows: Readings) -> None:
     """Refuse a place that is too far away from the array in some row."""
     import numpy as np
 
     array_m = np.zeros(3) if rows.array_position_m is None else rows.array_position_m
-    farthest = float(np.abs(np.array(position) - array_m).max())
+    farthest = float(np.abs(np.array(positions)[:, None] - array_m).max())
     if farthest > _FARTHEST_M:
         raise InputError(
             f"--position: found a place {farthest:g} m from the array, expected one within {_FARTHEST_M:g} m."

@@ -43,6 +43,14 @@ def refuse_not_positive(options: object, *names: str, expected: str = "a positiv
             raise InputError(f"--{name.replace('_', '-')}: found {value:g}, expected {expected}.")
 
 
+def array_of_several(path: Path) -> SensorArray:
+    """The array of a file, of two sensors at least."""
+    array = arrays.read_array(path)
+    if array.n_sensors < 2:
+        raise InputError(f"{path}: sensors must be at least 2; instead received 1.")
+    return array
+
+
 Grid = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=2, lte=2000))]
 """Points along an axis: 2000 are 8,000,000,000 points, more than a day of work."""
 

@@ -25,6 +25,7 @@ from magloc.cli.moments.known_path import (
     print_consistency,
     refuse_bounds,
     write_moment_track,
+    write_moment_tracks,
 )
 from magloc.cli.options import KnownOptions, ambient_field, print_note, refuse_not_positive
 
@@ -61,7 +62,8 @@ class MotionOptions:
     correlation_s : float
         How long a speed lasts, for wandering; by default as long as a turn at the characteristic rate.
     position : tuple of 3 floats
-        Where the source is, at rest, in the frame of the results [m]: only its moment is followed.
+        Where the source is, at rest, in the frame of the results [m]: only its moment is followed. More than once:
+        several sources.
     object_path : Path
         Path file (CSV) of the source: time_s,x_m,y_m,z_m and optionally its attitude qx,qy,qz,qw, in the frame of the
         results; only its moment is followed, and turns with the attitude. Rows outside the path are left out.
@@ -73,11 +75,11 @@ class MotionOptions:
     turn_deg_s: float = 5.0
     motion: Literal["unknown", "wandering", "turn"] | None = None
     correlation_s: float | None = None
-    position: Vector | None = None
+    position: list[Vector] | None = None
     object_path: Path | None = None
     error: PathErrorOptions = field(default_factory=PathErrorOptions)
 
-    def known_path(self) -> ObjectPath | Vector | None:
+    def known_path(self) -> ObjectPath | list[Vector] | None:
         """Where the source is known to be, None where that is to be found."""
         if self.position is None and self.object_path is None:
             if self.error != PathErrorOptions():
@@ -85,6 +87,8 @@ class MotionOptions:
             return None
         if self.position is not None and self.object_path is not None:
             raise InputError("--position: found it together with --object-path, expected one of them.")
+        if self.position is not None and len(self.position) > 1 and self.error != PathErrorOptions():
+            raise InputError("--path-sigma-m: found several places of --position, expected one.")
         if self.motion not in (None, "unknown"):
             raise InputError(f"--motion: found {self.motion} with a known position, expected unknown.")
         return self.position if self.object_path is None else magloc.read_object_path(self.object_path)
@@ -104,14 +108,14 @@ class MotionOptions:
 @Parameter(name="*", group="Conditioning of the readings")
 @dataclass(frozen=True)
 class ConditioningOptions:
-    """What is done to the readings first, in this order; not for a stream.
+    """What of the readings is no signal, and what is done to them first; not for a stream.
 
     Parameters
     ----------
     detrend : bool
-        Take a straight line out of every channel.
+        Every channel has a straight line through its mean, whose slope is estimated beside the source.
     high_pass_hz : float
-        Take out what changes more slowly.
+        Every channel has an offset and a drift, as large as its noise at this frequency, that are estimated too.
     mains_hz : float
         Take out this frequency and its harmonics.
     window_s : float
@@ -224,25 +228,32 @@ def track(
     rows, used = conditioning.apply(rows, used, readings)
     used, rows = _in_ambient_field(used, rows, where)
     if path is not None:
+        outputs = MomentOutputs(json, jsonl, geojson, out, truth, common.quiet)
+        turn_rad_s = math.radians(motion.turn_deg_s)
         with naming(str(array)):
+            if isinstance(path, list) and len(path) > 1:
+                write_moment_tracks(
+                    magloc.track_moments(used, rows, path, turn_rad_s=turn_rad_s, smooth=smooth), readings, outputs
+                )
+                return
             moments = magloc.track_moment(
                 used,
                 rows,
-                path,
-                turn_rad_s=math.radians(motion.turn_deg_s),
+                path[0] if isinstance(path, list) else path,
+                turn_rad_s=turn_rad_s,
                 path_error=motion.error.path_error(),
                 smooth=smooth,
             )
-        write_moment_track(moments, readings, known, MomentOutputs(json, jsonl, geojson, out, truth, common.quiet))
+        write_moment_track(moments, readings, known, outputs)
         return
+    printed = jsonl and not smooth and not rows.background
     with progress(len(rows), "rows", quiet=common.quiet) as advance, naming(str(array)):
-        if jsonl and not smooth:
+        if printed:
             tracker = magloc.Tracker(with_stated_pose(used, rows), model, prior=prior)
             points = tuple(map(_printed, tracker.run(rows_of(rows), advance)))
             found = magloc.Track(points, rows, tracker)
         else:
             found = magloc.track(used, rows, motion=model, smooth=smooth, prior=prior, progress=advance)
-    printed = jsonl and not smooth
     if not found.tracked.any():
         _print_track(found, None, json=json, jsonl=jsonl, printed=printed)
         raise _no_track(str(readings), found.status)

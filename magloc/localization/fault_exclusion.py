@@ -85,7 +85,7 @@ def without_faulty_sensors(
             examination = _Examination(array, refit, mask, block, readings_T[block], ambient, free_position)
             plain = [fixes[row] for row in block]
             examination.allow_for_model_errors(plain)
-            found += examination.fixes(examination.without_lonely_sources(plain))
+            found += examination.fixes(examination.without_lonely_sources(plain) if free_position else plain)
             examined.append(block)
     if not examined:
         return fixes
@@ -162,7 +162,7 @@ class _Examination:
     def allow_for_model_errors(self, plain: Sequence[Fix]) -> None:
         """Count as noise what bodies and the ambient field add to the fixes: no sensor is to be accused of it."""
         errors = []
-        sigma_T = self.array.ambient_uncertainty_T if self.array.channel_is_scalar.any() else 0.0
+        sigma_T = self.array.row_ambient_uncertainty_T if self.array.channel_is_scalar.any() else 0.0
         for row, fix in enumerate(plain):
             if fix.solutions and (fix.body_length_m > 0.0 or sigma_T):
                 q, mu = self._scaled(fix)

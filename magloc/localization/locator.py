@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,9 +16,11 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.pose import PoseUncertainty
 from arrays.typing import FloatArray, IntArray
+from magloc.ambient import in_world_field
 from magloc.averages import average as averaged
 from magloc.averages import averaging_array, complete_rows
 from magloc.blas_threads import one_blas_thread
+from magloc.conditioning import NO_BACKGROUND
 from magloc.localization.dipole_validity import too_near
 from magloc.localization.fault_exclusion import without_faulty_sensors
 from magloc.localization.fit.columns import Solutions, in_stable_order
@@ -36,7 +38,10 @@ from magloc.localization.uncertainty.pose_covariance import pose_covariances
 from magloc.localization.uncertainty.range_interval import is_detected
 from magloc.measurement.pose import PosesOfRows, with_stated_pose
 from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, checked_rows, whitened_rows
-from magloc.readings import Readings, as_readings, saturated_channels, without_saturated
+from magloc.readings import Readings, as_readings, without_saturated
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 _LOG = logging.getLogger(__name__)
 _ROWS_AT_ONCE = 256
@@ -53,8 +58,9 @@ class Locator:
         Vector sensors, scalar ones, or both, with six differences at least.
     sources : int or "auto"
         How many sources there are in every row; "auto": as many as the readings support, five at most.
-    position_m : array_like, shape (3,) or (n, 3), optional
-        Where the source is, in the array's frame [m], in all rows or in every one: only its moment is looked for.
+    position_m : array_like, shape (3,), (n, 3) or (n, K, 3), optional
+        Where the source is, in the array's frame [m], in all rows or in every one: only its moment is looked for. Of
+        several sources n is 1 for all rows.
     prior : SourcePrior
         Bounds of position and moment that hold for every source; solutions that contradict them are left out.
     body_length_m : float, optional
@@ -100,7 +106,8 @@ class Locator:
         self.exclude_faulty = exclude_faulty
         self._search: SingleSourceSearch | MultiSourceSearch | MomentSearch
         if position_m is not None:
-            self._search, self._fewest = MomentSearch(array, position_m, prior=prior), 3
+            self._search = MomentSearch(array, position_m, prior=prior)
+            self._fewest = 3 * self._search.position_m.shape[1]
         elif sources == 1 and not array.channel_is_scalar.any() and prior.known_moment_Am2 is None:
             self._search, self._fewest = SingleSourceSearch(array, prior=prior), 6
         else:
@@ -151,7 +158,7 @@ class Locator:
             if progress is not None:
                 progress(len(index))
         fixes = replace(Fixes.joined(parts), time_s=times)
-        if (fixes.solutions.n_sources > 1).any():
+        if (fixes.solutions.n_sources > 1).any() and not isinstance(self._search, MomentSearch):
             fixes = replace(fixes, solutions=in_stable_order(fixes.solutions))
         near = too_near(self.array, fixes, readings, ambient, self.body_length_m)
         return replace(fixes, too_near=near)
@@ -174,7 +181,7 @@ class Locator:
         if isinstance(search, MomentSearch):
             search = search.of_rows(index)
         at_once = _ROWS_AT_ONCE if isinstance(search, SingleSourceSearch) else _ROWS_OF_SEVERAL
-        found = _Rows(len(readings), self.body_length_m, self.array.ambient_uncertainty_T)
+        found = _Rows(len(readings), self.body_length_m, self.array.row_ambient_uncertainty_T)
         for rows in whitened_rows(self.array, readings, ambient, at_once):
             if rows.n_differences < self._fewest:
                 found.refuse(
@@ -303,8 +310,8 @@ def locate(
         Raw readings [T], NaN where missing. Those that saturate are not used, and named.
     sources, prior, body_length_m, exclude_faulty, seed
         As in :class:`Locator`.
-    position_m : array_like, shape (3,), optional
-        Where the source is [m], in the frame of the results: only its moment is looked for.
+    position_m : array_like, shape (3,) or (K, 3), optional
+        Where the source is, or several sources are [m], in the frame of the results: only moments are looked for.
     ambient_T : array_like, shape (n, 3) or (3,), optional
         Ambient field in the array's frame [T], in place of the readings' and the array's own.
     average : bool
@@ -340,10 +347,8 @@ def locate(
         _LOG.info(f"note: {n_complete} of {len(measured)} rows are averaged, the others miss some readings")
     rows, array, saturated = used_rows(measured, array, average=average)
     ambient = rows.ambient_T if ambient_T is None else np.broadcast_to(np.asarray(ambient_T, float), (len(rows), 3))
-    place = position_m
     pose = rows.pose
-    if position_m is not None and pose is not None:
-        place = pose[1].inv().apply(np.asarray(position_m, dtype=np.float64) - pose[0])
+    place = None if position_m is None else _places_in_array(position_m, pose)
     stated = with_stated_pose(array, rows).pose
     locator = Locator(
         array if stated is None else _seeing_turned_field(array, stated, rows, ambient),
@@ -362,6 +367,15 @@ def locate(
     return fixes.moved(*pose, frame="world", added_covariance=added)
 
 
+def _places_in_array(position_m: ArrayLike, pose: tuple[FloatArray, Rotation] | None) -> FloatArray:
+    """Known places (3,) or (K, 3) of the results' frame in the array's axes of every row: (n, K, 3), n is 1 at rest."""
+    place = np.asarray(position_m, dtype=np.float64)
+    if place.shape != (3,) and (place.ndim != 2 or place.shape[1] != 3 or not len(place)):
+        raise ValueError(f"Input position_m must have shape (3,) or (K, 3); instead received {place.shape}.")
+    place = place.reshape(1, -1, 3)
+    return place if pose is None else np.einsum("nji,nkj->nki", pose[1].as_matrix(), place - pose[0][:, None])
+
+
 def _seeing_turned_field(
     array: SensorArray, pose: PoseUncertainty, rows: Readings, ambient_T: FloatArray | None
 ) -> SensorArray:
@@ -377,7 +391,17 @@ def used_rows(
     readings: Readings, array: SensorArray, *, average: bool = False
 ) -> tuple[Readings, SensorArray, list[tuple[str, ...]]]:
     """Rows that fixes are made of, with the array of their noise, and names of the channels that saturate in each."""
-    rows = without_saturated(readings, array)
+    rows = in_world_field(without_saturated(readings, array), array)
+    if rows.background:
+        _LOG.warning("a row on its own has no background: filters take it out, and with it some of the signal")
+        values_T = rows.background.taken_out(rows.time_s, rows.values_T)
+        rows = replace(rows, values_T=values_T, background=NO_BACKGROUND)
     if not average:
-        return rows, array, saturated_channels(readings, rows, array)
+        return rows, array, _saturated_channels(readings, rows, array)
     return averaged(rows), averaging_array(array, rows), [()]
+
+
+def _saturated_channels(measured: Readings, rows: Readings, array: SensorArray) -> list[tuple[str, ...]]:
+    """Names of the channels that saturate, for every row."""
+    lost = np.isfinite(measured.values_T) & ~np.isfinite(rows.values_T)
+    return [tuple(array.channel_names[channel] for channel in np.flatnonzero(row)) for row in lost]

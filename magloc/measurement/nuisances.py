@@ -15,15 +15,55 @@ import numpy as np
 from arrays.array import SensorArray
 from arrays.noise import calibration_errors
 from arrays.sensor import FLICKER_DECADES
-from arrays.typing import FloatArray, IntArray
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.conditioning import Background
 
 # Corner frequencies of the processes that make up 1/f noise [Hz].
 _FLICKER_HZ = tuple(10.0**-decade for decade in range(FLICKER_DECADES))
 FASTEST_FLICKER_HZ = math.sqrt(10.0) * _FLICKER_HZ[0]
 """Upper end of the decades that they stand for [Hz]: 1/f noise above it counts as noise of one sample."""
 _SECONDS_PER_HOUR = 3600.0
+_UNKNOWN = 1e5
+"""Standard deviation, in that of a reading's noise, of a background of which nothing is known."""
+
 # Where the turns, the gains and the field start among the errors of a sensor.
 _TURN, _GAIN, _FIELD = 0, 3, 6
+
+
+@dataclass(frozen=True)
+class Drift:
+    """A background of every channel that is no signal, in units of the noise of its readings.
+
+    Attributes
+    ----------
+    offset, walk_rts : float
+        Standard deviation of an offset, and of what a random walk adds to it in the root of a second.
+    slope_Hz, about_s : float
+        Standard deviation of the slope of a line that is zero at this time [1/s].
+    """
+
+    offset: float = 0.0
+    walk_rts: float = 0.0
+    slope_Hz: float = 0.0
+    about_s: float = 0.0
+
+    @classmethod
+    def of(cls, background: Background, time_s: FloatArray) -> Drift | None:
+        r"""What a background is over rows at some times.
+
+        A random walk that adds :math:`2π f_c Δt` of the noise in every row leaves in its steady state what a high-pass
+        of first order with the corner :math:`f_c` leaves.
+        """
+        if not background or len(time_s) < 2:
+            return None
+        drift = cls()
+        if background.corner_Hz is not None:
+            interval_s = float(np.median(np.diff(time_s)))
+            drift = replace(drift, offset=_UNKNOWN, walk_rts=2.0 * math.pi * background.corner_Hz * interval_s**0.5)
+        if background.trend_about_s is not None:
+            slope_Hz = _UNKNOWN / float(np.ptp(time_s))
+            drift = replace(drift, slope_Hz=slope_Hz, about_s=background.trend_about_s)
+        return drift
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +83,8 @@ class SensorErrors:
         components of a field that is fixed to the array.
     of_channel : ndarray, shape (n - a,)
         Channel to which the others, drift and 1/f noise, are added.
+    is_slope : ndarray of bool, shape (n - a,)
+        Whether they are added times the time since `about_s`.
     """
 
     array: SensorArray
@@ -51,10 +93,13 @@ class SensorErrors:
     walk: FloatArray
     of_sensor: IntArray
     of_channel: IntArray
+    is_slope: BoolArray
+    about_s: float = 0.0
 
     @classmethod
-    def of(cls, array: SensorArray) -> SensorErrors:
-        """All lasting errors that an array states."""
+    def of(cls, array: SensorArray, background: Drift | None = None) -> SensorErrors:
+        """All lasting errors that an array states, and a background that drifts."""
+        background = background or Drift()
         of_sensor: list[tuple[int, int]] = []
         sigma: list[float] = []
         for i, sensor in enumerate(array.sensors):
@@ -72,18 +117,25 @@ class SensorErrors:
             drift, flicker = array.sensors[i].drift_T_rth / math.sqrt(_SECONDS_PER_HOUR), array.sensors[i].flicker_T
             processes = [(0.0, 0.0, drift)] if drift else []
             processes += [(flicker, 2.0 * math.pi * corner_Hz, 0.0) for corner_Hz in _FLICKER_HZ] if flicker else []
+            noise_T = array.sensors[i].noise_T
+            if background.offset:
+                processes.append((background.offset * noise_T, 0.0, background.walk_rts * noise_T))
             for at_first, rate, noise in processes:
                 of_channel.append(channel)
                 sigma.append(at_first)
                 decay.append(rate)
                 walk.append(noise)
+        slopes = (background.slope_Hz * array.channel_noise_T) if background.slope_Hz else np.zeros(0)
+        flat = np.zeros(slopes.size)
         return cls(
             array,
-            np.array(sigma),
-            np.array(decay),
-            np.array(walk),
+            np.concatenate([sigma, slopes]),
+            np.concatenate([decay, flat]),
+            np.concatenate([walk, flat]),
             np.array(of_sensor, dtype=np.intp).reshape(-1, 2),
-            np.array(of_channel, dtype=np.intp),
+            np.array([*of_channel, *range(slopes.size)], dtype=np.intp),
+            np.repeat([False, True], [len(of_channel), slopes.size]),
+            background.about_s,
         )
 
     @property
@@ -97,7 +149,7 @@ class SensorErrors:
         stationary = self.sigma * np.sqrt(-np.expm1(-2.0 * self.decay_Hz * dt_s))
         return kept, np.hypot(stationary, self.walk * math.sqrt(dt_s))
 
-    def effect(self, array: SensorArray, readings_T: FloatArray) -> FloatArray:
+    def effect(self, array: SensorArray, readings_T: FloatArray, time_s: float = 0.0) -> FloatArray:
         """Derivative (C, n) of one row's readings (C,) [T] by the errors; finite also for missing readings."""
         effect = np.zeros((array.n_channels, self.n_states))
         n = len(self.of_sensor)
@@ -107,7 +159,9 @@ class SensorErrors:
             channel = array.sensor_channels[sensor]
             state, axis = np.nonzero(channel >= 0)
             effect[channel[state, axis], state] = of_axes[sensor[state], axis, column[state]]
-        effect[self.of_channel, n + np.arange(self.of_channel.size)] = 1.0
+        effect[self.of_channel, n + np.arange(self.of_channel.size)] = np.where(
+            self.is_slope, time_s - self.about_s, 1.0
+        )
         return effect
 
 

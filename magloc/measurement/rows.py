@@ -178,5 +178,6 @@ def check_magnitudes(array: SensorArray) -> None:
         raise ValueError(f"Input array must have a common field of 1e12 nT at most; instead received {common_nT:g} nT.")
     if not np.abs(array.ambient_fields).max() <= 1e3:
         raise ValueError("Input array must have an ambient field of 1e12 nT at most; instead received a larger one.")
-    if array.noise_fraction > 10.0:
-        raise ValueError(f"Input array must have a noise_fraction of 10 at most; instead: {array.noise_fraction:g}.")
+    fraction = float(array.noise_fractions.max())
+    if fraction > 10.0:
+        raise ValueError(f"Input array must have a noise_fraction of 10 at most; instead: {fraction:g}.")

@@ -92,6 +92,7 @@ class WhitenedModel(ScaledSensors):
     def of(cls, array: SensorArray, whitenings: list[Whitening], ambient_T: FloatArray) -> WhitenedModel:
         """Model of b sets of readings, each with its whitening and its ambient field (b, N, 3)."""
         # One whitening for all rows, as where the noise is constant, is kept once.
+        radius = array.circumradius or 1.0  # of one sensor alone any length will do
         shared = all(w is whitenings[0] for w in whitenings)
         distinct = whitenings[:1] if shared else whitenings
 
@@ -103,8 +104,8 @@ class WhitenedModel(ScaledSensors):
 
         return cls(
             centroid=array.centroid,
-            radius=array.circumradius,
-            sensors=(array.positions - array.centroid) / array.circumradius,
+            radius=radius,
+            sensors=(array.positions - array.centroid) / radius,
             channel_sensor=array.channel_sensor.astype(np.intp),
             channel_is_scalar=array.channel_is_scalar,
             gain=of_rows([w.root @ array.channel_gain for w in distinct]),

@@ -189,12 +189,10 @@ def fix_columns(fixes: Fixes) -> FixColumns:
     position, moment, intervals = np.full((n, 3), np.nan), np.full((n, 3), np.nan), np.full((n, 2), np.nan)
     covariance = np.full((n, 6, 6), np.nan)
     position[solved], moment[solved] = columns.position_m[at], columns.moment_Am2[at]
-    if columns.covariance.shape[1] == 3:
-        covariance[solved] = 0.0
-        covariance[solved, 3:, 3:] = columns.covariance[at[0]]
-    else:
-        of_state = 6 * at[1][:, None] + np.arange(6)
-        covariance[solved] = columns.covariance[at[0][:, None, None], of_state[:, :, None], of_state[:, None]]
+    of_source = columns.covariance_of_source[at]
+    n_known = 6 - of_source.shape[1]  # a position that is known is exact
+    covariance[solved] = 0.0
+    covariance[solved, n_known:, n_known:] = of_source
     intervals[solved] = np.array([span(columns.ranges[i][k]) for i, k in zip(*at, strict=True)]).reshape(-1, 2)
     return FixColumns(
         row=row,

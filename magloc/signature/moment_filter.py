@@ -52,9 +52,9 @@ class Basis:
 
     Attributes
     ----------
-    M : ndarray, shape (n, 3, q)
-        Moment in the frame of the results per parameter.
-    by_turn : ndarray, shape (n, 3, 3, q)
+    M : ndarray, shape (n, 3 K, q)
+        Moments of K sources in the frame of the results per parameter.
+    by_turn : ndarray, shape (n, 3, 3 K, q)
         Its change by a turn of the object about each axis (the second) of that frame.
     """
 
@@ -72,8 +72,8 @@ class MomentModel:
     Attributes
     ----------
     rows : tuple of RowMeasurement
-    position_m : ndarray, shape (n, 3)
-        Of the object, in the frame of the results.
+    position_m : ndarray, shape (n, K, 3)
+        Of the object, or of several sources, in the frame of the results.
     basis : Basis
     errors : SensorErrors
     path_error : PathError
@@ -115,23 +115,24 @@ class MomentModel:
         signal = [np.linalg.norm(row.z - self.predicted(i, at_rest)) for i, row in enumerate(self.rows)]
         return max(1.0, float(np.max(signal))) / float(np.max(strength))
 
-    def source(self, i: int, x: FloatArray) -> FloatArray:
-        """Position and moment (6,) of a state in row i."""
-        p, M = self.position_m[i], self._turned(i, x)
-        return np.concatenate([p + x[:3] if self.path_error.position_m else p, M @ x[self.moment]])
+    def sources(self, i: int, x: FloatArray) -> FloatArray:
+        """Positions and moments (K, 6) of a state in row i."""
+        p, m = self.position_m[i], (self._turned(i, x) @ x[self.moment]).reshape(-1, 3)
+        return np.concatenate([p + x[:3] if self.path_error.position_m else p, m], axis=1)
 
-    def source_of_state(self, i: int, x: FloatArray) -> FloatArray:
-        """Its derivative (6, n) by the state."""
-        J = np.zeros((N_SOURCE, x.size))
-        J[3:, self.moment] = self._turned(i, x)
+    def sources_of_state(self, i: int, x: FloatArray) -> FloatArray:
+        """Their derivative (K, 6, n) by the state."""
+        J = np.zeros((self.position_m.shape[1], N_SOURCE, x.size))
+        J[:, 3:, self.moment] = self._turned(i, x).reshape(len(J), 3, -1)
         if self.path_error.position_m:
-            J[:3, :3] = np.eye(3)
+            J[:, :3, :3] = np.eye(3)
         if self.path_error.attitude_rad:
-            J[3:, self.moment.start - 3 : self.moment.start] = (self.basis.by_turn[i] @ x[self.moment]).T
+            by_turn = (self.basis.by_turn[i] @ x[self.moment]).T
+            J[:, 3:, self.moment.start - 3 : self.moment.start] = by_turn.reshape(len(J), 3, 3)
         return J
 
     def _turned(self, i: int, x: FloatArray) -> FloatArray:
-        """M (3, q) with the attitude's error."""
+        """M (3 K, q) with the attitude's error."""
         M: FloatArray = self.basis.M[i]
         if self.path_error.attitude_rad:
             M = M + np.einsum("k,kij->ij", x[self.moment.start - 3 : self.moment.start], self.basis.by_turn[i])
@@ -139,12 +140,19 @@ class MomentModel:
 
     def predicted(self, i: int, x: FloatArray) -> FloatArray:
         """Differences (k,) of row i in units of their noise."""
-        return self.rows[i].of_source(self.source(i, x)) + self.rows[i].effect @ x[self.moment.stop :]
+        row, (first, *others) = self.rows[i], self.sources(i, x)
+        others_T = np.sum([row.field_T(source) for source in others], axis=0) if others else None
+        return row.of_source(first, others_T=others_T) + row.effect @ x[self.moment.stop :]
 
     def jacobian(self, i: int, x: FloatArray) -> FloatArray:
         """Their Jacobian (k, n)."""
-        H = self.rows[i].source_jacobian(self.source(i, x)) @ self.source_of_state(i, x)
-        H[:, self.moment.stop :] = self.rows[i].effect
+        row, sources = self.rows[i], self.sources(i, x)
+        fields_T = [row.field_T(source) for source in sources] if len(sources) > 1 else []
+        H = np.zeros((row.z.size, x.size))
+        for k, J in enumerate(self.sources_of_state(i, x)):
+            others_T = np.delete(fields_T, k, axis=0).sum(axis=0) if fields_T else None
+            H += row.source_jacobian(sources[k], others_T) @ J
+        H[:, self.moment.stop :] = row.effect
         return H
 
     def start(self) -> tuple[FloatArray, FloatArray]:
@@ -159,10 +167,11 @@ class MomentModel:
         kept_path = np.zeros(self.moment.start) if self.begins[i] else self.path_error.kept(dt_s)
         kept_errors, added = self.errors.step(dt_s)
         theta = x[self.moment]
-        change = self.turn_rad_s * dt_s * math.sqrt(float(theta @ theta))
+        size = np.linalg.norm(theta.reshape(self.position_m.shape[1], -1), axis=1)
+        change = np.repeat(self.turn_rad_s * dt_s * size, theta.size // size.size)
         F = np.concatenate([kept_path, np.ones(theta.size), kept_errors])
         of_path = self.path_error.sigma * np.sqrt(1.0 - kept_path**2)
-        sigma = np.concatenate([of_path, np.full(theta.size, change), added])
+        sigma = np.concatenate([of_path, change, added])
         noisy = np.flatnonzero(sigma)
         S_q = np.zeros((x.size, noisy.size))
         S_q[noisy, np.arange(noisy.size)] = sigma[noisy]

@@ -12,10 +12,12 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
+from magloc.ambient import in_world_field
 from magloc.blas_threads import one_blas_thread
 from magloc.chi_square import mean_bounds, normalised_square
 from magloc.kalman import estimability
 from magloc.localization.fit.results import is_misfit
+from magloc.measurement.nuisances import Drift
 from magloc.navigation.rotations import cross_matrix, rotation_matrix
 from magloc.readings import Readings, as_readings, without_saturated
 from magloc.signature.moment_filter import (
@@ -203,8 +205,77 @@ def track_moment(
     >>> magloc.track_moment(array, readings_T, [5.0, 0.0, 0.3]).moment_Am2[-1, 1:].round(1)
     array([ 10., 300.])
     """
-    used = without_saturated(as_readings(readings), array)
+    used = in_world_field(without_saturated(as_readings(readings), array), array)
     position_m, rotations, used = known_rows(used, path)
+    (found,) = _tracks(array, used, position_m[:, None], rotations, turn_rad_s, path_error, smooth=smooth)
+    return found
+
+
+@one_blas_thread
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")
+def track_moments(
+    array: SensorArray,
+    readings: Readings | ArrayLike,
+    positions_m: ArrayLike,
+    *,
+    turn_rad_s: float = TURN_RAD_S,
+    smooth: bool = False,
+) -> tuple[MomentTrack, ...]:
+    """Follow the moments of several sources at known places together, such as the cells of a sample.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Three independent differences for every source are enough.
+    readings, turn_rad_s, smooth
+        As of :func:`magloc.track_moment`.
+    positions_m : array_like, shape (K, 3)
+        Where the sources are at rest, in the frame of the results [m].
+
+    Returns
+    -------
+    tuple of MomentTrack
+        One of every source, with the covariance that it has while the others are unknown too; χ² is of all together.
+
+    Raises
+    ------
+    ValueError
+        As of :func:`magloc.track_moment`, or two sources are at one place.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> import magloc
+    >>> array = arrays.grid(3, 3, 0.05, noise_T=1e-10)
+    >>> places_m = [[0.0, 0.0, 0.05], [0.05, 0.0, 0.05]]
+    >>> moments_Am2 = [[0.0, 0.0, 0.01], [0.0, 0.02, 0.0]]
+    >>> fields_T = (magloc.dipole.field(array.positions, p, m) for p, m in zip(places_m, moments_Am2))
+    >>> readings_T = [array.readings_of(sum(fields_T))] * 20
+    >>> first, second = magloc.track_moments(array, readings_T, places_m)
+    >>> first.moment_Am2[-1, 2].round(4), second.moment_Am2[-1, 1].round(4)
+    (np.float64(0.01), np.float64(0.02))
+    """
+    used = in_world_field(without_saturated(as_readings(readings), array), array)
+    places = np.asarray(positions_m, dtype=np.float64)
+    if places.ndim != 2 or places.shape[1] != 3 or not len(places) or not np.isfinite(places).all():
+        raise ValueError(f"Input positions_m must be finite, of shape (K, 3); instead received {places.tolist()}.")
+    if len(np.unique(places, axis=0)) < len(places):
+        raise ValueError(f"Input positions_m must be different places; instead received {places.tolist()}.")
+    position_m = np.broadcast_to(places, (len(used), *places.shape))
+    return _tracks(array, used, position_m, None, turn_rad_s, EXACT, smooth=smooth)
+
+
+def _tracks(
+    array: SensorArray,
+    used: Readings,
+    position_m: FloatArray,
+    rotations: FloatArray | None,
+    turn_rad_s: float,
+    path_error: PathError,
+    *,
+    smooth: bool,
+) -> tuple[MomentTrack, ...]:
+    """Tracks of all sources at places (n, K, 3)."""
     if array.channel_is_scalar.all() and used.ambient_T is None and array.ambient_T is None:
         raise ValueError(_SIGN_UNKNOWN)
     if rotations is None:
@@ -212,11 +283,15 @@ def track_moment(
         if used.motion is not None:
             rates = used.motion.rate_sigma_rad_s
             turn_rad_s = math.hypot(turn_rad_s, math.sqrt(float(np.mean(np.sum(rates**2, axis=1)))))
-    basis = turning_basis(rotations)
+    n_sources = position_m.shape[1]
+    basis = turning_basis(np.kron(np.eye(n_sources), rotations).astype(np.float64))
     model = moment_model(array, [used], [position_m], basis, path_error, turn_rad_s)
     steps = settled(model, gate=True) if smooth else filtered(model)
-    points = _points(model, steps, smooth=smooth)
-    return MomentTrack(tuple(points), used, model, *goodness(model, steps), smooth)
+    chi2, dof = goodness(model, steps)
+    return tuple(
+        MomentTrack(tuple(_points(model, steps, k, smooth=smooth)), used, model, chi2, dof, smooth)
+        for k in range(n_sources)
+    )
 
 
 def known_rows(readings: Readings, path: ObjectPath | ArrayLike) -> tuple[FloatArray, FloatArray | None, Readings]:
@@ -244,8 +319,10 @@ def _turned(readings: Readings) -> FloatArray:
 
 
 def turning_basis(M: FloatArray) -> Basis:
-    """Basis of a moment that turns with the object as a whole: M (n, 3, q)."""
-    return Basis(M, np.einsum("kij,njq->nkiq", cross_matrix(np.eye(3)), M))
+    """Basis of moments that turn with the object as a whole: M (n, 3 K, q)."""
+    n, size, q = M.shape
+    by_turn = np.einsum("aij,nkjq->nakiq", cross_matrix(np.eye(3)), M.reshape(n, -1, 3, q))
+    return Basis(M, by_turn.reshape(n, 3, size, q))
 
 
 def moment_model(
@@ -256,8 +333,9 @@ def moment_model(
     path_error: PathError,
     turn_rad_s: float,
 ) -> MomentModel:
-    """Model of records that follow each other in time, each with a path of its own."""
-    measurements = RowMeasurements(array, N_SOURCE)
+    """Model of records that follow each other in time, each with places (n, K, 3) of its own."""
+    background = Drift.of(passes[0].background, np.concatenate([of_pass.time_s for of_pass in passes]))
+    measurements = RowMeasurements(array, N_SOURCE, background)
     rows = tuple(measurements.of(row) for of_pass in passes for row in rows_of(of_pass))
     times = np.array([row.row.time_s for row in rows])
     if not (np.diff(times) > 0.0).all():
@@ -266,10 +344,13 @@ def moment_model(
             f"Input time_s must increase from row to row; instead {times[late + 1]:.15g} s follows"
             f" {times[late]:.15g} s."
         )
-    for row, p in zip(rows, np.concatenate(positions_m), strict=True):
-        offset = row.row.R_world_from_array.T @ (p - row.row.origin_m) - array.positions
-        if np.linalg.norm(offset, axis=1).min() <= _TOUCHING * array.circumradius:
-            raise ValueError(f"Input path must keep off the sensors; instead it has a place of a sensor: {p.tolist()}.")
+    for row, places in zip(rows, np.concatenate(positions_m), strict=True):
+        for p in places:
+            offset = row.row.R_world_from_array.T @ (p - row.row.origin_m) - array.positions
+            if np.linalg.norm(offset, axis=1).min() <= _TOUCHING * array.circumradius:
+                raise ValueError(
+                    f"Input path must keep off the sensors; instead it has a place of a sensor: {p.tolist()}."
+                )
     begins = np.concatenate([np.arange(len(of_pass)) == 0 for of_pass in passes])
     return MomentModel(rows, np.concatenate(positions_m), basis, measurements.errors, path_error, turn_rad_s, begins)
 
@@ -281,8 +362,8 @@ def goodness(model: MomentModel, steps: Sequence[MomentStep]) -> tuple[float, in
     return chi2, sum(size for nis, size in judged if math.isfinite(nis)) - model.n_parameters
 
 
-def _points(model: MomentModel, steps: Sequence[MomentStep], *, smooth: bool) -> list[TrackPoint]:
-    """Points of a track, from the filter or from the smoother."""
+def _points(model: MomentModel, steps: Sequence[MomentStep], k: int, *, smooth: bool) -> list[TrackPoint]:
+    """Points of the track of source k, from the filter or from the smoother."""
     states = smoothed(steps) if smooth else [(step.x, step.S) for step in steps]
     array = model.rows[0].model.array
     # S_0, the covariance that is propagated without any measurement from the start, of which MeasureS is the share.
@@ -293,8 +374,8 @@ def _points(model: MomentModel, steps: Sequence[MomentStep], *, smooth: bool) ->
         if i:
             F, S_q = model.step(x_0, i)
             open_loop = np.diag(np.linalg.norm(np.concatenate([np.diag(F) @ open_loop, S_q], axis=1), axis=1))
-        row, J = model.rows[i].row, model.source_of_state(i, x)
-        source, root = model.source(i, x), J @ S
+        row, J = model.rows[i].row, model.sources_of_state(i, x)[k]
+        source, root = model.sources(i, x)[k], J @ S
         known = np.linalg.norm(root[3:], ord=2) < _UNDETERMINED * unknown
         with np.errstate(invalid="ignore"):
             learned = np.nan_to_num(estimability(root, J @ open_loop))
@@ -325,5 +406,5 @@ def _covariances_at(model: MomentModel, moment_Am2: FloatArray, *, smooth: bool)
         at.append(state)
     steps = filtered(model, at=at, gate=False)
     states = smoothed(steps) if smooth else [(step.x, step.S) for step in steps]
-    roots = [(model.source_of_state(i, x) @ S)[3:] for i, (x, S) in enumerate(states)]
+    roots = [(model.sources_of_state(i, x)[0] @ S)[3:] for i, (x, S) in enumerate(states)]
     return np.array([root @ root.T for root in roots])

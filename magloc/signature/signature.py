@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
+from magloc.ambient import in_world_field
 from magloc.blas_threads import one_blas_thread
 from magloc.fields import dipole
 from magloc.localization.fit.results import is_misfit
@@ -316,13 +317,14 @@ def fit_signature(
     if len({part.array_position_m is None for part in passes}) > 1:
         raise ValueError("Input readings must all have the array's pose, or none; instead some have it.")
     used, positions, rotations, fields, rates = [], [], [], [], []
-    for part, of_part in zip(passes, paths, strict=True):
-        position, rotation, rows = known_rows(without_saturated(part, array), of_part.along_course())
+    for measured, of_part in zip(passes, paths, strict=True):
+        part = in_world_field(without_saturated(measured, array), array)
+        position, rotation, rows = known_rows(part, of_part.along_course())
         if rotation is None:
             raise ValueError("Input path must have an attitude; instead it has none.")  # along_course gives one
         field = np.einsum("nij,ni->nj", rotation, _ambient(array, rows, ambient_T, needed=induced != "none" or eddy))
         used.append(rows)
-        positions.append(position)
+        positions.append(position[:, None])
         rotations.append(rotation)
         fields.append(field)
         rates.append(np.gradient(field, rows.time_s, axis=0) if len(rows) > 1 else np.zeros_like(field))

@@ -18,7 +18,7 @@ THRESHOLD = 3.3
 
 @dataclass(frozen=True)
 class InnovationTest:
-    """Two sums over a track, each in standard deviations from its mean: standard normal numbers of a right model.
+    """Sums over a track, each in standard deviations from its mean: standard normal numbers of a right model.
 
     Attributes
     ----------
@@ -29,23 +29,30 @@ class InnovationTest:
     z_lag1 : float
         Of the sum of their products with the row before: too large, errors last that are said to be new in every row,
         or the readings were filtered before.
+    z_constants : float
+        Of the lever arm and the mounting that the rows tell of, where a pose is stated and these count as exact: too
+        large, they are not. NaN elsewhere.
     """
 
     rows: int
     z_chi2: float
     z_lag1: float
+    z_constants: float = math.nan
 
     @property
     def flagged(self) -> bool:
         """Whether one of them is beyond the threshold."""
-        return self.z_chi2 > THRESHOLD or self.z_lag1 > THRESHOLD
+        return max(self.z_chi2, self.z_lag1) > THRESHOLD or self.z_constants > THRESHOLD
 
     @property
     def reason(self) -> str:
         """What is wrong, in a sentence; empty where nothing is."""
         if not self.flagged:
             return ""
-        if self.z_lag1 > THRESHOLD:
+        if self.z_constants > THRESHOLD:
+            what = f"the rows agree on another mounting or lever arm than the exact one (z = {self.z_constants:.1f})"
+            why = "position_constant_m and attitude_constant_deg of the pose are stated too small"
+        elif self.z_lag1 > THRESHOLD:
             what = f"innovations of successive rows are alike (z = {self.z_lag1:.1f})"
             why = (
                 "errors that last, of the pose or of sensors, a motion that is not the stated one, or filtered readings"

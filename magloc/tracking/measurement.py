@@ -23,9 +23,10 @@ from arrays.array import SensorArray
 from arrays.differences import Differences, decorrelated_differences
 from arrays.noise import reading_covariance
 from arrays.typing import FloatArray
+from magloc.fields import dipole
 from magloc.kalman import MeasurementFunction
 from magloc.measurement.differences import DifferenceMeasurement, turn_jacobian
-from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
+from magloc.measurement.nuisances import Drift, SensorErrors, without_lasting_errors
 from magloc.measurement.pose import TURN, ArrayPose, PoseErrors
 from magloc.navigation.rotations import rotation_matrix, turn_of_change
 from magloc.tracking.motion import N_SOURCE
@@ -74,14 +75,24 @@ class RowMeasurement:
         states = state[self.n_motion + self.effect.shape[1] :]
         return self.pose_effect @ states if states.size else None
 
-    def of_source(self, source: FloatArray, error: FloatArray | None = None) -> FloatArray:
-        """Predicted differences (k,) of a source (6,) where the pose has an error (9,) and no sensor has any."""
-        in_array = self.pose.in_array(source, error)
-        return self.model.predicted(in_array[:3], in_array[3:], self._ambient_T(error)) / self.sigma
+    def of_source(
+        self, source: FloatArray, error: FloatArray | None = None, others_T: FloatArray | None = None
+    ) -> FloatArray:
+        """Predicted differences (k,) of a source (6,) where the pose has an error (9,) and no sensor has any.
 
-    def source_jacobian(self, source: FloatArray) -> FloatArray:
+        `others_T` (N, 3) is the field of other sources at the sensors.
+        """
+        in_array = self.pose.in_array(source, error)
+        return self.model.predicted(in_array[:3], in_array[3:], self._ambient_T(error, others_T)) / self.sigma
+
+    def source_jacobian(self, source: FloatArray, others_T: FloatArray | None = None) -> FloatArray:
         """Their Jacobian (k, 6) where the pose has no error."""
-        return self._by_source(self._by_array(self.pose.in_array(source)))
+        return self._by_source(self._by_array(self.pose.in_array(source), others_T=others_T))
+
+    def field_T(self, source: FloatArray) -> FloatArray:
+        """Field (N, 3) of a source (6,) at the sensors, in the array's axes, where the pose has no error."""
+        in_array = self.pose.in_array(source)
+        return dipole.field(self.model.array.positions, in_array[:3], in_array[3:])
 
     def predicted(self, state: FloatArray) -> FloatArray:
         """Predicted differences (k,) of a state (n,)."""
@@ -179,18 +190,27 @@ class RowMeasurement:
             full[:, behind:] = self.pose.error_jacobian(self._in_array(state), error) @ self.pose_effect
         return full
 
-    def _by_array(self, in_array: FloatArray, error: FloatArray | None = None) -> FloatArray:
+    def _by_array(
+        self, in_array: FloatArray, error: FloatArray | None = None, others_T: FloatArray | None = None
+    ) -> FloatArray:
         """Jacobian (k, 6) by a source in the array's axes."""
-        return self.model.jacobian(in_array[:3], in_array[3:], self._ambient_T(error)) / self.sigma[:, None]
+        ambient_T = self._ambient_T(error, others_T)
+        return self.model.jacobian(in_array[:3], in_array[3:], ambient_T) / self.sigma[:, None]
 
     def _by_source(self, H: FloatArray, error: FloatArray | None = None) -> FloatArray:
         """That by a source of the world."""
         R = self.pose.turned(error)
         return (H.reshape(-1, 2, 3) @ R.T).reshape(-1, N_SOURCE)
 
-    def _ambient_T(self, error: FloatArray | None) -> FloatArray | None:
-        """Ambient field at the sensors (N, 3) where the pose is turned by an error; None: the array's own."""
-        return None if error is None else self.model.array.ambient_fields @ rotation_matrix(error[TURN])
+    def _ambient_T(self, error: FloatArray | None, others_T: FloatArray | None = None) -> FloatArray | None:
+        """Field at the sensors (N, 3) besides the source's where the pose is turned by an error.
+
+        None: the array's own ambient field, unturned.
+        """
+        if error is None:
+            return None if others_T is None else self.model.array.ambient_fields + others_T
+        turned: FloatArray = self.model.array.ambient_fields @ rotation_matrix(error[TURN])
+        return turned if others_T is None else turned + others_T
 
 
 class RowMeasurements:
@@ -201,17 +221,19 @@ class RowMeasurements:
     array : SensorArray
     n_motion : int
         States of the motion.
+    background : Drift, optional
+        What all channels have besides.
 
     Attributes
     ----------
     errors : SensorErrors
-        The lasting errors of the array's sensors.
+        The lasting errors of the array's sensors, and the background.
     pose_errors : PoseErrors
         Those of its pose, behind them.
     """
 
-    def __init__(self, array: SensorArray, n_motion: int) -> None:
-        self.errors = SensorErrors.of(array)
+    def __init__(self, array: SensorArray, n_motion: int, background: Drift | None = None) -> None:
+        self.errors = SensorErrors.of(array, background)
         self.pose_errors = PoseErrors.of(array.pose)
         self._lever_arm_m = np.array(self.pose_errors.uncertainty.lever_arm_m)
         self._array = without_lasting_errors(array)
@@ -226,7 +248,7 @@ class RowMeasurements:
             array = replace(array, ambient_T=(x, y, z))
         differences = self.differences(row)
         sigma = np.sqrt(differences.variance)
-        effect = differences.transform @ self.errors.effect(array, row.readings_T) / sigma[:, None]
+        effect = differences.transform @ self.errors.effect(array, row.readings_T, row.time_s) / sigma[:, None]
         pose = row.pose(self._lever_arm_m)
         of_pose = self.pose_errors.effect(pose, row.pose_sigma)
         model = DifferenceMeasurement(array, differences)

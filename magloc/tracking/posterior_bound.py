@@ -13,8 +13,9 @@ from magloc.localization.fit.gauss_newton import inverse_information
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row, Step, TrackPoint
-from magloc.tracking.smoother import smoothed
 from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.background import steps_at
+from magloc.tracking.whole_records.smoother import smoothed
 
 # Rows determine a source if their Jacobian, columns scaled, is not nearer to singular.
 _SINGULAR_RTOL = 1e-6
@@ -64,6 +65,12 @@ def _steps_at_truth(
     motion, n_errors = tracker.motion, tracker.n_errors
     truth = np.concatenate([position_m, moment_Am2], axis=1)
     velocity, rate = _velocities(np.array([row.time_s for row in rows]), truth)
+    if tracker.background is not None:
+        states = [
+            np.concatenate([motion.state_of(truth[i], velocity[i], rate[i]), np.zeros(n_errors)])
+            for i in range(len(rows))
+        ]
+        return steps_at(tracker, rows, states)
     steps: list[Step] = []
     S: FloatArray | None = None
     seen: list[FloatArray] = []

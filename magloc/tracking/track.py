@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal, overload
@@ -16,9 +16,11 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.io.lazy import by_name
 from arrays.typing import BoolArray, FloatArray, IntArray, Vector
+from magloc.ambient import in_world_field
 from magloc.blas_threads import one_blas_thread
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import EVERYWHERE, Intervals
+from magloc.measurement.nuisances import Drift
 from magloc.measurement.pose import with_stated_pose
 from magloc.navigation.measured_motion import MeasuredMotion
 from magloc.readings import Readings, as_readings, without_saturated
@@ -29,8 +31,10 @@ from magloc.tracking.innovations import InnovationTest, innovation_test
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk, known_motions
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import Row, TrackPoint, rows_of, stacked
-from magloc.tracking.smoother import smoothed
 from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.background import track_on_background
+from magloc.tracking.whole_records.constants import constants_score
+from magloc.tracking.whole_records.smoother import smoothed
 from magloc.truth import Truth, truth_of_rows
 
 if TYPE_CHECKING:
@@ -191,7 +195,8 @@ class Track(TrackColumns):
     @cached_property
     def innovations(self) -> InnovationTest:
         """Whether the readings agree with what is stated of sensors, pose and motion."""
-        return innovation_test(self)
+        constants = constants_score(self.tracker, self._rows, self.points)
+        return replace(innovation_test(self), z_constants=constants)
 
     def table(self) -> str:
         """The table that ``magloc track`` prints, and what is wrong with the track."""
@@ -270,10 +275,16 @@ def track(
     >>> round(float(track.position_m[-1, 2]), 1)
     -0.6
     """
-    used = without_saturated(as_readings(readings), array)
+    used = in_world_field(without_saturated(as_readings(readings), array), array)
     if motion is None:
         motion = (OrnsteinUhlenbeck if smooth and used.motion is None else RandomWalk)(SPEED_M_S, TURN_RAD_S)
-    tracker = Tracker(with_stated_pose(array, used), motion, prior=prior, keep_steps=smooth)
+    background = Drift.of(used.background, used.time_s)
+    tracker = Tracker(with_stated_pose(array, used), motion, prior=prior, keep_steps=smooth, background=background)
+    if background is not None:
+        if used.motion is not None:
+            raise ValueError("Input readings must have measured velocities and rates or a background, not both.")
+        found = track_on_background(tracker, used, smooth=smooth, progress=progress)
+        return Track(tuple(found), used, tracker, smooth)
     if used.motion is None:
         points = track_record(tracker, list(rows_of(used)), progress)
     else:

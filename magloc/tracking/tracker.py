@@ -21,6 +21,7 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
+from magloc.ambient import in_world_field
 from magloc.blas_threads import one_blas_thread
 from magloc.kalman import (
     block_update,
@@ -33,6 +34,7 @@ from magloc.kalman import (
 from magloc.levels import CONTRADICTION
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import Solution
+from magloc.measurement.nuisances import Drift
 from magloc.readings import Readings, without_saturated
 from magloc.tracking.acquisition import CONFIRMED_RANGE_ERROR, STACKED_POSITION_ERROR, Acquisition
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements
@@ -82,6 +84,8 @@ class Tracker:
         Bounds for the fixes that start a track, in the array's frame.
     keep_steps : bool
         Keep what a smoother needs, in `steps`.
+    background : Drift, optional
+        States of every channel beside the source; rows do not start a track then, but :func:`magloc.track` does.
 
     Attributes
     ----------
@@ -111,10 +115,13 @@ class Tracker:
         *,
         prior: SourcePrior = NOTHING_KNOWN,
         keep_steps: bool = False,
+        background: Drift | None = None,
     ) -> None:
         self.array = array
         self.motion = motion
-        self.measurements = RowMeasurements(array, motion.n_states)
+        self.prior = prior
+        self.background = background
+        self.measurements = RowMeasurements(array, motion.n_states, background)
         self.errors, self.pose_errors = self.measurements.errors, self.measurements.pose_errors
         self.keep_steps = keep_steps
         self.steps: list[Step] = []
@@ -145,7 +152,7 @@ class Tracker:
         if isinstance(row, Readings):
             if len(row) != 1:
                 raise ValueError(f"Input row must be readings of length one; instead received {len(row)} rows.")
-            row = next(rows_of(without_saturated(row, self.array)))
+            row = next(rows_of(in_world_field(without_saturated(row, self.array), self.array)))
         if row.time_s <= self._time_s:
             raise ValueError(f"Input time_s must increase; instead {row.time_s} s follows {self._time_s} s.")
         if self.pose_errors.n_states:

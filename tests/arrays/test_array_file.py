@@ -149,6 +149,29 @@ class TestGeometryForm:
             ambient_uncertainty_T=5e-8,
         )
 
+    def test_field_of_the_world_and_its_white_error(self, write: WriteFile) -> None:
+        header = "ambient_world_nT = [1, 2.5, -3]\nambient_uncertainty_white_nT = 20\n"
+        expected = replace(
+            tetrahedron(1.5), name="", ambient_world_T=(1e-9, 2.5e-9, -3e-9), ambient_uncertainty_white_T=2e-8
+        )
+        assert read_array(write(f'name = ""\n{header}{GEOMETRY}')) == expected
+        assert read_array(write(array_toml(expected))) == expected
+
+    def test_proportional_noise_of_one_sensor(self, write: WriteFile) -> None:
+        """Its own stands in place of that of the defaults, and that in place of the array's."""
+        text = changed(SENSORS, 'id = "s2"', 'id = "s2"\nnoise_fraction = 0.02')
+        text = f"noise_fraction = 0.5\n{text}"
+        array = read_array(write(text))
+        assert array.noise_fractions.tolist() == [0.5, 0.02, *[0.5] * (array.n_sensors - 2)]
+        assert read_array(write(array_toml(array))) == array
+        defaults = read_array(write(f"{text}\n[defaults]\nnoise_fraction = 0\n"))
+        assert defaults.noise_fractions.tolist() == [0.0, 0.02, *[0.0] * (array.n_sensors - 2)]
+
+    def test_one_sensor_in_a_common_field(self, write: WriteFile) -> None:
+        array = read_array(write("common_field_nT = 5\n" + SENSORS[: SENSORS.rindex("[[sensor]]")]))
+        assert array.ids == ("s1",)
+        assert array.subset(["s1"]) == array
+
     def test_pose(self, write: WriteFile) -> None:
         """Constants that are left out are those of an ordinary mounting; writing and reading lose nothing."""
         table = "[pose]\nposition_m = 0.02\nattitude_deg = 0.3\ntime_s = 0.01\nlever_arm_m = [0.1, 0, -2]\n"
@@ -497,7 +520,11 @@ class TestRefused:
             (SENSORS, "sensor = 5", ("key sensor", "found a whole number, expected a list")),
             (SENSORS, "sensor = [5, 6]", ("sensor number 1", "found a whole number, expected a table")),
             (SENSORS, "[sensor]\nid = 's1'", ("key sensor", "found a table, expected a list")),
-            (SENSORS, SENSORS[: SENSORS.rindex("[[sensor]]")], ("sensors must be at least 2; instead received 1",)),
+            (
+                SENSORS,
+                SENSORS[: SENSORS.rindex("[[sensor]]")],
+                ("sensors must be at least 2, or 1 with a common_field_nT; instead received 1",),
+            ),
         ],
     )
     def test_sensors_form(self, write: WriteFile, old: str, new: str, parts: tuple[str, ...]) -> None:

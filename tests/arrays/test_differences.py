@@ -362,6 +362,14 @@ class TestProportionalNoise:
         assert_allclose(noise.reshape(4, 3)[:2], np.hypot(2e-9, 0.03 * 4e-6), rtol=1e-12)
         assert_allclose(noise.reshape(4, 3)[2:], 2e-9, rtol=1e-9)
 
+    def test_a_sensor_may_have_its_own(self):
+        first, *others = tetrahedron(1.0, noise_T=2e-9).sensors
+        array = SensorArray((replace(first, noise_fraction=0.1), *others), noise_fraction=0.03)
+        fields = np.array([[4.0, 0, 0], [-4.0, 0, 0], [0, 0, 0], [0, 0, 0]]) * 1e-6
+        noise = proportional_noise(array, fields.ravel()).reshape(4, 3)
+        assert_allclose(noise[0], np.hypot(2e-9, 0.1 * 4e-6), rtol=1e-12)
+        assert_allclose(noise[1], np.hypot(2e-9, 0.03 * 4e-6), rtol=1e-12)
+
     def test_a_uniform_field_adds_none(self):
         array = SensorArray(tetrahedron(1.0, noise_T=2e-9).sensors, noise_fraction=0.03)
         readings = np.tile([1e-5, 2e-5, 3e-5], 4)

@@ -381,14 +381,18 @@ class TestSensorArray:
         ("ids", "text"),
         [
             (["a", "x9"], "Input ids must be ids of sensors of the array; instead received 'x9'"),
-            (["a"], "Input sensors must be at least 2; instead received 1"),
-            ([], "Input sensors must be at least 2; instead received 0"),
+            ([], "Input sensors must be at least 1; instead received 0"),
             (["a", "a", "b"], "Input sensors must have different ids; instead received 'a' 2 times"),
         ],
     )
     def test_subset_refused(self, mixed: SensorArray, ids: list[str], text: str) -> None:
         with pytest.raises(ValueError, match=text):
             mixed.subset(ids)
+
+    def test_a_subset_of_one_needs_a_common_field(self, mixed: SensorArray) -> None:
+        assert mixed.subset(["a"]).ids == ("a",)
+        with pytest.raises(ValueError, match="at least 2 where no common field is known; instead received 1"):
+            replace(mixed, common_field_T=None).subset(["a"])
 
     @pytest.mark.parametrize(
         ("change", "text"),

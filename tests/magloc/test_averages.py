@@ -73,6 +73,13 @@ class TestAverage:
         for before, after in zip(uncertain.sensors, averaged.sensors, strict=True):
             assert after == replace(before, noise_T=before.noise_T / 2.0)
 
+    def test_what_is_new_in_every_row_does(self, array: SensorArray) -> None:
+        first, *others = array.sensors
+        stated = replace(array, sensors=(replace(first, noise_fraction=0.1), *others), ambient_uncertainty_white_T=4e-9)
+        averaged = averaging_array(stated, self.readings([[1.0] * 7] * 4))
+        assert averaged.noise_fractions.tolist() == [0.05, *[0.0] * len(others)]
+        assert averaged.ambient_uncertainty_white_T == 2e-9
+
     def test_array_that_moves(self) -> None:
         position = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.1, 0.0]])
         rows = self.readings([[1.0]] * 3, array_position_m=position, array_rotation=Rotation.identity(3))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,20 @@ from magloc.readings import Readings
 
 FloatArray = NDArray[np.float64]
 RATE_HZ = 200.0
-detrended, high_passed, without_hum = Readings.detrended, Readings.high_passed, Readings.without_hum
+without_hum = Readings.without_hum
+
+
+def detrended(readings: Readings) -> Readings:
+    return taken_out(readings.detrended())
+
+
+def high_passed(readings: Readings, hz: float) -> Readings:
+    return taken_out(readings.high_passed(hz))
+
+
+def taken_out(readings: Readings) -> Readings:
+    """As a filter leaves them."""
+    return replace(readings, values_T=readings.background.taken_out(readings.time_s, readings.values_T))
 
 
 def readings_of(time_s: FloatArray, values_T: FloatArray) -> Readings:

@@ -33,6 +33,7 @@ SHOWN = {
     "08-calibration": 1,
     "09-several-sources": 1,
     "10-ship": 1,
+    "11-uncertain-pose": 0,
 }
 # Another page's picture of a notebook.
 ON_PAGES = {"kalman-bank": ("attitude-track.png", 0)}

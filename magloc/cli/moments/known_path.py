@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from cyclopts import Parameter
 
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.text import write_text
+from arrays.typing import BoolArray
 from magloc.cli.framework import print_json
 from magloc.cli.options import KnownOptions, print_note
 
 if TYPE_CHECKING:
     from magloc.signature.moment_track import MomentTrack
     from magloc.signature.path import PathError
+    from magloc.tracking.results import TrackPoint
 
 
 @dataclass(frozen=True)
@@ -109,6 +112,35 @@ def write_moment_track(found: MomentTrack, readings: Path, known: KnownOptions, 
         print(found.table())
     if result is not None and not outputs.json:
         print_consistency(result.lines(), jsonl=outputs.jsonl)
+    _note(found, found.tracked, readings, outputs)
+
+
+def write_moment_tracks(found: Sequence[MomentTrack], readings: Path, outputs: MomentOutputs) -> None:
+    """Print those of several sources."""
+    for option, value in (("--truth", outputs.truth), ("--geojson", outputs.geojson), ("--out", outputs.out)):
+        if value is not None:
+            raise InputError(f"{option}: found several places of --position, expected one.")
+    entries = [_entry_of_several(points) for points in zip(*found, strict=True)]
+    first = found[0]
+    if outputs.json:
+        print_json({"results": entries, "chi2": first.chi2, "dof": first.dof, "misfit": first.misfit})
+    elif outputs.jsonl:
+        for entry in entries:
+            print_json(entry)
+    else:
+        print("\n".join(f"source {k}\n{track.table()}" for k, track in enumerate(found, start=1)))
+    _note(first, np.all([track.tracked for track in found], axis=0), readings, outputs)
+
+
+def _entry_of_several(points: Sequence[TrackPoint]) -> dict[str, object]:
+    """One row of several sources, in the keys of one and of fixes of several."""
+    first, keys = points[0], ("position_m", "moment_Am2", "covariance")
+    of_row = {key: getattr(first, key) for key in ("time_s", "nis", "nis_dof", "status")}
+    return of_row | {"sources": [{key: getattr(point, key) for key in keys} for point in points]}
+
+
+def _note(found: MomentTrack, determined: BoolArray, readings: Path, outputs: MomentOutputs) -> None:
+    """Say what does not fit, and refuse readings that determine nothing."""
     if not outputs.quiet:
         if found.misfit:
             print_note(
@@ -116,8 +148,8 @@ def write_moment_track(found: MomentTrack, readings: Path, known: KnownOptions, 
                 " clock, another source, a body too near, or noise that is understated)"
             )
         if not (outputs.json or outputs.jsonl):
-            print_note(f"{found.tracked.sum()} of {len(found)} rows with a moment")
-    if not found.tracked.any():
+            print_note(f"{determined.sum()} of {len(found)} rows with a moment")
+    if not determined.any():
         raise InputError(f"{readings}: found no row that determines the moment, expected rows nearer to the object.")
 
 

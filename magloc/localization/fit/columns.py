@@ -23,7 +23,7 @@ class Solutions:
     of_row, n_sources, dof, iterations, n_known : ndarray of int, shape (f,)
     position_m, moment_Am2 : ndarray, shape (f, K, 3)
         NaN beyond the sources of a solution.
-    covariance : ndarray, shape (f, 6 K, 6 K) or (f, 3, 3)
+    covariance : ndarray, shape (f, 6 K, 6 K), or (f, 3 K, 3 K) of moments alone
     chi2, weight, known_chi2 : ndarray, shape (f,)
     ranges : list of tuple of Intervals
         Of every source of every solution.
@@ -130,25 +130,33 @@ class Solutions:
         values["ranges"] = [self.ranges[i] for i in at]
         return Solutions(**(values if of_row is None else values | {"of_row": of_row}))
 
+    @property
+    def covariance_of_source(self) -> FloatArray:
+        """Covariances (f, K, n, n) of every source, all others being unknown too."""
+        n_sources = self.position_m.shape[1]
+        n = self.covariance.shape[1] // n_sources
+        blocks = self.covariance.reshape(len(self), n_sources, n, n_sources, n)
+        return np.einsum("fkikj->fkij", blocks)
+
     def solution(self, i: int) -> Solution:
         """One of them as an object."""
-        n, size = int(self.n_sources[i]), self.covariance.shape[1]
-        known = size == 3
+        n = int(self.n_sources[i])
+        of_source = self.covariance_of_source
+        used = n * of_source.shape[2]
         sources = tuple(
             Source(
                 self.position_m[i, k],
                 self.moment_Am2[i, k],
-                self.covariance[i] if known else self.covariance[i, 6 * k : 6 * k + 6, 6 * k : 6 * k + 6],
+                of_source[i, k],
                 self.ranges[i][k],
                 bool(self.gaussian[i, k]),
                 bool(self.merged[i, k]),
             )
             for k in range(n)
         )
-        covariance = self.covariance[i] if known else self.covariance[i, : 6 * n, : 6 * n]
         return Solution(
             sources,
-            covariance,
+            self.covariance[i, :used, :used],
             float(self.chi2[i]),
             int(self.dof[i]),
             float(self.weight[i]),

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import xarray as xr
 
-from arrays.typing import FloatArray, IntArray
+from arrays.typing import IntArray
 from magloc.localization.fit.results import span
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def dataset_of_fixes(fixes: Fixes, which: Literal["best", "all"]) -> xr.Dataset:
         full[at] = values
         return full
 
-    blocks = _blocks(columns.covariance[chosen], n_sources)
+    blocks = columns.covariance_of_source[chosen]
     source = (*leading, "source")
     variables = {
         "position_m": ((*source, "axis"), table(columns.position_m[chosen], np.nan)),
@@ -107,11 +107,3 @@ def geojson_of_fixes(fixes: Fixes) -> dict[str, Any]:
             geometry = {"type": "Point", "coordinates": source.position_m.tolist()}
             features.append({"type": "Feature", "geometry": geometry, "properties": properties})
     return {"type": "FeatureCollection", "frame": fixes.frame, "features": features}
-
-
-def _blocks(covariance: FloatArray, n_sources: int) -> FloatArray:
-    """Covariances (f, K, n, n) of every source, from those of all together."""
-    if covariance.shape[1] == 3:
-        return covariance[:, None]
-    parts = [covariance[:, 6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n_sources)]
-    return np.stack(parts, axis=1)

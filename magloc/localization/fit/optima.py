@@ -26,7 +26,7 @@ class Optima:
     merged : ndarray of bool, shape (f, K)
         Whether a source stands for two that the array does not tell apart.
     failed_starts : ndarray of int, shape (b,)
-    position_m : ndarray, shape (b, 3), optional
+    position_m : ndarray, shape (b, K, 3), optional
         Places of the sources where they are known: then the unknowns are the moments alone.
     undetermined : str
         Why a row has no solution if its optima have no finite covariance.
@@ -62,4 +62,4 @@ class Optima:
     @property
     def dof(self) -> int:
         """Degrees of freedom of a fit."""
-        return self.rows.n_differences - (3 if self.position_m is not None else 6 * self.fits.n_sources)
+        return self.rows.n_differences - (3 if self.position_m is not None else 6) * self.fits.n_sources

@@ -1,4 +1,4 @@
-"""The moment of a dipole whose place is known: the vector gradiometer of the source paper, by any sensors.
+"""The moments of dipoles whose places are known: the vector gradiometer of the source paper, by any sensors.
 
 Differences of moduli without an ambient field are even in the moment: m and -m fit exactly alike, and three of them
 usually have four exact solutions. All of them are returned. A known ambient field makes the differences nearly linear
@@ -32,35 +32,40 @@ _TOO_LARGE = "the differences between the sensors do not determine a moment that
 
 
 class MomentSearch:
-    """Optima of the moment of a source at known places.
+    """Optima of the moments of K sources at known places.
 
     Parameters
     ----------
-    position_m : array_like, shape (3,) or (n, 3)
-        The source in the array's frame [m]: in all rows, or in every one of an array that moves.
+    position_m : array_like, shape (3,), (n, 3) or (n, K, 3)
+        The source in the array's frame [m]: in all rows, or in every one of an array that moves; or several of them,
+        n is 1 for all rows.
     prior : SourcePrior
         Of which only what it says of the moment is used.
 
     Raises
     ------
     ValueError
-        The position is not three finite numbers, or is that of a sensor.
+        The position is not three finite numbers, or is that of a sensor, or of another source.
     """
 
     def __init__(self, array: SensorArray, position_m: ArrayLike, *, prior: SourcePrior = NOTHING_KNOWN) -> None:
         position = np.asarray(position_m, dtype=np.float64)
-        if position.ndim not in (1, 2) or position.shape[-1] != 3 or not np.isfinite(position).all():
+        if position.ndim not in (1, 2, 3) or position.shape[-1] != 3 or not np.isfinite(position).all():
             raise ValueError(f"Input position_m must be three finite numbers; instead received {position.tolist()}.")
         offsets = np.linalg.norm(array.positions - position.reshape(-1, 1, 3), axis=-1)
         if np.min(offsets, initial=np.inf) <= 1e-9 * array.circumradius:
             raise ValueError(f"Input position_m must not be that of a sensor; instead received {position.tolist()}.")
+        if position.ndim < 3:
+            position = position.reshape(-1, 1, 3)
+        if any(len(set(map(tuple, of_row))) < len(of_row) for of_row in position.tolist()):
+            raise ValueError(f"Input position_m must be different places; instead received {position[0].tolist()}.")
         self.array = array
         self.position_m = position
         self.prior = prior
 
     def of_rows(self, index: IntArray) -> MomentSearch:
         """The search in some of the rows."""
-        if self.position_m.ndim == 1:
+        if len(self.position_m) == 1:
             return self
         if len(self.position_m) <= index.max(initial=-1):
             raise ValueError(
@@ -71,13 +76,12 @@ class MomentSearch:
     def optima(self, rows: WhitenedRows) -> list[Optima]:
         """Every distinct optimum of every row."""
         rows = rows.knowing(self.prior.known_moment)
-        model, place = rows.model, self.position_m if self.position_m.ndim == 1 else self.position_m[rows.index]
-        position = np.broadcast_to(place, (len(rows), 3))
-        q = model.homogeneous(position)[:, None]
-        beam = _all_moments(model, rows.y, q)
-        moment = model.moment(beam.q[:, :, 0], beam.mu[:, :, 0])
+        model, place = rows.model, self.position_m if len(self.position_m) == 1 else self.position_m[rows.index]
+        position = np.broadcast_to(place, (len(rows), *place.shape[1:]))
+        beam = _all_moments(model, rows.y, model.homogeneous(position))
+        moment = model.moment(beam.q, beam.mu)
         with np.errstate(invalid="ignore"):
-            chi2 = np.where(self.prior.allows_moment(moment), beam.chi2, np.inf)
+            chi2 = np.where(self.prior.allows_moment(moment).all(axis=-1), beam.chi2, np.inf)
         of_row, of_fit = np.nonzero(np.isfinite(chi2) & (chi2 <= chi2.min(axis=1, keepdims=True) + DISTINCT_WITHIN))
         fits, converged = beam.rows((of_row, of_fit)), np.asarray(beam.converged.any(axis=1))
         reason = ["" if found else "the search did not converge from any of its starts" for found in converged]
@@ -85,21 +89,22 @@ class MomentSearch:
 
 
 def _all_moments(problem: WhitenedModel, y: FloatArray, q: FloatArray) -> JointFits:
-    """Every distinct optimum of the moment at q (b, 1, 4), from the linear solution and from moments all around."""
-    n = len(y)
-    starts = [fit_moments(problem, y, q)]
+    """Every distinct optimum of the moments at q (b, K, 4), from the linear solution and from moments all around."""
+    n, n_sources = q.shape[:2]
+    starts = [fit_moments(problem, y, q)[:, None]]
     if problem.channel_is_scalar.any():
-        directions = fibonacci_directions(_N_DIRECTIONS)
+        # Of several sources each start has other directions.
+        directions = np.stack([np.roll(fibonacci_directions(_N_DIRECTIONS), 17 * k, 0) for k in range(n_sources)], 1)
         row = np.repeat(np.arange(n), _N_DIRECTIONS)
         alone = problem.rows(row).without_ambient()
-        around = np.tile(directions, (n, 1))[:, None]
+        around = np.tile(directions, (n, 1, 1))
         unit = alone.predicted(alone.source_fields(q[row], around))
         # As long as the readings ask for if there were no ambient field: the scale of the moduli.
         length = np.linalg.norm(y[row], axis=-1) / np.maximum(np.linalg.norm(unit, axis=-1), 1e-300)
-        starts.append((length[:, None, None] * around).reshape(n, _N_DIRECTIONS, 3))
+        starts.append((length[:, None, None] * around).reshape(n, _N_DIRECTIONS, n_sources, 3))
     mu = np.concatenate(starts, axis=1)
     row = np.repeat(np.arange(n), mu.shape[1])
-    fits = refine_moments(problem.rows(row), y[row], q[row], mu.reshape(-1, 1, 3))
+    fits = refine_moments(problem.rows(row), y[row], q[row], mu.reshape(-1, n_sources, 3))
     return _distinct(problem, y, q, fits)
 
 
@@ -107,19 +112,20 @@ def _distinct(problem: WhitenedModel, y: FloatArray, q: FloatArray, fits: JointF
     """The best optima of every row that χ² rises between, and their opposites where χ² is even in the moment."""
     n = len(y)
     every = replace(fits, chi2=fits.chi2.copy()).shaped(n, -1)
-    mu, chi2 = every.mu[:, :, 0], every.chi2
+    mu, chi2 = every.mu, every.chi2
     row, rows = np.repeat(np.arange(n), mu.shape[1]), np.arange(n)
     each = problem.rows(row)
     even = _is_even(problem)
-    kept = JointFits.none((n, _MOST_SOLUTIONS), 1)
+    kept = JointFits.none((n, _MOST_SOLUTIONS), q.shape[1])
     for k in range(_MOST_SOLUTIONS):
         best = np.argmin(chi2, axis=1)
         if not np.isfinite(chi2[rows, best]).any():
             break
         kept.put((rows, k), every.rows((rows, best)))
-        opposite = even[:, None] & (np.sum(mu * kept.mu[:, k], axis=-1) < 0.0)
-        halfway = 0.5 * (np.where(opposite[..., None], -mu, mu) + kept.mu[:, k])
-        halfway = halfway.reshape(-1, 1, 3)
+        best_mu = kept.mu[:, None, k]
+        opposite = even[:, None] & (np.sum(mu * best_mu, axis=(-2, -1)) < 0.0)
+        halfway = 0.5 * (np.where(opposite[..., None, None], -mu, mu) + best_mu)
+        halfway = halfway.reshape(-1, *q.shape[1:2], 3)
         residual = each.residual(y[row], q[row], halfway, each.source_fields(q[row], halfway))
         between = np.sum(residual**2, axis=-1).reshape(n, -1)
         chi2[between < np.where(np.isfinite(chi2), chi2, 0.0) + _BARRIER] = np.inf

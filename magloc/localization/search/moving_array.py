@@ -44,9 +44,9 @@ def optima_at_rest(
     rows = rows.knowing(prior.known_moment)
     optima = _found(rows, prior)
     for step in range(_ROUNDS if errors is not None else 0):
-        best = optima.fits.rows(np.zeros(1, dtype=np.intp))
-        if errors is None or not np.isfinite(best.chi2).all():
+        if errors is None or not np.isfinite(optima.fits.chi2[:1]).any():
             break
+        best = optima.fits.rows(np.zeros(1, dtype=np.intp))
         place = [rows.model.position(best.q)[0, 0], rows.model.moment(best.q, best.mu)[0, 0]]
         noisy = rows.marginalised(errors(np.concatenate(place)))
         if step == 0:

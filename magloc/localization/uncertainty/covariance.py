@@ -57,7 +57,7 @@ def solutions_of(optima: Optima, energy: FloatArray, detected: BoolArray) -> Sol
     position, moment = model.position(fits.q), model.moment(fits.q, fits.mu)
     n_fits, n_sources = position.shape[:2]
     if optima.position_m is not None:
-        position = optima.position_m[of_row][:, None]
+        position = optima.position_m[of_row]
         known = _of_known_position(optima, optima.position_m, moment)
     elif n_sources == 1:
         known = _of_one(optima, energy)
@@ -211,10 +211,12 @@ def _of_known_position(optima: Optima, position_m: FloatArray, moment: FloatArra
     weight = _weights_of_rows(of_row, told, log_evidence_volume(covariance, moment))
     # The readings of vector sensors are linear in the moment, those of moduli only over a small part of it.
     with np.errstate(invalid="ignore", divide="ignore"):
-        sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2)) / np.linalg.norm(moment[:, 0], axis=1)
+        variance = np.diagonal(covariance, axis1=1, axis2=2).reshape(moment.shape).sum(axis=2)
+        sigma = np.sqrt(variance) / np.linalg.norm(moment, axis=2)
     gaussian = (sigma <= LARGEST_GAUSSIAN_SIGMA) | (not model.channel_is_scalar.any())
-    distance = np.linalg.norm(position_m - model.centroid, axis=-1)[of_row].tolist()
-    return _Known([(((r, r),),) for r in distance], covariance, gaussian[:, None], weight)
+    distances = np.linalg.norm(position_m - model.centroid, axis=-1)[of_row].tolist()
+    ranges: list[tuple[Intervals, ...]] = [tuple(((r, r),) for r in of_fit) for of_fit in distances]
+    return _Known(ranges, covariance, gaussian, weight)
 
 
 def _places(of_row: IntArray, n_rows: int) -> tuple[tuple[int, int], tuple[IntArray, IntArray]]:

@@ -395,6 +395,9 @@ ARRAYS = {
     "scalar": SCALARS,
     "mixed": replace(random_array(13, 9, kinds=("vector", "scalar")), ambient_T=AMBIENT),
     "noise that depends on the readings": replace(random_array(14, 5), noise_fraction=1e-2),
+    "noise of one sensor that depends on its reading": replace(
+        SCALARS, sensors=(replace(SCALARS.sensors[0], noise_fraction=0.1), *SCALARS.sensors[1:])
+    ),
     "uncertain calibration": replace(
         random_array(15, 9, kinds=("vector", "scalar"), uncertain=True, common_field_T=50e-9),
         ambient_T=AMBIENT,

@@ -24,8 +24,8 @@ from magloc.tracking.batch import track_record
 from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import rows_of
-from magloc.tracking.smoother import smoothed
 from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.smoother import smoothed
 from magloc.truth import Truth, truth_of_rows
 from tests.command_line import Outcome, Run, assert_refused, refuse_constant, results_of
 from tests.oracles import magpylib_field

@@ -76,6 +76,19 @@ class TestStated:
             assert nees(magloc.locate(stated, readings), position, moment).mean() < largest
 
 
+class TestNewInEveryRow:
+    def test_counts_in_a_row_as_what_is_constant(self):
+        array = cloud(1e-10, 50e-9)
+        _, _, readings = simulated(array, 3, 5)
+        parted = replace(array, ambient_uncertainty_T=30e-9, ambient_uncertainty_white_T=40e-9)
+        whole, parts = magloc.locate(array, readings), magloc.locate(parted, readings)
+        np.testing.assert_allclose(parts.covariance, whole.covariance, rtol=1e-9)
+        source = ([3.0, 1.0, 2.0], [0.0, 0.0, 300.0])
+        np.testing.assert_allclose(
+            cramer_rao_bounds(parted, *source).covariance, cramer_rao_bounds(array, *source).covariance, rtol=1e-9
+        )
+
+
 class TestBounds:
     def test_the_statement_of_the_array_counts(self):
         array, source = cloud(1e-10, 50e-9), ([3.0, 1.0, 2.0], [0.0, 0.0, 300.0])

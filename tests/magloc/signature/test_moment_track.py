@@ -18,6 +18,7 @@ from dataclasses import replace
 import filterpy.kalman
 import numpy as np
 import pytest
+import scipy.stats
 from scipy.spatial.transform import Rotation
 
 import arrays
@@ -289,3 +290,54 @@ def test_it_is_drawn_and_exported_as_any_track() -> None:
     assert track.to_geojson((54.4, 10.2, 0.0))["features"][0]["geometry"]["type"] == "LineString"
     assert len(track.plot().axes) > 1
     assert repr(track).splitlines()[0].split()[0] == "time_s"
+
+
+class TestSeveralSources:
+    """Sources at known places together: the last row is least squares of all rows where nothing changes."""
+
+    PLACES_M = np.array([[0.0, 0.0, 0.1], [0.1, 0.05, 0.12]])
+    MOMENTS_AM2 = np.array([[0.1, 0.2, -0.3], [0.3, 0.1, 0.2]])
+
+    def readings(self, array: arrays.SensorArray, seed: int) -> FloatArray:
+        pairs = zip(self.PLACES_M, self.MOMENTS_AM2, strict=True)
+        fields_T = array.ambient_fields + sum(magloc.dipole.field(array.positions, p, m) for p, m in pairs)
+        noise_T = np.random.default_rng(seed).normal(size=(8, array.n_channels)) * array.channel_noise_T
+        return np.asarray(array.readings_of(fields_T) + noise_T)
+
+    def test_is_the_fix_of_the_mean(self) -> None:
+        array = arrays.grid(3, 3, 0.1, noise_T=1e-6)
+        readings_T = self.readings(array, 1)
+        tracks = magloc.track_moments(array, readings_T, self.PLACES_M, turn_rad_s=1e-12)
+        mean = magloc.locate(array, magloc.Readings(readings_T), position_m=self.PLACES_M, average=True)[0].best
+        for track, source in zip(tracks, mean.sources, strict=True):
+            np.testing.assert_allclose(track.moment_Am2[-1], source.moment_Am2, rtol=1e-4)
+            np.testing.assert_allclose(track.covariance[-1][3:, 3:], source.covariance, rtol=1e-3, atol=1e-9)
+            np.testing.assert_array_equal(track.position_m[-1], source.position_m)
+
+    def test_moduli(self) -> None:
+        """NEES of 6 × 12 within 99.9 %."""
+        array = replace(arrays.grid(4, 3, 0.1, "scalar", 1e-8), ambient_T=(2e-5, 0.0, 4e-5))
+        total = 0.0
+        for seed in range(12):
+            tracks = magloc.track_moments(array, self.readings(array, seed), self.PLACES_M, turn_rad_s=1e-12)
+            for track, moment in zip(tracks, self.MOMENTS_AM2, strict=True):
+                error = track.moment_Am2[-1] - moment
+                total += float(normalised_square(error, track.covariance[-1][3:, 3:]))
+        low, high = scipy.stats.chi2.ppf([0.0005, 0.9995], 72)
+        assert low < total < high
+
+    def test_one_at_rest_is_that_of_one(self) -> None:
+        array = arrays.grid(3, 3, 0.1, noise_T=1e-6)
+        readings_T = self.readings(array, 3)
+        (of_several,) = magloc.track_moments(array, readings_T, self.PLACES_M[:1])
+        alone = magloc.track_moment(array, readings_T, self.PLACES_M[0])
+        np.testing.assert_array_equal(of_several.moment_Am2, alone.moment_Am2)
+
+    @pytest.mark.parametrize(
+        ("places_m", "text"),
+        [([1.0, 2.0, 3.0], r"of shape \(K, 3\)"), ([[0.0, 0.0, 1.0]] * 2, "different places")],
+    )
+    def test_refused(self, places_m: object, text: str) -> None:
+        array = arrays.grid(3, 3, 0.1)
+        with pytest.raises(ValueError, match=text):
+            magloc.track_moments(array, np.zeros((2, 27)), places_m)  # type: ignore[arg-type]

@@ -77,6 +77,23 @@ class TestConsistency:
         assert np.mean([nees(*found) for found in tracks if found[1].tracked[-1]]) > 5.0 * 6
 
 
+@pytest.mark.slow
+class TestExactMounting:
+    """A mounting that counts as exact: 20 tracks each; a right one is beyond 3.3 σ with 5e-4."""
+
+    def test_one_that_is_raises_no_alarm(self) -> None:
+        scores = [run(WHITE, seed, WHITE)[1].innovations.z_constants for seed in range(20)]
+        assert max(scores) < THRESHOLD
+        assert stats.kstest(scores, "norm").pvalue > 1e-3
+
+    def test_one_that_is_not_is_mostly_seen(self) -> None:
+        wrong = replace(ALL, correlation_s=0.0)
+        tests = [run(wrong, seed, WHITE)[1].innovations for seed in range(20)]
+        seen = [test for test in tests if test.z_constants > THRESHOLD]
+        assert len(seen) >= 13
+        assert all("another mounting or lever arm" in test.reason for test in seen)
+
+
 class TestTrack:
     def test_errors_of_the_pose_are_claimed(self) -> None:
         """One track: within 5 σ, and a claim of some centimetres, where without errors it is of some millimetres."""
@@ -85,6 +102,7 @@ class TestTrack:
         assert 0.01 < sigma < 0.15
         assert nees(simulation, track) < stats.chi2.ppf(1.0 - 1e-6, 6)
         assert not track.innovations.flagged
+        assert math.isnan(track.innovations.z_constants)  # they are states already
         assert track.table().count("\n") == len(track)
 
     def test_a_stream_of_rows_knows_its_motion_from_the_rows_before(self) -> None:

@@ -24,8 +24,8 @@ import magloc
 from arrays.io.errors import InputError
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import rows_of
-from magloc.tracking.smoother import smoothed
 from magloc.tracking.track import SPEED_M_S, TURN_RAD_S
+from magloc.tracking.whole_records.smoother import smoothed
 from tests.passing_source import ARRAY, SLOW, moving_source, readings_of
 
 N_ROWS, N_EMPTY = 24, 3

@@ -21,8 +21,8 @@ from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import consistency
 from magloc.tracking.motion import CoordinatedTurn, MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
-from magloc.tracking.smoother import smoothed
 from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.smoother import smoothed
 from tests.oracles import magpylib_field
 from tests.passing_source import (
     ARRAY,

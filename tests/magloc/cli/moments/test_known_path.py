@@ -121,3 +121,44 @@ class TestBadInput:
         place = map(float, ARRAY.positions[0])
         outcome = run("track", files / "ship.csv", "--array", files / "array.toml", "--position", *place)
         assert_refused(outcome, "a place of a sensor")
+
+
+class TestSeveralPlaces:
+    """--position more than once, of fixes and of tracks."""
+
+    PLACES = ("--position", "0", "0", "0.1", "--position", "0.1", "0.05", "0.12")
+
+    @pytest.fixture
+    def cells(self, tmp_path: Path) -> tuple[Path, Path]:
+        """A readings file and its array's: two cells below a board."""
+        array = arrays.grid(3, 3, 0.1, noise_T=1e-9)
+        pairs = (([0.0, 0.0, 0.1], [0.1, 0.2, -0.3]), ([0.1, 0.05, 0.12], [0.3, 0.1, 0.2]))
+        clean = array.readings_of(sum(magloc.dipole.field(array.positions, *pair) for pair in pairs))
+        values_T = clean + 1e-9 * np.random.default_rng(4).normal(size=(6, clean.size))
+        arrays.write_array(tmp_path / "board.toml", array)
+        write_readings(tmp_path / "cells.csv", magloc.Readings(values_T), array)
+        return tmp_path / "cells.csv", tmp_path / "board.toml"
+
+    @pytest.mark.parametrize("command", ["locate", "track"])
+    def test_json_lists_sources(self, run: Run, cells: tuple[Path, Path], command: str) -> None:
+        outcome = run(command, cells[0], "--array", cells[1], *self.PLACES, "--json")
+        assert outcome.status == 0, outcome.err
+        last = json.loads(outcome.out, parse_constant=refuse_constant)["results"][-1]
+        sources = last["solutions"][0]["sources"] if command == "locate" else last["sources"]
+        np.testing.assert_allclose([s["position_m"] for s in sources], [[0, 0, 0.1], [0.1, 0.05, 0.12]], atol=1e-12)
+        np.testing.assert_allclose([s["moment_Am2"] for s in sources], [[0.1, 0.2, -0.3], [0.3, 0.1, 0.2]], atol=1e-2)
+
+    def test_tables_and_lines(self, run: Run, cells: tuple[Path, Path]) -> None:
+        outcome = run("track", cells[0], "--array", cells[1], *self.PLACES)
+        assert outcome.status == 0, outcome.err
+        assert [line for line in outcome.out.splitlines() if line.startswith("source")] == ["source 1", "source 2"]
+        assert "6 of 6 rows with a moment" in outcome.err
+        lines = run("track", cells[0], "--array", cells[1], *self.PLACES, "--jsonl").out.splitlines()
+        assert [len(json.loads(line)["sources"]) for line in lines] == [2] * 6
+
+    @pytest.mark.parametrize(
+        ("more", "said"),
+        [(("--path-sigma-m", "1"), "--path-sigma-m"), (("--out", "folder"), "--out: found several places")],
+    )
+    def test_refused(self, run: Run, cells: tuple[Path, Path], more: tuple[str, ...], said: str) -> None:
+        assert_refused(run("track", cells[0], "--array", cells[1], *self.PLACES, *more), said)

@@ -20,9 +20,10 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.stats import chi2 as chi2_distribution
 
+import magloc
 from arrays.array import SensorArray
 from arrays.differences import decorrelated_differences
-from arrays.geometries import cube, tetrahedron
+from arrays.geometries import cube, grid, tetrahedron
 from magloc.fields import dipole
 from magloc.localization.fit.prior import SourcePrior
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
@@ -62,6 +63,75 @@ def chi2_of(array, readings, position, moment):
     measurement = DifferenceMeasurement(array, decorrelated_differences(array, np.isfinite(readings)))
     residual = measurement.measured(readings) - measurement.predicted(position, moment)
     return np.sum(residual**2 / measurement.variance, axis=-1)
+
+
+class TestSeveralSources:
+    """Moments of several sources at known places."""
+
+    PLACES = np.array([[0.0, 0.0, 0.1], [0.1, 0.05, 0.12]])
+
+    def readings(self, array, rng, n):
+        moments = random_moments(rng, 2, 0.3)
+        fields = sum(dipole.field(array.positions, p, m) for p, m in zip(self.PLACES, moments, strict=True))
+        clean = array.readings_of(fields + array.ambient_fields)
+        return moments.ravel(), clean + rng.normal(size=(n, clean.size)) * array.channel_noise_T
+
+    def test_vector_sensors_are_least_squares(self):
+        array = grid(3, 3, 0.1, noise_T=1e-9)
+        _, readings = self.readings(array, np.random.default_rng(1), 5)
+        differences = decorrelated_differences(array)
+        columns = [(dipole.field(array.positions, place, axis)).ravel() for place in self.PLACES for axis in np.eye(3)]
+        A = differences.transform @ np.transpose(columns) / np.sqrt(differences.variance)[:, None]
+        z = readings @ differences.transform.T / np.sqrt(differences.variance)
+        fixes = magloc.locate(array, readings, position_m=self.PLACES)
+        for fix, of_row in zip(fixes, z, strict=True):
+            found = np.concatenate([source.moment_Am2 for source in fix.best.sources])
+            assert_allclose(found, np.linalg.lstsq(A, of_row, rcond=None)[0], rtol=1e-8)
+            assert_allclose(fix.best.covariance, np.linalg.inv(A.T @ A), rtol=1e-6)
+            assert_allclose([source.position_m for source in fix.best.sources], self.PLACES)
+            assert fix.best.dof == differences.n_differences - 6
+
+    @pytest.mark.parametrize("ambient_T", [None, tuple(AMBIENT.tolist())])
+    def test_moduli_are_as_precise_as_they_say(self, ambient_T):
+        """NEES of 6 × 60 within 99.9 %; without an ambient field both signs are listed, and the nearer one counts."""
+        array = replace(grid(4, 3, 0.1, "scalar", 1e-10), ambient_T=ambient_T)
+        true, readings = self.readings(array, np.random.default_rng(2), 60)
+        total = 0.0
+        for fix in magloc.locate(array, readings, position_m=self.PLACES):
+            assert len(fix.solutions) == (2 if ambient_T is None else 1)
+            errors = [
+                (np.concatenate([source.moment_Am2 for source in solution.sources]) - true, solution.covariance)
+                for solution in fix.solutions
+            ]
+            error, covariance = min(errors, key=lambda pair: np.linalg.norm(pair[0]))
+            total += error @ np.linalg.solve(covariance, error)
+        low, high = chi2_distribution.ppf([0.0005, 0.9995], 360)
+        assert low < total < high
+
+    @pytest.mark.parametrize(
+        ("places", "text"),
+        [
+            ([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]], "must be different places"),
+            ([[0.0, 0.0, 1.0], [1.0, 0.0, np.nan]], "must be three finite numbers"),
+            (np.zeros((2, 2)), r"must have shape \(3,\) or \(K, 3\)"),
+        ],
+    )
+    def test_bad_places(self, places, text):
+        with pytest.raises(ValueError, match=text):
+            magloc.locate(tetrahedron(1.5), np.zeros((1, 12)), position_m=places)
+
+
+class TestOneSensor:
+    def test_in_a_common_field_with_a_prior(self):
+        """Three readings, three unknowns; the prior of the common field counts as noise."""
+        array = SensorArray((tetrahedron(1.5).sensors[0],), common_field_T=2e-9)
+        place = array.positions[0] + np.array([1.0, 0.0, 0.0])
+        readings = predicted_channels(array, place, [3.0, -1.0, 2.0])
+        fix = magloc.locate(array, readings, position_m=place)[0]
+        assert_allclose(fix.best.moment_Am2, [3.0, -1.0, 2.0], rtol=1e-9)
+        noise_T = np.hypot(array.sensors[0].noise_T, 2e-9)
+        A = np.transpose([dipole.field(array.positions[0], place, axis) for axis in np.eye(3)])
+        assert_allclose(fix.best.covariance, noise_T**2 * np.linalg.inv(A.T @ A), rtol=1e-9, atol=1e-9)
 
 
 class TestKnownAmbientField:
@@ -330,7 +400,7 @@ class TestKnowledge:
 
 
 class TestBadInput:
-    @pytest.mark.parametrize("place", [[1.0, 2.0], [1.0, np.nan, 2.0], [[1.0, 2.0]], [[[1.0, 2.0, 3.0]]]])
+    @pytest.mark.parametrize("place", [[1.0, 2.0], [1.0, np.nan, 2.0], [[1.0, 2.0]], [[[[1.0, 2.0, 3.0]]]]])
     def test_place(self, place):
         with pytest.raises(ValueError, match="Input position_m must be three finite numbers"):
             plain_locator(scalar_tetrahedron(1e-10), position_m=place)

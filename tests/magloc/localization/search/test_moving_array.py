@@ -14,6 +14,7 @@ from arrays import geometries
 from arrays.array import SensorArray
 from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.locator import fit_at_rest
+from magloc.measurement.pose import ArrayPose, PosesOfRows
 from tests.oracles import magpylib_field
 
 FloatArray = NDArray[np.float64]
@@ -114,6 +115,18 @@ class TestRefusal:
         fix = fit_at_rest(SQUARE, readings, *poses, prior=SourcePrior(largest_moment_Am2=1.0))
         assert all(np.linalg.norm(solution.moment_Am2) <= 1.0 for solution in fix.solutions)
         assert all(solution.chi2 > 1e3 for solution in fix.solutions)
+
+    def test_errors_of_poses_where_no_source_is_allowed(self) -> None:
+        """No search has an optimum then that they could be linearised at."""
+        readings, origins, R, ambient = passing(SQUARE)
+        nowhere = SourcePrior(low_m=(1e6, -math.inf, -math.inf), largest_moment_Am2=1e-9)
+        still = [
+            ArrayPose(origin, turn, np.zeros(3), np.zeros(3), np.zeros(3))
+            for origin, turn in zip(origins, R, strict=True)
+        ]
+        poses = PosesOfRows(SQUARE, still, [np.eye(9)[:, 3:6] * 0.02] * len(R))
+        fix = fit_at_rest(SQUARE, readings, origins, R, ambient, prior=nowhere, poses=poses)
+        assert fix.solutions == ()
 
 
 @pytest.mark.parametrize("shift", [np.zeros(3), np.array([4e5, -3e5, 200.0])])

@@ -8,8 +8,8 @@ from filterpy.kalman import KalmanFilter
 from magloc.tracking.batch import track_record
 from magloc.tracking.motion import OrnsteinUhlenbeck
 from magloc.tracking.results import Prediction, Step, TrackPoint
-from magloc.tracking.smoother import smoothed
 from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.smoother import smoothed
 from tests.passing_source import ARRAY, SLOW, moving_source, positions, readings_of, rows_from
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from arrays.typing import FloatArray
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Step, TrackPoint
 
@@ -16,6 +17,17 @@ def smoothed(points: list[TrackPoint], steps: list[Step]) -> list[TrackPoint]:
     Rauch, Tung and Striebel's recursion on the filter's steps: its gain is :math:`P F^T P_{pred}^{-1}`.
     """
     result = list(points)
+    for step, (x, P) in zip(steps, smoothed_states(steps), strict=True):
+        point = points[step.row]
+        if point.position_m is not None:
+            covariance = P[:N_SOURCE, :N_SOURCE]
+            result[step.row] = replace(point, position_m=x[:3], moment_Am2=x[3:6], covariance=covariance)
+    return result
+
+
+def smoothed_states(steps: list[Step]) -> list[tuple[FloatArray, FloatArray]]:
+    """State and covariance of every step with what later ones tell."""
+    result: list[tuple[FloatArray, FloatArray]] = []
     x, P = np.empty(0), np.empty((0, 0))
     after: Step | None = None
     for step in reversed(steps):
@@ -32,8 +44,5 @@ def smoothed(points: list[TrackPoint], steps: list[Step]) -> list[TrackPoint]:
             P = P + gain @ (later_P - predicted_P) @ gain.T
             P = 0.5 * (P + P.T)
         after = step
-        point = points[step.row]
-        if point.position_m is not None:
-            covariance = P[:N_SOURCE, :N_SOURCE]
-            result[step.row] = replace(point, position_m=x[:3], moment_Am2=x[3:6], covariance=covariance)
-    return result
+        result.append((x, P))
+    return result[::-1]

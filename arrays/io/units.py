@@ -1,0 +1,46 @@
+"""Numbers of files in SI and back: nT in T, by shifting the decimal point of what is written.
+
+Never by a multiplication: 1.0 nT is the number 1e-9 to the last digit, and every float survives the way to a file and
+back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from decimal import Context, Decimal
+
+from arrays.io.errors import InputError
+
+Number = int | Decimal
+"""A number of a file, as it is written."""
+_SHIFT = Context(prec=1000, traps=[])
+
+
+def tesla(place: str, nanotesla: Number) -> float:
+    """Field in T from a number in nT as it is written; `place` is for errors."""
+    return scaled(place, nanotesla, -9)
+
+
+def scaled(place: str, number: Number, exponent: int) -> float:
+    """A number as it is written, times a power of ten."""
+    result = float(Decimal(number).scaleb(exponent, _SHIFT))
+    if not abs(result) < float("inf"):
+        raise InputError(f"{place}: found {number}, expected a finite number.")
+    return result
+
+
+def nanotesla_text(tesla: float) -> str:
+    """A field in T as a TOML float in nT."""
+    return shifted_text(tesla, 9)
+
+
+def nanotesla_list(tesla: Iterable[float]) -> str:
+    """Fields in T as a TOML list in nT."""
+    return f"[{', '.join(map(nanotesla_text, tesla))}]"
+
+
+def shifted_text(value: float, exponent: int) -> str:
+    """A number times a power of ten as a TOML float."""
+    shifted = Decimal(repr(value)).scaleb(exponent, _SHIFT)
+    text = f"{shifted:f}" if not shifted or -7 < shifted.adjusted() < 16 else str(shifted)
+    return text if set(text) & set(".E") else f"{text}.0"

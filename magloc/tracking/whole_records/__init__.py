@@ -1,0 +1,1 @@
+"""Tracks of whole records: what later rows tell, too."""

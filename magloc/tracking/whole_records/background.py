@@ -1,0 +1,226 @@
+r"""Tracks of readings with a background that drifts, such as ``--detrend`` and ``--high-pass-hz`` speak of.
+
+The background is a state of every channel beside the source, on the rows as they were read: a filter would take signal
+out that the model still predicts. No row alone tells the source from it, so that a track cannot start from one; it
+starts from a track of filtered readings, which is near enough to linearise all rows about. They are filtered and
+smoothed until that leads nowhere else: Gauss-Newton over the whole record. What a row then knows is what rows before it
+tell, as of any filter.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtri
+
+from arrays.typing import BoolArray, FloatArray
+from magloc.kalman import block_update, estimability, whitened_innovation
+from magloc.levels import CONTRADICTION
+from magloc.readings import Readings
+from magloc.tracking.acquisition import CONFIRMED_RANGE_ERROR
+from magloc.tracking.batch import track_record
+from magloc.tracking.measurement import RowMeasurement
+from magloc.tracking.motion import N_SOURCE
+from magloc.tracking.results import Innovation, Prediction, Row, Step, TrackPoint, rows_of
+from magloc.tracking.tracker import LARGEST_RANGE_ERROR, Tracker
+from magloc.tracking.whole_records.smoother import smoothed, smoothed_states
+
+_LOG = logging.getLogger(__name__)
+TAKES_MUCH = 3.0
+"""A background is warned of that makes positions this many times as uncertain."""
+# Standard deviations of a source before its first row, over its distance and its moment.
+_UNKNOWN = 10.0
+_MOST_PASSES = 30
+_SETTLED = 1e-2
+_MOST_AGREE = 0.9
+# Noise that plain tracks are tried with, in that of the sensors, and rows that they must have.
+_NOISIER = (1.0, 10.0, 100.0)
+_FEWEST_ROWS = 5
+_NOTHING = "not acquired: no dipole on this background fits the rows"
+
+
+@dataclass(frozen=True, eq=False)
+class _Passed:
+    """A forward pass over rows from one on: steps, innovations, and which rows agree with those before and are used."""
+
+    begin: int
+    steps: list[Step]
+    innovations: list[Innovation | None]
+    agrees: BoolArray
+    used: BoolArray
+
+    @property
+    def rows(self) -> slice:
+        """Of the record."""
+        return slice(self.begin, self.begin + len(self.steps))
+
+
+def track_on_background(
+    tracker: Tracker, readings: Readings, *, smooth: bool, progress: Callable[[int], None] | None = None
+) -> list[TrackPoint]:
+    """Points of a record whose background is in the states of a tracker."""
+    rows = list(rows_of(readings))
+    measurements = [tracker.measurements.of(row) for row in rows]
+    points = [tracker._lost(row, _NOTHING) for row in rows]
+    near = (_settled(tracker, measurements, *states) for states in _plain_tracks(tracker, readings))
+    passed = next((found for found in near if found is not None), None)
+    if progress is not None:
+        progress(len(rows))
+    if passed is None:
+        return points
+    passed = _extended(tracker, measurements, passed)
+    of_rows = _points(tracker, measurements[passed.rows], passed)
+    points[passed.rows] = smoothed(of_rows, passed.steps) if smooth else of_rows
+    _warn_of_what_it_takes(tracker, rows[passed.rows], passed, of_rows)
+    return points
+
+
+def _plain_tracks(tracker: Tracker, readings: Readings) -> Iterator[tuple[int, list[FloatArray]]]:
+    """States that rows are linearised about first, from some row on: of tracks of readings without a background.
+
+    Of the readings as they are, with ever more noise, and of what filters leave of them.
+    """
+    background, n_motion = readings.background, tracker.motion.n_states
+    filtered = replace(readings, values_T=background.taken_out(readings.time_s, readings.values_T))
+    for source in (readings, filtered):
+        for times in _NOISIER:
+            sensors = tuple(replace(sensor, noise_T=times * sensor.noise_T) for sensor in tracker.array.sensors)
+            plain = Tracker(replace(tracker.array, sensors=sensors), tracker.motion, prior=tracker.prior)
+            points = track_record(plain, list(rows_of(source)))
+            known = np.flatnonzero([point.position_m is not None for point in points])
+            if len(known) < _FEWEST_ROWS:
+                continue
+            sources = np.array([np.concatenate([points[i].position_m, points[i].moment_Am2]) for i in known.tolist()])
+            every = np.arange(known[0], known[-1] + 1)
+            between = np.stack([np.interp(every, known, column) for column in sources.T], axis=1)
+            rest = np.zeros(n_motion - N_SOURCE + tracker.n_errors)
+            yield int(known[0]), [np.concatenate([state, rest]) for state in between]
+
+
+def _warn_of_what_it_takes(
+    tracker: Tracker, rows: Sequence[Row], passed: _Passed, points: Sequence[TrackPoint]
+) -> None:
+    """Warn where positions are much more certain if there is no background."""
+    plain, n = Tracker(tracker.array, tracker.motion), tracker.motion.n_states
+    states = [np.concatenate([step.x[:n], np.zeros(plain.n_errors)]) for step in passed.steps]
+    alone = _passed(plain, [plain.measurements.of(row) for row in rows], 0, states, passed.used)
+    known = [j for j, point in enumerate(points) if point.position_m is not None]
+    of_both = [sum(float(np.sum(steps[j].S[:3] ** 2)) for j in known) for steps in (passed.steps, alone.steps)]
+    if of_both[0] > TAKES_MUCH**2 * of_both[1]:
+        factor = math.sqrt(of_both[0] / of_both[1])
+        _LOG.warning(f"the background looks like the source: positions are {factor:.0f} times as uncertain as without")
+
+
+def steps_at(tracker: Tracker, rows: Sequence[Row], states: Sequence[FloatArray]) -> list[Step]:
+    """Steps of a forward pass that linearises all rows at some states."""
+    measurements = [tracker.measurements.of(row) for row in rows]
+    return _passed(tracker, measurements, 0, states, np.ones(len(rows), dtype=bool)).steps
+
+
+def settled_steps(tracker: Tracker, rows: Sequence[Row], states: Sequence[FloatArray]) -> list[Step] | None:
+    """Steps of the last pass over rows that are linearised where passes lead, from some states; None if nowhere."""
+    passed = _settled(tracker, [tracker.measurements.of(row) for row in rows], 0, states)
+    return None if passed is None else passed.steps
+
+
+def _extended(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _Passed) -> _Passed:
+    """The same with the rows before and after, as far as passes settle with them."""
+    while len(passed.steps) < len(measurements):
+        states = [x for x, _ in smoothed_states(passed.steps)]
+        more = _FEWEST_ROWS + len(states) // 4
+        before, after = min(more, passed.begin), min(more, len(measurements) - passed.begin - len(states))
+        states = [states[0]] * before + states + [states[-1]] * after
+        wider = _settled(tracker, measurements, passed.begin - before, states)
+        if wider is None:
+            return passed
+        passed = wider
+    return passed
+
+
+def _settled(
+    tracker: Tracker, measurements: Sequence[RowMeasurement], begin: int, states: Sequence[FloatArray]
+) -> _Passed | None:
+    """The last forward pass from a row on; None where the passes do not settle, or too many rows contradict it."""
+    measurements = measurements[begin : begin + len(states)]
+    used = np.ones(len(measurements), dtype=bool)
+    for _ in range(_MOST_PASSES):
+        passed = _passed(tracker, measurements, begin, states, used)
+        later = smoothed_states(passed.steps)
+        new = [x for x, _ in later]
+        if not np.isfinite(new).all():
+            return None
+        sigma = np.array([np.sqrt(np.diagonal(P)[:N_SOURCE]) for _, P in later])
+        moved = np.abs(np.array(new) - np.array(states))[:, :N_SOURCE]
+        states = new
+        if np.all(moved <= _SETTLED * sigma):
+            agrees = used & passed.agrees
+            if np.mean(agrees) < _MOST_AGREE:
+                return None
+            if np.array_equal(agrees, used):
+                return passed
+            used = agrees
+    return None
+
+
+def _passed(
+    tracker: Tracker,
+    measurements: Sequence[RowMeasurement],
+    begin: int,
+    states: Sequence[FloatArray],
+    used: BoolArray,
+) -> _Passed:
+    """One forward pass over rows that are linearised at some states, from a source that is hardly known."""
+    n = tracker.motion.n_states
+    offset = measurements[0].place_in_array(states[0], np.eye(states[0].size))[0]
+    sigma = _UNKNOWN * np.repeat([np.linalg.norm(offset), np.linalg.norm(states[0][3:6])], 3)
+    x, S = np.zeros(states[0].size), np.diag(np.concatenate([np.zeros(n), tracker.error_sigma]))
+    x[:n], S[:n, :n] = tracker.motion.start(states[0][:N_SOURCE], np.diag(sigma))
+    steps: list[Step] = []
+    innovations: list[Innovation | None] = []
+    agrees = np.ones(len(measurements), dtype=bool)
+    for j, (measurement, state) in enumerate(zip(measurements, states, strict=True)):
+        prediction = None
+        if j:
+            before = states[j - 1]
+            at = tracker.predicted(before, S, measurement.row.time_s - measurements[j - 1].row.time_s)
+            prediction = Prediction(at.x + at.F @ (x - before), at.S, at.F)
+            x, S = prediction.x, prediction.S
+        k = measurement.z.size
+        innovations.append(None)
+        if k:
+            H, ones = measurement.jacobian(state), np.ones(k)
+            innovation = measurement.z - measurement.predicted(state) - H @ (x - state)
+            whitened = whitened_innovation(S, H, innovation, ones)
+            innovations[j] = Innovation(measurement.row.available, whitened)
+            agrees[j] = whitened @ whitened <= chdtri(k, CONTRADICTION)
+            if used[j]:
+                x, S = block_update(x, S, H, innovation, ones)
+        steps.append(Step(j, prediction, x, S))
+    return _Passed(begin, steps, innovations, agrees, used)
+
+
+def _points(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _Passed) -> list[TrackPoint]:
+    """What is known of every row, from the first one on that knows the range."""
+    points: list[TrackPoint] = []
+    tracked, last = False, None
+    for j, (measurement, step) in enumerate(zip(measurements, passed.steps, strict=True)):
+        row, innovation = measurement.row, passed.innovations[j]
+        range_error = tracker._range_error(step.x, step.S, measurement)
+        if range_error > (LARGEST_RANGE_ERROR if tracked else CONFIRMED_RANGE_ERROR):
+            tracked, last = False, None
+            points.append(tracker._lost(row, "not acquired: the range is not certain enough"))
+            continue
+        status = "predicted" if innovation is None else "tracked" if passed.used[j] else "outlier"
+        told = {} if innovation is None or not tracked else innovation.after(last)
+        last = innovation if status == "tracked" else None
+        learned = np.ones(N_SOURCE)
+        if step.prediction is not None:
+            learned = estimability(step.S, step.prediction.S)[:N_SOURCE]
+        point = tracker._tracked(row, step.x, step.S, learned, 1, status if tracked else "acquired")
+        points.append(replace(point, **told))
+        tracked = True
+    return points

@@ -1,0 +1,57 @@
+r"""Whether a track that counts its mounting as exact has a mounting that is not.
+
+The record is fitted once more with constant errors of the pose as unknowns c of unit prior variance. Were they zero,
+what is found of them would be spread by :math:`P - P^2`, with their covariance P after all rows: a Wald test.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import chdtrc, ndtri
+
+from arrays.pose import PoseUncertainty
+from magloc.tracking.motion import N_SOURCE
+from magloc.tracking.results import Row, TrackPoint
+from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.background import settled_steps
+
+_LEAST_KNOWN = 1e-6
+"""A direction of the constants counts of which the rows tell a variance of more."""
+
+
+def constants_score(tracker: Tracker, rows: Sequence[Row], points: Sequence[TrackPoint]) -> float:
+    """How far beyond zero a lever arm and a mounting are that count as exact, as a standard normal number.
+
+    NaN where they do not, or where the rows of the last track do not settle.
+    """
+    stated = tracker.array.pose
+    if stated is None or stated.position_constant_m or stated.attitude_constant_rad:
+        return math.nan
+    usual = PoseUncertainty()
+    constants = {key: getattr(usual, key) for key in ("position_constant_m", "attitude_constant_rad")}
+    wider = Tracker(replace(tracker.array, pose=replace(stated, **constants)), tracker.motion)
+    known = [i for i, point in enumerate(points) if point.position_m is not None]
+    if not known:
+        return math.nan
+    begin = max(i for i in known if points[i].status == "acquired" or i == known[0])
+    rest = np.zeros(wider.motion.n_states - N_SOURCE + wider.n_errors)
+    used = [(rows[i], points[i]) for i in known if i >= begin]
+    states = [np.concatenate([point.position_m, point.moment_Am2, rest]) for _, point in used]
+    steps = settled_steps(wider, [row for row, _ in used], states)
+    if steps is None:
+        return math.nan
+    is_constant = np.concatenate(
+        [np.zeros(rest.size + N_SOURCE - wider.pose_errors.n_states, dtype=bool), ~wider.pose_errors.changes]
+    )
+    found, root = steps[-1].x[is_constant], steps[-1].S[is_constant]
+    left, axes = np.linalg.eigh(root @ root.T)
+    spread = left * (1.0 - left)
+    told = spread > _LEAST_KNOWN
+    if not told.any():
+        return math.nan
+    square = float(np.sum((axes.T @ found)[told] ** 2 / spread[told]))
+    return float(min(-ndtri(max(chdtrc(int(told.sum()), square), 1e-300)), 37.0))
