@@ -17,10 +17,11 @@ from scipy.stats import chi2
 from adcs.environment.environment import Environment
 from adcs.kalman.error_state import AttitudeTracks, SensorSet, State
 from adcs.kalman.mekf import deviations, residuals
-from adcs.quaternion import cross_matrix, rotate_back
+from adcs.quaternion import rotate_back
 from adcs.satellite.sensors import NIS_SIZES, SENSOR_WORDS
 from adcs.satellite.telemetry import Readings, Record, is_read
 from arrays.typing import BoolArray, FloatArray
+from magloc.navigation.rotations import cross_matrix
 
 COLLINEAR = "Sun and field on one line"
 COLLINEAR_RAD = math.radians(20.0)
@@ -254,6 +255,7 @@ def residuals_after(record: Record, estimates: AttitudeTracks, run: int) -> dict
         Readings(*(getattr(readings, one.name)[run][:, None] for one in fields(readings))),
         record.momentum_Nms[run][:, None],
         record.wheel_torque_Nm[run][:, None],
+        record.torquers_Am2[run][:, None],
     )
     optional = {name: values[run] for name, values in estimates.optional.items()}
     state = State(estimates.q[run], estimates.w[run], optional, estimates.covariance[run])

@@ -12,6 +12,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "fused_runs": "sims.experiments.mockup_navigation",
         "run_scenario": "sims.experiments.attitude",
         "sky_run": "sims.experiments.mockup_vision",
+        "switching_loads": "sims.experiments.loads",
         "zeros_run": "sims.experiments.mockup_navigation",
     },
 )
