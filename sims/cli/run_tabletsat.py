@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from adcs.kalman.bank import EstimatorSettings
     from sims.experiments.attitude import Part
 
-_OTHERS = ("complementary", "ellipsoid", "mockup")
+_OTHERS = ("complementary", "detumbling", "ellipsoid", "mockup")
 _STAR_NOISE_DEG = {"angle": 0.001, "paper": 0.002}
 
 

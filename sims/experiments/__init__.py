@@ -7,6 +7,7 @@ __getattr__, __dir__, __all__ = lazy_names(
     {
         "PAPER_ROWS": "sims.experiments.paper_tables",
         "compared_with_paper": "sims.experiments.paper_tables",
+        "detumbling": "sims.experiments.b_dot",
         "identified_files": "sims.experiments.mockup_vision",
         "fused_record": "sims.experiments.mockup_recording",
         "fused_runs": "sims.experiments.mockup_navigation",

@@ -69,6 +69,7 @@ LINES: dict[str, tuple[str, ...]] = {
     "adcs warm-up": ("",),
     "adcs run": ("scenario.toml --duration 20 --seeds 1 --json", "tabletsat --duration 20 --seeds 1"),
     "adcs run complementary": ("--duration 3000 --json",),
+    "adcs run detumbling": ("--seeds 1 --duration 20 --json",),
     "adcs run ellipsoid": ("--duration 300 --seeds 2 --json", "--closed-loop --duration 300 --seeds 1"),
     "adcs run mockup": (
         "--part fusion --duration 12 --seeds 1 --json",
