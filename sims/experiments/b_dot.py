@@ -111,6 +111,6 @@ def detumbling(
 
 def _time_below(rate: FloatArray, step_s: float) -> FloatArray:
     """Time (runs,) from which rates (runs, n) stay below the slow one for a minute; NaN where they do not."""
-    lasting = round(60.0 / step_s)
+    lasting = min(round(60.0 / step_s), rate.shape[1])
     largest = np.lib.stride_tricks.sliding_window_view(rate, lasting, axis=1).max(axis=-1)
     return np.where((largest < SLOW_RAD_S).any(axis=1), step_s * (largest < SLOW_RAD_S).argmax(axis=1), np.nan)
