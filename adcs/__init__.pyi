@@ -13,8 +13,13 @@ from adcs.io.telemetry_files import read_telemetry as read_telemetry
 from adcs.kalman.bank import EstimatorSettings as EstimatorSettings
 from adcs.kalman.bank import estimate as estimate
 from adcs.satellite.attitude_track import AttitudeTrack as AttitudeTrack
+from adcs.satellite.magnetic_control import BDot as BDot
+from adcs.satellite.magnetic_control import b_dot_gain as b_dot_gain
+from adcs.satellite.magnetic_control import detumbled as detumbled
 from adcs.satellite.magnetometer_calibration import MagnetometerPrior as MagnetometerPrior
 from adcs.satellite.magnetometer_calibration import calibrate_magnetometer as calibrate_magnetometer
+from adcs.satellite.own_fields import OwnFields as OwnFields
+from adcs.satellite.own_fields import find_own_fields as find_own_fields
 from adcs.satellite.satellite import Satellite as Satellite
 from adcs.satellite.telemetry import Telemetry as Telemetry
 from adcs.satellite.vectors import vector_attitude as vector_attitude

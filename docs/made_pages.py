@@ -51,7 +51,9 @@ EXPLAINED = {
     " arrays.read_sensors arrays.write_array arrays.array_toml arrays.mesh_of arrays.tetrahedron arrays.square"
     " arrays.cross arrays.cube arrays.hexagon arrays.axial arrays.grid",
     "attitude": "adcs.estimate adcs.EstimatorSettings adcs.Telemetry adcs.read_telemetry adcs.Satellite"
-    " adcs.circular_orbit adcs.read_scenario adcs.AttitudeTrack adcs.EllipsoidObserver adcs.BoundedSystem"
+    " adcs.circular_orbit adcs.read_scenario adcs.find_own_fields adcs.OwnFields"
+    " adcs.BDot adcs.b_dot_gain adcs.detumbled"
+    " adcs.AttitudeTrack adcs.EllipsoidObserver adcs.BoundedSystem"
     " adcs.Ellipsoid sims.AttitudeScenario sims.experiments.run_scenario sims.experiments.compared_with_paper",
     "calibration": "magloc.calibrate magloc.Calibration magloc.CalibrationPrior magloc.plots.calibration",
     "convergence-maps": "magloc.convergence_map magloc.source_map magloc.RepeatedFilter magloc.moments_on_sphere"

@@ -43,6 +43,11 @@ for _name, _where, _help in (
         "Calibrate the magnetometer of a log by the field along the orbit.",
     ),
     (
+        "loads",
+        "adcs.cli.loads:loads",
+        "Find the fields of what switches on board at each magnetometer, and where it is.",
+    ),
+    (
         "vectors",
         "adcs.cli.vectors:vectors",
         "Attitude of every row of telemetry from field and Sun alone, by TRIAD or QUEST.",

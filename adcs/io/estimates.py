@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -60,4 +61,10 @@ def summary_lines(track: AttitudeTrack) -> list[str]:
             nis = f"{kept.mean() / numbers:.3g}" if kept.size else "none is used"
             told = f", {rejected.sum()} rejected" if rejected.any() else ""
             lines.append(f"NIS of {name} / {numbers} (1 is consistent){'':3s}{nis}{told}")
-    return lines
+    return [*lines, *unseen_line(track.unseen_torque_Nm)]
+
+
+def unseen_line(torque_Nm: Mapping[float, float]) -> list[str]:
+    """A line with the amplitude, by period, below which a torque does not show in the readings; none of nothing."""
+    each = ", ".join(f"{torque:.2g} N·m ({period:g} s)" for period, torque in torque_Nm.items())
+    return [f"{'torques that do not show (period)':34s}{each}"] if each else []

@@ -16,6 +16,7 @@ from arrays.typing import FloatArray, Vector
 FIELD_UNITS = {"nT": 1e-9, "uT": 1e-6, "µT": 1e-6, "mT": 1e-3, "T": 1.0, "mG": 1e-7, "G": 1e-4}
 RATE_UNITS = {"deg/s": math.pi / 180.0, "rad/s": 1.0, "mrad/s": 1e-3, "deg/h": math.pi / 648_000.0}
 MOMENTUM_UNITS = {"Nms": 1.0, "mNms": 1e-3}
+MOMENT_UNITS = {"Am2": 1.0, "mAm2": 1e-3}
 TIME_FORMATS = ("seconds", "utc", "unix")
 ORDERS = ("scalar-first", "scalar-last")
 DIRECTIONS = ("inertial-from-body", "body-from-inertial")
@@ -106,6 +107,18 @@ class WheelColumns(MountedTable, kw_only=True):
         return MOMENTUM_UNITS[self.unit]
 
 
+class TorquerColumns(MountedTable, kw_only=True):
+    """Commanded magnetic moment."""
+
+    columns: Three = ("torquers_x_Am2", "torquers_y_Am2", "torquers_z_Am2")
+    unit: Annotated[str, one_of(MOMENT_UNITS)] = "Am2"
+
+    @property
+    def scale(self) -> float:
+        """[A·m²]."""
+        return MOMENT_UNITS[self.unit]
+
+
 class LogTable(Table, kw_only=True):
     """Which columns are read, and as what; the others are not looked at."""
 
@@ -116,15 +129,17 @@ class LogTable(Table, kw_only=True):
     magnetometer: MagnetometerColumns | None = None
     sun_sensor: SunColumns | None = None
     wheels: WheelColumns | None = None
+    torquers: TorquerColumns | None = None
 
 
-Columns = StarColumns | GyroColumns | MagnetometerColumns | SunColumns | WheelColumns
+Columns = StarColumns | GyroColumns | MagnetometerColumns | SunColumns | WheelColumns | TorquerColumns
 STANDARD: dict[str, Columns] = {
     "star": StarColumns(),
     "gyro_rad_s": GyroColumns(),
     "field_T": MagnetometerColumns(),
     "sun": SunColumns(),
     "wheels_Nms": WheelColumns(),
+    "torquers_Am2": TorquerColumns(),
 }
 """Of a log without a layout, by the argument of :class:`adcs.Telemetry` that they become."""
 
@@ -153,7 +168,7 @@ class LogLayout:
     @classmethod
     def of(cls, place: str, table: LogTable, start: np.datetime64) -> LogLayout:
         """Layout that a table describes; it names one sensor at least."""
-        named = (table.star_tracker, table.gyro, table.magnetometer, table.sun_sensor, table.wheels)
+        named = (table.star_tracker, table.gyro, table.magnetometer, table.sun_sensor, table.wheels, table.torquers)
         columns = {name: given for name, given in zip(STANDARD, named, strict=True) if given is not None}
         if not columns:
             raise InputError(f"{place}: found no table of a sensor, expected one such as [log.gyro].")

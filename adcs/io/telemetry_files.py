@@ -13,6 +13,7 @@ columns                                    meaning
 ``field_x_nT``, y, z                       magnetometer, body axes
 ``sun_x, sun_y, sun_z``                    direction to the Sun, body axes; of any length
 ``wheels_x_Nms``, y, z                     momentum of all wheels together, body axes; without them there are none
+``torquers_x_Am2``, y, z                   commanded magnetic moment, body axes, held until the next; without it none
 =========================================  ============================================================================
 
 ``adcs run SCENARIO --out DIR`` writes an example.
@@ -33,7 +34,7 @@ from arrays.typing import FloatArray
 
 TIME = "time_s"
 _UNUSED = np.datetime64(0, "us")
-STAR, GYRO, FIELD, SUN, WHEELS = GROUPS = tuple(one.columns for one in STANDARD.values())
+STAR, GYRO, FIELD, SUN, WHEELS, TORQUERS = GROUPS = tuple(one.columns for one in STANDARD.values())
 
 
 def read_telemetry(
@@ -106,6 +107,7 @@ def telemetry_columns(telemetry: Telemetry) -> dict[str, FloatArray]:
         (FIELD, 1e9 * telemetry.field_T),
         (SUN, telemetry.sun),
         (WHEELS, telemetry.wheels_Nms),
+        (TORQUERS, telemetry.torquers_Am2),
     )
     columns = {TIME: telemetry.time_s}
     for names, values in groups:

@@ -10,7 +10,7 @@ import numpy as np
 
 from adcs import quaternion
 from adcs.kalman.constant_gain import run_constant_gain
-from adcs.kalman.diagnostics import COLLINEAR, collinear_rows, warnings_of
+from adcs.kalman.diagnostics import COLLINEAR, collinear_rows, unseen_torque_Nm, warnings_of
 from adcs.kalman.error_state import AttitudeTracks, FilterSettings, Start, sensor_set, tuned_noise
 from adcs.kalman.gyro_driven import run_reduced
 from adcs.kalman.initialisation import any_start, first_told, vector_start
@@ -191,6 +191,7 @@ def _track(
         warnings=warnings_of(record, tracks)[0],
         gated=dict(zip(SENSORS, tracks.rejected[0].T, strict=True)),
         degraded={COLLINEAR: collinear_rows(record, used, 0)},
+        unseen_torque_Nm=unseen_torque_Nm(record, tracks, 0),
     )
 
 

@@ -7,16 +7,21 @@ tells how much, except where the model itself is wrong: there the readings must 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import fields
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
-from adcs.kalman.error_state import AttitudeTracks, SensorSet
-from adcs.kalman.mekf import deviations
+from adcs.environment.environment import Environment
+from adcs.kalman.error_state import AttitudeTracks, SensorSet, State
+from adcs.kalman.mekf import deviations, residuals
+from adcs.quaternion import rotate_back
 from adcs.satellite.sensors import NIS_SIZES, SENSOR_WORDS
-from adcs.satellite.telemetry import Record, is_read
+from adcs.satellite.telemetry import Readings, Record, is_read
 from arrays.typing import BoolArray, FloatArray
+from magloc.navigation.rotations import cross_matrix
 
 COLLINEAR = "Sun and field on one line"
 COLLINEAR_RAD = math.radians(20.0)
@@ -25,6 +30,12 @@ GROWS = 1.5
 """Growth of the attitude's deviation, with one direction left, of which it is worth while to speak."""
 FALSE_ALARM = 1e-6
 """Probability with which readings that fit their model are called wrong."""
+BLOCK = 64
+"""Readings over which residuals are summed: what lasts as long as that does not average out."""
+SEEN = 0.7
+"""Amplitude of an attitude, in deviations of one instant's readings, from which on a filter can tell what moves it."""
+PERIODS_S = (100.0, 300.0, 1000.0)
+"""Of torques, for which the filter is asked what it would not see."""
 
 
 class Problem(NamedTuple):
@@ -42,7 +53,8 @@ def problems_of(record: Record, estimates: AttitudeTracks) -> tuple[tuple[Proble
     - one direction with a biased gyro,
     - readings that contradict the rest,
     - a field that does not fit its model: an error of the model, or the satellite's own field,
-    - innovations that the covariance does not explain.
+    - innovations that the covariance does not explain,
+    - residuals that last: something turns the satellite that is not in the model.
     """
     used = estimates.settings.sensors
     always = np.ones(estimates.q.shape[1], dtype=np.bool_)
@@ -56,6 +68,7 @@ def problems_of(record: Record, estimates: AttitudeTracks) -> tuple[tuple[Proble
             *(Problem(text, ~always) for text in _rejected(estimates, run)),
             *(Problem(text, always) for text in _field_model(record, estimates, run)),
             *(Problem(text, always) for text in _innovations(estimates, run)),
+            *(Problem(text, always) for text in _lasting(record, estimates, run)),
         )
         for run in range(len(estimates.q))
     )
@@ -202,6 +215,78 @@ def _innovations(estimates: AttitudeTracks, run: int) -> list[str]:
     if numbers == 0 or total <= chi2.isf(FALSE_ALARM, numbers):
         return []
     return [f"innovations are {math.sqrt(total / numbers):.1f} times what the covariance explains: the model is wrong"]
+
+
+def _lasting(record: Record, estimates: AttitudeTracks, run: int) -> list[str]:
+    """Compare sums of residuals over blocks of readings with what white ones would have.
+
+    After its update a filter's residual is RS⁻¹ times the innovation, as white as that; a torque that the process noise
+    does not allow leaves a part that lasts, far below the noise of one reading, where NIS is blind to it.
+    """
+    total, numbers = 0.0, 0
+    for sensor, of_sensor in residuals_after(record, estimates, run).items():
+        rows = of_sensor[len(of_sensor) // 2 :]
+        rows = rows[~(np.isnan(rows[:, 0]) | estimates.rejected[run, -len(rows) :, sensor])]
+        blocks = rows[: len(rows) // BLOCK * BLOCK].reshape(-1, BLOCK, 3)
+        if len(blocks) < 2:
+            continue
+        # What is constant throughout, process noise can allow for.
+        sums = blocks.sum(axis=1) - blocks.sum(axis=1).mean(axis=0)
+        variance = np.var(blocks, axis=(0, 1))
+        told = variance > 0.0
+        total += float(np.sum(sums[:, told] ** 2 / (BLOCK * variance[told])))
+        numbers += (len(blocks) - 1) * int(told.sum())
+    if numbers == 0 or total <= chi2.isf(FALSE_ALARM, numbers):
+        return []
+    return [
+        f"residuals last for minutes ({math.sqrt(total / numbers):.1f} times white noise over {BLOCK} readings): "
+        "a torque or an error that is not in the model; the deviations may be too small"
+    ]
+
+
+def residuals_after(record: Record, estimates: AttitudeTracks, run: int) -> dict[int, FloatArray]:
+    """Residuals (n, 3) of a run's readings from its estimates, by the sensor's place; NaN without a reading."""
+    around, readings = record.environment, record.readings
+    of_run = {one.name: getattr(around, one.name)[run][:, None] for one in fields(around) if one.name != "time_s"}
+    each = Record(
+        record.satellite,
+        record.dt_s,
+        Environment(time_s=around.time_s[:1], **of_run),
+        Readings(*(getattr(readings, one.name)[run][:, None] for one in fields(readings))),
+        record.momentum_Nms[run][:, None],
+        record.wheel_torque_Nm[run][:, None],
+        record.torquers_Am2[run][:, None],
+    )
+    optional = {name: values[run] for name, values in estimates.optional.items()}
+    state = State(estimates.q[run], estimates.w[run], optional, estimates.covariance[run])
+    return {sensor: residual for sensor, residual, _ in residuals(each, 0, state, estimates.settings.sensors)}
+
+
+def unseen_torque_Nm(record: Record, estimates: AttitudeTracks, run: int) -> Mapping[float, float]:
+    """Largest amplitude [N·m] of a torque of each of some periods that the readings do not show.
+
+    A torque of amplitude J·d and period T moves the attitude by d (T/2π)² and the rate by d T/2π. Below 0.7 deviations
+    of one instant's readings, about the axis that they tell worst, no filter can say what moves the satellite, and
+    none can know how wrong it is.
+    """
+    sigma, used = deviations(record, estimates.settings), estimates.settings.sensors
+    q, around = estimates.q[run], record.environment
+    information = np.eye(3) * (used.star / (2.0 * sigma[0]) ** 2)
+    for is_used, model, deviation in (
+        (used.magnetometer, around.b_orbital_T[run], sigma[2]),
+        (used.sun, around.sun_orbital[run], sigma[3]),
+    ):
+        if is_used:
+            W = cross_matrix(rotate_back(q, model)) / deviation
+            information = information + np.mean(W.mT @ W, axis=0)
+    largest = float(np.linalg.eigvalsh(record.satellite.body.inertia_kgm2)[-1])
+    torque = {}
+    for period_s in PERIODS_S:
+        w = 2.0 * math.pi / period_s
+        of_period = information + np.eye(3) * (used.gyro * (w / sigma[1]) ** 2)
+        sigma_rad = 1.0 / math.sqrt(float(np.linalg.eigvalsh(of_period)[0]))
+        torque[period_s] = SEEN * sigma_rad * w**2 * largest
+    return torque
 
 
 def _seconds(rows: BoolArray, record: Record) -> str:

@@ -58,7 +58,7 @@ def known_torque_jacobian(record: Record, row: int, state: State) -> FloatArray:
         record.momentum_Nms[:, row],
         around.gravity_s2[:, row],
         around.b_orbital_T[:, row],
-        state.of("dipole"),
+        state.of("dipole") + record.torquers_Am2[:, row],
     )
 
 
@@ -118,7 +118,7 @@ def moved(record: Record, row: int, state: State) -> tuple[FloatArray, FloatArra
         around.gravity_s2[:, row],
         around.b_orbital_T[:, row],
         float(record.steps_s[row]),
-        state.of("dipole"),
+        state.of("dipole") + record.torquers_Am2[:, row],
     )
     return q, w
 
@@ -419,7 +419,7 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
     covariance, nis = np.empty((runs, n, used.size, used.size)), np.full((runs, n, len(SENSORS)), np.nan)
     rejected = np.zeros(nis.shape, dtype=np.bool_)
     readings = record.readings
-    wheels = (record.momentum_Nms, record.wheel_torque_Nm)
+    wheels = (record.momentum_Nms, record.wheel_torque_Nm, record.torquers_Am2)
     read = (readings.star, readings.gyro_rad_s, readings.field_T, readings.sun, around.sun_orbital)
     places = (around.orbital_rate_rad_s, around.gravity_s2, around.b_orbital_T)
     over_rows(

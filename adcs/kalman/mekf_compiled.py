@@ -55,10 +55,11 @@ class First(NamedTuple):
 
 
 class Record(NamedTuple):
-    """Wheels, readings, and the Sun in the orbital frame: (R, n, 3) or of the star tracker (R, n, 4)."""
+    """Wheels, torquers, readings, and the Sun in the orbital frame: (R, n, 3) or of the star tracker (R, n, 4)."""
 
     momentum: Array
     wheel_torque: Array
+    torquers: Array
     star: Array
     gyro: Array
     field: Array
@@ -235,14 +236,16 @@ def _advance(
     x, F, F_after = one.x, work.F, work.F_after
     q, w = quaternion_at(x), _at(x, 4)
     k, b_o = vector_at(record.momentum[run, i]), vector_at(around.b_orbital[run, i])
-    body = with_dipole(body, _at(x, 19))
+    own = with_dipole(body, _at(x, 19))
+    body = with_dipole(own, vector_at(record.torquers[run, i]))
     b = rotate_back(q, b_o)
     error_jacobian(body, q, w, k, around.gravity[run, i], b_o, F)
     u_k, torque = vector_at(record.wheel_torque[run, i]), applied(body.J, _at(x, 13))
     orbital_rate, gravity = around.orbital_rate[run, i], around.gravity[run, i]
     q, w, _ = step(body, q, w, k, u_k, torque, orbital_rate, gravity, b_o, dt)
     k, b_o = vector_at(record.momentum[run, i + 1]), vector_at(around.b_orbital[run, i + 1])
-    error_jacobian(body, q, w, k, around.gravity[run, i + 1], b_o, F_after)
+    after = with_dipole(own, vector_at(record.torquers[run, i + 1]))
+    error_jacobian(after, q, w, k, around.gravity[run, i + 1], b_o, F_after)
     for row in range(6):
         for column in range(6):
             F[row, column] = 0.5 * (F[row, column] + F_after[row, column])

@@ -54,6 +54,8 @@ class AttitudeTrack:
         Readings of each sensor that contradicted the estimate and were not used; empty for a filter without a gate.
     degraded : mapping of str to ndarray of bool, shape (n,)
         What is there and yet of little use, in words, and where.
+    unseen_torque_Nm : mapping of float to float
+        Amplitude of a torque below which the readings do not show it, by its period [s]; empty where not known.
 
     Examples
     --------
@@ -77,6 +79,7 @@ class AttitudeTrack:
     warnings: tuple[str, ...] = ()
     gated: Mapping[str, BoolArray] = field(default_factory=dict)
     degraded: Mapping[str, BoolArray] = field(default_factory=dict)
+    unseen_torque_Nm: Mapping[float, float] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Return the number of instants."""
@@ -128,5 +131,6 @@ def joined(tracks: Sequence[AttitudeTrack], warning: str) -> AttitudeTrack:
         first,
         rows=np.concatenate([track.rows + n for track, n in zip(tracks, before, strict=True)]),
         warnings=(warning, *texts[:_MOST_WARNINGS], *more),
+        unseen_torque_Nm={key: max(one.unseen_torque_Nm[key] for one in tracks) for key in first.unseen_torque_Nm},
         **{name: of(name) for name in arrays},
     )

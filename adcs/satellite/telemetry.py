@@ -78,6 +78,8 @@ class Record:
         Leading axis runs; has the instants.
     momentum_Nms, wheel_torque_Nm : ndarray, shape (runs, n, 3)
         Momentum of the wheels, and its rate of change from each instant to the next.
+    torquers_Am2 : ndarray, shape (runs, n, 3)
+        Magnetic moment that the torquers are commanded to have from each instant to the next, body axes.
     """
 
     satellite: Satellite
@@ -86,6 +88,7 @@ class Record:
     readings: Readings
     momentum_Nms: FloatArray
     wheel_torque_Nm: FloatArray
+    torquers_Am2: FloatArray
 
     @cached_property
     def steps_s(self) -> FloatArray:
@@ -107,6 +110,7 @@ def part(record: Record, runs: NDArray[np.intp], rows: slice = slice(None)) -> R
         Readings(*(getattr(readings, field.name)[runs, rows] for field in fields(readings))),
         record.momentum_Nms[runs, rows],
         record.wheel_torque_Nm[runs, rows],
+        record.torquers_Am2[runs, rows],
     )
 
 
@@ -128,6 +132,8 @@ class Telemetry:
         Direction to the Sun, of any length.
     wheels_Nms : ndarray, shape (n, 3)
         Momentum of all wheels together; straight lines go through what is missing.
+    torquers_Am2 : ndarray, shape (n, 3)
+        Commanded magnetic moment, held from each row until another one is told; none before the first.
     step_s : float
         Usual time between instants, which the process noise is for; by default the shortest between two rows, of times
         that are no multiples of it their median.
@@ -152,6 +158,7 @@ class Telemetry:
     field_T: FloatArray
     sun: FloatArray
     wheels_Nms: FloatArray
+    torquers_Am2: FloatArray
     step_s: float
 
     def __init__(
@@ -163,6 +170,7 @@ class Telemetry:
         field_T: ArrayLike | None = None,
         sun: ArrayLike | None = None,
         wheels_Nms: ArrayLike | None = None,
+        torquers_Am2: ArrayLike | None = None,
         step_s: float | None = None,
     ) -> None:
         times = np.array(time_s, dtype=np.float64)
@@ -181,6 +189,7 @@ class Telemetry:
         given = {"star": quaternions, "gyro_rad_s": gyro_rad_s, "field_T": field_T, "sun": sun}
         checked = {name: _columns(name, values, len(times)) for name, values in given.items()}
         checked["wheels_Nms"] = _columns("wheels_Nms", wheels_Nms, len(times))
+        checked["torquers_Am2"] = _columns("torquers_Am2", torquers_Am2, len(times))
         for name, value in ({"time_s": times, "step_s": step_s} | checked).items():
             object.__setattr__(self, name, value)
 
@@ -196,6 +205,7 @@ class Telemetry:
             field_T=readings.field_T[run],
             sun=readings.sun[run],
             wheels_Nms=record.momentum_Nms[run],
+            torquers_Am2=record.torquers_Am2[run] if record.torquers_Am2[run].any() else None,
             step_s=record.dt_s,
         )
 
@@ -215,6 +225,7 @@ class Telemetry:
                 field_T=self.field_T[rows],
                 sun=self.sun[rows],
                 wheels_Nms=self.wheels_Nms[rows],
+                torquers_Am2=self.torquers_Am2[rows],
                 step_s=self.step_s,
             )
             for rows in np.split(np.arange(len(self.time_s)), cuts)
@@ -247,7 +258,8 @@ class Telemetry:
             field_T=spread(self.field_T)[None],
             sun=(sun / np.linalg.norm(sun, axis=1, keepdims=True))[None],
         )
-        return Record(satellite, self.step_s, around, readings, momentum[None], torque[None])
+        torquers = _held(spread(self.torquers_Am2))
+        return Record(satellite, self.step_s, around, readings, momentum[None], torque[None], torquers[None])
 
     @property
     def instants_s(self) -> FloatArray:
@@ -304,6 +316,12 @@ def _through_gaps(momentum: FloatArray, instants_s: FloatArray) -> FloatArray:
     if not known.size:
         return np.zeros_like(momentum)
     return np.stack([np.interp(instants_s, instants_s[known], column[known]) for column in momentum.T], axis=1)
+
+
+def _held(values: FloatArray) -> FloatArray:
+    """Values (n, 3) that hold until there is another; zero before the first."""
+    last = np.maximum.accumulate(np.where(is_read(values), np.arange(len(values)), -1))
+    return np.where(last[:, None] >= 0, values[last], 0.0)
 
 
 def orbital_from_eci(around: Environment) -> FloatArray:

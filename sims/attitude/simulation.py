@@ -48,6 +48,7 @@ class Prepared:
     momentum_Nms: FloatArray
     torque_Nm: FloatArray  # (runs, n, 3): disturbing torque in body axes, held from each instant to the next
     dipole_Am2: FloatArray  # (runs, n, 3): besides the residual dipole of the satellite, held likewise
+    torquers_Am2: FloatArray  # (runs, n, 3): commanded, as the filters are told
     gyro_bias_rad_s: FloatArray  # (runs, n, 3)
     field_bias_T: FloatArray  # (runs, n, 3)
     field_gain: FloatArray  # (runs, 3, 3): D of a magnetometer that reads (E + D) b
@@ -78,7 +79,7 @@ class AttitudeRuns(Record):
         """Runs of a motion, with its readings."""
         scenario, readings = prepared.scenario, sense(prepared, q, w)
         known = scenario.satellite, scenario.dt_s, prepared.environment
-        return cls(*known, readings, momentum_Nms, wheel_torque_Nm, prepared, q, w)
+        return cls(*known, readings, momentum_Nms, wheel_torque_Nm, prepared.torquers_Am2, prepared, q, w)
 
     @property
     def scenario(self) -> AttitudeScenario:
@@ -137,6 +138,7 @@ def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
         momentum_Nms=np.zeros((len(numbers), 3)),
         torque_Nm=scenario.torque_Nm * _directions(numbers, "torque")[:, None] * wave[:, None],
         dipole_Am2=np.tile(np.array(scenario.dipole_Am2, dtype=np.float64), (len(numbers), n, 1)),
+        torquers_Am2=np.zeros((len(numbers), n, 3)),
         gyro_bias_rad_s=_bias(scenario, numbers, "gyro", scenario.gyro_bias_rad_s, satellite.gyro.bias_walk_rad_s),
         field_bias_T=_bias(scenario, numbers, "field", scenario.field_bias_T, satellite.magnetometer.bias_walk_T),
         field_gain=np.where(np.eye(3), scenario.field_gain, scenario.field_axes_rad)
@@ -146,13 +148,18 @@ def prepare(scenario: AttitudeScenario, seeds: Sequence[int]) -> Prepared:
     )
 
 
-@np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def simulate(scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
     """Truth and readings of one run for every seed, with a control that sees the true state."""
+    return moved(prepare(scenario, seeds))
+
+
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")
+def moved(prepared: Prepared) -> AttitudeRuns:
+    """Truth and readings from the start, torques and dipoles of prepared runs, which may have been changed."""
     from adcs.satellite import dynamics_compiled as rigid_body
     from magloc.compilation import over_rows
 
-    prepared = prepare(scenario, seeds)
+    scenario = prepared.scenario
     runs, n = prepared.torque_Nm.shape[:2]
     q, w, momentum, wheel_torque = np.empty((runs, n, 4)), *np.empty((3, runs, n, 3))
     q[:, 0], w[:, 0], momentum[:, 0] = prepared.q, prepared.w, prepared.momentum_Nms
@@ -164,7 +171,7 @@ def simulate(scenario: AttitudeScenario, seeds: Sequence[int]) -> AttitudeRuns:
         rigid_body.Body.of(scenario.satellite.body),
         rigid_body.Control.of(scenario.satellite.control, quaternion.IDENTITY),
         prepared.torque_Nm,
-        prepared.dipole_Am2,
+        prepared.dipole_Am2 + prepared.torquers_Am2,
         rigid_body.Surroundings(around.orbital_rate_rad_s, around.gravity_s2, prepared.true_field_orbital_T),
         scenario.dt_s,
     )
@@ -235,7 +242,7 @@ def advance(prepared: Prepared, state: State, wheel_torque_Nm: FloatArray, row: 
         around.gravity_s2[:, row],
         prepared.true_field_orbital_T[:, row],
         prepared.scenario.dt_s,
-        prepared.dipole_Am2[:, row],
+        prepared.dipole_Am2[:, row] + prepared.torquers_Am2[:, row],
     )
 
 

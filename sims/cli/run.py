@@ -19,6 +19,11 @@ for _name, _where, _help in (
         "Attitude of a satellite from magnetometer, Sun sensor and gyro by complementary filters.",
     ),
     (
+        "detumbling",
+        "sims.cli.run_detumbling:detumbling",
+        "Rate of a tumbling satellite taken out by torquers, with B-dot of its magnetometer.",
+    ),
+    (
         "ellipsoid",
         "sims.cli.run_ellipsoid:ellipsoid",
         "Yaw of a satellite from a horizon sensor and gyros, in guaranteed ellipsoids.",

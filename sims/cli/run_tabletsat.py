@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from adcs.kalman.bank import EstimatorSettings
     from sims.experiments.attitude import Part
 
-_OTHERS = ("complementary", "ellipsoid", "mockup")
+_OTHERS = ("complementary", "detumbling", "ellipsoid", "mockup")
 _STAR_NOISE_DEG = {"angle": 0.001, "paper": 0.002}
 
 
@@ -151,6 +151,8 @@ def run_attitude(
 
 def summary_lines(file: AttitudeFile, estimate: EstimatorSettings, numbers: dict[str, Any]) -> Sequence[str]:
     """The result as text."""
+    from adcs.io.estimates import unseen_line
+    from adcs.kalman.diagnostics import PERIODS_S
     from adcs.kalman.results import SHOWN
 
     runs = "1 run" if numbers["runs"] == 1 else f"{numbers['runs']} runs"
@@ -167,4 +169,5 @@ def summary_lines(file: AttitudeFile, estimate: EstimatorSettings, numbers: dict
         lines.append(f"{'readings that are not used':34s}{numbers['rejected']}, {good}")
     lines.append(f"{'NEES / numbers (1 is consistent)':34s}{numbers['nees_per_dimension']:.3g}")
     lines.append(f"{'diverged runs':34s}{numbers['diverged_runs']}")
+    lines += unseen_line({period: numbers[f"unseen_torque_{period:g}s_Nm"] for period in PERIODS_S})
     return lines

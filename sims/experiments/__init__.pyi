@@ -1,4 +1,6 @@
 from sims.experiments.attitude import run_scenario as run_scenario
+from sims.experiments.b_dot import detumbling as detumbling
+from sims.experiments.loads import switching_loads as switching_loads
 from sims.experiments.mockup_navigation import fused_runs as fused_runs
 from sims.experiments.mockup_navigation import zeros_run as zeros_run
 from sims.experiments.mockup_recording import fused_record as fused_record

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from adcs.io.scenario_files import AttitudeFile
 from adcs.kalman.bank import EstimatorSettings, estimated
-from adcs.kalman.diagnostics import Problem, problems_of
+from adcs.kalman.diagnostics import Problem, problems_of, unseen_torque_Nm
 from adcs.kalman.error_state import AttitudeTracks, start_near
 from adcs.kalman.results import by_state, in_units, worst_axis
 from arrays.io.errors import InputError
@@ -62,6 +62,8 @@ class Outcome:
         NaN where nothing is.
     rejected, rejected_good : ndarray of int, shape (runs,)
         Readings that the filter did not use, and those of them that are not wild.
+    unseen_torque_Nm : dict of float to float
+        Amplitude below which a torque does not show in the readings, by its period [s]; the largest of all runs.
     warnings : list of list of str
         What can be told of every run without the truth: what is degraded or not observable.
     """
@@ -77,6 +79,7 @@ class Outcome:
     worst_deg: FloatArray
     rejected: NDArray[np.int64]
     rejected_good: NDArray[np.int64]
+    unseen_torque_Nm: dict[float, float]
     warnings: list[list[str]]
 
     def last_minute(self) -> Outcome:
@@ -117,6 +120,7 @@ class Outcome:
             "worst_deg": None if np.isnan(self.worst_deg).all() else float(np.nanmax(self.worst_deg)),
             "rejected": int(self.rejected.sum()),
             "rejected_good": int(self.rejected_good.sum()),
+            **{f"unseen_torque_{period:g}s_Nm": torque for period, torque in self.unseen_torque_Nm.items()},
         }
 
 
@@ -202,7 +206,14 @@ def run_scenario(
         del part, outcome  # or two would be in memory while the next one is made
     of_runs = ("seeds", "axis_rms", "nees", "nis", "error_deg", "diverged", "worst_deg", "rejected", "rejected_good")
     joined: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in outcomes]) for name in of_runs}
+    joined["unseen_torque_Nm"] = _largest(one.unseen_torque_Nm for one in outcomes)
     return replace(outcomes[0], **joined, warnings=[texts for one in outcomes for texts in one.warnings])
+
+
+def _largest(each: Iterable[Mapping[float, float]]) -> dict[float, float]:
+    """The largest value of every key, of mappings that have the same ones."""
+    first, *others = each
+    return {key: max([value, *(other[key] for other in others)]) for key, value in first.items()}
 
 
 def errors_in_units(part: Part) -> FloatArray:
@@ -231,6 +242,7 @@ def outcome_of(part: Part) -> Outcome:
         worst_deg=np.array([_worst(*of_run, first) for of_run in zip(error_deg, problems, strict=True)]),
         rejected=estimates.rejected.sum(axis=(1, 2)),
         rejected_good=(estimates.rejected & ~wild).sum(axis=(1, 2)),
+        unseen_torque_Nm=_largest(unseen_torque_Nm(runs, estimates, run) for run in range(len(runs.q))),
         warnings=[[problem.text for problem in of_run] for of_run in problems],
     )
 

@@ -14,9 +14,11 @@ from scipy.spatial.transform import Rotation
 import arrays
 from adcs.cli.app import app as adcs_app
 from adcs.cli.app import main as adcs_main
+from arrays.io.csv import write_columns
 from magloc.cli.app import app as magloc_app
 from magloc.cli.app import main as magloc_main
 from magloc.measurement.differences import predicted_channels
+from sims.experiments.loads import switching_loads
 from tests.adcs.stars.test_identification import random_sky, write_frames
 
 APPS = {"magloc": magloc_app, "adcs": adcs_app}
@@ -67,6 +69,7 @@ LINES: dict[str, tuple[str, ...]] = {
     "adcs warm-up": ("",),
     "adcs run": ("scenario.toml --duration 20 --seeds 1 --json", "tabletsat --duration 20 --seeds 1"),
     "adcs run complementary": ("--duration 3000 --json",),
+    "adcs run detumbling": ("--seeds 1 --duration 20 --json",),
     "adcs run ellipsoid": ("--duration 300 --seeds 2 --json", "--closed-loop --duration 300 --seeds 1"),
     "adcs run mockup": (
         "--part fusion --duration 12 --seeds 1 --json",
@@ -84,6 +87,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "telemetry.csv --config scenario.toml --json",
         "telemetry.csv --config scenario.toml --method triad --out out",
     ),
+    "adcs loads": ("loads.csv --array loads.toml --json --out out.csv",),
     "adcs calibrate": ("telemetry.csv --config scenario.toml --json --out out.csv",),
     "adcs stars": ("frames --catalogue stars.csv --json",),
 }  # fmt: skip
@@ -234,6 +238,9 @@ def write_files(folder: Path) -> None:
     with (folder / "track.json").open("w") as file, redirect_stdout(file):
         run("magloc", "track readings.csv --array array.toml --json")
     _write_scalars(folder)
+    flight = switching_loads(seed=0, duration_s=150.0)
+    write_columns(flight.columns, folder / "loads.csv")
+    arrays.write_array(folder / "loads.toml", flight.array)
     _write_stars(folder)
 
 

@@ -64,14 +64,15 @@ class TestKeptOutputs:
         assert any("## What is not known" in cell.source for cell in notebook.cells)
 
 
-class TestRealMagnet:
-    def test_without_the_recording_a_simulated_twin_tells_the_story(self, tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", ["03-real-magnet", pytest.param("from-a-log", marks=pytest.mark.slow)])
+class TestRecordings:
+    def test_without_the_recording_a_simulated_twin_tells_the_story(self, name, tmp_path, monkeypatch):
         monkeypatch.delenv("MAGLOC_DATA", raising=False)
         monkeypatch.setenv("PYTHONWARNINGS", "error")
-        path = Path(shutil.copy(FOLDER / "03-real-magnet.ipynb", tmp_path))
+        path = Path(shutil.copy(FOLDER / f"{name}.ipynb", tmp_path))
         said = texts(executed(path, tmp_path))
         assert "Notice: the recording is not on this machine" in said
         assert "Real data" not in said
 
-    def test_the_kept_outputs_are_those_of_the_recording(self):
-        assert "Real data" in texts(nbformat.read(FOLDER / "03-real-magnet.ipynb", as_version=4))
+    def test_the_kept_outputs_are_those_of_the_recording(self, name):
+        assert "Real data" in texts(nbformat.read(FOLDER / f"{name}.ipynb", as_version=4))

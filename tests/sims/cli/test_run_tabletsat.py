@@ -34,6 +34,9 @@ KEYS = [
     "worst_deg",
     "rejected",
     "rejected_good",
+    "unseen_torque_100s_Nm",
+    "unseen_torque_300s_Nm",
+    "unseen_torque_1000s_Nm",
 ]
 
 
@@ -130,6 +133,10 @@ class TestNumbers:
         worst = [np.degrees(np.sqrt(np.mean(one[:, late] ** 2, axis=1)).mean(axis=0).max()) for one in differences]
         whole = np.concatenate([0.5 * angle, *differences[1:]], axis=-1)[:, late, :, None]
         nees = (whole.mT @ np.linalg.inv(estimates.covariance[:, late]) @ whole).mean() / 9.0
+        frequency = 2.0 * np.pi / np.array([100.0, 300.0, 1000.0])
+        star, gyro = 2.0 * runs.satellite.star_tracker.sigma_rad, runs.satellite.gyro.sigma_rad_s
+        largest = np.linalg.eigvalsh(runs.satellite.body.inertia_kgm2)[-1]
+        unseen = 0.7 * largest * frequency**2 / np.sqrt(star**-2 + (frequency / gyro) ** 2)
         expected = {
             "angle_rms_deg": worst[0],
             "rate_rms_deg_s": worst[1],
@@ -145,6 +152,9 @@ class TestNumbers:
             "worst_deg": None,
             "rejected": 0,
             "rejected_good": 0,
+            "unseen_torque_100s_Nm": unseen[0],
+            "unseen_torque_300s_Nm": unseen[1],
+            "unseen_torque_1000s_Nm": unseen[2],
         }
         found = run_scenario(file, estimate, range(3)).numbers()
         assert list(found) == list(expected)

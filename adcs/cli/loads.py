@@ -1,0 +1,124 @@
+"""``adcs loads``: what switches on board, at each magnetometer, and where it is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import adcs
+from adcs.cli.options import print_note
+from arrays.array_file import read_array
+from arrays.io.arguments import Flag
+from arrays.io.errors import naming
+from arrays.io.outputs import refuse_unwritable
+from arrays.typing import FloatArray
+from magloc.cli.framework import QuietOptions, print_json
+from magloc.localization.fit.results import Fix
+
+
+def loads(
+    readings: Path,
+    /,
+    *,
+    array: Path,
+    loads: str = "",
+    window_s: float = 8.0,
+    out: Path | None = None,
+    json: Flag = False,
+    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Find the fields of loads, magnets and torquers that switch on board, at each magnetometer.
+
+    Each switch is a step of the readings, and the gyro tells how the satellite turns meanwhile; no model of the
+    Earth's field is needed. With three magnetometers or more every load is located too, as a dipole: that names it,
+    gives its torque, and predicts its field elsewhere. What is subtracted is the field that was found, not the
+    dipole's.
+
+    Parameters
+    ----------
+    readings : Path
+        CSV file: time_s, readings of the array's magnetometers, gyro_x_deg_s and so on, and a column with the state of
+        each load, such as 0 and 1, or its current.
+    array : Path
+        Array file (TOML) of the magnetometers, in body axes.
+    loads : str
+        Columns of the loads with commas between them; by default all that have no unit.
+    window_s : float
+        Seconds before and after a switch that are used.
+    out : Path, optional
+        CSV file for the same log without the loads' fields.
+    json : bool
+        Print one JSON object.
+    common : QuietOptions
+        Common options.
+    """
+    from adcs.io.load_files import channel_columns, read_load_log
+    from arrays.io.csv import write_columns
+
+    if out is not None:
+        refuse_unwritable(out, "--out", ".csv")
+    sensors = read_array(array)
+    log = read_load_log(readings, sensors, [name.strip() for name in loads.split(",") if name.strip()])
+    with naming(str(readings)):
+        own = adcs.find_own_fields(sensors, log.readings_T, log.time_s, log.gyro_rad_s, log.states, window_s=window_s)
+    located = own.located() if sensors.n_sensors >= _LEAST_SENSORS else {}
+    if out is not None:
+        clean_nT = 1e9 * own.subtracted(log.readings_T, log.states)
+        write_columns(log.columns | dict(zip(channel_columns(sensors), clean_nT.T, strict=True)), out)
+        if not common.quiet:
+            print_note(f"wrote {out}")
+    if json:
+        print_json(report(own, located))
+    else:
+        print("\n".join(lines(own, located)))
+
+
+_LEAST_SENSORS = 3
+
+
+def report(own: adcs.OwnFields, located: dict[str, Fix]) -> dict[str, Any]:
+    """What ``--json`` prints."""
+    results = []
+    for name, vectors, sigma, switches in zip(own.names, own.vectors_T, own.sigma_T, own.switches, strict=True):
+        entry: dict[str, Any] = {
+            "load": name,
+            "switches": int(switches),
+            "field_nT": dict(zip(own.array.ids, (1e9 * vectors).tolist(), strict=True)),
+            "sigma_nT": dict(zip(own.array.ids, (1e9 * sigma).tolist(), strict=True)),
+            "position_m": None,
+            "moment_Am2": None,
+            "covariance": None,
+        }
+        if name in located and located[name].solutions:
+            best = located[name].best
+            entry["position_m"], entry["moment_Am2"] = best.position_m.tolist(), best.moment_Am2.tolist()
+            entry["covariance"] = best.covariance.tolist()
+        results.append(entry)
+    return {"results": results, "noise_nT": dict(zip(own.array.ids, (1e9 * own.noise_T).tolist(), strict=True))}
+
+
+def lines(own: adcs.OwnFields, located: dict[str, Fix]) -> list[str]:
+    """The result as text."""
+    noise = ", ".join(f"{name} {1e9 * one:.3g}" for name, one in zip(own.array.ids, own.noise_T, strict=True))
+    text = [f"noise that is left [nT]: {noise}"]
+    for name, vectors, sigma, switches in zip(own.names, own.vectors_T, own.sigma_T, own.switches, strict=True):
+        text.append(f"{name}: {switches} switches")
+        for sensor, field, deviation in zip(own.array.ids, vectors, sigma, strict=True):
+            text.append(_line(f"field at {sensor} [nT]", 1e9 * field, 1e9 * deviation))
+        if name not in located:
+            continue
+        if not located[name].solutions:
+            text.append(f"  not located: {located[name].reason}")
+            continue
+        best = located[name].best
+        deviations = np.sqrt(np.diagonal(best.covariance))
+        text.append(_line("place [mm]", 1e3 * best.position_m, 1e3 * deviations[:3]))
+        text.append(_line("moment [A·m²]", best.moment_Am2, deviations[3:]))
+    return text
+
+
+def _line(words: str, values: FloatArray, deviations: FloatArray) -> str:
+    shown = ", ".join(f"{value:9.4g}" for value in values)
+    return f"  {words:24s}{shown} (1σ {deviations.max():.2g})"

@@ -1,0 +1,283 @@
+"""A satellite's own fields: what loads, magnets and torquers that switch do to each of its magnetometers.
+
+Around a switch the ambient field, seen from axes that stand still, is a smooth function of time, and what switches adds
+a step. Fields y_i at a magnetometer in body axes, turned by the gyro (D_i) into those of the instant of the switch, are
+
+    D_i y_i = quadratic(t_i) + D_i (Σ_k s_k(t_i) V_k + o),
+
+with the states s_k of the loads, the field V_k of each there and an offset o. The polynomial is projected out; all
+switches make one regression for V. No model of the ambient field enters, nor an attitude, and V_k has the errors of
+gain and axes that the readings have: it is what must be subtracted of them. Where a load is, and what its moment is,
+tells a dipole that is fitted to its fields at all magnetometers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from adcs import quaternion
+from arrays.array import SensorArray
+from arrays.io.errors import check_positive
+from arrays.typing import BoolArray, FloatArray
+from magloc.localization.fit.results import Fix
+from magloc.localization.locator import Locator
+
+WINDOW_S = 8.0
+"""Before and after a switch: longer, and the ambient field is no parabola."""
+_DEGREE = 2
+_LEAST_ROWS = 6
+_AMBIENT_T = 30e-6
+_PRIOR_T = 100e-6
+"""Standard deviation of a component of V and o beforehand: what the readings do not tell stays there."""
+_UNKNOWN = 0.5
+_OTHERS = 12
+"""Numbers of each magnetometer that the regression finds besides: its offset, and nine errors of gains and axes."""
+
+
+@dataclass(frozen=True, eq=False)
+class OwnFields:
+    """Fields of K loads at the M vector magnetometers of a satellite.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the loads.
+    array : SensorArray
+        The magnetometers, in body axes.
+    vectors_T : ndarray, shape (K, M, 3)
+        What one unit of a load's state adds to the field at each magnetometer, body axes.
+    sigma_T : ndarray, shape (K, M, 3)
+        Its standard deviation.
+    switches : ndarray of int, shape (K,)
+        How often the state of each load changed.
+    noise_T : ndarray, shape (M,)
+        Standard deviation of a component of what the regression leaves.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> from sims import experiments
+    >>> run = experiments.switching_loads(seed=0, duration_s=600.0)
+    >>> own = adcs.find_own_fields(run.array, run.readings_T, run.time_s, run.gyro_rad_s, run.states)
+    >>> own.names, own.vectors_T.shape
+    (('heater', 'radio'), (2, 4, 3))
+    """
+
+    names: tuple[str, ...]
+    array: SensorArray
+    vectors_T: FloatArray
+    sigma_T: FloatArray
+    switches: NDArray[np.int64]
+    noise_T: FloatArray
+
+    def subtracted(self, readings_T: ArrayLike, states: Mapping[str, ArrayLike]) -> FloatArray:
+        """Readings (n, C) without what the loads add to them.
+
+        Parameters
+        ----------
+        readings_T : array_like, shape (n, C)
+            Of the array's channels.
+        states : mapping of str to array_like, shape (n,)
+            Of each load at each row.
+        """
+        s = _states(states, self.names, len(np.asarray(readings_T)))
+        fields = np.einsum("nk,kmi->nmi", s, self.vectors_T)
+        return np.asarray(readings_T) - self.array.readings_of(fields) + self.array.channel_offset_T
+
+    def located(self) -> dict[str, Fix]:
+        """Fix of each load as a dipole, body axes, of its fields at all magnetometers.
+
+        Noise is that of the fields, the array's ``noise_fraction`` what places of magnetometers and extents of loads
+        make of it. What all magnetometers have in common counts as known to the deviation of the fields.
+
+        Raises
+        ------
+        ValueError
+            There are fewer than three magnetometers.
+        """
+        if self.array.n_sensors < 3:
+            raise ValueError(
+                f"Input array must have 3 magnetometers to locate a load; instead received {self.array.n_sensors}."
+            )
+        fixes = {}
+        for name, vectors, sigma in zip(self.names, self.vectors_T, self.sigma_T, strict=True):
+            noise = np.sqrt(np.mean(sigma**2, axis=1))
+            sensors = (replace(one, noise_T=float(s)) for one, s in zip(self.array.sensors, noise, strict=True))
+            array = replace(self.array, sensors=tuple(sensors), common_field_T=float(noise.max()), ambient_T=None)
+            fixes[name] = Locator(array, exclude_faulty=False).fit(array.readings_of(vectors))
+        return fixes
+
+
+def find_own_fields(
+    array: SensorArray,
+    readings_T: ArrayLike,
+    time_s: ArrayLike,
+    gyro_rad_s: ArrayLike,
+    states: Mapping[str, ArrayLike],
+    *,
+    window_s: float = WINDOW_S,
+) -> OwnFields:
+    r"""Fields of what switches on board, at each magnetometer, from the steps of its readings.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Vector magnetometers in body axes; one alone gives its fields, three tell where the loads are.
+    readings_T : array_like, shape (n, C)
+        Of the array's channels; NaN where missing.
+    time_s : array_like, shape (n,)
+        Ascending.
+    gyro_rad_s : array_like, shape (n, 3)
+        Rate against inertial space, body axes; a constant bias of some hundredths of a degree a second does no harm.
+    states : mapping of str to array_like, shape (n,)
+        Of each load: 0 and 1, a current, a commanded moment.
+    window_s : float
+        Before and after a switch, in which the ambient field is a parabola in time.
+
+    Returns
+    -------
+    OwnFields
+        The field of each at each magnetometer, per unit of its state.
+
+    Raises
+    ------
+    ValueError
+        A shape does not match, the array has a scalar sensor, or a load never switches, or only together with others.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> from sims import experiments
+    >>> run = experiments.switching_loads(seed=0, duration_s=600.0)
+    >>> own = adcs.find_own_fields(run.array, run.readings_T, run.time_s, run.gyro_rad_s, run.states)
+    >>> bool(own.sigma_T.max() < 15e-9)
+    True
+    """
+    check_positive(window_s=window_s)
+    times = np.asarray(time_s, dtype=np.float64)
+    n = len(times)
+    if times.ndim != 1 or n < 2 or not (np.diff(times) > 0.0).all():
+        raise ValueError("Input time_s must ascend, two instants or more; instead received others.")
+    readings, gyro = np.asarray(readings_T, dtype=np.float64), np.asarray(gyro_rad_s, dtype=np.float64)
+    if array.channel_is_scalar.any():
+        raise ValueError("Input array must have vector magnetometers only; instead received a scalar one.")
+    for name, values, shape in (("readings_T", readings, (n, array.n_channels)), ("gyro_rad_s", gyro, (n, 3))):
+        if values.shape != shape:
+            raise ValueError(f"Input {name} must have shape {shape}; instead received {values.shape}.")
+    names = tuple(states)
+    s = _states(states, names, n)
+    fields = array.calibrated_field(readings)
+    used: BoolArray = np.isfinite(np.concatenate([readings, gyro], axis=1)).all(axis=1)
+    turns = _turns(times, gyro)
+    windows = _windows(times, s, used, window_s)
+    if 3 * sum(len(rows) - _DEGREE - 1 for rows in windows) <= 3 * len(names) + _OTHERS:
+        raise ValueError(
+            f"Input states must change where there are readings; instead received {len(windows)} switches."
+        )
+    D = [_attitudes(turns, rows) for rows in windows]
+    vectors = np.zeros((len(names), array.n_sensors, 3))
+    for _ in range(2):
+        # The second time without the steps, of which the gains' errors would take a hundredth for the ambient field's.
+        ambient = np.mean(fields - np.einsum("nk,kmi->nmi", s, vectors), axis=1)
+        vectors, deviations, noise = _regression(
+            [_projected(times[i], R, s[i], fields[i], ambient[i]) for i, R in zip(windows, D, strict=True)], len(names)
+        )
+    for name, deviation in zip(names, deviations, strict=True):
+        if deviation.max() > _UNKNOWN * _PRIOR_T:
+            raise ValueError(
+                f"Input states must have every load switch, and not always with another; instead received "
+                f"{name}, whose field the readings do not tell."
+            )
+    switches = np.sum(np.diff(s, axis=0) != 0.0, axis=0)
+    return OwnFields(names, array, vectors, deviations, switches, noise)
+
+
+def _states(states: Mapping[str, ArrayLike], names: tuple[str, ...], n: int) -> FloatArray:
+    """States (n, K) of the loads."""
+    if not names or set(names) - set(states):
+        raise ValueError(
+            f"Input states must have {', '.join(names) or 'a load'}; instead received {', '.join(states)}."
+        )
+    each = [np.asarray(states[name], dtype=np.float64) for name in names]
+    for name, values in zip(names, each, strict=True):
+        if values.shape != (n,) or not np.isfinite(values).all():
+            raise ValueError(
+                f"Input states must be finite with shape ({n},); instead received {values.shape} of {name}."
+            )
+    return np.stack(each, axis=1)
+
+
+def _windows(time_s: FloatArray, s: FloatArray, used: BoolArray, window_s: float) -> list[NDArray[np.intp]]:
+    """Rows of each switch: those within the window, and nearer to it than to another one."""
+    switches = np.flatnonzero((np.diff(s, axis=0) != 0.0).any(axis=1))
+    if not switches.size:
+        return []
+    at = 0.5 * (time_s[switches] + time_s[switches + 1])
+    away = np.abs(time_s[:, None] - at)
+    nearest = np.where(used & (away.min(axis=1) <= window_s), away.argmin(axis=1), -1)
+    rows = [np.flatnonzero(nearest == switch) for switch in range(len(switches))]
+    return [of_switch for of_switch in rows if len(of_switch) >= _LEAST_ROWS]
+
+
+def _turns(time_s: FloatArray, gyro_rad_s: FloatArray) -> FloatArray:
+    """Rotations (n, 4) of the steps that end at each instant, by a spline of the rates and the coning of its ends."""
+    from scipy.interpolate import CubicSpline
+
+    read = np.isfinite(gyro_rad_s).all(axis=1)
+    if read.sum() < 2:
+        raise ValueError(f"Input gyro_rad_s must have two readings at least; instead received {read.sum()}.")
+    spline = CubicSpline(time_s[read], gyro_rad_s[read])
+    angles, rates, steps = np.diff(spline.antiderivative()(time_s), axis=0), spline(time_s), np.diff(time_s)
+    angles += np.cross(rates[:-1], rates[1:]) * steps[:, None] ** 2 / 12.0
+    return np.concatenate([[quaternion.IDENTITY], quaternion.exp(angles)])
+
+
+def _attitudes(turns: FloatArray, rows: NDArray[np.intp]) -> FloatArray:
+    """Attitudes (len(rows), 3, 3) of rows against the first of them, from the turns (n, 4) of all steps."""
+    q = [quaternion.IDENTITY]
+    for turn in turns[rows[0] + 1 : rows[-1] + 1]:
+        q.append(quaternion.multiply(q[-1], turn))
+    return quaternion.matrix(np.array(q)[rows - rows[0]])
+
+
+def _projected(
+    time_s: FloatArray, D: FloatArray, s: FloatArray, fields: FloatArray, ambient: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Design (3n, 3K + 12) and fields (3n, M) of a window without their parabolas in time.
+
+    ``ambient`` (n, 3): about the field that is not the satellite's own; what an error of gains or axes makes of it.
+    """
+    n = len(time_s)
+    regressors = np.concatenate([s, np.ones((n, 1))], axis=1)
+    turned = np.einsum("nij,nmj->nim", D, fields)
+    polynomial, _ = np.linalg.qr(np.vander((time_s - time_s.mean()) / np.ptp(time_s), _DEGREE + 1))
+    smooth = polynomial @ (polynomial.T @ np.einsum("nij,nj->ni", D, ambient))
+    by_gain = np.einsum("nij,nk->nijk", D, np.einsum("nij,ni->nj", D, smooth / _AMBIENT_T))
+    design = np.concatenate(
+        [np.einsum("nij,nk->nikj", D, regressors).reshape(n, 3, -1), by_gain.reshape(n, 3, 9)], axis=2
+    )
+    without = np.eye(n) - polynomial @ polynomial.T
+    A, y = (np.einsum("np,pij->nij", without, one).reshape(3 * n, -1) for one in (design, turned))
+    return A, y
+
+
+def _regression(
+    windows: Sequence[tuple[FloatArray, FloatArray]], loads: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fields (K, M, 3) of the loads, deviations and noise (M,), by M least squares of one design and a weak prior."""
+    A, y = (np.concatenate(parts) for parts in zip(*windows, strict=True))
+    dof = len(A) - 3 * (_DEGREE + 1) * len(windows) - A.shape[1]
+    normal = A.T @ A
+    # The prior in units of a noise that is not known yet, twice: the second time it is.
+    noise = np.full(y.shape[1], np.sqrt(np.mean(y**2)))
+    for _ in range(2):
+        inverse = [np.linalg.inv(normal + np.eye(len(normal)) * (one / _PRIOR_T) ** 2) for one in noise]
+        x = np.stack([of_one @ (A.T @ column) for of_one, column in zip(inverse, y.T, strict=True)], axis=1)
+        noise = np.sqrt(np.sum((y - A @ x) ** 2, axis=0) / dof)
+    sigma = np.stack([one * np.sqrt(np.diagonal(of_one)) for one, of_one in zip(noise, inverse, strict=True)], axis=1)
+    fields, deviations = (v[: 3 * loads].reshape(loads, 3, -1).transpose(0, 2, 1) for v in (x, sigma))
+    return fields, deviations, noise

@@ -1,0 +1,140 @@
+"""A satellite of three units with four magnetometers, and two loads that switch and make fields of their own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from adcs.environment.orbit import circular_orbit
+from adcs.quaternion import rotate_back
+from adcs.satellite.dynamics import WheelControl
+from adcs.satellite.satellite import Satellite
+from adcs.satellite.sensors import Magnetometer
+from arrays.array import SensorArray
+from arrays.sensor import Sensor
+from arrays.typing import FloatArray
+from magloc.fields.dipole import total_field
+from sims.attitude.scenario import AttitudeScenario, StartConditions
+from sims.attitude.simulation import AttitudeRuns, moved, prepare
+from sims.noise import stream
+
+NOISE_T = 15e-9
+GAIN, AXES_RAD, PLACE_M = 0.01, math.radians(0.5), 1e-3
+"""Standard deviations of what is not known of a magnetometer: gains, axes, and where it stands, each component."""
+LOADS = {
+    "heater": ((0.02, -0.025, -0.06), (0.012, 0.0, 0.016)),
+    "radio": ((-0.015, 0.02, 0.085), (0.06, -0.08, 0.0)),
+}
+"""Place [m] and moment [A·m²] of each load, body axes: 0.02 and 0.1 A·m²."""
+PLACES_M = ((0.045, 0.045, 0.165), (-0.045, 0.045, -0.165), (0.045, -0.045, 0.0), (-0.045, -0.045, 0.12))
+"""Of the magnetometers; the first one is that of the attitude."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoadsRun:
+    """Readings of a run, and the truth behind them.
+
+    Attributes
+    ----------
+    array : SensorArray
+        The magnetometers ``m1`` to ``m4``, as their user knows them.
+    readings_T, quiet_T : ndarray, shape (n, 12)
+        Of the array, with the loads, and of the same magnetometers and noise without.
+    states : dict of str to ndarray, shape (n,)
+        0 and 1 of each load.
+    fields_T : ndarray, shape (K, 4, 3)
+        What each load adds to the readings, body axes.
+    run : AttitudeRuns
+        Of the satellite, one run; its magnetometer is not on board.
+    """
+
+    array: SensorArray
+    readings_T: FloatArray
+    quiet_T: FloatArray
+    states: Mapping[str, FloatArray]
+    fields_T: FloatArray
+    run: AttitudeRuns
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Of the rows, shape (n,)."""
+        return self.run.time_s
+
+    @property
+    def gyro_rad_s(self) -> FloatArray:
+        """Gyro, shape (n, 3)."""
+        return self.run.readings.gyro_rad_s[0]
+
+    @property
+    def columns(self) -> dict[str, FloatArray]:
+        """Columns (n,) of a log as ``adcs loads`` reads it."""
+        channels = dict(zip((f"{name}_nT" for name in self.array.channel_names), 1e9 * self.readings_T.T, strict=True))
+        gyro = dict(zip((f"gyro_{axis}_deg_s" for axis in "xyz"), np.degrees(self.gyro_rad_s.T), strict=True))
+        return {"time_s": self.time_s, **channels, **gyro, **self.states}
+
+
+def switching_loads(seed: int, *, duration_s: float = 2400.0, rate_deg_s: float = 0.4) -> LoadsRun:
+    """A tumbling satellite of 4 kg whose loads switch every 20 to 90 s.
+
+    Parameters
+    ----------
+    seed : int
+        Of everything that is random.
+    duration_s : float
+        At a reading a second.
+    rate_deg_s : float
+        Standard deviation of the rate about each axis.
+
+    Examples
+    --------
+    >>> from sims import experiments
+    >>> experiments.switching_loads(seed=0, duration_s=60.0).readings_T.shape
+    (61, 12)
+    """
+    rng = stream(seed, "loads")
+    orbit = circular_orbit(altitude_m=550e3, inclination_deg=97.6, epoch="2026-11-21", local_time_h=10.5)
+    satellite = Satellite(
+        inertia_kgm2=np.diag([0.041, 0.041, 0.007]),
+        orbit=orbit,
+        magnetometer=Magnetometer(sigma_T=NOISE_T),
+        control=WheelControl(np.zeros(3), np.zeros(3), torque_limit_Nm=1e-15),
+    )
+    scenario = AttitudeScenario(
+        satellite,
+        conditions=StartConditions(sunlit=False, least_separation_rad=0.0, least_field_T=0.0),
+        duration_s=duration_s,
+        torque_Nm=1e-8,
+        gyro_bias_rad_s=math.radians(0.01),
+        start_attitude_rad=1.0,
+        start_rate_rad_s=math.radians(rate_deg_s),
+    )
+    prepared = prepare(scenario, [seed])
+    n = scenario.n_instants
+    states = {name: _switched(n, rng) for name in LOADS}
+    moments = sum(states[name][:, None] * np.array(moment) for name, (_, moment) in LOADS.items())
+    run = moved(replace(prepared, dipole_Am2=prepared.dipole_Am2 + moments))
+    array = SensorArray(
+        tuple(
+            Sensor(f"m{i}", "vector", place, noise_T=NOISE_T, gain_uncertainty=GAIN, misalignment_rad=AXES_RAD)
+            for i, place in enumerate(PLACES_M, start=1)
+        ),
+        # Of the field of a dipole 0.1 m away, by 1 mm of the place.
+        noise_fraction=3.0 * PLACE_M / 0.1,
+    )
+    places = array.positions + PLACE_M * rng.standard_normal((4, 3))
+    response = np.eye(3) + np.where(np.eye(3), GAIN, AXES_RAD) * rng.standard_normal((4, 3, 3))
+    own = np.stack([total_field(places, np.array([place]), np.array([moment])) for place, moment in LOADS.values()])
+    fields = np.einsum("mij,kmj->kmi", response, own)
+    ambient = rotate_back(run.q[0], prepared.true_field_orbital_T[0])
+    quiet = np.einsum("mij,nj->nmi", response, ambient) + NOISE_T * rng.standard_normal((n, 4, 3))
+    loaded = quiet + np.einsum("kn,kmi->nmi", np.stack(list(states.values())), fields)
+    return LoadsRun(array, loaded.reshape(n, 12), quiet.reshape(n, 12), states, fields, run)
+
+
+def _switched(n: int, rng: np.random.Generator) -> FloatArray:
+    """0 and 1 of n rows, with changes 20 to 90 s apart."""
+    changes = np.cumsum(rng.integers(20, 91, size=1 + n // 20))
+    return np.asarray((np.searchsorted(changes, np.arange(n), side="right") % 2).astype(np.float64))

@@ -1,0 +1,76 @@
+"""What a filter says of torques that it does not know, from the residuals of readings that each fit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from adcs.kalman.diagnostics import residuals_after, unseen_torque_Nm, warnings_of
+from adcs.kalman.error_state import AttitudeTracks
+from adcs.kalman.mekf import run_filter, stacked_residuals
+from sims.attitude.simulation import AttitudeRuns, simulate
+from tests.adcs.filter_runs import ANY_START, believed_runs, settings, start_of, tabletsat
+
+SETTINGS = settings("mag+sun+gyro", ["gyro-bias", "disturbance"])
+
+
+def lasting(runs: AttitudeRuns, tracks: AttitudeTracks) -> list[bool]:
+    """Which runs have the warning."""
+    return [any(text.startswith("residuals last") for text in texts) for texts in warnings_of(runs, tracks)]
+
+
+def swinging(period_s: float, torque_Nm: float = 8e-7) -> tuple[AttitudeRuns, AttitudeTracks]:
+    scenario = replace(
+        tabletsat(2500.0), conditions=ANY_START, gyro_bias_rad_s=0.0, torque_Nm=torque_Nm, torque_period_s=period_s
+    )
+    runs = simulate(scenario, range(4))
+    return runs, run_filter(runs, SETTINGS, start_of(runs))
+
+
+class TestResidualsThatLast:
+    @pytest.mark.parametrize("period_s", [300.0, 1000.0])
+    def test_a_torque_that_swings_is_told(self, period_s: float) -> None:
+        assert all(lasting(*swinging(period_s)))
+
+    def test_a_truth_as_the_filter_believes_is_not(self) -> None:
+        # False-alarm rate 1e-6 a run.
+        runs = believed_runs(SETTINGS, 1000.0, range(40))
+        assert not any(lasting(runs, run_filter(runs, SETTINGS, start_of(runs))))
+
+    def test_they_are_those_of_the_filter(self) -> None:
+        runs = believed_runs(SETTINGS, 60.0, range(2))
+        tracks = run_filter(runs, SETTINGS, start_of(runs))
+        after = residuals_after(runs, tracks, run=1)
+        _, stacked = stacked_residuals(runs, 40, tracks.at(40), SETTINGS)
+        sigma = [
+            runs.satellite.gyro.sigma_rad_s,
+            runs.satellite.magnetometer.sigma_T,
+            runs.satellite.sun_sensor.sigma_rad,
+        ]
+        each = np.concatenate([after[sensor][40] / one for sensor, one in zip((1, 2, 3), sigma, strict=True)])
+        np.testing.assert_allclose(each, stacked[1], rtol=1e-9, atol=1e-12)
+
+
+class TestUnseenTorque:
+    def test_of_a_star_tracker_alone(self) -> None:
+        """0.7 of the angle's σ times (2π/T)² and the largest moment of inertia."""
+        runs = believed_runs(settings("st"), 30.0, range(1))
+        tracks = run_filter(runs, settings("st"), start_of(runs))
+        J = np.linalg.eigvalsh(runs.satellite.body.inertia_kgm2)[-1]
+        expected = 0.7 * 2.0 * runs.satellite.star_tracker.sigma_rad * (2.0 * np.pi / 300.0) ** 2 * J
+        assert unseen_torque_Nm(runs, tracks, 0)[300.0] == pytest.approx(expected, rel=1e-12)
+
+    def test_a_torque_below_is_not_seen(self) -> None:
+        """Of a period of 100 s 8e-7 N·m are below; the warning, a rate of 1e-6 but for the torque, does not come."""
+        runs, tracks = swinging(100.0)
+        assert unseen_torque_Nm(runs, tracks, 0)[100.0] > 8e-7
+        assert not any(lasting(runs, tracks))
+
+    def test_a_gyro_helps_with_short_periods(self) -> None:
+        runs, tracks = swinging(1000.0)
+        without = settings("mag+sun", ["disturbance"])
+        seen, alone = (unseen_torque_Nm(runs, one, 0) for one in (tracks, run_filter(runs, without, start_of(runs))))
+        assert seen[100.0] < 0.7 * alone[100.0]
+        assert seen[1000.0] == pytest.approx(alone[1000.0], rel=0.1)

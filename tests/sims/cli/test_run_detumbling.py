@@ -1,0 +1,34 @@
+"""``adcs run detumbling``."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from tests.adcs.refusals import assert_refused
+from tests.command_line import refuse_constant
+
+
+def test_numbers_and_text(adcs):
+    arguments = ("run", "detumbling", "--seeds", "2", "--rate-deg-s", "1", "--duration", "1200")
+    outcome = adcs(*arguments, "--json")
+    assert outcome.status == 0, outcome.err
+    found = json.loads(outcome.out, parse_constant=refuse_constant)
+    assert list(found) == ["time_s", "theory_s", "ratio", "within_20_percent", "detumbled_runs", "runs"]
+    assert found["detumbled_runs"] == found["runs"] == 2
+    assert f"after, median{found['time_s']:.0f} s" in adcs(*arguments).out.replace(" " * 8, "")
+
+
+def test_too_short_is_null(adcs):
+    outcome = adcs("run", "detumbling", "--seeds", "1", "--duration", "100", "--json")
+    found = json.loads(outcome.out, parse_constant=refuse_constant)
+    assert found["time_s"] is None
+    assert found["detumbled_runs"] == 0
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--rate-deg-s", "0"), ("--duty", "1.5"), ("--moment-Am2", "-1"), ("--duration", "1e9")]
+)
+def test_refused(adcs, option, value):
+    assert_refused(adcs("run", "detumbling", option, value), option, "expected more than 0")
