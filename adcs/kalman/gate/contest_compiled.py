@@ -159,9 +159,9 @@ def turned_onto(q: Quaternion, body: Vector, reference: Vector) -> Quaternion:
     if 1.0 + cosine < 1e-12:
         least = np.argmin(np.abs(np.array(body)))
         across = cross(body, (1.0 if least == 0 else 0.0, 1.0 if least == 1 else 0.0, 1.0 if least == 2 else 0.0))
-        return normalised(multiply(q, normalised((0.0, across[0], across[1], across[2]))))
+        return normalised(multiply(q, (0.0, across[0], across[1], across[2])))
     by = (1.0 + cosine, turn[0] / length, turn[1] / length, turn[2] / length)
-    return normalised(multiply(q, normalised(by)))
+    return normalised(multiply(q, by))
 
 
 @compiled

@@ -107,7 +107,7 @@ class TestRange:
 
 class TestStarTrackerView:
     def test_rate_limit(self) -> None:
-        w = np.radians([[1.9, 0.0, 0.0], [1.5, 1.5, 0.0]])
+        w = np.radians([[1.99, 0.0, 0.0], [1.42, 1.42, 0.0]])  # 1.99 and 2.01
         np.testing.assert_array_equal(np.isnan(star(StarTracker(), LEVEL[:2], NONE, w=w))[:, 0], [False, True])
 
     def test_sun(self) -> None:

@@ -36,6 +36,7 @@ from magloc.bounds.maps import BoundScenario, bound_slices
 from magloc.convergence.over_starts import Status
 from magloc.localization.fit.results import Fix, Solution
 from magloc.plots import style
+from magloc.plots.bounds import _palette
 from magloc.plots.bounds import bound_slices as bound_slices_figure
 from magloc.plots.calibrations import calibration_figure, turning_figure
 from magloc.plots.localization import distances_from_truth, fix_columns, fix_figure, residual_figure
@@ -500,3 +501,8 @@ def test_a_notebook_shows_a_figure_without_pyplot() -> None:
     picture = PIL.Image.open(io.BytesIO(figure._repr_png_()))
     assert picture.format == "PNG"
     assert picture.size == (round(120 * style.WIDTH_IN), 240)
+
+
+def test_colours_of_an_animation_are_256_of_three_bytes():
+    assert len(_palette()) == 3 * 256
+    assert (min(_palette()), max(_palette())) == (0, 255)
