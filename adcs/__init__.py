@@ -30,8 +30,12 @@ __getattr__, __dir__, __all__ = lazy_names(
         "identify_stars": "adcs.stars.identification",
         "inertial_magnetic_filter": "adcs.complementary.filters",
         "mockup": ":adcs.mockup",
+        "read_aem": "adcs.io.ccsds",
+        "read_oem": "adcs.io.ccsds",
         "read_scenario": "adcs.io.scenario_files",
         "read_telemetry": "adcs.io.telemetry_files",
         "vector_attitude": "adcs.satellite.vectors",
+        "write_aem": "adcs.io.ccsds",
+        "write_oem": "adcs.io.ccsds",
     },
 )

@@ -8,6 +8,10 @@ from adcs.ellipsoids.ellipsoid import Ellipsoid as Ellipsoid
 from adcs.ellipsoids.observer import BoundedSystem as BoundedSystem
 from adcs.ellipsoids.observer import EllipsoidObserver as EllipsoidObserver
 from adcs.environment.orbit import circular_orbit as circular_orbit
+from adcs.io.ccsds import read_aem as read_aem
+from adcs.io.ccsds import read_oem as read_oem
+from adcs.io.ccsds import write_aem as write_aem
+from adcs.io.ccsds import write_oem as write_oem
 from adcs.io.scenario_files import read_scenario as read_scenario
 from adcs.io.telemetry_files import read_telemetry as read_telemetry
 from adcs.kalman.bank import EstimatorSettings as EstimatorSettings

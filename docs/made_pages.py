@@ -52,7 +52,7 @@ EXPLAINED = {
     " arrays.cross arrays.cube arrays.hexagon arrays.axial arrays.grid",
     "attitude": "adcs.estimate adcs.EstimatorSettings adcs.Telemetry adcs.read_telemetry adcs.Satellite"
     " adcs.circular_orbit adcs.read_scenario adcs.find_own_fields adcs.OwnFields"
-    " adcs.BDot adcs.b_dot_gain adcs.detumbled"
+    " adcs.BDot adcs.b_dot_gain adcs.detumbled adcs.read_oem adcs.read_aem adcs.write_oem adcs.write_aem"
     " adcs.AttitudeTrack adcs.EllipsoidObserver adcs.BoundedSystem"
     " adcs.Ellipsoid sims.AttitudeScenario sims.experiments.run_scenario sims.experiments.compared_with_paper",
     "calibration": "magloc.calibrate magloc.Calibration magloc.CalibrationPrior magloc.plots.calibration",

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 import adcs
 from adcs.cli.options import EstimateOptions, print_note
@@ -11,6 +13,9 @@ from arrays.io.arguments import Flag
 from arrays.io.errors import naming
 from arrays.io.outputs import make_folder, refuse_file
 from magloc.cli.framework import QuietOptions, print_json
+
+if TYPE_CHECKING:
+    from adcs.io.scenario_files import AttitudeFile
 
 
 def estimate(
@@ -33,15 +38,15 @@ def estimate(
     ----------
     telemetry : Path
         CSV file: time_s, and any of star_qw, star_qx, star_qy, star_qz (inertial from body, scalar first), gyro_x_deg_s
-        and so on, field_x_nT, sun_x, and the wheels' momentum wheels_x_Nms, in body axes. Empty cells and missing rows
-        are missing readings.
+        and so on, field_x_nT, sun_x, the wheels' momentum wheels_x_Nms and the moment commanded torquers_x_Am2, in body
+        axes. Empty cells and missing rows are missing readings. Or an attitude ephemeris message of the CCSDS (.aem).
     config : Path
         Scenario file (TOML) of the satellite; time_s counts from its orbit's start. Its table log names other columns,
         UTC times, units, axes and conventions of quaternions.
     options : EstimateOptions
         What differs from the scenario file.
     out : Path, optional
-        Folder for estimates.csv and figures.
+        Folder for estimates.csv, the same as messages (attitude.aem, orbit.oem), and figures.
     json : bool
         Print one JSON object with one entry for every row.
     common : QuietOptions
@@ -54,7 +59,7 @@ def estimate(
     scenario = adcs.read_scenario(str(config))
     scenario = scenario.changed({"estimate": options.estimate(scenario.estimate.states)})
     settings = scenario.estimator(f"{config}, table estimate")
-    record = adcs.read_telemetry(telemetry, scenario.step_s, layout=scenario.log)
+    record = _log(telemetry, scenario)
     with naming(str(telemetry)):
         track = adcs.estimate(record, scenario.satellite, sensors=settings)
     columns = estimate_columns(track)
@@ -64,14 +69,26 @@ def estimate(
     if out is not None:
         make_folder(out, "--out")
         _write(out, scenario.name, track, columns)
+        utc = adcs.frames.instants(scenario.satellite.start, track.time_s[track.rows])
+        adcs.write_aem(out / "attitude.aem", utc, track.rotation[track.rows].as_quat())
+        adcs.write_oem(out / "orbit.oem", utc, *scenario.satellite.orbit.position_velocity_eci(utc))
         if not common.quiet:
-            print_note(f"wrote estimates.csv, estimates.png and consistency.png into {out}")
+            print_note(f"wrote estimates.csv, attitude.aem, orbit.oem, estimates.png and consistency.png into {out}")
     if json:
         rows = zip(*(values.tolist() for values in columns.values()), strict=True)
         entries = [dict(zip(columns, row, strict=True)) for row in rows]
         print_json({"results": entries, "warnings": list(track.warnings)})
     else:
         print("\n".join(summary_lines(track)))
+
+
+def _log(path: Path, scenario: AttitudeFile) -> adcs.Telemetry:
+    """Log of a table, or of an attitude ephemeris message."""
+    if path.suffix.lower() != ".aem":
+        return adcs.read_telemetry(path, scenario.step_s, layout=scenario.log)
+    utc, q = adcs.read_aem(path)
+    with naming(str(path)):
+        return adcs.Telemetry((utc - scenario.satellite.start) / np.timedelta64(1, "s"), star=q, step_s=scenario.step_s)
 
 
 def _write(out: Path, name: str, track: adcs.AttitudeTrack, columns: dict[str, Any]) -> None:

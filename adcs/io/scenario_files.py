@@ -18,6 +18,7 @@ import numpy as np
 
 from adcs.environment.orbit import Orbit, Sgp4Orbit, circular_orbit
 from adcs.frames import instants
+from adcs.io.ccsds import read_oem
 from adcs.io.log_layout import LogLayout
 from adcs.io.scenario_tables import (
     SENSOR_TABLES,
@@ -126,7 +127,7 @@ def scenario_of(path: str, tables: dict[str, Any]) -> AttitudeFile:
     """Scenario of the tables of a file, as :func:`arrays.io.toml.read_toml` returns them."""
     file = section_of(path, tables, FileTable)
     body, control = _satellite(f"{path}, table satellite", file.satellite)
-    orbit, start_utc, model = _orbit(f"{path}, table orbit", file.orbit)
+    orbit, start_utc, model = _orbit(path, f"{path}, table orbit", file.orbit)
     for name in file.sensors:
         if name not in SENSOR_TABLES:
             raise InputError(
@@ -227,11 +228,14 @@ def _satellite(place: str, section: SatelliteTable) -> tuple[RigidBody, WheelCon
     return body, control
 
 
-def _orbit(place: str, section: OrbitTable) -> tuple[Orbit, np.datetime64, Model]:
+def _orbit(path: str, place: str, section: OrbitTable) -> tuple[Orbit, np.datetime64, Model]:
     start: np.datetime64 = instants(datetime.datetime.fromisoformat(section.start))[()]  # type: ignore[assignment]
     if section.elements is not None:
         with naming(f"{place}, key elements"):
             return Sgp4Orbit(*section.elements), start, section.field_model
+    if section.ephemeris is not None:
+        # Beside the scenario file, wherever the command runs.
+        return read_oem(Path(path).parent / section.ephemeris), start, section.field_model
     with naming(place):
         orbit = circular_orbit(
             altitude_m=1e3 * (section.altitude_km or 0.0),

@@ -55,15 +55,19 @@ class OrbitTable(Table, kw_only=True):
     node_deg: float | None = None
     latitude_argument_deg: float = 0.0
     elements: tuple[str, str] | None = None
+    ephemeris: str | None = None
     field_model: Annotated[str, one_of(MODELS)] = "IGRF-14"
 
     def check(self) -> None:
         """Refuse anything but one orbit."""
         circle = ("altitude_km", "inclination_deg", "local_time_h", "node_deg")
         missing = [key for key in circle if getattr(self, key) is None]
-        if self.elements is not None:
+        if self.elements is not None and self.ephemeris is not None:
+            raise RefusalError("", "found elements and an ephemeris, expected one of them")
+        if self.elements is not None or self.ephemeris is not None:
             if len(missing) < len(circle):
-                raise RefusalError("", "found elements and a circle, expected one of them")
+                given = "an ephemeris" if self.elements is None else "elements"
+                raise RefusalError("", f"found {given} and a circle, expected one of them")
         elif missing and missing[0] in circle[:2]:
             raise RefusalError("", f"found no key {missing[0]}, expected one, or two-line elements")
         elif len(missing) != 1:

@@ -42,7 +42,7 @@ class BDot:
     >>> import adcs
     >>> law = adcs.BDot(gain_Nms=2e-4)
     >>> law.moment_Am2([30e-6, 0.0, 0.0], [30e-6, 1e-6, 0.0], step_s=1.0).round(3)
-    array([-0.   , -0.2  , -0.   ])
+    array([-0. , -0.2, -0. ])
     """
 
     gain_Nms: float

@@ -71,7 +71,13 @@ class TestExample:
     def test_files_and_pictures(self, adcs, example, tmp_path):
         files = (example / "telemetry.csv", "--config", example / "scenario.toml")
         outcome = adcs("estimate", *files, "--out", tmp_path)
-        assert sorted(path.name for path in tmp_path.iterdir()) == ["consistency.png", "estimates.csv", "estimates.png"]
+        assert sorted(path.name for path in tmp_path.iterdir()) == [
+            "attitude.aem",
+            "consistency.png",
+            "estimates.csv",
+            "estimates.png",
+            "orbit.oem",
+        ]
         assert "wrote estimates.csv" in outcome.err
         assert image.imread(tmp_path / "estimates.png").shape[0] > 700
         assert "bias of the gyro" in outcome.out
