@@ -42,6 +42,9 @@ from magloc.signature.path import PathError as PathError
 from magloc.signature.path import read_object_path as read_object_path
 from magloc.signature.signature import Signature as Signature
 from magloc.signature.signature import fit_signature as fit_signature
+from magloc.surveying.results import Survey as Survey
+from magloc.surveying.results import Target as Target
+from magloc.surveying.survey import survey as survey
 from magloc.tracking.motion import CoordinatedTurn as CoordinatedTurn
 from magloc.tracking.motion import KnownMotion as KnownMotion
 from magloc.tracking.motion import OrnsteinUhlenbeck as OrnsteinUhlenbeck

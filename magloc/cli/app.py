@@ -24,7 +24,7 @@ app = App(
 for _name, _where, _help in (
     (
         "calibrate",
-        "magloc.cli.calibrate:calibrate",
+        "magloc.cli.calibration.calibrate:calibrate",
         "Calibrate vector sensors by a source that moves past them, or by turning them in a field of known modulus.",
     ),
     ("locate", "magloc.cli.locate:locate", "Find the sources in every row of a readings file, each row on its own."),
@@ -54,6 +54,11 @@ for _name, _where, _help in (
         "new-array",
         "magloc.cli.first_steps.new_array:new_array",
         "Write an array file: a shape, a size and a sensor, by options or by answering questions.",
+    ),
+    (
+        "survey",
+        "magloc.cli.survey:survey",
+        "Find targets at rest in the ground that sensors moved over.",
     ),
     ("demo", "magloc.cli.first_steps.demo:demo", "Simulate, locate and track a source, and draw what comes out."),
     ("simulate", "sims.cli.simulate:simulate", "Simulate the readings of an array."),

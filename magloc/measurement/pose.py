@@ -165,16 +165,23 @@ class PoseErrors:
         """The error (9, n) of a pose by every state; `sigma` (2,) of place and attitude stands for the array's own."""
         if not self.n_states:
             return np.zeros((N_POSE, 0))
-        known = self.uncertainty
-        position_m, attitude_rad = (known.position_m, known.attitude_rad) if sigma is None else sigma.tolist()
-        unit = np.zeros((N_POSE, N_POSE + _N_CLOCK))
-        unit[:, :N_POSE] = np.eye(N_POSE)
-        unit[TURN, N_POSE], unit[SHIFT, N_POSE] = pose.rate_rad_s, pose.reference_velocity_m_s
-        changing = np.repeat([attitude_rad, position_m, 0.0, known.time_s], [3, 3, 3, 1])
+        return self.effects(pose.rate_rad_s, pose.reference_velocity_m_s, sigma)
+
+    def effects(self, rate_rad_s: FloatArray, velocity_m_s: FloatArray, sigma: FloatArray | None = None) -> FloatArray:
+        """Those (..., 9, n) of arrays that turn and whose reference points move so, (..., 3) each."""
+        known, rows = self.uncertainty, rate_rad_s.shape[:-1]
+        stated = np.array([known.position_m, known.attitude_rad]) if sigma is None else sigma
+        unit = np.zeros((*rows, N_POSE, N_POSE + _N_CLOCK))
+        unit[..., :N_POSE] = np.eye(N_POSE)
+        unit[..., TURN, N_POSE], unit[..., SHIFT, N_POSE] = rate_rad_s, velocity_m_s
+        changing = np.zeros((*rows, N_POSE + _N_CLOCK))
+        changing[..., TURN], changing[..., SHIFT] = stated[..., 1:], stated[..., :1]
+        changing[..., N_POSE] = known.time_s
         constant = np.repeat(
             [known.attitude_constant_rad, 0.0, known.position_constant_m, known.time_constant_s], [3, 3, 3, 1]
         )
-        return unit[:, self.of_pose] * np.where(self.changes, changing[self.of_pose], constant[self.of_pose])
+        size = np.where(self.changes, changing[..., self.of_pose], constant[self.of_pose])
+        return unit[..., self.of_pose] * size[..., None, :]
 
     def of_rows(
         self, array: SensorArray, time_s: FloatArray, poses: Sequence[ArrayPose], sigmas: Sequence[FloatArray | None]

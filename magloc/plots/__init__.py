@@ -16,6 +16,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "residuals": "magloc.plots.localization",
         "save": "magloc.plots.style",
         "sources": "magloc.plots.maps",
+        "survey": "magloc.plots.surveys:survey_figure",
         "track": "magloc.plots.tracks:track_figure",
         "write": "magloc.plots.style",
     },

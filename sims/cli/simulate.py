@@ -22,14 +22,14 @@ def simulate(
 
     Beside READINGS.csv are written READINGS-truth.csv, with the position and the moment of the source in the world
     frame (READINGS-truth-2.csv and so on of further sources), READINGS-path.csv, with its position and its attitude,
-    and READINGS-array.toml, with what the user of the array knows of it: noise of one sample, saturation, and how
-    uncertain axes and gains are.
+    READINGS-targets.csv, with a row for every target in the ground of a survey, and READINGS-array.toml, with what the
+    user of the array knows of it: noise of one sample, saturation, and how uncertain axes and gains are.
 
     Parameters
     ----------
     scenario : str
         Scenario file (TOML), or a built-in scenario: diver, drone, hand-magnet, paper, ship,
-        ship-headings or weaving.
+        ship-headings, survey-cart, survey-diver, survey-drone or weaving.
     out : Path
         Readings file (CSV) to write. Existing files are replaced.
     json : bool
@@ -44,7 +44,7 @@ def simulate(
     from sims.magnetics.simulation import simulate as simulated
 
     wanted = read_scenario(scenario)
-    for path in files_beside(out, len(wanted.sources)).all:
+    for path in files_beside(out, len(wanted.sources), has_targets=wanted.targets is not None).all:
         refuse_unwritable(path, "--out")
     try:
         result = simulated(wanted, common.seed)
@@ -61,6 +61,7 @@ def simulate(
             "array": str(files.array),
             "truths": [str(path) for path in files.truths],
             "paths": [str(path) for path in files.paths],
+            "targets": [str(path) for path in files.targets],
         }
         print_json(report)
     if not (json or common.quiet):

@@ -11,12 +11,15 @@ from typing import NamedTuple
 import numpy as np
 
 from arrays.array_file import write_array
+from arrays.io.csv import write_columns
 from arrays.io.errors import InputError
 from arrays.io.text import write_text
 from magloc.readings import write_readings
 from magloc.signature.path import write_object_path
 from magloc.truth import TRUE_MOMENT_COLUMNS, TRUE_POSITION_COLUMNS, Truth
 from sims.magnetics.simulation import Simulation
+
+_TARGET_COLUMNS = (*TRUE_POSITION_COLUMNS, *TRUE_MOMENT_COLUMNS)
 
 
 class SimulationFiles(NamedTuple):
@@ -26,31 +29,35 @@ class SimulationFiles(NamedTuple):
     ----------
     truths, paths : tuple of Path
         One for each source.
+    targets : tuple of Path
+        One for all targets in the ground, if there are any.
     """
 
     readings: Path
     array: Path
     truths: tuple[Path, ...]
     paths: tuple[Path, ...]
+    targets: tuple[Path, ...] = ()
 
     @property
     def all(self) -> tuple[Path, ...]:
         """Every file."""
-        return (self.readings, self.array, *self.truths, *self.paths)
+        return (self.readings, self.array, *self.truths, *self.paths, *self.targets)
 
 
-def files_beside(readings: str | PathLike[str], n_sources: int) -> SimulationFiles:
+def files_beside(readings: str | PathLike[str], n_sources: int, *, has_targets: bool = False) -> SimulationFiles:
     """Paths of the files of a simulation, from that of the readings.
 
     Returns: READINGS-array.toml, READINGS-truth.csv, READINGS-truth-2.csv and so on beside READINGS.csv, and the same
-    of READINGS-path.csv.
+    of READINGS-path.csv; READINGS-targets.csv if there are targets in the ground.
     """
     path = Path(readings)
     numbers = ["", *(f"-{number}" for number in range(2, n_sources + 1))][:n_sources]
     truths, paths = (
         tuple(path.with_name(f"{path.stem}-{name}{number}.csv") for number in numbers) for name in ("truth", "path")
     )
-    return SimulationFiles(path, path.with_name(f"{path.stem}-array.toml"), truths, paths)
+    targets = (path.with_name(f"{path.stem}-targets.csv"),) if has_targets else ()
+    return SimulationFiles(path, path.with_name(f"{path.stem}-array.toml"), truths, paths, targets)
 
 
 def write_simulation(simulation: Simulation, readings: str | PathLike[str]) -> SimulationFiles:
@@ -79,7 +86,7 @@ def write_simulation(simulation: Simulation, readings: str | PathLike[str]) -> S
     >>> sims.write_simulation(simulation, "weaving.csv").array.name
     'weaving-array.toml'
     """
-    files = files_beside(readings, len(simulation.truths))
+    files = files_beside(readings, len(simulation.truths), has_targets=simulation.scenario.targets is not None)
     folder = files.readings.absolute().parent
     if not folder.is_dir():
         raise InputError(f"{readings}: found no folder {folder}, expected one.")
@@ -95,6 +102,9 @@ def write_simulation(simulation: Simulation, readings: str | PathLike[str]) -> S
             write_truth(truth, hidden / path.name)
         for path, known in zip(files.paths, simulation.paths, strict=True):
             write_object_path(hidden / path.name, known)
+        for path in files.targets:
+            buried = np.hstack([simulation.target_position_m, simulation.target_moment_Am2])
+            write_columns(dict(zip(_TARGET_COLUMNS, buried.T, strict=True)), hidden / path.name)
         for path in files.all:
             os.replace(hidden / path.name, path)
     return files

@@ -11,6 +11,7 @@ from arrays.array import SensorArray
 from arrays.pose import PoseUncertainty
 from arrays.typing import FloatArray
 from magloc.signature.path import PathError
+from sims.magnetics.ground import Geology, Targets
 from sims.magnetics.paths import Attitude, Path, Steered, Vector
 from sims.magnetics.sensors import SensorModel, nominal_array
 
@@ -134,6 +135,10 @@ class MagneticScenario:
         Readings that are not there.
     pose : PoseUncertainty, optional
         Errors of the pose that the readings state. The nominal array states them too, unless `array` states others.
+    targets : Targets, optional
+        At random places in the ground, beside the sources.
+    geology : Geology, optional
+        The ground itself.
     name : str
 
     Raises
@@ -161,6 +166,8 @@ class MagneticScenario:
     platform: Platform = field(default_factory=Platform)
     missing: Missing = field(default_factory=Missing)
     pose: PoseUncertainty | None = None
+    targets: Targets | None = None
+    geology: Geology | None = None
     name: str = ""
 
     def __post_init__(self) -> None:

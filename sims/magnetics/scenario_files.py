@@ -20,6 +20,7 @@ from arrays.array_file import array_of_table, read_array
 from arrays.io.errors import InputError, naming
 from arrays.io.toml import BuiltIn, in_si, named_section, section_of
 from magloc.signature.path import PathError
+from sims.magnetics.ground import Geology, Targets
 from sims.magnetics.paths import Attitude, Path, Steered, Vector
 from sims.magnetics.scenario import Carrier, MagneticScenario, Matrix, Missing, Platform, Pulsation, Source
 from sims.magnetics.scenario_tables import (
@@ -27,6 +28,7 @@ from sims.magnetics.scenario_tables import (
     AmbientTable,
     CarrierTable,
     FileTable,
+    GeologyTable,
     PlatformTable,
     PulsationTable,
     SensorsTable,
@@ -62,6 +64,8 @@ def read_scenario(name_or_path: str) -> MagneticScenario:
             platform=_platform(file.platform),
             missing=Missing(file.missing.dropout, tuple(file.missing.gaps_s)),
             pose=None if file.pose is None else file.pose.uncertainty(f"{path}, table pose"),
+            targets=None if file.targets is None else Targets(**msgspec.structs.asdict(file.targets)),
+            geology=None if file.geology is None else _geology(file.geology),
             name=FilePath(path).stem if file.name is None else file.name,
         )
 
@@ -210,6 +214,10 @@ def _pulsation(table: PulsationTable) -> Pulsation:
 
 def _platform(table: PlatformTable) -> Platform:
     return Platform(table.position_m, table.moment_Am2, table.frequency_Hz, table.noise_nT / 1e9)
+
+
+def _geology(table: GeologyTable) -> Geology:
+    return Geology(table.field_nT / 1e9, table.shortest_m, table.longest_m)
 
 
 def _vector(function: Callable[[float], float], values: Any) -> Vector:

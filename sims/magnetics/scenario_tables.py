@@ -142,6 +142,41 @@ class PoseErrorTable(PoseTable, kw_only=True):
     attitude_constant_deg: Annotated[NotNegative, _BELOW_30] = 0.0
 
 
+Pair = tuple[float, float]
+
+
+class TargetsTable(Table, kw_only=True):
+    """Targets at random places in the ground."""
+
+    number: Annotated[int, POSITIVE]
+    x_m: Pair
+    y_m: Pair
+    depth_m: Annotated[Pair, POSITIVE] = (0.3, 2.0)
+    moment_Am2: Annotated[Pair, POSITIVE] = (0.1, 30.0)
+    gap_m: NotNegative = 5.0
+
+    def check(self) -> None:
+        """Refuse bounds in the wrong order."""
+        for key in ("x_m", "y_m", "depth_m", "moment_Am2"):
+            low, high = getattr(self, key)
+            if low > high:
+                raise RefusalError(key, f"found [{low:g}, {high:g}], expected the smaller one first")
+
+
+class GeologyTable(Table, kw_only=True):
+    """Field of the ground itself."""
+
+    field_nT: NotNegative
+    shortest_m: Positive = 15.0
+    longest_m: Positive = 80.0
+
+    def check(self) -> None:
+        """Refuse wavelengths that are none."""
+        if self.shortest_m > self.longest_m:
+            found = f"found {self.shortest_m:g} above longest_m = {self.longest_m:g}"
+            raise RefusalError("shortest_m", f"{found}, expected the shorter one")
+
+
 class FileTable(File, kw_only=True):
     """The whole file."""
 
@@ -157,6 +192,8 @@ class FileTable(File, kw_only=True):
     platform: PlatformTable = msgspec.field(default_factory=PlatformTable)
     missing: MissingTable = msgspec.field(default_factory=MissingTable)
     pose: PoseErrorTable | None = None
+    targets: TargetsTable | None = None
+    geology: GeologyTable | None = None
 
 
 class PathTable(Table, kw_only=True):

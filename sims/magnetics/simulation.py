@@ -44,6 +44,8 @@ class Simulation:
         Position and attitude of every source, as whoever steers it knows them.
     true_array : SensorArray
         The array with its true calibration: misalignments and errors of the gains are part of it.
+    target_position_m, target_moment_Am2 : ndarray, shape (k, 3)
+        Of the targets in the ground, world frame.
     """
 
     scenario: MagneticScenario
@@ -53,6 +55,8 @@ class Simulation:
     truths: tuple[Truth, ...]
     paths: tuple[ObjectPath, ...]
     true_array: SensorArray
+    target_position_m: FloatArray
+    target_moment_Am2: FloatArray
 
     @property
     def truth(self) -> Truth:
@@ -98,6 +102,11 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
         fields_T += field(sensors_m, pose.position_m[:, None, :], moment_Am2[:, None, :])
         truths.append(Truth(time_s, pose.position_m, moment_Am2))
         poses.append(pose)
+    buried = (np.zeros((0, 3)),) * 2 if scenario.targets is None else scenario.targets.drawn(seed)
+    for position_m, moment in zip(*buried, strict=True):
+        fields_T += field(sensors_m, position_m, moment)
+    if scenario.geology is not None:
+        fields_T += scenario.geology.at(sensors_m, seed)
     fields_T = _applied(array_pose.rotation.inv(), fields_T) + _platform_fields(scenario, time_s, seed)
     fields_T += _stray_fields(scenario, seed)
     true_array = _true_array(scenario, seed)
@@ -118,7 +127,7 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
     )
     kept = tuple(Truth(t.time_s[present], t.position_m[present], _rows(t.moment_Am2, present)) for t in truths)
     paths = tuple(_known_path(scenario, i, time_s, pose, seed) for i, pose in enumerate(poses))
-    return Simulation(scenario, seed, scenario.nominal_array, readings, kept, paths, true_array)
+    return Simulation(scenario, seed, scenario.nominal_array, readings, kept, paths, true_array, *buried)
 
 
 def _pose(carrier: Carrier, time_s: FloatArray, seed: int, owner: str) -> _Pose:

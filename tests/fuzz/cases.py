@@ -26,7 +26,11 @@ MAINS = {"magloc": magloc_main, "adcs": adcs_main}
 
 # What is written is written into "out"; a command that is not here fails the test that reads this table.
 LINES: dict[str, tuple[str, ...]] = {
-    "magloc simulate": ("simulate.toml --out out.csv --json", "moving.toml --out out.csv"),
+    "magloc simulate": ("simulate.toml --out out.csv --json", "moving.toml --out out.csv", "ground.toml --out out.csv"),
+    "magloc survey": (
+        "ground.csv --array ground-array.toml --json",
+        "ground.csv --array ground-array.toml --ground-m -0.1 --region=z>-2 --out out",
+    ),
     "magloc locate": (
         "readings.csv --array array.toml --json",
         "readings.csv --array array.toml --sources auto --json",
@@ -114,6 +118,34 @@ noise_nT = 1.0
 [[source]]
 moment_Am2 = [100.0, 0.0, 0.0]
 path = { kind = "fixed", position_m = [3.0, 0.5, 0.306] }
+""",
+    "ground.toml": """format_version = 1
+duration_s = 12.0
+rate_Hz = 4.0
+[[array.sensor]]
+id = "m"
+kind = "scalar"
+position_m = [0.0, 0.0, 0.0]
+noise_nT = 0.2
+[carrier.path]
+kind = "lawnmower"
+start_m = [-1.5, 1.0, 0.8]
+course_deg = 90.0
+length_m = 3.0
+spacing_m = 0.8
+lines = 3
+speed_m_s = 1.0
+[ambient]
+field_nT = [1000.0, 20000.0, -44000.0]
+[targets]
+number = 1
+x_m = [-0.5, 0.5]
+y_m = [-0.5, 0.5]
+moment_Am2 = [2.0, 3.0]
+[geology]
+field_nT = 1.0
+[pose]
+position_m = 0.01
 """,
     "moving.toml": """format_version = 1
 duration_s = 4.0
@@ -227,6 +259,7 @@ def write_files(folder: Path) -> None:
     run("magloc", "simulate simulate.toml --out readings.csv")
     (folder / "readings-array.toml").rename(folder / "array.toml")
     run("magloc", "simulate moving.toml --out moving.csv")
+    run("magloc", "simulate ground.toml --out ground.csv")
     run("magloc", "simulate passing.toml --out passing.csv")
     run("magloc", "map paper --grid 3 --out map")
     run("adcs", "run tabletsat --duration 20 --seeds 1 --out sat")

@@ -21,6 +21,7 @@ COMMANDS = (
     "map",
     "track",
     "signature",
+    "survey",
     "bounds",
     "design",
     "new-array",

@@ -115,7 +115,7 @@ def calibrate(
         Common options.
     """
     from magloc.calibration.results import TurningCalibration
-    from magloc.cli import calibrate_by_turning as turning
+    from magloc.cli.calibration import by_turning as turning
     from magloc.readings import read_readings
 
     refuse_unwritable(out, "--out")

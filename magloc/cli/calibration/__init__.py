@@ -1,0 +1,1 @@
+"""``magloc calibrate``, by a source that moves past or by turning."""

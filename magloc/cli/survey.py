@@ -1,0 +1,159 @@
+"""``magloc survey``: static targets from sensors that move over ground."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from json import dumps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+import magloc
+from arrays.io.arguments import Flag
+from arrays.io.errors import InputError
+from arrays.io.outputs import make_folder, refuse_file, refuse_one_for_two, refuse_unwritable
+from arrays.io.text import write_text
+from magloc.cli.framework import CommonOptions, print_json
+from magloc.cli.options import KnownOptions, ambient_field, naming_options, print_note, refuse_not_positive
+
+if TYPE_CHECKING:
+    from magloc.surveying.results import Survey
+
+
+@Parameter(name="*", group="Ground")
+@dataclass(frozen=True)
+class GroundOptions:
+    """What is known of the ground.
+
+    Parameters
+    ----------
+    ground_m : float
+        Height of the ground in the world frame.
+    shortest_geology_m : float
+        Shortest wavelength in the field of the ground itself; what is smaller is taken for a target.
+    false_per_hectare : float
+        False targets in a hectare that noise may make, on average.
+    """
+
+    ground_m: Annotated[float, Parameter(allow_leading_hyphen=True)] = 0.0
+    shortest_geology_m: float = 15.0
+    false_per_hectare: float = 0.1
+
+
+def survey(
+    readings: Annotated[list[Path], Parameter(negative_iterable="")],
+    /,
+    *,
+    array: Path,
+    known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
+    ground: GroundOptions = GroundOptions(),
+    geojson: Path | None = None,
+    kml: Path | None = None,
+    out: Path | None = None,
+    json: Flag = False,
+    common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Find targets at rest in the ground that sensors moved over.
+
+    All rows count together, and as many targets are found as are significant. Readings need the pose of the array, and
+    for scalar sensors the ambient field. The table has the most significant target first: ± xy is the longer half axis
+    of the 95 % ellipse, χ² what would be lost without the target. Flags: "weak" = trust the depth interval and not the
+    ellipse; "near" = another target is so near that one of the two may be spurious; "edge" = at the rim of what was
+    searched.
+
+    Parameters
+    ----------
+    readings : list of Path
+        Readings files (CSV), each later than the one before.
+    array : Path
+        Array file (TOML).
+    known : KnownOptions
+        What is known of the sensors, of the targets, in the world frame, and of the ambient field.
+    ground : GroundOptions
+        What is known of the ground.
+    geojson : Path
+        Write the targets as a GeoJSON file; needs --place.
+    kml : Path
+        Write the targets as a KML file; needs --place.
+    out : Path
+        Folder for targets.csv, residual.csv and the map.
+    json : bool
+        Print one JSON object in place of the table.
+    common : CommonOptions
+        Common options.
+    """
+    for name, path in (("--geojson", geojson), ("--kml", kml)):
+        if path is not None and known.place is None:
+            raise InputError(f"{name}: found no --place, expected the origin of the world frame with it.")
+        if path is not None:
+            refuse_unwritable(path, name)
+    if out is not None:
+        refuse_file(out, "--out")
+    refuse_one_for_two({"--out": out, "--geojson": geojson, "--kml": kml})
+    refuse_not_positive(ground, "shortest_geology_m", "false_per_hectare")
+    if not math.isfinite(ground.ground_m):
+        raise InputError(f"--ground-m: found {ground.ground_m:g}, expected a finite number.")
+    where = None if known.place is not None and known.date is None else known.where
+    used = known.array(array)
+    parts = [magloc.read_readings(path, used, sensors=known.ids, ordered=True) for path in readings]
+    fields = [ambient_field(used, part, where) for part in parts]
+    used, rows = fields[0][0], [replace(part, ambient_T=own) for part, (_, own) in zip(parts, fields, strict=True)]
+    with _naming(", ".join(map(str, readings))):
+        found = magloc.survey(
+            used,
+            rows,
+            prior=known.prior,
+            ground_m=ground.ground_m,
+            shortest_geology_m=ground.shortest_geology_m,
+            false_per_hectare=ground.false_per_hectare,
+            progress=None if common.quiet or json else _told,
+        )
+    if known.place is not None:
+        if geojson is not None:
+            write_text(dumps(found.to_geojson(known.place), allow_nan=False) + "\n", geojson)
+        if kml is not None:
+            write_text(found.to_kml(known.place), kml)
+    if out is not None:
+        _write(found, out)
+    if json:
+        from magloc.surveying.files import json_of_survey
+
+        print_json(json_of_survey(found))
+        return
+    print(found.table())
+    if found.pose_assumed and not common.quiet:
+        print_note("nothing is stated of the pose's errors: 2 cm are assumed")
+
+
+@contextmanager
+def _naming(readings: str) -> Iterator[None]:
+    """Let errors of the library speak of the options and of the file."""
+    try:
+        with naming_options("ground_m"):
+            yield
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{readings}: {str(error).removeprefix('Input ')}") from None
+
+
+def _told(number: int, sources: int) -> None:
+    print_note(f"round {number + 1}: {sources} sources")
+
+
+def _write(found: Survey, folder: Path) -> None:
+    """targets.csv, residual.csv, and the map."""
+    from arrays.io.csv import write_columns
+    from magloc.plots import save
+    from magloc.plots.surveys import survey_figure
+    from magloc.surveying.files import columns_of_survey, residual_columns
+
+    make_folder(folder, "--out")
+    write_columns(columns_of_survey(found), folder / "targets.csv")
+    write_columns(residual_columns(found), folder / "residual.csv")
+    save(survey_figure(found), folder / "survey.png")
+    print_note(f"wrote targets.csv, residual.csv and survey.png into {folder}/")

@@ -1,0 +1,81 @@
+"""A survey from above: the anomaly as measured, what the targets leave of it, and the targets."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.colors import SymLogNorm
+from matplotlib.figure import Figure
+
+from arrays.typing import FloatArray
+from magloc.plots import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from magloc.surveying.results import Survey, Target
+
+_MOST_POINTS = 20_000
+_ACROSS, _UP = "x, east [m]", "y, north [m]"
+
+
+def survey_figure(found: Survey) -> Figure:
+    """Map of the anomaly along the ambient field, of what the targets leave of it, and the targets.
+
+    Parameters
+    ----------
+    found : Survey
+        Of :func:`magloc.survey`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Examples
+    --------
+    >>> import sims
+    >>> import magloc
+    >>> from dataclasses import replace
+    >>> scenario = replace(sims.read_scenario("survey-drone"), duration_s=120.0)
+    >>> field = sims.simulate(scenario, seed=1)
+    >>> figure = magloc.plots.survey(magloc.survey(field.array, field.readings))
+    """
+    record = found.record
+    x, y = (record.sensors_m[..., axis].mean(axis=1) for axis in range(2))
+    height = style.WIDTH_IN * 0.5 * float(np.clip(np.ptp(y) / max(np.ptp(x), 1e-9), 0.4, 1.6)) + 1.0
+    figure = style.new_figure(height)
+    rows = slice(None, None, -(-len(record) // _MOST_POINTS))
+    both = figure.subplots(1, 2, sharex=True, sharey=True)
+    before, after = (record.along_ambient(values)[rows] * 1e9 for values in (record.values_T, found.residual_T))
+    for ax, values, title in zip(both, (before, after), ("anomaly", "less the targets' fields"), strict=True):
+        _draw_values(figure, ax, x[rows], y[rows], values)
+        style.dress(ax, _ACROSS, _UP, title)
+        ax.set_aspect("equal")
+    for target in found:
+        _draw_target(both[0], target, named=False)
+        _draw_target(both[1], target, named=True)
+    return figure
+
+
+def _draw_values(figure: Figure, ax: Axes, x: FloatArray, y: FloatArray, values_nT: FloatArray) -> None:
+    """Rows as coloured points; the scale is linear where most of them are, and logarithmic beyond."""
+    most = float(np.abs(values_nT).max())
+    usual = float(np.quantile(np.abs(values_nT), 0.8))
+    norm = SymLogNorm(max(usual, 1e-3 * most, 1e-6), vmin=-most, vmax=most)
+    points = ax.scatter(x, y, c=values_nT, s=1.5, lw=0.0, cmap="RdBu_r", norm=norm, rasterized=True)
+    bar = figure.colorbar(points, ax=ax, orientation="horizontal", shrink=0.8, aspect=30)
+    ticks = [-most, -norm.linthresh, 0.0, norm.linthresh, most]
+    bar.set_ticks(ticks, labels=[f"{tick:.2g}" for tick in ticks])
+    bar.minorticks_off()
+    bar.ax.tick_params(labelsize=style.SMALL_LETTERS)
+    bar.set_label("nT", fontsize=style.LETTERS)
+
+
+def _draw_target(ax: Axes, target: Target, *, named: bool) -> None:
+    place = (float(target.position_m[0]), float(target.position_m[1]))
+    ax.plot(*place, "+", color=style.BLACK, ms=5, mew=0.8, zorder=3)
+    ax.add_patch(style.ellipse95(target.position_m[:2], target.covariance[:2, :2], edgecolor=style.BLACK))
+    if named:
+        words = f"{target.id}: {target.depth_m:.1f} m"
+        ax.annotate(words, place, (3.0, 3.0), textcoords="offset points", fontsize=5.5, zorder=4)

@@ -1,0 +1,1 @@
+"""Static targets from sensors that move: all rows of a survey together."""

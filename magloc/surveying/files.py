@@ -1,0 +1,103 @@
+"""Files of a survey's targets: JSON, CSV, GeoJSON and KML."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from arrays.io.csv import Column
+from arrays.typing import Vector
+from magloc.surveying.results import IRON_Am2_PER_KG, Survey, Target
+
+_COMPONENTS = ("x_m", "y_m", "z_m", "mx_Am2", "my_Am2", "mz_Am2")
+
+
+def json_of_survey(found: Survey) -> dict[str, Any]:
+    """What ``magloc survey --json`` prints."""
+    targets = [
+        {
+            "id": target.id,
+            "position_m": target.position_m.tolist(),
+            "moment_Am2": target.moment_Am2.tolist(),
+            "covariance": target.covariance.tolist(),
+            "depth_m": target.depth_m,
+            "depth_interval95_m": list(target.depth_interval95_m),
+            "ellipse95_m": list(target.ellipse95[:2]),
+            "ellipse95_bearing_deg": target.ellipse95[2],
+            "iron_kg": list(target.iron_kg),
+            "significance": target.significance,
+            "flags": list(target.flags),
+        }
+        for target in found
+    ]
+    return {
+        "targets": targets,
+        "rows": len(found.record),
+        "seconds": found.seconds,
+        "threshold": found.threshold,
+        "chi2_per_dof": found.chi2_per_dof,
+        "pose_assumed": found.pose_assumed,
+    }
+
+
+def columns_of_survey(found: Survey) -> dict[str, Column]:
+    """Columns of ``targets.csv``."""
+    state = np.array([np.concatenate([t.position_m, t.moment_Am2]) for t in found]).reshape(-1, 6)
+    sigma = np.array([np.sqrt(np.diagonal(t.covariance)) for t in found]).reshape(-1, 6)
+    low, high = np.array([t.depth_interval95_m for t in found]).reshape(-1, 2).T
+    columns: dict[str, Column] = {"id": [t.id for t in found]}
+    columns |= dict(zip(_COMPONENTS, state.T, strict=True))
+    columns |= dict(zip((f"s_{name}" for name in _COMPONENTS), sigma.T, strict=True))
+    columns |= {"depth_m": np.array([t.depth_m for t in found]), "depth_low_m": low, "depth_high_m": high}
+    columns |= {"strength_Am2": np.array([t.strength_Am2 for t in found])}
+    columns |= {"significance": np.array([t.significance for t in found])}
+    columns["flags"] = [" ".join(t.flags) for t in found]
+    return columns
+
+
+def residual_columns(found: Survey) -> dict[str, Column]:
+    """Columns of ``residual.csv``: every row's anomaly, and what the targets leave of it."""
+    record = found.record
+    columns: dict[str, Column] = {"time_s": record.time_s}
+    columns |= dict(zip(("x_m", "y_m", "z_m"), record.sensors_m.mean(axis=1).T, strict=True))
+    columns["anomaly_nT"] = 1e9 * record.along_ambient(record.values_T)
+    columns["residual_nT"] = 1e9 * record.along_ambient(found.residual_T)
+    return columns
+
+
+def geojson_of_survey(found: Survey, origin: Vector) -> dict[str, Any]:
+    """:meth:`magloc.surveying.results.Survey.to_geojson`."""
+    features = []
+    for target, entry in zip(found, json_of_survey(found)["targets"], strict=True):
+        geometry = {"type": "Point", "coordinates": _place(target, origin)}
+        features.append({"type": "Feature", "geometry": geometry, "properties": entry})
+    return {"type": "FeatureCollection", "features": features}
+
+
+def kml_of_survey(found: Survey, origin: Vector) -> str:
+    """:meth:`magloc.surveying.results.Survey.to_kml`."""
+    marks = []
+    for target in found:
+        longitude, latitude, _ = _place(target, origin)
+        low, high = target.depth_interval95_m
+        least, most = target.iron_kg
+        words = (
+            f"{target.depth_m:.2f} m below ground (95 %: {low:.2f} to {high:.2f} m), {target.strength_Am2:.3g} A·m²: "
+            f"{least:.2g} to {most:.2g} kg of iron, if a kilogram has {IRON_Am2_PER_KG[0]:g} to "
+            f"{IRON_Am2_PER_KG[1]:g} A·m². {' '.join(target.flags)}"
+        )
+        point = f"<Point><coordinates>{longitude:.9f},{latitude:.9f}</coordinates></Point>"
+        text = escape(words.strip())
+        marks.append(f"<Placemark><name>{escape(target.id)}</name><description>{text}</description>{point}</Placemark>")
+    head = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
+    return "\n".join([head, *marks, "</Document></kml>", ""])
+
+
+def _place(target: Target, origin: Vector) -> list[float]:
+    """Longitude, latitude [deg] and height [m]."""
+    from pymap3d import enu2geodetic
+
+    latitude, longitude, height = enu2geodetic(*target.position_m.tolist(), *origin)
+    return [float(longitude), float(latitude), float(height)]

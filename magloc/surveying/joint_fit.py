@@ -1,0 +1,258 @@
+r"""All sources of a survey fitted together, with everything else that the readings hold projected out.
+
+The ground is an equivalent layer: poles below it, whose strengths are Gaussian and are eliminated,
+
+.. math:: \min_a |r - L a|^2 + |a|^2 = r^T (1 - L (L^T L + 1)^{-1} L^T) r
+
+in white units, and so are their columns in the Jacobian of the sources: Levenberg-Marquardt on what is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, solve_triangular
+
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.fields import dipole
+from magloc.measurement.pose import PoseErrors
+from magloc.surveying.record import SurveyRecord
+from magloc.surveying.whitening import Drift, Whitening
+from magloc.surveying.whitening_compiled import source_columns
+
+_MOST_STEPS = 25
+_SETTLED = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Sources:
+    """Positions and moments (K, 3)."""
+
+    position_m: FloatArray
+    moment_Am2: FloatArray
+
+    @classmethod
+    def none(cls) -> Sources:
+        """No source."""
+        return cls(np.zeros((0, 3)), np.zeros((0, 3)))
+
+    def __len__(self) -> int:
+        return len(self.position_m)
+
+    def some(self, which: BoolArray | IntArray) -> Sources:
+        """Those of a mask or of indices."""
+        return Sources(self.position_m[which], self.moment_Am2[which])
+
+    def with_more(self, others: Sources) -> Sources:
+        """These and others."""
+        return Sources(
+            np.concatenate([self.position_m, others.position_m]), np.concatenate([self.moment_Am2, others.moment_Am2])
+        )
+
+    def moved(self, step: FloatArray) -> Sources:
+        """After a step (K, 6)."""
+        return Sources(self.position_m + step[:, :3], self.moment_Am2 + step[:, 3:])
+
+
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """Poles (P, 3) below the ground, and the field that each is expected to make right above itself [T]."""
+
+    places_m: FloatArray
+    depth_m: float
+    field_T: float
+
+    @classmethod
+    def below(cls, record: SurveyRecord, shortest_m: float, field_T: float) -> Layer:
+        """A layer for fields whose wavelengths are not shorter than some length."""
+        depth = shortest_m / 2.5
+        spacing = depth / 1.5
+        low, high = record.sensors_m.min(axis=(0, 1)), record.sensors_m.max(axis=(0, 1))
+        x, y = (
+            np.linspace(a - depth, b + depth, max(2, round((b - a + 2.0 * depth) / spacing) + 1))
+            for a, b in zip(low[:2], high[:2], strict=True)
+        )
+        grid = np.stack(np.meshgrid(x, y, [low[2] - depth], indexing="ij"), axis=-1).reshape(-1, 3)
+        return cls(grid, depth, field_T)
+
+    def columns(self, record: SurveyRecord, directions: FloatArray) -> FloatArray:
+        """What poles of their expected strength add to the channels: (n, C, P)."""
+        out = np.empty((*directions.shape[:2], len(self.places_m)))
+        scale = self.field_T * self.depth_m**2
+        for j, place in enumerate(self.places_m):
+            away = record.sensors_m - place
+            pull = scale * away / np.linalg.norm(away, axis=-1, keepdims=True) ** 3
+            out[..., j] = np.einsum("nci,nci->nc", directions, pull[:, record.array.channel_sensor])
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class Background:
+    """What is projected out where some sources are: noise in time, the layer, and what is wrong with the sensors.
+
+    Attributes
+    ----------
+    white : Whitening
+    Q : ndarray, shape (g·k, P)
+        White columns of the layer, and of what is wrong with the sensors, times a root of the inverse of ``LᵀL + 1``.
+    """
+
+    white: Whitening
+    Q: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        record: SurveyRecord,
+        sources: Sources,
+        layer: Layer,
+        errors: PoseErrors,
+        drift: Drift,
+        group: IntArray,
+    ) -> Background:
+        """With errors of the pose as the field of the sources makes them felt."""
+        fields = record.fields(sources.position_m, sources.moment_Am2)
+        gradients = dipole.total_gradient_tensor(record.sensors_m, sources.position_m, sources.moment_Am2)
+        directions = record.directions(fields)
+        white = Whitening.of(record, record.by_pose(directions, fields, gradients), errors, drift, group)
+        columns = np.concatenate([layer.columns(record, directions), record.by_sensors(directions)], axis=2)
+        return cls(white, orthogonal(white(columns)))
+
+
+def orthogonal(L: FloatArray) -> FloatArray:
+    """``Q`` with ``Q Qᵀ = L (LᵀL + 1)⁻¹ Lᵀ``."""
+    factor = cho_factor(L.T @ L + np.eye(L.shape[1]), lower=True)[0]
+    return np.asarray(solve_triangular(factor, L.T, lower=True, check_finite=False).T)
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """Sources fitted together.
+
+    Attributes
+    ----------
+    sources : Sources
+    chi2 : float
+        Of the white residual, the layer's own prior included.
+    information : ndarray, shape (6 K, 6 K)
+        Of positions and moments, everything else eliminated.
+    residual : ndarray, shape (g·k,)
+        White, the layer not yet taken out.
+    """
+
+    sources: Sources
+    chi2: float
+    information: FloatArray
+    residual: FloatArray
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of positions and moments (6 K, 6 K)."""
+        scale = 1.0 / np.sqrt(np.diagonal(self.information))
+        return np.asarray(scale[:, None] * np.linalg.inv(scale[:, None] * self.information * scale) * scale)
+
+    @property
+    def significance(self) -> FloatArray:
+        """What χ² would grow by without each source (K,), the others free to move in its place."""
+        H, K = self.information, len(self.sources)
+        found = np.empty(K)
+        for j in range(K):
+            own = np.arange(6 * j + 3, 6 * j + 6)
+            others = np.delete(np.arange(6 * K), np.arange(6 * j, 6 * j + 6))
+            scale = 1.0 / np.sqrt(np.diagonal(H)[others])
+            among = scale[:, None] * H[np.ix_(others, others)] * scale
+            shared = scale[:, None] * H[np.ix_(others, own)]
+            left = H[np.ix_(own, own)] - shared.T @ np.linalg.solve(among, shared)
+            m = self.sources.moment_Am2[j]
+            found[j] = m @ left @ m
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Where a source may be, and how strong."""
+
+    low_m: FloatArray
+    high_m: FloatArray
+    moment_Am2: float = 300.0
+
+    def hold(self, sources: Sources) -> BoolArray:
+        """Which sources (K,) are within."""
+        inside = np.all((sources.position_m > self.low_m) & (sources.position_m < self.high_m), axis=1)
+        return np.asarray(inside & (np.linalg.norm(sources.moment_Am2, axis=1) < self.moment_Am2))
+
+    def around(self, sources: Sources, reach_m: FloatArray) -> Bounds:
+        """Those of sources that stay within some reach (K,) of where they are."""
+        return replace(
+            self,
+            low_m=np.maximum(self.low_m, sources.position_m - reach_m[:, None]),
+            high_m=np.minimum(self.high_m, sources.position_m + reach_m[:, None]),
+        )
+
+    def clipped(self, sources: Sources) -> Sources:
+        """Sources moved within."""
+        return replace(sources, position_m=np.clip(sources.position_m, self.low_m, self.high_m))
+
+
+def residual_of(record: SurveyRecord, background: Background, sources: Sources) -> FloatArray:
+    """White residual (g·k,) of sources."""
+    fields = record.fields(sources.position_m, sources.moment_Am2)
+    return background.white((record.values_T - record.predicted(fields))[..., None])[:, 0]
+
+
+def jacobian_of(record: SurveyRecord, background: Background, sources: Sources) -> FloatArray:
+    """White columns (g·k, 6 K) of what positions and moments add to the measurements."""
+    fields = record.fields(sources.position_m, sources.moment_Am2)
+    directions = record.directions(fields)
+    white, owner = background.white, record.array.channel_sensor
+    position, moment = sources.position_m, sources.moment_Am2
+    return white.of_groups(source_columns(record.sensors_m, directions, white.U, owner, position, moment, white.starts))
+
+
+def fit_jointly(
+    record: SurveyRecord,
+    background: Background,
+    sources: Sources,
+    bounds: Bounds,
+    *,
+    most: int = _MOST_STEPS,
+    settled: float = _SETTLED,
+) -> JointFit:
+    """Levenberg-Marquardt from some sources, the noise held."""
+
+    def cost_of(sources: Sources) -> tuple[float, FloatArray, FloatArray]:
+        residual = residual_of(record, background, sources)
+        of_layer = background.Q.T @ residual
+        return float(residual @ residual - of_layer @ of_layer), residual, of_layer
+
+    cost, residual, of_layer = cost_of(sources)
+    if not len(sources):
+        return JointFit(sources, cost, np.zeros((0, 0)), residual)
+    damping = 1e-3
+    for step_number in range(most + 1):
+        J = jacobian_of(record, background, sources)
+        J_layer = background.Q.T @ J
+        H = J.T @ J - J_layer.T @ J_layer
+        if step_number == most:
+            break
+        gradient = J.T @ residual - J_layer.T @ of_layer
+        scale = 1.0 / np.sqrt(np.diagonal(H))
+        gain = 0.0
+        while damping < 1e8:
+            scaled = scale[:, None] * H * scale + damping * np.eye(len(H))
+            step = scale * np.linalg.solve(scaled, scale * gradient)
+            trial = bounds.clipped(sources.moved(step.reshape(-1, 6)))
+            trial_cost, trial_residual, trial_layer = cost_of(trial)
+            if trial_cost < cost:
+                gain = cost - trial_cost
+                sources, cost, residual, of_layer = trial, trial_cost, trial_residual, trial_layer
+                damping = max(0.1 * damping, 1e-9)
+                break
+            damping *= 10.0
+        if gain < settled:
+            J = jacobian_of(record, background, sources)
+            J_layer = background.Q.T @ J
+            H = J.T @ J - J_layer.T @ J_layer
+            break
+    return JointFit(sources, cost, H, residual)

@@ -1,0 +1,196 @@
+r"""The rows of a survey as measurements of static sources in the world frame.
+
+A scalar sensor measures the anomaly of the modulus, without cancelling,
+
+.. math:: |b + B| - |b| = \frac{2 b·B + B^2}{|b + B| + |b|}
+
+Vector sensors are turned, row by row, so that their mean field lies along the ambient field b, and so is what is
+predicted of them: an attitude that is 0.5° off would move 50,000 nT by 440 nT. What is across b of their mean is zero
+then on both sides, and is projected out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from arrays.array import SensorArray
+from arrays.typing import BoolArray, FloatArray
+from magloc.fields.dipole_compiled import field_at_points
+from magloc.measurement.pose import LEVER, N_POSE, SHIFT, TURN, PoseErrors, rates_of
+from magloc.navigation.rotations import cross_matrix
+from magloc.readings import Readings
+
+_SMALL_TURN = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyRecord:
+    """Rows of sensors that move, in the world frame.
+
+    Attributes
+    ----------
+    array : SensorArray
+    time_s : ndarray, shape (n,)
+    sensors_m : ndarray, shape (n, N, 3)
+        Places of the sensors.
+    R_world_from_array : ndarray, shape (n, 3, 3)
+        Attitude as stated.
+    ambient_T : ndarray, shape (n, 3)
+    values_T : ndarray, shape (n, C)
+        Anomalies: calibrated, less what the ambient field alone gives.
+    pose_effects : ndarray, shape (n, 9, q)
+        Of errors of the pose, of unit variance, on turn, shift and lever arm.
+    """
+
+    array: SensorArray
+    time_s: FloatArray
+    sensors_m: FloatArray
+    R_world_from_array: FloatArray
+    ambient_T: FloatArray
+    values_T: FloatArray
+    pose_effects: FloatArray
+
+    @classmethod
+    def of(cls, array: SensorArray, readings: Readings, ambient_T: FloatArray, errors: PoseErrors) -> SurveyRecord:
+        """Rows of readings with a pose; ambient field (n, 3) in the array's frame."""
+        assert readings.array_position_m is not None
+        assert readings.array_rotation is not None
+        R = readings.array_rotation.as_matrix()
+        b = np.einsum("nij,nj->ni", R, ambient_T)
+        scalar = array.channel_is_scalar
+        values = np.empty_like(readings.values_T)
+        moduli = (readings.values_T - array.channel_offset_T)[:, scalar] / array.channel_gain[scalar, 0]
+        values[:, scalar] = moduli - np.linalg.norm(b, axis=1)[:, None]
+        if not scalar.all():
+            fields = array.calibrated_field(readings.values_T)[:, array.channel_sensor[~scalar][::3]]
+            fields = np.einsum("nij,nsj->nsi", R, fields)
+            turn = shortest_turns(fields.mean(axis=1), b)
+            values[:, ~scalar] = (np.einsum("nij,nsj->nsi", turn, fields) - b[:, None]).reshape(len(R), -1)
+        places = readings.array_position_m[:, None] + np.einsum("nij,sj->nsi", R, array.positions)
+        velocity, rate = rates_of(readings.time_s, readings.array_position_m, R)
+        arm = np.array(errors.uncertainty.lever_arm_m)
+        velocity = velocity - np.einsum("nij,nj->ni", R, np.cross(rate, arm))
+        effects = errors.effects(rate, velocity, readings.pose_sigma)
+        return cls(array, readings.time_s, places, R, b, values, effects)
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @cached_property
+    def is_vector(self) -> BoolArray:
+        """Channels of vector sensors, three by three."""
+        return ~self.array.channel_is_scalar
+
+    def rows(self, which: FloatArray | slice) -> SurveyRecord:
+        """Some of the rows."""
+        parts = (self.time_s, self.sensors_m, self.R_world_from_array, self.ambient_T, self.values_T, self.pose_effects)
+        return SurveyRecord(self.array, *(part[which] for part in parts))
+
+    def fields(self, position_m: FloatArray, moment_Am2: FloatArray) -> FloatArray:
+        """Field (n, N, 3) of sources (K, 3) together at the sensors."""
+        return field_at_points(self.sensors_m.reshape(-1, 3), position_m, moment_Am2).reshape(self.sensors_m.shape)
+
+    def predicted(self, fields_T: FloatArray) -> FloatArray:
+        """Anomalies (n, C) of fields (n, N, 3) beside the ambient one."""
+        b = self.ambient_T[:, None]
+        out = np.empty_like(self.values_T)
+        scalar = ~self.is_vector
+        seen = fields_T[:, self.array.channel_sensor[scalar]]
+        lengths = np.linalg.norm(b + seen, axis=-1) + np.linalg.norm(b, axis=-1)
+        out[:, scalar] = np.sum((2.0 * b + seen) * seen, axis=-1) / lengths
+        if self.is_vector.any():
+            seen = fields_T[:, self.array.channel_sensor[self.is_vector][::3]]
+            turn = shortest_turns(self.ambient_T + seen.mean(axis=1), self.ambient_T)
+            turned = np.einsum("nij,nsj->nsi", turn, b + seen) - b
+            out[:, self.is_vector] = turned.reshape(len(self), -1)
+        return out
+
+    def along_ambient(self, channels_T: FloatArray) -> FloatArray:
+        """Mean over the sensors (n,) of what channels (n, C) are along the ambient field."""
+        unit = self.ambient_T / np.linalg.norm(self.ambient_T, axis=1, keepdims=True)
+        weights = np.ones_like(channels_T)
+        weights[:, self.is_vector] = np.tile(unit, (1, int(self.is_vector.sum()) // 3))
+        return np.sum(weights * channels_T, axis=1) / self.array.n_sensors
+
+    def directions(self, fields_T: FloatArray) -> FloatArray:
+        """What each channel reads of a small change of the field at its sensor, (n, C, 3), where fields are."""
+        out = np.empty((*self.values_T.shape, 3))
+        total = self.ambient_T[:, None] + fields_T
+        unit = total / np.linalg.norm(total, axis=-1, keepdims=True)
+        out[:] = unit[:, self.array.channel_sensor]
+        out[:, self.is_vector] = np.tile(np.eye(3), (int(self.is_vector.sum()) // 3, 1))
+        return out
+
+    def by_sensors(self, directions: FloatArray) -> FloatArray:
+        """Derivative (n, C, q) of the channels by what is wrong with the sensors, of unit variance.
+
+        Stray fields that turn with the array, and gains and axes of vector sensors in the ambient field.
+        """
+        R, owner = self.R_world_from_array, self.array.channel_sensor
+        by_field = directions @ R  # of a field in the array's axes
+        body = np.einsum("nji,nj->ni", R, self.ambient_T)
+        columns = []
+        for i, sensor in enumerate(self.array.sensors):
+            own = (owner == i)[:, None]
+            if sensor.offset_uncertainty_T:
+                columns.append(sensor.offset_uncertainty_T * np.where(own, by_field, 0.0))
+            if sensor.kind == "vector" and (sensor.misalignment_rad or sensor.gain_uncertainty):
+                size = np.full((3, 3), sensor.misalignment_rad)
+                np.fill_diagonal(size, sensor.gain_uncertainty)
+                nine = np.where(own[..., None], by_field[..., None] * (size * body[:, None, None]), 0.0)
+                columns.append(nine.reshape(len(self), -1, 9))
+        return np.concatenate(columns, axis=2) if columns else np.zeros((len(self), len(owner), 0))
+
+    def by_pose(self, directions: FloatArray, fields_T: FloatArray, gradients: FloatArray) -> FloatArray:
+        """Derivative (n, C, q) of the channels by the errors of the pose: the sensors are not where they should be."""
+        R, n = self.R_world_from_array, len(self)
+        lever = np.zeros(3) if self.array.pose is None else np.array(self.array.pose.lever_arm_m)
+        arms = np.einsum("nij,sj->nsi", R, self.array.positions + lever)
+        moved = np.zeros((n, self.array.n_sensors, 3, N_POSE))
+        moved[..., SHIFT] = np.eye(3)
+        moved[..., TURN] = -cross_matrix(arms) @ R[:, None]
+        moved[..., LEVER] = R[:, None]
+        changed = gradients @ moved
+        # Of vector sensors only a turn about the ambient field is left; it turns the sources' field.
+        unit = self.ambient_T / np.linalg.norm(self.ambient_T, axis=1, keepdims=True)
+        about = np.einsum("ni,nj->nij", unit, np.einsum("ni,nij->nj", unit, R))
+        turned = cross_matrix(fields_T) @ about[:, None]
+        whole = changed[:, self.array.channel_sensor]
+        whole[:, self.is_vector, :, TURN] += turned[:, self.array.channel_sensor[self.is_vector]]
+        return np.einsum("nci,ncij->ncj", directions, whole) @ self.pose_effects
+
+
+def joined(parts: Sequence[Readings]) -> Readings:
+    """Readings of several files, one after the other.
+
+    Raises ValueError where some have what others lack.
+    """
+    rotations = [part.array_rotation for part in parts if part.array_rotation is not None]
+    return Readings(
+        np.concatenate([part.values_T for part in parts]),
+        time_s=np.concatenate([part.time_s for part in parts]),
+        array_position_m=_all_or_none([part.array_position_m for part in parts]),
+        array_rotation=Rotation.concatenate(rotations) if rotations else None,
+        ambient_T=_all_or_none([part.ambient_T for part in parts]),
+        pose_sigma=_all_or_none([part.pose_sigma for part in parts]),
+    )
+
+
+def _all_or_none(parts: Sequence[FloatArray | None]) -> FloatArray | None:
+    given = [part for part in parts if part is not None]
+    if given and len(given) < len(parts):
+        raise ValueError("Input readings must have the same columns; instead received some with more than others.")
+    return np.concatenate(given) if given else None
+
+
+def shortest_turns(vectors: FloatArray, onto: FloatArray) -> FloatArray:
+    """Smallest rotations (n, 3, 3) that lay vectors (n, 3) along others, which are not opposite to them."""
+    a, b = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (vectors, onto))
+    K = cross_matrix(np.cross(a, b))
+    cosine = np.sum(a * b, axis=-1)[..., None, None]
+    return np.asarray(np.eye(3) + K + K @ K / np.maximum(1.0 + cosine, _SMALL_TURN))

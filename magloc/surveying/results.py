@@ -1,0 +1,164 @@
+"""Targets of a survey."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, overload
+
+import numpy as np
+from scipy.special import chdtri
+
+from arrays.typing import FloatArray, Vector
+
+if TYPE_CHECKING:
+    from magloc.surveying.record import SurveyRecord
+
+IRON_Am2_PER_KG = (0.05, 0.3)
+"""Moment of a kilogram of iron in the ground: a range, as its remanence and shape are not known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A buried dipole.
+
+    Attributes
+    ----------
+    id : str
+    position_m, moment_Am2 : ndarray, shape (3,)
+        World frame.
+    covariance : ndarray, shape (6, 6)
+        Of position and moment, everything else in the survey eliminated.
+    depth_m : float
+        Below the ground.
+    depth_interval95_m : tuple of 2 floats
+        From the profile of χ² where the target is weak, whose depth is not Gaussian.
+    significance : float
+        χ² that is lost without it, of 3 degrees of freedom.
+    flags : tuple of str
+        ``weak``: the ellipse is not Gaussian. ``near``: another target is so near that one of the two may be spurious.
+        ``edge``: at the rim of what was searched. ``misfit``: more than one dipole, or no dipole.
+    """
+
+    id: str
+    position_m: FloatArray
+    moment_Am2: FloatArray
+    covariance: FloatArray
+    depth_m: float
+    depth_interval95_m: tuple[float, float]
+    significance: float
+    flags: tuple[str, ...] = ()
+
+    @property
+    def strength_Am2(self) -> float:
+        """Modulus of the moment [A·m²]."""
+        return float(np.linalg.norm(self.moment_Am2))
+
+    @property
+    def iron_kg(self) -> tuple[float, float]:
+        """Mass of iron with such a moment, from the most to the least magnetic."""
+        least, most = IRON_Am2_PER_KG
+        return self.strength_Am2 / most, self.strength_Am2 / least
+
+    @property
+    def ellipse95(self) -> tuple[float, float, float]:
+        """Half axes [m] of the 95 % ellipse on the map, and the bearing of the longer one, clockwise from north."""
+        values, vectors = np.linalg.eigh(self.covariance[:2, :2])
+        minor, major = np.sqrt(chdtri(2, 0.05) * values)
+        return float(major), float(minor), math.degrees(math.atan2(vectors[0, 1], vectors[1, 1])) % 180.0
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Survey:
+    """What a survey found.
+
+    Attributes
+    ----------
+    targets : tuple of Target
+        The most significant one first.
+    record : SurveyRecord
+        The rows, in the world frame.
+    residual_T : ndarray, shape (n, C)
+        Anomalies less the targets' fields: geology, drift and noise.
+    ground_m : float
+        Height of the ground in the world frame.
+    threshold : float
+        χ² of 3 degrees of freedom that a target exceeds.
+    chi2_per_dof : float
+        Of all white residuals: 1 where what is stated of the errors is right.
+    pose_assumed : bool
+        Whether nothing was stated of the pose's errors, so that 2 cm were assumed.
+    seconds : float
+
+    Examples
+    --------
+    >>> import sims
+    >>> import magloc
+    >>> from dataclasses import replace
+    >>> scenario = replace(sims.read_scenario("survey-drone"), duration_s=120.0)
+    >>> field = sims.simulate(scenario, seed=1)
+    >>> magloc.survey(field.array, field.readings)
+    Survey: 3 targets, 1921 rows
+    """
+
+    targets: tuple[Target, ...]
+    record: SurveyRecord
+    residual_T: FloatArray
+    ground_m: float
+    threshold: float
+    chi2_per_dof: float
+    pose_assumed: bool
+    seconds: float
+
+    def __len__(self) -> int:
+        return len(self.targets)
+
+    def __iter__(self) -> Iterator[Target]:
+        return iter(self.targets)
+
+    @overload
+    def __getitem__(self, index: int) -> Target: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[Target]: ...
+    def __getitem__(self, index: int | slice) -> Target | Sequence[Target]:
+        return self.targets[index]
+
+    def __repr__(self) -> str:
+        return f"Survey: {len(self)} target{'s' * (len(self) != 1)}, {len(self.record)} rows"
+
+    @cached_property
+    def position_m(self) -> FloatArray:
+        """Positions of all targets (K, 3)."""
+        return np.array([target.position_m for target in self]).reshape(-1, 3)
+
+    def to_geojson(self, place: Vector) -> dict[str, Any]:
+        """A FeatureCollection with a point for every target, as RFC 7946 has it.
+
+        Parameters
+        ----------
+        place : tuple of 3 floats
+            Latitude, longitude [deg] and height [m] of the origin of the world frame, which is east, north, up.
+        """
+        from magloc.surveying.files import geojson_of_survey
+
+        return geojson_of_survey(self, place)
+
+    def to_kml(self, place: Vector) -> str:
+        """A placemark for every target, for maps of the world; ``place`` as of :meth:`to_geojson`."""
+        from magloc.surveying.files import kml_of_survey
+
+        return kml_of_survey(self, place)
+
+    def table(self) -> str:
+        """The targets as text."""
+        head = f"{'id':>4} {'x':>9} {'y':>9} {'depth':>7} {'95 %':>13} {'|m|':>9} {'± xy':>7} {'χ²':>9}  flags"
+        unit = f"{'':>4} {'m':>9} {'m':>9} {'m':>7} {'m':>13} {'A·m²':>9} {'cm':>7} {'':>9}"
+        lines = [head, unit]
+        for t in self:
+            low, high = t.depth_interval95_m
+            where = f"{t.position_m[0]:9.2f} {t.position_m[1]:9.2f} {t.depth_m:7.2f} {f'{low:.2f}–{high:.2f}':>13}"
+            size = f"{t.strength_Am2:9.3g} {100.0 * t.ellipse95[0]:7.1f} {t.significance:9.4g}"
+            lines.append(f"{t.id:>4} {where} {size}  {', '.join(t.flags)}")
+        return "\n".join(line.rstrip() for line in lines)

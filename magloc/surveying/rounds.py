@@ -1,0 +1,93 @@
+"""Greedy rounds: look for sources in what is left, fit all of them together, leave out what is not significant."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from arrays.typing import FloatArray, IntArray
+from magloc.measurement.pose import PoseErrors
+from magloc.surveying.joint_fit import Background, Bounds, JointFit, Layer, Sources, fit_jointly
+from magloc.surveying.record import SurveyRecord
+from magloc.surveying.search import SearchGrid, peaks, search, sources_at
+from magloc.surveying.whitening import Drift
+
+_MOST_ROUNDS = 60
+_PROGRESS, _WORSE = 0.999, 1.02
+_MOST_AT_ONCE = 8
+_SAME_PLACE_M = 1e-6
+_REACH = 0.6  # of a fit, over the distance from the sensors
+_MOST_WEIGHINGS = 4
+_SETTLED_COARSELY = 0.5
+# While sources are missing, what they leave of each other's field counts as errors of the place.
+_POSE_WHILE_SEARCHING_M = 0.04
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What a survey's rows hold beside its sources."""
+
+    record: SurveyRecord
+    errors: PoseErrors
+    layer: Layer
+    drift: Drift
+    bounds: Bounds
+    threshold: float
+
+    def background(self, sources: Sources, group: IntArray) -> Background:
+        """Where some sources are, for groups of rows."""
+        return Background.of(self.record, sources, self.layer, self.errors, self.drift, group)
+
+    def fitted(self, sources: Sources, group: IntArray, settled: float) -> tuple[JointFit, Background]:
+        """Sources fitted and weighed anew until none is left out that is not significant or not within the bounds."""
+        for weighing in range(_MOST_WEIGHINGS):
+            background = self.background(sources, group)
+            # A source that leaps takes the place of one that is not found yet.
+            height = np.median(self.record.sensors_m[..., 2])
+            near = self.bounds.around(sources, _REACH * (height - sources.position_m[:, 2]))
+            fit = fit_jointly(self.record, background, sources, near, settled=settled)
+            if not len(sources):
+                break
+            kept = (fit.significance > self.threshold) & self.bounds.hold(fit.sources)
+            sources = fit.sources.some(kept)
+            if kept.all() and weighing:
+                break
+        if len(sources) < len(fit.sources):
+            background = self.background(sources, group)
+            fit = fit_jointly(self.record, background, sources, self.bounds, settled=settled)
+        return fit, background
+
+
+def found_in(
+    model: Model, group: IntArray, grid: SearchGrid, tell: Callable[[int, int], None] = lambda *_: None
+) -> Sources:
+    """Sources of a record whose rows count in groups; ``tell`` hears of every round and of how many it knows."""
+    stated = model.errors.uncertainty.position_m
+    share = max(1.0, _POSE_WHILE_SEARCHING_M / stated) if stated else 1.0
+    wide = replace(model, record=replace(model.record, pose_effects=share * model.record.pose_effects))
+    best = sources = Sources.none()
+    tried: FloatArray = np.zeros((0, 3))
+    least = math.inf
+    for number in range(_MOST_ROUNDS):
+        fit, background = wide.fitted(sources, group, _SETTLED_COARSELY)
+        tell(number, len(fit.sources))
+        at_once = _MOST_AT_ONCE
+        if fit.chi2 > _WORSE * least:
+            # Too many at a time led away: back, and one by one from there.
+            fit, background = wide.fitted(best, group, _SETTLED_COARSELY)
+            at_once = 1
+        elif fit.chi2 < _PROGRESS * least:
+            tried = np.zeros((0, 3))
+        best, least = fit.sources, min(least, fit.chi2)
+        candidates = search(wide.record, background, fit, grid)
+        # What was left out again is not tried twice, unless something else was found meanwhile.
+        known = (np.linalg.norm(candidates.place_m[:, None] - tried, axis=-1) < _SAME_PLACE_M).any(axis=1)
+        chosen = sources_at(candidates, peaks(candidates.without(known), model.threshold)[:at_once])
+        if not len(chosen):
+            break
+        tried = np.concatenate([tried, chosen.position_m])
+        sources = best.with_more(chosen)
+    return best

@@ -1,0 +1,127 @@
+"""Matched filter over a grid of places: where one more source would explain most of what the sources so far leave."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.surveying.joint_fit import Background, JointFit, Sources, jacobian_of, orthogonal
+from magloc.surveying.record import SurveyRecord
+from magloc.surveying.whitening_compiled import moment_columns, whiten
+
+N_DISTANCES = 5
+PITCH = 1.8
+"""Distance of a source from the sensors over the pitch of the grid: 91 % of its energy is found in the median."""
+_WINDOW = 5.0  # of rows that count, in distances
+_CHUNK = 8  # places along each side of a tile
+_UNKNOWN = 1e4
+_LEAST_SEEN = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Places (m, 3) of a grid, their distances from the sensors, χ² that a source there explains, and its moment."""
+
+    place_m: FloatArray
+    distance_m: FloatArray
+    chi2: FloatArray
+    moment_Am2: FloatArray
+
+    def without(self, which: BoolArray) -> Candidates:
+        """The same with some places explaining nothing."""
+        return replace(self, chi2=np.where(which, 0.0, self.chi2))
+
+
+@dataclass(frozen=True, eq=False)
+class SearchGrid:
+    """Places under the sensors, in tiles of one distance."""
+
+    tiles: list[tuple[float, FloatArray]]
+
+    @classmethod
+    def below(cls, record: SurveyRecord, low_m: FloatArray, high_m: FloatArray) -> SearchGrid:
+        """Of a box, at distances from the lowest sensors in geometric steps."""
+        height = float(np.median(record.sensors_m[..., 2].min(axis=1)))
+        nearest, farthest = max(height - high_m[2], 0.3), height - low_m[2]
+        tiles = []
+        for distance in np.geomspace(nearest * 1.1, max(farthest, nearest * 1.2), N_DISTANCES):
+            pitch = distance / PITCH
+            x, y = (np.arange(low_m[a] + 0.5 * pitch, high_m[a] + 0.5 * pitch, pitch) for a in range(2))
+            for i in range(0, len(x), _CHUNK):
+                for j in range(0, len(y), _CHUNK):
+                    square = np.meshgrid(x[i : i + _CHUNK], y[j : j + _CHUNK], [height - distance], indexing="ij")
+                    tiles.append((float(distance), np.stack(square, axis=-1).reshape(-1, 3)))
+        return cls(tiles)
+
+
+def search(record: SurveyRecord, background: Background, fit: JointFit, grid: SearchGrid) -> Candidates:
+    """χ² of one more source at every place of a grid, with the sources so far free to move."""
+    white = background.white
+    fields = record.fields(fit.sources.position_m, fit.sources.moment_Am2)
+    directions = record.directions(fields)
+    Q = background.Q
+    if len(fit.sources):
+        J = jacobian_of(record, background, fit.sources)
+        J = J - Q @ (Q.T @ J)
+        Q = np.concatenate([Q, orthogonal(_UNKNOWN * J / np.linalg.norm(J, axis=0))], axis=1)
+    left = fit.residual - Q @ (Q.T @ fit.residual)
+    starts = white.starts
+    middles = record.sensors_m.mean(axis=1)[starts[:-1]]
+    k = len(white.U)
+    parts = []
+    for distance, places in grid.tiles:
+        rows = _near(middles, places, _WINDOW * distance)
+        if not rows.any():
+            continue
+        used = np.flatnonzero(rows)
+        A = moment_columns(record.sensors_m, directions, white.U, record.array.channel_sensor, places, starts, used)
+        whiten(A, used, white.H, white.gains, white.kept, white.dt_s)
+        A = A.reshape(-1, A.shape[-1])
+        of = (used[:, None] * k + np.arange(k)).ravel()
+        A_Q = Q[of].T @ A
+        m = len(places)
+        whole, lost = (X.reshape(-1, m, 3).transpose(1, 2, 0) for X in (A, A_Q))
+        G = whole @ whole.mT
+        # Of a source that others nearly imitate rounding and the window's edge are left, which must not count.
+        least = _LEAST_SEEN * np.trace(G, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        G = G - lost @ lost.mT + least
+        v = (A.T @ left[of]).reshape(m, 3)
+        moment = np.linalg.solve(G, v[..., None])[..., 0]
+        parts.append((places, np.full(m, distance), np.sum(v * moment, axis=1), moment))
+    return Candidates(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def peaks(found: Candidates, threshold: float) -> IntArray:
+    """Places to start sources from, strongest first: peaks that are no skirt of a stronger one."""
+    order = np.argsort(-found.chi2)
+    kept: list[int] = []
+    for i in order:
+        if found.chi2[i] < max(threshold, _LEAST_SHARE * found.chi2[order[0]]):
+            break
+        if all(_stands_beside(found, int(i), other) for other in kept):
+            kept.append(int(i))
+    return np.array(kept, dtype=np.intp)
+
+
+_LEAST_SHARE, _SKIRT_SHARE, _SKIRT, _SAME = 5e-2, 0.6, 6.0, 1.5
+
+
+def _stands_beside(found: Candidates, i: int, stronger: int) -> bool:
+    apart = math.dist(found.place_m[i, :2], found.place_m[stronger, :2])
+    h = max(found.distance_m[i], found.distance_m[stronger])
+    if apart < _SAME * h:
+        return False
+    return bool(apart > _SKIRT * h or found.chi2[i] > _SKIRT_SHARE * found.chi2[stronger])
+
+
+def _near(points: FloatArray, places: FloatArray, window_m: float) -> BoolArray:
+    low, high = places.min(axis=0) - window_m, places.max(axis=0) + window_m
+    return np.asarray(np.all((points[:, :2] >= low[:2]) & (points[:, :2] <= high[:2]), axis=1))
+
+
+def sources_at(found: Candidates, which: IntArray) -> Sources:
+    """Sources that some places start with."""
+    return Sources(found.place_m[which], found.moment_Am2[which])

@@ -1,0 +1,133 @@
+r"""What disturbs a survey in time: errors of the pose that last, offsets that walk, and the variation of the field.
+
+All of it is a linear model of states that change from row to row,
+
+.. math:: y_i = H_i x_i + ν_i, \qquad x_{i+1} = F_i x_i + w_i
+
+so that the innovations of a Kalman filter, over their deviations, are white; and as the filter is linear, columns of a
+Jacobian pass through it as the readings do. What is left is an ordinary least-squares problem in the sources.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from arrays.typing import FloatArray, IntArray
+from magloc.measurement.nuisances import without_lasting_errors
+from magloc.measurement.pose import PoseErrors
+from magloc.surveying.record import SurveyRecord
+from magloc.surveying.whitening_compiled import gains_of, whiten
+
+OFFSET_T = 1e-6
+"""Standard deviation of what a sensor's offset may be at first."""
+_HOUR_S = 3600.0
+
+
+@dataclass(frozen=True)
+class Drift:
+    """What changes slowly at all sensors.
+
+    Attributes
+    ----------
+    common_T2_s3 : float
+        Of the ambient field: its second derivative is white noise of this density.
+    sensor_T2_s : float
+        Of every sensor's offset, which walks.
+    """
+
+    common_T2_s3: float = (0.05e-9) ** 2
+    sensor_T2_s: float = (0.005e-9) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """Linear map that makes a record's noise white, where some fields of sources are.
+
+    Attributes
+    ----------
+    U : ndarray, shape (k, C)
+        From channels to independent measurements, in units of their noise.
+    group : ndarray of int, shape (n,)
+        Rows that count as one, their mean.
+    H, gains, kept, dt : ndarray
+        Of the Kalman filter over the groups.
+    """
+
+    U: FloatArray
+    group: IntArray
+    H: FloatArray
+    gains: FloatArray
+    kept: FloatArray
+    dt_s: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        record: SurveyRecord,
+        by_pose: FloatArray,
+        errors: PoseErrors,
+        drift: Drift,
+        group: IntArray,
+    ) -> Whitening:
+        """Where errors of the pose change the channels by (n, C, q)."""
+        U = independent_measurements(record)
+        scale = np.sqrt(1.0 / np.bincount(group))
+        time_s = np.bincount(group, record.time_s) * scale**2
+        dt_s = np.diff(time_s, prepend=time_s[0])
+        C, q = record.array.n_channels, errors.n_states
+        # Offsets of the channels, and what is common to them: along the ambient field.
+        unit = record.ambient_T / np.linalg.norm(record.ambient_T, axis=1, keepdims=True)
+        common = np.ones((len(record), C))
+        common[:, record.is_vector] = np.tile(unit, (1, int(record.is_vector.sum()) // 3))
+        H = np.zeros((len(time_s), len(U), q + C + 2))
+        H[..., :q] = _summed(U @ by_pose, group, scale)
+        H[..., q : q + C] = U / scale[:, None, None]
+        H[..., q + C] = _summed((common @ U.T)[..., None], group, scale)[..., 0]
+        kept, added = np.ones((len(dt_s), q + C + 2)), np.zeros((len(dt_s), q + C + 2))
+        for i in range(1, len(dt_s)):
+            kept[i, :q], sigma = errors.step(float(dt_s[i]))
+            added[i, :q] = sigma**2
+        walk = np.array([sensor.drift_T_rth**2 / _HOUR_S for sensor in record.array.sensors]) + drift.sensor_T2_s
+        added[:, q : q + C] = dt_s[:, None] * walk[record.array.channel_sensor]
+        added[:, -2], added[:, -1] = drift.common_T2_s3 * dt_s**3 / 3.0, drift.common_T2_s3 * dt_s
+        start = np.concatenate([np.ones(q), np.full(C, OFFSET_T**2), [OFFSET_T**2, (1e-2 * OFFSET_T) ** 2]])
+        return cls(U, group, H, gains_of(H, kept, added, dt_s, start), kept, dt_s)
+
+    def __call__(self, channels: FloatArray) -> FloatArray:
+        """White columns (g·k, m) of columns (n, C, m) of the channels."""
+        summed = _summed(self.U @ channels, self.group, np.sqrt(1.0 / np.bincount(self.group)))
+        return self.of_groups(np.ascontiguousarray(summed))
+
+    @cached_property
+    def starts(self) -> IntArray:
+        """First row of every group, and the end of the last one."""
+        return np.flatnonzero(np.diff(self.group, prepend=-1, append=self.group[-1] + 1))
+
+    def of_groups(self, Y: FloatArray) -> FloatArray:
+        """White columns (g·k, m) of columns (g, k, m) of the independent measurements of the groups; they are lost."""
+        whiten(Y, np.arange(len(Y)), self.H, self.gains, self.kept, self.dt_s)
+        return Y.reshape(-1, Y.shape[-1])
+
+
+def independent_measurements(record: SurveyRecord) -> FloatArray:
+    """Rows (k, C) that make channels independent and of unit variance; what attitude errors move is projected out."""
+    sigma = without_lasting_errors(record.array).channel_noise_T
+    unit = record.ambient_T.mean(axis=0)
+    unit = unit / np.linalg.norm(unit)
+    across = np.linalg.svd(unit[None])[2][1:]
+    lost = np.zeros((record.array.n_channels, 2))
+    lost[record.is_vector] = np.tile(across.T, (int(record.is_vector.sum()) // 3, 1))
+    U, s, _ = np.linalg.svd(lost / sigma[:, None], full_matrices=True)
+    kept = U[:, int((s > 0.0).sum()) :]
+    return np.asarray(kept.T / sigma)
+
+
+def _summed(rows: FloatArray, group: IntArray, scale: FloatArray) -> FloatArray:
+    """Sums of the rows (n, ...) of every group, over the root of their number."""
+    if len(scale) == len(rows):
+        return rows
+    starts = np.flatnonzero(np.diff(group, prepend=-1))
+    return np.add.reduceat(rows, starts, axis=0) * scale.reshape(-1, *[1] * (rows.ndim - 1))

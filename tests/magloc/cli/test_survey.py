@@ -1,0 +1,109 @@
+"""``magloc survey``."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+import sims
+from tests.command_line import Run, assert_refused
+
+SCENARIO = """format_version = 1
+duration_s = 60.0
+rate_Hz = 8.0
+[[array.sensor]]
+id = "low"
+kind = "scalar"
+position_m = [0.0, 0.0, 0.0]
+noise_nT = 0.1
+[[array.sensor]]
+id = "high"
+kind = "scalar"
+position_m = [0.0, 0.0, 0.8]
+noise_nT = 0.1
+[carrier.path]
+kind = "lawnmower"
+start_m = [-3.0, 2.0, 1.0]
+course_deg = 90.0
+length_m = 6.0
+spacing_m = 0.8
+lines = 6
+speed_m_s = 0.8
+[ambient]
+field_nT = [1000.0, 20000.0, -44000.0]
+[targets]
+number = 1
+x_m = [-1.5, 1.5]
+y_m = [-1.5, 1.5]
+moment_Am2 = [2.0, 5.0]
+[geology]
+field_nT = 1.0
+[pose]
+position_m = 0.01
+correlation_s = 5.0
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A simulated survey."""
+    place = tmp_path_factory.mktemp("survey")
+    (place / "ground.toml").write_text(SCENARIO)
+    field = sims.simulate(sims.read_scenario(str(place / "ground.toml")), seed=11)
+    sims.write_simulation(field, place / "ground.csv")
+    return place
+
+
+class TestSurvey:
+    def test_json(self, folder: Path, run: Run) -> None:
+        done = run("survey", folder / "ground.csv", "--array", folder / "ground-array.toml", "--json")
+        assert done.status == 0, done.err
+        found = json.loads(done.out)
+        with (folder / "ground-targets.csv").open() as file:
+            (truth,) = csv.DictReader(file)
+        (target,) = found["targets"]
+        for value, axis in zip(target["position_m"], "xyz", strict=True):
+            assert value == pytest.approx(float(truth[f"{axis}_m"]), abs=0.06)
+        low, high = target["depth_interval95_m"]
+        assert low < -target["position_m"][2] < high
+        assert len(target["covariance"]) == len(target["covariance"][0]) == 6
+        assert set(target) >= {"id", "moment_Am2", "significance", "flags"}
+        assert found["rows"] == 481
+        assert found["seconds"] > 0.0
+
+    def test_files(self, folder: Path, tmp_path: Path, run: Run) -> None:
+        pytest.importorskip("pymap3d")
+        outputs = ("--out", tmp_path / "out", "--geojson", tmp_path / "t.json", "--kml", tmp_path / "t.kml")
+        array = folder / "ground-array.toml"
+        done = run("survey", folder / "ground.csv", "--array", array, *outputs, "--place", 48, 11, 500)
+        assert done.status == 0, done.err
+        assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
+            "residual.csv",
+            "survey.png",
+            "targets.csv",
+        ]
+        assert len(json.loads((tmp_path / "t.json").read_text())["features"]) == 1
+        assert "<Placemark>" in (tmp_path / "t.kml").read_text()
+        assert "t1" in done.out
+
+    def test_two_files_are_one_survey(self, folder: Path, tmp_path: Path, run: Run) -> None:
+        head, *rows = (folder / "ground.csv").read_text().splitlines()
+        parts = []
+        for k, part in enumerate((rows[:240], rows[240:])):
+            parts.append(tmp_path / f"{k}.csv")
+            parts[-1].write_text("\n".join([head, *part, ""]))
+        whole, both = (
+            json.loads(run("survey", *files, "--array", folder / "ground-array.toml", "--json").out)["targets"]
+            for files in ([folder / "ground.csv"], parts)
+        )
+        assert whole == both
+
+    def test_bad_input(self, folder: Path, run: Run) -> None:
+        line = ("survey", folder / "ground.csv", "--array", folder / "ground-array.toml")
+        assert_refused(run(*line, "--kml", folder / "t.kml"), "--place")
+        assert_refused(run(*line, "--ground-m", 5), "--ground-m")
+        assert_refused(run(*line, "--false-per-hectare", 0), "--false-per-hectare")
+        assert_refused(run(*line, "--region", "z>1"), "room below the ground")

@@ -1,0 +1,157 @@
+"""Surveys that the simulator flew: what is found, what is not, and how well it is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+import arrays
+import magloc
+import sims
+from arrays.typing import FloatArray
+from sims.magnetics.paths import Lawnmower, Steered
+from sims.magnetics.scenario import Carrier, Source
+from sims.magnetics.simulation import Simulation
+
+# A tenth of the built-in fields: 10 m × 10 m.
+PLOT_M = 5.0
+
+
+@cache
+def simulated(name: str, seed: int, number: int = 2) -> Simulation:
+    """A piece of a built-in survey."""
+    whole = sims.read_scenario(name)
+    path = whole.carrier.path
+    assert isinstance(path, Lawnmower)
+    path = replace(path, start_m=(-PLOT_M, PLOT_M, path.start_m[2]), length_m=2.0 * PLOT_M, lines=11, spacing_m=1.0)
+    rectangle = (-PLOT_M + 1.0, PLOT_M - 1.0)
+    targets = None
+    if number:
+        targets = replace(whole.targets, number=number, x_m=rectangle, y_m=rectangle, gap_m=4.0, moment_Am2=(1.0, 20.0))
+    carrier = replace(whole.carrier, path=path)
+    way = 11 * 2.0 * PLOT_M + 10 * np.pi / 2.0
+    return sims.simulate(replace(whole, carrier=carrier, targets=targets, duration_s=way / path.speed_m_s), seed=seed)
+
+
+@cache
+def surveyed(name: str, seed: int, number: int = 2) -> magloc.Survey:
+    field = simulated(name, seed, number)
+    return magloc.survey(field.array, field.readings)
+
+
+def nearest(found: magloc.Survey, position_m: FloatArray) -> magloc.Target:
+    return min(found, key=lambda target: float(np.linalg.norm(target.position_m - position_m)))
+
+
+class TestTargets:
+    """Strong ones, each in its own place; seeds that nothing was tuned on."""
+
+    @pytest.mark.parametrize(("name", "seed"), [("survey-drone", 901), ("survey-cart", 902), ("survey-diver", 903)])
+    def test_all_are_found_and_no_other(self, name: str, seed: int) -> None:
+        field, found = simulated(name, seed), surveyed(name, seed)
+        assert len(found) == 2
+        for position in field.target_position_m:
+            target = nearest(found, position)
+            error = target.position_m - position
+            assert np.linalg.norm(error) < 0.25
+            # χ² of three: 1 in 10,000 right ones is beyond 21.
+            assert error @ np.linalg.solve(target.covariance[:3, :3], error) < 21.0
+        assert 0.85 < found.chi2_per_dof < 1.15
+
+    def test_moments(self) -> None:
+        field, found = simulated("survey-drone", 901), surveyed("survey-drone", 901)
+        for position, moment in zip(field.target_position_m, field.target_moment_Am2, strict=True):
+            target = nearest(found, position)
+            error = np.concatenate([target.position_m - position, target.moment_Am2 - moment])
+            # χ² of six: 1 in 10,000 is beyond 28.
+            assert error @ np.linalg.solve(target.covariance, error) < 28.0
+
+    def test_what_is_left_is_the_ground(self) -> None:
+        found = surveyed("survey-drone", 901)
+        assert np.abs(found.residual_T).max() < 0.3 * np.abs(found.record.values_T).max()
+
+
+class TestEmptyField:
+    def test_geology_is_no_target(self) -> None:
+        """One in a million such plots has a false target at the threshold that promises 0.1 in a hectare."""
+        assert len(surveyed("survey-drone", 904, 0)) == 0
+
+
+class TestPair:
+    def test_two_beside_each_other(self) -> None:
+        """1.6 m apart: their fields overlap, and each is in the other's tangent space."""
+        whole = simulated("survey-drone", 905, 0)
+        scenario = whole.scenario
+        sources = tuple(
+            Source(Carrier(Steered(place)), moment)
+            for place, moment in (((0.0, 0.0, -0.5), (3.0, 1.0, -6.0)), ((1.2, 1.0, -0.6), (-4.0, 5.0, 2.0)))
+        )
+        field = sims.simulate(replace(scenario, sources=sources), seed=905)
+        found = magloc.survey(field.array, field.readings)
+        assert len(found) == 2
+        for truth in field.truths:
+            assert np.linalg.norm(nearest(found, truth.position_m[0]).position_m - truth.position_m[0]) < 0.15
+
+
+class TestBadInput:
+    ROWS = 60
+
+    def refused(self, match: str, **changes: object) -> None:
+        field = simulated("survey-drone", 904, 0)
+        with pytest.raises(ValueError, match=match):
+            magloc.survey(field.array, replace(field.readings[: self.ROWS], **changes))
+
+    def test_no_pose(self) -> None:
+        self.refused("pose", array_position_m=None, array_rotation=None)
+
+    def test_no_ambient_field(self) -> None:
+        self.refused("ambient field", ambient_T=None)
+
+    def test_time_that_goes_back(self) -> None:
+        self.refused("order of time", time_s=np.arange(60.0)[::-1])
+
+    def test_few_rows(self) -> None:
+        self.refused("20 whole rows", values_T=np.full((60, 2), np.nan))
+
+    def test_below_the_ground(self) -> None:
+        field = simulated("survey-drone", 904, 0)
+        with pytest.raises(ValueError, match="ground_m"):
+            magloc.survey(field.array, field.readings[: self.ROWS], ground_m=10.0)
+
+    @pytest.mark.parametrize("name", ["false_per_hectare", "shortest_geology_m"])
+    def test_not_positive(self, name: str) -> None:
+        field = simulated("survey-drone", 904, 0)
+        with pytest.raises(ValueError, match=name):
+            magloc.survey(field.array, field.readings[: self.ROWS], **{name: 0.0})
+
+
+class TestOutputs:
+    def test_table_has_a_line_for_each(self) -> None:
+        found = surveyed("survey-drone", 901)
+        assert len(found.table().splitlines()) == 2 + len(found)
+        assert repr(found) == f"Survey: 2 targets, {len(found.record)} rows"
+
+    def test_geojson_is_where_it_is(self) -> None:
+        pytest.importorskip("pymap3d")
+        from pymap3d import geodetic2enu
+
+        found = surveyed("survey-drone", 901)
+        feature = found.to_geojson((48.1, 11.6, 520.0))["features"][0]
+        longitude, latitude, height = feature["geometry"]["coordinates"]
+        back = geodetic2enu(latitude, longitude, height, 48.1, 11.6, 520.0)
+        np.testing.assert_allclose(back, found[0].position_m, atol=1e-6)
+        assert found.to_kml((48.1, 11.6, 520.0)).count("<Placemark>") == len(found)
+
+    def test_iron(self) -> None:
+        target = surveyed("survey-drone", 901)[0]
+        least, most = target.iron_kg
+        assert least == pytest.approx(target.strength_Am2 / 0.3)
+        assert most == pytest.approx(target.strength_Am2 / 0.05)
+
+    def test_unstated_pose_is_said(self) -> None:
+        field = simulated("survey-drone", 901)
+        array = arrays.SensorArray(field.array.sensors)
+        assert magloc.survey(array, field.readings).pose_assumed
