@@ -39,7 +39,18 @@ class Target:
         χ² that is lost without it, of 3 degrees of freedom.
     flags : tuple of str
         ``weak``: the ellipse is not Gaussian. ``near``: another target is so near that one of the two may be spurious.
-        ``edge``: at the rim of what was searched. ``misfit``: more than one dipole, or no dipole.
+        ``edge``: at the rim of what was searched.
+
+    Examples
+    --------
+    >>> import sims
+    >>> import magloc
+    >>> from dataclasses import replace
+    >>> scenario = replace(sims.read_scenario("survey-drone"), duration_s=120.0)
+    >>> field = sims.simulate(scenario, seed=1)
+    >>> target = magloc.survey(field.array, field.readings)[0]
+    >>> target.id, round(target.depth_m, 1), round(target.strength_Am2)
+    ('t1', 0.4, 14)
     """
 
     id: str

@@ -201,7 +201,7 @@ def _targets(model: Model, fit: JointFit, background: Background, ground_m: floa
     targets = []
     for number, j in enumerate(order, start=1):
         position, own = fit.sources.position_m[j], covariance[6 * j : 6 * j + 6, 6 * j : 6 * j + 6]
-        depth, sigma = ground_m - position[2], math.sqrt(own[2, 2])
+        depth, sigma = ground_m - float(position[2]), math.sqrt(own[2, 2])
         interval = (max(0.0, depth - 1.96 * sigma), depth + 1.96 * sigma)
         flags = []
         if significance[j] < _WEAK:
