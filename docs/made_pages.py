@@ -64,7 +64,8 @@ EXPLAINED = {
     "exporting": "magloc.plots.save magloc.plots.write",
     "figures-and-viewer": "magloc.view magloc.plots.design",
     "gradient-tensor": "magloc.fit_gradient_tensor magloc.GradientTensor",
-    "inertial-unit": "adcs.complementary_filter adcs.inertial_magnetic_filter adcs.Gains",
+    "inertial-unit": "adcs.complementary_filter adcs.inertial_magnetic_filter adcs.read_imu"
+    " adcs.HeadingModel adcs.Gains",
     "iterated-kalman-filter": "magloc.IteratedExtendedKalmanFilter",
     "localization": "magloc.locate magloc.Locator magloc.Fixes magloc.Fix magloc.Solution magloc.Source"
     " magloc.SourcePrior magloc.plots.fixes",
@@ -75,7 +76,7 @@ EXPLAINED = {
     "ship-signature": "magloc.track_moment magloc.track_moments magloc.MomentTrack magloc.ObjectPath magloc.PathError"
     " magloc.read_object_path magloc.fit_signature magloc.Signature",
     "single-sensor-ranging": "magloc.SourceLine magloc.fit_source_line magloc.distance_along_line",
-    "star-identification": "adcs.identify_stars",
+    "star-identification": "adcs.solve_photograph adcs.identify_stars adcs.read_picture adcs.hipparcos_catalogue",
     "table-top-satellite": "adcs.mockup sims.table_run sims.TableScenario sims.CameraErrors sims.rendered_frame"
     " sims.experiments.sky_run sims.experiments.identified_files sims.experiments.fused_runs"
     " sims.experiments.fused_record sims.experiments.zeros_run",

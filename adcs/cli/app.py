@@ -52,13 +52,22 @@ for _name, _where, _help in (
         "adcs.cli.vectors:vectors",
         "Attitude of every row of telemetry from field and Sun alone, by TRIAD or QUEST.",
     ),
+    (
+        "imu",
+        "adcs.cli.imu:imu",
+        "Attitude of an inertial unit with a magnetometer, with iron and magnets near it or not.",
+    ),
     ("demo", "adcs.cli.demo:demo", "Estimate the attitude of a simulated satellite, and draw what comes out."),
     (
         "stars",
         "adcs.cli.stars:stars",
         "Identify the stars of images by a catalogue, without knowing where the camera looked.",
     ),
-    ("warm-up", "adcs.cli.warm_up:warm_up", "Compile ahead what run and estimate compile when they are first used."),
+    (
+        "warm-up",
+        "adcs.cli.warm_up:warm_up",
+        "Compile ahead what run, estimate and imu compile when they are first used.",
+    ),
 ):
     app.command(_where, name=_name, help=_help)
 

@@ -9,8 +9,10 @@ from pathlib import Path
 
 import numpy as np
 from cyclopts import App
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
+import adcs
 import arrays
 from adcs.cli.app import app as adcs_app
 from adcs.cli.app import main as adcs_main
@@ -92,8 +94,12 @@ LINES: dict[str, tuple[str, ...]] = {
         "telemetry.csv --config scenario.toml --method triad --out out",
     ),
     "adcs loads": ("loads.csv --array loads.toml --json --out out.csv",),
+    "adcs imu": ("imu.csv --config imu.toml --json", "imu.csv --offline --out out"),
     "adcs calibrate": ("telemetry.csv --config scenario.toml --json --out out.csv",),
-    "adcs stars": ("frames --catalogue stars.csv --json",),
+    "adcs stars": (
+        "frames --catalogue stars.csv --json",
+        "sky.png --catalogue stars.csv --scale-arcsec 15.8 --out out --json",
+    ),
 }  # fmt: skip
 # How often beside one of the others: seconds each, and a demonstration reads nothing that could be mangled.
 SELDOM = {
@@ -107,6 +113,15 @@ SELDOM = {
 STREAM = "readings.csv"  # what stands on stdin where a line reads from there
 
 _FILES = {
+    "imu.toml": """format_version = 1
+[log]
+[log.gyro]
+columns = ["gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s"]
+unit = "rad/s"
+samples = "point"
+[log.accelerometer]
+[log.magnetometer]
+""",
     "simulate.toml": """format_version = 1
 duration_s = 11.0
 rate_Hz = 1.0
@@ -270,6 +285,8 @@ def write_files(folder: Path) -> None:
         shutil.rmtree(folder / made)
     with (folder / "track.json").open("w") as file, redirect_stdout(file):
         run("magloc", "track readings.csv --array array.toml --json")
+    rows = Path(adcs.datasets.load("imu").path).read_text(encoding="utf-8").splitlines()
+    (folder / "imu.csv").write_text("\n".join(rows[:101]), encoding="utf-8")
     _write_scalars(folder)
     flight = switching_loads(seed=0, duration_s=150.0)
     write_columns(flight.columns, folder / "loads.csv")
@@ -294,4 +311,6 @@ def _write_stars(folder: Path) -> None:
     rows = zip(sky.numbers, ra, dec, sky.magnitudes, strict=True)
     lines = [f"{number},{a:.9f},{d:.9f},{m:.3f}\n" for number, a, d, m in rows]
     (folder / "stars.csv").write_text("hip,ra_deg,dec_deg,mag\n" + "".join(lines))
+    dark = np.random.default_rng(0).normal(20.0, 3.0, (128, 128))
+    Image.fromarray(dark.astype(np.uint8)).save(folder / "sky.png")
     write_frames(folder / "frames", sky, Rotation.random(2, random_state=1).as_matrix(), np.random.default_rng(2))
