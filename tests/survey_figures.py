@@ -1,0 +1,131 @@
+"""What surveys of a built-in scenario find: ``python -m tests.survey_figures survey-drone --first 200 --seeds 12``.
+
+Prints every field, and of all of them: recall of visible targets (whose χ² at the true place is twice the threshold),
+false targets, errors, how often the 95 % ellipsoids and depth intervals hold the truth, and the error over the joint
+Cramér-Rao bound; the same by classes of χ².
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+import magloc
+import sims
+from arrays.typing import FloatArray
+from magloc.measurement.pose import PoseErrors
+from magloc.surveying.joint_fit import Background, Bounds, Layer, Sources, fit_jointly
+from magloc.surveying.whitening import Drift
+from sims.magnetics.simulation import Simulation
+
+NEAREST_M = 0.5
+CLASSES = ((0.0, 200.0), (200.0, 2000.0), (2000.0, np.inf))
+
+
+class Pair(NamedTuple):
+    """A true target and the one that was found there."""
+
+    error_m: FloatArray
+    depth_m: float
+    covariance: FloatArray
+    interval_m: tuple[float, float]
+    significance: float
+    bound_m: float
+    visible_chi2: float
+
+
+class Field(NamedTuple):
+    """One field: pairs, χ² at the true places of those that were missed, and false targets."""
+
+    pairs: list[Pair]
+    missed_chi2: list[float]
+    n_false: int
+    threshold: float
+    seconds: float
+    chi2_per_dof: float
+
+
+def judged(field: Simulation) -> Field:
+    """A simulated field surveyed, and its targets paired with the true ones."""
+    found = magloc.survey(field.array, field.readings)
+    truth = Sources(field.target_position_m, field.target_moment_Am2)
+    everywhere = Bounds(np.full(3, -1e4), np.full(3, 1e4), np.inf)
+    record = found.record
+    background = Background.of(
+        record,
+        truth,
+        Layer.below(record, 15.0, 5e-9),
+        PoseErrors.of(record.array.pose),
+        Drift(),
+        np.arange(len(record)),
+    )
+    at_truth = fit_jointly(record, background, truth, everywhere, most=0)
+    bound = np.sqrt(np.diagonal(at_truth.covariance).reshape(-1, 6)[:, :3].sum(axis=1))
+    pairs, missed, used = [], [], set()
+    for j, position in enumerate(truth.position_m):
+        apart = np.linalg.norm(found.position_m - position, axis=1)
+        k = int(apart.argmin()) if len(found) else -1
+        near = k >= 0 and apart[k] < max(NEAREST_M, 4.0 * np.sqrt(np.trace(found[k].covariance[:3, :3])))
+        if not near or k in used:
+            missed.append(float(at_truth.significance[j]))
+            continue
+        used.add(k)
+        target = found[k]
+        error = target.position_m - position
+        own = target.covariance[:3, :3]
+        interval, chi2 = target.depth_interval95_m, float(at_truth.significance[j])
+        pairs.append(Pair(error, -position[2], own, interval, target.significance, float(bound[j]), chi2))
+    return Field(pairs, missed, len(found) - len(used), found.threshold, found.seconds, found.chi2_per_dof)
+
+
+def holds(pair: Pair) -> bool:
+    """Whether the 95 % ellipsoid holds the truth."""
+    return bool(pair.error_m @ np.linalg.solve(pair.covariance, pair.error_m) < chdtri(3, 0.05))
+
+
+def summary(pairs: list[Pair]) -> str:
+    """Errors of targets that were found, in a line."""
+    across = [float(np.hypot(*pair.error_m[:2])) for pair in pairs]
+    depth = [abs(float(pair.error_m[2])) / pair.depth_m for pair in pairs]
+    inside = [pair.interval_m[0] <= pair.depth_m <= pair.interval_m[1] for pair in pairs]
+    ratio = np.sqrt(np.mean([float(pair.error_m @ pair.error_m) / pair.bound_m**2 for pair in pairs]))
+    return (
+        f"{len(pairs)} targets: {100.0 * np.median(across):.1f} cm across, {100.0 * np.median(depth):.1f} % of depth"
+        f" (medians); ellipsoids hold {np.mean([holds(pair) for pair in pairs]):.3f}, depth intervals"
+        f" {np.mean(inside):.3f}; rms over bound {ratio:.2f}"
+    )
+
+
+def main() -> None:
+    """Survey some fields."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("scenario")
+    parser.add_argument("--first", type=int, default=200)
+    parser.add_argument("--seeds", type=int, default=12)
+    given = parser.parse_args()
+    fields = []
+    for seed in range(given.first, given.first + given.seeds):
+        fields.append(judged(sims.simulate(sims.read_scenario(given.scenario), seed=seed)))  # type: ignore[arg-type]
+        last = fields[-1]
+        print(
+            f"seed {seed}: found {len(last.pairs)}, missed {[round(chi2) for chi2 in last.missed_chi2]} (χ²),"
+            f" false {last.n_false}, χ²/dof {last.chi2_per_dof:.3f}, {last.seconds:.0f} s",
+            flush=True,
+        )
+    pairs = [pair for field in fields for pair in field.pairs]
+    visible = sum(pair.visible_chi2 > 2.0 * fields[0].threshold for pair in pairs)
+    lost = sum(chi2 > 2.0 * fields[0].threshold for field in fields for chi2 in field.missed_chi2)
+    n_false = sum(field.n_false for field in fields)
+    print(f"found {visible} of {visible + lost} visible, {n_false / len(fields):.2f} false a field")
+    print(summary(pairs))
+    for low, high in CLASSES:
+        some = [pair for pair in pairs if low <= pair.significance < high]
+        if some:
+            print(f"χ² from {low:g} to {high:g}: {summary(some)}")
+
+
+if __name__ == "__main__":
+    main()
