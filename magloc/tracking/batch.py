@@ -3,28 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import chdtri
 
+from arrays.typing import FloatArray
 from magloc.compilation import own
-from magloc.kalman import estimability
 from magloc.levels import CONTRADICTION
 from magloc.measurement.rows import ambient_fields
 from magloc.tracking import batch_compiled as kernels
-from magloc.tracking.measurement import LEAST_SINGULAR
-from magloc.tracking.motion import N_SOURCE, LinearMotion
-from magloc.tracking.results import Prediction, Row, Step, TrackPoint
-from magloc.tracking.tracker import (
-    LARGEST_GROWTH,
-    LARGEST_RANGE_ERROR,
-    MOST_ITERATIONS,
-    REFIX_RANGE_ERROR,
-    ROWS_TO_LOSE,
-    SHRINK,
-    TOLERANCE,
-    Tracker,
-)
+from magloc.tracking.chart.coordinates import FIRM
+from magloc.tracking.chart.mixture import Mixture
+from magloc.tracking.chart.update import LEAST_GAIN, LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
+from magloc.tracking.motion import LinearMotion
+from magloc.tracking.results import Row, Step, TrackPoint
+from magloc.tracking.tracker import LARGEST_GROWTH, LARGEST_WIDTH, ROWS_TO_LOSE, Tracker, track_point
 
 _STATUS = {kernels.TRACKED: "tracked", kernels.PREDICTED: "predicted", kernels.OUTLIER: "outlier"}
 
@@ -34,15 +28,16 @@ def track_record(
 ) -> list[TrackPoint]:
     """Points of a whole record: as :meth:`Tracker.run`, with compiled steps where the motion is linear.
 
-    Sensors with lasting errors are tracked by the readable steps.
+    Sensors with lasting errors, and a source that may be at several places, are tracked by the readable steps.
     """
     points: list[TrackPoint] = []
     motion, compiled = tracker.motion, None
-    if isinstance(motion, LinearMotion) and rows and not tracker.n_errors:
+    if isinstance(motion, LinearMotion) and rows and not tracker.errors.n_states + tracker.pose_errors.n_states:
         compiled = _CompiledSteps(tracker, motion, rows)
     while len(points) < len(rows):
         before = len(points)
-        if compiled is not None and tracker.is_tracking:
+        known = tracker.known
+        if compiled is not None and known is not None and len(known.mixture) == 1 and not known.young:
             points += compiled.follow(before)
         if len(points) < len(rows):
             points.append(tracker.update(rows[len(points)]))
@@ -93,70 +88,71 @@ class _CompiledSteps:
             nis_limits=np.asarray(chdtri(np.maximum(np.arange(k + 1), 1), CONTRADICTION), dtype=np.float64),
             tolerance=TOLERANCE,
             max_iterations=MOST_ITERATIONS,
-            step_shrink=SHRINK,
-            least_singular=LEAST_SINGULAR,
+            rounding=ROUNDING,
+            least_gain=LEAST_GAIN,
+            least_share=LEAST_SHARE,
+            firm=FIRM,
+            full=tracker.measurements.n_differences,
             largest_growth=LARGEST_GROWTH,
             rows_to_lose=ROWS_TO_LOSE,
-            start_range_error=REFIX_RANGE_ERROR,
-            largest_range_error=LARGEST_RANGE_ERROR,
+            largest_width=LARGEST_WIDTH,
+            radius=array.circumradius,
         )
-        n = motion.n_states
+        n, m = motion.n_states, len(rows)
         self.out = kernels.Followed(
-            np.empty((len(rows), n)),
-            np.empty((len(rows), n, n)),
-            np.empty((len(rows), n)),
-            np.empty((len(rows), n, n)),
-            np.full(len(rows), np.nan),
-            *np.zeros((2, len(rows)), dtype=np.int64),
+            np.empty((m, n)),
+            np.empty((m, n, n)),
+            np.empty((m, n)),
+            np.empty((m, n, n)),
+            np.empty((m, n, n)),
+            np.empty((m, n)),
+            np.full(m, np.nan),
+            *np.zeros((2, m), dtype=np.int64),
         )
 
     def follow(self, begin: int) -> list[TrackPoint]:
-        """Points from a row to the one before the first that has to be acquired, or that goes back in time."""
-        tracker, array, times = self.tracker, self.tracker.array, self.times
-        x, S, contradictions = tracker.state()
+        """Points from a row to the one before the first that a track must start from, or that goes back in time."""
+        tracker, times, given, out = self.tracker, self.times, self.given, self.out
+        known = tracker.known
+        assert known is not None
+        mixture = known.mixture
+        state = kernels.State(
+            mixture.x[0].copy(), mixture.S[0].copy(), mixture.centroid_m.copy(), known.open_loop.copy()
+        )
         end, contradictions = kernels.follow(
             begin,
             next((i for i in range(max(begin, 1), len(times)) if times[i] <= times[i - 1]), len(times)),
-            x,
-            S,
-            contradictions,
+            state,
+            known.contradictions,
             self.channels,
-            self.given,
+            given,
             self.steps,
             self.rules,
-            self.out,
+            out,
         )
         if end == begin:
             return []
-        given, out = self.given, self.out
-        steps = [
-            Step(
-                i,
-                Prediction(out.predicted_x[i], out.predicted_S[i], self.steps.F[self.steps.of_row[i]]),
-                out.x[i],
-                out.S[i],
+        centroids = given.origins + given.rotations @ tracker.array.centroid
+
+        def single(row: int, x: FloatArray, S: FloatArray) -> Mixture:
+            return replace(mixture, x=x[row][None], S=S[row][None], centroid_m=centroids[row])
+
+        points, steps = [], []
+        for i in range(begin, end):
+            after = single(i, out.x, out.S)
+            if tracker.keep_steps:
+                steps.append(Step(i, after, single(i, out.predicted_x, out.predicted_S), out.transition[i]))
+            point = track_point(times[i], after, out.open_loop[i])
+            points.append(
+                replace(
+                    point,
+                    iterations=int(out.iterations[i]),
+                    nis=float(out.nis[i]),
+                    nis_dof=int(given.n_differences[i]),
+                    status=_STATUS[int(out.status[i])],
+                )
             )
-            for i in range(begin, end)
-        ]
-        tracker.resume(x, S, times[end - 1], contradictions, steps)
-        roots, predicted = out.S[begin:end], out.predicted_S[begin:end]
-        covariance = (roots @ roots.swapaxes(-1, -2))[:, :N_SOURCE, :N_SOURCE]
-        learned = estimability(roots, predicted)[:, :N_SOURCE]
-        centroids = given.origins[begin:end] + given.rotations[begin:end] @ array.centroid
-        return [
-            TrackPoint(
-                times[i],
-                out.x[i, :3],
-                out.x[i, 3:6],
-                covariance[i - begin],
-                learned[i - begin],
-                int(out.iterations[i]),
-                float(out.nis[i]),
-                int(given.n_differences[i]),
-                status=_STATUS[int(out.status[i])],
-                weight=tracker.weight,
-                centroid_m=centroids[i - begin],
-                radius_m=array.circumradius,
-            )
-            for i in range(begin, end)
-        ]
+        after = replace(mixture, x=state.x[None], S=state.S[None], centroid_m=state.centroid)
+        resumed = replace(known, mixture=after, open_loop=state.open_loop, contradictions=contradictions)
+        tracker.resume(resumed, times[end - 1], end - begin, steps)
+        return points

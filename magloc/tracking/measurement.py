@@ -1,19 +1,7 @@
-r"""What one row measures of a tracked source, and the coordinates in which a prediction of it is Gaussian.
-
-What earlier rows told of a source is nearly Gaussian in what they measured, not in position and moment: of a weak
-source the direction and the moment are known only together, along a curve. Far rows measure nearly the same functions
-of the source as the present one, so the prediction is taken to be Gaussian in
-
-.. math:: c(x) = M (h(x) - h(x_0)), \qquad M H(x_0) = I
-
-with the predicted differences h of the source in units of their noise, their Jacobian H, and the predicted state
-:math:`x_0`: to first order c is position and moment, and to second order it bends as the readings do. A filter in
-Cartesian coordinates believes itself too much while it learns of a source at rest: every row is linearised elsewhere.
-"""
+"""What one row measures of tracked sources."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -23,21 +11,19 @@ from arrays.array import SensorArray
 from arrays.differences import Differences, decorrelated_differences
 from arrays.noise import reading_covariance
 from arrays.typing import FloatArray
-from magloc.kalman import MeasurementFunction
+from magloc.chi_square import energy_threshold
 from magloc.measurement.differences import DifferenceMeasurement, turn_jacobian
 from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
-from magloc.measurement.pose import TURN, ArrayPose, PoseErrors
+from magloc.measurement.pose import N_POSE, TURN, ArrayPose, PoseErrors
 from magloc.navigation.rotations import rotation_matrix, turn_of_change
+from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row
-
-LEAST_SINGULAR = 1e-6
-"""A row has no coordinates of its own if a column of its Jacobian, in units of what is known, is so near to others."""
 
 
 @dataclass(frozen=True, eq=False)
 class RowMeasurement:
-    """Differences of one row, in units of their noise, as a function of the state in the world frame.
+    """Differences of one row, in units of their noise, as a function of states in the world frame.
 
     Attributes
     ----------
@@ -47,9 +33,9 @@ class RowMeasurement:
         Standard deviations of the differences [T].
     row : Row
     n_motion : int
-        States of the motion; behind them stand the sensors' errors, then those of the pose.
-    effect : ndarray, shape (k, n_errors)
-        Of the sensors' errors on the differences, in units of their noise.
+        States of the motion, the last of them errors of the pose; behind them stand the sensors' errors.
+    channel_effect : ndarray, shape (C, n_errors)
+        Of the sensors' errors on the channels [T].
     pose : ArrayPose
         As the row states it.
     pose_effect : ndarray, shape (9, n_pose)
@@ -60,7 +46,7 @@ class RowMeasurement:
     sigma: FloatArray
     row: Row
     n_motion: int
-    effect: FloatArray
+    channel_effect: FloatArray
     pose: ArrayPose
     pose_effect: FloatArray
 
@@ -69,128 +55,121 @@ class RowMeasurement:
         """Measured differences, shape (k,)."""
         return self.model.measured(self.row.readings_T) / self.sigma
 
-    def pose_error(self, state: FloatArray) -> FloatArray | None:
-        """Error (9,) of the pose that a state (n,) stands for, None where none is stated."""
-        states = state[self.n_motion + self.effect.shape[1] :]
-        return self.pose_effect @ states if states.size else None
-
-    def of_source(self, source: FloatArray, error: FloatArray | None = None) -> FloatArray:
-        """Predicted differences (k,) of a source (6,) where the pose has an error (9,) and no sensor has any."""
-        in_array = self.pose.in_array(source, error)
-        return self.model.predicted(in_array[:3], in_array[3:], self._ambient_T(error)) / self.sigma
-
-    def source_jacobian(self, source: FloatArray) -> FloatArray:
-        """Their Jacobian (k, 6) where the pose has no error."""
-        return self._by_source(self._by_array(self.pose.in_array(source)))
-
-    def predicted(self, state: FloatArray) -> FloatArray:
-        """Predicted differences (k,) of a state (n,)."""
-        of_source = self.of_source(state[:N_SOURCE], self.pose_error(state))
-        return of_source + self.effect @ state[self.n_motion : self.n_motion + self.effect.shape[1]]
-
-    def jacobian(self, state: FloatArray) -> FloatArray:
-        """Their Jacobian (k, n)."""
-        first, behind = self.n_motion, self.n_motion + self.effect.shape[1]
-        error = self.pose_error(state)
-        in_array = self.pose.in_array(state[:N_SOURCE], error)
-        H = self._by_array(in_array, error)
-        full = np.zeros((len(self.sigma), state.size))
-        full[:, :N_SOURCE] = self._by_source(H, error)
-        full[:, first:behind] = self.effect
-        if error is not None:
-            by_error = H @ self.pose.error_jacobian(in_array, error)
-            turned = turn_jacobian(self.model.array, in_array[:3], in_array[3:], self._ambient_T(error))
-            turned = self.model.differences.transform @ turned / self.sigma[:, None]
-            by_error[:, TURN] += turned @ turn_of_change(-error[TURN])
-            full[:, behind:] = by_error @ self.pose_effect
-        return full
+    @cached_property
+    def centroid_m(self) -> FloatArray:
+        """Of the sensors in the world frame, shape (3,)."""
+        return self.row.origin_m + self.row.R_world_from_array @ self.model.array.centroid
 
     @property
-    def n_states(self) -> int:
-        """Of the motion, of the sensors' errors and of those of the pose."""
-        return self.n_motion + self.effect.shape[1] + self.pose_effect.shape[1]
+    def radius_m(self) -> float:
+        """Largest distance of a sensor from it."""
+        return self.model.array.circumradius
 
-    def without_errors(self, source: FloatArray) -> FloatArray:
-        """The state (n,) of a source (6,) at rest where nothing has an error."""
-        return np.concatenate([source, np.zeros(self.n_states - N_SOURCE)])
+    @property
+    def n_pose(self) -> int:
+        """Number of the pose's errors."""
+        return self.pose_effect.shape[1]
 
-    def coordinates(self, state: FloatArray, unit: FloatArray, *, of_readings: bool = True) -> Coordinates:
-        """Coordinates about a state (n,), where `unit` (6,) is what is known of position and moment.
+    def chart(self, x: FloatArray) -> Chart:
+        """About states (..., n) of the motion."""
+        return Chart.at(x, self.centroid_m, self.radius_m, self.n_pose)
 
-        They bend as the readings do, if these determine a source; else, or if not `of_readings`, as its place in the
-        array's axes does with the errors of the pose.
-        """
-        if of_readings and len(self.sigma) >= N_SOURCE:
-            G = self.jacobian(state)
-            Q, R = np.linalg.qr(G[:, :N_SOURCE] * unit)
-            diagonal = np.abs(np.diagonal(R))
-            if diagonal.min() > LEAST_SINGULAR * diagonal.max():
-                M = unit[:, None] * np.linalg.solve(R, Q.T)
-                return Coordinates(state, self.predicted, self.jacobian, M, self.predicted(state), M @ G)
-        G = self._in_array_jacobian(state)
-        M = G[:, :N_SOURCE].T
-        return Coordinates(state, self._in_array, self._in_array_jacobian, M, self._in_array(state), M @ G)
+    @cached_property
+    def effect(self) -> FloatArray:
+        """Of the sensors' errors on the differences, in units of their noise: (k, n_errors)."""
+        return (self.model.differences.transform / self.sigma[:, None]) @ self.channel_effect
+
+    def effect_on(self, roots: FloatArray) -> FloatArray:
+        """Products ``effect @ roots`` (K, k, m) with matrices (K, n_errors, m): every channel has a few errors only."""
+        from scipy.sparse import csr_array
+
+        sparse, transform = csr_array(self.channel_effect), self.model.differences.transform / self.sigma[:, None]
+        return np.stack([transform @ (sparse @ root) for root in roots])
+
+    def of_source(self, state: FloatArray) -> FloatArray:
+        """Predicted differences (..., k) of sources (..., 6) or states of the motion, sensors being without errors."""
+        error = self._pose_error(state)
+        in_array = self.pose.in_array(state[..., :N_SOURCE], error)
+        return self.model.predicted(in_array[..., :3], in_array[..., 3:], self._ambient_T(error)) / self.sigma
+
+    def source_jacobian(self, state: FloatArray) -> FloatArray:
+        """Their Jacobian (..., k, 6) by position and moment."""
+        error = self._pose_error(state)
+        return self._by_source(self._by_array(self.pose.in_array(state[..., :N_SOURCE], error), error), error)
+
+    def along(self, state: FloatArray, directions: FloatArray) -> FloatArray:
+        """Their derivative (..., k, m) along directions (..., n, m) in states of the motion."""
+        error = self._pose_error(state)
+        if error is None:
+            return np.asarray(self.source_jacobian(state) @ directions[..., :N_SOURCE, :])
+        in_array = self.pose.in_array(state[..., :N_SOURCE], error)
+        H = self._by_array(in_array, error)
+        by_pose = self._by_pose(H, in_array, error) @ directions[..., self.n_motion - self.n_pose : self.n_motion, :]
+        return np.asarray(self._by_source(H, error) @ directions[..., :N_SOURCE, :] + by_pose)
+
+    def jacobian(self, state: FloatArray) -> FloatArray:
+        """Jacobian (k, N) of all differences by a Cartesian state (N,) with the sensors' errors."""
+        full = np.zeros((len(self.sigma), state.size))
+        full[:, : self.n_motion] = self.along(state[: self.n_motion], np.eye(self.n_motion))
+        full[:, self.n_motion :] = self.effect
+        return full
 
     def with_lasting_errors(self, lasting: FloatArray) -> RowMeasurement:
         """The row where only some shares (n_pose,) of the pose's errors have an effect."""
-        return replace(self, pose_effect=self.pose_effect * lasting)
+        return replace(self, pose_effect=self.pose_effect * lasting) if self.n_pose else self
 
-    def curved_prior(
-        self, x: FloatArray, S: FloatArray, *, of_readings: bool = True
-    ) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
-        """A prediction (x, S) that is Gaussian in the coordinates about it.
+    @cached_property
+    def without_source(self) -> FloatArray:
+        """What is left of the measured differences (k,) when the ambient field's own are taken out."""
+        array = self.model.array
+        ambient = array.readings_of(array.ambient_fields) - array.channel_offset_T
+        return self.z - (self.model.differences.transform @ ambient) / self.sigma
 
-        It gives, of a state, mean (n,) and square root (n, n) of the Gaussian that looks there as the prediction does.
-        """
-        source, rest = slice(0, N_SOURCE), slice(N_SOURCE, None)
-        coordinates = self.coordinates(x, np.linalg.norm(S[source], axis=1), of_readings=of_readings)
-        at_first = coordinates.J[:, rest]
+    def whitening(self, sigma_errors: FloatArray) -> FloatArray | None:
+        """``C^{-1/2}`` (k, k) of a row without a source, its sensors' errors known by their σ (n_errors,) alone."""
+        if not sigma_errors.size + self.n_pose:
+            return None
+        # Sources without a moment: what is left is the ambient field, turned by the pose's errors.
+        nowhere = self.pose.in_array(np.zeros(N_SOURCE))
+        by_pose = self._by_pose(np.zeros((len(self.sigma), N_SOURCE)), nowhere, np.zeros(N_POSE))
+        lasting = np.concatenate([self.effect * sigma_errors, by_pose], axis=1)
+        return np.linalg.inv(np.linalg.cholesky(np.eye(len(lasting)) + lasting @ lasting.T))
 
-        def prior(state: FloatArray) -> tuple[FloatArray, FloatArray]:
-            c, J = coordinates.at(state)
-            mean, root = x.copy(), S.copy()
-            try:
-                mean[source] = state[source] - np.linalg.solve(J[:, source], c - J[:, rest] @ (state - x)[rest])
-                root[source] = np.linalg.solve(J[:, source], S[source] + (at_first - J[:, rest]) @ S[rest])
-            except np.linalg.LinAlgError:
-                return x, S
-            return mean, root
+    def is_detected(self, sigma_errors: FloatArray) -> bool:
+        """Whether the differences stand out of noise and of what the errors of sensors and pose may make of them."""
+        if not self.z.size:
+            return False
+        whiten = self.whitening(sigma_errors)
+        left = self.without_source if whiten is None else whiten @ self.without_source
+        return bool(left @ left > energy_threshold(left.size))
 
-        return prior
+    def _pose_error(self, state: FloatArray) -> FloatArray | None:
+        """Errors (..., 9) of the pose that states of the motion stand for, None where they are of a source alone."""
+        if not self.n_pose or state.shape[-1] == N_SOURCE:
+            return None
+        return np.asarray(state[..., self.n_motion - self.n_pose : self.n_motion] @ self.pose_effect.T)
 
-    def place_in_array(self, state: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Offset (3,) of the source from the sensors' centroid in the array's axes, and a square root (3, n) of its P.
+    def _by_array(self, in_array: FloatArray, error: FloatArray | None) -> FloatArray:
+        """Jacobian (..., k, 6) by a source in the array's axes."""
+        H = self.model.jacobian(in_array[..., :3], in_array[..., 3:], self._ambient_T(error))
+        return np.asarray(H / self.sigma[:, None])
 
-        An error of the pose moves the source in the world, not from the array.
-        """
-        return self._in_array(state)[:3] - self.model.array.centroid, (self._in_array_jacobian(state) @ S)[:3]
-
-    def _in_array(self, state: FloatArray) -> FloatArray:
-        """Position and moment (6,) of a state in the true axes of the array."""
-        return self.pose.in_array(state[:N_SOURCE], self.pose_error(state))
-
-    def _in_array_jacobian(self, state: FloatArray) -> FloatArray:
-        """Their Jacobian (6, n)."""
-        error = self.pose_error(state)
-        full = np.zeros((N_SOURCE, state.size))
-        full[:, :N_SOURCE] = self._by_source(np.eye(N_SOURCE), error)
-        if error is not None:
-            behind = self.n_motion + self.effect.shape[1]
-            full[:, behind:] = self.pose.error_jacobian(self._in_array(state), error) @ self.pose_effect
-        return full
-
-    def _by_array(self, in_array: FloatArray, error: FloatArray | None = None) -> FloatArray:
-        """Jacobian (k, 6) by a source in the array's axes."""
-        return self.model.jacobian(in_array[:3], in_array[3:], self._ambient_T(error)) / self.sigma[:, None]
-
-    def _by_source(self, H: FloatArray, error: FloatArray | None = None) -> FloatArray:
+    def _by_source(self, H: FloatArray, error: FloatArray | None) -> FloatArray:
         """That by a source of the world."""
-        R = self.pose.turned(error)
-        return (H.reshape(-1, 2, 3) @ R.T).reshape(-1, N_SOURCE)
+        RT = np.swapaxes(self.pose.turned(error), -1, -2)
+        return np.concatenate([H[..., :3] @ RT, H[..., 3:] @ RT], axis=-1)
+
+    def _by_pose(self, H: FloatArray, in_array: FloatArray, error: FloatArray) -> FloatArray:
+        """That (..., k, n_pose) by the pose's errors."""
+        turned = turn_jacobian(self.model.array, in_array[..., :3], in_array[..., 3:], self._ambient_T(error))
+        by_error = H @ self.pose.error_jacobian(in_array, error)
+        of_ambient = self.model.differences.transform @ turned / self.sigma[:, None]
+        by_error[..., TURN] += of_ambient @ turn_of_change(-error[..., TURN])
+        return np.asarray(by_error @ self.pose_effect)
 
     def _ambient_T(self, error: FloatArray | None) -> FloatArray | None:
-        """Ambient field at the sensors (N, 3) where the pose is turned by an error; None: the array's own."""
-        return None if error is None else self.model.array.ambient_fields @ rotation_matrix(error[TURN])
+        """Ambient fields at the sensors (..., N, 3) where the pose is turned by errors; None: the array's own."""
+        return None if error is None else self.model.array.ambient_fields @ rotation_matrix(error[..., TURN])
 
 
 class RowMeasurements:
@@ -200,22 +179,25 @@ class RowMeasurements:
     ----------
     array : SensorArray
     n_motion : int
-        States of the motion.
+        States of the motion, without errors of the pose.
 
     Attributes
     ----------
     errors : SensorErrors
         The lasting errors of the array's sensors.
     pose_errors : PoseErrors
-        Those of its pose, behind them.
+        Those of its pose.
+    n_differences : int
+        Independent differences of a row whose readings are all there.
     """
 
     def __init__(self, array: SensorArray, n_motion: int) -> None:
         self.errors = SensorErrors.of(array)
         self.pose_errors = PoseErrors.of(array.pose)
         self._lever_arm_m = np.array(self.pose_errors.uncertainty.lever_arm_m)
+        self.n_differences = decorrelated_differences(array).n_differences
         self._array = without_lasting_errors(array)
-        self._n_motion = n_motion
+        self._n_motion = n_motion + self.pose_errors.n_states
         self._differences: dict[bytes, Differences] = {}
 
     def of(self, row: Row) -> RowMeasurement:
@@ -226,7 +208,7 @@ class RowMeasurements:
             array = replace(array, ambient_T=(x, y, z))
         differences = self.differences(row)
         sigma = np.sqrt(differences.variance)
-        effect = differences.transform @ self.errors.effect(array, row.readings_T) / sigma[:, None]
+        effect = self.errors.effect(array, row.readings_T)
         pose = row.pose(self._lever_arm_m)
         of_pose = self.pose_errors.effect(pose, row.pose_sigma)
         model = DifferenceMeasurement(array, differences)
@@ -242,33 +224,3 @@ class RowMeasurements:
         if key not in self._differences:
             self._differences[key] = decorrelated_differences(self._array, available)
         return self._differences[key]
-
-
-@dataclass(frozen=True, eq=False)
-class Coordinates:
-    """Six coordinates of a state, to first order its position and moment where errors are held; the others stay.
-
-    Attributes
-    ----------
-    centre : ndarray, shape (n,)
-        The state that they are counted from.
-    function, jacobian : callable
-        What bends as they do: (n,) -> (k,), and its derivative (k, n).
-    M : ndarray, shape (6, k)
-        They are M times its change.
-    value, J : ndarray, shapes (k,) and (6, n)
-        At the centre: of the function, and the derivative of the coordinates.
-    """
-
-    centre: FloatArray
-    function: MeasurementFunction
-    jacobian: MeasurementFunction
-    M: FloatArray
-    value: FloatArray
-    J: FloatArray
-
-    def at(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Coordinates (6,) of a state (n,), and their derivative (6, n)."""
-        if np.array_equal(state, self.centre):
-            return np.zeros(N_SOURCE), self.J
-        return self.M @ (self.function(state) - self.value), self.M @ self.jacobian(state)

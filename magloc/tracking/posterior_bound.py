@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.kalman import block_update
-from magloc.localization.fit.gauss_newton import inverse_information
-from magloc.tracking.measurement import RowMeasurement
-from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import Row, Step, TrackPoint
-from magloc.tracking.smoother import smoothed
+from magloc.kalman import block_update, predict_square_root
+from magloc.tracking.chart.start import prior_root
+from magloc.tracking.results import Row
+from magloc.tracking.smoother import smoother_gain
 from magloc.tracking.tracker import Tracker
-
-# Rows determine a source if their Jacobian, columns scaled, is not nearer to singular.
-_SINGULAR_RTOL = 1e-6
 
 
 def posterior_bound(
@@ -25,10 +21,10 @@ def posterior_bound(
 ) -> FloatArray:
     """Posterior Cramér-Rao bound of the distance from the truth, for every row, from this row and those before.
 
-    Nothing is known before the first row but the standard deviations of the sensors' lasting errors, which count as
-    unknowns of their own, and until the readings determine it the source counts as at rest. Speed and turn rate are
-    those of the truth. The root of the trace of the position's bound (n,) [m] is infinite as long as the readings do
-    not determine it.
+    It begins with the first row that shows a source; before it no more is known than what a tracker starts with
+    (:func:`magloc.tracking.chart.start.prior_root`), and the standard deviations of the sensors' lasting errors, which
+    count as unknowns of their own. Speed and turn rate are those of the truth. The root of the trace of the position's
+    bound (n,) [m] is infinite before that row.
     """
     bounds = np.full(len(rows), np.inf)
     for step in _steps_at_truth(tracker, rows, position_m, moment_Am2):
@@ -46,50 +42,63 @@ def smoothing_bound(
     :math:`P_{j|n} = P_j + G (P_{j+1|n} - P_{j+1|j}) G^T` with :math:`G = P_j F^T P_{j+1|j}^{-1}`. It is infinite at the
     same rows as :func:`posterior_bound`: a track that has not begun is not smoothed.
     """
-    steps = _steps_at_truth(tracker, rows, position_m, moment_Am2)
-    at_truth = [TrackPoint(row.time_s, place) for row, place in zip(rows, position_m, strict=True)]
-    points = smoothed(at_truth, steps)
     bounds = np.full(len(rows), np.inf)
-    for step in steps:
-        covariance = points[step.row].covariance
-        if covariance is not None:
-            bounds[step.row] = math.sqrt(float(np.trace(covariance[:3, :3])))
+    later: _StepAtTruth | None = None
+    P = np.empty((0, 0))
+    for step in reversed(_steps_at_truth(tracker, rows, position_m, moment_Am2)):
+        of_later, P = P, step.S @ step.S.T
+        if later is not None:
+            predicted = later.predicted_S @ later.predicted_S.T
+            gain = smoother_gain(P, later.F, predicted)
+            P = P + gain @ (of_later - predicted) @ gain.T
+            P = 0.5 * (P + P.T)
+        later = step
+        bounds[step.row] = math.sqrt(float(np.trace(P[:3, :3])))
     return bounds
+
+
+@dataclass(frozen=True, eq=False)
+class _StepAtTruth:
+    """Roots after and before a row's readings, and the transition that led there; all in Cartesian states."""
+
+    row: int
+    S: FloatArray
+    predicted_S: FloatArray
+    F: FloatArray
 
 
 def _steps_at_truth(
     tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
-) -> list[Step]:
-    """What a filter that linearises at the truth knows at every row, from the first one that determines the source."""
-    motion, n_errors = tracker.motion, tracker.n_errors
+) -> list[_StepAtTruth]:
+    """What a filter that linearises at the truth knows at every row, from the first one that shows the source."""
+    motion, errors = tracker.moved, tracker.errors
+    n = motion.n_states
+    N = n + errors.n_states
     truth = np.concatenate([position_m, moment_Am2], axis=1)
     velocity, rate = _velocities(np.array([row.time_s for row in rows]), truth)
-    steps: list[Step] = []
-    S: FloatArray | None = None
-    seen: list[FloatArray] = []
-    measurements: list[RowMeasurement] = []
+    states = [motion.state_of(*of_row) for of_row in zip(truth, velocity, rate, strict=True)]
+    steps: list[_StepAtTruth] = []
     for i, row in enumerate(rows):
         measurement = tracker.measurements.of(row)
-        before = max(i - 1, 0)
-        prediction = None
-        if S is not None:
-            state = np.concatenate([motion.state_of(truth[before], velocity[before], rate[before]), np.zeros(n_errors)])
-            prediction = tracker.predicted(state, S, row.time_s - rows[before].time_s)
-        state = np.concatenate([motion.state_of(truth[i], velocity[i], rate[i]), np.zeros(n_errors)])
-        H = measurement.jacobian(state)
-        if prediction is not None:
-            _, S = block_update(state, prediction.S, H, np.zeros(len(H)), np.ones(len(H)))
+        F, S_q = np.eye(N), np.zeros((N, 0))
+        if steps:
+            dt_s = row.time_s - rows[i - 1].time_s
+            _, F[:n, :n], of_motion = motion.step(states[i - 1], dt_s)
+            kept, added = errors.step(dt_s)
+            F[np.arange(n, N), np.arange(n, N)] = kept
+            S_q = np.zeros((N, of_motion.shape[1] + errors.n_states))
+            S_q[:n, : of_motion.shape[1]], S_q[n:, of_motion.shape[1] :] = of_motion, np.diag(added)
+            predicted_S = predict_square_root(steps[-1].S, F, S_q)
+        elif measurement.is_detected(errors.sigma):
+            predicted_S = np.diag(np.concatenate([np.zeros(n), errors.sigma]))
+            chart = measurement.chart(states[i])
+            predicted_S[:n, :n] = prior_root(chart, motion)
         else:
-            # Errors of sensors and pose as noise of the row: only to see whether the source is determined, how well.
-            lasting = H[:, motion.n_states :] * tracker.error_sigma
-            root = np.linalg.cholesky(np.eye(len(H)) + lasting @ lasting.T)
-            seen.append(np.linalg.solve(root, H[:, :N_SOURCE]))
-            measurements.append(measurement)
-            covariance = inverse_information(np.concatenate(seen)[None], _SINGULAR_RTOL)[0]
-            if np.isnan(covariance).any():
-                continue
-            S = tracker.filtered_start([state] * len(measurements), covariance, measurements).S
-        steps.append(Step(i, prediction, state, S))
+            continue
+        state = np.concatenate([states[i], np.zeros(errors.n_states)])
+        H = measurement.jacobian(state)
+        _, S = block_update(state, predicted_S, H, np.zeros(len(H)), np.ones(len(H)))
+        steps.append(_StepAtTruth(i, S, predicted_S, F))
     return steps
 
 

@@ -15,6 +15,7 @@ from magloc.localization.uncertainty.ambiguity import LARGEST_GAUSSIAN_SIGMA, re
 from magloc.localization.uncertainty.range_interval import gaussian_ranges, union
 from magloc.measurement.pose import ArrayPose, rates_of
 from magloc.readings import Readings
+from magloc.tracking.chart.mixture import Mixture
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,7 @@ class TrackPoint:
     covariance : ndarray, shape (6, 6)
         Of (position, moment).
     estimability : ndarray, shape (6,)
-        What the row's readings taught of every component: 1 - σ after / σ predicted without them.
+        What the readings taught of every component since the track began: 1 - σ / σ without any of them.
     iterations : int
         Linearisations.
     nis : float
@@ -113,6 +114,9 @@ class TrackPoint:
     lag1 : float
         Product of the whitened innovations of this row and of the one before, on average zero for a right model; its
         variance is `nis_dof`. NaN where there is none before, or of other differences.
+    mixture : Mixture, optional
+        All that is known of position and moment, in the coordinates in which it is Gaussian; None of a track that is
+        read from a file.
     """
 
     time_s: float
@@ -129,6 +133,7 @@ class TrackPoint:
     centroid_m: FloatArray | None = None
     radius_m: float = math.nan
     lag1: float = math.nan
+    mixture: Mixture | None = None
 
     @property
     def range_interval_m(self) -> Intervals | None:
@@ -137,6 +142,8 @@ class TrackPoint:
         Of a track it is :func:`magloc.localization.uncertainty.range_interval.gaussian_ranges` of its covariance;
         without one it is that of the row alone, or every range where the row says nothing.
         """
+        if self.mixture is not None:
+            return self.mixture.range_interval_m()
         if self.position_m is None or self.covariance is None:
             return self.rivals[0].range_interval_m if self.rivals else EVERYWHERE
         if self.centroid_m is None:
@@ -159,15 +166,6 @@ class TrackPoint:
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
-    """State and square root of its covariance before a row's readings, and the transition that led there."""
-
-    x: FloatArray
-    S: FloatArray
-    F: FloatArray
-
-
-@dataclass(frozen=True, eq=False)
 class Step:
     """One step of a track, for smoothing.
 
@@ -175,16 +173,18 @@ class Step:
     ----------
     row : int
         Which row it belongs to.
-    prediction : Prediction, optional
-        From the step before; None at the first step of a track.
-    x, S : ndarray
-        State and square root of its covariance after the row's readings.
+    known : Mixture
+        After the row's readings, as one Gaussian.
+    prediction : Mixture, optional
+        Before them; None at the first step of a track.
+    transition : ndarray, shape (N, N), optional
+        That led there, in the charts about the two states.
     """
 
     row: int
-    prediction: Prediction | None
-    x: FloatArray
-    S: FloatArray
+    known: Mixture
+    prediction: Mixture | None = None
+    transition: FloatArray | None = None
 
 
 def rows_of(readings: Readings) -> Iterator[Row]:

@@ -82,7 +82,7 @@ class TestTrueReadings:
         fields = magpylib_field(sensors, SOURCE[:3], SOURCE[3:]) + AMBIENT_T
         readings = array.readings_of(fields @ true_R)
         expected = measurement.model.measured(readings) / measurement.sigma
-        found = measurement.predicted(np.concatenate([SOURCE, u]))
+        found = measurement.of_source(np.concatenate([SOURCE, u]))
         np.testing.assert_allclose(found, expected, rtol=1e-7, atol=1e-7 * float(np.abs(expected).max()))
 
 
@@ -119,26 +119,9 @@ class TestDerivatives:
         unit = np.concatenate([UNIT, np.ones(14)])
         state = np.concatenate([SOURCE, np.random.default_rng(1).normal(size=14)])
         expected = derivative(
-            lambda y: np.apply_along_axis(lambda x: measurement.predicted(x * unit), -1, y), state / unit, 1e-2, 1e-7
+            lambda y: np.apply_along_axis(lambda x: measurement.of_source(x * unit), -1, y), state / unit, 1e-2, 1e-7
         )
         self.agree(measurement.jacobian(state) * unit, expected)
-
-    def test_of_the_coordinates(self) -> None:
-        array = replace(geometries.tetrahedron(1.5, "vector", 1e-9), pose=STATED)
-        measurement = Tracker(array, RandomWalk(1e-9, 1e-9)).measurements.of(row_of(array))
-        unit = np.concatenate([UNIT, np.ones(14)])
-        state = np.concatenate([SOURCE, np.zeros(14)])
-        elsewhere = np.concatenate([SOURCE * 1.02, np.random.default_rng(2).normal(size=14)])
-        for of_readings in (True, False):
-            coordinates = measurement.coordinates(state, 0.1 * UNIT, of_readings=of_readings)
-            np.testing.assert_allclose(coordinates.J[:, :6] * UNIT / UNIT[:, None], np.eye(6), atol=1e-9)
-            expected = derivative(
-                lambda y, c=coordinates: np.apply_along_axis(lambda x: c.at(x * unit)[0] / UNIT, -1, y),
-                elsewhere / unit,
-                1e-2,
-                1e-9,
-            )
-            self.agree(coordinates.at(elsewhere)[1] * unit / UNIT[:, None], expected)
 
 
 class TestErrors:

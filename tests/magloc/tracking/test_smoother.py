@@ -4,46 +4,56 @@ from __future__ import annotations
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
+from numpy.typing import NDArray
 
 from magloc.tracking.batch import track_record
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.motion import OrnsteinUhlenbeck
-from magloc.tracking.results import Prediction, Step, TrackPoint
+from magloc.tracking.results import Step, TrackPoint
 from magloc.tracking.smoother import smoothed
 from magloc.tracking.tracker import Tracker
 from tests.passing_source import ARRAY, SLOW, moving_source, positions, readings_of, rows_from
 
+FloatArray = NDArray[np.float64]
+
 
 class TestSmoother:
     def test_is_filterpys(self) -> None:
-        """Of a linear system with random transitions, by filterpy's Rauch-Tung-Striebel smoother."""
+        """Of steps so small that the chart is flat, by filterpy's Rauch-Tung-Striebel smoother in its coordinates."""
         rng = np.random.default_rng(4)
-        n = 12
+        n, small = 12, 1e-6
+        place = np.array([3.0, 1.5, 0.8, 120.0, -150.0, 160.0])
+        chart = Chart.at(place[None], ARRAY.centroid, ARRAY.circumradius)
         reference = KalmanFilter(dim_x=6, dim_z=4)
         reference.F = np.eye(6) + 0.1 * rng.normal(size=(6, 6))
         reference.H = rng.normal(size=(4, 6))
         reference.Q, reference.R, reference.P = 0.1 * np.eye(6), 0.5 * np.eye(4), 4.0 * np.eye(6)
         points, steps, xs, Ps = [], [], [], []
+
+        def mixture(x: FloatArray, P: FloatArray) -> Mixture:
+            state = chart.retracted(small * x[None])
+            S = small * np.linalg.cholesky(P)[None]
+            return Mixture(state, S, np.zeros(1), 6, ARRAY.centroid, ARRAY.circumradius)
+
         for i in range(n):
             prediction = None
             if i:
                 reference.predict()
-                x_predicted = reference.x.ravel().copy()
-                prediction = Prediction(x_predicted, np.linalg.cholesky(reference.P), reference.F)
+                prediction = mixture(reference.x.ravel(), reference.P)
             reference.update(rng.normal(size=4))
             x, P = reference.x.ravel().copy(), 0.5 * (reference.P + reference.P.T)
             xs.append(x)
             Ps.append(P)
-            steps.append(Step(i, prediction, x, np.linalg.cholesky(P)))
-            points.append(TrackPoint(float(i), x[:3], x[3:], P, status="tracked"))
+            steps.append(Step(i, mixture(x, P), prediction, reference.F if i else None))
+            points.append(TrackPoint(float(i), place[:3], place[3:], np.eye(6), status="tracked"))
         expected_x, expected_P, _, _ = reference.rts_smoother(np.array(xs)[..., None], np.array(Ps))
         for i, point in enumerate(smoothed(points, steps)):
-            assert point.position_m is not None
-            assert point.moment_Am2 is not None
-            np.testing.assert_allclose(
-                np.concatenate([point.position_m, point.moment_Am2]), expected_x[i].ravel(), rtol=1e-8, atol=1e-9
-            )
-            assert point.covariance is not None
-            np.testing.assert_allclose(point.covariance, expected_P[i], rtol=1e-8, atol=1e-9)
+            assert point.mixture is not None
+            found = chart.coordinates(point.mixture.x)[0] / small
+            np.testing.assert_allclose(found, expected_x[i].ravel(), atol=1e-3)
+            root = point.mixture.S[0] / small
+            np.testing.assert_allclose(root @ root.T, expected_P[i], rtol=1e-3, atol=1e-3)
 
     def test_goes_no_farther_than_a_track(self) -> None:
         """Every track is smoothed by itself: the last row of one stays as the filter had it."""

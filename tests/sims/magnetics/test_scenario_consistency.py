@@ -20,9 +20,11 @@ import numpy as np
 import pytest
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from magloc.chi_square import mean_bounds
+from magloc.kalman import block_update, normalised_innovation_squared, predict_square_root
 from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import consistency, nees_of
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
@@ -68,8 +70,7 @@ def track_statistics(simulation: Simulation, motion: MotionModel) -> dict[str, A
     for k, i in enumerate(np.linspace(0, len(rows) - 1, N_INSTANTS + 1).astype(int)[1:]):
         point = points[i]
         if point.position_m is not None and point.moment_Am2 is not None and point.covariance is not None:
-            estimate = np.concatenate([point.position_m, point.moment_Am2])
-            nees[k] = nees_of(tracker.measurements.of(rows[i]), estimate, point.covariance, source[i])[0]
+            nees[k] = nees_of(point, source[i], tracker.measurements.of(rows[i]))[0]
     used = [point for point in points if point.status == "tracked"]
     last = next((point for point in reversed(points) if point.covariance is not None), None)
     end = math.inf
@@ -201,17 +202,30 @@ def linear_filter(simulation: Simulation, _: None) -> dict[str, Any]:
     """
     readings, truth = simulation.readings, simulation.truth
     tracker = Tracker(simulation.array, REST)
-    rows = rows_of(readings)
-    measurements = [tracker.measurements.of(row) for row in rows]
     assert truth.moment_Am2 is not None
     source = np.concatenate([truth.position_m[-1], truth.moment_Am2[-1]])
-    hardly_known = np.diag(np.repeat([0.01, 0.1], 3)) ** 2  # of position and moment: a filtered start is from far less
-    found = tracker.filtered_start(
-        [measurements[0].without_errors(source)] * len(measurements), hardly_known, measurements
-    )
-    whitened = np.linalg.lstsq(found.S[:6], found.x[:6] - source)[0]
-    dof = sum(measurement.z.size for measurement in measurements) - source.size
-    return {"nees": whitened @ whitened, "nis": found.chi2, "nis_dof": dof}
+    motion, errors = tracker.moved, tracker.errors
+    state, root = motion.start(source, np.diag(np.repeat([100.0, 1000.0], 3)))  # hardly known
+    S = block_diag(root, np.diag(errors.sigma))
+    x, at_truth = np.zeros(len(S)), np.concatenate([state, np.zeros(errors.n_states)])
+    nis, dof, before_s = 0.0, -source.size, float(readings.time_s[0])
+    for row in rows_of(readings):
+        kept, added = errors.step(row.time_s - before_s)
+        _, of_motion, noise = motion.step(state, row.time_s - before_s)
+        before_s = row.time_s
+        F = block_diag(of_motion, np.diag(kept))
+        x, S = F @ x, predict_square_root(S, F, block_diag(noise, np.diag(added)))
+        measurement = tracker.measurements.of(row)
+        if not measurement.z.size:
+            continue
+        H, ones = measurement.jacobian(at_truth), np.ones(measurement.z.size)
+        # x is the offset from the truth.
+        left = measurement.z - measurement.of_source(source) - H @ x
+        nis += normalised_innovation_squared(S, H, left, ones)
+        dof += left.size
+        x, S = block_update(x, S, H, left, ones)
+    whitened = np.linalg.lstsq(S[:6], x[:6])[0]
+    return {"nees": whitened @ whitened, "nis": nis, "nis_dof": dof}
 
 
 class TestStatedErrors:
