@@ -4,6 +4,7 @@ from adcs import mockup as mockup
 from adcs.complementary.explicit import Gains as Gains
 from adcs.complementary.filters import complementary_filter as complementary_filter
 from adcs.complementary.filters import inertial_magnetic_filter as inertial_magnetic_filter
+from adcs.complementary.heading import HeadingModel as HeadingModel
 from adcs.ellipsoids.ellipsoid import Ellipsoid as Ellipsoid
 from adcs.ellipsoids.observer import BoundedSystem as BoundedSystem
 from adcs.ellipsoids.observer import EllipsoidObserver as EllipsoidObserver
@@ -12,6 +13,7 @@ from adcs.io.ccsds import read_aem as read_aem
 from adcs.io.ccsds import read_oem as read_oem
 from adcs.io.ccsds import write_aem as write_aem
 from adcs.io.ccsds import write_oem as write_oem
+from adcs.io.imu_files import read_imu as read_imu
 from adcs.io.scenario_files import read_scenario as read_scenario
 from adcs.io.telemetry_files import read_telemetry as read_telemetry
 from adcs.kalman.bank import EstimatorSettings as EstimatorSettings

@@ -64,7 +64,8 @@ EXPLAINED = {
     "exporting": "magloc.plots.save magloc.plots.write",
     "figures-and-viewer": "magloc.view magloc.plots.design",
     "gradient-tensor": "magloc.fit_gradient_tensor magloc.GradientTensor",
-    "inertial-unit": "adcs.complementary_filter adcs.inertial_magnetic_filter adcs.Gains",
+    "inertial-unit": "adcs.complementary_filter adcs.inertial_magnetic_filter adcs.read_imu"
+    " adcs.HeadingModel adcs.Gains",
     "iterated-kalman-filter": "magloc.IteratedExtendedKalmanFilter",
     "localization": "magloc.locate magloc.Locator magloc.Fixes magloc.Fix magloc.Solution magloc.Source"
     " magloc.SourcePrior magloc.plots.fixes",

@@ -52,6 +52,11 @@ for _name, _where, _help in (
         "adcs.cli.vectors:vectors",
         "Attitude of every row of telemetry from field and Sun alone, by TRIAD or QUEST.",
     ),
+    (
+        "imu",
+        "adcs.cli.imu:imu",
+        "Attitude of an inertial unit with a magnetometer, with iron and magnets near it or not.",
+    ),
     ("demo", "adcs.cli.demo:demo", "Estimate the attitude of a simulated satellite, and draw what comes out."),
     (
         "stars",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -12,20 +14,18 @@ from adcs import quaternion
 from adcs.complementary.adaptive import AdaptiveTuning, adaptive_track
 from adcs.complementary.explicit import BEST_GAINS, Gains, explicit_track
 from adcs.complementary.gauss_newton import gauss_newton_track
-from adcs.complementary.inertial_magnetic import (
-    InertialMagneticRecord,
-    inertial_magnetic_track,
-    prepare,
-    sensor_fixed_field,
-    undisturbed,
-)
+from adcs.complementary.heading import HeadingModel, heading_track, turned_to_north
+from adcs.complementary.inertial_magnetic import InertialMagneticRecord, prepare
 from adcs.complementary.names import MAGNETS, METHODS, Magnet, Method
 from adcs.satellite.attitude_track import AttitudeTrack
 from adcs.satellite.telemetry import is_read
 from adcs.satellite.vector_record import GyroSamples, VectorRecord, step_rates, steps_s
-from arrays.typing import FloatArray
+from arrays.typing import BoolArray, FloatArray
 
+LEFT_OUT, SUBTRACTED = "field left out", "magnet subtracted"
+"""What an inertial unit's field is where it is not the room's."""
 _NAMES = ("first vector", "second vector")
+_MAGNET = 5.0  # σ of the sensor's own offset: a larger one is a magnet's
 
 
 def complementary_filter(
@@ -123,13 +123,17 @@ def inertial_magnetic_filter(
     acceleration_m_s2: ArrayLike,
     field_T: ArrayLike,
     *,
-    magnet: Magnet = "rejected",
+    magnet: Magnet = "auto",
     gyro_samples: GyroSamples = "mean",
+    offline: bool = False,
+    model: HeadingModel = HeadingModel(),
 ) -> AttitudeTrack:
     """Attitude of an inertial unit with a magnetometer that is moved by hand, with magnets near it or not.
 
     The acceleration is smoothed in a frame that does not turn, the gyro's bias is that of rests, and the
-    magnetometer's lag is found. The field of the first second, which must be at rest, is north.
+    magnetometer's lag is found. The field of the first second, which must be at rest, is north. A Kalman filter of the
+    heading has as states what else changes a field: the gyro's scale and drift, the sensor's offset, and how the room's
+    field differs from that of the start.
 
     Parameters
     ----------
@@ -138,15 +142,22 @@ def inertial_magnetic_filter(
     gyro_rad_s, acceleration_m_s2, field_T : array_like, shape (n, 3)
         Body axes; at rest the acceleration is upwards. NaN where a sensor has no reading.
     magnet : str
-        Readings of an unusual length or dip are ``rejected``; or a field that moves with the sensor is ``subtracted``
-        as it is estimated beside the heading, for a magnet that comes or goes with it; or all are ``kept``.
+        A field that contradicts the filter is left out (``rejected``) or taken for a magnet that moves with the sensor
+        (``subtracted``); ``auto`` leaves it out until the turns that were made have shown that it moves with the
+        sensor, and subtracts it then. All readings are ``kept``, whatever they say.
     gyro_samples : str
         As of :func:`adcs.complementary_filter`.
+    offline : bool
+        Use the whole log for every instant (Rauch-Tung-Striebel), not only what was read up to it.
+    model : HeadingModel
+        Noise and limits of the heading's filter.
 
     Returns
     -------
     AttitudeTrack
-        East, north, up from body.
+        East, north, up from body. ``sigma["level"]`` (n, 3) is about east, north and up [rad]: the first two are those
+        of the tilt, the third that of the heading. ``degraded`` says where the field was left out, and where a magnet
+        was subtracted, ``warnings`` in which minutes nothing could tell the two apart.
 
     Raises
     ------
@@ -158,7 +169,7 @@ def inertial_magnetic_filter(
     >>> import adcs
     >>> imu = adcs.datasets.load("imu")
     >>> readings = imu.gyro_rad_s, imu.acceleration_m_s2, imu.field_T
-    >>> track = adcs.inertial_magnetic_filter(imu.time_s, *readings, magnet="subtracted")
+    >>> track = adcs.inertial_magnetic_filter(imu.time_s, *readings, gyro_samples="point")
     >>> bool((track.rotation.inv() * imu.truth).magnitude().max() < 0.1)
     True
     """
@@ -167,20 +178,53 @@ def inertial_magnetic_filter(
     times, rate, acceleration, field = (
         np.asarray(values, dtype=np.float64) for values in (time_s, gyro_rad_s, acceleration_m_s2, field_T)
     )
-    prepared = prepare(InertialMagneticRecord(times, rate, acceleration, field, gyro_samples))
-    used = prepared.field_T
-    if magnet == "subtracted":
-        used = used - sensor_fixed_field(prepared)
-    elif magnet == "rejected":
-        used = undisturbed(prepared)
+    prepared = prepare(InertialMagneticRecord(times, rate, acceleration, field, gyro_samples), model, offline=offline)
+    heading = heading_track(
+        times, prepared.rate_rad_s, prepared.q_level, prepared.field_T, _for(magnet, model), offline=offline
+    )
+    q = turned_to_north(prepared.q_level, heading.heading_rad)
+    of_tilt = prepared.tilt_sigma_rad / math.sqrt(2.0)
+    changed = heading.changes.size > 0
+    subtracted = changed & (np.linalg.norm(heading.offset_T, axis=1) > _MAGNET * model.offset_T)
     return AttitudeTrack(
-        title=f"inertial and magnetic filter, magnet {magnet}",
+        title=f"inertial and magnetic filter, magnet {magnet}{', offline' if offline else ''}",
         time_s=times,
         rows=np.arange(len(times)),
-        q=inertial_magnetic_track(prepared, used),
+        q=q,
         states={"rate": prepared.rate_rad_s, "gyro-bias": prepared.bias_rad_s},
         used=("accelerometer", "magnetometer"),
-        seen={"accelerometer": is_read(acceleration), "magnetometer": is_read(used)},
+        seen={"accelerometer": is_read(acceleration), "magnetometer": is_read(field) & ~heading.left_out},
+        sigma={
+            "attitude": _body_sigma(q, of_tilt, heading.sigma_rad),
+            "level": np.stack([of_tilt, of_tilt, heading.sigma_rad], axis=-1),
+        },
+        warnings=_minutes(times, heading.left_out),
+        degraded={LEFT_OUT: heading.left_out, SUBTRACTED: subtracted},
+    )
+
+
+def _for(magnet: Magnet, model: HeadingModel) -> HeadingModel:
+    """The model with the limits that a way to treat a magnet has."""
+    if magnet == "auto":
+        return model
+    if magnet == "kept":
+        return replace(model, gate=math.inf, mean_nis=math.inf)
+    return replace(model, evidence=math.inf if magnet == "rejected" else -math.inf)
+
+
+def _body_sigma(q: FloatArray, of_tilt: FloatArray, of_heading: FloatArray) -> FloatArray:
+    """Standard deviations (n, 3) about the body's axes."""
+    up = quaternion.rotate_back(q, [0.0, 0.0, 1.0])
+    return np.sqrt(of_tilt[:, None] ** 2 * (1.0 - up**2) + of_heading[:, None] ** 2 * up**2)
+
+
+def _minutes(time_s: FloatArray, left_out: BoolArray) -> tuple[str, ...]:
+    """One sentence for each minute in which the gyro alone held the heading for a second or more."""
+    minute = ((time_s - time_s[0]) // 60.0).astype(np.intp)
+    seconds = np.bincount(minute, weights=np.where(left_out, steps_s(time_s), 0.0))
+    return tuple(
+        f"minute {i + 1}: the field was left out for {seconds[i]:.0f} s, the gyro alone held the heading"
+        for i in np.flatnonzero(seconds >= 1.0)
     )
 
 

@@ -1,4 +1,4 @@
-"""The same filter on Earth: gyro, accelerometer and magnetometer, a drop-in for the field, the Sun and the gyro.
+"""Gyro, accelerometer and magnetometer on Earth: what is level, before the heading is asked for.
 
 See docs/theory/complementary-filters.md. Source of the low-pass: D. Laidig, T. Seel, VQF, Information Fusion 91, 2023.
 """
@@ -13,19 +13,21 @@ from numpy.typing import NDArray
 
 from adcs import quaternion
 from adcs.complementary.explicit import Gains, explicit_track
-from adcs.satellite.vector_record import GyroSamples, VectorRecord, step_rates, steps_s
+from adcs.complementary.heading import HeadingModel
+from adcs.satellite.vector_record import GAP_STEPS, GyroSamples, VectorRecord, step_rates, steps_s
 from arrays.typing import BoolArray, FloatArray
 
 GRAVITY_TIME_S = 3.0
 """Time constant of the low-pass of the acceleration, as published for VQF."""
-HEADING_TIME_S = 5.0
-"""Time constant with which the heading follows the field."""
+_TILT_FLOOR_RAD = math.radians(0.4)
+_TURN_S = 0.5  # for how long a hand turns one way
 _UP_STEP = 0.15  # part of the tilt's error that a step corrects: the direction up is smooth already
 _REST_S = 1.5
 _REST_RATE_RAD_S = math.radians(0.5)
 _REST_ACCELERATION_M_S2 = 0.15
 _LAG_WINDOW_S = 0.2
 _LONGEST_LAG_S = 0.04
+_USUAL_LENGTH = 0.1  # relative difference of a field's length
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +132,7 @@ class Prepared:
     field_T: FloatArray  # (n, 3): turned by the gyro to where it would be without the magnetometer's lag
     q_level: FloatArray
     lag_s: float  # of the magnetometer behind the gyro
+    tilt_sigma_rad: FloatArray  # (n,): of the angle between up and its estimate
 
     @property
     def starting(self) -> BoolArray:
@@ -137,123 +140,35 @@ class Prepared:
         return self.time_s < self.time_s[0] + 1.0
 
 
-def prepare(record: InertialMagneticRecord) -> Prepared:
+def prepare(record: InertialMagneticRecord, model: HeadingModel = HeadingModel(), *, offline: bool = False) -> Prepared:
     """Remove bias, lag and motion from a record; see :class:`Prepared`.
 
-    Everything but the lag, for which the whole record is used, is what can be known at the time.
+    Everything but the lag, for which the whole record is used, is what can be known at the time, or, offline, what the
+    whole record tells.
     """
     bias = rest_bias(record)
     rate = step_rates(record.rate_rad_s - bias, record.dt_s, record.gyro_samples)
     missing = np.full_like(rate, np.nan)
     gyro_alone = _vector_record(record.time_s, rate, missing, missing)
     q_gyro = explicit_track(gyro_alone, Gains(0.0, 0.0)).q[0]
-    up = _up(q_gyro, record)
+    up = _up(q_gyro, record, offline)
     lag = _lag_s(q_gyro, record)
     field_T = _without_lag(q_gyro, record.time_s, record.field_T, lag)
     vectors = _vector_record(record.time_s, rate, missing, up)
-    q_level = explicit_track(vectors, _gains(vectors), q_start=_attitude(up[0], _across(up[0]))).q[0]
-    return Prepared(record.time_s, rate, bias, up, field_T, q_level, lag)
+    gains = Gains(1.0, 0.0, second_weight=_UP_STEP / vectors.usual_dt_s)
+    q_level = explicit_track(vectors, gains, q_start=_attitude(up[0], _across(up[0]))).q[0]
+    return Prepared(record.time_s, rate, bias, up, field_T, q_level, lag, _tilt_sigma_rad(record, rate, model))
 
 
-def inertial_magnetic_track(prepared: Prepared, field_T: FloatArray) -> FloatArray:
-    """Attitude by the explicit filter.
+def _tilt_sigma_rad(record: InertialMagneticRecord, rate: FloatArray, model: HeadingModel) -> FloatArray:
+    """What an accelerometer at rest leaves, and what the gyro's scale makes of turns while the low-pass is behind."""
+    from adcs.complementary.inertial_magnetic_compiled import low_pass
 
-    ``field_T`` (n, 3): ``prepared.field_T``, or what is left of it, NaN where it is not used. Returns (n, 4): east,
-    north, up from body.
-    """
-    horizontal = field_T - np.sum(field_T * prepared.up, axis=1, keepdims=True) * prepared.up
-    first = horizontal[prepared.starting]
-    first = first[np.isfinite(first).all(axis=1)]
-    if len(first) == 0:
-        raise ValueError("Input field_T must be there within the first second; instead received none.")
-    vectors = _vector_record(prepared.time_s, prepared.rate_rad_s, horizontal, prepared.up)
-    return explicit_track(vectors, _gains(vectors), q_start=_attitude(prepared.up[0], first.mean(axis=0))).q[0]
-
-
-def undisturbed(prepared: Prepared, *, length: float = 0.1, dip_rad: float = math.radians(5.0)) -> FloatArray:
-    """Field, NaN where its length or dip is not that of the first second: the usual rejection.
-
-    ``length``: largest relative difference. ``dip_rad``: largest difference. Returns (n, 3) [T].
-    """
-    lengths = np.linalg.norm(prepared.field_T, axis=1)
-    dips = np.arcsin(np.clip(np.sum(prepared.field_T * prepared.up, axis=1) / lengths, -1.0, 1.0))
-    usual, usual_dip = np.nanmedian(lengths[prepared.starting]), np.nanmedian(dips[prepared.starting])
-    good = (np.abs(lengths - usual) < length * usual) & (np.abs(dips - usual_dip) < dip_rad)
-    return np.where(good[:, None], prepared.field_T, np.nan)
-
-
-@dataclass(frozen=True)
-class MagnetTuning:
-    """What :func:`sensor_fixed_field` assumes.
-
-    ``memory``, ``threshold``: smoothed squared innovation for each axis (1 on average) above which the offset is taken
-    to change. ``start_heading_rad``, ``heading_rate_rad_s``: standard deviations of the heading at the start and of its
-    drift.
-    """
-
-    block: int = 10  # readings that are averaged before they are used
-    sigma_T: float = 1e-6  # of a block, mostly what is left of lag and calibration
-    start_T: float = 0.5e-6  # standard deviation of the sensor's own offset at the start
-    walk_T: float = 0.02e-6  # growth of the offset's standard deviation in one second
-    memory: float = 0.7
-    threshold: float = 5.0
-    growth_T: float = 1.8e-6  # by which the offset's standard deviation then grows in a block
-    start_heading_rad: float = 0.01
-    heading_rate_rad_s: float = math.radians(0.05)
-
-
-def sensor_fixed_field(prepared: Prepared, tuning: MagnetTuning = MagnetTuning()) -> FloatArray:
-    r"""Field of what moves with the sensor, a magnet or its own offset, by a Kalman filter beside the heading.
-
-    The state is (heading ψ of the level frame, its drift, offset o), and a block of readings, turned to the level
-    frame, is :math:`f(\psi) + R\,o`, f the field of the first second turned by ψ. A magnet that comes or goes makes the
-    innovations grow, and then the covariance of the offset: the heading is kept by the gyro until both are known.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        Body axes [T]; constant within blocks, zero before the end of the first.
-    """
-    size = tuning.block
-    rows = np.flatnonzero(np.isfinite(prepared.field_T).all(axis=1))
-    count = len(rows) // size
-    of_block = rows[: count * size].reshape(count, size)
-    level = quaternion.rotate(prepared.q_level[rows], prepared.field_T[rows])
-    blocks = level[: count * size].reshape(count, size, 3).mean(axis=1)
-    R_level = quaternion.matrix(prepared.q_level[of_block[:, size // 2]])
-    start = level[prepared.starting[rows]].mean(axis=0)
-    horizontal = math.hypot(start[0], start[1])
-    ends_s = prepared.time_s[of_block[:, -1]]
-    steps = np.diff(ends_s, prepend=prepared.time_s[0])
-    x = np.array([math.atan2(-start[0], start[1]), 0.0, 0.0, 0.0, 0.0])
-    start_sigmas = [tuning.start_heading_rad, tuning.heading_rate_rad_s, *[tuning.start_T] * 3]
-    P = np.diag(np.square(start_sigmas))
-    F = np.eye(5)
-    R = tuning.sigma_T**2 * np.eye(3)
-    H = np.zeros((3, 5))
-    offsets, smoothed = np.zeros((count + 1, 3)), 1.0
-    for i, h in enumerate(steps):
-        F[0, 1] = h
-        Q = np.diag([1e-10, 1e-10 * h, *[tuning.walk_T**2 * h] * 3])
-        x, P = F @ x, F @ P @ F.T + Q
-        c, s = math.cos(x[0]), math.sin(x[0])
-        H[:, 0] = -horizontal * c, -horizontal * s, 0.0
-        H[:, 2:] = R_level[i]
-        nu = blocks[i] - np.array([-horizontal * s, horizontal * c, start[2]]) - R_level[i] @ x[2:]
-        S = H @ P @ H.T + R
-        smoothed = tuning.memory * smoothed + (1.0 - tuning.memory) * float(nu @ np.linalg.solve(S, nu)) / 3.0
-        if smoothed > tuning.threshold:
-            P[2:, 2:] += tuning.growth_T**2 * np.eye(3)
-            S = H @ P @ H.T + R
-        K = np.linalg.solve(S, H @ P).T
-        x, P = x + K @ nu, P - K @ S @ K.T
-        P = 0.5 * (P + P.T)
-        offsets[i + 1] = x[2:]
-    return offsets[np.searchsorted(ends_s, prepared.time_s, side="right")]
-
-
-def _gains(vectors: VectorRecord) -> Gains:
-    return Gains(1.0 / HEADING_TIME_S, 0.0, second_weight=_UP_STEP * HEADING_TIME_S / vectors.usual_dt_s)
+    dt_s = record.dt_s
+    gap_rad_s = model.gap_rad_s * np.where(dt_s > GAP_STEPS * np.median(dt_s), dt_s, 0.0) / _TURN_S
+    squares = (model.gyro_scale * rate) ** 2 + gap_rad_s[:, None] ** 2 / 3.0
+    smooth = low_pass(squares, dt_s, GRAVITY_TIME_S, squares[0]).sum(axis=1)
+    return np.sqrt(_TILT_FLOOR_RAD**2 + _TURN_S**2 * np.maximum(smooth, 0.0))
 
 
 def _vector_record(time_s: FloatArray, rate: FloatArray, first: FloatArray, up: FloatArray) -> VectorRecord:
@@ -261,28 +176,40 @@ def _vector_record(time_s: FloatArray, rate: FloatArray, first: FloatArray, up: 
     return VectorRecord(steps_s(time_s), rate, first, up, north, zenith, np.zeros_like(rate))
 
 
-def _up(q_gyro: FloatArray, record: InertialMagneticRecord) -> FloatArray:
+def _up(q_gyro: FloatArray, record: InertialMagneticRecord, offline: bool) -> FloatArray:
+    """Upward unit vectors (n, 3) in body axes; offline the mean of a low-pass from either end, which is not late."""
     from adcs.complementary.inertial_magnetic_compiled import low_pass
 
     steady = quaternion.rotate(q_gyro, record.acceleration_m_s2)
-    start = np.nanmean(steady[record.starting], axis=0)
-    smooth = low_pass(steady, record.dt_s, GRAVITY_TIME_S, start)
+    smooth = low_pass(steady, record.dt_s, GRAVITY_TIME_S, np.nanmean(steady[record.starting], axis=0))
+    if offline:
+        seen = steady[np.isfinite(steady).all(axis=1)]
+        end = seen[-np.count_nonzero(record.starting) :].mean(axis=0)
+        steps = np.concatenate([record.dt_s[:1], record.dt_s[:0:-1]])
+        smooth = 0.5 * (smooth + low_pass(steady[::-1], steps, GRAVITY_TIME_S, end)[::-1])
     up = quaternion.rotate_back(q_gyro, smooth)
     return up / np.linalg.norm(up, axis=1, keepdims=True)
 
 
 def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
-    """Lag at which the field changes least within a fifth of a second, seen from a frame that does not turn."""
+    """Lag at which the field changes least within a fifth of a second, seen from a frame that does not turn.
+
+    Readings whose length is not that of the first second are left out: a magnet on the sensor turns with it.
+    """
     from adcs.complementary.inertial_magnetic_compiled import without_turns
 
-    rows = np.flatnonzero(np.isfinite(record.field_T).all(axis=1))
+    lengths = np.linalg.norm(record.field_T, axis=1)
+    usual = np.nanmedian(lengths[record.starting])
+    rows = np.flatnonzero(np.isfinite(lengths))
     step = float(np.median(record.dt_s))
     apart = max(1, round(_LAG_WINDOW_S / float(np.median(np.diff(record.time_s[rows])))))
+    good = np.abs(lengths[rows] - usual) < _USUAL_LENGTH * usual
+    pairs = np.flatnonzero(good[apart:] & good[:-apart])
     most = round(_LONGEST_LAG_S / step)
     changes = []
     for lag in range(most + 1):
         field_T = without_turns(q_gyro, record.time_s, rows, record.field_T, lag * step)
-        changes.append(float(np.mean((field_T[apart:] - field_T[:-apart]) ** 2)))
+        changes.append(float(np.sum((field_T[pairs + apart] - field_T[pairs]) ** 2)))
     least = int(np.argmin(changes))
     if not 0 < least < most:
         return least * step

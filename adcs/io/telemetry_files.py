@@ -21,6 +21,7 @@ columns                                    meaning
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from os import PathLike
 
 import numpy as np
@@ -70,13 +71,27 @@ def read_telemetry(
         check_keys(f"{path}, line {table.header_line}", dict.fromkeys(table.header), known, "column")
         layout = LogLayout(_UNUSED, TIME, "seconds", {k: v for k, v in STANDARD.items() if table.has_group(v.columns)})
     else:
-        names = [layout.time, *(name for one in layout.columns.values() for name in one.columns)]
-        table = read_table(path, expected, only=names, instants=[layout.time] if layout.time_format == "utc" else [])
-        for name in names:
-            table.require(name, names)
+        table = read_named(path, expected, layout)
+    time_s, columns = columns_of(table, layout)
+    _refuse_many(table, layout.time, time_s, step_s)
+    with naming(str(path)):
+        return Telemetry(time_s, **columns, step_s=step_s)
+
+
+def read_named(path: str | PathLike[str], expected: str, layout: LogLayout, more: Sequence[str] = ()) -> Table:
+    """Table of the columns that a layout names, and of some more."""
+    names = [layout.time, *(name for one in layout.columns.values() for name in one.columns), *more]
+    table = read_table(path, expected, only=names, instants=[layout.time] if layout.time_format == "utc" else [])
+    for name in names:
+        table.require(name, names)
+    return table
+
+
+def columns_of(table: Table, layout: LogLayout) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Ascending times (n,), and readings by the names of a layout, in SI and body axes, NaN where missing."""
     table.require(layout.time, [layout.time])
     time_s = layout.seconds(table.complete([layout.time])[:, 0])
-    _refuse_times(table, layout.time, time_s, step_s)
+    table.refuse_back(layout.time, np.diff(time_s) <= 0.0, "times that ascend", "{:.15g} s")
     columns = {}
     for name, group in layout.columns.items():
         values = table.finite_or_missing(group.columns)
@@ -84,13 +99,11 @@ def read_telemetry(
             none = (values == 0.0).all(axis=1)[:, None]
             table.refuse(none, group.columns[:1], "found a reading of length 0, expected one with a direction")
         columns[name] = group.of(values)
-    with naming(str(path)):
-        return Telemetry(time_s, **columns, step_s=step_s)
+    return time_s, columns
 
 
-def _refuse_times(table: Table, column: str, time_s: FloatArray, step_s: float | None) -> None:
-    """Refuse times that are no instants, with their place."""
-    table.refuse_back(column, np.diff(time_s) <= 0.0, "times that ascend", "{:.15g} s")
+def _refuse_many(table: Table, column: str, time_s: FloatArray, step_s: float | None) -> None:
+    """Refuse more instants than a filter can hold."""
     steps = steps_within(time_s, step_s or usual_step_s(time_s))
     if steps >= MOST_INSTANTS:
         raise InputError(

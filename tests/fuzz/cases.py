@@ -11,6 +11,7 @@ import numpy as np
 from cyclopts import App
 from scipy.spatial.transform import Rotation
 
+import adcs
 import arrays
 from adcs.cli.app import app as adcs_app
 from adcs.cli.app import main as adcs_main
@@ -92,6 +93,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "telemetry.csv --config scenario.toml --method triad --out out",
     ),
     "adcs loads": ("loads.csv --array loads.toml --json --out out.csv",),
+    "adcs imu": ("imu.csv --config imu.toml --json", "imu.csv --offline --out out"),
     "adcs calibrate": ("telemetry.csv --config scenario.toml --json --out out.csv",),
     "adcs stars": ("frames --catalogue stars.csv --json",),
 }  # fmt: skip
@@ -107,6 +109,15 @@ SELDOM = {
 STREAM = "readings.csv"  # what stands on stdin where a line reads from there
 
 _FILES = {
+    "imu.toml": """format_version = 1
+[log]
+[log.gyro]
+columns = ["gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s"]
+unit = "rad/s"
+samples = "point"
+[log.accelerometer]
+[log.magnetometer]
+""",
     "simulate.toml": """format_version = 1
 duration_s = 11.0
 rate_Hz = 1.0
@@ -270,6 +281,8 @@ def write_files(folder: Path) -> None:
         shutil.rmtree(folder / made)
     with (folder / "track.json").open("w") as file, redirect_stdout(file):
         run("magloc", "track readings.csv --array array.toml --json")
+    rows = Path(adcs.datasets.load("imu").path).read_text(encoding="utf-8").splitlines()
+    (folder / "imu.csv").write_text("\n".join(rows[:101]), encoding="utf-8")
     _write_scalars(folder)
     flight = switching_loads(seed=0, duration_s=150.0)
     write_columns(flight.columns, folder / "loads.csv")

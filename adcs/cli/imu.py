@@ -1,0 +1,91 @@
+"""``adcs imu``: attitude from a log of gyro, accelerometer and magnetometer."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+import adcs
+from adcs.cli.options import print_note
+from adcs.complementary.names import Magnet
+from arrays.io.arguments import Flag
+from arrays.io.errors import naming
+from arrays.io.outputs import make_folder, refuse_file
+from magloc.cli.framework import QuietOptions, print_json
+
+_MAGNETS: dict[str, Magnet] = {"auto": "auto", "plain": "kept", "reject": "rejected", "subtract": "subtracted"}
+
+
+def imu(
+    log: Path,
+    /,
+    *,
+    config: Path | None = None,
+    method: Literal["auto", "plain", "reject", "subtract"] = "auto",
+    offline: Flag = False,
+    out: Path | None = None,
+    json: Flag = False,
+    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Attitude of an inertial unit with a magnetometer, with iron and magnets near it or not.
+
+    The first second must be at rest, and its field is north. After D. Laidig and T. Seel (VQF, Information Fusion 91,
+    2023), with a Kalman filter of the heading that knows what else changes a field.
+
+    Parameters
+    ----------
+    log : Path
+        CSV file: time_s, gyro_x_rad_s or gyro_x_deg_s, acceleration_x_m_s2, field_x_nT with y and z, and if known the
+        truth qw, qx, qy, qz (east, north, up from body) and moving (1 where errors count). Empty cells are missing
+        readings. Or a MAT file of the BROAD benchmark.
+    config : Path, optional
+        TOML file whose table log names other columns, units and mountings.
+    method : str
+        What is done with a field that contradicts the filter: it is left out until the turns that were made show that
+        it moves with the sensor, and subtracted then ("auto"), left out ("reject"), always taken for a magnet that
+        moves with the sensor ("subtract"), or used as it is ("plain").
+    offline : bool
+        Use the whole log for every row.
+    out : Path, optional
+        Folder for attitude.csv and attitude.png.
+    json : bool
+        Print one JSON object.
+    common : QuietOptions
+        Common options.
+    """
+    from adcs.io.imu_results import attitude_columns, imu_summary, summary_words
+
+    if out is not None:
+        refuse_file(out, "--out")
+    data = adcs.read_imu(log, config)
+    record = data.record
+    began = time.perf_counter()
+    with naming(str(log)):
+        track = adcs.inertial_magnetic_filter(
+            record.time_s,
+            record.rate_rad_s,
+            record.acceleration_m_s2,
+            record.field_T,
+            magnet=_MAGNETS[method],
+            gyro_samples=record.gyro_samples,
+            offline=offline,
+        )
+    summary: dict[str, Any] = {**imu_summary(track, data), "seconds": time.perf_counter() - began}
+    if not common.quiet:
+        for text in track.warnings:
+            print_note(f"warning: {text}")
+    if out is not None:
+        from adcs.plots.inertial import inertial_figure
+        from arrays.io.csv import write_columns
+        from magloc.plots import style
+
+        make_folder(out, "--out")
+        write_columns(attitude_columns(track), out / "attitude.csv")
+        style.save(inertial_figure(track, log.stem, data.q_true), out / "attitude.png")
+        if not common.quiet:
+            print_note(f"wrote attitude.csv and attitude.png into {out}")
+    if json:
+        print_json(summary)
+    else:
+        print("\n".join(summary_words(summary)))

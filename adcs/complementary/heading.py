@@ -1,0 +1,217 @@
+"""Heading from gyro and magnetometer: a Kalman filter that knows what else changes a field, and how much it may.
+
+A field differs from that of the start because the sensor has turned, because it has come to another place, or because
+something moves with it. The first is a turn, the second a vector in the room, the third one in the sensor's axes. Which
+it was shows in the turns that were made, and only there: where they do not tell, the covariance says so.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from adcs import quaternion
+from adcs.satellite.vector_record import GAP_STEPS, steps_s
+from arrays.typing import BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from adcs.complementary.heading_compiled import Blocks
+
+_BLOCK_S = 0.035
+"""How long readings are averaged: within it a hand turns by a few degrees."""
+_START_S = 1.0
+
+
+@dataclass(frozen=True)
+class HeadingModel:
+    """What the filter takes for granted, one standard deviation each.
+
+    Attributes
+    ----------
+    noise_T : float
+        Of a reading, or of the mean of those within 35 ms, with what is left of lag and calibration, each axis.
+    offset_T, offset_T_rts : float
+        Of the sensor's own offset at the start, each axis, and by how much that grows in the root of a second.
+    room_T, room_s : float
+        Of the field's difference between places a reach apart, each axis, and for how long a hand stays near one.
+    local_T, local_s : float
+        The same between places that a hand passes at once, with the vertical field that an error of the tilt turns
+        into a horizontal one; half of it upwards.
+    gyro_drift_rad_s, gyro_drift_s : float
+        Of the bias that turning adds to that at rest, and how long it lasts.
+    gyro_scale : float
+        Of each axis' gain.
+    gyro_walk_rad_rts : float
+        Growth of the heading's deviation.
+    start_rad : float
+        Of the heading at the start.
+    turning_rad_s : float
+        The rate from which on the sensor counts as moved: while it lies still, neither place nor drift changes.
+    gap_rad_s : float
+        Of the rate within a gap of the gyro.
+    jump_T : float
+        Of the field of a magnet, each axis.
+    gate, mean_nis, memory : float
+        Limits of the normalised innovation squared of a reading and, each axis, of the mean of the last ones.
+    patience_s, trial_s : float
+        How long readings contradict before a change of the offset is tried, and for how long it is.
+    evidence : float
+        Logarithm of the odds of a changed offset, against a changed room, from which on it is believed.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> adcs.HeadingModel(gyro_scale=0.01).gyro_scale
+    0.01
+    """
+
+    noise_T: float = 1e-6
+    offset_T: float = 0.3e-6
+    offset_T_rts: float = 0.02e-6
+    room_T: float = 0.4e-6
+    room_s: float = 40.0
+    local_T: float = 2e-6
+    local_s: float = 0.3
+    gyro_drift_rad_s: float = 0.0007
+    gyro_drift_s: float = 20.0
+    gyro_scale: float = 0.005
+    gyro_walk_rad_rts: float = 0.0003
+    start_rad: float = 0.02
+    turning_rad_s: float = math.radians(3.0)
+    gap_rad_s: float = 0.1
+    jump_T: float = 20e-6
+    gate: float = 25.0
+    mean_nis: float = 2.0
+    memory: float = 0.9
+    patience_s: float = 0.35
+    trial_s: float = 10.0
+    evidence: float = 10.0
+
+    def deviations(self) -> FloatArray:
+        """Of the state at the start (14,): nothing is known of the room but that its field there points north."""
+        return np.array(
+            [
+                self.start_rad,
+                self.gyro_drift_rad_s,
+                *[self.gyro_scale] * 3,
+                *[self.offset_T] * 3,
+                0.1 * self.offset_T,
+                *[self.offset_T] * 2,
+                *[self.local_T] * 2,
+                0.5 * self.local_T,
+            ]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class HeadingTrack:
+    """Heading at n instants, and what the magnetometer told of it."""
+
+    heading_rad: FloatArray  # (n,): turn about the vertical from east and north to the axes of the level frame
+    sigma_rad: FloatArray  # (n,)
+    offset_T: FloatArray  # (n, 3): of the sensor, body axes
+    offset_sigma_T: FloatArray  # (n, 3)
+    left_out: BoolArray  # (n,): where the field contradicted all of this
+    changes: NDArray[np.intp]  # instants from which on the offset is another one
+
+
+def heading_track(
+    time_s: FloatArray,
+    rate_rad_s: FloatArray,
+    q_level: FloatArray,
+    field_T: FloatArray,
+    model: HeadingModel = HeadingModel(),
+    *,
+    offline: bool = False,
+) -> HeadingTrack:
+    """Filter, or smoother, of the field in the level frame.
+
+    ``rate_rad_s`` (n, 3): mean over the step that ends at each instant. ``q_level`` (n, 4): level from body, of gyro
+    and accelerometer alone. ``field_T`` (n, 3): NaN where there is no reading. Raises ValueError: there is no reading
+    within the first second.
+    """
+    from adcs.complementary.heading_compiled import Noise, Tests, run, smooth
+
+    blocks, ends = _blocks(time_s, rate_rad_s, q_level, field_T, model)
+    start = blocks.start_T
+    x = np.zeros(14)
+    x[0] = math.atan2(-start[0], start[1])
+    blocks = blocks._replace(start_T=np.array([0.0, math.hypot(start[0], start[1]), start[2]]))
+    P = np.diag(model.deviations() ** 2)
+    m = len(ends)
+    xs, Ps, used, known = np.empty((m, 14)), np.empty((m, 14, 14)), np.zeros(m, np.int64), np.zeros(m, np.int64)
+    noise = Noise(
+        model.noise_T,
+        model.gyro_walk_rad_rts,
+        model.gyro_drift_rad_s,
+        model.gyro_drift_s,
+        model.offset_T_rts,
+        model.room_T,
+        model.room_s,
+        model.local_T,
+        0.5 * model.local_T,
+        model.local_s,
+        model.gap_rad_s,
+    )
+    anywhere = noise._replace(room_T=model.jump_T, room_s=model.local_s)
+    tests = Tests(
+        model.gate, model.mean_nis, model.memory, model.patience_s, model.jump_T, model.evidence, model.trial_s
+    )
+    run(x, P, blocks, noise, anywhere, tests, xs, Ps, used, known)
+    if offline:
+        smooth(x, P, blocks, noise, model.jump_T, known, xs, Ps)
+        used = known
+    # A block is known at its end; before the first one there is the start.
+    last = np.searchsorted(ends, np.arange(len(time_s)), side="left" if offline else "right") - (not offline)
+    last = np.clip(last, 0, m - 1)
+    deviations = np.sqrt(np.diagonal(Ps, axis1=1, axis2=2))[last]
+    return HeadingTrack(
+        heading_rad=xs[last, 0],
+        sigma_rad=deviations[:, 0],
+        offset_T=xs[last, 5:8],
+        offset_sigma_T=deviations[:, 5:8],
+        left_out=used[last] == 0,
+        changes=ends[known == 2],
+    )
+
+
+def _blocks(
+    time_s: FloatArray, rate_rad_s: FloatArray, q_level: FloatArray, field_T: FloatArray, model: HeadingModel
+) -> tuple[Blocks, NDArray[np.intp]]:
+    """Means over short times, and the instants (m,) that end them; ``start_T`` is in the level frame still."""
+    from adcs.complementary.heading_compiled import Blocks
+
+    rows = np.flatnonzero(np.isfinite(field_T).all(axis=1))
+    level = quaternion.rotate(q_level[rows], field_T[rows])
+    starting = time_s[rows] < time_s[0] + _START_S
+    if not starting.any():
+        raise ValueError("Input field_T must be there within the first second; instead received none.")
+    size = max(1, round(_BLOCK_S / float(np.median(np.diff(time_s[rows])))))
+    of_block = rows[: len(rows) // size * size].reshape(-1, size)
+    ends = of_block[:, -1]
+    dt_s = steps_s(time_s)
+    gap_s = np.cumsum(np.where(dt_s > GAP_STEPS * np.median(dt_s), dt_s, 0.0))
+    turned = np.cumsum(rate_rad_s * dt_s[:, None], axis=0)
+    steps = np.diff(time_s[ends], prepend=time_s[0] - dt_s[0])
+    rates = np.diff(turned[ends], axis=0, prepend=0.0) / steps[:, None]
+    blocks = Blocks(
+        field_T=level[: of_block.size].reshape(-1, size, 3).mean(axis=1),
+        R_level=np.ascontiguousarray(quaternion.matrix(q_level[of_block[:, size // 2]])),
+        rate_rad_s=rates,
+        dt_s=steps,
+        gap_s=np.diff(gap_s[ends], prepend=0.0),
+        turns=(np.linalg.norm(rates, axis=1) > model.turning_rad_s).astype(np.float64),
+        start_T=level[starting].mean(axis=0),
+    )
+    return blocks, ends
+
+
+def turned_to_north(q_level: FloatArray, heading_rad: FloatArray) -> FloatArray:
+    """East, north, up from body: the level attitude (n, 4) turned back by the heading (n,)."""
+    zero = np.zeros_like(heading_rad)
+    half = -0.5 * heading_rad
+    return quaternion.multiply(np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1), q_level)

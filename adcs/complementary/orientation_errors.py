@@ -1,0 +1,41 @@
+"""Errors of an attitude on Earth, as the BROAD benchmark defines them.
+
+Source: D. Laidig, M. Caruso, A. Cereatti, T. Seel, BROAD - A Benchmark for Robust Inertial Orientation Estimation,
+Data 6(7), 2021.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from adcs import quaternion
+from arrays.typing import BoolArray, FloatArray
+
+
+@dataclass(frozen=True)
+class OrientationErrors:
+    """Root mean squares of an attitude's errors [rad]."""
+
+    total: float
+    heading: float
+    inclination: float
+
+
+def error_angles(q: FloatArray, q_true: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Angle of the error, its part around the vertical, and the rest: (n,) each [rad]; NaN where the truth is unknown.
+
+    ``q``, ``q_true`` (n, 4): east, north, up from body.
+    """
+    error = quaternion.multiply(q, quaternion.conjugate(quaternion.normalised(q_true)))
+    w, x, y, z = np.abs(error).T
+    total = 2.0 * np.arctan2(np.sqrt(x * x + y * y + z * z), w)
+    return total, 2.0 * np.arctan2(z, w), 2.0 * np.arctan2(np.hypot(x, y), np.hypot(w, z))
+
+
+def orientation_errors(q: FloatArray, q_true: FloatArray, counted: BoolArray) -> OrientationErrors:
+    """Root mean squares of :func:`error_angles` where they are counted (n,) and the truth is known."""
+    known = counted & np.isfinite(q_true).all(axis=1)
+    angles = error_angles(q[known], q_true[known])
+    return OrientationErrors(*(float(np.sqrt(np.mean(angle**2))) for angle in angles))

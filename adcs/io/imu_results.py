@@ -1,0 +1,59 @@
+"""What is written and printed of an inertial unit's attitude."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from adcs.complementary.filters import LEFT_OUT, SUBTRACTED
+from adcs.complementary.orientation_errors import orientation_errors
+from adcs.io.imu_files import ImuLog
+from adcs.satellite.attitude_track import AttitudeTrack
+
+
+def attitude_columns(track: AttitudeTrack) -> dict[str, Any]:
+    """Columns (n,) of attitude.csv: east, north, up from body.
+
+    ``sigma_tilt_deg`` is that of the angle between up and its estimate, ``sigma_heading_deg`` that of the angle about
+    the vertical.
+    """
+    east, north, up = np.degrees(track.sigma["level"]).T
+    return {
+        "time_s": track.time_s,
+        **dict(zip(("qw", "qx", "qy", "qz"), track.q.T, strict=True)),
+        "sigma_tilt_deg": np.hypot(east, north),
+        "sigma_heading_deg": up,
+        "disturbed": track.degraded[LEFT_OUT] | track.degraded[SUBTRACTED],
+    }
+
+
+def imu_summary(track: AttitudeTrack, log: ImuLog) -> dict[str, Any]:
+    """Totals of a track, and its errors where the log has a truth."""
+    left_out, subtracted = track.degraded[LEFT_OUT], track.degraded[SUBTRACTED]
+    flags = {"field-left-out": left_out, "magnet-subtracted": subtracted}
+    summary: dict[str, Any] = {
+        "rows": len(track),
+        "method": "subtract" if subtracted.any() else "reject" if left_out.any() else "plain",
+        "disturbed_fraction": float((left_out | subtracted).mean()),
+        "flags": [name for name, there in flags.items() if there.any()],
+    }
+    if log.q_true is not None and (log.moving & np.isfinite(log.q_true).all(axis=1)).any():
+        errors = orientation_errors(track.q, log.q_true, log.moving)
+        for name in ("total", "heading", "inclination"):
+            summary[f"{name}_rms_deg"] = float(np.degrees(getattr(errors, name)))
+    return summary
+
+
+def summary_words(summary: dict[str, Any]) -> list[str]:
+    """The totals as text."""
+    used = {
+        "plain": "the field was used as it is",
+        "reject": "the field was left out where it contradicts",
+        "subtract": "a magnet that moves with the sensor was subtracted",
+    }
+    lines = [f"{summary['rows']} rows; {used[summary['method']]}; disturbed in {summary['disturbed_fraction']:.1%}"]
+    if "total_rms_deg" in summary:
+        total, heading, tilt = (summary[f"{name}_rms_deg"] for name in ("total", "heading", "inclination"))
+        lines.append(f"rms while it moved: {total:.2f}° in all, heading {heading:.2f}°, inclination {tilt:.2f}°")
+    return lines

@@ -1,0 +1,84 @@
+"""``adcs imu``: what it writes and prints of a log."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from matplotlib import image
+
+import adcs as package
+from arrays.io.csv import read_table, write_columns
+from tests.adcs.refusals import assert_refused
+from tests.command_line import refuse_constant
+
+IMU = package.datasets.load("imu")
+
+
+@pytest.fixture
+def log(tmp_path):
+    """The package's log with its truth."""
+    table = read_table(IMU.path, "a log")
+    columns = dict(zip(table.header, table.values.T, strict=True))
+    columns |= dict(zip(("qw", "qx", "qy", "qz"), IMU.truth.as_quat(scalar_first=True).T, strict=True))
+    write_columns(columns | {"moving": (IMU.time_s > 8.0).astype(float)}, tmp_path / "log.csv")
+    return tmp_path / "log.csv"
+
+
+class TestImu:
+    def test_files(self, adcs, log, tmp_path):
+        outcome = adcs("imu", log, "--out", tmp_path / "out", "--json")
+        assert outcome.status == 0, outcome.err
+        summary = json.loads(outcome.out, parse_constant=refuse_constant)
+        table = read_table(tmp_path / "out" / "attitude.csv", "attitudes")
+        assert table.header == (
+            *("time_s", "qw", "qx", "qy", "qz"),
+            *("sigma_tilt_deg", "sigma_heading_deg", "disturbed"),
+        )
+        values = table.complete(table.header)
+        assert len(values) == summary["rows"] == len(IMU.time_s)
+        assert values[:, 7].mean() == pytest.approx(summary["disturbed_fraction"])
+        np.testing.assert_array_equal(np.unique(values[:, 7]), [0.0, 1.0])
+        readings = IMU.gyro_rad_s, IMU.acceleration_m_s2, IMU.field_T
+        track = package.inertial_magnetic_filter(IMU.time_s, *readings)
+        np.testing.assert_allclose(values[:, 1:5], track.q, atol=1e-12)
+        assert image.imread(tmp_path / "out" / "attitude.png").std() > 0.05
+
+    def test_methods(self, adcs, log):
+        """A magnet comes to sit on the unit and goes: subtracted, or left out."""
+        found = {}
+        for method in ("auto", "plain", "reject", "subtract"):
+            outcome = adcs("imu", log, "--method", method, "--json", "--quiet")
+            found[method] = json.loads(outcome.out, parse_constant=refuse_constant)
+        assert {method: one["method"] for method, one in found.items()} == {
+            "auto": "subtract",
+            "plain": "plain",
+            "reject": "reject",
+            "subtract": "subtract",
+        }
+        assert found["auto"]["flags"] == ["field-left-out", "magnet-subtracted"]
+        assert found["auto"]["total_rms_deg"] < 2.0
+        assert 0.2 < found["auto"]["disturbed_fraction"] < 0.4
+        squares = found["auto"]["heading_rms_deg"] ** 2 + found["auto"]["inclination_rms_deg"] ** 2
+        assert found["auto"]["total_rms_deg"] ** 2 == pytest.approx(squares, rel=0.02)
+
+    def test_words(self, adcs, log):
+        outcome = adcs("imu", log, "--offline", "--quiet")
+        first, second = outcome.out.splitlines()
+        assert first.startswith("1500 rows; a magnet that moves with the sensor was subtracted; disturbed in ")
+        assert second.startswith("rms while it moved: ")
+        assert "minute 1: the field was left out" in adcs("imu", log, "--method", "reject").err
+
+    def test_without_truth(self, adcs):
+        summary = json.loads(adcs("imu", IMU.path, "--json", "--quiet").out)
+        assert "total_rms_deg" not in summary
+        assert set(summary) == {"rows", "method", "disturbed_fraction", "flags", "seconds"}
+
+    def test_refusals(self, adcs, log, tmp_path):
+        assert_refused(adcs("imu", tmp_path / "none.csv"), "none.csv does not exist")
+        text = log.read_text().splitlines()
+        log.write_text("\n".join([text[0], *text[900:], *text[1:5]]))
+        assert_refused(adcs("imu", log), "line 603, column time_s", "expected times that ascend")
+        log.write_text("\n".join(text[:5]))
+        assert_refused(adcs("imu", log), "time_s must last a second at least")
