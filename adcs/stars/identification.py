@@ -29,6 +29,9 @@ _CHECKED_AGAIN = 8
 # Triangles that agree and are checked, of an image: seconds of work, and some hundred megabytes.
 _MOST_HYPOTHESES = 250_000
 _REFITS = 3
+_COMPANIONS = 3  # of the catalogue, within the noise of one place
+_LEAST_SPREAD = 0.5  # of the magnitudes of an image
+_CLEARLY = 2.0  # difference of two squared distances: less is a toss
 MOST_PIXELS = 100_000
 """Of either side of an image."""
 SCALE_ARCSEC = (0.01, 3600.0)
@@ -178,17 +181,17 @@ class StarTriangles:
     is_counter_clockwise: BoolArray  # (T,): seen from the centre of the sphere
 
 
-def star_triangles(directions: FloatArray, longest: float) -> StarTriangles:
+def star_triangles(directions: FloatArray, longest: float, neighbours: int = _BRIGHTER) -> StarTriangles:
     """Triangles of every star with its nearest brighter neighbours.
 
-    ``directions`` (n, 3): unit vectors, brightest first. ``longest``: longest side, a chord. Returns: each triangle
-    once.
+    ``directions`` (n, 3): unit vectors, brightest first. ``longest``: longest side, a chord. ``neighbours``: of each
+    star. Returns: each triangle once.
     """
     n = len(directions)
     k = min(_NEIGHBOURS + 1, n)
     found = np.asarray(cKDTree(directions).query(directions, k=k)[1], dtype=np.intp).reshape(n, k)
     own = np.arange(n)[:, None]
-    first = np.argsort(found >= own, axis=1, kind="stable")[:, : min(_BRIGHTER, k)]
+    first = np.argsort(found >= own, axis=1, kind="stable")[:, : min(neighbours, k)]
     brighter = np.take_along_axis(found, first, axis=1)
     pairs = list(combinations(range(brighter.shape[1]), 2))
     if not pairs:
@@ -267,7 +270,7 @@ class StarMatcher:
         points_px : array_like, shape (f, 2)
             x to the right, y up.
         magnitudes : array_like, shape (f,)
-            Only their order counts.
+            Their order counts, and of stars that are as near as the noise their differences.
 
         Raises
         ------
@@ -275,7 +278,8 @@ class StarMatcher:
             The shapes do not agree, or a number is not finite.
         """
         directions = self.camera.directions(points_px)
-        order = np.argsort(np.asarray(magnitudes, dtype=np.float64), kind="stable")
+        brightness = np.asarray(magnitudes, dtype=np.float64)
+        order = np.argsort(brightness, kind="stable")
         if order.shape != (len(directions),):
             raise ValueError(f"Input magnitudes must have shape ({len(directions)},); instead received {order.shape}.")
         brightest = order[:_IMAGE_STARS]
@@ -290,7 +294,7 @@ class StarMatcher:
             return NoFix("no triangle of the image is in the catalogue")
         near = self._near(directions[brightest], R)[1]
         fixes = [
-            self._fitted(directions, R[i], len(R))
+            self.fitted(directions, brightness, R[i], len(R))
             for i in np.argsort(-near.sum(axis=1), kind="stable")[:_CHECKED_AGAIN]
         ]
         best = min(fixes, key=lambda fix: fix.log10_chance)
@@ -322,26 +326,39 @@ class StarMatcher:
         found = self.catalogue.tree.query(directions @ np.swapaxes(R, -1, -2), distance_upper_bound=self.gate_rad)
         return np.asarray(found[1], dtype=np.intp), np.isfinite(np.asarray(found[0]))
 
-    def _fitted(self, directions: FloatArray, R: FloatArray, hypotheses: int) -> StarFix:
-        """Fix by all stars near their places, with the chance of as many."""
+    def fitted(self, directions: FloatArray, magnitudes: FloatArray, R: FloatArray, hypotheses: int) -> StarFix:
+        """Fix by all stars near their places, brightest first or in any order, with the chance of as many."""
         for _ in range(_REFITS):
             row, near = self._near(directions, R)
             if np.count_nonzero(near) < 3:
                 break
             R = rotation_between(directions[near], self.catalogue.directions[row[near]])
-        row, near = self._near(directions, R)
-        star = np.flatnonzero(near)
-        distance = np.linalg.norm(directions[star] @ R.T - self.catalogue.directions[row[star]], axis=1)
-        order = np.argsort(distance, kind="stable")
-        _, first = np.unique(row[star][order], return_index=True)
-        kept = np.sort(order[first])
-        star, distance = star[kept], distance[kept]
-        rms = float(np.sqrt(np.mean(distance**2))) if len(star) else math.inf
-        return StarFix(
-            R, np.stack([star, row[star]], axis=1), rms, self._chance(R, len(star), len(directions), hypotheses)
-        )
+        stars = self._named(directions, magnitudes, R)
+        seen, there = directions[stars[:, 0]], self.catalogue.directions[stars[:, 1]]
+        rms = float(np.sqrt(np.mean(np.sum((seen @ R.T - there) ** 2, axis=1)))) if len(stars) else math.inf
+        return StarFix(R, stars, rms, self.chance(R, len(stars), len(directions), hypotheses))
 
-    def _chance(self, R: FloatArray, matched: int, stars: int, hypotheses: int) -> float:
+    def _named(self, directions: FloatArray, magnitudes: FloatArray, R: FloatArray) -> IntArray:
+        """Pairs (k, 2) of a star and its row in the catalogue, each once, by place and, as of doubles, brightness."""
+        found = self.catalogue.tree.query(directions @ R.T, k=_COMPANIONS, distance_upper_bound=self.gate_rad)
+        distance, row = np.asarray(found[0]), np.asarray(found[1], dtype=np.intp)
+        star, of_star = np.nonzero(np.isfinite(distance))
+        if not len(star):
+            return np.empty((0, 2), dtype=np.intp)
+        row, distance = row[star, of_star], distance[star, of_star] / (self.gate_rad / 3.0)
+        fainter = magnitudes[star] - self.catalogue.magnitudes[row]
+        nearest = fainter[of_star == 0]
+        spread = max(1.4826 * float(np.median(np.abs(nearest - np.median(nearest)))), _LEAST_SPREAD)
+        # Magnitudes of other colours and of noise have tails: Student's t of two degrees of freedom.
+        cost = distance**2 + 3.0 * np.log1p(0.5 * ((fainter - np.median(nearest)) / spread) ** 2)
+        # Each star its best row and each row its best star, if no other is nearly as good.
+        order = np.argsort(cost, kind="stable")
+        for of in (star, row):
+            order = order[_clearly_first(of[order], cost[order])]
+        order = order[np.argsort(star[order])]
+        return np.stack([star[order], row[order]], axis=1)
+
+    def chance(self, R: FloatArray, matched: int, stars: int, hypotheses: int) -> float:
         """Expected number of hypotheses, as a decimal logarithm, that match as many stars besides their three."""
         axis = -R[:, 2]
         radius = 2.0 * math.sin(0.25 * self.camera.diagonal_rad)
@@ -396,6 +413,17 @@ def identify_stars(
         if progress is not None:
             progress(1)
     return fixes
+
+
+def _clearly_first(of: IntArray, cost: FloatArray) -> IntArray:
+    """Where each value stands first in an order of ascending costs (k,), unless its second one is nearly as good."""
+    _, first, count = np.unique(of, return_index=True, return_counts=True)
+    later = np.ones(len(of), dtype=np.bool_)
+    later[first] = False
+    second = np.full(int(of.max()) + 1, math.inf)
+    np.minimum.at(second, of[later], cost[later])
+    clear: IntArray = np.sort(first[(count == 1) | (second[of[first]] - cost[first] > _CLEARLY)])
+    return clear
 
 
 def rotation_between(seen: FloatArray, there: FloatArray) -> FloatArray:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from cyclopts import App
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 import adcs
@@ -95,7 +96,10 @@ LINES: dict[str, tuple[str, ...]] = {
     "adcs loads": ("loads.csv --array loads.toml --json --out out.csv",),
     "adcs imu": ("imu.csv --config imu.toml --json", "imu.csv --offline --out out"),
     "adcs calibrate": ("telemetry.csv --config scenario.toml --json --out out.csv",),
-    "adcs stars": ("frames --catalogue stars.csv --json",),
+    "adcs stars": (
+        "frames --catalogue stars.csv --json",
+        "sky.png --catalogue stars.csv --scale-arcsec 15.8 --out out --json",
+    ),
 }  # fmt: skip
 # How often beside one of the others: seconds each, and a demonstration reads nothing that could be mangled.
 SELDOM = {
@@ -307,4 +311,6 @@ def _write_stars(folder: Path) -> None:
     rows = zip(sky.numbers, ra, dec, sky.magnitudes, strict=True)
     lines = [f"{number},{a:.9f},{d:.9f},{m:.3f}\n" for number, a, d, m in rows]
     (folder / "stars.csv").write_text("hip,ra_deg,dec_deg,mag\n" + "".join(lines))
+    dark = np.random.default_rng(0).normal(20.0, 3.0, (128, 128))
+    Image.fromarray(dark.astype(np.uint8)).save(folder / "sky.png")
     write_frames(folder / "frames", sky, Rotation.random(2, random_state=1).as_matrix(), np.random.default_rng(2))

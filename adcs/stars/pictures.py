@@ -1,0 +1,210 @@
+"""Stars in photographs of the sky: read a picture, and find lights above what surrounds them.
+
+A sky glows, more at one side than at the other, and a lens is darker at its corners: background and noise are those of
+a neighbourhood, not of the picture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from arrays.io.errors import InputError
+from arrays.typing import BoolArray, FloatArray
+
+SUFFIXES = (".png", ".tif", ".tiff", ".fits", ".fit", ".jpg", ".jpeg")
+_BLOCK_PX = 32
+LEAST_PX = 2 * _BLOCK_PX
+"""Of a picture, either way."""
+_STAR_PX = 1.0  # standard deviation of a star's light, with which it is looked for
+_THRESHOLD_SIGMAS = 5.0
+_HOT_SHARE = 0.85  # of a light that one pixel has: more than any optics leaves to one
+_HALF_WINDOW = 3
+_WEIGHT_PX, _ROUNDS = 1.2, 6  # of centroids
+_SIGMA_OF_MAD = 1.4826
+_MOST_PIXELS = 10**8
+_FITS_BLOCK, _FITS_CARD = 2880, 80
+_FITS_TYPES = {8: ">u1", 16: ">i2", 32: ">i4", -32: ">f4", -64: ">f8"}
+
+
+@dataclass(frozen=True, eq=False)
+class PictureStars:
+    """Lights of a picture, brightest first."""
+
+    points_px: FloatArray  # (n, 2): x to the right, y up, of centres: the first pixel's is (0.5, 0.5) from below
+    sigma_px: FloatArray  # (n,): per axis, from the noise alone
+    flux: FloatArray  # (n,): above the background
+    saturated: BoolArray  # (n,)
+
+    @property
+    def magnitudes(self) -> FloatArray:
+        """Of any zero (n,)."""
+        return -2.5 * np.log10(self.flux)
+
+    def __len__(self) -> int:
+        return len(self.flux)
+
+
+def read_picture(path: str | PathLike[str]) -> FloatArray:
+    """Grey picture (height, width), its first row at the top, from PNG, TIFF or JPEG of 8 or 16 bits, or FITS.
+
+    Parameters
+    ----------
+    path : str or path-like
+        Colours are averaged.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read or is no picture of such a kind.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> adcs.read_picture("night.png").shape  # doctest: +SKIP
+    (1040, 1392)
+    """
+    if not Path(path).is_file():
+        raise InputError(f"{path} does not exist, expected a picture ({', '.join(SUFFIXES)}).")
+    if Path(path).suffix.lower() in (".fits", ".fit"):
+        return _fits(path)
+    from PIL import Image
+
+    try:
+        with Image.open(path) as opened:
+            if opened.width * opened.height > _MOST_PIXELS:
+                raise InputError(f"{path}: found {opened.width} × {opened.height} pixels, expected 10⁸ at most.")
+            values = np.asarray(opened)
+    except InputError:
+        raise
+    except Exception as error:  # whatever the decoder makes of a file that is none
+        raise InputError(f"{path}: found no picture that can be read ({error}).") from None
+    if values.ndim == 3:
+        values = values[..., : 3 if values.shape[2] > 2 else 1].mean(axis=2)
+    return _checked(path, values)
+
+
+def _fits(path: str | PathLike[str]) -> FloatArray:
+    """First image of a FITS file; its first row is at the bottom."""
+    data = Path(path).read_bytes()
+    header: dict[str, str] = {}
+    start = 0
+    for start in range(0, len(data), _FITS_CARD):
+        card = data[start : start + _FITS_CARD].decode("ascii", "replace")
+        if card.startswith("END") and not card[3:].strip():
+            break
+        header[card[:8].strip()] = card[10:].partition("/")[0].strip()
+    start = -(-(start + _FITS_CARD) // _FITS_BLOCK) * _FITS_BLOCK
+    try:
+        kind = np.dtype(_FITS_TYPES[int(header["BITPIX"])])
+        width, height = int(header["NAXIS1"]), int(header["NAXIS2"])
+        values = np.frombuffer(data, kind, width * height, start).reshape(height, width)
+        scaled = float(header.get("BSCALE", 1.0)) * values + float(header.get("BZERO", 0.0))
+    except (KeyError, ValueError):
+        raise InputError(
+            f"{path}: found no image in two dimensions, expected one as the first of a FITS file."
+        ) from None
+    return _checked(path, scaled[::-1])
+
+
+def _checked(path: str | PathLike[str], values: np.ndarray) -> FloatArray:
+    picture = np.asarray(values, dtype=np.float64)
+    if picture.ndim != 2 or min(picture.shape) < LEAST_PX or not np.isfinite(picture).all():
+        raise InputError(f"{path}: found a picture of shape {picture.shape}, expected 64 × 64 finite pixels at least.")
+    return picture
+
+
+def find_picture_stars(picture: FloatArray, dark: FloatArray | None = None) -> PictureStars:
+    """Lights whose sum over a star's size is five standard deviations above their neighbourhood.
+
+    Background and noise are the median of blocks of 32 pixels and the standard deviation about it, smooth between them.
+    A light that one pixel has nearly alone is a hot pixel. Centroids are the first moments under a Gaussian that
+    follows them, in a window of 7 pixels.
+
+    ``picture``, ``dark`` (height, width): the latter is subtracted. Returns them brightest first.
+    """
+    values = picture if dark is None else picture - dark
+    level = _of_neighbourhood(values, _median)
+    above = values - level
+    noise = _of_neighbourhood(above, _deviation(1.0))
+    # Sum with the star's own shape, and its own noise: that of neighbouring pixels may be alike.
+    kernel = np.exp(-0.5 * (np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1) / _STAR_PX) ** 2)
+    kernel /= kernel.sum()
+    smooth = ndimage.correlate1d(ndimage.correlate1d(above, kernel, axis=0), kernel, axis=1)
+    significance = smooth / _of_neighbourhood(smooth, _deviation(float(np.sum(kernel**2))))
+    peak = (significance > _THRESHOLD_SIGMAS) & (significance == ndimage.maximum_filter(significance, 5))
+    inside = np.zeros_like(peak)
+    inside[_HALF_WINDOW:-_HALF_WINDOW, _HALF_WINDOW:-_HALF_WINDOW] = True
+    rows, columns = np.nonzero(peak & inside)
+    around = np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)
+    windows = above[rows[:, None, None] + around[:, None], columns[:, None, None] + around]
+    light = np.maximum(windows, 0.0) * (windows > 2.0 * noise[rows, columns][:, None, None])
+    alone = windows.max(axis=(1, 2)) / np.maximum(light.sum(axis=(1, 2)), 1e-300)
+    kept = (alone < _HOT_SHARE) & (np.count_nonzero(light, axis=(1, 2)) >= 3)
+    windows, rows, columns = windows[kept], rows[kept], columns[kept]
+    flux = smooth[rows, columns] / np.sum(kernel**2) ** 2
+    offsets, slope = _centroids(windows)
+    sigma = noise[rows, columns] * slope
+    x, y = columns + offsets[:, 0] + 0.5, len(values) - (rows + offsets[:, 1] + 0.5)
+    saturated = windows.max(axis=(1, 2)) + level[rows, columns] >= 0.98 * picture.max()
+    order = np.argsort(-flux, kind="stable")
+    return PictureStars(np.stack([x, y], axis=1)[order], sigma[order], flux[order], saturated[order])
+
+
+def _centroids(windows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Offsets (n, 2) of lights from the middle of their windows, and by how much a pixel's noise moves them (n,).
+
+    The weight is a Gaussian about the centroid itself, so that it favours no place within a pixel; as it is as wide as
+    a light, its first moment is half of the distance.
+    """
+    around = np.arange(-_HALF_WINDOW, _HALF_WINDOW + 1)
+    offsets = np.zeros((len(windows), 2))
+    slope = np.zeros(len(windows))
+    for _ in range(_ROUNDS):
+        dx, dy = around - offsets[:, :1], around - offsets[:, 1:]
+        weights = np.exp(-0.5 * (dy[:, :, None] ** 2 + dx[:, None, :] ** 2) / _WEIGHT_PX**2)
+        total = np.maximum(np.sum(weights * windows, axis=(1, 2)), 1e-300)
+        moments = [np.sum(weights * windows * d, axis=(1, 2)) / total for d in (dx[:, None, :], dy[:, :, None])]
+        offsets = np.clip(offsets + 2.0 * np.stack(moments, axis=1), -1.5, 1.5)
+        slope = 2.0 * np.sqrt(np.sum((weights * dx[:, None, :]) ** 2, axis=(1, 2))) / total
+    return offsets, slope
+
+
+def _of_neighbourhood(values: FloatArray, statistic: Callable[[FloatArray], float]) -> FloatArray:
+    """A statistic of the blocks around every pixel, of those alike."""
+    edges = [np.linspace(0, n, n // _BLOCK_PX + 1).astype(int) for n in values.shape]
+    found = np.array(
+        [
+            [statistic(values[top:bottom, left:right]) for left, right in pairwise(edges[1].tolist())]
+            for top, bottom in pairwise(edges[0].tolist())
+        ]
+    )
+    places = [(np.arange(n) - 0.5 * (e[0] + e[1])) / (e[1] - e[0]) for n, e in zip(values.shape, edges, strict=True)]
+    at = np.meshgrid(*places, indexing="ij")
+    smooth: FloatArray = ndimage.map_coordinates(ndimage.median_filter(found, 3), at, order=1, mode="nearest")
+    return smooth
+
+
+def _deviation(least: float) -> Callable[[FloatArray], float]:
+    """Standard deviation of what is within five of it, not less than what rounding may hide.
+
+    The median distance alone would be one of the whole numbers of a picture of 8 bits.
+    """
+
+    def of(block: FloatArray) -> float:
+        distance = np.abs(block - np.median(block))
+        usual = max(_SIGMA_OF_MAD * float(np.median(distance)), least)
+        return max(math.sqrt(float(np.mean(distance[distance <= 5.0 * usual] ** 2))), least)
+
+    return of
+
+
+def _median(block: FloatArray) -> float:
+    return float(np.median(block))

@@ -1,0 +1,235 @@
+"""Photographs: files of 8 and 16 bits, lights on a glowing sky, and where a picture looks without its scale."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+import adcs
+from adcs.cli.app import main
+from adcs.stars.files import read_star_frames
+from adcs.stars.identification import NoFix, StarCamera, StarMatcher
+from adcs.stars.pictures import find_picture_stars, read_picture
+from adcs.stars.unknown_scale import PictureFix, identify_at_unknown_scale, solve_photograph
+from arrays.io.errors import InputError
+from tests.adcs.stars.skies import photograph
+from tests.adcs.stars.test_identification import random_sky
+
+CAMERA = StarCamera(640, 480, math.radians(60.0 / 3600.0))
+SKY = random_sky(30_000)
+HARD = {"gradient": 1.0, "vignetting": 0.8, "hot": 20}
+
+
+def fits_bytes(values, bitpix, bzero=0.0):
+    """A FITS file of one image, by the standard: cards of 80, blocks of 2880 bytes, big-endian."""
+    cards = ["SIMPLE  =                    T", f"BITPIX  = {bitpix:20d}", "NAXIS   =                    2"]
+    cards += [f"NAXIS1  = {values.shape[1]:20d}", f"NAXIS2  = {values.shape[0]:20d}", f"BZERO   = {bzero:20.1f}", "END"]
+    header = "".join(card.ljust(80) for card in cards).encode()
+    kind = {8: ">u1", 16: ">i2", -32: ">f4"}[bitpix]
+    data = (values - bzero).astype(kind).tobytes()
+    return header.ljust(-(-len(header) // 2880) * 2880) + data.ljust(-(-len(data) // 2880) * 2880, b"\0")
+
+
+class TestFiles:
+    def test_same_in_all_kinds(self, tmp_path):
+        values = np.random.default_rng(0).integers(0, 65_535, (70, 90)).astype(np.uint16)
+        Image.fromarray(values).save(tmp_path / "a.png")
+        Image.fromarray(values).save(tmp_path / "a.tiff")
+        (tmp_path / "a.fits").write_bytes(fits_bytes(values[::-1].astype(np.float64), 16, 32768.0))
+        for suffix in ("png", "tiff", "fits"):
+            np.testing.assert_array_equal(read_picture(tmp_path / f"a.{suffix}"), values)
+
+    def test_colours(self, tmp_path):
+        values = np.random.default_rng(0).integers(0, 255, (70, 90, 4)).astype(np.uint8)
+        Image.fromarray(values, "RGBA").save(tmp_path / "a.png")
+        np.testing.assert_allclose(read_picture(tmp_path / "a.png"), values[..., :3].mean(axis=2))
+
+    def test_refusals(self, tmp_path):
+        (tmp_path / "no.png").write_bytes(b"no picture")
+        Image.fromarray(np.zeros((20, 90), np.uint8)).save(tmp_path / "small.png")
+        (tmp_path / "cube.fits").write_bytes(b"SIMPLE  = T".ljust(80) + b"END".ljust(2800))
+        for name, said in (
+            ("none.png", "does not exist"),
+            ("no.png", "no picture that can be read"),
+            ("small.png", "expected 64 × 64 finite pixels"),
+            ("cube.fits", "no image in two dimensions"),
+        ):
+            with pytest.raises(InputError, match=said):
+                read_picture(tmp_path / name)
+
+
+class TestLights:
+    @pytest.mark.parametrize("hard", [{}, HARD])
+    def test_places_and_sigma(self, hard):
+        """Nearly every light that is clear of the noise, to a tenth of a pixel, its σ true to a factor of two."""
+        distances, sigmas, there = [], [], 0
+        for seed, R in enumerate(Rotation.random(6, random_state=1).as_matrix()):
+            picture, points, rows = photograph(SKY, CAMERA, R, np.random.default_rng(seed), **hard)
+            lights = find_picture_stars(picture)
+            bright = points[SKY.magnitudes[rows] < 8.5]
+            distance, light = cKDTree(lights.points_px).query(bright)
+            there += len(bright)
+            distances.append(distance[distance < 1.0])
+            sigmas.append(lights.sigma_px[light[distance < 1.0]])
+        distance, sigma = np.concatenate(distances), np.concatenate(sigmas)
+        assert len(distance) > 0.9 * there > 50
+        assert np.median(distance) < 0.1
+        # The median of a Rayleigh distribution; of some hundred numbers it is known to a tenth.
+        assert np.median(distance / sigma) == pytest.approx(math.sqrt(2.0 * math.log(2.0)), rel=0.3)
+
+    def test_hot_pixels_and_noise_are_no_lights(self):
+        """Of 300,000 pixels some tens of 5 σ may be noise; none of the hot ones, which are brighter than most stars."""
+        empty = random_sky(4)
+        picture, _, _ = photograph(empty, CAMERA, np.eye(3), np.random.default_rng(1), **HARD | {"hot": 200})
+        assert len(find_picture_stars(picture)) < 20
+
+    def test_a_dark_picture(self):
+        rng = np.random.default_rng(2)
+        picture, points, _ = photograph(SKY, CAMERA, np.eye(3), rng)
+        glow = np.zeros(picture.shape)
+        glow[100:103, 200:203] = 20_000.0
+        bright = find_picture_stars(picture + glow).points_px[0]
+        np.testing.assert_allclose(bright, [201.5, 480.0 - 101.5], atol=0.2)
+        assert np.linalg.norm(points - find_picture_stars(picture + glow, glow).points_px[0], axis=1).min() < 0.5
+
+    def test_eight_bits(self):
+        picture, points, rows = photograph(SKY, CAMERA, np.eye(3), np.random.default_rng(3))
+        lights = find_picture_stars(np.clip(np.round(picture / 60.0), 0, 255))
+        bright = points[SKY.magnitudes[rows] < 6.5]
+        assert (cKDTree(lights.points_px).query(bright)[0] < 0.5).mean() > 0.9
+
+
+def is_right(found, R):
+    """Whether a fix looks where the camera did."""
+    turn = found.fix.R_catalogue_from_frame @ R.T
+    scale = found.camera.rad_per_px / CAMERA.rad_per_px
+    return Rotation.from_matrix(turn).magnitude() < math.radians(0.05) and abs(scale - 1.0) < 1e-3
+
+
+class TestUnknownScale:
+    def test_photographs(self):
+        """With gradient, vignetting, hot pixels and trails, the scale wrong by up to 10 %."""
+        rng = np.random.default_rng(4)
+        solved = 0
+        for i, R in enumerate(Rotation.random(10, random_state=5).as_matrix()):
+            picture, _, _ = photograph(SKY, CAMERA, R, rng, **HARD, trail_px=3.0 * (i % 2))
+            given = CAMERA.rad_per_px * rng.uniform(0.92, 1.08)
+            _, found = solve_photograph(picture, SKY, rad_per_px=given, tolerance=0.1)
+            assert isinstance(found, NoFix) or is_right(found, R)
+            solved += isinstance(found, PictureFix)
+            if isinstance(found, PictureFix):
+                assert abs(found.camera.rad_per_px - CAMERA.rad_per_px) < 5.0 * found.scale_sigma_rad
+        assert solved >= 9
+
+    def test_without_any_scale(self):
+        R = Rotation.random(random_state=6).as_matrix()
+        picture, _, _ = photograph(SKY, CAMERA, R, np.random.default_rng(7))
+        assert is_right(solve_photograph(picture, SKY)[1], R)
+
+    def test_a_mirrored_picture_gives_no_fix(self):
+        for seed in range(3):
+            R = Rotation.random(random_state=seed).as_matrix()
+            picture, _, _ = photograph(SKY, CAMERA, R, np.random.default_rng(seed))
+            _, found = solve_photograph(picture[:, ::-1], SKY, rad_per_px=CAMERA.rad_per_px, tolerance=0.1)
+            assert isinstance(found, NoFix)
+
+    def test_refusals(self):
+        points, ones = np.ones((5, 2)), np.ones(5)
+        with pytest.raises(ValueError, match=r"tolerance must be at most 0\.1"):
+            identify_at_unknown_scale(SKY, 640, 480, points, ones, rad_per_px=1e-4, tolerance=0.2)
+        assert "3 stars, 4 needed" in identify_at_unknown_scale(SKY, 640, 480, points[:3], ones[:3]).reason
+        with pytest.raises(ValueError, match="picture must have 64 pixels"):
+            solve_photograph(np.zeros((10, 10)), SKY)
+        with pytest.raises(ValueError, match="dark must have shape"):
+            solve_photograph(np.zeros((100, 100)), SKY, dark=np.zeros((10, 10)))
+
+
+class TestHipparcos:
+    def test_stars_of_any_almanac(self):
+        """Sirius, Vega and Polaris in J2000, and Barnard's star, which moves by 10.36 arc seconds a year."""
+        catalogue = adcs.hipparcos_catalogue(2000.0)
+        place = {int(number): i for i, number in enumerate(catalogue.numbers)}
+        for number, ra, dec, magnitude in (
+            (32349, 101.2872, -16.7161, -1.09),
+            (91262, 279.2347, 38.7837, 0.09),
+            (11767, 37.9546, 89.2641, 2.1),
+        ):
+            expected = [*np.cos(np.radians([ra, ra - 90.0])) * math.cos(math.radians(dec)), math.sin(math.radians(dec))]
+            np.testing.assert_allclose(catalogue.directions[place[number]], expected, atol=2e-5)
+            assert catalogue.magnitudes[place[number]] == pytest.approx(magnitude, abs=0.1)
+        later = adcs.hipparcos_catalogue(2010.0)
+        moved = later.directions[place[87937]] - catalogue.directions[place[87937]]
+        assert math.degrees(np.linalg.norm(moved)) * 3600.0 == pytest.approx(103.6, abs=0.5)
+
+    def test_frames(self, data_folder):
+        camera, frames = read_star_frames(data_folder / "star-frames")
+        catalogue = adcs.hipparcos_catalogue(1991.25)
+        matcher = StarMatcher.of(catalogue, camera)
+        right = identified = there = 0
+        for frame in frames:
+            there += np.count_nonzero(np.isin(frame.numbers, catalogue.numbers))
+            fix = matcher.identify(frame.points_px, frame.magnitudes)
+            right += np.count_nonzero(catalogue.numbers[fix.stars[:, 1]] == frame.numbers[fix.stars[:, 0]])
+            identified += len(fix.stars)
+        assert right / there > 0.993
+        assert right / identified > 0.999
+
+    @pytest.mark.parametrize(
+        ("name", "ra", "dec", "matched", "residual"),
+        [
+            ("esa-alt40.tiff", 230.67, 11.04, 60, 15.0),
+            ("openstartracker-3.png", 169.99, 13.75, 10, 10.0),
+            ("openstartracker-6.png", 151.97, 19.15, 10, 10.0),
+            ("openstartracker-8.png", 161.48, 4.37, 7, 10.0),
+        ],
+    )
+    def test_photographs_from_the_file_alone(self, data_folder, capsys, tmp_path, name, ra, dec, matched, residual):
+        path = data_folder / "star-photographs" / name
+        assert main(["stars", str(path), "--catalogue", "hipparcos", "--json", "--out", str(tmp_path)]) == 0
+        (row,) = json.loads(capsys.readouterr().out)["pictures"]
+        assert row["solved"]
+        assert (row["ra_deg"], row["dec_deg"]) == pytest.approx((ra, dec), abs=0.02)
+        assert row["matched"] >= matched
+        assert row["residual_arcsec"] < residual
+        scale = 40.3 if name.startswith("esa") else 15.73
+        assert row["scale_arcsec"] == pytest.approx(scale, rel=2e-3)
+        assert (tmp_path / f"{Path(name).stem}-stars.png").stat().st_size > 10_000
+
+
+class TestCommand:
+    @pytest.fixture
+    def files(self, tmp_path):
+        """A photograph and its catalogue."""
+        R = Rotation.random(random_state=8).as_matrix()
+        picture, _, _ = photograph(SKY, CAMERA, R, np.random.default_rng(9))
+        Image.fromarray(picture.astype(np.uint16)).save(tmp_path / "sky.png")
+        ra = np.degrees(np.arctan2(SKY.directions[:, 1], SKY.directions[:, 0])) % 360.0
+        columns = SKY.numbers, ra, np.degrees(np.arcsin(SKY.directions[:, 2])), SKY.magnitudes
+        np.savetxt(
+            tmp_path / "sky.csv", np.column_stack(columns), "%.9g", ",", header="hip,ra_deg,dec_deg,mag", comments=""
+        )
+        return tmp_path
+
+    def test_words(self, files, capsys):
+        arguments = [str(files / "sky.png"), "--catalogue", str(files / "sky.csv"), "--scale-arcsec", "61"]
+        assert main(["stars", *arguments]) == 0
+        line = capsys.readouterr().out
+        assert ": RA " in line
+        assert float(line.split(";")[1].split()[0]) == pytest.approx(60.0, abs=0.1)
+
+    @pytest.mark.parametrize(
+        ("arguments", "said"),
+        [
+            (["--scale-arcsec", "0"], "--scale-arcsec: found 0, expected a positive number"),
+            (["--scale-tolerance", "0.5"], "--scale-tolerance: found 0.5, expected 0.1 at most"),
+            (["--dark", "none.png"], "none.png does not exist"),
+        ],
+    )
+    def test_refusals(self, files, capsys, arguments, said):
+        assert main(["stars", str(files / "sky.png"), "--catalogue", str(files / "sky.csv"), *arguments]) == 2
+        assert said in capsys.readouterr().err
