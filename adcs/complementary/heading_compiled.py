@@ -1,4 +1,4 @@
-"""Compiled loops of :mod:`adcs.complementary.heading`, which has their readable twin."""
+"""Compiled loops of :mod:`adcs.complementary.heading`, in matrices; filterpy's filter and smoother hold them."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ class TestUnknownScale:
         """With gradient, vignetting, hot pixels and trails, the scale wrong by up to 10 %."""
         rng = np.random.default_rng(4)
         solved = 0
-        for i, R in enumerate(Rotation.random(10, random_state=5).as_matrix()):
+        for i, R in enumerate(Rotation.random(6, random_state=5).as_matrix()):
             picture, _, _ = photograph(SKY, CAMERA, R, rng, **HARD, trail_px=3.0 * (i % 2))
             given = CAMERA.rad_per_px * rng.uniform(0.92, 1.08)
             _, found = solve_photograph(picture, SKY, rad_per_px=given, tolerance=0.1)
@@ -124,7 +124,7 @@ class TestUnknownScale:
             solved += isinstance(found, PictureFix)
             if isinstance(found, PictureFix):
                 assert abs(found.camera.rad_per_px - CAMERA.rad_per_px) < 5.0 * found.scale_sigma_rad
-        assert solved >= 9
+        assert solved >= 5
 
     def test_without_any_scale(self):
         R = Rotation.random(random_state=6).as_matrix()
@@ -183,8 +183,8 @@ class TestHipparcos:
         ("name", "ra", "dec", "matched", "residual"),
         [
             ("esa-alt40.tiff", 230.67, 11.04, 60, 15.0),
-            ("openstartracker-3.png", 169.99, 13.75, 10, 10.0),
-            ("openstartracker-6.png", 151.97, 19.15, 10, 10.0),
+            pytest.param("openstartracker-3.png", 169.99, 13.75, 10, 10.0, marks=pytest.mark.slow),
+            pytest.param("openstartracker-6.png", 151.97, 19.15, 10, 10.0, marks=pytest.mark.slow),
             ("openstartracker-8.png", 161.48, 4.37, 7, 10.0),
         ],
     )
