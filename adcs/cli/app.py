@@ -63,7 +63,11 @@ for _name, _where, _help in (
         "adcs.cli.stars:stars",
         "Identify the stars of images by a catalogue, without knowing where the camera looked.",
     ),
-    ("warm-up", "adcs.cli.warm_up:warm_up", "Compile ahead what run and estimate compile when they are first used."),
+    (
+        "warm-up",
+        "adcs.cli.warm_up:warm_up",
+        "Compile ahead what run, estimate and imu compile when they are first used.",
+    ),
 ):
     app.command(_where, name=_name, help=_help)
 

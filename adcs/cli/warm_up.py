@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import adcs
 from adcs.complementary.names import METHODS
 from magloc.cli import framework
 from magloc.cli.framework import QuietOptions
 
 
 def warm_up(*, common: QuietOptions = QuietOptions()) -> None:  # noqa: B008 - frozen
-    """Compile ahead what run and estimate compile when they are first used, for this machine and version.
+    """Compile ahead what run, estimate and imu compile when they are first used, for this machine and version.
 
     Parameters
     ----------
@@ -24,5 +25,6 @@ def warm_up(*, common: QuietOptions = QuietOptions()) -> None:  # noqa: B008 - f
         ("run", "tabletsat", "--sensors", "mag+sun+gyro", "--states", "gyro-bias", *few),
         *(("run", "complementary", "--filter", name) for name in METHODS),
         ("run", "ellipsoid", "--seeds", "1"),
+        ("imu", str(adcs.datasets.load("imu").path), "--offline"),
     ]
     framework.warm_up(app, calls, common)
