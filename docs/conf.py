@@ -42,7 +42,7 @@ nb_code_prompt_hide = "Hide the code that draws this"
 
 autosummary_generate = True
 # Two pages that differ by case alone are one file on macOS and Windows.
-autosummary_filename_map = {"magloc.Track": "magloc.Track-class"}
+autosummary_filename_map = {"magloc.Survey": "magloc.Survey-class", "magloc.Track": "magloc.Track-class"}
 autodoc_typehints = "none"
 autodoc_member_order = "groupwise"
 autodoc_preserve_defaults = True

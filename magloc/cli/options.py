@@ -151,7 +151,11 @@ class KnownOptions:
 
     def array(self, path: Path) -> SensorArray:
         """The array of a file, reduced to the sensors in use."""
-        array, ids = arrays.read_array(path), self.ids
+        return self.reduced(arrays.read_array(path), path)
+
+    def reduced(self, array: SensorArray, path: Path) -> SensorArray:
+        """An array of a file, reduced to them."""
+        ids = self.ids
         if ids is None:
             return array
         for name in ids:

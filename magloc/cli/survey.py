@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+import arrays
 import magloc
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
@@ -98,7 +99,7 @@ def survey(
     if not math.isfinite(ground.ground_m):
         raise InputError(f"--ground-m: found {ground.ground_m:g}, expected a finite number.")
     where = None if known.place is not None and known.date is None else known.where
-    used = known.array(array)
+    used = known.reduced(arrays.read_sensors(array), array)  # one is enough
     parts = [magloc.read_readings(path, used, sensors=known.ids, ordered=True) for path in readings]
     fields = [ambient_field(used, part, where) for part in parts]
     used, rows = fields[0][0], [replace(part, ambient_T=own) for part, (_, own) in zip(parts, fields, strict=True)]
@@ -126,7 +127,9 @@ def survey(
         return
     print(found.table())
     if found.pose_assumed and not common.quiet:
-        print_note("nothing is stated of the pose's errors: 2 cm are assumed")
+        pose = found.record.array.pose
+        size = "" if pose is None else f" {100.0 * pose.position_m:g} cm that last {pose.correlation_s:g} s"
+        print_note(f"nothing is stated of the pose's errors: as the rows show them{size}")
 
 
 @contextmanager

@@ -42,6 +42,9 @@ if TYPE_CHECKING:
 
 
 STREAM = "-"
+# Two vector sensors have no more: too few for the six numbers of a source in one row.
+_FEW_CHANNELS = 6
+_USE_SURVEY = "; sources at rest that few sensors move past are found by magloc survey"
 
 
 @Parameter(name="*", group="Motion")
@@ -256,7 +259,8 @@ def track(
             found = magloc.track(used, rows, motion=model, smooth=smooth, prior=prior, progress=advance)
     if not found.tracked.any():
         _print_track(found, None, json=json, jsonl=jsonl, printed=printed)
-        raise _no_track(str(readings), found.status)
+        few = used.n_channels <= _FEW_CHANNELS and rows.array_rotation is not None
+        raise _no_track(str(readings), found.status, _USE_SURVEY if few else "")
     result = None if truth is None else found.consistency(magloc.read_truth(truth))
     if geojson is not None and known.place is not None:
         write_text(dumps(found.to_geojson(known.place), allow_nan=False) + "\n", geojson)
@@ -298,9 +302,9 @@ def _print_track(found: Track, result: Consistency | None, *, json: bool, jsonl:
             _printed(point)
 
 
-def _no_track(readings: str, statuses: Iterable[str]) -> InputError:
+def _no_track(readings: str, statuses: Iterable[str], hint: str = "") -> InputError:
     reasons = "; ".join(sorted(set(statuses))[:3])
-    return InputError(f"{readings}: found no row where a source can be tracked ({reasons}).")
+    return InputError(f"{readings}: found no row where a source can be tracked ({reasons}){hint}.")
 
 
 def _printed(point: TrackPoint) -> TrackPoint:

@@ -1,3 +1,4 @@
+from magloc.plots import surveys as _surveys
 from magloc.plots import tracks as _tracks
 from magloc.plots.bounds import bound_reach as bound_reach
 from magloc.plots.bounds import bound_slices as bound_slices
@@ -12,4 +13,5 @@ from magloc.plots.style import save as save
 from magloc.plots.style import write as write
 
 consistency = _tracks.consistency_figure
+survey = _surveys.survey_figure
 track = _tracks.track_figure

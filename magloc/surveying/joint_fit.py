@@ -101,6 +101,11 @@ class Background:
     white: Whitening
     Q: FloatArray
 
+    @property
+    def log_determinant(self) -> float:
+        """Of what is left of white noise when the columns are projected out: minus that of ``LᵀL + 1``."""
+        return float(np.linalg.slogdet(np.eye(self.Q.shape[1]) - self.Q.T @ self.Q)[1])
+
     @classmethod
     def of(
         cls,

@@ -12,13 +12,14 @@ then on both sides, and is projected out.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
+from arrays.pose import PoseUncertainty
 from arrays.typing import BoolArray, FloatArray
 from magloc.fields.dipole_compiled import field_at_points
 from magloc.measurement.pose import LEVER, N_POSE, SHIFT, TURN, PoseErrors, rates_of
@@ -80,6 +81,12 @@ class SurveyRecord:
 
     def __len__(self) -> int:
         return len(self.time_s)
+
+    def with_pose(self, pose: PoseUncertainty) -> SurveyRecord:
+        """The same rows where another pose is stated, without an error of the clock."""
+        still = np.zeros((len(self), 3))
+        effects = PoseErrors.of(pose).effects(still, still)
+        return replace(self, array=replace(self.array, pose=pose), pose_effects=effects)
 
     @cached_property
     def is_vector(self) -> BoolArray:

@@ -100,7 +100,7 @@ class Survey:
     chi2_per_dof : float
         Of all white residuals: 1 where what is stated of the errors is right.
     pose_assumed : bool
-        Whether nothing was stated of the pose's errors, so that 2 cm were assumed.
+        Whether nothing was stated of the pose's errors, so that they are what the rows tell: `record.array.pose`.
     seconds : float
 
     Examples

@@ -12,7 +12,6 @@ import numpy as np
 from scipy.special import chdtri
 
 from arrays.array import SensorArray
-from arrays.pose import PoseUncertainty
 from arrays.typing import FloatArray, IntArray
 from magloc.blas_threads import one_blas_thread
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
@@ -20,6 +19,7 @@ from magloc.measurement.pose import PoseErrors, with_stated_pose
 from magloc.readings import Readings, without_saturated
 from magloc.surveying.depth import depth_interval
 from magloc.surveying.joint_fit import Background, Bounds, JointFit, Layer
+from magloc.surveying.pose_components import UNSTATED, with_likeliest_pose
 from magloc.surveying.record import SurveyRecord, joined
 from magloc.surveying.results import Survey, Target
 from magloc.surveying.rounds import Model, found_in
@@ -37,8 +37,6 @@ _WEAK = 200.0
 _SETTLED = 1e-3
 _GROUPS_PER_HEIGHT = 4.0
 _NEAR = 1.5
-UNSTATED_POSE_M = 0.02
-"""Standard deviation of the pose's position where nothing is said of it."""
 
 
 @one_blas_thread
@@ -63,7 +61,8 @@ def survey(
     Parameters
     ----------
     array : SensorArray
-        Its noise counts, and what it states of its pose (:class:`arrays.PoseUncertainty`); 2 cm if it states nothing.
+        Its noise counts, and what it states of its pose (:class:`arrays.PoseUncertainty`); if it states nothing, how
+        large the errors of the pose are and how long they last is estimated from the targets' own fields.
     readings : Readings or sequence of them
         In order of time, with the pose of the array, and for scalar sensors with the ambient field.
     prior : SourcePrior
@@ -114,7 +113,12 @@ def survey(
     model = Model(record, errors, layer, Drift(), bounds, threshold)
     grid = SearchGrid.below(record, bounds.low_m, bounds.high_m)
     sources = found_in(model, group, grid, progress or (lambda *_: None))
-    fit, background = model.fitted(sources, np.arange(len(record)), _SETTLED)
+    assumed = array.pose is None and rows.pose_sigma is None
+    every = np.arange(len(record))
+    if assumed and len(sources):
+        model = with_likeliest_pose(model, model.fitted(sources, every, _SETTLED)[0].sources)
+        record = model.record
+    fit, background = model.fitted(sources, every, _SETTLED)
     residual = record.values_T - record.predicted(record.fields(fit.sources.position_m, fit.sources.moment_Am2))
     if fit.chi2 > 2.0 * fit.residual.size:
         _LOG.warning(
@@ -129,7 +133,7 @@ def survey(
         ground_m,
         threshold,
         fit.chi2 / fit.residual.size,
-        array.pose is None and rows.pose_sigma is None,
+        assumed,
         time.monotonic() - began,
     )
 
@@ -147,7 +151,7 @@ def _prepared(array: SensorArray, readings: Readings) -> tuple[SurveyRecord, Pos
         raise ValueError("Input readings must be in order of time; instead received others.")
     array = with_stated_pose(array, readings)
     if array.pose is None:
-        array = replace(array, pose=PoseUncertainty(position_m=UNSTATED_POSE_M))
+        array = replace(array, pose=UNSTATED)
     errors = PoseErrors.of(array.pose)
     record = SurveyRecord.of(array, readings, _ambient_T(array, readings), errors)
     return replace(record, values_T=record.values_T - np.median(record.values_T, axis=0)), errors

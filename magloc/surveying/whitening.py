@@ -101,6 +101,11 @@ class Whitening:
         summed = _summed(self.U @ channels, self.group, np.sqrt(1.0 / np.bincount(self.group)))
         return self.of_groups(np.ascontiguousarray(summed))
 
+    @property
+    def log_determinant(self) -> float:
+        """Of the noise's covariance."""
+        return float(-2.0 * np.log(self.gains[..., -1]).sum())
+
     @cached_property
     def starts(self) -> IntArray:
         """First row of every group, and the end of the last one."""

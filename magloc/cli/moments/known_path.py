@@ -9,16 +9,15 @@ from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 from cyclopts import Parameter
 
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.text import write_text
-from arrays.typing import BoolArray
 from magloc.cli.framework import print_json
 from magloc.cli.options import KnownOptions, print_note
 
 if TYPE_CHECKING:
+    from arrays.typing import BoolArray
     from magloc.signature.moment_track import MomentTrack
     from magloc.signature.path import PathError
     from magloc.tracking.results import TrackPoint
@@ -129,7 +128,10 @@ def write_moment_tracks(found: Sequence[MomentTrack], readings: Path, outputs: M
             print_json(entry)
     else:
         print("\n".join(f"source {k}\n{track.table()}" for k, track in enumerate(found, start=1)))
-    _note(first, np.all([track.tracked for track in found], axis=0), readings, outputs)
+    determined = first.tracked
+    for track in found[1:]:
+        determined = determined & track.tracked
+    _note(first, determined, readings, outputs)
 
 
 def _entry_of_several(points: Sequence[TrackPoint]) -> dict[str, object]:

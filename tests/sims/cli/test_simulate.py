@@ -88,7 +88,11 @@ class TestFiles:
 class TestBadInput:
     def test_an_unknown_scenario(self, run: Run, tmp_path: Path) -> None:
         outcome = run("simulate", "submarine", "--out", tmp_path / "run.csv")
-        assert_refused(outcome, "submarine", "diver, drone, hand-magnet, paper, ship, ship-headings, weaving")
+        assert_refused(
+            outcome,
+            "submarine",
+            "diver, drone, hand-magnet, paper, ship, ship-headings, survey-cart, survey-diver, survey-drone, weaving",
+        )
         assert not list(tmp_path.iterdir())
 
     def test_an_unknown_key(self, run: Run, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from arrays.array_file import read_array
+from arrays.array_file import read_sensors
 from arrays.geometries import tetrahedron
 from arrays.io.errors import InputError
 from magloc.fields.geomagnetic import field_enu
@@ -27,7 +27,10 @@ from sims.magnetics.simulation import simulate
 from tests.conftest import REPOSITORY
 from tests.sims.magnetics.white_noise import with_white_noise_only
 
-NAMES = ("diver", "drone", "hand-magnet", "paper", "ship", "ship-headings", "weaving")
+NAMES = (
+    *("diver", "drone", "hand-magnet", "paper", "ship", "ship-headings"),
+    *("survey-cart", "survey-diver", "survey-drone", "weaving"),
+)
 FILES = REPOSITORY / "sims" / "magnetics" / "scenarios"
 PLAIN = """
 duration_s = 10.0
@@ -67,7 +70,7 @@ class TestBuiltIn:
         simulation = simulate(read_scenario(name), 3)
         files = write_simulation(simulation, tmp_path / "run.csv")
         assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in files.all)
-        array = read_array(files.array)
+        array = read_sensors(files.array)
         assert array == simulation.array
         readings = read_readings(files.readings, array)
         np.testing.assert_array_equal(readings.time_s, simulation.readings.time_s)
@@ -79,15 +82,20 @@ class TestBuiltIn:
             assert (found is None) == (expected is None)
             if expected is not None:
                 np.testing.assert_allclose(found, expected, rtol=1e-13)
-        truth = read_truth(files.truths[0])
-        np.testing.assert_array_equal(truth.position_m, simulation.truth.position_m)
-        np.testing.assert_array_equal(truth.moment_Am2, simulation.truth.moment_Am2)
+        for path, expected in zip(files.truths, simulation.truths, strict=True):
+            truth = read_truth(path)
+            np.testing.assert_array_equal(truth.position_m, expected.position_m)
+            np.testing.assert_array_equal(truth.moment_Am2, expected.moment_Am2)
+        for path in files.targets:
+            buried = np.loadtxt(path, delimiter=",", skiprows=1)
+            np.testing.assert_array_equal(buried[:, :3], simulation.target_position_m)
+            np.testing.assert_array_equal(buried[:, 3:], simulation.target_moment_Am2)
 
     @pytest.mark.parametrize("name", NAMES)
     def test_the_source_is_seen(self, name: str) -> None:
         # Without its source the readings differ by 20 times the noise of a sample, at the best channel and time.
         wanted = with_white_noise_only(read_scenario(name))
-        seen, empty = (simulate(s, 3).readings.values_T for s in (wanted, replace(wanted, sources=())))
+        seen, empty = (simulate(s, 3).readings.values_T for s in (wanted, replace(wanted, sources=(), targets=None)))
         change = np.abs(np.diff(seen - empty, axis=1)) / wanted.nominal_array.channel_noise_T[1:]
         assert np.nanmax(change) > 20.0
 

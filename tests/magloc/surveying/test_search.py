@@ -1,0 +1,40 @@
+"""Where the search of a survey starts sources."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magloc.surveying.search import Candidates, peaks
+
+
+def candidates(*rows: tuple[float, float, float]) -> Candidates:
+    """Places along x with their χ², at a distance of 1 m from the sensors."""
+    x, y, chi2 = np.array(rows).T
+    place = np.column_stack([x, y, np.zeros_like(x)])
+    return Candidates(place, np.ones_like(x), chi2, np.zeros((len(x), 3)))
+
+
+class TestPeaks:
+    def test_strongest_first(self) -> None:
+        assert peaks(candidates((0.0, 0.0, 50.0), (20.0, 0.0, 80.0)), 25.0).tolist() == [1, 0]
+
+    def test_below_the_threshold(self) -> None:
+        assert peaks(candidates((0.0, 0.0, 24.0)), 25.0).tolist() == []
+
+    def test_the_same_peak(self) -> None:
+        """A neighbour in the grid is the same source."""
+        assert peaks(candidates((0.0, 0.0, 80.0), (1.0, 0.0, 79.0)), 25.0).tolist() == [0]
+
+    def test_a_skirt_of_a_stronger_one(self) -> None:
+        assert peaks(candidates((0.0, 0.0, 1000.0), (4.0, 0.0, 300.0)), 25.0).tolist() == [0]
+
+    def test_one_nearly_as_strong_is_no_skirt(self) -> None:
+        assert peaks(candidates((0.0, 0.0, 1000.0), (4.0, 0.0, 700.0)), 25.0).tolist() == [0, 1]
+
+    def test_weak_ones_wait(self) -> None:
+        """What a strong source leaves of its field would be taken for them."""
+        assert peaks(candidates((0.0, 0.0, 1e5), (30.0, 0.0, 1e3)), 25.0).tolist() == [0]
+
+    def test_places_that_were_tried(self) -> None:
+        found = candidates((0.0, 0.0, 50.0), (20.0, 0.0, 80.0))
+        assert peaks(found.without(np.array([False, True])), 25.0).tolist() == [0]
