@@ -153,5 +153,9 @@ class TestOutputs:
 
     def test_unstated_pose_is_said(self) -> None:
         field = simulated("survey-drone", 901)
-        array = arrays.SensorArray(field.array.sensors)
-        assert magloc.survey(array, field.readings).pose_assumed
+        found = magloc.survey(arrays.SensorArray(field.array.sensors), field.readings)
+        assert found.pose_assumed
+        assert found.record.array.pose is not None
+        # 2.4 cm that last 10 s; two targets tell it by a factor of two or so.
+        assert found.record.array.pose.position_m in (0.01, 0.02, 0.04)
+        assert found.record.array.pose.correlation_s >= 2.0
