@@ -19,6 +19,11 @@ _WINDOW = 5.0  # of rows that count, in distances
 _CHUNK = 8  # places along each side of a tile
 _UNKNOWN = 1e4
 _LEAST_SEEN = 1e-3
+# Peaks start sources if they have a share of the strongest one's χ²; within some distances of a stronger one a larger
+# share, as they may be its skirts; and none within fewer, where they are the same.
+_LEAST_SHARE = 0.05
+_SKIRT, _SKIRT_SHARE = 6.0, 0.6
+_SAME = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,9 +109,6 @@ def peaks(found: Candidates, threshold: float) -> IntArray:
         if all(_stands_beside(found, int(i), other) for other in kept):
             kept.append(int(i))
     return np.array(kept, dtype=np.intp)
-
-
-_LEAST_SHARE, _SKIRT_SHARE, _SKIRT, _SAME = 5e-2, 0.6, 6.0, 1.5
 
 
 def _stands_beside(found: Candidates, i: int, stronger: int) -> bool:

@@ -1,4 +1,4 @@
-"""Compiled loops of :mod:`magloc.surveying.whitening`, which has their readable twins."""
+"""Compiled loops of :mod:`magloc.surveying.whitening`; tests hold them to whole covariance matrices and to the dipole."""
 
 from __future__ import annotations
 
@@ -13,7 +13,11 @@ from magloc.fields.dipole_compiled import field_matrix_components, gradient_comp
 
 @compiled
 def gains_of(H: FloatArray, kept: FloatArray, added: FloatArray, dt: FloatArray, start: FloatArray) -> FloatArray:
-    """Kalman gains and 1/σ (n, k, S + 1): see :func:`magloc.surveying.whitening.plain_gains`."""
+    """Kalman gains, and 1/σ of every innovation behind them, (n, k, S + 1).
+
+    Of measurements H (n, k, S) of unit noise, one after the other; what is kept of states and added to their variances
+    in every step, (n, S) each, and their variances before the first one, (S,).
+    """
     n, k, S = H.shape
     out = np.empty((n, k, S + 1))
     P = np.diag(start)
