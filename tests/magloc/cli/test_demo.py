@@ -62,7 +62,7 @@ class TestWarmUp:
         done = run("warm-up")
         assert done.status == 0, done.err
         assert done.out == ""
-        assert set(called) == {"warm-up", "locate", "track", "map", "bounds"}
+        assert set(called) == {"warm-up", "locate", "simulate", "track", "map", "bounds"}
         assert "compiled" in done.err
 
 
