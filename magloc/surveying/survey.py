@@ -23,7 +23,7 @@ from magloc.surveying.pose_components import UNSTATED, with_likeliest_pose
 from magloc.surveying.record import SurveyRecord, joined
 from magloc.surveying.results import Survey, Target
 from magloc.surveying.rounds import Model, found_in
-from magloc.surveying.search import SearchGrid
+from magloc.surveying.search import PITCH, SearchGrid
 from magloc.surveying.whitening import Drift
 
 _LOG = logging.getLogger(__name__)
@@ -37,6 +37,8 @@ _WEAK = 200.0
 _SETTLED = 1e-3
 _GROUPS_PER_HEIGHT = 4.0
 _NEAR = 1.5
+_MOST_NUMBERS = 2.5e8  # of the columns of the ground: 2 GB
+_MOST_PLACES = 1e6
 
 
 @one_blas_thread
@@ -105,6 +107,7 @@ def survey(
     rows = readings if isinstance(readings, Readings) else joined(readings)
     record, errors = _prepared(array, rows)
     bounds = _bounds(record, prior, ground_m)
+    _refuse_too_large(record, bounds, shortest_geology_m)
     threshold = float(chdtri(3, min(0.5, false_per_hectare / (_HECTARE_M2 * _TRIALS_PER_M2))))
     height = float(np.median(record.sensors_m[..., 2].min(axis=1))) - bounds.high_m[2]
     group = _groups(record, height / _GROUPS_PER_HEIGHT)
@@ -160,6 +163,10 @@ def _prepared(array: SensorArray, readings: Readings) -> tuple[SurveyRecord, Pos
 def _ambient_T(array: SensorArray, readings: Readings) -> FloatArray:
     """Ambient field of every row (n, 3) in the array's frame; of vector sensors it is what they read on average."""
     if readings.ambient_T is not None:
+        if not (np.linalg.norm(readings.ambient_T, axis=1) > 0.0).all():
+            raise ValueError(
+                "Input readings must have an ambient field in every row; instead received zero or nothing."
+            )
         return readings.ambient_T
     if array.ambient_T is not None:
         return np.tile(array.ambient_T, (len(readings), 1))
@@ -186,6 +193,20 @@ def _bounds(record: SurveyRecord, prior: SourcePrior, ground_m: float) -> Bounds
     if not (low_m < high_m).all():
         raise ValueError("Input prior must leave room below the ground; instead received bounds that do not.")
     return Bounds(low_m, high_m, min(prior.largest_moment_Am2, _LARGEST_MOMENT_Am2))
+
+
+def _refuse_too_large(record: SurveyRecord, bounds: Bounds, shortest_geology_m: float) -> None:
+    """Raise where the ground's columns would not fit into memory, or its places not into a day."""
+    height = float(np.median(record.sensors_m[..., 2].min(axis=1)))
+    x, y = (bounds.high_m - bounds.low_m)[:2]
+    pitch = max(height - bounds.high_m[2], 0.3) / PITCH
+    spacing = shortest_geology_m / 3.75
+    numbers = len(record) * record.array.n_channels * (x / spacing + 5.0) * (y / spacing + 5.0)
+    if numbers > _MOST_NUMBERS or x * y / pitch**2 > _MOST_PLACES:
+        raise ValueError(
+            f"Input readings must be cut into smaller pieces; instead received {len(record)} rows over {x:.3g} m by "
+            f"{y:.3g} m, {height - bounds.high_m[2]:.2g} m above the ground."
+        )
 
 
 def _groups(record: SurveyRecord, length_m: float) -> IntArray:

@@ -113,6 +113,15 @@ class TestBadInput:
     def test_time_that_goes_back(self) -> None:
         self.refused("order of time", time_s=np.arange(60.0)[::-1])
 
+    def test_no_field(self) -> None:
+        self.refused("ambient field in every row", ambient_T=np.zeros((60, 3)))
+
+    def test_too_large(self) -> None:
+        """One row that is a thousand kilometres away."""
+        places = simulated("survey-drone", 904, 0).readings[: self.ROWS].array_position_m
+        assert places is not None
+        self.refused("smaller pieces", array_position_m=places + np.outer(np.arange(60) == 30, [1e6, 1e6, 0.0]))
+
     def test_few_rows(self) -> None:
         self.refused("20 whole rows", values_T=np.full((60, 2), np.nan))
 
