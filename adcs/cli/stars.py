@@ -114,7 +114,7 @@ def _pictures(
     if out is not None:
         refuse_file(out, "--out")
     off = None if dark is None else adcs.read_picture(dark)
-    rows = []
+    rows, solved = [], []
     for path in paths:
         picture = adcs.read_picture(path)
         began = time.perf_counter()
@@ -139,10 +139,11 @@ def _pictures(
                 "reason": "",
             }
         rows.append({**row, "milliseconds": took_ms})
-        if out is not None:
-            make_folder(out, "--out")
-            figure = picture_figure(path.name, picture, lights, None if isinstance(found, NoFix) else found, known)
-            style.save(figure, out / f"{path.stem}-stars.png")
+        solved.append((path, picture, lights, None if isinstance(found, NoFix) else found))
+    if out is not None:  # once all photographs are read: a later one may be refused
+        make_folder(out, "--out")
+        for path, picture, lights, fix in solved:
+            style.save(picture_figure(path.name, picture, lights, fix, known), out / f"{path.stem}-stars.png")
     if json:
         print_json({"pictures": rows})
         return

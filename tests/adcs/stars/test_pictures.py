@@ -233,3 +233,10 @@ class TestCommand:
     def test_refusals(self, files, capsys, arguments, said):
         assert main(["stars", str(files / "sky.png"), "--catalogue", str(files / "sky.csv"), *arguments]) == 2
         assert said in capsys.readouterr().err
+
+    def test_a_picture_that_is_not_there_leaves_nothing_written(self, files, capsys):
+        pictures = [str(files / "sky.png"), str(files / "none.png")]
+        catalogue = ["--catalogue", str(files / "sky.csv"), "--scale-arcsec", "61"]
+        assert main(["stars", *pictures, *catalogue, "--out", str(files / "out")]) == 2
+        assert "none.png does not exist" in capsys.readouterr().err
+        assert not (files / "out").exists()
