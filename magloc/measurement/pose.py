@@ -12,7 +12,6 @@ the array's own motion: :math:`δx = \dot x δt`, :math:`θ = ω δt`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -154,11 +153,11 @@ class PoseErrors:
         """Number of errors."""
         return self.of_pose.size
 
-    def step(self, dt_s: float) -> tuple[FloatArray, FloatArray]:
-        """What remains of every error after a step, and the standard deviation of what is added: (n,) each."""
+    def step(self, dt_s: float | FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What remains of every error after steps (...), and the standard deviation of what is added: (..., n) each."""
         lasts_s = self.uncertainty.correlation_s
-        share = math.exp(-dt_s / lasts_s) if lasts_s else 0.0
-        kept = np.where(self.changes, share, 1.0)
+        share = np.exp(-np.asarray(dt_s) / lasts_s) if lasts_s else np.zeros(np.shape(dt_s))
+        kept = np.where(self.changes, share[..., None], 1.0)
         return kept, np.sqrt(1.0 - kept**2)
 
     def effect(self, pose: ArrayPose, sigma: FloatArray | None = None) -> FloatArray:

@@ -23,6 +23,7 @@ from magloc.surveying.whitening_compiled import source_columns
 
 _MOST_STEPS = 25
 _SETTLED = 1e-3
+_UNKNOWN = 1e4  # standard deviation of a column of unit length
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +124,16 @@ class Background:
         white = Whitening.of(record, record.by_pose(directions, fields, gradients), errors, drift, group)
         columns = np.concatenate([layer.columns(record, directions), record.by_sensors(directions)], axis=2)
         return cls(white, orthogonal(white(columns)))
+
+
+def with_free_sources(record: SurveyRecord, background: Background, sources: Sources) -> FloatArray:
+    """``Q`` of a background where some sources, too, are free to move, to first order."""
+    Q = background.Q
+    if not len(sources):
+        return Q
+    J = jacobian_of(record, background, sources)
+    J = J - Q @ (Q.T @ J)
+    return np.concatenate([Q, orthogonal(_UNKNOWN * J / np.linalg.norm(J, axis=0))], axis=1)
 
 
 def orthogonal(L: FloatArray) -> FloatArray:
@@ -231,16 +242,17 @@ def fit_jointly(
         of_layer = background.Q.T @ residual
         return float(residual @ residual - of_layer @ of_layer), residual, of_layer
 
+    def linearised(sources: Sources) -> tuple[FloatArray, FloatArray, FloatArray]:
+        J = jacobian_of(record, background, sources)
+        J_layer = background.Q.T @ J
+        return J, J_layer, J.T @ J - J_layer.T @ J_layer
+
     cost, residual, of_layer = cost_of(sources)
     if not len(sources):
         return JointFit(sources, cost, np.zeros((0, 0)), residual)
+    J, J_layer, H = linearised(sources)
     damping = 1e-3
-    for step_number in range(most + 1):
-        J = jacobian_of(record, background, sources)
-        J_layer = background.Q.T @ J
-        H = J.T @ J - J_layer.T @ J_layer
-        if step_number == most:
-            break
+    for _ in range(most):
         gradient = J.T @ residual - J_layer.T @ of_layer
         scale = 1.0 / np.sqrt(np.diagonal(H))
         gain = 0.0
@@ -255,9 +267,7 @@ def fit_jointly(
                 damping = max(0.1 * damping, 1e-9)
                 break
             damping *= 10.0
+        J, J_layer, H = linearised(sources)
         if gain < settled:
-            J = jacobian_of(record, background, sources)
-            J_layer = background.Q.T @ J
-            H = J.T @ J - J_layer.T @ J_layer
             break
     return JointFit(sources, cost, H, residual)

@@ -117,12 +117,22 @@ class SurveyRecord:
             out[:, self.is_vector] = turned.reshape(len(self), -1)
         return out
 
+    @property
+    def height_m(self) -> float:
+        """Median height of the lowest sensor in the world frame."""
+        return float(np.median(self.sensors_m[..., 2].min(axis=1)))
+
+    @cached_property
+    def along(self) -> FloatArray:
+        """What each channel (n, C) reads of a small change of the ambient field along itself."""
+        unit = self.ambient_T / np.linalg.norm(self.ambient_T, axis=1, keepdims=True)
+        weights = np.ones_like(self.values_T)
+        weights[:, self.is_vector] = np.tile(unit, (1, int(self.is_vector.sum()) // 3))
+        return weights
+
     def along_ambient(self, channels_T: FloatArray) -> FloatArray:
         """Mean over the sensors (n,) of what channels (n, C) are along the ambient field."""
-        unit = self.ambient_T / np.linalg.norm(self.ambient_T, axis=1, keepdims=True)
-        weights = np.ones_like(channels_T)
-        weights[:, self.is_vector] = np.tile(unit, (1, int(self.is_vector.sum()) // 3))
-        return np.sum(weights * channels_T, axis=1) / self.array.n_sensors
+        return np.sum(self.along * channels_T, axis=1) / self.array.n_sensors
 
     def directions(self, fields_T: FloatArray) -> FloatArray:
         """What each channel reads of a small change of the field at its sensor, (n, C, 3), where fields are."""

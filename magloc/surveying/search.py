@@ -8,16 +8,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.surveying.joint_fit import Background, JointFit, Sources, jacobian_of, orthogonal
+from magloc.surveying.joint_fit import Background, JointFit, Sources, with_free_sources
 from magloc.surveying.record import SurveyRecord
+from magloc.surveying.whitening import Whitening
 from magloc.surveying.whitening_compiled import moment_columns, whiten
 
 N_DISTANCES = 5
 PITCH = 1.8
 """Distance of a source from the sensors over the pitch of the grid: 91 % of its energy is found in the median."""
-_WINDOW = 5.0  # of rows that count, in distances
+WINDOW = 5.0
+"""Of rows that count, in distances from the sensors."""
 _CHUNK = 8  # places along each side of a tile
-_UNKNOWN = 1e4
 _LEAST_SEEN = 1e-3
 # Peaks start sources if they have a share of the strongest one's χ²; within some distances of a stronger one a larger
 # share, as they may be its skirts; and none within fewer, where they are the same.
@@ -49,7 +50,7 @@ class SearchGrid:
     @classmethod
     def below(cls, record: SurveyRecord, low_m: FloatArray, high_m: FloatArray) -> SearchGrid:
         """Of a box, at distances from the lowest sensors in geometric steps."""
-        height = float(np.median(record.sensors_m[..., 2].min(axis=1)))
+        height = record.height_m
         nearest, farthest = max(height - high_m[2], 0.3), height - low_m[2]
         tiles = []
         for distance in np.geomspace(nearest * 1.1, max(farthest, nearest * 1.2), N_DISTANCES):
@@ -67,36 +68,43 @@ def search(record: SurveyRecord, background: Background, fit: JointFit, grid: Se
     white = background.white
     fields = record.fields(fit.sources.position_m, fit.sources.moment_Am2)
     directions = record.directions(fields)
-    Q = background.Q
-    if len(fit.sources):
-        J = jacobian_of(record, background, fit.sources)
-        J = J - Q @ (Q.T @ J)
-        Q = np.concatenate([Q, orthogonal(_UNKNOWN * J / np.linalg.norm(J, axis=0))], axis=1)
+    Q = with_free_sources(record, background, fit.sources)
     left = fit.residual - Q @ (Q.T @ fit.residual)
-    starts = white.starts
-    middles = record.sensors_m.mean(axis=1)[starts[:-1]]
-    k = len(white.U)
+    middles = record.sensors_m.mean(axis=1)[white.starts[:-1]]
     parts = []
     for distance, places in grid.tiles:
-        rows = _near(middles, places, _WINDOW * distance)
-        if not rows.any():
+        used = np.flatnonzero(_near(middles, places, WINDOW * distance))
+        if not used.size:
             continue
-        used = np.flatnonzero(rows)
-        A = moment_columns(record.sensors_m, directions, white.U, record.array.channel_sensor, places, starts, used)
-        whiten(A, used, white.H, white.gains, white.kept, white.dt_s)
-        A = A.reshape(-1, A.shape[-1])
-        of = (used[:, None] * k + np.arange(k)).ravel()
-        A_Q = Q[of].T @ A
-        m = len(places)
-        whole, lost = (X.reshape(-1, m, 3).transpose(1, 2, 0) for X in (A, A_Q))
-        G = whole @ whole.mT
+        alone, projected, v = normal_equations(record, white, directions, places, used, Q, left)
         # Of a source that others nearly imitate rounding and the window's edge are left, which must not count.
-        least = _LEAST_SEEN * np.trace(G, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        G = G - lost @ lost.mT + least
-        v = (A.T @ left[of]).reshape(m, 3)
-        moment = np.linalg.solve(G, v[..., None])[..., 0]
-        parts.append((places, np.full(m, distance), np.sum(v * moment, axis=1), moment))
+        least = _LEAST_SEEN * np.trace(alone, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        moment = np.linalg.solve(projected + least, v[..., None])[..., 0]
+        parts.append((places, np.full(len(places), distance), np.sum(v * moment, axis=1), moment))
     return Candidates(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def normal_equations(
+    record: SurveyRecord,
+    white: Whitening,
+    directions: FloatArray,
+    places: FloatArray,
+    used: IntArray,
+    Q: FloatArray,
+    left: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of the moments at places (m, 3), seen by some groups of rows: matrices (m, 3, 3) and right sides (m, 3).
+
+    The matrix of the moments alone, then that with everything else projected out by Q from what is ``left``.
+    """
+    A = moment_columns(record.sensors_m, directions, white.U, record.array.channel_sensor, places, white.starts, used)
+    whiten(A, used, white.H, white.gains, white.kept, white.dt_s)
+    A = A.reshape(-1, A.shape[-1])
+    k = len(white.U)
+    of = (used[:, None] * k + np.arange(k)).ravel()
+    whole, lost = (X.reshape(-1, len(places), 3).transpose(1, 2, 0) for X in (A, Q[of].T @ A))
+    alone = whole @ whole.mT
+    return alone, alone - lost @ lost.mT, (A.T @ left[of]).reshape(-1, 3)
 
 
 def peaks(found: Candidates, threshold: float) -> IntArray:

@@ -109,7 +109,7 @@ def survey(
     bounds = _bounds(record, prior, ground_m)
     _refuse_too_large(record, bounds, shortest_geology_m)
     threshold = float(chdtri(3, min(0.5, false_per_hectare / (_HECTARE_M2 * _TRIALS_PER_M2))))
-    height = float(np.median(record.sensors_m[..., 2].min(axis=1))) - bounds.high_m[2]
+    height = record.height_m - bounds.high_m[2]
     group = _groups(record, height / _GROUPS_PER_HEIGHT)
     spread = float(np.median(np.abs(record.values_T)) * 1.4826)
     layer = Layer.below(record, shortest_geology_m, max(min(spread, 5e-9), 1e-10))
@@ -197,7 +197,7 @@ def _bounds(record: SurveyRecord, prior: SourcePrior, ground_m: float) -> Bounds
 
 def _refuse_too_large(record: SurveyRecord, bounds: Bounds, shortest_geology_m: float) -> None:
     """Raise where the ground's columns would not fit into memory, or its places not into a day."""
-    height = float(np.median(record.sensors_m[..., 2].min(axis=1)))
+    height = record.height_m
     x, y = (bounds.high_m - bounds.low_m)[:2]
     pitch = max(height - bounds.high_m[2], 0.3) / PITCH
     spacing = shortest_geology_m / 3.75

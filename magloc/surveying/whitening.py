@@ -79,17 +79,14 @@ class Whitening:
         dt_s = np.diff(time_s, prepend=time_s[0])
         C, q = record.array.n_channels, errors.n_states
         # Offsets of the channels, and what is common to them: along the ambient field.
-        unit = record.ambient_T / np.linalg.norm(record.ambient_T, axis=1, keepdims=True)
-        common = np.ones((len(record), C))
-        common[:, record.is_vector] = np.tile(unit, (1, int(record.is_vector.sum()) // 3))
         H = np.zeros((len(time_s), len(U), q + C + 2))
         H[..., :q] = _summed(U @ by_pose, group, scale)
         H[..., q : q + C] = U / scale[:, None, None]
-        H[..., q + C] = _summed((common @ U.T)[..., None], group, scale)[..., 0]
+        H[..., q + C] = _summed((record.along @ U.T)[..., None], group, scale)[..., 0]
         kept, added = np.ones((len(dt_s), q + C + 2)), np.zeros((len(dt_s), q + C + 2))
-        for i in range(1, len(dt_s)):
-            kept[i, :q], sigma = errors.step(float(dt_s[i]))
-            added[i, :q] = sigma**2
+        kept[:, :q], sigma = errors.step(dt_s)
+        added[1:, :q] = sigma[1:] ** 2
+        kept[0] = 1.0
         walk = np.array([sensor.drift_T_rth**2 / _HOUR_S for sensor in record.array.sensors]) + drift.sensor_T2_s
         added[:, q : q + C] = dt_s[:, None] * walk[record.array.channel_sensor]
         added[:, -2], added[:, -1] = drift.common_T2_s3 * dt_s**3 / 3.0, drift.common_T2_s3 * dt_s
