@@ -167,6 +167,48 @@ class TestWholeFiles:
             assert not self.in_place(ast.parse(code)), code
 
 
+class TestInterruptedKernels:
+    """A named tuple is made by Python code, in which a signal may raise: numba does not look, and crashes."""
+
+    @staticmethod
+    def callers(trees: dict[Path, ast.Module]) -> list[str]:
+        """Functions that are not compiled themselves and get a named tuple from a kernel."""
+        functions = {
+            path: [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)] for path, tree in trees.items()
+        }
+        named = {
+            node.name
+            for tree in trees.values()
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ClassDef) and any(ast.unparse(base) == "NamedTuple" for base in node.bases)
+        }
+        compiled = {
+            (path, node.name): "" if node.returns is None else ast.unparse(node.returns)
+            for path, nodes in functions.items()
+            for node in nodes
+            if any(ast.unparse(decorator).startswith("compiled") for decorator in node.decorator_list)
+        }
+        kernels = {name for (_, name), made in compiled.items() if named & set(re.findall(r"\w+", made))}
+        own = {name for _, name in compiled}
+        return [
+            f"{path.relative_to(REPOSITORY)}: {node.name} calls {call.func.id}"
+            for path, nodes in functions.items()
+            if any(f"{name}(" in path.read_text(encoding="utf-8") for name in kernels)
+            for node in nodes
+            if node.name not in own
+            for call in ast.walk(node)
+            if isinstance(call, ast.Call) and isinstance(call.func, ast.Name) and call.func.id in kernels
+        ]
+
+    def test_none_makes_a_named_tuple(self, trees: dict[Path, ast.Module]) -> None:
+        assert self.callers(trees) == []
+
+    def test_such_would_be_found(self) -> None:
+        path = REPOSITORY / "magloc/convergence/filters_compiled.py"
+        text = "class Ends(NamedTuple): ...\n@compiled\ndef _run() -> Ends: ...\ndef ends(): return _run()"
+        assert self.callers({path: ast.parse(text)}) == ["magloc/convergence/filters_compiled.py: ends calls _run"]
+
+
 class TestSizes:
     def test_no_function_has_too_many_parameters(self, trees: dict[Path, ast.Module]) -> None:
         found = []

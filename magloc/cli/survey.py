@@ -64,7 +64,7 @@ def survey(
     for scalar sensors the ambient field. The table has the most significant target first: ± xy is the longer half axis
     of the 95 % ellipse, χ² what would be lost without the target. Flags: "weak" = trust the depth interval and not the
     ellipse; "near" = another target is so near that one of the two may be spurious; "edge" = at the rim of what was
-    searched.
+    searched; "misfit" = errors are larger than is said. Sensors that stick, wild readings and late ones are named.
 
     Parameters
     ----------

@@ -123,7 +123,7 @@ class RepeatedFilter(_LikelihoodFilter):
         inflation, rule = self.noise_inflation, (self.tolerance_T, self.max_iterations)
         steps = self.position_step_m, self.moment_step_Am2
         if self.relinearise_every_scalar:
-            return relinearised_map(starts, z, variance, sensors, weights, inflation, *steps, *rule)
+            return Ends(*relinearised_map(starts, z, variance, sensors, weights, inflation, *steps, *rule))
         found = ends(REPEATED, Model.of(z, inflation * variance, sensors, weights, *steps), starts, *rule)
         return found._replace(chi2=inflation * found.chi2)
 

@@ -88,24 +88,26 @@ def ends(
     """End of every start (n, 6), the mean of its prior, by IEKF, REPEATED or DAMPED; a step has the prior's units."""
     unit = np.repeat([model.length, model.moment], 3)
     tolerance = tolerance_T / (model.moment / model.length**3)
-    found = _run(
+    states, chi2, iterations, stopped = _run(
         method,
         np.ascontiguousarray(starts / unit),
         _Rules(float(first_damping), tolerance**2, float(max_iterations)),
         min(get_num_threads(), -(-len(starts) // LANES)),
         model,
     )
-    return Ends(found.states * unit, found.chi2, found.iterations, found.stopped)
+    return Ends(states * unit, chi2, iterations, stopped)
 
 
 @compiled_parallel
-def _run(method: int, starts: FloatArray, rules: _Rules, n_blocks: int, model: Model) -> Ends:
+def _run(
+    method: int, starts: FloatArray, rules: _Rules, n_blocks: int, model: Model
+) -> tuple[FloatArray, FloatArray, NDArray[np.int64], NDArray[np.bool_]]:
     n = starts.shape[0]
     states, chi2 = np.empty((n, 6)), np.empty(n)
     iterations, stopped = np.empty(n, np.int64), np.empty(n, np.bool_)
     for block in prange(n_blocks):
         _run_block(method, starts, block, n_blocks, rules, model, Ends(states, chi2, iterations, stopped))
-    return Ends(states, chi2, iterations, stopped)
+    return states, chi2, iterations, stopped
 
 
 @compiled

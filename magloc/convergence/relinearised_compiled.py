@@ -14,10 +14,10 @@ import math
 
 import numpy as np
 from numba import prange
+from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
 from magloc.compilation import compiled, compiled_parallel
-from magloc.convergence.filters_compiled import Ends
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.kalman_compiled import scalar_update, triangular_root
 
@@ -84,8 +84,8 @@ def relinearised_map(
     moment_step_Am2: float,
     tolerance: float,
     max_iterations: int,
-) -> Ends:
-    """Ends of the filter that is linearised before every scalar, from starts (n, 6)."""
+) -> tuple[FloatArray, FloatArray, NDArray[np.int64], NDArray[np.bool_]]:
+    """The filter that is linearised before every scalar, from starts (n, 6): the parts of `Ends`."""
     n, k = starts.shape[0], z.size
     states = starts.copy()
     chi2 = np.empty(n)
@@ -115,4 +115,4 @@ def relinearised_map(
                 stopped[i] = True
                 break
         chi2[i] = _finish(x, z, variance, sensors, weights, h)
-    return Ends(states, chi2, passes, stopped)
+    return states, chi2, passes, stopped

@@ -39,6 +39,7 @@ def json_of_survey(found: Survey) -> dict[str, Any]:
         "threshold": found.threshold,
         "chi2_per_dof": found.chi2_per_dof,
         "pose_assumed": found.pose_assumed,
+        "lag_s": found.lag_s,
     }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from arrays.pose import PoseUncertainty
 from magloc.measurement.pose import PoseErrors
-from magloc.surveying.joint_fit import Sources, residual_of
+from magloc.surveying.joint_fit import Sources
 from magloc.surveying.rounds import Model
 
 UNSTATED = PoseUncertainty(position_m=0.02, attitude_rad=math.radians(0.5))
@@ -21,9 +21,10 @@ _CORRELATIONS_S = (0.0, 2.0, 10.0, 40.0)
 
 def with_likeliest_pose(model: Model, sources: Sources) -> Model:
     """The model whose errors of the pose have the largest likelihood where sources are: how lasting, and how large."""
+    every = np.arange(len(model.record))
 
     def likeliest(poses: Iterable[PoseUncertainty]) -> PoseUncertainty:
-        return max(poses, key=lambda pose: log_likelihood(with_pose(model, pose), sources))
+        return min(poses, key=lambda pose: with_pose(model, pose).misfit(sources, every))
 
     lasting = likeliest(replace(UNSTATED, correlation_s=seconds) for seconds in _CORRELATIONS_S)
     large = likeliest(replace(lasting, position_m=metres) for metres in _POSITIONS_M)
@@ -33,12 +34,3 @@ def with_likeliest_pose(model: Model, sources: Sources) -> Model:
 def with_pose(model: Model, pose: PoseUncertainty) -> Model:
     """The model where some uncertainty of the pose is stated."""
     return replace(model, record=model.record.with_pose(pose), errors=PoseErrors.of(pose))
-
-
-def log_likelihood(model: Model, sources: Sources) -> float:
-    """Of all rows where some sources are, but for a constant; the ground is Gaussian and integrated over."""
-    background = model.background(sources, np.arange(len(model.record)))
-    residual = residual_of(model.record, background, sources)
-    of_layer = background.Q.T @ residual
-    square = float(residual @ residual - of_layer @ of_layer)
-    return -0.5 * (square + background.white.log_determinant - background.log_determinant)

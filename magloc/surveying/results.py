@@ -39,7 +39,8 @@ class Target:
         χ² that is lost without it, of 3 degrees of freedom.
     flags : tuple of str
         ``weak``: the ellipse is not Gaussian. ``near``: another target is so near that one of the two may be spurious.
-        ``edge``: at the rim of what was searched.
+        ``edge``: at the rim of what was searched. ``misfit``: the rows above it do not fit a dipole within what is
+        stated of noise and pose, so that its errors are larger than its covariance says.
 
     Examples
     --------
@@ -101,6 +102,9 @@ class Survey:
         Of all white residuals: 1 where what is stated of the errors is right.
     pose_assumed : bool
         Whether nothing was stated of the pose's errors, so that they are what the rows tell: `record.array.pose`.
+    lag_s : float
+        How much later the readings were taken for than they were, as the targets showed and as was corrected: 0 where
+        they showed nothing.
     seconds : float
 
     Examples
@@ -121,6 +125,7 @@ class Survey:
     threshold: float
     chi2_per_dof: float
     pose_assumed: bool
+    lag_s: float
     seconds: float
 
     def __len__(self) -> int:

@@ -10,12 +10,13 @@ import numpy as np
 
 from arrays.typing import FloatArray, IntArray
 from magloc.measurement.pose import PoseErrors
-from magloc.surveying.joint_fit import Background, Bounds, JointFit, Layer, Sources, fit_jointly
+from magloc.surveying.joint_fit import Background, Bounds, JointFit, Layer, Sources, fit_jointly, residual_of
 from magloc.surveying.record import SurveyRecord
 from magloc.surveying.search import SearchGrid, peaks, search, sources_at
 from magloc.surveying.whitening import Drift
 
-_MOST_ROUNDS = 60
+MOST_ROUNDS = 60
+_MOST_IN_VAIN, _MISFIT = 8, 1.5  # rounds where χ² per reading says that no further source is what is missing
 _PROGRESS, _WORSE = 0.999, 1.02
 _MOST_AT_ONCE = 8
 _SAME_PLACE_M = 1e-6
@@ -41,14 +42,33 @@ class Model:
         """Where some sources are, for groups of rows."""
         return Background.of(self.record, sources, self.layer, self.errors, self.drift, group)
 
+    def refitted(self, sources: Sources, group: IntArray) -> Sources:
+        """The same sources where they fit best, within their reach."""
+        for _ in range(2):
+            background = self.background(sources, group)
+            sources = fit_jointly(
+                self.record, background, sources, self._around(sources), settled=_SETTLED_COARSELY
+            ).sources
+        return sources
+
+    def misfit(self, sources: Sources, group: IntArray) -> float:
+        """Minus twice the log-likelihood of some sources, but for a constant; the ground is Gaussian."""
+        background = self.background(sources, group)
+        residual = residual_of(self.record, background, sources)
+        of_layer = background.Q.T @ residual
+        square = float(residual @ residual - of_layer @ of_layer)
+        return square + background.white.log_determinant - background.log_determinant
+
+    def _around(self, sources: Sources) -> Bounds:
+        """Bounds within which sources stay what they are: one that leaps takes the place of one not found yet."""
+        height = np.median(self.record.sensors_m[..., 2])
+        return self.bounds.around(sources, _REACH * (height - sources.position_m[:, 2]))
+
     def fitted(self, sources: Sources, group: IntArray, settled: float) -> tuple[JointFit, Background]:
         """Sources fitted and weighed anew until none is left out that is not significant or not within the bounds."""
         for weighing in range(_MOST_WEIGHINGS):
             background = self.background(sources, group)
-            # A source that leaps takes the place of one that is not found yet.
-            height = np.median(self.record.sensors_m[..., 2])
-            near = self.bounds.around(sources, _REACH * (height - sources.position_m[:, 2]))
-            fit = fit_jointly(self.record, background, sources, near, settled=settled)
+            fit = fit_jointly(self.record, background, sources, self._around(sources), settled=settled)
             if not len(sources):
                 break
             kept = (fit.significance > self.threshold) & self.bounds.hold(fit.sources)
@@ -62,16 +82,17 @@ class Model:
 
 
 def found_in(
-    model: Model, group: IntArray, grid: SearchGrid, tell: Callable[[int, int], None] = lambda *_: None
+    model: Model, group: IntArray, grid: SearchGrid, known: Sources, most: int, tell: Callable[[int, int], None]
 ) -> Sources:
-    """Sources of a record whose rows count in groups; ``tell`` hears of every round and of how many it knows."""
+    """Sources of a record whose rows count in groups, after some rounds; ``tell`` hears of each and of their number."""
     stated = model.errors.uncertainty.position_m
     share = max(1.0, _POSE_WHILE_SEARCHING_M / stated) if stated else 1.0
     wide = replace(model, record=replace(model.record, pose_effects=share * model.record.pose_effects))
-    best = sources = Sources.none()
+    best = sources = known
+    in_vain = 0
     tried: FloatArray = np.zeros((0, 3))
     least = math.inf
-    for number in range(_MOST_ROUNDS):
+    for number in range(most):
         fit, background = wide.fitted(sources, group, _SETTLED_COARSELY)
         tell(number, len(fit.sources))
         at_once = _MOST_AT_ONCE
@@ -80,12 +101,15 @@ def found_in(
             fit, background = wide.fitted(best, group, _SETTLED_COARSELY)
             at_once = 1
         elif fit.chi2 < _PROGRESS * least:
-            tried = np.zeros((0, 3))
+            tried, in_vain = np.zeros((0, 3)), 0
+        in_vain += 1
+        if in_vain > _MOST_IN_VAIN and fit.chi2 > _MISFIT * fit.residual.size:
+            break
         best, least = fit.sources, min(least, fit.chi2)
         candidates = search(wide.record, background, fit, grid)
         # What was left out again is not tried twice, unless something else was found meanwhile.
-        known = (np.linalg.norm(candidates.place_m[:, None] - tried, axis=-1) < _SAME_PLACE_M).any(axis=1)
-        chosen = sources_at(candidates, peaks(candidates.without(known), model.threshold)[:at_once])
+        tried_before = (np.linalg.norm(candidates.place_m[:, None] - tried, axis=-1) < _SAME_PLACE_M).any(axis=1)
+        chosen = sources_at(candidates, peaks(candidates.without(tried_before), model.threshold)[:at_once])
         if not len(chosen):
             break
         tried = np.concatenate([tried, chosen.position_m])

@@ -15,21 +15,22 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray, IntArray
 from magloc.blas_threads import one_blas_thread
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
-from magloc.measurement.pose import PoseErrors, with_stated_pose
-from magloc.readings import Readings, without_saturated
+from magloc.readings import Readings
+from magloc.surveying.clock import lag_of, taken_earlier
 from magloc.surveying.depth import depth_interval
-from magloc.surveying.joint_fit import Background, Bounds, JointFit, Layer
-from magloc.surveying.pose_components import UNSTATED, with_likeliest_pose
+from magloc.surveying.joint_fit import Background, Bounds, JointFit, Layer, Sources
+from magloc.surveying.pose_components import with_likeliest_pose
+from magloc.surveying.preparation import record_of, whole_rows
 from magloc.surveying.record import SurveyRecord, joined
 from magloc.surveying.results import Survey, Target
-from magloc.surveying.rounds import Model, found_in
+from magloc.surveying.rounds import MOST_ROUNDS, Model, found_in
 from magloc.surveying.search import PITCH, SearchGrid
 from magloc.surveying.whitening import Drift
 
 _LOG = logging.getLogger(__name__)
 _TRIALS_PER_M2 = 0.8  # independent ones of a map: 0.65 to 0.9
 _HECTARE_M2 = 1e4
-_FEWEST_ROWS = 20
+_FIRST_ROUNDS = 4  # until the clock is looked at
 _DEEPEST = 4.0
 _MARGIN_M = 1.0
 _LARGEST_MOMENT_Am2 = 300.0
@@ -37,6 +38,7 @@ _WEAK = 200.0
 _SETTLED = 1e-3
 _GROUPS_PER_HEIGHT = 4.0
 _NEAR = 1.5
+_MISFIT = 1.5  # χ² per reading
 _MOST_NUMBERS = 2.5e8  # of the columns of the ground: 2 GB
 _MOST_PLACES = 1e6
 
@@ -105,7 +107,9 @@ def survey(
     if not shortest_geology_m > 0.0:
         raise ValueError(f"Input shortest_geology_m must be positive; instead received {shortest_geology_m:g}.")
     rows = readings if isinstance(readings, Readings) else joined(readings)
-    record, errors = _prepared(array, rows)
+    assumed = array.pose is None and rows.pose_sigma is None
+    array, rows = whole_rows(array, rows)
+    record, errors = record_of(array, rows)
     bounds = _bounds(record, prior, ground_m)
     _refuse_too_large(record, bounds, shortest_geology_m)
     threshold = float(chdtri(3, min(0.5, false_per_hectare / (_HECTARE_M2 * _TRIALS_PER_M2))))
@@ -115,12 +119,20 @@ def survey(
     layer = Layer.below(record, shortest_geology_m, max(min(spread, 5e-9), 1e-10))
     model = Model(record, errors, layer, Drift(), bounds, threshold)
     grid = SearchGrid.below(record, bounds.low_m, bounds.high_m)
-    sources = found_in(model, group, grid, progress or (lambda *_: None))
-    assumed = array.pose is None and rows.pose_sigma is None
+    tell = progress or (lambda *_: None)
+    strongest = found_in(model, group, grid, Sources.none(), _FIRST_ROUNDS, tell)
+    lag = lag_of(lambda lag_s: replace(model, record=record_of(array, taken_earlier(rows, lag_s))[0]), strongest, group)
+    if lag.s:
+        _LOG.warning(
+            f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show: taken"
+            " into account"
+        )
+        model = replace(model, record=record_of(array, taken_earlier(rows, lag.s))[0])
+    sources = found_in(model, group, grid, strongest, MOST_ROUNDS, tell)
     every = np.arange(len(record))
     if assumed and len(sources):
         model = with_likeliest_pose(model, model.fitted(sources, every, _SETTLED)[0].sources)
-        record = model.record
+    record = model.record
     fit, background = model.fitted(sources, every, _SETTLED)
     residual = record.values_T - record.predicted(record.fields(fit.sources.position_m, fit.sources.moment_Am2))
     if fit.chi2 > 2.0 * fit.residual.size:
@@ -137,46 +149,9 @@ def survey(
         threshold,
         fit.chi2 / fit.residual.size,
         assumed,
+        lag.s,
         time.monotonic() - began,
     )
-
-
-def _prepared(array: SensorArray, readings: Readings) -> tuple[SurveyRecord, PoseErrors]:
-    """Whole rows, in the world frame."""
-    if readings.array_rotation is None:
-        raise ValueError("Input readings must have the pose of the array in every row; instead received none.")
-    readings = without_saturated(readings, array)
-    whole = np.asarray(np.isfinite(readings.values_T).all(axis=1))
-    if whole.sum() < _FEWEST_ROWS:
-        raise ValueError(f"Input readings must have {_FEWEST_ROWS} whole rows or more; instead received {whole.sum()}.")
-    readings = readings[whole]
-    if not (np.diff(readings.time_s) > 0.0).all():
-        raise ValueError("Input readings must be in order of time; instead received others.")
-    array = with_stated_pose(array, readings)
-    if array.pose is None:
-        array = replace(array, pose=UNSTATED)
-    errors = PoseErrors.of(array.pose)
-    record = SurveyRecord.of(array, readings, _ambient_T(array, readings), errors)
-    return replace(record, values_T=record.values_T - np.median(record.values_T, axis=0)), errors
-
-
-def _ambient_T(array: SensorArray, readings: Readings) -> FloatArray:
-    """Ambient field of every row (n, 3) in the array's frame; of vector sensors it is what they read on average."""
-    if readings.ambient_T is not None:
-        if not (np.linalg.norm(readings.ambient_T, axis=1) > 0.0).all():
-            raise ValueError(
-                "Input readings must have an ambient field in every row; instead received zero or nothing."
-            )
-        return readings.ambient_T
-    if array.ambient_T is not None:
-        return np.tile(array.ambient_T, (len(readings), 1))
-    if array.channel_is_scalar.all():
-        raise ValueError("Input readings must have the ambient field for scalar sensors; instead received none.")
-    assert readings.array_rotation is not None
-    vector = np.array([sensor.kind == "vector" for sensor in array.sensors])
-    fields = array.calibrated_field(readings.values_T)[:, vector]
-    world = np.median(readings.array_rotation.apply(fields.mean(axis=1)), axis=0)
-    return np.asarray(readings.array_rotation.inv().apply(world))
 
 
 def _bounds(record: SurveyRecord, prior: SourcePrior, ground_m: float) -> Bounds:
@@ -222,6 +197,7 @@ def _targets(model: Model, fit: JointFit, background: Background, ground_m: floa
     if not len(fit.sources):
         return ()
     covariance, significance = fit.covariance, fit.significance
+    left = (fit.residual - background.Q @ (background.Q.T @ fit.residual)).reshape(len(background.white.H), -1)
     order = np.argsort(-significance)
     targets = []
     for number, j in enumerate(order, start=1):
@@ -236,6 +212,8 @@ def _targets(model: Model, fit: JointFit, background: Background, ground_m: floa
         apart[j] = math.inf
         if apart.min() < _NEAR * depth + 0.5:
             flags.append("near")
+        if _misfit(model, left, position):
+            flags.append("misfit")
         rim = np.minimum(position - model.bounds.low_m, model.bounds.high_m - position)
         if (rim[:2] < 0.3).any() or rim[2] < 0.02:
             flags.append("edge")
@@ -252,3 +230,10 @@ def _targets(model: Model, fit: JointFit, background: Background, ground_m: floa
             )
         )
     return tuple(targets)
+
+
+def _misfit(model: Model, left: FloatArray, position: FloatArray) -> bool:
+    """Whether rows (n, k) near a target fit worse than one of ten thousand right models, and by more than a half."""
+    apart = np.linalg.norm(model.record.sensors_m.mean(axis=1)[:, :2] - position[:2], axis=1)
+    near = left[apart < _NEAR * (model.record.height_m - position[2])]
+    return bool(np.sum(near**2) > max(float(chdtri(max(near.size, 1), 1e-4)), _MISFIT * near.size))

@@ -131,7 +131,7 @@ class TestFiniteBodyFields:
 
     def moments(self, rank):
         """Mean of xⁿ over the cuboid in the orthonormal traceless basis, by a fine midpoint rule."""
-        axis = (np.arange(60) + 0.5) / 60.0 - 0.5
+        axis = (np.arange(30) + 0.5) / 30.0 - 0.5
         x = np.stack(np.meshgrid(*(axis * side for side in self.SIDES), indexing="ij"), axis=-1).reshape(-1, 3)
         tensor = x
         for _ in range(rank - 1):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from functools import cache
 
@@ -44,6 +45,11 @@ def surveyed(name: str, seed: int, number: int = 2) -> magloc.Survey:
 
 def nearest(found: magloc.Survey, position_m: FloatArray) -> magloc.Target:
     return min(found, key=lambda target: float(np.linalg.norm(target.position_m - position_m)))
+
+
+def nearest_truth(field: Simulation, target: magloc.Target) -> FloatArray:
+    apart = np.linalg.norm(field.target_position_m - target.position_m, axis=1)
+    return np.asarray(field.target_position_m[apart.argmin()])
 
 
 class TestTargets:
@@ -94,6 +100,59 @@ class TestPair:
         assert len(found) == 2
         for truth in field.truths:
             assert np.linalg.norm(nearest(found, truth.position_m[0]).position_m - truth.position_m[0]) < 0.15
+
+
+class TestHostileWorld:
+    """What a survey is told is wrong: the targets are still right within what they claim, or they are flagged."""
+
+    @staticmethod
+    def check(readings: magloc.Readings, caplog: pytest.LogCaptureFixture, word: str) -> magloc.Survey:
+        field = simulated("survey-drone", 901)
+        with caplog.at_level(logging.WARNING):
+            found = magloc.survey(field.array, readings)
+        assert word in caplog.text
+        for target in found:
+            error = target.position_m - nearest_truth(field, target)
+            # χ² of three: 1 in 10,000 right ones is beyond 21.
+            assert "misfit" in target.flags or error @ np.linalg.solve(target.covariance[:3, :3], error) < 21.0
+        return found
+
+    @pytest.mark.parametrize("lag_s", [-0.1, pytest.param(0.3, marks=pytest.mark.slow)])
+    def test_readings_that_are_late(self, lag_s: float, caplog: pytest.LogCaptureFixture) -> None:
+        readings = simulated("survey-drone", 901).readings
+        earlier = readings.time_s - lag_s
+        late = np.stack([np.interp(earlier, readings.time_s, channel) for channel in readings.values_T.T], axis=1)
+        found = self.check(replace(readings, values_T=late), caplog, "later than their poses")
+        assert len(found) == 2
+        assert found.lag_s == pytest.approx(lag_s, abs=0.02)  # five standard deviations
+
+    @pytest.mark.parametrize("since", [0, 500])
+    def test_a_sensor_that_sticks(self, since: int, caplog: pytest.LogCaptureFixture) -> None:
+        readings = simulated("survey-drone", 901).readings
+        values = readings.values_T.copy()
+        values[since:, 1] = values[since, 1]
+        found = self.check(replace(readings, values_T=values), caplog, "high sticks in")
+        assert (len(found), found.record.array.ids) == (2, ("low",))
+
+    @pytest.mark.parametrize("share", [0.001, 0.01])
+    def test_wild_readings(self, share: float, caplog: pytest.LogCaptureFixture) -> None:
+        readings, rng = simulated("survey-drone", 901).readings, np.random.default_rng(11)
+        values = readings.values_T
+        wild = np.where(rng.random(values.shape) < share, 1e-6 * rng.standard_normal(values.shape), 0.0)
+        assert len(self.check(replace(readings, values_T=values + wild), caplog, "leap and come back")) == 2
+
+    @pytest.mark.slow
+    def test_more_noise_than_is_stated(self, caplog: pytest.LogCaptureFixture) -> None:
+        field, rng = simulated("survey-drone", 901), np.random.default_rng(12)
+        noise = 20.0 * field.array.channel_noise_T * rng.standard_normal(field.readings.values_T.shape)
+        self.check(replace(field.readings, values_T=field.readings.values_T + noise), caplog, "χ² per reading")
+
+    @pytest.mark.slow
+    def test_poses_that_are_worse_than_is_stated(self, caplog: pytest.LogCaptureFixture) -> None:
+        readings, rng = simulated("survey-drone", 901).readings, np.random.default_rng(13)
+        assert readings.array_position_m is not None
+        moved = readings.array_position_m + 0.2 * rng.standard_normal((len(readings), 3))
+        self.check(replace(readings, array_position_m=moved), caplog, "χ² per reading")
 
 
 class TestBadInput:

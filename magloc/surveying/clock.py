@@ -1,0 +1,75 @@
+"""How much later than their poses the readings of a survey are, as targets that are passed both ways show."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+from scipy.spatial.transform import Slerp
+
+from arrays.typing import FloatArray, IntArray
+from magloc.readings import Readings
+from magloc.surveying.joint_fit import Sources
+from magloc.surveying.rounds import Model
+
+_STEP_M = 0.05  # of the way, for the curvature of the likelihood
+_MOST_S = 1.0
+_TOLERANCE_S = 1e-3
+_MISFIT, _SHARE = 2.0, 0.5  # per reading, and of the misfit without a lag
+
+
+class Lag(NamedTuple):
+    """Seconds by which readings are late, and their standard deviation."""
+
+    s: float
+    sigma_s: float
+
+
+def lag_of(model_at: Callable[[float], Model], sources: Sources, group: IntArray) -> Lag:
+    """Likeliest lag of a record, 0 where it explains no more than chance does; ``model_at`` has one corrected."""
+    record = model_at(0.0).record
+    way = np.linalg.norm(np.diff(record.sensors_m.mean(axis=1), axis=0), axis=1)
+    speed = float(np.median(way / np.diff(record.time_s)))
+    if not len(sources) or speed * _MOST_S < _STEP_M:
+        return Lag(0.0, math.inf)
+    step = _STEP_M / speed
+
+    def cost(lag_s: float) -> float:
+        """Twice the negative logarithm of the likelihood, sources refitted."""
+        model = model_at(lag_s)
+        return model.misfit(model.refitted(sources, group), group)
+
+    before, here, after = cost(-step), cost(0.0), cost(step)
+    curvature = (before - 2.0 * here + after) / step**2
+    slope = (after - before) / (2.0 * step)
+    if here < min(before, after) and slope**2 < 2.0 * curvature * model_at(0.0).threshold:
+        return Lag(0.0, math.sqrt(2.0 / curvature))
+    found = minimize_scalar(cost, bounds=(-_MOST_S, _MOST_S), method="bounded", options={"xatol": _TOLERANCE_S})
+    size = (int(group[-1]) + 1) * record.array.n_channels
+    explained = found.fun < max(_MISFIT * size, _SHARE * here)  # else something is wrong that a lag imitates
+    if not explained or here - found.fun < model_at(0.0).threshold or abs(found.x) > 0.99 * _MOST_S:
+        return Lag(0.0, math.inf)
+    around = [cost(found.x + sign * step) for sign in (-1.0, 1.0)]
+    return Lag(float(found.x), step * math.sqrt(2.0 / (sum(around) - 2.0 * found.fun)))
+
+
+def taken_earlier(readings: Readings, lag_s: float) -> Readings:
+    """Readings with the poses of some time before their own, and the ambient field that belongs to these."""
+    assert readings.array_position_m is not None
+    assert readings.array_rotation is not None
+    time_s = readings.time_s
+    earlier = np.clip(time_s - lag_s, time_s[0], time_s[-1])
+
+    def at(columns: FloatArray) -> FloatArray:
+        return np.stack([np.interp(earlier, time_s, column) for column in columns.T], axis=1)
+
+    ambient = readings.ambient_T
+    rotation = Slerp(time_s, readings.array_rotation)(earlier)
+    if ambient is not None:  # in the world it hardly turns: between two directions its modulus would be too small
+        ambient = rotation.inv().apply(at(readings.array_rotation.apply(ambient)))
+    position = at(readings.array_position_m)
+    return replace(readings, array_position_m=position, array_rotation=rotation, ambient_T=ambient)

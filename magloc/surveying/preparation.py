@@ -1,0 +1,116 @@
+"""What a survey takes of readings: whole rows of sensors that tell something, as anomalies in the world frame."""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d, median_filter
+
+from arrays.array import SensorArray
+from arrays.typing import BoolArray, FloatArray
+from magloc.measurement.pose import PoseErrors, with_stated_pose
+from magloc.readings import Readings, without_saturated
+from magloc.surveying.pose_components import UNSTATED
+from magloc.surveying.record import SurveyRecord
+
+_LOG = logging.getLogger(__name__)
+_FEWEST_ROWS = 20
+_WILD, _NEIGHBOURS = 15.0, 20  # over the medians of all rows and of so many on either side
+_MOST_WILD = 0.25  # of all readings: more are not
+_LONGEST_RUN = 25  # of the same reading, over what the liveliest sensor repeats
+
+
+def whole_rows(array: SensorArray, readings: Readings) -> tuple[SensorArray, Readings]:
+    """Rows where all sensors read, without the sensors that would cost more rows than they are worth."""
+    if readings.array_rotation is None:
+        raise ValueError("Input readings must have the pose of the array in every row; instead received none.")
+    readings = without_saturated(readings, array)
+    stuck = stuck_readings(array, readings.values_T)
+    owner = array.channel_sensor
+    moduli = np.linalg.norm(array.calibrated_field(readings.values_T), axis=2)  # which no attitude changes
+    scalar = array.channel_is_scalar
+    moduli[:, owner[scalar]] = readings.values_T[:, scalar]
+    wild = wild_readings(moduli) & ~stuck
+    missing = np.isnan(moduli) | wild | stuck
+    order = np.argsort(missing.sum(axis=0), kind="stable")
+    worth = [(i + 1) * int((~missing[:, order[: i + 1]].any(axis=1)).sum()) for i in range(len(order))]
+    kept = np.sort(order[: len(worth) - int(np.argmax(worth[::-1]))])
+    whole = np.asarray(~missing[:, kept].any(axis=1))
+    for i, sensor in enumerate(array.sensors):
+        if i not in kept:
+            why = "sticks" if stuck[:, i].any() else "lacks readings"
+            _LOG.warning(f"sensor {sensor.id} {why} in {missing[:, i].sum()} of {len(missing)} rows and is left out")
+        elif stuck[:, i].any():
+            _LOG.warning(f"sensor {sensor.id} sticks in {stuck[:, i].sum()} of {len(missing)} rows, which are left out")
+    if wild[:, kept].any():
+        _LOG.warning(f"{wild[:, kept].sum()} readings leap and come back: their rows are left out")
+    if whole.sum() < _FEWEST_ROWS:
+        raise ValueError(f"Input readings must have {_FEWEST_ROWS} whole rows or more; instead received {whole.sum()}.")
+    readings = replace(readings, values_T=readings.values_T[:, np.isin(owner, kept)])[whole]
+    if not (np.diff(readings.time_s) > 0.0).all():
+        raise ValueError("Input readings must be in order of time; instead received others.")
+    array = replace(array, sensors=tuple(array.sensors[i] for i in kept))
+    array = with_stated_pose(array, readings)
+    return (replace(array, pose=UNSTATED) if array.pose is None else array), readings
+
+
+def stuck_readings(array: SensorArray, values: FloatArray) -> BoolArray:
+    """Rows and sensors (n, N) of long runs of the same reading, while what other sensors read changes."""
+    n = len(values)
+    lengths = np.empty((n, array.n_sensors))
+    for i in range(array.n_sensors):
+        own = values[:, array.channel_sensor == i]
+        begins = np.concatenate([[True], (own[1:] != own[:-1]).any(axis=1)])  # NaN is no run
+        run = np.cumsum(begins) - 1
+        lengths[:, i] = np.bincount(run)[run]
+    typical = [len(column) / np.sum(1.0 / column) for column in lengths.T]  # mean length of a run
+    return np.asarray(lengths > max(_LONGEST_RUN, _LONGEST_RUN * min(typical, default=math.inf)))
+
+
+def wild_readings(values: FloatArray) -> BoolArray:
+    """Single readings (n, N) that are far from the cubic through their neighbours, over what is usual there."""
+    wild = np.isnan(values)
+    if len(values) <= 2 * _NEIGHBOURS or wild.all(axis=0).any():
+        return np.zeros(values.shape, np.bool_)
+    index = np.arange(len(values))
+    kept = values.copy()
+    while True:
+        for channel, lost in zip(kept.T, wild.T, strict=True):
+            channel[lost] = np.interp(index[lost], index[~lost], channel[~lost])
+        size = np.zeros(values.shape)
+        size[2:-2] = np.abs(kept[2:-2] - (4.0 * (kept[1:-3] + kept[3:-1]) - kept[:-4] - kept[4:]) / 6.0)
+        usual = median_filter(size, (2 * _NEIGHBOURS + 1, 1)) + np.median(size, axis=0)
+        more = (size == maximum_filter1d(size, 5, axis=0)) & (size > _WILD * usual) & ~wild
+        if not more.any() or (wild | more).mean() > _MOST_WILD:
+            return np.asarray(wild & ~np.isnan(values))
+        wild |= more
+
+
+def record_of(array: SensorArray, readings: Readings) -> tuple[SurveyRecord, PoseErrors]:
+    """Anomalies of whole rows in the world frame, and the errors of their pose."""
+    assert array.pose is not None
+    errors = PoseErrors.of(array.pose)
+    record = SurveyRecord.of(array, readings, _ambient_T(array, readings), errors)
+    return replace(record, values_T=record.values_T - np.median(record.values_T, axis=0)), errors
+
+
+def _ambient_T(array: SensorArray, readings: Readings) -> FloatArray:
+    """Ambient field of every row (n, 3) in the array's frame; of vector sensors it is what they read on average."""
+    if readings.ambient_T is not None:
+        if not (np.linalg.norm(readings.ambient_T, axis=1) > 0.0).all():
+            raise ValueError(
+                "Input readings must have an ambient field in every row; instead received zero or nothing."
+            )
+        return readings.ambient_T
+    if array.ambient_T is not None:
+        return np.tile(array.ambient_T, (len(readings), 1))
+    if array.channel_is_scalar.all():
+        raise ValueError("Input readings must have the ambient field for scalar sensors; instead received none.")
+    assert readings.array_rotation is not None
+    vector = np.array([sensor.kind == "vector" for sensor in array.sensors])
+    fields = array.calibrated_field(readings.values_T)[:, vector]
+    world = np.median(readings.array_rotation.apply(fields.mean(axis=1)), axis=0)
+    return np.asarray(readings.array_rotation.inv().apply(world))
