@@ -12,6 +12,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "consistency": "magloc.plots.tracks:consistency_figure",
         "convergence": "magloc.plots.maps",
         "design": "magloc.plots.designs",
+        "design_counts": "magloc.plots.designs",
         "fixes": "magloc.plots.localization",
         "residuals": "magloc.plots.localization",
         "save": "magloc.plots.style",

@@ -213,13 +213,12 @@ def _reach_row(axes: Sequence[Any], dataset: xr.Dataset, name: str) -> None:
         if not np.max(curves) > 0.0:
             ax.text(0.5, 0.5, "at no distance", transform=ax.transAxes, ha="center", fontsize=style.LETTERS)
         for circle in circles:
+            text = f"{per_m * circle:g} {unit}"
             if circle == circles[-1]:
-                ax.text(
-                    _LOWER_RIGHT, 1.03 * circle, f"{per_m * circle:g} {unit}", va="top", fontsize=style.SMALL_LETTERS
-                )
+                ax.text(_LOWER_RIGHT, 1.03 * circle, text, va="top", fontsize=style.SMALL_LETTERS)
             elif not low < circle < high:  # a number where curves pass could not be read
                 ax.text(
-                    _LOWER_RIGHT, circle, f"{per_m * circle:g} {unit}", ha="center", va="center", fontsize=style.SMALL_LETTERS,
+                    _LOWER_RIGHT, circle, text, ha="center", va="center", fontsize=style.SMALL_LETTERS,
                     bbox={"facecolor": "#ffffff", "edgecolor": "none", "pad": 0.4},
                 )  # fmt: skip
         ax.tick_params(labelsize=style.SMALL_LETTERS, pad=0.5)
