@@ -31,6 +31,8 @@ from magloc.plots.bound_scale import (
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
+
+    from magloc.bounds.crlb import Bounds
 from arrays import typing
 
 FloatArray = typing.FloatArray
@@ -45,6 +47,47 @@ _KNOWN_NOTHING_DEG = 100.0
 _LOWER_RIGHT = np.radians(-45.0)
 _FRAME_MS, _LAST_FRAME_MS = 200, 1500
 _FRAME_DPI = 110
+
+
+def bounds_figure(found: Bounds) -> Figure:
+    """Bounds of sources one by one, over their distance from the array: σ of range, bearing, position and moment.
+
+    Parameters
+    ----------
+    found : Bounds
+        Of :func:`magloc.cramer_rao_bounds`; infinite ones are not drawn.
+
+    Examples
+    --------
+    >>> import arrays
+    >>> import magloc
+    >>> places = [[x, 0.0, 0.5] for x in (2.0, 3.0, 4.0, 6.0)]
+    >>> figure = magloc.plots.bounds(magloc.cramer_rao_bounds(arrays.tetrahedron(1.5), places, [0.0, 0.0, 100.0]))
+    """
+    distance = np.ravel(found.range_m)
+    order = np.argsort(distance, kind="stable")
+    across, per_across = style.length_unit(float(distance.max()))
+    figure = style.new_figure(2.9)
+    axes = figure.subplots(1, 3)
+    lengths = [np.ravel(found.sigma_range_m), np.ravel(found.sigma_position_m)]
+    finite = np.concatenate(lengths)
+    finite = finite[np.isfinite(finite)]
+    unit, per_m = style.length_unit(float(finite.max()) if finite.size else 1.0)
+    panels = (
+        (
+            f"σ [{unit}]",
+            (("position", per_m * lengths[1], style.BLACK, "s--"), ("range", per_m * lengths[0], style.BLUE, "o-")),
+        ),
+        ("σ [°]", (("bearing", np.degrees(np.ravel(found.sigma_bearing_rad)), style.BLUE, "o-"),)),
+        ("σ [A·m²]", (("moment", np.ravel(found.sigma_moment_Am2), style.BLUE, "o-"),)),
+    )
+    for ax, (up, curves) in zip(axes, panels, strict=True):
+        for name, values, colour, line in curves:
+            ax.plot(per_across * distance[order], values[order], line, color=colour, lw=0.8, ms=3.0, label=name)
+        style.logarithmic(ax, [values for _, values, _, _ in curves])
+        style.dress(ax, f"distance [{across}]", up)
+        style.legend(ax)
+    return figure
 
 
 def bound_slices(dataset: xr.Dataset, scenario: BoundScenario) -> Figure:

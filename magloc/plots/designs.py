@@ -53,7 +53,7 @@ def design(result: Design, seed: int = 0) -> Figure:
     >>> figure = magloc.plots.design(found)  # doctest: +SKIP
     """
     figure = style.new_figure(3.3, layout=None)
-    scene = figure.add_axes((0.0, 0.06, 0.375, 0.84), projection="3d")
+    scene = figure.add_axes((0.025, 0.06, 0.36, 0.84), projection="3d")
     _scene(scene, result)
     ax = figure.add_axes((0.5, 0.15, 0.205, 0.68))
     relative = figure.add_axes((0.785, 0.15, 0.205, 0.68))
@@ -78,7 +78,12 @@ def design(result: Design, seed: int = 0) -> Figure:
     style.logarithmic(ax, curves)
     relative.set_ylim(bottom=0.0)
     style.legend(
-        figure, handles=ax.get_legend_handles_labels()[0], loc="upper right", bbox_to_anchor=(0.995, 0.92), ncols=4
+        figure,
+        handles=ax.get_legend_handles_labels()[0],
+        loc="upper right",
+        bbox_to_anchor=(1.0, 0.92),
+        ncols=5,
+        columnspacing=0.8,
     )
     style.headline(figure, _headline(result))
     return figure
@@ -107,7 +112,7 @@ def design_counts(results: Sequence[Design]) -> Figure:
         _DESIGN: np.array([result.judged[0].criterion_m for result in ordered]),
         EVEN: np.array([judged.criterion_m for judged in grids]),
     }
-    unit, per_m = style.length_unit(max(float(np.min(curve)) for curve in curves.values()))
+    unit, per_m = style.length_unit(max(float(np.max(curve)) for curve in curves.values()))
     figure = style.new_figure(2.7)
     ax, relative = figure.subplots(1, 2, width_ratios=[1.6, 1.0])
     for name, curve in curves.items():
