@@ -8,17 +8,22 @@ all that is not the source. A nuisance x that enters the readings as N x, with a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
 from arrays.io.errors import _vectors
+from arrays.io.lazy import by_name
 from arrays.noise import reading_covariance
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.measurement.differences import channel_jacobian, fields_at_sensors, predicted_channels
 from magloc.measurement.pose import pose_errors_at_rest
 from magloc.measurement.rows import check_magnitudes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 LOST = 1e-6
 """A combination of parameters is not estimable if the readings tell of it so much less than of others."""
@@ -66,6 +71,10 @@ class Bounds:
     sigma_position_m: FloatArray
     sigma_moment_Am2: FloatArray
     rank: IntArray
+
+    def plot(self) -> Figure:
+        """σ of range, bearing, position and moment over the distance of the sources."""
+        return by_name("magloc.plots.bounds:bounds_figure")(self)
 
     @property
     def is_regular(self) -> BoolArray:

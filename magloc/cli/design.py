@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
 
 import arrays
 import magloc
-from arrays.io.arguments import Flag
+from arrays.io.arguments import Flag, whole_number
 from arrays.io.errors import naming
 from arrays.io.outputs import refuse_one_for_two, refuse_unwritable
 from magloc.cli.framework import CommonOptions, print_json, progress
 from magloc.cli.options import print_note
 
+Sensors = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=1, lte=1000))]
+
 if TYPE_CHECKING:
     from arrays.array import SensorArray
     from magloc.design.evaluation import Judgement
     from magloc.design.optimise import Design
+    from magloc.design.task import DesignTask
 
 
 def design(
@@ -28,13 +36,14 @@ def design(
     out: Path | None = None,
     png: Path | None = None,
     json: Flag = False,
+    counts: Annotated[list[Sensors] | None, Parameter(consume_multiple=True)] = None,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
     """Design an array: place its sensors for the sources that it is to locate.
 
     Makes a quantile or the mean, over sources and moments, of the least standard deviation of the range (the
     Cramér-Rao bound) as small as it can, and compares the array with a tetrahedron, a cube and a cross of the same
-    span. Interrupted, it writes the best array so far.
+    span, and with an even grid of as many sensors in the same volume. Interrupted, it writes the best array so far.
 
     Parameters
     ----------
@@ -46,11 +55,18 @@ def design(
         Picture to write: the sensors, and the range's standard deviation over the distance.
     json : bool
         Print one JSON object with the array and the comparison.
+    counts : list of int
+        Numbers of sensors in place of the task's: one array each, as NAME-NUMBER.toml, and what more of them gain.
     common : CommonOptions
         Common options.
     """
     wanted = magloc.DesignTask.read(task)
     target = Path(f"design-{wanted.name}.toml") if out is None else out
+    if counts:
+        with naming(task):
+            tasks = [replace(wanted, n_sensors=count) for count in sorted(set(counts))]
+        _compare_counts(tasks, target, png, json=json, common=common)
+        return
     refuse_one_for_two({"--out": target, "--png": png})
     refuse_unwritable(target, "--out")
     if png is not None:
@@ -79,6 +95,50 @@ def design(
             f"{result.n_converged} of {result.n_descents} refined starts converged, {seconds:.1f} s; wrote"
             f" {target}{drawn}"
         )
+
+
+def _compare_counts(
+    tasks: Sequence[DesignTask], out: Path, png: Path | None, *, json: bool, common: CommonOptions
+) -> None:
+    """Designs of several numbers of sensors, their arrays, a table and a picture of what more sensors gain."""
+    from magloc.design.evaluation import EVEN
+
+    targets = [out.with_name(f"{out.stem}-{task.n_sensors}{out.suffix}") for task in tasks]
+    for path in targets:
+        refuse_one_for_two({"--out": path, "--png": png})
+        refuse_unwritable(path, "--out")
+    if png is not None:
+        refuse_unwritable(png, "--png", ".png")
+    results = []
+    with progress(sum(task.search.n_steps for task in tasks), "steps", quiet=common.quiet) as advance:
+        for task, path in zip(tasks, targets, strict=True):
+            with naming(task.name):
+                results.append(magloc.design_array(task, seed=common.seed, progress=advance))
+            arrays.write_array(path, results[-1].array)
+    if png is not None:
+        magloc.plots.save(magloc.plots.design_counts(results), png)
+    grids = [next(judged for judged in result.judged if judged.name == EVEN) for result in results]
+    rows: list[dict[str, Any]] = [
+        {
+            "sensors": result.task.n_sensors,
+            "criterion_m": result.judged[0].criterion_m,
+            "even_grid_m": grid.criterion_m,
+            "design_gain": grid.gain,
+            "design_gain_standard_error": grid.gain_error,
+            "positions_m": result.array.positions,
+            "out": str(path),
+        }
+        for result, grid, path in zip(results, grids, targets, strict=True)
+    ]
+    if json:
+        print_json({"task": tasks[0].name, "criterion": str(tasks[0].criterion), "counts": rows})
+        return
+    print(f"{tasks[0].criterion} of the range's standard deviation, on independent sources")
+    print(f"{'sensors':>7}{'design_m':>11}{'even_grid_m':>13}{'gain_%':>8}{'±':>5}")
+    for row in rows:
+        gain, error = 100.0 * row["design_gain"], 100.0 * row["design_gain_standard_error"]
+        sigma, grid_sigma = _number(row["criterion_m"]), _number(row["even_grid_m"])
+        print(f"{row['sensors']:>7}{sigma:>11}{grid_sigma:>13}{gain:>8.1f}{error:>5.1f}")
 
 
 def _report(result: Design, out: Path, png: Path | None, seconds: float) -> dict[str, Any]:
@@ -135,6 +195,7 @@ def _table(result: Design) -> list[str]:
 
 def _findings(result: Design) -> list[str]:
     """What the table says, in sentences."""
+    from magloc.design.evaluation import EVEN
     from magloc.design.optimise import NEAR_OPTIMAL
 
     criterion = result.task.criterion
@@ -143,8 +204,8 @@ def _findings(result: Design) -> list[str]:
     for other in result.judged[1:]:
         lines.append(f"  {_compared(other)}")
     lines += [
-        f"The {name} of the same span is near-optimal for this task: the design gains less than"
-        f" {100.0 * NEAR_OPTIMAL:g} % on it."
+        f"The {name} of the same {'volume' if name == EVEN else 'span'} is near-optimal for this task: the design gains"
+        f" less than {100.0 * NEAR_OPTIMAL:g} % on it."
         for name in result.near_optimal
     ]
     lines.append(_worst_case(result))

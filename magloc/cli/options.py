@@ -7,8 +7,9 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -17,6 +18,8 @@ import arrays
 import magloc
 from arrays.io.arguments import whole_number
 from arrays.io.errors import LARGEST, InputError
+from arrays.io.outputs import refuse_unwritable
+from arrays.io.text import write_text
 from arrays.typing import Vector
 from magloc.ambient import Place
 from magloc.cli import framework
@@ -208,3 +211,54 @@ class KnownOptions:
         if not _DATE.fullmatch(self.date):
             raise InputError(f"--date: found {self.date!r}, expected a date such as 2026-11-21.")
         return Place(*self.place, self.date, self.geomagnetic_model or "IGRF-14")
+
+
+class OnMaps(Protocol):
+    """What maps of the world can show."""
+
+    def to_geojson(self, place: Vector) -> dict[str, Any]:
+        """A FeatureCollection."""
+        ...
+
+    def to_kml(self, place: Vector) -> str:
+        """Placemarks."""
+        ...
+
+
+@Parameter(name="*", group="Maps of the world")
+@dataclass(frozen=True)
+class MapOptions:
+    """Files for maps of the world.
+
+    Parameters
+    ----------
+    geojson : Path
+        Write what is found as a GeoJSON file; needs --place.
+    kml : Path
+        Write what is found as a KML file; needs --place.
+    """
+
+    geojson: Path | None = None
+    kml: Path | None = None
+
+    @property
+    def outputs(self) -> dict[str, Path | None]:
+        """The files by their options."""
+        return {"--geojson": self.geojson, "--kml": self.kml}
+
+    def refuse(self, place: Vector | None) -> None:
+        """Refuse, before long work, files without a place, and those that cannot be written."""
+        for option, path in self.outputs.items():
+            if path is not None and place is None:
+                raise InputError(f"{option}: found no --place, expected the origin of the world frame with it.")
+            if path is not None:
+                refuse_unwritable(path, option)
+
+    def write(self, found: OnMaps, place: Vector | None) -> None:
+        """Write the files that are asked for."""
+        if place is None:
+            return
+        if self.geojson is not None:
+            write_text(dumps(found.to_geojson(place), allow_nan=False) + "\n", self.geojson)
+        if self.kml is not None:
+            write_text(found.to_kml(place), self.kml)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,10 +15,9 @@ import arrays
 import magloc
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
-from arrays.io.outputs import make_folder, refuse_file, refuse_one_for_two, refuse_unwritable
-from arrays.io.text import write_text
+from arrays.io.outputs import make_folder, refuse_file, refuse_one_for_two
 from magloc.cli.framework import CommonOptions, print_json
-from magloc.cli.options import KnownOptions, ambient_field, naming_options, print_note, refuse_not_positive
+from magloc.cli.options import KnownOptions, MapOptions, ambient_field, naming_options, print_note, refuse_not_positive
 
 if TYPE_CHECKING:
     from magloc.surveying.results import Survey
@@ -52,8 +50,7 @@ def survey(
     array: Path,
     known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
     ground: GroundOptions = GroundOptions(),
-    geojson: Path | None = None,
-    kml: Path | None = None,
+    maps: MapOptions = MapOptions(),  # noqa: B008 - frozen
     out: Path | None = None,
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
@@ -76,10 +73,8 @@ def survey(
         What is known of the sensors, of the targets, in the world frame, and of the ambient field.
     ground : GroundOptions
         What is known of the ground.
-    geojson : Path
-        Write the targets as a GeoJSON file; needs --place.
-    kml : Path
-        Write the targets as a KML file; needs --place.
+    maps : MapOptions
+        Files for maps of the world.
     out : Path
         Folder for targets.csv, residual.csv and the map.
     json : bool
@@ -87,14 +82,10 @@ def survey(
     common : CommonOptions
         Common options.
     """
-    for name, path in (("--geojson", geojson), ("--kml", kml)):
-        if path is not None and known.place is None:
-            raise InputError(f"{name}: found no --place, expected the origin of the world frame with it.")
-        if path is not None:
-            refuse_unwritable(path, name)
+    maps.refuse(known.place)
     if out is not None:
         refuse_file(out, "--out")
-    refuse_one_for_two({"--out": out, "--geojson": geojson, "--kml": kml})
+    refuse_one_for_two({"--out": out, **maps.outputs})
     refuse_not_positive(ground, "shortest_geology_m", "false_per_hectare")
     if not math.isfinite(ground.ground_m):
         raise InputError(f"--ground-m: found {ground.ground_m:g}, expected a finite number.")
@@ -113,11 +104,7 @@ def survey(
             false_per_hectare=ground.false_per_hectare,
             progress=None if common.quiet or json else _told,
         )
-    if known.place is not None:
-        if geojson is not None:
-            write_text(dumps(found.to_geojson(known.place), allow_nan=False) + "\n", geojson)
-        if kml is not None:
-            write_text(found.to_kml(known.place), kml)
+    maps.write(found, known.place)
     if out is not None:
         _write(found, out)
     if json:

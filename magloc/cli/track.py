@@ -6,7 +6,6 @@ import math
 import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -15,8 +14,7 @@ from cyclopts import Parameter
 import magloc
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
-from arrays.io.outputs import refuse_file, refuse_one_for_two, refuse_unwritable
-from arrays.io.text import write_text
+from arrays.io.outputs import refuse_file, refuse_one_for_two
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, print_json, progress
 from magloc.cli.moments.known_path import (
@@ -27,7 +25,7 @@ from magloc.cli.moments.known_path import (
     write_moment_track,
     write_moment_tracks,
 )
-from magloc.cli.options import KnownOptions, ambient_field, print_note, refuse_not_positive
+from magloc.cli.options import KnownOptions, MapOptions, ambient_field, print_note, refuse_not_positive
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -161,7 +159,7 @@ def track(
     json: Flag = False,
     jsonl: Flag = False,
     known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
-    geojson: Path | None = None,
+    maps: MapOptions = MapOptions(),  # noqa: B008 - frozen
     out: Path | None = None,
     motion: MotionOptions = MotionOptions(),
     conditioning: ConditioningOptions = ConditioningOptions(),
@@ -191,8 +189,8 @@ def track(
         Print one JSON line for every row, as soon as it is known.
     known : KnownOptions
         What is known of the sensors, of the source when a track starts, and of the ambient field.
-    geojson : Path
-        Write the track as a GeoJSON file; needs --place.
+    maps : MapOptions
+        Files for maps of the world: one point of a source at rest, else the track.
     out : Path
         Folder for the picture of the track with its 95 % ellipses and the data behind it.
     motion : MotionOptions
@@ -209,11 +207,8 @@ def track(
         raise InputError("--json: found it together with --jsonl, expected one of them.")
     if out is not None:
         refuse_file(out, "--out")
-    if geojson is not None and known.place is None:
-        raise InputError("--geojson: found no --place, expected the origin of the world frame with it.")
-    refuse_one_for_two({"--out": out, "--geojson": geojson})
-    if geojson is not None:
-        refuse_unwritable(geojson, "--geojson")
+    refuse_one_for_two({"--out": out, **maps.outputs})
+    maps.refuse(known.place)
     # A place without a date may be there for the map alone.
     where = None if known.place is not None and known.date is None else known.where
     used, model, prior = known.array(array), motion.model(smooth=smooth), known.prior
@@ -221,7 +216,7 @@ def track(
     if path is not None:
         refuse_bounds(known)
     if str(readings) == STREAM:
-        whole = smooth or json or any(option is not None for option in (truth, out, geojson, path))
+        whole = smooth or json or maps != MapOptions() or any(option is not None for option in (truth, out, path))
         if whole or conditioning != ConditioningOptions():
             raise InputError("READINGS -: found an option that needs the whole record, expected a stream of --jsonl.")
         with naming(str(array)):
@@ -231,7 +226,7 @@ def track(
     rows, used = conditioning.apply(rows, used, readings)
     used, rows = _in_ambient_field(used, rows, where)
     if path is not None:
-        outputs = MomentOutputs(json, jsonl, geojson, out, truth, common.quiet)
+        outputs = MomentOutputs(json, jsonl, maps, out, truth, common.quiet)
         turn_rad_s = math.radians(motion.turn_deg_s)
         with naming(str(array)):
             if isinstance(path, list) and len(path) > 1:
@@ -262,8 +257,7 @@ def track(
         few = used.n_channels <= _FEW_CHANNELS and rows.array_rotation is not None
         raise _no_track(str(readings), found.status, _USE_SURVEY if few else "")
     result = None if truth is None else found.consistency(magloc.read_truth(truth))
-    if geojson is not None and known.place is not None:
-        write_text(dumps(found.to_geojson(known.place), allow_nan=False) + "\n", geojson)
+    maps.write(found, known.place)
     if out is not None:
         from magloc.plots.tracks import write_picture
 

@@ -16,9 +16,12 @@ from arrays.typing import FloatArray
 from magloc.bounds.over_moments import sigma_table
 from magloc.design.descent import Sample
 from magloc.design.task import DesignTask
+from magloc.design.volumes import even_grid
 from magloc.levels import TYPICAL_AND_BAD
 
 REFERENCES = ("tetrahedron", "cube", "cross")
+EVEN = "even grid"
+"""As many sensors as the design has, spread evenly over the same volume."""
 _N_ATTITUDES = 24
 _N_RESAMPLES = 200
 _N_BEARINGS, _N_BEARING_MOMENTS = 1000, 16
@@ -68,9 +71,9 @@ class Judgement:
 
 
 def references(task: DesignTask, sample: Sample, rng: np.random.Generator) -> list[SensorArray]:
-    """Tetrahedron, cube and cross of the volume's span, each in the best of 24 random attitudes for a sample.
+    """Tetrahedron, cube, cross of the volume's span, each in the best of 24 random attitudes for a sample; even grid.
 
-    They need not fit into the volume: what they share with it is the enclosing ball.
+    The shapes need not fit into the volume: what they share with it is the enclosing ball. The grid is in it.
     """
     arrays = []
     for name in REFERENCES:
@@ -79,7 +82,7 @@ def references(task: DesignTask, sample: Sample, rng: np.random.Generator) -> li
         turned = [task.volume.centre + turn.apply(shape) for turn in turns]
         best = min(turned, key=lambda sensors: sample.value(task, sensors))
         arrays.append(task.array(best, name))
-    return arrays
+    return [*arrays, task.array(even_grid(task.volume, task.n_sensors, rng), EVEN)]
 
 
 def judged(

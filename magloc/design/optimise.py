@@ -79,7 +79,10 @@ class Design:
 
     @property
     def gain(self) -> float:
-        """Share by which its criterion is below that of the best reference: tetrahedron, cube, cross of its span."""
+        """Share by which its criterion is below that of the best reference.
+
+        These are a tetrahedron, a cube and a cross of its span, and an even grid of as many sensors in its volume.
+        """
         return min(other.gain for other in self.judged[2:])
 
     @property

@@ -9,7 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+from scipy.cluster.vq import kmeans2
+from scipy.optimize import brentq
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import pdist
 
 from arrays.io.errors import InputError, of_extra
 from arrays.typing import FloatArray
@@ -18,6 +21,7 @@ if TYPE_CHECKING:
     import trimesh
 
 MESH_FORMATS = ("stl", "obj", "ply")
+_N_EVEN, _N_EVEN_TRIES, _EVEN_RTOL = 4096, 32, 1e-9
 
 
 class Volume(Protocol):
@@ -218,3 +222,47 @@ def read_surface(path: str | PathLike[str]) -> Surface:
     if not faces.size or not np.isfinite(mesh.triangles).all() or not mesh.area > 0.0:
         raise InputError(f"{path}: found no triangles with an area, expected {expected}.")
     return Surface(mesh)
+
+
+def even_grid(volume: Volume, n: int, rng: np.random.Generator) -> FloatArray:
+    """Points (n, 3) [m] spread evenly over a volume, out to its rim: where sensors go of which nothing is computed.
+
+    In a box the lattice of n points whose least spacing is largest. In other volumes, and where points spread so are
+    farther apart, the middles of n equal parts (Lloyd's centroidal Voronoi cells, by k-means of random points, the
+    best of several), stretched from the centre as far as all stay inside; on a surface the nearest points of it.
+    """
+    spread = _stretched(volume, _middles(volume.random(_N_EVEN, rng), n, rng))
+    lattices = _lattices(volume, n) if isinstance(volume, Box) else []
+    return max([*lattices, spread], key=lambda points: float(pdist(points).min()))
+
+
+def _middles(points: FloatArray, n: int, rng: np.random.Generator) -> FloatArray:
+    """Means (n, 3) of the parts of points (k, 3) with the least sum of squares."""
+    tries = [kmeans2(points, n, minit="++", rng=rng) for _ in range(_N_EVEN_TRIES)]
+    middles, _ = min(tries, key=lambda tried: float(np.sum((points - tried[0][tried[1]]) ** 2)))
+    return np.asarray(middles)
+
+
+def _stretched(volume: Volume, points: FloatArray) -> FloatArray:
+    """Points (n, 3) moved from the centre by the largest factor that leaves all of them in a volume."""
+
+    def outside(factor: float) -> float:
+        moved = volume.centre + factor * (points - volume.centre)
+        return float(np.abs(volume.nearest(moved) - moved).max()) - _EVEN_RTOL * volume.radius
+
+    factor = 1.0
+    if outside(1.0) < 0.0:
+        most = volume.radius / float(np.linalg.norm(points - volume.centre, axis=1).max())
+        factor = float(brentq(outside, 1.0, 2.0 * most, xtol=_EVEN_RTOL))
+    return volume.nearest(volume.centre + factor * (points - volume.centre))
+
+
+def _lattices(box: Box, n: int) -> list[FloatArray]:
+    """All lattices of n points that reach the faces of a box; one layer lies in its middle."""
+    counts = [(i, j, n // (i * j)) for i in range(1, n + 1) for j in range(1, n // i + 1) if n % (i * j) == 0]
+    ends = 0.5 * np.array(box.size_m)
+    lattices = []
+    for count in counts:
+        axes = [np.linspace(-end, end, k) if k > 1 else np.zeros(1) for end, k in zip(ends, count, strict=True)]
+        lattices.append(box.centre + np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
+    return lattices

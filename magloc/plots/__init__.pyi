@@ -1,3 +1,5 @@
+from magloc.plots import bounds as _bounds
+from magloc.plots import signatures as _signatures
 from magloc.plots import surveys as _surveys
 from magloc.plots import tracks as _tracks
 from magloc.plots.bounds import bound_reach as bound_reach
@@ -5,6 +7,7 @@ from magloc.plots.bounds import bound_slices as bound_slices
 from magloc.plots.bounds import bound_sphere as bound_sphere
 from magloc.plots.calibrations import calibration as calibration
 from magloc.plots.designs import design as design
+from magloc.plots.designs import design_counts as design_counts
 from magloc.plots.localization import fixes as fixes
 from magloc.plots.localization import residuals as residuals
 from magloc.plots.maps import convergence as convergence
@@ -13,5 +16,7 @@ from magloc.plots.style import save as save
 from magloc.plots.style import write as write
 
 consistency = _tracks.consistency_figure
+cramer_rao_bounds = _bounds.bounds_figure
+signature = _signatures.signature_figure
 survey = _surveys.survey_figure
 track = _tracks.track_figure

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 from scipy.spatial.distance import pdist
 
 from arrays.typing import FloatArray
-from magloc.design.evaluation import Judgement, range_spread
+from magloc.design.evaluation import EVEN, Judgement, range_spread
 from magloc.design.optimise import BEST_START, Design, random_sample
 from magloc.design.task import Cap
 from magloc.design.volumes import Ball, Box, Cylinder, Surface, Volume
@@ -24,6 +25,7 @@ _LINES = {
     "tetrahedron": (style.BLACK, "s", "--"),
     "cube": (style.ORANGE, "^", "-."),
     "cross": (style.GREY, "v", ":"),
+    EVEN: (style.ORANGE, "P", (0, (1, 1))),
     BEST_START: (style.PALE_GREY, "D", (0, (4, 1))),
 }
 # More sensors than this would hide behind their names.
@@ -51,7 +53,7 @@ def design(result: Design, seed: int = 0) -> Figure:
     >>> figure = magloc.plots.design(found)  # doctest: +SKIP
     """
     figure = style.new_figure(3.3, layout=None)
-    scene = figure.add_axes((0.0, 0.06, 0.375, 0.84), projection="3d")
+    scene = figure.add_axes((0.025, 0.06, 0.36, 0.84), projection="3d")
     _scene(scene, result)
     ax = figure.add_axes((0.5, 0.15, 0.205, 0.68))
     relative = figure.add_axes((0.785, 0.15, 0.205, 0.68))
@@ -76,9 +78,58 @@ def design(result: Design, seed: int = 0) -> Figure:
     style.logarithmic(ax, curves)
     relative.set_ylim(bottom=0.0)
     style.legend(
-        figure, handles=ax.get_legend_handles_labels()[0], loc="upper right", bbox_to_anchor=(0.995, 0.92), ncols=4
+        figure,
+        handles=ax.get_legend_handles_labels()[0],
+        loc="upper right",
+        bbox_to_anchor=(1.0, 0.92),
+        ncols=5,
+        columnspacing=0.8,
     )
     style.headline(figure, _headline(result))
+    return figure
+
+
+def design_counts(results: Sequence[Design]) -> Figure:
+    """What more sensors gain: the criterion over their number, of designs and of even grids in the same volume.
+
+    Parameters
+    ----------
+    results : sequence of Design
+        Of one task with several numbers of sensors.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> from dataclasses import replace
+    >>> task = magloc.DesignTask.read("half-space-2m")
+    >>> tasks = [replace(task, n_sensors=n) for n in (4, 6, 8)]
+    >>> figure = magloc.plots.design_counts([magloc.design_array(task) for task in tasks])  # doctest: +SKIP
+    """
+    ordered = sorted(results, key=lambda result: result.task.n_sensors)
+    numbers = np.array([result.task.n_sensors for result in ordered])
+    grids = [next(judged for judged in result.judged if judged.name == EVEN) for result in ordered]
+    curves = {
+        _DESIGN: np.array([result.judged[0].criterion_m for result in ordered]),
+        EVEN: np.array([judged.criterion_m for judged in grids]),
+    }
+    unit, per_m = style.length_unit(max(float(np.max(curve)) for curve in curves.values()))
+    figure = style.new_figure(2.7)
+    ax, relative = figure.subplots(1, 2, width_ratios=[1.6, 1.0])
+    for name, curve in curves.items():
+        colour, marker, line = _LINES[name]
+        ax.plot(numbers, per_m * curve, color=colour, marker=marker, ls=line, lw=1.0, ms=4.0, label=name)
+    criterion = ordered[0].task.criterion
+    style.logarithmic(ax, [per_m * curve for curve in curves.values()])
+    style.dress(ax, "sensors", f"{criterion} of the σ of the range [{unit}]", ordered[0].task.name)
+    gain, error = (np.array([getattr(judged, name) for judged in grids]) for name in ("gain", "gain_error"))
+    relative.errorbar(
+        numbers, 100.0 * gain, 100.0 * style.SIGMAS_95 * error, color=style.BLUE, marker="o", lw=1.0, ms=4.0
+    )
+    relative.axhline(0.0, color=style.GREY, lw=0.6)
+    style.dress(relative, "sensors", "gain over the even grid [%]", "with 95 % intervals")
+    for panel in (ax, relative):
+        panel.xaxis.set_major_locator(MaxNLocator(integer=True))
+    style.legend(ax)
     return figure
 
 
@@ -97,7 +148,8 @@ def _headline(result: Design) -> str:
         return text
     first = others[0]
     sign = "below" if first.gain >= 0.0 else "above"
-    what = f"that of its {first.name}" if first.name == BEST_START else f"a {first.name} of the same span"
+    whose = {BEST_START: f"that of its {first.name}", EVEN: f"an {EVEN} of the same volume"}
+    what = whose.get(first.name, f"a {first.name} of the same span")
     return f"{text}, {100.0 * abs(first.gain):.0f} % {sign} {what}"
 
 

@@ -37,7 +37,7 @@ GREY, PALE_GREY, LIGHT_GREY = "#7f7f7f", "#adadad", "#d9d9d9"
 ESTIMATE, TRUTH, BOUND = BLUE, BLACK, ORANGE
 COMPONENTS = (("x", BLACK, "o", "-"), ("y", BLUE, "s", "--"), ("z", ORANGE, "^", ":"))
 """Name, colour, marker and line of the components of a vector."""
-_MILLIMETRES_BELOW_M = 1.0
+_MICROMETRES_BELOW_M, _MILLIMETRES_BELOW_M = 1e-3, 1.0
 _MOST_ELLIPSES = 24
 # Ratios of the limits below which some, many, or all numbers between the powers of ten are written.
 _FEW_DECADES, _FEW_TIMES, _NO_TIMES = 30.0, 4.0, 2.5
@@ -144,8 +144,16 @@ def name_sensors(ax: Axes, ids: Sequence[str]) -> None:
 
 
 def length_unit(span_m: float) -> tuple[str, float]:
-    """Unit that suits lengths up to a span [m], and how many of it make a metre: mm below a metre, else m."""
+    """Unit that suits lengths up to a span [m], and how many of it make a metre: µm below a millimetre, mm, or m."""
+    if span_m < _MICROMETRES_BELOW_M:
+        return "µm", 1e6
     return ("mm", 1e3) if span_m < _MILLIMETRES_BELOW_M else ("m", 1.0)
+
+
+def length_text(length_m: float) -> str:
+    """A length with the unit that suits it, such as ``0.5 m`` or ``20 mm``."""
+    unit, per_m = length_unit(10.0 * length_m)
+    return f"{per_m * length_m:.3g} {unit}"
 
 
 def logarithmic(ax: Axes, values: Sequence[FloatArray]) -> None:

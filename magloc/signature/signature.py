@@ -15,13 +15,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
 from arrays.io.errors import InputError
+from arrays.io.lazy import by_name
 from arrays.typing import FloatArray
 from magloc.ambient import in_world_field
 from magloc.blas_threads import one_blas_thread
@@ -32,6 +33,9 @@ from magloc.signature.files import lines_of_signature
 from magloc.signature.moment_filter import Basis, settled
 from magloc.signature.moment_track import EXACT, goodness, known_rows, moment_model, turning_basis
 from magloc.signature.path import ObjectPath, PathError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Induced = Literal["none", "diagonal", "symmetric"]
 AXES = {"none": (), "diagonal": ("xx", "yy", "zz"), "symmetric": ("xx", "yy", "zz", "yz", "xz", "xy")}
@@ -191,6 +195,10 @@ class Signature:
     def misfit(self) -> bool:
         """Whether no such moment on these paths explains the readings: χ² is beyond noise by one in a million."""
         return bool(is_misfit(self.chi2, self.dof))
+
+    def plot(self) -> Figure:
+        """Its parts with 95 % intervals, and the moment over the heading."""
+        return by_name("magloc.plots.signatures:signature_figure")(self)
 
     def moment(self, heading_deg: ArrayLike, ambient_T: ArrayLike | None = None) -> tuple[FloatArray, FloatArray]:
         """Moment on a level keel and a steady course, and its covariance.

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from html import escape
 from typing import Any
 
 import numpy as np
 
 from arrays.io.csv import Column
+from arrays.io.world_maps import feature, feature_collection, kml, placemark, world_place
 from arrays.typing import Vector
-from magloc.surveying.results import IRON_Am2_PER_KG, Survey, Target
+from magloc.surveying.results import IRON_Am2_PER_KG, Survey
 
 _COMPONENTS = ("x_m", "y_m", "z_m", "mx_Am2", "my_Am2", "mz_Am2")
 
@@ -70,18 +70,17 @@ def residual_columns(found: Survey) -> dict[str, Column]:
 
 def geojson_of_survey(found: Survey, origin: Vector) -> dict[str, Any]:
     """:meth:`magloc.surveying.results.Survey.to_geojson`."""
-    features = []
-    for target, entry in zip(found, json_of_survey(found)["targets"], strict=True):
-        geometry = {"type": "Point", "coordinates": _place(target, origin)}
-        features.append({"type": "Feature", "geometry": geometry, "properties": entry})
-    return {"type": "FeatureCollection", "features": features}
+    entries = json_of_survey(found)["targets"]
+    return feature_collection(
+        feature("Point", world_place(target.position_m, origin), entry)
+        for target, entry in zip(found, entries, strict=True)
+    )
 
 
 def kml_of_survey(found: Survey, origin: Vector) -> str:
     """:meth:`magloc.surveying.results.Survey.to_kml`."""
     marks = []
     for target in found:
-        longitude, latitude, _ = _place(target, origin)
         low, high = target.depth_interval95_m
         least, most = target.iron_kg
         words = (
@@ -89,16 +88,5 @@ def kml_of_survey(found: Survey, origin: Vector) -> str:
             f"{least:.2g} to {most:.2g} kg of iron, if a kilogram has {IRON_Am2_PER_KG[0]:g} to "
             f"{IRON_Am2_PER_KG[1]:g} A·m². {' '.join(target.flags)}"
         )
-        point = f"<Point><coordinates>{longitude:.9f},{latitude:.9f}</coordinates></Point>"
-        text = escape(words.strip())
-        marks.append(f"<Placemark><name>{escape(target.id)}</name><description>{text}</description>{point}</Placemark>")
-    head = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
-    return "\n".join([head, *marks, "</Document></kml>", ""])
-
-
-def _place(target: Target, origin: Vector) -> list[float]:
-    """Longitude, latitude [deg] and height [m]."""
-    from pymap3d import enu2geodetic
-
-    latitude, longitude, height = enu2geodetic(*target.position_m.tolist(), *origin)
-    return [float(longitude), float(latitude), float(height)]
+        marks.append(placemark(target.id, words, [world_place(target.position_m, origin)]))
+    return kml(marks)

@@ -11,9 +11,12 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 from scipy.special import chdtri
 
+from arrays.io.lazy import by_name
 from arrays.typing import FloatArray, Vector
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from magloc.surveying.record import SurveyRecord
 
 IRON_Am2_PER_KG = (0.05, 0.3)
@@ -148,6 +151,10 @@ class Survey:
     def position_m(self) -> FloatArray:
         """Positions of all targets (K, 3)."""
         return np.array([target.position_m for target in self]).reshape(-1, 3)
+
+    def plot(self) -> Figure:
+        """The anomaly from above, what the targets leave of it, and the targets."""
+        return by_name("magloc.plots.surveys:survey_figure")(self)
 
     def to_geojson(self, place: Vector) -> dict[str, Any]:
         """A FeatureCollection with a point for every target, as RFC 7946 has it.

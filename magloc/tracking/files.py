@@ -1,4 +1,4 @@
-"""Tracks as a table for people, and for other programs: JSON, GeoJSON, xarray."""
+"""Tracks as a table for people, and for other programs: JSON, GeoJSON, KML, xarray."""
 
 from __future__ import annotations
 
@@ -10,18 +10,22 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
+from scipy.special import chdtri
 
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.text import read_text
+from arrays.io.world_maps import feature, feature_collection, kml, placemark, world_place
 from arrays.typing import FloatArray, Vector
+from magloc.levels import FALSE_ALARM
 from magloc.tracking.consistency import Consistency
-from magloc.tracking.results import TrackPoint, TrackResult
+from magloc.tracking.results import TrackPoint, TrackResult, stacked
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from magloc.tracking.track import TrackColumns
 
+_SAME_PLACE_M = 1e-9
 _RIVAL_KEYS = ("position_m", "moment_Am2", "chi2", "dof", "weight")
 _CONSISTENCY_KEYS = (
     "rows",
@@ -112,41 +116,82 @@ def json_of_track(points: Sequence[TrackPoint], consistency: Consistency | None)
 
 def geojson_of_track(points: Sequence[TrackPoint], origin: Vector) -> dict[str, Any]:
     """:meth:`magloc.tracking.track.TrackColumns.to_geojson`."""
-    from pymap3d import enu2geodetic
+    rest = at_rest(points)
+    if rest is not None:
+        return feature_collection([_feature(rest, origin)])
+    features = [_feature(point, origin) for point in points if point.position_m is not None]
+    lines = [feature("LineString", part, {"name": "track"}) for part in _unbroken(points, origin)]
+    return feature_collection([*lines, *features])
 
-    features: list[dict[str, object]] = []
-    line: list[list[float]] = []
-    lines: list[list[list[float]]] = []
+
+def kml_of_track(points: Sequence[TrackPoint], origin: Vector) -> str:
+    """:meth:`magloc.tracking.track.TrackColumns.to_kml`."""
+    rest = at_rest(points)
+    if rest is not None:
+        return kml([_placemark("source", rest, origin)])
+    ends = [point for point in points if point.position_m is not None]
+    ends = ends[:: max(1, len(ends) - 1)]  # the first and the last
+    lines = [placemark("track", "", part) for part in _unbroken(points, origin)]
+    return kml([*lines, *(_placemark(f"{point.time_s:.6g} s", point, origin) for point in ends)])
+
+
+def at_rest(points: Sequence[TrackPoint]) -> TrackPoint | None:
+    """The row whose position is best known, if that of no other row differs from it by more than both are uncertain.
+
+    Each difference has a χ² of three degrees of freedom under its quantile of 0.999, the covariances added: errors of
+    neighbouring rows go together, which makes true differences smaller still. None for a single row, for a source
+    that moves, and without a track.
+    """
+    known = [point for point in points if point.position_m is not None and point.covariance is not None]
+    if len(known) < 2:
+        return None
+    position, covariance = stacked(known, "position_m", 3), stacked(known, "covariance", 6, 6)[:, :3, :3]
+    best = int(np.argmin(np.trace(covariance, axis1=1, axis2=2)))
+    # Places that are known beforehand have no covariance: these are at rest to a nanometre.
+    both = covariance + covariance[best] + _SAME_PLACE_M**2 * np.eye(3)
+    offset = position - position[best]
+    chi2 = np.einsum("ni,ni->n", offset, np.linalg.solve(both, offset[..., None])[..., 0])
+    return known[best] if (chi2 <= chdtri(3, FALSE_ALARM)).all() else None
+
+
+def _unbroken(points: Sequence[TrackPoint], origin: Vector) -> list[list[list[float]]]:
+    """Places of every part of a track that has two rows at least and no row without the source."""
+    parts: list[list[list[float]]] = [[]]
     for point in points:
-        if point.position_m is None or point.covariance is None:
-            line = []
-            continue
-        latitude, longitude, height = enu2geodetic(*point.position_m.tolist(), *origin)
-        place = [float(longitude), float(latitude), float(height)]
-        if not line:
-            line = []
-            lines.append(line)
-        line.append(place)
-        deviations = np.sqrt(np.diagonal(point.covariance)[:3])
-        features.append(
-            {
-                "type": "Feature",
-                "geometry": {"type": "Point", "coordinates": place},
-                "properties": {
-                    "time_s": point.time_s,
-                    "sigma_east_m": float(deviations[0]),
-                    "sigma_north_m": float(deviations[1]),
-                    "sigma_up_m": float(deviations[2]),
-                    "moment_Am2": None if point.moment_Am2 is None else point.moment_Am2.tolist(),
-                    "status": point.status,
-                },
-            }
-        )
-    for part in lines:
-        if len(part) > 1:
-            geometry = {"type": "LineString", "coordinates": part}
-            features.insert(0, {"type": "Feature", "geometry": geometry, "properties": {"name": "track"}})
-    return {"type": "FeatureCollection", "features": features}
+        if point.position_m is None:
+            parts.append([])
+        else:
+            parts[-1].append(world_place(point.position_m, origin))
+    return [part for part in parts if len(part) > 1]
+
+
+def _feature(point: TrackPoint, origin: Vector) -> dict[str, Any]:
+    """A row with a source as a point."""
+    position, moment, sigma = _known(point)
+    properties = {
+        "time_s": point.time_s,
+        "depth_m": -float(position[2]),
+        **{f"sigma_{name}_m": float(s) for name, s in zip(("east", "north", "up"), sigma, strict=False)},
+        "moment_Am2": moment.tolist(),
+        "sigma_moment_Am2": sigma[3:].tolist(),
+        "status": point.status,
+    }
+    return feature("Point", world_place(position, origin), properties)
+
+
+def _placemark(name: str, point: TrackPoint, origin: Vector) -> str:
+    """A row with a source as a point, with what is known of it in a sentence."""
+    position, moment, sigma = _known(point)
+    words = (
+        f"{-position[2]:.2f} ± {sigma[2]:.2g} m below the origin, ± {np.hypot(*sigma[:2]):.2g} m on the map (1 σ), "
+        f"{np.linalg.norm(moment):.3g} A·m² at {point.time_s:.6g} s."
+    )
+    return placemark(name, words, [world_place(position, origin)])
+
+
+def _known(point: TrackPoint) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Position, moment and standard deviations (6,) of a row with a source."""
+    return np.asarray(point.position_m), np.asarray(point.moment_Am2), np.sqrt(np.diagonal(point.covariance))  # type: ignore[arg-type]
 
 
 def dataset_of_track(track: TrackColumns) -> xr.Dataset:

@@ -26,7 +26,7 @@ from magloc.navigation.measured_motion import MeasuredMotion
 from magloc.readings import Readings, as_readings, without_saturated
 from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import Consistency, consistency
-from magloc.tracking.files import dataset_of_track, geojson_of_track, lines_of_track
+from magloc.tracking.files import dataset_of_track, geojson_of_track, kml_of_track, lines_of_track
 from magloc.tracking.innovations import InnovationTest, innovation_test
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk, known_motions
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
@@ -136,7 +136,10 @@ class TrackColumns(Sequence[TrackPoint]):
         return dataset_of_track(self)
 
     def to_geojson(self, place: Vector) -> dict[str, Any]:
-        """A FeatureCollection: a line for every unbroken part, and a point for every row.
+        """A FeatureCollection: one point of a source at rest, else a line for every unbroken part and a point a row.
+
+        A source is at rest if no row puts it elsewhere than the best one does, by more than both are uncertain; the
+        point is that of the best row, and its σ are too.
 
         Parameters
         ----------
@@ -149,6 +152,10 @@ class TrackColumns(Sequence[TrackPoint]):
             Coordinates are longitude, latitude [deg] and height above the ellipsoid [m], as RFC 7946 has them.
         """
         return geojson_of_track(self, place)
+
+    def to_kml(self, place: Vector) -> str:
+        """The same as placemarks: one of a source at rest, else the track and its ends; ``place`` as before."""
+        return kml_of_track(self, place)
 
     def __repr__(self) -> str:
         return "\n".join(lines_of_track(self, most=10))

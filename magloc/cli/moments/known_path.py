@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cyclopts import Parameter
 
 from arrays.io.errors import LARGEST, InputError
-from arrays.io.text import write_text
 from magloc.cli.framework import print_json
-from magloc.cli.options import KnownOptions, print_note
+from magloc.cli.options import KnownOptions, MapOptions, print_note
 
 if TYPE_CHECKING:
     from arrays.typing import BoolArray
@@ -29,7 +27,7 @@ class MomentOutputs:
 
     json: bool
     jsonl: bool
-    geojson: Path | None
+    maps: MapOptions
     out: Path | None
     truth: Path | None
     quiet: bool
@@ -95,8 +93,7 @@ def write_moment_track(found: MomentTrack, readings: Path, known: KnownOptions, 
     result = None
     if outputs.truth is not None:
         result = found.consistency(magloc.read_truth(outputs.truth))
-    if outputs.geojson is not None and known.place is not None:
-        write_text(dumps(found.to_geojson(known.place), allow_nan=False) + "\n", outputs.geojson)
+    outputs.maps.write(found, known.place)
     if outputs.out is not None:
         from magloc.plots.tracks import write_picture
 
@@ -116,7 +113,7 @@ def write_moment_track(found: MomentTrack, readings: Path, known: KnownOptions, 
 
 def write_moment_tracks(found: Sequence[MomentTrack], readings: Path, outputs: MomentOutputs) -> None:
     """Print those of several sources."""
-    for option, value in (("--truth", outputs.truth), ("--geojson", outputs.geojson), ("--out", outputs.out)):
+    for option, value in {**outputs.maps.outputs, "--truth": outputs.truth, "--out": outputs.out}.items():
         if value is not None:
             raise InputError(f"{option}: found several places of --position, expected one.")
     entries = [_entry_of_several(points) for points in zip(*found, strict=True)]

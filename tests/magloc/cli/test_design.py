@@ -58,8 +58,8 @@ class TestResult:
         assert result["fitted_m"] <= result["best_start_m"]
         assert result["worst_is_bounded"] is False
         names = [judged["name"] for judged in result["arrays"]]
-        assert names == ["task", "best start", "tetrahedron", "cube", "cross"]
-        assert [judged["sensors"] for judged in result["arrays"]] == [4, 4, 4, 8, 4]
+        assert names == ["task", "best start", "tetrahedron", "cube", "cross", "even grid"]
+        assert [judged["sensors"] for judged in result["arrays"]] == [4, 4, 4, 8, 4, 4]
         for judged in result["arrays"]:
             assert len(judged["sigma_range_q95_m"]) == len(judged["distance_m"])
             assert np.all(np.diff(judged["sigma_range_q95_m"]) > 0.0)
@@ -77,6 +77,19 @@ class TestResult:
         result = design_array(read_task(str(task)))
         blind = replace(result.judged[-1], name="blind", criterion_m=np.inf)
         assert _table(replace(result, judged=(*result.judged, blind))) == _table(result)
+
+    def test_counts(self, run, task, tmp_path):
+        """More sensors know more; an array file each, and the picture has the numbers of the table."""
+        out, png = tmp_path / "a.toml", tmp_path / "a.png"
+        result = reported(run, task, "--counts", 8, 4, "--out", out, "--png", png)
+        few, many = result["counts"]
+        assert [entry["sensors"] for entry in result["counts"]] == [4, 8]
+        assert many["criterion_m"] < few["criterion_m"]
+        for entry in result["counts"]:
+            assert entry["design_gain"] == pytest.approx(1.0 - entry["criterion_m"] / entry["even_grid_m"])
+            np.testing.assert_array_equal(read_array(entry["out"]).positions, entry["positions_m"])
+        assert png.read_bytes().startswith(b"\x89PNG")
+        assert_refused(run("design", task, "--counts", 4, 1, "--out", out), "n_sensors must be at least 3")
 
     def test_fixes_are_possible(self, run, task, tmp_path):
         """The file is one that the other commands read."""
@@ -109,7 +122,7 @@ class TestResult:
         result = reported(run, write(tmp_path, SENSORS, HULL, SOURCES, QUICK), "--out", out)
         _, distance, _ = trimesh.proximity.closest_point_naive(mesh, read_array(out).positions)
         assert distance.max() < 1e-6  # the corners of an STL file are in single precision
-        assert [judged["fits_volume"] for judged in result["arrays"]] == [True, True, False, False, False]
+        assert [judged["fits_volume"] for judged in result["arrays"]] == [True, True, False, False, False, True]
         assert result["near_optimal"] == []
 
 

@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pymap3d
@@ -311,9 +312,17 @@ class TestGeojson:
             assert feature["properties"]["sigma_east_m"] == pytest.approx(deviation[0])
             assert feature["properties"]["sigma_up_m"] == pytest.approx(deviation[2])
 
-    def test_needs_a_place(self, run: Run, array: Path, readings: Path, tmp_path: Path) -> None:
-        path = tmp_path / "track.geojson"
-        assert_refused(run("track", readings, "--array", array, "--geojson", path), "--geojson", "no --place")
+    def test_kml(self, run: Run, array: Path, readings: Path, tmp_path: Path) -> None:
+        path = tmp_path / "track.kml"
+        outcome = run("track", readings, "--array", array, *MOTION, "--place", *self.PLACE, "--kml", path)
+        assert outcome.status == 0
+        root = ElementTree.parse(path).getroot()
+        assert len(root.findall(".//{*}LineString")) == 1
+
+    @pytest.mark.parametrize("option", ["--geojson", "--kml"])
+    def test_needs_a_place(self, run: Run, array: Path, readings: Path, tmp_path: Path, option: str) -> None:
+        path = tmp_path / "track.map"
+        assert_refused(run("track", readings, "--array", array, option, path), option, "no --place")
         assert not path.exists()
 
     def test_of_a_folder_that_is_not_there(self, run: Run, array: Path, readings: Path, tmp_path: Path) -> None:

@@ -46,7 +46,9 @@ class TestNames:
         tree = ast.parse((Path(magloc.plots.__file__ or "").parent / "__init__.pyi").read_text(encoding="utf-8"))
         imported = [alias.asname for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names]
         assigned = [ast.unparse(node.targets[0]) for node in tree.body if isinstance(node, ast.Assign)]
-        assert sorted({*imported, *assigned} - {"_surveys", "_tracks"}) == magloc.plots.__all__
+        assert (
+            sorted({*imported, *assigned} - {"_bounds", "_signatures", "_surveys", "_tracks"}) == magloc.plots.__all__
+        )
 
 
 @pytest.mark.filterwarnings("error")
@@ -81,3 +83,39 @@ def test_residuals_are_the_same_in_either_frame(fixes: Fixes) -> None:
     here, there = ([line.get_ydata() for line in figure.axes[0].lines] for figure in figures)
     for one, other in zip(here, there, strict=True):
         np.testing.assert_allclose(one, other, atol=1e-3)  # standard deviations
+
+
+class TestEveryResult:
+    """Whatever a door gives draws itself."""
+
+    @pytest.mark.parametrize("name", [
+        "Bounds", "Calibration", "Design", "Fixes", "MomentTrack", "Signature", "Survey", "Track",
+    ])  # fmt: skip
+    def test_has_plot(self, name: str) -> None:
+        assert callable(getattr(magloc, name).plot)
+
+    def test_bounds_are_drawn_over_the_distance(self) -> None:
+        places = np.array([[6.0, 0.0, 0.5], [2.0, 0.0, 0.5], [4.0, 0.0, 0.5]])
+        bounds = magloc.cramer_rao_bounds(ARRAY, places, [0.0, 0.0, 100.0])
+        position, range_ = bounds.plot().axes[0].lines
+        order = np.argsort(bounds.range_m)
+        per_m = 1e3 if bounds.sigma_position_m.max() < 1.0 else 1.0
+        np.testing.assert_allclose(position.get_xdata(), bounds.range_m[order])
+        np.testing.assert_allclose(position.get_ydata(), per_m * bounds.sigma_position_m[order])
+        np.testing.assert_allclose(range_.get_ydata(), per_m * bounds.sigma_range_m[order])
+
+    def test_bounds_that_are_infinite_are_not_drawn(self) -> None:
+        known_nothing = magloc.cramer_rao_bounds(ARRAY, [1.0, 2.0, 3.0], [0.0, 0.0, 0.0])
+        assert known_nothing.plot().axes
+
+    def test_signature(self) -> None:
+        ship = magloc.datasets.load("ship")
+        assert ship.truth is not None
+        found = magloc.fit_signature(
+            ship.array, ship.readings, magloc.ObjectPath(ship.truth.time_s, ship.truth.position_m)
+        )
+        parts, turns = found.plot().axes
+        assert [text.get_text() for text in parts.get_yticklabels()] == list(found.names)
+        east, north, up = turns.lines
+        moment, _ = found.moment(np.asarray(east.get_xdata()))
+        np.testing.assert_allclose(np.array([line.get_ydata() for line in (east, north, up)]).T, moment)

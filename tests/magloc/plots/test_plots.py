@@ -21,16 +21,18 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Patch
+from matplotlib.text import Text
 from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 from skimage.color import rgb2lab
 
-from arrays.geometries import tetrahedron
+from arrays.geometries import grid, tetrahedron
 from arrays.sensor import Calibration
 from magloc.bounds.maps import BoundScenario, bound_slices
 from magloc.convergence.over_starts import Status
@@ -289,6 +291,26 @@ class TestBoundSlices:
             np.testing.assert_allclose(images[known], values[known])
             assert known.any()
         assert {ax.get_aspect() for ax in axes[:9]} == {1.0}
+
+    def test_small_arrays_are_in_millimetres_and_nothing_is_cut(self) -> None:
+        scenario = BoundScenario(grid(3, 3, 0.02), (0.0, 1e-3, 1e-3), half_width_m=0.1, accuracy_m=1e-3, n_moments=3)
+        dataset = bound_slices(scenario, 11)
+        figure = bound_slices_figure(dataset, scenario)
+        first = figure.axes[0]
+        assert (first.get_ylabel(), first.get_images()[0].get_extent()[1]) == ("y [mm]", pytest.approx(110.0))
+        shown, sigma_m = np.ma.filled(first.get_images()[0].get_array(), np.nan), dataset["sigma_range"].to_numpy()[0]
+        known = np.isfinite(sigma_m)
+        np.testing.assert_allclose(shown[known], 1e3 * sigma_m[known])
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        texts = [text for text in figure.findobj(Text) if text.get_text() and text.get_visible()]
+        assert "required: 1 mm" in [text.get_text() for text in texts]
+        assert not [text.get_text() for text in texts if "e-" in text.get_text()]
+        for ax in figure.axes:
+            for label in (ax.xaxis.label, ax.yaxis.label):
+                place = label.get_window_extent()
+                assert place.x0 >= 0.0, label.get_text()
+                assert place.x1 <= figure.bbox.width, label.get_text()
 
 
 class TestTrack:

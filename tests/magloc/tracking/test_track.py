@@ -22,8 +22,9 @@ from scipy.spatial.transform import Rotation
 
 import magloc
 from arrays.io.errors import InputError
+from magloc.tracking.files import at_rest
 from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
-from magloc.tracking.results import rows_of
+from magloc.tracking.results import TrackPoint, rows_of
 from magloc.tracking.track import SPEED_M_S, TURN_RAD_S
 from magloc.tracking.whole_records.smoother import smoothed
 from tests.passing_source import ARRAY, SLOW, moving_source, readings_of
@@ -145,6 +146,45 @@ class TestShapes:
         longitude, latitude, height = np.array([point["geometry"]["coordinates"] for point in points]).T
         enu = pymap3d.geodetic2enu(latitude, longitude, height, *place)
         np.testing.assert_allclose(np.array(enu).T, track.position_m[N_EMPTY:], atol=1e-6)
+
+
+class TestSourceAtRest:
+    """On a map, a source that no row puts elsewhere is one point."""
+
+    PLACE = (48.0, 11.0, 500.0)
+
+    def test_diver(self) -> None:
+        """The magnet lies 0.6 m below the origin; the point is that of the best row, with its σ."""
+        diver = magloc.datasets.load("diver")
+        track = magloc.track(diver.array, diver.readings)
+        (point,) = track.to_geojson(self.PLACE)["features"]
+        assert point["geometry"]["type"] == "Point"
+        found = point["properties"]
+        sigma = np.array([found[f"sigma_{axis}_m"] for axis in ("east", "north", "up")])
+        assert np.sum(sigma**2) == np.nanmin(np.trace(track.covariance[:, :3, :3], axis1=1, axis2=2))
+        enu = np.array(pymap3d.geodetic2enu(*np.array(point["geometry"]["coordinates"])[[1, 0, 2]], *self.PLACE))
+        assert found["depth_m"] == pytest.approx(-enu[2], abs=1e-6)
+        assert np.sum(((enu - [0.0, 0.0, -0.6]) / sigma) ** 2) < 16.3  # χ² of 3, once in a thousand
+        assert len(found["moment_Am2"]) == len(found["sigma_moment_Am2"]) == 3
+        kml = track.to_kml(self.PLACE)
+        assert kml.count("<Placemark>") == kml.count("<Point>") == 1
+        assert f"{found['depth_m']:.2f} ± {sigma[2]:.2g} m below the origin" in kml
+
+    def test_one_that_moves(self, track: magloc.Track) -> None:
+        assert at_rest(track) is None
+        kml = track.to_kml(self.PLACE)
+        assert (kml.count("<LineString>"), kml.count("<Point>")) == (1, 2)  # its ends
+
+    @pytest.mark.parametrize(("step_m", "rests"), [(0.0, True), (1e-3, False)])
+    def test_known_places(self, step_m: float, rests: bool) -> None:
+        """They have no covariance."""
+        covariance = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+        places = [np.array([1.0 + i * step_m, 2.0, 3.0]) for i in range(3)]
+        points = [TrackPoint(float(i), place, np.ones(3), covariance) for i, place in enumerate(places)]
+        assert (at_rest(points) is not None) == rests
+
+    def test_one_row_tells_nothing(self, track: magloc.Track) -> None:
+        assert at_rest([*track[:N_EMPTY], track[N_EMPTY]]) is None
 
 
 class TestConsistency:

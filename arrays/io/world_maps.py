@@ -1,0 +1,51 @@
+"""What maps of the world read: GeoJSON (RFC 7946) and KML, of places east, north, up of an origin."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from arrays.io.errors import of_extra
+from arrays.typing import FloatArray, Vector
+
+
+def world_place(position_m: FloatArray, origin: Vector) -> list[float]:
+    """Longitude, latitude [deg] and height [m] of a position (3,); `origin` has latitude, longitude, height."""
+    with of_extra("geo", "a map of the world"):
+        from pymap3d import enu2geodetic
+
+    latitude, longitude, height = enu2geodetic(*np.asarray(position_m).tolist(), *origin)
+    return [float(longitude), float(latitude), float(height)]
+
+
+def feature(kind: str, coordinates: Sequence[Any], properties: Mapping[str, Any]) -> dict[str, Any]:
+    """A feature of GeoJSON: "Point" with one place, "LineString" with several."""
+    return {
+        "type": "Feature",
+        "geometry": {"type": kind, "coordinates": coordinates},
+        "properties": dict(properties),
+    }
+
+
+def feature_collection(features: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """A file of GeoJSON."""
+    return {"type": "FeatureCollection", "features": list(features)}
+
+
+def placemark(name: str, words: str, places: Sequence[Sequence[float]]) -> str:
+    """A placemark of KML, clamped to the ground: a point at one place, a line along several."""
+    kind = "Point" if len(places) == 1 else "LineString"
+    text = " ".join(f"{longitude:.9f},{latitude:.9f}" for longitude, latitude, *_ in places)
+    return (
+        f"<Placemark><name>{escape(name)}</name><description>{escape(words.strip())}</description>"
+        f"<{kind}><coordinates>{text}</coordinates></{kind}></Placemark>"
+    )
+
+
+def kml(placemarks: Iterable[str]) -> str:
+    """A file of KML."""
+    head = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
+    return "\n".join([head, *placemarks, "</Document></kml>", ""])
