@@ -13,11 +13,13 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import chdtrc
 
 from arrays.array import SensorArray
 from arrays.io.errors import check_positive
 from arrays.sensor import Calibration
 from arrays.typing import FloatArray
+from magloc.levels import MISFIT
 from magloc.measurement.rows import checked_rows
 
 N_PARAMETERS = 9
@@ -73,6 +75,11 @@ class EllipsoidCalibration:
     iterations: int
     converged: bool
     reason: str = ""
+
+    @property
+    def misfit(self) -> bool:
+        """Whether χ² is beyond noise: the modulus, its noise or the sensor are not as stated, nor is the covariance."""
+        return self.converged and self.dof > 0 and bool(chdtrc(self.dof, self.chi2) < MISFIT)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,21 +7,61 @@ from typing import Any
 
 import numpy as np
 
+from arrays.io.csv import read_table
 from arrays.io.errors import InputError
+from arrays.typing import FloatArray
 from magloc.calibration.modulus import EllipsoidCalibration
 from magloc.calibration.results import TurningCalibration
+from magloc.readings import Readings
 
 # Of a gain from the array file: beyond it the modulus is in another unit.
 _LARGEST_CHANGE = 3.0
 
 
-NOTES = ["the modulus does not tell how a sensor is mounted: its rotation stays as in the array file"]
-
-
-def check_modulus(modulus_nT: float) -> None:
-    """Refuse what is no modulus."""
+def modulus_of(given: str, readings: Readings) -> float | FloatArray:
+    """Modulus [T] that the option gives: a number, or of every row from a file of moduli through time."""
+    try:
+        modulus_nT = float(given)
+    except ValueError:
+        return _modulus_through_time(Path(given), readings.time_s)
     if not 0.0 < modulus_nT < np.inf:
         raise InputError(f"--modulus-nT: found {modulus_nT:g}, expected a positive number.")
+    return 1e-9 * modulus_nT
+
+
+def _modulus_through_time(path: Path, time_s: FloatArray) -> FloatArray:
+    """Modulus at some times, linear between those of a file."""
+    table = read_table(path, "a header with time_s and modulus_nT, or a number for --modulus-nT")
+    columns = ("time_s", "modulus_nT")
+    for name in columns:
+        table.require(name, columns)
+    table.refuse_unknown(columns)
+    known_s = table.complete_and_distinct("time_s")
+    order = np.argsort(known_s)
+    known_s, modulus_nT = known_s[order], table.complete(columns[1:])[order, 0]
+    if not (modulus_nT > 0.0).all():
+        raise InputError(f"{path}: found a modulus_nT of {modulus_nT.min():g}, expected positive numbers.")
+    low, high = time_s.min(), time_s.max()
+    if not known_s[0] <= low <= high <= known_s[-1]:
+        raise InputError(
+            f"{path}: found moduli from {known_s[0]:.15g} s to {known_s[-1]:.15g} s, expected them for all readings,"
+            f" {low:.15g} s to {high:.15g} s."
+        )
+    return np.asarray(1e-9 * np.interp(time_s, known_s, modulus_nT))
+
+
+def notes(result: TurningCalibration) -> list[str]:
+    """What the modulus does not tell, and sensors that it does not fit."""
+    said = ["the modulus does not tell how a sensor is mounted: its rotation stays as in the array file"]
+    for name, fit in result.fits.items():
+        if fit.misfit:
+            ratio = fit.chi2 / fit.dof
+            said.append(
+                f"warning: sensor {name} does not fit (χ² {ratio:.3g} times what its noise explains): more noise, a"
+                f" field that changes, or iron near it; standard deviations are at least {np.sqrt(ratio):.2g} times as"
+                " large"
+            )
+    return said
 
 
 def check(result: TurningCalibration, readings: Path, array: Path, out: Path) -> None:
@@ -34,8 +74,8 @@ def check(result: TurningCalibration, readings: Path, array: Path, out: Path) ->
         ratio = float(np.cbrt(volumes[0] / volumes[1]))
         if not 1.0 / _LARGEST_CHANGE < ratio < _LARGEST_CHANGE:
             raise InputError(
-                f"--modulus-nT: found {1e9 * float(result.modulus_T):g}, which makes the gains of sensor {sensor.id}"
-                f" {ratio:.3g} times those of {array}, expected the modulus in nT, or an array file with its gains;"
+                f"--modulus-nT: found {1e9 * float(np.median(result.modulus_T)):g}, which makes the gains of sensor"
+                f" {sensor.id} {ratio:.3g} times those of {array}, expected the modulus in nT, or an array file with its gains;"
                 f" {out} is not written."
             )
 
@@ -68,6 +108,7 @@ def _entry(name: str, result: EllipsoidCalibration) -> dict[str, Any]:
         "dof": result.dof,
         "iterations": result.iterations,
         "converged": result.converged,
+        "misfit": result.misfit,
     }
 
 

@@ -69,7 +69,7 @@ def calibrate(
     array: Path,
     out: Path,
     truth: Path | None = None,
-    modulus_nT: Annotated[float | None, Parameter(name="--modulus-nT")] = None,
+    modulus_nT: Annotated[str | None, Parameter(name="--modulus-nT", allow_leading_hyphen=True)] = None,
     height_m: float | None = None,
     moment: Literal["constant", "free"] | None = None,
     known: PriorOptions = PriorOptions(),
@@ -98,8 +98,9 @@ def calibrate(
     truth : Path
         Truth file (CSV); rows belong to the readings of the same time. A missing z_m is one unknown height for all
         rows. Moments, where it has them, are taken as known.
-    modulus_nT : float
-        Modulus of the uniform field that the sensors were turned in.
+    modulus_nT : str
+        Modulus of the uniform field that the sensors were turned in: a number, or a CSV file with time_s and
+        modulus_nT, such as a base station's, between whose rows it is linear.
     height_m : float
         The z of a truth file without z_m.
     moment : {"constant", "free"}
@@ -126,11 +127,10 @@ def calibrate(
             raise InputError("--modulus-nT: found it together with --truth, expected one of them.")
         if known != PriorOptions() or height_m is not None or moment is not None:
             raise InputError("--modulus-nT: found it together with an option for a moving source, expected none.")
-        turning.check_modulus(modulus_nT)
         nominal = arrays.read_sensors(array)
         rows = read_readings(readings, nominal)
         with naming(str(array)):
-            result = magloc.calibrate(nominal, rows, modulus_T=1e-9 * modulus_nT)
+            result = magloc.calibrate(nominal, rows, modulus_T=turning.modulus_of(modulus_nT, rows))
     else:
         nominal = array_of_several(array)
         prior = _prior(known, nominal, array)
@@ -140,7 +140,7 @@ def calibrate(
             result = magloc.calibrate(nominal, rows, truth=path, moment=moment, prior=prior)
     if isinstance(result, TurningCalibration):
         turning.check(result, readings, array, out)
-        report, lines, notes = turning.report(result, out), turning.lines(result), turning.NOTES
+        report, lines, notes = turning.report(result, out), turning.lines(result), turning.notes(result)
     else:
         _check_converged(result, readings, out)
         report, lines, notes = _report(result, len(rows), out), _table(result), _notes(result, len(rows), prior)

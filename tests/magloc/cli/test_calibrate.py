@@ -356,6 +356,45 @@ class TestTurnedInAKnownModulus:
         assert entry["converged"]
         assert entry["dof"] == 400 - 9
 
+    def changing(self, folder: Path) -> tuple[tuple[str, ...], np.ndarray]:
+        """A record in a field that changes, and its modulus."""
+        rng = np.random.default_rng(1)
+        directions = rng.normal(size=(400, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        modulus = 48e3 + 300.0 * np.sin(np.arange(400) / 40.0)
+        return self.write(folder, directions * modulus[:, None] / 48e3), modulus
+
+    def test_modulus_through_time(self, run: Run, tmp_path: Path) -> None:
+        command, modulus = self.changing(tmp_path)
+        rows = [f"{time},{value}" for time, value in enumerate(modulus)]
+        (tmp_path / "base.csv").write_text("\n".join(["time_s,modulus_nT", *rows, ""]), encoding="utf-8")
+        outcome = run(*command[:-1], str(tmp_path / "base.csv"), "--json")
+        assert outcome.status == 0, outcome.err
+        (sensor,) = read_sensors(tmp_path / "out.toml").sensors
+        np.testing.assert_allclose(sensor.calibration.offset_T, self.OFFSET_T, atol=3e-9)
+        assert not json.loads(outcome.out)["sensors"][0]["misfit"]
+
+    def test_modulus_that_is_not_constant_is_warned_of(self, run: Run, tmp_path: Path) -> None:
+        outcome = run(*self.changing(tmp_path)[0])
+        assert outcome.status == 0
+        assert "warning: sensor m does not fit" in outcome.err
+
+    @pytest.mark.parametrize(
+        ("lines", "word"),
+        [
+            ("time_s,modulus_nT\n0,48000\n10,48000\n", "for all readings"),
+            ("time_s,modulus_nT\n0,48000\n0,48000\n", "time_s"),
+            ("time_s,modulus_nT\n0,48000\n500,-1\n", "positive"),
+            ("time_s,modulus_nT\n0,48000\n500,\n", "modulus_nT"),
+            ("time_s,b_nT\n0,48000\n", "modulus_nT"),
+        ],
+    )
+    def test_bad_moduli(self, lines: str, word: str, run: Run, tmp_path: Path) -> None:
+        command, _ = self.changing(tmp_path)
+        (tmp_path / "base.csv").write_text(lines, encoding="utf-8")
+        assert_refused(run(*command[:-1], str(tmp_path / "base.csv")), "base.csv", word)
+        assert not (tmp_path / "out.toml").exists()
+
     def test_turned_about_one_axis_only(self, run: Run, tmp_path: Path) -> None:
         angle = np.linspace(0.0, 6.0, 100)
         directions = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
