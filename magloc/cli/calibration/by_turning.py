@@ -75,8 +75,8 @@ def check(result: TurningCalibration, readings: Path, array: Path, out: Path) ->
         if not 1.0 / _LARGEST_CHANGE < ratio < _LARGEST_CHANGE:
             raise InputError(
                 f"--modulus-nT: found {1e9 * float(np.median(result.modulus_T)):g}, which makes the gains of sensor"
-                f" {sensor.id} {ratio:.3g} times those of {array}, expected the modulus in nT, or an array file with its"
-                f" gains; {out} is not written."
+                f" {sensor.id} {ratio:.3g} times those of {array}, expected the modulus in nT, or an array file with"
+                f" its gains; {out} is not written."
             )
 
 
