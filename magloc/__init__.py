@@ -50,6 +50,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "fit_signature": "magloc.signature.signature",
         "fit_source_line": "magloc.localization.line_ranging",
         "geomagnetic": ":magloc.fields.geomagnetic",
+        "live": ":magloc.live",
         "locate": "magloc.localization.locator",
         "moments_on_sphere": "magloc.directions",
         "plots": ":magloc.plots",

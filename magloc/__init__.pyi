@@ -1,4 +1,5 @@
 from magloc import datasets as datasets
+from magloc import live as live
 from magloc import plots as plots
 from magloc.bounds.crlb import Bounds as Bounds
 from magloc.bounds.crlb import cramer_rao_bounds as cramer_rao_bounds

@@ -39,13 +39,12 @@ POSITION_COLUMNS = ("array_x_m", "array_y_m", "array_z_m")
 ROTATION_COLUMNS = ("array_qx", "array_qy", "array_qz", "array_qw")
 POSE_SIGMA_COLUMNS = ("array_sigma_m", "array_sigma_deg")
 AMBIENT_COLUMNS = tuple(f"{name}_nT" for name in AMBIENT_CHANNELS)
-_EXPECTED_HEADER = "a header with time_s and the sensors' columns"
+EXPECTED_HEADER = "a header with time_s and the sensors' columns"
 _T_IN_nT = 1e9
 _SIGMA_UNITS = np.array([1.0, np.pi / 180.0])  # of a pose's standard deviations, m and degrees
 _SATURATION_RTOL = 1e-12
 _LARGEST_nT = 1e15  # a million tesla: a column of something else, or a broken line
-# Change of the ambient field, relative, within which moduli may be averaged: 50 nT in 50 µT.
-_SAME_AMBIENT_RTOL = 1e-3
+_SAME_AMBIENT_RTOL = 1e-3  # change of the ambient field within which moduli may be averaged: 50 nT in 50 µT
 _UNIT_QUATERNION_ATOL = 1e-3  # a log that keeps four decimals passes; the quaternion is normalised afterwards
 _SENSOR_COLUMN = re.compile(r"(?P<id>.+?)(_[xyz])?_nT")
 
@@ -145,7 +144,7 @@ class Readings:
         InputError
             They are not the columns of this array's readings; the text names the row, counted from one, and column.
         """
-        return _readings_of_table(table_of_columns(columns, "the readings"), array, None)
+        return readings_of_table(table_of_columns(columns, "the readings"), array, None)
 
     def __len__(self) -> int:
         return len(self.values_T)
@@ -265,8 +264,8 @@ def read_readings(
     >>> magloc.read_readings(board.path, board.array).values_T.shape
     (101, 90)
     """
-    table = read_table(path, _EXPECTED_HEADER)
-    readings = _readings_of_table(table, array, sensors)
+    table = read_table(path, EXPECTED_HEADER)
+    readings = readings_of_table(table, array, sensors)
     if ordered:
         table.refuse_back("time_s", ~(np.diff(readings.time_s) > 0.0), "time to increase from row to row", "{:.15g}")
     if still:
@@ -282,10 +281,11 @@ def readings_of_text(
     text: str, name: str, array: SensorArray, *, sensors: Sequence[str] | None = None, first_line: int = 2
 ) -> Readings:
     """Readings as :func:`read_readings`, from CSV text called `name` in errors, its first row on line `first_line`."""
-    return _readings_of_table(table_of_text(text, name, _EXPECTED_HEADER, first_line=first_line), array, sensors)
+    return readings_of_table(table_of_text(text, name, EXPECTED_HEADER, first_line=first_line), array, sensors)
 
 
-def _readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] | None) -> Readings:
+def readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] | None) -> Readings:
+    """Readings as :func:`read_readings`, from a table, which may have no row."""
     if sensors is not None:
         array = array.subset(sensors)
     channels = [f"{name}_nT" for name in array.channel_names]

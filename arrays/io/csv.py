@@ -223,6 +223,13 @@ def table_of_text(
     return Table(name, chosen, header_line, table, np.array(line_numbers, dtype=np.int64))
 
 
+def table_of_header(line: str, name: str, expected_header: str, *, number: int = 1) -> Table:
+    """Table without rows from the line that names its columns; `name` and `number` are what errors call it."""
+    _, cells = next(_csv_rows(name, line), (1, [""]))
+    header = _checked_header(f"{name}, line {number}", cells, expected_header)
+    return Table(name, header, number, np.zeros((0, len(header))), np.zeros(0, dtype=np.int64))
+
+
 def _unix_seconds(place: str, cell: str) -> str:
     """Seconds since 1970 of an instant, as text."""
     try:

@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-def read_text(path: str | PathLike[str], expected: str) -> str:
-    """Text of a UTF-8 file, with or without a byte order mark; `expected` says in words what it should be."""
+def read_bytes(path: str | PathLike[str], expected: str) -> bytes:
+    """What a file holds; `expected` says in words what it should be."""
     try:
-        data = Path(path).read_bytes()
+        return Path(path).read_bytes()
     except FileNotFoundError:
         raise InputError(f"{path} does not exist, expected {expected}.") from None
     except IsADirectoryError:
@@ -26,6 +26,11 @@ def read_text(path: str | PathLike[str], expected: str) -> str:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path} cannot be read ({reason}), expected {expected}.") from None
+
+
+def read_text(path: str | PathLike[str], expected: str) -> str:
+    """Text of a UTF-8 file, with or without a byte order mark, as :func:`read_bytes`."""
+    data = read_bytes(path, expected)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

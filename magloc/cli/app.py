@@ -35,6 +35,7 @@ for _name, _where, _help in (
         " sources.",
     ),
     ("track", "magloc.cli.track:track", "Follow one source through time."),
+    ("live", "magloc.cli.live:live", "Follow one source while its readings come in."),
     (
         "signature",
         "magloc.cli.moments.signature:signature",

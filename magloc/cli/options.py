@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from json import dumps
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from arrays.array import SensorArray
     from magloc.localization.fit.prior import SourcePrior
     from magloc.readings import Readings
+    from magloc.tracking.motion import MotionModel
 
 
 def print_note(text: str) -> None:
@@ -103,8 +104,49 @@ def ambient_field(
     """The array with its ambient field, and that of every row if it differs; errors speak of the options."""
     from magloc.ambient import with_ambient_field
 
-    with naming_options("place", "date", "geomagnetic_model", "ambient_gradient"):
+    with naming_place():
         return with_ambient_field(array, rows, where, gradient=gradient)
+
+
+def naming_place() -> AbstractContextManager[None]:
+    """Let errors of the ambient field speak of its options."""
+    return naming_options("place", "date", "geomagnetic_model", "ambient_gradient")
+
+
+@Parameter(name="*", group="Motion")
+@dataclass(frozen=True)
+class MotionOptions:
+    """What is known of the motion.
+
+    Parameters
+    ----------
+    speed_m_s : float
+        Characteristic speed of the source along each axis.
+    turn_deg_s : float
+        Characteristic rate at which its moment turns.
+    motion : {"unknown", "wandering", "turn"}
+        unknown: position and moment are random walks, by the speed and the rate times the interval in every row.
+        wandering: speed and turn rate are estimated too, and forgotten in --correlation-s. turn: a steady turn about
+        the vertical. By default unknown.
+    correlation_s : float
+        How long a speed lasts, for wandering; by default as long as a turn at the characteristic rate.
+    """
+
+    speed_m_s: float = 0.5
+    turn_deg_s: float = 5.0
+    motion: Literal["unknown", "wandering", "turn"] | None = None
+    correlation_s: float | None = None
+
+    def model(self, *, smooth: bool = False) -> MotionModel:
+        """The motion model that the options name."""
+        refuse_not_positive(self, "speed_m_s", "turn_deg_s", "correlation_s")
+        turn = math.radians(self.turn_deg_s)
+        name = self.motion or ("wandering" if smooth else "unknown")
+        if name == "unknown":
+            return magloc.RandomWalk(self.speed_m_s, turn)
+        if name == "wandering":
+            return magloc.OrnsteinUhlenbeck(self.speed_m_s, turn, self.correlation_s)
+        return magloc.CoordinatedTurn(self.speed_m_s, turn)
 
 
 _DATE = re.compile(r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}(:\d{2}(\.\d+)?)?)?")

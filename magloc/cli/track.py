@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal  # noqa: F401 - of an inherited option
 
 from cyclopts import Parameter
 
@@ -25,7 +25,15 @@ from magloc.cli.moments.known_path import (
     write_moment_track,
     write_moment_tracks,
 )
-from magloc.cli.options import KnownOptions, MapOptions, ambient_field, print_note, refuse_not_positive
+from magloc.cli.options import (
+    KnownOptions,
+    MapOptions,
+    MotionOptions,
+    ambient_field,
+    naming_place,
+    print_note,
+    refuse_not_positive,
+)
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -34,7 +42,7 @@ if TYPE_CHECKING:
     from magloc.signature.path import ObjectPath
     from magloc.tracking.consistency import Consistency
     from magloc.tracking.motion import MotionModel
-    from magloc.tracking.results import TrackPoint
+    from magloc.tracking.results import Row, TrackPoint
     from magloc.tracking.track import Track
     from magloc.tracking.tracker import Tracker
 
@@ -47,7 +55,7 @@ _USE_SURVEY = "; sources at rest that few sensors move past are found by magloc 
 
 @Parameter(name="*", group="Motion")
 @dataclass(frozen=True)
-class MotionOptions:
+class PathOptions(MotionOptions):
     """What is known of the motion.
 
     Parameters
@@ -72,10 +80,6 @@ class MotionOptions:
         How wrong a known path may be.
     """
 
-    speed_m_s: float = 0.5
-    turn_deg_s: float = 5.0
-    motion: Literal["unknown", "wandering", "turn"] | None = None
-    correlation_s: float | None = None
     position: list[Vector] | None = None
     object_path: Path | None = None
     error: PathErrorOptions = field(default_factory=PathErrorOptions)
@@ -93,17 +97,6 @@ class MotionOptions:
         if self.motion not in (None, "unknown"):
             raise InputError(f"--motion: found {self.motion} with a known position, expected unknown.")
         return self.position if self.object_path is None else magloc.read_object_path(self.object_path)
-
-    def model(self, *, smooth: bool) -> MotionModel:
-        """The motion model that the options name."""
-        refuse_not_positive(self, "speed_m_s", "turn_deg_s", "correlation_s")
-        turn = math.radians(self.turn_deg_s)
-        name = self.motion or ("wandering" if smooth else "unknown")
-        if name == "unknown":
-            return magloc.RandomWalk(self.speed_m_s, turn)
-        if name == "wandering":
-            return magloc.OrnsteinUhlenbeck(self.speed_m_s, turn, self.correlation_s)
-        return magloc.CoordinatedTurn(self.speed_m_s, turn)
 
 
 @Parameter(name="*", group="Conditioning of the readings")
@@ -161,7 +154,7 @@ def track(
     known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
     maps: MapOptions = MapOptions(),  # noqa: B008 - frozen
     out: Path | None = None,
-    motion: MotionOptions = MotionOptions(),
+    motion: PathOptions = PathOptions(),
     conditioning: ConditioningOptions = ConditioningOptions(),
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
@@ -193,7 +186,7 @@ def track(
         Files for maps of the world: one point of a source at rest, else the track.
     out : Path
         Folder for the picture of the track with its 95 % ellipses and the data behind it.
-    motion : MotionOptions
+    motion : PathOptions
         What is known of the motion.
     conditioning : ConditioningOptions
         What is done to the readings first.
@@ -248,8 +241,7 @@ def track(
     with progress(len(rows), "rows", quiet=common.quiet) as advance, naming(str(array)):
         if printed:
             tracker = magloc.Tracker(with_stated_pose(used, rows), model, prior=prior)
-            points = tuple(map(_printed, tracker.run(rows_of(rows), advance)))
-            found = magloc.Track(points, rows, tracker)
+            found = magloc.Track(tuple(_printed_points(tracker, list(rows_of(rows)), advance)), rows, tracker)
         else:
             found = magloc.track(used, rows, motion=model, smooth=smooth, prior=prior, progress=advance)
     if not found.tracked.any():
@@ -301,6 +293,18 @@ def _no_track(readings: str, statuses: Iterable[str], hint: str = "") -> InputEr
     return InputError(f"{readings}: found no row where a source can be tracked ({reasons}){hint}.")
 
 
+def _printed_points(tracker: Tracker, rows: list[Row], advance: Callable[[int], None]) -> Iterator[TrackPoint]:
+    """Points of rows, each printed as soon as it is known."""
+    from magloc.tracking.batch import next_points
+
+    done = 0
+    while done < len(rows):
+        points = next_points(tracker, rows, done)
+        yield from map(_printed, points)
+        done += len(points)
+        advance(len(points))
+
+
 def _printed(point: TrackPoint) -> TrackPoint:
     """The point, after its line is printed."""
     from magloc.tracking.files import json_entry
@@ -312,52 +316,15 @@ def _printed(point: TrackPoint) -> TrackPoint:
 
 def _stream(array: SensorArray, known: KnownOptions, model: MotionModel, where: Place | None) -> None:
     """Answer every row of standard input by one line; none that is tracked is an InputError at its end."""
-    from magloc.measurement.pose import with_stated_pose
+    from magloc.live.follower import Follower
 
-    tracker: Tracker | None = None
+    follower = Follower(array, model, prior=known.prior, sensors=known.ids, place=where)
     statuses: set[str] = set()
-    is_tracked = False
-    for row in _rows_of_stdin(array, known.ids):
-        array_here, row_here = _in_ambient_field(array, row, where)
-        if tracker is None:
-            tracker = magloc.Tracker(with_stated_pose(array_here, row_here), model, prior=known.prior)
-        point = _printed(tracker.update(row_here))
-        statuses.add(point.status)
-        is_tracked = is_tracked or point.position_m is not None
-    if not statuses:
-        raise InputError("standard input, line 1: found a header without rows, expected a row below it.")
-    if not is_tracked:
+    with naming_place():
+        for point in follower.follow(STREAM):
+            _printed(point)
+            statuses.add(point.status)
+    if follower.tally.faults:
+        print_note(str(follower.tally))
+    if not follower.tally.tracked:
         raise _no_track("standard input", statuses)
-
-
-def _rows_of_stdin(array: SensorArray, ids: list[str] | None) -> Iterator[Readings]:
-    """Every row of standard input below its header, as soon as it comes."""
-    from magloc.readings import readings_of_text
-
-    header = _line_of_stdin().removeprefix("\ufeff")
-    if not header:
-        raise InputError("standard input: found nothing, expected a header with time_s and the sensors' columns.")
-    number, last = 1, -math.inf
-    while line := _line_of_stdin():
-        number += 1
-        if not line.strip():
-            continue
-        row = readings_of_text(f"{header}{line}", "standard input", array, sensors=ids, first_line=number)
-        time = float(row.time_s[0])
-        if time <= last:
-            raise InputError(
-                f"standard input, line {number}, column time_s: found {time:.15g} after {last:.15g}, expected time to"
-                " increase from row to row."
-            )
-        last = time
-        yield row
-
-
-def _line_of_stdin() -> str:
-    try:
-        return sys.stdin.readline()
-    except UnicodeDecodeError as error:
-        byte = error.object[error.start]
-        raise InputError(
-            f"standard input: found the byte 0x{byte:02x}, which is not UTF-8, expected UTF-8 text."
-        ) from None

@@ -21,6 +21,9 @@ from arrays.typing import FloatArray
 from magloc.fields import dipole
 from magloc.navigation.rotations import cross_matrix
 
+_NICE_SIGNAL = 300.0
+_NICE_RANGE = 3.0
+
 
 def predicted_channels(
     array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, ambient_T: FloatArray | None = None
@@ -110,3 +113,19 @@ class DifferenceMeasurement:
     def jacobian(self, position_m: ArrayLike, moment_Am2: ArrayLike, ambient_T: FloatArray | None = None) -> FloatArray:
         """Jacobian (..., k, 6) of :meth:`predicted` (JacobianH), columns (p, m): [T/m] and [T/(A·m²)]."""
         return self.differences.transform @ channel_jacobian(self.array, position_m, moment_Am2, ambient_T)
+
+
+def suitable_dipole(array: SensorArray) -> tuple[FloatArray, FloatArray]:
+    """Place and moment of a dipole that an array locates well: three radii away, a few hundred times the noise."""
+    direction = np.array([2.0, 1.0, 2.0]) / 3.0
+    distance = _NICE_RANGE * array.circumradius
+    field_T = _NICE_SIGNAL * float(np.median(array.channel_noise_T))
+    moment = rounded(field_T * distance**3 / dipole.MU0_OVER_4PI)
+    step = 10.0 ** np.floor(np.log10(array.circumradius) - 1.0)
+    position = np.round((array.centroid + distance * direction) / step) * step
+    return position, np.array([0.0, 0.0, moment])
+
+
+def rounded(value: float) -> float:
+    """A positive number to one significant digit."""
+    return float(f"{value:.0e}")

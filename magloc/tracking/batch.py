@@ -26,20 +26,20 @@ from magloc.tracking.tracker import (
     Tracker,
 )
 
+_MOST_AT_ONCE = 64
 _STATUS = {kernels.TRACKED: "tracked", kernels.PREDICTED: "predicted", kernels.OUTLIER: "outlier"}
 
 
 def track_record(
     tracker: Tracker, rows: Sequence[Row], progress: Callable[[int], None] | None = None
 ) -> list[TrackPoint]:
-    """Points of a whole record: as :meth:`Tracker.run`, with compiled steps where the motion is linear.
+    """Points of a whole record, or of the next rows of one: as :meth:`Tracker.run`, with compiled steps if there are.
 
     Sensors with lasting errors are tracked by the readable steps.
     """
     points: list[TrackPoint] = []
-    motion, compiled = tracker.motion, None
-    if isinstance(motion, LinearMotion) and rows and not tracker.n_errors:
-        compiled = _CompiledSteps(tracker, motion, rows)
+    motion = compiled_motion(tracker)
+    compiled = _CompiledSteps(tracker, motion, rows) if motion is not None and rows else None
     while len(points) < len(rows):
         before = len(points)
         if compiled is not None and tracker.is_tracking:
@@ -51,6 +51,18 @@ def track_record(
     return points
 
 
+def next_points(tracker: Tracker, rows: Sequence[Row], begin: int = 0) -> list[TrackPoint]:
+    """Points of the rows from one on: of as many as compiled steps take in a moment, else of one."""
+    many = tracker.is_tracking and compiled_motion(tracker) is not None
+    return track_record(tracker, rows[begin : begin + (_MOST_AT_ONCE if many else 1)])
+
+
+def compiled_motion(tracker: Tracker) -> LinearMotion | None:
+    """The motion of a tracker whose steps are compiled, None where they are not."""
+    motion = tracker.motion
+    return motion if isinstance(motion, LinearMotion) and not tracker.n_errors else None
+
+
 class _CompiledSteps:
     """A record in the layout of :func:`magloc.tracking.batch_compiled.follow`."""
 
@@ -58,6 +70,7 @@ class _CompiledSteps:
         array = tracker.array
         self.tracker = tracker
         self.times = [row.time_s for row in rows]
+        self.times_before = [tracker.time_s, *self.times[:-1]]
         differences = [tracker.measurements.differences(row) for row in rows]
         distinct = {id(of_row): of_row for of_row in differences}
         index = {key: i for i, key in enumerate(distinct)}
@@ -82,7 +95,8 @@ class _CompiledSteps:
             ambients=ambients,
             ambient_of_row=ambient_of_row,
         )
-        lengths, step_of_row = np.unique(np.diff(self.times, prepend=self.times[0]), return_inverse=True)
+        since_before = np.nan_to_num(np.subtract(self.times, self.times_before))  # NaN of the first of all
+        lengths, step_of_row = np.unique(since_before, return_inverse=True)
         steps = [motion.linear_step(max(length, 0.0)) for length in lengths.tolist()]
         F, A, B = (np.stack(part) for part in zip(*steps, strict=True))
         self.steps = kernels.Steps(F, A, B, step_of_row)
@@ -112,11 +126,11 @@ class _CompiledSteps:
 
     def follow(self, begin: int) -> list[TrackPoint]:
         """Points from a row to the one before the first that has to be acquired, or that goes back in time."""
-        tracker, array, times = self.tracker, self.tracker.array, self.times
+        tracker, array, times, before = self.tracker, self.tracker.array, self.times, self.times_before
         x, S, contradictions = tracker.state()
         end, contradictions = kernels.follow(
             begin,
-            next((i for i in range(max(begin, 1), len(times)) if times[i] <= times[i - 1]), len(times)),
+            next((i for i in range(begin, len(times)) if times[i] <= before[i]), len(times)),
             x,
             S,
             contradictions,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -130,7 +131,7 @@ class TrackPoint:
     radius_m: float = math.nan
     lag1: float = math.nan
 
-    @property
+    @cached_property
     def range_interval_m(self) -> Intervals | None:
         """95 % set of the distance from the sensors' centroid [m], None where the sensors are not known.
 

@@ -220,6 +220,11 @@ class Tracker:
         return self._weight
 
     @property
+    def time_s(self) -> float:
+        """Of the last row, NaN before the first."""
+        return self._time_s
+
+    @property
     def is_tracking(self) -> bool:
         """Whether the next row continues a track."""
         return self._x is not None

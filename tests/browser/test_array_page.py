@@ -11,7 +11,7 @@ import viser
 from numpy.typing import NDArray
 
 from arrays.geometries import tetrahedron
-from magloc.viewer.pages.live_fit import suitable_dipole
+from magloc.measurement.differences import suitable_dipole
 from magloc.viewer.pages.pages import array_page
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, FIELD_LINE_COLOUR, FIT_COLOUR, ArrayGlyphs
 from magloc.viewer.scene.shapes import field_lines

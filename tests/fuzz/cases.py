@@ -49,6 +49,10 @@ LINES: dict[str, tuple[str, ...]] = {
         "passing.csv --array passing-array.toml --object-path passing-path.csv --path-sigma-m 1 --smooth --json",
         "readings.csv --array array.toml --position 3 0.5 0.306 --truth readings-truth.csv",
     ),
+    "magloc live": (
+        "--array array.toml --from - --speed-m-s 0.1",
+        "--array array.toml --from replay:readings.csv --replay-speed 1e6 --rest-s 3",
+    ),
     "magloc signature": (
         "passing.csv --array passing-array.toml --object-path passing-path.csv --depth-m 2 --json",
         "passing.csv --array passing-array.toml --object-path passing-path.csv --eddy --attitude-sigma-deg 1",

@@ -85,7 +85,8 @@ def extreme_case(extreme: Extreme, files: Path, folder: Path) -> Case:
 def read_files(words: Sequence[str], files: Path, folder: Path) -> list[str]:
     """The words of a line that name what it reads, of which a copy is put into a new folder."""
     folder.mkdir()
-    read = [word for word in words if (files / word).exists()]
+    names = [word.removeprefix("replay:") for word in words]
+    read = [name for name in names if (files / name).exists()]
     for word in read:
         (shutil.copytree if (files / word).is_dir() else shutil.copyfile)(files / word, folder / word)
     return read

@@ -21,9 +21,10 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.localization.fit.results import Fix
+from magloc.measurement.differences import rounded, suitable_dipole
 from magloc.viewer.pages import words
 from magloc.viewer.pages.fixes import heaviest_first
-from magloc.viewer.pages.live_fit import Forecast, LiveFit, rounded, suitable_dipole
+from magloc.viewer.pages.live_fit import Forecast, LiveFit
 from magloc.viewer.panels.inputs import SharedInput, set_value
 from magloc.viewer.panels.latest import Latest
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, FIT_COLOUR, DipoleGlyph, SurfaceGlyph, turned_to

@@ -14,7 +14,6 @@ from arrays.noise import reading_covariance, reading_errors
 from arrays.typing import FloatArray
 from magloc.bounds.crlb import cramer_rao_bounds
 from magloc.chi_square import energy_threshold
-from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.localization.fit.results import Fix, is_observable, open_ended
 from magloc.localization.locator import Locator
 from magloc.localization.search.single_source import N_UNKNOWNS
@@ -22,8 +21,6 @@ from magloc.localization.uncertainty.range_interval import gaussian_ranges
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 
 _CERTAIN = 1e5  # squared signal over noise that is detected by any array; the distribution is not evaluated beyond
-_NICE_SIGNAL = 300.0
-_NICE_RANGE = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,22 +118,6 @@ class LiveFit:
         if not self.array.noise_depends_on_reading:
             return self._differences
         return decorrelated_differences(self.array, covariance_T2=reading_covariance(self.array, readings_T))
-
-
-def suitable_dipole(array: SensorArray) -> tuple[FloatArray, FloatArray]:
-    """Place and moment of a dipole that an array locates well: three radii away, a few hundred times the noise."""
-    direction = np.array([2.0, 1.0, 2.0]) / 3.0
-    distance = _NICE_RANGE * array.circumradius
-    field_T = _NICE_SIGNAL * float(np.median(array.channel_noise_T))
-    moment = rounded(field_T * distance**3 / MU0_OVER_4PI)
-    step = 10.0 ** np.floor(np.log10(array.circumradius) - 1.0)
-    position = np.round((array.centroid + distance * direction) / step) * step
-    return position, np.array([0.0, 0.0, moment])
-
-
-def rounded(value: float) -> float:
-    """A positive number to one significant digit."""
-    return float(f"{value:.0e}")
 
 
 def _why_singular(moment_Am2: ArrayLike) -> str:

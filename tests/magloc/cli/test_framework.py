@@ -20,6 +20,7 @@ COMMANDS = (
     "locate",
     "map",
     "track",
+    "live",
     "signature",
     "bounds",
     "design",

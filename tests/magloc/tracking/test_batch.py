@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -71,6 +72,24 @@ class TestCompiledRecord:
             if a.position_m is not None and b.position_m is not None:
                 np.testing.assert_allclose(a.position_m, b.position_m, rtol=0.0, atol=1e-8)
         return points
+
+    def test_rows_that_come_piece_by_piece(self) -> None:
+        time_s, p, m = moving_source(60)
+        rows = rows_from(time_s, readings_of(ARRAY, p, m))
+        whole, pieces = Tracker(ARRAY, SLOW), Tracker(ARRAY, SLOW)
+        expected, points = track_record(whole, rows), list[TrackPoint]()
+        for first, last in pairwise([0, 3, 4, 5, 20, 47, 60]):
+            points += track_record(pieces, rows[first:last])
+        assert_same_points(points, expected)
+        assert statuses(points).count("tracked") > 50
+
+    def test_a_row_that_is_not_later_than_the_piece_before(self) -> None:
+        time_s, p, m = moving_source(30)
+        rows = rows_from(time_s, readings_of(ARRAY, p, m))
+        tracker = Tracker(ARRAY, SLOW)
+        assert track_record(tracker, rows)[-1].status == "tracked"
+        with pytest.raises(ValueError, match="must increase"):
+            track_record(tracker, rows[-1:])
 
     def test_gaps_missing_channels_and_spikes(self) -> None:
         n = 120

@@ -29,9 +29,10 @@ from arrays.sensor import Calibration
 from magloc.levels import FALSE_ALARM
 from magloc.localization.fit.results import Fix
 from magloc.localization.uncertainty.range_interval import gaussian_ranges
+from magloc.measurement.differences import suitable_dipole
 from magloc.viewer.pages.array_editor import ArrayEditor, fault_of_path, moved
 from magloc.viewer.pages.dipole_editor import DipoleEditor, angles_of, direction_of, sensible_step
-from magloc.viewer.pages.live_fit import LiveFit, suitable_dipole
+from magloc.viewer.pages.live_fit import LiveFit
 from magloc.viewer.pages.words import panel
 from magloc.viewer.panels.inputs import set_value
 from magloc.viewer.panels.latest import Latest

@@ -1,0 +1,79 @@
+"""``magloc live``: one source followed while its readings come in."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from arrays.io.errors import LARGEST, InputError, naming
+from magloc.cli.framework import QuietOptions, print_json
+from magloc.cli.options import KnownOptions, MotionOptions, naming_place, print_note
+
+if TYPE_CHECKING:
+    from magloc.live.follower import LivePoint
+
+
+def live(
+    *,
+    array: Path,
+    source: Annotated[str, Parameter(name="--from", allow_leading_hyphen=True)] = "-",
+    rest_s: float = 0.0,
+    replay_speed: float = 1.0,
+    known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
+    motion: MotionOptions = MotionOptions(),  # noqa: B008 - frozen
+    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+) -> None:
+    """Follow one source while its readings come in.
+
+    Every row is answered by one JSON line at once, as of magloc track --jsonl, with latency_ms. Rows are CSV, first a
+    header with the columns of a readings file, or JSON objects with these names. Those that are late, lost, doubled or
+    garbled are counted and named on stderr, and end nothing.
+
+    Parameters
+    ----------
+    array : Path
+        Array file (TOML).
+    source : str
+        Where rows come from: - for standard input, tcp://HOST:PORT to connect to, udp://HOST:PORT to listen at,
+        serial:DEVICE@BAUD (extra serial), or replay:FILE for a readings file in its own time.
+    rest_s : float
+        The first seconds are a rest, without a source, whose mean is taken off all later readings; vector sensors of an
+        array that stands.
+    replay_speed : float
+        How much faster than in its own time a file is replayed.
+    known : KnownOptions
+        What is known of the sensors, of the source when a track starts, and of the ambient field.
+    motion : MotionOptions
+        What is known of the motion.
+    common : QuietOptions
+        Common options.
+    """
+    from magloc.live.follower import Follower
+
+    if not 0.0 <= rest_s <= LARGEST:
+        raise InputError(f"--rest-s: found {rest_s:g}, expected 0 or a positive number.")
+    if not 0.0 < replay_speed <= LARGEST:
+        raise InputError(f"--replay-speed: found {replay_speed:g}, expected a positive number.")
+    used, model = known.array(array), motion.model()
+    with naming(str(array)):
+        follower = Follower(used, model, prior=known.prior, sensors=known.ids, place=known.where, rest_s=rest_s)
+    points = follower.follow(source, replay_speed=replay_speed)
+    try:
+        with closing(points), naming_place(), naming(str(array)):
+            for point in points:
+                print_point(point)
+    finally:
+        if not common.quiet and follower.tally.rows:
+            print_note(str(follower.tally))
+
+
+def print_point(point: LivePoint) -> None:
+    """Print the line of a point at once."""
+    from magloc.tracking.files import json_entry
+
+    print_json(json_entry(point) | {"latency_ms": 1e3 * point.latency_s})
+    sys.stdout.flush()

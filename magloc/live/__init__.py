@@ -1,0 +1,13 @@
+"""A source followed while its readings come in: from a pipe, a socket, a serial port, or a file in its own time."""
+
+from arrays.io.lazy import lazy_names
+
+__getattr__, __dir__, __all__ = lazy_names(
+    __name__,
+    {
+        "Follower": "magloc.live.follower",
+        "LivePoint": "magloc.live.follower",
+        "Tally": "magloc.live.tally",
+        "track": "magloc.live.follower",
+    },
+)

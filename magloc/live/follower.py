@@ -1,0 +1,314 @@
+"""A source followed through rows that come in, whatever they come as."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Generator, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+
+import msgspec
+import numpy as np
+
+from arrays.array import SensorArray
+from arrays.io.errors import InputError, check_not_negative
+from magloc.ambient import Place, in_world_field, with_ambient_field
+from magloc.blas_threads import one_blas_thread
+from magloc.live.rest import Background, refuse_rest
+from magloc.live.rows import RowParser
+from magloc.live.tally import Clock, Tally
+from magloc.live.transports import Stream, opened, sender_waits
+from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
+from magloc.measurement.differences import predicted_channels, suitable_dipole
+from magloc.measurement.pose import with_stated_pose
+from magloc.readings import EXPECTED_HEADER, Readings, without_saturated
+from magloc.tracking.batch import compiled_motion, next_points
+from magloc.tracking.motion import MotionModel, RandomWalk
+from magloc.tracking.results import Row, TrackPoint, rows_of
+from magloc.tracking.track import SPEED_M_S, TURN_RAD_S
+from magloc.tracking.tracker import Tracker
+
+_LOG = logging.getLogger(__name__)
+_ROWS_TO_LOAD = 3
+RESTING, STOPPED, SKIPPED = "rest: the background is taken", "stopped", "skipped: newer rows were waiting"
+Source = str | Iterable["Readings | Mapping[str, float | None] | str"]
+
+
+@dataclass(frozen=True, eq=False)
+class LivePoint(TrackPoint):
+    """What is known of the source at one instant, and of the stream that tells it.
+
+    Attributes
+    ----------
+    time_s, position_m, moment_Am2, covariance, estimability, iterations
+        As of every point of a track.
+    nis, nis_dof, status, weight, rivals, centroid_m, radius_m, lag1
+        The same.
+    row : Row
+        Readings and pose that it was found from, without the background of a rest.
+    latency_s : float
+        From the arrival of the row to this answer.
+    tally : Tally
+        Of the whole stream, as it is now.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> diver = magloc.datasets.load("diver")
+    >>> first = next(iter(magloc.live.track(diver.readings, diver.array)))
+    >>> first.status, first.row.time_s
+    ('not acquired: the range is not observable', 0.0)
+    """
+
+    row: Row = field(kw_only=True)
+    latency_s: float = field(kw_only=True)
+    tally: Tally = field(kw_only=True)
+
+
+_OF_POINT = tuple(each.name for each in fields(TrackPoint))
+
+
+class Follower:
+    """Follows one source through a stream that may be stopped, started and tared meanwhile, from another thread too.
+
+    Parameters
+    ----------
+    array : SensorArray
+    motion : MotionModel, optional
+        By default :class:`magloc.RandomWalk` of 0.5 m/s and 5°/s.
+    prior : SourcePrior
+        Bounds for the fixes that start a track, in the array's frame.
+    sensors : sequence of str, optional
+        Ids of the array's sensors, where the stream has columns of others too.
+    place : Place, optional
+        Where and when the geomagnetic field is wanted.
+    rest_s : float
+        How long the array is at rest, without a source, before it is followed [s].
+
+    Attributes
+    ----------
+    tally : Tally
+        Of all rows so far.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> diver = magloc.datasets.load("diver")
+    >>> follower = magloc.live.Follower(diver.array, magloc.RandomWalk(1e-3, 1e-3))
+    >>> points = list(follower.follow(diver.readings))
+    >>> follower.tally.rows, points[-1].status
+    (141, 'tracked')
+    """
+
+    def __init__(
+        self,
+        array: SensorArray,
+        motion: MotionModel | None = None,
+        *,
+        prior: SourcePrior = NOTHING_KNOWN,
+        sensors: Sequence[str] | None = None,
+        place: Place | None = None,
+        rest_s: float = 0.0,
+    ) -> None:
+        check_not_negative(rest_s=rest_s)
+        self.array, self.prior, self.tally = array, prior, Tally()
+        self.motion = RandomWalk(SPEED_M_S, TURN_RAD_S) if motion is None else motion
+        self._sensors, self._place = sensors, place
+        self._in_field: SensorArray | None = None
+        self._tracker: Tracker | None = None
+        self._clock = Clock(self.tally, self.restart)
+        self._background: Background | None = None
+        self._rest_rows: list[Row] = []
+        self._rest_s = 0.0
+        self._stopped = self._moves = False
+        if rest_s:
+            self.tare(rest_s)
+
+    def tare(self, rest_s: float) -> None:
+        """Take what the next seconds read as the background, and start anew behind them.
+
+        Raises
+        ------
+        InputError
+            The array moves, or has scalar sensors, whose readings are not linear in the field.
+        """
+        refuse_rest(self.array, moves=self._moves)
+        self._rest_rows, self._rest_s = [], rest_s
+
+    def stop(self) -> None:
+        """Follow nothing until :meth:`start`; rows are still taken and counted."""
+        self._stopped = True
+
+    def start(self) -> None:
+        """Follow again, from a new start."""
+        self.restart()
+        self._stopped = False
+
+    def restart(self) -> None:
+        """Begin a new track at the next row, and a rest that is not over anew."""
+        self._tracker, self._rest_rows = None, []
+
+    def follow(self, source: Source, *, replay_speed: float = 1.0) -> Generator[LivePoint]:
+        """Points of all rows of a source, each as soon as it is known; as :func:`magloc.live.track`."""
+        if not isinstance(source, str):
+            yield from self._follow_rows(source)
+            return
+        waits = sender_waits(source)
+        if not waits:
+            self._load()
+        with opened(source, replay_speed=replay_speed) as stream:
+            yield from self._follow_stream(stream, waits=waits)
+
+    def _load(self) -> None:
+        """Load what a track needs, by following a made source, while nobody waits yet."""
+        values_T = predicted_channels(self.array, *suitable_dipole(self.array)) + self.array.channel_offset_T
+        tracker = Tracker(self.array, self.motion, prior=self.prior)
+        for i in range(_ROWS_TO_LOAD):
+            next_points(tracker, [Row(float(i), values_T)])
+
+    def _follow_stream(self, stream: Stream, *, waits: bool) -> Generator[LivePoint]:
+        parser = RowParser(self.array, stream.name, self.tally, self._sensors)
+        if not waits:
+            _LOG.info(f"{stream.name}: waiting for rows")
+        for lines in stream.lines:
+            arrived = time.perf_counter()
+            for readings in parser.rows_of(lines):
+                yield from self._answers(readings, arrived, waits=waits)
+        if self.tally.rows:
+            return
+        if self.tally.garbled:
+            raise InputError(f"{stream.name}: found garbled lines alone ({self.tally.garbled}), expected rows.")
+        if parser.has_header:
+            raise InputError(f"{stream.name}, line 1: found a header without rows, expected a row below it.")
+        raise InputError(f"{stream.name}: found nothing, expected {EXPECTED_HEADER}.")
+
+    def _follow_rows(self, source: Iterable[Readings | Mapping[str, float | None] | str]) -> Generator[LivePoint]:
+        parser = RowParser(self.array, "the rows", self.tally, self._sensors)
+        for row in source:
+            arrived = time.perf_counter()
+            if isinstance(row, Readings):
+                yield from self._answers(row, arrived, waits=True)
+                continue
+            line = row.encode() if isinstance(row, str) else msgspec.json.encode(row)
+            for readings in parser.rows_of([line]):
+                yield from self._answers(readings, arrived, waits=True)
+
+    def _answers(self, readings: Readings, arrived: float, *, waits: bool) -> Generator[LivePoint]:
+        """Answers to the rows that are new."""
+        new = np.array([self._clock.takes(time_s) for time_s in readings.time_s.tolist()], dtype=bool)
+        rows = self._rows(readings[new]) if new.any() else []
+        while rows:
+            answers = self._next_answers(rows, waits=waits)
+            for row, point in answers:
+                self.tally.tracked += point.position_m is not None
+                latency_s = time.perf_counter() - arrived
+                self.tally.latencies_s.append(latency_s)
+                known = {name: getattr(point, name) for name in _OF_POINT}
+                yield LivePoint(**known, row=row, latency_s=latency_s, tally=self.tally)
+            rows = rows[len(answers) :]
+
+    def _rows(self, readings: Readings) -> list[Row]:
+        """Rows in their ambient field, without what saturates."""
+        if self._in_field is None:
+            array, ambient_T = with_ambient_field(self.array, readings, self._place, gradient=False)
+            if ambient_T is not None and readings.ambient_T is None and readings.array_rotation is not None:
+                x, y, z = readings.array_rotation[0].apply(ambient_T[0]).tolist()
+                array = replace(array, ambient_world_T=(x, y, z))
+            self._in_field, self._moves = with_stated_pose(array, readings), readings.pose is not None
+            if self._rest_s:
+                refuse_rest(array, moves=self._moves)
+        used = in_world_field(without_saturated(readings, self._in_field), self._in_field)
+        if self._in_field.pose is None:
+            return list(rows_of(used))
+        return [row for one in used for row in rows_of(one)]  # whose motion is that since the row before
+
+    @one_blas_thread
+    def _next_answers(self, rows: Sequence[Row], *, waits: bool) -> list[tuple[Row, TrackPoint]]:
+        """The first of the rows, or some of them, with what is known of the source there."""
+        if self._stopped:
+            return _without_track(rows, STOPPED)
+        if self._rest_s and self._rests(rows[0]):
+            return _without_track(rows[:1], RESTING)
+        if self._tracker is None:
+            assert self._in_field is not None
+            array = self._in_field if self._background is None else self._background.array(self._in_field)
+            self._tracker = Tracker(array, self.motion, prior=self.prior)
+        is_quick = self._tracker.is_tracking and compiled_motion(self._tracker) is not None
+        if len(rows) > 1 and not waits and not is_quick:
+            self.tally.skipped += len(rows) - 1
+            return _without_track(rows[:-1], SKIPPED)
+        if self._background is not None:
+            rows = [self._background.subtracted(row) for row in rows]
+        return list(zip(rows, next_points(self._tracker, rows), strict=False))
+
+    def _rests(self, row: Row) -> bool:
+        """Whether a row belongs to the rest; the first one behind it makes the background of it."""
+        rest = self._rest_rows
+        if not rest or row.time_s - rest[0].time_s < self._rest_s:
+            rest.append(row)
+            return True
+        self._background = Background.of(self.array, rest)
+        self._rest_s = 0.0
+        self.restart()
+        _LOG.info(f"the background is taken from {len(rest)} rows")
+        if self._background.restless:
+            names = ", ".join(self._background.restless)
+            _LOG.warning(f"the readings of {names} changed by more than their noise: was the array at rest?")
+        return False
+
+
+def _without_track(rows: Sequence[Row], status: str) -> list[tuple[Row, TrackPoint]]:
+    return [(row, TrackPoint(row.time_s, status=status)) for row in rows]
+
+
+def track(
+    source: Source,
+    array: SensorArray,
+    *,
+    motion: MotionModel | None = None,
+    prior: SourcePrior = NOTHING_KNOWN,
+    rest_s: float = 0.0,
+    replay_speed: float = 1.0,
+) -> Generator[LivePoint]:
+    """Follow one source while its readings come in.
+
+    Rows are CSV, whose first line is a header with the columns of a readings file, or JSON objects with these names.
+    Those that are late, doubled or garbled are counted in the tally and left out; none ends the stream.
+
+    Parameters
+    ----------
+    source : str or iterable
+        ``"-"`` (standard input), ``"tcp://HOST:PORT"`` (to connect to), ``"udp://HOST:PORT"`` (to listen at),
+        ``"serial:DEVICE@BAUD"`` (needs the extra ``serial``) or ``"replay:FILE"`` (a readings file in its own time); or
+        rows: :class:`magloc.Readings`, mappings from the names of columns to numbers, or lines of text.
+    array : SensorArray
+    motion : MotionModel, optional
+        By default :class:`magloc.RandomWalk` of 0.5 m/s and 5°/s.
+    prior : SourcePrior
+        Bounds for the fixes that start a track, in the array's frame.
+    rest_s : float
+        For so long [s] the array is at rest and no source is near: what it reads then is taken off all later readings.
+    replay_speed : float
+        How much faster than in its own time a file is replayed.
+
+    Yields
+    ------
+    LivePoint
+        Of every row that is used, as soon as it is known: a :class:`TrackPoint` with its row, latency and tally.
+
+    Raises
+    ------
+    InputError
+        The source cannot be opened, ends without a row, or has the columns of another array.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> diver = magloc.datasets.load("diver")
+    >>> motion = magloc.RandomWalk(speed_m_s=1e-3, turn_rad_s=1e-3)
+    >>> for point in magloc.live.track(f"replay:{diver.path}", diver.array, motion=motion, replay_speed=1e6):
+    ...     pass
+    >>> point.status, round(float(point.position_m[2]), 1), point.tally.lost
+    ('tracked', -0.6, 0)
+    """
+    return Follower(array, motion, prior=prior, rest_s=rest_s).follow(source, replay_speed=replay_speed)

@@ -1,0 +1,88 @@
+r"""The background of an array at rest: what its channels read while no source is there, and how well that is known.
+
+The mean of n rows is subtracted from all later ones, and with it offsets, the field of the Earth and of iron nearby.
+Its own error, of variance :math:`σ^2/n`, is the same in every later row: an uncertain offset.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from arrays.array import SensorArray
+from arrays.io.errors import InputError
+from arrays.typing import FloatArray
+from magloc.tracking.results import Row
+
+_OUTLIER = 5.0
+_MAD_TO_SIGMA = 1.4826
+_TOO_NOISY = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Background:
+    """What is subtracted.
+
+    Attributes
+    ----------
+    mean_T : ndarray, shape (C,)
+        Raw readings at rest, less the offsets that the calibration knows; NaN of a channel without readings.
+    sigma_T : ndarray, shape (C,)
+        Standard deviation of the mean's error.
+    n_rows : int
+    restless : tuple of str
+        Ids of sensors whose readings scattered by more than three times their noise.
+    """
+
+    mean_T: FloatArray
+    sigma_T: FloatArray
+    n_rows: int
+    restless: tuple[str, ...]
+
+    @classmethod
+    def of(cls, array: SensorArray, rows: Sequence[Row]) -> Background:
+        """Of the rows of a rest; readings far from their channel's median do not count."""
+        values = np.array([row.readings_T for row in rows])
+        stated = np.array([sensor.noise_T for sensor in array.sensors])[array.channel_sensor]
+        known = np.isfinite(values)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            middle = _median(values)
+            scatter = np.maximum(stated, _MAD_TO_SIGMA * np.nan_to_num(_median(np.abs(values - middle))))
+            used = known & (np.abs(values - middle) <= _OUTLIER * scatter)
+            count = used.sum(axis=0)
+            mean = np.where(used, values, 0.0).sum(axis=0) / count
+            sigma = scatter / np.sqrt(count)
+        noisy = scatter > _TOO_NOISY * stated
+        restless = tuple(name for i, name in enumerate(array.ids) if noisy[array.channel_sensor == i].any())
+        return cls(mean - array.channel_offset_T, sigma, len(rows), restless)
+
+    def subtracted(self, row: Row) -> Row:
+        """A row without it."""
+        return replace(row, readings_T=row.readings_T - self.mean_T)
+
+    def array(self, array: SensorArray) -> SensorArray:
+        """The array whose offsets are as uncertain as the background, in place of what was said of them before."""
+        sigma = [float(np.nanmax(self.sigma_T[array.channel_sensor == i], initial=0.0)) for i in range(array.n_sensors)]
+        sensors = tuple(
+            replace(sensor, offset_uncertainty_T=value if math.isfinite(value) else 0.0)
+            for sensor, value in zip(array.sensors, sigma, strict=True)
+        )
+        return replace(array, sensors=sensors)
+
+
+def refuse_rest(array: SensorArray, *, moves: bool) -> None:
+    """Raise an InputError where a rest says nothing of later rows: an array that moves, a modulus."""
+    if moves:
+        raise InputError("a rest: found rows with the array's pose, expected an array that stands.")
+    scalar = [sensor.id for sensor in array.sensors if sensor.kind == "scalar"]
+    if scalar:
+        raise InputError(f"a rest: found scalar sensor {scalar[0]}, expected vector sensors alone.")
+
+
+def _median(values: FloatArray) -> FloatArray:
+    """Of every column, NaN of one without a number."""
+    columns = (column[np.isfinite(column)] for column in values.T)
+    return np.array([np.median(column) if column.size else math.nan for column in columns])

@@ -1,0 +1,137 @@
+"""Lines that come in, as rows: CSV with its header first, or JSON objects; what is neither is counted and named."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import msgspec
+
+from arrays.array import SensorArray
+from arrays.io.csv import table_of_header
+from arrays.io.errors import InputError
+from magloc.live.tally import Tally
+from magloc.readings import EXPECTED_HEADER, Readings, readings_of_table, readings_of_text
+
+_LINES_WITHOUT_HEADER = 100
+_TIME = "time_s"
+_AROUND = "\ufeff \t\r"
+
+
+class GarbledError(ValueError):
+    """A line that is no row."""
+
+
+class RowParser:
+    """Reads the lines of one stream, strictly: the rows are those of a readings file with the same lines.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Whose sensors the rows must have, with a column for each channel.
+    name : str
+        Of the stream, in errors.
+    tally : Tally
+        Where garbled lines are counted.
+    sensors : sequence of str, optional
+        Ids of a subset of the array; columns of others are ignored.
+    """
+
+    def __init__(self, array: SensorArray, name: str, tally: Tally, sensors: Sequence[str] | None = None) -> None:
+        self._array, self._name, self._tally, self._sensors = array, name, tally, sensors
+        self._header = ""
+        self._columns: tuple[str, ...] = ()
+        self._n_lines = 0
+
+    @property
+    def has_header(self) -> bool:
+        """Whether a header has come."""
+        return bool(self._header)
+
+    def rows_of(self, lines: Sequence[bytes]) -> Iterator[Readings]:
+        """Rows of the next lines, in order, as many as possible in one piece.
+
+        InputError where the header is not that of the array, or none comes.
+        """
+        rows: list[str] = []
+        for line in lines:
+            self._n_lines += 1
+            try:
+                row = self._row_of(line)
+            except GarbledError as error:
+                self._tally.name("garbled", f"{self._name}, line {self._n_lines}: {error}")
+                row = None
+            if row is None or _TIME in row:
+                yield from self._readings(rows, self._n_lines - len(rows))
+                rows = []
+            if row is not None:
+                if _TIME in row:
+                    self._take_header(row)
+                else:
+                    rows.append(row)
+        yield from self._readings(rows, self._n_lines - len(rows) + 1)
+
+    def _row_of(self, line: bytes) -> str | None:
+        """A line as one of CSV, None where it is empty."""
+        try:
+            text = line.decode().strip(_AROUND)
+        except UnicodeDecodeError as error:
+            raise GarbledError(f"the byte 0x{line[error.start]:02x} is not UTF-8") from None
+        if text.startswith("{"):
+            return self._row_of_object(text)
+        if text.count('"') % 2:
+            raise GarbledError("found a quotation mark without another, expected cells")
+        if text and not self._header and _TIME not in text:
+            if self._n_lines >= _LINES_WITHOUT_HEADER:
+                raise InputError(f"{self._name}: found no header in {self._n_lines} lines, expected {EXPECTED_HEADER}.")
+            raise GarbledError(f"found no header yet, expected {EXPECTED_HEADER}")
+        return text or None
+
+    def _row_of_object(self, text: str) -> str | None:
+        try:
+            of_name: Any = msgspec.json.decode(text)
+        except (msgspec.DecodeError, RecursionError) as error:
+            raise GarbledError(f"found what is not JSON ({str(error).lower()})") from None
+        if _TIME not in of_name:
+            raise GarbledError("found an object without time_s")
+        if not self._header:
+            self._take_header(",".join(of_name))
+        unknown = [name for name in of_name if name not in self._columns]
+        if unknown:
+            raise GarbledError(f"found column {unknown[0]}, which the first row does not have")
+        cells = (of_name.get(name) for name in self._columns)
+        return ",".join("" if cell is None else str(cell) for cell in cells)
+
+    def _take_header(self, text: str) -> None:
+        """Use a line that names columns from here on; one that is sent again changes nothing."""
+        if text == self._header:
+            return
+        try:
+            table = table_of_header(text, self._name, EXPECTED_HEADER, number=self._n_lines)
+            readings_of_table(table, self._array, self._sensors)
+        except InputError as error:
+            if not self._header:
+                raise
+            self._tally.name("garbled", str(error))
+            return
+        self._header, self._columns = text, table.header
+
+    def _readings(self, rows: list[str], first_line: int) -> Iterator[Readings]:
+        """Readings of successive lines; of halves of them where they are no table, until all garbled ones are found."""
+        if not rows:
+            return
+        try:
+            text = "\n".join([self._header, *rows])
+            readings = readings_of_text(text, self._name, self._array, sensors=self._sensors, first_line=first_line)
+            if len(readings) == len(rows):
+                yield readings
+                return
+            why = f"{self._name}, line {first_line}: found {len(readings)} rows in {len(rows)} lines"
+        except InputError as error:
+            why = str(error)
+        if len(rows) == 1:
+            self._tally.name("garbled", why)
+            return
+        half = len(rows) // 2
+        yield from self._readings(rows[:half], first_line)
+        yield from self._readings(rows[half:], first_line + half)

@@ -1,0 +1,201 @@
+"""Where rows come from: addresses of pipes, sockets, serial ports and files, and the lines that arrive there.
+
+Lines come in batches: all that have arrived since the last look, so that whoever is behind catches up.
+"""
+
+from __future__ import annotations
+
+import math
+import select
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from urllib.parse import SplitResult, urlsplit
+
+from arrays.io.errors import InputError, check_positive, of_extra
+from arrays.io.text import read_bytes
+
+STANDARD_INPUT = "-"
+KINDS = "-, tcp://HOST:PORT, udp://HOST:PORT, serial:DEVICE@BAUD or replay:FILE"
+"""Of addresses."""
+_CHUNK = 65536
+LONGEST_LINE = 2**20
+"""Bytes: what has no line end until then is a garbled line."""
+_CONNECTION_S = 10.0
+_UDP_BUFFER = 2**22
+_LONGEST_PAUSE_S = 10.0
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Lines that come in.
+
+    Attributes
+    ----------
+    name : str
+        In errors.
+    lines : iterator of lists of bytes
+        All whole lines that have arrived since the last ones.
+    """
+
+    name: str
+    lines: Iterator[list[bytes]]
+
+
+def sender_waits(address: str) -> bool:
+    """Whether whoever sends waits for a slow reader: a pipe and a file do."""
+    return address == STANDARD_INPUT or address.startswith("replay:")
+
+
+@contextmanager
+def opened(address: str, *, replay_speed: float = 1.0) -> Iterator[Stream]:
+    """What comes in at an address; InputError if nothing can."""
+    if address == STANDARD_INPUT:
+        yield Stream("standard input", _lines(_of_stdin()))
+        return
+    kind, _, rest = address.partition(":")
+    match kind:
+        case "tcp":
+            with _connected(address) as peer:
+                yield Stream(address, _lines(_of_tcp(peer)))
+        case "udp":
+            with _bound(address) as peer:
+                yield Stream(address, _of_udp(peer))
+        case "serial":
+            device, separator, baud = rest.rpartition("@")
+            if not (separator and device and baud.isascii() and baud.isdigit() and int(baud)):
+                raise InputError(f"{address}: found no device with its baud rate, expected serial:DEVICE@BAUD.")
+            with of_extra("serial", "a serial port"):
+                import serial
+            try:
+                port = serial.Serial(device, int(baud))
+            except (OSError, ValueError, OverflowError) as error:
+                raise InputError(f"{address}: cannot be opened ({_reason(error)}), expected a serial port.") from None
+            with port:
+                yield Stream(address, _lines(_of_serial(port)))
+        case "replay":
+            check_positive(replay_speed=replay_speed)
+            lines = read_bytes(rest, "a readings file").splitlines()
+            yield Stream(rest, _in_own_time(lines, replay_speed))
+        case _:
+            raise InputError(f"{address}: found no such kind of source, expected {KINDS}.")
+
+
+def _reason(error: Exception) -> str:
+    """What the system says, without what pyserial and Python put around it."""
+    return getattr(error, "strerror", None) or str(error)
+
+
+def _lines(chunks: Iterator[bytes]) -> Iterator[list[bytes]]:
+    """Whole lines of chunks of bytes; the last one may have no end."""
+    begun = b""
+    for chunk in chunks:
+        *whole, begun = (begun + chunk).split(b"\n")
+        if len(begun) > LONGEST_LINE:
+            whole.append(begun)
+            begun = b""
+        if whole:
+            yield whole
+    if begun:
+        yield [begun]
+
+
+def _of_stdin() -> Iterator[bytes]:
+    buffer = getattr(sys.stdin, "buffer", None)
+    if buffer is None:  # somebody's text
+        yield from (line.encode() for line in sys.stdin)
+        return
+    while chunk := buffer.read1(_CHUNK):
+        yield chunk
+
+
+def _host_and_port(address: str) -> tuple[str, int]:
+    parts: SplitResult | None = None
+    try:
+        parts = urlsplit(address)
+        if parts.hostname and parts.port and not (parts.path or parts.query or parts.fragment or parts.username):
+            return parts.hostname, parts.port
+    except ValueError:
+        pass
+    raise InputError(f"{address}: found no host with a port, expected {address.partition(':')[0]}://HOST:PORT.")
+
+
+@contextmanager
+def _connected(address: str) -> Iterator[socket.socket]:
+    """A connection to whoever sends."""
+    where = _host_and_port(address)
+    try:
+        peer = socket.create_connection(where, timeout=_CONNECTION_S)
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"{address}: cannot be reached ({_reason(error)}), expected a sender of rows.") from None
+    with peer:
+        peer.settimeout(None)
+        yield peer
+
+
+def _of_tcp(peer: socket.socket) -> Iterator[bytes]:
+    try:
+        while chunk := peer.recv(_CHUNK):
+            yield chunk
+    except ConnectionError:  # as good an end as another
+        return
+
+
+@contextmanager
+def _bound(address: str) -> Iterator[socket.socket]:
+    """A socket that others send to."""
+    host, port = _host_and_port(address)
+    try:
+        family, kind, protocol, _, where = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        with socket.socket(family, kind, protocol) as own:
+            own.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _UDP_BUFFER)
+            own.bind(where)
+            bound = own.dup()
+    except (OSError, UnicodeError) as error:
+        expected = "expected a free port of this machine"
+        raise InputError(f"{address}: cannot be listened at ({_reason(error)}), {expected}.") from None
+    with bound:
+        yield bound
+
+
+def _of_udp(own: socket.socket) -> Iterator[list[bytes]]:
+    """Lines of all datagrams that wait; each ends with its last line."""
+    while True:
+        waiting = [own.recv(_CHUNK)]
+        while select.select([own], [], [], 0.0)[0]:
+            waiting.append(own.recv(_CHUNK))
+        yield [line for datagram in waiting for line in datagram.removesuffix(b"\n").split(b"\n")]
+
+
+def _of_serial(port: serial.Serial) -> Iterator[bytes]:  # type: ignore[name-defined]  # noqa: F821 - an extra
+    import serial
+
+    while True:
+        try:
+            yield port.read(port.in_waiting or 1)
+        except (serial.SerialException, OSError):  # unplugged
+            return
+
+
+def _in_own_time(lines: list[bytes], speed: float) -> Iterator[list[bytes]]:
+    """Lines of a readings file, each when its time has come; nobody waits for long pauses."""
+    header = [cell.strip() for cell in lines[0].removeprefix(b"\xef\xbb\xbf").split(b",")] if lines else []
+    column = header.index(b"time_s") if b"time_s" in header else 0
+    due_s, last_s = time.monotonic(), math.inf
+    waiting: list[bytes] = []
+    for line in lines:
+        with suppress(IndexError, ValueError):  # what has no time comes with the line before
+            time_s = float(line.split(b",")[column])
+            step_s, last_s = time_s - last_s, time_s
+            due_s += step_s / speed if 0.0 < step_s <= _LONGEST_PAUSE_S * speed else 0.0
+        if due_s > time.monotonic():
+            if waiting:
+                yield waiting
+                waiting = []
+            time.sleep(max(0.0, due_s - time.monotonic()))
+        waiting.append(line)
+    if waiting:
+        yield waiting

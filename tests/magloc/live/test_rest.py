@@ -1,0 +1,107 @@
+"""The background of a rest: its mean, how well that is known, and what remains of it in a track."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from arrays import geometries
+from arrays.io.errors import InputError
+from arrays.sensor import Calibration
+from magloc.live.follower import RESTING, Follower
+from magloc.live.rest import Background
+from magloc.readings import Readings
+from magloc.tracking.results import Row
+from tests.passing_source import ARRAY, NOISE_T, SLOW, moving_source, readings_of
+
+N_REST = 40
+OFFSET_T = 1e3 * NOISE_T * np.random.default_rng(0).normal(size=ARRAY.n_channels)
+
+
+def rows_at_rest(seed: int) -> list[Row]:
+    """Rows without a source, under offsets of a thousand times the noise."""
+    rng = np.random.default_rng(seed)
+    return [Row(0.1 * i, OFFSET_T + NOISE_T * rng.normal(size=ARRAY.n_channels)) for i in range(N_REST)]
+
+
+class TestBackground:
+    def test_its_error_is_as_large_as_it_says(self) -> None:
+        """χ² of 100 means of 12 channels: a right one is outside once in a million."""
+        found = [Background.of(ARRAY, rows_at_rest(seed)) for seed in range(100)]
+        square = sum(float(np.sum(((one.mean_T - OFFSET_T) / one.sigma_T) ** 2)) for one in found)
+        low, high = chi2.ppf([5e-7, 1.0 - 5e-7], 1200)
+        assert low < square < high
+
+    def test_a_calibrated_offset_is_left_to_the_calibration(self) -> None:
+        """As everything else that is subtracted, it may not be taken off twice."""
+        known = tuple(replace(s, calibration=Calibration.of("vector", 1.0, [1e-6, 2e-6, 3e-6])) for s in ARRAY.sensors)
+        array = replace(ARRAY, sensors=known)
+        found = Background.of(array, rows_at_rest(1))
+        np.testing.assert_allclose(found.mean_T, Background.of(ARRAY, rows_at_rest(1)).mean_T - array.channel_offset_T)
+
+    def test_spikes_do_not_count(self) -> None:
+        rows = rows_at_rest(2)
+        spiked = list(rows)
+        for i in range(0, N_REST, 8):
+            spiked[i] = replace(rows[i], readings_T=rows[i].readings_T + 1e-3)
+        found, plain = Background.of(ARRAY, spiked), Background.of(ARRAY, rows)
+        assert np.all(np.abs(found.mean_T - plain.mean_T) < 3.0 * plain.sigma_T)
+        assert np.all(found.sigma_T > plain.sigma_T)
+
+    def test_a_sensor_that_was_moved_is_named(self) -> None:
+        rows = rows_at_rest(3)
+        ramp = np.zeros(ARRAY.n_channels)
+        ramp[4] = 2.0 * NOISE_T
+        moved = [replace(row, readings_T=row.readings_T + i * ramp) for i, row in enumerate(rows)]
+        assert Background.of(ARRAY, moved).restless == ("s2",)
+        assert Background.of(ARRAY, rows).restless == ()
+
+    def test_a_channel_without_readings_stays_without(self) -> None:
+        rows = rows_at_rest(4)
+        for row in rows:
+            row.readings_T[5] = math.nan
+        found = Background.of(ARRAY, rows)
+        assert np.isnan(found.mean_T[5])
+        assert np.isnan(found.subtracted(Row(9.0, np.ones(12))).readings_T).sum() == 1
+        assert all(math.isfinite(sensor.offset_uncertainty_T) for sensor in found.array(ARRAY).sensors)
+
+    def test_offsets_are_as_uncertain_as_it_is(self) -> None:
+        found = Background.of(ARRAY, rows_at_rest(5)).array(ARRAY)
+        for sensor in found.sensors:
+            assert sensor.offset_uncertainty_T == pytest.approx(NOISE_T / math.sqrt(N_REST), rel=0.6)
+
+
+def squared_error_after_a_rest(seed: int) -> float:
+    """NEES of the position in the last row of a passage that follows a rest of four seconds."""
+    rest = rows_at_rest(seed)
+    time_s, p, m = moving_source(40, 0.1)
+    values = readings_of(ARRAY, p, m, seed=1000 + seed) + OFFSET_T
+    values_T = np.vstack([[row.readings_T for row in rest], values])
+    times = np.concatenate([[row.time_s for row in rest], rest[-1].time_s + 0.1 + time_s])
+    points = list(Follower(ARRAY, SLOW, rest_s=0.1 * (N_REST - 0.5)).follow(Readings(values_T, time_s=times)))
+    assert [point.status == RESTING for point in points] == [True] * N_REST + [False] * 40
+    last = points[-1]
+    assert last.position_m is not None
+    assert last.covariance is not None
+    error = last.position_m - p[-1]
+    return float(error @ np.linalg.solve(last.covariance[:3, :3], error))
+
+
+class TestTrackAfterARest:
+    def test_is_as_good_as_it_says(self) -> None:
+        """The sum of ten NEES is above its bound once in 10,000; the source moves less than is said."""
+        assert sum(map(squared_error_after_a_rest, range(10))) < chi2.ppf(1.0 - 1e-4, 30)
+
+    def test_without_a_rest_there_is_none(self) -> None:
+        time_s, p, m = moving_source(20, 0.1)
+        values = readings_of(ARRAY, p, m) + OFFSET_T
+        points = list(Follower(ARRAY, SLOW).follow(Readings(values, time_s=time_s)))
+        assert all(point.position_m is None for point in points)
+
+    def test_scalar_sensors_are_refused(self) -> None:
+        with pytest.raises(InputError, match="scalar sensor s1"):
+            Follower(geometries.tetrahedron(1.0, "scalar"), rest_s=1.0)

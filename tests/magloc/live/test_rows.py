@@ -1,0 +1,161 @@
+"""Lines as rows: those of a readings file with the same lines, whatever stands between them."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from arrays.io.errors import InputError
+from magloc.live.rows import RowParser
+from magloc.live.tally import Tally
+from magloc.readings import Readings, read_readings, write_readings
+from tests.passing_source import ARRAY, moving_source, readings_of
+
+N_ROWS = 60
+HEADER = ",".join(["time_s", *(f"{name}_nT" for name in ARRAY.channel_names)])
+
+
+@pytest.fixture(scope="module")
+def lines(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
+    """A readings file with some missing readings."""
+    time_s, p, m = moving_source(N_ROWS)
+    values = readings_of(ARRAY, p, m)
+    values[7, 3] = values[20, 0] = math.nan
+    path = tmp_path_factory.mktemp("rows") / "rows.csv"
+    write_readings(path, Readings(values, time_s=time_s), ARRAY)
+    return path.read_text().splitlines()
+
+
+def parsed(pieces: Sequence[Sequence[str | bytes]], sensors: Sequence[str] | None = None) -> tuple[Readings, Tally]:
+    """All rows of some batches of lines."""
+    tally = Tally()
+    parser = RowParser(ARRAY, "the stream", tally, sensors)
+    rows = [
+        readings
+        for piece in pieces
+        for readings in parser.rows_of([line.encode() if isinstance(line, str) else line for line in piece])
+    ]
+    return Readings(np.vstack([r.values_T for r in rows]), time_s=np.concatenate([r.time_s for r in rows])), tally
+
+
+def assert_same(found: Readings, expected: Readings) -> None:
+    np.testing.assert_array_equal(found.time_s, expected.time_s)
+    np.testing.assert_array_equal(found.values_T, expected.values_T)
+
+
+class TestGoodLines:
+    @pytest.mark.parametrize("size", [1, 2, 7, 100])
+    @pytest.mark.parametrize("end", ["", "\r"])
+    def test_are_those_of_the_file(self, lines: list[str], tmp_path: Path, size: int, end: str) -> None:
+        (tmp_path / "rows.csv").write_text("\n".join(lines))
+        sent = [line + end for line in lines]
+        found, tally = parsed([sent[i : i + size] for i in range(0, len(sent), size)])
+        assert_same(found, read_readings(tmp_path / "rows.csv", ARRAY))
+        assert tally == Tally()
+
+    def test_json_objects_are_the_same(self, lines: list[str]) -> None:
+        names = lines[0].split(",")
+        objects = []
+        for i, line in enumerate(lines[1:]):
+            cells = {name: float(cell) if cell else None for name, cell in zip(names, line.split(","), strict=True)}
+            # What is missing may be left out but in the first row, and the order of the names is free.
+            kept = {name: cells[name] for name in sorted(cells) if not i or cells[name] is not None}
+            objects.append(json.dumps(kept))
+        assert_same(parsed([objects])[0], parsed([lines])[0])
+
+    def test_a_header_that_comes_again(self, lines: list[str]) -> None:
+        again = [text for line in lines[1:] for text in (lines[0], line)]
+        found, tally = parsed([again])
+        assert_same(found, parsed([lines])[0])
+        assert not tally.faults
+
+    def test_another_header_counts_from_there_on(self, lines: list[str]) -> None:
+        turned = [",".join(reversed(line.split(","))) for line in lines]
+        found, tally = parsed([[*lines[:30], turned[0], *turned[30:]]])
+        assert_same(found, parsed([lines])[0])
+        assert not tally.faults
+
+    def test_columns_of_others_are_ignored_where_sensors_are_chosen(self, lines: list[str]) -> None:
+        found, _ = parsed([lines], sensors=["s1", "s2"])
+        assert found.values_T.shape == (N_ROWS, 6)
+
+
+def garbled(line: str, rng: random.Random) -> bytes:
+    """A line after one of the accidents of a cable or a radio; never a row of the same number of cells again."""
+    at = rng.randrange(1, len(line) - 1)
+    cut = line[:at].rsplit(",", 1)[0] if "," in line[:at] else line[:at]
+    return rng.choice(
+        [
+            cut.encode(),
+            (line + "," + line).encode(),
+            line.replace(",", ";").encode(),
+            b"\xff\xfe" + line.encode(),
+            line.encode().replace(b".", b"\x00", 1),
+            (line.rsplit(",", 1)[0] + ",4_2").encode(),
+            (line.rsplit(",", 1)[0] + ',"').encode(),
+            (line + "\r" + line).encode(),
+            b'{"time_s": 1.0',
+            b'{"noise": 1.0}',
+            b'{"time_s": 1.0, "x": 2.0}',
+            (line.split(",", 1)[1] + ",inf").encode(),
+        ]
+    )
+
+
+class TestGarbledLines:
+    @pytest.mark.parametrize("seed", range(20))
+    def test_are_counted_and_cost_no_other(self, lines: list[str], seed: int) -> None:
+        rng = random.Random(seed)
+        sent: list[bytes] = [lines[0].encode()]
+        n_garbled = 0
+        for line in lines[1:]:
+            if rng.random() < 0.3:
+                sent.append(garbled(line, rng))
+                n_garbled += 1
+            sent.append(line.encode())
+        size = rng.randrange(1, 30)
+        found, tally = parsed([sent[i : i + size] for i in range(0, len(sent), size)])
+        assert_same(found, parsed([lines])[0])
+        assert tally.garbled == tally.faults == n_garbled
+
+    def test_are_named_by_line_and_column(self, lines: list[str], caplog: pytest.LogCaptureFixture) -> None:
+        caplog.set_level("INFO")
+        bad = lines[3].rsplit(",", 1)[0] + ",much"
+        parsed([[*lines[:3], "", bad, *lines[3:]]])
+        assert caplog.messages == [
+            "garbled: the stream, line 5, column s4_z_nT: found 'much', expected a number or an empty cell."
+        ]
+
+    def test_named_are_the_first_ones(self, lines: list[str], caplog: pytest.LogCaptureFixture) -> None:
+        caplog.set_level("INFO")
+        parsed([[*lines, *["x"] * 100]])
+        assert len(caplog.messages) == 5
+        assert "only counted" in caplog.messages[-1]
+
+
+class TestHeader:
+    def test_lines_before_it_are_garbled(self, lines: list[str]) -> None:
+        """As where a cable is plugged in while the sender runs."""
+        found, tally = parsed([[lines[5][10:], *lines]])
+        assert len(found) == N_ROWS
+        assert tally.garbled == 1
+
+    def test_of_another_array_is_refused(self, lines: list[str]) -> None:
+        other = lines[0].replace("s4_", "s5_")
+        with pytest.raises(InputError, match=r"the stream, line 1, column s4_x_nT: found no"):
+            parsed([[other, lines[1]]])
+
+    def test_of_another_array_later_is_garbled(self, lines: list[str]) -> None:
+        found, tally = parsed([[*lines[:9], lines[0].replace("s4_", "s5_"), *lines[9:]]])
+        assert len(found) == N_ROWS
+        assert tally.garbled == 1
+
+    def test_that_never_comes(self, lines: list[str]) -> None:
+        with pytest.raises(InputError, match="found no header in 100 lines"):
+            parsed([lines[1:2] * 200])
