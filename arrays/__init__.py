@@ -8,6 +8,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "GEOMETRIES": "arrays.geometries",
         "Calibration": "arrays.sensor",
         "InputError": "arrays.io.errors",
+        "LogColumns": "arrays.columns",
         "PoseUncertainty": "arrays.pose",
         "SENSOR_PRESETS": "arrays.presets",
         "Sensor": "arrays.sensor",

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from arrays.columns import LogColumns
 from arrays.pose import PoseUncertainty
 from arrays.sensor import Sensor, _finite, _finite_number, _plain
 from arrays.typing import BoolArray, FloatArray, IntArray
@@ -55,6 +56,8 @@ class SensorArray:
         The same of an error that is new in every row [T].
     pose : PoseUncertainty, optional
         How wrong the pose in the readings may be; None: it counts as exact.
+    columns : LogColumns, optional
+        How its logs name and count their columns; None: as a readings file does.
 
     Raises
     ------
@@ -79,6 +82,7 @@ class SensorArray:
     ambient_gradient_T_m: tuple[tuple[float, float, float], ...] | None = None
     ambient_uncertainty_T: float = 0.0
     pose: PoseUncertainty | None = None
+    columns: LogColumns | None = None
     ambient_world_T: tuple[float, float, float] | None = None
     ambient_uncertainty_white_T: float = 0.0
 

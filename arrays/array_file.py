@@ -38,7 +38,7 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
 
 Both may have ``noise_fraction``, ``common_field_nT``, ``ambient_nT = [x, y, z]`` or ``ambient_world_nT``, the gradient
 of that field ``ambient_gradient_nT_m = [[…], […], […]]`` (symmetric and traceless), ``ambient_uncertainty_nT``,
-``ambient_uncertainty_white_nT``, ``format_version = 1``, and a table ``[pose]``; see
+``ambient_uncertainty_white_nT``, ``format_version = 1``, and the tables ``[pose]`` and ``[columns]``; see
 :class:`arrays.array.SensorArray` for what they mean.
 """
 
@@ -53,6 +53,7 @@ from typing import Annotated, Any, ClassVar
 import msgspec
 
 from arrays.array import SensorArray
+from arrays.columns import ColumnsTable, columns_toml
 from arrays.geometries import GEOMETRIES
 from arrays.io.errors import InputError, naming
 from arrays.io.text import write_text
@@ -92,6 +93,7 @@ class _Header(File, kw_only=True):
     ambient_uncertainty_nT: _NotNegative = 0
     ambient_uncertainty_white_nT: _NotNegative = 0
     pose: PoseTable | None = None
+    columns: ColumnsTable | None = None
 
 
 class _Quality(Table, kw_only=True):
@@ -251,6 +253,8 @@ def array_toml(array: SensorArray) -> str:
             lines.append(f"{key} = {nanotesla_text(uncertainty_T)}")
     if array.pose is not None:
         lines += pose_toml(array.pose)
+    if array.columns is not None:
+        lines += columns_toml(array.columns)
     for sensor in array.sensors:
         lines += ["", "[[sensor]]", f"id = {_quoted(sensor.id)}", f'kind = "{sensor.kind}"']
         lines.append(f"position_m = {list(sensor.position_m)}")
@@ -384,7 +388,8 @@ def _with_header(path: str, array: SensorArray, header: _Header) -> SensorArray:
     name = array.name if header.name is None else header.name
     pose = None if header.pose is None else header.pose.uncertainty(f"{path}, table pose")
     with naming(path):
-        return SensorArray(array.sensors, name, header.noise_fraction, pose=pose, **of_field)
+        columns = None if header.columns is None else header.columns.columns()
+        return SensorArray(array.sensors, name, header.noise_fraction, pose=pose, columns=columns, **of_field)
 
 
 def _quality(place: str, table: _Quality) -> dict[str, Any]:

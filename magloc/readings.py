@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from arrays.array import AMBIENT_CHANNELS, SensorArray
-from arrays.io.csv import Columns, Table, read_table, table_of_columns, table_of_text
+from arrays.columns import read_log
+from arrays.io.csv import Columns, Table, table_of_columns, table_of_text
 from arrays.io.errors import InputError
 from arrays.io.text import write_text
 from arrays.sensor import Sensor
@@ -264,16 +265,14 @@ def read_readings(
     >>> magloc.read_readings(board.path, board.array).values_T.shape
     (101, 90)
     """
-    table = read_table(path, EXPECTED_HEADER)
+    table = read_log(path, array, EXPECTED_HEADER)
     readings = readings_of_table(table, array, sensors)
     if ordered:
         table.refuse_back("time_s", ~(np.diff(readings.time_s) > 0.0), "time to increase from row to row", "{:.15g}")
-    if still:
-        change = change_between_rows(readings)
-        if change is not None:
-            what, row, expected = change
-            lines = f"lines {table.line_numbers[0]} and {table.line_numbers[row]}"
-            raise InputError(f"{path}: found {what} between {lines}, expected {expected}.")
+    if still and (change := change_between_rows(readings)) is not None:
+        what, row, expected = change
+        lines = f"lines {table.line_numbers[0]} and {table.line_numbers[row]}"
+        raise InputError(f"{path}: found {what} between {lines}, expected {expected}.")
     return readings
 
 

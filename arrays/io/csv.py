@@ -185,13 +185,15 @@ def table_of_text(
     first_line: int | None = None,
     only: Collection[str] | None = None,
     instants: Collection[str] = (),
+    separator: str = ",",
+    decimal: str = ".",
 ) -> Table:
     """As :func:`read_table`, from text that errors call `name` and whose rows begin at `first_line` of a longer one."""
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
         raise InputError(f"{name}, line {line}: found a NUL byte, expected UTF-8 text.")
-    rows = _csv_rows(name, text)
+    rows = _csv_rows(name, text, separator)
     header_line, cells = next(rows, (1, []))
     if not cells:
         raise InputError(f"{name} is empty, expected {expected_header}.")
@@ -209,6 +211,8 @@ def table_of_text(
             raise InputError(f"{name}, line {line}: found {len(cells)} cells, expected {len(header)} as in the header.")
         if only is not None:
             cells = [cells[i] for i in kept]
+        if decimal != ".":
+            cells = [cell if i in timed else cell.replace(decimal, ".") for i, cell in enumerate(cells)]
         for i in timed:
             cells[i] = _unix_seconds(f"{name}, line {line}, column {chosen[i]}", cells[i])
         try:
@@ -240,9 +244,9 @@ def _unix_seconds(place: str, cell: str) -> str:
     return repr((instant if instant.tzinfo else instant.replace(tzinfo=datetime.UTC)).timestamp())
 
 
-def _csv_rows(path: str, text: str) -> Iterator[tuple[int, list[str]]]:
+def _csv_rows(path: str, text: str, separator: str = ",") -> Iterator[tuple[int, list[str]]]:
     """Line number and cells of every row that is not blank."""
-    rows = csv.reader(io.StringIO(text))
+    rows = csv.reader(io.StringIO(text), delimiter=separator, skipinitialspace=separator == " ")
     line = 1
     try:
         for cells in rows:

@@ -62,7 +62,8 @@ def bounds_figure(found: Bounds) -> Figure:
     >>> import arrays
     >>> import magloc
     >>> places = [[x, 0.0, 0.5] for x in (2.0, 3.0, 4.0, 6.0)]
-    >>> figure = magloc.plots.bounds(magloc.cramer_rao_bounds(arrays.tetrahedron(1.5), places, [0.0, 0.0, 100.0]))
+    >>> bounds = magloc.cramer_rao_bounds(arrays.tetrahedron(1.5), places, [0.0, 0.0, 100.0])
+    >>> figure = magloc.plots.cramer_rao_bounds(bounds)
     """
     distance = np.ravel(found.range_m)
     order = np.argsort(distance, kind="stable")

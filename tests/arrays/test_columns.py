@@ -1,0 +1,170 @@
+"""Logs of other programs: what is read is what a readings file of the same rows has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import arrays
+import magloc
+from arrays.array_file import array_toml
+
+HEADER = '[[sensor]]\nid = "low"\nkind = "scalar"\nposition_m = [0.0, 0.0, 0.0]\nnoise_nT = 0.1\n'
+SECOND = '[[sensor]]\nid = "high"\nkind = "{}"\nposition_m = [0.0, 0.0, 1.0]\nnoise_nT = 0.1\n'
+
+
+def array_of(folder: Path, columns: str, kind: str = "scalar") -> arrays.SensorArray:
+    path = folder / "array.toml"
+    path.write_text(f"{columns}\n{HEADER}{SECOND.format(kind)}", encoding="utf-8")
+    return arrays.read_array(path)
+
+
+def read(folder: Path, array: arrays.SensorArray, text: str) -> magloc.Readings:
+    path = folder / "log.csv"
+    path.write_text(text, encoding="utf-8")
+    return magloc.read_readings(path, array)
+
+
+class TestValues:
+    def test_names_units_and_times(self, tmp_path: Path) -> None:
+        array = array_of(
+            tmp_path,
+            '[columns]\nseparator = "semicolon"\ndecimal = ","\ntime = "Clock"\ntime_unit = "ms"\nunit = "uT"\n'
+            '[columns.sensors]\nlow = "Mag 1"\nhigh = "Mag 2"\n',
+        )
+        found = read(tmp_path, array, "Clock;Mag 1;Mag 2;Comment\n0;48,5;48,6;start\n500;48,7;;\n")
+        assert found.time_s.tolist() == [0.0, 0.5]
+        np.testing.assert_allclose(found.values_T, [[48.5e-6, 48.6e-6], [48.7e-6, np.nan]], rtol=1e-14)
+
+    def test_counts_of_a_vector_sensor(self, tmp_path: Path) -> None:
+        columns = '[columns]\nunit = 0.5\n[columns.sensors]\nlow = "T"\nhigh = ["X", "Y", "Z"]\n'
+        found = read(
+            tmp_path, array_of(tmp_path, columns, "vector"), "time_s,T,X,Y,Z\n0,100000,1,2,3\n1,100000,4,5,6\n"
+        )
+        np.testing.assert_allclose(found.values_T[0], [5e-5, 0.5e-9, 1e-9, 1.5e-9], rtol=1e-14)
+
+    def test_instants(self, tmp_path: Path) -> None:
+        columns = '[columns]\ntime = "UTC"\ntime_unit = "iso"\n'
+        text = "UTC,low_nT,high_nT\n2026-11-21T12:00:00,1,2\n2026-11-21T12:00:01.25Z,1,2\n"
+        found = read(tmp_path, array_of(tmp_path, columns), text)
+        assert np.diff(found.time_s).tolist() == [1.25]
+
+    @pytest.mark.parametrize(("unit", "of_nT"), [("nT", 1e-9), ("µT", 1e-6), ("mG", 1e-7), ("G", 1e-4), ("T", 1.0)])
+    def test_units(self, unit: str, of_nT: float, tmp_path: Path) -> None:
+        found = read(
+            tmp_path, array_of(tmp_path, f'[columns]\nunit = "{unit}"\n'), "time_s,low_nT,high_nT\n0,3,4\n1,3,4\n"
+        )
+        np.testing.assert_allclose(found.values_T[0], np.array([3.0, 4.0]) * of_nT, rtol=1e-14)
+
+
+class TestPose:
+    GEODETIC = '[columns]\ngeodetic = ["Lat", "Lon", "Alt"]\n'
+
+    def test_latitude_and_longitude(self, tmp_path: Path) -> None:
+        """A minute of latitude is a nautical mile of 1,852 m, by its definition, to the Earth's flattening."""
+        rows = "0,1,2,50,8,100\n1,1,2,50.016666667,8,101\n2,1,2,50,8.016666667,100\n"
+        found = read(tmp_path, array_of(tmp_path, self.GEODETIC), f"time_s,low_nT,high_nT,Lat,Lon,Alt\n{rows}")
+        assert found.array_position_m is not None
+        np.testing.assert_allclose(found.array_position_m[0], 0.0, atol=1e-6)
+        east, north = found.array_position_m[2, 0], found.array_position_m[1, 1]
+        assert north == pytest.approx(1852.0, rel=5e-3)
+        assert east == pytest.approx(1852.0 * np.cos(np.radians(50.0)), rel=5e-3)
+        assert found.array_position_m[1, 2] == pytest.approx(1.0 - 1852.0**2 / 2.0 / 6.37e6, abs=0.01)
+
+    def test_an_origin(self, tmp_path: Path) -> None:
+        columns = self.GEODETIC + "origin = [50.0, 8.0, 90.0]\n"
+        found = read(
+            tmp_path, array_of(tmp_path, columns), "time_s,low_nT,high_nT,Lat,Lon,Alt\n0,1,2,50,8,100\n1,1,2,50,8,100\n"
+        )
+        assert found.array_position_m is not None
+        np.testing.assert_allclose(found.array_position_m[0], [0.0, 0.0, 10.0], atol=1e-6)
+
+    @pytest.mark.parametrize(
+        ("angles", "of_row", "forward", "up"),
+        [
+            ('["Yaw"]', "90", [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]),  # to the east
+            ('["Yaw", "Pitch", "Roll"]', "0,90,0", [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]),  # nose up
+            ('["Yaw", "Pitch", "Roll"]', "0,0,90", [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]),  # right wing down
+        ],
+    )
+    def test_angles(self, angles: str, of_row: str, forward: list[float], up: list[float], tmp_path: Path) -> None:
+        columns = f'[columns]\nposition = ["E", "N", "U"]\nangles = {angles}\n'
+        names = ",".join(name.strip(' "[]') for name in angles.split(","))
+        rows = f"0,1,2,0,0,5,{of_row}\n1,1,2,1,2,5,{of_row}\n"
+        found = read(tmp_path, array_of(tmp_path, columns), f"time_s,low_nT,high_nT,E,N,U,{names}\n{rows}")
+        assert found.array_rotation is not None
+        np.testing.assert_allclose(found.array_rotation[0].apply([1.0, 0.0, 0.0]), forward, atol=1e-12)
+        np.testing.assert_allclose(found.array_rotation[0].apply([0.0, 0.0, 1.0]), up, atol=1e-12)
+
+    def test_a_place_alone(self, tmp_path: Path) -> None:
+        columns = '[columns]\nposition = ["E", "N", "U"]\n'
+        found = read(tmp_path, array_of(tmp_path, columns), "time_s,low_nT,high_nT,E,N,U\n0,1,2,3,4,5\n1,1,2,3,4,5\n")
+        assert found.array_rotation is not None
+        assert found.array_rotation.magnitude().tolist() == [0.0, 0.0]
+
+    def test_latency(self, tmp_path: Path) -> None:
+        """What a row says of its pose was so half a second before: a steady motion is half a second further on."""
+        columns = '[columns]\nposition = ["E", "N", "U"]\nquaternion = ["a", "b", "c", "d"]\npose_latency_s = 0.5\n'
+        time_s = np.arange(10.0)
+        turned = Rotation.from_euler("z", 0.1 * (time_s[:, None] - 0.5)).as_quat()
+        rows = [f"{t},1,2,{3.0 * (t - 0.5)},0,1,{','.join(map(str, q))}" for t, q in zip(time_s, turned, strict=True)]
+        found = read(tmp_path, array_of(tmp_path, columns), "\n".join(["time_s,low_nT,high_nT,E,N,U,a,b,c,d", *rows]))
+        assert found.array_position_m is not None
+        assert found.array_rotation is not None
+        np.testing.assert_allclose(found.array_position_m[:-1, 0], 3.0 * time_s[:-1], atol=1e-9)
+        np.testing.assert_allclose(found.array_rotation.as_euler("zyx")[:-1, 0], 0.1 * time_s[:-1], atol=1e-9)
+
+
+class TestFile:
+    def test_written_as_read(self, tmp_path: Path) -> None:
+        columns = (
+            '[columns]\nseparator = "tab"\ntime = "t \\"x\\""\nunit = 0.25\ngeodetic = ["Lat", "Lon", "Höhe"]\n'
+            'origin = [50.0, 8.0, 1.0]\nangles = ["Kurs"]\npose_latency_s = 0.1\n'
+            '[columns.sensors]\nhigh = ["X", "Y", "Z"]\n'
+        )
+        array = array_of(tmp_path, columns, "vector")
+        (tmp_path / "again.toml").write_text(array_toml(array), encoding="utf-8")
+        assert arrays.read_array(tmp_path / "again.toml") == array
+        assert hash(array) == hash(arrays.read_array(tmp_path / "array.toml"))
+        assert array.columns is not None
+        assert array.subset(["low", "high"]).columns == array.columns
+
+    @pytest.mark.parametrize(
+        ("columns", "word"),
+        [
+            ('unit = "kT"', "unit"),
+            ('separator = "|"', "separator"),
+            ('decimal = ","', "separator comma"),
+            ('time_unit = "h"', "time_unit"),
+            ('angles = ["Yaw"]', "position or geodetic"),
+            ('position = ["a", "b", "c"]\ngeodetic = ["a", "b", "c"]', "geodetic"),
+            ('position = ["a", "b", "c"]\nangles = ["a", "b"]', "angles"),
+            ('latitude = "Lat"', "latitude"),
+        ],
+    )
+    def test_bad_tables(self, columns: str, word: str, tmp_path: Path) -> None:
+        with pytest.raises(arrays.InputError, match=word):
+            array_of(tmp_path, f"[columns]\n{columns}\n")
+
+    @pytest.mark.parametrize(
+        ("columns", "header", "word"),
+        [
+            ('[columns.sensors]\nother = "A"', "time_s,low_nT,high_nT", "columns.sensors.other"),
+            ('[columns.sensors]\nlow = ["A", "B"]', "time_s,low_nT,high_nT", "columns.sensors.low"),
+            ('[columns.sensors]\nlow = "A"', "time_s,low_nT,high_nT", "column A"),
+            ('[columns]\ntime = "UTC"', "time_s,low_nT,high_nT", "UTC"),
+            ("[columns]", "time_s,low_nT,Mag2", "high_nT"),
+        ],
+    )
+    def test_bad_logs(self, columns: str, header: str, word: str, tmp_path: Path) -> None:
+        array = array_of(tmp_path, columns + "\n")
+        with pytest.raises(arrays.InputError, match=word):
+            read(tmp_path, array, f"{header}\n0,1,2\n1,1,2\n")
+
+    def test_a_row_without_a_place(self, tmp_path: Path) -> None:
+        text = "time_s,low_nT,high_nT,Lat,Lon,Alt\n0,1,2,50,8,100\n1,1,2,,8,100\n"
+        with pytest.raises(arrays.InputError, match="line 3, column Lat"):
+            read(tmp_path, array_of(tmp_path, TestPose.GEODETIC), text)
