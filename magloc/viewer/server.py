@@ -18,7 +18,7 @@ from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import replaced, write_text
 from magloc.viewer.chromium import BrowserError, Chromium, find_chromium
 from magloc.viewer.origin import guarded_server
-from magloc.viewer.scene.legend import with_legend
+from magloc.viewer.scene.legend import ABOVE_THE_PLAYER, with_legend
 
 if TYPE_CHECKING:
     from magloc.viewer.pages.pages import Page
@@ -29,6 +29,17 @@ _PORTS = 20
 _PICTURE_PX = (1280, 800)
 _PANEL_PX = 330
 _CONNECTION_S = 60.0
+_PLAY = "the bar below plays the rows"
+# viser's player begins by itself, and has nothing to show until it has begun; the space bar stops it.
+_STANDS_S = 2.0
+_STAND_STILL = """
+const player = setInterval(() => {
+  const time = document.querySelector('input[inputmode=decimal]');
+  if (!time || Number(time.value) === 0) return;
+  clearInterval(player);
+  window.dispatchEvent(new KeyboardEvent('keydown', {key: ' ', code: 'Space', bubbles: true}));
+}, 20);
+"""
 _CLOSE_NOTICES = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(button => button.click())"
 
 
@@ -102,8 +113,21 @@ def wait_for_interruption() -> None:
 
 
 def page_html(server: viser.ViserServer, page: Page) -> str:
-    """The scene as one HTML page that needs nothing else."""
-    return with_legend(server.scene.as_html(), page.title, page.entries, page.notes)
+    """The scene as one HTML page that needs nothing else; with a time slider where there are several rows."""
+    playing = page.playing
+    if playing is None:
+        return with_legend(server.scene.as_html(), page.title, page.entries, page.notes)
+    # The page stands still on the row that a live one would show, until it is played.
+    recording = server.get_scene_serializer()
+    recording.insert_sleep(_STANDS_S)
+    for step in playing.steps:
+        playing.show(step)
+        recording.insert_sleep(playing.duration_s / len(playing.steps))
+    html = recording.as_html()
+    playing.show(playing.first)
+    return with_legend(
+        html, page.title, page.entries, (*page.notes, _PLAY), bottom=ABOVE_THE_PLAYER, script=_STAND_STILL
+    )
 
 
 def write_page(html: str, path: Path) -> None:
