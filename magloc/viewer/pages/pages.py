@@ -295,7 +295,11 @@ def _centroids(array: SensorArray, rows: Readings | None, n: int) -> FloatArray:
 
 def _nearest_rows(rows: Readings, points: Sequence[TrackPoint]) -> NDArray[np.intp]:
     """The row of the readings that is nearest in time, for every point of a track."""
-    return np.abs(rows.time_s[:, None] - stacked(points, "time_s")).argmin(axis=0)
+    order = np.argsort(rows.time_s, kind="stable")
+    times, wanted = rows.time_s[order], stacked(points, "time_s")
+    after = np.searchsorted(times, wanted).clip(0, len(times) - 1)
+    before = (after - 1).clip(0)
+    return order[np.where(wanted - times[before] <= times[after] - wanted, before, after)]
 
 
 def _not_far(positions_m: FloatArray, centroids_m: FloatArray) -> FloatArray:
