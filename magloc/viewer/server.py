@@ -43,16 +43,20 @@ const player = setInterval(() => {
 _CLOSE_NOTICES = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(button => button.click())"
 
 
-def check_outputs(html: str | Path | None, png: str | Path | None) -> None:
-    """Refuse, before long work, files that cannot be written, and a picture without a browser."""
+def check_outputs(html: str | Path | None, png: str | Path | None, movie: str | Path | None = None) -> None:
+    """Refuse, before long work, files that cannot be written, and a picture or a film without a browser."""
     if html is not None:
         refuse_unwritable(Path(html), "Input html")
     if png is not None:
         refuse_unwritable(Path(png), "Input png", ".png")
-        try:
-            find_chromium()
-        except InputError as error:
-            raise InputError(f"Input png: {error}") from None
+    if movie is not None:
+        refuse_unwritable(Path(movie), "Input movie")
+    for name, path in (("png", png), ("movie", movie)):
+        if path is not None:
+            try:
+                find_chromium()
+            except InputError as error:
+                raise InputError(f"Input {name}: {error}") from None
 
 
 def free_port(wanted: int) -> int:
@@ -140,16 +144,24 @@ def write_page(html: str, path: Path) -> None:
 
 def write_picture(server: viser.ViserServer, path: Path) -> None:
     """Write the page as a headless Chromium shows it, a PNG file; InputError if it cannot be, BrowserError."""
-    with Chromium(address(server), _PICTURE_PX) as browser:
-        browser.wait_for("document.querySelector('canvas') !== null")
-        # The scene is sent when the page has reported its camera; before that a blank page is at rest too.
-        _wait_for_client(server)
-        picture = browser.settled_screenshot(before=_CLOSE_NOTICES)
+    with opened_page(server, _PICTURE_PX) as browser:
+        picture = browser.screenshot()
     try:
         with replaced(path) as written:
             written.write_bytes(picture)
     except OSError as error:
         raise InputError(f"Input png {path} cannot be written ({error.strerror}).") from None
+
+
+@contextmanager
+def opened_page(server: viser.ViserServer, size: tuple[int, int]) -> Iterator[Chromium]:
+    """A headless Chromium with the page of a server, at rest, notices closed."""
+    with Chromium(address(server), size) as browser:
+        browser.wait_for("document.querySelector('canvas') !== null")
+        # The scene is sent when the page has reported its camera; before that a blank page is at rest too.
+        _wait_for_client(server)
+        browser.settled_screenshot(before=_CLOSE_NOTICES)
+        yield browser
 
 
 def _wait_for_client(server: viser.ViserServer) -> None:
