@@ -12,7 +12,7 @@ from adcs.viewer.drive_player import DrivePlayer
 from adcs.viewer.table_scene import TableScene, scene_entries, scene_extent
 from magloc.viewer.pages.pages import Page
 from magloc.viewer.scene.framing import prepare
-from magloc.viewer.scene.legend import legend_html, with_legend
+from magloc.viewer.scene.legend import ABOVE_THE_PLAYER, legend_html, with_legend
 from magloc.viewer.server import write_page
 
 _STEP_S = 0.2
@@ -45,6 +45,5 @@ def write_playing_page(server: viser.ViserServer, page: Page, player: DrivePlaye
     for time_s in np.arange(step_s, drive.duration_s, step_s):
         recording.insert_sleep(step_s)
         player.move_to(float(time_s))
-    # The legend stands above the bar that plays.
-    html = with_legend(recording.as_html(), page.title, page.entries, page.notes, bottom="4em")
+    html = with_legend(recording.as_html(), page.title, page.entries, page.notes, bottom=ABOVE_THE_PLAYER)
     write_page(html, path)

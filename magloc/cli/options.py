@@ -88,11 +88,11 @@ def naming_options(*names: str) -> Iterator[None]:
 
 @contextmanager
 def naming_outputs() -> Iterator[None]:
-    """Let errors of a viewer speak of the options --html, --png and --port."""
+    """Let errors of a viewer speak of the options --html, --png, --movie and --port."""
     from magloc.viewer.chromium import BrowserError
 
     try:
-        with naming_options("html", "png", "port"):
+        with naming_options("html", "png", "movie", "port"):
             yield
     except BrowserError as error:
         raise InputError(f"--png: {error}") from None

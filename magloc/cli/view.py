@@ -33,6 +33,7 @@ def view(
     readings: Path | None = None,
     html: Path | None = None,
     png: Path | None = None,
+    movie: Path | None = None,
     port: Port = 8080,
     open: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
@@ -40,7 +41,7 @@ def view(
     """See an array, readings, a track or a map in three dimensions.
 
     Starts a server on this machine and prints its address, which any browser on this machine opens; Ctrl-C ends it.
-    With --html or --png a file is written instead.
+    With --html, --png or --movie a file is written instead.
 
     Parameters
     ----------
@@ -56,6 +57,8 @@ def view(
         Write one static HTML file that needs no server.
     png : Path
         Write a picture; needs Chromium or Chrome.
+    movie : Path
+        Write a film (.gif or .apng) of all rows, or once around an array or a map; needs Chromium or Chrome.
     port : int
         Port of the server; the next one that is free if it is in use.
     open : bool
@@ -64,11 +67,14 @@ def view(
         Common options.
     """
     import magloc
+    from magloc.viewer.film import refuse_format
     from magloc.viewer.pages.open_result import ReadingsResult, read_result
     from magloc.viewer.server import check_outputs, free_port
 
     with naming_outputs():
-        check_outputs(html, png)
+        if movie is not None:
+            refuse_format(movie)
+        check_outputs(html, png, movie)
     result = read_result(path, array)
     sensors, rows = _with_track(result, array, readings)
     file = path if isinstance(result, arrays.SensorArray) else None
@@ -77,14 +83,14 @@ def view(
         sensors, (shown, rows) = result.array, _fixes(result, quiet=common.quiet)
     elif isinstance(result, arrays.SensorArray):
         sensors, shown = result, None
-    written = [str(file) for file in (html, png) if file is not None]
+    written = [str(file) for file in (html, png, movie) if file is not None]
     with naming_outputs():
         used = port if written else free_port(port)
         if used != port and port and not common.quiet:
             print_note(f"port {port} is in use, {used} is taken")
         title = path.name or path.resolve().name
         scene = magloc.view(
-            sensors, shown, readings=rows, html=html, png=png, open=open, port=used, title=title, file=file
+            sensors, shown, readings=rows, html=html, png=png, movie=movie, open=open, port=used, title=title, file=file
         )
     if written:
         if not common.quiet:

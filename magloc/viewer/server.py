@@ -18,7 +18,7 @@ from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import replaced, write_text
 from magloc.viewer.chromium import BrowserError, Chromium, find_chromium
 from magloc.viewer.origin import guarded_server
-from magloc.viewer.scene.legend import with_legend
+from magloc.viewer.scene.legend import ABOVE_THE_PLAYER, with_legend
 
 if TYPE_CHECKING:
     from magloc.viewer.pages.pages import Page
@@ -29,19 +29,34 @@ _PORTS = 20
 _PICTURE_PX = (1280, 800)
 _PANEL_PX = 330
 _CONNECTION_S = 60.0
+_PLAY = "the bar below plays the rows"
+# viser's player begins by itself, and has nothing to show until it has begun; the space bar stops it.
+_STANDS_S = 2.0
+_STAND_STILL = """
+const player = setInterval(() => {
+  const time = document.querySelector('input[inputmode=decimal]');
+  if (!time || Number(time.value) === 0) return;
+  clearInterval(player);
+  window.dispatchEvent(new KeyboardEvent('keydown', {key: ' ', code: 'Space', bubbles: true}));
+}, 20);
+"""
 _CLOSE_NOTICES = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(button => button.click())"
 
 
-def check_outputs(html: str | Path | None, png: str | Path | None) -> None:
-    """Refuse, before long work, files that cannot be written, and a picture without a browser."""
+def check_outputs(html: str | Path | None, png: str | Path | None, movie: str | Path | None = None) -> None:
+    """Refuse, before long work, files that cannot be written, and a picture or a film without a browser."""
     if html is not None:
         refuse_unwritable(Path(html), "Input html")
     if png is not None:
         refuse_unwritable(Path(png), "Input png", ".png")
-        try:
-            find_chromium()
-        except InputError as error:
-            raise InputError(f"Input png: {error}") from None
+    if movie is not None:
+        refuse_unwritable(Path(movie), "Input movie")
+    for name, path in (("png", png), ("movie", movie)):
+        if path is not None:
+            try:
+                find_chromium()
+            except InputError as error:
+                raise InputError(f"Input {name}: {error}") from None
 
 
 def free_port(wanted: int) -> int:
@@ -102,8 +117,21 @@ def wait_for_interruption() -> None:
 
 
 def page_html(server: viser.ViserServer, page: Page) -> str:
-    """The scene as one HTML page that needs nothing else."""
-    return with_legend(server.scene.as_html(), page.title, page.entries, page.notes)
+    """The scene as one HTML page that needs nothing else; with a time slider where there are several rows."""
+    playing = page.playing
+    if playing is None:
+        return with_legend(server.scene.as_html(), page.title, page.entries, page.notes)
+    # The page stands still on the row that a live one would show, until it is played.
+    recording = server.get_scene_serializer()
+    recording.insert_sleep(_STANDS_S)
+    for step in playing.steps:
+        playing.show(step)
+        recording.insert_sleep(playing.duration_s / len(playing.steps))
+    html = recording.as_html()
+    playing.show(playing.first)
+    return with_legend(
+        html, page.title, page.entries, (*page.notes, _PLAY), bottom=ABOVE_THE_PLAYER, script=_STAND_STILL
+    )
 
 
 def write_page(html: str, path: Path) -> None:
@@ -116,16 +144,24 @@ def write_page(html: str, path: Path) -> None:
 
 def write_picture(server: viser.ViserServer, path: Path) -> None:
     """Write the page as a headless Chromium shows it, a PNG file; InputError if it cannot be, BrowserError."""
-    with Chromium(address(server), _PICTURE_PX) as browser:
-        browser.wait_for("document.querySelector('canvas') !== null")
-        # The scene is sent when the page has reported its camera; before that a blank page is at rest too.
-        _wait_for_client(server)
-        picture = browser.settled_screenshot(before=_CLOSE_NOTICES)
+    with opened_page(server, _PICTURE_PX) as browser:
+        picture = browser.screenshot()
     try:
         with replaced(path) as written:
             written.write_bytes(picture)
     except OSError as error:
         raise InputError(f"Input png {path} cannot be written ({error.strerror}).") from None
+
+
+@contextmanager
+def opened_page(server: viser.ViserServer, size: tuple[int, int]) -> Iterator[Chromium]:
+    """A headless Chromium with the page of a server, at rest, notices closed."""
+    with Chromium(address(server), size) as browser:
+        browser.wait_for("document.querySelector('canvas') !== null")
+        # The scene is sent when the page has reported its camera; before that a blank page is at rest too.
+        _wait_for_client(server)
+        browser.settled_screenshot(before=_CLOSE_NOTICES)
+        yield browser
 
 
 def _wait_for_client(server: viser.ViserServer) -> None:

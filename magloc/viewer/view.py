@@ -19,6 +19,7 @@ from magloc.localization.fit.fixes import Fixes
 from magloc.readings import Readings
 from magloc.tracking.results import TrackResult
 from magloc.truth import Truth
+from magloc.viewer.film import refuse_format, write_film
 from magloc.viewer.pages.open_result import MapResult, map_of, path_of_truth
 from magloc.viewer.pages.pages import Page, array_page, map_page, readings_page, track_page
 from magloc.viewer.server import (
@@ -68,6 +69,10 @@ class View(Closing):
         """Write the page as a headless Chromium shows it."""
         write_picture(self._server, path)
 
+    def write_movie(self, path: Path, progress: Callable[[int], None] | None = None) -> None:
+        """Write the rows of the page, or a turn around what it shows, as a film (.gif, .apng)."""
+        write_film(self._server, self._page, path, progress)
+
     def wait(self) -> None:
         """Serve until Ctrl-C, and close."""
         wait_for_interruption()
@@ -91,6 +96,7 @@ def view(
     readings: Readings | None = None,
     html: str | Path | None = None,
     png: str | Path | None = None,
+    movie: str | Path | None = None,
     open: bool = True,
     port: int = FIRST_PORT,
     title: str = "",
@@ -113,6 +119,8 @@ def view(
         Rows that fixes were made of, or a track that does not have its own, for their plot and the array's poses.
     html, png : path, optional
         Write a static page or, by Chromium, a picture, and serve nothing.
+    movie : path, optional
+        Write a film by Chromium, GIF or animated PNG (.apng): row by row, or once around an array or a map.
     open : bool
         Open the browser.
     port : int
@@ -138,8 +146,10 @@ def view(
     >>> import magloc
     >>> view = magloc.view(arrays.grid(3, 3, 0.1), html="board.html", title="board")
     """
-    check_outputs(html, png)
-    static = html is not None or png is not None or _in_notebook()
+    if movie is not None:
+        refuse_format(Path(movie))
+    check_outputs(html, png, movie)
+    static = any(path is not None for path in (html, png, movie)) or _in_notebook()
     fill = _filling(array, result, readings, progress, None if file is None else Path(file), live=not static)
     shown = View(title or (array.name if array is not None else "") or "view", fill, 0 if static else port)
     if not static:
@@ -151,6 +161,8 @@ def view(
             write_page(shown.html, Path(html))
         if png is not None:
             shown.write_png(Path(png))
+        if movie is not None:
+            shown.write_movie(Path(movie))
         _ = shown.html  # taken while there is a server
     return shown
 

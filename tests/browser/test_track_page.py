@@ -8,6 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import viser
+from matplotlib.colors import rgb_to_hsv
 from numpy.typing import NDArray
 
 from arrays.geometries import tetrahedron
@@ -15,7 +16,8 @@ from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
 from magloc.tracking.results import TrackPoint, TrackResult
 from magloc.viewer.pages.pages import track_page
-from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, TRACK_COLOUR
+from magloc.viewer.pages.track_player import time_colours
+from magloc.viewer.scene.glyphs import DIPOLE_COLOUR
 from magloc.viewer.server import opened
 from tests.browser.screen import Screen, Sight, dark_grey, hue_of
 
@@ -26,7 +28,14 @@ POSITIONS = np.stack([np.linspace(-4.0, 4.0, 41), np.full(41, 3.0), np.linspace(
 MOMENT = np.array([0.0, 0.0, 80.0])
 SIGMA_M = 0.1
 Z = np.array([0.0, 0.0, 1.0])
-BLUE, ORANGE = hue_of(TRACK_COLOUR), hue_of(DIPOLE_COLOUR)
+ORANGE = hue_of(DIPOLE_COLOUR)
+EARLY, LATE = (hue_of(colour, 35.0, 0.25) for colour in time_colours(np.array([0.0, 0.3, 0.75, 1.0]))[1:3])
+
+
+def coloured(picture: FloatArray) -> NDArray[np.bool_]:
+    """Pixels of a colour of times, from violet to green; not of the moment, of ellipsoids or of grey lines."""
+    hue, saturation, value = np.moveaxis(rgb_to_hsv(picture), -1, 0)
+    return (hue > 60.0 / 360.0) & (hue < 300.0 / 360.0) & (saturation > 0.25) & (value > 0.2)
 
 
 @pytest.fixture(scope="module")
@@ -73,10 +82,12 @@ class TestTrack:
         camera = screen.live_camera(server)
         between = 0.5 * (POSITIONS[1:] + POSITIONS[:-1])
         screen.until_seen(
-            Sight("track", camera.pixels(between), BLUE),
+            Sight("track", camera.pixels(between), coloured),
+            Sight("track a third on", camera.pixels(POSITIONS[11:14]), EARLY),
+            Sight("track three quarters on", camera.pixels(POSITIONS[29:32]), LATE),
             Sight("moment at the end", camera.pixels(arrow_in(40, arrow_m)), ORANGE, radius=4),
             Sight("sensor", camera.pixels(ARRAY.positions), dark_grey),
-            Sight("track", camera.pixels(between[::8] + 1.5 * Z), BLUE, absent=True),
+            Sight("track", camera.pixels(between[::8] + 1.5 * Z), coloured, absent=True),
         )
         screen.keep("track")
         assert row_of(screen) == 40
@@ -90,9 +101,9 @@ class TestTrack:
         later = 0.5 * (POSITIONS[row + 2 :] + POSITIONS[row + 1 : -1])
         screen.until_seen(
             Sight("moment", camera.pixels(arrow_in(row, arrow_m)), ORANGE, radius=4),
-            Sight("track so far", camera.pixels(POSITIONS[1:row]), BLUE),
+            Sight("track so far", camera.pixels(POSITIONS[1:row]), coloured),
             Sight("moment where it was", camera.pixels(arrow_in(40, arrow_m)), ORANGE, radius=4, absent=True),
-            Sight("track of later times", camera.pixels(later[2:]), BLUE, absent=True),
+            Sight("track of later times", camera.pixels(later[2:]), coloured, absent=True),
         )
         screen.keep("track-earlier")
 
@@ -103,8 +114,8 @@ class TestTrack:
         screen.slide("Tail [s]", 0.25)
         screen.until(lambda: abs(screen.numbers("Tail [s]")[0] - 5.0) < 1.0, "the slider moves")
         screen.until_seen(
-            Sight("tail", camera.pixels(POSITIONS[33:40]), BLUE),
-            Sight("track before the tail", camera.pixels(POSITIONS[:27]), BLUE, absent=True),
+            Sight("tail", camera.pixels(POSITIONS[33:40]), coloured),
+            Sight("track before the tail", camera.pixels(POSITIONS[:27]), coloured, absent=True),
         )
 
     def test_play_and_pause(

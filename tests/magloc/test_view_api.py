@@ -99,12 +99,12 @@ class TestInline:
         page = self.page(shown)
         assert page == shown.html
         assert "__VISER_EMBED_DATA__" in page
-        assert "fixes of all rows" in page
+        assert "rows, in which a source is detected" in page
         with pytest.raises(OSError, match="refused"):
             page_of(shown.address)
 
     def test_readings_are_located(self) -> None:
-        assert "fixes of all rows" in self.page(magloc.view(ARRAY, Readings(VALUES_T)))
+        assert "rows, in which a source is detected" in self.page(magloc.view(ARRAY, Readings(VALUES_T)))
 
     def test_readings_that_cannot_be_located_are_seen_all_the_same(self) -> None:
         two = ARRAY.subset(ARRAY.ids[:2])

@@ -28,6 +28,7 @@ from magloc.viewer.pages.live_fit import Forecast, LiveFit
 from magloc.viewer.panels.inputs import SharedInput, set_value
 from magloc.viewer.panels.latest import Latest
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR, FIT_COLOUR, DipoleGlyph, SurfaceGlyph, turned_to
+from magloc.viewer.scene.ruler import DropLines
 from magloc.viewer.scene.shapes import uncertainty
 
 _SOLUTIONS_SHOWN = 3
@@ -59,6 +60,8 @@ class DipoleEditor:
         Of the present dipole.
     fix : Fix
         Of its simulated readings.
+    drop : DropLines
+        From the dipole to the floor.
     milliseconds : tuple of 2 floats
         How long the last forecast and the last fix took, from the state of the controls to the scene [ms].
     """
@@ -125,6 +128,7 @@ class DipoleEditor:
     def _add_nodes(self, server: viser.ViserServer, array: SensorArray, parent: str) -> None:
         name, radius = f"{parent}/dipole", array.circumradius
         self._region = SurfaceGlyph(server.scene, f"{name}/region")
+        self.drop = DropLines(server.scene, f"{name}/drop", DIPOLE_COLOUR)
         self._glyph = DipoleGlyph(server.scene, f"{name}/true", _ARROW * radius, DIPOLE_COLOUR, reach_m=1.5 * radius)
         # A good fit stands where the dipole is: it is thinner and longer, so that its tip is seen beyond the other's.
         length, thickness = _FIT_LENGTH * _ARROW * radius, _FIT_THICKNESS * _ARROW * radius
@@ -136,6 +140,10 @@ class DipoleEditor:
             f"{name}/control",
             scale=_CONTROL * radius,
             depth_test=False,
+            # Told apart from the arrows of dipole and fit: fainter, and without squares that hide them.
+            disable_sliders=True,
+            line_width=1.5,
+            opacity=0.45,
             translation_limits=((-1e9, 1e9),) * 3,
         )
         self.control.on_update(self._follow)
@@ -207,6 +215,7 @@ class DipoleEditor:
         self.forecast = forecast = live.forecast(position, moment)
         self._forecast_of = (live, position, moment, forecast)
         self._glyph.show(position, moment)
+        self.drop.show(position)
         self._show_region(live.array, position, forecast)
         self._show_inputs(position)
         self.readings_panel.content = words.readings_table(live.array, forecast.readings_T, forecast.signal_T)

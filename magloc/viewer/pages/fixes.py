@@ -18,11 +18,14 @@ from magloc.viewer.scene.glyphs import (
     FIT_COLOUR,
     OTHER_COLOUR,
     REGION_COLOUR,
+    UNDETECTED_COLOUR,
     DipoleGlyph,
     SurfaceGlyph,
     dots,
+    screen_label,
 )
 from magloc.viewer.scene.legend import Entry, Swatch
+from magloc.viewer.scene.ruler import DropLines
 from magloc.viewer.scene.shapes import NOTHING, Surface, joined, uncertainty
 
 _MOST_OTHERS = 3
@@ -55,8 +58,10 @@ class FixView:
         self._server, self._times, self._fixes, self._centroids = server, times_s, fixes, centroids_m
         scene = server.scene
         of_row, positions = best_positions(fixes)
+        self._detected = np.array([fix.detected and bool(fix.solutions) for fix in fixes])
         if len(positions) > 1:
-            dots(scene, "/fixes/all", positions, FIT_COLOUR, dot_m)
+            colours = np.where(self._detected[of_row, None], FIT_COLOUR, UNDETECTED_COLOUR).astype(np.uint8)
+            dots(scene, "/fixes/all", positions, colours, dot_m)
         most = int(np.bincount(of_row, minlength=1).max())  # sources of a row
         self.best = DipoleGlyph(scene, "/fixes/best", size_m, DIPOLE_COLOUR, reach_m)
         more = [DipoleGlyph(scene, f"/fixes/best-{i}", size_m, DIPOLE_COLOUR, reach_m) for i in range(2, most + 1)]
@@ -64,22 +69,42 @@ class FixView:
         n_others = _MOST_OTHERS * max(most, 1)
         self.others = [DipoleGlyph(scene, f"/fixes/other-{i}", 0.8 * size_m, OTHER_COLOUR) for i in range(n_others)]
         self.region = SurfaceGlyph(scene, "/fixes/region", REGION_COLOUR, 0.4)
+        self.drop = DropLines(scene, "/fixes/drop", DIPOLE_COLOUR)
+        self.time_label = screen_label(scene, "/fixes/time", "", np.zeros(3), "center-left")
         self.row = _clearest(fixes, centroids_m)
         self.show_row(self.row)
 
     def show_row(self, row: int) -> None:
         """Show another row."""
+        with self._server.atomic():
+            self._show(row)
+
+    def _show(self, row: int) -> None:
         self.row = row
         solutions = heaviest_first(self._fixes[row])
-        best, others = _sources(solutions[:1]), _sources(solutions[1 : 1 + _MOST_OTHERS])
+        self.shown_sources = _sources(solutions[:1])
+        best, others = self.shown_sources, _sources(solutions[1 : 1 + _MOST_OTHERS])
+        for glyph in self._best:
+            glyph.body.color = DIPOLE_COLOUR if self._detected[row] else UNDETECTED_COLOUR
         for glyphs, sources in ((self._best, best), (self.others, others)):
             for glyph in glyphs:
                 glyph.visible = False
             for glyph, source in zip(glyphs, sources, strict=False):
                 glyph.visible = True
                 glyph.show(source.position_m, source.moment_Am2)
+        self.time_label.text = f"   {self._times[row]:.6g} s"
+        self.time_label.visible = bool(best) and len(self._fixes) > 1
+        if best:
+            self.time_label.position = best[0].position_m
+        self.drop.show([source.position_m for source in best])
         regions = [self._region_of(source) for source in best]
         self.region.show(regions[0] if len(regions) == 1 else joined(regions))
+
+    def show_field_lines(self, visible: bool) -> None:
+        """Show the field lines of the row's sources, or not."""
+        for glyph in self._best:
+            if glyph.field_lines is not None:
+                glyph.field_lines.visible = visible
 
     def _region_of(self, source: Source) -> Surface:
         """Where a source may be; nowhere else if its place is known beforehand."""
@@ -124,6 +149,7 @@ class FixView:
             places.append(words.place(source.position_m))
             places.append(f"moment {np.linalg.norm(source.moment_Am2):.3g} A·m²")
         lines = [
+            *([] if fix.detected else ["<b>nothing is detected</b> in this row: a fit of noise"]),
             f"{time}, {places[0]}",
             *places[1:],
             f"χ² {best.chi2:.3g}, {best.dof} degrees of freedom",
@@ -136,7 +162,7 @@ class FixView:
         others = len(fix.solutions) - 1
         if others:
             lines.append(f"<b>{others} other solution{'s fit' if others > 1 else ' fits'}</b> almost as well")
-        return words.panel(lines)
+        return words.panel(lines, warning=not fix.detected)
 
     def entries(self) -> list[Entry]:
         """Lines of the legend."""
@@ -150,15 +176,20 @@ class FixView:
                 "95 % ellipsoid; where the range is not observable, its 95 % interval, with 95 % of the direction",
             ),
         ]
-        if len(self._fixes) > 1:
-            lines.append(Swatch(FIT_COLOUR, "fixes of all rows"))
+        solved = np.array([bool(fix.solutions) for fix in self._fixes])
+        n, n_detected, n_noise = len(solved), int(self._detected.sum()), int((solved & ~self._detected).sum())
+        if n > 1 and n_detected:
+            lines.append(Swatch(FIT_COLOUR, f"fixes of {n_detected} of {n} rows, in which a source is detected"))
+        if n_noise:
+            where = "this row" if n == 1 else f"{n_noise} of {n} rows"
+            lines.append(Swatch(UNDETECTED_COLOUR, f"nothing is detected in {where}: fits of noise, no sources"))
         if any(len(fix.solutions) > 1 for fix in self._fixes):
             lines.append(Swatch(OTHER_COLOUR, "other solutions that fit almost as well"))
         return lines
 
 
 def _clearest(fixes: Sequence[Fix], centroids_m: FloatArray) -> int:
-    """The row that is shown first: where the position is best known, relative to its range."""
+    """The row that is shown first: of those with a source, where the position is best known, relative to its range."""
 
     def relative_variance(row: int) -> float:
         if not fixes[row].solutions:
@@ -169,7 +200,7 @@ def _clearest(fixes: Sequence[Fix], centroids_m: FloatArray) -> int:
         variance = float(np.trace(source.covariance[:3, :3]) / np.sum((source.position_m - centroids_m[row]) ** 2))
         return variance if np.isfinite(variance) else np.inf
 
-    return min(range(len(fixes)), key=relative_variance)
+    return min(range(len(fixes)), key=lambda row: (not fixes[row].detected, relative_variance(row)))
 
 
 def heaviest_first(fix: Fix) -> list[Solution]:

@@ -15,25 +15,27 @@ from arrays.typing import FloatArray
 from magloc.localization.fit.results import Fix
 from magloc.readings import Readings
 from magloc.tracking.results import TrackPoint, TrackResult, stacked
+from magloc.viewer.pages import words
+from magloc.viewer.pages.field_panel import FieldPanel
 from magloc.viewer.pages.fixes import FixView, best_positions
 from magloc.viewer.pages.map import MapControls, MapView
 from magloc.viewer.pages.open_result import MapResult
-from magloc.viewer.pages.track_player import TrackPlayer
+from magloc.viewer.pages.track_player import TrackPlayer, time_colours
 from magloc.viewer.panels.readings_plot import ReadingsPlot
-from magloc.viewer.scene.framing import Extent, corners_of, extent_of, prepare
+from magloc.viewer.scene.framing import Extent, aim, corners_of, extent_of, prepare
 from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
     FIELD_LINE_COLOUR,
     FIT_COLOUR,
     REGION_COLOUR,
-    TRACK_COLOUR,
     ArrayGlyphs,
     DipoleGlyph,
     length_text,
     screen_label,
     screen_lines,
 )
-from magloc.viewer.scene.legend import Entry, Swatch, legend_html
+from magloc.viewer.scene.legend import ColourScale, Entry, Swatch, legend_html
+from magloc.viewer.scene.ruler import DropLines, add_ruler
 from magloc.viewer.scene.shapes import line_segments
 
 SENSOR_COLOUR = (90, 96, 105)
@@ -43,7 +45,37 @@ AXES_WORDS = "axes of array and sensors: x red, y green, z blue"
 _FARTHEST_IN_MEDIANS = 3.0
 # Size of the glyphs, in radii of the scene, below which the sensors' ids are specks.
 _LEAST_LEGIBLE = 0.04
-_FIELD_UNITS = (("mT", 1e-3), ("µT", 1e-6), ("nT", 1e-9), ("pT", 1e-12))
+_SHADES = 9
+_MOST_STEPS, _PLAYED_S = 150, (5.0, 30.0)
+
+
+@dataclass(frozen=True)
+class Playing:
+    """What a page without a server plays: a sequence of scenes.
+
+    Attributes
+    ----------
+    steps : tuple of int
+        Rows, one scene each.
+    show : callable
+        Shows a row, with all that follows it.
+    duration_s : float
+        How long it takes to play them.
+    first : int
+        Row that the live page shows at first.
+    """
+
+    steps: tuple[int, ...]
+    show: Callable[[int], None]
+    duration_s: float
+    first: int
+
+    @classmethod
+    def of(cls, times_s: FloatArray, show: Callable[[int], None], first: int) -> Playing:
+        """Of all rows, or of 150, evenly: as long as they took, but 5 s at least and 30 s at most."""
+        n = len(times_s)
+        steps = np.unique(np.linspace(0, n - 1, min(n, _MOST_STEPS)).round().astype(int))
+        return cls(tuple(steps.tolist()), show, float(np.clip(np.ptp(times_s), *_PLAYED_S)), first)
 
 
 @dataclass(frozen=True)
@@ -59,12 +91,15 @@ class Page:
         Below the legend.
     close : callable
         Ends what runs by itself; to be called before the server is stopped.
+    playing : Playing, optional
+        What its static page plays.
     """
 
     title: str
     entries: tuple[Entry, ...]
     notes: tuple[str, ...]
     close: Callable[[], None] = lambda: None
+    playing: Playing | None = None
 
 
 def array_page(server: viser.ViserServer, array: SensorArray, *, live: bool, file: Path | None = None) -> Page:
@@ -72,6 +107,7 @@ def array_page(server: viser.ViserServer, array: SensorArray, *, live: bool, fil
     glyphs = ArrayGlyphs(server.scene, array)
     ball = extent_of(*(corners_of(place, glyphs.size_m) for place in array.positions))
     entries: list[Entry] = [_sensors_entry(array)]
+    drops: list[DropLines] = []
     legend = server.gui.add_folder("Legend")
     if live and array.n_sensors > 1:
         # What fits readings takes a second to load, and the other pages do without.
@@ -84,6 +120,7 @@ def array_page(server: viser.ViserServer, array: SensorArray, *, live: bool, fil
         with tabs.add_tab("Array"):
             follow = [glyphs.set_array, dipole.set_array]
             ArrayEditor(server, array, on_change=follow, parent="/array", file=file)
+        drops = [dipole.drop]
         # Its control and most of its field lines too.
         ball = extent_of(ball.points_m, dipole.extent_m, corners_of(dipole.position_m, 0.8 * array.circumradius))
         entries += [
@@ -92,7 +129,7 @@ def array_page(server: viser.ViserServer, array: SensorArray, *, live: bool, fil
             Swatch(FIT_COLOUR, "what a fix of its readings finds: thinner and longer"),
             Swatch(REGION_COLOUR, "95 % region by the Cramér-Rao bound; long where the range is not observable"),
         ]
-    return _finished(server, legend, ball, array.name or "array", entries)
+    return _finished(server, legend, ball, array.name or "array", entries, drops=drops)
 
 
 def readings_page(server: viser.ViserServer, array: SensorArray, fixes: Sequence[Fix], rows: Readings | None) -> Page:
@@ -116,6 +153,7 @@ def readings_page(server: viser.ViserServer, array: SensorArray, fixes: Sequence
     # The plot stands below the choice of the row, which has to move its mark.
     followers: list[Callable[[int], None]] = [move_array]
     view.add_controls(followers)
+    followers.append(FieldPanel(server, array, view, rows, size).show_row)
     if rows is not None and len(rows) > 1:
         plot = ReadingsPlot(server, rows, array)
         plot.show_row(view.row)
@@ -123,7 +161,10 @@ def readings_page(server: viser.ViserServer, array: SensorArray, fixes: Sequence
     if view.region.mesh is not None and view.region.visible:
         ball = extent_of(ball.points_m, view.region.mesh.vertices)
     entries = [*view.entries(), *_array_entries(server, glyphs, rows, ball)]
-    return _finished(server, legend, ball, array.name or "readings", entries)
+    playing = (
+        Playing.of(times, lambda row: follow([view.show_row, *followers], row), view.row) if len(fixes) > 1 else None
+    )
+    return _finished(server, legend, ball, array.name or "readings", entries, drops=[view.drop], playing=playing)
 
 
 def track_page(
@@ -135,8 +176,10 @@ def track_page(
     legend = gui.add_folder("Legend")
     name = "true path" if result.is_truth else "track"
     ellipsoids = "" if result.is_truth else ", with 95 % ellipsoids"
+    shades = time_colours(np.linspace(0.0, 1.0, _SHADES)).tolist()
+    colours = tuple((red, green, blue) for red, green, blue in shades)
     entries: list[Entry] = [
-        Swatch(TRACK_COLOUR, f"{name}{ellipsoids}"),
+        ColourScale(f"{name}{ellipsoids}, by time", f"{points[0].time_s:.6g} s", f"{points[-1].time_s:.6g} s", colours),
         Swatch(DIPOLE_COLOUR, "direction of the moment at this time"),
     ]
     seen = [positions]
@@ -164,7 +207,8 @@ def track_page(
     for i in dict.fromkeys((tracked[0], tracked[-1])):
         below = positions[i] - np.array([0.0, 0.0, 0.14 * ball.radius_m])  # above, the arrow of the moment may be
         screen_label(server.scene, f"/times/{i}", f"{points[i].time_s:.6g} s", below)
-    return _finished(server, legend, ball, name, entries, close=player.pause)
+    playing = Playing.of(stacked(points, "time_s"), player.show_row, player.index) if len(points) > 1 else None
+    return _finished(server, legend, ball, name, entries, close=player.pause, drops=[player.drop], playing=playing)
 
 
 def map_page(server: viser.ViserServer, result: MapResult) -> Page:
@@ -186,7 +230,7 @@ def map_page(server: viser.ViserServer, result: MapResult) -> Page:
     ball = extent_of(corners_of([axis[0] + half] * 3, half))
     entries += _array_entries(server, glyphs, None, ball)
     notes = [] if result.every == 1 else [f"Every {result.every}th point of the map along each axis is shown."]
-    return _finished(server, legend, ball, result.title, entries, notes)
+    return _finished(server, legend, ball, result.title, entries, notes, ruler=False)  # its box has numbers
 
 
 def _finished(
@@ -197,21 +241,28 @@ def _finished(
     entries: Sequence[Entry],
     notes: Sequence[str] = (),
     close: Callable[[], None] = lambda: None,
+    *,
+    drops: Sequence[DropLines] = (),
+    ruler: bool = True,
+    playing: Playing | None = None,
 ) -> Page:
-    """Floor, light, camera and legend."""
-    cell = prepare(server, ball)
-    all_notes = (*notes, AXES_WORDS, f"one square of the floor: {length_text(cell)}")
+    """Floor, light, camera, axes, what stands on the floor, and legend."""
+    floor = prepare(server, ball)
+    if ruler:
+        aim(server, ball._replace(points_m=np.vstack([ball.points_m, add_ruler(server.scene, ball, floor)])))
+    for lines in drops:
+        lines.stand_on(floor, ball)
+    height = f"floor at z = {length_text(floor.height_m)}"
+    all_notes = (*notes, AXES_WORDS, height, f"one square of the floor: {length_text(floor.cell_m)}")
     with legend:
         server.gui.add_html(legend_html(entries, all_notes))
-    return Page(title, tuple(entries), all_notes, close)
+    return Page(title, tuple(entries), all_notes, close, playing)
 
 
-def field_text(field_T: float) -> str:
-    """A field with the unit that suits it, such as ``15 µT`` or ``0.2 nT``."""
-    for unit, tesla in _FIELD_UNITS:
-        if field_T >= tesla or (unit == "nT" and field_T >= 0.1 * tesla):
-            return f"{field_T / tesla:.3g} {unit}"
-    return f"{field_T * 1e12:.3g} pT"
+def follow(followers: Sequence[Callable[[int], None]], row: int) -> None:
+    """Let all that follows a row show it."""
+    for show in followers:
+        show(row)
 
 
 def _array_entries(server: viser.ViserServer, glyphs: ArrayGlyphs, rows: Readings | None, ball: Extent) -> list[Entry]:
@@ -229,7 +280,7 @@ def _array_entries(server: viser.ViserServer, glyphs: ArrayGlyphs, rows: Reading
 def _sensors_entry(array: SensorArray) -> Swatch:
     kinds = {sensor.kind for sensor in array.sensors}
     kind = f"{kinds.pop()} " if len(kinds) == 1 else ""
-    least, most = (field_text(bound([sensor.noise_T for sensor in array.sensors])) for bound in (min, max))
+    least, most = (words.field_text(bound([sensor.noise_T for sensor in array.sensors])) for bound in (min, max))
     noise = least if least == most else f"{least} to {most}"
     return Swatch(SENSOR_COLOUR, f"{array.n_sensors} {kind}sensor{'s' if array.n_sensors > 1 else ''}, noise {noise}")
 
@@ -244,7 +295,11 @@ def _centroids(array: SensorArray, rows: Readings | None, n: int) -> FloatArray:
 
 def _nearest_rows(rows: Readings, points: Sequence[TrackPoint]) -> NDArray[np.intp]:
     """The row of the readings that is nearest in time, for every point of a track."""
-    return np.abs(rows.time_s[:, None] - stacked(points, "time_s")).argmin(axis=0)
+    order = np.argsort(rows.time_s, kind="stable")
+    times, wanted = rows.time_s[order], stacked(points, "time_s")
+    after = np.searchsorted(times, wanted).clip(0, len(times) - 1)
+    before = (after - 1).clip(0)
+    return order[np.where(wanted - times[before] <= times[after] - wanted, before, after)]
 
 
 def _not_far(positions_m: FloatArray, centroids_m: FloatArray) -> FloatArray:

@@ -22,9 +22,10 @@ from html import escape
 
 import numpy as np
 import viser
+from matplotlib import colormaps
 from numpy.typing import NDArray
 
-from arrays.typing import FloatArray
+from arrays.typing import ByteArray, FloatArray
 from magloc.tracking.results import TrackPoint, stacked
 from magloc.viewer.pages import words
 from magloc.viewer.panels.inputs import SharedInput
@@ -34,18 +35,20 @@ from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
     TRACK_COLOUR,
     DipoleGlyph,
-    TrackGlyph,
     length_text,
     round_length,
+    screen_label,
     screen_lines,
 )
-from magloc.viewer.scene.shapes import line_segments
+from magloc.viewer.scene.ruler import DropLines
+from magloc.viewer.scene.track_glyph import TrackGlyph, track_segments
 
 Poses = tuple[FloatArray, FloatArray]
 _SPEEDS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 1000.0)
 _SUITABLE_DURATION_S = 30.0
 _STEPS_OF_SLIDER = 1000.0
 _STRIP_PARTS = 200
+_BRIGHTEST = 0.88
 _WHOLE_COLOUR = (190, 196, 203)
 
 
@@ -73,6 +76,8 @@ class TrackPlayer(PlayedTime):
     ----------
     index : int
         Row that is shown.
+    drop : DropLines
+        From the source at this time to the floor.
     """
 
     def __init__(
@@ -86,19 +91,26 @@ class TrackPlayer(PlayedTime):
         on_row: Sequence[Callable[[int], None]] = (),
         name: str = "/track",
     ) -> None:
-        self.points = points
+        self._server, self.points = server, points
         self._poses, self._on_pose, self._on_row = array_poses, on_pose, on_row
         time = stacked(points, "time_s")
         self._since_first_s = time - time[0]
         self._span_s = float(self._since_first_s[-1])
         positions, self._moments = stacked(points, "position_m", 3), stacked(points, "moment_Am2", 3)
         self._tracked = np.array([point.position_m is not None for point in points])
-        self.whole = screen_lines(server.scene, f"{name}/whole", line_segments(positions), _WHOLE_COLOUR, 1.5)
+        whole = positions[track_segments(positions, 0, len(positions) - 1)]
+        self.whole = screen_lines(server.scene, f"{name}/whole", whole, _WHOLE_COLOUR, 1.0)
         has_any = any(point.covariance is not None for point in points)
         covariances = stacked(points, "covariance", 6, 6)[:, :3, :3] if has_any else None
-        self.glyph = TrackGlyph(server.scene, f"{name}/tail", positions, covariances, size_m=0.15 * size_m)
+        self.glyph = TrackGlyph(
+            server.scene, f"{name}/tail", positions, covariances, size_m=0.15 * size_m, colours=time_colours(time)
+        )
         self.dipole = DipoleGlyph(server.scene, f"{name}/moment", size_m, DIPOLE_COLOUR)
-        self.index = int(np.flatnonzero(self._tracked)[-1]) if self._tracked.any() else 0
+        self.drop = DropLines(server.scene, f"{name}/drop", DIPOLE_COLOUR)
+        self.time_label = screen_label(server.scene, f"{name}/now", "", np.zeros(3), "center-left")
+        tracked = np.flatnonzero(self._tracked)
+        self._ends = {int(row) for row in tracked[[0, -1]]} if tracked.size else set()  # which have times of their own
+        self.index = int(tracked[-1]) if self._tracked.any() else 0
         self._follow = Latest(self._show)
         self._add_panels(server)
         super().__init__(self._span_s, self._follow, self.play_button, self.speed_dropdown, "magloc-track-player")
@@ -138,7 +150,7 @@ class TrackPlayer(PlayedTime):
         self._time = SharedInput(self.time_slider, self._time_moved)
         self.row_buttons.on_click(lambda _: self._step_row(self.row_buttons.value))
         self.tail_slider.on_update(self._follow)
-        self.whole_checkbox.on_update(self._whole_switched)
+        self.whole_checkbox.on_update(self._follow)
 
     def _time_moved(self) -> None:
         self.move_to(float(self.time_slider.value) + 0.5 * self._step_s)
@@ -147,21 +159,41 @@ class TrackPlayer(PlayedTime):
         self.pause()
         self.show_row(self.index + (1 if direction == "next" else -1))
 
-    def _whole_switched(self, *_: object) -> None:
-        self.whole.visible = self.whole_checkbox.value
+    def _show_rest(self, first: int, last: int) -> None:
+        """The thin line before and after the tail, not through it."""
+        positions = self.glyph.positions_m
+        parts = ((0, first), (last, len(positions) - 1))
+        ends = np.concatenate([track_segments(positions, *part) for part in parts])
+        self.whole.visible = self.whole_checkbox.value and bool(len(ends))
+        if len(ends):
+            self.whole.points = positions[ends].astype(np.float32)
 
     def _show(self) -> None:
         index = max(0, int(np.searchsorted(self._since_first_s, self.now_s, side="right")) - 1)
         self.index, point, now = index, self.points[index], float(self._since_first_s[index])
         first = int(np.searchsorted(self._since_first_s, now - self.tail_slider.value - 1e-9 * self._span_s))
-        self.glyph.show_until(index, index - first)
+        with self._server.atomic():
+            self.glyph.show_until(index, index - first)
+            self._show_rest(first, index)
         self.dipole.show(self.glyph.positions_m[index], self._moments[index])
+        self.drop.show(self.glyph.positions_m[index])
+        self.time_label.visible = bool(self._tracked[index]) and index not in self._ends
+        if self.time_label.visible:
+            self.time_label.text, self.time_label.position = f"   {point.time_s:.6g} s", self.glyph.positions_m[index]
         if self._poses is not None and self._on_pose is not None:
             self._on_pose(self._poses[0][index], self._poses[1][index])
         self._time.show(now)
         self.row_panel.content = row_words(point, index, len(self.points))
         for follow in self._on_row:
             follow(index)
+
+
+def time_colours(time_s: FloatArray) -> ByteArray:
+    """Colours (n, 3) of times (n,), evenly from the first to the last."""
+    span = float(time_s[-1] - time_s[0])
+    share = (time_s - time_s[0]) / span if span > 0.0 else np.zeros_like(time_s)
+    # To where it is still seen on white.
+    return np.asarray(colormaps["viridis"](_BRIGHTEST * share, bytes=True)[:, :3], dtype=np.uint8)
 
 
 def row_words(point: TrackPoint, index: int, n_rows: int) -> str:

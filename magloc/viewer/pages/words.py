@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from magloc.viewer.pages.live_fit import Forecast
 from arrays.typing import FloatArray
 
+_FIELD_UNITS = (("mT", 1e-3), ("µT", 1e-6), ("nT", 1e-9), ("pT", 1e-12))
 _POSITIVE, _NEGATIVE = "0,114,178", "213,94,0"
 
 
@@ -24,6 +25,14 @@ def place(position_m: FloatArray) -> str:
     largest = float(np.abs(position_m).max())
     decimals = 3 if largest == 0.0 else max(0, 3 - int(np.floor(np.log10(largest))))
     return f"({', '.join(f'{x:.{decimals}f}' for x in position_m)}) m"
+
+
+def field_text(field_T: float) -> str:
+    """A field with the unit that suits it, such as ``15 µT`` or ``0.2 nT``."""
+    for unit, tesla in _FIELD_UNITS:
+        if field_T >= tesla or (unit == "nT" and field_T >= 0.1 * tesla):
+            return f"{field_T / tesla:.3g} {unit}"
+    return f"{field_T * 1e12:.3g} pT"
 
 
 def range_words(interval_m: tuple[float, float | None], *, observable: bool) -> str:

@@ -8,6 +8,7 @@ Use, inside a tab or folder of the GUI::
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from magloc.viewer.panels.latest import Latest
 
 RAW = "readings"
 DIFFERENCES = "differences from the mean"
+TICKED, ALL = "those ticked", "all"
 # Okabe and Ito, without yellow, which is not seen on white.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#666666")
 _DASHES: dict[str, tuple[float, ...]] = {"x": (), "y": (6.0, 3.0), "z": (2.0, 2.0), "": ()}
@@ -66,8 +68,11 @@ class ReadingsPlot:
         self._server, self._order = server, np.argsort(readings.time_s, kind="stable")
         self._time_s = readings.time_s[self._order] - readings.time_s.min()
         self._channels, self._ids = channels_of(array), array.ids
-        ordered = readings.values_T[self._order]
-        self._values_nT = {RAW: 1e9 * ordered, DIFFERENCES: 1e9 * differences_from_mean(array, ordered)}
+        self._rank = np.argsort(self._order)
+        self._array, self._values_T = array, readings.values_T[self._order]
+        # Long records are thinned once for every choice: the mark that moves is all that changes in between.
+        self._values_nT = lru_cache(maxsize=2)(self._computed_nT)
+        self._thinned = lru_cache(maxsize=4)(self._thinned_lines)
         self._follow = Latest(self._show)
         self.index = 0
         gui = server.gui
@@ -88,6 +93,7 @@ class ReadingsPlot:
                 ),
                 aspect=1.2,
             )
+            self.sensors_dropdown = gui.add_dropdown("Sensors", (TICKED, ALL, *array.ids), hint="or those ticked below")
             with gui.add_folder("Channels", expand_by_default=False):
                 axes = sorted({channel.axis for channel in self._channels if channel.axis})
                 self.axis_checkboxes = {axis: gui.add_checkbox(f"axis {axis}", True) for axis in axes}
@@ -96,6 +102,7 @@ class ReadingsPlot:
                     sensor: gui.add_checkbox(sensor, i < at_first) for i, sensor in enumerate(array.ids)
                 }
         self.kind_dropdown.on_update(self._follow)
+        self.sensors_dropdown.on_update(self._follow)
         for checkbox in (*self.axis_checkboxes.values(), *self.sensor_checkboxes.values()):
             checkbox.on_update(self._follow)
         self._follow()
@@ -115,9 +122,12 @@ class ReadingsPlot:
         return [
             i
             for i, channel in enumerate(self._channels)
-            if self.sensor_checkboxes[channel.sensor].value
-            and (not channel.axis or self.axis_checkboxes[channel.axis].value)
+            if self._is_chosen(channel.sensor) and (not channel.axis or self.axis_checkboxes[channel.axis].value)
         ]
+
+    def _is_chosen(self, sensor: str) -> bool:
+        chosen = self.sensors_dropdown.value
+        return bool(self.sensor_checkboxes[sensor].value) if chosen == TICKED else chosen in (ALL, sensor)
 
     def _show(self) -> None:
         series, data, scales = self._lines(self._chosen())
@@ -134,10 +144,29 @@ class ReadingsPlot:
         self, chosen: list[int]
     ) -> tuple[tuple[uplot.Series, ...], tuple[FloatArray, ...], dict[str, uplot.Scale]]:
         """What uPlot draws: the time, the channels, and the mark; and from where to where."""
-        values = self._values_nT[self.kind_dropdown.value][:, chosen]
-        row = int(np.flatnonzero(self._order == self.index)[0]) if len(self._order) else 0
-        time, shown = thinned(self._time_s, values, _MOST_POINTS)
-        time, shown, mark = with_mark(time, shown, float(self._time_s[row]), values[row])
+        kind = self.kind_dropdown.value
+        series, time, shown, span = self._thinned(kind, tuple(chosen))
+        row = int(self._rank[self.index]) if len(self._rank) else 0
+        time, shown, mark = with_mark(time, shown, float(self._time_s[row]), self._values_nT(kind)[row, chosen])
+        # uPlot finds no range of its own where a number is missing.
+        scales = {
+            "x": uplot.Scale(time=False),
+            "y": uplot.Scale(range=span),
+            "mark": uplot.Scale(range=(0.0, 1.0)),
+        }
+        return series, (time, *shown.T, mark), scales
+
+    def _computed_nT(self, kind: str) -> FloatArray:
+        """Readings (n, C), or their differences, in the order of time."""
+        if kind == RAW:
+            return 1e9 * self._values_T
+        return 1e9 * differences_from_mean(self._array, self._values_T)
+
+    def _thinned_lines(
+        self, kind: str, chosen: tuple[int, ...]
+    ) -> tuple[tuple[uplot.Series, ...], FloatArray, FloatArray, tuple[float, float]]:
+        """Series, times, values (k, chosen) and their span, of no more points than can be seen."""
+        values = self._values_nT(kind)[:, chosen]
         series = [uplot.Series(label="time [s]")]
         for column, i in enumerate(chosen):
             channel = self._channels[i]
@@ -145,13 +174,7 @@ class ReadingsPlot:
             broken = bool(np.isnan(values[:, column]).any())
             series.append(_series(channel, colour, broken=broken))
         series.append(uplot.Series(label="now", scale="mark", stroke="#000000", width=1.5, points={"show": False}))
-        # uPlot finds no range of its own where a number is missing.
-        scales = {
-            "x": uplot.Scale(time=False),
-            "y": uplot.Scale(range=span_of(values)),
-            "mark": uplot.Scale(range=(0.0, 1.0)),
-        }
-        return tuple(series), (time, *shown.T, mark), scales
+        return tuple(series), *thinned(self._time_s, values, _MOST_POINTS), span_of(values)
 
 
 def channels_of(array: SensorArray) -> list[Channel]:

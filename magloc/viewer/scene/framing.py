@@ -16,12 +16,13 @@ _FIELD_OF_VIEW_RAD = np.radians(40.0)
 # From where the first camera looks: from the front right, from above.
 _TOWARDS_CAMERA = np.array([0.55, -0.72, 0.42])
 _ASPECT = 1.15  # of the scene beside the panel, about
-_MARGIN = 1.2
+_MARGIN = 1.12
 _CELLS_PER_RADIUS = 4.0
 _FLOOR_RADII = 3.0
-# Strengths of the lights beside the one from above, which has 3.
-_AMBIENT = 1.8
-_FRONT = 2.0
+_BELOW_RADII = 0.05
+# Strengths of the lights beside the one from above, which has 3: from everywhere, and from each of four sides.
+_AMBIENT = 1.6
+_SIDE = 1.3
 
 
 class Extent(NamedTuple):
@@ -40,6 +41,13 @@ class Extent(NamedTuple):
     centre_m: FloatArray
     radius_m: float
     points_m: FloatArray
+
+
+class Floor(NamedTuple):
+    """Where the floor is [m], and the side of its squares [m]."""
+
+    height_m: float
+    cell_m: float
 
 
 def extent_of(*points_m: ArrayLike) -> Extent:
@@ -65,10 +73,10 @@ def corners_of(centre_m: ArrayLike, half_side_m: float) -> FloatArray:
     return np.asarray(centre_m, dtype=np.float64) + half_side_m * signs
 
 
-def prepare(server: viser.ViserServer, extent: Extent) -> float:
+def prepare(server: viser.ViserServer, extent: Extent) -> Floor:
     """Up direction, light, floor and the first camera.
 
-    ``extent``: what should be in view. Returns: side of the floor's squares [m].
+    ``extent``: what should be in view.
     """
     scene, centre, radius = server.scene, extent.centre_m, extent.radius_m
     scene.set_up_direction("+z")
@@ -77,6 +85,8 @@ def prepare(server: viser.ViserServer, extent: Extent) -> float:
     cell = round_length(radius / _CELLS_PER_RADIUS * 1.5)
     side = 2.0 * np.ceil(_FLOOR_RADII * radius / cell) * cell
     middle = np.round(centre[:2] / cell) * cell
+    lowest = float(extent.points_m[:, 2].min())
+    height = float(np.floor((lowest - _BELOW_RADII * radius) / cell) * cell)
     scene.add_grid(
         "/floor",
         width=side,
@@ -87,20 +97,22 @@ def prepare(server: viser.ViserServer, extent: Extent) -> float:
         section_color=(196, 202, 208),
         shadow_opacity=0.0,
         fade_distance=20.0 * radius,
-        position=(middle[0], middle[1], centre[2] - 0.8 * radius),
+        position=(middle[0], middle[1], height),
     )
     aim(server, extent)
-    return cell
+    return Floor(height, cell)
 
 
 def _light(scene: viser.SceneApi) -> None:
-    """From above, from where the first camera stands, and a little from everywhere."""
+    """From above, and from all sides: nothing is black, wherever it is seen from."""
     # Shadows fall on whatever is near, and say nothing.
     scene.configure_default_lights(enabled=True, cast_shadow=False)
     # The picture of surroundings that viser lights with costs a machine without a graphics card several seconds.
     scene.configure_environment_map(hdri=None)
     scene.add_light_ambient("/lights/everywhere", intensity=_AMBIENT)
-    scene.add_light_directional("/lights/front", intensity=_FRONT, position=tuple(_TOWARDS_CAMERA.tolist()))
+    x, y, z = _TOWARDS_CAMERA.tolist()
+    for i, side in enumerate(((x, y, z), (-x, -y, z), (y, -x, z), (-y, x, z))):
+        scene.add_light_directional(f"/lights/side-{i}", intensity=_SIDE, position=side)
 
 
 def aim(server: viser.ViserServer, extent: Extent) -> None:

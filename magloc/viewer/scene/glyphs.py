@@ -11,19 +11,15 @@ from typing import Literal
 import numpy as np
 import viser
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
 from arrays.meshes import glyph_size, sensor_mesh
 from arrays.sensor import Sensor, SensorKind
 from arrays.typing import ByteArray, FloatArray
 from magloc.viewer.scene.shapes import (
-    CHI2_95,
     NOTHING,
     Surface,
     dipole_body,
-    ellipsoid,
-    ellipsoid_axes,
     field_lines,
     frame_edges,
     line_segments,
@@ -38,8 +34,9 @@ FIELD_LINE_COLOUR: Colour = (230, 159, 0)
 TRACK_COLOUR: Colour = (0, 114, 178)
 REGION_COLOUR: Colour = (86, 180, 233)
 OTHER_COLOUR: Colour = (204, 121, 167)
+ARROW_COLOUR: Colour = (0, 158, 115)
+UNDETECTED_COLOUR: Colour = (165, 165, 165)
 _EDGE_COLOUR: Colour = (150, 156, 165)
-_MOST_ELLIPSOIDS = 40
 
 
 def round_length(length_m: float) -> float:
@@ -49,17 +46,29 @@ def round_length(length_m: float) -> float:
     return float(steps[steps <= length_m * (1.0 + 1e-9)][-1])
 
 
+def length_unit(length_m: float) -> tuple[str, float]:
+    """The unit that suits a length, and how long it is [m]."""
+    for unit, metres, least in (("km", 1e3, 1e3), ("m", 1.0, 0.1), ("cm", 1e-2, 1e-2)):
+        if abs(length_m) >= least * (1.0 - 1e-9):
+            return unit, metres
+    return "mm", 1e-3
+
+
 def length_text(length_m: float) -> str:
     """A length with the unit that suits it, such as ``5 mm``, ``0.5 m`` or ``2 km``."""
     # Not a figure more than it takes, and no exponent.
-    for unit, metres, least in (("km", 1e3, 1e3), ("m", 1.0, 0.1), ("cm", 1e-2, 1e-2), ("mm", 1e-3, 0.0)):
-        if abs(length_m) >= least * (1.0 - 1e-9):
-            return f"{length_m / metres:.3g} {unit}"
-    return f"{length_m:g} m"
+    unit, metres = length_unit(length_m)
+    return f"{length_m / metres:.3g} {unit}"
 
 
 def screen_lines(
-    scene: viser.SceneApi, name: str, segments_m: FloatArray, colour: Colour, width: float, *, visible: bool = True
+    scene: viser.SceneApi,
+    name: str,
+    segments_m: FloatArray,
+    colour: Colour | ByteArray,
+    width: float,
+    *,
+    visible: bool = True,
 ) -> viser.LineSegmentsHandle:
     """Lines (k, 2, 3) that are as wide on the screen from near as from far."""
     return scene.add_line_segments(name, segments_m, colour, thickness=width, thickness_units="screen", visible=visible)
@@ -123,10 +132,6 @@ class ArrayGlyphs:
         self.axes = scene.add_frame(
             f"{name}/axes", axes_length=axes_length, axes_radius=0.012 * axes_length, origin_radius=0.03 * axes_length
         )
-        self.axis_labels = [
-            _label(scene, f"{name}/axes/{axis}", axis, 1.05 * axes_length * np.eye(3)[i], 0.45 * self.size_m)
-            for i, axis in enumerate("xyz")
-        ]
         edges = frame_edges(array.positions)
         self._edges = scene.add_line_segments(f"{name}/bars", edges, _EDGE_COLOUR, thickness=0.08 * self.size_m)
         kinds: tuple[SensorKind, ...] = ("vector", "scalar")
@@ -182,7 +187,7 @@ class ArrayGlyphs:
 
     def name_as_a_whole(self, text: str) -> None:
         """One text for the array in place of the ids of its sensors, where these would be too small to be read."""
-        for label in (*self.labels.values(), *self.axis_labels):
+        for label in self.labels.values():
             label.visible = False
         place = self.array.centroid + np.array([0.0, 0.0, 1.3 * self.array.circumradius])
         screen_label(self._scene, f"{self.frame.name}/name", text, place)
@@ -214,6 +219,8 @@ class DipoleGlyph:
     ----------
     frame : viser.FrameHandle
         At the source, its z axis along the moment.
+    body : viser.MeshHandle
+    field_lines : viser.LineSegmentsHandle, optional
     """
 
     def __init__(
@@ -228,10 +235,11 @@ class DipoleGlyph:
     ) -> None:
         # The moment is the frame's z axis: a turn of the frame turns all that belongs to it.
         self.frame = scene.add_frame(name, show_axes=False, visible=False)
-        solid(scene, f"{name}/body", dipole_body(size_m, thickness_m), colour)
+        self.body = solid(scene, f"{name}/body", dipole_body(size_m, thickness_m), colour)
+        self.field_lines: viser.LineSegmentsHandle | None = None
         if reach_m is not None:
             segments = line_segments(field_lines(np.zeros(3), np.array([0.0, 0.0, 1.0]), reach_m))
-            screen_lines(scene, f"{name}/field-lines", segments, FIELD_LINE_COLOUR, 1.3)
+            self.field_lines = screen_lines(scene, f"{name}/field-lines", segments, FIELD_LINE_COLOUR, 1.3)
         if label:
             # Beside the tip, beyond which there may be the arrow of a control.
             screen_label(scene, f"{name}/text", label, np.array([0.0, 0.0, 0.9 * size_m]), "center-right")
@@ -310,85 +318,6 @@ class SurfaceGlyph:
                 self.mesh = solid(self._scene, self._name, shown, self._colour, opacity=self._opacity)
         self._faces = shown.faces
         self.visible = self._wanted
-
-
-class TrackGlyph:
-    """A track in a scene: its line, 95 % ellipsoids of some of its points, and the place at one time.
-
-    Parameters
-    ----------
-    scene : viser.SceneApi
-    name : str
-        Of the node that holds it all.
-    positions_m : ndarray, shape (n, 3)
-        NaN where the source is not tracked [m].
-    covariances_m2 : ndarray, shape (n, 3, 3), optional
-        Of the positions [m²]; without them there are no ellipsoids.
-    size_m : float
-        Diameter of the mark at one time.
-    colour : tuple of 3 ints
-    """
-
-    def __init__(
-        self,
-        scene: viser.SceneApi,
-        name: str,
-        positions_m: FloatArray,
-        covariances_m2: FloatArray | None = None,
-        *,
-        size_m: float,
-        colour: Colour = TRACK_COLOUR,
-    ) -> None:
-        self.positions_m, self.covariances_m2 = positions_m, covariances_m2
-        self._scene, self._name, self._colour = scene, name, colour
-        self.line = screen_lines(scene, f"{name}/line", line_segments(positions_m), colour, 3.0)
-        self.mark = scene.add_icosphere(
-            f"{name}/mark", radius=0.5 * size_m, color=colour, visible=False, cast_shadow=False, receive_shadow=False
-        )
-        self.region = SurfaceGlyph(scene, f"{name}/region-now", colour, 0.3)
-        self.regions: viser.BatchedMeshHandle | None = None
-        if covariances_m2 is not None:
-            self._add_ellipsoids(covariances_m2)
-
-    def show_until(self, index: int, tail: int) -> None:
-        """Show the track up to a point, which is marked with its ellipsoid, and some intervals before it."""
-        first, position = max(0, index - tail), self.positions_m[index]
-        segments = line_segments(self.positions_m[first : index + 1])
-        self.line.visible = bool(len(segments))
-        if len(segments):
-            self.line.points = segments.astype(np.float32)
-        self.mark.visible = bool(np.isfinite(position).all())
-        if self.mark.visible:
-            self.mark.position = position
-        self.region.show(None if self.covariances_m2 is None else ellipsoid(position, self.covariances_m2[index]))
-        if self.regions is not None:
-            # Those that are not to be seen shrink to nothing: their number cannot change.
-            seen = (self._chosen >= first) & (self._chosen <= index)
-            self.regions.batched_scales = np.where(seen[:, None], self._semi_axes, 0.0).astype(np.float32)
-
-    def _add_ellipsoids(self, covariances_m2: FloatArray) -> None:
-        """One node for all; at most 40, evenly among the points that are tracked."""
-        tracked = np.flatnonzero(
-            np.isfinite(self.positions_m).all(axis=1) & np.isfinite(covariances_m2).all(axis=(1, 2))
-        )
-        if not tracked.size:
-            return
-        self._chosen = tracked[:: int(np.ceil(len(tracked) / _MOST_ELLIPSOIDS))]
-        rotations, self._semi_axes = ellipsoid_axes(covariances_m2[self._chosen])
-        sphere = ellipsoid(np.zeros(3), np.eye(3) / CHI2_95[3])
-        self.regions = self._scene.add_batched_meshes_simple(
-            f"{self._name}/regions",
-            sphere.vertices,
-            sphere.faces,
-            np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=-1),
-            self.positions_m[self._chosen],
-            batched_scales=self._semi_axes,
-            batched_colors=self._colour,
-            opacity=0.18,
-            lod="off",
-            cast_shadow=False,
-            receive_shadow=False,
-        )
 
 
 def screen_label(

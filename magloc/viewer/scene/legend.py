@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from html import escape
 
 Colour = tuple[int, int, int]
+ABOVE_THE_PLAYER = "4em"
+"""Where the legend stands on a page that plays."""
 
 
 @dataclass(frozen=True)
@@ -58,9 +60,15 @@ def legend_html(entries: Sequence[Entry], notes: Sequence[str] = ()) -> str:
 
 
 def with_legend(
-    page: str, title: str, entries: Sequence[Entry], notes: Sequence[str] = (), *, bottom: str = ".8em"
+    page: str,
+    title: str,
+    entries: Sequence[Entry],
+    notes: Sequence[str] = (),
+    *,
+    bottom: str = ".8em",
+    script: str = "",
 ) -> str:
-    """A static page as viser makes it, without a panel, with the title and the legend in its corner."""
+    """A static page as viser makes it, without a panel, with title and legend in its corner, and a script."""
     box = (
         f'<div style="position:fixed;bottom:{bottom};left:.8em;z-index:1000;max-width:19rem;'
         "background:rgba(255,255,255,.9);"
@@ -69,6 +77,8 @@ def with_legend(
         f"{legend_html(entries, notes)}</div>"
     )
     before, end, after = page.rpartition("</body>")
+    if script:
+        box += f"<script>{script}</script>"
     return f"{before}{box}{end}{after}"
 
 

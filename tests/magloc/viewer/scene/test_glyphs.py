@@ -18,12 +18,12 @@ from arrays.sensor import Sensor, SensorKind
 from magloc.localization.fit.results import Fix, Solution
 from magloc.readings import Readings
 from magloc.tracking.results import TrackPoint, TrackResult
-from magloc.viewer.pages import pages
+from magloc.viewer.pages import pages, words
 from magloc.viewer.pages.fixes import FixView
 from magloc.viewer.pages.map import MapControls, MapView
 from magloc.viewer.pages.open_result import MapResult
 from magloc.viewer.panels.inputs import set_value
-from magloc.viewer.scene import framing, shapes
+from magloc.viewer.scene import framing, shapes, track_glyph
 from magloc.viewer.scene import glyphs as scene
 from magloc.viewer.scene.legend import ColourScale, Swatch, legend_html, with_legend
 from magloc.viewer.server import opened
@@ -122,7 +122,7 @@ class TestFloor:
         floors: list[dict[str, Any]] = []
         monkeypatch.setattr(server.scene, "add_grid", lambda name, **how: floors.append({"name": name, **how}))
         points = size * (np.array([7.0, -3.0, 2.0]) + np.random.default_rng(5).uniform(-1.0, 1.0, (30, 3)))
-        cell = framing.prepare(server, framing.extent_of(points))
+        height, cell = framing.prepare(server, framing.extent_of(points))
         (floor,) = floors
         assert floor["name"] == "/floor"
         assert floor["cell_size"] == cell
@@ -132,7 +132,8 @@ class TestFloor:
             assert np.abs(places - middle).max() < half
             for line in (half, middle):  # lines of the floor are at multiples of a square
                 assert line / cell == pytest.approx(round(line / cell), abs=1e-6)
-        assert z < np.median(points[:, 2])
+        assert z == height
+        assert points[:, 2].min() - 1.5 * cell < z < points[:, 2].min()
 
 
 class TestLengths:
@@ -154,7 +155,7 @@ class TestLengths:
         ("field", "expected"), [(1.5e-5, "15 µT"), (1e-9, "1 nT"), (2e-10, "0.2 nT"), (5e-12, "5 pT"), (2e-3, "2 mT")]
     )
     def test_units_suit_the_noise(self, field: float, expected: str) -> None:
-        assert pages.field_text(field) == expected
+        assert words.field_text(field) == expected
 
 
 class TestArray:
@@ -264,7 +265,7 @@ class TestTrack:
     COVARIANCES = np.tile(np.diag([0.04, 0.01, 0.01]), (10, 1, 1))
 
     def test_tail(self, server: viser.ViserServer) -> None:
-        track = scene.TrackGlyph(server.scene, "/t", self.POSITIONS, self.COVARIANCES, size_m=0.1)
+        track = track_glyph.TrackGlyph(server.scene, "/t", self.POSITIONS, self.COVARIANCES, size_m=0.1)
         assert len(track.line.points) == 9
         assert track.line.visible
         assert not track.mark.visible
@@ -277,7 +278,7 @@ class TestTrack:
         assert not track.line.visible
 
     def test_ellipsoids_have_the_axes_of_the_covariance(self, server: viser.ViserServer) -> None:
-        track = scene.TrackGlyph(server.scene, "/t", self.POSITIONS, self.COVARIANCES, size_m=0.1)
+        track = track_glyph.TrackGlyph(server.scene, "/t", self.POSITIONS, self.COVARIANCES, size_m=0.1)
         assert track.regions is not None
         assert np.sort(track.regions.batched_scales[0]) == pytest.approx(
             np.sqrt(7.814728 * np.array([0.01, 0.01, 0.04]))
@@ -286,14 +287,14 @@ class TestTrack:
     def test_rows_that_are_not_tracked_leave_a_gap(self, server: viser.ViserServer) -> None:
         positions = self.POSITIONS.copy()
         positions[5] = np.nan
-        track = scene.TrackGlyph(server.scene, "/t", positions, None, size_m=0.1)
+        track = track_glyph.TrackGlyph(server.scene, "/t", positions, None, size_m=0.1)
         assert len(track.line.points) == 7
         track.show_until(5, tail=5)
         assert not track.mark.visible
 
     def test_many_ellipsoids_are_thinned(self, server: viser.ViserServer) -> None:
         n = 1000
-        track = scene.TrackGlyph(server.scene, "/t", np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)), size_m=0.1)
+        track = track_glyph.TrackGlyph(server.scene, "/t", np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1)), size_m=0.1)
         assert track.regions is not None
         assert len(track.regions.batched_positions) <= 40
 
@@ -511,6 +512,6 @@ class TestSpeed:
         assert calls_of(lambda: long.show_until(1500, 1500)) == calls_of(lambda: short.show_until(15, 15))
 
     @staticmethod
-    def track(server: viser.ViserServer, n: int) -> scene.TrackGlyph:
+    def track(server: viser.ViserServer, n: int) -> track_glyph.TrackGlyph:
         positions = np.cumsum(np.random.default_rng(2).normal(size=(n, 3)), axis=0)
-        return scene.TrackGlyph(server.scene, f"/t{n}", positions, np.tile(np.eye(3), (n, 1, 1)), size_m=0.1)
+        return track_glyph.TrackGlyph(server.scene, f"/t{n}", positions, np.tile(np.eye(3), (n, 1, 1)), size_m=0.1)

@@ -1,0 +1,85 @@
+"""A page as a film: row by row where it has several, else once around what is seen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import viser
+from scipy.spatial.transform import Rotation
+
+from arrays.io.errors import InputError
+from arrays.io.text import replaced
+from arrays.typing import FloatArray
+from magloc.viewer.pages.pages import Page
+from magloc.viewer.server import opened_page
+
+_FORMATS = {".gif": "GIF", ".apng": "PNG"}
+_NO_MP4 = "MP4 is not written, for the encoders that come as Python packages bring code under the GPL"
+_MOST_FRAMES = 60
+_TURN_S = 6.0
+_FILM_PX = (960, 600)
+_PALETTE_OF = 4  # lines, of which one tells the colours
+
+
+def refuse_format(path: Path) -> None:
+    """Refuse a film that cannot be written by its name."""
+    suffix = path.suffix.lower()
+    if suffix not in _FORMATS:
+        why = f": {_NO_MP4}" if suffix == ".mp4" else ""
+        raise InputError(f"Input movie {path}: found a name that ends with {suffix!r}, expected .gif or .apng{why}.")
+
+
+def write_film(
+    server: viser.ViserServer, page: Page, path: Path, progress: Callable[[int], None] | None = None
+) -> None:
+    """Write what a headless Chromium shows as a GIF or an animated PNG; `progress` is called with frames finished."""
+    from PIL import Image
+
+    pictures: list[Image.Image] = []
+    with opened_page(server, _FILM_PX):
+        client = next(iter(server.get_clients().values()))
+        camera = server.initial_camera
+        look_at, fov = np.array(camera.look_at), float(camera.fov)
+        for position in _scenes(page, np.array(camera.position), look_at):
+            wxyz = _looking_at(look_at, position)
+            # The page draws what it was told before it was asked.
+            shot = client.get_render(_FILM_PX[1], _FILM_PX[0], wxyz=wxyz, position=position, fov=fov)
+            pictures.append(Image.fromarray(np.asarray(shot)[..., :3]))
+            if progress is not None:
+                progress(1)
+    kind = _FORMATS[path.suffix.lower()]
+    if kind == "GIF":
+        # One palette of all: colours that changed from frame to frame would seem to mean something.
+        every = Image.fromarray(np.concatenate([np.asarray(picture)[::_PALETTE_OF] for picture in pictures]))
+        palette = every.quantize(256, dither=Image.Dither.NONE)
+        pictures = [picture.quantize(256, palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    seconds = _TURN_S if page.playing is None else page.playing.duration_s
+    options: dict[str, Any] = {"duration": max(20, round(1e3 * seconds / len(pictures))), "loop": 0}
+    try:
+        with replaced(path) as written:
+            pictures[0].save(written, format=kind, save_all=True, append_images=pictures[1:], **options)
+    except OSError as error:
+        raise InputError(f"Input movie {path} cannot be written ({error.strerror}).") from None
+
+
+def _scenes(page: Page, position_m: FloatArray, look_at_m: FloatArray) -> Iterator[FloatArray]:
+    """Show one frame after the other, 60 at most, and give the place of its camera (3,)."""
+    playing = page.playing
+    if playing is not None:
+        for i in np.linspace(0, len(playing.steps) - 1, min(len(playing.steps), _MOST_FRAMES)).round().astype(int):
+            playing.show(playing.steps[i])
+            yield position_m
+        return
+    for angle in np.linspace(0.0, 2.0 * np.pi, _MOST_FRAMES, endpoint=False):
+        yield look_at_m + Rotation.from_rotvec([0.0, 0.0, angle]).apply(position_m - look_at_m)
+
+
+def _looking_at(look_at_m: FloatArray, position_m: FloatArray) -> FloatArray:
+    """Attitude wxyz of a camera whose axes are right, down and ahead, upright."""
+    ahead = look_at_m - position_m
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    axes = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+    return np.roll(Rotation.from_matrix(axes / np.linalg.norm(axes, axis=0)).as_quat(), 1)

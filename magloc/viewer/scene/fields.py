@@ -1,0 +1,111 @@
+"""Fields in a scene: arrows at the sensors, and a plane through a source that is coloured by the field's modulus."""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+from matplotlib import colormaps
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from arrays.typing import ByteArray, FloatArray
+from magloc.fields.dipole import field
+from magloc.viewer.scene.glyphs import Colour
+
+_SCALE = colormaps["viridis"]
+_PIXELS = 160
+_DECADES = 3.0
+_ALPHA = 200
+# Of arrows, in their greatest length.
+_SHAFT, _HEAD, _HEAD_LENGTH = 0.03, 0.08, 0.2
+
+
+class SensorArrows:
+    """Arrows at places of a frame, all to one linear scale: the longest has a given length.
+
+    Parameters
+    ----------
+    scene : viser.SceneApi
+    name : str
+        Of the node; below the frame that places and vectors are in.
+    size_m : float
+        Length of the longest arrow.
+    colour : tuple of 3 ints
+    """
+
+    def __init__(self, scene: viser.SceneApi, name: str, size_m: float, colour: Colour) -> None:
+        self._size_m = size_m
+        self._arrows = scene.add_arrows(
+            name, np.zeros((1, 2, 3), dtype=np.float32), colour, shaft_radius=_SHAFT * size_m,
+            head_radius=_HEAD * size_m, head_length=_HEAD_LENGTH * size_m, visible=False,
+        )  # fmt: skip
+
+    def hide(self) -> None:
+        """Show none."""
+        self._arrows.visible = False
+
+    def show(self, places_m: ArrayLike, vectors: ArrayLike) -> float:
+        """Show vectors (n, 3) at places (n, 3) [m], those that are finite; returns the modulus of the longest."""
+        places, values = np.asarray(places_m, dtype=np.float64), np.asarray(vectors, dtype=np.float64)
+        known = np.isfinite(values).all(axis=1)
+        longest = float(np.linalg.norm(values[known], axis=1).max()) if known.any() else 0.0
+        self._arrows.visible = longest > 0.0
+        if longest > 0.0:
+            ends = places[known] + self._size_m / longest * values[known]
+            self._arrows.points = np.stack([places[known], ends], axis=1).astype(np.float32)
+        return longest
+
+
+class FieldSlice:
+    """A square plane through a source across an axis, coloured by the logarithm of the field's modulus.
+
+    Parameters
+    ----------
+    scene : viser.SceneApi
+    name : str
+        Of the node.
+    side_m : float
+        Of the square.
+    """
+
+    def __init__(self, scene: viser.SceneApi, name: str, side_m: float) -> None:
+        self._side_m = side_m
+        nothing = np.zeros((2, 2, 4), dtype=np.uint8)
+        self._image = scene.add_image(
+            name, nothing, side_m, side_m, format="png", cast_shadow=False, receive_shadow=False, visible=False
+        )
+
+    def hide(self) -> None:
+        """Show none."""
+        self._image.visible = False
+
+    def show(self, positions_m: ArrayLike, moments_Am2: ArrayLike, axis: int) -> tuple[float, float]:
+        """Show the field of sources (k, 3) [m, A·m²] across an axis through the first; returns ends of the scale [T].
+
+        Three decades, up to the field that one pixel in a hundred exceeds.
+        """
+        positions, moments = np.atleast_2d(positions_m), np.atleast_2d(moments_Am2)
+        R = _picture_axes(axis)
+        steps = self._side_m * (np.arange(_PIXELS) + 0.5 - 0.5 * _PIXELS) / _PIXELS
+        points = positions[0] + steps[None, :, None] * R[0] + steps[:, None, None] * R[1]
+        B = np.linalg.norm(field(points[..., None, :], positions, moments).sum(axis=-2), axis=-1)
+        high = float(np.nanquantile(B, 0.99))
+        low = high * 10.0**-_DECADES
+        self._image.image = _coloured(np.log10(B / low) / _DECADES)
+        self._image.position = positions[0]
+        self._image.wxyz = np.roll(Rotation.from_matrix(R.T).as_quat(), 1)
+        self._image.visible = True
+        return low, high
+
+
+def _picture_axes(axis: int) -> FloatArray:
+    """Across, down and out of a picture (3, 3), one a row; right-handed."""
+    across, down = ((1, 2), (2, 0), (0, 1))[axis]
+    return np.eye(3)[[across, down, axis]]
+
+
+def _coloured(share: FloatArray) -> ByteArray:
+    """Shares of the scale as colours (..., 4); what is not known is transparent."""
+    colours = _SCALE(np.clip(np.nan_to_num(share), 0.0, 1.0), bytes=True)
+    colours[..., 3] = np.where(np.isfinite(share), _ALPHA, 0)
+    return np.asarray(colours, dtype=np.uint8)

@@ -1,0 +1,123 @@
+"""A track in a scene, coloured by time: as many points as an eye can tell, however long it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from arrays.typing import ByteArray, FloatArray
+from magloc.viewer.scene.glyphs import TRACK_COLOUR, Colour, SurfaceGlyph, screen_lines
+from magloc.viewer.scene.shapes import CHI2_95, ellipsoid, ellipsoid_axes
+
+_MOST_ELLIPSOIDS = 40
+_MOST_SEGMENTS = 1000
+
+
+class TrackGlyph:
+    """A track in a scene: its line, 95 % ellipsoids of some of its points, and the place at one time.
+
+    Parameters
+    ----------
+    scene : viser.SceneApi
+    name : str
+        Of the node that holds it all.
+    positions_m : ndarray, shape (n, 3)
+        NaN where the source is not tracked [m].
+    covariances_m2 : ndarray, shape (n, 3, 3), optional
+        Of the positions [m²]; without them there are no ellipsoids.
+    size_m : float
+        Diameter of the mark at one time.
+    colour : tuple of 3 ints
+        Of mark and ellipsoids.
+    colours : ndarray of uint8, shape (n, 3), optional
+        Of the line at every point; by default it has one colour.
+    """
+
+    def __init__(
+        self,
+        scene: viser.SceneApi,
+        name: str,
+        positions_m: FloatArray,
+        covariances_m2: FloatArray | None = None,
+        *,
+        size_m: float,
+        colour: Colour = TRACK_COLOUR,
+        colours: ByteArray | None = None,
+    ) -> None:
+        self.positions_m, self.covariances_m2 = positions_m, covariances_m2
+        self._scene, self._name, self._colour = scene, name, colour
+        every = np.tile(np.array(colour, dtype=np.uint8), (len(positions_m), 1)) if colours is None else colours
+        self._colours = linear(every)
+        ends = track_segments(positions_m, 0, len(positions_m) - 1)
+        self.line = screen_lines(scene, f"{name}/line", positions_m[ends], self._colours[ends], 4.0)
+        self.mark = scene.add_icosphere(
+            f"{name}/mark", radius=0.5 * size_m, color=colour, visible=False, cast_shadow=False, receive_shadow=False
+        )
+        self.region = SurfaceGlyph(scene, f"{name}/region-now", colour, 0.3)
+        self.regions: viser.BatchedMeshHandle | None = None
+        if covariances_m2 is not None:
+            self._add_ellipsoids(covariances_m2)
+
+    def show_until(self, index: int, tail: int) -> None:
+        """Show the track up to a point, which is marked with its ellipsoid, and some intervals before it.
+
+        What changes belongs together: to be called where the server is atomic.
+        """
+        first, position = max(0, index - tail), self.positions_m[index]
+        ends = track_segments(self.positions_m, first, index)
+        self.line.visible = bool(len(ends))
+        if len(ends):
+            self.line.points, self.line.colors = self.positions_m[ends].astype(np.float32), self._colours[ends]
+        self.mark.visible = bool(np.isfinite(position).all())
+        if self.mark.visible:
+            self.mark.position = position
+        self.region.show(None if self.covariances_m2 is None else ellipsoid(position, self.covariances_m2[index]))
+        if self.regions is not None:
+            # Those that are not to be seen shrink to nothing: their number cannot change.
+            seen = (self._chosen >= first) & (self._chosen <= index)
+            self.regions.batched_scales = np.where(seen[:, None], self._semi_axes, 0.0).astype(np.float32)
+
+    def _add_ellipsoids(self, covariances_m2: FloatArray) -> None:
+        """One node for all; at most 40, evenly among the points that are tracked."""
+        tracked = np.flatnonzero(
+            np.isfinite(self.positions_m).all(axis=1) & np.isfinite(covariances_m2).all(axis=(1, 2))
+        )
+        if not tracked.size:
+            return
+        self._chosen = tracked[:: int(np.ceil(len(tracked) / _MOST_ELLIPSOIDS))]
+        rotations, self._semi_axes = ellipsoid_axes(covariances_m2[self._chosen])
+        sphere = ellipsoid(np.zeros(3), np.eye(3) / CHI2_95[3])
+        self.regions = self._scene.add_batched_meshes_simple(
+            f"{self._name}/regions",
+            sphere.vertices,
+            sphere.faces,
+            np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=-1),
+            self.positions_m[self._chosen],
+            batched_scales=self._semi_axes,
+            batched_colors=self._colour,
+            opacity=0.18,
+            lod="off",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+
+def linear(colours: ByteArray) -> ByteArray:
+    """Colours as the page wants those of single vertices, which it takes for linear intensities (sRGB undone)."""
+    share = colours / 255.0
+    intensity = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return np.rint(255.0 * intensity).astype(np.uint8)
+
+
+def track_segments(positions_m: FloatArray, first: int, last: int) -> NDArray[np.intp]:
+    """Ends (k, 2) of the segments of a track from one of its points (n, 3) to another: 1000 segments at most, evenly.
+
+    None leads over a point that is not finite.
+    """
+    chosen = np.unique(np.linspace(first, last, min(last - first, _MOST_SEGMENTS) + 1).round().astype(np.intp))
+    missing = np.cumsum(~np.isfinite(positions_m).all(axis=1))
+    ends = np.stack([chosen[:-1], chosen[1:]], axis=1)
+    known = np.isfinite(positions_m[ends]).all(axis=(1, 2)) & (missing[ends[:, 0]] == missing[ends[:, 1]])
+    return ends[known]
