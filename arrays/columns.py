@@ -7,9 +7,10 @@ east, north, up of an origin, and yaw, pitch and roll a quaternion. Columns that
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from os import PathLike
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -20,9 +21,6 @@ from arrays.io.errors import InputError, of_extra
 from arrays.io.text import read_text
 from arrays.io.toml import RefusalError, Table, one_of
 from arrays.typing import FloatArray, Vector
-
-if TYPE_CHECKING:
-    from arrays.array import SensorArray
 
 _NANOTESLA = {"nT": 1.0, "uT": 1e3, "µT": 1e3, "mT": 1e6, "T": 1e9, "mG": 1e2, "G": 1e5}
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "iso": 1.0}
@@ -138,12 +136,14 @@ def _toml(value: object) -> str:
     return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)
 
 
-def read_log(path: str | PathLike[str], array: SensorArray, expected: str) -> CsvTable:
-    """Table of a readings file, or of a log whose columns the array names; ``expected`` is what such a file has."""
-    if (columns := array.columns) is None:
+def read_log(
+    path: str | PathLike[str], channels: Mapping[str, Sequence[str]], columns: LogColumns | None, expected: str
+) -> CsvTable:
+    """Table of a readings file, or of a log, with the columns ``channels`` of every sensor."""
+    if columns is None:
         return read_table(path, expected)
-    named = _named(array, columns)
-    own = {name for channels in _channels(array).values() for name in channels}
+    named = _named(channels, columns)
+    own = {name for of_sensor in channels.values() for name in of_sensor}
     known = {"time_s", *own, *_POSITION, *_TURN}
     text = read_text(path, "a CSV file")
     table = table_of_text(
@@ -168,15 +168,9 @@ def read_log(path: str | PathLike[str], array: SensorArray, expected: str) -> Cs
     return CsvTable(table.path, tuple(kept), table.header_line, values, table.line_numbers)
 
 
-def _channels(array: SensorArray) -> dict[str, list[str]]:
-    """Columns of every sensor in a readings file."""
-    return {sensor.id: [f"{channel}_nT" for channel in sensor.channel_names] for sensor in array.sensors}
-
-
-def _named(array: SensorArray, columns: LogColumns) -> dict[str, str]:
+def _named(channels: Mapping[str, Sequence[str]], columns: LogColumns) -> dict[str, str]:
     """What each column that the table names is for, or ``_latitude`` and so on."""
     named = {"time_s": columns.time}
-    channels = _channels(array)
     for sensor, theirs in columns.sensors.items():
         ours, names = channels.get(sensor, []), [theirs] if isinstance(theirs, str) else list(theirs)
         if len(ours) != len(names):

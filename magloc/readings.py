@@ -265,7 +265,7 @@ def read_readings(
     >>> magloc.read_readings(board.path, board.array).values_T.shape
     (101, 90)
     """
-    table = read_log(path, array, EXPECTED_HEADER)
+    table = read_log(path, {of.id: _columns_of(of) for of in array.sensors}, array.columns, EXPECTED_HEADER)
     readings = readings_of_table(table, array, sensors)
     if ordered:
         table.refuse_back("time_s", ~(np.diff(readings.time_s) > 0.0), "time to increase from row to row", "{:.15g}")

@@ -50,10 +50,13 @@ def detumbling(
     """
     from sims import experiments
 
-    for name, value, most in (("--rate-deg-s", rate_deg_s, 30.0), ("--duration", duration, _LONGEST_S)):
-        if not 0.0 < value <= most:
-            raise InputError(f"{name}: found {value:g}, expected more than 0 and at most {most:g}.")
-    for name, value, most in (("--moment-Am2", moment_Am2, 100.0), ("--duty", duty, 1.0)):
+    if not 1.0 <= duration <= _LONGEST_S:
+        raise InputError(f"--duration: found {duration:g}, expected 1 to {_LONGEST_S:g}.")
+    for name, value, most in (
+        ("--rate-deg-s", rate_deg_s, 30.0),
+        ("--moment-Am2", moment_Am2, 100.0),
+        ("--duty", duty, 1.0),
+    ):
         if not 0.0 < value <= most:
             raise InputError(f"{name}: found {value:g}, expected more than 0 and at most {most:g}.")
     with progress(round(duration) + 1, "seconds", quiet=common.quiet) as advanced:

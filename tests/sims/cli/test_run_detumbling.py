@@ -28,7 +28,8 @@ def test_too_short_is_null(adcs):
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("--rate-deg-s", "0"), ("--duty", "1.5"), ("--moment-Am2", "-1"), ("--duration", "1e9")]
+    ("option", "value"),
+    [("--rate-deg-s", "0"), ("--duty", "1.5"), ("--moment-Am2", "-1"), ("--duration", "1e9"), ("--duration", "1e-9")],
 )
 def test_refused(adcs, option, value):
     assert_refused(adcs("run", "detumbling", option, value), option, "expected more than 0")
