@@ -63,7 +63,8 @@ def loads(
     log = read_load_log(readings, sensors, [name.strip() for name in loads.split(",") if name.strip()])
     with naming(str(readings)):
         own = adcs.find_own_fields(sensors, log.readings_T, log.time_s, log.gyro_rad_s, log.states, window_s=window_s)
-    located = own.located() if sensors.n_sensors >= _LEAST_SENSORS else {}
+    with naming(str(array)):
+        located = own.located() if sensors.n_sensors >= _LEAST_SENSORS else {}
     if out is not None:
         clean_nT = 1e9 * own.subtracted(log.readings_T, log.states)
         write_columns(log.columns | dict(zip(channel_columns(sensors), clean_nT.T, strict=True)), out)

@@ -188,7 +188,8 @@ def _frames(
             "beyond it, stars cannot be told apart."
         )
     if rad_per_px is not None:
-        camera = replace(camera, rad_per_px=rad_per_px)
+        with naming("--scale-arcsec"):
+            camera = replace(camera, rad_per_px=rad_per_px)
     ended = [time.perf_counter()]
     with progress(len(images), "frames", quiet=common.quiet) as advance:
 

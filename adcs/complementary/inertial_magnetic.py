@@ -28,6 +28,7 @@ _REST_ACCELERATION_M_S2 = 0.15
 _LAG_WINDOW_S = 0.2
 _LONGEST_LAG_S = 0.04
 _USUAL_LENGTH = 0.1  # relative difference of a field's length
+_LARGEST = {"rate_rad_s": 1e4, "acceleration_m_s2": 1e6, "field_T": 1.0}  # of a reading: more is something else
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +66,8 @@ class InertialMagneticRecord:
             values = np.asarray(getattr(self, name), dtype=np.float64)
             if values.shape != shape or np.isinf(values).any():
                 raise ValueError(f"Input {name} must be finite, of shape {shape}; instead received {values.shape}.")
+            if np.nanmax(np.abs(values), initial=0.0) > _LARGEST[name]:
+                raise ValueError(f"Input {name} must not exceed {_LARGEST[name]:g}; instead received more.")
             if not np.isfinite(values[self.starting]).all(axis=1).any():
                 raise ValueError(f"Input {name} must have a reading within the first second; instead received none.")
             if name != "rate_rad_s" and (values == 0.0).all(axis=1).any():

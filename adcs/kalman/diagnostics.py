@@ -284,7 +284,8 @@ def unseen_torque_Nm(record: Record, estimates: AttitudeTracks, run: int) -> Map
     for period_s in PERIODS_S:
         w = 2.0 * math.pi / period_s
         of_period = information + np.eye(3) * (used.gyro * (w / sigma[1]) ** 2)
-        sigma_rad = 1.0 / math.sqrt(float(np.linalg.eigvalsh(of_period)[0]))
+        exact = not np.isfinite(of_period).all()
+        sigma_rad = 0.0 if exact else 1.0 / math.sqrt(float(np.linalg.eigvalsh(of_period)[0]))
         torque[period_s] = SEEN * sigma_rad * w**2 * largest
     return torque
 

@@ -265,6 +265,14 @@ def _projected(
     return A, y
 
 
+def _inverse(normal: FloatArray) -> FloatArray:
+    """Of a positive definite matrix, which the result is too, whatever rounding has left of its least eigenvalues."""
+    scale = 1.0 / np.sqrt(np.diagonal(normal))
+    values, vectors = np.linalg.eigh(scale[:, None] * normal * scale)
+    root = scale[:, None] * vectors / np.sqrt(np.maximum(values, np.finfo(float).eps * values[-1]))
+    return np.asarray(root @ root.T)
+
+
 def _regression(
     windows: Sequence[tuple[FloatArray, FloatArray]], loads: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -275,7 +283,7 @@ def _regression(
     # The prior in units of a noise that is not known yet, twice: the second time it is.
     noise = np.full(y.shape[1], np.sqrt(np.mean(y**2)))
     for _ in range(2):
-        inverse = [np.linalg.inv(normal + np.eye(len(normal)) * (one / _PRIOR_T) ** 2) for one in noise]
+        inverse = [_inverse(normal + np.eye(len(normal)) * (one / _PRIOR_T) ** 2) for one in noise]
         x = np.stack([of_one @ (A.T @ column) for of_one, column in zip(inverse, y.T, strict=True)], axis=1)
         noise = np.sqrt(np.sum((y - A @ x) ** 2, axis=0) / dof)
     sigma = np.stack([one * np.sqrt(np.diagonal(of_one)) for one, of_one in zip(noise, inverse, strict=True)], axis=1)

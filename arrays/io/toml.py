@@ -224,6 +224,8 @@ def _check_value(where: str, value: Any, rules: tuple[Rule, ...]) -> None:
         raise InputError(f"{where}: found {value:g}, expected a number of {LARGEST:g} at most.")
     for rule in rules:
         if not rule.holds(value):
+            if isinstance(value, int) and value.bit_length() > 1000:
+                value = math.inf if value > 0 else -math.inf
             found = repr(value) if isinstance(value, str) else f"{value:g}"
             raise InputError(f"{where}: found {found}, expected {rule.expected}.")
 

@@ -43,7 +43,7 @@ def refuse_not_positive(options: object, *names: str, expected: str = "a positiv
     """Refuse an option that is given and not positive, or endless, by the names of the fields that hold them."""
     for name in names:
         value = getattr(options, name)
-        if value is not None and not 0.0 < value <= LARGEST:
+        if value is not None and not 1.0 / LARGEST <= value <= LARGEST:
             raise InputError(f"--{name.replace('_', '-')}: found {value:g}, expected {expected}.")
 
 

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 _LOG = logging.getLogger(__name__)
+_LONGEST_BODY_M = 1e4
 _ROWS_AT_ONCE = 256
 # A search for several sources, or by moduli, takes its rows in smaller blocks.
 _ROWS_OF_SEVERAL = 64
@@ -97,8 +98,10 @@ class Locator:
         exclude_faulty: bool = True,
         seed: int = 0,
     ) -> None:
-        if body_length_m is not None and not 0.0 <= body_length_m < np.inf:
-            raise ValueError(f"Input body_length_m must not be negative; instead received {body_length_m:g}.")
+        if body_length_m is not None and not 0.0 <= body_length_m <= _LONGEST_BODY_M:
+            raise ValueError(
+                f"Input body_length_m must be from 0 to {_LONGEST_BODY_M:g} m; instead received {body_length_m:g}."
+            )
         if position_m is not None and sources != 1:
             raise ValueError(f"Input sources must be 1 where position_m is known; instead received {sources}.")
         self.array = array

@@ -12,6 +12,7 @@ from scipy.ndimage import maximum_filter1d, median_filter
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
 from magloc.measurement.pose import PoseErrors, with_stated_pose
+from magloc.measurement.rows import check_magnitudes
 from magloc.readings import Readings, without_saturated
 from magloc.surveying.pose_components import UNSTATED
 from magloc.surveying.record import SurveyRecord
@@ -27,6 +28,7 @@ def whole_rows(array: SensorArray, readings: Readings) -> tuple[SensorArray, Rea
     """Rows where all sensors read, without the sensors that would cost more rows than they are worth."""
     if readings.array_rotation is None:
         raise ValueError("Input readings must have the pose of the array in every row; instead received none.")
+    check_magnitudes(array)
     readings = without_saturated(readings, array)
     stuck = stuck_readings(array, readings.values_T)
     owner = array.channel_sensor

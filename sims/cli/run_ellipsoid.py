@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from sims.experiments.ellipsoid import EllipsoidRuns, EllipsoidSettings
 
 JUMP_S = 2000.0
+_LEAST_DEG = 1e-9
 _RUNS_AT_ONCE = 500  # 90 MB of an orbit
 
 
@@ -65,8 +66,8 @@ class EllipsoidOptions:
         from adcs.ellipsoids.roll_yaw import STEP_S
 
         for name, value in (("--noise-deg", self.noise_deg), ("--drift-deg-s", self.drift_deg_s)):
-            if not 0.0 < value <= LARGEST:
-                raise InputError(f"{name}: found {value:g}, expected a positive number.")
+            if not _LEAST_DEG <= value <= LARGEST:
+                raise InputError(f"{name}: found {value:g}, expected {_LEAST_DEG:g} or more.")
         if not STEP_S <= self.duration <= 1e7:
             raise InputError(f"--duration: found {self.duration:g} s, expected {STEP_S:g} to 1e7 s.")
         if self.jump and self.duration <= JUMP_S:

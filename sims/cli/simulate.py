@@ -43,6 +43,8 @@ def simulate(
     from sims.magnetics.scenario_files import read_scenario
     from sims.magnetics.simulation import simulate as simulated
 
+    if not out.name:
+        raise InputError(f"--out: found {out}, expected the name of a file.")
     wanted = read_scenario(scenario)
     for path in files_beside(out, len(wanted.sources), has_targets=wanted.targets is not None).all:
         refuse_unwritable(path, "--out")

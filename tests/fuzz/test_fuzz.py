@@ -50,6 +50,29 @@ def test_mangled(chunk, files, tmp_path):
     assert not found, "\n\n".join(found)
 
 
+@pytest.mark.parametrize(
+    ("line", "word"),
+    [
+        ("magloc locate moving.csv --array moving-array.toml --body-length-m 1e155", "body"),
+        ("magloc locate scalar.csv --array scalar.toml --known-moment-Am2 1e155", "known"),
+        ("magloc simulate ground.toml --out /", "--out"),
+        ("magloc calibrate readings.csv --array array.toml --out out.toml --offset-prior-nT 5e-324", "--offset-prior"),
+        ("adcs run ellipsoid --duration 300 --seeds 1 --noise-deg 5e-324", "--noise-deg"),
+        ("adcs run ellipsoid --closed-loop --duration 300 --seeds 1 --drift-deg-s 1e-300", "--drift-deg-s"),
+        ("adcs run mockup --part sky --poses 1 --sky sky.toml --believed-k1 1e308", "--believed-k1"),
+        ("adcs run detumbling --seeds 1 --duration 1e-300", "--duration"),
+        ("adcs stars frames --catalogue stars.csv --scale-arcsec 1e-300", "--scale-arcsec"),
+    ],
+)
+def test_what_was_found(line, word, files, tmp_path):
+    program, *words = line.split()
+    read_files([name for name in words if name != "/"], files, tmp_path / "case")
+    ended = run_case(Case(program, words, b""), tmp_path / "case")
+    assert (ended.status, ended.trace) == (2, "")
+    assert word in ended.err
+    assert len(ended.err.splitlines()) == 1
+
+
 @pytest.mark.parametrize("part", [pytest.param(i, marks=[pytest.mark.slow] if i else []) for i in range(PARTS // 10)])
 def test_extremes(part, files, tmp_path):
     """Each number of each file, and each option, at 1e30, 1e-30, 0, -1, NaN and infinity."""

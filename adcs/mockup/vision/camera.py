@@ -15,6 +15,7 @@ from arrays.typing import BoolArray, FloatArray
 
 REFERENCE_RADIUS_PX = 320.0
 """Radius at which the lens moves a light by k1 of its distance to the optical centre."""
+_LARGEST_K1 = 1e6
 _NO_LENS = 1e-17  # less is lost in rounding, and the closed form of the inverse would overflow
 
 
@@ -96,7 +97,7 @@ class Camera:
             raise ValueError(f"Input centre_px must be two finite numbers; instead received {self.centre_px}.")
         object.__setattr__(self, "centre_px", (float(centre[0]), float(centre[1])))
         corners = np.array([[x, y] for x in (0, self.width_px - 1) for y in (0, self.height_px - 1)])
-        if not math.isfinite(self.k1) or np.isnan(undistorted(self, corners)).any():
+        if not abs(self.k1) < _LARGEST_K1 or np.isnan(undistorted(self, corners)).any():
             raise ValueError(f"Input k1 must leave each pixel its own place; instead received {self.k1}.")
 
     @property

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from arrays.io.errors import LARGEST
 from arrays.typing import BoolArray, FloatArray
 from magloc.measurement.known_moment import KnownMoment
 
@@ -70,12 +71,12 @@ class SourcePrior:
         value = np.atleast_1d(np.asarray(self.known_moment_Am2, dtype=np.float64))
         if (
             value.shape not in ((1,), (3,))
-            or not 0.0 < np.linalg.norm(value) < math.inf
+            or not 0.0 < np.abs(value).max() <= LARGEST
             or value[0] <= 0.0 == value.size - 1
         ):
             raise ValueError(
-                "Input known_moment_Am2 must be a positive number or three numbers, not all zero; instead received"
-                f" {self.known_moment_Am2}."
+                f"Input known_moment_Am2 must be a positive number up to {LARGEST:g} or three numbers, not all zero;"
+                f" instead received {self.known_moment_Am2}."
             )
         sigma = self.known_moment_sigma_Am2
         if sigma is not None and not 0.0 < sigma < math.inf:

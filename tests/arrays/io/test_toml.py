@@ -164,3 +164,8 @@ def test_built_in_files_and_others(tmp_path: Path) -> None:
     assert files.read(str(own)) == (str(own), {"a": 1})
     with pytest.raises(InputError, match="none does not exist, expected a scenario file, or one of the built-in scen"):
         files.read("none")
+
+
+def test_an_integer_beyond_all_floats_is_refused(tmp_path):
+    with pytest.raises(InputError, match="format_version: found inf, expected 1"):
+        read(tmp_path, f"format_version = 1{'0' * 400}")

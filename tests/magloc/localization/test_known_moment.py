@@ -155,7 +155,7 @@ class TestKnownVector:
 class TestRefused:
     @pytest.mark.parametrize("value", [0.0, -1.0, (0.0, 0.0, 0.0), (1.0, 2.0)])
     def test_a_moment_that_is_none(self, value):
-        with pytest.raises(ValueError, match="known_moment_Am2 must be a positive number or three"):
+        with pytest.raises(ValueError, match="known_moment_Am2 must be a positive number"):
             magloc.SourcePrior(known_moment_Am2=value)
 
     def test_a_sigma_that_is_none(self):

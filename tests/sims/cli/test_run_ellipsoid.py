@@ -151,12 +151,12 @@ class TestFiles:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"noise_deg": 0.0}, "--noise-deg: found 0, expected a positive number."),
-        ({"noise_deg": 1e308}, "--noise-deg: found 1e.308, expected a positive number."),
-        ({"drift_deg_s": 1e308}, "--drift-deg-s: found 1e.308, expected a positive number."),
-        ({"noise_deg": -1.0}, "--noise-deg: found -1, expected a positive number."),
-        ({"noise_deg": math.nan}, "--noise-deg: found nan, expected a positive number."),
-        ({"drift_deg_s": 0.0}, "--drift-deg-s: found 0, expected a positive number."),
+        ({"noise_deg": 0.0}, "--noise-deg: found 0, expected 1e-09 or more."),
+        ({"noise_deg": 1e308}, "--noise-deg: found 1e.308, expected 1e-09 or more."),
+        ({"drift_deg_s": 1e308}, "--drift-deg-s: found 1e.308, expected 1e-09 or more."),
+        ({"noise_deg": -1.0}, "--noise-deg: found -1, expected 1e-09 or more."),
+        ({"noise_deg": math.nan}, "--noise-deg: found nan, expected 1e-09 or more."),
+        ({"drift_deg_s": 0.0}, "--drift-deg-s: found 0, expected 1e-09 or more."),
         ({"duration": 1.0}, "--duration: found 1 s, expected 2 to 1e7 s."),
         ({"jump": True, "duration": 1000.0}, "--duration: found 1000 s, expected more than the 2000 s of --jump."),
         ({"seed": -1}, "--seed: found -1, expected 0 or more."),
