@@ -10,7 +10,9 @@ only.
 
 from __future__ import annotations
 
+import gzip
 import threading
+from functools import lru_cache
 from http import HTTPStatus
 from typing import Any
 
@@ -34,6 +36,30 @@ def comes_from_outside(headers: Headers) -> bool:
     return origins != [f"http://{hosts[0]}"] and not (may_be_silent and not origins)
 
 
+# Until it has connected, viser's page says that it is inactive, as if nothing were to come.
+_CONNECTING = """<style>.tabler-icon-player-pause { display: none; }</style>
+<script>
+const waiting = setInterval(() => {
+  const said = document.evaluate("//text()[. = 'Inactive']", document, null, 6, null);
+  for (let i = 0; i < said.snapshotLength; i++) said.snapshotItem(i).data = "Connecting…";
+}, 30);
+setTimeout(() => clearInterval(waiting), 60000);
+</script>
+""".encode()
+
+
+def _say_what_it_waits_for(page: Response) -> None:
+    """Let a page of viser say that it is connecting."""
+    page.body = _with_words(bytes(page.body), page.headers.get("Content-Encoding") == "gzip")
+    del page.headers["Content-Length"]
+    page.headers["Content-Length"] = str(len(page.body))
+
+
+@lru_cache(maxsize=4)
+def _with_words(body: bytes, compressed: bool) -> bytes:
+    return gzip.compress(gzip.decompress(body) + _CONNECTING) if compressed else body + _CONNECTING
+
+
 def guarded_server(**options: Any) -> viser.ViserServer:
     """A server of viser that answers its own page only, whatever asks.
 
@@ -50,6 +76,8 @@ def guarded_server(**options: Any) -> viser.ViserServer:
                 return connection.respond(HTTPStatus.FORBIDDEN, "Only the viewer's own page is answered.\n")
             reply: Response | None = process_request(connection, request)
             if reply is not None:
+                if reply.headers.get("Content-Type", "").startswith("text/html"):
+                    _say_what_it_waits_for(reply)
                 reply.headers["Content-Security-Policy"] = (
                     f"connect-src 'self' ws://{request.headers['Host']} data: blob:; "
                     f"frame-ancestors 'self' {' '.join(f'http://{name}:*' for name in NAMES)}"

@@ -56,3 +56,8 @@ class TestReadings:
             Sight("sensor", camera.pixels(ARRAY.positions), dark_grey, share=0.75),
         )
         screen.keep("readings")
+
+    def test_what_is_not_connected_yet_says_so(self, screen: Screen, server: viser.ViserServer) -> None:
+        """viser's page says "Inactive" until it has connected."""
+        screen.evaluate("document.body.append(Object.assign(document.createElement('p'), {innerText: 'Inactive'}))")
+        screen.until(lambda: "Connecting…" in screen.text() and "Inactive" not in screen.text(), "it connects")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import gzip
 import http.client
 import socket
 from collections import deque
@@ -114,6 +115,19 @@ class TestWhoIsAnswered:
         assert f"connect-src 'self' ws://{here} data: blob:;" in headers["Content-Security-Policy"]
         assert "frame-ancestors 'self'" in headers["Content-Security-Policy"]
         assert "Access-Control-Allow-Origin" not in headers
+
+    @pytest.mark.parametrize("compressed", [False, True])
+    def test_page_says_that_it_connects(self, server: viser.ViserServer, compressed: bool) -> None:
+        """What is served is viser's page and ours after it, as long as it says, however it is packed."""
+        connection = http.client.HTTPConnection("127.0.0.1", server.get_port(), timeout=WAIT_S)
+        connection.request("GET", "/", headers={"Accept-Encoding": "gzip" if compressed else "identity"})
+        reply = connection.getresponse()
+        body = reply.read()
+        connection.close()
+        assert int(reply.headers["Content-Length"]) == len(body)
+        page = (gzip.decompress(body) if compressed else body).decode()
+        assert page.startswith("<!doctype html>")
+        assert page.count("Connecting…") == 1
 
     def test_no_endless_message(self, server: viser.ViserServer) -> None:
         with client(server) as websocket:
