@@ -171,7 +171,6 @@ def iterated_update(
     tolerance: float,
     max_iterations: int = 50,
     shrink: float = 1.0,
-    prior: Callable[[FloatArray], tuple[FloatArray, FloatArray]] | None = None,
 ) -> IteratedUpdate:
     r"""Iterated extended Kalman update with the paper's stop rule.
 
@@ -205,20 +204,19 @@ def iterated_update(
     """
     x_k, predicted = x, Hx(x)
     innovation = z - predicted
-    S_k, root, H, linearised = S, S, np.zeros((len(z), len(x))), innovation
+    S_k, H, linearised = S, np.zeros((len(z), len(x))), innovation
     iteration, change, length = 0, np.inf, 1.0
     while iteration < max_iterations and np.isfinite(predicted).all() and not change < tolerance:
         iteration += 1
         H = HJacobian(x_k)
-        mean, root = (x, S) if prior is None else prior(x_k)
-        linearised = z - predicted - H @ (mean - x_k)
-        optimum, S_k = block_update(mean, root, H, linearised, variance)
+        linearised = z - predicted - H @ (x - x_k)
+        optimum, S_k = block_update(x, S, H, linearised, variance)
         x_k = optimum if length == 1.0 else x_k + length * (optimum - x_k)
         before, predicted = predicted, Hx(x_k)
         change_before, change = change, float(np.linalg.norm(predicted - before)) / length
         if change >= change_before:
             length *= shrink
-    whitened = whitened_innovation(root, H, linearised, variance)
+    whitened = whitened_innovation(S, H, linearised, variance)
     nis = float(whitened @ whitened)
     return IteratedUpdate(x_k, S_k, iteration, change < tolerance, innovation, nis, whitened)
 

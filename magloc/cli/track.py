@@ -160,8 +160,8 @@ def track(
 ) -> None:
     """Follow one source through time.
 
-    The track starts by itself from the first row whose fix is certain, is updated by every row, and ends where the
-    readings contradict it three times in a row or its range is no longer known; then it starts anew. Rows where the
+    The track starts by itself from the first row that shows a source, is updated by every row, and ends where the
+    readings contradict it three times in a row or its place is no longer known; then it starts anew. Rows where the
     source is not tracked are null. With --position or --object-path the source is where they say, and its moment alone
     is followed from the first row that determines it.
 

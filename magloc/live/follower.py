@@ -42,7 +42,7 @@ class LivePoint(TrackPoint):
     ----------
     time_s, position_m, moment_Am2, covariance, estimability, iterations
         As of every point of a track.
-    nis, nis_dof, status, weight, rivals, centroid_m, radius_m, lag1
+    nis, nis_dof, status, weight, rivals, centroid_m, radius_m, lag1, mixture
         The same.
     row : Row
         Readings and pose that it was found from, without the background of a rest.
@@ -57,7 +57,7 @@ class LivePoint(TrackPoint):
     >>> diver = magloc.datasets.load("diver")
     >>> first = next(iter(magloc.live.track(diver.readings, diver.array)))
     >>> first.status, first.row.time_s
-    ('not acquired: the range is not observable', 0.0)
+    ('not acquired: no signal stands out of noise', 0.0)
     """
 
     row: Row = field(kw_only=True)

@@ -55,10 +55,10 @@ def channel_jacobian(
 def turn_jacobian(
     array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, ambient_T: FloatArray | None = None
 ) -> FloatArray:
-    """Derivative (..., C, 3) of :func:`predicted_channels` where the ambient field (N, 3) turns by b × θ [T/rad]."""
+    """Derivative (..., C, 3) of :func:`predicted_channels` where ambient fields (..., N, 3) turn by b × θ [T/rad]."""
     rows = array.linear_gain(fields_at_sensors(array, position_m, moment_Am2, ambient_T))
     turned = cross_matrix(array.ambient_fields if ambient_T is None else ambient_T)
-    return np.einsum("...ci,cij->...cj", rows, turned[array.channel_sensor])
+    return np.einsum("...ci,...cij->...cj", rows, turned[..., array.channel_sensor, :, :])
 
 
 def fields_at_sensors(

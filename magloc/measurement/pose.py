@@ -62,26 +62,28 @@ class ArrayPose:
         return self.velocity_m_s - self.R_world_from_array @ np.cross(self.rate_rad_s, self.lever_arm_m)
 
     def turned(self, error: FloatArray | None = None) -> FloatArray:
-        """True attitude, array to world (3, 3), where the pose has an error (9,)."""
-        return self.R_world_from_array if error is None else self.R_world_from_array @ rotation_matrix(error[TURN])
+        """True attitude, array to world (..., 3, 3), where the pose has errors (..., 9)."""
+        R = self.R_world_from_array
+        return R if error is None else R @ rotation_matrix(error[..., TURN])
 
     def in_array(self, source: FloatArray, error: FloatArray | None = None) -> FloatArray:
-        """Position and moment (6,) of a source (6,) of the world, in the true axes of the array."""
+        """Position and moment (..., 6) of sources (..., 6) of the world, in the true axes of the array."""
         if error is None:
-            R, position = self.R_world_from_array, (source[:3] - self.origin_m) @ self.R_world_from_array
-        else:
-            R = self.turned(error)
-            position = R.T @ (source[:3] - self.reference_m - error[SHIFT]) - self.lever_arm_m - error[LEVER]
-        return np.concatenate([position, source[3:] @ R])
+            R = self.R_world_from_array
+            return np.concatenate([(source[..., :3] - self.origin_m) @ R, source[..., 3:6] @ R], axis=-1)
+        R = self.turned(error)
+        offset = source[..., :3] - self.reference_m - error[..., SHIFT]
+        position = (offset[..., None, :] @ R)[..., 0, :] - self.lever_arm_m - error[..., LEVER]
+        return np.concatenate([position, (source[..., None, 3:6] @ R)[..., 0, :]], axis=-1)
 
     def error_jacobian(self, in_array: FloatArray, error: FloatArray) -> FloatArray:
-        """Derivative (6, 9) of :meth:`in_array`, which is given, by the error."""
-        right = turn_of_change(-error[TURN])
-        D = np.zeros((6, N_POSE))
-        D[:3, TURN] = cross_matrix(in_array[:3] + self.lever_arm_m + error[LEVER]) @ right
-        D[:3, SHIFT] = -self.turned(error).T
-        D[:3, LEVER] = -np.eye(3)
-        D[3:, TURN] = cross_matrix(in_array[3:]) @ right
+        """Derivative (..., 6, 9) of :meth:`in_array`, which is given, by the errors."""
+        right = turn_of_change(-error[..., TURN])
+        D = np.zeros((*in_array.shape, N_POSE))
+        D[..., :3, TURN] = cross_matrix(in_array[..., :3] + self.lever_arm_m + error[..., LEVER]) @ right
+        D[..., :3, SHIFT] = -np.swapaxes(self.turned(error), -1, -2)
+        D[..., :3, LEVER] = -np.eye(3)
+        D[..., 3:, TURN] = cross_matrix(in_array[..., 3:]) @ right
         return D
 
     def world_jacobian(self, in_array: FloatArray) -> FloatArray:

@@ -20,26 +20,21 @@ def cross_matrix(vector: ArrayLike) -> FloatArray:
 
 
 def rotation_matrix(rotation_vector: FloatArray) -> FloatArray:
-    """Rotation (3, 3) by a vector (3,), by Rodrigues' formula [rad]."""
-    angle = math.sqrt(float(rotation_vector @ rotation_vector))
-    if angle == 0.0:
-        return np.eye(3)
+    """Rotations (..., 3, 3) by vectors (..., 3), by Rodrigues' formula [rad]."""
+    angle = np.sqrt(np.sum(rotation_vector * rotation_vector, axis=-1))[..., None, None]
     K = cross_matrix(rotation_vector)
     # sin(a)/a and (1 - cos(a))/a², without cancelling.
-    first = math.sin(angle) / angle if angle > 1e-8 else 1.0
-    half = 0.5 * angle
-    second = 0.5 * (math.sin(half) / half) ** 2 if angle > 1e-8 else 0.5
-    return np.eye(3) + first * K + second * (K @ K)
+    first, half = np.sinc(angle / math.pi), np.sinc(0.5 * angle / math.pi)
+    return np.asarray(np.eye(3) + first * K + 0.5 * half * half * (K @ K))
 
 
 def turn_of_change(rotation_vector: FloatArray) -> FloatArray:
-    """The small turn J δ (3, 3) that follows a rotation by a vector (3,) when δ is added to the vector."""
-    square = float(rotation_vector @ rotation_vector)
-    angle = math.sqrt(square)
+    """The small turns J δ (..., 3, 3) that follow rotations by vectors (..., 3) when δ is added to these."""
+    square = np.sum(rotation_vector * rotation_vector, axis=-1)[..., None, None]
+    angle = np.sqrt(square)
     K = cross_matrix(rotation_vector)
-    # (1 - cos(a))/a² and (a - sin(a))/a³, by series where they cancel.
-    if angle < 1e-2:
-        first, second = 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
-    else:
-        first, second = (1.0 - math.cos(angle)) / square, (angle - math.sin(angle)) / (square * angle)
-    return np.eye(3) + first * K + second * (K @ K)
+    # (1 - cos(a))/a², and (a - sin(a))/a³ by a series where it cancels.
+    half, small = np.sinc(0.5 * angle / math.pi), angle < 1e-2
+    safe = np.where(small, 1.0, angle)
+    third = np.where(small, 1.0 / 6.0 - square / 120.0, (safe - np.sin(safe)) / safe**3)
+    return np.asarray(np.eye(3) + 0.5 * half * half * K + third * (K @ K))

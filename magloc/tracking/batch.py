@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import chdtri
 
+from arrays.typing import FloatArray
 from magloc.compilation import own
-from magloc.kalman import estimability
 from magloc.levels import CONTRADICTION
 from magloc.measurement.rows import ambient_fields
 from magloc.tracking import batch_compiled as kernels
-from magloc.tracking.measurement import LEAST_SINGULAR
+from magloc.tracking.chart.coordinates import FIRM, Chart
+from magloc.tracking.chart.mixture import Mixture, component_moments, root_of
+from magloc.tracking.chart.steps import LARGEST_GROWTH, LARGEST_WIDTH
+from magloc.tracking.chart.update import LEAST_GAIN, LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
 from magloc.tracking.motion import N_SOURCE, LinearMotion
 from magloc.tracking.results import Prediction, Row, Step, TrackPoint
-from magloc.tracking.tracker import (
-    LARGEST_GROWTH,
-    LARGEST_RANGE_ERROR,
-    MOST_ITERATIONS,
-    REFIX_RANGE_ERROR,
-    ROWS_TO_LOSE,
-    SHRINK,
-    TOLERANCE,
-    Tracker,
-)
+from magloc.tracking.tracker import ROWS_TO_LOSE, Tracker, learned
 
 _MOST_AT_ONCE = 64
 _STATUS = {kernels.TRACKED: "tracked", kernels.PREDICTED: "predicted", kernels.OUTLIER: "outlier"}
@@ -35,7 +30,7 @@ def track_record(
 ) -> list[TrackPoint]:
     """Points of a whole record, or of the next rows of one: as :meth:`Tracker.run`, with compiled steps if there are.
 
-    Sensors with lasting errors are tracked by the readable steps.
+    Sensors with lasting errors, and a source that may be at several places, are tracked by the readable steps.
     """
     points: list[TrackPoint] = []
     motion = compiled_motion(tracker)
@@ -107,70 +102,90 @@ class _CompiledSteps:
             nis_limits=np.asarray(chdtri(np.maximum(np.arange(k + 1), 1), CONTRADICTION), dtype=np.float64),
             tolerance=TOLERANCE,
             max_iterations=MOST_ITERATIONS,
-            step_shrink=SHRINK,
-            least_singular=LEAST_SINGULAR,
+            rounding=ROUNDING,
+            least_gain=LEAST_GAIN,
+            least_share=LEAST_SHARE,
+            firm=FIRM,
+            full=tracker.filter.n_differences,
             largest_growth=LARGEST_GROWTH,
             rows_to_lose=ROWS_TO_LOSE,
-            start_range_error=REFIX_RANGE_ERROR,
-            largest_range_error=LARGEST_RANGE_ERROR,
+            largest_width=LARGEST_WIDTH,
+            radius=array.circumradius,
         )
-        n = motion.n_states
+        n, m = motion.n_states, len(rows)
         self.out = kernels.Followed(
-            np.empty((len(rows), n)),
-            np.empty((len(rows), n, n)),
-            np.empty((len(rows), n)),
-            np.empty((len(rows), n, n)),
-            np.full(len(rows), np.nan),
-            *np.zeros((2, len(rows)), dtype=np.int64),
+            np.empty((m, n)),
+            np.empty((m, n, n)),
+            np.empty((m, n)),
+            np.empty((m, n, n)),
+            np.empty((m, n)),
+            np.full(m, np.nan),
+            *np.zeros((2, m), dtype=np.int64),
         )
 
     def follow(self, begin: int) -> list[TrackPoint]:
-        """Points from a row to the one before the first that has to be acquired, or that goes back in time."""
-        tracker, array, times, before = self.tracker, self.tracker.array, self.times, self.times_before
-        x, S, contradictions = tracker.state()
+        """Points from a row to the one before the first that a track must start from, or that goes back in time."""
+        tracker, times, before = self.tracker, self.times, self.times_before
+        given, out = self.given, self.out
+        known = tracker.known
+        assert known is not None
+        mixture = known.mixture
+        state = kernels.State(
+            mixture.x[0].copy(), mixture.S[0].copy(), mixture.centroid_m.copy(), known.open_loop.copy()
+        )
         end, contradictions = kernels.follow(
             begin,
             next((i for i in range(begin, len(times)) if times[i] <= before[i]), len(times)),
-            x,
-            S,
-            contradictions,
+            state,
+            known.contradictions,
             self.channels,
-            self.given,
+            given,
             self.steps,
             self.rules,
-            self.out,
+            out,
         )
         if end == begin:
             return []
-        given, out = self.given, self.out
-        steps = [
-            Step(
-                i,
-                Prediction(out.predicted_x[i], out.predicted_S[i], self.steps.F[self.steps.of_row[i]]),
-                out.x[i],
-                out.S[i],
-            )
-            for i in range(begin, end)
-        ]
-        tracker.resume(x, S, times[end - 1], contradictions, steps)
-        roots, predicted = out.S[begin:end], out.predicted_S[begin:end]
-        covariance = (roots @ roots.swapaxes(-1, -2))[:, :N_SOURCE, :N_SOURCE]
-        learned = estimability(roots, predicted)[:, :N_SOURCE]
-        centroids = given.origins[begin:end] + given.rotations[begin:end] @ array.centroid
+        rows = slice(begin, end)
+        centroids = given.origins[rows] + given.rotations[rows] @ tracker.array.centroid
+        steps = self._steps(rows, centroids) if tracker.keep_steps else []
+        after = replace(mixture, x=state.x[None], S=state.S[None], centroid_m=state.centroid)
+        resumed = replace(known, mixture=after, open_loop=state.open_loop, contradictions=contradictions)
+        tracker.resume(resumed, times[end - 1], end - begin, steps)
+        means, covariances = component_moments(
+            Chart.at(out.x[rows, :N_SOURCE], centroids, mixture.radius_m), out.S[rows]
+        )
+        estimability = learned(np.diagonal(covariances, axis1=1, axis2=2), out.open_loop[rows, :N_SOURCE])
+        roots, single = root_of(out.S[rows, :N_SOURCE]), np.zeros(1)
         return [
             TrackPoint(
                 times[i],
-                out.x[i, :3],
-                out.x[i, 3:6],
-                covariance[i - begin],
-                learned[i - begin],
+                means[j, :3],
+                means[j, 3:],
+                covariances[j],
+                estimability[j],
                 int(out.iterations[i]),
                 float(out.nis[i]),
                 int(given.n_differences[i]),
                 status=_STATUS[int(out.status[i])],
-                weight=tracker.weight,
-                centroid_m=centroids[i - begin],
-                radius_m=array.circumradius,
+                weight=1.0,
+                centroid_m=centroids[j],
+                radius_m=mixture.radius_m,
+                mixture=Mixture(
+                    out.x[i, None, :N_SOURCE], roots[j, None], single, N_SOURCE, centroids[j], mixture.radius_m
+                ),
             )
-            for i in range(begin, end)
+            for j, i in enumerate(range(begin, end))
+        ]
+
+    def _steps(self, rows: slice, centroids: FloatArray) -> list[Step]:
+        """Steps for a smoother of some rows."""
+        out, of_row, radius_m = self.out, self.steps.of_row, self.tracker.array.circumradius
+        before, after = (
+            Chart.at(x[rows], centroids, radius_m).jacobian(np.zeros_like(x[rows])) @ S[rows]
+            for x, S in ((out.predicted_x, out.predicted_S), (out.x, out.S))
+        )
+        return [
+            Step(i, Prediction(out.predicted_x[i], before[j], self.steps.F[of_row[i]]), out.x[i], after[j])
+            for j, i in enumerate(range(rows.start, rows.stop))
         ]

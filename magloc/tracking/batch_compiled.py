@@ -1,7 +1,8 @@
-"""The tracker's steps over many rows, the twin of :meth:`magloc.tracking.tracker.Tracker.update` between acquisitions.
+"""The tracker's steps over many rows, the twin of :meth:`magloc.tracking.tracker.Tracker.update` for one component.
 
-A state of n numbers begins with position and moment. Every row has a transition F, and a square root of its noise in
-two parts, ``S_q = A + |m| B``; its readings are whitened differences, padded to k with rows that are zero.
+A state of n numbers begins with position and moment, and the velocity where there is one. Every row has a transition F,
+and a square root of its noise in two parts, ``S_q = A + |m| B``; its readings are whitened differences, padded to k
+with rows that are zero.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from numpy.typing import NDArray
 from arrays.typing import FloatArray
 from magloc.compilation import compiled
 from magloc.fields.dipole import MU0_OVER_4PI
-from magloc.kalman_compiled import scalar_update, triangular_root
+from magloc.kalman_compiled import triangular_root
 from magloc.linalg_compiled import orthonormalise, put, put_rows
+from magloc.tracking.chart.coordinates_compiled import fill_chart, into_chart, is_firm, move
 
 IntArray = NDArray[np.int64]
 TRACKED, PREDICTED, OUTLIER = 0, 1, 2
@@ -55,29 +57,42 @@ class Steps(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """When an update has converged, and when it is believed; see :mod:`magloc.tracking.tracker`."""
+    """When an update has converged, and when it is believed; see :mod:`magloc.tracking.chart.update` and `.tracker`."""
 
     nis_limits: FloatArray
     tolerance: float
     max_iterations: int
-    step_shrink: float
-    least_singular: float
+    rounding: float
+    least_gain: float
+    least_share: float
+    firm: float
+    full: int
     largest_growth: float
     rows_to_lose: int
-    start_range_error: float
-    largest_range_error: float
+    largest_width: float
+    radius: float
 
 
 class Followed(NamedTuple):
-    """Outputs of every row: the state after and before its readings, and what became of them."""
+    """Outputs of every row: state and root after and before its readings, and what became of them."""
 
     x: FloatArray
     S: FloatArray
     predicted_x: FloatArray
     predicted_S: FloatArray
+    open_loop: FloatArray
     nis: FloatArray
     iterations: IntArray
     status: IntArray
+
+
+class State(NamedTuple):
+    """What is known between rows, changed in place: state, root in the chart about it, its centroid, open loop."""
+
+    x: FloatArray
+    S: FloatArray
+    centroid: FloatArray
+    open_loop: FloatArray
 
 
 @compiled
@@ -145,138 +160,46 @@ def _predicted(
 
 
 @compiled
-def _updated(x: FloatArray, S: FloatArray, H: FloatArray, innovation: FloatArray, phi: FloatArray) -> float:
-    """Updates by all scalars of unit variance in turn, in place; the sum of normalised squared innovations."""
-    x0 = x[:6].copy()
-    squares = 0.0
-    for j in range(innovation.size):
-        nu = innovation[j]
-        for i in range(6):
-            nu -= H[j, i] * (x[i] - x0[i])
-        squares += scalar_update(x, S, H[j], nu, 1.0, phi)
-    return squares
+def _product(A: FloatArray, B: FloatArray, AB: FloatArray) -> None:
+    """AB (n, m) = A (n, p) B (p, m)."""
+    for i in range(A.shape[0]):
+        for c in range(B.shape[1]):
+            t = 0.0
+            for j in range(A.shape[1]):
+                t += A[i, j] * B[j, c]
+            AB[i, c] = t
 
 
 @compiled
-def _chart(H: FloatArray, predicted_S: FloatArray, least_singular: float, M: FloatArray) -> bool:
-    """M (6, k) with M H = I, by Gram and Schmidt on H's columns in units of what is known; whether there is one."""
-    k = H.shape[0]
-    n = predicted_S.shape[1]
-    Q, R, unit = np.empty((6, k)), np.zeros((6, 6)), np.empty(6)
-    for i in range(6):
+def _widest(S: FloatArray) -> float:
+    """Larger one of the standard deviations of log-range and direction."""
+    widest = 0.0
+    for i in range(3):
         t = 0.0
-        for c in range(n):
-            t += predicted_S[i, c] * predicted_S[i, c]
-        unit[i] = math.sqrt(t)
-        for j in range(k):
-            Q[i, j] = H[j, i] * unit[i]
-    orthonormalise(Q, R)
-    smallest, largest = math.inf, 0.0
-    for i in range(6):
-        smallest, largest = min(smallest, R[i, i]), max(largest, R[i, i])
-    if not smallest > least_singular * largest:
-        return False
-    for i in range(5, -1, -1):
-        for j in range(k):
-            t = Q[i, j]
-            for c in range(i + 1, 6):
-                t -= R[i, c] * M[c, j]
-            M[i, j] = t / R[i, i]
-    for i in range(6):
-        for j in range(k):
-            M[i, j] *= unit[i]
-    return True
+        for c in range(S.shape[1]):
+            t += S[i, c] * S[i, c]
+        widest = max(widest, t)
+    return math.sqrt(widest)
 
 
 @compiled
-def _is_of_readings(S: FloatArray, predicted_S: FloatArray, largest_growth: float) -> bool:
-    """Whether no standard deviation of position and moment has grown by more than a factor."""
-    n = S.shape[1]
+def _grows(S: FloatArray, predicted_S: FloatArray, largest_growth: float) -> bool:
+    """Whether a standard deviation of position and moment has grown by more than a factor."""
     for i in range(6):
         before, after = 0.0, 0.0
-        for c in range(n):
+        for c in range(S.shape[1]):
             before += S[i, c] * S[i, c]
             after += predicted_S[i, c] * predicted_S[i, c]
         if after > largest_growth * largest_growth * before:
-            return False
-    return True
-
-
-@compiled
-def _solved(A: FloatArray, B: FloatArray) -> bool:
-    """B becomes the solution X (6, m) of A X = B, by elimination with pivots that destroys A; whether there is one."""
-    m = B.shape[1]
-    for i in range(6):
-        pivot = i
-        for r in range(i + 1, 6):
-            if abs(A[r, i]) > abs(A[pivot, i]):
-                pivot = r
-        if not abs(A[pivot, i]) > 0.0:
-            return False
-        if pivot != i:
-            for c in range(6):
-                A[i, c], A[pivot, c] = A[pivot, c], A[i, c]
-            for c in range(m):
-                B[i, c], B[pivot, c] = B[pivot, c], B[i, c]
-        inverse = 1.0 / A[i, i]
-        for r in range(i + 1, 6):
-            factor = A[r, i] * inverse
-            if factor != 0.0:
-                for c in range(i + 1, 6):
-                    A[r, c] -= factor * A[i, c]
-                for c in range(m):
-                    B[r, c] -= factor * B[i, c]
-    for i in range(5, -1, -1):
-        inverse = 1.0 / A[i, i]
-        for c in range(m):
-            t = B[i, c]
-            for r in range(i + 1, 6):
-                t -= A[i, r] * B[r, c]
-            B[i, c] = t * inverse
-    return True
-
-
-@compiled
-def _curved_prior(
-    M: FloatArray,
-    H: FloatArray,
-    predicted: FloatArray,
-    predicted_first: FloatArray,
-    x: FloatArray,
-    S: FloatArray,
-    x_k: FloatArray,
-    A: FloatArray,
-    B: FloatArray,
-    mean: FloatArray,
-    root: FloatArray,
-) -> None:
-    """Mean (6,) and root (6, n) that the prediction (x, S) has to first order at the state x_k."""
-    k, n = predicted.size, S.shape[1]
-    for i in range(6):
-        for c in range(6):
-            t = 0.0
-            for j in range(k):
-                t += M[i, j] * H[j, c]
-            A[i, c] = t
-        t = 0.0
-        for j in range(k):
-            t += M[i, j] * (predicted[j] - predicted_first[j])
-        B[i, 0] = t
-        for c in range(n):
-            B[i, 1 + c] = S[i, c]
-    solved = _solved(A, B)
-    for i in range(6):
-        mean[i] = x_k[i] - B[i, 0] if solved else x[i]
-        for c in range(n):
-            root[i, c] = B[i, 1 + c] if solved else S[i, c]
+            return True
+    return False
 
 
 @compiled
 def follow(
     begin: int,
     end: int,
-    x: FloatArray,
-    S: FloatArray,
+    state: State,
     contradictions: int,
     array: Channels,
     given: Rows,
@@ -284,126 +207,232 @@ def follow(
     rules: Rules,
     out: Followed,
 ) -> tuple[int, int]:
-    """Follow a track from the state (x, S) before row begin, which are changed, to the first row that must be acquired.
+    """Follow a track from a state before row begin, which is changed, to the first row that must be started from.
 
     Returns that row, or end, and the number of contradictions so far. Outputs of rows before it are filled.
     """
-    z, n_differences, transforms, transform_of_row, origins, rotations, ambients, ambient_of_row = given
-    F_steps, A_steps, B_steps, step_of_row = steps
-    centroid = array.centroid
+    x, S, centroid, open_loop = state
     n = x.size
-    k, n_channels = transforms.shape[1], array.sensor.size
-    width = n + A_steps.shape[2]
-    rows = np.empty((n, width))
-    predicted_x, predicted_S = np.empty(n), np.empty((n, n))
-    x_k, S_k, x_next = np.empty(n), np.empty((n, n)), np.empty(n)
-    H, predicted, predicted_next = np.empty((k, 6)), np.empty(k), np.empty(k)
+    k, n_channels = given.transforms.shape[1], array.sensor.size
+    n_noise = steps.A.shape[2]
+    rows, product = np.empty((n, n + n_noise)), np.empty((n, n))
+    frame, frame_there, centroid_there = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    x_before, S_before, L = np.empty(n), np.empty((n, n)), np.empty((n, n))
+    zero, e, zeta, step = np.zeros(n), np.empty(n), np.empty(n), np.empty(n)
+    M, bent = np.empty((n, k)), np.empty(k)
+    H, h, h_first, h_there = np.empty((k, 6)), np.empty(k), np.empty(k), np.empty(k)
     channels, slopes = np.empty(n_channels), np.empty((n_channels, 6))
-    innovation, phi = np.empty(k), np.empty(n)
-    predicted_first, M = np.empty(k), np.empty((6, k))
-    A, B, mean, root = np.empty((6, 6)), np.empty((6, 1 + n)), np.empty(n), np.empty((n, n))
+    J_e, J_first = np.empty((k, n)), np.empty((k, n))
+    residual, residual_there = np.empty(k + n), np.empty(k + n)
+    columns, triangle = np.empty((n + 1, k + n)), np.zeros((n + 1, n + 1))
+    there, here, solution = np.empty(n), np.empty(n), np.empty((n, n))
+    noise, transition = np.empty((n, n_noise)), np.empty((n, n))
     for row in range(begin, end):
-        step, origin, rotation = step_of_row[row], origins[row], rotations[row]
+        s, origin, R = steps.of_row[row], given.origins[row], given.rotations[row]
+        for i in range(3):
+            t = origin[i]
+            for j in range(3):
+                t += R[i, j] * array.centroid[j]
+            centroid_there[i] = t
+        # Prediction.
         strength = math.sqrt(x[3] * x[3] + x[4] * x[4] + x[5] * x[5])
+        length = fill_chart(x, centroid, rules.radius, frame)
+        move(x, zero, frame, length, False, here, L)
+        _product(steps.F[s], L, transition)
         for i in range(n):
             t = 0.0
             for j in range(n):
-                t += F_steps[step, i, j] * x[j]
-            predicted_x[i] = t
+                t += steps.F[s, i, j] * x[j]
+            x_before[i] = t
+            for c in range(n_noise):
+                noise[i, c] = steps.A[s, i, c] + strength * steps.B[s, i, c]
+        length = fill_chart(x_before, centroid_there, rules.radius, frame)
+        into_chart(x_before, frame, length, transition)
+        _product(transition, S, product)
+        for i in range(n):
             for c in range(n):
-                t = 0.0
-                for j in range(n):
-                    t += F_steps[step, i, j] * S[j, c]
-                rows[i, c] = t
-            for c in range(A_steps.shape[2]):
-                rows[i, n + c] = A_steps[step, i, c] + strength * B_steps[step, i, c]
-        triangular_root(rows, predicted_S)
-        status = TRACKED
-        nis = math.nan
-        iterations = 0
-        if n_differences[row] == 0:
+                rows[i, c] = product[i, c]
+            for c in range(n_noise):
+                rows[i, n + c] = noise[i, c]
+        into_chart(x_before, frame, length, rows[:, n:])
+        triangular_root(rows, S_before)
+        status, nis, iterations = TRACKED, math.nan, 0
+        if given.n_differences[row] == 0:
             status = PREDICTED
+        elif _widest(S_before) > rules.largest_width:
+            return row, contradictions
         else:
-            if _range_error(predicted_x, predicted_S, origin, rotation, centroid) > rules.start_range_error:
-                return row, contradictions
-            put(x_k, predicted_x)
-            w, a = transform_of_row[row], ambient_of_row[row]
-            _predicted(x_k, origin, rotation, ambients[a], array, transforms[w], channels, slopes, predicted, H)
-            curved = _is_of_readings(S, predicted_S, rules.largest_growth) and _chart(
-                H, predicted_S, rules.least_singular, M
-            )
-            put(predicted_first, predicted)
-            put(mean, predicted_x)
-            put_rows(root, predicted_S)
-            converged, change_before, length = False, math.inf, 1.0
-            for _ in range(rules.max_iterations):
+            w, a = given.transform_of_row[row], given.ambient_of_row[row]
+            transform, ambient = given.transforms[w], given.ambients[a]
+            put(here, x_before)
+            put(zeta, zero)
+            put(e, zero)
+            _predicted(here, origin, R, ambient, array, transform, channels, slopes, h, H)
+            put(h_first, h)
+            firm = is_firm(x_before, S_before, length, rules.firm)
+            move(x_before, e, frame, length, firm, here, L)
+            bends = given.n_differences[row] >= rules.full and not _grows(S, S_before, rules.largest_growth)
+            if bends:
+                _derivatives(H, L, S_before, J_e, columns)
+                for j in range(k):
+                    for i in range(n):
+                        J_first[j, i] = columns[i, j]
+                _damped_inverse(columns, triangle, rules.least_share, M)
+            cost = 0.0
+            for j in range(k):
+                residual[j] = given.z[row, j] - h[j]
+                cost += residual[j] * residual[j]
+            for i in range(n):
+                residual[k + i] = 0.0
+            is_stale, converged, share, gain = True, False, 1.0, 0.0
+            while True:
+                if is_stale:
+                    _linearised(H, L, S_before, M, J_first, bends, J_e, columns)
+                    for c in range(k + n):
+                        columns[n, c] = residual[c]
+                    orthonormalise(columns, triangle)
+                    gain = 0.0
+                    for i in range(n - 1, -1, -1):
+                        t = triangle[i, n]
+                        gain += t * t
+                        for j in range(i + 1, n):
+                            t -= triangle[i, j] * step[j]
+                        step[i] = t / triangle[i, i]
+                    is_stale, share = False, 1.0
+                    converged = gain < rules.tolerance * rules.tolerance
+                if converged or iterations >= rules.max_iterations:
+                    break
                 iterations += 1
-                if curved and iterations > 1:
-                    _curved_prior(
-                        M, H, predicted, predicted_first, predicted_x, predicted_S, x_k, A, B, mean, root
-                    )  # fmt: skip
-                for j in range(k):
-                    t = z[row, j] - predicted[j]
-                    for i in range(6):
-                        t -= H[j, i] * (mean[i] - x_k[i])
-                    innovation[j] = t
-                put(x_next, mean)
-                put_rows(S_k, root)
-                nis = _updated(x_next, S_k, H, innovation, phi)
                 for i in range(n):
-                    x_next[i] = x_k[i] + length * (x_next[i] - x_k[i])
-                _predicted(
-                    x_next, origin, rotation, ambients[a], array, transforms[w],
-                    channels, slopes, predicted_next, H,
-                )  # fmt: skip
-                change = 0.0
+                    solution[i, 0] = zeta[i] + share * step[i]
+                for i in range(n):
+                    t = 0.0
+                    for j in range(i + 1):
+                        t += S_before[i, j] * solution[j, 0]
+                    e[i] = t
+                move(x_before, e, frame, length, firm, there, L)
+                _predicted(there, origin, R, ambient, array, transform, channels, slopes, h_there, H)
+                for i in range(n):
+                    residual_there[k + i] = -solution[i, 0]
+                if bends:
+                    for j in range(k):
+                        t = h_there[j] - h_first[j]
+                        for i in range(n):
+                            t -= J_first[j, i] * solution[i, 0]
+                        bent[j] = t
+                    for i in range(n):
+                        for j in range(k):
+                            residual_there[k + i] -= M[i, j] * bent[j]
+                cost_there = 0.0
                 for j in range(k):
-                    change += (predicted_next[j] - predicted[j]) ** 2
-                    predicted[j] = predicted_next[j]
-                put(x_k, x_next)
-                change = math.sqrt(change) / length
-                if not math.isfinite(change):
-                    break
-                if change < rules.tolerance:
-                    converged = True
-                    break
-                if change >= change_before:
-                    length *= rules.step_shrink
-                change_before = change
-            if not converged or nis > rules.nis_limits[n_differences[row]]:
+                    residual_there[j] = given.z[row, j] - h_there[j]
+                for c in range(k + n):
+                    cost_there += residual_there[c] * residual_there[c]
+                if cost_there <= cost - rules.least_gain * share * gain + rules.rounding * (1.0 + cost):
+                    for i in range(n):
+                        zeta[i] = solution[i, 0]
+                    put(here, there)
+                    put(residual, residual_there)
+                    cost, is_stale = cost_there, True
+                else:
+                    share *= 0.5
+            nis = cost
+            if not converged or not nis <= rules.nis_limits[given.n_differences[row]]:
                 if contradictions + 1 >= rules.rows_to_lose:
                     return row, contradictions
                 contradictions += 1
-                status = OUTLIER
-                iterations = 0
+                status, iterations = OUTLIER, 0
             else:
                 contradictions = 0
-        used_x, used_S = (x_k, S_k) if status == TRACKED else (predicted_x, predicted_S)
-        if _range_error(used_x, used_S, origin, rotation, centroid) > rules.largest_range_error:
+        if status == TRACKED:
+            # U R⁻¹, seen from the new state: L is that at e.
+            for i in range(n):
+                for c in range(n):
+                    t = S_before[i, c]
+                    for j in range(c):
+                        t -= solution[i, j] * triangle[j, c]
+                    solution[i, c] = t / triangle[c, c]
+            _product(L, solution, product)
+            length = fill_chart(here, centroid_there, rules.radius, frame_there)
+            into_chart(here, frame_there, length, product)
+        else:
+            put(here, x_before)
+            put_rows(product, S_before)
+        if _widest(product) > rules.largest_width:
             return row, contradictions
-        put(x, used_x)
-        put_rows(S, used_S)
+        _product(steps.F[s], open_loop, solution)
+        for i in range(n):
+            for j in range(n):
+                t = 0.0
+                for c in range(n):
+                    t += solution[i, c] * steps.F[s, j, c]
+                for c in range(n_noise):
+                    t += noise[i, c] * noise[j, c]
+                open_loop[i, j] = t
+            out.open_loop[row, i] = open_loop[i, i]
+        put(x, here)
+        put_rows(S, product)
+        put(centroid, centroid_there)
         put(out.x[row], x)
         put_rows(out.S[row], S)
-        put(out.predicted_x[row], predicted_x)
-        put_rows(out.predicted_S[row], predicted_S)
+        put(out.predicted_x[row], x_before)
+        put_rows(out.predicted_S[row], S_before)
         out.nis[row], out.iterations[row], out.status[row] = nis, iterations, status
     return end, contradictions
 
 
 @compiled
-def _range_error(x: FloatArray, S: FloatArray, origin: FloatArray, R: FloatArray, centroid: FloatArray) -> float:
-    """Standard deviation of the range over the range."""
-    offset = np.empty(3)
-    square = 0.0
-    for i in range(3):
-        t = x[i] - origin[i]
-        for j in range(3):
-            t -= R[i, j] * centroid[j]
-        offset[i] = t
-        square += t * t
-    variance = 0.0
-    for c in range(S.shape[1]):
-        t = offset[0] * S[0, c] + offset[1] * S[1, c] + offset[2] * S[2, c]
-        variance += t * t
-    return math.sqrt(variance) / square if square > 0.0 else math.inf
+def _derivatives(H: FloatArray, L: FloatArray, S: FloatArray, J_e: FloatArray, columns: FloatArray) -> None:
+    """Derivatives of the readings by standard numbers, as rows (n, k) of columns."""
+    k, n = J_e.shape
+    for j in range(k):
+        for i in range(n):
+            t = 0.0
+            for c in range(6):
+                t += H[j, c] * L[c, i]
+            J_e[j, i] = t
+    for j in range(k):
+        for i in range(n):
+            t = 0.0
+            for c in range(i, n):
+                t += J_e[j, c] * S[c, i]
+            columns[i, j] = t
+
+
+@compiled
+def _damped_inverse(columns: FloatArray, triangle: FloatArray, least_share: float, M: FloatArray) -> None:
+    """The twin of :func:`magloc.tracking.chart.update.damped_inverse`; columns are spoilt."""
+    n, k = M.shape
+    for i in range(n):
+        for c in range(n):
+            columns[i, k + c] = least_share if i == c else 0.0
+    orthonormalise(columns[:n], triangle)
+    for j in range(k):
+        for i in range(n - 1, -1, -1):
+            t = columns[i, j]
+            for c in range(i + 1, n):
+                t -= triangle[i, c] * M[c, j]
+            M[i, j] = t / triangle[i, i]
+
+
+@compiled
+def _linearised(
+    H: FloatArray,
+    L: FloatArray,
+    S: FloatArray,
+    M: FloatArray,
+    J_first: FloatArray,
+    bends: bool,
+    J_e: FloatArray,
+    columns: FloatArray,
+) -> None:
+    """Derivatives of the misfits of readings and prediction by standard numbers, as the first n rows of columns."""
+    k, n = J_e.shape
+    _derivatives(H, L, S, J_e, columns)
+    for i in range(n):
+        for c in range(n):
+            t = 1.0 if i == c else 0.0
+            if bends:
+                for j in range(k):
+                    t += M[c, j] * (columns[i, j] - J_first[j, i])
+            columns[i, k + c] = t

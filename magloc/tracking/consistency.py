@@ -18,6 +18,9 @@ import numpy as np
 
 from arrays.typing import FloatArray, IntArray
 from magloc.chi_square import mean_bounds, normalised_square
+from magloc.tracking.chart.mixture import Mixture
+from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.update import damped_inverse
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.results import Row, TrackPoint
 from magloc.tracking.tracker import Tracker
@@ -114,7 +117,14 @@ def consistency(
             squares.append(float(error @ error))
             if bound_m is not None:
                 bounds.append(float(bound_m[i]))
-    of_rows, dof_of_rows = _nees_of_rows(points, tracker, rows, position_m, moment_Am2)
+    moments = np.full_like(position_m, np.nan) if moment_Am2 is None else moment_Am2
+    truth = np.hstack([position_m, moments])
+    of_points = [
+        nees_of(point, of_row, tracker.measurements.of(row))
+        for point, of_row, row in zip(points, truth, rows, strict=True)
+    ]
+    of_rows = np.array([square for square, _ in of_points])
+    dof_of_rows = np.array([dof for _, dof in of_points], dtype=np.intp)
     nees, nees_dof = float(np.nansum(of_rows)), int(dof_of_rows.sum())
     return Consistency(
         rows=int(np.isfinite(position_m).any(axis=1).sum()),
@@ -132,37 +142,23 @@ def consistency(
     )
 
 
-def _nees_of_rows(
-    points: Sequence[TrackPoint],
-    tracker: Tracker,
-    rows: Sequence[Row],
-    position_m: FloatArray,
-    moment_Am2: FloatArray | None,
-) -> tuple[FloatArray, IntArray]:
-    """Normalised estimation error squared of every row (n,), NaN where it has none, and its degrees of freedom (n,)."""
-    moments = np.full_like(position_m, np.nan) if moment_Am2 is None else moment_Am2
-    truth = np.concatenate([position_m, moments], axis=1)
-    nees, dof = np.full(len(points), np.nan), np.zeros(len(points), dtype=np.intp)
-    for i, point in enumerate(points):
-        if point.position_m is None or point.moment_Am2 is None or point.covariance is None:
-            continue
-        if np.isfinite(truth[i]).any():
-            estimate = np.concatenate([point.position_m, point.moment_Am2])
-            nees[i], dof[i] = nees_of(tracker.measurements.of(rows[i]), estimate, point.covariance, truth[i])
-    return nees, dof
-
-
-def nees_of(
-    measurement: RowMeasurement, estimate: FloatArray, covariance: FloatArray, truth: FloatArray
-) -> tuple[float, int]:
-    """Normalised estimation error squared of one estimate, and how many numbers it is of.
+def nees_of(point: TrackPoint, truth: FloatArray, measurement: RowMeasurement) -> tuple[float, int]:
+    """Normalised estimation error squared of a point, and how many numbers it is of.
 
     It is that of what is known of the truth (6,), NaN elsewhere. If all of it is, the error is counted in the
-    coordinates of :mod:`magloc.tracking.measurement`, in which it is Gaussian.
+    coordinates in which it is Gaussian: those of :mod:`magloc.tracking.measurement`, or, of a young track, those of the
+    chart, bent as the row's readings bend.
     """
+    if point.position_m is None or point.moment_Am2 is None or point.covariance is None:
+        return math.nan, 0
     known = np.isfinite(truth)
     known[3:] &= known[3:].all()
-    error = truth - estimate
+    if not known.any():
+        return math.nan, 0
+    if known[:3].all() and point.mixture is not None:
+        return _young_nees(point.mixture.matched(), truth, ChartRow.of(measurement))
+    estimate = np.concatenate([point.position_m, point.moment_Am2])
+    error, covariance = truth - estimate, point.covariance
     if known.all():
         # Where poses have errors, most of the covariance may be of them, which the readings do not bend.
         posed = measurement.pose_effect.shape[1] > 0
@@ -172,3 +168,22 @@ def nees_of(
         error, _ = coordinates.at(measurement.without_errors(truth))
     error, covariance = error[known], covariance[np.ix_(known, known)]
     return float(normalised_square(error, covariance)), int(known.sum())
+
+
+def _young_nees(source: Mixture, truth: FloatArray, row: ChartRow) -> tuple[float, int]:
+    """That of a single component, whose moment may not be known."""
+    known = np.isfinite(truth)
+    error = source.chart.coordinates(np.where(known, truth, source.x[0])[None])[0]
+    if known.all():
+        return float(np.sum(standard_error(source, truth, row) ** 2)), truth.size
+    P = (source.S[0] @ source.S[0].T)[np.ix_(known, known)]
+    return float(normalised_square(error[known], P)), int(known.sum())
+
+
+def standard_error(source: Mixture, truth: FloatArray, row: ChartRow) -> FloatArray:
+    """Error (6,) of a single component in standard numbers, bent as a row's readings bend."""
+    L = source.chart.jacobian(np.zeros((1, truth.size)))[0]
+    J = row.source_jacobian(source.x[0]) @ L @ source.S[0]
+    standard = np.linalg.solve(source.S[0], source.chart.coordinates(truth[None])[0])
+    difference = row.of_source(truth) - row.of_source(source.x[0])
+    return np.asarray(standard + damped_inverse(J[None])[0] @ (difference - J @ standard))

@@ -42,7 +42,7 @@ _COLUMNS = {
     "position_m": (("axis",), "m", "position of the source"),
     "moment_Am2": (("axis",), "A m2", "magnetic moment of the source"),
     "covariance": (("component", "component_"), "m, A m2", "covariance of (position, moment)"),
-    "estimability": (("component",), "1", "what the row taught: 1 - sigma after / sigma predicted"),
+    "estimability": (("component",), "1", "what the readings taught: 1 - sigma / sigma without any of them"),
     "nis": ((), "1", "normalised innovation squared"),
     "nis_dof": ((), "1", "degrees of freedom of nis"),
     "weight": ((), "1", "probability that the track is the right one"),

@@ -1,19 +1,16 @@
-r"""What one row measures of a tracked source, and the coordinates in which a prediction of it is Gaussian.
+r"""What one row measures of a tracked source, and coordinates that bend as its readings do.
 
-What earlier rows told of a source is nearly Gaussian in what they measured, not in position and moment: of a weak
-source the direction and the moment are known only together, along a curve. Far rows measure nearly the same functions
-of the source as the present one, so the prediction is taken to be Gaussian in
+What rows told of a source is nearly Gaussian in what they measured, not in position and moment: of a weak source the
+direction and the moment are known only together, along a curve. Errors are counted in
 
 .. math:: c(x) = M (h(x) - h(x_0)), \qquad M H(x_0) = I
 
-with the predicted differences h of the source in units of their noise, their Jacobian H, and the predicted state
-:math:`x_0`: to first order c is position and moment, and to second order it bends as the readings do. A filter in
-Cartesian coordinates believes itself too much while it learns of a source at rest: every row is linearised elsewhere.
+with the predicted differences h of the source in units of their noise, their Jacobian H, and the estimate
+:math:`x_0`: to first order c is position and moment, and to second order it bends as the readings do.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -141,33 +138,6 @@ class RowMeasurement:
         G = self._in_array_jacobian(state)
         M = G[:, :N_SOURCE].T
         return Coordinates(state, self._in_array, self._in_array_jacobian, M, self._in_array(state), M @ G)
-
-    def with_lasting_errors(self, lasting: FloatArray) -> RowMeasurement:
-        """The row where only some shares (n_pose,) of the pose's errors have an effect."""
-        return replace(self, pose_effect=self.pose_effect * lasting)
-
-    def curved_prior(
-        self, x: FloatArray, S: FloatArray, *, of_readings: bool = True
-    ) -> Callable[[FloatArray], tuple[FloatArray, FloatArray]]:
-        """A prediction (x, S) that is Gaussian in the coordinates about it.
-
-        It gives, of a state, mean (n,) and square root (n, n) of the Gaussian that looks there as the prediction does.
-        """
-        source, rest = slice(0, N_SOURCE), slice(N_SOURCE, None)
-        coordinates = self.coordinates(x, np.linalg.norm(S[source], axis=1), of_readings=of_readings)
-        at_first = coordinates.J[:, rest]
-
-        def prior(state: FloatArray) -> tuple[FloatArray, FloatArray]:
-            c, J = coordinates.at(state)
-            mean, root = x.copy(), S.copy()
-            try:
-                mean[source] = state[source] - np.linalg.solve(J[:, source], c - J[:, rest] @ (state - x)[rest])
-                root[source] = np.linalg.solve(J[:, source], S[source] + (at_first - J[:, rest]) @ S[rest])
-            except np.linalg.LinAlgError:
-                return x, S
-            return mean, root
-
-        return prior
 
     def place_in_array(self, state: FloatArray, S: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Offset (3,) of the source from the sensors' centroid in the array's axes, and a square root (3, n) of its P.

@@ -9,16 +9,12 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.kalman import block_update
-from magloc.localization.fit.gauss_newton import inverse_information
-from magloc.tracking.measurement import RowMeasurement
-from magloc.tracking.motion import N_SOURCE
-from magloc.tracking.results import Row, Step, TrackPoint
+from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.start import prior_root
+from magloc.tracking.results import Row, Step
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import steps_at
-from magloc.tracking.whole_records.smoother import smoothed
-
-# Rows determine a source if their Jacobian, columns scaled, is not nearer to singular.
-_SINGULAR_RTOL = 1e-6
+from magloc.tracking.whole_records.smoother import smoothed_states
 
 
 def posterior_bound(
@@ -26,10 +22,10 @@ def posterior_bound(
 ) -> FloatArray:
     """Posterior Cramér-Rao bound of the distance from the truth, for every row, from this row and those before.
 
-    Nothing is known before the first row but the standard deviations of the sensors' lasting errors, which count as
-    unknowns of their own, and until the readings determine it the source counts as at rest. Speed and turn rate are
-    those of the truth. The root of the trace of the position's bound (n,) [m] is infinite as long as the readings do
-    not determine it.
+    It begins with the first row that shows a source; before it no more is known than what a tracker starts with
+    (:func:`magloc.tracking.chart.start.prior_root`), and the standard deviations of the sensors' lasting errors, which
+    count as unknowns of their own. Speed and turn rate are those of the truth. The root of the trace of the position's
+    bound (n,) [m] is infinite before that row.
     """
     bounds = np.full(len(rows), np.inf)
     for step in _steps_at_truth(tracker, rows, position_m, moment_Am2):
@@ -47,21 +43,17 @@ def smoothing_bound(
     :math:`P_{j|n} = P_j + G (P_{j+1|n} - P_{j+1|j}) G^T` with :math:`G = P_j F^T P_{j+1|j}^{-1}`. It is infinite at the
     same rows as :func:`posterior_bound`: a track that has not begun is not smoothed.
     """
-    steps = _steps_at_truth(tracker, rows, position_m, moment_Am2)
-    at_truth = [TrackPoint(row.time_s, place) for row, place in zip(rows, position_m, strict=True)]
-    points = smoothed(at_truth, steps)
     bounds = np.full(len(rows), np.inf)
-    for step in steps:
-        covariance = points[step.row].covariance
-        if covariance is not None:
-            bounds[step.row] = math.sqrt(float(np.trace(covariance[:3, :3])))
+    steps = _steps_at_truth(tracker, rows, position_m, moment_Am2)
+    for step, (_, P) in zip(steps, smoothed_states(steps), strict=True):
+        bounds[step.row] = math.sqrt(float(np.trace(P[:3, :3])))
     return bounds
 
 
 def _steps_at_truth(
     tracker: Tracker, rows: Sequence[Row], position_m: FloatArray, moment_Am2: FloatArray
 ) -> list[Step]:
-    """What a filter that linearises at the truth knows at every row, from the first one that determines the source."""
+    """What a filter that linearises at the truth knows at every row, from the first one that shows the source."""
     motion, n_errors = tracker.motion, tracker.n_errors
     truth = np.concatenate([position_m, moment_Am2], axis=1)
     velocity, rate = _velocities(np.array([row.time_s for row in rows]), truth)
@@ -73,8 +65,6 @@ def _steps_at_truth(
         return steps_at(tracker, rows, states)
     steps: list[Step] = []
     S: FloatArray | None = None
-    seen: list[FloatArray] = []
-    measurements: list[RowMeasurement] = []
     for i, row in enumerate(rows):
         measurement = tracker.measurements.of(row)
         before = max(i - 1, 0)
@@ -82,20 +72,16 @@ def _steps_at_truth(
         if S is not None:
             state = np.concatenate([motion.state_of(truth[before], velocity[before], rate[before]), np.zeros(n_errors)])
             prediction = tracker.predicted(state, S, row.time_s - rows[before].time_s)
+            predicted_S = prediction.S
+        elif ChartRow.of(measurement).is_detected(tracker.errors.sigma):
+            predicted_S = np.diag(np.concatenate([np.zeros(motion.n_states), tracker.error_sigma]))
+            root = prior_root(ChartRow.of(measurement).chart(truth[i]))
+            _, predicted_S[: motion.n_states, : motion.n_states] = motion.start(truth[i], root)
+        else:
+            continue
         state = np.concatenate([motion.state_of(truth[i], velocity[i], rate[i]), np.zeros(n_errors)])
         H = measurement.jacobian(state)
-        if prediction is not None:
-            _, S = block_update(state, prediction.S, H, np.zeros(len(H)), np.ones(len(H)))
-        else:
-            # Errors of sensors and pose as noise of the row: only to see whether the source is determined, how well.
-            lasting = H[:, motion.n_states :] * tracker.error_sigma
-            root = np.linalg.cholesky(np.eye(len(H)) + lasting @ lasting.T)
-            seen.append(np.linalg.solve(root, H[:, :N_SOURCE]))
-            measurements.append(measurement)
-            covariance = inverse_information(np.concatenate(seen)[None], _SINGULAR_RTOL)[0]
-            if np.isnan(covariance).any():
-                continue
-            S = tracker.filtered_start([state] * len(measurements), covariance, measurements).S
+        _, S = block_update(state, predicted_S, H, np.zeros(len(H)), np.ones(len(H)))
         steps.append(Step(i, prediction, state, S))
     return steps
 

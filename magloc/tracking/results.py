@@ -16,6 +16,7 @@ from magloc.localization.uncertainty.ambiguity import LARGEST_GAUSSIAN_SIGMA, re
 from magloc.localization.uncertainty.range_interval import gaussian_ranges, union
 from magloc.measurement.pose import ArrayPose, rates_of
 from magloc.readings import Readings
+from magloc.tracking.chart.mixture import Mixture
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +95,7 @@ class TrackPoint:
     covariance : ndarray, shape (6, 6)
         Of (position, moment).
     estimability : ndarray, shape (6,)
-        What the row's readings taught of every component: 1 - σ after / σ predicted without them.
+        What the readings taught of every component since the track began: 1 - σ / σ without any of them.
     iterations : int
         Linearisations.
     nis : float
@@ -103,10 +104,9 @@ class TrackPoint:
         "tracked", "acquired" (a new track started here), "predicted" (no readings), "outlier" (readings that contradict
         the track, not used), or why there is no track.
     weight : float
-        How likely the track is the right one of all solutions that explained the readings which it started from; rows
-        that it explains since then only make it more likely. NaN without a track.
+        How likely the place is the right one of all that explain the readings so far. NaN without a track.
     rivals : tuple of Solution
-        Where a track starts, the other solutions of these readings; where there is none, all solutions of the row.
+        Where a track starts from several rows, the other solutions of these.
     centroid_m : ndarray, shape (3,), optional
         Of the sensors, where the range is counted from.
     radius_m : float
@@ -114,6 +114,9 @@ class TrackPoint:
     lag1 : float
         Product of the whitened innovations of this row and of the one before, on average zero for a right model; its
         variance is `nis_dof`. NaN where there is none before, or of other differences.
+    mixture : Mixture, optional
+        All that is known of position and moment, in the coordinates in which it is Gaussian; None of a track that is
+        read from a file.
     """
 
     time_s: float
@@ -130,16 +133,19 @@ class TrackPoint:
     centroid_m: FloatArray | None = None
     radius_m: float = math.nan
     lag1: float = math.nan
+    mixture: Mixture | None = None
 
     @cached_property
     def range_interval_m(self) -> Intervals | None:
         """95 % set of the distance from the sensors' centroid [m], None where the sensors are not known.
 
         Of a track it is :func:`magloc.localization.uncertainty.range_interval.gaussian_ranges` of its covariance;
-        without one it is that of the row alone, or every range where the row says nothing.
+        without one it is every range.
         """
+        if self.mixture is not None:
+            return self.mixture.range_interval_m()
         if self.position_m is None or self.covariance is None:
-            return self.rivals[0].range_interval_m if self.rivals else EVERYWHERE
+            return EVERYWHERE
         if self.centroid_m is None:
             return None
         ends = gaussian_ranges(self.covariance, self.position_m - self.centroid_m, self.radius_m)

@@ -90,7 +90,7 @@ class TrackColumns(Sequence[TrackPoint]):
 
     @cached_property
     def estimability(self) -> FloatArray:
-        """What the row's readings taught (n, 6): 1 - σ after / σ predicted without them."""
+        """What the readings taught since the track began (n, 6): 1 - σ / σ without any of them."""
         return stacked(self, "estimability", 6)
 
     @cached_property
@@ -187,7 +187,7 @@ class Track(TrackColumns):
     >>> diver = magloc.datasets.load("diver")
     >>> track = magloc.track(diver.array, diver.readings)
     >>> int(track.tracked.sum()), len(track), track.status[-1], track.frame
-    (75, 141, 'tracked', 'world')
+    (120, 141, 'tracked', 'world')
     """
 
     points: tuple[TrackPoint, ...]
@@ -245,8 +245,8 @@ def track(
 ) -> Track:
     """Follow one source through the rows of readings.
 
-    The track starts by itself from the first row whose fix is certain, is updated by every row, and ends where the
-    readings contradict it three times in a row or its range is no longer known; then it starts anew.
+    The track starts by itself from the first row that shows a source, is updated by every row, and ends where the
+    readings contradict it three times in a row or its place is no longer known; then it starts anew.
 
     Parameters
     ----------

@@ -1,11 +1,12 @@
-r"""One dipole through time: an iterated extended Kalman filter that starts by itself, and says when it is lost.
+r"""One dipole through time: an iterated extended Kalman filter from the first row in which the source is seen.
 
-A track is acquired from a start-free fix (:mod:`magloc.tracking.acquisition`), followed by
-:func:`magloc.kalman.iterated_update` with a :class:`magloc.tracking.motion.MotionModel`, and given up when the readings
-contradict it or the range is no longer known; then it is acquired anew. The state is in the world frame where the
-array's pose is known, else in the array's. Behind the states of the motion stand the lasting errors that the array
-states of its sensors (:mod:`magloc.measurement.nuisances`), and those of its pose (:mod:`magloc.measurement.pose`):
-also those that are new in every row, so that the readings are modelled at the pose that they tell of.
+What is known of the source is a mixture of Gaussians in the coordinates of :mod:`magloc.tracking.chart.coordinates`,
+soon a single one (:mod:`magloc.tracking.chart.steps`), moved by a :class:`magloc.tracking.motion.MotionModel`. A track
+ends when the readings contradict it or its place is no longer known; then it starts anew. The state is in the world
+frame where the array's pose is known, else in the array's. Behind the states of the motion stand the lasting errors
+that the array states of its sensors (:mod:`magloc.measurement.nuisances`), and those of its pose
+(:mod:`magloc.measurement.pose`): also those that are new in every row, so that the readings are modelled at the pose
+that they tell of. Positions, moments and steps for smoothing are Cartesian.
 
 This module is the readable form; :mod:`magloc.tracking.batch` steps long records, and a test holds the two together.
 """
@@ -25,37 +26,27 @@ from magloc.ambient import in_world_field
 from magloc.blas_threads import one_blas_thread
 from magloc.kalman import (
     block_update,
-    estimability,
-    iterated_update,
     normalised_innovation_squared,
     predict_square_root,
     symmetric_square_root,
 )
 from magloc.levels import CONTRADICTION
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
-from magloc.localization.fit.results import Solution
 from magloc.measurement.nuisances import Drift
 from magloc.readings import Readings, without_saturated
-from magloc.tracking.acquisition import CONFIRMED_RANGE_ERROR, STACKED_POSITION_ERROR, Acquisition
+from magloc.tracking.acquisition import STACKED_POSITION_ERROR, Acquisition
+from magloc.tracking.chart.mixture import Mixture
+from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.start import prior_root
+from magloc.tracking.chart.steps import LARGEST_WIDTH, ChartFilter, Known, cartesian, charted, width_of
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.results import Innovation, Prediction, Row, Step, TrackPoint, moving, rows_of
 
-Prior = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 ROWS_TO_LOSE = 3
 """Contradicting rows in a row that end a track."""
-REFIX_RANGE_ERROR = 0.15
-"""A prediction whose range is less certain, σ over range, is replaced by a fix, if there is one."""
-LARGEST_RANGE_ERROR = 0.4
-"""A track whose range is less certain is lost."""
-TOLERANCE = 1e-4
-"""Stop of the iteration, in standard deviations of the differences: equation (19)."""
-MOST_ITERATIONS = 50
-SHRINK = 0.5
-"""Of steps that swing: see :func:`magloc.kalman.iterated_update`."""
-LARGEST_GROWTH = 1.5
-"""A prediction bends as the readings do while no standard deviation grows by more in the step: beyond that it is the
-motion that it is uncertain of, which is Gaussian in Cartesian coordinates."""
+LARGEST_RANGE_ERROR = LARGEST_WIDTH
+"""A track whose range is less certain, σ over range, is lost."""
 # How often the rows that a track starts from are linearised anew, until they move it by less than a share of its σ.
 _MOST_START_STEPS = 30
 _START_TOLERANCE = 1e-3
@@ -105,7 +96,7 @@ class Tracker:
     >>> motion = magloc.RandomWalk(speed_m_s=0.1, turn_rad_s=0.01)
     >>> tracker = magloc.Tracker(diver.array, motion)
     >>> tracker.update(diver.readings[0]).status
-    'not acquired: the range is not observable'
+    'not acquired: no signal stands out of noise'
     """
 
     def __init__(
@@ -125,13 +116,11 @@ class Tracker:
         self.errors, self.pose_errors = self.measurements.errors, self.measurements.pose_errors
         self.keep_steps = keep_steps
         self.steps: list[Step] = []
-        self._acquisition = Acquisition(array, prior, motion.speed_m_s)
-        self._x: FloatArray | None = None
-        self._S: FloatArray = np.zeros((0, 0))
+        self._acquisition = Acquisition(array)
+        self.filter = ChartFilter(array, self.errors, self.pose_errors, prior)
+        self._known: Known | None = None
         self._time_s = math.nan
-        self._contradictions = 0
         self._n_rows = 0
-        self._weight = math.nan
         self._last: Innovation | None = None
         self._row_before: Row | None = None
 
@@ -159,51 +148,10 @@ class Tracker:
             row, self._row_before = moving(row, self._row_before), row
         dt_s, self._time_s = row.time_s - self._time_s, row.time_s
         index, self._n_rows = self._n_rows, self._n_rows + 1
-        if self._x is None:
-            return self._acquired(row, index)
-        prediction = self.predicted(self._x, self._S, dt_s)
-        x, S = prediction.x, prediction.S
         measurement = self.measurements.of(row)
-        if not measurement.z.size:
-            return self._kept(measurement, index, x, S, prediction, status="predicted")
-        if self._range_error(x, S, measurement) > REFIX_RANGE_ERROR:
-            # The prediction says too little for an iteration to start from it.
-            self._x = None
-            point = self._acquired(row, index, near=(x, S))
-            if point.position_m is None and self._range_error(x, S, measurement) <= LARGEST_RANGE_ERROR:
-                return self._kept(measurement, index, x, S, prediction, status="predicted")
-            return point
-        k = measurement.z.size
-        update = iterated_update(
-            x,
-            S,
-            measurement.z,
-            np.ones(k),
-            measurement.predicted,
-            measurement.jacobian,
-            tolerance=TOLERANCE,
-            max_iterations=MOST_ITERATIONS,
-            shrink=SHRINK,
-            prior=self.curved_prior(measurement, x, S, dt_s),
-        )
-        innovation = Innovation(row.available, update.whitened)
-        if not update.converged or update.nis > chdtri(k, CONTRADICTION):
-            self._contradictions += 1
-            if self._contradictions >= ROWS_TO_LOSE:
-                self._x = None
-                return self._acquired(row, index)
-            return self._kept(measurement, index, x, S, prediction, status="outlier", innovation=innovation)
-        self._contradictions = 0
-        return self._kept(
-            measurement,
-            index,
-            update.x,
-            update.S,
-            prediction,
-            status="tracked",
-            innovation=innovation,
-            iterations=update.iterations,
-        )
+        if self._known is None:
+            return self._started(measurement, index)
+        return self._followed(self._known, measurement, index, dt_s)
 
     def run(
         self, rows: Iterable[Row | Readings], progress: Callable[[int], None] | None = None
@@ -215,9 +163,9 @@ class Tracker:
                 progress(1)
 
     @property
-    def weight(self) -> float:
-        """How likely the present track is among those that could have been started."""
-        return self._weight
+    def known(self) -> Known | None:
+        """What is known of the source before the next row; None without a track."""
+        return self._known
 
     @property
     def time_s(self) -> float:
@@ -226,19 +174,13 @@ class Tracker:
 
     @property
     def is_tracking(self) -> bool:
-        """Whether the next row continues a track."""
-        return self._x is not None
+        """Whether the next row continues a track that is no longer young, of one place."""
+        return self._known is not None and not self._known.young and len(self._known.mixture) == 1
 
-    def state(self) -> tuple[FloatArray, FloatArray, int]:
-        """Copies of the state and its square root, and the number of contradicting rows before the next one."""
-        if self._x is None:
-            raise RuntimeError("The tracker has no track, and so no state.")
-        return self._x.copy(), self._S.copy(), self._contradictions
-
-    def resume(self, x: FloatArray, S: FloatArray, time_s: float, contradictions: int, steps: Sequence[Step]) -> None:
-        """Go on from where compiled steps ended."""
-        self._x, self._S, self._time_s, self._contradictions = x, S, time_s, contradictions
-        self._n_rows += len(steps)
+    def resume(self, known: Known, time_s: float, n_rows: int = 0, steps: Sequence[Step] = ()) -> None:
+        """Go on from what is known at a time, after so many rows more."""
+        self._known, self._time_s, self._last = known, time_s, None
+        self._n_rows += n_rows
         if self.keep_steps:
             self.steps += steps
 
@@ -269,18 +211,16 @@ class Tracker:
         S_q[n + noisy, S_q_motion.shape[1] + np.arange(noisy.size)] = added[noisy]
         return Prediction(np.concatenate([moved, kept * x[n:]]), predict_square_root(S, F, S_q), F)
 
-    def curved_prior(self, measurement: RowMeasurement, x: FloatArray, S: FloatArray, dt_s: float) -> Prior | None:
-        """What a prediction (x, S) is Gaussian in; None: in Cartesian coordinates.
+    def known_before(self, measurement: RowMeasurement, x: FloatArray) -> FloatArray:
+        """Covariance (n, n) of the motion's states of a source at x before its first row."""
+        root = prior_root(ChartRow.of(measurement).chart(x[:N_SOURCE]))
+        _, S = self.motion.start(x[:N_SOURCE], root)
+        return S @ S.T
 
-        Errors of the pose bend them by what has lasted of them since the row before: place and moment are known with
-        those, and independently of what is new.
-        """
-        of_readings = _is_of_readings(self._S, S)
-        if self.pose_errors.n_states:
-            measurement = measurement.with_lasting_errors(self.pose_errors.step(dt_s)[0] ** 2)
-        elif not of_readings:
-            return None
-        return measurement.curved_prior(x, S, of_readings=of_readings)
+    def open_loop(self, covariance: FloatArray, x: FloatArray, dt_s: float) -> FloatArray:
+        """What becomes of it in a step from a state x in which no readings are taken."""
+        _, F, S_q = self.motion.step(x[: self.motion.n_states], dt_s)
+        return F @ covariance @ F.T + S_q @ S_q.T
 
     def start(self, source: FloatArray, covariance: FloatArray, rows: Sequence[Row]) -> FilteredStart | None:
         """State at the last of the rows that a source (6,) was found from, as if at rest, with a covariance (6, 6).
@@ -326,90 +266,102 @@ class Tracker:
             of_rows.append(x)
         return FilteredStart(x, S, chi2, of_rows)
 
+    def _lost(self, row: Row, reason: str) -> TrackPoint:
+        """What is known of a row without a track."""
+        centroid_m = row.origin_m + row.R_world_from_array @ self.array.centroid
+        return TrackPoint(row.time_s, status=reason, centroid_m=centroid_m, radius_m=self.array.circumradius)
+
+    def _started(self, measurement: RowMeasurement, index: int, near: Mixture | None = None) -> TrackPoint:
+        """A new track, if one can be started."""
+        self._known = None
+        if measurement.z.size < N_SOURCE:
+            return self._acquired(measurement, index)
+        row = ChartRow.of(measurement)
+        mixture, reason = self.filter.started(row, self.motion, near)
+        if mixture is None:
+            return self._lost(measurement.row, reason)
+        open_loop = self.known_before(measurement, mixture.matched().x[0])
+        known = self.filter.refitted(Known(mixture, open_loop, young=((row, self.motion),)))
+        return self._kept(measurement, index, known, None, status="acquired")
+
+    def _followed(self, before: Known, measurement: RowMeasurement, index: int, dt_s: float) -> TrackPoint:
+        """A track after one more row."""
+        row = ChartRow.of(measurement)
+        predicted = self.filter.predicted(before.mixture, self.motion, dt_s, row)
+        x = before.mixture.x[np.argmax(before.mixture.log_weight)]
+        known = replace(before, mixture=predicted, open_loop=self.open_loop(before.open_loop, x, dt_s))
+        prediction = self.predicted(*cartesian(before.mixture), dt_s) if self.keep_steps else None
+        if not row.z.size:
+            return self._kept(measurement, index, known, prediction, status="predicted")
+        if width_of(predicted) > LARGEST_WIDTH:
+            # The prediction says too little for an iteration to start from it.
+            if self.filter.is_detected(row):
+                return self._started(measurement, index, predicted.matched())
+            return self._kept(measurement, index, known, prediction, status="predicted")
+        update = self.filter.updated(before.mixture, predicted, dt_s, row)
+        innovation = Innovation(measurement.row.available, update.innovation)
+        if update.mixture is None:
+            if before.contradictions + 1 >= ROWS_TO_LOSE:
+                return self._started(measurement, index)
+            known = replace(known, contradictions=before.contradictions + 1)
+            point = self._kept(measurement, index, known, prediction, status="outlier", innovation=innovation)
+            return replace(point, nis=update.nis)
+        known = replace(known, mixture=update.mixture, contradictions=0)
+        if before.young:
+            known = self.filter.refitted(replace(known, young=(*before.young, (row, self.motion))))
+        return self._kept(
+            measurement,
+            index,
+            known,
+            prediction,
+            status="tracked",
+            innovation=innovation,
+            iterations=update.iterations,
+        )
+
     def _kept(
         self,
         measurement: RowMeasurement,
         index: int,
-        x: FloatArray,
-        S: FloatArray,
-        prediction: Prediction,
+        known: Known,
+        prediction: Prediction | None,
         *,
         status: str,
         innovation: Innovation | None = None,
         iterations: int = 0,
     ) -> TrackPoint:
-        row = measurement.row
+        row, mixture = measurement.row, known.mixture
         tracked = status == "tracked"
         told = {} if innovation is None else innovation.after(self._last if tracked else None)
         self._last = innovation if tracked else None
-        if self._range_error(x, S, measurement) > LARGEST_RANGE_ERROR:
-            self._x = None
-            return replace(self._lost(row, "lost: the range is no longer known"), **told)
-        self._x, self._S = x, S
+        if status != "acquired" and width_of(mixture) > LARGEST_WIDTH:
+            self._known = None
+            return replace(self._lost(row, "lost: the place is no longer known"), **told)
+        self._known = known
         if self.keep_steps:
-            self.steps.append(Step(index, prediction, x, S))
-        learned = estimability(S, prediction.S)[:N_SOURCE]
-        return replace(self._tracked(row, x, S, learned, iterations, status), **told)
+            self.steps.append(Step(index, prediction, *cartesian(mixture)))
+        point = of_mixture(row.time_s, mixture, np.diagonal(known.open_loop))
+        return replace(point, status=status, iterations=iterations, **told)
 
-    def _tracked(
-        self, row: Row, x: FloatArray, S: FloatArray, learned: FloatArray, iterations: int, status: str
-    ) -> TrackPoint:
-        """What is known of a row with a track."""
-        covariance = S[:N_SOURCE] @ S[:N_SOURCE].T
-        return TrackPoint(
-            row.time_s,
-            x[:3].copy(),
-            x[3:6].copy(),
-            covariance,
-            learned,
-            iterations,
-            status=status,
-            weight=self._weight,
-            centroid_m=self.centroid(row),
-            radius_m=self.array.circumradius,
-        )
-
-    def centroid(self, row: Row) -> FloatArray:
-        """Of the sensors in the world frame, shape (3,)."""
-        return row.origin_m + row.R_world_from_array @ self.array.centroid
-
-    def _lost(self, row: Row, reason: str, rivals: tuple[Solution, ...] = ()) -> TrackPoint:
-        """What is known of a row without a track."""
-        return TrackPoint(
-            row.time_s,
-            status=reason,
-            rivals=rivals,
-            centroid_m=self.centroid(row),
-            radius_m=self.array.circumradius,
-        )
-
-    def _acquired(self, row: Row, index: int, near: tuple[FloatArray, FloatArray] | None = None) -> TrackPoint:
-        """A new track, if one can be started."""
-        start, reason = self._acquisition.start(row, near)
-        alone = self._acquisition.of_last_row.solutions
+    def _acquired(self, measurement: RowMeasurement, index: int) -> TrackPoint:
+        """A new track from several rows of which one alone does not determine the source."""
+        row = measurement.row
+        start = self._acquisition.start(row)
         if start is None:
-            return self._lost(row, reason, alone)
+            return self._lost(row, "not acquired: one row does not determine the source")
         solution = start.solution
         source = np.concatenate([solution.position_m, solution.moment_Am2])
         found = self.start(source, solution.covariance, start.rows)
         if found is None:
-            return self._lost(row, "not acquired: no dipole fits the latest rows together", alone)
+            return self._lost(row, "not acquired: no dipole fits the latest rows together")
         x, S = found.x, found.S
-        measurement = self.measurements.of(row)
-        certain = self._range_error(x, S, measurement) <= CONFIRMED_RANGE_ERROR
-        if len(start.rows) > 1:
-            offset, root = measurement.place_in_array(x, S)
-            certain = float(np.linalg.norm(root)) <= STACKED_POSITION_ERROR * float(np.linalg.norm(offset))
-        if not certain:
-            return self._lost(row, "not acquired: the range is not certain enough", alone)
+        offset, root = measurement.place_in_array(x, S)
+        if float(np.linalg.norm(root)) > STACKED_POSITION_ERROR * float(np.linalg.norm(offset)):
+            return self._lost(row, "not acquired: the range is not certain enough")
         self._acquisition.forget()
-        self._x, self._S, self._last = x, S, None
-        self._contradictions = 0
-        self._weight = solution.weight
-        if self.keep_steps:
-            self.steps.append(Step(index, None, x, S))
-        learned = np.ones(N_SOURCE)
-        return replace(self._tracked(row, x, S, learned, solution.iterations, "acquired"), rivals=start.rivals)
+        known = Known(charted(x, S, ChartRow.of(measurement)), self.known_before(measurement, x))
+        point = self._kept(measurement, index, known, None, status="acquired", iterations=solution.iterations)
+        return replace(point, weight=solution.weight, rivals=start.rivals)
 
     def _range_error(self, x: FloatArray, S: FloatArray, measurement: RowMeasurement) -> float:
         """Standard deviation of the range over the range."""
@@ -419,7 +371,23 @@ class Tracker:
         return math.sqrt(float(along @ along)) / square if square > 0.0 else math.inf
 
 
-def _is_of_readings(S: FloatArray, S_predicted: FloatArray) -> bool:
-    """Whether what a prediction knows of a source is mostly what readings told, not what the motion leaves of it."""
-    before, after = (np.linalg.norm(root[:N_SOURCE], axis=1) for root in (S, S_predicted))
-    return bool(np.all(after <= LARGEST_GROWTH * before))
+def learned(variance: FloatArray, open_loop: FloatArray) -> FloatArray:
+    """Estimability: 1 - σ / σ without any readings, from both variances."""
+    return 1.0 - np.sqrt(np.minimum(variance / open_loop, 1.0))
+
+
+def of_mixture(time_s: float, mixture: Mixture, open_loop: FloatArray) -> TrackPoint:
+    """What is known at an instant, for a user; open_loop (n,) are the variances had no readings been taken."""
+    source = mixture.of_source()
+    mean, covariance = source.moments()
+    return TrackPoint(
+        time_s,
+        mean[:3],
+        mean[3:],
+        covariance,
+        learned(np.diagonal(covariance), open_loop[:N_SOURCE]),
+        weight=float(source.weight.max()),
+        centroid_m=source.centroid_m,
+        radius_m=source.radius_m,
+        mixture=source,
+    )

@@ -6,7 +6,6 @@
 | scalar_update, sequential_update | exact rational arithmetic, filterpy's batch update, information form |
 | predict_square_root | F P Fᵀ + Q |
 | iterated_update | scipy's minimiser of the MAP cost, Stone Soup's IteratedKalmanUpdater, the affine closed form |
-| its curved prior | the linear update in coordinates where everything is linear |
 | IteratedExtendedKalmanFilter | filterpy's ExtendedKalmanFilter where one linearisation is exact |
 """
 
@@ -240,7 +239,7 @@ def _solve_extended(a, b):
 
 
 class TestPlainFormIsUnchanged:
-    """Without a prior that bends and without shrinking it is Gauss-Newton, scalar by scalar, to rounding."""
+    """Without shrinking it is Gauss-Newton, scalar by scalar, to rounding."""
 
     def reference(self, x, S, z, r, h, H, tolerance):
         x_k, predicted, change, iterations = x, h(x), np.inf, 0
@@ -259,38 +258,6 @@ class TestPlainFormIsUnchanged:
         np.testing.assert_allclose(result.x, expected_x, rtol=1e-8)
         np.testing.assert_allclose(result.S @ result.S.T, expected_S @ expected_S.T, rtol=1e-8, atol=1e-15)
         assert (result.converged, result.iterations) == (True, iterations)
-
-    def test_a_prior_that_is_the_prediction_everywhere_changes_nothing(self):
-        x, S, z, r, h, H = dipole_problem(START)
-        plain = iterated_update(x, S, z, r, h, H, tolerance=1e-6)
-        same = iterated_update(x, S, z, r, h, H, tolerance=1e-6, prior=lambda _: (x, S))
-        np.testing.assert_array_equal(same.x, plain.x)
-        np.testing.assert_array_equal(same.S, plain.S)
-        assert (same.nis, same.iterations) == (plain.nis, plain.iterations)
-
-
-class TestCurvedPrior:
-    def test_a_gaussian_in_other_coordinates_is_the_plain_update_in_them(self):
-        """c = sinh(x) of every number: prior and readings are linear in c, and one linear update there is exact."""
-        x, S, H, nu, r = random_problem(8)
-        c = np.sinh(x)
-        z = H @ c + nu
-        c_new, S_new = sequential_update(c, S, H, nu, r)
-
-        def prior(y):
-            J = np.cosh(y)
-            return y - (np.sinh(y) - c) / J, S / J[:, None]
-
-        result = iterated_update(
-            x, S, z, r, lambda y: H @ np.sinh(y), lambda y: H * np.cosh(y), tolerance=1e-10, prior=prior
-        )
-        assert result.converged
-        np.testing.assert_allclose(np.sinh(result.x), c_new, rtol=1e-9, atol=1e-9)
-        J = np.cosh(result.x)[:, None]
-        P = S_new @ S_new.T
-        np.testing.assert_allclose((J * result.S) @ (J * result.S).T, P, rtol=1e-7, atol=1e-9 * np.abs(P).max())
-        expected_nis = nu @ np.linalg.solve(H @ S @ S.T @ H.T + np.diag(r), nu)
-        assert result.nis == pytest.approx(expected_nis, rel=1e-7)
 
 
 class TestShrink:

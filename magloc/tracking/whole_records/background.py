@@ -18,15 +18,16 @@ import numpy as np
 from scipy.special import chdtri
 
 from arrays.typing import BoolArray, FloatArray
-from magloc.kalman import block_update, estimability, whitened_innovation
+from magloc.kalman import block_update, whitened_innovation
 from magloc.levels import CONTRADICTION
 from magloc.readings import Readings
-from magloc.tracking.acquisition import CONFIRMED_RANGE_ERROR
 from magloc.tracking.batch import track_record
+from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.steps import charted
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Innovation, Prediction, Row, Step, TrackPoint, rows_of
-from magloc.tracking.tracker import LARGEST_RANGE_ERROR, Tracker
+from magloc.tracking.tracker import LARGEST_RANGE_ERROR, Tracker, of_mixture
 from magloc.tracking.whole_records.smoother import smoothed, smoothed_states
 
 _LOG = logging.getLogger(__name__)
@@ -37,6 +38,8 @@ _UNKNOWN = 10.0
 _MOST_PASSES = 30
 _SETTLED = 1e-2
 _MOST_AGREE = 0.9
+# Standard deviation of the range over the range, with which a track on a background begins.
+_FIRST_RANGE_ERROR = 0.06
 # Noise that plain tracks are tried with, in that of the sensors, and rows that they must have.
 _NOISIER = (1.0, 10.0, 100.0)
 _FEWEST_ROWS = 5
@@ -207,20 +210,21 @@ def _points(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _P
     """What is known of every row, from the first one on that knows the range."""
     points: list[TrackPoint] = []
     tracked, last = False, None
+    open_loop = tracker.known_before(measurements[0], passed.steps[0].x)
     for j, (measurement, step) in enumerate(zip(measurements, passed.steps, strict=True)):
         row, innovation = measurement.row, passed.innovations[j]
+        if j:
+            open_loop = tracker.open_loop(open_loop, passed.steps[j - 1].x, row.time_s - measurements[j - 1].row.time_s)
         range_error = tracker._range_error(step.x, step.S, measurement)
-        if range_error > (LARGEST_RANGE_ERROR if tracked else CONFIRMED_RANGE_ERROR):
+        if range_error > (LARGEST_RANGE_ERROR if tracked else _FIRST_RANGE_ERROR):
             tracked, last = False, None
             points.append(tracker._lost(row, "not acquired: the range is not certain enough"))
             continue
         status = "predicted" if innovation is None else "tracked" if passed.used[j] else "outlier"
         told = {} if innovation is None or not tracked else innovation.after(last)
         last = innovation if status == "tracked" else None
-        learned = np.ones(N_SOURCE)
-        if step.prediction is not None:
-            learned = estimability(step.S, step.prediction.S)[:N_SOURCE]
-        point = tracker._tracked(row, step.x, step.S, learned, 1, status if tracked else "acquired")
-        points.append(replace(point, **told))
+        mixture = charted(step.x, step.S, ChartRow.of(measurement))
+        point = of_mixture(row.time_s, mixture, np.diagonal(open_loop))
+        points.append(replace(point, iterations=1, status=status if tracked else "acquired", **told))
         tracked = True
     return points

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from arrays.typing import FloatArray
+from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Step, TrackPoint
 
@@ -20,8 +21,12 @@ def smoothed(points: list[TrackPoint], steps: list[Step]) -> list[TrackPoint]:
     for step, (x, P) in zip(steps, smoothed_states(steps), strict=True):
         point = points[step.row]
         if point.position_m is not None:
-            covariance = P[:N_SOURCE, :N_SOURCE]
-            result[step.row] = replace(point, position_m=x[:3], moment_Am2=x[3:6], covariance=covariance)
+            assert point.centroid_m is not None
+            source = Mixture.of_gaussian(x[:N_SOURCE], P[:N_SOURCE, :N_SOURCE], point.centroid_m, point.radius_m)
+            mean, covariance = source.moments()
+            result[step.row] = replace(
+                point, position_m=mean[:3], moment_Am2=mean[3:], covariance=covariance, mixture=source
+            )
     return result
 
 

@@ -23,14 +23,15 @@ import sims
 from arrays import geometries
 from arrays.array import SensorArray
 from arrays.sensor import Calibration, Sensor
-from magloc.kalman import iterated_update, predict_square_root
 from magloc.measurement.differences import predicted_channels
 from magloc.measurement.nuisances import SensorErrors, without_lasting_errors
-from magloc.readings import Readings
 from magloc.tracking.batch import track_record
-from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.update import updated
+from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import Row, rows_of
-from magloc.tracking.tracker import MOST_ITERATIONS, SHRINK, TOLERANCE, Tracker
+from magloc.tracking.tracker import Tracker
 from sims.magnetics.paths import Attitude, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
 from sims.magnetics.sensors import SensorModel
@@ -218,39 +219,6 @@ class TestEffect:
         np.testing.assert_allclose(effect[vector], whole[vector], rtol=1e-9, atol=1e-15)
 
 
-class TestWithoutLastingErrors:
-    def test_the_track_is_that_of_the_motion_alone(self) -> None:
-        """To the last bit: the state, its square root and the NIS of a filter that knows nothing of sensor errors."""
-        array, motion = geometries.tetrahedron(1.5, "vector", 2e-10), RandomWalk(1e-4, 1e-5)
-        t = 0.5 * np.arange(30.0)
-        readings = np.tile(predicted_channels(array, SOURCE[:3], SOURCE[3:]), (30, 1))
-        readings += 2e-10 * np.random.default_rng(6).normal(size=readings.shape)
-        rows = list(rows_of(Readings(readings, time_s=t)))
-        tracker = Tracker(array, motion, keep_steps=True)
-        points = list(tracker.run(rows))
-        x, S = tracker.steps[0].x, tracker.steps[0].S
-        for row, step, point in zip(rows[1:], tracker.steps[1:], points[1:], strict=True):
-            x, F, S_q = motion.step(x, 0.5)
-            S = predict_square_root(S, F, S_q)
-            measurement = tracker.measurements.of(row)
-            update = iterated_update(
-                x,
-                S,
-                measurement.z,
-                np.ones(9),
-                measurement.of_source,
-                measurement.source_jacobian,
-                tolerance=TOLERANCE,
-                max_iterations=MOST_ITERATIONS,
-                shrink=SHRINK,
-                prior=measurement.curved_prior(x, S),
-            )
-            x, S = update.x, update.S
-            np.testing.assert_array_equal(step.x, x)
-            np.testing.assert_array_equal(step.S, S)
-            assert (point.status, point.nis) == ("tracked", update.nis)
-
-
 def uncalibrated(array: SensorArray, rng: np.random.Generator) -> tuple[FloatArray, SensorArray]:
     """Errors drawn from what an array of vector sensors states of turns, and the array that has them."""
     sensors, state = [], []
@@ -262,65 +230,43 @@ def uncalibrated(array: SensorArray, rng: np.random.Generator) -> tuple[FloatArr
     return np.concatenate(state), replace(array, sensors=tuple(sensors))
 
 
-class TestStart:
+class TestUpdate:
     def test_is_the_best_fit_of_source_and_errors_together(self) -> None:
-        """scipy's minimum of residuals and errors in units of their σ, and the inverse information there."""
+        """scipy's minimum of residuals, source and errors in units of their σ, and the inverse information there."""
         rng = np.random.default_rng(7)
         array = replace(with_errors(geometries.tetrahedron(1.5, "vector", 2e-10), **LASTING), ambient_T=AMBIENT_T)
         _, true = uncalibrated(array, rng)
-        readings = predicted_channels(true, SOURCE[:3], SOURCE[3:]) + 2e-10 * rng.normal(size=(6, 12))
-        rows = list(rows_of(Readings(readings)))
+        readings = predicted_channels(true, SOURCE[:3], SOURCE[3:]) + 2e-10 * rng.normal(size=12)
         tracker = Tracker(array, RandomWalk(1e-6, 1e-6))
-        measurements = [tracker.measurements.of(row) for row in rows]
-        scale = np.concatenate([UNIT, tracker.errors.sigma])
+        measurement = ChartRow.of(tracker.measurements.of(Row(0.0, readings)))
+        chart = Chart.at(SOURCE[None] * 1.01, array.centroid, array.circumradius)
+        N = 6 + tracker.errors.n_states
+        x, S = np.zeros((1, N)), np.zeros((1, N, N))
+        x[0, :6] = SOURCE * 1.01
+        S[0, :6, :6] = np.diag([0.05, 0.05, 0.05, 0.2, 0.2, 0.2])
+        S[0, np.arange(6, N), np.arange(6, N)] = tracker.errors.sigma
+        scale = np.concatenate([np.diagonal(S[0, :6, :6]), tracker.errors.sigma])
 
         def residuals(y: FloatArray) -> FloatArray:
-            misfits = [measurement.z - measurement.predicted(y * scale) for measurement in measurements]
-            return np.concatenate([*misfits, y[6:]])
+            source = chart.retracted((y * scale)[None, :6])[0]
+            misfit = measurement.z - measurement.of_source(source) - measurement.effect @ (y * scale)[6:]
+            return np.concatenate([misfit, y])
 
-        fit = least_squares(
-            residuals, np.concatenate([SOURCE / UNIT, np.zeros(36)]), xtol=1e-15, ftol=1e-15, gtol=1e-15
-        )
+        fit = least_squares(residuals, np.zeros(N), xtol=1e-15, ftol=1e-15, gtol=1e-15)
         J = np.asarray(fit.jac)
-        P = np.linalg.inv(J.T @ J)
-        found = tracker.start(SOURCE * 1.01, np.diag(UNIT**2), rows)
-        assert found is not None
-        x, S = found.x, found.S
+        P = np.linalg.inv(J.T @ J) * np.outer(scale, scale)
+        found = updated(x, S, measurement, np.zeros(1, dtype=bool))
         deviation = np.sqrt(np.diagonal(P))
-        np.testing.assert_allclose((x / scale - fit.x) / deviation, 0.0, atol=2e-3)
-        root = S / scale[:, None] / deviation[:, None]
-        np.testing.assert_allclose(root @ root.T, P / np.outer(deviation, deviation), atol=1e-4)
-
-    def test_is_converged(self) -> None:
-        """Sixteen rows of a drone (seed 1010), whose fix without lasting errors is 1 m off: one pass more is nothing.
-
-        To 0.1 σ; there the true source is within 5 σ (once in 1.7 million).
-        """
-        simulation = sims.simulate(replace(sims.read_scenario("drone"), duration_s=14.0), 1010)
-        readings, truth = simulation.readings, simulation.truth
-        rows = list(rows_of(readings))[79::4]
-        tracker = Tracker(simulation.array, RandomWalk(1e-6, 1e-6))
-        source = np.array([1.259, 0.109, -0.234, 6.0, 3.0, -4.0])
-        covariance = np.diag([0.18, 0.47, 0.46, 3.0, 3.0, 3.0]) ** 2
-        found = tracker.start(source, covariance, rows)
-        assert found is not None
-        x, S = found.x, found.S
-        again = tracker.filtered_start([x] * len(rows), covariance, [tracker.measurements.of(row) for row in rows])
-        end, S_end = again.x, again.S
-        deviation = np.linalg.norm(S_end, axis=1)
-        np.testing.assert_allclose((x - end) / deviation, 0.0, atol=0.1)
-        np.testing.assert_allclose(np.linalg.norm(S, axis=1) / deviation, 1.0, atol=0.05)
-        off = np.linalg.lstsq(S_end[:3] @ S_end[:3].T, end[:3] - truth.position_m[0], rcond=None)[0]
-        assert off @ (end[:3] - truth.position_m[0]) < chi2.isf(5.7e-7, 3)
-
-    def test_without_errors_is_the_fix(self) -> None:
-        covariance = np.diag((0.1 * UNIT) ** 2)
-        tracker = Tracker(geometries.tetrahedron(1.5), OrnsteinUhlenbeck(0.1, 0.02))
-        found = tracker.start(SOURCE, covariance, [Row(0.0, np.zeros(12))])
-        assert found is not None
-        x, S = found.x, found.S
-        np.testing.assert_array_equal(x, [*SOURCE, *np.zeros(6)])
-        np.testing.assert_allclose(np.diagonal(S @ S.T), [*np.diagonal(covariance), *[0.01] * 3, *[0.0004] * 3])
+        assert found.nis[0] == pytest.approx(2.0 * fit.cost, rel=1e-6)
+        offset = np.concatenate([chart.coordinates(found.x[:, :6])[0], found.x[0, 6:]])
+        np.testing.assert_allclose((offset - fit.x * scale) / deviation, 0.0, atol=2e-3)
+        after = Chart.at(found.x[:, :6], array.centroid, array.circumradius)
+        turn = np.eye(N)
+        turn[:6, :6] = after.inverse_jacobian()[0] @ chart.jacobian(offset[None, :6])[0]
+        expected = turn @ P @ turn.T
+        root = found.S[0] / np.sqrt(np.diagonal(expected))[:, None]
+        unit = np.sqrt(np.diagonal(expected))
+        np.testing.assert_allclose(root @ root.T, expected / np.outer(unit, unit), atol=1e-3)
 
 
 class TestErrorsAreFound:
@@ -359,15 +305,18 @@ class TestErrorsAreFound:
             tracker = Tracker(simulation.array, RandomWalk(1e-7, 1e-7))
             points = track_record(tracker, rows)
             assert points[-1].status == "tracked"
-            x, S, _ = tracker.state()
+            assert tracker.known is not None
+            mixture = tracker.known.mixture
             turns = [
                 Rotation.from_matrix(np.array(sensor.calibration.scale)).as_rotvec()
                 for sensor in simulation.true_array.sensors
             ]
             assert truth.moment_Am2 is not None
             state = np.concatenate([truth.position_m[-1], truth.moment_Am2[-1], *turns])
-            square += float(np.sum(np.linalg.solve(S, x - state) ** 2))
-            of_turns = S[6:].reshape(4, 3, -1)
+            error = state - mixture.x[0]
+            error[:6] = mixture.chart.coordinates(state[None, :6])[0]
+            square += float(np.sum(np.linalg.solve(mixture.S[0], error) ** 2))
+            of_turns = mixture.S[0, 6:].reshape(4, 3, -1)
             learned.append(np.linalg.norm(of_turns - of_turns.mean(axis=0), axis=-1).max() / 1e-4)
         dof = 18 * self.N_RUNS
         assert chi2.ppf(0.005, dof) < square < chi2.ppf(0.995, dof)

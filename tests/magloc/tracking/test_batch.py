@@ -15,7 +15,6 @@ from arrays import geometries
 from arrays.array import SensorArray
 from magloc.readings import Readings
 from magloc.tracking.batch import track_record
-from magloc.tracking.batch_compiled import _solved
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
 from magloc.tracking.tracker import Tracker
@@ -187,17 +186,3 @@ class TestCompiledRecord:
         finished: list[int] = []
         track_record(Tracker(ARRAY, SLOW), rows_from(time_s, readings_of(ARRAY, p, m)), finished.append)
         assert sum(finished) == 25
-
-
-@pytest.mark.parametrize("place", [0, 2, 4])
-def test_elimination_goes_by_the_largest_pivot(place: int) -> None:
-    """A number next to zero in the diagonal would cost all digits; no pivot at all is said."""
-    rng = np.random.default_rng(place)
-    A, B = rng.normal(size=(6, 6)), rng.normal(size=(6, 2))
-    A[:place, place:], A[place:, :place] = 0.0, 0.0
-    A[place, place] = 1e-20
-    expected = np.linalg.solve(A, B)
-    assert _solved(A.copy(), B)
-    np.testing.assert_allclose(B, expected, rtol=0.0, atol=1e-11 * np.abs(expected).max())
-    A[:, place] = 0.0
-    assert not _solved(A, B)

@@ -12,9 +12,13 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from arrays import geometries
+from arrays.array import SensorArray
 from arrays.differences import contrasts
 from magloc.chi_square import mean_bounds
+from magloc.kalman import symmetric_square_root
 from magloc.readings import Readings
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.consistency import consistency, nees_of
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
@@ -106,7 +110,7 @@ class TestNeesOfACurvedEstimate:
     UNIT = np.repeat([1.0, 100.0], 3)
 
     def test_is_the_square_of_the_noise(self) -> None:
-        """To rounding, for 200 draws of a noise that leaves the range known to 5 %; the Cartesian one is far off."""
+        """To 1 %, for 200 draws of a noise that leaves the range known to 5 %; the Cartesian one is far off."""
         rng = np.random.default_rng(3)
         array = replace(self.THREE, sensors=tuple(replace(s, noise_T=6e-9) for s in self.THREE.sensors))
         tracker = Tracker(array, RandomWalk(0.1, 0.1))
@@ -118,13 +122,20 @@ class TestNeesOfACurvedEstimate:
             if estimate is None:
                 continue
             H = measurement.source_jacobian(estimate)
-            covariance = np.linalg.inv(H.T @ H)
+            point = self.point(array, estimate, np.linalg.inv(H.T @ H))
             expected.append(noise @ noise)
-            found.append(nees_of(measurement, estimate, covariance, self.TRUTH)[0])
+            found.append(nees_of(point, self.TRUTH, measurement)[0])
             cartesian.append((H @ (self.TRUTH - estimate)) @ (H @ (self.TRUTH - estimate)))
         assert len(found) > 190
-        np.testing.assert_allclose(found, expected, rtol=1e-5)
+        np.testing.assert_allclose(found, expected, rtol=1e-2)
         assert np.max(np.abs(np.array(cartesian) / expected - 1.0)) > 0.1
+
+    def point(self, array: SensorArray, estimate: FloatArray, covariance: FloatArray) -> TrackPoint:
+        """Of a single component."""
+        chart = Chart.at(estimate[None], array.centroid, array.circumradius)
+        S = chart.inverse_jacobian() @ symmetric_square_root(covariance)
+        mixture = Mixture(estimate[None], S, np.zeros(1), 6, array.centroid, array.circumradius)
+        return replace(point_of(estimate[:3], estimate[3:], covariance), mixture=mixture)
 
     def solved(self, measurement: RowMeasurement, z: FloatArray) -> FloatArray | None:
         """The source whose six differences are z, if scipy finds it."""
@@ -142,11 +153,23 @@ class TestNeesOfACurvedEstimate:
         measurement = Tracker(ARRAY, RandomWalk(0.1, 0.1)).measurements.of(Row(0.0, np.zeros(12)))
         truth = self.TRUTH.copy()
         truth[2] = np.nan
-        square, dof = nees_of(measurement, self.TRUTH + 0.1 * self.UNIT, np.diag(self.UNIT**2), truth)
+        off = self.TRUTH + 0.1 * self.UNIT
+        square, dof = nees_of(point_of(off[:3], off[3:], np.diag(self.UNIT**2)), truth, measurement)
         assert (square, dof) == (pytest.approx(5 * 0.01), 5)
         # A moment that is known in part is not known.
         truth[3] = np.nan
-        assert nees_of(measurement, self.TRUTH, np.diag(self.UNIT**2), truth)[1] == 2
+        assert nees_of(point_of(off[:3], off[3:], np.diag(self.UNIT**2)), truth, measurement)[1] == 2
+
+    def test_without_a_moment_it_is_that_of_the_place(self) -> None:
+        """Of a known direction and a log-range that is off by 1.5 σ."""
+        covariance = np.diag(np.repeat([0.01, 1.0], 3)) ** 2
+        point = self.point(ARRAY, self.TRUTH, covariance)
+        assert point.mixture is not None
+        away = np.concatenate([ARRAY.centroid + 1.002 * (self.TRUTH[:3] - ARRAY.centroid), np.full(3, np.nan)])
+        measurement = Tracker(ARRAY, RandomWalk(0.1, 0.1)).measurements.of(Row(0.0, np.zeros(12)))
+        square, dof = nees_of(point, away, measurement)
+        sigma = 0.01 / np.linalg.norm(self.TRUTH[:3] - ARRAY.centroid)
+        assert (square, dof) == (pytest.approx((math.log(1.002) / sigma) ** 2, rel=1e-6), 3)
 
 
 class TestCounting:
@@ -202,6 +225,11 @@ def jacobian_of(state: FloatArray, rotation: FloatArray, origin: FloatArray) -> 
     return derivative(differences, state / scale, step=1e-2, atol=1e-9) * 1e-9 / scale
 
 
+def shown(n: int) -> FloatArray:
+    """Readings (n, 12) that stand out of noise."""
+    return np.tile(1e-6 * np.arange(12.0), (n, 1))
+
+
 class MovingArray:
     """A source that moves, and an array that moves and turns."""
 
@@ -213,14 +241,12 @@ class MovingArray:
         return t, p, np.tile([120.0, -150.0, 160.0], (self.N_ROWS, 1))
 
     def rows(self, t: FloatArray) -> tuple[list[Row], FloatArray, FloatArray]:
-        """Of an array that moves and turns; their readings play no part, only that they are there."""
+        """Of an array that moves and turns; their readings play no part, only that they show a source."""
         from scipy.spatial.transform import Rotation
 
         origin = np.outer(t, [0.1, -0.1, 0.0])
         rotation = Rotation.from_rotvec(np.outer(t, [0.1, 0.0, -0.2]))
-        rows = list(
-            rows_of(Readings(np.zeros((self.N_ROWS, 12)), time_s=t, array_position_m=origin, array_rotation=rotation))
-        )
+        rows = list(rows_of(Readings(shown(self.N_ROWS), time_s=t, array_position_m=origin, array_rotation=rotation)))
         return rows, rotation.as_matrix(), origin
 
 
@@ -249,14 +275,14 @@ class TestPosteriorBound(MovingArray):
     def test_first_row_is_the_cramer_rao_bound(self) -> None:
         """Spec 1, section 4: edge 1.5 m, 1 nT, source (5, 0, 0.306) m, moment along z: (0.289, 0.082, 0.076) m."""
         array = geometries.tetrahedron(1.5, "vector", 1e-9)
-        row = Row(0.0, np.zeros(12))
+        row = Row(0.0, shown(1)[0])
         p, m = np.array([[5.0, 0.0, 0.306]]), np.array([[0.0, 0.0, 100.0]])
         (bound,) = posterior_bound(Tracker(array, RandomWalk(0.1, 0.1)), [row], p, m)
         assert bound == pytest.approx(math.sqrt(0.289**2 + 0.082**2 + 0.076**2), rel=0.01)
 
     def test_of_rest_falls_with_the_root_of_the_rows(self) -> None:
         t, p, m = self.truth()
-        rows = list(rows_of(Readings(np.zeros((self.N_ROWS, 12)), time_s=t)))
+        rows = list(rows_of(Readings(shown(self.N_ROWS), time_s=t)))
         still_p, still_m = np.tile(p[0], (self.N_ROWS, 1)), m
         bounds = posterior_bound(Tracker(ARRAY, RandomWalk(1e-9, 1e-9)), rows, still_p, still_m)
         np.testing.assert_allclose(bounds, bounds[0] / np.sqrt(np.arange(1.0, self.N_ROWS + 1.0)), rtol=1e-6)
@@ -277,11 +303,11 @@ class TestPosteriorBound(MovingArray):
             expected.append(math.sqrt(float(np.trace(np.linalg.inv(J)[:3, :3]))))
         np.testing.assert_allclose(bounds, expected, rtol=1e-3)
 
-    def test_is_infinite_until_the_readings_determine_the_source(self) -> None:
+    def test_is_infinite_until_a_row_shows_the_source(self) -> None:
         t, p, m = self.truth()
-        readings = np.zeros((self.N_ROWS, 12))
+        readings = shown(self.N_ROWS)
         readings[0] = np.nan
-        readings[1, 6:] = np.nan  # three differences
+        readings[1] = 0.0
         readings[4] = np.nan
         bounds = posterior_bound(
             Tracker(ARRAY, OrnsteinUhlenbeck(0.2, 0.05)), list(rows_of(Readings(readings, time_s=t))), p, m
@@ -312,7 +338,7 @@ class TestSmoothingBound(MovingArray):
     def test_of_wandering_motion_with_a_gap(self) -> None:
         """Velocity and turn rate are known from the start by their standard deviations alone."""
         t, p, m = self.truth()
-        readings = np.zeros((self.N_ROWS, 12))
+        readings = shown(self.N_ROWS)
         readings[3] = np.nan
         rows = list(rows_of(Readings(readings, time_s=t)))
         motion = OrnsteinUhlenbeck(0.2, 0.05)
@@ -333,8 +359,8 @@ class TestSmoothingBound(MovingArray):
 
     def test_is_below_that_of_a_filter_but_at_the_last_row(self) -> None:
         t, p, m = self.truth()
-        readings = np.zeros((self.N_ROWS, 12))
-        readings[0, 6:] = np.nan  # three differences: no source yet
+        readings = shown(self.N_ROWS)
+        readings[0] = 0.0
         rows, tracker = list(rows_of(Readings(readings, time_s=t))), Tracker(ARRAY, OrnsteinUhlenbeck(0.2, 0.05))
         filtered, with_later_rows = posterior_bound(tracker, rows, p, m), smoothing_bound(tracker, rows, p, m)
         assert np.isinf(with_later_rows[0])

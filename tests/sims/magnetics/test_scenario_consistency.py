@@ -68,8 +68,7 @@ def track_statistics(simulation: Simulation, motion: MotionModel) -> dict[str, A
     for k, i in enumerate(np.linspace(0, len(rows) - 1, N_INSTANTS + 1).astype(int)[1:]):
         point = points[i]
         if point.position_m is not None and point.moment_Am2 is not None and point.covariance is not None:
-            estimate = np.concatenate([point.position_m, point.moment_Am2])
-            nees[k] = nees_of(tracker.measurements.of(rows[i]), estimate, point.covariance, source[i])[0]
+            nees[k] = nees_of(point, source[i], tracker.measurements.of(rows[i]))[0]
     used = [point for point in points if point.status == "tracked"]
     last = next((point for point in reversed(points) if point.covariance is not None), None)
     end = math.inf

@@ -7,9 +7,9 @@ from filterpy.kalman import KalmanFilter
 
 from magloc.tracking.batch import track_record
 from magloc.tracking.motion import OrnsteinUhlenbeck
-from magloc.tracking.results import Prediction, Step, TrackPoint
+from magloc.tracking.results import Prediction, Step
 from magloc.tracking.tracker import Tracker
-from magloc.tracking.whole_records.smoother import smoothed
+from magloc.tracking.whole_records.smoother import smoothed, smoothed_states
 from tests.passing_source import ARRAY, SLOW, moving_source, positions, readings_of, rows_from
 
 
@@ -22,7 +22,7 @@ class TestSmoother:
         reference.F = np.eye(6) + 0.1 * rng.normal(size=(6, 6))
         reference.H = rng.normal(size=(4, 6))
         reference.Q, reference.R, reference.P = 0.1 * np.eye(6), 0.5 * np.eye(4), 4.0 * np.eye(6)
-        points, steps, xs, Ps = [], [], [], []
+        steps, xs, Ps = [], [], []
         for i in range(n):
             prediction = None
             if i:
@@ -34,16 +34,10 @@ class TestSmoother:
             xs.append(x)
             Ps.append(P)
             steps.append(Step(i, prediction, x, np.linalg.cholesky(P)))
-            points.append(TrackPoint(float(i), x[:3], x[3:], P, status="tracked"))
         expected_x, expected_P, _, _ = reference.rts_smoother(np.array(xs)[..., None], np.array(Ps))
-        for i, point in enumerate(smoothed(points, steps)):
-            assert point.position_m is not None
-            assert point.moment_Am2 is not None
-            np.testing.assert_allclose(
-                np.concatenate([point.position_m, point.moment_Am2]), expected_x[i].ravel(), rtol=1e-8, atol=1e-9
-            )
-            assert point.covariance is not None
-            np.testing.assert_allclose(point.covariance, expected_P[i], rtol=1e-8, atol=1e-9)
+        for i, (x, P) in enumerate(smoothed_states(steps)):
+            np.testing.assert_allclose(x, expected_x[i].ravel(), rtol=1e-8, atol=1e-9)
+            np.testing.assert_allclose(P, expected_P[i], rtol=1e-8, atol=1e-9)
 
     def test_goes_no_farther_than_a_track(self) -> None:
         """Every track is smoothed by itself: the last row of one stays as the filter had it."""
@@ -53,8 +47,8 @@ class TestSmoother:
         points = track_record(tracker, rows_from(time_s, readings_of(ARRAY, p, m)))
         again = points.index(next(point for point in points[1:] if point.status == "acquired"))
         finished = smoothed(points, tracker.steps)
-        np.testing.assert_array_equal(finished[again - 1].position_m, points[again - 1].position_m)
-        np.testing.assert_array_equal(finished[-1].position_m, points[-1].position_m)
+        np.testing.assert_allclose(positions(finished)[again - 1], positions(points)[again - 1], rtol=1e-9)
+        np.testing.assert_allclose(positions(finished)[-1], positions(points)[-1], rtol=1e-9)
         assert np.abs(positions(finished)[5] - positions(points)[5]).max() > 0.0
 
     def test_never_claims_to_know_less(self) -> None:

@@ -1,0 +1,221 @@
+"""Where a source may be: a mixture of Gaussians in log-range, direction, and the moment as it is seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import ndtr
+
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.kalman import symmetric_square_root
+from magloc.localization.fit.results import Intervals
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.motion import N_SOURCE
+
+MERGED_BELOW = 0.02
+"""Kullback and Leibler's divergence below which two components are one."""
+DROPPED_BELOW = -12.0
+"""Logarithm of a component's weight, against the heaviest one, below which it is forgotten."""
+NEAREST, FARTHEST = 0.6, 60.0
+"""Ranges between which a source is looked for, in radii of the array. A set that reaches there is open, unless it is
+narrow."""
+_OUTSIDE = 0.025
+# Standard deviation of the log-range beyond which the mean range tells of the prior alone.
+_WIDEST = 1.0
+_N_BISECTIONS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """Components of what is known of a source.
+
+    Attributes
+    ----------
+    x : ndarray, shape (K, N)
+        Cartesian states: source, motion, and the sensors' lasting errors.
+    S : ndarray, shape (K, N, N)
+        Roots of their covariances, in the chart about each.
+    log_weight : ndarray, shape (K,)
+        Logarithms of their weights, which add up to one.
+    n_motion : int
+        Length of the states without the sensors' errors.
+    centroid_m : ndarray, shape (3,)
+        Of the sensors, in the world frame.
+    radius_m : float
+        Largest distance of a sensor from it.
+    n_pose : int
+        How many of the last of them are errors of the array's pose.
+    """
+
+    x: FloatArray
+    S: FloatArray
+    log_weight: FloatArray
+    n_motion: int
+    centroid_m: FloatArray
+    radius_m: float
+    n_pose: int = 0
+
+    @classmethod
+    def of_gaussian(cls, x: FloatArray, P: FloatArray, centroid_m: FloatArray, radius_m: float) -> Mixture:
+        """A source alone, of a Cartesian state (6,) and covariance (6, 6)."""
+        root = Chart.at(x, centroid_m, radius_m).inverse_jacobian() @ symmetric_square_root(P)
+        return cls(x[None], root_of(root)[None], np.zeros(1), x.size, centroid_m, radius_m)
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    @property
+    def weight(self) -> FloatArray:
+        """Weights (K,)."""
+        return np.exp(self.log_weight)
+
+    @property
+    def chart(self) -> Chart:
+        """About every component."""
+        return Chart.at(self.x[:, : self.n_motion], self.centroid_m, self.radius_m, self.n_pose)
+
+    @property
+    def widths(self) -> FloatArray:
+        """Larger one of the standard deviations of log-range and direction (K,)."""
+        return np.sqrt(np.max(np.sum(self.S[:, :3] ** 2, axis=2), axis=1))
+
+    def take(self, index: IntArray | BoolArray) -> Mixture:
+        """Some of the components, their weights adding up to one."""
+        log_weight = self.log_weight[index]
+        log_weight = log_weight - np.logaddexp.reduce(log_weight)
+        return replace(self, x=self.x[index], S=self.S[index], log_weight=log_weight)
+
+    def of_source(self) -> Mixture:
+        """Position and moment alone."""
+        return replace(self, x=self.x[:, :N_SOURCE], S=root_of(self.S[:, :N_SOURCE]), n_motion=N_SOURCE, n_pose=0)
+
+    def reduced(self) -> Mixture:
+        """Without components of no weight, and those that are as good as one merged."""
+        kept = self.take(self.log_weight > self.log_weight.max() + DROPPED_BELOW)
+        if len(kept) == 1:
+            return kept
+        kept = kept.take(np.argsort(-kept.log_weight, kind="stable"))
+        groups = _groups(kept)
+        if len(groups) == len(kept):
+            return kept
+        parts = [kept.take(group).matched() if len(group) > 1 else kept.take(group) for group in groups]
+        log_weight = np.array([np.logaddexp.reduce(kept.log_weight[group]) for group in groups])
+        x, S = np.concatenate([part.x for part in parts]), np.concatenate([part.S for part in parts])
+        return replace(self, x=x, S=S, log_weight=log_weight - np.logaddexp.reduce(log_weight))
+
+    def matched(self) -> Mixture:
+        """The one Gaussian of the same mean and covariance, in the chart of the heaviest component."""
+        if len(self) == 1:
+            return self
+        n, best = self.n_motion, int(np.argmax(self.log_weight))
+        about = self.take(np.array([best])).chart
+        offset, roots = _in_chart(about, self)
+        mean = self.weight @ offset
+        spread = np.sqrt(self.weight)[:, None, None] * np.concatenate([roots, (offset - mean)[:, :, None]], axis=2)
+        x = self.x[best] + mean
+        x[:n] = about.retracted(mean[None, :n])[0]
+        after = Chart.at(x[None, :n], self.centroid_m, self.radius_m, self.n_pose)
+        rows = np.concatenate(list(spread), axis=1)
+        turn = after.inverse_jacobian()[0] @ about.jacobian(mean[None, :n])[0]
+        rows[:n] = turn @ rows[:n]
+        return replace(self, x=x[None], S=block_root(rows, n)[None], log_weight=np.zeros(1))
+
+    def moments(self) -> tuple[FloatArray, FloatArray]:
+        """Cartesian mean (6,) and covariance (6, 6) of position and moment; a range is log-normal."""
+        mean, covariance = component_moments(self.chart, self.S)
+        weight = self.weight
+        centre = weight @ mean
+        off = mean - centre
+        of_all = np.einsum("k,kij->ij", weight, covariance) + (weight[:, None] * off).T @ off
+        return centre, of_all
+
+    def range_interval_m(self) -> Intervals:
+        """95 % set of the distance from the centroid [m]: quantiles of the mixture."""
+        chart = self.chart
+        r = np.linalg.norm(self.x[:, :3] - self.centroid_m, axis=1)
+        sigma, weight = np.linalg.norm(self.S[:, 0], axis=1), self.weight
+        # The chart's origin stands back from the centroid where the source is nearer than the array's radius.
+        back = chart.length - r
+
+        def quantile(share: float) -> float:
+            low, high = -30.0, 30.0
+            for _ in range(_N_BISECTIONS):
+                middle = 0.5 * (low + high)
+                with np.errstate(divide="ignore"):
+                    below = ndtr((np.log((np.exp(middle) + back) / chart.length)) / np.maximum(sigma, 1e-300))
+                low, high = (middle, high) if weight @ below < share else (low, middle)
+            return float(np.exp(low))
+
+        nearest, farthest = quantile(_OUTSIDE), quantile(1.0 - _OUTSIDE)
+        is_open = farthest > max(2.0 * nearest, FARTHEST * self.radius_m)
+        return ((nearest, None if is_open else farthest),)
+
+
+def component_moments(chart: Chart, S: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Cartesian means (K, 6) and covariances (K, 6, 6) of single components with roots (K, N, N) in the chart."""
+    S = S[:, :N_SOURCE]
+    L = chart.jacobian(np.zeros_like(chart.x))[:, :N_SOURCE, :N_SOURCE]
+    mean = chart.x[:, :N_SOURCE].copy()
+    by_range = np.expm1(0.5 * np.minimum(np.sum(S[:, 0] ** 2, axis=1), _WIDEST**2))
+    mean[:, :3] += (by_range * chart.length)[:, None] * chart.u
+    root = L @ S
+    return mean, root @ np.swapaxes(root, -1, -2)
+
+
+def _in_chart(about: Chart, mixture: Mixture) -> tuple[FloatArray, FloatArray]:
+    """Means (K, N) and roots (K, N, N) of components in the chart of one."""
+    n, K = mixture.n_motion, len(mixture)
+    chart = about.take(np.zeros(K, dtype=np.intp))
+    offset, roots = np.zeros_like(mixture.x), mixture.S.copy()
+    best = int(np.argmax(mixture.log_weight))
+    offset[:, n:] = mixture.x[:, n:] - mixture.x[best, n:]
+    offset[:, :n] = chart.coordinates(mixture.x[:, :n])
+    turn = np.linalg.solve(chart.jacobian(offset[:, :n]), mixture.chart.jacobian(np.zeros((K, n))))
+    roots[:, :n] = turn @ roots[:, :n]
+    return offset, roots
+
+
+def root_of(rows: FloatArray) -> FloatArray:
+    """Lower root (..., n, n) of ``rows rowsᵀ``, by an orthogonal factorisation of rows (..., n, m), m ≥ n."""
+    return np.swapaxes(np.linalg.qr(np.swapaxes(rows, -1, -2), mode="r"), -1, -2)
+
+
+def block_root(rows: FloatArray, n: int) -> FloatArray:
+    """Block-triangular root (N, N) of ``rows rowsᵀ`` whose first n rows are full."""
+    # The lower root of the rows in reverse order is an upper one.
+    lower = root_of(rows[::-1])
+    return lower[::-1, ::-1]
+
+
+def _groups(mixture: Mixture) -> list[IntArray]:
+    """Components in groups of such as are as good as the group's first, heaviest first."""
+    chart, S = mixture.chart, mixture.S
+    sigma = np.sqrt(np.sum(S[:, :3] ** 2, axis=2))
+    log_range = np.log(chart.length)
+    left, groups = np.arange(len(mixture)), []
+    while left.size:
+        first, others = left[0], left[1:]
+        # Divergence is at least half the square of an offset in any one coordinate.
+        reach = 2.0 * np.sqrt(MERGED_BELOW)
+        near = np.abs(log_range[others] - log_range[first]) < reach * sigma[first, 0]
+        angle = np.linalg.norm(chart.u[others] - chart.u[first], axis=1)
+        near &= angle < reach * np.hypot(sigma[first, 1], sigma[first, 2])
+        candidates = others[near]
+        same = candidates[_divergence(mixture, first, candidates) < MERGED_BELOW] if candidates.size else candidates
+        groups.append(np.concatenate([[first], same]))
+        left = others[~np.isin(others, same)]
+    return groups
+
+
+def _divergence(mixture: Mixture, first: int, others: IntArray) -> FloatArray:
+    """Kullback and Leibler's divergence (m,) of source and motion of some components from one of them."""
+    n = mixture.n_motion
+    both = mixture.take(np.concatenate([[first], others]))
+    offset, roots = _in_chart(both.take(np.array([0])).chart, both)
+    P = roots[:, :n] @ np.swapaxes(roots[:, :n], -1, -2)
+    inverse = np.linalg.inv(P[0])
+    d = offset[1:, :n]
+    traces = np.einsum("ij,kji->k", inverse, P[1:])
+    log_det = np.linalg.slogdet(P)[1]
+    return 0.5 * (traces + np.einsum("ki,ij,kj->k", d, inverse, d) - n + log_det[0] - log_det[1:])

@@ -1,0 +1,173 @@
+"""What one row measures of states that stand side by side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from arrays.typing import FloatArray
+from magloc.chi_square import energy_threshold
+from magloc.measurement.differences import DifferenceMeasurement, turn_jacobian
+from magloc.measurement.pose import N_POSE, TURN, ArrayPose
+from magloc.navigation.rotations import rotation_matrix, turn_of_change
+from magloc.tracking.chart.coordinates import Chart
+from magloc.tracking.measurement import RowMeasurement
+from magloc.tracking.motion import N_SOURCE
+from magloc.tracking.results import Row
+
+
+@dataclass(frozen=True, eq=False)
+class ChartRow:
+    """Differences of one row, in units of their noise, as a function of states (..., n) in the world frame.
+
+    A state is that of the motion, and behind it errors of the pose: a prediction of it bends as a whole. Errors of
+    sensors are no part of it; they only add `effect` to the differences.
+
+    Attributes
+    ----------
+    measurement : RowMeasurement
+    pose_effect : ndarray, shape (9, n_pose)
+        Of the pose's errors on it.
+    """
+
+    measurement: RowMeasurement
+    pose_effect: FloatArray
+
+    @classmethod
+    def of(cls, measurement: RowMeasurement) -> ChartRow:
+        """As a row is measured."""
+        return cls(measurement, measurement.pose_effect)
+
+    @property
+    def row(self) -> Row:
+        """Its readings."""
+        return self.measurement.row
+
+    @property
+    def z(self) -> FloatArray:
+        """Measured differences, shape (k,)."""
+        return self.measurement.z
+
+    @property
+    def model(self) -> DifferenceMeasurement:
+        """In the array's frame."""
+        return self.measurement.model
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations of the differences [T], shape (k,)."""
+        return self.measurement.sigma
+
+    @property
+    def effect(self) -> FloatArray:
+        """Of the sensors' errors on the differences, in units of their noise: (k, n_errors)."""
+        return self.measurement.effect
+
+    @property
+    def pose(self) -> ArrayPose:
+        """As the row states it."""
+        return self.measurement.pose
+
+    @property
+    def n_pose(self) -> int:
+        """Number of the pose's errors."""
+        return self.pose_effect.shape[1]
+
+    @property
+    def n_motion(self) -> int:
+        """States of the motion and errors of the pose."""
+        return self.measurement.n_motion + self.n_pose
+
+    @cached_property
+    def centroid_m(self) -> FloatArray:
+        """Of the sensors in the world frame, shape (3,)."""
+        return self.row.origin_m + self.row.R_world_from_array @ self.model.array.centroid
+
+    @cached_property
+    def radius_m(self) -> float:
+        """Largest distance of a sensor from it."""
+        return self.model.array.circumradius
+
+    def chart(self, x: FloatArray) -> Chart:
+        """About states (..., n)."""
+        return Chart.at(x, self.centroid_m, self.radius_m, self.n_pose)
+
+    def with_lasting_errors(self, lasting: FloatArray) -> ChartRow:
+        """The row where only some shares (n_pose,) of the pose's errors have an effect."""
+        return replace(self, pose_effect=self.pose_effect * lasting) if self.n_pose else self
+
+    def of_source(self, state: FloatArray) -> FloatArray:
+        """Predicted differences (..., k) of sources (..., 6) or states, sensors being without errors."""
+        error = self._pose_error(state)
+        in_array = self.pose.in_array(state[..., :N_SOURCE], error)
+        return self.model.predicted(in_array[..., :3], in_array[..., 3:], self._ambient_T(error)) / self.sigma
+
+    def source_jacobian(self, source: FloatArray) -> FloatArray:
+        """Their Jacobian (..., k, 6) by sources (..., 6)."""
+        return self._by_source(self._by_array(self.pose.in_array(source), None), None)
+
+    def along(self, state: FloatArray, directions: FloatArray) -> FloatArray:
+        """Their derivative (..., k, m) along directions (..., n, m) in states."""
+        error = self._pose_error(state)
+        in_array = self.pose.in_array(state[..., :N_SOURCE], error)
+        H = self._by_array(in_array, error)
+        of_source = self._by_source(H, error) @ directions[..., :N_SOURCE, :]
+        if error is None:
+            return np.asarray(of_source)
+        first = self.measurement.n_motion
+        return np.asarray(of_source + self._by_pose(H, in_array, error) @ directions[..., first : self.n_motion, :])
+
+    @cached_property
+    def without_source(self) -> FloatArray:
+        """What is left of the measured differences (k,) when the ambient field's own are taken out."""
+        array = self.model.array
+        ambient = array.readings_of(array.ambient_fields) - array.channel_offset_T
+        return self.z - (self.model.differences.transform @ ambient) / self.sigma
+
+    def whitening(self, sigma_errors: FloatArray) -> FloatArray | None:
+        """``C^{-1/2}`` (k, k) of a row without a source, its sensors' errors known by their σ (n_errors,) alone."""
+        if not sigma_errors.size + self.n_pose:
+            return None
+        # Sources without a moment: what is left is the ambient field, turned by the pose's errors.
+        nowhere = self.pose.in_array(np.zeros(N_SOURCE))
+        by_pose = self._by_pose(np.zeros((len(self.sigma), N_SOURCE)), nowhere, np.zeros(N_POSE))
+        lasting = np.concatenate([self.effect * sigma_errors, by_pose], axis=1)
+        return np.linalg.inv(np.linalg.cholesky(np.eye(len(lasting)) + lasting @ lasting.T))
+
+    def is_detected(self, sigma_errors: FloatArray) -> bool:
+        """Whether the differences stand out of noise and of what the errors of sensors and pose may make of them."""
+        if not self.z.size:
+            return False
+        whiten = self.whitening(sigma_errors)
+        left = self.without_source if whiten is None else whiten @ self.without_source
+        return bool(left @ left > energy_threshold(left.size))
+
+    def _pose_error(self, state: FloatArray) -> FloatArray | None:
+        """Errors (..., 9) of the pose that states stand for, None where they are of a source alone."""
+        if not self.n_pose or state.shape[-1] == N_SOURCE:
+            return None
+        return np.asarray(state[..., self.measurement.n_motion : self.n_motion] @ self.pose_effect.T)
+
+    def _by_array(self, in_array: FloatArray, error: FloatArray | None) -> FloatArray:
+        """Jacobian (..., k, 6) by a source in the array's axes."""
+        H = self.model.jacobian(in_array[..., :3], in_array[..., 3:], self._ambient_T(error))
+        return np.asarray(H / self.sigma[:, None])
+
+    def _by_source(self, H: FloatArray, error: FloatArray | None) -> FloatArray:
+        """That by a source of the world."""
+        RT = np.swapaxes(self.pose.turned(error), -1, -2)
+        return np.concatenate([H[..., :3] @ RT, H[..., 3:] @ RT], axis=-1)
+
+    def _by_pose(self, H: FloatArray, in_array: FloatArray, error: FloatArray) -> FloatArray:
+        """That (..., k, n_pose) by the pose's errors."""
+        turned = turn_jacobian(self.model.array, in_array[..., :3], in_array[..., 3:], self._ambient_T(error))
+        by_error = H @ self.pose.error_jacobian(in_array, error)
+        of_ambient = self.model.differences.transform @ turned / self.sigma[:, None]
+        by_error[..., TURN] += of_ambient @ turn_of_change(-error[..., TURN])
+        return np.asarray(by_error @ self.pose_effect)
+
+    def _ambient_T(self, error: FloatArray | None) -> FloatArray | None:
+        """Ambient fields at the sensors (..., N, 3) where the pose is turned by errors; None: the array's own."""
+        return None if error is None else self.model.array.ambient_fields @ rotation_matrix(error[..., TURN])

@@ -1,0 +1,226 @@
+"""Where a track starts: a mixture over all directions and ranges that the first row allows.
+
+The start is a grid of cells, equal in direction and in the logarithm of the range, each a Gaussian in the chart about
+its centre whose moment is hardly known, so that all together they are an even density. The filter's own update makes of
+them what the row tells. Cells that explain the row as well as the best one does are taken, and those that explain it
+better than all around them, and the optima that :class:`magloc.localization.locator.Locator` finds between them.
+
+Where a row tells more than a cell does, the cell's own Gaussian would pull the component and its weight: there it is
+centred anew where the row puts it, and what several cells have found alike counts once.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri
+
+from arrays.array import SensorArray
+from arrays.differences import decorrelated_differences
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.directions import sphere_directions
+from magloc.levels import CONTRADICTION, CREDIBLE_ROW
+from magloc.localization.fit.prior import SourcePrior
+from magloc.localization.locator import Locator
+from magloc.measurement.nuisances import SensorErrors
+from magloc.measurement.rows import check_magnitudes
+from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart, source_root
+from magloc.tracking.chart.mixture import FARTHEST, NEAREST, Mixture
+from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.update import Updated, updated
+from magloc.tracking.motion import N_SOURCE, MotionModel
+
+_N_DIRECTIONS, _N_RANGES = 100, 14
+_PITCH = math.log(FARTHEST / NEAREST) / (_N_RANGES - 1)
+# Standard deviations of a cell, in units of the grid's pitch: neighbours add up to an even density.
+_OF_PITCH = 0.6
+_SPACING = math.sqrt(4.0 * math.pi / _N_DIRECTIONS)
+# Cells that explain so much less than the best one, as a rise of χ², are taken only where they are local peaks.
+_WITHIN = 20.0
+_NEIGHBOURS = 1.6 * _SPACING
+# The moment before anything is known, in units of what the row says of it at a cell's centre.
+_UNKNOWN_MOMENT = 10.0
+# Of a cell's standard deviation: a component that is narrower is the row's own.
+_NARROW = 0.5
+# The even density of all cells over the density of one at its centre, as a logarithm, along one coordinate.
+_EVEN = math.log(_OF_PITCH * math.sqrt(2.0 * math.pi))
+_CELL = _OF_PITCH * np.array([_PITCH, _SPACING, _SPACING])
+_SIGMA_PRIOR = (math.log(FARTHEST / NEAREST) / math.sqrt(12.0), 1.0, 1.0)
+NOT_ALLOWED = "not acquired: no source of the stated region and moment explains the readings"
+
+
+def prior_root(chart: Chart) -> FloatArray:
+    r"""Cartesian root (6, 6) of what is known of a source at x (n,) before its first row.
+
+    A Gaussian of the information that the start has of it: log-range and direction uniform, density
+    :math:`\propto |\mu|^{-3}` of the moment as it is seen, whose mean information along an axis is
+    :math:`1 / |\mu|^2`.
+    """
+    strength = float(np.linalg.norm(chart.x[3:6])) / float(chart.length) ** MOMENT_POWER
+    return source_root(chart, np.array([*_SIGMA_PRIOR, *[strength] * 3]))
+
+
+def first_root(chart: Chart, motion: MotionModel) -> FloatArray:
+    """Cartesian roots (K, n, n) of sources of which hardly more is known than that they are at x (K, n)."""
+    return _with_motion(chart, motion, np.tile(_SIGMA_PRIOR, (len(chart.x), 1)))
+
+
+def _with_motion(chart: Chart, motion: MotionModel, sigma: FloatArray) -> FloatArray:
+    """Cartesian roots (K, n, n) from standard deviations (K, 3) of range and direction; the moment is hardly known."""
+    strength = np.linalg.norm(chart.x[:, 3:6], axis=1) / chart.length**MOMENT_POWER
+    _, rest = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
+    root = np.tile(rest, (len(chart.x), 1, 1))
+    of_moment = _UNKNOWN_MOMENT * np.tile(strength[:, None], 3)
+    root[:, :N_SOURCE, :N_SOURCE] = source_root(chart, np.concatenate([sigma, of_moment], axis=1))
+    return root
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Cells in the array's frame: positions (n, 3), and which are neighbours (directions, directions)."""
+
+    position_m: FloatArray
+    neighbours: BoolArray
+
+    @classmethod
+    def of(cls, array: SensorArray) -> _Grid:
+        directions = sphere_directions(_N_DIRECTIONS)
+        ranges = array.circumradius * np.geomspace(NEAREST, FARTHEST, _N_RANGES)
+        position = array.centroid + ranges[:, None, None] * directions
+        return cls(position.reshape(-1, 3), np.arccos(np.clip(directions @ directions.T, -1, 1)) < _NEIGHBOURS)
+
+    def chosen(self, explained: FloatArray) -> BoolArray:
+        """Cells (n,) from which to start, by the energy that each explains, -inf where it is not allowed."""
+        table = explained.reshape(_N_RANGES, _N_DIRECTIONS)
+        around = np.where(self.neighbours, table[:, None, :], -np.inf).max(axis=2)
+        padded = np.pad(table, ((1, 1), (0, 0)), constant_values=-np.inf)
+        peak = (table >= around) & (table >= padded[:-2]) & (table >= padded[2:])
+        return np.asarray((peak | (table > table.max() - _WITHIN)) & np.isfinite(table)).ravel()
+
+
+@dataclass(frozen=True, eq=False)
+class _Seeds:
+    """Where components start.
+
+    Attributes
+    ----------
+    position_m, moment_Am2 : ndarray, shape (n, 3)
+        In the world frame.
+    cell : ndarray of int, shape (n, 2)
+        Range and direction on the grid whose share of the even density each stands for, -1 where it is the row's own.
+    """
+
+    position_m: FloatArray
+    moment_Am2: FloatArray
+    cell: IntArray
+
+
+class Start:
+    """Starts tracks of one array."""
+
+    def __init__(self, array: SensorArray, errors: SensorErrors, prior: SourcePrior) -> None:
+        check_magnitudes(array)
+        self.errors, self.prior = errors, prior
+        self._grid = _Grid.of(array)
+        self._locator: Locator | None = None
+        if decorrelated_differences(array).n_differences >= N_SOURCE:
+            self._locator = Locator(array, prior=prior, body_length_m=0.0, exclude_faulty=False)
+
+    def mixture(self, measurement: ChartRow, motion: MotionModel) -> tuple[Mixture | None, str]:
+        """What one row says of a source, or why there is none."""
+        if not measurement.is_detected(self.errors.sigma):
+            return None, "not acquired: no signal stands out of noise"
+        seeds = self._seeds(measurement)
+        if len(seeds.cell):
+            seeds = _centred(seeds, self._components(measurement, motion, seeds), measurement)
+        if not len(seeds.cell):
+            return None, NOT_ALLOWED
+        found = self._components(measurement, motion, seeds)
+        row = measurement.row
+        position = (found.x[:, :3] - row.origin_m) @ row.R_world_from_array
+        sound = self.prior.allows_position(position) & self.prior.allows_moment(found.x[:, 3:6])
+        sound &= np.isfinite(found.log_evidence) & found.converged
+        if not sound.any():
+            return None, NOT_ALLOWED
+        dof = measurement.z.size - N_SOURCE
+        if dof > 0 and found.chi2[sound].min() > chdtri(dof, CONTRADICTION):
+            return None, "not acquired: no dipole fits the readings"
+        log_weight = found.log_evidence + _EVEN * ((seeds.cell < 0) @ np.array([1.0, 2.0]))
+        mixture = _mixture(found, log_weight, measurement)
+        return mixture.take(sound).take(once(mixture.take(sound), seeds.cell[sound])).reduced(), ""
+
+    def _seeds(self, measurement: ChartRow) -> _Seeds:
+        """Chosen cells, and the row's best fits."""
+        cells, row = self._grid.position_m, measurement.row
+        world = row.origin_m + cells @ row.R_world_from_array.T
+        columns = measurement.source_jacobian(np.concatenate([world, np.zeros_like(world)], axis=1))[..., 3:]
+        left, whiten = measurement.without_source, measurement.whitening(self.errors.sigma)
+        if whiten is not None:
+            columns, left = whiten @ columns, whiten @ left
+        moments = (np.linalg.pinv(columns, rcond=1e-6) @ left[:, None])[..., 0]
+        explained = np.sum((columns @ moments[..., None])[..., 0] ** 2, axis=1)
+        explained[~self.prior.allows_position(cells) | ~(explained > 0.0)] = -np.inf
+        chosen = np.flatnonzero(self._grid.chosen(explained))
+        position, moment = [world[chosen]], [moments[chosen]]
+        cell = [np.stack(np.divmod(chosen, _N_DIRECTIONS), axis=1)]
+        if self._locator is not None and measurement.z.size >= N_SOURCE:
+            for solution in self._locator.fit(row.readings_T, row.ambient_T).solutions:
+                position.append(row.origin_m + row.R_world_from_array @ solution.position_m)
+                moment.append(row.R_world_from_array @ solution.moment_Am2)
+                cell.append(np.array([-1, -1]))
+        return _Seeds(np.vstack(position), np.vstack(moment), np.vstack(cell))
+
+    def _components(self, measurement: ChartRow, motion: MotionModel, seeds: _Seeds) -> Updated:
+        """What the row makes of cells about seeds."""
+        n, n_errors = measurement.n_motion, self.errors.n_states
+        state, _ = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
+        x = np.zeros((len(seeds.cell), n + n_errors))
+        x[:, :n] = state
+        x[:, :3], x[:, 3:6] = seeds.position_m, seeds.moment_Am2
+        chart = measurement.chart(x[:, :n])
+        S = np.zeros((len(x), n + n_errors, n + n_errors))
+        S[:, :n, :n] = chart.inverse_jacobian() @ _with_motion(chart, motion, np.tile(_CELL, (len(x), 1)))
+        S[:, n + np.arange(n_errors), n + np.arange(n_errors)] = self.errors.sigma
+        return updated(x, S, measurement, np.zeros(len(x), dtype=bool))
+
+
+def _mixture(found: Updated, log_weight: FloatArray, measurement: ChartRow) -> Mixture:
+    n, centroid_m, radius_m = measurement.n_motion, measurement.centroid_m, measurement.radius_m
+    return Mixture(found.x, found.S, log_weight, n, centroid_m, radius_m, measurement.n_pose)
+
+
+def _centred(seeds: _Seeds, found: Updated, measurement: ChartRow) -> _Seeds:
+    """Seeds that stand where the row puts them, along the coordinates in which it tells more than their cells do."""
+    sigma = np.sqrt(np.sum(found.S[:, :3] ** 2, axis=2))
+    narrow = sigma < _NARROW * _CELL
+    narrow = np.stack([narrow[:, 0], narrow[:, 1] & narrow[:, 2]], axis=1)
+    old, new = (Chart.at(x, measurement.centroid_m, measurement.radius_m) for x in (seeds.position_m, found.x[:, :3]))
+    seen = found.x[:, 3:6] / new.length[:, None] ** 4
+    offset = np.where(narrow[:, 1:], new.u, old.u)
+    range_old, range_new = (np.linalg.norm(chart.x[:, :3] - measurement.centroid_m, axis=1) for chart in (old, new))
+    r = np.where(narrow[:, 0], range_new, range_old)
+    length = np.maximum(r, measurement.radius_m)
+    cell = np.where(narrow, -1, seeds.cell)
+    # A best fit has no cell whose share it could stand for.
+    sound = np.isfinite(found.log_evidence) & found.converged & ((seeds.cell >= 0) | narrow).all(axis=1)
+    return _Seeds(
+        (measurement.centroid_m + r[:, None] * offset)[sound], (seen * length[:, None] ** 4)[sound], cell[sound]
+    )
+
+
+def once(mixture: Mixture, cell: IntArray) -> IntArray:
+    """Components, heaviest first, without those that another one with the same share of the even density has found."""
+    source = mixture.of_source()
+    chart, left, kept = source.chart, np.argsort(-mixture.log_weight, kind="stable"), []
+    limit = chdtri(N_SOURCE, 1.0 - CREDIBLE_ROW)
+    while left.size:
+        first, others = left[0], left[1:]
+        kept.append(first)
+        same = others[(cell[others] == cell[first]).all(axis=1)]
+        about = chart.take(same)
+        e = about.coordinates(np.repeat(source.x[first][None], len(same), axis=0))
+        square = np.sum(np.linalg.solve(source.S[same], e[..., None])[..., 0] ** 2, axis=1)
+        left = others[~np.isin(others, same[square < limit])]
+    return np.array(kept)

@@ -1,0 +1,221 @@
+"""How what is known of a source changes from row to row: started, predicted, updated, and fitted anew while young.
+
+The first row that shows a source makes a mixture (:mod:`magloc.tracking.chart.start`); every later one moves its
+components, updates them (:mod:`magloc.tracking.chart.update`) and leaves fewer of them, soon a single one. While the
+track is young, all its rows are fitted together now and then (:mod:`magloc.tracking.chart.refit`). Behind the states of
+the motion stand the errors of the array's pose, and behind them those of its sensors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtri
+
+from arrays.array import SensorArray
+from arrays.differences import decorrelated_differences
+from arrays.typing import FloatArray, IntArray
+from magloc.levels import CONTRADICTION
+from magloc.localization.fit.prior import SourcePrior
+from magloc.measurement.nuisances import SensorErrors
+from magloc.measurement.pose import PoseErrors
+from magloc.tracking.chart.coordinates import mirrored
+from magloc.tracking.chart.mixture import Mixture, block_root, root_of
+from magloc.tracking.chart.posed_motion import PosedMotion
+from magloc.tracking.chart.refit import refitted
+from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.start import Start, once
+from magloc.tracking.chart.update import Move, predicted_root, updated
+from magloc.tracking.motion import N_SOURCE, MotionModel
+
+LARGEST_GROWTH = 1.5
+"""A prediction bends as the readings do while no standard deviation grows by more in the step: beyond that it is the
+motion that it is uncertain of, which does not. Nor does it bend as a row does in which readings are missing: the rows
+that made it had them."""
+LARGEST_WIDTH = 0.4
+"""Standard deviation of the log-range, or of the direction, beyond which a component is no place any more."""
+SETTLED = 0.05
+"""A young track is old when fitting it as a whole changes its state by less, in squares of σ per number, and it is
+narrow."""
+OLD_WIDTH = 0.03
+"""Standard deviation of log-range or direction with which a track grows old."""
+SEEDS = 6
+"""Components of a young track that are fitted anew, the first time each with its mirror images."""
+LARGEST_REFIT_WIDTH = 0.25
+"""Width of a component that is fitted to all rows of a young track."""
+MOST_YOUNG_ROWS = 100
+"""Rows up to which a track is fitted anew as a whole."""
+FIRST_REFIT, REFITS_GROW = 3, 1.6
+"""Number of rows of the first such fit, and how much larger it is each time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What a tracker knows between rows.
+
+    Attributes
+    ----------
+    mixture : Mixture
+    open_loop : ndarray, shape (n, n)
+        Cartesian covariance of the motion's states had no readings been taken since the track began.
+    contradictions : int
+        Contradicting rows before the next one.
+    young : tuple of (ChartRow, MotionModel)
+        Rows of a track that are still fitted together, and the motion that led to each; `next_refit`, after how many.
+    """
+
+    mixture: Mixture
+    open_loop: FloatArray
+    contradictions: int = 0
+    young: tuple[tuple[ChartRow, MotionModel], ...] = ()
+    next_refit: int = FIRST_REFIT
+
+
+@dataclass(frozen=True, eq=False)
+class RowUpdate:
+    """What a row's readings make of a prediction.
+
+    Attributes
+    ----------
+    mixture : Mixture, optional
+        None where they contradict it.
+    nis : float
+    innovation : ndarray, shape (k,)
+        Whitened, of the component that explains them best.
+    iterations : int
+    """
+
+    mixture: Mixture | None
+    nis: float
+    innovation: FloatArray
+    iterations: int = 0
+
+
+class ChartFilter:
+    """Starts tracks of one array, and steps them."""
+
+    def __init__(self, array: SensorArray, errors: SensorErrors, pose_errors: PoseErrors, prior: SourcePrior) -> None:
+        self.errors, self.pose_errors = errors, pose_errors
+        self._start = Start(array, errors, prior)
+        self.n_differences = decorrelated_differences(array).n_differences
+
+    def started(self, row: ChartRow, motion: MotionModel, near: Mixture | None = None) -> tuple[Mixture | None, str]:
+        """What one row says of a source, weighed by a prediction of its place if there is one, or why there is none."""
+        mixture, reason = self._start.mixture(row, PosedMotion.of(motion, self.pose_errors))
+        if mixture is not None and near is not None:
+            mixture = _near(mixture, near).reduced()
+        return mixture, reason
+
+    def is_detected(self, row: ChartRow) -> bool:
+        """Whether a row shows that there is a source."""
+        return row.is_detected(self.errors.sigma)
+
+    def predicted(self, mixture: Mixture, motion: MotionModel, dt_s: float, row: ChartRow) -> Mixture:
+        """What is known after a time without readings, as seen from a row's array."""
+        n, posed = mixture.n_motion, PosedMotion.of(motion, self.pose_errors)
+        steps = [posed.step(x, dt_s) for x in mixture.x[:, :n]]
+        kept, added = self.errors.step(dt_s)
+        x = mixture.x.copy()
+        x[:, :n] = [step[0] for step in steps]
+        x[:, n:] *= kept
+        move = Move(np.stack([step[1] for step in steps]), np.stack([step[2] for step in steps]), kept, added)
+        after = replace(mixture, x=x, centroid_m=row.centroid_m)
+        return replace(after, S=predicted_root(mixture.chart, after.chart, mixture.S, move))
+
+    def updated(self, before: Mixture, predicted: Mixture, dt_s: float, row: ChartRow) -> RowUpdate:
+        """What a row makes of a prediction from the mixture before it."""
+        sigma, sigma_before = (np.linalg.norm(m.S[:, :N_SOURCE], axis=2) for m in (predicted, before))
+        k = row.z.size
+        bends = (sigma <= LARGEST_GROWTH * sigma_before).all(axis=1) & (k >= self.n_differences)
+        lasting = row.with_lasting_errors(self.pose_errors.step(dt_s)[0] ** 2)
+        after = updated(predicted.x, predicted.S, row, bends, lasting)
+        sound = after.converged & np.isfinite(after.log_evidence)
+        if not np.where(sound, after.nis, np.inf).min() <= chdtri(k, CONTRADICTION):
+            best = int(np.argmin(after.nis))
+            return RowUpdate(None, float(after.nis[best]), after.whitened_innovation(best))
+        log_weight = predicted.log_weight + np.where(sound, after.log_evidence, -np.inf)
+        best = int(np.argmax(log_weight))
+        mixture = replace(predicted, x=after.x, S=after.S, log_weight=log_weight).take(sound).reduced()
+        return RowUpdate(mixture, float(after.nis[best]), after.whitened_innovation(best), int(after.iterations[best]))
+
+    def refitted(self, known: Known) -> Known:
+        """What is known when all rows of a young track are fitted together, if it is time to."""
+        mixture, n_rows = known.mixture, len(known.young)
+        is_narrow = len(mixture) == 1 and mixture.widths[0] < OLD_WIDTH
+        if n_rows > MOST_YOUNG_ROWS or (n_rows < FIRST_REFIT and is_narrow):
+            return replace(known, young=())
+        if n_rows < known.next_refit or mixture.widths.max() > LARGEST_REFIT_WIDTH:
+            return known
+        rows, motions = zip(*known.young, strict=True)
+        seeds = mixture.take(once(mixture, np.zeros((len(mixture), 2), dtype=np.intp))[:SEEDS])
+        n_seeds = len(seeds)
+        if known.next_refit == FIRST_REFIT:
+            x = mirrored(seeds.x, seeds.centroid_m).reshape(-1, seeds.x.shape[1])
+            seeds = replace(seeds, x=x, S=np.tile(seeds.S, (4, 1, 1)), log_weight=np.zeros(len(x)))
+        known = replace(known, next_refit=int(REFITS_GROW * n_rows))
+        fit = refitted(seeds, rows, [PosedMotion.of(m, self.pose_errors) for m in motions], self.errors)
+        found = fit.mixture
+        # A component that is not fitted to its end may be the true one: then the filter goes on with all of them.
+        if not fit.decided[:n_seeds].all() or not _believed(found, fit.nis, rows):
+            return known
+        found = found.take(once(found, np.zeros((len(found), 2), dtype=np.intp))).reduced()
+        if len(found) == 1 and len(mixture) == 1:
+            n = mixture.n_motion
+            e = mixture.chart.coordinates(found.x[:, :n])[0]
+            change = np.sum(np.linalg.solve(root_of(mixture.S[0, :n]), e) ** 2)
+            if change < SETTLED * n and found.widths[0] < OLD_WIDTH:
+                known = replace(known, young=())
+            if change < n:
+                # The mode of all states together stands nearer than the source does on average: the filter's own stays.
+                return known
+        return replace(known, mixture=found)
+
+
+def _believed(found: Mixture, nis: FloatArray, rows: tuple[ChartRow, ...]) -> bool:
+    """Whether sources that were fitted to rows explain them, and are determined by them."""
+    if not len(found):
+        return False
+    dof = sum(row.z.size for row in rows) - N_SOURCE
+    best = int(np.argmax(found.log_weight))
+    return bool(dof > 0 and nis[best] <= chdtri(dof, CONTRADICTION) and found.widths[best] < LARGEST_REFIT_WIDTH)
+
+
+def width_of(mixture: Mixture) -> float:
+    """Standard deviation of log-range or direction of the likeliest place."""
+    return float(mixture.widths[np.argmax(mixture.log_weight)])
+
+
+def cartesian(mixture: Mixture) -> tuple[FloatArray, FloatArray]:
+    """State (N,) and root (N, N) of a Gaussian of the same mean and covariance, errors of sensors before the pose's."""
+    one = mixture.matched()
+    n, root = one.n_motion, one.S[0].copy()
+    root[:n] = one.chart.jacobian(np.zeros((1, n)))[0] @ root[:n]
+    order = _sensors_first(one.x.shape[1], n, one.n_pose)
+    return one.x[0, order], root[order]
+
+
+def charted(x: FloatArray, S: FloatArray, row: ChartRow) -> Mixture:
+    """The inverse of :func:`cartesian`, as seen from a row's array."""
+    n, order = row.n_motion, _sensors_first(len(x), row.n_motion, row.n_pose)
+    state, root = np.empty_like(x), np.empty_like(S)
+    state[order], root[order] = x, S
+    root[:n] = row.chart(state[None, :n]).inverse_jacobian()[0] @ root[:n]
+    S_young = block_root(root, n)
+    return Mixture(state[None], S_young[None], np.zeros(1), n, row.centroid_m, row.radius_m, row.n_pose)
+
+
+def _sensors_first(n_all: int, n_motion: int, n_pose: int) -> IntArray:
+    """Order of the states in which errors of sensors stand before those of the pose."""
+    return np.r_[: n_motion - n_pose, n_motion:n_all, n_motion - n_pose : n_motion]
+
+
+def _near(mixture: Mixture, prediction: Mixture) -> Mixture:
+    """Components weighed by what a prediction says of their places."""
+    mean, covariance = prediction.moments()
+    offset, log_density = mixture.x[:, :3] - mean[:3], np.empty(len(mixture))
+    for k in range(len(mixture)):
+        _, own = mixture.take(np.array([k])).moments()
+        both = covariance[:3, :3] + own[:3, :3]
+        log_density[k] = -0.5 * (offset[k] @ np.linalg.solve(both, offset[k]) + np.linalg.slogdet(both)[1])
+    return replace(mixture, log_weight=mixture.log_weight + log_density)

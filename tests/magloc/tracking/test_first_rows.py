@@ -1,0 +1,90 @@
+"""Tracks from their first row: truth drawn from the motion model, 8 m from a tetrahedron of 1.5 m.
+
+Source and noise are drawn anew in every run: 250 A·m² in any direction, anywhere 8 m away, 0.2 nT, 2 Hz. Seeds are not
+chosen.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from magloc.measurement.differences import predicted_channels
+from magloc.tracking.batch import track_record
+from magloc.tracking.consistency import nees_of
+from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
+from magloc.tracking.posterior_bound import posterior_bound
+from magloc.tracking.results import Row
+from magloc.tracking.tracker import Tracker
+from tests.passing_source import ARRAY
+
+FloatArray = NDArray[np.float64]
+DT_S, RANGE_M, MOMENT_AM2 = 0.5, 8.0, 250.0
+TURN_RAD_S = math.radians(1.2)
+WALK, VELOCITY = RandomWalk(0.1, TURN_RAD_S), OrnsteinUhlenbeck(0.1, TURN_RAD_S, correlation_s=math.inf)
+
+
+def drawn(motion: MotionModel, n: int, seed: int) -> tuple[FloatArray, list[Row]]:
+    """True states (n, n_states), drawn from the motion model, and rows of them."""
+    rng = np.random.default_rng(seed)
+    direction, moment = rng.normal(size=(2, 3))
+    place = ARRAY.centroid + RANGE_M * direction / np.linalg.norm(direction)
+    source = np.concatenate([place, MOMENT_AM2 * moment / np.linalg.norm(moment)])
+    x, S = motion.start(source, np.zeros((6, 6)))
+    states = [x + S @ rng.normal(size=len(x))]
+    while len(states) < n:
+        mean, _, S_q = motion.step(states[-1], DT_S)
+        states.append(mean + S_q @ rng.normal(size=S_q.shape[1]))
+    truth = np.array(states)
+    readings = predicted_channels(ARRAY, truth[:, :3], truth[:, 3:6])
+    readings += ARRAY.channel_noise_T * rng.normal(size=readings.shape)
+    return truth, [Row(DT_S * i, values) for i, values in enumerate(readings)]
+
+
+def judged(motion: MotionModel, n: int, seeds: range) -> FloatArray:
+    """Squared error, its bound, NEES per dimension, and whether the range set holds the truth: (runs, n, 4)."""
+    result = np.empty((len(seeds), n, 4))
+    for k, seed in enumerate(seeds):
+        truth, rows = drawn(motion, n, seed)
+        tracker = Tracker(ARRAY, motion)
+        bounds = posterior_bound(tracker, rows, truth[:, :3], truth[:, 3:6])
+        for i, point in enumerate(track_record(tracker, rows)):
+            assert point.position_m is not None
+            ((low, high),) = point.range_interval_m or ((0.0, None),)
+            range_m = float(np.linalg.norm(truth[i, :3] - ARRAY.centroid))
+            result[k, i] = (
+                np.sum((point.position_m - truth[i, :3]) ** 2),
+                bounds[i] ** 2,
+                nees_of(point, truth[i, :6], tracker.measurements.of(rows[i]))[0] / 6.0,
+                low <= range_m and (high is None or range_m <= high),
+            )
+    return result
+
+
+@pytest.mark.parametrize("motion", [WALK, VELOCITY], ids=["random walk", "constant velocity"])
+class TestFromTheFirstRow:
+    def test_every_row_has_an_answer_that_holds_the_truth(self, motion: MotionModel) -> None:
+        """Six runs of 12 rows: 5 σ in the filter's coordinates, once in 600,000 of each row."""
+        result = judged(motion, 12, range(6))
+        assert (6.0 * result[..., 2] < 41.4).all()
+        assert result[..., 3].mean() > 0.8
+
+    @pytest.mark.slow
+    def test_is_consistent_and_reaches_the_bound(self, motion: MotionModel) -> None:
+        """100 runs of 40 rows. The least of 38 rows is below 88 % once in 100: σ of one row's coverage is 2.2 %.
+
+        The ratio's standard error is 0.07 to 0.09, as a few runs near two optima carry most of it, and that of NEES
+        0.06 where no such run is among them. Measured over 200 runs of the walk with seeds 20000 to 20199: ratio at
+        most 1.38, 1.19 over all rows; NEES 0.93 to 1.13; coverage 92.6 %, 88 % at the worst row. The tracker that
+        waited until it was certain answered 24 to 45 % of these rows.
+        """
+        result = judged(motion, 40, range(1000, 1100))
+        ratio = np.sqrt(result[..., 0].mean(axis=0) / result[..., 1].mean(axis=0))
+        inside = result[..., 3]
+        assert ratio[2:].max() <= 1.4
+        assert 0.93 <= inside.mean() <= 0.97
+        assert inside[:, 2:].mean(axis=0).min() >= 0.88
+        assert math.sqrt((result[..., 0] / result[..., 1]).mean()) <= 1.25
