@@ -67,7 +67,7 @@ EXPLAINED = {
     "inertial-unit": "adcs.complementary_filter adcs.inertial_magnetic_filter adcs.read_imu"
     " adcs.HeadingModel adcs.Gains",
     "iterated-kalman-filter": "magloc.IteratedExtendedKalmanFilter",
-    "live": "magloc.live",
+    "live": "magloc.live magloc.viewer",
     "localization": "magloc.locate magloc.Locator magloc.Fixes magloc.Fix magloc.Solution magloc.Source"
     " magloc.SourcePrior magloc.plots.fixes",
     "moving-arrays": "magloc.MeasuredMotion magloc.KnownMotion",

@@ -63,5 +63,6 @@ __getattr__, __dir__, __all__ = lazy_names(
         "track_moment": "magloc.signature.moment_track",
         "track_moments": "magloc.signature.moment_track",
         "view": "magloc.viewer.view",
+        "viewer": ":magloc.viewer",
     },
 )

@@ -31,7 +31,17 @@ CODE = re.compile(r"^```[a-z]+\n(.*?)^```|^    ([^\n]*)$", re.DOTALL | re.MULTIL
 HIDDEN = re.compile(r"<!--.*?-->", re.DOTALL)
 # What a page of the site shows of a line of code at desktop width without a scroll bar.
 WIDEST = 88
-PACKAGES = ["arrays", "magloc", "adcs", "sims", "magloc.live", "magloc.plots", "adcs.mockup", "sims.experiments"]
+PACKAGES = [
+    "arrays",
+    "magloc",
+    "adcs",
+    "sims",
+    "magloc.live",
+    "magloc.viewer",
+    "magloc.plots",
+    "adcs.mockup",
+    "sims.experiments",
+]
 # What a docstring says of its parameters: the heading's entries up to the next heading or the end.
 STATED = re.compile(r"^(?:Parameters|Attributes)\n-+\n(.*?)(?=^\S[^\n]*\n-|\Z)", re.DOTALL | re.MULTILINE)
 # A public name on a page of the reference, in a list of autosummary or by itself.

@@ -3,26 +3,54 @@
 from __future__ import annotations
 
 import sys
-from contextlib import closing
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
+from arrays.io.arguments import Flag
 from arrays.io.errors import LARGEST, InputError, naming
 from magloc.cli.framework import QuietOptions, print_json
-from magloc.cli.options import KnownOptions, MotionOptions, naming_place, print_note
+from magloc.cli.options import STREAM, KnownOptions, MotionOptions, naming_options, naming_place, print_note
+from magloc.cli.view import Port
 
 if TYPE_CHECKING:
-    from magloc.live.follower import LivePoint
+    from magloc.live.follower import Follower, LivePoint
+    from magloc.viewer.live_view import LiveView
+
+_SWITCH_S = 5e-4
+"""After so long a thread of the page lets a row that has come be followed."""
+
+
+@Parameter(name="*", group="Live page")
+@dataclass(frozen=True)
+class PageOptions:
+    """The live page.
+
+    Parameters
+    ----------
+    view : bool
+        Serve a page that shows the source while it moves; it stays until Ctrl-C.
+    port : int
+        Port of its server; the next one that is free if it is in use.
+    open : bool
+        Open the browser.
+    """
+
+    view: Flag = False
+    port: Port = 8080
+    open: Flag = False
 
 
 def live(
     *,
     array: Path,
-    source: Annotated[str, Parameter(name="--from", allow_leading_hyphen=True)] = "-",
+    source: Annotated[str, Parameter(name="--from", allow_leading_hyphen=True)] = STREAM,
     rest_s: float = 0.0,
     replay_speed: float = 1.0,
+    page: PageOptions = PageOptions(),
     known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
     motion: MotionOptions = MotionOptions(),  # noqa: B008 - frozen
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
@@ -45,6 +73,8 @@ def live(
         array that stands.
     replay_speed : float
         How much faster than in its own time a file is replayed.
+    page : PageOptions
+        The live page.
     known : KnownOptions
         What is known of the sensors, of the source when a track starts, and of the ambient field.
     motion : MotionOptions
@@ -61,14 +91,31 @@ def live(
     used, model = known.array(array), motion.model()
     with naming(str(array)):
         follower = Follower(used, model, prior=known.prior, sensors=known.ids, place=known.where, rest_s=rest_s)
-    points = follower.follow(source, replay_speed=replay_speed)
-    try:
-        with closing(points), naming_place(), naming(str(array)):
-            for point in points:
-                print_point(point)
-    finally:
-        if not common.quiet and follower.tally.rows:
-            print_note(str(follower.tally))
+    with ExitStack() as open_page:
+        view = open_page.enter_context(shown(follower, page, quiet=common.quiet)) if page.view else None
+        try:
+            with naming_place(), naming(str(array)):
+                for point in follower.follow(source, replay_speed=replay_speed):
+                    print_point(point)
+                    if view is not None:
+                        view.update(point)
+        finally:
+            if not common.quiet and follower.tally.rows:
+                print_note(str(follower.tally))
+        if view is not None:
+            view.wait()
+
+
+def shown(follower: Follower, page: PageOptions, *, quiet: bool) -> LiveView:
+    """A page of what a follower follows, and a note of its address."""
+    import magloc.viewer
+
+    with naming_options("port"):
+        view = magloc.viewer.LiveView(follower.array, controls=follower, port=page.port, open=page.open)
+    sys.setswitchinterval(_SWITCH_S)
+    if not quiet:
+        print_note(f"open {view.address} in a browser; Ctrl-C ends the page")
+    return view
 
 
 def print_point(point: LivePoint) -> None:

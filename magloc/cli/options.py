@@ -34,6 +34,10 @@ if TYPE_CHECKING:
     from magloc.tracking.motion import MotionModel
 
 
+STREAM = "-"
+"""In place of a file: standard input."""
+
+
 def print_note(text: str) -> None:
     """Print one line on stderr, whatever the text."""
     framework.print_note(text, "magloc")

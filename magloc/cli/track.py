@@ -26,6 +26,7 @@ from magloc.cli.moments.known_path import (
     write_moment_tracks,
 )
 from magloc.cli.options import (
+    STREAM,
     KnownOptions,
     MapOptions,
     MotionOptions,
@@ -47,7 +48,6 @@ if TYPE_CHECKING:
     from magloc.tracking.tracker import Tracker
 
 
-STREAM = "-"
 # Two vector sensors have no more: too few for the six numbers of a source in one row.
 _FEW_CHANNELS = 6
 _USE_SURVEY = "; sources at rest that few sensors move past are found by magloc survey"

@@ -11,9 +11,9 @@ from cyclopts.validators import Number
 
 import arrays
 from arrays.io.arguments import Flag, whole_number
-from arrays.io.errors import InputError
+from arrays.io.errors import InputError, naming
 from magloc.cli.framework import CommonOptions, progress
-from magloc.cli.options import naming_outputs, print_note
+from magloc.cli.options import STREAM, naming_outputs, print_note
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -26,7 +26,7 @@ Port = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, 
 
 
 def view(
-    path: Path,
+    path: Annotated[Path, Parameter(allow_leading_hyphen=True)],
     /,
     *,
     array: Path | None = None,
@@ -46,8 +46,8 @@ def view(
     Parameters
     ----------
     path : Path
-        Array file (TOML), readings or truth file (CSV), track of magloc track --json or --jsonl, or folder of magloc
-        map.
+        Array file (TOML), readings or truth file (CSV), track of magloc track --json or --jsonl, folder of magloc
+        map, or - for rows on standard input, whose source is followed as by magloc live.
     array : Path
         Array file that readings or a track belong to; for readings by default NAME-array.toml or array.toml beside
         them.
@@ -66,10 +66,18 @@ def view(
     common : CommonOptions
         Common options.
     """
+    if str(path).startswith("-") and str(path) != STREAM:
+        raise InputError(f"Unknown option: {path}.")
     import magloc
     from magloc.viewer.film import refuse_format
     from magloc.viewer.pages.open_result import ReadingsResult, read_result
     from magloc.viewer.server import check_outputs, free_port
+
+    if str(path) == STREAM:
+        if array is None or any(file is not None for file in (readings, html, png, movie)):
+            raise InputError("-: found no --array, or a file to be read or written, expected --array alone.")
+        _view_stream(array, port, open=open, quiet=common.quiet)
+        return
 
     with naming_outputs():
         if movie is not None:
@@ -102,6 +110,19 @@ def view(
         print(scene.address, flush=True)
         scene.wait()
     scene.close()
+
+
+def _view_stream(array: Path, port: int, *, open: bool, quiet: bool) -> None:
+    """Show a source that is followed through rows on standard input, and what is last known of it until Ctrl-C."""
+    from magloc.cli.live import PageOptions, shown
+    from magloc.live.follower import Follower
+
+    follower = Follower(arrays.read_array(array))
+    with shown(follower, PageOptions(port=port, open=open), quiet=quiet) as scene, naming(str(array)):
+        print(scene.address, flush=True)
+        for point in follower.follow(STREAM):
+            scene.update(point)
+        scene.wait()
 
 
 def _with_track(

@@ -38,6 +38,11 @@ class RowParser:
     """
 
     def __init__(self, array: SensorArray, name: str, tally: Tally, sensors: Sequence[str] | None = None) -> None:
+        if array.columns is not None:
+            raise InputError(
+                f"{name}: found a table [columns] in the array file, which is for logs in files; expected rows as of a"
+                " readings file, and an array without it."
+            )
         self._array, self._name, self._tally, self._sensors = array, name, tally, sensors
         self._header = ""
         self._columns: tuple[str, ...] = ()

@@ -18,6 +18,7 @@ from magloc.tracking.results import TrackPoint, TrackResult, stacked
 from magloc.viewer.pages import words
 from magloc.viewer.pages.field_panel import FieldPanel
 from magloc.viewer.pages.fixes import FixView, best_positions
+from magloc.viewer.pages.live import LivePage
 from magloc.viewer.pages.map import MapControls, MapView
 from magloc.viewer.pages.open_result import MapResult
 from magloc.viewer.pages.track_player import TrackPlayer, time_colours
@@ -45,6 +46,7 @@ AXES_WORDS = "axes of array and sensors: x red, y green, z blue"
 _FARTHEST_IN_MEDIANS = 3.0
 # Size of the glyphs, in radii of the scene, below which the sensors' ids are specks.
 _LEAST_LEGIBLE = 0.04
+_LIVE_RADII = 1.5  # half the side of the cube that a live page shows at first
 _SHADES = 9
 _MOST_STEPS, _PLAYED_S = 150, (5.0, 30.0)
 
@@ -209,6 +211,14 @@ def track_page(
         screen_label(server.scene, f"/times/{i}", f"{points[i].time_s:.6g} s", below)
     playing = Playing.of(stacked(points, "time_s"), player.show_row, player.index) if len(points) > 1 else None
     return _finished(server, legend, ball, name, entries, close=player.pause, drops=[player.drop], playing=playing)
+
+
+def live_page(server: viser.ViserServer, array: SensorArray, live: LivePage) -> Page:
+    """A source that is followed while its readings come in, which is expected within three radii of the array."""
+    legend = server.gui.add_folder("Legend", expand_by_default=False)
+    ball = extent_of(array.positions, corners_of(array.centroid, _LIVE_RADII * array.circumradius))
+    entries = [*live.entries(), _sensors_entry(array)]
+    return _finished(server, legend, ball, array.name or "live", entries, close=live.close)
 
 
 def map_page(server: viser.ViserServer, result: MapResult) -> Page:

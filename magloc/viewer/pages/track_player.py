@@ -198,7 +198,12 @@ def time_colours(time_s: FloatArray) -> ByteArray:
 
 def row_words(point: TrackPoint, index: int, n_rows: int) -> str:
     """What is known of the source in one row, as HTML."""
-    lines = [f"row {index + 1} of {n_rows}, time {point.time_s:.3f} s"]
+    return point_words(point, f"row {index + 1} of {n_rows}, time {point.time_s:.3f} s")
+
+
+def point_words(point: TrackPoint, when: str) -> str:
+    """What is known of the source at a time, as HTML."""
+    lines = [when]
     if point.position_m is None:
         return words.panel([*lines, f"<b>not tracked</b>: {escape(point.status or 'no reason given')}"], warning=True)
     lines.append(f"{escape(point.status)} at {words.place(point.position_m)}")

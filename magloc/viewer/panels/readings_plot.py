@@ -22,6 +22,7 @@ from magloc.viewer.panels.latest import Latest
 
 RAW = "readings"
 DIFFERENCES = "differences from the mean"
+RESIDUALS = "residuals of the differences"
 TICKED, ALL = "those ticked", "all"
 # Okabe and Ito, without yellow, which is not seen on white.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#666666")
@@ -57,6 +58,10 @@ class ReadingsPlot:
     readings : Readings
     array : SensorArray
         Whose channels they have.
+    residuals_T : ndarray, shape (n, C), optional
+        Readings less what a source explains of them; without it they cannot be shown.
+    window_s : float, optional
+        The time axis shows so long before the last row [s]; by default all since the first row.
 
     Attributes
     ----------
@@ -64,22 +69,24 @@ class ReadingsPlot:
         Row whose time is marked.
     """
 
-    def __init__(self, server: viser.ViserServer, readings: Readings, array: SensorArray) -> None:
-        self._server, self._order = server, np.argsort(readings.time_s, kind="stable")
-        self._time_s = readings.time_s[self._order] - readings.time_s.min()
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        readings: Readings,
+        array: SensorArray,
+        residuals_T: FloatArray | None = None,
+        window_s: float | None = None,
+    ) -> None:
+        self._server, self._array, self._window_s = server, array, window_s
         self._channels, self._ids = channels_of(array), array.ids
-        self._rank = np.argsort(self._order)
-        self._array, self._values_T = array, readings.values_T[self._order]
-        # Long records are thinned once for every choice: the mark that moves is all that changes in between.
-        self._values_nT = lru_cache(maxsize=2)(self._computed_nT)
-        self._thinned = lru_cache(maxsize=4)(self._thinned_lines)
+        self._hold(readings, residuals_T)
         self._follow = Latest(self._show)
         self.index = 0
         gui = server.gui
         with gui.add_folder("Readings"):
             self.kind_dropdown = gui.add_dropdown(
                 "Show",
-                (RAW, DIFFERENCES),
+                (RAW, DIFFERENCES) if residuals_T is None else (RAW, DIFFERENCES, RESIDUALS),
                 hint="Differences are of the field in the array's axes, from the mean of the sensors with a reading.",
             )
             series, data, scales = self._lines([0])
@@ -88,7 +95,7 @@ class ReadingsPlot:
                 series,
                 scales=scales,
                 axes=(
-                    uplot.Axis(label="time since the first row [s]"),
+                    uplot.Axis(label=f"time {'since the first' if window_s is None else 'before the last'} row [s]"),
                     uplot.Axis(label="field [nT]", size=76.0),
                 ),
                 aspect=1.2,
@@ -106,6 +113,21 @@ class ReadingsPlot:
         for checkbox in (*self.axis_checkboxes.values(), *self.sensor_checkboxes.values()):
             checkbox.on_update(self._follow)
         self._follow()
+
+    def take(self, readings: Readings, residuals_T: FloatArray | None = None) -> None:
+        """Show other readings of the array in place of those so far, and mark the last row."""
+        self._hold(readings, residuals_T)
+        self.show_row(len(readings) - 1)
+
+    def _hold(self, readings: Readings, residuals_T: FloatArray | None) -> None:
+        self._order = np.argsort(readings.time_s, kind="stable")
+        self._time_s = readings.time_s[self._order] - readings.time_s[self._order[0 if self._window_s is None else -1]]
+        self._rank = np.argsort(self._order)
+        self._values_T = readings.values_T[self._order]
+        self._residuals_T = None if residuals_T is None else residuals_T[self._order]
+        # Long records are thinned once for every choice: the mark that moves is all that changes in between.
+        self._values_nT = lru_cache(maxsize=2)(self._computed_nT)
+        self._thinned = lru_cache(maxsize=4)(self._thinned_lines)
 
     def show_row(self, index: int) -> None:
         """Mark the time of a row.
@@ -150,17 +172,18 @@ class ReadingsPlot:
         time, shown, mark = with_mark(time, shown, float(self._time_s[row]), self._values_nT(kind)[row, chosen])
         # uPlot finds no range of its own where a number is missing.
         scales = {
-            "x": uplot.Scale(time=False),
+            "x": uplot.Scale(time=False, **({} if self._window_s is None else {"range": (-self._window_s, 0.0)})),
             "y": uplot.Scale(range=span),
             "mark": uplot.Scale(range=(0.0, 1.0)),
         }
         return series, (time, *shown.T, mark), scales
 
     def _computed_nT(self, kind: str) -> FloatArray:
-        """Readings (n, C), or their differences, in the order of time."""
+        """Readings (n, C), their differences, or what a source leaves of these, in the order of time."""
         if kind == RAW:
             return 1e9 * self._values_T
-        return 1e9 * differences_from_mean(self._array, self._values_T)
+        of = self._values_T if kind != RESIDUALS or self._residuals_T is None else self._residuals_T
+        return 1e9 * differences_from_mean(self._array, of)
 
     def _thinned_lines(
         self, kind: str, chosen: tuple[int, ...]

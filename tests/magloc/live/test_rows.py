@@ -6,11 +6,13 @@ import json
 import math
 import random
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from arrays.columns import LogColumns
 from arrays.io.errors import InputError
 from magloc.live.rows import RowParser
 from magloc.live.tally import Tally
@@ -155,6 +157,12 @@ class TestHeader:
         found, tally = parsed([[*lines[:9], lines[0].replace("s4_", "s5_"), *lines[9:]]])
         assert len(found) == N_ROWS
         assert tally.garbled == 1
+
+    def test_of_a_log_of_another_program_is_refused(self) -> None:
+        """It may count in another unit under the same names."""
+        array = replace(ARRAY, columns=LogColumns(unit="uT"))
+        with pytest.raises(InputError, match=r"found a table \[columns\] in the array file"):
+            RowParser(array, "the stream", Tally())
 
     def test_that_never_comes(self, lines: list[str]) -> None:
         with pytest.raises(InputError, match="found no header in 100 lines"):

@@ -1,0 +1,83 @@
+"""A page that shows a source while it moves, for the command and for a loop of one's own."""
+
+from __future__ import annotations
+
+import math
+import webbrowser
+
+import viser
+
+from arrays.array import SensorArray
+from magloc.live.follower import LivePoint
+from magloc.readings import Readings
+from magloc.tracking.results import TrackPoint, rows_of
+from magloc.viewer.pages.live import Controls, LivePage
+from magloc.viewer.pages.pages import Page, live_page
+from magloc.viewer.server import FIRST_PORT
+from magloc.viewer.view import View
+
+
+class LiveView(View):
+    """A page of a source that is followed: scene, readings, residuals, rate, latency and lost rows.
+
+    It draws the newest point whenever it is ready, in a thread of its own, so that no row waits for the picture. A
+    context manager that closes it.
+
+    Parameters
+    ----------
+    array : SensorArray
+    controls : Follower, optional
+        Which the buttons of the page stop, start and tare: a :class:`magloc.live.Follower`, or what has these methods.
+    port : int
+        The next one that is free is taken if it is in use.
+    open : bool
+        Open the browser.
+    title : str
+        Of the browser's tab; by default the array's name.
+
+    Attributes
+    ----------
+    address : str
+        Where a browser of this machine finds it until it is closed.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> diver = magloc.datasets.load("diver")
+    >>> tracker = magloc.Tracker(diver.array, magloc.RandomWalk(1e-3, 1e-3))
+    >>> with magloc.viewer.LiveView(diver.array, open=False) as view:
+    ...     for row in diver.readings[:3]:
+    ...         view.update(tracker.update(row), row)
+    """
+
+    def __init__(
+        self,
+        array: SensorArray,
+        *,
+        controls: Controls | None = None,
+        port: int = FIRST_PORT,
+        open: bool = True,
+        title: str = "",
+    ) -> None:
+        def fill(server: viser.ViserServer) -> Page:
+            self._live = LivePage(server, array, controls)
+            return live_page(server, array, self._live)
+
+        super().__init__(title or array.name or "live", fill, port)
+        if open:
+            webbrowser.open(self.address)
+
+    def update(self, point: TrackPoint, row: Readings | None = None) -> None:
+        """Show one more point, unless a newer one comes before it is drawn.
+
+        Parameters
+        ----------
+        point : TrackPoint
+            Of :meth:`magloc.Tracker.update` or :func:`magloc.live.track`.
+        row : Readings of length one, optional
+            That it was found from; a LivePoint has it already.
+        """
+        if isinstance(point, LivePoint):
+            self._live.update(point, point.row, point.tally, point.latency_s)
+        else:
+            self._live.update(point, None if row is None else next(rows_of(row)), None, math.nan)

@@ -1,0 +1,235 @@
+"""The page of a source that is followed while its readings come in: the newest row, and the last seconds."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from threading import Event, Lock, Thread
+from time import perf_counter
+from typing import Protocol
+
+import numpy as np
+import viser
+
+from arrays.array import SensorArray
+from arrays.io.errors import InputError
+from arrays.typing import FloatArray
+from magloc.live.tally import Tally
+from magloc.measurement.differences import predicted_channels
+from magloc.readings import Readings
+from magloc.tracking.results import Row, TrackPoint, stacked
+from magloc.viewer.pages import words
+from magloc.viewer.pages.track_player import point_words
+from magloc.viewer.panels.readings_plot import ReadingsPlot
+from magloc.viewer.scene.glyphs import (
+    DIPOLE_COLOUR,
+    REGION_COLOUR,
+    TRACK_COLOUR,
+    ArrayGlyphs,
+    DipoleGlyph,
+    SurfaceGlyph,
+    screen_lines,
+)
+from magloc.viewer.scene.legend import Entry, Swatch
+from magloc.viewer.scene.shapes import ellipsoid, line_segments
+
+WINDOW_S = 10.0
+"""Of the tail and the plots."""
+_MOST_ROWS = 400
+_FRAMES_PER_SECOND = 15.0
+_PLOT_S = 0.25
+"""Between two drawings of the plots, which take longer."""
+_RATE_ROWS = 200
+_REST_S = 3.0
+NOWHERE = np.full(3, np.nan)
+
+
+class Controls(Protocol):
+    """What the buttons of the page do, as of :class:`magloc.live.Follower`."""
+
+    def stop(self) -> None:
+        """Follow nothing."""
+
+    def start(self) -> None:
+        """Follow again."""
+
+    def tare(self, rest_s: float) -> None:
+        """Take the next seconds as the background."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """One row as the page shows it."""
+
+    point: TrackPoint
+    row: Row | None
+
+
+class LivePage:
+    """Shows the newest of the rows that it is told of, from a thread of its own: who tells it never waits.
+
+    Parameters
+    ----------
+    server : viser.ViserServer
+    array : SensorArray
+    controls : Controls, optional
+        What the buttons work on; without it there are none.
+    """
+
+    def __init__(self, server: viser.ViserServer, array: SensorArray, controls: Controls | None) -> None:
+        self._server, self._array, self._controls = server, array, controls
+        self._lock, self._new, self._stop = Lock(), Event(), Event()
+        self._newest: Seen | None = None
+        self._tally: Tally | None = None
+        self._latency_s = math.nan
+        self._window: deque[Seen] = deque(maxlen=_MOST_ROWS + 1)
+        self._arrivals: deque[float] = deque(maxlen=_RATE_ROWS)
+        size = 0.5 * array.circumradius
+        self._glyphs = ArrayGlyphs(server.scene, array)
+        self._dipole = DipoleGlyph(server.scene, "/live/moment", size, DIPOLE_COLOUR)
+        self._tail = screen_lines(server.scene, "/live/tail", np.zeros((1, 2, 3)), TRACK_COLOUR, 3.0, visible=False)
+        self._region = SurfaceGlyph(server.scene, "/live/region", REGION_COLOUR, 0.35)
+        self._add_panels()
+        self._thread = Thread(target=self._run, name="magloc-live-page", daemon=True)
+        self._thread.start()
+
+    def entries(self) -> list[Entry]:
+        """Lines of the legend."""
+        return [
+            Swatch(DIPOLE_COLOUR, "the source now: the arrow is its moment"),
+            Swatch(TRACK_COLOUR, f"its track of the last {WINDOW_S:g} s"),
+            Swatch(REGION_COLOUR, "95 % region of its position"),
+        ]
+
+    def update(self, point: TrackPoint, row: Row | None, tally: Tally | None, latency_s: float) -> None:
+        """Take one more row; what has not been shown yet is passed over."""
+        seen = Seen(point, row)
+        with self._lock:
+            self._newest, self._tally, self._latency_s = seen, tally, latency_s
+            self._arrivals.append(perf_counter())
+            window = self._window
+            if window and point.time_s < window[-1].point.time_s:  # the sender's clock was set back
+                window.clear()
+            if not window or point.time_s - window[-1].point.time_s >= WINDOW_S / _MOST_ROWS:
+                window.append(seen)
+        self._new.set()
+
+    def close(self) -> None:
+        """End the thread; to be called before the server is stopped."""
+        self._stop.set()
+        self._new.set()
+        self._thread.join()
+
+    def _add_panels(self) -> None:
+        gui = self._server.gui
+        if self._controls is not None:  # above all that grows and shrinks
+            with gui.add_folder("Follow"):
+                self._switch = gui.add_button("Stop", hint="Follow nothing until Start; rows are still counted.")
+                self._tare = gui.add_button("Tare", hint="What is read meanwhile is taken off all later readings.")
+                self._rest = gui.add_number("Rest [s]", _REST_S, min=0.1, max=600.0, step=0.1)
+                self._said = gui.add_html("")
+                self._switch.on_click(self._switched)
+                self._tare.on_click(self._tared)
+        with gui.add_folder("Source"):
+            self._source_panel = gui.add_html(words.panel(["no row yet"]))
+        with gui.add_folder("Stream"):
+            self._stream_panel = gui.add_html(words.panel(["no row yet"]))
+        empty = Readings(np.full((1, self._array.n_channels), np.nan))
+        self._plot = ReadingsPlot(self._server, empty, self._array, residuals_T=empty.values_T, window_s=WINDOW_S)
+
+    def _switched(self, _: object) -> None:
+        assert self._controls is not None
+        if self._switch.label == "Stop":
+            self._controls.stop()
+            self._switch.label = "Start"
+        else:
+            self._controls.start()
+            self._switch.label = "Stop"
+
+    def _tared(self, _: object) -> None:
+        assert self._controls is not None
+        try:
+            self._controls.tare(float(self._rest.value))
+            self._said.content = ""
+        except InputError as error:
+            self._said.content = words.panel([escape(str(error))], warning=True)
+
+    def _run(self) -> None:
+        plotted, plotted_at = True, 0.0
+        while True:
+            is_new = self._new.wait(None if plotted else _PLOT_S)
+            if self._stop.is_set():
+                return
+            self._new.clear()
+            with self._lock:
+                newest, window = self._newest, list(self._window)
+            if newest is None:
+                continue
+            if is_new:
+                with self._server.atomic():
+                    self._show(newest, window)
+                plotted = False
+            if perf_counter() - plotted_at >= _PLOT_S:
+                self._show_plot(window)
+                plotted, plotted_at = True, perf_counter()
+            self._stop.wait(1.0 / _FRAMES_PER_SECOND)
+
+    def _show(self, newest: Seen, window: Sequence[Seen]) -> None:
+        """The newest row in the scene and in words."""
+        point, row = newest.point, newest.row
+        if row is not None:
+            x, y, z, w = _quaternion(row.R_world_from_array)
+            self._glyphs.set_pose(row.origin_m, (x, y, z, w))
+        position, moment, covariance = point.position_m, point.moment_Am2, point.covariance
+        self._dipole.show(NOWHERE if position is None else position, NOWHERE if moment is None else moment)
+        region = None if position is None or covariance is None else ellipsoid(position, covariance[:3, :3])
+        self._region.show(region)
+        recent = [seen.point for seen in window if seen.point.time_s >= point.time_s - WINDOW_S]
+        segments = line_segments(stacked(recent, "position_m", 3)) if len(recent) > 1 else np.zeros((0, 2, 3))
+        self._tail.visible = bool(len(segments))
+        if len(segments):
+            self._tail.points = segments.astype(np.float32)
+        self._source_panel.content = point_words(point, f"time {point.time_s:.3f} s")
+        self._stream_panel.content = words.panel(self._stream_lines())
+
+    def _stream_lines(self) -> list[str]:
+        """Rate, latency and what was lost."""
+        with self._lock:
+            arrivals, tally, latency_s = list(self._arrivals), self._tally, self._latency_s
+        lines = []
+        if len(arrivals) > 1 and arrivals[-1] > arrivals[0]:
+            lines.append(f"{(len(arrivals) - 1) / (arrivals[-1] - arrivals[0]):.3g} rows/s")
+        if math.isfinite(latency_s):
+            lines.append(f"latency {1e3 * latency_s:.2g} ms")
+        if tally is not None:
+            lines.append(f"{tally.rows} rows, {tally.tracked} tracked")
+            lines.append(f"{tally.lost} lost, {tally.late} late, {tally.doubled} doubled, {tally.garbled} garbled")
+            if tally.skipped:
+                lines.append(f"{tally.skipped} skipped")
+        return lines
+
+    def _show_plot(self, window: Sequence[Seen]) -> None:
+        """Readings and residuals of the last seconds."""
+        last_s = window[-1].point.time_s if window else 0.0
+        shown = [(seen.point, seen.row) for seen in window if seen.point.time_s >= last_s - WINDOW_S]
+        rows = [row for _, row in shown if row is not None]
+        if len(rows) != len(shown) or not rows:
+            return
+        values = np.array([row.readings_T for row in rows])
+        origins, R = np.array([row.origin_m for row in rows]), np.array([row.R_world_from_array for row in rows])
+        points = [point for point, _ in shown]
+        position = np.einsum("nji,nj->ni", R, stacked(points, "position_m", 3) - origins)
+        moment = np.einsum("nji,nj->ni", R, stacked(points, "moment_Am2", 3))
+        time_s = np.array([point.time_s for point in points]) - last_s
+        residuals = values - predicted_channels(self._array, position, moment)
+        self._plot.take(Readings(values, time_s=time_s), residuals)
+
+
+def _quaternion(R: FloatArray) -> FloatArray:
+    """The unit quaternion xyzw of a rotation matrix (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(R).as_quat()

@@ -1,0 +1,112 @@
+"""The live page without a browser: who tells it of rows never waits, and its buttons do what they say."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from arrays.geometries import tetrahedron
+from arrays.io.errors import InputError
+from magloc.tracking.results import TrackPoint
+from magloc.viewer.live_view import LiveView
+from tests.waiting import wait_for
+
+ARRAY = tetrahedron(1.5)
+
+
+def point_at(time_s: float) -> TrackPoint:
+    position = np.array([1.0, time_s, 0.5])
+    return TrackPoint(time_s, position, np.array([0.0, 0.0, 80.0]), 1e-4 * np.eye(6), status="tracked")
+
+
+class Controls:
+    """Notes what the buttons do."""
+
+    def __init__(self) -> None:
+        self.calls: list[object] = []
+
+    def stop(self) -> None:
+        self.calls.append("stop")
+
+    def start(self) -> None:
+        self.calls.append("start")
+
+    def tare(self, rest_s: float) -> None:
+        self.calls.append(rest_s)
+        if len(self.calls) > 3:
+            raise InputError("a rest: found scalar sensor s1, expected vector sensors alone.")
+
+
+@pytest.fixture
+def controls() -> Controls:
+    return Controls()
+
+
+@pytest.fixture
+def view(controls: Controls) -> Iterator[LiveView]:
+    with LiveView(ARRAY, controls=controls, port=0, open=False) as view:
+        yield view
+
+
+def test_the_newest_row_is_shown_and_none_waits(view: LiveView, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While the page draws, a hundred rows come; it goes on with the last of them."""
+    page, shown = view._live, list[float]()
+    drawing, go_on = threading.Event(), threading.Event()
+
+    def show(newest: object, window: object) -> None:
+        shown.append(newest.point.time_s)  # type: ignore[attr-defined]
+        drawing.set()
+        go_on.wait()
+
+    monkeypatch.setattr(page, "_show", show)
+    view.update(point_at(0.0))
+    drawing.wait()
+    for i in range(1, 101):
+        view.update(point_at(0.01 * i))
+    go_on.set()
+    wait_for(lambda: shown[-1:] == [1.0])
+    assert shown == [0.0, 1.0]
+
+
+def test_what_is_said(view: LiveView) -> None:
+    for i in range(20):
+        view.update(point_at(0.1 * i))
+    page = view._live
+    wait_for(lambda: "time 1.900 s" in page._source_panel.content)
+    assert "tracked at (1.000, 1.900, 0.500) m" in page._source_panel.content
+    np.testing.assert_allclose(page._dipole.frame.position, [1.0, 1.9, 0.5])
+    view.update(TrackPoint(2.0, status="lost: the range is no longer known"))
+    wait_for(lambda: "lost: the range" in page._source_panel.content)
+    assert not page._dipole.frame.visible
+
+
+def test_the_window_is_as_long_as_it_says(view: LiveView) -> None:
+    for i in range(20_000):
+        view.update(point_at(0.002 * i))
+    window = [seen.point.time_s for seen in view._live._window]
+    assert len(window) <= 401
+    assert 9.9 < window[-1] - window[0] < 14.0
+    view.update(point_at(0.0))  # the sender was started anew
+    assert [seen.point.time_s for seen in view._live._window] == [0.0]
+
+
+def test_buttons(view: LiveView, controls: Controls) -> None:
+    page = view._live
+    page._switched(None)
+    assert page._switch.label == "Start"
+    page._switched(None)
+    assert page._switch.label == "Stop"
+    page._tared(None)
+    assert controls.calls == ["stop", "start", 3.0]
+    assert page._said.content == ""
+    page._tared(None)
+    assert "scalar sensor s1" in page._said.content
+
+
+def test_it_ends() -> None:
+    with LiveView(ARRAY, port=0, open=False) as view:
+        view.update(point_at(0.0))
+    assert not view._live._thread.is_alive()
