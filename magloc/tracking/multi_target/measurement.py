@@ -75,13 +75,24 @@ class JointRow:
         H[:, -N_COMMON:] = self.gain
         return np.vecdot(self.gain, fields[self.channel_sensor]), H
 
-    def moment_at(self, position_m: FloatArray, residual: FloatArray) -> FloatArray:
-        """The moment (3,) of a source at a place that explains most of residuals (C,), beside a common field."""
+    def energy_of(self, position_m: FloatArray, moment_Am2: FloatArray) -> FloatArray:
+        """Energy (N,) of a source in each sensor."""
+        fields = dipole.field(self.positions_m, position_m, moment_Am2)[self.channel_sensor]
+        energy: FloatArray = np.bincount(self.channel_sensor, np.vecdot(self.gain, fields) ** 2).astype(np.float64)
+        return energy
+
+    def moment_at(self, position_m: FloatArray, innovation: FloatArray, linear: FloatArray) -> FloatArray:
+        """The moment (3,) of a source at a place that explains most of an innovation (C,).
+
+        Beside it the innovation has errors of unit variance along the columns of `linear` (C, d).
+        """
         fields = dipole.field_matrix(self.positions_m, position_m)[self.channel_sensor]
-        columns = np.concatenate([(self.gain[:, None] @ fields)[:, 0], self.gain], axis=1)
-        size = np.linalg.norm(columns, axis=0)
-        found: FloatArray = np.linalg.lstsq(columns / size, residual, rcond=None)[0] / size
-        return found[:3]
+        columns = (self.gain[:, None] @ fields)[:, 0]
+        size = np.linalg.norm(columns)
+        d = linear.shape[1]
+        A = np.block([[columns / size, linear], [np.zeros((d, 3)), np.eye(d)]])
+        found: FloatArray = np.linalg.lstsq(A, np.concatenate([innovation, np.zeros(d)]), rcond=None)[0]
+        return found[:3] / size
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,7 +46,7 @@ class FreeMotion:
     1.5
     """
 
-    speed_m_s: float = 0.6
+    speed_m_s: float = 0.5
     turn_rad_s: float = 1.8
     correlation_s: float = 1.5
     turn_correlation_s: float = 0.4

@@ -20,7 +20,7 @@ from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState, mom
 
 TOLERANCE = 0.02
 """Change of the predicted readings, squared, in units of the noise, at which the iteration ends."""
-MOST_ITERATIONS = 40
+MOST_ITERATIONS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +35,10 @@ class JointUpdate:
         Of whitened readings at the state.
     seen : ndarray, shape (C, 6 K + 3)
         A root of what the state's uncertainty makes of the predicted readings: A P⁺ Aᵀ.
+    innovation : ndarray, shape (C,)
+        The same at the prediction.
+    linear : ndarray, shape (C, 6 K + 3)
+        A root of what the prediction's uncertainty makes of the predicted readings, there.
     cost : float
         :math:`J = |r|^2 + e^T P^{-1} e`, χ² of the innovation with the number of readings as degrees of freedom.
     log_volume : float
@@ -46,6 +50,8 @@ class JointUpdate:
     row: JointRow
     residual: FloatArray
     seen: FloatArray
+    innovation: FloatArray
+    linear: FloatArray
     cost: float
     log_volume: float
     converged: bool
@@ -66,6 +72,16 @@ class JointUpdate:
         """χ² (N,) with three degrees of freedom of every sensor's residual: tᵀ (I - A P⁺ Aᵀ)⁻¹ t."""
         return np.vecdot(self.standardised, self.standardised)
 
+    @cached_property
+    def surprise(self) -> FloatArray:
+        """Innovation (C,) less what the prediction's uncertainty explains, to first order.
+
+        Where something new is strong, the iterated update moves what is known onto it, and the residual tells little.
+        """
+        A = np.eye(self.linear.shape[1]) + self.linear.T @ self.linear
+        surprise: FloatArray = self.innovation - self.linear @ np.linalg.solve(A, self.linear.T @ self.innovation)
+        return surprise
+
 
 _FOLLOWED = 1e-3
 
@@ -77,6 +93,7 @@ def joint_update(prior: JointState, row: JointRow) -> JointUpdate:
     y, best_y, best, residual = np.zeros(d), np.zeros(d), np.inf, row.z
     HL, converged = np.zeros((len(row.z), d)), False
     R: FloatArray = np.eye(d)
+    at_prediction: tuple[FloatArray, FloatArray] | None = None
     for _ in range(MOST_ITERATIONS):
         error = L @ y
         state = prior.moved(error)
@@ -94,6 +111,8 @@ def joint_update(prior: JointState, row: JointRow) -> JointUpdate:
             continue
         best, best_y, residual = cost, y, r
         HL = _in_chart(H, prior, error) @ L
+        if at_prediction is None:
+            at_prediction = r, HL
         R = _lower_root(np.eye(d) + HL.T @ HL)
         new = _solved(R, HL.T @ (r + HL @ y))
         along = HL @ (new - y)
@@ -103,7 +122,10 @@ def joint_update(prior: JointState, row: JointRow) -> JointUpdate:
             converged = True
             break
         y = new
-    return _updated(prior, row, L, R, HL, best_y, residual, best, converged)
+    state, seen = _updated(prior, L, R, HL, best_y)
+    innovation, linear = at_prediction or (row.z, HL)
+    log_volume = 2.0 * float(np.sum(np.log(np.diagonal(R))))
+    return JointUpdate(state, row, residual, seen, innovation, linear, best, log_volume, converged)
 
 
 def _in_chart(H: FloatArray, prior: JointState, error: FloatArray) -> FloatArray:
@@ -127,17 +149,9 @@ def _solved(R: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def _updated(
-    prior: JointState,
-    row: JointRow,
-    L: FloatArray,
-    R: FloatArray,
-    HL: FloatArray,
-    y: FloatArray,
-    residual: FloatArray,
-    cost: float,
-    converged: bool,
-) -> JointUpdate:
-    """State and covariance after the last linearisation, in the chart of the new state."""
+    prior: JointState, L: FloatArray, R: FloatArray, HL: FloatArray, y: FloatArray
+) -> tuple[JointState, FloatArray]:
+    """State and covariance after the last linearisation, in the chart of the new state, and a root of A P⁺ Aᵀ."""
     d, k = prior.n_seen, prior.n_sources
     rest = solve_triangular(L, prior.P[:d, d:], lower=True, check_finite=False).T
     W = np.concatenate([L, rest])
@@ -152,8 +166,7 @@ def _updated(
     P = root @ root.T
     P[d:, d:] += prior.P[d:, d:] - rest @ rest.T
     seen = solve_triangular(R, HL.T, lower=True, check_finite=False).T
-    log_volume = 2.0 * float(np.sum(np.log(np.diagonal(R))))
-    return JointUpdate(replace(state, P=P), row, residual, seen, cost, log_volume, converged)
+    return replace(state, P=P), seen
 
 
 def innovation_chi2(state: JointState, row: JointRow, sensors: BoolArray) -> FloatArray:

@@ -59,7 +59,7 @@ def test_two_half_steps_are_one(dt_s):
 def test_position_and_velocity_are_those_of_one_source():
     """As :class:`OrnsteinUhlenbeck` has them."""
     state = state_of(1)
-    single = OrnsteinUhlenbeck(0.6, 1.8, correlation_s=1.5)
+    single = OrnsteinUhlenbeck(MOTION.speed_m_s, MOTION.turn_rad_s, MOTION.correlation_s)
     x = np.concatenate([state.position_m[0], state.moment_Am2[0], state.velocity_m_s[0], state.rate_rad_s[0]])
     at = places_of(1)[0, [0, 1, 2, 6, 7, 8]]
     moved, F, S_q = single.step(x, 0.1)
