@@ -40,6 +40,7 @@ _WIDTH = 4
 _RETURNED = 3
 _AS_GOOD = 20.0
 _SAME_SCORE = 0.1
+_MUCH_STRONGER = 100.0
 # Share of a source's energy in one sensor above which no other sensor sees it.
 _LONELY = 0.9
 # What is known of a new source: the direction of its moment [rad], ln of its strength, its place over its distance.
@@ -140,14 +141,23 @@ class RowProblem:
         moved = self.updated(manoeuvring, plain.ids, plain.out, plain.penalty + MANOEUVRE)
         return [moved] if self.holds(moved) else self._beam(moved, 1)
 
-    def _beam(self, plain: Explanation, most_events: int) -> list[Explanation]:
+    def of_more_sources(self, common: JointState, out: BoolArray, least: int) -> list[Explanation]:
+        """Explanations from nothing, with some number of sources at least: fewer may hold in a row, and be wrong."""
+        return self._beam(self.updated(common, (), out), least + 1, least)
+
+    def _beam(self, plain: Explanation, most_events: int, least: int = 0) -> list[Explanation]:
         level = [plain]
         for _ in range(most_events):
             # An event that does not make the row likelier by more than it costs leads nowhere.
             level = distinct(
-                one for before in level[:_WIDTH] for one in self._one_event_more(before) if one.score < before.score
+                one
+                for before in level[:_WIDTH]
+                for one in self._one_event_more(before)
+                if one.score < before.score or len(before.ids) < len(one.ids) <= least
             )
-            holding = [found for found in level if self.holds(found)]
+            holding = [found for found in level if len(found.ids) >= least and self.holds(found)]
+            if holding and least:
+                return holding[:_RETURNED]
             if holding:
                 holding = distinct([*holding, *(fewer for found in holding[:_WIDTH] for fewer in self._merged(found))])
                 return [found for found in holding if found.score < holding[0].score + _AS_GOOD][:_RETURNED]
@@ -215,10 +225,17 @@ class RowProblem:
         return self.index * NAMES_A_ROW
 
     def _allows(self, update: JointUpdate) -> bool:
-        """Whether the last source agrees with what is known; one that a single sensor sees may be a fault of it."""
+        """Whether the last source agrees with what is known, and may be told from a fault and from the ambient field.
+
+        A single sensor that sees it may be at fault; so far away that it is much stronger than all others it is a
+        gradient of the ambient field.
+        """
         position, moment = update.state.position_m[-1], update.state.moment_Am2[-1]
         in_array = self.row.R_world_from_array.T @ (position - self.row.origin_m)
         if not (self.scene.prior.allows_position(in_array) and self.scene.prior.allows_moment(moment)):
+            return False
+        others = np.linalg.norm(update.state.moment_Am2[:-1], axis=1)
+        if np.linalg.norm(moment) > _MUCH_STRONGER * others.max(initial=0.0) and len(others):
             return False
         energy = update.row.energy_of(position, moment)
         return bool(energy.max() < _LONELY * energy.sum())

@@ -242,6 +242,7 @@ class SourcesTracker:
         anew.append(problem.found_anew(common, best.state.position_m, best.state.moment_Am2, dead))
         if len(best.ids) < self.scene.most_sources:
             before = (found, *anew)
+            anew += problem.of_more_sources(common, dead, len(best.ids) + 1)
             anew += distinct(one for start in before for one in problem.births(start))[:_MOST_HYPOTHESES]
         restarts = [self._after(problem, best, one) for one in distinct(anew) if one.update.converged]
         suspect = best.health.suspect
