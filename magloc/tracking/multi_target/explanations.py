@@ -12,7 +12,7 @@ import numpy as np
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
 from magloc.localization.fit.prior import SourcePrior
-from magloc.tracking.multi_target.measurement import Cells, JointRow
+from magloc.tracking.multi_target.measurement import Cells, Channels, JointRow
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.state import JointState
 from magloc.tracking.multi_target.update import JointUpdate, joint_update
@@ -51,10 +51,15 @@ _TURN, _LOG_STRENGTH, _PLACE = 1.0, 1.5, 0.5
 class Scene:
     """What does not change from row to row: array, motion, and what is known of the sources."""
 
-    array: SensorArray
+    channels: Channels
     motion: FreeMotion
     prior: SourcePrior
     most_sources: int
+
+    @property
+    def array(self) -> SensorArray:
+        """Whose rows they are."""
+        return self.channels.array
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,11 +116,11 @@ class RowProblem:
     @cached_property
     def measured(self) -> JointRow:
         """All readings of the row."""
-        return JointRow.of(self.scene.array, self.row)
+        return self.scene.channels.measured(self.row)
 
     @cached_property
     def _cells(self) -> Cells:
-        return Cells.of(self.scene.array, self.row.available)
+        return self.scene.channels.of(self.row)[1]
 
     def updated(self, prior: JointState, ids: tuple[int, ...], out: BoolArray, penalty: float = 0.0) -> Explanation:
         """The readings put into a prediction."""
@@ -227,15 +232,15 @@ class RowProblem:
     def _allows(self, update: JointUpdate) -> bool:
         """Whether the last source agrees with what is known, and may be told from a fault and from the ambient field.
 
-        A single sensor that sees it may be at fault; so far away that it is much stronger than all others it is a
+        A single sensor that sees it may be at fault; one so far away that it is much stronger than the others is a
         gradient of the ambient field.
         """
         position, moment = update.state.position_m[-1], update.state.moment_Am2[-1]
         in_array = self.row.R_world_from_array.T @ (position - self.row.origin_m)
         if not (self.scene.prior.allows_position(in_array) and self.scene.prior.allows_moment(moment)):
             return False
-        others = np.linalg.norm(update.state.moment_Am2[:-1], axis=1)
-        if np.linalg.norm(moment) > _MUCH_STRONGER * others.max(initial=0.0) and len(others):
+        strength = np.linalg.norm(update.state.moment_Am2, axis=1)
+        if strength.max() > _MUCH_STRONGER * strength.min():
             return False
         energy = update.row.energy_of(position, moment)
         return bool(energy.max() < _LONELY * energy.sum())

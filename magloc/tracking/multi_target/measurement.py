@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
@@ -14,6 +13,9 @@ from magloc.localization.search.candidates import candidate_positions
 from magloc.measurement.rows import ambient_fields, channels_above_ambient, whitenings_of
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
 from magloc.tracking.results import Row
+
+# Sets of channels that are kept: rows miss the same ones more often than not.
+_MOST_MASKS = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +41,10 @@ class JointRow:
     used: BoolArray
 
     @classmethod
-    def of(cls, array: SensorArray, row: Row) -> JointRow:
-        """A row with all of its readings."""
+    def of(cls, array: SensorArray, row: Row, root: FloatArray | None = None) -> JointRow:
+        """A row with all of its readings; `root` (C, C) is their whitening, where that is known already."""
         used, readings = row.available, row.readings_T[None]
-        root = whitenings_of(array, used, readings)[0].root
+        root = whitenings_of(array, used, readings)[0].root if root is None else root
         ambient = ambient_fields(array, 1, None if row.ambient_T is None else row.ambient_T[None])
         above = channels_above_ambient(array, used, readings, ambient)[0]
         R = row.R_world_from_array
@@ -111,9 +113,17 @@ class Cells:
     bases: FloatArray
 
     @classmethod
-    def of(cls, array: SensorArray, used: BoolArray) -> Cells:
-        """Cells of rows with these channels; made once for an array and its channels."""
-        return _cells(array, used.tobytes())
+    def of(cls, array: SensorArray, root: FloatArray) -> Cells:
+        """Cells of rows whose channels are whitened by a root (C, C)."""
+        positions = candidate_positions(array, n_directions=60, n_ranges=10, n_near_directions=4)
+        gain = root @ array.channel_gain
+        common, size, _ = np.linalg.svd(gain, full_matrices=False)
+        common = common[:, size > 1e-10 * size.max(initial=0.0)]
+        fields = dipole.field_matrix(array.positions, positions[:, None])[:, array.channel_sensor]
+        columns = (gain[None, :, None] @ fields)[:, :, 0]
+        columns -= common @ (common.T @ columns)
+        bases, _ = np.linalg.qr(columns)
+        return cls(positions, bases.transpose(1, 2, 0).reshape(len(gain), -1).astype(np.float32))
 
     def energy(self, residual: FloatArray) -> FloatArray:
         """Energy (n,) of residuals (C,) that a source at each cell explains: χ² with three degrees of freedom."""
@@ -133,16 +143,23 @@ class Cells:
         return np.array(chosen, dtype=np.intp)
 
 
-@lru_cache(maxsize=8)
-def _cells(array: SensorArray, available: bytes) -> Cells:
-    used = np.frombuffer(available, dtype=np.bool_)
-    positions = candidate_positions(array, n_directions=60, n_ranges=10, n_near_directions=4)
-    root = whitenings_of(array, used, np.zeros((1, array.n_channels)))[0].root
-    gain = root @ array.channel_gain
-    common, size, _ = np.linalg.svd(gain, full_matrices=False)
-    common = common[:, size > 1e-10 * size.max(initial=0.0)]
-    fields = dipole.field_matrix(array.positions, positions[:, None])[:, array.channel_sensor]
-    columns = (gain[None, :, None] @ fields)[:, :, 0]
-    columns -= common @ (common.T @ columns)
-    bases, _ = np.linalg.qr(columns)
-    return Cells(positions, bases.transpose(1, 2, 0).reshape(len(gain), -1).astype(np.float32))
+class Channels:
+    """Whitening and cells of an array's rows, made once for all that have the same channels."""
+
+    def __init__(self, array: SensorArray) -> None:
+        self.array = array
+        self._known: dict[bytes, tuple[FloatArray, Cells]] = {}
+
+    def of(self, row: Row) -> tuple[FloatArray, Cells]:
+        """Whitening (C, C) and cells of a row; where the noise depends on the readings, those of the first such row."""
+        key = row.available.tobytes()
+        if key not in self._known:
+            if len(self._known) == _MOST_MASKS:
+                self._known.clear()
+            root = whitenings_of(self.array, row.available, row.readings_T[None])[0].root
+            self._known[key] = root, Cells.of(self.array, root)
+        return self._known[key]
+
+    def measured(self, row: Row) -> JointRow:
+        """A row with all of its readings."""
+        return JointRow.of(self.array, row, None if self.array.noise_depends_on_reading else self.of(row)[0])

@@ -38,8 +38,9 @@ class SourcesPoint:
     tracks : tuple of SourcePoint
         In the order of their ids.
     status : str
-        "tracked", "no source", "no readings", or "misfit": no sources, deaths and faults explain the readings, and the
-        tracks are predictions.
+        "tracked", "no source", "no readings", "misfit": no sources, losses and faults explain the readings, and the
+        tracks are predictions; or "doubtful": χ² of the last rows together is beyond noise, and what is wrong is being
+        looked for.
     chi2 : float
         Of the row given its prediction.
     dof : int

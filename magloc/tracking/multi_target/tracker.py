@@ -26,6 +26,7 @@ from magloc.tracking.multi_target.explanations import (
     Scene,
     distinct,
 )
+from magloc.tracking.multi_target.measurement import Channels
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.results import SourcePoint, SourcesPoint
 from magloc.tracking.multi_target.sensor_health import SensorHealth
@@ -44,6 +45,8 @@ _LESS_LIKELY = 25.0
 # A restart is judged by its predictions of so many rows; the next one comes so many rows later.
 _JUDGED_ROWS = 11
 _RESTART_PAUSE = 15
+# Restarts with a source more, and others.
+_MOST_RESTARTS = 3
 # Rows after which it is asked whether a source is one too many.
 _DOUBT_EVERY = 12
 # Memories of the excess of χ² [rows], and five times the deviation of its mean with each.
@@ -130,7 +133,7 @@ class SourcesTracker:
                 f"Input sources must be between 1 and {most} for an array of {array.n_channels} readings a row, with"
                 f" {N_SEEN} unknowns a source and {N_COMMON} of the common field; instead received {wanted}."
             )
-        self.scene = Scene(array, motion, prior, wanted)
+        self.scene = Scene(Channels(array), motion, prior, wanted)
         self._hypotheses: list[Hypothesis] = []
         self._numbers: dict[int, int] = {}
         self._time_s = math.nan
@@ -173,12 +176,17 @@ class SourcesTracker:
         found = next(found for hypothesis, found in children if hypothesis.state is best.state)
         explained = best.state is found.update.state
         status = "misfit" if not explained else "tracked" if best.ids else "no source"
+        if status == "tracked" and (best.excess > _POOR).any():
+            status = "doubtful"
         poor = bool((best.excess > _POOR).any()) or best.health.suspect is not None
         if len(best.ids) > 1 and self._n_rows % _DOUBT_EVERY == 0:
             self._hypotheses += self._superfluous(problem, best, found)
         if best.ids and poor and self._n_rows >= self._next_restart:
             self._next_restart = self._n_rows + _RESTART_PAUSE
-            self._hypotheses += self._restarts(problem, best, found)
+            restarts = self._restarts(problem, best, found)
+            # Whether the suspect is at fault, they are to tell.
+            self._hypotheses[0] = replace(best, health=best.health.forgetful)
+            self._hypotheses += restarts
         return self._point(problem, status, found.update.cost)
 
     def _nothing_yet(self, problem: RowProblem) -> Hypothesis:
@@ -244,7 +252,10 @@ class SourcesTracker:
             before = (found, *anew)
             anew += problem.of_more_sources(common, dead, len(best.ids) + 1)
             anew += distinct(one for start in before for one in problem.births(start))[:_MOST_HYPOTHESES]
-        restarts = [self._after(problem, best, one) for one in distinct(anew) if one.update.converged]
+        tried = [one for one in distinct(anew) if one.update.converged]
+        more = [one for one in tried if len(one.ids) > len(best.ids)]
+        tried = [one for one in tried if len(one.ids) <= len(best.ids)][:_MOST_RESTARTS] + more[:_MOST_RESTARTS]
+        restarts = [self._after(problem, best, one) for one in tried]
         suspect = best.health.suspect
         restarts = [replace(one, health=one.health.forgetful) for one in restarts]
         if suspect is not None and best.health.may_drift:
@@ -288,7 +299,7 @@ class SourcesTracker:
                 best.state.covariance(k),
                 nis=chi2,
                 nis_dof=int(np.count_nonzero(row.available)),
-                status="predicted" if status in ("misfit", "no readings") else "merged" if merged[k] else "tracked",
+                status="predicted" if status in ("misfit", "no readings") else "merged" if merged[k] else status,
                 weight=float(likely @ [best.ids[k] in one.ids for one in believed] / likely.sum()),
                 centroid_m=row.origin_m + row.R_world_from_array @ array.centroid,
                 radius_m=array.circumradius,

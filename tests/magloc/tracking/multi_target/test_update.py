@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 import arrays
 from magloc.fields import dipole
-from magloc.tracking.multi_target.measurement import Cells, JointRow
+from magloc.tracking.multi_target.measurement import Channels, JointRow
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.state import N_SEEN, JointState
 from magloc.tracking.multi_target.update import innovation_chi2, joint_update
@@ -124,7 +124,7 @@ def test_cost_and_residuals_are_chi_squared():
     assert abs(np.mean([one.cost for one in found]) - n) < 5.0 * np.sqrt(2.0 * n / 100)
     chi2 = np.array([one.sensor_chi2 for one in found])
     assert np.abs(chi2.mean(axis=0) - 3.0).max() < 5.0 * np.sqrt(6.0 / 100)
-    cells = Cells.of(BOARD, np.ones(n, dtype=bool))
+    cells = Channels(BOARD).of(Row(0.0, readings(rng)))[1]
     energy = np.array([cells.energy(one.residual) for one in found])
     # What the sources may explain already is missing from it.
     assert energy.mean(axis=0).max() < 3.0 + 5.0 * np.sqrt(6.0 / 100)
@@ -149,7 +149,7 @@ class TestContradictions:
     def test_another_source_lies_in_a_cell_beside_it(self):
         rng = np.random.default_rng(4)
         found = joint_update(known(1, 0.05), JointRow.of(BOARD, Row(0.0, readings(rng))))
-        cells = Cells.of(BOARD, np.ones(BOARD.n_channels, dtype=bool))
+        cells = Channels(BOARD).of(Row(0.0, readings(rng)))[1]
         best = cells.best(cells.energy(found.residual), 4)
         assert np.linalg.norm(cells.position_m[best] - PLACES[1], axis=1).min() < 0.03
 
