@@ -61,7 +61,7 @@ class TestBookkeeping:
         state = state_of(1)
         small = JointState(*(getattr(state, name) for name in list(vars(state))[:5]), 1e-8 * state.P)
         errors = np.random.default_rng(1).multivariate_normal(np.zeros(15), small.P, 50_000)
-        moved = np.array([moved_moment(state.moment_Am2[0], c) for c in errors[:, 3:6]])
+        moved = moved_moment(np.tile(state.moment_Am2, (len(errors), 1)), errors[:, 3:6])
         drawn = np.cov(np.hstack([state.position_m[0] + errors[:, :3], moved]).T)
         scale = np.sqrt(np.diagonal(small.covariance(0)))
         np.testing.assert_allclose(

@@ -50,9 +50,9 @@ class TestTracks:
         assert {track.id for point in points for track in point.tracks} == {1}
 
     def test_noise_is_no_source(self):
-        """300 rows: a false birth in any has a probability below 1e-3."""
+        """100 rows: a false birth in any has a probability below 1e-3."""
         rng = np.random.default_rng(4)
-        nothing = Magnets(np.zeros((0, 300, 3)), np.zeros((0, 300, 3)), np.zeros((0, 300), dtype=bool))
+        nothing = Magnets(np.zeros((0, 100, 3)), np.zeros((0, 100, 3)), np.zeros((0, 100), dtype=bool))
         points, _ = followed(BOARD, nothing.readings_T(BOARD, rng))
         assert {point.status for point in points} == {"no source"}
         assert not any(point.tracks for point in points)
