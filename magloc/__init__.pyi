@@ -51,6 +51,10 @@ from magloc.tracking.motion import CoordinatedTurn as CoordinatedTurn
 from magloc.tracking.motion import KnownMotion as KnownMotion
 from magloc.tracking.motion import OrnsteinUhlenbeck as OrnsteinUhlenbeck
 from magloc.tracking.motion import RandomWalk as RandomWalk
+from magloc.tracking.multi_target.motion import FreeMotion as FreeMotion
+from magloc.tracking.multi_target.track import SourcesTrack as SourcesTrack
+from magloc.tracking.multi_target.track import track_sources as track_sources
+from magloc.tracking.multi_target.tracker import SourcesTracker as SourcesTracker
 from magloc.tracking.track import Track as Track
 from magloc.tracking.track import track as track
 from magloc.tracking.tracker import Tracker as Tracker

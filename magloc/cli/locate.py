@@ -17,7 +17,7 @@ from arrays.io.errors import InputError
 from arrays.io.outputs import refuse_file
 from arrays.typing import Vector
 from magloc.cli.framework import CommonOptions, print_json, progress
-from magloc.cli.options import KnownOptions, ambient_field, print_note
+from magloc.cli.options import KnownOptions, ambient_field, number_of_sources, print_note
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -61,14 +61,7 @@ class FixOptions:
     @property
     def n_sources(self) -> int | Literal["auto"]:
         """The number of sources that is asked for."""
-        if self.sources is None:
-            return 1
-        if self.sources == "auto":
-            return "auto"
-        try:
-            return int(self.sources)
-        except ValueError:
-            raise InputError(f"--sources: found {self.sources!r}, expected a whole number or auto.") from None
+        return 1 if self.sources is None else number_of_sources(self.sources)
 
 
 def locate(

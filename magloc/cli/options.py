@@ -43,6 +43,16 @@ def print_note(text: str) -> None:
     framework.print_note(text, "magloc")
 
 
+def number_of_sources(sources: str) -> int | Literal["auto"]:
+    """What --sources asks for."""
+    if sources == "auto":
+        return "auto"
+    try:
+        return int(sources)
+    except ValueError:
+        raise InputError(f"--sources: found {sources!r}, expected a whole number or auto.") from None
+
+
 def refuse_not_positive(options: object, *names: str, expected: str = "a positive number") -> None:
     """Refuse an option that is given and not positive, or endless, by the names of the fields that hold them."""
     for name in names:
@@ -127,7 +137,7 @@ class MotionOptions:
     speed_m_s : float
         Characteristic speed of the source along each axis.
     turn_deg_s : float
-        Characteristic rate at which its moment turns.
+        Characteristic rate at which its moment turns; 5 by default, of several sources 100.
     motion : {"unknown", "wandering", "turn"}
         unknown: position and moment are random walks, by the speed and the rate times the interval in every row.
         wandering: speed and turn rate are estimated too, and forgotten in --correlation-s. turn: a steady turn about
@@ -137,14 +147,19 @@ class MotionOptions:
     """
 
     speed_m_s: float = 0.5
-    turn_deg_s: float = 5.0
+    turn_deg_s: float | None = None
     motion: Literal["unknown", "wandering", "turn"] | None = None
     correlation_s: float | None = None
+
+    @property
+    def turn_rad_s(self) -> float:
+        """Characteristic rate of turn of one source."""
+        return math.radians(5.0 if self.turn_deg_s is None else self.turn_deg_s)
 
     def model(self, *, smooth: bool = False) -> MotionModel:
         """The motion model that the options name."""
         refuse_not_positive(self, "speed_m_s", "turn_deg_s", "correlation_s")
-        turn = math.radians(self.turn_deg_s)
+        turn = self.turn_rad_s
         name = self.motion or ("wandering" if smooth else "unknown")
         if name == "unknown":
             return magloc.RandomWalk(self.speed_m_s, turn)

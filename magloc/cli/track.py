@@ -25,6 +25,7 @@ from magloc.cli.moments.known_path import (
     write_moment_track,
     write_moment_tracks,
 )
+from magloc.cli.multi_target.sources_track import SourcesWanted, follow_sources, stream_sources
 from magloc.cli.options import (
     STREAM,
     KnownOptions,
@@ -32,6 +33,7 @@ from magloc.cli.options import (
     MotionOptions,
     ambient_field,
     naming_place,
+    number_of_sources,
     print_note,
     refuse_not_positive,
 )
@@ -39,6 +41,7 @@ from magloc.cli.options import (
 if TYPE_CHECKING:
     from arrays.array import SensorArray
     from magloc.ambient import Place
+    from magloc.localization.fit.prior import SourcePrior
     from magloc.readings import Readings
     from magloc.signature.path import ObjectPath
     from magloc.tracking.consistency import Consistency
@@ -60,16 +63,20 @@ class PathOptions(MotionOptions):
 
     Parameters
     ----------
+    sources : str
+        Follow several moving sources in one filter: at most so many, or "auto": as many as the readings support, five
+        at most. Speeds and rates of turn are then estimated too, and a sensor that dies is left out and named.
     speed_m_s : float
         Characteristic speed of the source along each axis.
     turn_deg_s : float
-        Characteristic rate at which its moment turns.
+        Characteristic rate at which its moment turns; 5 by default, of several sources 100.
     motion : {"unknown", "wandering", "turn"}
         unknown: position and moment are random walks, by the speed and the rate times the interval in every row.
         wandering: speed and turn rate are estimated too, and forgotten in --correlation-s. turn: a steady turn about
         the vertical. By default unknown, and with --smooth wandering.
     correlation_s : float
-        How long a speed lasts, for wandering; by default as long as a turn at the characteristic rate.
+        How long a speed lasts, for wandering; by default as long as a turn at the characteristic rate. Of several
+        sources 1.5 by default.
     position : tuple of 3 floats
         Where the source is, at rest, in the frame of the results [m]: only its moment is followed. More than once:
         several sources.
@@ -80,9 +87,24 @@ class PathOptions(MotionOptions):
         How wrong a known path may be.
     """
 
+    sources: str | None = None
     position: list[Vector] | None = None
     object_path: Path | None = None
     error: PathErrorOptions = field(default_factory=PathErrorOptions)
+
+    def several(self, prior: SourcePrior) -> SourcesWanted | None:
+        """What several sources are asked for; None: one source is followed on its own."""
+        if self.sources is None:
+            return None
+        if self.motion is not None:
+            raise InputError(f"--motion: found {self.motion} together with --sources, expected one of them.")
+        refuse_not_positive(self, "speed_m_s", "turn_deg_s", "correlation_s")
+        motion = magloc.FreeMotion(speed_m_s=self.speed_m_s)
+        if self.turn_deg_s is not None:
+            motion = replace(motion, turn_rad_s=math.radians(self.turn_deg_s))
+        if self.correlation_s is not None:
+            motion = replace(motion, correlation_s=self.correlation_s)
+        return SourcesWanted(number_of_sources(self.sources), motion, prior)
 
     def known_path(self) -> ObjectPath | list[Vector] | None:
         """Where the source is known to be, None where that is to be found."""
@@ -208,19 +230,30 @@ def track(
     path = motion.known_path()
     if path is not None:
         refuse_bounds(known)
+    several = motion.several(prior)
+    if several is not None:
+        others = {"--smooth": smooth or None, "--truth": truth, "--out": out, "--position": path, **maps.outputs}
+        for option in (name for name, value in others.items() if value is not None):
+            raise InputError(f"{option}: found it together with --sources, expected one of them.")
     if str(readings) == STREAM:
         whole = smooth or json or maps != MapOptions() or any(option is not None for option in (truth, out, path))
         if whole or conditioning != ConditioningOptions():
             raise InputError("READINGS -: found an option that needs the whole record, expected a stream of --jsonl.")
         with naming(str(array)):
-            _stream(used, known, model, where)
+            if several is not None:
+                stream_sources(used, known.ids, several)
+            else:
+                _stream(used, known, model, where)
         return
     rows = magloc.read_readings(readings, used, sensors=known.ids, ordered=True)
     rows, used = conditioning.apply(rows, used, readings)
     used, rows = _in_ambient_field(used, rows, where)
+    if several is not None:
+        follow_sources(used, rows, several, str(readings), json=json, jsonl=jsonl, quiet=common.quiet)
+        return
     if path is not None:
         outputs = MomentOutputs(json, jsonl, maps, out, truth, common.quiet)
-        turn_rad_s = math.radians(motion.turn_deg_s)
+        turn_rad_s = motion.turn_rad_s
         with naming(str(array)):
             if isinstance(path, list) and len(path) > 1:
                 write_moment_tracks(

@@ -209,7 +209,7 @@ class OrnsteinUhlenbeck:
         correlation_s = self.correlation_s
         if correlation_s is None:
             correlation_s = 1.0 / self.turn_rad_s if self.turn_rad_s > 0.0 else math.inf
-        moved, kept, root = _wandering_step(correlation_s, dt_s)
+        moved, kept, root = wandering_step(correlation_s, dt_s)
         p, m, v, rate = x[:3], x[3:6], x[6:9], x[9:]
         turn = rotation_matrix(moved * rate)
         turned = turn @ m
@@ -314,7 +314,7 @@ def known_motions(measured: MeasuredMotion, unknown: RandomWalk) -> list[KnownMo
 
 
 @lru_cache(maxsize=64)
-def _wandering_step(correlation_s: float, dt_s: float) -> tuple[float, float, FloatArray]:
+def wandering_step(correlation_s: float, dt_s: float) -> tuple[float, float, FloatArray]:
     """Entries of F of (value, rate), and the square root of its noise for a rate of unit standard deviation."""
     if dt_s == 0.0:
         return 0.0, 1.0, np.zeros((2, 2))

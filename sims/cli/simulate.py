@@ -29,7 +29,7 @@ def simulate(
     ----------
     scenario : str
         Scenario file (TOML), or a built-in scenario: diver, drone, hand-magnet, paper, ship,
-        ship-headings, survey-cart, survey-diver, survey-drone or weaving.
+        ship-headings, survey-cart, survey-diver, survey-drone, three-magnets or weaving.
     out : Path
         Readings file (CSV) to write. Existing files are replaced.
     json : bool

@@ -55,6 +55,8 @@ class Source:
         Size of the body: no sensor may come nearer.
     path_error : PathError
         Of what is known of its path and its attitude.
+    from_s, until_s : float
+        When it is there; its truth has no other rows.
     """
 
     carrier: Carrier = field(default_factory=Carrier)
@@ -62,6 +64,8 @@ class Source:
     polarisability_m3: Matrix = (_ZERO, _ZERO, _ZERO)
     radius_m: float = 0.0
     path_error: PathError = field(default_factory=PathError)
+    from_s: float = -math.inf
+    until_s: float = math.inf
 
 
 @dataclass(frozen=True)

@@ -173,7 +173,8 @@ def _source(place: str, table: SourceTable) -> Source:
         math.radians(table.attitude_sigma_deg),
         table.attitude_correlation_s,
     )
-    return Source(_carrier(place, table), table.moment_Am2, polarisability, table.radius_m, error)
+    carrier, radius_m = _carrier(place, table), table.radius_m
+    return Source(carrier, table.moment_Am2, polarisability, radius_m, error, table.from_s, table.until_s)
 
 
 def _matrix(place: str, value: float | list[float | list[float]]) -> Matrix:

@@ -81,6 +81,14 @@ class SourceTable(CarrierTable, kw_only=True):
     path_correlation_s: Annotated[NotNegative, MAY_BE_INFINITE] = math.inf
     attitude_sigma_deg: NotNegative = 0.0
     attitude_correlation_s: Annotated[NotNegative, MAY_BE_INFINITE] = math.inf
+    from_s: float = 0.0
+    until_s: Annotated[float, MAY_BE_INFINITE] = math.inf
+
+    def check(self) -> None:
+        """Refuse a source that goes before it comes."""
+        super().check()
+        if not self.from_s < self.until_s:
+            raise RefusalError("until_s", f"found {self.until_s:g}, expected a time after from_s = {self.from_s:g}")
 
 
 class AmbientTable(Table, kw_only=True):

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
@@ -98,9 +97,10 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
     for number, source in enumerate(scenario.sources, start=1):
         pose = _pose(source.carrier, time_s, seed, f"source {number}")
         moment_Am2 = _moments(source, pose.rotation, ambient_T)
-        _refuse_contact(scenario, number, time_s, sensors_m - pose.position_m[:, None, :])
-        fields_T += field(sensors_m, pose.position_m[:, None, :], moment_Am2[:, None, :])
-        truths.append(Truth(time_s, pose.position_m, moment_Am2))
+        there = (time_s >= source.from_s) & (time_s <= source.until_s)
+        _refuse_contact(scenario, number, time_s[there], (sensors_m - pose.position_m[:, None, :])[there])
+        fields_T[there] += field(sensors_m, pose.position_m[:, None, :], moment_Am2[:, None, :])[there]
+        truths.append(Truth(time_s[there], pose.position_m[there], moment_Am2[there]))
         poses.append(pose)
     buried = (np.zeros((0, 3)),) * 2 if scenario.targets is None else scenario.targets.drawn(seed)
     for position_m, moment in zip(*buried, strict=True):
@@ -125,7 +125,7 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
         array_rotation=stated.rotation[present] if posed else None,
         ambient_T=None if scenario.ambient_T is None else stated.rotation.inv().apply(ambient_T)[present],
     )
-    kept = tuple(Truth(t.time_s[present], t.position_m[present], _rows(t.moment_Am2, present)) for t in truths)
+    kept = tuple(_of_rows(truth, time_s[present]) for truth in truths)
     paths = tuple(_known_path(scenario, i, time_s, pose, seed) for i, pose in enumerate(poses))
     return Simulation(scenario, seed, scenario.nominal_array, readings, kept, paths, true_array, *buried)
 
@@ -173,6 +173,8 @@ def _moments(source: Source, rotation: Rotation, ambient_T: FloatArray) -> Float
 
 def _refuse_contact(scenario: MagneticScenario, number: int, time_s: FloatArray, offset_m: FloatArray) -> None:
     """Raise if a sensor is inside a source; offset (n, N, 3)."""
+    if not len(time_s):  # the source is never there
+        return
     distance = np.linalg.norm(offset_m, axis=-1)
     row, sensor = np.unravel_index(int(distance.argmin()), distance.shape)
     nearest = max(scenario.sources[number - 1].radius_m, NEAREST_M)
@@ -269,8 +271,11 @@ def _read(model: SensorModel, clean_T: FloatArray, rate_Hz: float, seed: int, na
     return np.clip(values, -model.range_T, model.range_T)
 
 
-def _rows(values: FloatArray | None, rows: NDArray[np.bool_]) -> FloatArray | None:
-    return None if values is None else values[rows]
+def _of_rows(truth: Truth, time_s: FloatArray) -> Truth:
+    """A truth at those of its instants at which there are readings."""
+    rows = np.isin(truth.time_s, time_s)
+    moments = None if truth.moment_Am2 is None else truth.moment_Am2[rows]
+    return Truth(truth.time_s[rows], truth.position_m[rows], moments)
 
 
 def _applied(rotation: Rotation, vectors: FloatArray) -> FloatArray:

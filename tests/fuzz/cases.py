@@ -46,6 +46,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "readings.csv --array array.toml --json",
         "moving.csv --array moving-array.toml --truth moving-truth.csv --smooth",
         "- --array array.toml --jsonl",
+        "readings.csv --array array.toml --sources auto --jsonl",
         "passing.csv --array passing-array.toml --object-path passing-path.csv --path-sigma-m 1 --smooth --json",
         "readings.csv --array array.toml --position 3 0.5 0.306 --truth readings-truth.csv",
     ),

@@ -91,7 +91,8 @@ class TestBadInput:
         assert_refused(
             outcome,
             "submarine",
-            "diver, drone, hand-magnet, paper, ship, ship-headings, survey-cart, survey-diver, survey-drone, weaving",
+            "diver, drone, hand-magnet, paper, ship, ship-headings, survey-cart, survey-diver, survey-drone,"
+            " three-magnets, weaving",
         )
         assert not list(tmp_path.iterdir())
 

@@ -29,7 +29,7 @@ from tests.sims.magnetics.white_noise import with_white_noise_only
 
 NAMES = (
     *("diver", "drone", "hand-magnet", "paper", "ship", "ship-headings"),
-    *("survey-cart", "survey-diver", "survey-drone", "weaving"),
+    *("survey-cart", "survey-diver", "survey-drone", "three-magnets", "weaving"),
 )
 FILES = REPOSITORY / "sims" / "magnetics" / "scenarios"
 PLAIN = """

@@ -1,0 +1,1 @@
+"""Several moving sources in one filter."""

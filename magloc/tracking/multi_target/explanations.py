@@ -1,0 +1,279 @@
+"""What may have happened in a row that its prediction does not explain: a beam over the fewest, likeliest events."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+
+from arrays.array import SensorArray
+from arrays.typing import BoolArray, FloatArray
+from magloc.localization.fit.prior import SourcePrior
+from magloc.tracking.multi_target.measurement import Cells, Channels, JointRow
+from magloc.tracking.multi_target.motion import FreeMotion
+from magloc.tracking.multi_target.state import JointState
+from magloc.tracking.multi_target.update import JointUpdate, joint_update
+from magloc.tracking.results import Row
+
+SENSOR_LIMIT = 32.0
+"""χ² with three degrees of freedom of a sensor's post-fit residual above which it contradicts the others: 5e-7."""
+BIRTH_LIMIT = 45.0
+"""Energy, of three degrees of freedom, in one of some hundred cells above which another source is there."""
+COST_LIMIT = 5.0
+"""Standard deviations above its mean at which χ² of a row contradicts the prediction."""
+SENSOR_OUT, BIRTH, DEATH, MANOEUVRE = 32.0, 16.0, 14.0, 12.0
+"""What an event costs, as -2 ln of how likely it is."""
+MANOEUVRE_AGILITY = 10.0
+"""How much faster than usual a source moves and turns in the step of a manoeuvre."""
+NAMES_A_ROW = 100
+"""A source's name is this times the row of its birth, and a number."""
+# What three readings of noise cost, and half as much again: a sensor that is well is better not left out.
+_LEFT_OUT = 4.5
+# A birth starts from so many cells, if they explain that much.
+_BIRTH_STARTS = 4
+_WORTH_A_BIRTH = 16.0
+# Explanations that go on from one event to the next, and those that are returned.
+_WIDTH = 4
+_RETURNED = 3
+_AS_GOOD = 20.0
+_SAME_SCORE = 0.1
+_MUCH_STRONGER = 100.0
+# Share of a source's energy in one sensor above which no other sensor sees it.
+_LONELY = 0.9
+# What is known of a new source: the direction of its moment [rad], ln of its strength, its place over its distance.
+_TURN, _LOG_STRENGTH, _PLACE = 1.0, 1.5, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """What does not change from row to row: array, motion, and what is known of the sources."""
+
+    channels: Channels
+    motion: FreeMotion
+    prior: SourcePrior
+    most_sources: int
+
+    @property
+    def array(self) -> SensorArray:
+        """Whose rows they are."""
+        return self.channels.array
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A prediction, what has happened since, and the update by the row's readings.
+
+    Attributes
+    ----------
+    prior : JointState
+        The prediction after what has happened.
+    update : JointUpdate
+    ids : tuple of int
+        Of the sources.
+    out : ndarray of bool, shape (N,)
+        Sensors that are left out.
+    penalty : float
+        Of what has happened.
+    """
+
+    prior: JointState
+    update: JointUpdate
+    ids: tuple[int, ...]
+    out: BoolArray
+    penalty: float = 0.0
+
+    @property
+    def score(self) -> float:
+        """-2 ln of how likely the row is with what has happened, up to a constant."""
+        return self.update.cost + self.update.log_volume + self.penalty + _LEFT_OUT * float(np.count_nonzero(self.out))
+
+    @property
+    def excess(self) -> float:
+        """χ² of the row above its mean, in standard deviations."""
+        n = max(1, self.update.row.n_readings)
+        return (self.update.cost - n) / float(np.sqrt(2.0 * n))
+
+
+@dataclass(frozen=True, eq=False)
+class RowProblem:
+    """One row that is to be explained.
+
+    Attributes
+    ----------
+    scene : Scene
+    row : Row
+    index : int
+        Of the row: sources that are born in it are called by it.
+    """
+
+    scene: Scene
+    row: Row
+    index: int
+
+    @cached_property
+    def measured(self) -> JointRow:
+        """All readings of the row."""
+        return self.scene.channels.measured(self.row)
+
+    @cached_property
+    def _cells(self) -> Cells:
+        return self.scene.channels.of(self.row)[1]
+
+    def updated(self, prior: JointState, ids: tuple[int, ...], out: BoolArray, penalty: float = 0.0) -> Explanation:
+        """The readings put into a prediction."""
+        return Explanation(prior, joint_update(prior, self.measured.without(out)), ids, out, penalty)
+
+    def holds(self, found: Explanation) -> bool:
+        """Whether nothing in the row contradicts an explanation."""
+        if not (found.update.converged and found.excess < COST_LIMIT):
+            return False
+        if float(found.update.sensor_chi2.max()) > SENSOR_LIMIT:
+            return False
+        full = len(found.ids) >= self.scene.most_sources
+        return full or float(self._cells.energy(found.update.residual).max()) < BIRTH_LIMIT
+
+    def explanations(self, plain: Explanation, manoeuvring: JointState) -> list[Explanation]:
+        """The likeliest explanations that hold, from one that does not; none: nothing explains the row.
+
+        That the known sources manoeuvre is only tried where nothing else holds: else an old one jumps onto a newcomer.
+        """
+        found = self._beam(plain, self.scene.most_sources + 1)
+        if found or not plain.ids:
+            return found
+        moved = self.updated(manoeuvring, plain.ids, plain.out, plain.penalty + MANOEUVRE)
+        return [moved] if self.holds(moved) else self._beam(moved, 1)
+
+    def of_more_sources(self, common: JointState, out: BoolArray, least: int) -> list[Explanation]:
+        """Explanations from nothing, with some number of sources at least: fewer may hold in a row, and be wrong."""
+        return self._beam(self.updated(common, (), out), least + 1, least)
+
+    def _beam(self, plain: Explanation, most_events: int, least: int = 0) -> list[Explanation]:
+        level = [plain]
+        for _ in range(most_events):
+            # An event that does not make the row likelier by more than it costs leads nowhere.
+            level = distinct(
+                one
+                for before in level[:_WIDTH]
+                for one in self._one_event_more(before)
+                if one.score < before.score or len(before.ids) < len(one.ids) <= least
+            )
+            holding = [found for found in level if len(found.ids) >= least and self.holds(found)]
+            if holding and least:
+                return holding[:_RETURNED]
+            if holding:
+                holding = distinct([*holding, *(fewer for found in holding[:_WIDTH] for fewer in self._merged(found))])
+                return [found for found in holding if found.score < holding[0].score + _AS_GOOD][:_RETURNED]
+        return []
+
+    def _merged(self, found: Explanation) -> list[Explanation]:
+        """The same with a source less, of those that are born in this row, where that holds too.
+
+        A first birth between two sources is followed by two more, of which two stand for one.
+        """
+        born = [k for k, name in enumerate(found.ids) if name >= self._first_id]
+        if len(born) < 2:
+            return []
+        return [fewer for fewer in self.one_less(found, born, list(combinations(born, 2))) if self.holds(fewer)]
+
+    def one_less(
+        self, found: Explanation, sources: Sequence[int], pairs: Sequence[tuple[int, int]]
+    ) -> Iterator[Explanation]:
+        """Without each of some sources, and with one source in place of each of some pairs."""
+        prior, state, ids, penalty = found.prior, found.update.state, found.ids, found.penalty - BIRTH
+        for k in sources:
+            yield self.updated(prior.without(k), ids[:k] + ids[k + 1 :], found.out, penalty)
+        for first, second in pairs:
+            place_m = 0.5 * (state.position_m[first] + state.position_m[second])
+            together = state.moment_Am2[first] + state.moment_Am2[second]
+            others = tuple(name for k, name in enumerate(ids) if k not in (first, second))
+            alone = self.with_source(prior.without(second).without(first), place_m, together)
+            yield self.updated(alone, (*others, min(ids[first], ids[second])), found.out, penalty)
+
+    def _one_event_more(self, found: Explanation) -> Iterator[Explanation]:
+        """A sensor out, a death, and births at the best cells."""
+        if not found.update.converged and not np.isfinite(found.update.cost):
+            return
+        chi2 = found.update.sensor_chi2
+        worst = int(np.argmax(chi2))
+        if 2 * np.count_nonzero(found.out) < len(found.out) and chi2[worst] > 0.5 * SENSOR_LIMIT:
+            out = found.out.copy()
+            out[worst] = True
+            yield self.updated(found.prior, found.ids, out, found.penalty + SENSOR_OUT)
+        for k in range(len(found.ids)):
+            ids = found.ids[:k] + found.ids[k + 1 :]
+            yield self.updated(found.prior.without(k), ids, found.out, found.penalty + DEATH)
+        if len(found.ids) < self.scene.most_sources:
+            yield from self.births(found)
+
+    def births(self, found: Explanation) -> Iterator[Explanation]:
+        """Explanations with another source, from the cells that explain most of what is left."""
+        energy = self._cells.energy(found.update.surprise)
+        born = 1 + sum(name >= self._first_id for name in found.ids)
+        for cell in self._cells.best(energy, _BIRTH_STARTS):
+            if energy[cell] < _WORTH_A_BIRTH:
+                continue
+            place_m = self.row.origin_m + self.row.R_world_from_array @ self._cells.position_m[cell]
+            moment = found.update.row.moment_at(place_m, found.update.innovation, found.update.linear)
+            ids = (*found.ids, self._first_id + born)
+            start = joint_update(self.with_source(found.prior, place_m, moment), found.update.row).state
+            # Where it is found, not where it was looked for, is what the next event starts from.
+            prior = self.with_source(found.prior, start.position_m[-1], start.moment_Am2[-1])
+            child = self.updated(prior, ids, found.out, found.penalty + BIRTH)
+            if self._allows(child.update):
+                yield child
+
+    @property
+    def _first_id(self) -> int:
+        return self.index * NAMES_A_ROW
+
+    def _allows(self, update: JointUpdate) -> bool:
+        """Whether the last source agrees with what is known, and may be told from a fault and from the ambient field.
+
+        A single sensor that sees it may be at fault; one so far away that it is much stronger than the others is a
+        gradient of the ambient field.
+        """
+        position, moment = update.state.position_m[-1], update.state.moment_Am2[-1]
+        in_array = self.row.R_world_from_array.T @ (position - self.row.origin_m)
+        if not (self.scene.prior.allows_position(in_array) and self.scene.prior.allows_moment(moment)):
+            return False
+        strength = np.linalg.norm(update.state.moment_Am2, axis=1)
+        if strength.max() > _MUCH_STRONGER * strength.min():
+            return False
+        energy = update.row.energy_of(position, moment)
+        return bool(energy.max() < _LONELY * energy.sum())
+
+    def with_source(self, state: JointState, position_m: FloatArray, moment_Am2: FloatArray) -> JointState:
+        """The state with another source, of which hardly more is known than where the readings have it."""
+        scene = self.scene
+        strength = float(np.linalg.norm(moment_Am2))
+        direction, log_strength = moment_Am2 / strength, _LOG_STRENGTH
+        known = scene.prior.known_moment
+        if known is not None:
+            log_strength = known.sigma_Am2 / known.modulus_Am2
+            strength = known.modulus_Am2
+        centroid = self.row.origin_m + self.row.R_world_from_array @ scene.array.centroid
+        place_m = max(_PLACE * float(np.linalg.norm(position_m - centroid)), scene.array.circumradius)
+        covariance = scene.motion.start(direction, place_m, _TURN, log_strength)
+        return state.with_source(position_m, strength * direction, covariance)
+
+    def found_anew(
+        self, common: JointState, positions_m: FloatArray, moments_Am2: FloatArray, out: BoolArray
+    ) -> Explanation:
+        """The row explained by sources (K, 3) that a search has found, with nothing else known of them."""
+        state = common
+        for position, moment in zip(positions_m, moments_Am2, strict=True):
+            state = self.with_source(state, position, moment)
+        ids = tuple(self._first_id + 1 + k for k in range(len(positions_m)))
+        return self.updated(state, ids, out, BIRTH * len(ids))
+
+
+def distinct(found: Iterable[Explanation]) -> list[Explanation]:
+    """The likeliest first, without those that are one: births from different cells often end in the same place."""
+    kept: list[Explanation] = []
+    for one in sorted(found, key=lambda one: one.score):
+        if not any(abs(one.score - other.score) < _SAME_SCORE and len(one.ids) == len(other.ids) for other in kept):
+            kept.append(one)
+    return kept

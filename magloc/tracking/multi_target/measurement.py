@@ -1,0 +1,165 @@
+"""What one row of readings says of several sources and the common field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from arrays.array import SensorArray
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.fields import dipole
+from magloc.localization.search.candidates import candidate_positions
+from magloc.measurement.rows import ambient_fields, channels_above_ambient, whitenings_of
+from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
+from magloc.tracking.results import Row
+
+# Sets of channels that are kept: rows miss the same ones more often than not.
+_MOST_MASKS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class JointRow:
+    """One row of vector sensors, in units of its noise; channels without a reading are zero.
+
+    Attributes
+    ----------
+    z : ndarray, shape (C,)
+        Readings above the known ambient field.
+    gain : ndarray, shape (C, 3)
+        Of the field in the world frame [1/T].
+    positions_m : ndarray, shape (N, 3)
+        Of the sensors in the world.
+    channel_sensor : ndarray of int, shape (C,)
+    used : ndarray of bool, shape (C,)
+    """
+
+    z: FloatArray
+    gain: FloatArray
+    positions_m: FloatArray
+    channel_sensor: IntArray
+    used: BoolArray
+
+    @classmethod
+    def of(cls, array: SensorArray, row: Row, root: FloatArray | None = None) -> JointRow:
+        """A row with all of its readings; `root` (C, C) is their whitening, where that is known already."""
+        used, readings = row.available, row.readings_T[None]
+        root = whitenings_of(array, used, readings)[0].root if root is None else root
+        ambient = ambient_fields(array, 1, None if row.ambient_T is None else row.ambient_T[None])
+        above = channels_above_ambient(array, used, readings, ambient)[0]
+        R = row.R_world_from_array
+        gain = root @ array.channel_gain @ R.T
+        return cls(root @ above, gain, row.origin_m + array.positions @ R.T, array.channel_sensor, used)
+
+    @property
+    def n_readings(self) -> int:
+        """Channels that are used."""
+        return int(np.count_nonzero(self.used))
+
+    def without(self, out: BoolArray) -> JointRow:
+        """The row without some of the sensors (N,)."""
+        if not out.any():
+            return self
+        used = self.used & ~out[self.channel_sensor]
+        return replace(self, z=np.where(used, self.z, 0.0), gain=np.where(used[:, None], self.gain, 0.0), used=used)
+
+    def predicted(self, state: JointState) -> tuple[FloatArray, FloatArray]:
+        """Predicted channels (C,), and their derivatives (C, 6 K + 3) by (p, m) of every source and the common field.
+
+        The moments' derivatives are Cartesian.
+        """
+        k = state.n_sources
+        by_source = dipole.field_jacobian(self.positions_m, state.position_m[:, None], state.moment_Am2[:, None])
+        fields = state.common_T + np.sum(by_source[..., 3:] @ state.moment_Am2[:, None, :, None], axis=0)[..., 0]
+        H = np.empty((len(self.z), N_SEEN * k + N_COMMON))
+        of_sources = self.gain[None, :, None] @ by_source[:, self.channel_sensor]
+        H[:, :-N_COMMON] = of_sources[:, :, 0].transpose(1, 0, 2).reshape(len(self.z), N_SEEN * k)
+        H[:, -N_COMMON:] = self.gain
+        return np.vecdot(self.gain, fields[self.channel_sensor]), H
+
+    def energy_of(self, position_m: FloatArray, moment_Am2: FloatArray) -> FloatArray:
+        """Energy (N,) of a source in each sensor."""
+        fields = dipole.field(self.positions_m, position_m, moment_Am2)[self.channel_sensor]
+        energy: FloatArray = np.bincount(self.channel_sensor, np.vecdot(self.gain, fields) ** 2).astype(np.float64)
+        return energy
+
+    def moment_at(self, position_m: FloatArray, innovation: FloatArray, linear: FloatArray) -> FloatArray:
+        """The moment (3,) of a source at a place that explains most of an innovation (C,).
+
+        Beside it the innovation has errors of unit variance along the columns of `linear` (C, d).
+        """
+        fields = dipole.field_matrix(self.positions_m, position_m)[self.channel_sensor]
+        columns = (self.gain[:, None] @ fields)[:, 0]
+        size = np.linalg.norm(columns)
+        d = linear.shape[1]
+        A = np.block([[columns / size, linear], [np.zeros((d, 3)), np.eye(d)]])
+        found: FloatArray = np.linalg.lstsq(A, np.concatenate([innovation, np.zeros(d)]), rcond=None)[0]
+        return found[:3] / size
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """Places where another source may be, and what it could explain there.
+
+    Attributes
+    ----------
+    position_m : ndarray, shape (n, 3)
+        In the array's frame.
+    bases : ndarray, shape (C, 3 n)
+        Orthonormal readings of unit moments at each of them, the common field projected out: by axis, then by cell.
+    """
+
+    position_m: FloatArray
+    bases: FloatArray
+
+    @classmethod
+    def of(cls, array: SensorArray, root: FloatArray) -> Cells:
+        """Cells of rows whose channels are whitened by a root (C, C)."""
+        positions = candidate_positions(array, n_directions=60, n_ranges=10, n_near_directions=4)
+        gain = root @ array.channel_gain
+        common, size, _ = np.linalg.svd(gain, full_matrices=False)
+        common = common[:, size > 1e-10 * size.max(initial=0.0)]
+        fields = dipole.field_matrix(array.positions, positions[:, None])[:, array.channel_sensor]
+        columns = (gain[None, :, None] @ fields)[:, :, 0]
+        columns -= common @ (common.T @ columns)
+        bases, _ = np.linalg.qr(columns)
+        return cls(positions, bases.transpose(1, 2, 0).reshape(len(gain), -1).astype(np.float32))
+
+    def energy(self, residual: FloatArray) -> FloatArray:
+        """Energy (n,) of residuals (C,) that a source at each cell explains: χ² with three degrees of freedom."""
+        components = (residual.astype(np.float32) @ self.bases).reshape(3, -1)
+        energy: FloatArray = np.sum(np.square(components), axis=0, dtype=np.float64)
+        return energy
+
+    def best(self, energy: FloatArray, n: int) -> IntArray:
+        """The `n` best cells, half their distance from the array's centre apart from each other."""
+        left, chosen = energy.copy(), []
+        centre = self.position_m.mean(axis=0)
+        for _ in range(n):
+            cell = int(np.argmax(left))
+            chosen.append(cell)
+            apart = np.linalg.norm(self.position_m - self.position_m[cell], axis=1)
+            left[apart < 0.5 * np.linalg.norm(self.position_m[cell] - centre)] = -1.0
+        return np.array(chosen, dtype=np.intp)
+
+
+class Channels:
+    """Whitening and cells of an array's rows, made once for all that have the same channels."""
+
+    def __init__(self, array: SensorArray) -> None:
+        self.array = array
+        self._known: dict[bytes, tuple[FloatArray, Cells]] = {}
+
+    def of(self, row: Row) -> tuple[FloatArray, Cells]:
+        """Whitening (C, C) and cells of a row; where the noise depends on the readings, those of the first such row."""
+        key = row.available.tobytes()
+        if key not in self._known:
+            if len(self._known) == _MOST_MASKS:
+                self._known.clear()
+            root = whitenings_of(self.array, row.available, row.readings_T[None])[0].root
+            self._known[key] = root, Cells.of(self.array, root)
+        return self._known[key]
+
+    def measured(self, row: Row) -> JointRow:
+        """A row with all of its readings."""
+        return JointRow.of(self.array, row, None if self.array.noise_depends_on_reading else self.of(row)[0])

@@ -1,0 +1,173 @@
+r"""State of several sources that one filter follows together, and the chart in which its errors are Gaussian.
+
+Of every source it has position p, moment m, velocity v and rate of turn ω, and of all together the common field b. The
+moment's error is a vector c, :math:`δ\ln|m|` along :math:`u = m/|m|` and a turn of u at right angles to it:
+:math:`m^+ = |m| e^{u·c} \exp_u(c - (u·c) u)` with the exponential map of the sphere. In Cartesian coordinates the
+filter believes itself too much, because |m| is known better than its direction.
+
+The covariance's order is (p, c) of every source, b, then (v, ω) of every source: what a row sees comes first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from arrays.typing import FloatArray, IntArray
+
+N_SEEN = 6
+"""Numbers of a source that a row sees: position and moment."""
+N_OF_SOURCE = 12
+N_COMMON = 3
+
+
+@dataclass(frozen=True, eq=False)
+class JointState:
+    """K sources and the common field, with the covariance of their errors.
+
+    Attributes
+    ----------
+    position_m, moment_Am2, velocity_m_s, rate_rad_s : ndarray, shape (K, 3)
+    common_T : ndarray, shape (3,)
+    P : ndarray, shape (12 K + 3, 12 K + 3)
+    """
+
+    position_m: FloatArray
+    moment_Am2: FloatArray
+    velocity_m_s: FloatArray
+    rate_rad_s: FloatArray
+    common_T: FloatArray
+    P: FloatArray
+
+    @classmethod
+    def empty(cls, common_T: FloatArray, sigma_T: float) -> JointState:
+        """No source yet."""
+        none = np.zeros((0, 3))
+        return cls(none, none, none, none, common_T, sigma_T**2 * np.eye(N_COMMON))
+
+    @property
+    def n_sources(self) -> int:
+        """K."""
+        return len(self.position_m)
+
+    @property
+    def n_seen(self) -> int:
+        """Leading numbers of the error that a row sees."""
+        return N_SEEN * self.n_sources + N_COMMON
+
+    @property
+    def of_source(self) -> IntArray:
+        """Places (K, 12) of every source's errors (p, c, v, ω) in the covariance."""
+        return places_of(self.n_sources)
+
+    def moved(self, error: FloatArray) -> JointState:
+        """The state that an error (n,), or what a row sees of it, leads to; the covariance stays as it is."""
+        k, seen = self.n_sources, self.n_seen
+        of_seen, of_motion = error[: N_SEEN * k].reshape(k, N_SEEN), error[seen:].reshape(-1, N_SEEN)
+        moved = replace(
+            self,
+            position_m=self.position_m + of_seen[:, :3],
+            moment_Am2=moved_moment(self.moment_Am2, of_seen[:, 3:]),
+            common_T=self.common_T + error[N_SEEN * k : seen],
+        )
+        if not of_motion.size:
+            return moved
+        return replace(
+            moved,
+            velocity_m_s=self.velocity_m_s + of_motion[:, :3],
+            rate_rad_s=self.rate_rad_s + of_motion[:, 3:],
+        )
+
+    def covariance(self, source: int) -> FloatArray:
+        """Covariance (6, 6) of a source's position and moment, Cartesian."""
+        at = self.of_source[source, :N_SEEN]
+        scale = np.ones(N_SEEN)
+        scale[3:] = np.linalg.norm(self.moment_Am2[source])
+        return self.P[np.ix_(at, at)] * np.outer(scale, scale)
+
+    def gap(self, first: int, second: int) -> tuple[float, float]:
+        """Distance between two sources, and its standard deviation [m]."""
+        offset = self.position_m[first] - self.position_m[second]
+        distance = float(np.linalg.norm(offset))
+        direction = offset / distance if distance else np.array([1.0, 0.0, 0.0])
+        along = np.zeros(len(self.P))
+        along[self.of_source[first, :3]], along[self.of_source[second, :3]] = direction, -direction
+        return distance, float(np.sqrt(np.maximum(along @ self.P @ along, 0.0)))
+
+    @property
+    def common_alone(self) -> JointState:
+        """What is known of the common field, and no source."""
+        at = slice(self.n_seen - N_COMMON, self.n_seen)
+        return replace(JointState.empty(self.common_T, 0.0), P=self.P[at, at])
+
+    def without(self, source: int) -> JointState:
+        """The state of the others."""
+        P = np.delete(np.delete(self.P, self.of_source[source], 0), self.of_source[source], 1)
+        others = np.arange(self.n_sources) != source
+        return JointState(
+            self.position_m[others],
+            self.moment_Am2[others],
+            self.velocity_m_s[others],
+            self.rate_rad_s[others],
+            self.common_T,
+            P,
+        )
+
+    def with_source(self, position_m: FloatArray, moment_Am2: FloatArray, covariance: FloatArray) -> JointState:
+        """The state with another source, last, at rest: covariance (12, 12) of its (p, c, v, ω)."""
+        k = self.n_sources
+        before = np.concatenate([self.of_source.ravel(), N_SEEN * k + np.arange(N_COMMON)])
+        new = places_of(k + 1)
+        after = np.concatenate([new[:k].ravel(), N_SEEN * (k + 1) + np.arange(N_COMMON)])
+        P = np.zeros((len(self.P) + N_OF_SOURCE,) * 2)
+        P[np.ix_(after, after)] = self.P[np.ix_(before, before)]
+        P[np.ix_(new[k], new[k])] = covariance
+        rest = np.zeros((1, 3))
+        return JointState(
+            np.concatenate([self.position_m, position_m[None]]),
+            np.concatenate([self.moment_Am2, moment_Am2[None]]),
+            np.concatenate([self.velocity_m_s, rest]),
+            np.concatenate([self.rate_rad_s, rest]),
+            self.common_T,
+            P,
+        )
+
+
+def places_of(n_sources: int) -> IntArray:
+    """Places (K, 12) of (p, c, v, ω) of every source in the covariance of K sources."""
+    seen = np.arange(N_SEEN * n_sources).reshape(n_sources, N_SEEN)
+    return np.concatenate([seen, seen + N_SEEN * n_sources + N_COMMON], axis=1)
+
+
+def moved_moment(moment_Am2: FloatArray, c: FloatArray) -> FloatArray:
+    """Moments (..., 3) that errors c (..., 3) lead to."""
+    length, u, along, turn, angle = _parts(moment_Am2, c)
+    moved: FloatArray = length * np.exp(along) * (np.cos(angle) * u + np.sinc(angle / np.pi) * turn)
+    return moved
+
+
+def moment_derivative(moment_Am2: FloatArray, c: FloatArray) -> FloatArray:
+    """Derivative (..., 3, 3) of :func:`moved_moment` with respect to c; |m| times the identity at c = 0."""
+    length, u, along, turn, angle = _parts(moment_Am2, c)
+    sinc, cosine = np.sinc(angle / np.pi), np.cos(angle)
+    # (cos a - sin a / a) / a², by series where it cancels.
+    small = angle < 1e-2
+    square = np.where(small, 1.0, angle) ** 2
+    bend = np.where(small, angle**2 / 30.0 - 1.0 / 3.0, (cosine - sinc) / square)
+    by_turn = (sinc * np.eye(3).ravel()).reshape(*c.shape, 3)
+    by_turn = by_turn - (sinc * u)[..., :, None] * turn[..., None, :]
+    by_turn = by_turn + (bend * turn)[..., :, None] * turn[..., None, :]
+    by_turn = by_turn - (by_turn @ u[..., None]) * u[..., None, :]
+    direction = cosine * u + sinc * turn
+    derivative: FloatArray = (length * np.exp(along))[..., None] * (direction[..., :, None] * u[..., None, :] + by_turn)
+    return derivative
+
+
+def _parts(moment_Am2: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Modulus, direction, and of the error its part along it, the turn and the angle; the scalars (..., 1)."""
+    length = np.sqrt(np.vecdot(moment_Am2, moment_Am2))[..., None]
+    u = moment_Am2 / length
+    along = np.vecdot(u, c)[..., None]
+    turn = c - along * u
+    return length, u, along, turn, np.sqrt(np.vecdot(turn, turn))[..., None]

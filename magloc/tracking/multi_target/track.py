@@ -1,0 +1,170 @@
+"""The door to tracks of several moving sources."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from html import escape
+from typing import Literal, overload
+
+from numpy.typing import ArrayLike
+
+from arrays.array import SensorArray
+from arrays.typing import FloatArray
+from magloc.ambient import in_world_field
+from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
+from magloc.readings import Readings, as_readings, without_saturated
+from magloc.tracking.multi_target.files import lines_of_sources
+from magloc.tracking.multi_target.motion import FreeMotion
+from magloc.tracking.multi_target.results import SourcesPoint
+from magloc.tracking.multi_target.tracker import SourcesTracker
+from magloc.tracking.results import TrackPoint, rows_of
+from magloc.tracking.track import TrackColumns
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SourceTrack(TrackColumns):
+    """One of several sources through time: columns, NaN where it is not tracked."""
+
+    points: tuple[TrackPoint, ...]
+    readings: Readings
+    id: int
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SourcesTrack(Sequence[SourcesPoint]):
+    """Several sources through time: all of them in a row, or one of them through all rows.
+
+    Attributes
+    ----------
+    points : tuple of SourcesPoint
+        Of every row.
+    readings : Readings
+        That they were found from.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> track = magloc.track_sources(board.array, board.readings[:20], sources=2)
+    >>> track.ids, len(track), track[-1].status
+    ((1,), 20, 'tracked')
+    >>> track.of(1).position_m[-1].round(2)
+    array([ 0.05, -0.03,  0.1 ])
+    """
+
+    points: tuple[SourcesPoint, ...]
+    readings: Readings
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @overload
+    def __getitem__(self, row: int) -> SourcesPoint: ...
+    @overload
+    def __getitem__(self, row: slice) -> tuple[SourcesPoint, ...]: ...
+    def __getitem__(self, row: int | slice) -> SourcesPoint | tuple[SourcesPoint, ...]:
+        return self.points[row]
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Instants (n,) [s]."""
+        return self.readings.time_s
+
+    @cached_property
+    def ids(self) -> tuple[int, ...]:
+        """All ids, in the order in which they were first told."""
+        return tuple(sorted({track.id for point in self for track in point.tracks}))
+
+    @property
+    def dropped_sensors(self) -> tuple[str, ...]:
+        """Sensors that are left out of some row."""
+        return tuple(sorted({name for point in self for name in point.dropped_sensors}))
+
+    def of(self, id: int) -> SourceTrack:
+        """One source through all rows.
+
+        Raises
+        ------
+        KeyError
+            There is none of that id.
+        """
+        if id not in self.ids:
+            raise KeyError(f"Input id must be one of {self.ids}; instead received {id}.")
+        points = []
+        for point in self:
+            own = [track for track in point.tracks if track.id == id]
+            points.append(own[0] if own else TrackPoint(point.time_s, status=point.status))
+        return SourceTrack(tuple(points), self.readings, id)
+
+    def table(self) -> str:
+        """The table that ``magloc track --sources`` prints."""
+        return "\n".join(lines_of_sources(self))
+
+    def __repr__(self) -> str:
+        return "\n".join(lines_of_sources(self, most=10))
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(repr(self))}</pre>"
+
+
+def track_sources(
+    array: SensorArray,
+    readings: Readings | ArrayLike,
+    *,
+    sources: int | Literal["auto"] = "auto",
+    motion: FreeMotion = FreeMotion(),  # noqa: B008 - frozen
+    prior: SourcePrior = NOTHING_KNOWN,
+    progress: Callable[[int], None] | None = None,
+) -> SourcesTrack:
+    """Follow several moving sources through the rows of readings, in one joint filter.
+
+    Every sensor sees all sources, so that nothing is associated: it is their motion alone that keeps them apart where
+    they cross. Sources are born where the readings support another, and lost where they support one less; a sensor that
+    dies is named and left out until it is well.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Vector sensors.
+    readings : Readings or array_like, shape (n, C)
+        Raw readings [T], NaN where missing, in the order of time. Those that saturate are not used.
+    sources : int or "auto"
+        How many sources there are at most; "auto": five, or as many as the array can tell.
+    motion : FreeMotion
+        How each of them moves.
+    prior : SourcePrior
+        Bounds of every source in the array's frame, and its strength, if that is known.
+    progress : callable, optional
+        Called with the number of rows finished since the last call.
+
+    Returns
+    -------
+    SourcesTrack
+        In the world frame where the readings have the array's pose, else in the array's.
+
+    Raises
+    ------
+    ValueError
+        Time does not increase from row to row, the readings have a background, or the array has a scalar sensor or
+        cannot tell that many sources.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> track = magloc.track_sources(board.array, board.readings)
+    >>> track.ids, len(track)
+    ((1,), 101)
+    """
+    used = in_world_field(without_saturated(as_readings(readings), array), array)
+    if used.background or used.motion is not None:
+        raise ValueError("Input readings must have neither a background nor measured velocities for several sources.")
+    tracker = SourcesTracker(array, sources=sources, motion=motion, prior=prior)
+    points = []
+    for row in rows_of(used):
+        points.append(tracker.update(row))
+        if progress is not None:
+            progress(1)
+    return SourcesTrack(tuple(points), used)

@@ -1,0 +1,352 @@
+"""Several moving sources through time: one filter of all of them, and a few hypotheses of what has happened."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from arrays.array import SensorArray
+from arrays.typing import FloatArray
+from magloc.ambient import in_world_field
+from magloc.blas_threads import one_blas_thread
+from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
+from magloc.measurement.rows import check_magnitudes
+from magloc.readings import Readings, without_saturated
+from magloc.tracking.multi_target.explanations import (
+    COST_LIMIT,
+    MANOEUVRE_AGILITY,
+    NAMES_A_ROW,
+    Explanation,
+    RowProblem,
+    Scene,
+    distinct,
+)
+from magloc.tracking.multi_target.measurement import Channels
+from magloc.tracking.multi_target.motion import FreeMotion
+from magloc.tracking.multi_target.results import SourcePoint, SourcesPoint
+from magloc.tracking.multi_target.sensor_health import SensorHealth
+from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
+from magloc.tracking.multi_target.update import innovation_chi2
+from magloc.tracking.results import Row, rows_of
+
+ROWS_TO_REPORT = 10
+"""Rows after its birth in which a source is not yet told, unless there is no other: one taken for two dies sooner."""
+MERGED_GAP = 1.0 / 3.0
+"""Standard deviation of a gap over the gap above which two sources are merged."""
+MOST_BY_ITSELF = 5
+# Hypotheses that are kept, and by how much they may be less likely (-2 ln).
+_MOST_HYPOTHESES = 4
+_LESS_LIKELY = 25.0
+# A restart is judged by its predictions of so many rows; the next one comes so many rows later.
+_JUDGED_ROWS = 11
+_RESTART_PAUSE = 15
+# Restarts with a source more, and others.
+_MOST_RESTARTS = 3
+# Rows after which it is asked whether a source is one too many.
+_DOUBT_EVERY = 12
+# Memories of the excess of χ² [rows], and five times the deviation of its mean with each.
+_MEMORIES = np.array([10.0, 80.0])
+_POOR = 5.0 / np.sqrt(2.0 * _MEMORIES - 1.0)
+# By how much it must be likelier in the end, or at once.
+_MUST_GAIN, _CLEAR_GAIN = 10.0, 60.0
+_SAME_SIGMA2 = 9.0
+# What a row costs at most that nothing explains.
+_UNBEARABLE = 1000.0
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One history of births, deaths and faults, and the state after it.
+
+    Attributes
+    ----------
+    state : JointState
+    ids : tuple of int
+        Of the sources, by the rows in which they were born.
+    health : SensorHealth
+    score : float
+        -2 ln of how likely it is, up to a constant.
+    excess : ndarray, shape (2,)
+        Mean excess of χ² over some last rows, and over more of them.
+    judged : int
+        Rows in which a restart is still judged, the last one counted; 0: it is believed.
+    """
+
+    state: JointState
+    ids: tuple[int, ...]
+    health: SensorHealth
+    score: float = 0.0
+    excess: FloatArray = field(default_factory=lambda: np.zeros(2))
+    judged: int = 0
+
+
+class SourcesTracker:
+    """Follows several sources, row by row.
+
+    Parameters
+    ----------
+    array : SensorArray
+        Vector sensors.
+    sources : int or "auto"
+        How many sources there are at most; "auto": five, or as many as the array can tell.
+    motion : FreeMotion
+        How each of them moves.
+    prior : SourcePrior
+        Bounds of every source in the array's frame, and its strength, if that is known.
+
+    Raises
+    ------
+    ValueError
+        The array has a scalar sensor, or cannot tell that many sources.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> tracker = magloc.SourcesTracker(board.array, sources=2)
+    >>> for row in range(12):
+    ...     point = tracker.update(board.readings[row])
+    >>> [(track.id, track.position_m.round(2).tolist()) for track in point.tracks]
+    [(1, [0.0, -0.04, 0.11])]
+    """
+
+    def __init__(
+        self,
+        array: SensorArray,
+        *,
+        sources: int | Literal["auto"] = "auto",
+        motion: FreeMotion = FreeMotion(),  # noqa: B008 - frozen
+        prior: SourcePrior = NOTHING_KNOWN,
+    ) -> None:
+        if array.channel_is_scalar.any():
+            raise ValueError("Input array must have vector sensors alone for several moving sources.")
+        check_magnitudes(array)
+        most = (array.n_channels - N_COMMON - 1) // N_SEEN
+        wanted = min(most, MOST_BY_ITSELF) if sources == "auto" else sources
+        if not 1 <= wanted <= most:
+            raise ValueError(
+                f"Input sources must be between 1 and {most} for an array of {array.n_channels} readings a row, with"
+                f" {N_SEEN} unknowns a source and {N_COMMON} of the common field; instead received {wanted}."
+            )
+        self.scene = Scene(Channels(array), motion, prior, wanted)
+        self._hypotheses: list[Hypothesis] = []
+        self._numbers: dict[int, int] = {}
+        self._time_s = math.nan
+        self._n_rows = 0
+        self._next_restart = 0
+
+    @one_blas_thread
+    def update(self, row: Row | Readings) -> SourcesPoint:
+        """What is known of all sources after one more row.
+
+        Parameters
+        ----------
+        row : Row or Readings of length one
+            Later than the one before. Of readings those that saturate are not used.
+
+        Raises
+        ------
+        ValueError
+            Time goes backwards, or the readings are not one row.
+        """
+        if isinstance(row, Readings):
+            if len(row) != 1:
+                raise ValueError(f"Input row must be readings of length one; instead received {len(row)} rows.")
+            row = next(rows_of(in_world_field(without_saturated(row, self.scene.array), self.scene.array)))
+        if row.time_s <= self._time_s:
+            raise ValueError(f"Input time_s must increase; instead {row.time_s} s follows {self._time_s} s.")
+        dt_s = 0.0 if math.isnan(self._time_s) else row.time_s - self._time_s
+        self._time_s = row.time_s
+        problem = RowProblem(self.scene, row, self._n_rows)
+        self._n_rows += 1
+        if not row.available.any():
+            predicted = self.scene.motion.predicted
+            self._hypotheses = [replace(one, state=predicted(one.state, dt_s)) for one in self._hypotheses]
+            return self._point(problem, "no readings", math.nan)
+        if not self._hypotheses:
+            self._hypotheses = [self._nothing_yet(problem)]
+        children = [child for one in self._hypotheses for child in self._continued(problem, one, dt_s)]
+        self._hypotheses = self._pruned([hypothesis for hypothesis, _ in children])
+        best = self._hypotheses[0]
+        found = next(found for hypothesis, found in children if hypothesis.state is best.state)
+        explained = best.state is found.update.state
+        status = "misfit" if not explained else "tracked" if best.ids else "no source"
+        if status == "tracked" and (best.excess > _POOR).any():
+            status = "doubtful"
+        poor = bool((best.excess > _POOR).any()) or best.health.suspect is not None
+        if len(best.ids) > 1 and self._n_rows % _DOUBT_EVERY == 0:
+            self._hypotheses += self._superfluous(problem, best, found)
+        if best.ids and poor and self._n_rows >= self._next_restart:
+            self._next_restart = self._n_rows + _RESTART_PAUSE
+            restarts = self._restarts(problem, best, found)
+            # Whether the suspect is at fault, they are to tell.
+            self._hypotheses[0] = replace(best, health=best.health.forgetful)
+            self._hypotheses += restarts
+        return self._point(problem, status, found.update.cost)
+
+    def _nothing_yet(self, problem: RowProblem) -> Hypothesis:
+        """No source, and a common field that may be as large as the readings."""
+        array = self.scene.array
+        sigma_T = array.common_field_T
+        if sigma_T is None:
+            largest = np.nanmax(np.abs(problem.row.readings_T - array.channel_offset_T))
+            sigma_T = 3.0 * float(largest) + 100.0 * float(array.channel_noise_T.max())
+        return Hypothesis(JointState.empty(np.zeros(3), sigma_T), (), SensorHealth.of(array.n_sensors))
+
+    def _continued(self, problem: RowProblem, before: Hypothesis, dt_s: float) -> list[tuple[Hypothesis, Explanation]]:
+        """What becomes of a hypothesis: one for every explanation of the row, or the prediction if there is none."""
+        motion = self.scene.motion
+        prior = motion.predicted(before.state, dt_s)
+        plain = problem.updated(prior, before.ids, before.health.dead)
+        if problem.holds(plain) or (before.judged > 0 and plain.update.converged):
+            explanations = [plain]
+        else:
+            manoeuvring = motion.predicted(before.state, dt_s, agility=MANOEUVRE_AGILITY)
+            explanations = problem.explanations(plain, manoeuvring)
+        if not explanations:
+            kept = replace(before, state=prior, score=before.score + min(plain.score, _UNBEARABLE))
+            return [(self._with_excess(kept, plain), plain)]
+        return [(self._after(problem, before, found), found) for found in explanations]
+
+    def _after(self, problem: RowProblem, before: Hypothesis, found: Explanation) -> Hypothesis:
+        """A hypothesis after an explanation of the row."""
+        of_dead = innovation_chi2(found.update.state, problem.measured, before.health.dead)
+        after = replace(
+            before,
+            state=found.update.state,
+            ids=found.ids,
+            health=before.health.after(found.update, found.out, of_dead),
+            score=before.score + found.score,
+            judged=max(0, before.judged - 1),
+        )
+        return self._with_excess(after, found)
+
+    def _with_excess(self, after: Hypothesis, found: Explanation) -> Hypothesis:
+        excess = min(found.excess, 2.0 * COST_LIMIT)
+        return replace(after, excess=after.excess + (excess - after.excess) / _MEMORIES)
+
+    def _superfluous(self, problem: RowProblem, best: Hypothesis, found: Explanation) -> list[Hypothesis]:
+        """Hypotheses of a source less, where the row does not miss it; they are to be judged.
+
+        It is taken away, or one with another that it is not told apart from: the two may be a single one, and their
+        moments then grow against each other.
+        """
+        fewer = problem.one_less(found, range(len(best.ids)), merged_pairs(best.state))
+        held = [self._after(problem, best, one) for one in fewer if problem.holds(one)]
+        return [replace(one, score=best.score, excess=np.zeros(2), judged=_JUDGED_ROWS) for one in held]
+
+    def _restarts(self, problem: RowProblem, best: Hypothesis, found: Explanation) -> list[Hypothesis]:
+        """Hypotheses that are to be judged: a sensor drifts, there is a source more, or the past is forgotten.
+
+        Of that either all is, or all but where the sources are.
+        """
+        common, dead = best.state.common_alone, best.health.dead
+        anew = problem.explanations(problem.updated(common, (), dead), common)
+        anew.append(problem.found_anew(common, best.state.position_m, best.state.moment_Am2, dead))
+        if len(best.ids) < self.scene.most_sources:
+            before = (found, *anew)
+            anew += problem.of_more_sources(common, dead, len(best.ids) + 1)
+            anew += distinct(one for start in before for one in problem.births(start))[:_MOST_HYPOTHESES]
+        tried = [one for one in distinct(anew) if one.update.converged]
+        more = [one for one in tried if len(one.ids) > len(best.ids)]
+        tried = [one for one in tried if len(one.ids) <= len(best.ids)][:_MOST_RESTARTS] + more[:_MOST_RESTARTS]
+        restarts = [self._after(problem, best, one) for one in tried]
+        suspect = best.health.suspect
+        restarts = [replace(one, health=one.health.forgetful) for one in restarts]
+        if suspect is not None and best.health.may_drift:
+            restarts.append(replace(best, health=best.health.without(suspect)))
+        return [replace(one, score=best.score, excess=np.zeros(2), judged=_JUDGED_ROWS) for one in restarts]
+
+    def _pruned(self, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
+        """The likeliest ones, the best first; behind them restarts while they are judged."""
+        believed = sorted((one for one in hypotheses if not one.judged), key=_score)
+        judged = []
+        for one in (one for one in hypotheses if one.judged):
+            gain = believed[0].score - one.score
+            if gain > (_MUST_GAIN if one.judged == 1 else _CLEAR_GAIN):
+                believed.append(replace(one, ids=_old_names(one, believed[0]), judged=0))
+            elif one.judged > 1:
+                judged.append(one)
+        kept: list[Hypothesis] = []
+        for one in sorted(believed, key=_score):
+            if len(kept) == _MOST_HYPOTHESES or (kept and one.score > kept[0].score + _LESS_LIKELY):
+                break
+            if not any(_are_same(one.state, other.state) for other in kept):
+                kept.append(one)
+        return kept + judged
+
+    def _point(self, problem: RowProblem, status: str, chi2: float) -> SourcesPoint:
+        """What is told of the best hypothesis."""
+        array, row = self.scene.array, problem.row
+        best = self._hypotheses[0] if self._hypotheses else self._nothing_yet(problem)
+        told = [k for k, name in enumerate(best.ids) if self._n_rows - name // NAMES_A_ROW >= ROWS_TO_REPORT]
+        told = told or list(range(len(best.ids)))
+        for k in told:
+            self._numbers.setdefault(best.ids[k], len(self._numbers) + 1)
+        merged = np.isin(np.arange(len(best.ids)), merged_pairs(best.state))
+        believed = [one for one in self._hypotheses if not one.judged]
+        likely = np.exp(-0.5 * np.array([one.score - best.score for one in believed]))
+        tracks = [
+            SourcePoint(
+                row.time_s,
+                best.state.position_m[k],
+                best.state.moment_Am2[k],
+                best.state.covariance(k),
+                nis=chi2,
+                nis_dof=int(np.count_nonzero(row.available)),
+                status="predicted" if status in ("misfit", "no readings") else "merged" if merged[k] else status,
+                weight=float(likely @ [best.ids[k] in one.ids for one in believed] / likely.sum()),
+                centroid_m=row.origin_m + row.R_world_from_array @ array.centroid,
+                radius_m=array.circumradius,
+                id=self._numbers[best.ids[k]],
+                merged=bool(merged[k]),
+            )
+            for k in told
+        ]
+        return SourcesPoint(
+            row.time_s,
+            tuple(sorted(tracks, key=lambda track: track.id)),
+            status,
+            chi2,
+            int(np.count_nonzero(row.available)),
+            tuple(name for name, dead in zip(array.ids, best.health.dead, strict=True) if dead),
+        )
+
+
+def _score(hypothesis: Hypothesis) -> float:
+    return hypothesis.score
+
+
+def _old_names(restart: Hypothesis, before: Hypothesis) -> tuple[int, ...]:
+    """Names of a restart's sources: those of the nearest ones before it, as far as there are."""
+    apart = np.linalg.norm(restart.state.position_m[:, None] - before.state.position_m, axis=-1)
+    names = list(restart.ids)
+    for new, old in zip(*linear_sum_assignment(apart), strict=True):
+        names[new] = before.ids[old]
+    return tuple(names)
+
+
+def _are_same(first: JointState, second: JointState) -> bool:
+    """Whether two states have the same sources, in some order."""
+    if first.n_sources != second.n_sources:
+        return False
+    offset = first.position_m[:, None] - second.position_m
+    at = first.of_source[:, :3]
+    inverse = np.linalg.inv(first.P[at[:, :, None], at[:, None, :]])
+    near = np.einsum("kli,kij,klj->kl", offset, inverse, offset) < _SAME_SIGMA2
+    return bool(near.any(axis=1).all() and near.any(axis=0).all())
+
+
+def merged_pairs(state: JointState) -> list[tuple[int, int]]:
+    """Pairs of sources that are too near to each other for their gap to be known."""
+    pairs = []
+    for first, second in combinations(range(state.n_sources), 2):
+        distance, sigma = state.gap(first, second)
+        if sigma > MERGED_GAP * distance:
+            pairs.append((first, second))
+    return pairs

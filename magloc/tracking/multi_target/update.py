@@ -1,0 +1,187 @@
+r"""One row's readings put into a joint state: an iterated update, and what of the row contradicts it.
+
+With the prediction's covariance :math:`P_{oo} = L L^T` of what a row sees, N = HᵀH of whitened readings and the error
+e = L y, every iteration solves :math:`(I + L^T N L) y = L^T H^T (r + H e)`, which is
+:math:`e = P_{oo} (I + N P_{oo})^{-1} (H^T r + N e)` in a form that is symmetric and free of units. It ends when
+:math:`δe^T N δe` is small, in units of the noise: no rule in millimetres holds at every strength of signal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from arrays.typing import BoolArray, FloatArray
+from magloc.tracking.multi_target.measurement import JointRow
+from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState, moment_derivative
+
+TOLERANCE = 0.02
+"""Change of the predicted readings, squared, in units of the noise, at which the iteration ends."""
+MOST_ITERATIONS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class JointUpdate:
+    r"""A state after a row.
+
+    Attributes
+    ----------
+    state : JointState
+    row : JointRow
+    residual : ndarray, shape (C,)
+        Of whitened readings at the state.
+    seen : ndarray, shape (C, 6 K + 3)
+        A root of what the state's uncertainty makes of the predicted readings: A P⁺ Aᵀ.
+    innovation : ndarray, shape (C,)
+        The same at the prediction.
+    linear : ndarray, shape (C, 6 K + 3)
+        A root of what the prediction's uncertainty makes of the predicted readings, there.
+    cost : float
+        :math:`J = |r|^2 + e^T P^{-1} e`, χ² of the innovation with the number of readings as degrees of freedom.
+    log_volume : float
+        :math:`\log |I + N P_{oo}|`.
+    converged : bool
+    """
+
+    state: JointState
+    row: JointRow
+    residual: FloatArray
+    seen: FloatArray
+    innovation: FloatArray
+    linear: FloatArray
+    cost: float
+    log_volume: float
+    converged: bool
+
+    @cached_property
+    def standardised(self) -> FloatArray:
+        """Post-fit residuals (N, 3) of every sensor's channels with unit covariance; zero for those not used."""
+        # Channels of vector sensors stand three by three.
+        seen, residual = self.seen.reshape(-1, 3, self.seen.shape[1]), self.residual.reshape(-1, 3)
+        covariance = np.eye(3) - seen @ seen.transpose(0, 2, 1)
+        # A sensor that the fit follows wholly says nothing of itself.
+        root = np.linalg.cholesky(covariance + _FOLLOWED * np.eye(3))
+        found: FloatArray = np.linalg.solve(root, residual[..., None])[..., 0]
+        return found
+
+    @property
+    def sensor_chi2(self) -> FloatArray:
+        """χ² (N,) with three degrees of freedom of every sensor's residual: tᵀ (I - A P⁺ Aᵀ)⁻¹ t."""
+        return np.vecdot(self.standardised, self.standardised)
+
+    @cached_property
+    def surprise(self) -> FloatArray:
+        """Innovation (C,) less what the prediction's uncertainty explains, to first order.
+
+        Where something new is strong, the iterated update moves what is known onto it, and the residual tells little.
+        """
+        A = np.eye(self.linear.shape[1]) + self.linear.T @ self.linear
+        surprise: FloatArray = self.innovation - self.linear @ np.linalg.solve(A, self.linear.T @ self.innovation)
+        return surprise
+
+
+_FOLLOWED = 1e-3
+
+
+def joint_update(prior: JointState, row: JointRow) -> JointUpdate:
+    """A predicted state after a row's readings, by damped Gauss-Newton in the chart of the prediction."""
+    d = prior.n_seen
+    L = _lower_root(prior.P[:d, :d])
+    y, best_y, best, residual = np.zeros(d), np.zeros(d), np.inf, row.z
+    HL, converged = np.zeros((len(row.z), d)), False
+    R: FloatArray = np.eye(d)
+    at_prediction: tuple[FloatArray, FloatArray] | None = None
+    for _ in range(MOST_ITERATIONS):
+        error = L @ y
+        state = prior.moved(error)
+        h, H = row.predicted(state)
+        r = row.z - h
+        cost = float(r @ r + y @ y)
+        if not cost < best:
+            if best == np.inf:  # a source stands on a sensor
+                break
+            step = y - best_y
+            if cost <= best + TOLERANCE or float(np.sum((HL @ step) ** 2)) < TOLERANCE:
+                converged = True
+                break
+            y = best_y + 0.4 * step
+            continue
+        best, best_y, residual = cost, y, r
+        HL = _in_chart(H, prior, error) @ L
+        if at_prediction is None:
+            at_prediction = r, HL
+        R = _lower_root(np.eye(d) + HL.T @ HL)
+        new = _solved(R, HL.T @ (r + HL @ y))
+        along = HL @ (new - y)
+        if float(along @ along) < TOLERANCE:
+            best_y, residual = new, r - along
+            best = float(residual @ residual + new @ new)
+            converged = True
+            break
+        y = new
+    state, seen = _updated(prior, L, R, HL, best_y)
+    innovation, linear = at_prediction or (row.z, HL)
+    log_volume = 2.0 * float(np.sum(np.log(np.diagonal(R))))
+    return JointUpdate(state, row, residual, seen, innovation, linear, best, log_volume, converged)
+
+
+def _in_chart(H: FloatArray, prior: JointState, error: FloatArray) -> FloatArray:
+    """Derivatives by the errors of a prediction, from those by Cartesian moments at an error (d,) of it."""
+    k = prior.n_sources
+    of_sources = H[:, :-N_COMMON].reshape(len(H), k, N_SEEN)
+    c = error[: N_SEEN * k].reshape(k, N_SEEN)[:, 3:]
+    of_sources[:, :, 3:] = (of_sources[:, :, None, 3:] @ moment_derivative(prior.moment_Am2, c))[:, :, 0]
+    return H
+
+
+def _lower_root(matrix: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.cholesky(matrix), dtype=np.float64)
+
+
+def _solved(R: FloatArray, right: FloatArray) -> FloatArray:
+    """Solution of R Rᵀ y = right."""
+    half = solve_triangular(R, right, lower=True, check_finite=False)
+    y: FloatArray = solve_triangular(R, half, lower=True, trans="T", check_finite=False)
+    return y
+
+
+def _updated(
+    prior: JointState, L: FloatArray, R: FloatArray, HL: FloatArray, y: FloatArray
+) -> tuple[JointState, FloatArray]:
+    """State and covariance after the last linearisation, in the chart of the new state, and a root of A P⁺ Aᵀ."""
+    d, k = prior.n_seen, prior.n_sources
+    rest = solve_triangular(L, prior.P[:d, d:], lower=True, check_finite=False).T
+    W = np.concatenate([L, rest])
+    error = W @ y
+    state = prior.moved(error)
+    root = solve_triangular(R, W.T, lower=True, check_finite=False).T
+    c = error[: N_SEEN * k].reshape(k, N_SEEN)[:, 3:]
+    length = np.linalg.norm(state.moment_Am2, axis=1)[:, None, None]
+    turned = moment_derivative(prior.moment_Am2, c) / length
+    of_c = state.of_source[:, 3:N_SEEN]
+    root[of_c] = turned @ root[of_c]
+    P = root @ root.T
+    P[d:, d:] += prior.P[d:, d:] - rest @ rest.T
+    seen = solve_triangular(R, HL.T, lower=True, check_finite=False).T
+    return replace(state, P=P), seen
+
+
+def innovation_chi2(state: JointState, row: JointRow, sensors: BoolArray) -> FloatArray:
+    """χ² (N,) with three degrees of freedom of sensors that a state does not know of; infinite for all others."""
+    chi2 = np.full(len(sensors), np.inf)
+    asked = sensors & row.used.reshape(-1, 3).all(axis=1)
+    if not asked.any():
+        return chi2
+    h, H = row.predicted(state)
+    scale = np.ones(state.n_seen)
+    of_sources = scale[:-N_COMMON].reshape(-1, N_SEEN)
+    of_sources[:, 3:] = np.linalg.norm(state.moment_Am2, axis=1)[:, None]
+    seen = (H * scale) @ np.linalg.cholesky(state.P[: state.n_seen, : state.n_seen])
+    for sensor in np.flatnonzero(asked):
+        at = np.flatnonzero(row.channel_sensor == sensor)
+        r = (row.z - h)[at]
+        chi2[sensor] = float(r @ np.linalg.solve(np.eye(3) + seen[at] @ seen[at].T, r))
+    return chi2

@@ -1,0 +1,235 @@
+"""Magnets that move over a board, and their tracks: ``python -m tests.moving_magnets --sources 3 --seeds 20``.
+
+Prints every run, and of all of them: swaps, births and losses, NEES per dimension, sensors that were named, and the
+time of a row. Paths are sums of sinusoids, rates of turn Ornstein-Uhlenbeck processes; a path is drawn anew where two
+magnets come nearer than ``--gap-mm``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import magloc
+import sims
+from arrays.array import SensorArray
+from arrays.typing import BoolArray, FloatArray
+from magloc.fields import dipole
+from magloc.tracking.multi_target.results import SourcesPoint
+
+RATE_HZ = 100.0
+NOISE_T = 5e-7
+AMBIENT_T = np.array([1.5e-6, 20.5e-6, -43e-6])
+LOW_M, HIGH_M = np.array([-0.05, -0.04, 0.03]), np.array([0.05, 0.04, 0.08])
+SPEED_M_S, STRENGTH_AM2 = 0.3, (0.02, 0.1)
+RATE_RAD_S, RATE_LASTS_S = 1.2, 0.4
+# Rows in which a track must be nearer to another magnet than to its own to be counted as swapped.
+ROWS_OF_A_SWAP = 20
+FAULTS = ("zero", "stuck", "noisy", "drift")
+
+
+def board() -> SensorArray:
+    """30 sensors, 16 mm apart, of 0.5 µT."""
+    array = sims.read_scenario("hand-magnet").array  # type: ignore[union-attr]
+    sensors = (
+        replace(one, noise_T=NOISE_T, misalignment_rad=0.0, gain_uncertainty=0.0, flicker_T=0.0)
+        for one in array.sensors
+    )
+    return replace(array, sensors=tuple(sensors), ambient_T=None)
+
+
+@dataclass(frozen=True, eq=False)
+class Magnets:
+    """Truth: positions and moments (K, n, 3), and when each magnet is there (K, n)."""
+
+    position_m: FloatArray
+    moment_Am2: FloatArray
+    present: BoolArray
+
+    @classmethod
+    def drawn(
+        cls, k: int, n_rows: int, gap_m: float, rng: np.random.Generator, *, come_and_go: bool = False
+    ) -> Magnets:
+        """Magnets whose paths keep a gap; `come_and_go`: the last one comes at 30 % of the rows and goes at 70 %."""
+        while True:
+            position = np.stack([_path(n_rows, rng) for _ in range(k)])
+            apart = np.linalg.norm(position[:, None] - position, axis=-1)
+            apart[np.arange(k), np.arange(k)] = np.inf
+            if apart.min() >= gap_m:
+                break
+        strength = rng.uniform(*STRENGTH_AM2, k)
+        moment = np.stack([one * _direction(n_rows, rng) for one in strength])
+        present = np.ones((k, n_rows), dtype=bool)
+        if come_and_go:
+            present[-1, : int(0.3 * n_rows)] = present[-1, int(0.7 * n_rows) :] = False
+        return cls(position, moment, present)
+
+    def readings_T(self, array: SensorArray, rng: np.random.Generator) -> FloatArray:
+        """What the board reads (n, C)."""
+        fields = np.zeros((self.present.shape[1], array.n_sensors, 3)) + AMBIENT_T
+        for place, moment, there in zip(self.position_m, self.moment_Am2, self.present, strict=True):
+            fields += there[:, None, None] * dipole.field(array.positions, place[:, None], moment[:, None])
+        return array.readings_of(fields) + NOISE_T * rng.normal(size=(len(fields), array.n_channels))
+
+
+def _path(n_rows: int, rng: np.random.Generator) -> FloatArray:
+    """Three sinusoids an axis within the box, no faster than the largest speed."""
+    t = np.arange(n_rows) / RATE_HZ
+    frequency, phase = rng.uniform(0.15, 0.45, (3, 3)), rng.uniform(0.0, 2.0 * np.pi, (3, 3))
+    share = rng.dirichlet(np.ones(3), 3)
+    wave = np.sum(share[:, :, None] * np.sin(2.0 * np.pi * frequency[:, :, None] * t + phase[:, :, None]), axis=1).T
+    position = 0.5 * (LOW_M + HIGH_M) + 0.5 * (HIGH_M - LOW_M) * wave
+    speed = np.linalg.norm(np.diff(position, axis=0), axis=1).max(initial=0.0) * RATE_HZ
+    return position if speed <= SPEED_M_S else _path(n_rows, rng)
+
+
+def _direction(n_rows: int, rng: np.random.Generator) -> FloatArray:
+    """Unit vectors (n, 3) that turn, by 180°/s at most along an axis."""
+    kept = np.exp(-1.0 / (RATE_HZ * RATE_LASTS_S))
+    rate = RATE_RAD_S * rng.normal(size=3)
+    turned, directions = Rotation.random(rng=rng), []
+    for _ in range(n_rows):
+        directions.append(turned.apply([0.0, 0.0, 1.0]))
+        turned = Rotation.from_rotvec(np.clip(rate, -np.pi, np.pi) / RATE_HZ) * turned
+        rate = kept * rate + RATE_RAD_S * np.sqrt(1.0 - kept**2) * rng.normal(size=3)
+    return np.array(directions)
+
+
+def with_fault(readings_T: FloatArray, kind: str, sensor: int, first: int, drift_T_s: float = 2e-6) -> FloatArray:
+    """Readings (n, C) of which a sensor fails from a row on."""
+    bad, at = readings_T.copy(), slice(3 * sensor, 3 * sensor + 3)
+    left = len(bad) - first
+    if kind == "zero":
+        bad[first:, at] = 0.0
+    elif kind == "stuck":
+        bad[first:, at] = bad[first, at]
+    elif kind == "noisy":
+        bad[first:, at] += 20.0 * NOISE_T * np.random.default_rng(first).normal(size=(left, 3))
+    else:
+        bad[first:, at] += drift_T_s / np.sqrt(3.0) * (np.arange(1, left + 1) / RATE_HZ)[:, None]
+    return bad
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """How one run went; NEES is per dimension, over all rows and tracks that are told."""
+
+    swaps: int
+    false_births: int
+    lost_rows: int
+    misfit_rows: int
+    merged_rows: int
+    late_birth_rows: int
+    late_loss_rows: int
+    nees: float
+    rms_m: float
+    named: dict[str, int]
+    row_ms: FloatArray
+
+
+def judged(points: list[SourcesPoint], truth: Magnets, row_ms: FloatArray) -> Run:
+    """Tracks against the magnets: each is the one that it was nearest to when it was first told."""
+    owner: dict[int, int] = {}
+    away: dict[int, int] = {}
+    named: dict[str, int] = {}
+    squares, errors, swaps, false, lost = [], [], 0, 0, 0
+    last = truth.present[-1]
+    first, end = int(np.argmax(last)), int(len(last) - np.argmax(last[::-1]))
+    seen_first, seen_last = len(last), 0
+    for row, point in enumerate(points):
+        for name in point.dropped_sensors:
+            named.setdefault(name, row)
+        there = np.flatnonzero(truth.present[:, row])
+        false += len(point.tracks) > len(there)
+        lost += len(point.tracks) < len(there)
+        for track in point.tracks:
+            assert track.position_m is not None
+            apart = np.linalg.norm(truth.position_m[:, row] - track.position_m, axis=1)
+            nearest = int(there[np.argmin(apart[there])])
+            own = owner.setdefault(track.id, nearest)
+            away[track.id] = away.get(track.id, 0) + 1 if nearest != own and apart[nearest] < 0.5 * apart[own] else 0
+            if away[track.id] == ROWS_OF_A_SWAP:
+                swaps, owner[track.id] = swaps + 1, nearest
+            own = owner[track.id]
+            if own == len(truth.present) - 1:
+                seen_first, seen_last = min(seen_first, row), row + 1
+            offset = track.position_m - truth.position_m[own, row]
+            error = np.concatenate([offset, track.moment_Am2 - truth.moment_Am2[own, row]])
+            if truth.present[own, row]:
+                squares.append(error @ np.linalg.solve(track.covariance, error) / 6.0)
+                errors.append(offset @ offset)
+    return Run(
+        swaps=swaps,
+        false_births=false,
+        lost_rows=lost,
+        misfit_rows=sum(point.status == "misfit" for point in points),
+        merged_rows=sum(any(track.merged for track in point.tracks) for point in points),
+        late_birth_rows=seen_first - first,
+        late_loss_rows=seen_last - end,
+        nees=float(np.mean(squares)),
+        rms_m=float(np.sqrt(np.mean(errors))),
+        named=named,
+        row_ms=row_ms,
+    )
+
+
+def followed(array: SensorArray, readings_T: FloatArray, **options: object) -> tuple[list[SourcesPoint], FloatArray]:
+    """Points of all rows, and how long each took [ms]."""
+    tracker = magloc.SourcesTracker(array, **options)  # type: ignore[arg-type]
+    points, took = [], []
+    for row, values in enumerate(readings_T):
+        begin = time.perf_counter()
+        points.append(tracker.update(magloc.Readings(values[None], time_s=np.array([row / RATE_HZ]))))
+        took.append(1e3 * (time.perf_counter() - begin))
+    return points, np.array(took)
+
+
+def main() -> None:
+    """Follow magnets in some runs."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sources", type=int, default=2)
+    parser.add_argument("--first", type=int, default=1000)
+    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--gap-mm", type=float, default=20.0)
+    parser.add_argument("--come-and-go", action="store_true")
+    parser.add_argument("--fault", choices=FAULTS)
+    given = parser.parse_args()
+    array, n_rows, runs = board(), int(given.seconds * RATE_HZ), []
+    for seed in range(given.first, given.first + given.seeds):
+        rng = np.random.default_rng(seed)
+        truth = Magnets.drawn(given.sources, n_rows, 1e-3 * given.gap_mm, rng, come_and_go=given.come_and_go)
+        readings_T = truth.readings_T(array, rng)
+        if given.fault:
+            readings_T = with_fault(readings_T, given.fault, int(rng.integers(array.n_sensors)), n_rows // 2)
+        runs.append(judged(*_points_and_truth(array, readings_T, truth)))
+        run = runs[-1]
+        print(
+            f"seed {seed}: swaps {run.swaps}, rows with too many {run.false_births}, too few {run.lost_rows}, misfit"
+            f" {run.misfit_rows}, merged {run.merged_rows}, birth after {run.late_birth_rows}, loss after"
+            f" {run.late_loss_rows}, NEES {run.nees:.2f}, rms {1e3 * run.rms_m:.2f} mm, named {run.named},"
+            f" {np.median(run.row_ms):.2f} ms a row, {run.row_ms.mean():.2f} mean, {run.row_ms.max():.0f} most",
+            flush=True,
+        )
+    nees = np.array([run.nees for run in runs])
+    print(
+        f"{len(runs)} runs: {sum(run.swaps > 0 for run in runs)} with a swap,"
+        f" {sum(run.false_births > 0 for run in runs)} with a false birth, {np.sum(nees > 3.0)} broken (NEES above 3);"
+        f" NEES of the median run {np.median(nees):.2f};"
+        f" {np.median([np.median(run.row_ms) for run in runs]):.2f} ms a row"
+    )
+
+
+def _points_and_truth(
+    array: SensorArray, readings_T: FloatArray, truth: Magnets
+) -> tuple[list[SourcesPoint], Magnets, FloatArray]:
+    points, took = followed(array, readings_T)
+    return points, truth, took
+
+
+if __name__ == "__main__":
+    main()
