@@ -10,7 +10,7 @@ unexport PYTHONDONTWRITEBYTECODE
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 MAKE_VENV = $(PYTHON) -m venv --clear
 
-.PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel bench docs notebooks chromium lint clean
+.PHONY: map test test-full test-oldest mutation coverage licences sbom audit wheel bench docs notebooks pictures chromium lint clean
 .PHONY: ready compiled-magloc compiled-adcs compiled-tests
 
 map: .venv/installed
@@ -93,6 +93,10 @@ chromium:
 # The notebooks executed anew, and the gallery's pictures of them.
 notebooks: .venv/installed-test
 	$(BIN)/python -m tests.notebooks
+
+# The other pictures of the site, those whose commands, code or scenario changed since they were drawn.
+pictures: .venv/installed-test chromium
+	$(BIN)/python -m tests.pictures
 
 # The lower bounds of pyproject.toml, installed exactly.
 test-oldest: .venv-oldest/installed chromium

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,9 +23,13 @@ from numpy.typing import ArrayLike, NDArray
 from adcs import quaternion
 from arrays.array import SensorArray
 from arrays.io.errors import check_positive
+from arrays.io.lazy import by_name
 from arrays.typing import BoolArray, FloatArray
 from magloc.localization.fit.results import Fix
 from magloc.localization.locator import Locator
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 WINDOW_S = 8.0
 """Before and after a switch: longer, and the ambient field is no parabola."""
@@ -110,6 +115,10 @@ class OwnFields:
             array = replace(self.array, sensors=tuple(sensors), common_field_T=float(noise.max()), ambient_T=None)
             fixes[name] = Locator(array, exclude_faulty=False).fit(array.readings_of(vectors))
         return fixes
+
+    def plot(self) -> Figure:
+        """What every load adds to every magnetometer, with ±3σ."""
+        return by_name("adcs.plots.magnetometers:own_fields_figure")(self)
 
 
 def find_own_fields(

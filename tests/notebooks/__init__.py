@@ -84,16 +84,16 @@ def kept(notebook: NotebookNode) -> NotebookNode:
                 if "<iframe" in output.data.get("text/html", ""):
                     output.data["text/plain"] = "<View>"  # its address is that of a server that is gone
                 if "image/png" in output.data:
-                    picture = base64.b64encode(_small(base64.b64decode(output.data["image/png"]))).decode()
+                    picture = base64.b64encode(small(base64.b64decode(output.data["image/png"]))).decode()
                     output.data = NotebookNode({"image/png": picture, "text/plain": "<Figure>"})
     return notebook
 
 
-def _small(png: bytes) -> bytes:
+def small(png: bytes, widest_px: int = MOST_PIXELS) -> bytes:
     """A picture with a palette of its own: less than half the size, and the same to the eye."""
     result = io.BytesIO()
     picture = Image.open(io.BytesIO(png)).convert("RGB")
-    picture.thumbnail((MOST_PIXELS, MOST_PIXELS), Image.Resampling.LANCZOS)
+    picture.thumbnail((widest_px, widest_px), Image.Resampling.LANCZOS)
     # Maximum coverage keeps small spots of a colour that is rare, such as a star on a map; means keep large areas.
     picture.quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=2, dither=Image.Dither.NONE).save(
         result, "png", optimize=True
