@@ -11,13 +11,13 @@ import magloc
 from arrays.io.errors import InputError, naming
 from magloc.cli.framework import print_json, progress
 from magloc.cli.options import print_note
-from magloc.tracking.multi_target.results import SourcesPoint
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
     from magloc.localization.fit.prior import SourcePrior
     from magloc.readings import Readings
     from magloc.tracking.multi_target.motion import FreeMotion
+    from magloc.tracking.multi_target.results import SourcesPoint
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,8 @@ def stream_sources(array: SensorArray, sensors: list[str] | None, wanted: Source
     from magloc.live.tally import Clock, Tally
     from magloc.live.transports import opened
 
-    tracker, tally, points = wanted.tracker(array), Tally(), list[SourcesPoint]()
+    tracker, tally = wanted.tracker(array), Tally()
+    points: list[SourcesPoint] = []
 
     def restart() -> None:
         nonlocal tracker

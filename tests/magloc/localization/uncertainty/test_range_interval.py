@@ -675,17 +675,15 @@ class TestTrack:
         assert last.rivals == ()
 
     def test_without_one_it_is_that_of_the_row(self) -> None:
-        _, points = self.points(8, 14.0)
+        """The rows show nothing of a source that is so far."""
+        _, points = self.points(8, 22.0)
         locator = plain_locator(ARRAY)
-        position = 14.0 * POSITION / np.linalg.norm(POSITION)
+        position = 22.0 * POSITION / np.linalg.norm(POSITION)
         readings = readings_of(ARRAY, np.tile(position, (8, 1)), np.tile(MOMENT, (8, 1)), 0)
-        assert any(point.position_m is None for point in points)
         for point, fix in zip(points, locator.fit_rows(readings), strict=True):
-            if point.position_m is not None:
-                continue
+            assert point.position_m is None
             assert np.isnan(point.weight)
             assert not point.gaussian
-            assert sum(s.weight for s in point.rivals) == pytest.approx(1.0)
             assert point.range_interval_m is not None
             assert_allclose(ends_of(point), ends_of(fix.solutions[0]), rtol=1e-6)
             assert point.range_observable == fix.solutions[0].range_observable
