@@ -34,6 +34,7 @@ def interrupted(process: subprocess.Popen[str]) -> str:
 
 
 class TestProcess:
+    @pytest.mark.slow
     def test_a_closed_page_leaves_the_server_as_it_was(self, screen: Screen, array_file: Path) -> None:
         with socket.create_server(("127.0.0.1", 0)) as taken:
             port = taken.getsockname()[1]

@@ -42,6 +42,7 @@ def test_the_source_moves_from_frame_to_frame(screen: Screen, tmp_path: Path) ->
     assert (np.diff(across) > 20.0).all()
 
 
+@pytest.mark.slow
 def test_a_turn(screen: Screen, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(film, "_MOST_FRAMES", 4)
     path = tmp_path / "array.apng"

@@ -113,7 +113,9 @@ def folder(tmp_path: Path) -> Path:
 class TestCommands:
     """They serve the page until Ctrl-C, also when the rows have ended."""
 
-    @pytest.mark.parametrize("words", ["live --from - --view --speed-m-s 1", "view -"])
+    @pytest.mark.parametrize(
+        "words", ["live --from - --view --speed-m-s 1", pytest.param("view -", marks=pytest.mark.slow)]
+    )
     def test_the_last_row_stays(self, screen: Screen, folder: Path, words: str) -> None:
         command = [sys.executable, "-m", "magloc.cli", *words.split(), "--array", "array.toml", "--port", "0"]
         with (
