@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 import adcs
+import arrays
 from adcs.cli.options import print_note
-from arrays.array_file import read_array
 from arrays.io.arguments import Flag
 from arrays.io.errors import naming
 from arrays.io.outputs import refuse_unwritable
-from arrays.typing import FloatArray
 from magloc.cli.framework import QuietOptions, print_json
-from magloc.localization.fit.results import Fix
+
+if TYPE_CHECKING:
+    from arrays.typing import FloatArray
+    from magloc.localization.fit.results import Fix
 
 
 def loads(
@@ -59,7 +59,7 @@ def loads(
 
     if out is not None:
         refuse_unwritable(out, "--out", ".csv")
-    sensors = read_array(array)
+    sensors = arrays.read_array(array)
     log = read_load_log(readings, sensors, [name.strip() for name in loads.split(",") if name.strip()])
     with naming(str(readings)):
         own = adcs.find_own_fields(sensors, log.readings_T, log.time_s, log.gyro_rad_s, log.states, window_s=window_s)
@@ -102,6 +102,8 @@ def report(own: adcs.OwnFields, located: dict[str, Fix]) -> dict[str, Any]:
 
 def lines(own: adcs.OwnFields, located: dict[str, Fix]) -> list[str]:
     """The result as text."""
+    import numpy as np
+
     noise = ", ".join(f"{name} {1e9 * one:.3g}" for name, one in zip(own.array.ids, own.noise_T, strict=True))
     text = [f"noise that is left [nT]: {noise}"]
     for name, vectors, sigma, switches in zip(own.names, own.vectors_T, own.sigma_T, own.switches, strict=True):
