@@ -387,8 +387,9 @@ def _with_header(path: str, array: SensorArray, header: _Header) -> SensorArray:
         of_field[in_si(key)[0]] = None if value is None else _tesla_vector(f"{path}, key {key}", value)
     name = array.name if header.name is None else header.name
     pose = None if header.pose is None else header.pose.uncertainty(f"{path}, table pose")
+    channels = {of.id: of.channel_names for of in array.sensors}
+    columns = None if header.columns is None else header.columns.columns(path, channels)
     with naming(path):
-        columns = None if header.columns is None else header.columns.columns()
         return SensorArray(array.sensors, name, header.noise_fraction, pose=pose, columns=columns, **of_field)
 
 

@@ -7,26 +7,27 @@ east, north, up of an origin, and yaw, pitch and roll a quaternion. Columns that
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from os import PathLike
-from typing import Annotated
 
 import msgspec
 import numpy as np
 
 from arrays.io.csv import Table as CsvTable
 from arrays.io.csv import read_table, table_of_text
-from arrays.io.errors import InputError, of_extra
+from arrays.io.errors import InputError, naming, of_extra
 from arrays.io.text import read_text
-from arrays.io.toml import RefusalError, Table, one_of
+from arrays.io.toml import Table
 from arrays.typing import FloatArray, Vector
 
+POSITION_COLUMNS = ("array_x_m", "array_y_m", "array_z_m")
+ROTATION_COLUMNS = ("array_qx", "array_qy", "array_qz", "array_qw")
 _NANOTESLA = {"nT": 1.0, "uT": 1e3, "µT": 1e3, "mT": 1e6, "T": 1e9, "mG": 1e2, "G": 1e5}
 _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "iso": 1.0}
 _SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
-_POSITION, _TURN = ("array_x_m", "array_y_m", "array_z_m"), ("array_qx", "array_qy", "array_qz", "array_qw")
-_GEODETIC, _ANGLES = ("_latitude", "_longitude", "_height"), ("_yaw", "_pitch", "_roll")
+_CHOICES = {"separator": _SEPARATORS, "decimal": (".", ","), "time_unit": _SECONDS}
 _ENU_FROM_NED = ((0, 1, 0), (1, 0, 0), (0, 0, -1))
 _BODY_FROM_ARRAY = ((1, 0, 0), (0, -1, 0), (0, 0, -1))
 
@@ -55,7 +56,7 @@ class LogColumns:
     geodetic : tuple of 3 str, optional
         In its place: those of latitude, longitude [deg] and height [m].
     origin : tuple of 3 floats, optional
-        Latitude, longitude [deg] and height [m] of the world's origin; the place of the first row where it is left out.
+        With `geodetic`: latitude, longitude [deg] and height [m] of the world's origin, one for all logs.
     quaternion : tuple of 4 str, optional
         Columns of the attitude, from the array's frame to the world, x, y, z, w.
     angles : tuple of str, optional
@@ -64,10 +65,16 @@ class LogColumns:
     pose_latency_s : float
         How much older the pose of a row is than its readings [s].
 
+    Raises
+    ------
+    ValueError
+        A value is none of those above, or two do not fit each other.
+
     Examples
     --------
     >>> import arrays
-    >>> columns = arrays.LogColumns(time="UTC", time_unit="iso", unit="uT", geodetic=("Lat", "Lon", "Alt"))
+    >>> geodetic = {"geodetic": ("Lat", "Lon", "Alt"), "origin": (48.14, 11.57, 520.0)}
+    >>> columns = arrays.LogColumns(time="UTC", time_unit="iso", unit="uT", **geodetic)
     >>> columns.separator
     'comma'
     """
@@ -85,14 +92,62 @@ class LogColumns:
     angles: tuple[str, ...] | None = None
     pose_latency_s: float = 0.0
 
+    def __post_init__(self) -> None:
+        for name, choices in _CHOICES.items():
+            if (value := getattr(self, name)) not in choices:
+                raise ValueError(f"Input {name} must be one of {', '.join(choices)}; instead received {value!r}.")
+        if self.unit not in _NANOTESLA and not (isinstance(self.unit, float | int) and 0.0 < self.unit < math.inf):
+            expected = f"one of {', '.join(_NANOTESLA)}, or how many nT a count is"
+            raise ValueError(f"Input unit must be {expected}; instead received {self.unit!r}.")
+        if self.decimal == "," and self.separator == "comma":
+            raise ValueError("Input decimal must not be ',' beside the separator comma.")
+        for first, second in (("position", "geodetic"), ("quaternion", "angles")):
+            if getattr(self, first) is not None and getattr(self, second) is not None:
+                raise ValueError(f"Input {second} must not come together with {first}.")
+        if self.angles is not None and len(self.angles) not in (1, 3):
+            raise ValueError(
+                f"Input angles must be yaw, or yaw, pitch, roll; instead received {len(self.angles)} names."
+            )
+        if not self.place and (self.attitude or self.pose_latency_s):
+            raise ValueError(
+                "Inputs position or geodetic must come with an attitude or a latency; instead received none."
+            )
+        if (self.geodetic is None) != (self.origin is None):
+            raise ValueError("Inputs geodetic and origin must come together; instead received one of them.")
+        numbers = (self.pose_latency_s, *(self.origin or ()))
+        if not np.isfinite(numbers).all():
+            raise ValueError(f"Inputs origin and pose_latency_s must be finite; instead received {numbers}.")
+
+    @property
+    def place(self) -> tuple[str, ...]:
+        """Columns of the array's place."""
+        return self.position or self.geodetic or ()
+
+    @property
+    def attitude(self) -> tuple[str, ...]:
+        """Columns of its attitude."""
+        return self.quaternion or self.angles or ()
+
+    def of_sensors(self, channels: Mapping[str, Sequence[str]]) -> dict[str, str]:
+        """By the names of a readings file those of the log; sensors that are not among ``channels`` are left out."""
+        named: dict[str, str] = {}
+        for sensor, ours in channels.items():
+            of_sensor = self.sensors.get(sensor, ())
+            theirs = [of_sensor] if isinstance(of_sensor, str) else of_sensor
+            if theirs and len(theirs) != len(ours):
+                expected = f"{len(ours)} of them, as the sensor has channels"
+                raise InputError(f"key columns.sensors.{sensor}: found {len(theirs)} names, expected {expected}.")
+            named |= dict(zip(ours, theirs, strict=False))
+        return named
+
 
 class ColumnsTable(Table, kw_only=True):
     """The table ``columns`` of an array file."""
 
-    separator: Annotated[str, one_of(tuple(_SEPARATORS))] = "comma"
-    decimal: Annotated[str, one_of((".", ","))] = "."
+    separator: str = "comma"
+    decimal: str = "."
     time: str = "time_s"
-    time_unit: Annotated[str, one_of(tuple(_SECONDS))] = "s"
+    time_unit: str = "s"
     unit: str | float = "nT"
     sensors: dict[str, str | list[str]] = msgspec.field(default_factory=dict)
     position: tuple[str, str, str] | None = None
@@ -102,25 +157,23 @@ class ColumnsTable(Table, kw_only=True):
     angles: list[str] | None = None
     pose_latency_s: float = 0.0
 
-    def check(self) -> None:
-        """Raise a RefusalError if its values do not fit each other."""
-        if isinstance(self.unit, str) and self.unit not in _NANOTESLA:
-            raise RefusalError("unit", f"found {self.unit!r}, expected {', '.join(_NANOTESLA)}, or nT of a count")
-        for first, second in (("position", "geodetic"), ("quaternion", "angles")):
-            if getattr(self, first) is not None and getattr(self, second) is not None:
-                raise RefusalError(second, f"found it together with {first}, expected one of them")
-        if self.angles is not None and len(self.angles) not in (1, 3):
-            raise RefusalError("angles", f"found {len(self.angles)} names, expected yaw, or yaw, pitch and roll")
-        if self.position is None and self.geodetic is None and (self.quaternion or self.angles or self.pose_latency_s):
-            raise RefusalError("", "found an attitude or a latency without a place, expected position or geodetic")
-        if self.decimal == "," and self.separator == "comma":
-            raise RefusalError("decimal", "found ',' beside the separator comma, expected another separator")
-
-    def columns(self) -> LogColumns:
-        """What the table says."""
+    def columns(self, path: str, channels: Mapping[str, Sequence[str]]) -> LogColumns:
+        """What the table of the array file `path` says, whose sensors have these channels."""
         said = msgspec.structs.asdict(self)
         sensors = {name: tuple(of) if isinstance(of, list) else of for name, of in self.sensors.items()}
-        return LogColumns(**said | {"sensors": sensors, "angles": None if self.angles is None else tuple(self.angles)})
+        with naming(f"{path}, table columns"):
+            columns = LogColumns(
+                **said | {"sensors": sensors, "angles": None if self.angles is None else tuple(self.angles)}
+            )
+        for sensor in sensors:
+            if sensor not in channels:
+                expected = f"one of {', '.join(channels)}"
+                raise InputError(f"{path}, key columns.sensors.{sensor}: found no such sensor, expected {expected}.")
+        try:
+            columns.of_sensors(channels)
+        except InputError as error:
+            raise InputError(f"{path}, {error}") from None
+        return columns
 
 
 def columns_toml(columns: LogColumns) -> list[str]:
@@ -137,90 +190,64 @@ def _toml(value: object) -> str:
 
 
 def read_log(
-    path: str | PathLike[str], channels: Mapping[str, Sequence[str]], columns: LogColumns | None, expected: str
+    path: str | PathLike[str],
+    channels: Mapping[str, Sequence[str]],
+    columns: LogColumns | None,
+    expected: str,
+    others: Collection[str],
 ) -> CsvTable:
-    """Table of a readings file, or of a log, with the columns ``channels`` of every sensor."""
+    """Table of a readings file, or of a log, with the columns ``channels`` of every sensor and those of ``others``."""
     if columns is None:
         return read_table(path, expected)
-    named = _named(channels, columns)
+    named = columns.of_sensors(channels)
+    theirs = (columns.time, *named.values(), *columns.place, *columns.attitude)
     own = {name for of_sensor in channels.values() for name in of_sensor}
-    known = {"time_s", *own, *_POSITION, *_TURN}
-    text = read_text(path, "a CSV file")
     table = table_of_text(
-        text,
+        read_text(path, "a CSV file"),
         str(path),
         expected,
-        only={*named.values(), *known},
+        only={*theirs, *own, *others},
         instants=[columns.time] if columns.time_unit == "iso" else [],
         separator=_SEPARATORS[columns.separator],
         decimal=columns.decimal,
     )
-    for name in named.values():
-        table.require(name, tuple(named.values()))
-    found = {name: table.values[:, i] for i, name in enumerate(table.header) if name in known}
-    found |= {ours: table.values[:, table.header.index(theirs)] for ours, theirs in named.items()}
-    unit = _NANOTESLA[columns.unit] if isinstance(columns.unit, str) else columns.unit
+    for name in theirs:
+        table.require(name, theirs)
+    found = {name: table.values[:, i] for i, name in enumerate(table.header) if name in own or name in others}
+    found |= {ours: table.values[:, table.header.index(logged)] for ours, logged in named.items()}
+    unit = columns.unit if isinstance(columns.unit, float | int) else _NANOTESLA[columns.unit]
     found |= {name: unit * found[name] for name in own & found.keys()}
-    found["time_s"] = _SECONDS[columns.time_unit] * found["time_s"]
-    found |= _pose(found, columns, table)
-    kept = [name for name in found if not name.startswith("_")]
-    values = np.stack([found[name] for name in kept], axis=1)
-    return CsvTable(table.path, tuple(kept), table.header_line, values, table.line_numbers)
+    found["time_s"] = _SECONDS[columns.time_unit] * table.complete_and_distinct(columns.time)
+    if columns.place:
+        found |= zip(POSITION_COLUMNS, _position(table, columns).T, strict=True)
+    if columns.attitude or (columns.place and not set(ROTATION_COLUMNS) & found.keys()):
+        found |= zip(ROTATION_COLUMNS, _quaternion(table, columns).T, strict=True)
+    return CsvTable(
+        table.path, tuple(found), table.header_line, np.stack([*found.values()], axis=1), table.line_numbers
+    )
 
 
-def _named(channels: Mapping[str, Sequence[str]], columns: LogColumns) -> dict[str, str]:
-    """What each column that the table names is for, or ``_latitude`` and so on."""
-    named = {"time_s": columns.time}
-    for sensor, theirs in columns.sensors.items():
-        ours, names = channels.get(sensor, []), [theirs] if isinstance(theirs, str) else list(theirs)
-        if len(ours) != len(names):
-            raise InputError(
-                f"key columns.sensors.{sensor}: found {len(names)} names, expected {len(ours)}, as the sensor has"
-                " channels."
-                if ours
-                else f"key columns.sensors.{sensor}: found no such sensor, expected ids of the array."
-            )
-        named |= dict(zip(ours, names, strict=True))
-    poses: list[tuple[tuple[str, ...], tuple[str, ...] | None]] = [
-        (_POSITION, columns.position),
-        (_GEODETIC, columns.geodetic),
-        (_TURN, columns.quaternion),
-        (_ANGLES, columns.angles),
-    ]
-    for of_pose, logged in poses:
-        named |= dict(zip(of_pose, logged or (), strict=False))
-    return named
+def _position(table: CsvTable, columns: LogColumns) -> FloatArray:
+    """Places (n, 3) [m] in the world."""
+    place = table.complete(columns.place)
+    if columns.origin is None:
+        return place
+    with of_extra("geo", "latitude and longitude"):
+        from pymap3d import geodetic2enu
+    return np.stack(geodetic2enu(*place.T, *columns.origin), axis=1)
 
 
-def _pose(found: dict[str, FloatArray], columns: LogColumns, table: CsvTable) -> dict[str, FloatArray]:
-    """Columns of the pose, where a place is known."""
-    from scipy.spatial.transform import Rotation, Slerp
+def _quaternion(table: CsvTable, columns: LogColumns) -> FloatArray:
+    """Attitudes (n, 4), from the array's axes to the world's, which they are where nothing is known."""
+    from scipy.spatial.transform import Rotation
 
-    if columns.geodetic is not None:
-        place = np.stack([found[name] for name in _GEODETIC], axis=1)
-        table.refuse(~np.isfinite(place), columns.geodetic, "found no place, expected one in every row")
-        with of_extra("geo", "latitude and longitude"):
-            from pymap3d import geodetic2enu
-        position = np.stack(geodetic2enu(*place.T, *(place[0] if columns.origin is None else columns.origin)), axis=1)
-    elif all(name in found for name in _POSITION):
-        position = np.stack([found[name] for name in _POSITION], axis=1)
-    else:
-        return {}
-    if "_yaw" in found:
-        angles = np.stack([found.get(name, np.zeros(len(position))) for name in _ANGLES], axis=1)
-        if not np.isfinite(angles).all():
-            row = int(np.argmin(np.isfinite(angles).all(axis=1)))
-            raise InputError(f"{table.row_place(row)}: found no angle, expected one in every row.")
-        enu_from_ned, body_from_array = map(Rotation.from_matrix, (_ENU_FROM_NED, _BODY_FROM_ARRAY))
-        turn = enu_from_ned * Rotation.from_euler("ZYX", angles, degrees=True) * body_from_array
-        quaternion = turn.as_quat()
-    elif all(name in found for name in _TURN):
-        quaternion = np.stack([found[name] for name in _TURN], axis=1)
-    else:
-        quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (len(position), 1))
-    if columns.pose_latency_s:
-        time_s = found["time_s"]
-        later = np.clip(time_s + columns.pose_latency_s, time_s.min(), time_s.max())
-        position = np.stack([np.interp(later, time_s, axis) for axis in position.T], axis=1)
-        quaternion = Slerp(time_s, Rotation.from_quat(quaternion))(later).as_quat()
-    return dict(zip((*_POSITION, *_TURN), np.concatenate([position, quaternion], axis=1).T, strict=True))
+    logged = table.complete(columns.attitude)
+    if columns.quaternion is not None:
+        return logged
+    if not columns.attitude:
+        return np.tile([0.0, 0.0, 0.0, 1.0], (len(logged), 1))
+    angles = np.zeros((len(logged), 3))
+    angles[:, : logged.shape[1]] = logged
+    enu_from_ned, body_from_array = map(Rotation.from_matrix, (_ENU_FROM_NED, _BODY_FROM_ARRAY))
+    turn = enu_from_ned * Rotation.from_euler("ZYX", angles, degrees=True) * body_from_array
+    return np.asarray(turn.as_quat())

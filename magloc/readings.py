@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from arrays.array import AMBIENT_CHANNELS, SensorArray
-from arrays.columns import read_log
+from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS, read_log
 from arrays.io.csv import Columns, Table, table_of_columns, table_of_text
 from arrays.io.errors import InputError
 from arrays.io.text import write_text
@@ -32,21 +32,20 @@ from arrays.sensor import Sensor
 from arrays.typing import FloatArray, IntArray
 from magloc.conditioning import NO_BACKGROUND, Background, without_hum
 from magloc.navigation.measured_motion import MOTION_COLUMNS, MeasuredMotion, motion_columns, motion_of_table
+from magloc.navigation.poses import rotations_at, unit_rotation, vectors_at
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-POSITION_COLUMNS = ("array_x_m", "array_y_m", "array_z_m")
-ROTATION_COLUMNS = ("array_qx", "array_qy", "array_qz", "array_qw")
 POSE_SIGMA_COLUMNS = ("array_sigma_m", "array_sigma_deg")
 AMBIENT_COLUMNS = tuple(f"{name}_nT" for name in AMBIENT_CHANNELS)
+_OPTIONAL_COLUMNS = (*POSITION_COLUMNS, *ROTATION_COLUMNS, *POSE_SIGMA_COLUMNS, *AMBIENT_COLUMNS, *MOTION_COLUMNS)
 EXPECTED_HEADER = "a header with time_s and the sensors' columns"
 _T_IN_nT = 1e9
 _SIGMA_UNITS = np.array([1.0, np.pi / 180.0])  # of a pose's standard deviations, m and degrees
 _SATURATION_RTOL = 1e-12
 _LARGEST_nT = 1e15  # a million tesla: a column of something else, or a broken line
 _SAME_AMBIENT_RTOL = 1e-3  # change of the ambient field within which moduli may be averaged: 50 nT in 50 µT
-_UNIT_QUATERNION_ATOL = 1e-3  # a log that keeps four decimals passes; the quaternion is normalised afterwards
 _SENSOR_COLUMN = re.compile(r"(?P<id>.+?)(_[xyz])?_nT")
 
 
@@ -211,6 +210,17 @@ class Readings:
         """
         return replace(self, values_T=without_hum(self.time_s, self.values_T, mains_hz))
 
+    def posed_later(self, latency_s: float) -> Readings:
+        """Readings with the poses that their rows have some time later [s], which were so much older than they."""
+        if self.pose is None:
+            raise ValueError("Input readings must have a pose; instead received none.")
+        (position_m, rotation), later_s = self.pose, self.time_s + latency_s
+        return replace(
+            self,
+            array_position_m=vectors_at(later_s, self.time_s, position_m),
+            array_rotation=rotations_at(later_s, self.time_s, rotation),
+        )
+
     @property
     def pose(self) -> tuple[FloatArray, Rotation] | None:
         """Origin (n, 3) [m] and rotation of the array's frame in the world frame, if they are known."""
@@ -265,8 +275,11 @@ def read_readings(
     >>> magloc.read_readings(board.path, board.array).values_T.shape
     (101, 90)
     """
-    table = read_log(path, {of.id: _columns_of(of) for of in array.sensors}, array.columns, EXPECTED_HEADER)
+    channels = {of.id: _columns_of(of) for of in array.sensors if sensors is None or of.id in sensors}
+    table = read_log(path, channels, array.columns, EXPECTED_HEADER, _OPTIONAL_COLUMNS)
     readings = readings_of_table(table, array, sensors)
+    if array.columns is not None and array.columns.pose_latency_s:
+        readings = readings.posed_later(array.columns.pose_latency_s)
     if ordered:
         table.refuse_back("time_s", ~(np.diff(readings.time_s) > 0.0), "time to increase from row to row", "{:.15g}")
     if still and (change := change_between_rows(readings)) is not None:
@@ -292,7 +305,7 @@ def readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] |
     time_s = table.complete_and_distinct("time_s")
     position_m = rotation = ambient_T = pose_sigma = None
     if table.has_group(POSITION_COLUMNS + ROTATION_COLUMNS):
-        position_m, rotation = table.complete(POSITION_COLUMNS), unit_rotation(table)
+        position_m, rotation = table.complete(POSITION_COLUMNS), unit_rotation(table, ROTATION_COLUMNS)
     if table.has_group(POSE_SIGMA_COLUMNS):
         if position_m is None:
             place = table.header_place(POSE_SIGMA_COLUMNS[0])
@@ -383,8 +396,7 @@ def _check_channels(readings: Readings, array: SensorArray) -> None:
 
 
 def _check_sensor_columns(table: Table, array: SensorArray, channels: Sequence[str], *, ignore_others: bool) -> None:
-    poses = (*POSITION_COLUMNS, *ROTATION_COLUMNS, *POSE_SIGMA_COLUMNS)
-    known = ("time_s", *channels, *poses, *AMBIENT_COLUMNS, *MOTION_COLUMNS)
+    known = ("time_s", *channels, *_OPTIONAL_COLUMNS)
     called = f"array {array.name!r}" if array.name else "the array"
     table.require("time_s", known)
     for sensor in array.sensors:
@@ -431,19 +443,3 @@ def _columns_of_other_kind(sensor: Sensor) -> list[str]:
 
 def _listed(ids: Sequence[str], most: int = 6) -> str:
     return ", ".join(ids) if len(ids) <= most else f"{', '.join(ids[: most - 1])} … {ids[-1]}"
-
-
-def unit_rotation(table: Table, columns: Sequence[str] = ROTATION_COLUMNS) -> Rotation:
-    """Rotations of a table's columns of unit quaternions, scalar last."""
-    from scipy.spatial.transform import Rotation
-
-    quaternion = table.complete(columns)
-    norm = np.linalg.norm(quaternion, axis=1)
-    wrong = np.abs(norm - 1.0) > _UNIT_QUATERNION_ATOL
-    if wrong.any():
-        row = int(wrong.argmax())
-        raise InputError(
-            f"{table.row_place(row)}, columns {columns[0]} to {columns[-1]}: "
-            f"found a quaternion of norm {norm[row]:.6g}, expected norm 1."
-        )
-    return Rotation.from_quat(quaternion / norm[:, None])

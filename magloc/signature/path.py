@@ -18,7 +18,8 @@ from arrays.io.csv import read_table
 from arrays.io.errors import InputError
 from arrays.io.text import write_text
 from arrays.typing import FloatArray
-from magloc.readings import Readings, unit_rotation
+from magloc.navigation.poses import rotations_at, unit_rotation
+from magloc.readings import Readings
 from magloc.truth import TRUE_POSITION_COLUMNS, Truth, truth_of_rows
 
 if TYPE_CHECKING:
@@ -74,13 +75,7 @@ class ObjectPath:
         position, _ = truth_of_rows(wanted, Truth(self.time_s, self.position_m, name=self.name))
         if self.rotation is None:
             return position, None
-        if len(self.time_s) == 1:
-            return position, np.broadcast_to(self.rotation.as_matrix(), (len(time_s), 3, 3))
-        from scipy.spatial.transform import Slerp
-
-        order = np.argsort(self.time_s, kind="stable")
-        times = self.time_s[order]
-        return position, Slerp(times, self.rotation[order])(np.clip(time_s, times[0], times[-1])).as_matrix()
+        return position, rotations_at(time_s, self.time_s, self.rotation).as_matrix()
 
     def along_course(self) -> ObjectPath:
         """The path with its attitude: as it is, or level with the bow along the horizontal velocity.

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.spatial.transform import Slerp
 
-from arrays.typing import FloatArray, IntArray
+from arrays.typing import IntArray
+from magloc.navigation.poses import vectors_at
 from magloc.readings import Readings
 from magloc.surveying.joint_fit import Sources
 from magloc.surveying.rounds import Model
@@ -59,17 +59,11 @@ def lag_of(model_at: Callable[[float], Model], sources: Sources, group: IntArray
 
 def taken_earlier(readings: Readings, lag_s: float) -> Readings:
     """Readings with the poses of some time before their own, and the ambient field that belongs to these."""
-    assert readings.array_position_m is not None
-    assert readings.array_rotation is not None
-    time_s = readings.time_s
-    earlier = np.clip(time_s - lag_s, time_s[0], time_s[-1])
-
-    def at(columns: FloatArray) -> FloatArray:
-        return np.stack([np.interp(earlier, time_s, column) for column in columns.T], axis=1)
-
+    posed = readings.posed_later(-lag_s)
     ambient = readings.ambient_T
-    rotation = Slerp(time_s, readings.array_rotation)(earlier)
     if ambient is not None:  # in the world it hardly turns: between two directions its modulus would be too small
-        ambient = rotation.inv().apply(at(readings.array_rotation.apply(ambient)))
-    position = at(readings.array_position_m)
-    return replace(readings, array_position_m=position, array_rotation=rotation, ambient_T=ambient)
+        assert readings.array_rotation is not None
+        assert posed.array_rotation is not None
+        in_world = vectors_at(readings.time_s - lag_s, readings.time_s, readings.array_rotation.apply(ambient))
+        ambient = posed.array_rotation.inv().apply(in_world)
+    return replace(posed, ambient_T=ambient)

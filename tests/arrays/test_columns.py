@@ -59,9 +59,30 @@ class TestValues:
         )
         np.testing.assert_allclose(found.values_T[0], np.array([3.0, 4.0]) * of_nT, rtol=1e-14)
 
+    def test_other_columns_of_a_readings_file(self, tmp_path: Path) -> None:
+        """What the table does not name keeps its name: the ambient field, standard deviations of the pose, motion."""
+        columns = '[columns]\nunit = "uT"\nposition = ["E", "N", "U"]\n'
+        header = "time_s,low_nT,high_nT,E,N,U,array_sigma_m,array_sigma_deg,ambient_x_nT,ambient_y_nT,ambient_z_nT"
+        found = read(tmp_path, array_of(tmp_path, columns), f"{header}\n0,1,2,0,0,1,0.02,0.3,100,200,300\n")
+        assert found.pose_sigma is not None
+        assert found.ambient_T is not None
+        np.testing.assert_allclose(found.pose_sigma, [[0.02, np.radians(0.3)]])
+        np.testing.assert_allclose(found.ambient_T, [[1e-7, 2e-7, 3e-7]])
+        with pytest.raises(arrays.InputError, match="array_sigma_deg"):
+            read(tmp_path, array_of(tmp_path, columns), "time_s,low_nT,high_nT,E,N,U,array_sigma_m\n0,1,2,0,0,1,0.02\n")
+
+    def test_some_of_the_sensors(self, tmp_path: Path) -> None:
+        """The others' columns need not be there, whatever the table calls them."""
+        array = array_of(tmp_path, 'common_field_nT = 100.0\n[columns.sensors]\nlow = "A"\nhigh = "B"\n')
+        (tmp_path / "log.csv").write_text("time_s,A\n0,1\n1,2\n", encoding="utf-8")
+        found = magloc.read_readings(tmp_path / "log.csv", array, sensors=["low"])
+        np.testing.assert_allclose(found.values_T[:, 0], [1e-9, 2e-9])
+        part = magloc.read_readings(tmp_path / "log.csv", array.subset(["low"]))
+        assert part.values_T.tolist() == found.values_T.tolist()
+
 
 class TestPose:
-    GEODETIC = '[columns]\ngeodetic = ["Lat", "Lon", "Alt"]\n'
+    GEODETIC = '[columns]\ngeodetic = ["Lat", "Lon", "Alt"]\norigin = [50.0, 8.0, 100.0]\n'
 
     def test_latitude_and_longitude(self, tmp_path: Path) -> None:
         """A minute of latitude is a nautical mile of 1,852 m, by its definition, to the Earth's flattening."""
@@ -74,13 +95,15 @@ class TestPose:
         assert east == pytest.approx(1852.0 * np.cos(np.radians(50.0)), rel=5e-3)
         assert found.array_position_m[1, 2] == pytest.approx(1.0 - 1852.0**2 / 2.0 / 6.37e6, abs=0.01)
 
-    def test_an_origin(self, tmp_path: Path) -> None:
-        columns = self.GEODETIC + "origin = [50.0, 8.0, 90.0]\n"
-        found = read(
-            tmp_path, array_of(tmp_path, columns), "time_s,low_nT,high_nT,Lat,Lon,Alt\n0,1,2,50,8,100\n1,1,2,50,8,100\n"
-        )
-        assert found.array_position_m is not None
-        np.testing.assert_allclose(found.array_position_m[0], [0.0, 0.0, 10.0], atol=1e-6)
+    def test_origin(self, tmp_path: Path) -> None:
+        """Logs of the same origin are of the same world, wherever they begin."""
+        array, header = array_of(tmp_path, self.GEODETIC), "time_s,low_nT,high_nT,Lat,Lon,Alt"
+        whole = read(tmp_path, array, f"{header}\n0,1,2,50,8,110\n1,1,2,50.001,8,110\n")
+        part = read(tmp_path, array, f"{header}\n1,1,2,50.001,8,110\n")
+        assert whole.array_position_m is not None
+        assert part.array_position_m is not None
+        np.testing.assert_allclose(whole.array_position_m[0], [0.0, 0.0, 10.0], atol=1e-6)
+        assert part.array_position_m.tolist() == whole.array_position_m[1:].tolist()
 
     @pytest.mark.parametrize(
         ("angles", "of_row", "forward", "up"),
@@ -117,6 +140,39 @@ class TestPose:
         np.testing.assert_allclose(found.array_position_m[:-1, 0], 3.0 * time_s[:-1], atol=1e-9)
         np.testing.assert_allclose(found.array_rotation.as_euler("zyx")[:-1, 0], 0.1 * time_s[:-1], atol=1e-9)
 
+    LATE = '[columns]\nposition = ["E", "N", "U"]\nangles = ["Yaw"]\npose_latency_s = 0.5\n'
+
+    def test_latency_of_rows_in_any_order(self, tmp_path: Path) -> None:
+        array, header = array_of(tmp_path, self.LATE), "time_s,low_nT,high_nT,E,N,U,Yaw"
+        rows = [f"{t},1,2,{t},0,1,{10 * t}" for t in range(6)]
+        forth, back = (read(tmp_path, array, "\n".join([header, *order])) for order in (rows, rows[::-1]))
+        assert forth.array_position_m is not None
+        assert back.array_position_m is not None
+        assert back.array_position_m[::-1].tolist() == forth.array_position_m.tolist()
+        alone = read(tmp_path, array, f"{header}\n{rows[2]}")
+        assert alone.array_position_m is not None
+        assert alone.array_position_m.tolist() == [[2.0, 0.0, 1.0]]
+
+    @pytest.mark.parametrize(
+        ("row", "word"),
+        [
+            ("0,1,2,0,0,1,0\n0,1,2,1,0,1,0", "line 3, column time_s: found 0 as on line 2"),
+            (",1,2,0,0,1,0", "line 2, column time_s: found no value"),
+            ("0,1,2,0,,1,0", "line 2, column N: found no value"),
+            ("0,1,2,0,0,1,", "line 2, column Yaw: found no value"),
+        ],
+    )
+    def test_a_cell_that_is_not_there(self, row: str, word: str, tmp_path: Path) -> None:
+        with pytest.raises(arrays.InputError, match=word):
+            read(tmp_path, array_of(tmp_path, self.LATE), f"time_s,low_nT,high_nT,E,N,U,Yaw\n{row}\n")
+
+    @pytest.mark.parametrize("turn", [",,,", "0,0,0,0", "0,0,0,2"])
+    def test_no_quaternion(self, turn: str, tmp_path: Path) -> None:
+        columns = '[columns]\nposition = ["E", "N", "U"]\nquaternion = ["a", "b", "c", "d"]\npose_latency_s = 0.5\n'
+        rows = f"0,1,2,0,0,1,{turn}\n1,1,2,0,0,1,{turn}\n"
+        with pytest.raises(arrays.InputError, match="line 2"):
+            read(tmp_path, array_of(tmp_path, columns), f"time_s,low_nT,high_nT,E,N,U,a,b,c,d\n{rows}")
+
 
 class TestFile:
     def test_written_as_read(self, tmp_path: Path) -> None:
@@ -143,17 +199,26 @@ class TestFile:
             ('position = ["a", "b", "c"]\ngeodetic = ["a", "b", "c"]', "geodetic"),
             ('position = ["a", "b", "c"]\nangles = ["a", "b"]', "angles"),
             ('latitude = "Lat"', "latitude"),
+            ('geodetic = ["a", "b", "c"]', "origin"),
+            ('position = ["a", "b", "c"]\norigin = [1.0, 2.0, 3.0]', "geodetic and origin"),
+            ("unit = 0", "unit"),
+            ("unit = -2.0", "unit"),
+            ("pose_latency_s = inf", "pose_latency_s"),
+            ('sensors = {other = "A"}', "columns.sensors.other"),
+            ('sensors = {low = ["A", "B"]}', "columns.sensors.low: found 2 names"),
         ],
     )
     def test_bad_tables(self, columns: str, word: str, tmp_path: Path) -> None:
         with pytest.raises(arrays.InputError, match=word):
             array_of(tmp_path, f"[columns]\n{columns}\n")
 
+    def test_bad_values_in_python(self) -> None:
+        with pytest.raises(ValueError, match="Input unit must be one of nT"):
+            arrays.LogColumns(unit="kT")
+
     @pytest.mark.parametrize(
         ("columns", "header", "word"),
         [
-            ('[columns.sensors]\nother = "A"', "time_s,low_nT,high_nT", "columns.sensors.other"),
-            ('[columns.sensors]\nlow = ["A", "B"]', "time_s,low_nT,high_nT", "columns.sensors.low"),
             ('[columns.sensors]\nlow = "A"', "time_s,low_nT,high_nT", "column A"),
             ('[columns]\ntime = "UTC"', "time_s,low_nT,high_nT", "UTC"),
             ("[columns]", "time_s,low_nT,Mag2", "high_nT"),

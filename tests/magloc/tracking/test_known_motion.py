@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import magloc
+from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS
 from arrays.io.errors import InputError
 from magloc.chi_square import mean_bounds, normalised_square
 from magloc.navigation.measured_motion import MOTION_COLUMNS
-from magloc.readings import POSITION_COLUMNS, ROTATION_COLUMNS, write_readings
+from magloc.readings import write_readings
 from tests.passing_source import ARRAY, MOMENT, readings_of
 
 FloatArray = NDArray[np.float64]
