@@ -40,6 +40,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "read_telemetry": "adcs.io.telemetry_files",
         "solve_photograph": "adcs.stars.unknown_scale",
         "vector_attitude": "adcs.satellite.vectors",
+        "view": "adcs.viewer.view",
         "write_aem": "adcs.io.ccsds",
         "write_oem": "adcs.io.ccsds",
     },

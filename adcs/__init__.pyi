@@ -35,3 +35,4 @@ from adcs.stars.hipparcos import hipparcos_catalogue as hipparcos_catalogue
 from adcs.stars.identification import identify_stars as identify_stars
 from adcs.stars.pictures import read_picture as read_picture
 from adcs.stars.unknown_scale import solve_photograph as solve_photograph
+from adcs.viewer.view import view as view

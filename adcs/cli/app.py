@@ -64,6 +64,11 @@ for _name, _where, _help in (
         "Identify the stars of images by a catalogue, without knowing where the camera looked.",
     ),
     (
+        "view",
+        "adcs.cli.view:view",
+        "See the attitude of a log in three dimensions, in a browser, as a page, a picture or a film.",
+    ),
+    (
         "warm-up",
         "adcs.cli.warm_up:warm_up",
         "Compile ahead what run, estimate and imu compile when they are first used.",

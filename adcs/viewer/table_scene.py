@@ -16,7 +16,7 @@ from arrays.typing import FloatArray
 from magloc.viewer.scene.framing import Extent, extent_of
 from magloc.viewer.scene.glyphs import screen_label, screen_lines, solid
 from magloc.viewer.scene.legend import Colour, Swatch
-from magloc.viewer.scene.shapes import Surface, line_segments, surface_of
+from magloc.viewer.scene.shapes import Surface, line_segments, surface_of, unit_circle
 
 CEILING_M = 1.5
 """Height of the sky above the table; the source does not tell it."""
@@ -35,7 +35,6 @@ _RADIUS_M, _HEIGHT_M = 0.085, 0.1
 _RING_M, _ARROW_M = 0.105, 0.24
 _LIGHT_M = 0.016
 _TRAIL_POINTS = 400
-_AROUND = 40
 
 
 class TableScene:
@@ -70,8 +69,8 @@ class TableScene:
         self._late = self._mark("/fix", FIX_COLOUR, _HEIGHT_M + 0.006, 3.0)
         self._rejected = self._mark("/rejected-fix", _REJECTED_COLOUR, _HEIGHT_M + 0.006, 3.0)
         rim = unit_circle()
-        disc = np.concatenate([np.zeros((1, 3)), rim[:-1]])
-        faces = np.array([[0, i + 1, (i + 1) % (_AROUND) + 1] for i in range(_AROUND)])
+        disc, n = np.concatenate([np.zeros((1, 3)), rim[:-1]]), len(rim) - 1
+        faces = np.array([[0, i + 1, (i + 1) % n + 1] for i in range(n)])
         self._ellipse = solid(scene, "/ellipse", Surface(disc, faces), ESTIMATE_COLOUR, opacity=0.3)
         self._ellipse.visible = False
         # What the camera sees moves with it: only poses change.
@@ -240,12 +239,6 @@ def show_at(frame: viser.FrameHandle, place_m: FloatArray, heading_rad: float) -
 def turn_about_z(angle_rad: float) -> FloatArray:
     """Quaternion (w, x, y, z)."""
     return np.array([np.cos(0.5 * angle_rad), 0.0, 0.0, np.sin(0.5 * angle_rad)])
-
-
-def unit_circle() -> FloatArray:
-    """Points around the z axis, the first one again at the end, shape (n + 1, 3)."""
-    angle = 2.0 * np.pi * np.arange(_AROUND + 1) / _AROUND
-    return np.stack([np.cos(angle), np.sin(angle), np.zeros(_AROUND + 1)], axis=1)
 
 
 def satellite_body() -> Surface:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from magloc.localization.fit.fixes import Fixes
     from magloc.readings import Readings
     from magloc.viewer.pages.open_result import ReadingsResult, Result
+    from magloc.viewer.view import View
 
 
 Port = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, lte=65535))]
@@ -71,7 +73,7 @@ def view(
     import magloc
     from magloc.viewer.film import refuse_format
     from magloc.viewer.pages.open_result import ReadingsResult, read_result
-    from magloc.viewer.server import check_outputs, free_port
+    from magloc.viewer.server import check_outputs
 
     if str(path) == STREAM:
         if array is None or any(file is not None for file in (readings, html, png, movie)):
@@ -92,24 +94,37 @@ def view(
     elif isinstance(result, arrays.SensorArray):
         sensors, shown = result, None
     written = [str(file) for file in (html, png, movie) if file is not None]
+    title = path.name or path.resolve().name
+
+    def scene(port: int) -> View:
+        return magloc.view(
+            sensors, shown, readings=rows, html=html, png=png, movie=movie, open=open, port=port, title=title, file=file
+        )
+
+    written_or_served(scene, written, port, quiet=common.quiet, note=print_note)
+
+
+def written_or_served(
+    scene: Callable[[int], View], written: Sequence[str], port: int, *, quiet: bool, note: Callable[[str], None]
+) -> None:
+    """Make a scene, which writes files or is served at a port until Ctrl-C."""
+    from magloc.viewer.server import free_port
+
     with naming_outputs():
         used = port if written else free_port(port)
-        if used != port and port and not common.quiet:
-            print_note(f"port {port} is in use, {used} is taken")
-        title = path.name or path.resolve().name
-        scene = magloc.view(
-            sensors, shown, readings=rows, html=html, png=png, movie=movie, open=open, port=used, title=title, file=file
-        )
+        if used != port and port and not quiet:
+            note(f"port {port} is in use, {used} is taken")
+        view = scene(used)
     if written:
-        if not common.quiet:
-            print_note(f"wrote {', '.join(written)}")
+        if not quiet:
+            note(f"wrote {', '.join(written)}")
         return
     with suppress(KeyboardInterrupt):  # who has the address may press Ctrl-C before the waiting begins
-        if not common.quiet:
-            print_note("open this address in a browser; Ctrl-C ends the viewer")
-        print(scene.address, flush=True)
-        scene.wait()
-    scene.close()
+        if not quiet:
+            note("open this address in a browser; Ctrl-C ends the viewer")
+        print(view.address, flush=True)
+        view.wait()
+    view.close()
 
 
 def _view_stream(array: Path, port: int, *, open: bool, quiet: bool) -> None:

@@ -54,7 +54,7 @@ class View(Closing):
 
     def __init__(self, title: str, fill: Callable[[viser.ViserServer], Page], port: int) -> None:
         with ExitStack() as stack:
-            self._server = stack.enter_context(opened(free_port(port), f"magloc · {title}"))
+            self._server = stack.enter_context(opened(free_port(port), title))
             self._page = fill(self._server)
             stack.callback(self._page.close)
             self._open = stack.pop_all()
@@ -146,25 +146,46 @@ def view(
     >>> import magloc
     >>> view = magloc.view(arrays.grid(3, 3, 0.1), html="board.html", title="board")
     """
+    static = is_static(html, png, movie)
+    fill = _filling(array, result, readings, progress, None if file is None else Path(file), live=not static)
+    called = title or (array.name if array is not None else "") or "view"
+    return shown(f"magloc · {called}", fill, html=html, png=png, movie=movie, open=open, port=port)
+
+
+def is_static(html: str | Path | None, png: str | Path | None, movie: str | Path | None) -> bool:
+    """Whether a view is written or put into a notebook and not served; InputError for what cannot be written."""
     if movie is not None:
         refuse_format(Path(movie))
     check_outputs(html, png, movie)
-    static = any(path is not None for path in (html, png, movie)) or _in_notebook()
-    fill = _filling(array, result, readings, progress, None if file is None else Path(file), live=not static)
-    shown = View(title or (array.name if array is not None else "") or "view", fill, 0 if static else port)
+    return any(path is not None for path in (html, png, movie)) or _in_notebook()
+
+
+def shown(
+    title: str,
+    fill: Callable[[viser.ViserServer], Page],
+    *,
+    html: str | Path | None,
+    png: str | Path | None,
+    movie: str | Path | None,
+    open: bool,
+    port: int,
+) -> View:
+    """A scene that `fill` fills, served and opened, or written."""
+    static = is_static(html, png, movie)
+    view = View(title, fill, 0 if static else port)
     if not static:
         if open:
-            webbrowser.open(shown.address)
-        return shown
-    with shown:
+            webbrowser.open(view.address)
+        return view
+    with view:
         if html is not None:
-            write_page(shown.html, Path(html))
+            write_page(view.html, Path(html))
         if png is not None:
-            shown.write_png(Path(png))
+            view.write_png(Path(png))
         if movie is not None:
-            shown.write_movie(Path(movie))
-        _ = shown.html  # taken while there is a server
-    return shown
+            view.write_movie(Path(movie))
+        _ = view.html  # taken while there is a server
+    return view
 
 
 def _in_notebook() -> bool:

@@ -98,6 +98,10 @@ LINES: dict[str, tuple[str, ...]] = {
         "telemetry.csv --config scenario.toml --json",
         "telemetry.csv --config scenario.toml --method triad --out out",
     ),
+    "adcs view": (
+        "telemetry.csv --config scenario.toml --html out.html",
+        "imu.csv --config imu.toml --html out.html",
+    ),
     "adcs loads": ("loads.csv --array loads.toml --json --out out.csv",),
     "adcs imu": ("imu.csv --config imu.toml --json", "imu.csv --offline --out out"),
     "adcs calibrate": ("telemetry.csv --config scenario.toml --json --out out.csv",),

@@ -30,7 +30,7 @@ from magloc.tracking.results import TrackPoint, stacked
 from magloc.viewer.pages import words
 from magloc.viewer.panels.inputs import SharedInput
 from magloc.viewer.panels.latest import Latest
-from magloc.viewer.panels.played_time import PlayedTime, speed_text
+from magloc.viewer.panels.played_time import PlayedTime, speed_text, time_strip
 from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
     TRACK_COLOUR,
@@ -47,7 +47,6 @@ Poses = tuple[FloatArray, FloatArray]
 _SPEEDS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 1000.0)
 _SUITABLE_DURATION_S = 30.0
 _STEPS_OF_SLIDER = 1000.0
-_STRIP_PARTS = 200
 _BRIGHTEST = 0.88
 _WHOLE_COLOUR = (190, 196, 203)
 
@@ -219,13 +218,5 @@ def point_words(point: TrackPoint, when: str) -> str:
 
 def _strip(since_first_s: FloatArray, tracked: NDArray[np.bool_]) -> str:
     """A strip along the time, coloured where the source is tracked."""
-    n = min(_STRIP_PARTS, len(tracked))
-    span = max(float(since_first_s[-1]), 1e-300)
-    part = np.minimum((since_first_s / span * n).astype(np.intp), n - 1)
-    rows, found = np.bincount(part, minlength=n), np.bincount(part, tracked, minlength=n)
-    colour = f"rgb({','.join(map(str, TRACK_COLOUR))})"
-    # A part counts as tracked only if all its rows are, so that a short gap is seen.
-    stops = [colour if count and hit == count else "#d5d9de" for count, hit in zip(rows, found, strict=True)]
-    cells = "".join(f'<div style="flex:1;background:{stop}"></div>' for stop in stops)
     text = f"tracked in {int(tracked.sum())} of {len(tracked)} rows" + ("" if tracked.all() else "; grey: not tracked")
-    return words.panel([f'<div style="display:flex;height:0.6em;margin-top:0.4em">{cells}</div>{text}'])
+    return words.panel([time_strip(since_first_s, tracked, TRACK_COLOUR), text])

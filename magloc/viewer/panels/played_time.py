@@ -5,11 +5,26 @@ from __future__ import annotations
 from threading import Event, Lock, Thread, current_thread
 from time import perf_counter
 
+import numpy as np
 import viser
 
+from arrays.typing import BoolArray, FloatArray
 from magloc.viewer.panels.latest import Latest
+from magloc.viewer.scene.legend import Colour, css
 
+_STRIP_PARTS, _ROUNDING = 200, 1e-9  # of a part; even times have one each
 _FRAMES_PER_SECOND = 15.0
+
+
+def time_strip(since_first_s: FloatArray, found: BoolArray, colour: Colour) -> str:
+    """A strip along the time (n,) as HTML, coloured where all rows have found something: short gaps are seen."""
+    n = min(_STRIP_PARTS, len(found))
+    span = max(float(since_first_s[-1]), 1e-300)
+    part = np.minimum((since_first_s / span * n + _ROUNDING).astype(np.intp), n - 1)
+    rows, hits = np.bincount(part, minlength=n), np.bincount(part, found, minlength=n)
+    stops = [css(colour) if count and hit == count else "#d5d9de" for count, hit in zip(rows, hits, strict=True)]
+    cells = "".join(f'<div style="flex:1;background:{stop}"></div>' for stop in stops)
+    return f'<div style="display:flex;height:0.6em;margin-top:0.4em">{cells}</div>'
 
 
 def speed_text(speed: float) -> str:

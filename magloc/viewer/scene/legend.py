@@ -84,9 +84,9 @@ def with_legend(
 
 def _row(entry: Entry) -> str:
     if isinstance(entry, Swatch):
-        swatch = f"background:{_css(entry.colour)};width:.9em;height:.9em;border-radius:.15em;flex:none;margin-top:.2em"
+        swatch = f"background:{css(entry.colour)};width:.9em;height:.9em;border-radius:.15em;flex:none;margin-top:.2em"
         return f'<div style="display:flex;gap:.55em"><span style="{swatch}"></span>{escape(entry.text)}</div>'
-    gradient = ",".join(_css(colour) for colour in entry.colours)
+    gradient = ",".join(css(colour) for colour in entry.colours)
     bar = f"background:linear-gradient(to right,{gradient});height:.7em;border-radius:.15em"
     ends = f"<span>{escape(entry.low)}</span><span>{escape(entry.high)}</span>"
     return (
@@ -95,5 +95,6 @@ def _row(entry: Entry) -> str:
     )
 
 
-def _css(colour: Colour) -> str:
+def css(colour: Colour) -> str:
+    """A colour as a page writes it."""
     return f"rgb({colour[0]},{colour[1]},{colour[2]})"

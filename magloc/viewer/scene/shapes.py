@@ -23,6 +23,7 @@ IntArray = NDArray[np.int64]
 CHI2_95 = {2: 5.991464547107979, 3: 7.814727903251179}
 """95 % quantiles of χ², by degrees of freedom."""
 _AROUND, _ALONG = 24, 33  # points of a range region
+_OF_CIRCLE = 48
 _NEAREST_OF_RANGE = 0.02
 _SAME_LENGTH_RTOL = 1e-6
 
@@ -125,6 +126,12 @@ def line_segments(lines: ArrayLike) -> FloatArray:
     points = np.asarray(lines, dtype=np.float64)
     segments = np.stack([points[..., :-1, :], points[..., 1:, :]], axis=-2).reshape(-1, 2, 3)
     return segments[np.isfinite(segments).all(axis=(1, 2))]
+
+
+def unit_circle() -> FloatArray:
+    """Points (n + 1, 3) of a circle around the z axis, of radius 1, the first one again at the end."""
+    angle = 2.0 * np.pi * np.arange(_OF_CIRCLE + 1) / _OF_CIRCLE
+    return np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
 
 
 def frame_edges(positions_m: ArrayLike) -> FloatArray:

@@ -1,0 +1,134 @@
+"""``adcs view``: an attitude through time in three dimensions, in a browser, as a page, a picture or a film."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+import adcs
+from adcs.cli.options import print_note
+from arrays.io.arguments import Flag, whole_number
+from arrays.io.errors import InputError, naming
+from arrays.io.text import read_text
+from magloc.cli.framework import QuietOptions
+from magloc.cli.options import naming_outputs
+
+if TYPE_CHECKING:
+    from arrays.typing import FloatArray
+
+_OF_A_LAYOUT = {"log", "format_version"}
+_QUATERNION = ("qw", "qx", "qy", "qz")
+
+
+def view(
+    log: Path,
+    /,
+    *,
+    config: Path | None = None,
+    truth: Path | None = None,
+    html: Path | None = None,
+    png: Path | None = None,
+    movie: Path | None = None,
+    port: Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, lte=65535))] = 8080,
+    open: Flag = False,
+    common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
+) -> None:
+    """See the attitude of a log in three dimensions: body axes with 3σ cones, field and Sun as measured and expected.
+
+    Estimates as `adcs estimate` does, or `adcs imu` of an inertial unit, and starts a server on this machine, whose
+    address any browser on this machine opens; Ctrl-C ends it. With --html, --png or --movie a file is written instead.
+
+    Parameters
+    ----------
+    log : Path
+        Telemetry as of `adcs estimate`, such as `adcs run --out` writes, or a log as of `adcs imu`.
+    config : Path, optional
+        Scenario file of the satellite; or the layout of an inertial unit's log, a file with the table log alone.
+    truth : Path, optional
+        CSV file of the true attitude of telemetry, such as `adcs run --out` writes: time_s, qw, qx, qy, qz, orbital
+        frame from body.
+    html : Path
+        Write one static HTML file that plays and needs no server.
+    png : Path
+        Write a picture; needs Chromium or Chrome.
+    movie : Path
+        Write a film (.gif or .apng); needs Chromium or Chrome.
+    port : int
+        Port of the server; the next one that is free if it is in use.
+    open : bool
+        Open the browser.
+    common : QuietOptions
+        Common options.
+    """
+    from magloc.cli.view import written_or_served
+    from magloc.viewer.view import is_static
+
+    with naming_outputs():
+        is_static(html, png, movie)
+    track, *made_of, q_true = (
+        _of_inertial_unit(log, config, truth) if _is_layout(config) else _of_satellite(log, config, truth)
+    )
+    if not common.quiet:
+        for text in track.warnings:
+            print_note(f"warning: {text}")
+    files: dict[str, Any] = {"html": html, "png": png, "movie": movie}
+    written_or_served(
+        lambda used: adcs.view(track, *made_of, truth=q_true, open=open, port=used, title=log.stem, **files),
+        [str(file) for file in files.values() if file is not None],
+        port,
+        quiet=common.quiet,
+        note=print_note,
+    )
+
+
+def _is_layout(config: Path | None) -> bool:
+    """Whether a file, if there is one, describes a log alone."""
+    if config is None:
+        return True
+    try:
+        return set(tomllib.loads(read_text(config, "a TOML file"))) <= _OF_A_LAYOUT
+    except tomllib.TOMLDecodeError:
+        return False
+
+
+def _of_inertial_unit(log: Path, config: Path | None, truth: Path | None) -> tuple[Any, ...]:
+    if truth is not None:
+        raise InputError(
+            f"--truth {truth}: found it with the log of an inertial unit, expected the truth in its columns."
+        )
+    data = adcs.read_imu(log, config)
+    record = data.record
+    with naming(str(log)):
+        readings = (record.time_s, record.rate_rad_s, record.acceleration_m_s2, record.field_T)
+        track = adcs.inertial_magnetic_filter(*readings, gyro_samples=record.gyro_samples)
+    return track, data, None, data.q_true
+
+
+def _of_satellite(log: Path, config: Path | None, truth: Path | None) -> tuple[Any, ...]:
+    scenario = adcs.read_scenario(str(config))
+    telemetry = adcs.read_telemetry(log, scenario.step_s, layout=scenario.log)
+    q_true = None if truth is None else _truth(truth, telemetry.time_s)
+    with naming(str(log)):
+        track = adcs.estimate(telemetry, scenario.satellite, sensors=scenario.estimator(f"{config}, table estimate"))
+    return track, telemetry, scenario.satellite, q_true
+
+
+def _truth(path: Path, time_s: FloatArray) -> FloatArray:
+    """True attitudes at some instants; NaN where the file has none."""
+    import numpy as np
+
+    from adcs.viewer.attitude_replay import rows_at
+    from arrays.io.csv import read_table
+
+    columns = ("time_s", *_QUATERNION)
+    table = read_table(path, "a header with time_s, qw, qx, qy and qz", only=columns)
+    for name in columns:
+        table.require(name, columns)
+    at = rows_at(time_s, table.complete_and_distinct("time_s"))
+    if (at < 0).all():
+        raise InputError(f"{path}: found none of the log's times, expected rows with the same time_s.")
+    return np.where((at >= 0)[:, None], table.finite_or_missing(_QUATERNION)[at], np.nan)

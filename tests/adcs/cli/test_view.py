@@ -1,0 +1,57 @@
+"""``adcs view``: pages of logs, and what it refuses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import adcs as library
+from tests.adcs.refusals import assert_refused
+
+
+@pytest.fixture(scope="module")
+def satellite() -> Path:
+    return library.datasets.load("satellite").path
+
+
+def config_of(path: Path) -> Path:
+    return path.with_name(f"{path.stem}-scenario.toml")
+
+
+class TestPage:
+    def test_satellite(self, adcs, satellite, tmp_path):
+        truth = satellite.with_name(f"{satellite.stem}-truth.csv")
+        outcome = adcs(
+            "view", satellite, "--config", config_of(satellite), "--truth", truth, "--html", tmp_path / "a.html"
+        )
+        assert outcome.status == 0, outcome.err
+        page = (tmp_path / "a.html").read_text(encoding="utf-8")
+        for words in ("true body axes", "3σ cones", "field: thick as measured", "the bar below plays the rows"):
+            assert words in page
+
+    def test_inertial_unit(self, adcs, tmp_path):
+        log = library.datasets.load("imu").path
+        assert adcs("view", log, "--html", tmp_path / "a.html", "--quiet").err == ""
+        page = (tmp_path / "a.html").read_text(encoding="utf-8")
+        assert "up: thick as measured" in page
+        assert "true body axes" not in page
+
+
+class TestRefused:
+    def test_truth_of_an_inertial_unit(self, adcs, tmp_path):
+        log = library.datasets.load("imu").path
+        assert_refused(adcs("view", log, "--truth", log, "--html", tmp_path / "a.html"), "--truth")
+
+    def test_truth_of_another_time(self, adcs, satellite, tmp_path):
+        (tmp_path / "truth.csv").write_text("time_s,qw,qx,qy,qz\n-5,1,0,0,0\n", encoding="utf-8")
+        files = (satellite, "--config", config_of(satellite), "--truth", tmp_path / "truth.csv")
+        assert_refused(adcs("view", *files, "--html", tmp_path / "a.html"), "none of the log's times")
+        assert not (tmp_path / "a.html").exists()
+
+    def test_a_film_of_another_kind(self, adcs, satellite):
+        assert_refused(adcs("view", satellite, "--config", config_of(satellite), "--movie", "a.mp4"), ".gif or .apng")
+
+    def test_a_log_of_no_kind(self, adcs, tmp_path):
+        (tmp_path / "log.csv").write_text("a,b\n1,2\n", encoding="utf-8")
+        assert_refused(adcs("view", tmp_path / "log.csv", "--html", tmp_path / "a.html"), "log.csv")
