@@ -10,12 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
+from magloc.ambient import in_world_field
 from magloc.localization.fit.results import EVERYWHERE, Intervals, Solution, is_observable_set
 from magloc.localization.uncertainty.ambiguity import LARGEST_GAUSSIAN_SIGMA, relative_sigma
 from magloc.localization.uncertainty.range_interval import gaussian_ranges, union
 from magloc.measurement.pose import ArrayPose, rates_of
-from magloc.readings import Readings
+from magloc.readings import Readings, without_saturated
 from magloc.tracking.chart.mixture import Mixture
 
 
@@ -209,6 +211,23 @@ def rows_of(readings: Readings) -> Iterator[Row]:
             columns |= {"velocity_m_s": velocity_m_s, "rate_rad_s": rate_rad_s}
     for i, time in enumerate(readings.time_s.tolist()):
         yield Row(time, readings.values_T[i], **{name: column[i] for name, column in columns.items()})
+
+
+def next_row(row: Row | Readings, array: SensorArray, after_s: float) -> Row:
+    """The one row that comes after a time: of readings, without those that saturate.
+
+    Raises
+    ------
+    ValueError
+        Time goes backwards, or the readings are not one row.
+    """
+    if isinstance(row, Readings):
+        if len(row) != 1:
+            raise ValueError(f"Input row must be readings of length one; instead received {len(row)} rows.")
+        row = next(rows_of(in_world_field(without_saturated(row, array), array)))
+    if row.time_s <= after_s:
+        raise ValueError(f"Input time_s must increase; instead {row.time_s} s follows {after_s} s.")
+    return row
 
 
 def stacked(points: Sequence[TrackPoint], name: str, *shape: int) -> FloatArray:

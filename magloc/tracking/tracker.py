@@ -22,7 +22,6 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
-from magloc.ambient import in_world_field
 from magloc.blas_threads import one_blas_thread
 from magloc.kalman import (
     block_update,
@@ -33,7 +32,7 @@ from magloc.kalman import (
 from magloc.levels import CONTRADICTION
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.nuisances import Drift
-from magloc.readings import Readings, without_saturated
+from magloc.readings import Readings
 from magloc.tracking.acquisition import STACKED_POSITION_ERROR, Acquisition
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.row import ChartRow
@@ -41,7 +40,7 @@ from magloc.tracking.chart.start import prior_root
 from magloc.tracking.chart.steps import LARGEST_WIDTH, ChartFilter, Known, cartesian, charted, width_of
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import Innovation, Prediction, Row, Step, TrackPoint, moving, rows_of
+from magloc.tracking.results import Innovation, Prediction, Row, Step, TrackPoint, moving, next_row
 
 ROWS_TO_LOSE = 3
 """Contradicting rows in a row that end a track."""
@@ -138,12 +137,7 @@ class Tracker:
         ValueError
             Time goes backwards, or the readings are not one row.
         """
-        if isinstance(row, Readings):
-            if len(row) != 1:
-                raise ValueError(f"Input row must be readings of length one; instead received {len(row)} rows.")
-            row = next(rows_of(in_world_field(without_saturated(row, self.array), self.array)))
-        if row.time_s <= self._time_s:
-            raise ValueError(f"Input time_s must increase; instead {row.time_s} s follows {self._time_s} s.")
+        row = next_row(row, self.array, self._time_s)
         if self.pose_errors.n_states:
             row, self._row_before = moving(row, self._row_before), row
         dt_s, self._time_s = row.time_s - self._time_s, row.time_s

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -29,9 +30,15 @@ class SourcesWanted:
     prior: SourcePrior
 
     def tracker(self, array: SensorArray) -> magloc.SourcesTracker:
-        """A filter of these sources; what the array cannot tell is said of the option."""
-        try:
+        """A filter of these sources."""
+        with self.named():
             return magloc.SourcesTracker(array, sources=self.sources, motion=self.motion, prior=self.prior)
+
+    @contextmanager
+    def named(self) -> Iterator[None]:
+        """What an array cannot tell is said of the option."""
+        try:
+            yield
         except ValueError as error:
             sentence = str(error).removeprefix("Input ")
             if not sentence.startswith("sources"):
@@ -52,19 +59,19 @@ def follow_sources(
 ) -> None:
     """Follow sources through a file of readings; none in any row is an InputError."""
     from magloc.tracking.multi_target.files import json_of_sources
-    from magloc.tracking.results import rows_of
 
     if rows.background:
         raise InputError("--sources: found it together with --detrend or --high-pass-hz, expected one of them.")
-    with progress(len(rows), "rows", quiet=quiet) as advance, naming(name):
-        tracker = wanted.tracker(array)
-        points = []
-        for row in rows_of(rows):
-            points.append(tracker.update(row))
-            if jsonl:
-                wanted.printed(points[-1])
-            advance(1)
-    found = magloc.SourcesTrack(tuple(points), rows)
+    with progress(len(rows), "rows", quiet=quiet) as advance, naming(name), wanted.named():
+        found = magloc.track_sources(
+            array,
+            rows,
+            sources=wanted.sources,
+            motion=wanted.motion,
+            prior=wanted.prior,
+            progress=advance,
+            told=wanted.printed if jsonl else None,
+        )
     if json:
         print_json({"results": [json_of_sources(point, single=wanted.sources == 1) for point in found]})
     if not found.ids:

@@ -117,6 +117,7 @@ def track_sources(
     motion: FreeMotion = FreeMotion(),  # noqa: B008 - frozen
     prior: SourcePrior = NOTHING_KNOWN,
     progress: Callable[[int], None] | None = None,
+    told: Callable[[SourcesPoint], object] | None = None,
 ) -> SourcesTrack:
     """Follow several moving sources through the rows of readings, in one joint filter.
 
@@ -138,6 +139,8 @@ def track_sources(
         Bounds of every source in the array's frame, and its strength, if that is known.
     progress : callable, optional
         Called with the number of rows finished since the last call.
+    told : callable, optional
+        Called with what is known after every row, as soon as it is.
 
     Returns
     -------
@@ -165,6 +168,8 @@ def track_sources(
     points = []
     for row in rows_of(used):
         points.append(tracker.update(row))
+        if told is not None:
+            told(points[-1])
         if progress is not None:
             progress(1)
     return SourcesTrack(tuple(points), used)

@@ -12,11 +12,10 @@ from scipy.optimize import linear_sum_assignment
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
-from magloc.ambient import in_world_field
 from magloc.blas_threads import one_blas_thread
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.rows import check_magnitudes
-from magloc.readings import Readings, without_saturated
+from magloc.readings import Readings
 from magloc.tracking.multi_target.explanations import (
     COST_LIMIT,
     MANOEUVRE_AGILITY,
@@ -32,7 +31,7 @@ from magloc.tracking.multi_target.results import SourcePoint, SourcesPoint
 from magloc.tracking.multi_target.sensor_health import SensorHealth
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
 from magloc.tracking.multi_target.update import innovation_chi2
-from magloc.tracking.results import Row, rows_of
+from magloc.tracking.results import Row, next_row
 
 ROWS_TO_REPORT = 10
 """Rows after its birth in which a source is not yet told, unless there is no other: one taken for two dies sooner."""
@@ -154,12 +153,7 @@ class SourcesTracker:
         ValueError
             Time goes backwards, or the readings are not one row.
         """
-        if isinstance(row, Readings):
-            if len(row) != 1:
-                raise ValueError(f"Input row must be readings of length one; instead received {len(row)} rows.")
-            row = next(rows_of(in_world_field(without_saturated(row, self.scene.array), self.scene.array)))
-        if row.time_s <= self._time_s:
-            raise ValueError(f"Input time_s must increase; instead {row.time_s} s follows {self._time_s} s.")
+        row = next_row(row, self.scene.array, self._time_s)
         dt_s = 0.0 if math.isnan(self._time_s) else row.time_s - self._time_s
         self._time_s = row.time_s
         problem = RowProblem(self.scene, row, self._n_rows)
@@ -176,12 +170,12 @@ class SourcesTracker:
         found = next(found for hypothesis, found in children if hypothesis.state is best.state)
         explained = best.state is found.update.state
         status = "misfit" if not explained else "tracked" if best.ids else "no source"
-        if status == "tracked" and (best.excess > _POOR).any():
+        is_poor = bool((best.excess > _POOR).any())
+        if status == "tracked" and is_poor:
             status = "doubtful"
-        poor = bool((best.excess > _POOR).any()) or best.health.suspect is not None
         if len(best.ids) > 1 and self._n_rows % _DOUBT_EVERY == 0:
             self._hypotheses += self._superfluous(problem, best, found)
-        if best.ids and poor and self._n_rows >= self._next_restart:
+        if best.ids and (is_poor or best.health.suspect is not None) and self._n_rows >= self._next_restart:
             self._next_restart = self._n_rows + _RESTART_PAUSE
             restarts = self._restarts(problem, best, found)
             # Whether the suspect is at fault, they are to tell.

@@ -99,7 +99,8 @@ def joint_update(prior: JointState, row: JointRow) -> JointUpdate:
         state = prior.moved(error)
         h, H = row.predicted(state)
         r = row.z - h
-        cost = float(r @ r + y @ y)
+        with np.errstate(over="ignore"):
+            cost = float(r @ r + y @ y)
         if not cost < best:
             if best == np.inf:  # a source stands on a sensor
                 break

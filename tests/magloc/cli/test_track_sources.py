@@ -105,6 +105,13 @@ class TestBadInput:
         outcome = run("track", files[0], "--array", files[1], "--sources", 2, "--detrend")
         assert_refused(outcome, "--detrend", "expected one of them")
 
+    def test_measured_velocities(self, run: Run, files: tuple[Path, Path], tmp_path: Path) -> None:
+        lines = files[0].read_text().splitlines()
+        header = f"{lines[0]},array_vx_m_s,array_vy_m_s,array_vz_m_s"
+        (tmp_path / "moving.csv").write_text("\n".join([header, *(f"{line},0,0,0" for line in lines[1:])]) + "\n")
+        outcome = run("track", tmp_path / "moving.csv", "--array", files[1], "--sources", 2)
+        assert_refused(outcome, "moving.csv", "measured velocities")
+
     def test_noise_alone(self, run: Run, files: tuple[Path, Path], tmp_path: Path) -> None:
         noise = Readings(5e-7 * np.random.default_rng(0).normal(size=(5, 90)), time_s=np.arange(5.0))
         write_readings(tmp_path / "noise.csv", noise, board())

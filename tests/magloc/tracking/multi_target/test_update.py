@@ -163,3 +163,12 @@ class TestContradictions:
         assert found.residual[4] == 0.0
         assert np.isfinite(found.sensor_chi2).all()
         assert found.state.P.shape == (2 * 2 * N_SEEN + 3,) * 2
+
+    def test_a_source_on_a_sensor_costs_without_end(self):
+        """So near that its readings' square is beyond double precision."""
+        state = known(1, 0.05)
+        near = replace(state, position_m=BOARD.positions[:1] + np.array([0.0, 0.0, 1e-55]))
+        found = joint_update(near, JointRow.of(BOARD, Row(0.0, readings(np.random.default_rng(6)))))
+        assert np.isinf(found.cost)
+        assert not found.converged
+        np.testing.assert_array_equal(found.state.position_m, near.position_m)
