@@ -93,7 +93,7 @@ def with_ambient_field(
                 " the array file, or place and date): moduli are taken as those of the source alone"
             )
         return array, None
-    if scalar:
+    if scalar and not array.row_ambient_uncertainty_T:
         _LOG.info("note: the geomagnetic model is taken as exact; crust and storms make it wrong by some 100 nT")
     if readings.array_rotation is None:
         return replace(array, ambient_T=tuple(model_T.tolist())), None

@@ -19,7 +19,6 @@ from arrays.array import SensorArray
 from arrays.differences import Differences, decorrelated_differences
 from arrays.typing import FloatArray
 from magloc.fields import dipole
-from magloc.navigation.rotations import cross_matrix
 
 _NICE_SIGNAL = 300.0
 _NICE_RANGE = 3.0
@@ -50,15 +49,6 @@ def channel_jacobian(
     jacobian = dipole.field_jacobian(array.positions, p, m)
     rows = array.linear_gain(fields_at_sensors(array, position_m, moment_Am2, ambient_T))
     return np.einsum("...ci,...cij->...cj", rows, jacobian[..., array.channel_sensor, :, :])
-
-
-def turn_jacobian(
-    array: SensorArray, position_m: ArrayLike, moment_Am2: ArrayLike, ambient_T: FloatArray | None = None
-) -> FloatArray:
-    """Derivative (..., C, 3) of :func:`predicted_channels` where ambient fields (..., N, 3) turn by b × θ [T/rad]."""
-    rows = array.linear_gain(fields_at_sensors(array, position_m, moment_Am2, ambient_T))
-    turned = cross_matrix(array.ambient_fields if ambient_T is None else ambient_T)
-    return np.einsum("...ci,...cij->...cj", rows, turned[..., array.channel_sensor, :, :])
 
 
 def fields_at_sensors(

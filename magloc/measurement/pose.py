@@ -1,4 +1,4 @@
-r"""Errors of an array's pose: what they do to its readings, and how they last from row to row.
+r"""Errors of an array's pose and of the ambient field: what they do to its readings, how they last from row to row.
 
 With the true attitude :math:`R e^{[θ]_×}`, the true place of the pose's reference point moved by δx in the world, and
 the lever arm l from there to the array's origin wrong by δl, a source at p with the moment m stands in the array's axes
@@ -8,6 +8,12 @@ at
 
 and an ambient field that is known through the attitude turns as m does. An error δt of the clock moves and turns with
 the array's own motion: :math:`δx = \dot x δt`, :math:`θ = ω δt`.
+
+An error d of the ambient field b in the world counts along b as one of its modulus, across as a turn of its direction,
+
+.. math:: b' = (|b| + u \cdot d) \, w/|w|, \qquad w = u + (1 - u u^T) d/|b|, \qquad u = b/|b|,
+
+since moduli know the first much better than the second: along a straight d they would lose the square of it.
 """
 
 from __future__ import annotations
@@ -21,13 +27,13 @@ import numpy as np
 from arrays.array import SensorArray
 from arrays.pose import PoseUncertainty
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.measurement.differences import channel_jacobian, turn_jacobian
+from magloc.measurement.differences import channel_jacobian, fields_at_sensors
 from magloc.navigation.rotations import cross_matrix, rotation_matrix, turn_of_change
 from magloc.readings import Readings
 
-N_POSE = 9
-"""Numbers of an error of a pose: θ [rad], δx [m], δl [m]."""
-TURN, SHIFT, LEVER = slice(0, 3), slice(3, 6), slice(6, 9)
+N_POSE = 12
+"""Numbers of an error of a pose: θ [rad], δx [m], δl [m], and that of the ambient field d [T]."""
+TURN, SHIFT, LEVER, FIELD = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
 _N_CLOCK = 1
 _NO_ERROR = np.zeros(N_POSE)
 
@@ -62,7 +68,7 @@ class ArrayPose:
         return self.velocity_m_s - self.R_world_from_array @ np.cross(self.rate_rad_s, self.lever_arm_m)
 
     def turned(self, error: FloatArray | None = None) -> FloatArray:
-        """True attitude, array to world (..., 3, 3), where the pose has errors (..., 9)."""
+        """True attitude, array to world (..., 3, 3), where the pose has errors (..., 12)."""
         R = self.R_world_from_array
         return R if error is None else R @ rotation_matrix(error[..., TURN])
 
@@ -77,7 +83,7 @@ class ArrayPose:
         return np.concatenate([position, (source[..., None, 3:6] @ R)[..., 0, :]], axis=-1)
 
     def error_jacobian(self, in_array: FloatArray, error: FloatArray) -> FloatArray:
-        """Derivative (..., 6, 9) of :meth:`in_array`, which is given, by the errors."""
+        """Derivative (..., 6, 12) of :meth:`in_array`, which is given, by the errors."""
         right = turn_of_change(-error[..., TURN])
         D = np.zeros((*in_array.shape, N_POSE))
         D[..., :3, TURN] = cross_matrix(in_array[..., :3] + self.lever_arm_m + error[..., LEVER]) @ right
@@ -87,7 +93,7 @@ class ArrayPose:
         return D
 
     def world_jacobian(self, in_array: FloatArray) -> FloatArray:
-        """Derivative (6, 9) by the error at zero of a source of the world that is known in the array's axes, (6,)."""
+        """Derivative (6, 12) by the error at zero of a source of the world that is known in the array's axes, (6,)."""
         R = self.R_world_from_array
         J = np.zeros((6, N_POSE))
         J[:3, TURN] = -R @ cross_matrix(in_array[:3] + self.lever_arm_m)
@@ -95,6 +101,44 @@ class ArrayPose:
         J[:3, LEVER] = R
         J[3:, TURN] = -R @ cross_matrix(in_array[3:])
         return J
+
+    def ambient(self, fields_T: FloatArray, error: FloatArray) -> FloatArray:
+        """Ambient fields (..., N, 3) in the true axes of the array, of which some (N, 3) are stated."""
+        mean_T = fields_T.mean(axis=0)
+        true_T, _ = _field_with_error(mean_T, error[..., FIELD] @ self.R_world_from_array)
+        return np.asarray((fields_T + (true_T - mean_T)[..., None, :]) @ rotation_matrix(error[..., TURN]))
+
+    def ambient_jacobian(
+        self, array: SensorArray, in_array: FloatArray, error: FloatArray, fields_T: FloatArray
+    ) -> FloatArray:
+        """Derivative (..., C, 12) of channels by what errors do to the ambient fields that are stated (N, 3) [T].
+
+        The sources (..., 6) stay in the true axes of the array.
+        """
+        ambient_T = self.ambient(fields_T, error)
+        rows = array.linear_gain(fields_at_sensors(array, in_array[..., :3], in_array[..., 3:], ambient_T))
+        turned = np.einsum("...ci,...cij->...cj", rows, cross_matrix(ambient_T)[..., array.channel_sensor, :, :])
+        R = self.R_world_from_array
+        _, moved = _field_with_error(fields_T.mean(axis=0), error[..., FIELD] @ R)
+        J = np.zeros((*turned.shape[:-1], N_POSE))
+        J[..., TURN] = turned @ turn_of_change(-error[..., TURN])
+        J[..., FIELD] = rows @ np.swapaxes(rotation_matrix(error[..., TURN]), -1, -2) @ moved @ R.T
+        return J
+
+
+def _field_with_error(field_T: FloatArray, error_T: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A field (3,) with errors (..., 3) of its modulus and direction, and the derivative (..., 3, 3) by these."""
+    modulus_T, one = float(np.linalg.norm(field_T)), np.eye(3)
+    if modulus_T == 0.0:
+        return error_T, np.broadcast_to(one, (*error_T.shape, 3))
+    unit = field_T / modulus_T
+    longer_T = modulus_T + error_T @ unit
+    w = unit + error_T @ (one - np.outer(unit, unit)) / modulus_T
+    length = np.linalg.norm(w, axis=-1)
+    direction = w / length[..., None]
+    across = (one - direction[..., :, None] * direction[..., None, :]) @ (one - np.outer(unit, unit))
+    share = longer_T / (length * modulus_T)
+    return longer_T[..., None] * direction, direction[..., :, None] * unit + share[..., None, None] * across
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +149,7 @@ class PosesOfRows:
     ----------
     array : SensorArray
     poses : sequence of ArrayPose
-    effects : list of ndarray, shape (9, n)
+    effects : list of ndarray, shape (12, n)
     """
 
     array: SensorArray
@@ -120,56 +164,79 @@ class PosesOfRows:
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """The errors of an array's poses, as states of unit variance.
+    """The errors of an array's poses and of the ambient field, as states of unit variance.
 
     Attributes
     ----------
     uncertainty : PoseUncertainty
     of_pose : ndarray of int, shape (n,)
-        What each of the n states is of: a component of the error (0 to 8), or 9, the clock.
-    changes : ndarray of bool, shape (n,)
-        Whether it changes; else it is constant.
+        What each of the n states is of: a component of the error (0 to 11), or 12, the clock.
+    lasts_s : ndarray, shape (n,)
+        How long it does: 0 of one that is new in every row, infinite of a constant.
+    ambient_T : tuple of 2 floats
+        Standard deviations of the ambient field's constant error and of the one that is new in every row.
     """
 
     uncertainty: PoseUncertainty
     of_pose: IntArray
-    changes: BoolArray
+    lasts_s: FloatArray
+    ambient_T: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def of(cls, uncertainty: PoseUncertainty | None) -> PoseErrors:
+    def of(cls, uncertainty: PoseUncertainty | None, ambient_T: tuple[float, float] = (0.0, 0.0)) -> PoseErrors:
         """All errors that are stated; what changes of place and attitude always is, a row may say how much."""
-        if uncertainty is None:
-            return cls(PoseUncertainty(), np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.bool_))
-        turn, shift, lever, clock = list(range(3)), list(range(3, 6)), list(range(6, 9)), [N_POSE]
-        changing = turn + shift + (clock if uncertainty.time_s else [])
-        constant = [
-            *(turn if uncertainty.attitude_constant_rad else []),
-            *(lever if uncertainty.position_constant_m else []),
-            *(clock if uncertainty.time_constant_s else []),
-        ]
-        of_pose = np.array(changing + constant, dtype=np.intp)
-        return cls(uncertainty, of_pose, np.arange(of_pose.size) < len(changing))
+        turn, shift, lever, field = (list(range(N_POSE)[part]) for part in (TURN, SHIFT, LEVER, FIELD))
+        clock, known = [N_POSE], uncertainty or PoseUncertainty()
+        parts: list[tuple[list[int], float, float]] = []
+        if uncertainty is not None:
+            parts = [
+                (turn + shift, known.correlation_s, 1.0),
+                (clock, known.correlation_s, known.time_s),
+                (turn, np.inf, known.attitude_constant_rad),
+                (lever, np.inf, known.position_constant_m),
+                (clock, np.inf, known.time_constant_s),
+            ]
+        parts += [(field, np.inf, ambient_T[0]), (field, 0.0, ambient_T[1])]
+        stated = [(component, lasts_s) for of, lasts_s, size in parts if size for component in of]
+        of_pose, lasts = np.array(stated, dtype=np.float64).reshape(-1, 2).T
+        return cls(known, of_pose.astype(np.intp), lasts, ambient_T)
+
+    @classmethod
+    def of_array(cls, array: SensorArray) -> PoseErrors:
+        """All that an array states; its vector sensors' differences do not see an error of the ambient field."""
+        moduli = bool(array.channel_is_scalar.any())
+        known = (array.ambient_uncertainty_T, array.ambient_uncertainty_white_T) if moduli else (0.0, 0.0)
+        return cls.of(array.pose, known)
 
     @property
     def n_states(self) -> int:
         """Number of errors."""
         return self.of_pose.size
 
+    @property
+    def changes(self) -> BoolArray:
+        """Whether every one changes (n,)."""
+        return np.isfinite(self.lasts_s)
+
+    @property
+    def of_mounting(self) -> BoolArray:
+        """Whether every one is a constant of the mounting or of the lever arm (n,)."""
+        return np.asarray(~self.changes & (self.of_pose < FIELD.start))
+
     def step(self, dt_s: float | FloatArray) -> tuple[FloatArray, FloatArray]:
         """What remains of every error after steps (...), and the standard deviation of what is added: (..., n) each."""
-        lasts_s = self.uncertainty.correlation_s
-        share = np.exp(-np.asarray(dt_s) / lasts_s) if lasts_s else np.zeros(np.shape(dt_s))
-        kept = np.where(self.changes, share[..., None], 1.0)
+        lasts = self.lasts_s > 0.0
+        kept = np.where(lasts, np.exp(-np.asarray(dt_s)[..., None] / np.where(lasts, self.lasts_s, 1.0)), 0.0)
         return kept, np.sqrt(1.0 - kept**2)
 
     def effect(self, pose: ArrayPose, sigma: FloatArray | None = None) -> FloatArray:
-        """The error (9, n) of a pose by every state; `sigma` (2,) of place and attitude stands for the array's own."""
+        """The error (12, n) of a pose by every state; `sigma` (2,) of place and attitude stands for the array's own."""
         if not self.n_states:
             return np.zeros((N_POSE, 0))
         return self.effects(pose.rate_rad_s, pose.reference_velocity_m_s, sigma)
 
     def effects(self, rate_rad_s: FloatArray, velocity_m_s: FloatArray, sigma: FloatArray | None = None) -> FloatArray:
-        """Those (..., 9, n) of arrays that turn and whose reference points move so, (..., 3) each."""
+        """Those (..., 12, n) of arrays that turn and whose reference points move so, (..., 3) each."""
         known, rows = self.uncertainty, rate_rad_s.shape[:-1]
         stated = np.array([known.position_m, known.attitude_rad]) if sigma is None else sigma
         unit = np.zeros((*rows, N_POSE, N_POSE + _N_CLOCK))
@@ -177,9 +244,10 @@ class PoseErrors:
         unit[..., TURN, N_POSE], unit[..., SHIFT, N_POSE] = rate_rad_s, velocity_m_s
         changing = np.zeros((*rows, N_POSE + _N_CLOCK))
         changing[..., TURN], changing[..., SHIFT] = stated[..., 1:], stated[..., :1]
-        changing[..., N_POSE] = known.time_s
+        changing[..., FIELD], changing[..., N_POSE] = self.ambient_T[1], known.time_s
+        constant_T, arm_m = self.ambient_T[0], known.position_constant_m
         constant = np.repeat(
-            [known.attitude_constant_rad, 0.0, known.position_constant_m, known.time_constant_s], [3, 3, 3, 1]
+            [known.attitude_constant_rad, 0.0, arm_m, constant_T, known.time_constant_s], [3, 3, 3, 3, 1]
         )
         size = np.where(self.changes, changing[..., self.of_pose], constant[self.of_pose])
         return unit[..., self.of_pose] * size[..., None, :]
@@ -190,14 +258,14 @@ class PoseErrors:
         """Errors of several rows together, as they last between these; None where there are none."""
         if not self.n_states:
             return None
-        lasts_s = self.uncertainty.correlation_s
         apart_s = np.abs(time_s[:, None] - time_s)
-        share = np.linalg.cholesky(np.exp(-apart_s / lasts_s) if lasts_s else np.eye(len(time_s)))
-        effects = []
-        for i, (pose, sigma) in enumerate(zip(poses, sigmas, strict=True)):
-            own = self.effect(pose, sigma)
-            effects.append(np.hstack([np.kron(share[i], own[:, self.changes]), own[:, ~self.changes]]))
-        return PosesOfRows(array, poses, effects)
+        of_all = [self.effect(pose, sigma) for pose, sigma in zip(poses, sigmas, strict=True)]
+        parts: list[list[FloatArray]] = [[own[:, ~self.changes]] for own in of_all]
+        for lasts_s in np.unique(self.lasts_s[self.changes]).tolist():
+            share = np.linalg.cholesky(np.exp(-apart_s / lasts_s) if lasts_s else np.eye(len(time_s)))
+            for i, own in enumerate(of_all):
+                parts[i].append(np.kron(share[i], own[:, self.lasts_s == lasts_s]))
+        return PosesOfRows(array, poses, [np.hstack(part) for part in parts])
 
 
 def pose_covariance(errors: PoseErrors, pose: ArrayPose, in_array: FloatArray, sigma: FloatArray | None) -> FloatArray:
@@ -209,15 +277,14 @@ def pose_covariance(errors: PoseErrors, pose: ArrayPose, in_array: FloatArray, s
 def channel_errors(
     array: SensorArray, pose: ArrayPose, source: FloatArray, effect: FloatArray, ambient_T: FloatArray
 ) -> FloatArray:
-    """Derivative (C, n) of the channels by errors of the pose, of some effect (9, n) on it, at zero [T].
+    """Derivative (C, n) of the channels by errors of the pose, of some effect (12, n) on it, at zero [T].
 
     The source (6,) stands in the world, the ambient field (N, 3) in the array's axes.
     """
     in_array = pose.in_array(source)
     position, moment = in_array[:3], in_array[3:]
     H = channel_jacobian(array, position, moment, ambient_T) @ pose.error_jacobian(in_array, _NO_ERROR)
-    H[:, TURN] += turn_jacobian(array, position, moment, ambient_T)
-    return H @ effect
+    return np.asarray((H + pose.ambient_jacobian(array, in_array, _NO_ERROR, ambient_T)) @ effect)
 
 
 def pose_errors_at_rest(
@@ -227,15 +294,11 @@ def pose_errors_at_rest(
 
     Of sources (..., 3) in the axes of the stated pose.
     """
-    lever_arm_m = np.array(uncertainty.lever_arm_m)
-    pose = ArrayPose(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3), lever_arm_m)
-    D = np.zeros((*position_m.shape[:-1], 6, N_POSE))
-    D[..., :3, TURN] = cross_matrix(position_m + lever_arm_m)
-    D[..., :3, SHIFT] = D[..., :3, LEVER] = -np.eye(3)
-    D[..., 3:, TURN] = cross_matrix(moment_Am2)
-    columns = channel_jacobian(array, position_m, moment_Am2) @ D
-    columns[..., TURN] += turn_jacobian(array, position_m, moment_Am2, array.ambient_fields)
-    return columns @ PoseErrors.of(uncertainty).effect(pose)
+    pose = ArrayPose(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3), np.array(uncertainty.lever_arm_m))
+    in_array = np.concatenate([position_m, moment_Am2], axis=-1)
+    columns = channel_jacobian(array, position_m, moment_Am2) @ pose.error_jacobian(in_array, _NO_ERROR)
+    columns += pose.ambient_jacobian(array, in_array, _NO_ERROR, array.ambient_fields)
+    return np.asarray(columns @ PoseErrors.of(uncertainty).effect(pose))
 
 
 def with_stated_pose(array: SensorArray, readings: Readings) -> SensorArray:

@@ -56,7 +56,7 @@ class Acquisition:
 
     def __init__(self, array: SensorArray) -> None:
         self.array = array
-        self._pose_errors = PoseErrors.of(array.pose)
+        self._pose_errors = PoseErrors.of_array(array)
         self.forget()
 
     def forget(self) -> None:

@@ -22,10 +22,9 @@ from arrays.noise import reading_covariance
 from arrays.typing import FloatArray
 from magloc.fields import dipole
 from magloc.kalman import MeasurementFunction
-from magloc.measurement.differences import DifferenceMeasurement, turn_jacobian
+from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.nuisances import Drift, SensorErrors, without_lasting_errors
-from magloc.measurement.pose import TURN, ArrayPose, PoseErrors
-from magloc.navigation.rotations import rotation_matrix, turn_of_change
+from magloc.measurement.pose import ArrayPose, PoseErrors
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row
 
@@ -50,8 +49,8 @@ class RowMeasurement:
         Of the sensors' errors on the differences, in units of their noise.
     pose : ArrayPose
         As the row states it.
-    pose_effect : ndarray, shape (9, n_pose)
-        Of the pose's errors on it.
+    pose_effect : ndarray, shape (12, n_pose)
+        Of the errors of the pose and of the ambient field on it.
     """
 
     model: DifferenceMeasurement
@@ -68,14 +67,14 @@ class RowMeasurement:
         return self.model.measured(self.row.readings_T) / self.sigma
 
     def pose_error(self, state: FloatArray) -> FloatArray | None:
-        """Error (9,) of the pose that a state (n,) stands for, None where none is stated."""
+        """Error (12,) of the pose that a state (n,) stands for, None where none is stated."""
         states = state[self.n_motion + self.effect.shape[1] :]
         return self.pose_effect @ states if states.size else None
 
     def of_source(
         self, source: FloatArray, error: FloatArray | None = None, others_T: FloatArray | None = None
     ) -> FloatArray:
-        """Predicted differences (k,) of a source (6,) where the pose has an error (9,) and no sensor has any.
+        """Predicted differences (k,) of a source (6,) where the pose has an error (12,) and no sensor has any.
 
         `others_T` (N, 3) is the field of other sources at the sensors.
         """
@@ -106,10 +105,9 @@ class RowMeasurement:
         full[:, :N_SOURCE] = self._by_source(H, error)
         full[:, first:behind] = self.effect
         if error is not None:
+            array, whiten = self.model.array, self.model.differences.transform / self.sigma[:, None]
             by_error = H @ self.pose.error_jacobian(in_array, error)
-            turned = turn_jacobian(self.model.array, in_array[:3], in_array[3:], self._ambient_T(error))
-            turned = self.model.differences.transform @ turned / self.sigma[:, None]
-            by_error[:, TURN] += turned @ turn_of_change(-error[TURN])
+            by_error += whiten @ self.pose.ambient_jacobian(array, in_array, error, array.ambient_fields)
             full[:, behind:] = by_error @ self.pose_effect
         return full
 
@@ -173,14 +171,14 @@ class RowMeasurement:
         return (H.reshape(-1, 2, 3) @ R.T).reshape(-1, N_SOURCE)
 
     def _ambient_T(self, error: FloatArray | None, others_T: FloatArray | None = None) -> FloatArray | None:
-        """Field at the sensors (N, 3) besides the source's where the pose is turned by an error.
+        """Field at the sensors (N, 3) besides the source's where the pose and that field have an error.
 
         None: the array's own ambient field, unturned.
         """
         if error is None:
             return None if others_T is None else self.model.array.ambient_fields + others_T
-        turned: FloatArray = self.model.array.ambient_fields @ rotation_matrix(error[TURN])
-        return turned if others_T is None else turned + others_T
+        ambient_T = self.pose.ambient(self.model.array.ambient_fields, error)
+        return ambient_T if others_T is None else ambient_T + others_T
 
 
 class RowMeasurements:
@@ -199,12 +197,12 @@ class RowMeasurements:
     errors : SensorErrors
         The lasting errors of the array's sensors, and the background.
     pose_errors : PoseErrors
-        Those of its pose, behind them.
+        Those of its pose and of the ambient field, behind them.
     """
 
     def __init__(self, array: SensorArray, n_motion: int, background: Drift | None = None) -> None:
         self.errors = SensorErrors.of(array, background)
-        self.pose_errors = PoseErrors.of(array.pose)
+        self.pose_errors = PoseErrors.of_array(array)
         self._lever_arm_m = np.array(self.pose_errors.uncertainty.lever_arm_m)
         self._array = without_lasting_errors(array)
         self._n_motion = n_motion

@@ -36,7 +36,7 @@ class Simulation:
         As its user knows it.
     readings : Readings
         With the pose of the array, and its errors, unless its frame is the world's; and with the ambient field if there
-        is one, as that attitude turns it.
+        is one, with the errors that the array states of it, as that attitude turns it.
     truths : tuple of Truth
         Position and moment of every source at the times of the readings, world frame.
     paths : tuple of ObjectPath
@@ -123,7 +123,7 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
         time_s=time_s[present],
         array_position_m=stated.position_m[present] if posed else None,
         array_rotation=stated.rotation[present] if posed else None,
-        ambient_T=None if scenario.ambient_T is None else stated.rotation.inv().apply(ambient_T)[present],
+        ambient_T=None if scenario.ambient_T is None else _stated_ambient(scenario, stated, seed)[present],
     )
     kept = tuple(_of_rows(truth, time_s[present]) for truth in truths)
     paths = tuple(_known_path(scenario, i, time_s, pose, seed) for i, pose in enumerate(poses))
@@ -149,6 +149,14 @@ def _stated_pose(scenario: MagneticScenario, of: PoseUncertainty, time_s: FloatA
     rotation = true.rotation * Rotation.from_rotvec(-turn)
     reference_m = true.position_m - true.rotation.apply(true_lever_m) - of.position_m * changing[:, 3:6]
     return _Pose(reference_m + rotation.apply(lever_arm_m), rotation)
+
+
+def _stated_ambient(scenario: MagneticScenario, stated: _Pose, seed: int) -> FloatArray:
+    """Ambient field (n, 3) in the axes of the stated pose, with the errors that the array states of it."""
+    constant = scenario.array.ambient_uncertainty_T * stream(seed, "ambient error").standard_normal(3)
+    white = stream(seed, "white ambient error").standard_normal(stated.position_m.shape)
+    field_T = np.asarray(scenario.ambient_T) + constant + scenario.array.ambient_uncertainty_white_T * white
+    return np.asarray(stated.rotation.inv().apply(field_T))
 
 
 def _known_path(scenario: MagneticScenario, number: int, time_s: FloatArray, pose: _Pose, seed: int) -> ObjectPath:

@@ -9,9 +9,8 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.chi_square import energy_threshold
-from magloc.measurement.differences import DifferenceMeasurement, turn_jacobian
-from magloc.measurement.pose import N_POSE, TURN, ArrayPose
-from magloc.navigation.rotations import rotation_matrix, turn_of_change
+from magloc.measurement.differences import DifferenceMeasurement
+from magloc.measurement.pose import N_POSE, ArrayPose
 from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.measurement import RowMeasurement
 from magloc.tracking.motion import N_SOURCE
@@ -22,13 +21,13 @@ from magloc.tracking.results import Row
 class ChartRow:
     """Differences of one row, in units of their noise, as a function of states (..., n) in the world frame.
 
-    A state is that of the motion, and behind it errors of the pose: a prediction of it bends as a whole. Errors of
-    sensors are no part of it; they only add `effect` to the differences.
+    A state is that of the motion, and behind it errors of the pose and of the ambient field: a prediction of it bends
+    as a whole. Errors of sensors are no part of it; they only add `effect` to the differences.
 
     Attributes
     ----------
     measurement : RowMeasurement
-    pose_effect : ndarray, shape (9, n_pose)
+    pose_effect : ndarray, shape (12, n_pose)
         Of the pose's errors on it.
     """
 
@@ -145,7 +144,7 @@ class ChartRow:
         return bool(left @ left > energy_threshold(left.size))
 
     def _pose_error(self, state: FloatArray) -> FloatArray | None:
-        """Errors (..., 9) of the pose that states stand for, None where they are of a source alone."""
+        """Errors (..., 12) of the pose that states stand for, None where they are of a source alone."""
         if not self.n_pose or state.shape[-1] == N_SOURCE:
             return None
         return np.asarray(state[..., self.measurement.n_motion : self.n_motion] @ self.pose_effect.T)
@@ -162,12 +161,11 @@ class ChartRow:
 
     def _by_pose(self, H: FloatArray, in_array: FloatArray, error: FloatArray) -> FloatArray:
         """That (..., k, n_pose) by the pose's errors."""
-        turned = turn_jacobian(self.model.array, in_array[..., :3], in_array[..., 3:], self._ambient_T(error))
+        array, whiten = self.model.array, self.model.differences.transform / self.sigma[:, None]
         by_error = H @ self.pose.error_jacobian(in_array, error)
-        of_ambient = self.model.differences.transform @ turned / self.sigma[:, None]
-        by_error[..., TURN] += of_ambient @ turn_of_change(-error[..., TURN])
+        by_error += whiten @ self.pose.ambient_jacobian(array, in_array, error, array.ambient_fields)
         return np.asarray(by_error @ self.pose_effect)
 
     def _ambient_T(self, error: FloatArray | None) -> FloatArray | None:
-        """Ambient fields at the sensors (..., N, 3) where the pose is turned by errors; None: the array's own."""
-        return None if error is None else self.model.array.ambient_fields @ rotation_matrix(error[..., TURN])
+        """Ambient fields at the sensors (..., N, 3) that errors make of the array's own, which is meant by None."""
+        return None if error is None else self.pose.ambient(self.model.array.ambient_fields, error)

@@ -44,9 +44,8 @@ def constants_score(tracker: Tracker, rows: Sequence[Row], points: Sequence[Trac
     steps = settled_steps(wider, [row for row, _ in used], states)
     if steps is None:
         return math.nan
-    is_constant = np.concatenate(
-        [np.zeros(rest.size + N_SOURCE - wider.pose_errors.n_states, dtype=bool), ~wider.pose_errors.changes]
-    )
+    errors = wider.pose_errors
+    is_constant = np.concatenate([np.zeros(rest.size + N_SOURCE - errors.n_states, dtype=bool), errors.of_mounting])
     found, root = steps[-1].x[is_constant], steps[-1].S[is_constant]
     left, axes = np.linalg.eigh(root @ root.T)
     spread = left * (1.0 - left)

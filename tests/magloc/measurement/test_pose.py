@@ -48,6 +48,16 @@ AMBIENT_T = np.array([2e-6, 20e-6, -43e-6])
 STATED = PoseUncertainty(0.02, math.radians(0.3), 0.02, 10.0, 0.05, math.radians(0.5), 0.01, (0.1, 0.3, -0.2))
 
 
+ALONG = AMBIENT_T / np.linalg.norm(AMBIENT_T)
+ACROSS = np.linalg.svd(AMBIENT_T[None])[2][1:].T
+
+
+def uncertain(kind: str, noise_T: float = 1e-11) -> SensorArray:
+    """Whose pose errs, and whose ambient field too, by 200 nT and by 100 nT more that are new in every row."""
+    array = geometries.tetrahedron(1.5, kind, noise_T)  # type: ignore[arg-type]
+    return replace(array, pose=STATED, ambient_uncertainty_T=2e-7, ambient_uncertainty_white_T=1e-7)
+
+
 def row_of(array: SensorArray, pose: ArrayPose = POSE) -> Row:
     return Row(
         0.0,
@@ -61,25 +71,31 @@ def row_of(array: SensorArray, pose: ArrayPose = POSE) -> Row:
 
 
 class TestTrueReadings:
-    """Of sensors that stand where an erring pose truly has them."""
+    """Of sensors that stand where an erring pose truly has them, in the ambient field that there truly is."""
 
     @pytest.mark.parametrize("kind", ["vector", "scalar"])
     def test_are_predicted_by_the_state_that_holds_the_errors(self, kind: str) -> None:
-        array = replace(geometries.tetrahedron(1.5, kind, 1e-11), pose=STATED)  # type: ignore[arg-type]
+        array = uncertain(kind)
         measurement = Tracker(array, RandomWalk(1e-9, 1e-9)).measurements.of(row_of(array))
-        u = np.random.default_rng(0).normal(size=14)
-        assert measurement.pose_effect.shape == (9, 14)
+        n = measurement.pose_effect.shape[1]
+        assert n == (20 if kind == "scalar" else 14)
+        u = np.random.default_rng(0).normal(size=n)
         sigma = np.repeat(
             [STATED.attitude_rad, 0.02, 0.02, STATED.attitude_constant_rad, 0.05, 0.01], [3, 3, 1, 3, 3, 1]
         )
-        turn, shift, late, mount, lever, clock = np.split(u * sigma, [3, 6, 7, 10, 13])
+        turn, shift, late, mount, lever, clock = np.split(u[:14] * sigma, [3, 6, 7, 10, 13])
+        off_T = (2e-7 * u[14:17] + 1e-7 * u[17:] if n == 20 else np.zeros(3)) @ np.column_stack([ALONG, ACROSS])
+        longer, turned_T = float(off_T[0]), off_T[1:] @ ACROSS.T
+        angle = math.atan(np.linalg.norm(turned_T) / np.linalg.norm(AMBIENT_T))
+        turned = math.cos(angle) * ALONG + math.sin(angle) * turned_T / max(np.linalg.norm(turned_T), 1e-30)
+        ambient_T = (np.linalg.norm(AMBIENT_T) + longer) * turned
         late_s = float(late[0] + clock[0])
         # The pose is where the array was late_s ago, to first order of its motion.
         true_R = R @ Rotation.from_rotvec(turn + mount + late_s * POSE.rate_rad_s).as_matrix()
         velocity = POSE.velocity_m_s - R @ np.cross(POSE.rate_rad_s, POSE.lever_arm_m)
         reference = POSE.origin_m - R @ POSE.lever_arm_m + shift + late_s * velocity
         sensors = reference + (POSE.lever_arm_m + lever + array.positions) @ true_R.T
-        fields = magpylib_field(sensors, SOURCE[:3], SOURCE[3:]) + AMBIENT_T
+        fields = magpylib_field(sensors, SOURCE[:3], SOURCE[3:]) + ambient_T
         readings = array.readings_of(fields @ true_R)
         expected = measurement.model.measured(readings) / measurement.sigma
         found = measurement.predicted(np.concatenate([SOURCE, u]))
@@ -97,7 +113,9 @@ class TestDerivatives:
         expected = derivative(
             lambda y: np.apply_along_axis(lambda e: POSE.in_array(SOURCE, e) / UNIT, -1, y), ERROR, 1e-2, 1e-9
         )
-        self.agree(POSE.error_jacobian(POSE.in_array(SOURCE, ERROR), ERROR) / UNIT[:, None], expected)
+        J = POSE.error_jacobian(POSE.in_array(SOURCE, ERROR), ERROR)
+        self.agree(J[:, :9] / UNIT[:, None], expected)
+        assert not np.any(J[:, 9:])
 
     def test_of_the_source_in_the_world(self) -> None:
         """Of what the array knows: where in_array gives the same again."""
@@ -105,19 +123,20 @@ class TestDerivatives:
 
         def world(error: FloatArray) -> FloatArray:
             turned = POSE.turned(error)
-            arm = in_array[:3] + POSE.lever_arm_m + error[6:]
+            arm = in_array[:3] + POSE.lever_arm_m + error[6:9]
             return np.concatenate([POSE.reference_m + error[3:6] + turned @ arm, turned @ in_array[3:]])
 
         np.testing.assert_allclose(POSE.in_array(world(ERROR), ERROR), in_array, rtol=1e-12)
         expected = derivative(lambda y: np.apply_along_axis(lambda e: world(e) / UNIT, -1, y), np.zeros(9), 1e-2, 1e-9)
-        self.agree(POSE.world_jacobian(in_array) / UNIT[:, None], expected)
+        self.agree(POSE.world_jacobian(in_array)[:, :9] / UNIT[:, None], expected)
 
     @pytest.mark.parametrize("kind", ["vector", "scalar"])
     def test_of_the_readings(self, kind: str) -> None:
-        array = replace(geometries.tetrahedron(1.5, kind, 1e-9), pose=STATED)  # type: ignore[arg-type]
+        array = uncertain(kind, 1e-9)
         measurement = Tracker(array, RandomWalk(1e-9, 1e-9)).measurements.of(row_of(array))
-        unit = np.concatenate([UNIT, np.ones(14)])
-        state = np.concatenate([SOURCE, np.random.default_rng(1).normal(size=14)])
+        n = measurement.pose_effect.shape[1]
+        unit = np.concatenate([UNIT, np.ones(n)])
+        state = np.concatenate([SOURCE, np.random.default_rng(1).normal(size=n)])
         expected = derivative(
             lambda y: np.apply_along_axis(lambda x: measurement.predicted(x * unit), -1, y), state / unit, 1e-2, 1e-7
         )
@@ -164,6 +183,16 @@ class TestErrors:
                 share = math.exp(-abs(time_s[i] - time_s[j]) / 10.0)
                 expected = share * changing @ changing.T + constant @ constant.T
                 np.testing.assert_allclose(rows.effects[i] @ rows.effects[j].T, expected, rtol=1e-9, atol=1e-18)
+
+    def test_of_the_ambient_field_are_constant_or_new_in_every_row(self) -> None:
+        errors = PoseErrors.of_array(replace(uncertain("scalar"), pose=None))
+        np.testing.assert_array_equal(errors.step(3.0)[0], np.repeat([1.0, 0.0], 3))
+        rows = errors.of_rows(uncertain("scalar"), np.arange(2.0), [POSE] * 2, [None] * 2)
+        assert rows is not None
+        first, second = rows.effects
+        np.testing.assert_allclose((first @ first.T)[9:, 9:], (2e-7**2 + 1e-7**2) * np.eye(3), rtol=1e-9, atol=1e-30)
+        np.testing.assert_allclose((first @ second.T)[9:, 9:], 2e-7**2 * np.eye(3), rtol=1e-9, atol=1e-30)
+        assert not PoseErrors.of_array(replace(uncertain("vector"), pose=None)).n_states
 
     def test_a_row_states_its_own(self) -> None:
         effect = PoseErrors.of(STATED).effect(POSE, np.array([0.5, 0.1]))

@@ -333,7 +333,7 @@ class TestRandomNumbers:
         monkeypatch.setattr(simulation_module, "stream", recorded)
         platform = Platform((0.0, 0.0, 3.0), (0.0, 0.0, 1.0), 0.5, 1e-9)
         simulate(replace(self.FULL, sources=(TARGET, TARGET), platform=platform), 1)
-        assert len(set(used)) == len(used) == 3 + 1 + 2 + 6 * 4
+        assert len(set(used)) == len(used) == 3 + 1 + 2 + 2 + 6 * 4
 
     def test_leaving_out_a_sensor_changes_no_other(self) -> None:
         part = replace(self.FULL, array=self.FULL.array.subset(["s1", "s3", "s4"]), models=(self.NOISY,) * 3)
