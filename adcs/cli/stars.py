@@ -18,8 +18,9 @@ from arrays.typing import FloatArray
 from magloc.cli.framework import QuietOptions, print_json, progress
 
 if TYPE_CHECKING:
+    from adcs.stars.catalogue import StarCatalogue
     from adcs.stars.files import StarFrame
-    from adcs.stars.identification import NoFix, StarCatalogue, StarFix
+    from adcs.stars.identification import NoFix, StarFix
 
 
 _LARGEST_NOISE = 0.1
@@ -125,17 +126,22 @@ def _pictures(
         took_ms = 1e3 * (time.perf_counter() - began)
         row: dict[str, Any] = {"file": str(path), "solved": not isinstance(found, NoFix)}
         if isinstance(found, NoFix):
-            row |= dict.fromkeys(("ra_deg", "dec_deg", "roll_deg", "scale_arcsec", "scale_sigma_arcsec", "field_deg"))
+            row |= dict.fromkeys(("ra_deg", "dec_deg", "roll_deg", "scale_arcsec", "scale_sigma_arcsec"))
+            row |= dict.fromkeys(("corner_px", "corner_sigma_px", "field_deg"))
             row |= {"matched": 0, "residual_arcsec": None, "reason": found.reason}
         else:
-            row |= _where(found.fix.R_catalogue_from_frame)
-            width = math.atan(0.5 * picture.shape[1] * math.tan(found.camera.rad_per_px))
+            row |= _where(found.R_catalogue_from_frame)
+            camera, sigma = found.pose.camera, np.sqrt(np.diag(found.pose.covariance))
+            width = math.atan(0.5 * picture.shape[1] * math.tan(camera.rad_per_px))
+            corner_px = 0.5 * math.hypot(camera.width_px, camera.height_px)
             row |= {
-                "scale_arcsec": _arcsec(found.camera.rad_per_px),
-                "scale_sigma_arcsec": _arcsec(found.scale_sigma_rad),
+                "scale_arcsec": _arcsec(camera.rad_per_px),
+                "scale_sigma_arcsec": _arcsec(camera.rad_per_px * sigma[3]),
+                "corner_px": camera.radial * camera.corner**2 * corner_px,
+                "corner_sigma_px": sigma[4] * camera.corner**2 * corner_px,
                 "field_deg": math.degrees(2.0 * width),
-                "matched": len(found.fix.stars),
-                "residual_arcsec": _arcsec(found.fix.rms_rad),
+                "matched": len(found.stars),
+                "residual_arcsec": _arcsec(found.rms_rad),
                 "reason": "",
             }
         rows.append({**row, "milliseconds": took_ms})
@@ -163,7 +169,8 @@ def _picture_line(row: dict[str, Any]) -> str:
         return f"{row['file']}: no fix, {row['reason']}"
     return (
         f"{row['file']}: RA {row['ra_deg']:.3f}°, Dec {row['dec_deg']:+.3f}°, roll {row['roll_deg']:+.2f}°; "
-        f"{row['scale_arcsec']:.3f} ± {row['scale_sigma_arcsec']:.3f} arcsec/px, {row['field_deg']:.2f}° wide; "
+        f"{row['scale_arcsec']:.3f} ± {row['scale_sigma_arcsec']:.3f} arcsec/px, {row['field_deg']:.2f}° wide, "
+        f"corners bent by {row['corner_px']:+.1f} ± {row['corner_sigma_px']:.1f} px; "
         f"{row['matched']} stars, {row['residual_arcsec']:.1f} arcsec rms"
     )
 
@@ -178,7 +185,7 @@ def _frames(
     common: QuietOptions,
 ) -> None:
     from adcs.stars.files import read_star_frames
-    from adcs.stars.unknown_scale import PictureFix, identify_at_unknown_scale
+    from adcs.stars.pose import UNKNOWN_LENS, LensPrior
 
     camera, images = read_star_frames(folder)
     most_px = _LARGEST_NOISE * min(camera.width_px, camera.height_px)
@@ -197,24 +204,9 @@ def _frames(
             ended.append(time.perf_counter())
             advance(frames)
 
-        if tolerance is None:
-            frames_of = [(image.points_px, image.magnitudes) for image in images]
-            fixes = adcs.identify_stars(known, camera, frames_of, noise_px=noise_px, progress=done)
-        else:
-            fixes = []
-            for image in images:
-                found = identify_at_unknown_scale(
-                    known,
-                    camera.width_px,
-                    camera.height_px,
-                    image.points_px,
-                    image.magnitudes,
-                    rad_per_px=camera.rad_per_px,
-                    tolerance=tolerance,
-                    noise_px=noise_px,
-                )
-                fixes.append(found.fix if isinstance(found, PictureFix) else found)
-                done(1)
+        prior = LensPrior() if tolerance is None else replace(UNKNOWN_LENS, scale=tolerance)
+        frames_of = [(image.points_px, image.magnitudes) for image in images]
+        fixes = adcs.identify_stars(known, camera, frames_of, noise_px=noise_px, lens=prior, progress=done)
     rows = [_row(known, image, fix) for image, fix in zip(images, fixes, strict=True)]
     # The first frame waits for the triangles of the catalogue.
     milliseconds = 1e3 * np.diff(ended)[min(1, len(images) - 1) :]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.figure import Figure
 
-from adcs.stars.identification import StarCatalogue
+from adcs.stars.catalogue import StarCatalogue
+from adcs.stars.identification import StarFix
 from adcs.stars.pictures import PictureStars
-from adcs.stars.unknown_scale import PictureFix
 from arrays.typing import FloatArray
 from magloc.plots import style
 
@@ -15,7 +15,7 @@ _NAMED = 20
 
 
 def picture_figure(
-    name: str, picture: FloatArray, lights: PictureStars, found: PictureFix | None, catalogue: StarCatalogue
+    name: str, picture: FloatArray, lights: PictureStars, found: StarFix | None, catalogue: StarCatalogue
 ) -> Figure:
     """The picture, brightened, with a circle around every star that was identified and the brightest ones' numbers."""
     height, width = picture.shape
@@ -26,14 +26,14 @@ def picture_figure(
     ax.imshow(shown, cmap="gray", extent=(0, width, 0, height), interpolation="nearest")
     text = "no fix"
     if found is not None:
-        stars = found.fix.stars
+        stars = found.stars
         x, y = lights.points_px[stars[:, 0]].T
         ax.scatter(x, y, s=40.0, facecolor="none", edgecolor=style.ORANGE, lw=0.8)
         # Lights are brightest first.
         for light, row in stars[:_NAMED]:
             place = lights.points_px[light] + [0.008 * width, 0.008 * width]
             ax.annotate(f"{catalogue.numbers[row]}", place, color=style.ORANGE, fontsize=style.SMALL_LETTERS)
-        text = f"{len(stars)} stars, {np.degrees(found.camera.rad_per_px) * 3600.0:.2f} arc seconds per pixel"
+        text = f"{len(stars)} stars, {np.degrees(found.pose.camera.rad_per_px) * 3600.0:.2f} arc seconds per pixel"
     ax.set(xlim=(0, width), ylim=(0, height), aspect="equal")
     style.dress(ax, "x [px]", "y [px]")
     ax.grid(visible=False)

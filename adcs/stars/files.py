@@ -22,7 +22,8 @@ from pathlib import Path
 
 import numpy as np
 
-from adcs.stars.identification import MOST_PIXELS, SCALE_ARCSEC, WIDEST_RAD, StarCamera, StarCatalogue
+from adcs.stars.camera import MOST_PIXELS, SCALE_ARCSEC, WIDEST_RAD, StarCamera
+from adcs.stars.catalogue import StarCatalogue
 from arrays.io.csv import read_table
 from arrays.io.errors import LARGEST, InputError
 from arrays.io.text import read_text

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from adcs.stars.identification import StarCatalogue
+from adcs.stars.catalogue import StarCatalogue
 from arrays.io.errors import of_extra
 from arrays.typing import FloatArray
 

@@ -7,147 +7,37 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from functools import cached_property
-from itertools import combinations
+from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
 from scipy.stats import binom
 
-from arrays.io.errors import check_positive
-from arrays.typing import BoolArray, FloatArray, IntArray
+from adcs.stars.camera import StarCamera
+from adcs.stars.catalogue import StarCatalogue
+from adcs.stars.pose import CameraPose, LensPrior, fitted
+from adcs.stars.triangles import Hypothesis, TriangleIndex, star_triangles
+from adcs.stars.triangles_compiled import Checks
+from arrays.typing import FloatArray, IntArray
 
-# Brighter neighbours with which a star makes triangles, and the neighbours among which they are looked for.
-_BRIGHTER = 4
-_NEIGHBOURS = 24
-# Stars of the catalogue in the triangles, per image on average, and of an image.
-_BRIGHT_PER_IMAGE = 20
+# Brighter neighbours with which a star makes triangles: of the catalogue, and of an image, which has hot pixels too.
+_BRIGHTER, _IMAGE_BRIGHTER = 4, 8
+# Stars of the catalogue in the triangles, per image on average; of an image; and those that check an attitude.
+_BRIGHT_PER_IMAGE = 30
 _IMAGE_STARS = 30
-_CHECKED_AGAIN = 8
-# Triangles that agree and are checked, of an image: seconds of work, and some hundred megabytes.
+_CHECKED = 24
+# Triangles that agree and are checked, of an image: a second of work.
 _MOST_HYPOTHESES = 250_000
-_REFITS = 3
+_ROUNDS = 3  # of hypotheses that match enough stars to be fitted
+_CROWDED = 4.0  # stars about an image, over their mean
+_WIDENED = 2.0  # gate of a hypothesis of three noisy stars
+_REFITS = 6
+# Lights are brightest first, and few of a picture may be stars: the chance of the best beginning.
+_BEGINNINGS = (15, 30, 60, 100)
 _COMPANIONS = 3  # of the catalogue, within the noise of one place
 _LEAST_SPREAD = 0.5  # of the magnitudes of an image
 _CLEARLY = 2.0  # difference of two squared distances: less is a toss
-MOST_PIXELS = 100_000
-"""Of either side of an image."""
-SCALE_ARCSEC = (0.01, 3600.0)
-"""Of a pixel: from the largest telescopes to a degree."""
-WIDEST_RAD = math.radians(150.0)
-"""Between opposite corners: no lens that maps like a pinhole shows more."""
-
-
-@dataclass(frozen=True, eq=False)
-class StarCatalogue:
-    """Stars of the sky; made by :meth:`of`.
-
-    Attributes
-    ----------
-    numbers : ndarray, shape (n,)
-        Such as those of Hipparcos.
-    directions : ndarray, shape (n, 3)
-        Unit vectors in the catalogue's frame.
-    magnitudes : ndarray, shape (n,)
-    """
-
-    numbers: IntArray
-    directions: FloatArray
-    magnitudes: FloatArray
-
-    @classmethod
-    def of(
-        cls, numbers: ArrayLike, right_ascension_rad: ArrayLike, declination_rad: ArrayLike, magnitudes: ArrayLike
-    ) -> StarCatalogue:
-        """Catalogue from right ascension and declination, of shape (n,) each.
-
-        Raises
-        ------
-        ValueError
-            The shapes differ, a number is not finite, or there are fewer than four stars.
-        """
-        ra, dec = np.asarray(right_ascension_rad, dtype=np.float64), np.asarray(declination_rad, dtype=np.float64)
-        hip, magnitude = np.asarray(numbers, dtype=np.intp), np.asarray(magnitudes, dtype=np.float64)
-        if not (ra.shape == dec.shape == hip.shape == magnitude.shape and ra.ndim == 1 and ra.size >= 4):
-            raise ValueError(
-                "Input numbers, right_ascension_rad, declination_rad and magnitudes must be of one shape (n,), "
-                f"n at least 4; instead received shapes {hip.shape}, {ra.shape}, {dec.shape} and {magnitude.shape}."
-            )
-        if not (np.isfinite(ra).all() and np.isfinite(dec).all() and np.isfinite(magnitude).all()):
-            raise ValueError("Inputs of a star catalogue must be finite; instead received NaN or infinity.")
-        directions = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
-        return cls(hip, directions, magnitude)
-
-    @cached_property
-    def tree(self) -> cKDTree:
-        """Directions, for search."""
-        return cKDTree(self.directions)
-
-
-@dataclass(frozen=True)
-class StarCamera:
-    """A pinhole camera.
-
-    Attributes
-    ----------
-    rad_per_px : float
-        Scale at the centre [rad/px].
-
-    Raises
-    ------
-    ValueError
-        A value is not positive, or out of the range of :data:`MOST_PIXELS`, :data:`SCALE_ARCSEC` or :data:`WIDEST_RAD`.
-    """
-
-    width_px: int
-    height_px: int
-    rad_per_px: float
-
-    def __post_init__(self) -> None:
-        check_positive(**vars(self))
-        if max(self.width_px, self.height_px) > MOST_PIXELS:
-            raise ValueError(
-                f"Inputs width_px and height_px must be at most {MOST_PIXELS}; "
-                f"instead received {self.width_px} and {self.height_px}."
-            )
-        low, high = SCALE_ARCSEC
-        arcsec = math.degrees(self.rad_per_px) * 3600.0
-        if not low * (1.0 - 1e-9) <= arcsec <= high * (1.0 + 1e-9):
-            raise ValueError(f"Input rad_per_px must be {low:g} to {high:g} arc seconds; instead received {arcsec:g}.")
-        if self.diagonal_rad > WIDEST_RAD:
-            raise ValueError(
-                f"An image must be at most {math.degrees(WIDEST_RAD):.0f}° wide from corner to corner; "
-                f"instead received a camera of {math.degrees(self.diagonal_rad):.1f}°."
-            )
-
-    @property
-    def diagonal_rad(self) -> float:
-        """Angle between opposite corners."""
-        return 2.0 * math.atan(0.5 * math.hypot(self.width_px, self.height_px) * math.tan(self.rad_per_px))
-
-    @property
-    def solid_angle_sr(self) -> float:
-        """Part of the sphere that an image shows, as if it were flat."""
-        return self.width_px * self.height_px * self.rad_per_px**2
-
-    def directions(self, points_px: ArrayLike) -> FloatArray:
-        """Unit vectors (f, 3) in the frame's axes of points (f, 2), y up; see docs/theory/star-identification.md.
-
-        Raises
-        ------
-        ValueError
-            The shape is another one, or a number is not finite.
-        """
-        points = np.asarray(points_px, dtype=np.float64)
-        if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
-            raise ValueError(
-                f"Input points_px must be finite numbers of shape (f, 2); instead received shape {points.shape}."
-            )
-        offset = (points - 0.5 * np.array([self.width_px, self.height_px])) * math.tan(self.rad_per_px)
-        outward = np.concatenate([offset, np.full((len(offset), 1), -1.0)], axis=1)
-        return outward / np.linalg.norm(outward, axis=1, keepdims=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,62 +46,25 @@ class StarFix:
 
     Attributes
     ----------
-    R_catalogue_from_frame : ndarray, shape (3, 3)
-        Rotation of components in the frame's axes into those of the catalogue.
     stars : ndarray, shape (k, 2)
         Pairs of a star's number in the image and its row in the catalogue.
     rms_rad : float
         Root mean square angle of these stars from their catalogue's places [rad].
     log10_chance : float
         Logarithm of the number of attitudes expected to match as many stars by chance alone.
+    pose : CameraPose
+        The same attitude with its covariance and that of the lens.
     """
 
-    R_catalogue_from_frame: FloatArray
     stars: IntArray
     rms_rad: float
     log10_chance: float
+    pose: CameraPose
 
-
-@dataclass(frozen=True, eq=False)
-class StarTriangles:
-    """Triangles of stars: corners ordered by the opposite side, shortest first."""
-
-    corners: IntArray  # (T, 3)
-    sides: FloatArray  # (T, 3): chords, ascending
-    is_counter_clockwise: BoolArray  # (T,): seen from the centre of the sphere
-
-
-def star_triangles(directions: FloatArray, longest: float, neighbours: int = _BRIGHTER) -> StarTriangles:
-    """Triangles of every star with its nearest brighter neighbours.
-
-    ``directions`` (n, 3): unit vectors, brightest first. ``longest``: longest side, a chord. ``neighbours``: of each
-    star. Returns: each triangle once.
-    """
-    n = len(directions)
-    k = min(_NEIGHBOURS + 1, n)
-    found = np.asarray(cKDTree(directions).query(directions, k=k)[1], dtype=np.intp).reshape(n, k)
-    own = np.arange(n)[:, None]
-    first = np.argsort(found >= own, axis=1, kind="stable")[:, : min(neighbours, k)]
-    brighter = np.take_along_axis(found, first, axis=1)
-    pairs = list(combinations(range(brighter.shape[1]), 2))
-    if not pairs:
-        return StarTriangles(np.empty((0, 3), dtype=np.intp), np.empty((0, 3)), np.empty(0, dtype=np.bool_))
-    corners = np.concatenate([np.column_stack([own[:, 0], brighter[:, i], brighter[:, j]]) for i, j in pairs])
-    corners = corners[(corners[:, 1:] < corners[:, :1]).all(axis=1)]
-    opposite = np.stack(
-        [
-            np.linalg.norm(directions[corners[:, (i + 1) % 3]] - directions[corners[:, (i + 2) % 3]], axis=1)
-            for i in range(3)
-        ],
-        axis=1,
-    )
-    order = np.argsort(opposite, axis=1)
-    corners, sides = np.take_along_axis(corners, order, axis=1), np.take_along_axis(opposite, order, axis=1)
-    short = sides[:, 2] <= longest
-    # Turned inside out: the triple product is positive for corners that go round clockwise seen from the centre.
-    one, two, three = np.moveaxis(directions[corners[short]], 1, 0)
-    sense = np.sum(np.cross(one, two) * three, axis=-1) < 0.0
-    return StarTriangles(corners[short], sides[short], sense)
+    @property
+    def R_catalogue_from_frame(self) -> FloatArray:
+        """Of the pose."""
+        return self.pose.R_catalogue_from_frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,12 +73,8 @@ class StarMatcher:
 
     Attributes
     ----------
-    bright : ndarray
-        Rows of the catalogue that make triangles, brightest first.
-    triangles : StarTriangles
-        Corners count in ``bright``.
-    tree : cKDTree
-        Of their sides.
+    index : TriangleIndex
+        Of the catalogue's stars that an image of this camera shows.
     noise_px : float
         Standard deviation of a centroid, per axis [px].
     most_chance : float
@@ -234,9 +83,7 @@ class StarMatcher:
 
     catalogue: StarCatalogue
     camera: StarCamera
-    bright: IntArray
-    triangles: StarTriangles
-    tree: cKDTree
+    index: TriangleIndex
     noise_px: float = 1.0
     most_chance: float = 1e-6
 
@@ -254,15 +101,18 @@ class StarMatcher:
         per_image = camera.solid_angle_sr / (4.0 * math.pi)
         bright = np.argsort(catalogue.magnitudes, kind="stable")[: math.ceil(_BRIGHT_PER_IMAGE / per_image)]
         longest = 2.0 * math.sin(0.5 * camera.diagonal_rad)
-        triangles = star_triangles(catalogue.directions[bright], longest)
-        return cls(catalogue, camera, bright, triangles, cKDTree(triangles.sides), noise_px)
+        return cls(catalogue, camera, TriangleIndex.of(catalogue.directions[bright], longest, _BRIGHTER), noise_px)
 
-    @property
-    def gate_rad(self) -> float:
-        """Within which a star of the image is one of the catalogue: three standard deviations."""
-        return 3.0 * self.noise_px * self.camera.rad_per_px
+    def gate_rad(self, camera: StarCamera) -> float:
+        """Within which a star of an image is one of the catalogue: three standard deviations."""
+        return 3.0 * self.noise_px * camera.rad_per_px
 
-    def identify(self, points_px: ArrayLike, magnitudes: ArrayLike) -> StarFix | NoFix:
+    def identify(
+        self,
+        points_px: ArrayLike,
+        magnitudes: ArrayLike,
+        prior: LensPrior = LensPrior(),  # noqa: B008 - frozen
+    ) -> StarFix | NoFix:
         """Attitude and stars of an image.
 
         Parameters
@@ -271,81 +121,74 @@ class StarMatcher:
             x to the right, y up.
         magnitudes : array_like, shape (f,)
             Their order counts, and of stars that are as near as the noise their differences.
+        prior : LensPrior
+            How well the camera is known: exactly, if not stated.
 
         Raises
         ------
         ValueError
             The shapes do not agree, or a number is not finite.
         """
-        directions = self.camera.directions(points_px)
+        tangents = self.camera.tangents(points_px)
         brightness = np.asarray(magnitudes, dtype=np.float64)
         order = np.argsort(brightness, kind="stable")
-        if order.shape != (len(directions),):
-            raise ValueError(f"Input magnitudes must have shape ({len(directions)},); instead received {order.shape}.")
-        brightest = order[:_IMAGE_STARS]
-        if len(brightest) < 4:
-            return NoFix(f"{len(brightest)} stars, 4 needed")
-        mine = star_triangles(directions[brightest], 2.0)
-        agreeing = self._agreeing(mine)
-        if agreeing > _MOST_HYPOTHESES:
-            return NoFix(f"{agreeing} triangles agree within the noise, {_MOST_HYPOTHESES} can be told apart")
-        R = self._hypotheses(directions[brightest], mine)
-        if not len(R):
-            return NoFix("no triangle of the image is in the catalogue")
-        near = self._near(directions[brightest], R)[1]
-        fixes = [
-            self.fitted(directions, brightness, R[i], len(R))
-            for i in np.argsort(-near.sum(axis=1), kind="stable")[:_CHECKED_AGAIN]
-        ]
-        best = min(fixes, key=lambda fix: fix.log10_chance)
-        if best.log10_chance > math.log10(self.most_chance):
-            return NoFix(f"chance matches {len(best.stars)} of {len(directions)} stars too easily")
-        return best
+        if order.shape != (len(tangents),):
+            raise ValueError(f"Input magnitudes must have shape ({len(tangents)},); instead received {order.shape}.")
+        if len(order) < 4:
+            return NoFix(f"{len(order)} stars, 4 needed")
+        points = np.asarray(points_px, dtype=np.float64)[order]
+        checks = self._checks(min(len(order), _CHECKED), prior)
+        image = star_triangles(self.camera.directions(points[:_IMAGE_STARS]), 2.0, _IMAGE_BRIGHTER)
+        found = self.index.best(tangents[order], image, self.catalogue.cells, checks)
+        reason = "no triangle of the image is in the catalogue"
+        for hypotheses in islice(found, _ROUNDS):
+            fixes = [self._fitted(points, brightness[order], hypothesis, prior) for hypothesis in hypotheses]
+            best = min(fixes, key=lambda fix: fix.log10_chance)
+            if best.log10_chance <= math.log10(self.most_chance):
+                return replace(best, stars=np.stack([order[best.stars[:, 0]], best.stars[:, 1]], axis=1))
+            reason = f"chance matches {len(best.stars)} of {len(points)} stars too easily"
+        return NoFix(reason)
 
-    @property
-    def _side_gate(self) -> float:
-        return 4.0 * self.noise_px * self.camera.rad_per_px
+    def _checks(self, stars: int, prior: LensPrior) -> Checks:
+        """Stars that match by chance in a crowded part of the sky one time in a hundred that would be accepted."""
+        near = _WIDENED * self.gate_rad(self.camera)
+        crowd = min(_CROWDED * len(self.catalogue.numbers) * (0.5 * near) ** 2, 1.0)
+        chance = binom.logsf(np.arange(stars) - 3, max(stars - 3, 0), crowd) + math.log(_MOST_HYPOTHESES)
+        enough = int(np.count_nonzero(chance > math.log(0.01 * self.most_chance)))
+        return Checks(4.0 * self.noise_px * self.camera.rad_per_px, prior.scale, near, stars, enough, _MOST_HYPOTHESES)
 
-    def _agreeing(self, mine: StarTriangles) -> int:
-        """Number of triangles whose three sides agree; it grows with the cube of the noise."""
-        return int(np.sum(self.tree.query_ball_point(mine.sides, self._side_gate, return_length=True)))
-
-    def _hypotheses(self, directions: FloatArray, mine: StarTriangles) -> FloatArray:
-        """Rotations (h, 3, 3) of triangles whose three sides and sense agree."""
-        agreeing = self.tree.query_ball_point(mine.sides, self._side_gate)
-        found: list[list[int]] = np.asarray(agreeing, dtype=object).tolist()
-        image = np.repeat(np.arange(len(found)), [len(matches) for matches in found])
-        known = np.array([match for matches in found for match in matches], dtype=np.intp)
-        agree = mine.is_counter_clockwise[image] == self.triangles.is_counter_clockwise[known]
-        seen = directions[mine.corners[image[agree]]]
-        there = self.catalogue.directions[self.bright[self.triangles.corners[known[agree]]]]
-        return rotation_between(seen, there)
-
-    def _near(self, directions: FloatArray, R: FloatArray) -> tuple[IntArray, BoolArray]:
-        """Row of the catalogue nearest to each star under rotations (..., 3, 3), and whether it is within the gate."""
-        found = self.catalogue.tree.query(directions @ np.swapaxes(R, -1, -2), distance_upper_bound=self.gate_rad)
-        return np.asarray(found[1], dtype=np.intp), np.isfinite(np.asarray(found[0]))
-
-    def fitted(self, directions: FloatArray, magnitudes: FloatArray, R: FloatArray, hypotheses: int) -> StarFix:
-        """Fix by all stars near their places, brightest first or in any order, with the chance of as many."""
+    def _fitted(self, points: FloatArray, magnitudes: FloatArray, hypothesis: Hypothesis, prior: LensPrior) -> StarFix:
+        """Fix by all stars near their places, brightest first, with the chance of as many."""
+        rad_per_px = math.atan(hypothesis.scale * math.tan(self.camera.rad_per_px))
+        pose = CameraPose(hypothesis.R, replace(self.camera, rad_per_px=rad_per_px), np.zeros((5, 5)))
+        widened, before = _WIDENED, np.empty(0, dtype=np.intp)
         for _ in range(_REFITS):
-            row, near = self._near(directions, R)
-            if np.count_nonzero(near) < 3:
+            directions = pose.camera.directions(points) @ pose.R_catalogue_from_frame.T
+            gate = widened * self.gate_rad(pose.camera)
+            row = np.asarray(self.catalogue.tree.query(directions, distance_upper_bound=gate)[1], dtype=np.intp)
+            near = row < len(self.catalogue.numbers)
+            if np.count_nonzero(near) < 3 or np.array_equal(row, before):
                 break
-            R = rotation_between(directions[near], self.catalogue.directions[row[near]])
-        stars = self._named(directions, magnitudes, R)
-        seen, there = directions[stars[:, 0]], self.catalogue.directions[stars[:, 1]]
-        rms = float(np.sqrt(np.mean(np.sum((seen @ R.T - there) ** 2, axis=1)))) if len(stars) else math.inf
-        return StarFix(R, stars, rms, self.chance(R, len(stars), len(directions), hypotheses))
+            there = self.catalogue.directions[row[near]]
+            pose = fitted(points[near], there, pose, self.camera, prior, self.noise_px)
+            widened, before = 1.0, row
+        directions = pose.camera.directions(points) @ pose.R_catalogue_from_frame.T
+        stars = self._named(directions, magnitudes, self.gate_rad(pose.camera))
+        off = directions[stars[:, 0]] - self.catalogue.directions[stars[:, 1]]
+        rms = float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) if len(stars) else math.inf
+        sizes = np.unique(np.minimum((*_BEGINNINGS, len(points)), len(points)))
+        chance = self._log_chance(pose, np.searchsorted(stars[:, 0], sizes), sizes).min()
+        chance = (float(chance) + math.log(hypothesis.tried * len(sizes))) / math.log(10.0)
+        return StarFix(stars, rms, chance, pose)
 
-    def _named(self, directions: FloatArray, magnitudes: FloatArray, R: FloatArray) -> IntArray:
+    def _named(self, directions: FloatArray, magnitudes: FloatArray, gate: float) -> IntArray:
         """Pairs (k, 2) of a star and its row in the catalogue, each once, by place and, as of doubles, brightness."""
-        found = self.catalogue.tree.query(directions @ R.T, k=_COMPANIONS, distance_upper_bound=self.gate_rad)
+        found = self.catalogue.tree.query(directions, k=_COMPANIONS, distance_upper_bound=gate)
         distance, row = np.asarray(found[0]), np.asarray(found[1], dtype=np.intp)
         star, of_star = np.nonzero(np.isfinite(distance))
         if not len(star):
             return np.empty((0, 2), dtype=np.intp)
-        row, distance = row[star, of_star], distance[star, of_star] / (self.gate_rad / 3.0)
+        row, distance = row[star, of_star], distance[star, of_star] / (gate / 3.0)
         fainter = magnitudes[star] - self.catalogue.magnitudes[row]
         nearest = fainter[of_star == 0]
         spread = max(1.4826 * float(np.median(np.abs(nearest - np.median(nearest)))), _LEAST_SPREAD)
@@ -358,15 +201,14 @@ class StarMatcher:
         order = order[np.argsort(star[order])]
         return np.stack([star[order], row[order]], axis=1)
 
-    def chance(self, R: FloatArray, matched: int, stars: int, hypotheses: int) -> float:
-        """Expected number of hypotheses, as a decimal logarithm, that match as many stars besides their three."""
-        axis = -R[:, 2]
+    def _log_chance(self, pose: CameraPose, matched: IntArray, stars: IntArray) -> FloatArray:
+        """Logarithm of the chance that an attitude matches as many of some stars besides the three that state it."""
         radius = 2.0 * math.sin(0.25 * self.camera.diagonal_rad)
+        axis = -pose.R_catalogue_from_frame[:, 2]
         around = self.catalogue.tree.query_ball_point(axis, radius, return_length=True)
-        covered = float(np.asarray(around)) * (self.gate_rad / radius) ** 2
+        covered = float(np.asarray(around)) * (self.gate_rad(pose.camera) / radius) ** 2
         # Of at least `matched` - 3: the survival function counts what is more than its argument.
-        chance = float(binom.logsf(matched - 4, max(stars - 3, 0), min(covered, 1.0)))
-        return (chance + math.log(hypotheses)) / math.log(10.0)
+        return np.asarray(binom.logsf(matched - 4, np.maximum(stars - 3, 0), min(covered, 1.0)))
 
 
 def identify_stars(
@@ -375,6 +217,7 @@ def identify_stars(
     frames: Iterable[tuple[ArrayLike, ArrayLike]],
     *,
     noise_px: float = 1.0,
+    lens: LensPrior = LensPrior(),  # noqa: B008 - frozen
     progress: Callable[[int], None] | None = None,
 ) -> list[StarFix | NoFix]:
     """Attitude and stars of images, without knowing where the camera looked.
@@ -389,6 +232,8 @@ def identify_stars(
         Points (f, 2), y up, and magnitudes (f,) of each image; see :meth:`StarMatcher.identify`.
     noise_px : float
         Standard deviation of a star's place, per axis.
+    lens : LensPrior
+        Errors of the camera's scale and of its distortion, such as ``adcs.stars.pose.UNKNOWN_LENS``: exact without it.
     progress : callable, optional
         Called with 1 after every image.
 
@@ -409,7 +254,7 @@ def identify_stars(
     matcher = StarMatcher.of(catalogue, camera, noise_px)
     fixes = []
     for points_px, magnitudes in frames:
-        fixes.append(matcher.identify(points_px, magnitudes))
+        fixes.append(matcher.identify(points_px, magnitudes, lens))
         if progress is not None:
             progress(1)
     return fixes
@@ -424,14 +269,6 @@ def _clearly_first(of: IntArray, cost: FloatArray) -> IntArray:
     np.minimum.at(second, of[later], cost[later])
     clear: IntArray = np.sort(first[(count == 1) | (second[of[first]] - cost[first] > _CLEARLY)])
     return clear
-
-
-def rotation_between(seen: FloatArray, there: FloatArray) -> FloatArray:
-    """Rotations (..., 3, 3) of least squares of k ≥ 2 unit vectors (..., k, 3): there ≈ R seen, by SVD (Kabsch)."""
-    U, _, Vt = np.linalg.svd(np.swapaxes(there, -1, -2) @ seen)
-    sign = np.ones(U.shape[:-1])
-    sign[..., 2] = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    return (U * sign[..., None, :]) @ Vt
 
 
 @dataclass(frozen=True)

@@ -218,7 +218,9 @@ class TestComplementaryFilter:
 class TestIdentifyStars:
     def test_a_frame_of_a_made_up_sky(self):
         """Stars at the places of a catalogue, seen by a camera of known attitude."""
-        from adcs.stars.identification import StarCamera, StarCatalogue, StarFix
+        from adcs.stars.camera import StarCamera
+        from adcs.stars.catalogue import StarCatalogue
+        from adcs.stars.identification import StarFix
 
         rng = np.random.default_rng(5)
         z = rng.uniform(-1.0, 1.0, 3000)

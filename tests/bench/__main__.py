@@ -17,6 +17,7 @@ from tests.bench import (
     mockup,
     recording,
     sources,
+    stars,
 )
 from tests.bench.table import header, table
 from tests.bench.timing import FULL, QUICK, Size
@@ -31,6 +32,7 @@ GROUPS = {
     "maps": maps,
     "bounds": bounds,
     "mockup": mockup,
+    "stars": stars,
     "machine": machine,
     "recording": recording,
 }

@@ -4,7 +4,8 @@ What is checked                  by what
 identification                   random skies of which the truth is known; frames of the same part of the sky, one as
                                  the catalogue of the other; a catalogue that MAGLOC_STAR_CATALOGUE names
 the image's handedness           three bright stars of Cepheus, from any almanac
-rotation of least squares        scipy's Rotation.align_vectors
+the compiled search              every pair of triangles, checked by a k-d tree
+pose and covariance              the truth, whitened by the covariance (NEES); the exact pose without noise
 """
 
 import json
@@ -20,16 +21,13 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from adcs.cli.stars import stars
+from adcs.stars.camera import StarCamera
+from adcs.stars.catalogue import StarCatalogue
 from adcs.stars.files import read_star_catalogue, read_star_frames
-from adcs.stars.identification import (
-    NoFix,
-    StarCamera,
-    StarCatalogue,
-    StarFix,
-    StarMatcher,
-    rotation_between,
-    star_triangles,
-)
+from adcs.stars.identification import NoFix, StarFix, StarMatcher
+from adcs.stars.pose import UNKNOWN_LENS, CameraPose, fitted
+from adcs.stars.triangles import TriangleIndex, star_triangles
+from adcs.stars.triangles_compiled import KEPT, Checks
 from arrays.io.errors import InputError
 from magloc.cli import framework
 from tests.adcs.refusals import assert_refused
@@ -80,6 +78,17 @@ class TestRandomSky:
         assert right / there > 0.98
         assert right / identified > 0.995
 
+    def test_the_scale_may_be_wrong(self):
+        sky, rng = random_sky(30_000), np.random.default_rng(10)
+        for R, off in zip(Rotation.random(3, random_state=11).as_matrix(), (0.955, 1.02, 1.045), strict=True):
+            points, magnitudes, rows = image_of(sky, R, rng)
+            matcher = StarMatcher.of(sky, StarCamera(1392, 1040, off * CAMERA.rad_per_px))
+            fix = matcher.identify(points, magnitudes, UNKNOWN_LENS)
+            assert isinstance(fix, StarFix)
+            assert (rows[fix.stars[:, 0]] == fix.stars[:, 1]).mean() > 0.9
+            wrong = fix.pose.camera.rad_per_px / CAMERA.rad_per_px - 1.0
+            assert abs(wrong) < 5.0 * math.sqrt(fix.pose.covariance[3, 3]) < 0.02
+
     def test_an_unknown_sky_gives_no_fix(self):
         matcher, rng = StarMatcher.of(random_sky(30_000), CAMERA), np.random.default_rng(3)
         other = random_sky(30_000, seed=4)
@@ -112,15 +121,9 @@ class TestRandomSky:
 
 
 class TestGeometry:
-    def test_rotation_of_least_squares(self):
-        rng = np.random.default_rng(0)
-        seen, there = rng.standard_normal((2, 6, 3))
-        expected = Rotation.align_vectors(there, seen)[0].as_matrix()
-        assert_allclose(rotation_between(seen, there), expected, atol=1e-9)
-
     def test_triangles_have_brighter_corners_and_do_not_depend_on_fainter_stars(self):
         directions = random_sky(3000).directions
-        few, many = star_triangles(directions[:500], 0.3), star_triangles(directions, 0.3)
+        few, many = star_triangles(directions[:500], 0.3, 4), star_triangles(directions, 0.3, 4)
         known = {frozenset(corners) for corners in many.corners.tolist()}
         # Fainter stars may crowd brighter neighbours out of the nearest 24, no more.
         assert np.mean([frozenset(corners) in known for corners in few.corners.tolist()]) > 0.2
@@ -147,6 +150,77 @@ class TestGeometry:
             CAMERA.directions(points)
 
 
+class TestCompiledSearch:
+    @pytest.mark.parametrize("scale", [0.0, 0.05])
+    def test_is_that_of_all_pairs_of_triangles(self, scale):
+        """Of a small sky, all that match by chance too: the best are those of a k-d tree."""
+        sky, camera, rng = random_sky(2000), StarCamera(600, 400, math.radians(0.05)), np.random.default_rng(20)
+        points, magnitudes, _ = image_of(sky, Rotation.random(random_state=21).as_matrix(), rng, camera=camera)
+        points = points[np.argsort(magnitudes)]
+        tangents = camera.tangents(points)
+        index = TriangleIndex.of(sky.directions[np.argsort(sky.magnitudes)[:1000]], 1.0, 4)
+        image = star_triangles(camera.directions(points[:20]), 2.0, 4)
+        checks = Checks(0.02, scale, 0.01, 15, 1000, 10**9)
+        R, factor = index.hypotheses(tangents, image, checks)
+        scaled = factor[:, None, None] * tangents[:15]
+        scaled = np.concatenate([scaled, np.full((*scaled.shape[:2], 1), -1.0)], axis=2)
+        scaled /= np.linalg.norm(scaled, axis=2, keepdims=True)
+        distance = sky.tree.query(scaled @ np.swapaxes(R, 1, 2))[0]
+        matched = np.count_nonzero(distance < checks.near, axis=1)
+        (found,) = index.best(tangents, image, sky.cells, checks)
+        assert len(found) == KEPT
+        assert found[0].tried == len(R) > 300
+        expected = np.sort(matched)[: -KEPT - 1 : -1]
+        for hypothesis, count in zip(found, expected, strict=True):
+            same = np.flatnonzero(np.abs(R - hypothesis.R).max(axis=(1, 2)) < 1e-9)
+            assert matched[same].max() == count
+            assert np.abs(factor[same] - hypothesis.scale).min() < 1e-12
+
+
+class TestPose:
+    LENS = StarCamera(1392, 1040, math.radians(15.78 / 3600.0), radial=-2.0)
+
+    def points(self, R, rng, noise_px):
+        """Stars of a camera whose lens bends by 2 px at a corner: its model inverted by iteration."""
+        directions, camera = random_sky(40_000).directions, self.LENS
+        seen = directions @ R
+        tangents = seen[:, :2] / -seen[:, 2:]
+        inside = (seen[:, 2] < 0.0) & (np.abs(tangents) < 0.95 * camera.corner * np.array([0.8, 0.6])).all(axis=1)
+        tangents = tangents[inside]
+        pinhole = tangents
+        for _ in range(20):
+            pinhole = tangents / (1.0 + camera.radial * np.sum(pinhole**2, axis=1, keepdims=True))
+        points = pinhole / math.tan(camera.rad_per_px) + [696.0, 520.0]
+        return points + noise_px * rng.standard_normal(points.shape), directions[inside]
+
+    def fit(self, R, rng, noise_px):
+        points, there = self.points(R, rng, noise_px)
+        known = StarCamera(1392, 1040, 1.02 * CAMERA.rad_per_px)
+        pose = CameraPose(R @ Rotation.from_rotvec([1e-3, -1e-3, 2e-3]).as_matrix(), known, np.zeros((5, 5)))
+        for _ in range(5):
+            pose = fitted(points, there, pose, known, UNKNOWN_LENS, max(noise_px, 1e-6))
+        return pose
+
+    def test_is_exact_without_noise(self):
+        R = Rotation.random(random_state=30).as_matrix()
+        pose = self.fit(R, np.random.default_rng(0), 0.0)
+        assert_allclose(pose.R_catalogue_from_frame, R, atol=1e-10)
+        assert pose.camera.rad_per_px == pytest.approx(self.LENS.rad_per_px, rel=1e-9)
+        assert pose.camera.radial == pytest.approx(-2.0, rel=1e-6)
+
+    def test_covariance(self):
+        """NEES of 60 poses over 5 states: χ²(300) is within 240 to 360 but for 1 % of seeds."""
+        rng, total = np.random.default_rng(31), 0.0
+        for R in Rotation.random(60, random_state=32).as_matrix():
+            pose = self.fit(R, rng, 0.3)
+            turn = Rotation.from_matrix(R.T @ pose.R_catalogue_from_frame).as_rotvec()
+            scale = math.log(pose.camera.rad_per_px / self.LENS.rad_per_px)
+            error = np.array([*turn, scale, pose.camera.radial + 2.0])
+            total += error @ np.linalg.solve(pose.covariance, error)
+        # The scatter of the residuals is estimated too, of some 40 numbers: Student's tails add a tenth.
+        assert 240.0 < total < 1.1 * 360.0
+
+
 @pytest.fixture(scope="module")
 def frames(data_folder):
     return read_star_frames(data_folder / "star-frames")
@@ -166,12 +240,11 @@ class TestRecordedFrames:
         sky = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
         rows = [int(np.flatnonzero(image.numbers == number)[0]) for number in (109492, 110991, 109857)]
         seen = camera.directions(image.points_px[rows])
-        R = rotation_between(seen, sky)
+        R = Rotation.align_vectors(sky, seen)[0].as_matrix()
         assert np.linalg.norm(seen @ R.T - sky, axis=1).max() < 3.0 * camera.rad_per_px
         mirrored = seen * [-1.0, 1.0, 1.0]
-        assert (
-            np.linalg.norm(mirrored @ rotation_between(mirrored, sky).T - sky, axis=1).max() > 100 * camera.rad_per_px
-        )
+        R = Rotation.align_vectors(sky, mirrored)[0].as_matrix()
+        assert np.linalg.norm(mirrored @ R.T - sky, axis=1).max() > 100 * camera.rad_per_px
 
     def catalogue_of(self, images, camera, chosen):
         """Labelled stars of frames, each frame turned to a place of its own."""
@@ -399,14 +472,13 @@ class TestCommand:
         outcome = adcs("stars", sky_files / "frames", "--catalogue", sky_files / "sky.csv", "--noise-px", noise)
         assert_refused(outcome, "--noise-px", "expected at most 104, a tenth of the image's shorter side")
 
-    def test_noise_in_which_all_triangles_agree_is_no_long_work(self, adcs, sky_files):
+    def test_noise_in_which_most_triangles_agree_is_no_long_work(self, adcs, sky_files):
         outcome = adcs(
             "stars", sky_files / "frames", "--catalogue", sky_files / "sky.csv", "--noise-px", "50", "--json"
         )
         found = json.loads(outcome.out)
         assert found["fixes"] == 0
-        for frame in found["frames"]:
-            assert "triangles agree within the noise, 250000 can be told apart" in frame["reason"]
+        assert all("stars too easily" in frame["reason"] for frame in found["frames"])
 
 
 def test_a_folder_that_is_none(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,12 @@ from scipy.spatial.transform import Rotation
 
 import adcs
 from adcs.cli.app import main
+from adcs.stars.camera import StarCamera
 from adcs.stars.files import read_star_frames
-from adcs.stars.identification import NoFix, StarCamera, StarMatcher
+from adcs.stars.identification import NoFix, StarFix, StarMatcher
 from adcs.stars.pictures import find_picture_stars, read_picture
-from adcs.stars.unknown_scale import PictureFix, identify_at_unknown_scale, solve_photograph
+from adcs.stars.pose import UNKNOWN_LENS, LensPrior
+from adcs.stars.unknown_scale import identify_at_unknown_scale, solve_photograph
 from arrays.io.errors import InputError
 from tests.adcs.stars.skies import photograph
 from tests.adcs.stars.test_identification import random_sky
@@ -106,8 +109,8 @@ class TestLights:
 
 def is_right(found, R):
     """Whether a fix looks where the camera did."""
-    turn = found.fix.R_catalogue_from_frame @ R.T
-    scale = found.camera.rad_per_px / CAMERA.rad_per_px
+    turn = found.R_catalogue_from_frame @ R.T
+    scale = found.pose.camera.rad_per_px / CAMERA.rad_per_px
     return Rotation.from_matrix(turn).magnitude() < math.radians(0.05) and abs(scale - 1.0) < 1e-3
 
 
@@ -121,9 +124,11 @@ class TestUnknownScale:
             given = CAMERA.rad_per_px * rng.uniform(0.92, 1.08)
             _, found = solve_photograph(picture, SKY, rad_per_px=given, tolerance=0.1)
             assert isinstance(found, NoFix) or is_right(found, R)
-            solved += isinstance(found, PictureFix)
-            if isinstance(found, PictureFix):
-                assert abs(found.camera.rad_per_px - CAMERA.rad_per_px) < 5.0 * found.scale_sigma_rad
+            solved += isinstance(found, StarFix)
+            if isinstance(found, StarFix):
+                assert abs(found.pose.camera.rad_per_px - CAMERA.rad_per_px) < 5.0 * CAMERA.rad_per_px * math.sqrt(
+                    found.pose.covariance[3, 3]
+                )
         assert solved >= 5
 
     def test_without_any_scale(self):
@@ -166,14 +171,15 @@ class TestHipparcos:
         moved = later.directions[place[87937]] - catalogue.directions[place[87937]]
         assert math.degrees(np.linalg.norm(moved)) * 3600.0 == pytest.approx(103.6, abs=0.5)
 
-    def test_frames(self, data_folder):
+    @pytest.mark.parametrize(("off", "lens"), [(1.0, LensPrior()), (0.955, UNKNOWN_LENS), (1.045, UNKNOWN_LENS)])
+    def test_frames(self, data_folder, off, lens):
         camera, frames = read_star_frames(data_folder / "star-frames")
         catalogue = adcs.hipparcos_catalogue(1991.25)
-        matcher = StarMatcher.of(catalogue, camera)
+        matcher = StarMatcher.of(catalogue, replace(camera, rad_per_px=off * camera.rad_per_px))
         right = identified = there = 0
         for frame in frames:
             there += np.count_nonzero(np.isin(frame.numbers, catalogue.numbers))
-            fix = matcher.identify(frame.points_px, frame.magnitudes)
+            fix = matcher.identify(frame.points_px, frame.magnitudes, lens)
             right += np.count_nonzero(catalogue.numbers[fix.stars[:, 1]] == frame.numbers[fix.stars[:, 0]])
             identified += len(fix.stars)
         assert right / there > 0.993

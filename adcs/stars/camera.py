@@ -1,0 +1,97 @@
+"""A camera that looks at the sky: a pinhole with the radial distortion of its lens."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from arrays.io.errors import check_positive
+from arrays.typing import FloatArray
+
+MOST_PIXELS = 100_000
+"""Of either side of an image."""
+SCALE_ARCSEC = (0.01, 3600.0)
+"""Of a pixel: from the largest telescopes to a degree."""
+WIDEST_RAD = math.radians(150.0)
+"""Between opposite corners: no lens that maps like a pinhole shows more."""
+
+
+@dataclass(frozen=True)
+class StarCamera:
+    """A pinhole camera with a lens: tangents s = tan(rad_per_px) x, bent to s (1 + radial |s|²).
+
+    Attributes
+    ----------
+    rad_per_px : float
+        Scale at the centre [rad/px].
+    radial : float
+        Distortion: positive where a star stands nearer to the centre than through a pinhole.
+
+    Raises
+    ------
+    ValueError
+        A value is not positive, or out of the range of :data:`MOST_PIXELS`, :data:`SCALE_ARCSEC` or :data:`WIDEST_RAD`.
+    """
+
+    width_px: int
+    height_px: int
+    rad_per_px: float
+    radial: float = 0.0
+
+    def __post_init__(self) -> None:
+        check_positive(width_px=self.width_px, height_px=self.height_px, rad_per_px=self.rad_per_px)
+        if max(self.width_px, self.height_px) > MOST_PIXELS:
+            raise ValueError(
+                f"Inputs width_px and height_px must be at most {MOST_PIXELS}; "
+                f"instead received {self.width_px} and {self.height_px}."
+            )
+        low, high = SCALE_ARCSEC
+        arcsec = math.degrees(self.rad_per_px) * 3600.0
+        if not low * (1.0 - 1e-9) <= arcsec <= high * (1.0 + 1e-9):
+            raise ValueError(f"Input rad_per_px must be {low:g} to {high:g} arc seconds; instead received {arcsec:g}.")
+        if self.diagonal_rad > WIDEST_RAD:
+            raise ValueError(
+                f"An image must be at most {math.degrees(WIDEST_RAD):.0f}° wide from corner to corner; "
+                f"instead received a camera of {math.degrees(self.diagonal_rad):.1f}°."
+            )
+
+    @property
+    def diagonal_rad(self) -> float:
+        """Angle between opposite corners."""
+        return 2.0 * math.atan(self.corner)
+
+    @property
+    def solid_angle_sr(self) -> float:
+        """Part of the sphere that an image shows, as if it were flat."""
+        return self.width_px * self.height_px * self.rad_per_px**2
+
+    @property
+    def corner(self) -> float:
+        """Tangent of a corner's angle from the centre, through a pinhole."""
+        return 0.5 * math.hypot(self.width_px, self.height_px) * math.tan(self.rad_per_px)
+
+    def tangents(self, points_px: ArrayLike) -> FloatArray:
+        """Components (f, 2) across the line of sight, over that along it, of points (f, 2), y up.
+
+        Raises
+        ------
+        ValueError
+            The shape is another one, or a number is not finite.
+        """
+        points = np.asarray(points_px, dtype=np.float64)
+        if points.ndim != 2 or points.shape[1] != 2 or not np.isfinite(points).all():
+            raise ValueError(
+                f"Input points_px must be finite numbers of shape (f, 2); instead received shape {points.shape}."
+            )
+        pinhole = (points - 0.5 * np.array([self.width_px, self.height_px])) * math.tan(self.rad_per_px)
+        bent: FloatArray = pinhole * (1.0 + self.radial * np.sum(pinhole**2, axis=1, keepdims=True))
+        return bent
+
+    def directions(self, points_px: ArrayLike) -> FloatArray:
+        """Unit vectors (f, 3) in the frame's axes of points (f, 2); see docs/theory/star-identification.md."""
+        tangents = self.tangents(points_px)
+        outward = np.concatenate([tangents, np.full((len(tangents), 1), -1.0)], axis=1)
+        return outward / np.linalg.norm(outward, axis=1, keepdims=True)

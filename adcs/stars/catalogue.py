@@ -1,0 +1,67 @@
+"""Stars of the sky, and where among them a direction is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
+
+from adcs.stars.triangles_compiled import CELLS, SkyCells
+from arrays.typing import FloatArray, IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class StarCatalogue:
+    """Stars of the sky; made by :meth:`of`.
+
+    Attributes
+    ----------
+    numbers : ndarray, shape (n,)
+        Such as those of Hipparcos.
+    directions : ndarray, shape (n, 3)
+        Unit vectors in the catalogue's frame.
+    magnitudes : ndarray, shape (n,)
+    """
+
+    numbers: IntArray
+    directions: FloatArray
+    magnitudes: FloatArray
+
+    @classmethod
+    def of(
+        cls, numbers: ArrayLike, right_ascension_rad: ArrayLike, declination_rad: ArrayLike, magnitudes: ArrayLike
+    ) -> StarCatalogue:
+        """Catalogue from right ascension and declination, of shape (n,) each.
+
+        Raises
+        ------
+        ValueError
+            The shapes differ, a number is not finite, or there are fewer than four stars.
+        """
+        ra, dec = np.asarray(right_ascension_rad, dtype=np.float64), np.asarray(declination_rad, dtype=np.float64)
+        hip, magnitude = np.asarray(numbers, dtype=np.intp), np.asarray(magnitudes, dtype=np.float64)
+        if not (ra.shape == dec.shape == hip.shape == magnitude.shape and ra.ndim == 1 and ra.size >= 4):
+            raise ValueError(
+                "Input numbers, right_ascension_rad, declination_rad and magnitudes must be of one shape (n,), "
+                f"n at least 4; instead received shapes {hip.shape}, {ra.shape}, {dec.shape} and {magnitude.shape}."
+            )
+        if not (np.isfinite(ra).all() and np.isfinite(dec).all() and np.isfinite(magnitude).all()):
+            raise ValueError("Inputs of a star catalogue must be finite; instead received NaN or infinity.")
+        directions = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+        return cls(hip, directions, magnitude)
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Directions, for search."""
+        return cKDTree(self.directions)
+
+    @cached_property
+    def cells(self) -> SkyCells:
+        """Directions by their cell of a cube, for compiled search."""
+        cell = np.clip(((self.directions + 1.0) * (0.5 * CELLS)).astype(np.intp), 0, CELLS - 1)
+        number = cell @ np.array([CELLS * CELLS, CELLS, 1])
+        order = np.argsort(number, kind="stable")
+        return SkyCells(self.directions[order], np.searchsorted(number[order], np.arange(CELLS**3 + 1)))
