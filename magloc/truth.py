@@ -10,13 +10,14 @@ from os import PathLike
 
 import numpy as np
 
-from arrays.io.csv import read_table
+from arrays.io.csv import Column, read_table
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray, IntArray
 from magloc.readings import Readings
 
 TRUE_POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 TRUE_MOMENT_COLUMNS = ("mx_Am2", "my_Am2", "mz_Am2")
+STATE_COLUMNS = TRUE_POSITION_COLUMNS + TRUE_MOMENT_COLUMNS
 SAME_TIME_S = 1e-6
 # Of the truth's usual interval: over a longer one it is not interpolated.
 _LONGEST_STEP = 2.0
@@ -115,3 +116,11 @@ def truth_of_rows(readings: Readings, truth: Truth) -> tuple[FloatArray, FloatAr
         return np.asarray(np.where(known[:, None], between, np.nan))
 
     return of_rows(truth.position_m), None if truth.moment_Am2 is None else of_rows(truth.moment_Am2)
+
+
+def state_columns(position_m: FloatArray, moment_Am2: FloatArray, covariance: FloatArray) -> dict[str, Column]:
+    """Columns of positions, moments (n, 3) and their standard deviations."""
+    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    state = np.concatenate([position_m, moment_Am2], axis=1)
+    columns: dict[str, Column] = dict(zip(STATE_COLUMNS, state.T, strict=True))
+    return columns | dict(zip((f"s_{name}" for name in STATE_COLUMNS), sigma.T, strict=True))

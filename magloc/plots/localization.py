@@ -21,6 +21,7 @@ from magloc.localization.residuals import fix_residuals
 from magloc.plots import style
 from magloc.plots.style import write
 from magloc.readings import Readings
+from magloc.truth import state_columns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -97,7 +98,7 @@ def write_pictures(
     left = _residuals_of(array, rows, fixes, ambient_T)
     found = fix_columns(fixes)
     columns: dict[str, Column] = {"time_s": found.time_s, "source": found.source}
-    columns |= style.state_columns(found.position_m, found.moment_Am2, found.covariance)
+    columns |= state_columns(found.position_m, found.moment_Am2, found.covariance)
     columns |= style.square_columns("chi2", found.chi2, found.dof)
     columns |= {"range95_low_m": found.range95_m[:, 0], "range95_high_m": found.range95_m[:, 1]}
     columns["range_observable"] = found.range_observable

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 from arrays.typing import FloatArray
 from magloc.levels import INTERVAL
 from magloc.levels import SIGMAS_95 as SIGMAS_95
+from magloc.truth import STATE_COLUMNS
 
 WIDTH_IN = 7.1
 DPI = 200
@@ -43,7 +44,6 @@ _MOST_ELLIPSES = 24
 _FEW_DECADES, _FEW_TIMES, _NO_TIMES = 30.0, 4.0, 2.5
 _FEW_MARKS = 40
 FEW_SENSORS, _MOST_NAMED_SENSORS = 10, 60
-STATE = ("x_m", "y_m", "z_m", "mx_Am2", "my_Am2", "mz_Am2")
 """Columns of position and moment."""
 
 
@@ -251,17 +251,9 @@ def bounds99(degrees_of_freedom: ArrayLike) -> tuple[FloatArray, FloatArray]:
     return chdtri(known, 0.995) / known, chdtri(known, 0.005) / known
 
 
-def state_columns(position_m: FloatArray, moment_Am2: FloatArray, covariance: FloatArray) -> dict[str, Column]:
-    """Columns of positions, moments (n, 3) and their standard deviations."""
-    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    state = np.concatenate([position_m, moment_Am2], axis=1)
-    columns: dict[str, Column] = dict(zip(STATE, state.T, strict=True))
-    return columns | dict(zip((f"s_{name}" for name in STATE), sigma.T, strict=True))
-
-
 def truth_columns(truth_m: FloatArray) -> dict[str, Column]:
     """Columns of true positions (n, 3)."""
-    return dict(zip((f"true_{name}" for name in STATE), truth_m.T, strict=False))
+    return dict(zip((f"true_{name}" for name in STATE_COLUMNS), truth_m.T, strict=False))
 
 
 def square_columns(name: str, square: FloatArray, dof: NDArray[np.int64]) -> dict[str, Column]:

@@ -16,6 +16,7 @@ from arrays.typing import FloatArray, IntArray
 from magloc.plots import style
 from magloc.plots.style import save
 from magloc.tracking.results import TrackPoint, stacked
+from magloc.truth import STATE_COLUMNS, state_columns
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,9 +45,9 @@ def write_picture(
     nis, nis_dof = np.array([point.nis for point in points]), np.array([point.nis_dof for point in points])
     estimability = stacked(points, "estimability", 6)
     columns: dict[str, Column] = {"time_s": time}
-    columns |= style.state_columns(position, moment, covariance)
+    columns |= state_columns(position, moment, covariance)
     columns |= style.square_columns("nis", nis, nis_dof)
-    components = (name.split("_")[0] for name in style.STATE)
+    components = (name.split("_")[0] for name in STATE_COLUMNS)
     columns |= dict(zip((f"estimability_{name}" for name in components), estimability.T, strict=True))
     if truth_m is not None:
         columns |= style.truth_columns(truth_m)

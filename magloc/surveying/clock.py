@@ -14,6 +14,7 @@ from arrays.typing import IntArray
 from magloc.navigation.poses import vectors_at
 from magloc.readings import Readings
 from magloc.surveying.joint_fit import Sources
+from magloc.surveying.record import SurveyRecord
 from magloc.surveying.rounds import Model
 
 _STEP_M = 0.05  # of the way, for the curvature of the likelihood
@@ -29,9 +30,9 @@ class Lag(NamedTuple):
     sigma_s: float
 
 
-def lag_of(model_at: Callable[[float], Model], sources: Sources, group: IntArray) -> Lag:
-    """Likeliest lag of a record, 0 where it explains no more than chance does; ``model_at`` has one corrected."""
-    record = model_at(0.0).record
+def lag_of(model: Model, sources: Sources, group: IntArray, delayed: Callable[[float], SurveyRecord]) -> Lag:
+    """Likeliest lag of a record, 0 where it explains no more than chance does; ``delayed`` has one corrected."""
+    record = model.record
     way = np.linalg.norm(np.diff(record.sensors_m.mean(axis=1), axis=0), axis=1)
     speed = float(np.median(way / np.diff(record.time_s)))
     if not len(sources) or speed * _MOST_S < _STEP_M:
@@ -40,18 +41,18 @@ def lag_of(model_at: Callable[[float], Model], sources: Sources, group: IntArray
 
     def cost(lag_s: float) -> float:
         """Twice the negative logarithm of the likelihood, sources refitted."""
-        model = model_at(lag_s)
-        return model.misfit(model.refitted(sources, group), group)
+        at = replace(model, record=delayed(lag_s)) if lag_s else model
+        return at.misfit(at.refitted(sources, group), group)
 
     before, here, after = cost(-step), cost(0.0), cost(step)
     curvature = (before - 2.0 * here + after) / step**2
     slope = (after - before) / (2.0 * step)
-    if here < min(before, after) and slope**2 < 2.0 * curvature * model_at(0.0).threshold:
+    if here < min(before, after) and slope**2 < 2.0 * curvature * model.threshold:
         return Lag(0.0, math.sqrt(2.0 / curvature))
     found = minimize_scalar(cost, bounds=(-_MOST_S, _MOST_S), method="bounded", options={"xatol": _TOLERANCE_S})
     size = (int(group[-1]) + 1) * record.array.n_channels
     explained = found.fun < max(_MISFIT * size, _SHARE * here)  # else something is wrong that a lag imitates
-    if not explained or here - found.fun < model_at(0.0).threshold or abs(found.x) > 0.99 * _MOST_S:
+    if not explained or here - found.fun < model.threshold or abs(found.x) > 0.99 * _MOST_S:
         return Lag(0.0, math.inf)
     around = [cost(found.x + sign * step) for sign in (-1.0, 1.0)]
     return Lag(float(found.x), step * math.sqrt(2.0 / (sum(around) - 2.0 * found.fun)))

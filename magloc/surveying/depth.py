@@ -28,7 +28,8 @@ def depth_interval(
     near = np.linalg.norm(others.position_m[:, :2] - position[:2], axis=1) < 2.0 * WINDOW * height
     Q = with_free_sources(record, background, others.some(near))
     # What the source explains itself is put back, to first order: it is weak.
-    own = jacobian_of(record, background, source)[:, 3:] @ source.moment_Am2[0]
+    own_field = record.fields(source.position_m, source.moment_Am2)
+    own = jacobian_of(record, background, source, own_field)[:, 3:] @ source.moment_Am2[0]
     left = fit.residual + own
     left = left - Q @ (Q.T @ left)
     directions = record.directions(record.fields(fit.sources.position_m, fit.sources.moment_Am2))

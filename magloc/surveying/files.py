@@ -10,8 +10,7 @@ from arrays.io.csv import Column
 from arrays.io.world_maps import feature, feature_collection, kml, placemark, world_place
 from arrays.typing import Vector
 from magloc.surveying.results import IRON_Am2_PER_KG, Survey
-
-_COMPONENTS = ("x_m", "y_m", "z_m", "mx_Am2", "my_Am2", "mz_Am2")
+from magloc.truth import state_columns
 
 
 def json_of_survey(found: Survey) -> dict[str, Any]:
@@ -45,12 +44,11 @@ def json_of_survey(found: Survey) -> dict[str, Any]:
 
 def columns_of_survey(found: Survey) -> dict[str, Column]:
     """Columns of ``targets.csv``."""
-    state = np.array([np.concatenate([t.position_m, t.moment_Am2]) for t in found]).reshape(-1, 6)
-    sigma = np.array([np.sqrt(np.diagonal(t.covariance)) for t in found]).reshape(-1, 6)
+    covariance = np.array([t.covariance for t in found]).reshape(-1, 6, 6)
+    moment = np.array([t.moment_Am2 for t in found]).reshape(-1, 3)
     low, high = np.array([t.depth_interval95_m for t in found]).reshape(-1, 2).T
     columns: dict[str, Column] = {"id": [t.id for t in found]}
-    columns |= dict(zip(_COMPONENTS, state.T, strict=True))
-    columns |= dict(zip((f"s_{name}" for name in _COMPONENTS), sigma.T, strict=True))
+    columns |= state_columns(found.position_m, moment, covariance)
     columns |= {"depth_m": np.array([t.depth_m for t in found]), "depth_low_m": low, "depth_high_m": high}
     columns |= {"strength_Am2": np.array([t.strength_Am2 for t in found])}
     columns |= {"significance": np.array([t.significance for t in found])}

@@ -19,7 +19,7 @@ from magloc.fields import dipole
 from magloc.measurement.pose import PoseErrors
 from magloc.surveying.record import SurveyRecord
 from magloc.surveying.whitening import Drift, Whitening
-from magloc.surveying.whitening_compiled import source_columns
+from magloc.surveying.whitening_compiled import pole_columns, source_columns
 
 _MOST_STEPS = 25
 _SETTLED = 1e-3
@@ -77,15 +77,11 @@ class Layer:
         grid = np.stack(np.meshgrid(x, y, [low[2] - depth], indexing="ij"), axis=-1).reshape(-1, 3)
         return cls(grid, depth, field_T)
 
-    def columns(self, record: SurveyRecord, directions: FloatArray) -> FloatArray:
-        """What poles of their expected strength add to the channels: (n, C, P)."""
-        out = np.empty((*directions.shape[:2], len(self.places_m)))
-        scale = self.field_T * self.depth_m**2
-        for j, place in enumerate(self.places_m):
-            away = record.sensors_m - place
-            pull = scale * away / np.linalg.norm(away, axis=-1, keepdims=True) ** 3
-            out[..., j] = np.einsum("nci,nci->nc", directions, pull[:, record.array.channel_sensor])
-        return out
+    def columns(self, record: SurveyRecord, directions: FloatArray, white: Whitening) -> FloatArray:
+        """White columns (g·k, P) of what poles of their expected strength add to the measurements."""
+        owner = record.array.channel_sensor
+        columns = pole_columns(record.sensors_m, directions, white.U, owner, self.places_m, white.starts)
+        return self.field_T * self.depth_m**2 * white.of_groups(columns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,8 +118,8 @@ class Background:
         gradients = dipole.total_gradient_tensor(record.sensors_m, sources.position_m, sources.moment_Am2)
         directions = record.directions(fields)
         white = Whitening.of(record, record.by_pose(directions, fields, gradients), errors, drift, group)
-        columns = np.concatenate([layer.columns(record, directions), record.by_sensors(directions)], axis=2)
-        return cls(white, orthogonal(white(columns)))
+        columns = [layer.columns(record, directions, white), white(record.by_sensors(directions))]
+        return cls(white, orthogonal(np.concatenate(columns, axis=1)))
 
 
 def with_free_sources(record: SurveyRecord, background: Background, sources: Sources) -> FloatArray:
@@ -131,7 +127,7 @@ def with_free_sources(record: SurveyRecord, background: Background, sources: Sou
     Q = background.Q
     if not len(sources):
         return Q
-    J = jacobian_of(record, background, sources)
+    J = jacobian_of(record, background, sources, record.fields(sources.position_m, sources.moment_Am2))
     J = J - Q @ (Q.T @ J)
     return np.concatenate([Q, orthogonal(_UNKNOWN * J / np.linalg.norm(J, axis=0))], axis=1)
 
@@ -211,16 +207,14 @@ class Bounds:
         return replace(sources, position_m=np.clip(sources.position_m, self.low_m, self.high_m))
 
 
-def residual_of(record: SurveyRecord, background: Background, sources: Sources) -> FloatArray:
-    """White residual (g·k,) of sources."""
-    fields = record.fields(sources.position_m, sources.moment_Am2)
-    return background.white((record.values_T - record.predicted(fields))[..., None])[:, 0]
+def residual_of(record: SurveyRecord, background: Background, fields_T: FloatArray) -> FloatArray:
+    """White residual (g·k,) of the fields of sources."""
+    return background.white((record.values_T - record.predicted(fields_T))[..., None])[:, 0]
 
 
-def jacobian_of(record: SurveyRecord, background: Background, sources: Sources) -> FloatArray:
-    """White columns (g·k, 6 K) of what positions and moments add to the measurements."""
-    fields = record.fields(sources.position_m, sources.moment_Am2)
-    directions = record.directions(fields)
+def jacobian_of(record: SurveyRecord, background: Background, sources: Sources, fields_T: FloatArray) -> FloatArray:
+    """White columns (g·k, 6 K) of what positions and moments add to the measurements, where their fields are."""
+    directions = record.directions(fields_T)
     white, owner = background.white, record.array.channel_sensor
     position, moment = sources.position_m, sources.moment_Am2
     return white.of_groups(source_columns(record.sensors_m, directions, white.U, owner, position, moment, white.starts))
@@ -237,20 +231,21 @@ def fit_jointly(
 ) -> JointFit:
     """Levenberg-Marquardt from some sources, the noise held."""
 
-    def cost_of(sources: Sources) -> tuple[float, FloatArray, FloatArray]:
-        residual = residual_of(record, background, sources)
+    def cost_of(sources: Sources) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+        fields = record.fields(sources.position_m, sources.moment_Am2)
+        residual = residual_of(record, background, fields)
         of_layer = background.Q.T @ residual
-        return float(residual @ residual - of_layer @ of_layer), residual, of_layer
+        return float(residual @ residual - of_layer @ of_layer), residual, of_layer, fields
 
-    def linearised(sources: Sources) -> tuple[FloatArray, FloatArray, FloatArray]:
-        J = jacobian_of(record, background, sources)
+    def linearised(sources: Sources, fields_T: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        J = jacobian_of(record, background, sources, fields_T)
         J_layer = background.Q.T @ J
         return J, J_layer, J.T @ J - J_layer.T @ J_layer
 
-    cost, residual, of_layer = cost_of(sources)
+    cost, residual, of_layer, fields = cost_of(sources)
     if not len(sources):
         return JointFit(sources, cost, np.zeros((0, 0)), residual)
-    J, J_layer, H = linearised(sources)
+    J, J_layer, H = linearised(sources, fields)
     damping = 1e-3
     for _ in range(most):
         gradient = J.T @ residual - J_layer.T @ of_layer
@@ -260,14 +255,14 @@ def fit_jointly(
             scaled = scale[:, None] * H * scale + damping * np.eye(len(H))
             step = scale * np.linalg.solve(scaled, scale * gradient)
             trial = bounds.clipped(sources.moved(step.reshape(-1, 6)))
-            trial_cost, trial_residual, trial_layer = cost_of(trial)
+            trial_cost, *of_trial = cost_of(trial)
             if trial_cost < cost:
                 gain = cost - trial_cost
-                sources, cost, residual, of_layer = trial, trial_cost, trial_residual, trial_layer
+                sources, cost, (residual, of_layer, fields) = trial, trial_cost, of_trial
                 damping = max(0.1 * damping, 1e-9)
                 break
             damping *= 10.0
-        J, J_layer, H = linearised(sources)
+        J, J_layer, H = linearised(sources, fields)
         if gain < settled:
             break
     return JointFit(sources, cost, H, residual)

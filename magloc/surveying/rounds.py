@@ -54,7 +54,8 @@ class Model:
     def misfit(self, sources: Sources, group: IntArray) -> float:
         """Minus twice the log-likelihood of some sources, but for a constant; the ground is Gaussian."""
         background = self.background(sources, group)
-        residual = residual_of(self.record, background, sources)
+        fields = self.record.fields(sources.position_m, sources.moment_Am2)
+        residual = residual_of(self.record, background, fields)
         of_layer = background.Q.T @ residual
         square = float(residual @ residual - of_layer @ of_layer)
         return square + background.white.log_determinant - background.log_determinant

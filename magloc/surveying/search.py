@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import get_num_threads
 
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.surveying.joint_fit import Background, JointFit, Sources, with_free_sources
@@ -19,7 +21,7 @@ PITCH = 1.8
 WINDOW = 5.0
 """Of rows that count, in distances from the sensors."""
 _CHUNK = 8  # places along each side of a tile
-_LEAST_SEEN = 1e-3
+_LEAST_SEEN, _TINY = 1e-3, 1e-30
 # Peaks start sources if they have a share of the strongest one's χ²; within some distances of a stronger one a larger
 # share, as they may be its skirts; and none within fewer, where they are the same.
 _LEAST_SHARE = 0.05
@@ -71,17 +73,18 @@ def search(record: SurveyRecord, background: Background, fit: JointFit, grid: Se
     Q = with_free_sources(record, background, fit.sources)
     left = fit.residual - Q @ (Q.T @ fit.residual)
     middles = record.sensors_m.mean(axis=1)[white.starts[:-1]]
-    parts = []
-    for distance, places in grid.tiles:
+
+    def explained(tile: tuple[float, FloatArray]) -> tuple[FloatArray, ...]:
+        distance, places = tile
         used = np.flatnonzero(_near(middles, places, WINDOW * distance))
-        if not used.size:
-            continue
         alone, projected, v = normal_equations(record, white, directions, places, used, Q, left)
         # Of a source that others nearly imitate rounding and the window's edge are left, which must not count.
-        least = _LEAST_SEEN * np.trace(alone, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+        least = np.maximum(_LEAST_SEEN * np.trace(alone, axis1=1, axis2=2), _TINY)[:, None, None] * np.eye(3)
         moment = np.linalg.solve(projected + least, v[..., None])[..., 0]
-        parts.append((places, np.full(len(places), distance), np.sum(v * moment, axis=1), moment))
-    return Candidates(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+        return places, np.full(len(places), distance), np.sum(v * moment, axis=1), moment
+
+    with ThreadPoolExecutor(get_num_threads()) as pool:
+        return Candidates(*map(np.concatenate, zip(*pool.map(explained, grid.tiles), strict=True)))
 
 
 def normal_equations(

@@ -121,13 +121,17 @@ def survey(
     grid = SearchGrid.below(record, bounds.low_m, bounds.high_m)
     tell = progress or (lambda *_: None)
     strongest = found_in(model, group, grid, Sources.none(), _FIRST_ROUNDS, tell)
-    lag = lag_of(lambda lag_s: replace(model, record=record_of(array, taken_earlier(rows, lag_s))[0]), strongest, group)
+
+    def delayed(lag_s: float) -> SurveyRecord:
+        return record_of(array, taken_earlier(rows, lag_s))[0]
+
+    lag = lag_of(model, strongest, group, delayed)
     if lag.s:
         _LOG.warning(
             f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show: taken"
             " into account"
         )
-        model = replace(model, record=record_of(array, taken_earlier(rows, lag.s))[0])
+        model = replace(model, record=delayed(lag.s))
     sources = found_in(model, group, grid, strongest, MOST_ROUNDS, tell)
     every = np.arange(len(record))
     if assumed and len(sources):

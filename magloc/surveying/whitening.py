@@ -111,7 +111,7 @@ class Whitening:
     def of_groups(self, Y: FloatArray) -> FloatArray:
         """White columns (g·k, m) of columns (g, k, m) of the independent measurements of the groups; they are lost."""
         whiten(Y, np.arange(len(Y)), self.H, self.gains, self.kept, self.dt_s)
-        return Y.reshape(-1, Y.shape[-1])
+        return Y.reshape(len(Y) * Y.shape[1], Y.shape[2])
 
 
 def independent_measurements(record: SurveyRecord) -> FloatArray:

@@ -157,3 +157,34 @@ def source_columns(
                         for a in range(6):
                             out[n, j, 6 * q + a] += scale * U[j, c] * of_channel[a]
     return out
+
+
+@compiled
+def pole_columns(
+    sensors: FloatArray,
+    directions: FloatArray,
+    U: FloatArray,
+    channel_sensor: IntArray,
+    poles: FloatArray,
+    starts: IntArray,
+) -> FloatArray:
+    """What unit poles (P, 3), whose field is away/|away|³, add to the measurements of all groups: (g, k, P)."""
+    C, k, P = directions.shape[1], len(U), len(poles)
+    out = np.zeros((len(starts) - 1, k, P))
+    seen = np.empty(P)
+    for n in range(len(starts) - 1):
+        first, end = starts[n], starts[n + 1]
+        scale = 1.0 / math.sqrt(end - first)
+        for i in range(first, end):
+            for c in range(C):
+                s = sensors[i, channel_sensor[c]]
+                u0, u1, u2 = scale * directions[i, c, 0], scale * directions[i, c, 1], scale * directions[i, c, 2]
+                for p in range(P):
+                    x, y, z = s[0] - poles[p, 0], s[1] - poles[p, 1], s[2] - poles[p, 2]
+                    square = x * x + y * y + z * z
+                    seen[p] = (u0 * x + u1 * y + u2 * z) / (square * math.sqrt(square))
+                for j in range(k):
+                    if U[j, c] != 0.0:
+                        for p in range(P):
+                            out[n, j, p] += U[j, c] * seen[p]
+    return out

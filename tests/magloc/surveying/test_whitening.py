@@ -6,7 +6,7 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.fields import dipole
-from magloc.surveying.whitening_compiled import gains_of, moment_columns, source_columns, whiten
+from magloc.surveying.whitening_compiled import gains_of, moment_columns, pole_columns, source_columns, whiten
 
 N, K, S = 40, 2, 5
 RNG = np.random.default_rng(5)
@@ -85,3 +85,10 @@ class TestColumns:
             self.SENSORS, self.DIRECTIONS, self.U, self.OWNER, self.PLACES, self.MOMENTS, self.STARTS
         )
         np.testing.assert_allclose(found, self.grouped(expected), rtol=1e-9, atol=1e-20)
+
+    def test_poles(self) -> None:
+        away = self.SENSORS[:, self.OWNER, None] - self.PLACES
+        pull = away / np.linalg.norm(away, axis=-1, keepdims=True) ** 3
+        expected = np.einsum("nci,ncpi->ncp", self.DIRECTIONS, pull)
+        found = pole_columns(self.SENSORS, self.DIRECTIONS, self.U, self.OWNER, self.PLACES, self.STARTS)
+        np.testing.assert_allclose(found, self.grouped(expected), rtol=1e-9)
