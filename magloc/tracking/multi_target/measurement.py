@@ -56,6 +56,11 @@ class JointRow:
         """Channels that are used."""
         return int(np.count_nonzero(self.used))
 
+    @property
+    def parts(self) -> tuple[FloatArray, FloatArray, FloatArray, IntArray]:
+        """The row as compiled loops take it."""
+        return self.z, self.gain, self.positions_m, self.channel_sensor
+
     def without(self, out: BoolArray) -> JointRow:
         """The row without some of the sensors (N,)."""
         if not out.any():

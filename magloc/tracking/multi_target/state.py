@@ -52,6 +52,11 @@ class JointState:
         return len(self.position_m)
 
     @property
+    def means(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """What a row sees: positions, moments and the common field, as compiled loops take them."""
+        return self.position_m, self.moment_Am2, self.common_T
+
+    @property
     def n_seen(self) -> int:
         """Leading numbers of the error that a row sees."""
         return N_SEEN * self.n_sources + N_COMMON
@@ -79,12 +84,31 @@ class JointState:
             rate_rad_s=self.rate_rad_s + of_motion[:, 3:],
         )
 
+    def moved_with(self, error: FloatArray, P: FloatArray) -> JointState:
+        """The same with a covariance P of errors in this state's chart, brought into the chart there."""
+        k, moved, P = self.n_sources, self.moved(error), P.copy()
+        c = error[: N_SEEN * k].reshape(k, N_SEEN)[:, 3:]
+        length = np.linalg.norm(moved.moment_Am2, axis=1)[:, None, None]
+        turned, of_c = moment_derivative(self.moment_Am2, c) / length, self.of_source[:, 3:N_SEEN]
+        for one in (P, P.T):
+            one[of_c] = turned @ one[of_c]
+        return replace(moved, P=P)
+
     def covariance(self, source: int) -> FloatArray:
-        """Covariance (6, 6) of a source's position and moment, Cartesian."""
-        at = self.of_source[source, :N_SEEN]
+        """Second moments (6, 6) of the Cartesian error of a source's position and moment.
+
+        Where |m| is known better than its direction, what turns leave of a moment's length is more than the error of
+        |m| itself: 1 - cos δ ≈ δ²/2, whose mean square is (tr² Σ + 2 tr Σ²)/4 for turns of covariance Σ.
+        """
+        at, moment = self.of_source[source, :N_SEEN], self.moment_Am2[source]
         scale = np.ones(N_SEEN)
-        scale[3:] = np.linalg.norm(self.moment_Am2[source])
-        return self.P[np.ix_(at, at)] * np.outer(scale, scale)
+        scale[3:] = np.linalg.norm(moment)
+        covariance: FloatArray = self.P[np.ix_(at, at)] * np.outer(scale, scale)
+        across = np.eye(3) - np.outer(moment, moment) / (moment @ moment)
+        turns = across @ self.P[np.ix_(at[3:], at[3:])] @ across
+        shorter = 0.25 * np.trace(turns) ** 2 + 0.5 * np.sum(turns * turns)
+        covariance[3:, 3:] += shorter * np.outer(moment, moment)
+        return covariance
 
     def gap(self, first: int, second: int) -> tuple[float, float]:
         """Distance between two sources, and its standard deviation [m]."""

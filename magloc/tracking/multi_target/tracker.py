@@ -29,6 +29,7 @@ from magloc.tracking.multi_target.measurement import Channels
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.results import SourcePoint, SourcesPoint
 from magloc.tracking.multi_target.sensor_health import SensorHealth
+from magloc.tracking.multi_target.splitting import split
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
 from magloc.tracking.multi_target.update import innovation_chi2
 from magloc.tracking.results import Row, next_row
@@ -39,11 +40,12 @@ MERGED_GAP = 1.0 / 3.0
 """Standard deviation of a gap over the gap above which two sources are merged."""
 MOST_BY_ITSELF = 5
 # Hypotheses that are kept, and by how much they may be less likely (-2 ln).
-_MOST_HYPOTHESES = 4
+_MOST_HYPOTHESES = 8
 _LESS_LIKELY = 25.0
-# A restart is judged by its predictions of so many rows; the next one comes so many rows later.
+# A restart is judged by its predictions of so many rows; the next one comes so many rows later. Where χ² is not poor,
+# the first one comes so many rows after the number of sources has changed, and each next one after twice as many.
 _JUDGED_ROWS = 11
-_RESTART_PAUSE = 15
+_RESTART_PAUSE, _FIRST_PAUSE = 15, 4
 # Restarts with a source more, and others.
 _MOST_RESTARTS = 3
 # Rows after which it is asked whether a source is one too many.
@@ -52,8 +54,8 @@ _DOUBT_EVERY = 12
 _MEMORIES = np.array([10.0, 80.0])
 _POOR = 5.0 / np.sqrt(2.0 * _MEMORIES - 1.0)
 # By how much it must be likelier in the end, or at once.
-_MUST_GAIN, _CLEAR_GAIN = 10.0, 60.0
-_SAME_SIGMA2 = 9.0
+_MUST_GAIN, _CLEAR_GAIN = 20.0, 60.0
+_SAME_SIGMA2 = 1.0
 # What a row costs at most that nothing explains.
 _UNBEARABLE = 1000.0
 
@@ -137,7 +139,9 @@ class SourcesTracker:
         self._numbers: dict[int, int] = {}
         self._time_s = math.nan
         self._n_rows = 0
-        self._next_restart = 0
+        self._ids: tuple[int, ...] = ()
+        self._last_restart = self._next_restart = -_RESTART_PAUSE
+        self._pause = _FIRST_PAUSE
 
     @one_blas_thread
     def update(self, row: Row | Readings) -> SourcesPoint:
@@ -173,15 +177,22 @@ class SourcesTracker:
         is_poor = bool((best.excess > _POOR).any())
         if status == "tracked" and is_poor:
             status = "doubtful"
+        poor = is_poor or best.health.suspect is not None
         if len(best.ids) > 1 and self._n_rows % _DOUBT_EVERY == 0:
             self._hypotheses += self._superfluous(problem, best, found)
-        if best.ids and (is_poor or best.health.suspect is not None) and self._n_rows >= self._next_restart:
-            self._next_restart = self._n_rows + _RESTART_PAUSE
+        if best.ids != self._ids:
+            self._ids, self._pause = best.ids, _FIRST_PAUSE
+            self._next_restart = self._n_rows + _FIRST_PAUSE
+        if best.ids and self._n_rows >= (self._last_restart + _RESTART_PAUSE if poor else self._next_restart):
+            self._pause *= 2
+            self._last_restart, self._next_restart = self._n_rows, self._n_rows + self._pause
             restarts = self._restarts(problem, best, found)
-            # Whether the suspect is at fault, they are to tell.
-            self._hypotheses[0] = replace(best, health=best.health.forgetful)
+            if poor:  # whether the suspect is at fault, they are to tell
+                self._hypotheses[0] = replace(best, health=best.health.forgetful)
             self._hypotheses += restarts
-        return self._point(problem, status, found.update.cost)
+        point = self._point(problem, status, found.update.cost)
+        self._hypotheses = self._split(problem)
+        return point
 
     def _nothing_yet(self, problem: RowProblem) -> Hypothesis:
         """No source, and a common field that may be as large as the readings."""
@@ -237,24 +248,26 @@ class SourcesTracker:
     def _restarts(self, problem: RowProblem, best: Hypothesis, found: Explanation) -> list[Hypothesis]:
         """Hypotheses that are to be judged: a sensor drifts, there is a source more, or the past is forgotten.
 
-        Of that either all is, or all but where the sources are.
+        Of that either all is, or all but where the sources are. Fewer sources than there are may explain the first
+        rows, in a wrong place, and χ² agree: so they are tried at growing intervals where nothing seems wrong, too.
         """
-        common, dead = best.state.common_alone, best.health.dead
-        anew = problem.explanations(problem.updated(common, (), dead), common)
-        anew.append(problem.found_anew(common, best.state.position_m, best.state.moment_Am2, dead))
-        if len(best.ids) < self.scene.most_sources:
-            before = (found, *anew)
-            anew += problem.of_more_sources(common, dead, len(best.ids) + 1)
-            anew += distinct(one for start in before for one in problem.births(start))[:_MOST_HYPOTHESES]
+        common, dead, known = best.state.common_alone, best.health.dead, len(best.ids)
+        again = problem.found_anew(common, best.state.position_m, best.state.moment_Am2, dead)
+        anew = [again, *problem.of_more_sources(common, dead, known)]
+        if known < self.scene.most_sources:
+            anew += problem.of_more_sources(common, dead, known + 1)
+            anew += distinct(one for start in (found, again) for one in problem.births(start))
         tried = [one for one in distinct(anew) if one.update.converged]
-        more = [one for one in tried if len(one.ids) > len(best.ids)]
-        tried = [one for one in tried if len(one.ids) <= len(best.ids)][:_MOST_RESTARTS] + more[:_MOST_RESTARTS]
-        restarts = [self._after(problem, best, one) for one in tried]
+        more = [one for one in tried if len(one.ids) > known]
+        tried = [one for one in tried if len(one.ids) <= known][:_MOST_RESTARTS] + more[:_MOST_RESTARTS]
+        # What the sources' motion tells is still to be learned by them, and was by the best one.
+        learned = np.linalg.slogdet(again.update.state.P)[1] - np.linalg.slogdet(best.state.P)[1]
+        score, health = best.score - max(0.0, float(learned)), best.health.forgetful
+        restarts = [replace(self._after(problem, best, one), score=score, health=health) for one in tried]
         suspect = best.health.suspect
-        restarts = [replace(one, health=one.health.forgetful) for one in restarts]
         if suspect is not None and best.health.may_drift:
             restarts.append(replace(best, health=best.health.without(suspect)))
-        return [replace(one, score=best.score, excess=np.zeros(2), judged=_JUDGED_ROWS) for one in restarts]
+        return [replace(one, excess=np.zeros(2), judged=_JUDGED_ROWS) for one in restarts]
 
     def _pruned(self, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
         """The likeliest ones, the best first; behind them restarts while they are judged."""
@@ -263,16 +276,28 @@ class SourcesTracker:
         for one in (one for one in hypotheses if one.judged):
             gain = believed[0].score - one.score
             if gain > (_MUST_GAIN if one.judged == 1 else _CLEAR_GAIN):
-                believed.append(replace(one, ids=_old_names(one, believed[0]), judged=0))
+                ids = _old_names(one, believed[0])
+                believed.append(replace(one, ids=ids, score=believed[0].score - _MUST_GAIN, judged=0))
             elif one.judged > 1:
                 judged.append(one)
         kept: list[Hypothesis] = []
         for one in sorted(believed, key=_score):
-            if len(kept) == _MOST_HYPOTHESES or (kept and one.score > kept[0].score + _LESS_LIKELY):
-                break
-            if not any(_are_same(one.state, other.state) for other in kept):
+            same = (i for i, other in enumerate(kept) if _are_same(one.state, other.state))
+            if (i := next(same, None)) is not None:
+                score = -2.0 * np.logaddexp(-0.5 * one.score, -0.5 * kept[i].score)
+                kept[i] = replace(kept[i], score=float(score))
+            elif not kept or (len(kept) < _MOST_HYPOTHESES and one.score < kept[0].score + _LESS_LIKELY):
                 kept.append(one)
         return kept + judged
+
+    def _split(self, problem: RowProblem) -> list[Hypothesis]:
+        """Hypotheses as narrow as the readings want them, the likeliest first, as long as there is room for parts."""
+        parts: list[Hypothesis] = []
+        for i, one in enumerate(self._hypotheses):
+            room = _MOST_HYPOTHESES - len(parts) - sum(not other.judged for other in self._hypotheses[i:])
+            of_one = split(one.state, problem.measured) if room > 1 and not one.judged else [(1.0, one.state)]
+            parts += [replace(one, state=state, score=one.score - 2.0 * math.log(share)) for share, state in of_one]
+        return parts
 
     def _point(self, problem: RowProblem, status: str, chi2: float) -> SourcesPoint:
         """What is told of the best hypothesis."""
@@ -285,12 +310,11 @@ class SourcesTracker:
         merged = np.isin(np.arange(len(best.ids)), merged_pairs(best.state))
         believed = [one for one in self._hypotheses if not one.judged]
         likely = np.exp(-0.5 * np.array([one.score - best.score for one in believed]))
+        alike = [(one, weight) for one, weight in zip(believed, likely, strict=True) if one.ids == best.ids]
         tracks = [
             SourcePoint(
                 row.time_s,
-                best.state.position_m[k],
-                best.state.moment_Am2[k],
-                best.state.covariance(k),
+                *_moments([one.state for one, _ in alike], np.array([weight for _, weight in alike]), k),
                 nis=chi2,
                 nis_dof=int(np.count_nonzero(row.available)),
                 status="predicted" if status in ("misfit", "no readings") else "merged" if merged[k] else status,
@@ -314,6 +338,15 @@ class SourcesTracker:
 
 def _score(hypothesis: Hypothesis) -> float:
     return hypothesis.score
+
+
+def _moments(states: list[JointState], weights: FloatArray, source: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Position, moment and covariance of a source in a mixture of states."""
+    x = np.array([np.concatenate([one.position_m[source], one.moment_Am2[source]]) for one in states])
+    share = weights / weights.sum()
+    mean = share @ x
+    covariance = sum(part * one.covariance(source) for part, one in zip(share, states, strict=True))
+    return mean[:3], mean[3:], covariance + (share[:, None] * (x - mean)).T @ (x - mean)
 
 
 def _old_names(restart: Hypothesis, before: Hypothesis) -> tuple[int, ...]:

@@ -8,7 +8,7 @@ e = L y, every iteration solves :math:`(I + L^T N L) y = L^T H^T (r + H e)`, whi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -16,11 +16,8 @@ from scipy.linalg import solve_triangular
 
 from arrays.typing import BoolArray, FloatArray
 from magloc.tracking.multi_target.measurement import JointRow
-from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState, moment_derivative
-
-TOLERANCE = 0.02
-"""Change of the predicted readings, squared, in units of the noise, at which the iteration ends."""
-MOST_ITERATIONS = 20
+from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
+from magloc.tracking.multi_target.update_compiled import iterate
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,86 +85,28 @@ _FOLLOWED = 1e-3
 
 def joint_update(prior: JointState, row: JointRow) -> JointUpdate:
     """A predicted state after a row's readings, by damped Gauss-Newton in the chart of the prediction."""
-    d = prior.n_seen
-    L = _lower_root(prior.P[:d, :d])
-    y, best_y, best, residual = np.zeros(d), np.zeros(d), np.inf, row.z
-    HL, converged = np.zeros((len(row.z), d)), False
-    R: FloatArray = np.eye(d)
-    at_prediction: tuple[FloatArray, FloatArray] | None = None
-    for _ in range(MOST_ITERATIONS):
-        error = L @ y
-        state = prior.moved(error)
-        h, H = row.predicted(state)
-        r = row.z - h
-        with np.errstate(over="ignore"):
-            cost = float(r @ r + y @ y)
-        if not cost < best:
-            if best == np.inf:  # a source stands on a sensor
-                break
-            step = y - best_y
-            if cost <= best + TOLERANCE or float(np.sum((HL @ step) ** 2)) < TOLERANCE:
-                converged = True
-                break
-            y = best_y + 0.4 * step
-            continue
-        best, best_y, residual = cost, y, r
-        HL = _in_chart(H, prior, error) @ L
-        if at_prediction is None:
-            at_prediction = r, HL
-        R = _lower_root(np.eye(d) + HL.T @ HL)
-        new = _solved(R, HL.T @ (r + HL @ y))
-        along = HL @ (new - y)
-        if float(along @ along) < TOLERANCE:
-            best_y, residual = new, r - along
-            best = float(residual @ residual + new @ new)
-            converged = True
-            break
-        y = new
-    state, seen = _updated(prior, L, R, HL, best_y)
-    innovation, linear = at_prediction or (row.z, HL)
+    d, n = prior.n_seen, len(row.z)
+    L: FloatArray = np.asarray(np.linalg.cholesky(prior.P[:d, :d]), dtype=np.float64)
+    y, R, residuals, HLs = np.zeros(d), np.eye(d), np.empty((2, n)), np.zeros((2, n, d))
+    residuals[:] = row.z
+    cost, converged = iterate(prior.means, L, row.parts, y, residuals, HLs, R)
+    after, seen = _updated(prior, L, R, HLs[1], y)
     log_volume = 2.0 * float(np.sum(np.log(np.diagonal(R))))
-    return JointUpdate(state, row, residual, seen, innovation, linear, best, log_volume, converged)
-
-
-def _in_chart(H: FloatArray, prior: JointState, error: FloatArray) -> FloatArray:
-    """Derivatives by the errors of a prediction, from those by Cartesian moments at an error (d,) of it."""
-    k = prior.n_sources
-    of_sources = H[:, :-N_COMMON].reshape(len(H), k, N_SEEN)
-    c = error[: N_SEEN * k].reshape(k, N_SEEN)[:, 3:]
-    of_sources[:, :, 3:] = (of_sources[:, :, None, 3:] @ moment_derivative(prior.moment_Am2, c))[:, :, 0]
-    return H
-
-
-def _lower_root(matrix: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.cholesky(matrix), dtype=np.float64)
-
-
-def _solved(R: FloatArray, right: FloatArray) -> FloatArray:
-    """Solution of R Rᵀ y = right."""
-    half = solve_triangular(R, right, lower=True, check_finite=False)
-    y: FloatArray = solve_triangular(R, half, lower=True, trans="T", check_finite=False)
-    return y
+    return JointUpdate(after, row, residuals[1], seen, residuals[0], HLs[0], cost, log_volume, converged)
 
 
 def _updated(
     prior: JointState, L: FloatArray, R: FloatArray, HL: FloatArray, y: FloatArray
 ) -> tuple[JointState, FloatArray]:
     """State and covariance after the last linearisation, in the chart of the new state, and a root of A P⁺ Aᵀ."""
-    d, k = prior.n_seen, prior.n_sources
+    d = prior.n_seen
     rest = solve_triangular(L, prior.P[:d, d:], lower=True, check_finite=False).T
     W = np.concatenate([L, rest])
-    error = W @ y
-    state = prior.moved(error)
     root = solve_triangular(R, W.T, lower=True, check_finite=False).T
-    c = error[: N_SEEN * k].reshape(k, N_SEEN)[:, 3:]
-    length = np.linalg.norm(state.moment_Am2, axis=1)[:, None, None]
-    turned = moment_derivative(prior.moment_Am2, c) / length
-    of_c = state.of_source[:, 3:N_SEEN]
-    root[of_c] = turned @ root[of_c]
     P = root @ root.T
     P[d:, d:] += prior.P[d:, d:] - rest @ rest.T
     seen = solve_triangular(R, HL.T, lower=True, check_finite=False).T
-    return replace(state, P=P), seen
+    return prior.moved_with(W @ y, P), seen
 
 
 def innovation_chi2(state: JointState, row: JointRow, sensors: BoolArray) -> FloatArray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ import arrays
 from magloc.fields import dipole
 from magloc.tracking.multi_target.measurement import Channels, JointRow
 from magloc.tracking.multi_target.motion import FreeMotion
-from magloc.tracking.multi_target.state import N_SEEN, JointState
+from magloc.tracking.multi_target.state import N_SEEN, JointState, moment_derivative
 from magloc.tracking.multi_target.update import innovation_chi2, joint_update
 from magloc.tracking.results import Row
 from tests.oracles import derivative
@@ -91,6 +92,67 @@ def test_is_a_plain_filter_where_little_is_unknown():
     error = (found.state.moment_Am2 - expected.moment_Am2)[0] / np.linalg.norm(MOMENTS[0])
     np.testing.assert_allclose(error / sigma[at[3:6]], 0.0, atol=3e-3)
     np.testing.assert_allclose(found.state.P / np.outer(sigma, sigma), P / np.outer(sigma, sigma), atol=3e-3)
+
+
+@pytest.mark.parametrize("n_sources", [0, 1, 2])
+def test_compiled_iteration_is_the_readable_one(n_sources):
+    """And so are its linearisations at the prediction and at the end; on a sensor both give up."""
+    rng = np.random.default_rng(n_sources)
+    values = readings(rng)
+    values[4] = np.nan
+    state, row = known(n_sources, 0.2, rng), JointRow.of(BOARD, Row(0.0, values))
+    found, expected = joint_update(state, row), iterated(state, row)
+    assert found.converged == expected["converged"]
+    for name in ("residual", "innovation", "linear", "cost"):
+        np.testing.assert_allclose(getattr(found, name), expected[name], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(found.state.position_m, expected["state"].position_m, rtol=1e-6, atol=1e-9)
+    on_sensor = replace(state, position_m=BOARD.positions[:n_sources])
+    assert joint_update(on_sensor, row).converged == iterated(on_sensor, row)["converged"] == (n_sources == 0)
+
+
+def iterated(prior: JointState, row: JointRow) -> dict[str, Any]:
+    """The readable twin of the compiled iteration: damped Gauss-Newton, its steps in units of the prediction's root."""
+    d, k = prior.n_seen, prior.n_sources
+    L = np.linalg.cholesky(prior.P[:d, :d])
+    y, best_y, best, residual, converged = np.zeros(d), np.zeros(d), np.inf, row.z, False
+    HL, at_prediction = np.zeros((len(row.z), d)), None
+    for _ in range(60):
+        error = L @ y
+        h, H = row.predicted(prior.moved(error))
+        r = row.z - h
+        cost = float(r @ r + y @ y)
+        if not cost < best:
+            if best == np.inf:
+                break
+            step = y - best_y
+            if cost <= best + 0.02 or float(np.sum((HL @ step) ** 2)) < 0.02:
+                converged = True
+                break
+            y = best_y + 0.4 * step
+            continue
+        best, best_y, residual = cost, y, r
+        of_sources = H[:, :-3].reshape(len(H), k, N_SEEN)
+        c = error[: N_SEEN * k].reshape(k, N_SEEN)[:, 3:]
+        of_sources[:, :, 3:] = (of_sources[:, :, None, 3:] @ moment_derivative(prior.moment_Am2, c))[:, :, 0]
+        HL = H @ L
+        at_prediction = (r, HL) if at_prediction is None else at_prediction
+        new = np.linalg.solve(np.eye(d) + HL.T @ HL, HL.T @ (r + HL @ y))
+        along = HL @ (new - y)
+        if float(along @ along) < 0.02:
+            best_y, residual, converged = new, r - along, True
+            best = float(residual @ residual + new @ new)
+            break
+        y = new
+    innovation, linear = at_prediction or (row.z, HL)
+    state = prior.moved(L @ best_y)
+    return {
+        "state": state,
+        "residual": residual,
+        "innovation": innovation,
+        "linear": linear,
+        "cost": best,
+        "converged": converged,
+    }
 
 
 @pytest.mark.parametrize("seed", range(4))
