@@ -233,11 +233,14 @@ def _track_point(place: str, entry: dict[str, Any]) -> TrackPoint:
     time_s, nis, nis_dof = (_number(place, entry, key) for key in ("time_s", "nis", "nis_dof"))
     if time_s is None:
         raise InputError(f"{place}, key time_s: found None, expected a number.")
+    covariance = _numbers(place, entry, "covariance", (6, 6))
+    if covariance is not None and (np.diagonal(covariance) < 0.0).any():
+        raise InputError(f"{place}, key covariance: found a variance below zero, expected none.")
     return TrackPoint(
         time_s,
         _numbers(place, entry, "position_m", (3,)),
         _numbers(place, entry, "moment_Am2", (3,)),
-        _numbers(place, entry, "covariance", (6, 6)),
+        covariance,
         nis=math.nan if nis is None else nis,
         nis_dof=int(nis_dof or 0),
         status=str(entry.get("status", "")),

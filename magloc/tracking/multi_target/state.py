@@ -167,7 +167,8 @@ def places_of(n_sources: int) -> IntArray:
 def moved_moment(moment_Am2: FloatArray, c: FloatArray) -> FloatArray:
     """Moments (..., 3) that errors c (..., 3) lead to."""
     length, u, along, turn, angle = _parts(moment_Am2, c)
-    moved: FloatArray = length * np.exp(along) * (np.cos(angle) * u + np.sinc(angle / np.pi) * turn)
+    with np.errstate(over="ignore", invalid="ignore"):  # a moment beyond all numbers explains nothing
+        moved: FloatArray = length * np.exp(along) * (np.cos(angle) * u + np.sinc(angle / np.pi) * turn)
     return moved
 
 

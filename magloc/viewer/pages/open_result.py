@@ -175,6 +175,8 @@ def map_of(dataset: xr.Dataset, place: str = "Input result") -> MapResult:
 
 def _map_of(dataset: xr.Dataset, place: str) -> MapResult:
     axis = dataset["x"].to_numpy().astype(np.float64)
+    if not (np.isfinite(axis).all() and (np.diff(axis) > 0.0).all()):
+        raise InputError(f"{place}: found an axis that does not increase, expected the map as it was written.")
     every = max(1, math.ceil(len(axis) / _MOST_POINTS))
     part = dataset.isel(x=slice(None, None, every), y=slice(None, None, every), z=slice(None, None, every))
     over = "starts" if "half" in dataset else "sources"

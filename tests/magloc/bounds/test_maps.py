@@ -25,6 +25,7 @@ from magloc.bounds.maps import (
     BoundMap,
     BoundScenario,
     Reached,
+    bound_map,
     bound_slices,
     bounds_at,
     summary,
@@ -79,6 +80,14 @@ class TestCube:
             point = dataset.isel(x=x, y=y, z=z)
             place = MOVED.array.centroid + np.array([point.x, point.y, point.z])
             assert_same(point, direct(MOVED, place))
+
+    def test_the_ambient_field_of_moduli_is_exact_where_nothing_is_said(self):
+        array = replace(cube(1.0, "scalar", 1e-10), ambient_T=(2e-5, 0.0, 4e-5))
+        dataset = bound_map(array, (60.0, 50.0, 60.0), edge_m=8.0, n=2, n_moments=3)
+        point = dataset.isel(x=0, y=1, z=1)
+        place = array.centroid + np.array([point.x, point.y, point.z])
+        exact = cramer_rao_bounds(array, place, (60.0, 50.0, 60.0))
+        assert_allclose(point.sigma_range, exact.sigma_range_m, rtol=1e-6)
 
     def test_reached_counts_the_moments_that_are_accurate_enough(self):
         dataset = computed_map(BoundMap(SCENARIO, 9))

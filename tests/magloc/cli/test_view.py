@@ -210,6 +210,13 @@ class TestBadInput:
             run("view", tmp_path / "map"), "map.zarr" if "x/" in file else "map", "something else than a map"
         )
 
+    def test_a_map_whose_axis_is_lost(self, run: Run, tmp_path: Path) -> None:
+        import zarr
+
+        run("map", "paper", "--grid", 3, "--out", tmp_path, "--quiet")
+        zarr.open_array(tmp_path / "map.zarr" / "x")[:] = np.nan
+        assert_refused(run("view", tmp_path), "an axis that does not increase")
+
     def test_readings_that_all_miss(self, run: Run, readings_file: Path) -> None:
         header = readings_file.read_text().splitlines()[0]
         readings_file.write_text(f"{header}\n0{',' * 12}\n1{',nan' * 12}\n")
@@ -238,6 +245,10 @@ class TestBadInput:
             (f'{{"results": [{{"time_s": 0, "position_m": [1, 2, {"9" * 400}]}}]}}', "position_m"),
             ('{"results": [{"time_s": 1e300, "position_m": [1, 2, 3]}]}', "time_s"),
             ('{"results": [{"time_s": 0, "position_m": [1, 2, 3], "nis": "x"}]}', "nis"),
+            (
+                f'{{"results": [{{"time_s": 0, "position_m": [1, 2, 3], "covariance": {[[-1.0] * 6] * 6}}}]}}',
+                "variance below zero",
+            ),
             ('{"results": [{"time_s": 0, "position_m": null}]}', "no row where the source is tracked"),
         ],
     )

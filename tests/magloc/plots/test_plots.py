@@ -264,6 +264,12 @@ class TestMaps:
         assert figure.axes[0].get_xlabel() == "start x [m]"
         assert_units(figure)
 
+    def test_every_point_is_in_the_middle_of_its_cell(self) -> None:
+        axis = self.dataset()["x"].to_numpy()
+        half = 0.5 * (axis[1] - axis[0])
+        ends = [axis[0] - half, axis[-1] + half] * 2
+        assert [list(ax.images[-1].get_extent()) for ax in self.figure().axes[:3]] == [ends] * 3
+
     def test_other_ends_are_hatched_each_in_its_way(self) -> None:
         figure = self.figure()
         hatches = [hatch for artist in figure.axes[0].collections for hatch in getattr(artist, "hatches", [])]

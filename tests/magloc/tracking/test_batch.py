@@ -82,6 +82,19 @@ class TestCompiledRecord:
         assert_same_points(points, expected)
         assert statuses(points).count("tracked") > 50
 
+    def test_few_rows_are_stepped_in_python(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        time_s, p, m = moving_source(60)
+        readable: list[float] = []
+        update = Tracker.update
+
+        def counted(tracker: Tracker, row: Row) -> TrackPoint:
+            readable.append(row.time_s)
+            return update(tracker, row)
+
+        monkeypatch.setattr(Tracker, "update", counted)
+        points = track_record(Tracker(ARRAY, SLOW), rows_from(time_s, readings_of(ARRAY, p, m)))
+        assert (len(points), len(readable) <= 6) == (60, True)
+
     def test_a_row_that_is_not_later_than_the_piece_before(self) -> None:
         time_s, p, m = moving_source(30)
         rows = rows_from(time_s, readings_of(ARRAY, p, m))

@@ -38,6 +38,10 @@ class TestChart:
         turned = Rotation.from_rotvec(np.cross(u, across)).apply(MOMENT)
         np.testing.assert_allclose(moved, np.exp(0.2) * turned, rtol=1e-12)
 
+    def test_beyond_all_numbers(self):
+        """Nothing is warned of: what is not finite explains nothing."""
+        assert not np.isfinite(moved_moment(MOMENT, np.array([1e4, 0.0, 0.0]))).any()
+
 
 class TestBookkeeping:
     def test_a_source_more_and_away_again(self):
