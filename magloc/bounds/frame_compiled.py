@@ -12,13 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.array import SensorArray
+from arrays.pose import PoseUncertainty
 from arrays.typing import FloatArray
 from magloc.compilation import compiled
 
 # Information about a parameter that is less than this part of what it would be were the others known is none.
 LOST_INFORMATION = 1e-12
-# Nuisances: components of the common field, its modulus for scalar sensors, components of the ambient field's error.
-COMMON, COMMON_MODULUS, AMBIENT = 0, 3, 4
+# Nuisances: components of the common field, its modulus for scalar sensors, components of the ambient field's error,
+# turns of the array, and its shifts.
+COMMON, COMMON_MODULUS, AMBIENT, TURN, SHIFT = 0, 3, 4, 7, 10
 
 
 class BoundModel(NamedTuple):
@@ -46,11 +48,13 @@ class BoundModel(NamedTuple):
     nuisances : ndarray, shape (q,)
         Which ones there are.
     prior : ndarray, shape (q,)
-        Their inverse standard deviations, 0 if nothing is known [1/T].
+        Their inverse standard deviations, 0 if nothing is known [1/T, 1/rad, 1/m].
+    lever_arm : ndarray, shape (3,)
+        From the point about which the array turns to its origin [m].
     modulus_prior : float
         Inverse standard deviation of what is known of the moment's modulus, 0 if nothing is [1/(A·m²)].
     varies : bool
-        Whether axes, noise or what is known depend on the moment.
+        Whether axes, noise, nuisances or what is known depend on the moment.
     """
 
     centroid: FloatArray
@@ -66,6 +70,7 @@ class BoundModel(NamedTuple):
     noise_fraction: FloatArray
     nuisances: NDArray[np.intp]
     prior: FloatArray
+    lever_arm: FloatArray
     modulus_prior: float
     varies: bool
 
@@ -73,7 +78,7 @@ class BoundModel(NamedTuple):
     def of(
         cls, array: SensorArray, ambient_uncertainty_T: float = 0.0, known_moment_sigma_Am2: float = math.inf
     ) -> BoundModel:
-        """Model of an array, its ambient field known to a σ [T] per axis and the moment's modulus to another."""
+        """Model of an array at rest, its ambient field known to a σ [T] per axis, the moment's modulus to another."""
         scales = np.tile(np.eye(3), (array.n_sensors, 1, 1))
         for scale, sensor in zip(scales, array.sensors, strict=True):
             scale[: sensor.n_channels, : sensor.n_channels] = sensor.calibration.scale
@@ -82,7 +87,11 @@ class BoundModel(NamedTuple):
         deviation = 3 * [0.0 if scalar.all() else common]
         deviation += [common if scalar.any() else 0.0]
         deviation += 3 * [(ambient_uncertainty_T or array.row_ambient_uncertainty_T) if scalar.any() else 0.0]
+        pose = array.pose or PoseUncertainty(position_constant_m=0.0, attitude_constant_rad=0.0)
+        deviation += 3 * [math.hypot(pose.attitude_rad, pose.attitude_constant_rad)]
+        deviation += 3 * [math.hypot(pose.position_m, pose.position_constant_m)]
         nuisances = np.flatnonzero(deviation)
+        constant = nuisances.max(initial=0) < COMMON_MODULUS and not array.noise_depends_on_reading
         return cls(
             centroid=read_only(array.centroid),
             sensors=read_only(array.positions),
@@ -97,8 +106,9 @@ class BoundModel(NamedTuple):
             noise_fraction=read_only(array.noise_fractions),
             nuisances=read_only(nuisances),
             prior=read_only(1.0 / np.array(deviation)[nuisances]),
+            lever_arm=read_only(np.array(pose.lever_arm_m)),
             modulus_prior=1.0 / known_moment_sigma_Am2,
-            varies=bool(scalar.any() or array.noise_depends_on_reading or known_moment_sigma_Am2 < math.inf),
+            varies=bool(scalar.any() or not constant or known_moment_sigma_Am2 < math.inf),
         )
 
 

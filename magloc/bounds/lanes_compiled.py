@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.bounds.frame_compiled import AMBIENT, COMMON_MODULUS, LOST_INFORMATION, BoundModel, turned
+from magloc.bounds.frame_compiled import AMBIENT, COMMON_MODULUS, LOST_INFORMATION, SHIFT, TURN, BoundModel, turned
 from magloc.compilation import compiled
 from magloc.fields.dipole_compiled import field_components, gradient_components
 
@@ -49,6 +49,8 @@ class Block(NamedTuple):
         Of the moment's columns before they are freed of each other.
     displacements, ambient, axes, rotations : ndarray
         As in the model.
+    arm : ndarray, shape (3,)
+        From the point about which the array turns to the source.
     """
 
     w: FloatArray
@@ -60,6 +62,7 @@ class Block(NamedTuple):
     ambient: FloatArray
     axes: FloatArray
     rotations: FloatArray
+    arm: FloatArray
 
 
 @compiled
@@ -81,6 +84,7 @@ def new_block(model: BoundModel, n_moments: int) -> Block:
         np.empty(model.sensors.shape),
         np.empty(model.axes.shape),
         np.empty(model.rotations.shape),
+        np.empty(3),
     )
 
 
@@ -111,6 +115,8 @@ def fill_entries(
 @compiled
 def _place(model: BoundModel, position: FloatArray, frame: FloatArray, block: Block) -> None:
     """Turn the array to the axes u, v, n."""
+    arm = position + model.lever_arm
+    _turn_into(block.arm, frame, arm[0], arm[1], arm[2])
     for s in range(model.scalar.size):
         d, b = model.sensors[s], model.ambient[s]
         _turn_into(block.displacements[s], frame, d[0] - position[0], d[1] - position[1], d[2] - position[2])
@@ -180,11 +186,15 @@ def _fill_columns(model: BoundModel, block: Block) -> None:
         first = model.channel[s]
         for c in range(first, first + (1 if model.scalar[s] else 3)):
             axis = AXES + 3 * (c - first) * LANES
+            _fill_row(block.displacements[s], w[axis:], n_lanes, w)
             for q in range(n_nuisances):
-                effect = w[_effect(model.nuisances[q], model.scalar[s], axis) :]
+                nuisance = model.nuisances[q]
+                if TURN <= nuisance < SHIFT:
+                    _fill_turn(nuisance - TURN, block.arm, block.ambient[s], w[axis:], w, columns[c, q])
+                    continue
+                effect = w[_effect(nuisance, model.scalar[s], axis) :]
                 for i in range(n_lanes):
                     columns[c, q, i] = effect[i]
-            _fill_row(block.displacements[s], w[axis:], n_lanes, w)
             for k in range(6):
                 for i in range(n_lanes):
                     columns[c, n_nuisances + k, i] = w[ROW + k * LANES + i]
@@ -210,6 +220,8 @@ def _effect(nuisance: int, scalar: bool, axis: int) -> int:
         return GAIN if scalar else NOTHING
     if nuisance < COMMON_MODULUS:
         return NOTHING if scalar else axis + nuisance * LANES
+    if nuisance >= SHIFT:
+        return ROW + (3 + nuisance - SHIFT) * LANES
     return axis + (nuisance - AMBIENT) * LANES
 
 
@@ -226,6 +238,18 @@ def _fill_row(displacement: FloatArray, axis: FloatArray, n_lanes: int, w: Float
         w[ROW + 3 * LANES + i] = xx * mx + xy * my + xz * mz
         w[ROW + 4 * LANES + i] = xy * mx + yy * my + yz * mz
         w[ROW + 5 * LANES + i] = xz * mx + yz * my + zz * mz
+
+
+@compiled
+def _fill_turn(k: int, arm: FloatArray, ambient: FloatArray, axis: FloatArray, w: FloatArray, out: FloatArray) -> None:
+    """What a channel reads of a turn about axis k: the source's place, its moment and the ambient field turn back."""
+    a, b = (k + 1) % 3, (k + 2) % 3  # component a of v × e_k is v_b, component b is -v_a
+    for i in range(out.size):
+        by_moment = (
+            w[ROW + a * LANES + i] * w[MOMENT + b * LANES + i] - w[ROW + b * LANES + i] * w[MOMENT + a * LANES + i]
+        )
+        by_place = w[ROW + (3 + a) * LANES + i] * arm[b] - w[ROW + (3 + b) * LANES + i] * arm[a]
+        out[i] = by_moment - by_place + axis[a * LANES + i] * ambient[b] - axis[b * LANES + i] * ambient[a]
 
 
 @compiled

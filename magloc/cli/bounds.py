@@ -157,8 +157,6 @@ def bounds(
     wanted = _scenario(array, source.moment_Am2 if of.moment_Am2 is None else of.moment_Am2, radius, of, task)
     if array.channel_is_scalar.any() and array.ambient_T is None:
         print_note("warning: the array has scalar sensors and no ambient_nT, the ambient field is taken to be zero")
-    if array.pose is not None:
-        print_note("the uncertainty of the pose counts for the source; means, maps and spheres take the pose as exact")
     uncertain = {
         "ambient_uncertainty_T": wanted.ambient_uncertainty_T,
         "known_moment_sigma_Am2": wanted.known_moment_sigma_Am2,

@@ -28,7 +28,7 @@ class InnovationTest:
         Of the sum of squares of the whitened innovations: too large, there are errors that are not stated.
     z_lag1 : float
         Of the sum of their products with the row before: too large, errors last that are said to be new in every row,
-        or the readings were filtered before.
+        or the readings were filtered before. NaN where there are none: compiled steps keep no innovations.
     z_constants : float
         Of the lever arm and the mounting that the rows tell of, where a pose is stated and these count as exact: too
         large, they are not. NaN elsewhere.
@@ -42,7 +42,7 @@ class InnovationTest:
     @property
     def flagged(self) -> bool:
         """Whether one of them is beyond the threshold."""
-        return max(self.z_chi2, self.z_lag1) > THRESHOLD or self.z_constants > THRESHOLD
+        return any(z > THRESHOLD for z in (self.z_chi2, self.z_lag1, self.z_constants))
 
     @property
     def reason(self) -> str:
@@ -82,4 +82,4 @@ def innovation_test(points: Sequence[TrackPoint]) -> InnovationTest:
 
 
 def _standardised(total: float, variance: float) -> float:
-    return total / math.sqrt(variance) if variance > 0.0 else 0.0
+    return total / math.sqrt(variance) if variance > 0.0 else math.nan

@@ -151,8 +151,12 @@ def _settled(
     measurements = measurements[begin : begin + len(states)]
     used = np.ones(len(measurements), dtype=bool)
     for _ in range(_MOST_PASSES):
-        passed = _passed(tracker, measurements, begin, states, used)
-        later = smoothed_states(passed.steps)
+        try:
+            with np.errstate(all="ignore"):  # passes may lead out of double precision
+                passed = _passed(tracker, measurements, begin, states, used)
+                later = smoothed_states(passed.steps)
+        except np.linalg.LinAlgError:
+            return None
         new = [x for x, _ in later]
         if not np.isfinite(new).all():
             return None

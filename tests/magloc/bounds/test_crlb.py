@@ -27,6 +27,7 @@ from scipy.stats import chi2
 from arrays.array import SensorArray
 from arrays.differences import decorrelated_differences
 from arrays.geometries import cube, hexagon, square, tetrahedron
+from arrays.pose import PoseUncertainty
 from magloc.bounds.crlb import cramer_rao_bounds, whitened_jacobian
 from magloc.bounds.over_moments import (
     bounds_over_moments,
@@ -387,6 +388,7 @@ class TestBatches:
             cramer_rao_bounds(TETRAHEDRON, position, moment, ambient_uncertainty_T=uncertainty)
 
 
+POSE = PoseUncertainty(0.02, 0.005, 0.02, 10.0, 0.05, 0.01, 0.0, (0.3, -0.2, 0.5))
 ARRAYS = {
     "tetrahedron": TETRAHEDRON,
     "any vector sensors": random_array(11, 6),
@@ -402,6 +404,10 @@ ARRAYS = {
         random_array(15, 9, kinds=("vector", "scalar"), uncertain=True, common_field_T=50e-9),
         ambient_T=AMBIENT,
         noise_fraction=1e-2,
+    ),
+    "a pose that errs": replace(random_array(16, 6), pose=POSE),
+    "a pose that errs, mixed": replace(
+        random_array(17, 9, kinds=("vector", "scalar"), common_field_T=50e-9), ambient_T=AMBIENT, pose=POSE
     ),
 }
 each_array = pytest.mark.parametrize("array", ARRAYS.values(), ids=ARRAYS.keys())

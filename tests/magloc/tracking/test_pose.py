@@ -43,8 +43,10 @@ SCENARIO = MagneticScenario(
 )
 
 
-def run(pose: PoseUncertainty, seed: int, stated: PoseUncertainty | None = None) -> tuple[Simulation, Track]:
-    simulation = simulate(replace(SCENARIO, pose=pose), seed)
+def run(
+    pose: PoseUncertainty, seed: int, stated: PoseUncertainty | None = None, scenario: MagneticScenario = SCENARIO
+) -> tuple[Simulation, Track]:
+    simulation = simulate(replace(scenario, pose=pose), seed)
     array = simulation.array if stated is None else replace(simulation.array, pose=stated)
     return simulation, magloc.track(array, simulation.readings, motion=REST)
 
@@ -62,7 +64,11 @@ def nees(simulation: Simulation, track: Track) -> float:
 class TestConsistency:
     """Of the last rows of 20 tracks: χ² of 120 numbers, which a right filter leaves with the probability 1e-3."""
 
-    @pytest.mark.parametrize("pose", [WHITE, replace(WHITE, correlation_s=10.0), ALL], ids=["white", "walk", "all"])
+    @pytest.mark.parametrize(
+        "pose",
+        [WHITE, replace(WHITE, correlation_s=0.3), replace(WHITE, correlation_s=10.0), ALL],
+        ids=["white", "short walk", "walk", "all"],
+    )
     def test_stated_errors_are_claimed(self, pose: PoseUncertainty) -> None:
         squares = [nees(*run(pose, seed)) for seed in range(20)]
         low, high = stats.chi2.ppf([5e-4, 1.0 - 5e-4], 6 * len(squares))
@@ -79,18 +85,22 @@ class TestConsistency:
 
 @pytest.mark.slow
 class TestExactMounting:
-    """A mounting that counts as exact: 20 tracks each; a right one is beyond 3.3 σ with 5e-4."""
+    """A mounting that counts as exact: a right one is beyond 3.3 σ with 5e-4."""
 
     def test_one_that_is_raises_no_alarm(self) -> None:
         scores = [run(WHITE, seed, WHITE)[1].innovations.z_constants for seed in range(20)]
         assert max(scores) < THRESHOLD
         assert stats.kstest(scores, "norm").pvalue > 1e-3
 
-    def test_one_that_is_not_is_mostly_seen(self) -> None:
+    @pytest.mark.parametrize(("slower", "least"), [(1.0, 9), (3.0, 16)])
+    def test_one_that_is_not_is_seen(self, slower: float, least: int) -> None:
+        """Of 20 draws of 0.5° and 5 cm this test sees 0.69 and 0.94, any at all 0.71 and 0.94; fewer: 1 in 100."""
+        path = Steered((-2.5, 0.5, 2.0), speed_m_s=0.5 / slower)
+        scenario = replace(SCENARIO, duration_s=10.0 * slower, carrier=replace(SCENARIO.carrier, path=path))
         wrong = replace(ALL, correlation_s=0.0)
-        tests = [run(wrong, seed, WHITE)[1].innovations for seed in range(20)]
+        tests = [run(wrong, seed, WHITE, scenario)[1].innovations for seed in range(20)]
         seen = [test for test in tests if test.z_constants > THRESHOLD]
-        assert len(seen) >= 13
+        assert len(seen) >= least
         assert all("another mounting or lever arm" in test.reason for test in seen)
 
 

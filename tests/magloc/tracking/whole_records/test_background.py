@@ -28,7 +28,10 @@ from arrays.geometries import tetrahedron
 from arrays.typing import FloatArray
 from magloc.measurement.nuisances import Drift
 from magloc.readings import Readings
+from magloc.tracking.results import rows_of
 from magloc.tracking.track import Track
+from magloc.tracking.tracker import Tracker
+from magloc.tracking.whole_records.background import settled_steps
 from sims.magnetics.paths import Attitude, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
 from sims.magnetics.sensors import SensorModel
@@ -140,6 +143,14 @@ class TestTrack:
             _, track = run(none, lambda readings: readings.high_passed(0.1), 0)
         assert "the background looks like the source: positions are" in caplog.text
         assert track.tracked.any()
+
+    def test_passes_that_lead_nowhere_are_none(self) -> None:
+        """From sources beyond double precision; without an error."""
+        readings = high_passed(sims.simulate(SCENARIO, 0).readings[:20])
+        tracker = Tracker(SCENARIO.nominal_array, REST, background=Drift.of(readings.background, readings.time_s))
+        rows = list(rows_of(readings))
+        nowhere = np.concatenate([[1.0, 0.0, 0.0], [0.0, 0.0, 1e200], np.zeros(tracker.n_errors)])
+        assert settled_steps(tracker, rows, [nowhere] * len(rows)) is None
 
     def test_without_a_source_there_is_none(self) -> None:
         readings = sims.simulate(SCENARIO, 3).readings
