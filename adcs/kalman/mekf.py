@@ -171,7 +171,8 @@ def residuals(record: Record, row: int, state: State, used: SensorSet) -> list[t
 
     parts: list[tuple[int, FloatArray, FloatArray]] = []
     if used.star:
-        parts.append((0, quaternion.error_vector(state.q, readings.star[:, row]), rows(0, np.eye(3))))
+        W = readings.star_whitening[:, row]
+        parts.append((0, turned(W, quaternion.error_vector(state.q, readings.star[:, row])), rows(0, W)))
     if used.gyro:
         residual = readings.gyro_rad_s[:, row] - state.w - state.of("gyro-bias")
         parts.append((1, residual, rows(3, np.eye(3), "gyro-bias")))
@@ -420,7 +421,8 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
     rejected = np.zeros(nis.shape, dtype=np.bool_)
     readings = record.readings
     wheels = (record.momentum_Nms, record.wheel_torque_Nm, record.torquers_Am2)
-    read = (readings.star, readings.gyro_rad_s, readings.field_T, readings.sun, around.sun_orbital)
+    star = (readings.star, readings.star_whitening)
+    read = (*star, readings.gyro_rad_s, readings.field_T, readings.sun, around.sun_orbital)
     places = (around.orbital_rate_rad_s, around.gravity_s2, around.b_orbital_T)
     over_rows(
         kernel.run,

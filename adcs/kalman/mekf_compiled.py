@@ -55,12 +55,16 @@ class First(NamedTuple):
 
 
 class Record(NamedTuple):
-    """Wheels, torquers, readings, and the Sun in the orbital frame: (R, n, 3) or of the star tracker (R, n, 4)."""
+    """Wheels, torquers, readings, and the Sun in the orbital frame: (R, n, 3), of the star tracker (R, n, 4).
+
+    ``star_whitening`` (R, n, 3, 3): what makes all errors of a star tracker's attitude alike.
+    """
 
     momentum: Array
     wheel_torque: Array
     torquers: Array
     star: Array
+    star_whitening: Array
     gyro: Array
     field: Array
     sun: Array
@@ -137,9 +141,19 @@ def _at(x: Array, first: int) -> Vector:
 
 @compiled
 def _with_reading(
-    one: Hypothesis, sensor: int, reading: Array, model: Vector, firsts: NDArray[np.int64], r: float, work: Work
+    one: Hypothesis,
+    sensor: int,
+    reading: Array,
+    whitening: Array,
+    model: Vector,
+    firsts: NDArray[np.int64],
+    r: float,
+    work: Work,
 ) -> gate.Fit:
-    """Take a reading into covariance and correction, and keep in ``work`` what they were; how it fits."""
+    """Take a reading into covariance and correction, and keep in ``work`` what they were; how it fits.
+
+    ``whitening`` (3, 3): of a star tracker's attitude.
+    """
     x, h, columns = one.x, work.h, work.columns
     _copied(one.P, one.dx, work.P, work.dx)
     q, bias, v = quaternion_at(x), -1, model
@@ -148,7 +162,8 @@ def _with_reading(
         model = model[0] + x[16], model[1] + x[17], model[2] + x[18]
         axes = rotate_back(q, (1.0, 0.0, 0.0)), rotate_back(q, (0.0, 1.0, 0.0)), rotate_back(q, (0.0, 0.0, 1.0))
     if sensor == 0:
-        residual = error_vector(q, quaternion_at(reading))
+        e_q, W = error_vector(q, quaternion_at(reading)), whitening
+        residual = gate.dot(vector_at(W[0]), e_q), gate.dot(vector_at(W[1]), e_q), gate.dot(vector_at(W[2]), e_q)
     elif sensor == 1:
         residual, bias = _minus(_minus(vector_at(reading), _at(x, 4)), _at(x, 10)), firsts[1]
     else:
@@ -160,8 +175,12 @@ def _with_reading(
             residual, bias = _minus(residual, _at(x, 7)), firsts[0]
     nis, determinant = 0.0, 1.0
     for j in range(3):
-        if sensor < 2:
-            columns[0], h[0], m = 3 * sensor + j, 1.0, 1
+        if sensor == 0:
+            for k in range(3):
+                columns[k], h[k] = k, whitening[j, k]
+            m = 3
+        elif sensor == 1:
+            columns[0], h[0], m = 3 + j, 1.0, 1
         elif g >= 0:
             # Row j of (E + D)2W(v), and the field itself for that row of D.
             row = (x[22 + 3 * j] + (j == 0), x[23 + 3 * j] + (j == 1), x[24 + 3 * j] + (j == 2))
@@ -329,24 +348,24 @@ def _take_readings(
     run, i = place
     used, firsts = settings.used, settings.firsts
     for sensor in range(4):
-        reading = _reading_of(record, sensor, run, i)
+        reading, whitening = _reading_of(record, sensor, run, i), record.star_whitening[run, i]
         if not (used[sensor] and np.isfinite(reading[0])):
             continue
         model, r = models[1 if sensor == 3 else 0], settings.sigma[sensor] ** 2
         fit_second = (np.nan, np.nan, np.nan)
         there = contest.counts[gate.BEGAN] >= 0
-        fit = _with_reading(main, sensor, reading, model, firsts, r, work)
+        fit = _with_reading(main, sensor, reading, whitening, model, firsts, r, work)
         out.nis[run, i, sensor] = fit[0]
         if there:
             # Decided before it is taken, for there is room to undo one reading only.
             _without_reading(main, work)
-            fit_second = _with_reading(second, sensor, reading, model, firsts, r, work)
+            fit_second = _with_reading(second, sensor, reading, whitening, model, firsts, r, work)
         use, use_second = gate.decided(contest, sensor, settings.limit, fit, fit_second)
         if there:
             if not use_second:
                 _without_reading(second, work)
             if use:
-                _with_reading(main, sensor, reading, model, firsts, r, work)
+                _with_reading(main, sensor, reading, whitening, model, firsts, r, work)
         elif not use:
             _without_reading(main, work)
         out.rejected[run, i, sensor] = not use
@@ -355,7 +374,7 @@ def _take_readings(
         if not use and gate.may_begin(contest, sensor, firsts[1] >= 0, both):
             star = quaternion_at(record.star[run, i])
             _begin(main, second, sensor, gate.begun(quaternion_at(main.x), sensor, star, field, sun, *models), settings)
-            _with_reading(second, sensor, reading, model, firsts, r, work)
+            _with_reading(second, sensor, reading, whitening, model, firsts, r, work)
             gate.begin(contest, sensor)
         gate.read(contest, sensor)
 
