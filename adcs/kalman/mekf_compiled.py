@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 
 
 class Estimated(NamedTuple):
-    """Outputs (R, n, …); optional (R, n, N - 6): the states that there are; nis and rejected (R, n, 4) at readings."""
+    """Outputs (R, n, …); optional (R, n, N - 6): the states that there are; the last three (R, n, 4), at readings."""
 
     q: Array
     w: Array
@@ -44,6 +44,7 @@ class Estimated(NamedTuple):
     covariance: Array
     nis: Array
     rejected: NDArray[np.bool_]
+    log_det: Array
 
 
 class First(NamedTuple):
@@ -76,8 +77,8 @@ class Settings(NamedTuple):
 
     Biases of field and gyro, the disturbance, the error of the field model, the dipole and the three rows of the
     magnetometer's D begin at ``firsts`` in the error state, -1 where there are none. ``open_variance`` (N,): of an
-    error state of which nothing is known. ``variance`` (n - 1, N): what each step adds; ``decay`` (n - 1,): what it
-    leaves of the error of the field model.
+    error state of which nothing is known. ``variance`` (n - 1, N): what each step adds; ``kept`` (n - 1, N): what it
+    leaves.
     """
 
     used: NDArray[np.bool_]
@@ -85,7 +86,7 @@ class Settings(NamedTuple):
     firsts: NDArray[np.int64]
     variance: Array
     open_variance: Array
-    decay: Array
+    kept: Array
     limit: float
     patience: NDArray[np.int64]
 
@@ -253,6 +254,14 @@ def _advance(
     """State and covariance of the instant after ``place``, a run and an instant."""
     run, i = place
     x, F, F_after = one.x, work.F, work.F_after
+    for state in range(len(settings.firsts)):
+        for j in range(3):
+            first = settings.firsts[state] + j
+            if settings.firsts[state] >= 0 and settings.kept[i, first] < 1.0:
+                x[7 + 3 * state + j] *= settings.kept[i, first]
+                for other in range(len(one.P)):
+                    one.P[first, other] *= settings.kept[i, first]
+                    one.P[other, first] *= settings.kept[i, first]
     q, w = quaternion_at(x), _at(x, 4)
     k, b_o = vector_at(record.momentum[run, i]), vector_at(around.b_orbital[run, i])
     own = with_dipole(body, _at(x, 19))
@@ -274,14 +283,6 @@ def _advance(
         b_after = rotate_back(q, b_o)
         mean = (0.5 * (b[0] + b_after[0]), 0.5 * (b[1] + b_after[1]), 0.5 * (b[2] + b_after[2]))
         by_dipole(work.G[0], body, mean, work.G[1])
-    e, N = settings.firsts[3], one.P.shape[0]
-    if e >= 0:
-        for j in range(e, e + 3):
-            for column in range(N):
-                one.P[j, column] *= settings.decay[i]
-            for row in range(N):
-                one.P[row, j] *= settings.decay[i]
-            x[16 + j - e] *= settings.decay[i]
     spread(work.Phi, work.G, (settings.firsts[2], settings.firsts[4]), settings.variance[i], one.P, work.T)
     _put(x, q)
     x[4], x[5], x[6] = w
@@ -355,7 +356,7 @@ def _take_readings(
         fit_second = (np.nan, np.nan, np.nan)
         there = contest.counts[gate.BEGAN] >= 0
         fit = _with_reading(main, sensor, reading, whitening, model, firsts, r, work)
-        out.nis[run, i, sensor] = fit[0]
+        out.nis[run, i, sensor], out.log_det[run, i, sensor] = fit[0], fit[2]
         if there:
             # Decided before it is taken, for there is room to undo one reading only.
             _without_reading(main, work)
