@@ -22,6 +22,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "b_dot_gain": "adcs.satellite.magnetic_control",
         "calibrate_magnetometer": "adcs.satellite.magnetometer_calibration",
         "circular_orbit": "adcs.environment.orbit",
+        "combined_star_fixes": "adcs.stars.combined",
         "complementary_filter": "adcs.complementary.filters",
         "datasets": ":adcs.datasets",
         "detumbled": "adcs.satellite.magnetic_control",

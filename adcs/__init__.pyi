@@ -31,6 +31,7 @@ from adcs.satellite.telemetry import Telemetry as Telemetry
 from adcs.satellite.vectors import vector_attitude as vector_attitude
 from adcs.satellite.wahba import VectorAttitudes as VectorAttitudes
 from adcs.satellite.wahba import attitude_of_vectors as attitude_of_vectors
+from adcs.stars.combined import combined_star_fixes as combined_star_fixes
 from adcs.stars.hipparcos import hipparcos_catalogue as hipparcos_catalogue
 from adcs.stars.identification import identify_stars as identify_stars
 from adcs.stars.pictures import read_picture as read_picture

@@ -78,6 +78,11 @@ def julian_dates(utc: Instants) -> tuple[FloatArray, FloatArray]:
     return _JD_J2000 - 0.5 + days, rest / 86_400e6
 
 
+def of_julian_year(year: float) -> Instants:
+    """Instant, UTC, of a Julian year such as 2026.9, shape ()."""
+    return instants(_J2000, (year - 2000.0) * 365.25 * DAY_S)
+
+
 def pyerfa() -> ModuleType:
     """The standards of astronomy, loaded when they are first used."""
     with of_extra("satellites", "the rotation of the Earth"):

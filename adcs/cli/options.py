@@ -81,7 +81,7 @@ class ScenarioOptions(EstimateOptions):
     filter : str
         Error-state Kalman filter ("mekf"); with its converged gain ("constant-gain"); with a filter of the disturbance
         beside it ("parallel-disturbance"); of attitude and gyro bias alone ("reduced"); with a smoother of the whole
-        run after it ("smoother").
+        run after it ("smoother"); a bank that finds how large the disturbance is ("self-tuning").
     process_noise : str
         Found by us ("tuned"), or as printed ("paper").
     star_noise : str

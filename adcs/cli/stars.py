@@ -34,6 +34,7 @@ def stars(
     scale_arcsec: float | None = None,
     scale_tolerance: float | None = None,
     year: float = 2015.0,
+    aberration: Flag = False,
     dark: Path | None = None,
     out: Path | None = None,
     json: Flag = False,
@@ -61,6 +62,9 @@ def stars(
         Relative error of the scale, 0.1 at most: 0.05 in photographs; in frames it is exact without it.
     year : float
         Date of the images, to which the stars of Hipparcos are moved.
+    aberration : bool
+        Show the stars as the Earth sees them, which moves at 30 km/s at that date: up to 20.5 arc seconds off. A day
+        is 0.0027 years and 0.35 arc seconds. Needs the extra "satellites".
     dark : Path, optional
         Photograph without a sky, which is subtracted.
     out : Path, optional
@@ -83,12 +87,19 @@ def stars(
             raise InputError(f"{option}: found {value:g}, expected a positive number.")
     if scale_tolerance is not None and scale_tolerance > 0.1:
         raise InputError(f"--scale-tolerance: found {scale_tolerance:g}, expected 0.1 at most.")
+    if not 1900.0 <= year <= 2100.0:
+        raise InputError(f"--year: found {year:g}, expected 1900 to 2100.")
     if not images:
         raise InputError("IMAGES: found none, expected photographs, or a folder of frames.")
     of_pictures = images[0].suffix.lower() in SUFFIXES
     if len(images) > 1 and not of_pictures:
         raise InputError(f"{images[1]}: found more than one folder of frames, expected one.")
     known = hipparcos_catalogue(year) if str(catalogue) == "hipparcos" else read_star_catalogue(catalogue)
+    if aberration:
+        from adcs.environment.sun import earth_velocity_m_s
+        from adcs.frames import of_julian_year
+
+        known = known.aberrated(earth_velocity_m_s(of_julian_year(year)))
     rad_per_px = None if scale_arcsec is None else math.radians(scale_arcsec / 3600.0)
     if of_pictures:
         _pictures(images, known, rad_per_px, scale_tolerance or 0.05, noise_px or 0.5, dark, out, json, common)

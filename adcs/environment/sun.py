@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.constants import speed_of_light
 
 from adcs.environment.orbit import EARTH_RADIUS_M
-from adcs.frames import Instants, pyerfa, terrestrial_dates
+from adcs.frames import DAY_S, Instants, pyerfa, terrestrial_dates
 from arrays.typing import FloatArray
 
 SUN_RADIUS_M = 695_700e3
 """Nominal solar radius, IAU 2015."""
 ASTRONOMICAL_UNIT_M = 149_597_870_700.0
-_SPEED_OF_LIGHT_AU_DAY = 173.144632674
+_AU_DAY_M_S = ASTRONOMICAL_UNIT_M / DAY_S
+_SPEED_OF_LIGHT_AU_DAY = speed_of_light / _AU_DAY_M_S
 
 
 def sun_position_eci(utc: Instants) -> FloatArray:
@@ -28,6 +30,12 @@ def sun_position_eci(utc: Instants) -> FloatArray:
     contraction = np.sqrt(1.0 - np.sum(velocity * velocity, axis=-1))
     apparent: FloatArray = pyerfa().ab(direction, velocity, distance, contraction)
     return ASTRONOMICAL_UNIT_M * distance[..., None] * apparent
+
+
+def earth_velocity_m_s(utc: Instants) -> FloatArray:
+    """Velocity (..., 3) of the Earth's centre in eci, from the solar system's, at instants (...); 30 km/s."""
+    velocity: FloatArray = _AU_DAY_M_S * pyerfa().epv00(*terrestrial_dates(utc))[1]["v"]
+    return velocity
 
 
 def illuminated_fraction(position_eci_m: ArrayLike, sun_position_eci_m: ArrayLike) -> FloatArray:

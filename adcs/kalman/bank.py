@@ -17,6 +17,7 @@ from adcs.kalman.initialisation import any_start, first_told, vector_start
 from adcs.kalman.mekf import closed_loop_jacobian, run_filter, run_readable
 from adcs.kalman.names import FILTERS, Filter, StartKind
 from adcs.kalman.results import sigma_by_state
+from adcs.kalman.self_tuning import run_self_tuned
 from adcs.kalman.separate_bias import run_parallel
 from adcs.kalman.smoother import smoothed
 from adcs.satellite.attitude_track import AttitudeTrack, joined
@@ -26,7 +27,11 @@ from adcs.satellite.sensors import SENSOR_WORDS, SENSORS
 from adcs.satellite.telemetry import Record, Telemetry, orbital_from_eci, part
 from arrays.io.errors import InputError, naming
 
-IMPLIED_STATES = {"parallel-disturbance": ("disturbance",), "reduced": ("gyro-bias",)}
+IMPLIED_STATES = {
+    "parallel-disturbance": ("disturbance",),
+    "reduced": ("gyro-bias",),
+    "self-tuning": ("disturbance",),
+}
 """What a filter estimates whether it is asked to or not."""
 
 
@@ -112,7 +117,7 @@ def estimate(
     filter : str
         ``mekf``; with its converged gain (``constant-gain``); with a filter of the disturbance beside it
         (``parallel-disturbance``); of attitude and gyro bias alone (``reduced``); with a smoother after it
-        (``smoother``).
+        (``smoother``); a bank that finds how large the disturbance is (``self-tuning``).
 
     Returns
     -------
@@ -221,6 +226,8 @@ def _estimated(record: Record, chosen: EstimatorSettings, start: Start) -> Attit
         return run_parallel(record, settings, start, forgetting=chosen.forgetting)
     if chosen.filter == "reduced":
         return run_reduced(record, settings, start)
+    if chosen.filter == "self-tuning":
+        return run_self_tuned(record, settings, start)
     if chosen.closed_loop_F:
         return run_readable(record, settings, start, jacobian=closed_loop_jacobian)
     tracks = run_filter(record, settings, start)

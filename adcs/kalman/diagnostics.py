@@ -271,7 +271,8 @@ def unseen_torque_Nm(record: Record, estimates: AttitudeTracks, run: int) -> Map
     """
     sigma, used = deviations(record, estimates.settings), estimates.settings.sensors
     q, around = estimates.q[run], record.environment
-    information = np.eye(3) * (used.star / (2.0 * sigma[0]) ** 2)
+    star = record.readings.star_whitening[run] / (2.0 * sigma[0])
+    information = used.star * np.mean(star.mT @ star, axis=0)
     for is_used, model, deviation in (
         (used.magnetometer, around.b_orbital_T[run], sigma[2]),
         (used.sun, around.sun_orbital[run], sigma[3]),

@@ -221,6 +221,9 @@ class FilterSettings:
         the state ``field-model``, for which :data:`FIELD_ERROR_T` stands in place of 0.
     field_correlation_s : float
         Time constant of the state ``field-model``; 1,000 km of a low orbit.
+    disturbance_correlation_s : float
+        Time constant of the state ``disturbance``, whose standard deviation then stays that of the start; without one
+        it walks.
     field_bias_sigma_T, gyro_bias_sigma_rad_s, disturbance_sigma_s2, dipole_sigma_Am2 : float
         Standard deviations of those states at the start, where they are zero: the dipole is that besides the residual
         dipole which the satellite is known to have.
@@ -241,6 +244,7 @@ class FilterSettings:
     field_gain_sigma: float = 0.05
     field_axes_sigma_rad: float = math.radians(1.0)
     field_correlation_s: float = 132.0
+    disturbance_correlation_s: float = math.inf
     gate: float = CONTRADICTION
 
     def __post_init__(self) -> None:
@@ -256,15 +260,26 @@ class FilterSettings:
             field_axes_sigma_rad=self.field_axes_sigma_rad,
             field_correlation_s=self.field_correlation_s,
         )
+        if not self.disturbance_correlation_s > 0.0:
+            raise ValueError(
+                f"Input disturbance_correlation_s must be positive; instead received {self.disturbance_correlation_s}."
+            )
 
     @property
     def field_model_sigma_T(self) -> float:
         """Standard deviation of the state ``field-model``."""
         return self.field_error_T or FIELD_ERROR_T
 
-    def field_decay(self, step_s: float | FloatArray) -> FloatArray:
-        """What a step leaves of the state ``field-model``, an Ornstein-Uhlenbeck process."""
-        return np.exp(-np.asarray(step_s) / self.field_correlation_s)
+    def kept(self, step_s: float | FloatArray) -> FloatArray:
+        """What a step leaves of the error state, (N,), or (k, N) of steps (k, 1): not all with a time constant."""
+        rate = np.zeros(self.sensors.size)
+        for state, time_s in (
+            ("field-model", self.field_correlation_s),
+            ("disturbance", self.disturbance_correlation_s),
+        ):
+            if state in self.sensors.states:
+                rate[self.sensors.place(state)] = 1.0 / time_s
+        return np.exp(-np.asarray(step_s) * rate)
 
     def process_variance(self, step_s: float | FloatArray, usual_s: float) -> FloatArray:
         """Diagonal of Q of steps, (N,), or (k, N) of steps (k, 1); ``noise`` is that of a usual one."""
@@ -279,10 +294,7 @@ class FilterSettings:
         }
         always = np.repeat(np.square([noise.attitude, noise.rate_rad_s]), 3)
         variance = np.concatenate([always, self._variances(walks)]) * (np.asarray(step_s) / usual_s)
-        if "field-model" in self.sensors.states:
-            kept = self.field_decay(step_s)
-            variance[..., self.sensors.place("field-model")] = self.field_model_sigma_T**2 * (1.0 - kept**2)
-        return variance
+        return variance + np.concatenate([np.zeros(ALWAYS), self.start_variance]) * (1.0 - self.kept(step_s) ** 2)
 
     @property
     def start_variance(self) -> FloatArray:
@@ -367,6 +379,9 @@ class AttitudeTracks:
         NaN where there was no reading. It is a χ² of 3 numbers, of 2 for the Sun sensor.
     rejected : ndarray of bool, shape (runs, n, 4)
         Readings that contradicted the estimate and were not used; none of a filter without a gate.
+    log_det : ndarray, shape (runs, n, 4)
+        Logarithm of the determinant of the innovations' covariance over that of the noise; NaN of other filters than
+        the error-state filter itself.
     """
 
     settings: FilterSettings
@@ -376,6 +391,7 @@ class AttitudeTracks:
     covariance: FloatArray
     nis: FloatArray
     rejected: BoolArray
+    log_det: FloatArray
 
     @property
     def sigma(self) -> FloatArray:

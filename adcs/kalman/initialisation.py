@@ -66,7 +66,8 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
     ):
         H = 2.0 * cross_matrix(v) / noise[:, None, None]
         information[seen] += (H.mT @ H)[seen]
-    information[seen_star] += np.eye(3) / (AGAIN * sigma[0]) ** 2
+    W = readings.star_whitening[seen_star, 0] / (AGAIN * sigma[0])
+    information[seen_star] += W.mT @ W
     w = absolute_rate(q, np.zeros((runs, 3)), around.orbital_rate_rad_s[:, 0])
     rate_variance = np.full(runs, rate_rad_s**2)
     if used.gyro:

@@ -97,11 +97,7 @@ def transition(F: FloatArray, by_dipole: FloatArray, settings: FilterSettings, d
             full[:, 3:6, used.place(state)] = acceleration
     step = full * dt_s
     squared = step @ step
-    Phi = np.eye(used.size) + step + squared / 2.0 + squared @ step / 6.0
-    if "field-model" in used.states:
-        place = used.place("field-model")
-        Phi[:, place, place] = settings.field_decay(dt_s) * np.eye(3)
-    return np.asarray(Phi)
+    return np.asarray(np.eye(used.size) + step + squared / 2.0 + squared @ step / 6.0)
 
 
 def moved(record: Record, row: int, state: State) -> tuple[FloatArray, FloatArray]:
@@ -126,18 +122,18 @@ def moved(record: Record, row: int, state: State) -> tuple[FloatArray, FloatArra
 def predicted(
     record: Record, row: int, state: State, settings: FilterSettings, jacobian: Jacobian = known_torque_jacobian
 ) -> tuple[State, FloatArray]:
-    """State one step after instant ``row`` before its readings, and Φ (runs, N, N)."""
+    """State one step after instant ``row`` before its readings, and Φ (runs, N, N): decay, and then motion."""
+    step_s = float(record.steps_s[row])
+    kept = settings.kept(step_s)
+    own = {name: kept[settings.sensors.place(name)] * state.of(name) for name in settings.sensors.states}
+    state = replace(state, optional={**state.optional, **own}, P=kept[:, None] * state.P * kept)
     q, w = moved(record, row, state)
     ahead = replace(state, q=q, w=w)
     F = 0.5 * (jacobian(record, row, state) + jacobian(record, row + 1, ahead))
     by_dipole = 0.5 * (acceleration_by_dipole(record, row, state) + acceleration_by_dipole(record, row + 1, ahead))
-    step_s = float(record.steps_s[row])
     Phi = transition(F, by_dipole, settings, step_s)
     P = Phi @ state.P @ Phi.mT + np.diag(settings.process_variance(step_s, record.dt_s))
-    optional = dict(state.optional)
-    if "field-model" in optional:
-        optional["field-model"] = settings.field_decay(step_s) * optional["field-model"]
-    return replace(ahead, optional=optional, P=0.5 * (P + P.mT)), Phi
+    return replace(ahead, P=0.5 * (P + P.mT)), Phi * kept
 
 
 def deviations(record: Record, settings: FilterSettings) -> FloatArray:
@@ -171,7 +167,8 @@ def residuals(record: Record, row: int, state: State, used: SensorSet) -> list[t
 
     parts: list[tuple[int, FloatArray, FloatArray]] = []
     if used.star:
-        parts.append((0, quaternion.error_vector(state.q, readings.star[:, row]), rows(0, np.eye(3))))
+        W = readings.star_whitening[:, row]
+        parts.append((0, turned(W, quaternion.error_vector(state.q, readings.star[:, row])), rows(0, W)))
     if used.gyro:
         residual = readings.gyro_rad_s[:, row] - state.w - state.of("gyro-bias")
         parts.append((1, residual, rows(3, np.eye(3), "gyro-bias")))
@@ -289,7 +286,8 @@ class _Readable:
         self.main, self.second = first_state(settings, start), None
         self.contest = Contest(settings, record.dt_s)
         n = record.momentum_Nms.shape[1]
-        self.nis, self.rejected = np.full((1, n, len(SENSORS)), np.nan), np.zeros((1, n, len(SENSORS)), dtype=np.bool_)
+        self.nis, self.log_det = np.full((2, 1, n, len(SENSORS)), np.nan)
+        self.rejected = np.zeros((1, n, len(SENSORS)), dtype=np.bool_)
 
     second: State | None
 
@@ -317,7 +315,8 @@ class _Readable:
             with_it, fits = tried
             other = None if second is None else second.with_reading(self.record, row, settings, sensor)
             use, use_second = contest.decided(sensor, fits, None if other is None else other[1])
-            self.nis[0, row, sensor], self.rejected[0, row, sensor] = fits.nis, not use
+            self.nis[0, row, sensor], self.log_det[0, row, sensor] = fits.nis, fits.log_determinant
+            self.rejected[0, row, sensor] = not use
             if not use and contest.may_begin(sensor, both=self._both(row)):
                 state = begun(self.record, row, main.state, settings, sensor)
                 first = Hypothesis.of(state, main.dx if sensor == GYRO else zero)
@@ -360,20 +359,19 @@ def run_readable(
         begins = Start(start.q[only], start.w[only], start.covariance[only])
         one = _Readable(part(record, only), settings, begins, jacobian)
         states = [one.state_of(row) for row in range(record.momentum_Nms.shape[1])]
-        tracks.append(collected(settings, states, one.nis, one.rejected))
-    return AttitudeTracks(
-        settings,
-        np.concatenate([one.q for one in tracks]),
-        np.concatenate([one.w for one in tracks]),
-        {name: np.concatenate([one.optional[name] for one in tracks]) for name in settings.sensors.states},
-        np.concatenate([one.covariance for one in tracks]),
-        np.concatenate([one.nis for one in tracks]),
-        np.concatenate([one.rejected for one in tracks]),
-    )
+        tracks.append(collected(settings, states, one.nis, one.rejected, one.log_det))
+    names = ("q", "w", "covariance", "nis", "rejected", "log_det")
+    whole = {name: np.concatenate([getattr(one, name) for one in tracks]) for name in names}
+    optional = {name: np.concatenate([one.optional[name] for one in tracks]) for name in settings.sensors.states}
+    return AttitudeTracks(settings, optional=optional, **whole)
 
 
 def collected(
-    settings: FilterSettings, states: list[State], nis: FloatArray, rejected: BoolArray | None = None
+    settings: FilterSettings,
+    states: list[State],
+    nis: FloatArray,
+    rejected: BoolArray | None = None,
+    log_det: FloatArray | None = None,
 ) -> AttitudeTracks:
     """Estimates of the states of all instants; a filter without a gate rejects nothing."""
     return AttitudeTracks(
@@ -384,6 +382,7 @@ def collected(
         np.stack([state.P for state in states], axis=1),
         nis,
         np.zeros(nis.shape, dtype=np.bool_) if rejected is None else rejected,
+        np.full(nis.shape, np.nan) if log_det is None else log_det,
     )
 
 
@@ -416,16 +415,17 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
     used, first, around = settings.sensors, first_state(settings, start), record.environment
     runs, n = record.momentum_Nms.shape[:2]
     q, w, optional = np.empty((runs, n, 4)), np.empty((runs, n, 3)), np.empty((runs, n, used.size - ALWAYS))
-    covariance, nis = np.empty((runs, n, used.size, used.size)), np.full((runs, n, len(SENSORS)), np.nan)
+    covariance, (nis, log_det) = np.empty((runs, n, used.size, used.size)), np.full((2, runs, n, len(SENSORS)), np.nan)
     rejected = np.zeros(nis.shape, dtype=np.bool_)
     readings = record.readings
     wheels = (record.momentum_Nms, record.wheel_torque_Nm, record.torquers_Am2)
-    read = (readings.star, readings.gyro_rad_s, readings.field_T, readings.sun, around.sun_orbital)
+    star = (readings.star, readings.star_whitening)
+    read = (*star, readings.gyro_rad_s, readings.field_T, readings.sun, around.sun_orbital)
     places = (around.orbital_rate_rad_s, around.gravity_s2, around.b_orbital_T)
     over_rows(
         kernel.run,
         runs,
-        kernel.Estimated(q, w, optional, covariance, nis, rejected),
+        kernel.Estimated(q, w, optional, covariance, nis, rejected, log_det),
         kernel.First(np.ascontiguousarray(first.q), np.ascontiguousarray(first.w), first.P),
         dynamics_compiled.Body.of(record.satellite.body),
         # One layout in memory, for which the kernel is compiled.
@@ -437,11 +437,13 @@ def run_filter(record: Record, settings: FilterSettings, start: Start) -> Attitu
             np.array([_begins(used, state, part) for state in STATES for part in range(SIZES[state] // 3)]),
             settings.process_variance(record.steps_s[:, None], record.dt_s),
             settings.open_variance,
-            settings.field_decay(record.steps_s),
+            settings.kept(record.steps_s[:, None]),
             settings.gate_limit,
             np.array([patience(sensor, record.dt_s) for sensor in range(len(SENSORS))]),
         ),
         record.steps_s,
     )
     parts = np.split(optional, np.cumsum([SIZES[state] for state in used.states]), axis=-1)
-    return AttitudeTracks(settings, q, w, dict(zip(used.states, parts, strict=False)), covariance, nis, rejected)
+    return AttitudeTracks(
+        settings, q, w, dict(zip(used.states, parts, strict=False)), covariance, nis, rejected, log_det
+    )

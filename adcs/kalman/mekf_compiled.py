@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 
 
 class Estimated(NamedTuple):
-    """Outputs (R, n, …); optional (R, n, N - 6): the states that there are; nis and rejected (R, n, 4) at readings."""
+    """Outputs (R, n, …); optional (R, n, N - 6): the states that there are; the last three (R, n, 4), at readings."""
 
     q: Array
     w: Array
@@ -44,6 +44,7 @@ class Estimated(NamedTuple):
     covariance: Array
     nis: Array
     rejected: NDArray[np.bool_]
+    log_det: Array
 
 
 class First(NamedTuple):
@@ -55,12 +56,16 @@ class First(NamedTuple):
 
 
 class Record(NamedTuple):
-    """Wheels, torquers, readings, and the Sun in the orbital frame: (R, n, 3) or of the star tracker (R, n, 4)."""
+    """Wheels, torquers, readings, and the Sun in the orbital frame: (R, n, 3), of the star tracker (R, n, 4).
+
+    ``star_whitening`` (R, n, 3, 3): what makes all errors of a star tracker's attitude alike.
+    """
 
     momentum: Array
     wheel_torque: Array
     torquers: Array
     star: Array
+    star_whitening: Array
     gyro: Array
     field: Array
     sun: Array
@@ -72,8 +77,8 @@ class Settings(NamedTuple):
 
     Biases of field and gyro, the disturbance, the error of the field model, the dipole and the three rows of the
     magnetometer's D begin at ``firsts`` in the error state, -1 where there are none. ``open_variance`` (N,): of an
-    error state of which nothing is known. ``variance`` (n - 1, N): what each step adds; ``decay`` (n - 1,): what it
-    leaves of the error of the field model.
+    error state of which nothing is known. ``variance`` (n - 1, N): what each step adds; ``kept`` (n - 1, N): what it
+    leaves.
     """
 
     used: NDArray[np.bool_]
@@ -81,7 +86,7 @@ class Settings(NamedTuple):
     firsts: NDArray[np.int64]
     variance: Array
     open_variance: Array
-    decay: Array
+    kept: Array
     limit: float
     patience: NDArray[np.int64]
 
@@ -137,9 +142,19 @@ def _at(x: Array, first: int) -> Vector:
 
 @compiled
 def _with_reading(
-    one: Hypothesis, sensor: int, reading: Array, model: Vector, firsts: NDArray[np.int64], r: float, work: Work
+    one: Hypothesis,
+    sensor: int,
+    reading: Array,
+    whitening: Array,
+    model: Vector,
+    firsts: NDArray[np.int64],
+    r: float,
+    work: Work,
 ) -> gate.Fit:
-    """Take a reading into covariance and correction, and keep in ``work`` what they were; how it fits."""
+    """Take a reading into covariance and correction, and keep in ``work`` what they were; how it fits.
+
+    ``whitening`` (3, 3): of a star tracker's attitude.
+    """
     x, h, columns = one.x, work.h, work.columns
     _copied(one.P, one.dx, work.P, work.dx)
     q, bias, v = quaternion_at(x), -1, model
@@ -148,7 +163,8 @@ def _with_reading(
         model = model[0] + x[16], model[1] + x[17], model[2] + x[18]
         axes = rotate_back(q, (1.0, 0.0, 0.0)), rotate_back(q, (0.0, 1.0, 0.0)), rotate_back(q, (0.0, 0.0, 1.0))
     if sensor == 0:
-        residual = error_vector(q, quaternion_at(reading))
+        e_q, W = error_vector(q, quaternion_at(reading)), whitening
+        residual = gate.dot(vector_at(W[0]), e_q), gate.dot(vector_at(W[1]), e_q), gate.dot(vector_at(W[2]), e_q)
     elif sensor == 1:
         residual, bias = _minus(_minus(vector_at(reading), _at(x, 4)), _at(x, 10)), firsts[1]
     else:
@@ -160,8 +176,12 @@ def _with_reading(
             residual, bias = _minus(residual, _at(x, 7)), firsts[0]
     nis, determinant = 0.0, 1.0
     for j in range(3):
-        if sensor < 2:
-            columns[0], h[0], m = 3 * sensor + j, 1.0, 1
+        if sensor == 0:
+            for k in range(3):
+                columns[k], h[k] = k, whitening[j, k]
+            m = 3
+        elif sensor == 1:
+            columns[0], h[0], m = 3 + j, 1.0, 1
         elif g >= 0:
             # Row j of (E + D)2W(v), and the field itself for that row of D.
             row = (x[22 + 3 * j] + (j == 0), x[23 + 3 * j] + (j == 1), x[24 + 3 * j] + (j == 2))
@@ -234,6 +254,14 @@ def _advance(
     """State and covariance of the instant after ``place``, a run and an instant."""
     run, i = place
     x, F, F_after = one.x, work.F, work.F_after
+    for state in range(len(settings.firsts)):
+        for j in range(3):
+            first = settings.firsts[state] + j
+            if settings.firsts[state] >= 0 and settings.kept[i, first] < 1.0:
+                x[7 + 3 * state + j] *= settings.kept[i, first]
+                for other in range(len(one.P)):
+                    one.P[first, other] *= settings.kept[i, first]
+                    one.P[other, first] *= settings.kept[i, first]
     q, w = quaternion_at(x), _at(x, 4)
     k, b_o = vector_at(record.momentum[run, i]), vector_at(around.b_orbital[run, i])
     own = with_dipole(body, _at(x, 19))
@@ -255,14 +283,6 @@ def _advance(
         b_after = rotate_back(q, b_o)
         mean = (0.5 * (b[0] + b_after[0]), 0.5 * (b[1] + b_after[1]), 0.5 * (b[2] + b_after[2]))
         by_dipole(work.G[0], body, mean, work.G[1])
-    e, N = settings.firsts[3], one.P.shape[0]
-    if e >= 0:
-        for j in range(e, e + 3):
-            for column in range(N):
-                one.P[j, column] *= settings.decay[i]
-            for row in range(N):
-                one.P[row, j] *= settings.decay[i]
-            x[16 + j - e] *= settings.decay[i]
     spread(work.Phi, work.G, (settings.firsts[2], settings.firsts[4]), settings.variance[i], one.P, work.T)
     _put(x, q)
     x[4], x[5], x[6] = w
@@ -329,24 +349,24 @@ def _take_readings(
     run, i = place
     used, firsts = settings.used, settings.firsts
     for sensor in range(4):
-        reading = _reading_of(record, sensor, run, i)
+        reading, whitening = _reading_of(record, sensor, run, i), record.star_whitening[run, i]
         if not (used[sensor] and np.isfinite(reading[0])):
             continue
         model, r = models[1 if sensor == 3 else 0], settings.sigma[sensor] ** 2
         fit_second = (np.nan, np.nan, np.nan)
         there = contest.counts[gate.BEGAN] >= 0
-        fit = _with_reading(main, sensor, reading, model, firsts, r, work)
-        out.nis[run, i, sensor] = fit[0]
+        fit = _with_reading(main, sensor, reading, whitening, model, firsts, r, work)
+        out.nis[run, i, sensor], out.log_det[run, i, sensor] = fit[0], fit[2]
         if there:
             # Decided before it is taken, for there is room to undo one reading only.
             _without_reading(main, work)
-            fit_second = _with_reading(second, sensor, reading, model, firsts, r, work)
+            fit_second = _with_reading(second, sensor, reading, whitening, model, firsts, r, work)
         use, use_second = gate.decided(contest, sensor, settings.limit, fit, fit_second)
         if there:
             if not use_second:
                 _without_reading(second, work)
             if use:
-                _with_reading(main, sensor, reading, model, firsts, r, work)
+                _with_reading(main, sensor, reading, whitening, model, firsts, r, work)
         elif not use:
             _without_reading(main, work)
         out.rejected[run, i, sensor] = not use
@@ -355,7 +375,7 @@ def _take_readings(
         if not use and gate.may_begin(contest, sensor, firsts[1] >= 0, both):
             star = quaternion_at(record.star[run, i])
             _begin(main, second, sensor, gate.begun(quaternion_at(main.x), sensor, star, field, sun, *models), settings)
-            _with_reading(second, sensor, reading, model, firsts, r, work)
+            _with_reading(second, sensor, reading, whitening, model, firsts, r, work)
             gate.begin(contest, sensor)
         gate.read(contest, sensor)
 

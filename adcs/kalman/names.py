@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-Filter = Literal["mekf", "constant-gain", "parallel-disturbance", "reduced", "smoother"]
+Filter = Literal["mekf", "constant-gain", "parallel-disturbance", "reduced", "smoother", "self-tuning"]
 Noise = Literal["tuned", "paper"]
 StartKind = Literal["near", "vectors", "any"]
 FILTERS: tuple[str, ...] = get_args(Filter)

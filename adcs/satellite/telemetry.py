@@ -6,7 +6,7 @@ one without it. The leading axis of all arrays is the run, the second the instan
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -43,12 +43,20 @@ class Readings:
     field_T : ndarray, shape (runs, n, 3)
     sun : ndarray, shape (runs, n, 3)
         Unit vector to the Sun.
+    star_whitening : ndarray, shape (runs, n, 3, 3)
+        W of every attitude: of W δq each component has the star tracker's standard deviation.
     """
 
     star: FloatArray
     gyro_rad_s: FloatArray
     field_T: FloatArray
     sun: FloatArray
+    star_whitening: FloatArray = field(default_factory=lambda: np.eye(3))
+
+    def __post_init__(self) -> None:
+        """One whitening for each attitude, E where nothing else is said."""
+        each = np.broadcast_to(self.star_whitening, (*self.star.shape[:2], 3, 3))
+        object.__setattr__(self, "star_whitening", each)
 
     @property
     def seen(self) -> dict[str, BoolArray]:
@@ -100,14 +108,12 @@ class Record:
 def part(record: Record, runs: NDArray[np.intp], rows: slice = slice(None)) -> Record:
     """Some runs of a record, each as often as its index comes, and instants that follow one another."""
     around, readings = record.environment, record.readings
-    of_runs = {
-        field.name: getattr(around, field.name)[runs, rows] for field in fields(around) if field.name != "time_s"
-    }
+    of_runs = {one.name: getattr(around, one.name)[runs, rows] for one in fields(around) if one.name != "time_s"}
     return Record(
         record.satellite,
         record.dt_s,
         Environment(time_s=around.time_s[rows], **of_runs),
-        Readings(*(getattr(readings, field.name)[runs, rows] for field in fields(readings))),
+        Readings(*(getattr(readings, one.name)[runs, rows] for one in fields(readings))),
         record.momentum_Nms[runs, rows],
         record.wheel_torque_Nm[runs, rows],
         record.torquers_Am2[runs, rows],
@@ -134,6 +140,9 @@ class Telemetry:
         Momentum of all wheels together; straight lines go through what is missing.
     torquers_Am2 : ndarray, shape (n, 3)
         Commanded magnetic moment, held from each row until another one is told; none before the first.
+    star_covariance_rad2 : ndarray, shape (n, 3, 3)
+        Of a small turn of the star tracker's attitude about the body's axes, NaN where it is as the satellite's star
+        tracker has it; such as of :func:`adcs.combined_star_fixes`.
     step_s : float
         Usual time between instants, which the process noise is for; by default the shortest between two rows, of times
         that are no multiples of it their median.
@@ -159,6 +168,7 @@ class Telemetry:
     sun: FloatArray
     wheels_Nms: FloatArray
     torquers_Am2: FloatArray
+    star_covariance_rad2: FloatArray
     step_s: float
 
     def __init__(
@@ -171,6 +181,7 @@ class Telemetry:
         sun: ArrayLike | None = None,
         wheels_Nms: ArrayLike | None = None,
         torquers_Am2: ArrayLike | None = None,
+        star_covariance_rad2: ArrayLike | None = None,
         step_s: float | None = None,
     ) -> None:
         times = np.array(time_s, dtype=np.float64)
@@ -190,6 +201,7 @@ class Telemetry:
         checked = {name: _columns(name, values, len(times)) for name, values in given.items()}
         checked["wheels_Nms"] = _columns("wheels_Nms", wheels_Nms, len(times))
         checked["torquers_Am2"] = _columns("torquers_Am2", torquers_Am2, len(times))
+        checked["star_covariance_rad2"] = _covariances(star_covariance_rad2, len(times))
         for name, value in ({"time_s": times, "step_s": step_s} | checked).items():
             object.__setattr__(self, name, value)
 
@@ -226,6 +238,7 @@ class Telemetry:
                 sun=self.sun[rows],
                 wheels_Nms=self.wheels_Nms[rows],
                 torquers_Am2=self.torquers_Am2[rows],
+                star_covariance_rad2=self.star_covariance_rad2[rows],
                 step_s=self.step_s,
             )
             for rows in np.split(np.arange(len(self.time_s)), cuts)
@@ -257,6 +270,9 @@ class Telemetry:
             gyro_rad_s=spread(self.gyro_rad_s)[None],
             field_T=spread(self.field_T)[None],
             sun=(sun / np.linalg.norm(sun, axis=1, keepdims=True))[None],
+            star_whitening=_whitening(
+                spread(self.star_covariance_rad2.reshape(-1, 9)).reshape(-1, 3, 3), satellite.star_tracker.sigma_rad
+            )[None],
         )
         torquers = _held(spread(self.torquers_Am2))
         return Record(satellite, self.step_s, around, readings, momentum[None], torque[None], torquers[None])
@@ -276,6 +292,27 @@ def _columns(name: str, given: ArrayLike | None, n: int) -> FloatArray:
     if name in ("star", "sun") and (values == 0.0).all(axis=1).any():
         raise ValueError(f"Input {name} must have a direction; instead received a reading of length 0.")
     return np.where(np.isnan(values).any(axis=1, keepdims=True), np.nan, values)
+
+
+def _covariances(given: ArrayLike | None, n: int) -> FloatArray:
+    """Covariances (n, 3, 3) that are symmetric and positive definite, or NaN."""
+    values = np.full((n, 3, 3), np.nan) if given is None else np.array(given, dtype=np.float64)
+    if values.shape != (n, 3, 3):
+        raise ValueError(
+            f"Input star_covariance_rad2 must have shape ({n}, 3, 3); instead received shape {values.shape}."
+        )
+    known = values[~np.isnan(values).any(axis=(1, 2))]
+    if not np.isfinite(known).all() or not (np.linalg.eigvalsh(known) > 0.0).all():
+        raise ValueError("Input star_covariance_rad2 must be positive definite; instead received one that is not.")
+    return values
+
+
+def _whitening(covariance_rad2: FloatArray, sigma: float) -> FloatArray:
+    """W (n, 3, 3) of covariances of turns: W δq has the covariance σ²E, δq being half a turn."""
+    W = np.tile(np.eye(3), (len(covariance_rad2), 1, 1))
+    known = ~np.isnan(covariance_rad2).any(axis=(1, 2))
+    W[known] = 2.0 * sigma * np.linalg.inv(np.linalg.cholesky(covariance_rad2[known]))
+    return W
 
 
 def steps_of(time_s: FloatArray, step_s: float) -> tuple[NDArray[np.int64], BoolArray]:

@@ -39,7 +39,7 @@ class CompareOptions:
     states : str
         Sets of states, as in none,gyro-bias,gyro-bias+disturbance; by default each scenario's.
     filter : str
-        Filters: mekf, constant-gain, parallel-disturbance, reduced, smoother; by default each scenario's.
+        Filters: mekf, constant-gain, parallel-disturbance, reduced, smoother, self-tuning; by default each scenario's.
     """
 
     sensors: str | None = None

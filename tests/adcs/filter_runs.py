@@ -147,3 +147,13 @@ def tumbled(duration_s: float, seeds: range, conditions: StartConditions | None 
     q = random_attitudes(len(seeds), np.random.default_rng(seeds[0]))
     rest = dynamics.absolute_rate(q, np.zeros((len(seeds), 3)), prepared.environment.orbital_rate_rad_s[:, 0])
     return followed(replace(prepared, q=q, w=rest))
+
+
+def unlike_stars(runs: AttitudeRuns, worse: float = 20.0) -> AttitudeRuns:
+    """Runs whose star cameras look elsewhere every time, and tell the turn about that some times worse."""
+    axes = random_attitudes(runs.q.size // 4, np.random.default_rng(40)).reshape(runs.q.shape)
+    unlike = np.swapaxes(quaternion.matrix(axes), -1, -2) * np.array([1.0, 1.0, 1.0 / worse])[:, None]
+    error = quaternion.error_vector(runs.q, runs.readings.star)
+    worsened = quaternion.from_error_vector((np.linalg.inv(unlike) @ error[..., None])[..., 0])
+    star = np.where(np.isnan(error[..., :1]), np.nan, quaternion.multiply(runs.q, worsened))
+    return replace(runs, readings=replace(runs.readings, star=star, star_whitening=unlike))

@@ -29,7 +29,7 @@ class TestDivergence:
         runs = simulate(SCENARIO, [0])
         runs.readings.gyro_rad_s[0, 5:] = rate_rad_s
         telemetry = adcs.Telemetry.of(runs, SCENARIO.satellite.start)
-        if name in ("mekf", "smoother"):
+        if name in ("mekf", "smoother", "self-tuning"):
             # These have a gate, and go on without the gyro.
             track = adcs.estimate(telemetry, SCENARIO.satellite, sensors=SENSORS, filter=name)
             assert track.rejected["gyro"][5:].all()

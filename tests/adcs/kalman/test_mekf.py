@@ -65,6 +65,7 @@ from tests.adcs.filter_runs import (
     settings,
     start_of,
     tabletsat,
+    unlike_stars,
 )
 from tests.adcs.kalman.test_error_state import TABLE_3
 from tests.calls import calls_of
@@ -168,7 +169,10 @@ class TestJacobians:
 
     def after(self, runs: AttitudeRuns, state: State) -> State:
         q, w = moved(runs, 3, state)
-        model = {"field-model": self.CHOSEN.field_decay(runs.dt_s) * state.of("field-model")}
+        model = {
+            "field-model": self.CHOSEN.kept(runs.dt_s)[self.CHOSEN.sensors.place("field-model")]
+            * state.of("field-model")
+        }
         return replace(state, q=q, w=w, optional={**state.optional, **model})
 
     def error(self, state: State, other: State) -> Array:
@@ -243,6 +247,25 @@ class TestCompiledTwin:
             atol = 1e-10 * scales.get(name, 1e-3)
             np.testing.assert_allclose(fast.states[name], values, rtol=0, atol=atol)
         assert list(fast.states) == list(slow.states)
+        by_deviations = slow.sigma[..., :, None] * slow.sigma[..., None, :]
+        np.testing.assert_allclose(fast.covariance / by_deviations, slow.covariance / by_deviations, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(fast.nis, slow.nis, rtol=1e-7, atol=1e-7)
+
+    def test_agrees_where_the_disturbance_has_a_time_constant(self) -> None:
+        chosen = replace(settings("mag+sun", ["disturbance", "field-model"]), disturbance_correlation_s=30.0)
+        runs, start = runs_for(chosen.sensors, 40.0, range(2))
+        fast, slow = run_filter(runs, chosen, start), run_readable(runs, chosen, start)
+        np.testing.assert_allclose(fast.q, slow.q, rtol=0, atol=1e-13)
+        by_deviations = slow.sigma[..., :, None] * slow.sigma[..., None, :]
+        np.testing.assert_allclose(fast.covariance / by_deviations, slow.covariance / by_deviations, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(fast.log_det, slow.log_det, rtol=1e-7, atol=1e-9)
+
+    def test_agrees_where_a_star_camera_tells_one_turn_worse(self) -> None:
+        chosen = settings("st+gyro+sun", ["gyro-bias"])
+        runs, start = runs_for(chosen.sensors, 40.0, range(2))
+        unlike = unlike_stars(runs)
+        fast, slow = run_filter(unlike, chosen, start), run_readable(unlike, chosen, start)
+        np.testing.assert_allclose(fast.q, slow.q, rtol=0, atol=1e-13)
         by_deviations = slow.sigma[..., :, None] * slow.sigma[..., None, :]
         np.testing.assert_allclose(fast.covariance / by_deviations, slow.covariance / by_deviations, rtol=0, atol=1e-9)
         np.testing.assert_allclose(fast.nis, slow.nis, rtol=1e-7, atol=1e-7)
@@ -610,6 +633,7 @@ class TestAccuracy:
             covariance,
             np.zeros((3, 101, 4)),
             np.zeros((3, 101, 4), dtype=np.bool_),
+            np.zeros((3, 101, 4)),
         )
         reached = evaluate(runs, estimates)
         assert reached["angle_rms_deg"] == pytest.approx(np.degrees(6e-3), rel=1e-9)

@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.constants import speed_of_light
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 import adcs
 from adcs.cli.app import main
+from adcs.environment.sun import earth_velocity_m_s
+from adcs.frames import of_julian_year
 from adcs.stars.camera import StarCamera
 from adcs.stars.files import read_star_frames
 from adcs.stars.identification import NoFix, StarFix, StarMatcher
@@ -107,6 +110,11 @@ class TestLights:
         assert (cKDTree(lights.points_px).query(bright)[0] < 0.5).mean() > 0.9
 
 
+def direction(ra_deg, dec_deg):
+    ra, dec = np.radians([ra_deg, dec_deg])
+    return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+
+
 def is_right(found, R):
     """Whether a fix looks where the camera did."""
     turn = found.R_catalogue_from_frame @ R.T
@@ -171,6 +179,19 @@ class TestHipparcos:
         moved = later.directions[place[87937]] - catalogue.directions[place[87937]]
         assert math.degrees(np.linalg.norm(moved)) * 3600.0 == pytest.approx(103.6, abs=0.5)
 
+    def test_aberration(self):
+        """That of the standards of astronomy, whose deflection of light by the Sun is none at this distance of it."""
+        erfa = pytest.importorskip("erfa")
+        utc = of_julian_year(2026.9)
+        velocity, catalogue = earth_velocity_m_s(utc), adcs.hipparcos_catalogue(2026.9)
+        assert 29.2e3 < np.linalg.norm(velocity) < 30.4e3
+        seen = catalogue.aberrated(velocity).directions[::500]
+        beta = velocity / speed_of_light
+        expected = erfa.ab(catalogue.directions[::500], beta, 1e12, math.sqrt(1.0 - beta @ beta))
+        np.testing.assert_allclose(seen, expected, rtol=0.0, atol=1e-12)
+        off = np.linalg.norm(seen - catalogue.directions[::500], axis=1)
+        assert 20.0 < math.degrees(off.max()) * 3600.0 < 20.8
+
     @pytest.mark.parametrize(("off", "lens"), [(1.0, LensPrior()), (0.955, UNKNOWN_LENS), (1.045, UNKNOWN_LENS)])
     def test_frames(self, data_folder, off, lens):
         camera, frames = read_star_frames(data_folder / "star-frames")
@@ -232,6 +253,7 @@ class TestCommand:
         ("arguments", "said"),
         [
             (["--scale-arcsec", "0"], "--scale-arcsec: found 0, expected a positive number"),
+            (["--year", "1e9"], "--year: found 1e+09, expected 1900 to 2100"),
             (["--scale-tolerance", "0.5"], "--scale-tolerance: found 0.5, expected 0.1 at most"),
             (["--dark", "none.png"], "none.png does not exist"),
         ],
@@ -239,6 +261,19 @@ class TestCommand:
     def test_refusals(self, files, capsys, arguments, said):
         assert main(["stars", str(files / "sky.png"), "--catalogue", str(files / "sky.csv"), *arguments]) == 2
         assert said in capsys.readouterr().err
+
+    def test_aberration_moves_the_centre(self, files, capsys):
+        """By what the Earth's velocity across the line of sight is of that of light."""
+        arguments = ["stars", str(files / "sky.png"), "--catalogue", str(files / "sky.csv"), "--scale-arcsec", "61"]
+        places = []
+        for option in ([], ["--aberration", "--year", "2026.5"]):
+            assert main([*arguments, "--json", *option]) == 0
+            (row,) = json.loads(capsys.readouterr().out)["pictures"]
+            places.append(direction(row["ra_deg"], row["dec_deg"]))
+        across = np.cross(places[0], earth_velocity_m_s(of_julian_year(2026.5)))
+        # Stars are nearer to where the Earth goes: so is the camera that sees them at the catalogue's places.
+        expected = np.cross(across, places[0]) / speed_of_light
+        np.testing.assert_allclose(places[1] - places[0], expected, rtol=0.0, atol=2e-7)
 
     def test_a_picture_that_is_not_there_leaves_nothing_written(self, files, capsys):
         pictures = [str(files / "sky.png"), str(files / "none.png")]

@@ -1,0 +1,88 @@
+r"""A bank of error-state filters that differ in how large a disturbance they expect, weighed by how each predicts.
+
+The disturbance is an Ornstein-Uhlenbeck process of 300 s with a standard deviation of 1e-8 to 1e-4 s⁻², by half
+decades. With the innovations ν of each filter and their covariance S, the weights are
+
+.. math:: w \propto \exp\left(-\tfrac12 \sum (\nu^T S^{-1} \nu + \ln |S|)\, e^{-\mathrm{age} / 1000\,\mathrm{s}}\right)
+
+and the estimate is the mean of the mixture, with its covariance: multiple-model adaptive estimation. The source
+proposes to estimate elements of Q: Ivanov, Ivlev, Karpenko, Ovchinnikov, Keldysh Institute preprint 64, 2014.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import softmax
+
+from adcs import quaternion
+from adcs.kalman.error_state import ALWAYS, AttitudeTracks, FilterSettings, Start
+from adcs.kalman.mekf import run_filter
+from adcs.satellite.telemetry import Record
+from arrays.typing import FloatArray
+
+DISTURBANCES_S2 = 10.0 ** np.arange(-8.0, -3.75, 0.5)
+CORRELATION_S = 300.0
+MEMORY_S = 1000.0
+_RATE_NOISE_RAD_S = 1e-8  # of a step: what moves the rate is in the state
+
+
+def run_self_tuned(record: Record, settings: FilterSettings, start: Start) -> AttitudeTracks:
+    """Mixture of the bank's estimates of whole runs.
+
+    ``settings``: of a set with the state ``disturbance``, whose deviation and process noise the bank takes the place
+    of. Returns: ``nis`` is the mean of the bank's, ``rejected`` that of the filter of the largest weight.
+    """
+    if "disturbance" not in settings.sensors.states:
+        raise ValueError("Input settings must have the state disturbance; instead received a set without it.")
+    noise = replace(settings.noise, rate_rad_s=_RATE_NOISE_RAD_S, disturbance_s2=0.0)
+    one = replace(settings, noise=noise, disturbance_correlation_s=CORRELATION_S)
+    bank = [run_filter(record, replace(one, disturbance_sigma_s2=float(sigma)), start) for sigma in DISTURBANCES_S2]
+    return mixture(bank, weights(bank, record))
+
+
+def weights(bank: list[AttitudeTracks], record: Record) -> FloatArray:
+    """Weight (filters, runs, n) of every filter after the readings of every instant; all are alike before."""
+    limit = bank[0].settings.gate_limit
+    fits = np.stack([np.nansum(np.minimum(one.nis, limit) + one.log_det, axis=-1) for one in bank])
+    log_weight = -0.5 * fits
+    for row, step_s in enumerate(record.steps_s):
+        log_weight[..., row + 1] += np.exp(-step_s / MEMORY_S) * log_weight[..., row]
+    return np.asarray(softmax(log_weight, axis=0))
+
+
+def mixture(bank: list[AttitudeTracks], weight: FloatArray) -> AttitudeTracks:
+    """Mean and covariance of the estimates of filters with weights (filters, runs, n)."""
+    settings, first = bank[0].settings, bank[len(bank) // 2]
+    names = settings.sensors.states
+    off = np.stack(
+        [
+            np.concatenate(
+                [
+                    quaternion.error_vector(first.q, one.q),
+                    one.w - first.w,
+                    *(one.optional[name] - first.optional[name] for name in names),
+                ],
+                axis=-1,
+            )
+            for one in bank
+        ]
+    )
+    mean = np.sum(weight[..., None] * off, axis=0)
+    covariance = np.zeros_like(first.covariance)
+    for one, each, share in zip(bank, off - mean, weight, strict=True):
+        covariance += share[..., None, None] * (one.covariance + each[..., :, None] * each[..., None, :])
+    best = np.argmax(weight, axis=0)[None, ..., None]
+    q = quaternion.multiply(first.q, quaternion.from_error_vector(mean[..., :3]))
+    nis = np.stack([one.nis for one in bank])
+    return AttitudeTracks(
+        settings,
+        quaternion.normalised(q),
+        first.w + mean[..., 3:ALWAYS],
+        {name: first.optional[name] + mean[..., settings.sensors.place(name)] for name in names},
+        covariance,
+        np.sum(weight[..., None] * nis, axis=0),
+        np.take_along_axis(np.stack([one.rejected for one in bank]), best, axis=0)[0],
+        np.full(nis.shape[1:], np.nan),
+    )
