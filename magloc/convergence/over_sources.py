@@ -164,7 +164,7 @@ class SourcesMap(CubeMap):
     @property
     def point_s(self) -> float:
         """Seconds of one core that a fix takes, roughly."""
-        return 2.4e-4
+        return 5e-5
 
     @property
     def settings(self) -> Mapping[str, Any]:
