@@ -102,6 +102,11 @@ def compiled(function: Function) -> Function:
     return cast(Function, cached(njit(nogil=True, error_model="numpy", fastmath={"contract"})(function)))
 
 
+def inlined(function: Function) -> Function:
+    """Compile a piece of a loop over lanes: a call that remained one would keep the loop from being vectorised."""
+    return cast(Function, cached(njit(error_model="numpy", fastmath={"contract"}, forceinline=True)(function)))
+
+
 def compiled_parallel(function: Function) -> Function:
     """Compile a kernel whose ``prange`` loops run on numba's threads."""
     return cast(Function, cached(njit(parallel=True, error_model="numpy", fastmath={"contract"})(function)))

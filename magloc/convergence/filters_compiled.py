@@ -14,7 +14,7 @@ from numba import get_num_threads, prange
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled, compiled_parallel
+from magloc.compilation import compiled, compiled_parallel, inlined
 from magloc.convergence.linearisation_compiled import Model, linearise_contrasts, linearise_rows
 from magloc.convergence.workspace_compiled import (
     ACCEPT,
@@ -39,7 +39,6 @@ from magloc.convergence.workspace_compiled import (
     WORKSPACE,
     add_identity,
     aligned,
-    inlined,
     swept,
     swept_once,
     triangle,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from arrays.typing import FloatArray
-from magloc.compilation import compiled
+from magloc.compilation import compiled, inlined
 from magloc.convergence.workspace_compiled import (
     BASE,
     CHANGE,
@@ -23,7 +23,6 @@ from magloc.convergence.workspace_compiled import (
     SENSOR,
     SENSOR_ROWS,
     STATE,
-    inlined,
 )
 from magloc.fields.dipole_compiled import field_matrix_components, gradient_components
 

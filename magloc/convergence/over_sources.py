@@ -20,7 +20,7 @@ from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.io.errors import check_positive
 from arrays.noise import reading_errors
-from arrays.typing import FloatArray
+from arrays.typing import BoolArray, FloatArray
 from arrays.whitening import whitening
 from magloc.bounds.crlb import cramer_rao_bounds
 from magloc.grids.computed import computed_map
@@ -36,17 +36,17 @@ from magloc.grids.cube import (
     flags,
     tallied,
 )
-from magloc.localization.fit.results import Fix
+from magloc.localization.fit.fixes import Fixes
+from magloc.localization.fit.results import is_observable, spans
+from magloc.localization.fit.variable_projection_compiled import SAME_CHI2, SAME_COS, Refined, refined
 from magloc.localization.locator import Locator
 from magloc.localization.search.single_source import N_UNKNOWNS
 from magloc.measurement.differences import predicted_channels
-from magloc.measurement.rows import check_magnitudes, whitenings_of
+from magloc.measurement.rows import check_magnitudes, whitened_rows
 from magloc.measurement.whitened import WhitenedModel
 
 if TYPE_CHECKING:
     import xarray as xr
-from magloc.localization.fit import variable_projection_compiled
-from magloc.measurement.whitened_compiled import ModelRow
 
 # χ² above that of the optimum searched from the truth within which a fix has found it.
 CHI2_FOUND = 0.05
@@ -164,7 +164,7 @@ class SourcesMap(CubeMap):
     @property
     def point_s(self) -> float:
         """Seconds of one core that a fix takes, roughly."""
-        return 2.4e-4
+        return 5e-5
 
     @property
     def settings(self) -> Mapping[str, Any]:
@@ -184,7 +184,7 @@ class SourcesMap(CubeMap):
         position = array.centroid + 3.0 * array.circumradius * np.eye(3)[:1]
         moment = self.scenario.moment_Am2 * np.eye(3)[:1]
         readings = self._readings(position, moment, np.zeros((1, array.n_channels)))
-        self._lists(self._locator.fit_rows(readings)[0], *self._searched_from(position, readings)[0])
+        self._listed(self._locator.fit_rows(readings), self._searched_from(position, readings))
 
     def values_at(self, box: Box) -> Mapping[str, Any]:
         """Fixes of the sources of a box."""
@@ -192,32 +192,42 @@ class SourcesMap(CubeMap):
         distance = np.linalg.norm(relative, axis=1)
         used = (distance >= self.scenario.nearest_m) & (distance <= self.scenario.farthest_m)
         moment, noise = (part[used] for part in self._random(box))
-        position = self.scenario.array.centroid + relative[used]
-        readings = self._readings(position, moment, noise)
-        fixes = self._locator.fit_rows(readings)
-        from_truth = self._searched_from(position, readings)
-        reference = np.array([chi2 for _, chi2 in from_truth])
-        chi2 = np.array([fix.solutions[0].chi2 if fix.solutions else np.nan for fix in fixes])
-        found = np.where(chi2 <= reference + CHI2_FOUND, SourceStatus.FOUND, SourceStatus.MISSED)
-        bounds = cramer_rao_bounds(self.scenario.array, position, moment)
-        of_used: dict[str, Any] = {
-            "status": np.where(np.isnan(chi2), SourceStatus.UNSOLVED, found),
-            "iterations": [fix.solutions[0].iterations if fix.solutions else 0 for fix in fixes],
-            "chi2": chi2,
-            "chi2_from_truth": reference,
-            "distance": [_error(fix, truth) for fix, truth in zip(fixes, position, strict=True)],
-            "solutions": [len(fix.solutions) for fix in fixes],
-            "truth_listed": [self._lists(fix, *end) for fix, end in zip(fixes, from_truth, strict=True)],
-            "range_observable": [bool(fix.solutions) and fix.solutions[0].range_observable for fix in fixes],
-            "sigma_range": bounds.sigma_range_m,
-            "sigma_position": bounds.sigma_position_m,
-        }
+        of_used = self._values_of(self.scenario.array.centroid + relative[used], moment, noise) if used.any() else {}
         values = {}
         for name, variable in _VARIABLES.items():
             of_all = np.full(box.size, _LEFT_OUT.get(name, np.nan), variable.dtype)
-            of_all[used] = of_used[name]
+            of_all[used] = of_used.get(name, ())
             values[name] = of_all
         return values
+
+    def _values_of(self, position: FloatArray, moment: FloatArray, noise: FloatArray) -> Mapping[str, Any]:
+        """Fixes of sources (n, 3), noise as standard normal numbers."""
+        readings = self._readings(position, moment, noise)
+        fixes = self._locator.fit_rows(readings)
+        from_truth = self._searched_from(position, readings)
+        solved, every = fixes.solved, fixes.solutions
+        first = fixes.first[solved]
+
+        def of_first(values: Any, empty: float) -> Any:
+            column = np.full(len(fixes), empty, dtype=np.asarray(values).dtype)
+            column[solved] = values
+            return column
+
+        chi2 = of_first(every.chi2[first], np.nan)
+        found = np.where(chi2 <= from_truth.chi2 + CHI2_FOUND, SourceStatus.FOUND, SourceStatus.MISSED)
+        bounds = cramer_rao_bounds(self.scenario.array, position, moment)
+        return {
+            "status": np.where(np.isnan(chi2), SourceStatus.UNSOLVED, found),
+            "iterations": of_first(every.iterations[first], 0),
+            "chi2": chi2,
+            "chi2_from_truth": from_truth.chi2,
+            "distance": of_first(np.linalg.norm(every.position_m[first, 0] - position[solved], axis=1), np.nan),
+            "solutions": np.bincount(every.of_row, minlength=len(fixes)),
+            "truth_listed": self._listed(fixes, from_truth),
+            "range_observable": of_first(is_observable(*spans(every.ranges[first, 0]).T), False),
+            "sigma_range": bounds.sigma_range_m,
+            "sigma_position": bounds.sigma_position_m,
+        }
 
     def _random(self, box: Box) -> tuple[FloatArray, FloatArray]:
         """Moments (n, 3) [A·m²] and standard normal noise (n, C) of a box, the same in whatever boxes."""
@@ -238,46 +248,21 @@ class SourcesMap(CubeMap):
         exact = predicted_channels(array, position, moment) + array.channel_offset_T
         return exact + reading_errors(array, exact, noise)
 
-    def _searched_from(self, truth: FloatArray, readings: FloatArray) -> list[tuple[FloatArray, float]]:
-        """Ends q (4,) and χ² of the refinements that start at the truth (n, 3).
+    def _searched_from(self, truth: FloatArray, readings: FloatArray) -> Refined:
+        """Ends of the refinements that start at the truth (n, 3).
 
         One that has not converged only ever has a χ² that is too high, so it counts like the others: a fix is held
         against it where it is lower.
         """
-        array = self.scenario.array
-        without_source = array.readings_of(array.ambient_fields)
-        ends = []
-        model = self._model
-        whitenings = whitenings_of(array, np.ones(array.n_channels, dtype=bool), readings)
-        for position, row, white in zip(truth, readings, whitenings, strict=True):
-            q = model.homogeneous(position)
-            chi2, _, _ = variable_projection_compiled.refine(
-                q,
-                white.apply(row - without_source),
-                ModelRow.of(model, white.root @ array.channel_gain, white.basis, white.shrinkage),
-                3,
-                variable_projection_compiled.OPTIMUM_TOLERANCE,
-                _MAX_ITERATIONS,
-                np.empty((0, 4)),
-                np.empty(0),
-                0,
-                np.empty(3),
-            )
-            ends.append((q, chi2))
-        return ends
+        (rows,) = whitened_rows(self.scenario.array, readings, None, len(readings))
+        return refined(rows.model, rows.y, rows.model.homogeneous(truth), _MAX_ITERATIONS)
 
-    def _lists(self, fix: Fix, q: FloatArray, chi2: float) -> bool:
-        """Whether a solution is the optimum that the search from the truth ended at."""
-        return any(
-            variable_projection_compiled.same_optimum(
-                self._model.homogeneous(solution.position_m), solution.chi2, q, chi2
-            )
-            for solution in fix.solutions
-        )
-
-
-def _error(fix: Fix, truth: FloatArray) -> float:
-    return float(np.linalg.norm(fix.solutions[0].position_m - truth)) if fix.solutions else np.nan
+    def _listed(self, fixes: Fixes, ends: Refined) -> BoolArray:
+        """Whether the optima (n,) that the search from the truth ended at are among the solutions."""
+        every = fixes.solutions
+        cosine = np.sum(self._model.homogeneous(every.position_m[:, 0]) * ends.q[every.of_row], axis=1)
+        same = (np.abs(cosine) > SAME_COS) & (np.abs(every.chi2 - ends.chi2[every.of_row]) < SAME_CHI2)
+        return np.bincount(every.of_row[same], minlength=len(fixes)) > 0
 
 
 @dataclass(frozen=True)

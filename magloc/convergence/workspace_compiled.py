@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar, cast
-
 import numpy as np
-from numba import njit
 
 from arrays.typing import FloatArray
-from magloc.compilation import cached, compiled
+from magloc.compilation import compiled, inlined
 
-Function = TypeVar("Function", bound=Callable[..., Any])
 LANES = 32
 # Rows, as offsets into the workspace. The first four groups are the linearisation at the state of its first six rows.
 STATE = 0
@@ -37,11 +32,6 @@ ROW = 134 * LANES  # one difference: residual, Jacobian (6)
 WORKSPACE = 141 * LANES
 SENSOR_ROWS = 13
 DIAGONAL = (0, 6, 11, 15, 18, 20)  # rows of an upper triangle
-
-
-def inlined(function: Function) -> Function:
-    """Compile a piece of a loop over the lanes: a call that remained one would keep the loop from being vectorised."""
-    return cast(Function, cached(njit(error_model="numpy", fastmath={"contract"}, forceinline=True)(function)))
 
 
 @compiled

@@ -7,7 +7,7 @@ the source's, and need one. Distributions: docs/theory/detection.md.
 
 from __future__ import annotations
 
-import math
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -19,13 +19,19 @@ from arrays.whitening import Whitening, whitening
 from magloc.chi_square import check_differences
 from magloc.compilation import over_rows
 from magloc.fields import dipole
-from magloc.localization.search.candidates import SingleArray, candidate_positions, linear_bases, linear_scores
-from magloc.localization.search.single_source_compiled import Candidates, Ends, search_rows
+from magloc.localization.search.candidates import (
+    SingleArray,
+    candidate_positions,
+    chosen_candidates,
+    linear_bases,
+    linear_scores,
+)
+from magloc.localization.search.single_source_compiled import Ends, search_rows
 from magloc.measurement.whitened import WhitenedModel
-from magloc.measurement.whitened_compiled import ModelRows
+from magloc.measurement.whitened_compiled import LaneModel, signals
 
 # As Locator searches: starts of every refinement, least angle between them, linearisations at most.
-_N_STARTS, _APART_RAD, _MOST_ITERATIONS = 6, 0.3, 100
+_N_STARTS, _APART_RAD, _MOST_ITERATIONS = 12, 0.25, 100
 _ROWS_AT_ONCE = 512
 
 
@@ -122,21 +128,13 @@ class DipoleFilter:
     def refined_energy(self, whitened: FloatArray) -> FloatArray:
         """The same of refined candidates alone: minus infinity where none converged."""
         n = len(whitened)
-        problem = self._problem
-        y = np.ascontiguousarray(whitened)
-        q, mu, chi2 = np.empty((n, _N_STARTS, 4)), np.empty((n, _N_STARTS, 3)), np.full((n, _N_STARTS), np.inf)
-        rows = ModelRows.of(problem)._replace(gain=self._gain[None], set_of_row=np.zeros(n, dtype=np.intp))
-        over_rows(
-            search_rows,
-            n,
-            y,
-            y,
-            np.arange(n),
-            Candidates(self._candidates, self._bases, math.cos(_APART_RAD)),
-            np.empty((n, 0, 4)),
-            np.inf,
-            _MOST_ITERATIONS,
-            rows,
-            Ends(q, mu, chi2, np.empty((n, _N_STARTS), dtype=np.int64), np.zeros((n, 3), dtype=np.int64)),
+        problem = replace(
+            self._problem.rows(np.zeros(n, dtype=np.intp)), gain=np.broadcast_to(self._gain, (n, *self._gain.shape))
         )
-        return self.energy(y) - chi2.min(axis=1)
+        chosen = chosen_candidates(self._bases, whitened, self._candidates, _N_STARTS, _APART_RAD)
+        found = Ends.empty(n, _N_STARTS)
+        signal, in_lanes = signals(problem, whitened), LaneModel.of(problem)
+        over_rows(
+            search_rows, n, signal, np.arange(n), self._candidates[chosen], np.inf, _MOST_ITERATIONS, in_lanes, found
+        )  # fmt: skip
+        return self.energy(whitened) - np.where(found.counts[:, 0] > 0, found.chi2[:, 0], np.inf)

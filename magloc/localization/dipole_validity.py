@@ -204,18 +204,17 @@ def too_near(
 ) -> BoolArray:
     """Whether each row's source is too near for a dipole, by length or misfit; fixes are in the array's frame."""
     near = np.zeros(len(fixes), dtype=bool)
-    solutions, first = fixes.solutions, fixes.first
-    for row in np.flatnonzero(fixes.solved).tolist():
-        best = int(first[row])
-        if solutions.n_sources[best] > 1:
-            continue
-        place, moment = solutions.position_m[best, 0], solutions.moment_Am2[best, 0]
-        if body_length_m:
-            nearest = np.linalg.norm(array.positions - place, axis=1).min()
-            near[row] = not dipole_validity(nearest, body_length_m)
-        dof = int(solutions.dof[best])
-        if not near[row] and dof > 0 and chdtrc(dof, solutions.chi2[best]) < SECOND_LOOK:
-            used = ~np.isin(array.ids, fixes.dropped_sensors[row])[array.channel_sensor]
-            of_row = array if ambient_T is None else replace(array, ambient_T=tuple(ambient_T[row].tolist()))
-            near[row] = nearness_test(of_row, place, moment, np.where(used, readings_T[row], np.nan)).extended
+    solved, solutions = np.flatnonzero(fixes.solved), fixes.solutions
+    alone = solved[solutions.n_sources[fixes.first[solved]] == 1]
+    best = fixes.first[alone]
+    place, moment, dof = solutions.position_m[best, 0], solutions.moment_Am2[best, 0], solutions.dof[best]
+    if body_length_m:
+        nearest = np.min([np.linalg.norm(place - sensor, axis=1) for sensor in array.positions], axis=0)
+        near[alone] = ~dipole_validity(nearest, body_length_m)
+    doubtful = ~near[alone] & (dof > 0) & (chdtrc(np.maximum(dof, 1), solutions.chi2[best]) < SECOND_LOOK)
+    for i in np.flatnonzero(doubtful).tolist():
+        row = alone[i]
+        used = ~np.isin(array.ids, fixes.dropped_sensors[row])[array.channel_sensor]
+        of_row = array if ambient_T is None else replace(array, ambient_T=tuple(ambient_T[row].tolist()))
+        near[row] = nearness_test(of_row, place[i], moment[i], np.where(used, readings_T[row], np.nan)).extended
     return near

@@ -1,9 +1,11 @@
 r"""Fixes that a bad sensor does not ruin.
 
 A row whose χ² is not credible is fitted again with Student-t scores, which give the residual of a whole sensor,
-:math:`\rho_s`, the weight :math:`(\nu + n_s)/(\nu + \rho_s)`, iterated from the plain fit and from the fits without
-one sensor each. The sensors that are then far outside of what their noise allows are named, and the row is fitted anew
-without them; what is returned is a plain least-squares fix, with the χ² and the covariance of the sensors that it uses.
+:math:`\rho_s`, the weight :math:`(\nu + n_s)/(\nu + \rho_s)`, iterated from the plain fit and from the best fits
+without one sensor each. These are refined from the plain fit, which a single sensor seldom moves to another optimum;
+only where none of them explains the others are optima without some sensors searched for anew. The sensors that are then
+far outside of what their noise allows are named, and the row is fitted anew without them; what is returned is a plain
+least-squares fix, with the χ² and the covariance of the sensors that it uses.
 """
 
 from __future__ import annotations
@@ -21,9 +23,10 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.chi_square import energy_threshold
 from magloc.levels import CREDIBLE_ROW, MISFIT, SENSOR_FALSE_ALARM
 from magloc.localization.fit.fixes import Fixes
-from magloc.localization.fit.gauss_newton import refine
+from magloc.localization.fit.gauss_newton import JointFits, refine
 from magloc.localization.fit.model_errors import model_errors
 from magloc.localization.fit.results import Fix
+from magloc.localization.fit.variable_projection_compiled import refined
 from magloc.localization.search.multi_source import NOISE_ALONE
 from magloc.measurement.rows import (
     NO_SIGNAL,
@@ -43,15 +46,23 @@ _BEYOND_DOUBT = 10.0
 # A fix that explains the other sensors badly must be better by this factor in χ² per degree of freedom.
 _INCOMPARABLE = 1000.0
 _N_REWEIGHTINGS = 30
+# Sensors in turn left out of a small array: of a larger one where a fit blames them.
 _MOST_LEFT_OUT = 8
+# Fits without one sensor that are kept of a row.
+_MOST_REFINED = 3
+# Sensors of a larger array without which an optimum is searched for anew, of those that a fit blames.
+_MOST_SEARCHED = 2
 _LEAST_WEIGHT = 1e-16
 # Share of a source's energy in one sensor above which no other sensor sees it.
 _LONELY = 0.9
-# Columns of the common field that are smaller than this against the largest are none.
+# Columns of the common field whose squares are smaller than this against the largest are none.
 _UNSEEN = 1e-13
 # Median of χ²/n of three degrees of freedom.
 _MEDIAN_RATIO = 0.789
 _ROWS_AT_ONCE = 64
+
+
+Weighted = tuple[WhitenedModel, FloatArray]
 
 
 class Refit(Protocol):
@@ -102,16 +113,15 @@ def _doubtful(fixes: Fixes) -> BoolArray:
     return result
 
 
-def _explains(fix: Fix) -> bool:
-    """Whether a fix is credible and might have been incredible."""
-    return bool(fix.solutions) and fix.solutions[0].dof > 0 and _is_credible(fix)
-
-
 def _is_credible(fix: Fix) -> bool:
     best = fix.solutions[0]
+    return best.dof <= 0 or best.chi2 <= _largest_credible(best.dof, fix.body_length_m)
+
+
+def _largest_credible(dof: int, body_length_m: float) -> float:
+    """Largest χ² that is credible."""
     # The prior of a body's shape is a coarse one, and no fault of a sensor.
-    level = MISFIT if fix.body_length_m > 0.0 else 1.0 - CREDIBLE_ROW
-    return best.dof <= 0 or bool(best.chi2 <= chdtri(best.dof, level))
+    return float(chdtri(dof, MISFIT if body_length_m > 0.0 else 1.0 - CREDIBLE_ROW))
 
 
 def _is_worth_dropping_for(fix: Fix, plain: Fix) -> bool:
@@ -130,10 +140,15 @@ def _is_worth_dropping_for(fix: Fix, plain: Fix) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _Start:
-    """A fix to reweight from, and the sensors that it was made without."""
+    """A fit q (K, 4), mu (K, 3) to reweight from, the sensors that it was made without, and whether it is credible.
 
-    fix: Fix
+    A fit is not for lack of degrees of freedom.
+    """
+
+    q: FloatArray
+    mu: FloatArray
     without: frozenset[int]
+    explains: bool
 
 
 class _Examination:
@@ -205,15 +220,14 @@ class _Examination:
         suspected = self._suspected(plain)
         if not suspected.size:
             return found
-        starts = {int(row): [_Start(plain[row], frozenset[int]())] for row in suspected}
-        for sensor, rows in self._left_out(plain, suspected):
-            self._start_without(starts, frozenset({sensor}), rows)
-        unexplained = [row for row, tried in starts.items() if not any(_explains(start.fix) for start in tried)]
-        for sensors in self._all_left_out():
-            rows = np.array([r for r in unexplained if all(start.without != sensors for start in starts[r])], np.intp)
-            if rows.size:
-                self._start_without(starts, sensors, rows)
-        standing_out = self._standing_out(starts)
+        starts = self._refined_without_one(plain, suspected)
+        unexplained = [row for row in suspected.tolist() if not any(start.explains for start in starts[row])]
+        for sensors, without in self._searched(plain, starts, unexplained).items():
+            for row, fix in zip(without, self._without(sensors, np.array(without)), strict=True):
+                starts[row] += self._start(fix, sensors)
+        standing_out = self._standing_out(
+            {row: [start for start in tried if start.explains] or tried for row, tried in starts.items()}
+        )
         for dropped in set(standing_out.values()) - {frozenset()}:
             rows = np.array([row for row, sensors in standing_out.items() if sensors == dropped], dtype=np.intp)
             names = tuple(self.array.ids[sensor] for sensor in sorted(dropped))
@@ -254,38 +268,60 @@ class _Examination:
             rows, q, mu = zip(*alike, strict=True)
             yield np.array(rows, dtype=np.intp), np.stack(q), np.stack(mu)
 
-    def _left_out(self, plain: Sequence[Fix], rows: IntArray) -> list[tuple[int, IntArray]]:
-        """Sensors to leave out in turn, and in which rows: those that fit worst, and the nearest to the source."""
+    def _start(self, fix: Fix, without: frozenset[int]) -> list[_Start]:
+        """The fit of a fix, if there is one."""
+        if not fix.solutions:
+            return []
+        return [_Start(*self._scaled(fix), without, fix.solutions[0].dof > 0 and _is_credible(fix))]
+
+    def _refined_without_one(self, plain: Sequence[Fix], rows: IntArray) -> dict[int, list[_Start]]:
+        """The plain fits of rows, and the best of those without one sensor, refined from them, best first."""
+        starts = {row: self._start(plain[row], frozenset()) for row in rows.tolist()}
         standing = np.flatnonzero(self.count)
-        if standing.size <= _MOST_LEFT_OUT:
-            return [(int(sensor), rows) for sensor in standing]
-        chosen: dict[int, list[int]] = {}
         for row in rows.tolist():
-            near: list[int] = []
-            if plain[row].solutions:
-                q, mu = self._scaled(plain[row])
-                position = self.problem.position(q)
-                nearest = np.argmin(np.linalg.norm(self.array.positions[standing] - position[:, None], axis=-1), axis=1)
-                near = standing[nearest].tolist()
-            else:
-                q, mu = np.array([[0.0, 0.0, 1.0, 1e-3]]), np.zeros((1, 3))
-            misfit = self._misfit(np.array([row]), q[None], mu[None], np.ones((1, self.array.n_sensors)))[0]
-            worst = np.argsort(-misfit)[: _MOST_LEFT_OUT - 1]
-            for sensor in {*worst.tolist(), *near}:
-                chosen.setdefault(int(sensor), []).append(row)
-        return [(sensor, np.array(of_sensor, dtype=np.intp)) for sensor, of_sensor in sorted(chosen.items())]
+            if not starts[row]:
+                continue
+            ((q, mu),) = [(start.q, start.mu) for start in starts[row]]
+            n = standing.size
+            weight = np.ones((n, self.array.n_sensors))
+            weight[np.arange(n), standing] = _LEAST_WEIGHT
+            of_row = np.full(n, row)
+            lighter = weighted(self.problem.rows(of_row), self.raw[of_row], weight[:, self.array.channel_sensor])
+            fits = self._refined(lighter, np.tile(q, (n, 1, 1)), np.tile(mu, (n, 1, 1)))
+            dof = plain[row].solutions[0].dof - self.count[standing]
+            for k in np.argsort(fits.chi2)[:_MOST_REFINED]:
+                if np.isfinite(fits.chi2[k]):
+                    credible = dof[k] > 0 and fits.chi2[k] <= _largest_credible(dof[k], plain[row].body_length_m)
+                    starts[row].append(_Start(fits.q[k], fits.mu[k], frozenset({int(standing[k])}), bool(credible)))
+        return starts
 
-    def _all_left_out(self) -> list[frozenset[int]]:
-        """What to leave out where nothing has helped: every sensor, and of a small array every two."""
+    def _searched(
+        self, plain: Sequence[Fix], starts: dict[int, list[_Start]], unexplained: Sequence[int]
+    ) -> dict[frozenset[int], list[int]]:
+        """Rows in which to search anew, by the sensors that are left out: of a small array every one and every two.
+
+        Of a large one those that the refinements blame most, and the nearest to every source.
+        """
         standing = np.flatnonzero(self.count).tolist()
-        singles = [frozenset({sensor}) for sensor in standing]
-        if len(standing) > _MOST_LEFT_OUT:
-            return singles
-        return singles + [frozenset(pair) for pair in combinations(standing, 2)]
+        every = [frozenset({sensor}) for sensor in standing] + [frozenset(pair) for pair in combinations(standing, 2)]
+        chosen: dict[frozenset[int], list[int]] = {}
+        for row in unexplained:
+            sets = every
+            if len(standing) > _MOST_LEFT_OUT:
+                sets = [start.without for start in starts[row][1 : 1 + _MOST_SEARCHED]]
+                q, mu = self._fit_of(plain[row])
+                distance = np.linalg.norm(self.array.positions[standing] - self.problem.position(q)[:, None], axis=-1)
+                misfit = self._misfit(np.array([row]), q[None], mu[None], np.ones((1, self.array.n_sensors)))[0]
+                blamed = {*np.argsort(-misfit)[:_MOST_SEARCHED].tolist()}
+                blamed |= {standing[k] for k in np.argmin(distance, axis=1)} if plain[row].solutions else set()
+                sets += [frozenset({sensor}) for sensor in blamed]
+            for sensors in dict.fromkeys(sets):
+                chosen.setdefault(sensors, []).append(row)
+        return chosen
 
-    def _start_without(self, starts: dict[int, list[_Start]], sensors: frozenset[int], rows: IntArray) -> None:
-        for row, fix in zip(rows.tolist(), self._without(sensors, rows), strict=True):
-            starts[row].append(_Start(fix, sensors))
+    def _fit_of(self, fix: Fix) -> tuple[FloatArray, FloatArray]:
+        """Sources of a fix, or nothing far away where it has none."""
+        return self._scaled(fix) if fix.solutions else (np.array([[0.0, 0.0, 1.0, 1e-3]]), np.zeros((1, 3)))
 
     def _without(self, sensors: set[int] | frozenset[int], rows: IntArray) -> list[Fix]:
         readings = self.readings[rows].copy()
@@ -300,10 +336,15 @@ class _Examination:
     def _misfit(self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray) -> FloatArray:
         """Squared residuals (f, N) of the sensors of some rows, the common field being that of the weighted fit."""
         owner = self.array.channel_sensor
-        problem, raw = weighted(self.problem.rows(row), self.raw[row], weight[:, owner])
+        return self._squares(weighted(self.problem.rows(row), self.raw[row], weight[:, owner]), q, mu, weight)
+
+    def _squares(self, lighter: Weighted, q: FloatArray, mu: FloatArray, weight: FloatArray) -> FloatArray:
+        """Squared residuals (f, N) of the sensors of some weighted rows."""
+        owner, (problem, raw) = self.array.channel_sensor, lighter
         residual = problem.whitened(raw) - problem.predicted(problem.source_fields(q, mu))
-        squares = residual**2 / weight[:, owner]
-        return np.stack([np.bincount(owner, of_row, self.array.n_sensors) for of_row in squares])
+        of_sensor = owner[:, None] == np.arange(self.array.n_sensors)
+        squares: FloatArray = (residual**2 / weight[:, owner]) @ of_sensor
+        return squares
 
     def _scale2(self, misfit: FloatArray) -> FloatArray:
         """Variance of the noise (f,) in units of what is stated, one at least, from the median sensor.
@@ -319,8 +360,10 @@ class _Examination:
         best = dict.fromkeys(starts, np.inf)
         found = dict.fromkeys(starts, frozenset[int]())
         every = [(row, start) for row, of_row in starts.items() for start in of_row]
-        for index, q, mu in self._by_count([(i, start.fix) for i, (_, start) in enumerate(every)]):
+        for count in sorted({len(start.q) for _, start in every}):
+            index = [i for i, (_, start) in enumerate(every) if len(start.q) == count]
             row = np.array([every[i][0] for i in index], dtype=np.intp)
+            q, mu = np.stack([every[i][1].q for i in index]), np.stack([every[i][1].mu for i in index])
             weight = np.ones((len(row), self.array.n_sensors))
             for f, i in enumerate(index):
                 weight[f, list(every[i][1].without)] = _LEAST_WEIGHT
@@ -352,30 +395,43 @@ class _Examination:
         self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Squared residuals (f, N) of the sensors after reweighting from starts, and the scale of the noise."""
-        problem, raw = self.problem.rows(row), self.raw[row]
         owner = self.array.channel_sensor
-        free = np.full((q.shape[1], 3), self.free_position)
+        lighter = weighted(self.problem.rows(row), self.raw[row], weight[:, owner])
         for _ in range(_N_REWEIGHTINGS):
-            misfit = self._misfit(row, q, mu, weight)
+            misfit = self._squares(lighter, q, mu, weight)
             scale2 = self._scale2(misfit)
             new = (DEGREES_OF_FREEDOM + self.count) / (DEGREES_OF_FREEDOM + misfit / scale2[:, None])
             new = np.clip(new, _LEAST_WEIGHT, None)
             if np.all(np.abs(new - weight) < 1e-3 * weight):
                 break
             weight = new
-            lighter, lighter_raw = weighted(problem, raw, weight[:, owner])
-            fits = refine(lighter, lighter.whitened(lighter_raw), q, mu, free=free, max_iterations=8)
+            lighter = weighted(self.problem.rows(row), self.raw[row], weight[:, owner])
+            fits = self._refined(lighter, q, mu, max_iterations=8)
             q, mu = fits.q, fits.mu
         return misfit, scale2
 
+    def _refined(self, lighter: Weighted, q: FloatArray, mu: FloatArray, max_iterations: int = 60) -> JointFits:
+        """Fits of weighted rows (f,) from sources (f, K, …)."""
+        problem, raw = lighter
+        y = problem.whitened(raw)
+        if q.shape[1] > 1 or not self.free_position or problem.known or problem.channel_is_scalar.any():
+            free = np.full((q.shape[1], 3), self.free_position)
+            return refine(problem, y, q, mu, free=free, max_iterations=max_iterations)
+        ends = refined(problem, y, q[:, 0], max_iterations)
+        chi2 = np.where(ends.converged, ends.chi2, np.inf)
+        return JointFits(ends.q[:, None], ends.mu[:, None], chi2, ends.iterations)
 
-def weighted(problem: WhitenedModel, raw: FloatArray, weight: FloatArray) -> tuple[WhitenedModel, FloatArray]:
+
+def weighted(problem: WhitenedModel, raw: FloatArray, weight: FloatArray) -> Weighted:
     """A problem and its raw readings (b, C) with the variance of every channel divided by a weight (b, C)."""
     root = np.sqrt(weight)[..., None]
     flat = problem.shrinkage >= 1.0
     # A flat prior needs only the span of its columns; of the others the variance along each of them counts.
-    span, size, _ = np.linalg.svd(root * problem.basis * flat[:, None], full_matrices=False)
-    seen = size > _UNSEEN * size[:, :1]
+    span = root * problem.basis * flat[:, None]
+    for _ in range(2):  # once more, for the digits that squares lose
+        square, axes = np.linalg.eigh(span.transpose(0, 2, 1) @ span)
+        seen = square > _UNSEEN * square[:, -1:]
+        span = span @ (axes * np.where(seen, 1.0 / np.sqrt(np.where(seen, square, 1.0)), 0.0)[:, None])
     lighter = replace(problem, gain=root * problem.gain, basis=span, shrinkage=seen.astype(np.float64))
     if not flat.all():
         with np.errstate(divide="ignore"):

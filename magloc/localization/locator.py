@@ -45,9 +45,10 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 _LONGEST_BODY_M = 1e4
-_ROWS_AT_ONCE = 256
 # A search for several sources, or by moduli, takes its rows in smaller blocks.
-_ROWS_OF_SEVERAL = 64
+_ROWS_AT_ONCE, _ROWS_OF_SEVERAL = 1024, 64
+# Numbers of the whitenings of a block, where each row has its own.
+_MOST_NUMBERS = 8_000_000
 
 
 class Locator:
@@ -107,6 +108,7 @@ class Locator:
         self.array = array
         self.body_length_m = body_length_m
         self.exclude_faulty = exclude_faulty
+        self._at_once = min(_ROWS_AT_ONCE, max(_ROWS_OF_SEVERAL, _MOST_NUMBERS // array.n_channels**2))
         self._search: SingleSourceSearch | MultiSourceSearch | MomentSearch
         if position_m is not None:
             self._search = MomentSearch(array, position_m, prior=prior)
@@ -155,8 +157,8 @@ class Locator:
         ambient = None if ambient_T is None else np.asarray(ambient_T, dtype=np.float64)
         times = np.arange(len(readings), dtype=np.float64) if time_s is None else time_s
         parts = []
-        for begin in range(0, len(readings), _ROWS_AT_ONCE):
-            index = np.arange(begin, min(begin + _ROWS_AT_ONCE, len(readings)))
+        for begin in range(0, len(readings), self._at_once):
+            index = np.arange(begin, min(begin + self._at_once, len(readings)))
             parts.append(self._credible(index, readings[index], None if ambient is None else ambient[index]))
             if progress is not None:
                 progress(len(index))
@@ -183,7 +185,7 @@ class Locator:
         search = self._search
         if isinstance(search, MomentSearch):
             search = search.of_rows(index)
-        at_once = _ROWS_AT_ONCE if isinstance(search, SingleSourceSearch) else _ROWS_OF_SEVERAL
+        at_once = self._at_once if isinstance(search, SingleSourceSearch) else _ROWS_OF_SEVERAL
         found = _Rows(len(readings), self.body_length_m, self.array.row_ambient_uncertainty_T)
         for rows in whitened_rows(self.array, readings, ambient, at_once):
             if rows.n_differences < self._fewest:

@@ -158,7 +158,7 @@ def whitened_model(
     """
     fields = ambient_fields(array, len(readings_T), ambient_T)
     channels = channels_above_ambient(array, mask, readings_T, fields)
-    if all(w is whitenings[0] for w in whitenings):
+    if len(set(map(id, whitenings))) == 1:
         raw = channels @ whitenings[0].root.T
     else:
         raw = np.stack([w.root @ row for w, row in zip(whitenings, channels, strict=True)])

@@ -93,7 +93,7 @@ class WhitenedModel(ScaledSensors):
         """Model of b sets of readings, each with its whitening and its ambient field (b, N, 3)."""
         # One whitening for all rows, as where the noise is constant, is kept once.
         radius = array.circumradius or 1.0  # of one sensor alone any length will do
-        shared = all(w is whitenings[0] for w in whitenings)
+        shared = len(set(map(id, whitenings))) == 1
         distinct = whitenings[:1] if shared else whitenings
 
         def of_rows(values: list[FloatArray]) -> FloatArray:

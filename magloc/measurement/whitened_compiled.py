@@ -63,6 +63,61 @@ class ModelRows(NamedTuple):
         )
 
 
+class LaneModel(NamedTuple):
+    """Whitened channels of many rows in threes, those of a sensor, for kernels that fit many starts side by side.
+
+    Sensors (s, 3); of every set gains (sets, s, 9) and, in threes too, orthonormal common fields (sets, t, s, 9); the
+    set of a row. A channel that is not there is zero. A prior of the common field is readings of it, so that taking
+    that out is a projection, whatever is known of it.
+    """
+
+    sensors: FloatArray
+    gain: FloatArray
+    common: FloatArray
+    set_of_row: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, model: WhitenedModel) -> LaneModel:
+        """All rows of a model."""
+        sets = slice(0, 1) if model.shares_whitening else slice(None)
+        basis, shrinkage = model.basis[sets], model.shrinkage[sets]
+        n_sets, _, n_common = basis.shape
+        place, known, n_sensors = _threes(model)
+        gain = np.zeros((n_sets, 3 * n_sensors, 3))
+        gain[:, place] = model.gain[sets]
+        n_triples = -(-n_common // 3)
+        common = np.zeros((n_sets, 3 * n_sensors, 3 * n_triples))
+        common[:, place, :n_common] = basis * np.sqrt(shrinkage * (2.0 - shrinkage))[:, None]
+        common[:, 3 * len(model.sensors) + np.arange(known.size), known] = 1.0 - shrinkage[:, known]
+        return cls(
+            own(np.concatenate([model.sensors, np.tile(model.sensors[:1], (n_sensors - len(model.sensors), 1))])),
+            gain.reshape(n_sets, n_sensors, 9),
+            own(common.reshape(n_sets, n_sensors, 3, n_triples, 3).transpose(0, 3, 1, 2, 4)).reshape(
+                n_sets, n_triples, n_sensors, 9
+            ),
+            np.zeros(len(model), dtype=np.intp) if n_sets == 1 else np.arange(len(model), dtype=np.intp),
+        )
+
+
+def signals(model: WhitenedModel, y: FloatArray) -> FloatArray:
+    """Whitened readings (b, C) as those of a :class:`LaneModel`: (b, s, 3)."""
+    place, known, n_sensors = _threes(model)
+    result = np.zeros((len(y), 3 * n_sensors))
+    basis, shrinkage = model.basis[:, :, known], model.shrinkage[:, known]
+    along = np.einsum("bck,bc->bk", basis, y)
+    result[:, place] = y - np.einsum("bck,bk->bc", basis, shrinkage * along)
+    result[:, 3 * len(model.sensors) + np.arange(known.size)] = -np.sqrt(shrinkage * (2.0 - shrinkage)) * along
+    return result.reshape(len(y), n_sensors, 3)
+
+
+def _threes(model: WhitenedModel) -> tuple[NDArray[np.intp], NDArray[np.intp], int]:
+    """Places of the channels, columns of the common field with a prior, and sensors together with theirs."""
+    owner = model.channel_sensor
+    known = np.flatnonzero((model.shrinkage < 1.0).any(axis=0))
+    place = 3 * owner + np.arange(owner.size) - np.searchsorted(owner, owner)
+    return place, known, len(model.sensors) + -(-known.size // 3)
+
+
 @compiled
 def row_at(rows: ModelRows, i: int) -> ModelRow:
     """Row i of many."""

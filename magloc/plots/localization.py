@@ -16,7 +16,7 @@ from arrays.array import SensorArray
 from arrays.io.csv import Column
 from arrays.io.outputs import make_folder
 from magloc.localization.fit.fixes import Fixes
-from magloc.localization.fit.results import is_observable, span
+from magloc.localization.fit.results import is_observable, spans
 from magloc.localization.residuals import fix_residuals
 from magloc.plots import style
 from magloc.plots.style import write
@@ -194,7 +194,7 @@ def fix_columns(fixes: Fixes) -> FixColumns:
     n_known = 6 - of_source.shape[1]  # a position that is known is exact
     covariance[solved] = 0.0
     covariance[solved, n_known:, n_known:] = of_source
-    intervals[solved] = np.array([span(columns.ranges[i][k]) for i, k in zip(*at, strict=True)]).reshape(-1, 2)
+    intervals[solved] = spans(columns.ranges[at])
     return FixColumns(
         row=row,
         source=np.where(solved, place + 1, 0),
@@ -204,7 +204,7 @@ def fix_columns(fixes: Fixes) -> FixColumns:
         position_m=position,
         moment_Am2=moment,
         covariance=covariance,
-        range_observable=np.array([is_observable(low, high) for low, high in intervals], dtype=bool),
+        range_observable=is_observable(*intervals.T),
         range95_m=intervals,
     )
 

@@ -13,9 +13,9 @@ import numpy as np
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
 from magloc.ambient import in_world_field
-from magloc.localization.fit.results import EVERYWHERE, Intervals, Solution, is_observable_set
+from magloc.localization.fit.results import EVERYWHERE, Intervals, Solution, intervals_of, is_observable_set
 from magloc.localization.uncertainty.ambiguity import LARGEST_GAUSSIAN_SIGMA, relative_sigma
-from magloc.localization.uncertainty.range_interval import gaussian_ranges, union
+from magloc.localization.uncertainty.range_interval import gaussian_ranges
 from magloc.measurement.pose import ArrayPose, rates_of
 from magloc.readings import Readings, without_saturated
 from magloc.tracking.chart.mixture import Mixture
@@ -151,7 +151,7 @@ class TrackPoint:
         if self.centroid_m is None:
             return None
         ends = gaussian_ranges(self.covariance, self.position_m - self.centroid_m, self.radius_m)
-        return union([ends.tolist()])
+        return intervals_of(ends[None])
 
     @property
     def range_observable(self) -> bool:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import numba
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
+from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
+from arrays.sensor import Sensor
+from magloc.directions import fibonacci_directions
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
@@ -65,6 +69,36 @@ def rows(size: Size) -> Iterator[Row]:
                 f"optimum found: ours {ours}, peer {success(chi2_found[n_starts])}" if what == "many" else "",
             )
     yield Row(f"a fix, {size.rows:,} at once, {threads} thr.", timings["all threads"])
+    yield from growth(size)
+
+
+def growth(size: Size) -> Iterator[Row]:
+    """How the time of a fix grows with the rows that are fitted at once, and with the sensors.
+
+    The slope is that of the logarithms: 0 where a fix costs the same, 1 where it grows in proportion.
+    """
+    measurement = DifferenceMeasurement.of(tetrahedron(1.5, noise_T=1e-9))
+    _, readings = simulated(measurement, size.rows, np.random.default_rng(5))
+    locator = plain_locator(measurement.array)
+    numbers = sorted({min(n, size.rows) for n in (1, 10, 100, 1000)})
+    yield from _grown("rows at once", [(n, partial(locator.fit_rows, readings[:n]), n) for n in numbers], size.rounds)
+    runs = []
+    for n in (4, 8, 16, 32, 64):
+        places = 1.5 * fibonacci_directions(n)
+        sensors = [Sensor(id=f"s{i}", kind="vector", position_m=p, noise_T=1e-9) for i, p in enumerate(places)]
+        of_n = DifferenceMeasurement.of(SensorArray(tuple(sensors), noise_fraction=1e-4))
+        _, of_rows = simulated(of_n, max(1, size.rows // 10), np.random.default_rng(6))
+        runs.append((n, partial(plain_locator(of_n.array, body_length_m=0.0).fit_rows, of_rows), len(of_rows)))
+    yield from _grown("sensors, noise of its own in every row", runs, size.rounds)
+
+
+def _grown(what: str, runs: Sequence[tuple[int, Callable[[], object], int]], rounds: int) -> Iterator[Row]:
+    """A row for every number of something, its run and the fixes of that; the last with the slope over all of them."""
+    timings = interleaved({str(n): Contestant(run, 1, count) for n, run, count in runs}, rounds)
+    numbers = [n for n, _, _ in runs]
+    slope = float(np.polyfit(np.log(numbers), np.log([timings[str(n)].best for n in numbers]), 1)[0])
+    for n in numbers:
+        yield Row(f"a fix, {n:,} {what}", timings[str(n)], note=f"slope {slope:.2f}" if n == numbers[-1] else "")
 
 
 def simulated(measurement: DifferenceMeasurement, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

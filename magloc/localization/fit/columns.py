@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.localization.fit.results import Intervals, Solution, Source
+from magloc.localization.fit.results import Intervals, Solution, Source, intervals_of
 
 _NUMBERS = ("of_row", "n_sources", "chi2", "dof", "weight", "iterations", "known_chi2", "n_known")
 
@@ -25,8 +25,8 @@ class Solutions:
         NaN beyond the sources of a solution.
     covariance : ndarray, shape (f, 6 K, 6 K), or (f, 3 K, 3 K) of moments alone
     chi2, weight, known_chi2 : ndarray, shape (f,)
-    ranges : list of tuple of Intervals
-        Of every source of every solution.
+    ranges : ndarray, shape (f, K, i, 2)
+        95 % sets of the range of every source, intervals in ascending order [m]; NaN where there are fewer.
     gaussian, merged : ndarray of bool, shape (f, K)
     """
 
@@ -39,7 +39,7 @@ class Solutions:
     dof: IntArray
     weight: FloatArray
     iterations: IntArray
-    ranges: list[tuple[Intervals, ...]]
+    ranges: FloatArray
     gaussian: BoolArray
     merged: BoolArray
     known_chi2: FloatArray
@@ -63,7 +63,7 @@ class Solutions:
             whole,
             number,
             whole,
-            [],
+            np.zeros((0, 1, 1, 2)),
             flags,
             flags,
             number,
@@ -88,7 +88,7 @@ class Solutions:
             dof=np.array([solution.dof]),
             weight=np.array([solution.weight]),
             iterations=np.array([solution.iterations]),
-            ranges=[tuple(source.range_interval_m for source in sources)],
+            ranges=_sets_of([source.range_interval_m for source in sources])[None],
             gaussian=np.array([[source.gaussian for source in sources]]),
             merged=np.array([[source.merged for source in sources]]),
             known_chi2=np.array([solution.known_chi2]),
@@ -104,6 +104,7 @@ class Solutions:
         order = np.argsort(np.concatenate([part.of_row for part in filled]), kind="stable")
         most = max(part.position_m.shape[1] for part in filled)
         size = max(part.covariance.shape[1] for part in filled)
+        widest = max(part.ranges.shape[2] for part in filled)
 
         def stacked(name: str, shape: tuple[int, ...], empty: float) -> Any:
             values = [getattr(part, name) for part in filled]
@@ -114,20 +115,18 @@ class Solutions:
                 begin += len(value)
             return result[order]
 
-        ranges = [intervals for part in filled for intervals in part.ranges]
         return cls(
             **{name: stacked(name, (), 0) for name in _NUMBERS},
             **{name: stacked(name, (most, 3), np.nan) for name in ("position_m", "moment_Am2")},
             **{name: stacked(name, (most,), False) for name in ("gaussian", "merged")},
             covariance=stacked("covariance", (size, size), np.nan),
-            ranges=[ranges[i] for i in order],
+            ranges=stacked("ranges", (most, widest, 2), np.nan),
         )
 
     def chosen(self, index: IntArray | BoolArray, of_row: IntArray | None = None) -> Solutions:
         """Some of the solutions, of other rows if these are named."""
         at = np.arange(len(self))[index]
-        values = {name: value[at] for name, value in vars(self).items() if name != "ranges"}
-        values["ranges"] = [self.ranges[i] for i in at]
+        values = {name: value[at] for name, value in vars(self).items()}
         return Solutions(**(values if of_row is None else values | {"of_row": of_row}))
 
     @property
@@ -148,7 +147,7 @@ class Solutions:
                 self.position_m[i, k],
                 self.moment_Am2[i, k],
                 of_source[i, k],
-                self.ranges[i][k],
+                intervals_of(self.ranges[i, k]),
                 bool(self.gaussian[i, k]),
                 bool(self.merged[i, k]),
             )
@@ -164,6 +163,15 @@ class Solutions:
             float(self.known_chi2[i]),
             int(self.n_known[i]),
         )
+
+
+def _sets_of(intervals: Sequence[Intervals]) -> FloatArray:
+    """Sets of several sources (K, i, 2)."""
+    sets = np.full((len(intervals), max(1, *map(len, intervals)), 2), np.nan)
+    for k, of_source in enumerate(intervals):
+        for i, (low, high) in enumerate(of_source):
+            sets[k, i] = low, np.inf if high is None else high
+    return sets
 
 
 def in_stable_order(solutions: Solutions) -> Solutions:
@@ -184,14 +192,10 @@ def in_stable_order(solutions: Solutions) -> Solutions:
         solutions,
         **{
             name: np.take_along_axis(values, order.reshape(*order.shape, *[1] * (values.ndim - 2)), axis=1)
-            for name in ("position_m", "moment_Am2", "gaussian", "merged")
+            for name in ("position_m", "moment_Am2", "gaussian", "merged", "ranges")
             for values in (getattr(solutions, name),)
         },
         covariance=solutions.covariance[every[..., None], of_state[:, :, None], of_state[:, None]],
-        ranges=[
-            tuple(of_fit[k] for k in of_row[: len(of_fit)])
-            for of_fit, of_row in zip(solutions.ranges, order, strict=True)
-        ],
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from arrays.typing import IntArray
-from magloc.localization.fit.results import span
+from magloc.localization.fit.results import spans
 
 if TYPE_CHECKING:
     from magloc.localization.fit.fixes import Fixes
@@ -39,7 +39,7 @@ _UNITS = {
 def dataset_of_fixes(fixes: Fixes, which: Literal["best", "all"]) -> xr.Dataset:
     """:meth:`magloc.localization.fit.fixes.Fixes.to_xarray`."""
     columns = fixes.solutions
-    n, n_sources = len(fixes), columns.position_m.shape[1]
+    n = len(fixes)
     at: tuple[IntArray, ...]
     leading: tuple[str, ...]
     shape: tuple[int, ...]
@@ -52,9 +52,7 @@ def dataset_of_fixes(fixes: Fixes, which: Literal["best", "all"]) -> xr.Dataset:
         leading, shape = ("row", "solution"), (n, int(place.max(initial=-1)) + 1)
     else:
         raise ValueError(f"Input which must be 'best' or 'all'; instead received {which!r}.")
-    ends = np.array(
-        [[span(of_source) for of_source in columns.ranges[i]] + [(np.nan, np.nan)] * n_sources for i in chosen]
-    ).reshape(len(chosen), -1, 2)[:, :n_sources]
+    ends = spans(columns.ranges[chosen])
 
     def table(values: Any, empty: Any) -> Any:
         full = np.full((*shape, *values.shape[1:]), empty, dtype=np.result_type(values, type(empty)))

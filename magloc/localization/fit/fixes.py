@@ -13,7 +13,7 @@ import numpy as np
 from arrays.io.lazy import by_name
 from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.localization.fit.columns import Solutions
-from magloc.localization.fit.results import EVERYWHERE, Fix, Intervals, is_misfit
+from magloc.localization.fit.results import EVERYWHERE, Fix, Intervals, intervals_of, is_misfit
 from magloc.localization.fit.table import lines_of_fixes
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ class Fixes(Sequence[Fix]):
     def range_interval_m(self) -> list[Intervals]:
         """95 % sets of the range of every row with one source [m]."""
         self._of_one(None)
-        return [self.solutions.ranges[i][0] if i >= 0 else EVERYWHERE for i in self.best]
+        return [intervals_of(self.solutions.ranges[i, 0]) if i >= 0 else EVERYWHERE for i in self.best]
 
     @property
     def misfit(self) -> BoolArray:

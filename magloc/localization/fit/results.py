@@ -227,9 +227,9 @@ def is_misfit(chi2: ArrayLike, dof: ArrayLike) -> Any:
     return (np.asarray(dof) > 0) & (chdtrc(np.maximum(dof, 1), chi2) < MISFIT)
 
 
-def is_observable(low: float, high: float) -> bool:
-    """Whether an interval of the range is closed and its ends differ by a factor of two at most."""
-    return low > 0.0 and high <= 2.0 * low
+def is_observable(low: Any, high: Any) -> Any:
+    """Whether intervals of the range (...) are closed and their ends differ by a factor of two at most."""
+    return (low > 0.0) & (high <= 2.0 * low)
 
 
 def open_ended(low: float, high: float) -> tuple[float, float | None]:
@@ -245,6 +245,16 @@ def span(intervals: Intervals) -> tuple[float, float]:
     return intervals[0][0], math.inf if high is None else high
 
 
+def intervals_of(ranges: FloatArray) -> Intervals:
+    """A set of ranges (i, 2), NaN where there are fewer, as pairs."""
+    return tuple(open_ended(low, high) for low, high in ranges.tolist() if not math.isnan(low))
+
+
+def spans(ranges: FloatArray) -> FloatArray:
+    """Least and largest range (..., 2) of sets (..., i, 2); NaN if they are empty."""
+    return np.stack([ranges[..., 0, 0], np.fmax.reduce(ranges[..., 1], axis=-1)], axis=-1)
+
+
 def is_observable_set(intervals: Intervals) -> bool:
     """Whether a set of ranges is closed, and its ends differ by a factor of two at most."""
-    return is_observable(*span(intervals))
+    return bool(is_observable(*span(intervals)))

@@ -1,196 +1,263 @@
 """Compiled variable projection: the moment is linear and eliminated, so a fit is a search over the position.
 
-The readable twin is ``tests/variable_projection.py``; coordinates are :mod:`magloc.measurement.whitened_compiled`'s.
+A start is a lane, 16 of them side by side: docs/theory/lanes.md. The readable twin is ``tests/variable_projection.py``.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from arrays.typing import FloatArray
-from magloc.compilation import compiled
-from magloc.linalg_compiled import _directional_tangent, _solve_damped, _tangent, orthonormalise, put
-from magloc.measurement.whitened_compiled import (
-    SMALLEST_S,
-    ModelRow,
-    _project_common,
-    homogeneous_jacobian,
-    unit_basis,
+from arrays.typing import FloatArray, IntArray
+from magloc.compilation import compiled, inlined, own
+from magloc.localization.fit.linearisation_compiled import (
+    CHI2,
+    DAMPING,
+    END,
+    GAIN,
+    ITERATIONS,
+    LANES,
+    MOMENT,
+    NORMAL,
+    PROMISED,
+    SENSOR_ROWS,
+    SIGNAL,
+    STATE,
+    TRIAL,
+    WORKSPACE,
+    linearise,
+    tangents,
 )
+from magloc.measurement.whitened import WhitenedModel
+from magloc.measurement.whitened_compiled import SMALLEST_S, LaneModel, signals
 
 # How a refinement ends.
-CONVERGED, KNOWN, FAILED = 0, 1, 2
+RUNNING, CONVERGED, FAILED = 0.0, 1.0, 2.0
 # Gauss-Newton gain in χ² at which an optimum is one: the position is then within 1e-4 σ of it.
 OPTIMUM_TOLERANCE = 1e-9
+# Two ends are one optimum 0.01 rad apart on the sphere of homogeneous coordinates, at the same χ².
+SAME_COS, SAME_CHI2 = 0.99995, 0.01
 
 
-@compiled
-def _residual(
-    q: FloatArray,
-    y: FloatArray,
-    row: ModelRow,
-    basis: FloatArray,
-    triangle: FloatArray,
-    mu: FloatArray,
-    residual: FloatArray,
-) -> float:
-    """Orthonormal basis, best scaled moment mu and residual at q; returns χ²."""
-    unit_basis(q, row, basis)
-    orthonormalise(basis, triangle)
-    n = y.size
-    for c in range(n):
-        residual[c] = y[c]
-    for j in range(3):
-        t = 0.0
-        for c in range(n):
-            t += basis[j, c] * residual[c]
-        mu[j] = t
-        for c in range(n):
-            residual[c] -= t * basis[j, c]
-    for j in range(2, -1, -1):
-        t = mu[j]
-        for k in range(j + 1, 3):
-            t -= triangle[j, k] * mu[k]
-        mu[j] = t / triangle[j, j] if triangle[j, j] > 0.0 else 0.0
-    chi2 = 0.0
-    for c in range(n):
-        chi2 += residual[c] * residual[c]
-    return chi2
+class Refined(NamedTuple):
+    """Outputs of refinements (n, …): q, scaled moment, χ², linearisations, and whether they converged."""
+
+    q: FloatArray
+    mu: FloatArray
+    chi2: FloatArray
+    iterations: IntArray
+    converged: NDArray[np.bool_]
+
+
+def refined(model: WhitenedModel, y: FloatArray, starts: FloatArray, max_iterations: int = 100) -> Refined:
+    """:func:`refine` of one start (b, 4) of every row of whitened readings (b, C)."""
+    n = len(starts)
+    out = Refined(np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_))
+    each = np.arange(n)
+    refine(
+        signals(model, y), each, own(starts), LaneModel.of(model), 1.0, OPTIMUM_TOLERANCE, max_iterations, out
+    )  # fmt: skip
+    return out
 
 
 @compiled
 def same_optimum(q: FloatArray, chi2: float, other_q: FloatArray, other_chi2: float) -> bool:
-    """Whether two ends are one optimum: 0.01 rad apart on the sphere of homogeneous coordinates, at the same χ²."""
+    """Whether two ends are one optimum."""
     t = q[0] * other_q[0] + q[1] * other_q[1] + q[2] * other_q[2] + q[3] * other_q[3]
-    return abs(t) > 0.99995 and abs(chi2 - other_chi2) < 0.01
+    return abs(t) > SAME_COS and abs(chi2 - other_chi2) < SAME_CHI2
 
 
 @compiled
 def refine(
-    q: FloatArray,
-    y: FloatArray,
-    row: ModelRow,
-    n_free: int,
+    signal: FloatArray,
+    reading: IntArray,
+    starts: FloatArray,
+    model: LaneModel,
+    free_range: float,
     tolerance: float,
     max_iterations: int,
-    known_q: FloatArray,
-    known_chi2: FloatArray,
-    n_known: int,
-    mu: FloatArray,
-) -> tuple[float, int, int]:
-    """Damped Gauss-Newton on the projected cost, from q (4,), which becomes the optimum as mu its scaled moment.
+    out: Refined,
+) -> None:
+    """Damped Gauss-Newton on the projected cost from starts q (n, 4) of the signals (rows, sensors, 3) of a row each.
 
-    With n_free = 3 it moves on the sphere of homogeneous coordinates, with 2 at one range. Every accepted step
-    decreases χ². It ends where a further Gauss-Newton step would gain less than the tolerance, or as soon as it has
-    come to one of the known optima. Returns χ², the number of linearisations, and CONVERGED, KNOWN or FAILED.
+    It moves on the sphere of homogeneous coordinates, or, where `free_range` is 0 instead of 1, at one range. Every
+    accepted step decreases χ². It ends where a further Gauss-Newton step would gain less than the tolerance. A lane
+    whose start has ended takes the next one.
     """
-    n = y.size
-    basis, triangle, residual = np.empty((3, n)), np.zeros((3, 3)), np.empty(n)
-    new_basis, new_triangle, new_residual = np.empty((3, n)), np.zeros((3, 3)), np.empty(n)
-    jacobian, rows = np.empty((4, n)), np.empty((n_free, n))
-    tangent, new_q, new_mu = np.empty((3, 4)), np.empty(4), np.empty(3)
-    a, b, step = np.empty((3, 3)), np.empty(3), np.empty(3)
-    chi2 = _residual(q, y, row, basis, triangle, mu, residual)
-    if not math.isfinite(chi2):
-        return math.inf, 0, FAILED
-    damping = 1e-3
-    for iteration in range(1, max_iterations + 1):
-        for j in range(n_known):
-            if same_optimum(q, chi2, known_q[j], known_chi2[j]):
-                return chi2, iteration - 1, KNOWN
-        homogeneous_jacobian(q, mu, row, jacobian)
-        if n_free == 2:
-            _directional_tangent(q, tangent)
-        else:
-            _tangent(q, tangent)
-        for j in range(n_free):
-            for c in range(n):
-                rows[j, c] = (
-                    tangent[j, 0] * jacobian[0, c]
-                    + tangent[j, 1] * jacobian[1, c]
-                    + tangent[j, 2] * jacobian[2, c]
-                    + tangent[j, 3] * jacobian[3, c]
-                )
-        _project_common(rows, n_free, row)
-        # Kaufman's form of variable projection: the moment's part of every column is taken out.
-        for j in range(n_free):
-            for k in range(3):
-                t = 0.0
-                for c in range(n):
-                    t += basis[k, c] * rows[j, c]
-                for c in range(n):
-                    rows[j, c] -= t * basis[k, c]
-        for i in range(n_free):
-            t = 0.0
-            for c in range(n):
-                t += rows[i, c] * residual[c]
-            b[i] = t
-            for j in range(i + 1):
-                t = 0.0
-                for c in range(n):
-                    t += rows[i, c] * rows[j, c]
-                a[i, j] = t
-                a[j, i] = t
-        _solve_damped(a, b, n_free, 0.0, step)
-        decrement = 0.0
-        for i in range(n_free):
-            decrement += b[i] * step[i]
-        if not math.isfinite(decrement):
-            return chi2, iteration, FAILED
-        if decrement < tolerance + 1e-14 * chi2:
-            return chi2, iteration, CONVERGED
-        accepted = False
-        while damping < 1e12:
-            _solve_damped(a, b, n_free, damping, step)
-            length = 0.0
-            for i in range(n_free):
-                length += step[i] * step[i]
-            length = math.sqrt(length)
-            shorten = 0.5 / length if length > 0.5 else 1.0
-            norm = 0.0
-            for d in range(4):
-                t = q[d]
-                for i in range(n_free):
-                    t += shorten * step[i] * tangent[i, d]
-                new_q[d] = t
-                norm += t * t
-            if n_free == 2:
-                u2 = norm - new_q[3] * new_q[3]
-                stretch = math.sqrt((1.0 - new_q[3] * new_q[3]) / u2)
-                for d in range(3):
-                    new_q[d] *= stretch
-            else:
-                norm = 1.0 / math.sqrt(norm)
+    n, n_sensors, n_triples = len(starts), len(model.sensors), model.common.shape[1]
+    w, rows = np.zeros(WORKSPACE), np.zeros((n_sensors, SENSOR_ROWS))
+    common, dots = np.zeros((n_sensors, n_triples, 9 * LANES)), np.empty((n_triples, 9 * LANES))
+    start_of_lane, set_of_lane = np.full(LANES, -1), np.full(LANES, -1)
+    w[END : END + LANES] = FAILED
+    next_start, active = 0, 0
+    while True:
+        for i in range(LANES):
+            if w[END + i] == RUNNING:
+                continue
+            k = start_of_lane[i]
+            if k >= 0:
+                active -= 1
                 for d in range(4):
-                    new_q[d] *= norm
-                if abs(new_q[3]) < SMALLEST_S:
-                    new_q[3] = math.copysign(SMALLEST_S, new_q[3])
-            new_chi2 = _residual(new_q, y, row, new_basis, new_triangle, new_mu, new_residual)
-            if new_chi2 < chi2:
-                accepted = True
-                break
-            damping = max(damping, 1e-4) * 5.0
-        if not accepted:
-            # No representable step decreases χ²: an optimum to rounding if the model promised next to nothing.
-            return chi2, iteration, CONVERGED if decrement < 1e-6 * (1.0 + chi2) else FAILED
+                    out.q[k, d] = w[STATE + d * LANES + i]
+                for d in range(3):
+                    out.mu[k, d] = w[STATE + MOMENT + d * LANES + i]
+                out.chi2[k] = w[CHI2 + i]
+                out.iterations[k] = int(w[ITERATIONS + i])
+                out.converged[k] = w[END + i] == CONVERGED
+            start_of_lane[i] = next_start if next_start < n else -1
+            active += next_start < n
+            k = min(next_start, n - 1)  # an idle lane computes something, too
+            next_start += 1
+            _load(i, starts[k], signal[reading[k]], w, rows)
+            of_row = model.set_of_row[reading[k]]
+            if set_of_lane[i] != of_row:
+                set_of_lane[i] = of_row
+                _load_model(i, model.gain[of_row], model.common[of_row], rows, common)
+        if active == 0:
+            return
+        linearise(model.sensors, w, rows, common, dots, free_range)
+        _judge(w, tolerance, float(max_iterations))
+        _step(w, free_range)
+
+
+@compiled
+def _load(i: int, start: FloatArray, signal: FloatArray, w: FloatArray, rows: FloatArray) -> None:
+    """Begin a start in lane i."""
+    for d in range(4):
+        w[TRIAL + d * LANES + i] = start[d]
+    for d in range(9):
+        w[NORMAL + d * LANES + i] = 0.0
+    w[CHI2 + i], w[DAMPING + i], w[PROMISED + i] = math.inf, 1e-3, 0.0
+    w[ITERATIONS + i], w[END + i] = 0.0, RUNNING
+    for s in range(len(signal)):
+        for a in range(3):
+            rows[s, SIGNAL + a * LANES + i] = signal[s, a]
+
+
+@compiled
+def _load_model(i: int, gain: FloatArray, of_row: FloatArray, rows: FloatArray, common: FloatArray) -> None:
+    for s in range(len(gain)):
+        for a in range(9):
+            rows[s, GAIN + a * LANES + i] = gain[s, a]
+        for k in range(len(of_row)):
+            for a in range(9):
+                common[s, k, a * LANES + i] = of_row[k, s, a]
+
+
+@inlined
+def _normal(w: FloatArray, i: int) -> tuple[float, ...]:
+    return (
+        w[NORMAL + i], w[NORMAL + LANES + i], w[NORMAL + 2 * LANES + i], w[NORMAL + 3 * LANES + i],
+        w[NORMAL + 4 * LANES + i], w[NORMAL + 5 * LANES + i], w[NORMAL + 6 * LANES + i], w[NORMAL + 7 * LANES + i],
+        w[NORMAL + 8 * LANES + i],
+    )  # fmt: skip
+
+
+@inlined
+def _solved(n: tuple[float, ...], damping: float) -> tuple[float, float, float]:
+    """Step (A + damping · diag A)⁻¹ b ; columns without information do not move."""
+    a00, a01, a02, a11, a12, a22, b0, b1, b2 = n
+    larger = a00 if a00 > a11 else a11
+    tiny = 1e-14 * (larger if larger > a22 else a22)
+    grown = 1.0 + damping
+    d0 = grown * a00 + tiny
+    i0 = 1.0 / d0 if d0 > 0.0 else 0.0
+    l1, l2 = a01 * i0, a02 * i0
+    d1 = grown * a11 + tiny - l1 * a01
+    i1 = 1.0 / d1 if d1 > 0.0 else 0.0
+    t = a12 - l1 * a02
+    l3 = t * i1
+    d2 = grown * a22 + tiny - l2 * a02 - l3 * t
+    i2 = 1.0 / d2 if d2 > 0.0 else 0.0
+    y1 = b1 - l1 * b0
+    x2 = (b2 - l2 * b0 - l3 * y1) * i2
+    x1 = y1 * i1 - l3 * x2
+    return b0 * i0 - l1 * x1 - l2 * x2, x1, x2
+
+
+@inlined
+def _take(w: FloatArray, at: int, i: int, taken: bool) -> None:
+    w[at + i] = w[TRIAL + at + i] if taken else w[at + i]
+
+
+@compiled
+def _judge(w: FloatArray, tolerance: float, max_iterations: float) -> None:
+    """Take the trial state where its χ² is lower, adapt the damping, and see which lanes have ended."""
+    for i in range(LANES):
+        before, promised, damping = w[CHI2 + i], w[PROMISED + i], w[DAMPING + i]
+        gained = before - w[TRIAL + CHI2 + i]
+        taken = gained > 0.0
         # χ² falls by twice the step's product with the gradient, less its curvature: a ratio of gains of one is a model
         # that holds, a low one a step that went too far.
-        promised = 0.0
-        for i in range(n_free):
-            t = 0.0
-            for j in range(n_free):
-                t += a[i, j] * shorten * step[j]
-            promised += shorten * step[i] * (2.0 * b[i] - t)
-        gained = chi2 - new_chi2
-        if gained > 0.75 * promised:
-            damping *= 0.1
-        elif gained < 0.5 * promised:
-            damping = max(damping, 0.1) * 3.0
-        put(q, new_q)
-        put(mu, new_mu)
-        chi2 = new_chi2
-        basis, new_basis = new_basis, basis
-        residual, new_residual = new_residual, residual
-    return chi2, max_iterations, FAILED
+        less = 0.1 * damping if gained > 0.75 * promised else damping
+        more = 3.0 * (damping if damping > 0.1 else 0.1)
+        after = more if gained < 0.5 * promised else less
+        refused = 5.0 * (damping if damping > 1e-4 else 1e-4)
+        after = after if taken else refused
+        w[DAMPING + i] = damping if before == math.inf else after
+        w[ITERATIONS + i] += 1.0 if taken else 0.0
+        w[END + i] = 1.0 if taken else 0.0
+    for i in range(LANES):
+        taken = w[END + i] > 0.0
+        _take(w, STATE, i, taken)
+        _take(w, STATE + LANES, i, taken)
+        _take(w, STATE + 2 * LANES, i, taken)
+        _take(w, STATE + 3 * LANES, i, taken)
+        _take(w, MOMENT, i, taken)
+        _take(w, MOMENT + LANES, i, taken)
+        _take(w, MOMENT + 2 * LANES, i, taken)
+        _take(w, CHI2, i, taken)
+        _take(w, NORMAL, i, taken)
+        _take(w, NORMAL + LANES, i, taken)
+        _take(w, NORMAL + 2 * LANES, i, taken)
+        _take(w, NORMAL + 3 * LANES, i, taken)
+        _take(w, NORMAL + 4 * LANES, i, taken)
+        _take(w, NORMAL + 5 * LANES, i, taken)
+        _take(w, NORMAL + 6 * LANES, i, taken)
+        _take(w, NORMAL + 7 * LANES, i, taken)
+        _take(w, NORMAL + 8 * LANES, i, taken)
+    for i in range(LANES):
+        n = _normal(w, i)
+        x0, x1, x2 = _solved(n, 0.0)
+        decrement = n[6] * x0 + n[7] * x1 + n[8] * x2
+        chi2 = w[CHI2 + i]
+        # No representable step decreases χ²: an optimum to rounding if the model promised next to nothing.
+        stuck = w[DAMPING + i] > 1e12
+        limit = tolerance + 1e-14 * chi2
+        small = 1e-6 * (1.0 + chi2) if stuck else limit
+        lost = FAILED if stuck or w[ITERATIONS + i] >= max_iterations else RUNNING
+        end = CONVERGED if decrement < small else lost
+        w[END + i] = end if decrement < math.inf and chi2 < math.inf else FAILED
+
+
+@compiled
+def _step(w: FloatArray, free_range: float) -> None:
+    """A damped step of every lane, half a radian at most."""
+    for i in range(LANES):
+        a00, a01, a02, a11, a12, a22, b0, b1, b2 = _normal(w, i)
+        x0, x1, x2 = _solved((a00, a01, a02, a11, a12, a22, b0, b1, b2), w[DAMPING + i])
+        length = math.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
+        share = 0.5 / length if length > 0.5 else 1.0
+        x0, x1, x2 = share * x0, share * x1, share * x2
+        w[PROMISED + i] = (
+            x0 * (2.0 * b0 - a00 * x0 - a01 * x1 - a02 * x2)
+            + x1 * (2.0 * b1 - a01 * x0 - a11 * x1 - a12 * x2)
+            + x2 * (2.0 * b2 - a02 * x0 - a12 * x1 - a22 * x2)
+        )
+        t00, t01, t02, t10, t11, t12, t20, t21, t22, t23 = tangents(w, STATE, i)
+        x2 *= free_range
+        u0 = w[STATE + i] + x0 * t00 + x1 * t10 + x2 * t20
+        u1 = w[STATE + LANES + i] + x0 * t01 + x1 * t11 + x2 * t21
+        u2 = w[STATE + 2 * LANES + i] + x0 * t02 + x1 * t12 + x2 * t22
+        s = w[STATE + 3 * LANES + i] + x2 * t23
+        square = u0 * u0 + u1 * u1 + u2 * u2
+        # On the sphere again: all of q, or at one range u alone.
+        norm2 = square / (1.0 - s * s) if free_range == 0.0 else square + s * s
+        scale = 1.0 / math.sqrt(norm2)
+        s = s if free_range == 0.0 else s * scale
+        least = SMALLEST_S if s >= 0.0 else -SMALLEST_S
+        w[TRIAL + i], w[TRIAL + LANES + i], w[TRIAL + 2 * LANES + i] = scale * u0, scale * u1, scale * u2
+        w[TRIAL + 3 * LANES + i] = s if abs(s) >= SMALLEST_S else least

@@ -8,22 +8,25 @@ scored by the energy along one template.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.compilation import over_rows
 from magloc.directions import fibonacci_directions
 from magloc.localization.fit.prior import SourcePrior
+from magloc.localization.search.single_source_compiled import choose_rows
 from magloc.measurement.whitened import WhitenedModel
 from magloc.measurement.whitened_compiled import ModelRow, candidate_bases
 
 SingleArray = NDArray[np.float32]
 _SAME_GAIN = 0.02
 _CANDIDATES_AT_ONCE = 512
+_ROWS_AT_ONCE = 128  # whose components stay in the processor's cache
 
 
 def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
@@ -50,6 +53,20 @@ def linear_scores(bases: SingleArray, residual: FloatArray) -> FloatArray:
     scores: FloatArray = np.add(x, y, dtype=np.float64)
     scores += z
     return np.nan_to_num(scores, copy=False, nan=-1.0)
+
+
+def chosen_candidates(
+    bases: SingleArray, residual: FloatArray, candidates: FloatArray, n_starts: int, apart_rad: float
+) -> NDArray[np.intp]:
+    """:func:`distinct_best` of the :func:`linear_scores` of residuals (b, C), compiled."""
+    chosen = np.zeros((len(residual), n_starts), dtype=np.intp)
+    single = candidates.astype(np.float32)
+    for begin in range(0, len(residual), _ROWS_AT_ONCE):
+        some = residual[begin : begin + _ROWS_AT_ONCE]
+        components = (bases.T @ some.T.astype(np.float32)).reshape(3, len(candidates), -1)
+        of_some = chosen[begin : begin + _ROWS_AT_ONCE]
+        over_rows(choose_rows, len(some), components, single, math.cos(apart_rad), of_some)
+    return chosen
 
 
 def rows_of_equal_gain(gain: FloatArray) -> Iterator[NDArray[np.intp]]:
@@ -108,28 +125,38 @@ def distinct_best(scores: FloatArray, candidates: FloatArray, n_starts: int, apa
 def candidate_positions(
     array: SensorArray,
     *,
-    n_directions: int = 200,
-    n_ranges: int = 10,
+    n_directions: int = 150,
+    ranges: ArrayLike = (0.6, 0.9, 1.4, 2.4, 6.0, 30.0),
     n_near_directions: int = 12,
+    n_inner_directions: int = 60,
 ) -> FloatArray:
     """Positions (n, 3) [m] that a search scores before it refines the best of them.
 
-    Directions times geometric ranges of 0.6 to 60 circumradii around the centroid, and shells of 0.35, 0.7 and 1.4
-    times the distance of the next sensor around every sensor, for sources close to a large array.
+    Directions times geometric ranges of 0.6 to 60 circumradii around the centroid, shells of 0.35, 0.7 and 1.4 times
+    the distance of the next sensor around every sensor, for sources close to a large array, and inner ones of 0.2 and
+    0.4 circumradii, where weak rows have optima.
     """
-    ranges = array.circumradius * np.geomspace(0.6, 60.0, n_ranges)
-    outer = array.centroid + (ranges[:, None, None] * fibonacci_directions(n_directions)).reshape(-1, 3)
+    shells = array.circumradius * np.asarray(ranges)
+    outer = array.centroid + (shells[:, None, None] * fibonacci_directions(n_directions)).reshape(-1, 3)
     distances = np.linalg.norm(array.positions[:, None] - array.positions, axis=-1)
     np.fill_diagonal(distances, np.inf)
-    shells = distances.min(axis=1)[:, None] * np.array([0.35, 0.7, 1.4])
-    offsets = shells[:, :, None, None] * fibonacci_directions(n_near_directions)
+    near_shells = distances.min(axis=1)[:, None] * np.array([0.35, 0.7, 1.4])
+    offsets = near_shells[:, :, None, None] * fibonacci_directions(n_near_directions)
     near = (array.positions[:, None, None] + offsets).reshape(-1, 3)
-    return np.concatenate([outer, near])
+    inner = array.centroid + array.circumradius * np.multiply.outer(
+        [0.2, 0.4], fibonacci_directions(n_inner_directions)
+    )
+    return np.concatenate([outer, near, inner.reshape(-1, 3)])
 
 
-def allowed_positions(array: SensorArray, prior: SourcePrior) -> FloatArray:
-    """Those of :func:`candidate_positions` that a prior allows; a ValueError if there is none."""
-    candidates = candidate_positions(array)
+def fine_positions(array: SensorArray) -> FloatArray:
+    """More of :func:`candidate_positions` around the array: a search for several sources refines few of them."""
+    return candidate_positions(array, n_directions=200, ranges=np.geomspace(0.6, 60.0, 10), n_inner_directions=0)
+
+
+def allowed_positions(array: SensorArray, prior: SourcePrior, candidates: FloatArray | None = None) -> FloatArray:
+    """Those of candidates, by default :func:`candidate_positions`, that a prior allows; ValueError if none is left."""
+    candidates = candidate_positions(array) if candidates is None else candidates
     allowed: FloatArray = candidates[prior.allows_position(candidates)]
     if not len(allowed):
         raise ValueError("Input prior must leave some of the space around the array; instead it leaves nothing.")

@@ -26,7 +26,7 @@ from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
 from magloc.localization.search.beam_search import Search, best_distinct, merged
-from magloc.localization.search.candidates import allowed_positions, linear_bases, linear_scores
+from magloc.localization.search.candidates import allowed_positions, fine_positions, linear_bases, linear_scores
 from magloc.measurement.rows import WhitenedRows, check_magnitudes, whitenings_of
 
 N_UNKNOWNS = 6
@@ -92,7 +92,7 @@ class MultiSourceSearch:
         self.prior = prior
         self.seed = seed
         self._thresholds: dict[int, float] = {}
-        self._candidates = allowed_positions(array, prior)
+        self._candidates = allowed_positions(array, prior, fine_positions(array))
 
     def optima(self, rows: WhitenedRows) -> list[Optima]:
         """Distinct optima with the chosen number of sources: one entry for every number."""

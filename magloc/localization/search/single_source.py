@@ -22,10 +22,10 @@ from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
 from magloc.localization.search import single_source_compiled as kernels
-from magloc.localization.search.candidates import SingleArray, allowed_positions, linear_bases
+from magloc.localization.search.candidates import SingleArray, allowed_positions, chosen_candidates, linear_bases
 from magloc.measurement.rows import WhitenedRows, channels_above_ambient, check_magnitudes, whitened_rows
 from magloc.measurement.whitened import WhitenedModel
-from magloc.measurement.whitened_compiled import ModelRows
+from magloc.measurement.whitened_compiled import LaneModel, signals
 
 N_UNKNOWNS = 6
 
@@ -51,7 +51,7 @@ class BestFits:
 
 @dataclass(frozen=True, eq=False)
 class _Ranking:
-    """All candidates, and their bases under the whitening of a mask, by which its rows rank them."""
+    """All candidates, and their bases (3 n, C) under the whitening of a mask, by which its rows rank them."""
 
     whitening: Whitening
     candidates: FloatArray
@@ -84,8 +84,8 @@ class SingleSourceSearch:
         self,
         array: SensorArray,
         *,
-        n_starts: int = 6,
-        apart_rad: float = 0.3,
+        n_starts: int = 12,
+        apart_rad: float = 0.25,
         max_iterations: int = 100,
         prior: SourcePrior = NOTHING_KNOWN,
     ) -> None:
@@ -124,7 +124,7 @@ class SingleSourceSearch:
         return [Optima(rows, fits, of_row, reason, failed_starts=found.counts[:, 1])]
 
     def optima_from(self, readings_T: ArrayLike, starts_m: ArrayLike) -> BestFits:
-        """Best optimum of readings (C,) for every start (n, 3) [m], refined before the candidates; without prior."""
+        """Best optimum of readings (C,) for every start (n, 3) [m], refined beside the candidates; without prior."""
         (rows,) = whitened_rows(self.array, np.asarray(readings_T, dtype=np.float64)[None], None, 1)
         starts = rows.model.homogeneous(np.asarray(starts_m, dtype=np.float64))[:, None]
         found = self._search(rows, np.zeros(len(starts), dtype=np.intp), starts, DISTINCT_WITHIN)
@@ -149,32 +149,26 @@ class SingleSourceSearch:
     def _search(
         self, rows: WhitenedRows, reading_of_row: IntArray, first: FloatArray, keep_within: float
     ) -> kernels.Ends:
-        """Optima of some of the rows, starts of their own refined before the best candidates."""
+        """Optima of some of the rows, from starts of their own and the best candidates."""
         ranking, model = self._ranking(rows.mask), rows.model
         ranked = rows.y
         if self.array.noise_depends_on_reading:
             channels = channels_above_ambient(self.array, rows.mask, rows.readings_T, model.ambient)
             ranked = ranking.whitening.apply(channels)
-        shape = (len(reading_of_row), self.n_starts + first.shape[1])
-        found = kernels.Ends(
-            q=np.full((*shape, 4), np.nan),
-            mu=np.full((*shape, 3), np.nan),
-            chi2=np.full(shape, np.nan),
-            iterations=np.zeros(shape, dtype=np.int64),
-            counts=np.zeros((shape[0], 3), dtype=np.int64),
-        )
-        every = ModelRows.of(model)
+        best = ranking.candidates[
+            chosen_candidates(ranking.bases, ranked, ranking.candidates, self.n_starts, self.apart_rad)
+        ]
+        starts = np.concatenate([first, best[reading_of_row]], axis=1)
+        found = kernels.Ends.empty(*starts.shape[:2])
         over_rows(
             kernels.search_rows,
-            shape[0],
-            rows.y,
-            ranked,
+            len(starts),
+            signals(model, rows.y),
             reading_of_row,
-            kernels.Candidates(ranking.candidates, ranking.bases, math.cos(self.apart_rad)),
-            first,
+            starts,
             keep_within,
             self.max_iterations,
-            every._replace(set_of_row=every.set_of_row[reading_of_row]),
+            LaneModel.of(model),
             found,
         )
         return found

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from arrays.typing import FloatArray
 from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95
-from magloc.localization.fit.results import EVERYWHERE, Intervals, is_observable_set, span
+from magloc.localization.fit.results import is_observable, spans
 from magloc.localization.uncertainty.range_interval import levels, ranges_of, relative_range_sigma, rise, union
 
 LARGEST_GAUSSIAN_SIGMA = 0.04
@@ -141,12 +141,11 @@ class Rivals:
 
     def ranges(self, alpha: FloatArray, unit_m: float) -> RowRanges:
         """What is known of the ranges, from the stretches of α (b, n, 2) that the solutions' profiles cover."""
-        ends = ranges_of(alpha, unit_m).tolist()
-        bounded = np.isfinite(self.rise).tolist()
-        sets = [union(of_row) if known else EVERYWHERE for of_row, known in zip(ends, bounded, strict=True)]
-        low, high = np.array([span(intervals) for intervals in sets]).reshape(-1, 2).T
-        observable = np.array([is_observable_set(intervals) for intervals in sets], dtype=bool)
-        single = np.array([len(intervals) == 1 for intervals in sets], dtype=bool)
+        bounded = np.isfinite(self.rise)
+        sets = union(np.where(bounded[:, None, None], ranges_of(alpha, unit_m), [0.0, np.inf]))
+        low, high = spans(sets).T
+        observable = is_observable(low, high)
+        single = np.isfinite(sets[..., 0]).sum(axis=1) == 1
         sharp = relative_sigma(self.covariance, self.offset_m, self.moment) <= LARGEST_GAUSSIAN_SIGMA
         sharp &= self.weight >= CERTAIN_WEIGHT
         covariance, blurred = self.covariance, ~observable
@@ -164,8 +163,8 @@ class RowRanges:
 
     Attributes
     ----------
-    sets : list of tuple of (low, high)
-        95 % sets [m].
+    sets : ndarray, shape (b, i, 2)
+        95 % sets of intervals [m], NaN where there are fewer.
     observable : ndarray of bool, shape (b,)
     covariance : ndarray, shape (b, n, 6, 6)
         Of the solutions, :func:`widened` where the range is not observable.
@@ -173,7 +172,7 @@ class RowRanges:
         Whether a covariance describes the uncertainty.
     """
 
-    sets: list[Intervals]
+    sets: FloatArray
     observable: NDArray[np.bool_]
     covariance: FloatArray
     gaussian: NDArray[np.bool_]

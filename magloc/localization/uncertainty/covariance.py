@@ -19,7 +19,7 @@ from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95, MISFIT
 from magloc.localization.fit.columns import Solutions
 from magloc.localization.fit.gauss_newton import covariances
 from magloc.localization.fit.optima import Optima
-from magloc.localization.fit.results import EVERYWHERE, Intervals, is_misfit, is_observable_set, span
+from magloc.localization.fit.results import is_misfit, is_observable
 from magloc.localization.uncertainty.ambiguity import (
     LARGEST_GAUSSIAN_SIGMA,
     Rivals,
@@ -31,11 +31,11 @@ from magloc.localization.uncertainty.ambiguity import (
 )
 from magloc.localization.uncertainty.covariance_compiled import covariance_rows
 from magloc.localization.uncertainty.moment_covariance import moment_covariances
-from magloc.localization.uncertainty.range_interval import relative_range_sigma, union
+from magloc.localization.uncertainty.range_interval import relative_range_sigma
 from magloc.localization.uncertainty.range_profile import profile_stretches, ranges_within
 from magloc.localization.uncertainty.range_profile_compiled import profile_rows
 from magloc.measurement.whitened import WhitenedModel
-from magloc.measurement.whitened_compiled import ModelRows
+from magloc.measurement.whitened_compiled import LaneModel, ModelRows, signals
 
 # By how much the rise of χ² at one standard deviation may differ from one where errors are Gaussian.
 _BEND = 0.5
@@ -45,7 +45,7 @@ _BEND = 0.5
 class _Known:
     """What is known of f fits of K sources: the columns of :class:`Solutions` of these names."""
 
-    ranges: list[tuple[Intervals, ...]]
+    ranges: FloatArray
     covariance: FloatArray
     gaussian: BoolArray
     weight: FloatArray
@@ -143,7 +143,8 @@ def _of_one(optima: Optima, energy: FloatArray) -> _Known:
     rise = rivals.rise * understated
     alpha = np.full((*shape, 2), np.nan)
     if compiled:
-        over_rows(profile_rows, n_rows, rows.y, rise, ModelRows.of(model), q, chi2, counts, scaled, alpha)
+        signal, in_lanes = signals(model, rows.y), LaneModel.of(model)
+        over_rows(profile_rows, n_rows, signal, rise, in_lanes, q, chi2, counts, scaled, alpha)
     else:
         left = rise[of_row] - (fits.chi2 - chi2[of_row, 0])
         inside = np.flatnonzero((left > 0.0) & np.isfinite(left))
@@ -156,7 +157,7 @@ def _of_one(optima: Optima, energy: FloatArray) -> _Known:
     claimed = np.flatnonzero(gaussian)
     if claimed.size:
         gaussian[claimed] = covariance_is_valid(optima, covariance[at][claimed], claimed)
-    return _Known([(ranges.sets[row],) for row in of_row], ranges.covariance[at], gaussian[:, None], rivals.weight[at])
+    return _Known(ranges.sets[of_row, None], ranges.covariance[at], gaussian[:, None], rivals.weight[at])
 
 
 def _understated(chi2: FloatArray, optima: Optima) -> FloatArray:
@@ -181,25 +182,23 @@ def _of_several(optima: Optima, detected: BoolArray) -> _Known:
     offset, moment = model.position(fits.q) - model.centroid, model.moment(fits.q, fits.mu)
     n_fits, n_sources = offset.shape[:2]
     wide = covariance.copy()
-    sets: list[list[Intervals]] = [[] for _ in range(n_fits)]
+    sets = np.empty((n_fits, n_sources, 1, 2))
     gaussian = np.zeros((n_fits, n_sources), dtype=bool)
     for k in range(n_sources):
-        ends = ranges_within(model, y, fits, k, covariance, DELTA_CHI2_95 * understated).tolist()
-        of_source = [union([pair]) if seen else EVERYWHERE for pair, seen in zip(ends, detected[of_row], strict=True)]
-        low, high = np.array([span(intervals) for intervals in of_source]).reshape(-1, 2).T
-        observable = np.array([is_observable_set(intervals) for intervals in of_source], dtype=bool)
+        ends = ranges_within(model, y, fits, k, covariance, DELTA_CHI2_95 * understated)
+        sets[:, k, 0] = np.where(detected[of_row, None], ends, [0.0, np.inf])
+        low, high = sets[:, k, 0].T
+        observable = is_observable(low, high)
         sigma = relative_sigma(covariance[:, 6 * k :, 6 * k :], offset[:, k], moment[:, k])
         gaussian[:, k] = observable & (sigma <= LARGEST_GAUSSIAN_SIGMA)
         blurred = ~observable
         wide[blurred] = widened(wide[blurred], offset[blurred, k], low[blurred], high[blurred], k)
-        for of_fit, intervals in zip(sets, of_source, strict=True):
-            of_fit.append(intervals)
     chi2 = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2 / understated, np.inf)
     weight = _weights_of_rows(of_row, chi2, log_evidence_volume(covariance, moment, offset, scale_m=_scale_m(model)))
     gaussian &= (weight >= CERTAIN_WEIGHT)[:, None]
     claimed = np.flatnonzero(gaussian.any(axis=1))
     gaussian[claimed] &= covariance_is_valid(optima, covariance[claimed], claimed)[:, None]
-    return _Known([tuple(of_fit) for of_fit in sets], wide, gaussian, weight)
+    return _Known(sets, wide, gaussian, weight)
 
 
 def _of_known_position(optima: Optima, position_m: FloatArray, moment: FloatArray) -> _Known:
@@ -214,9 +213,8 @@ def _of_known_position(optima: Optima, position_m: FloatArray, moment: FloatArra
         variance = np.diagonal(covariance, axis1=1, axis2=2).reshape(moment.shape).sum(axis=2)
         sigma = np.sqrt(variance) / np.linalg.norm(moment, axis=2)
     gaussian = (sigma <= LARGEST_GAUSSIAN_SIGMA) | (not model.channel_is_scalar.any())
-    distances = np.linalg.norm(position_m - model.centroid, axis=-1)[of_row].tolist()
-    ranges: list[tuple[Intervals, ...]] = [tuple(((r, r),) for r in of_fit) for of_fit in distances]
-    return _Known(ranges, covariance, gaussian, weight)
+    distances = np.linalg.norm(position_m - model.centroid, axis=-1)[of_row]
+    return _Known(np.tile(distances[:, :, None, None], 2), covariance, gaussian, weight)
 
 
 def _places(of_row: IntArray, n_rows: int) -> tuple[tuple[int, int], tuple[IntArray, IntArray]]:

@@ -9,7 +9,6 @@ solutions raise it, and so do weak signals, given that they are detected: docs/t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -19,7 +18,6 @@ from scipy.special import chndtr, erfc
 from arrays.typing import FloatArray
 from magloc.chi_square import energy_threshold
 from magloc.levels import DELTA_CHI2_95
-from magloc.localization.fit.results import Intervals
 
 # Signals so many standard deviations above the root of the threshold are seen for certain.
 _CERTAIN = 8.0
@@ -104,15 +102,22 @@ def gaussian_ranges(covariance: FloatArray, offset_m: FloatArray, unit_m: float)
     return ranges_of(np.stack([first, last], axis=-1), unit_m)
 
 
-def union(ends: Sequence[Sequence[float]]) -> Intervals:
-    """Disjoint intervals in ascending order, None for an open end, from pairs that may overlap, NaN for none."""
-    merged: list[list[float]] = []
-    for low, high in sorted([low, high] for low, high in ends if low == low):
-        if merged and low <= merged[-1][1]:
-            merged[-1][1] = max(merged[-1][1], high)
-        else:
-            merged.append([low, high])
-    return tuple((low, high if high < np.inf else None) for low, high in merged)
+def union(ends: FloatArray) -> FloatArray:
+    """Disjoint intervals (b, i, 2) in ascending order from pairs (b, n, 2) that may overlap; NaN for none."""
+    n_rows, n = ends.shape[:2]
+    each = np.arange(n_rows)[:, None]
+    low, high = ends[each, np.argsort(ends[..., 0], axis=1)].transpose(2, 0, 1)
+    reach = np.maximum.accumulate(np.where(np.isnan(low), -np.inf, high), axis=1)
+    begins = ~np.isnan(low)
+    begins[:, 1:] &= low[:, 1:] > reach[:, :-1]
+    place = np.cumsum(begins, axis=1) - 1
+    merged = np.full((n_rows, max(1, int(place.max(initial=0)) + 1), 2), np.nan)
+    for k in range(n):
+        row = np.flatnonzero(begins[:, k])
+        merged[row, place[row, k], 0] = low[row, k]
+        row = np.flatnonzero(~np.isnan(low[:, k]))
+        merged[row, place[row, k], 1] = reach[row, k]
+    return merged
 
 
 def relative_range_sigma(covariance: FloatArray, offset_m: FloatArray) -> FloatArray:

@@ -120,7 +120,9 @@ class Cells:
     @classmethod
     def of(cls, array: SensorArray, root: FloatArray) -> Cells:
         """Cells of rows whose channels are whitened by a root (C, C)."""
-        positions = candidate_positions(array, n_directions=60, n_ranges=10, n_near_directions=4)
+        positions = candidate_positions(
+            array, n_directions=60, ranges=np.geomspace(0.6, 60.0, 10), n_near_directions=4, n_inner_directions=0
+        )
         gain = root @ array.channel_gain
         common, size, _ = np.linalg.svd(gain, full_matrices=False)
         common = common[:, size > 1e-10 * size.max(initial=0.0)]

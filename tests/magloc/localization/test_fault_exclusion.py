@@ -25,7 +25,7 @@ from arrays.geometries import cube, tetrahedron
 from arrays.sensor import Sensor
 from magloc.chi_square import energy_threshold
 from magloc.fields import dipole
-from magloc.localization.fault_exclusion import weighted
+from magloc.localization.fault_exclusion import _Examination, weighted
 from magloc.localization.locator import Locator, locate
 from magloc.measurement.differences import predicted_channels
 from magloc.measurement.rows import whitened_model, whitened_rows, whitenings_of
@@ -277,6 +277,27 @@ class TestOtherLocators:
         assert [fix.dropped_sensors for fix in fixes] == [(array.ids[sensor],) for sensor in which]
         error = [np.linalg.norm(fix.solutions[0].moment_Am2 - m) for fix, m in zip(fixes, moment, strict=True)]
         assert max(error) <= 1.0
+
+
+class TestWithoutOneSensor:
+    """Deleting a sensor moves a fit a little: one refinement of it is what a search without that sensor finds."""
+
+    def test_refined_is_searched(self):
+        clean, _, _ = on_cube(5, seed=16)
+        locator = Locator(CUBE, exclude_faulty=False)
+        plain, mask, rows = locator.fit_rows(clean), np.ones(24, dtype=bool), np.arange(5)
+        examination = _Examination(CUBE, lambda _, other: locator.fit_rows(other), mask, rows, clean, None, True)
+        for row, starts in examination._refined_without_one(list(plain), rows).items():
+            assert len(starts) == 4
+            assert [start.without for start in starts].count(frozenset()) == 1
+            for start in starts[1:]:
+                (sensor,) = start.without
+                without = clean[row].copy()
+                without[CUBE.channel_sensor == sensor] = np.nan
+                searched = locator.fit(without).solutions[0]
+                place = examination.problem.position(start.q)[0]
+                assert_allclose(place, searched.position_m, rtol=1e-4)
+                assert start.explains
 
 
 class TestWeightedProblem:

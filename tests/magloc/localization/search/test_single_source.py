@@ -74,22 +74,6 @@ def row_of(problem):
     return whitened_compiled.row_at(whitened_compiled.ModelRows.of(problem), 0)
 
 
-def refined(problem, q, y, mu, max_iterations=100):
-    """The compiled refinement of q (in place) without known optima: χ², linearisations, how it ended."""
-    return variable_projection_compiled.refine(
-        q,
-        y,
-        row_of(problem),
-        3,
-        variable_projection_compiled.OPTIMUM_TOLERANCE,
-        max_iterations,
-        np.empty((1, 4)),
-        np.empty(1),
-        0,
-        mu,
-    )
-
-
 class TestNoiseFreeReadings:
     """The true source comes back, whatever the array's sensors, poses, gains and offsets."""
 
@@ -248,7 +232,7 @@ class TestUncertainty:
         p, m = random_sources(rng, 20, 20.0, 30.0, moment=3000.0)
         for fix in plain_locator(TETRAHEDRON).fit_rows(noisy_readings(TETRAHEDRON, p, m, rng)):
             for s in fix.solutions:
-                low, high = s.range_interval_m[0]
+                low, high = s.range_interval_m[0][0], s.range_interval_m[-1][1]
                 assert s.range_observable == (high is not None and low > 0 and high <= 2 * low)
         assert not any(s.range_observable for s in fix.solutions)
 
@@ -448,9 +432,9 @@ class TestReadableTwin:
         y = self.white.apply(noisy_readings(array, p, m, rng)[0] - array.channel_offset_T)
         q = self.problem.homogeneous(p[0] + 0.1 * rng.normal(size=3))
         before = float(projected_chi2(self.problem, q, y))
-        mu = np.empty(3)
-        chi2, _, end = refined(self.problem, q, y, mu)
-        assert end == variable_projection_compiled.CONVERGED
+        end = variable_projection_compiled.refined(self.problem, y[None], q[None])
+        q, mu, chi2 = end.q[0], end.mu[0], end.chi2[0]
+        assert end.converged
         assert chi2 <= before
         assert chi2 == pytest.approx(float(projected_chi2(self.problem, q, y)), rel=1e-9)
         assert_allclose(mu, best_moment(self.problem, q, y), rtol=1e-6, atol=1e-9 * np.linalg.norm(mu))

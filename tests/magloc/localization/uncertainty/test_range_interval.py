@@ -25,7 +25,15 @@ from arrays.sensor import Sensor
 from arrays.whitening import whitening
 from magloc.directions import fibonacci_directions
 from magloc.levels import DELTA_CHI2_95
-from magloc.localization.fit.results import EVERYWHERE, Fix, Intervals, Solution, Source, is_observable_set
+from magloc.localization.fit.results import (
+    EVERYWHERE,
+    Fix,
+    Intervals,
+    Solution,
+    Source,
+    intervals_of,
+    is_observable_set,
+)
 from magloc.localization.uncertainty.ambiguity import weights
 from magloc.localization.uncertainty.range_interval import (
     gaussian_ranges,
@@ -301,8 +309,9 @@ class TestSetOfRanges:
         assert_allclose(ends, [[0.0, 2.0 * near], [0.0, np.inf]])
 
     def test_intervals_that_overlap_become_one(self) -> None:
-        assert union([[3.0, 5.0], [1.0, 2.0], [np.nan, np.nan], [4.0, np.inf]]) == ((1.0, 2.0), (3.0, None))
-        assert union([]) == ()
+        pairs = np.array([[[3.0, 5.0], [1.0, 2.0], [np.nan, np.nan], [4.0, np.inf]], np.full((4, 2), np.nan)])
+        merged = union(pairs)
+        assert [intervals_of(of_row) for of_row in merged] == [((1.0, 2.0), (3.0, None)), ()]
         assert is_observable_set(((3.0, 4.0), (5.0, 6.0)))
         assert not is_observable_set(((3.0, 4.0), (5.0, 6.1)))
         assert not is_observable_set(((3.0, None),))
