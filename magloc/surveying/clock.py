@@ -13,8 +13,8 @@ from scipy.spatial.transform import Slerp
 
 from arrays.typing import FloatArray, IntArray
 from magloc.readings import Readings
-from magloc.surveying.joint_fit import Sources
-from magloc.surveying.record import SurveyRecord
+from magloc.surveying.fit.joint_fit import Sources
+from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.rounds import Model
 
 _STEP_M = 0.05  # of the way, for the curvature of the likelihood
