@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import os
+import io
 import pickle
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
@@ -21,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.io.errors import InputError
+from arrays.io.text import replace_file
 from magloc.grids.cluster import check_address, worked_by
 from magloc.grids.pool import process_pool
 
@@ -102,11 +102,6 @@ def _read(path: Path) -> Arrays | None:
 def _write(path: Path, result: Arrays) -> None:
     """Keep a result: whole or not at all, whenever the process ends."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_suffix(f".{os.getpid()}.part")
-    try:
-        with part.open("wb") as file:
-            np.savez(file, allow_pickle=False, **result)
-        part.replace(path)
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            part.unlink()
+    content = io.BytesIO()
+    np.savez(content, allow_pickle=False, **result)
+    replace_file(path, lambda place: place.write_bytes(content.getvalue()))

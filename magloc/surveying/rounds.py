@@ -15,7 +15,8 @@ from magloc.surveying.fit.whitening import Drift
 from magloc.surveying.search import SearchGrid, peaks, search, sources_at
 
 MOST_ROUNDS = 60
-_MOST_IN_VAIN, _MISFIT = 8, 1.5  # rounds where χ² per reading says that no further source is what is missing
+_MOST_IN_VAIN = 4  # rounds: beside strong sources, and at the rims of tiles, there is always something left to try
+_MOST_OF_MISFITS, _MISFIT = 8, 1.5  # and as long as χ² per reading says that something is missing
 _PROGRESS, _WORSE = 0.999, 1.02
 _MOST_AT_ONCE = 8
 _SAME_PLACE_M = 1e-6
@@ -97,10 +98,10 @@ def found_in(model: Model, group: IntArray, grid: SearchGrid, known: Sources, mo
             # Too many at a time led away: back, and one by one from there.
             fit, background = wide.fitted(best, group, _SETTLED_COARSELY)
             at_once = 1
-        elif fit.chi2 < _PROGRESS * least:
+        elif fit.chi2 < min(_PROGRESS * least, least - model.threshold):
             tried, in_vain = np.zeros((0, 3)), 0
         in_vain += 1
-        if in_vain > _MOST_IN_VAIN and fit.chi2 > _MISFIT * fit.residual.size:
+        if in_vain > (_MOST_OF_MISFITS if fit.chi2 > _MISFIT * fit.residual.size else _MOST_IN_VAIN):
             break
         best, least = fit.sources, min(least, fit.chi2)
         candidates = search(wide.record, background, fit, grid)
