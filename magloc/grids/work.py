@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.io.errors import InputError
-from arrays.io.text import replace_file
+from arrays.io.text import replaced
 from magloc.grids.cluster import check_address, worked_by
 from magloc.grids.pool import process_pool
 
@@ -93,7 +93,7 @@ def _key(work: Work, item: Any) -> str:
 def _read(path: Path) -> Arrays | None:
     """A result that was kept; None if it is not there or was cut short."""
     try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
             return dict(file)
     except (OSError, ValueError, BadZipFile, EOFError):
         return None
@@ -101,7 +101,9 @@ def _read(path: Path) -> Arrays | None:
 
 def _write(path: Path, result: Arrays) -> None:
     """Keep a result: whole or not at all, whenever the process ends."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    content = io.BytesIO()
-    np.savez(content, allow_pickle=False, **result)
-    replace_file(path, lambda place: place.write_bytes(content.getvalue()))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replaced(path) as written, written.open("wb") as file:
+            np.savez(file, allow_pickle=False, **result)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written ({error.strerror or error}).") from None
