@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import pickle
-import signal
 from collections.abc import Callable, Generator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from functools import partial
 from importlib.metadata import version
-from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -19,6 +17,7 @@ import xarray as xr
 
 from adcs.satellite.telemetry import Telemetry
 from arrays.typing import FloatArray
+from magloc.grids.pool import process_pool
 from sims.attitude.scenario import AttitudeScenario
 from sims.attitude.simulation import AttitudeRuns
 from sims.magnetics.scenario import MagneticScenario
@@ -126,9 +125,7 @@ def _in_parallel(work: _Work, seeds: Sequence[int], processes: int) -> Generator
         raise ValueError(
             f"Input estimator must be one that can be pickled, for more than one process; instead received {refusal}."
         )
-    # New interpreters: a fork of a process with threads, such as those of compiled code, may never come back.
-    pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_prepare)
-    try:
+    with process_pool(processes) as pool:
         futures: dict[Future[_Outcome], int] = {pool.submit(work, seed): seed for seed in seeds}
         for future in as_completed(futures):
             try:
@@ -136,18 +133,6 @@ def _in_parallel(work: _Work, seeds: Sequence[int], processes: int) -> Generator
             except BrokenProcessPool:
                 outcome = "BrokenProcessPool: a process of the pool died"
             yield futures[future], outcome
-    except BaseException:
-        for process in list((pool._processes or {}).values()):  # what a pool has no public name for before 3.14
-            process.terminate()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _prepare() -> None:
-    """Settings of a process: one thread, and an interruption is the business of the process that started it."""
-    os.environ["NUMBA_NUM_THREADS"] = "1"  # compiled code is not loaded yet
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def against_truth(simulation: Simulation | AttitudeRuns, result: Any) -> Mapping[str, Any]:

@@ -8,6 +8,8 @@ Cramér-Rao bound; the same by classes of χ².
 from __future__ import annotations
 
 import argparse
+import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,13 +18,29 @@ from scipy.special import chdtri
 import magloc
 import sims
 from arrays.typing import FloatArray
-from magloc.measurement.pose import PoseErrors
-from magloc.surveying.joint_fit import Background, Bounds, Layer, Sources, fit_jointly
-from magloc.surveying.whitening import Drift
+from magloc.surveying.fit.joint_fit import Background, Bounds, Layer, Sources, fit_jointly
+from magloc.surveying.fit.whitening import Drift
+from magloc.surveying.preparation import record_of, whole_rows
+from sims.magnetics.paths import Lawnmower
+from sims.magnetics.scenario import MagneticScenario
 from sims.magnetics.simulation import Simulation
 
 NEAREST_M = 0.5
 CLASSES = ((0.0, 200.0), (200.0, 2000.0), (2000.0, np.inf))
+
+
+def enlarged(scenario: MagneticScenario, edge_m: float) -> MagneticScenario:
+    """A built-in survey over a square of another size, as dense in lines and in targets."""
+    path, targets = scenario.carrier.path, scenario.targets
+    assert isinstance(path, Lawnmower)
+    assert targets is not None
+    half, lines = 0.5 * edge_m, round(edge_m / path.spacing_m) + 1
+    number = round(targets.number * (edge_m / path.length_m) ** 2)
+    targets = replace(targets, number=number, x_m=(-half, half), y_m=(-half, half))
+    path = replace(path, start_m=(-half, half, path.start_m[2]), length_m=edge_m, lines=lines)
+    way = lines * edge_m + 0.5 * math.pi * path.spacing_m * (lines - 1)
+    carrier = replace(scenario.carrier, path=path)
+    return replace(scenario, carrier=carrier, targets=targets, duration_s=way / path.speed_m_s)
 
 
 class Pair(NamedTuple):
@@ -53,15 +71,10 @@ def judged(field: Simulation) -> Field:
     found = magloc.survey(field.array, field.readings)
     truth = Sources(field.target_position_m, field.target_moment_Am2)
     everywhere = Bounds(np.full(3, -1e4), np.full(3, 1e4), np.inf)
-    record = found.record
-    background = Background.of(
-        record,
-        truth,
-        Layer.below(record, 15.0, 5e-9),
-        PoseErrors.of(record.array.pose),
-        Drift(),
-        np.arange(len(record)),
-    )
+    record, errors = record_of(found.array, whole_rows(field.array, field.readings)[1])
+    record = replace(record, values_T=record.values_T - np.median(record.values_T, axis=0))
+    layer = Layer.below(record, 15.0, 5e-9)
+    background = Background.of(record, truth, layer, errors, Drift(), np.arange(len(record)))
     at_truth = fit_jointly(record, background, truth, everywhere, most=0)
     bound = np.sqrt(np.diagonal(at_truth.covariance).reshape(-1, 6)[:, :3].sum(axis=1))
     pairs, missed, used = [], [], set()
@@ -105,10 +118,15 @@ def main() -> None:
     parser.add_argument("scenario")
     parser.add_argument("--first", type=int, default=200)
     parser.add_argument("--seeds", type=int, default=12)
+    parser.add_argument("--edge-m", type=float, help="of the square, in place of the scenario's")
     given = parser.parse_args()
+    scenario = sims.read_scenario(given.scenario)
+    assert isinstance(scenario, MagneticScenario)
+    if given.edge_m:
+        scenario = enlarged(scenario, given.edge_m)
     fields = []
     for seed in range(given.first, given.first + given.seeds):
-        fields.append(judged(sims.simulate(sims.read_scenario(given.scenario), seed=seed)))  # type: ignore[arg-type]
+        fields.append(judged(sims.simulate(scenario, seed=seed)))
         last = fields[-1]
         print(
             f"seed {seed}: found {len(last.pairs)}, missed {[round(chi2) for chi2 in last.missed_chi2]} (χ²),"

@@ -17,7 +17,15 @@ from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
 from arrays.io.outputs import make_folder, refuse_file, refuse_one_for_two
 from magloc.cli.framework import CommonOptions, print_json
-from magloc.cli.options import KnownOptions, MapOptions, ambient_field, naming_options, print_note, refuse_not_positive
+from magloc.cli.options import (
+    KnownOptions,
+    MapOptions,
+    ambient_field,
+    naming_options,
+    naming_scheduler,
+    print_note,
+    refuse_not_positive,
+)
 
 if TYPE_CHECKING:
     from magloc.surveying.results import Survey
@@ -51,6 +59,7 @@ def survey(
     known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
     ground: GroundOptions = GroundOptions(),
     maps: MapOptions = MapOptions(),  # noqa: B008 - frozen
+    scheduler: str | None = None,
     out: Path | None = None,
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
@@ -75,8 +84,11 @@ def survey(
         What is known of the ground.
     maps : MapOptions
         Files for maps of the world.
+    scheduler : str
+        Address of a dask scheduler (tcp://HOST:PORT) whose workers search the tiles of a large survey.
     out : Path
-        Folder for targets.csv, residual.csv and the map.
+        Folder for targets.csv, residual.csv and the map; of a large survey it keeps what is done, until all is: the
+        same command goes on with one that was interrupted.
     json : bool
         Print one JSON object in place of the table.
     common : CommonOptions
@@ -94,7 +106,7 @@ def survey(
     parts = [magloc.read_readings(path, used, sensors=known.ids, ordered=True) for path in readings]
     fields = [ambient_field(used, part, where) for part in parts]
     used, rows = fields[0][0], [replace(part, ambient_T=own) for part, (_, own) in zip(parts, fields, strict=True)]
-    with _naming(", ".join(map(str, readings))):
+    with _naming(", ".join(map(str, readings))), naming_scheduler():
         found = magloc.survey(
             used,
             rows,
@@ -102,7 +114,9 @@ def survey(
             ground_m=ground.ground_m,
             shortest_geology_m=ground.shortest_geology_m,
             false_per_hectare=ground.false_per_hectare,
-            progress=None if common.quiet or json else _told,
+            scheduler=scheduler,
+            unfinished=None if out is None else out / "tiles",
+            progress=None if common.quiet or json else print_note,
         )
     maps.write(found, known.place)
     if out is not None:
@@ -114,7 +128,7 @@ def survey(
         return
     print(found.table())
     if found.pose_assumed and not common.quiet:
-        pose = found.record.array.pose
+        pose = found.array.pose
         size = "" if pose is None else f" {100.0 * pose.position_m:g} cm that last {pose.correlation_s:g} s"
         print_note(f"nothing is stated of the pose's errors: as the rows show them{size}")
 
@@ -129,10 +143,6 @@ def _naming(readings: str) -> Iterator[None]:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{readings}: {str(error).removeprefix('Input ')}") from None
-
-
-def _told(number: int, sources: int) -> None:
-    print_note(f"round {number + 1}: {sources} sources")
 
 
 def _write(found: Survey, folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Boxes of a map on the workers of a dask cluster.
+"""Boxes of a map, or other pieces of work, on the workers of a dask cluster.
 
 The results come back to this process, which alone writes them: workers need no disk in common, only magloc.
 """
@@ -9,16 +9,19 @@ import asyncio
 import logging
 import re
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
+from functools import partial
 from itertools import islice
-from typing import Any
+from typing import Any, TypeVar
 
 from arrays.io.errors import InputError, of_extra
 from magloc.grids.cube import Box, Chunk, CubeMap, computed
 
-# Boxes sent ahead for every worker: one that it computes, one that it has ready.
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+# Items sent ahead for every worker: one that it computes, one that it has ready.
 _PER_WORKER = 2
 # Those of TLS need dask's own configuration besides.
 _ADDRESS = re.compile(r"(?:(?:tcp|tls)://)?(?:[^\s/:@\[\]]+|\[[0-9a-fA-F:.]+\]):(?P<port>[0-9]{1,5})")
@@ -39,17 +42,24 @@ def check_address(scheduler: str) -> None:
 
 
 def computed_by(scheduler: str, cube: CubeMap, wanted: Iterable[Box], timeout_s: float = 10.0) -> Iterator[Chunk]:
-    """Values of boxes, as they become ready, from the workers of a dask scheduler; a few boxes a worker at any time."""
+    """Values of boxes, as they become ready, from the workers of a dask scheduler."""
+    return worked_by(scheduler, partial(computed, cube), wanted, timeout_s)
+
+
+def worked_by(
+    scheduler: str, work: Callable[[Item], Result], items: Iterable[Item], timeout_s: float = 10.0
+) -> Iterator[Result]:
+    """Results as they become ready, from the workers of a dask scheduler; a few items a worker at any time."""
     check_address(scheduler)
     with of_extra("cluster", "a scheduler"):
         from distributed import as_completed
-    waiting = iter(wanted)
+    waiting = iter(items)
     with _client(scheduler, timeout_s) as client:
         try:
             running = as_completed(loop=client.loop)
             while True:
-                for box in islice(waiting, max(0, _PER_WORKER * len(client.nthreads()) - running.count())):
-                    running.add(client.submit(_computed_by_worker, cube, box, pure=False))
+                for item in islice(waiting, max(0, _PER_WORKER * len(client.nthreads()) - running.count())):
+                    running.add(client.submit(_by_worker, work, item, pure=False))
                 if running.is_empty():
                     return
                 yield next(running).result()
@@ -59,13 +69,13 @@ def computed_by(scheduler: str, cube: CubeMap, wanted: Iterable[Box], timeout_s:
             raise SchedulerError(f"scheduler {scheduler}: a worker failed ({type(error).__name__}: {error}).") from None
 
 
-def _computed_by_worker(cube: CubeMap, box: Box) -> Chunk:
+def _by_worker(work: Callable[[Item], Result], item: Item) -> Result:
     import numba
     from distributed import get_worker
 
     with _one_chunk:
         numba.set_num_threads(min(get_worker().state.nthreads, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
-        return computed(cube, box)
+        return work(item)
 
 
 @contextmanager

@@ -41,13 +41,12 @@ def survey_figure(found: Survey) -> Figure:
     >>> field = sims.simulate(scenario, seed=1)
     >>> figure = magloc.plots.survey(magloc.survey(field.array, field.readings))
     """
-    record = found.record
-    x, y = (record.sensors_m[..., axis].mean(axis=1) for axis in range(2))
+    x, y, _ = found.rows.place_m.T
     height = style.WIDTH_IN * 0.5 * float(np.clip(np.ptp(y) / max(np.ptp(x), 1e-9), 0.4, 1.6)) + 1.0
     figure = style.new_figure(height)
-    rows = slice(None, None, -(-len(record) // _MOST_POINTS))
+    rows = slice(None, None, -(-len(x) // _MOST_POINTS))
     both = figure.subplots(1, 2, sharex=True, sharey=True)
-    before, after = (record.along_ambient(values)[rows] * 1e9 for values in (record.values_T, found.residual_T))
+    before, after = (values[rows] * 1e9 for values in (found.rows.anomaly_T, found.rows.residual_T))
     for ax, values, title in zip(both, (before, after), ("anomaly", "less the targets' fields"), strict=True):
         _draw_values(figure, ax, x[rows], y[rows], values)
         style.dress(ax, _ACROSS, _UP, title)

@@ -13,8 +13,8 @@ from scipy.optimize import minimize_scalar
 from arrays.typing import IntArray
 from magloc.navigation.poses import vectors_at
 from magloc.readings import Readings
-from magloc.surveying.joint_fit import Sources
-from magloc.surveying.record import SurveyRecord
+from magloc.surveying.fit.joint_fit import Sources
+from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.rounds import Model
 
 _STEP_M = 0.05  # of the way, for the curvature of the likelihood

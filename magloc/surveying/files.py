@@ -10,7 +10,7 @@ from arrays.io.csv import Column
 from arrays.io.world_maps import feature, feature_collection, kml, placemark, world_place
 from arrays.typing import Vector
 from magloc.surveying.results import IRON_Am2_PER_KG, Survey
-from magloc.truth import state_columns
+from magloc.truth import TRUE_POSITION_COLUMNS, state_columns
 
 
 def json_of_survey(found: Survey) -> dict[str, Any]:
@@ -33,7 +33,7 @@ def json_of_survey(found: Survey) -> dict[str, Any]:
     ]
     return {
         "targets": targets,
-        "rows": len(found.record),
+        "rows": len(found.rows.time_s),
         "seconds": found.seconds,
         "threshold": found.threshold,
         "chi2_per_dof": found.chi2_per_dof,
@@ -58,11 +58,11 @@ def columns_of_survey(found: Survey) -> dict[str, Column]:
 
 def residual_columns(found: Survey) -> dict[str, Column]:
     """Columns of ``residual.csv``: every row's anomaly, and what the targets leave of it."""
-    record = found.record
-    columns: dict[str, Column] = {"time_s": record.time_s}
-    columns |= dict(zip(("x_m", "y_m", "z_m"), record.sensors_m.mean(axis=1).T, strict=True))
-    columns["anomaly_nT"] = 1e9 * record.along_ambient(record.values_T)
-    columns["residual_nT"] = 1e9 * record.along_ambient(found.residual_T)
+    rows = found.rows
+    columns: dict[str, Column] = {"time_s": rows.time_s}
+    columns |= dict(zip(TRUE_POSITION_COLUMNS, rows.place_m.T, strict=True))
+    columns["anomaly_nT"] = 1e9 * rows.anomaly_T
+    columns["residual_nT"] = 1e9 * rows.residual_T
     return columns
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from arrays.pose import PoseUncertainty
 from magloc.measurement.pose import PoseErrors
-from magloc.surveying.joint_fit import Sources
+from magloc.surveying.fit.joint_fit import Sources
 from magloc.surveying.rounds import Model
 
 UNSTATED = PoseUncertainty(position_m=0.02, attitude_rad=math.radians(0.5))

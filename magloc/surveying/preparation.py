@@ -14,11 +14,11 @@ from arrays.typing import BoolArray, FloatArray
 from magloc.measurement.pose import PoseErrors, with_stated_pose
 from magloc.measurement.rows import check_magnitudes
 from magloc.readings import Readings, without_saturated
+from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.pose_components import UNSTATED
-from magloc.surveying.record import SurveyRecord
 
 _LOG = logging.getLogger(__name__)
-_FEWEST_ROWS = 20
+FEWEST_ROWS = 20
 _WILD, _NEIGHBOURS = 15.0, 20  # over the medians of all rows and of so many on either side
 _MOST_WILD = 0.25  # of all readings: more are not
 _LONGEST_RUN = 25  # of the same reading, over what the liveliest sensor repeats
@@ -49,14 +49,15 @@ def whole_rows(array: SensorArray, readings: Readings) -> tuple[SensorArray, Rea
             _LOG.warning(f"sensor {sensor.id} sticks in {stuck[:, i].sum()} of {len(missing)} rows, which are left out")
     if wild[:, kept].any():
         _LOG.warning(f"{wild[:, kept].sum()} readings leap and come back: their rows are left out")
-    if whole.sum() < _FEWEST_ROWS:
-        raise ValueError(f"Input readings must have {_FEWEST_ROWS} whole rows or more; instead received {whole.sum()}.")
+    if whole.sum() < FEWEST_ROWS:
+        raise ValueError(f"Input readings must have {FEWEST_ROWS} whole rows or more; instead received {whole.sum()}.")
     readings = replace(readings, values_T=readings.values_T[:, np.isin(owner, kept)])[whole]
     if not (np.diff(readings.time_s) > 0.0).all():
         raise ValueError("Input readings must be in order of time; instead received others.")
     array = replace(array, sensors=tuple(array.sensors[i] for i in kept))
     array = with_stated_pose(array, readings)
-    return (replace(array, pose=UNSTATED) if array.pose is None else array), readings
+    array = replace(array, pose=UNSTATED) if array.pose is None else array
+    return array, replace(readings, ambient_T=_ambient_T(array, readings))
 
 
 def stuck_readings(array: SensorArray, values: FloatArray) -> BoolArray:
@@ -92,11 +93,11 @@ def wild_readings(values: FloatArray) -> BoolArray:
 
 
 def record_of(array: SensorArray, readings: Readings) -> tuple[SurveyRecord, PoseErrors]:
-    """Anomalies of whole rows in the world frame, and the errors of their pose."""
+    """Anomalies of whole rows in the world frame, offsets of the sensors with them, and the errors of their pose."""
     assert array.pose is not None
     errors = PoseErrors.of(array.pose)
-    record = SurveyRecord.of(array, readings, _ambient_T(array, readings), errors)
-    return replace(record, values_T=record.values_T - np.median(record.values_T, axis=0)), errors
+    assert readings.ambient_T is not None
+    return SurveyRecord.of(array, readings, readings.ambient_T, errors), errors
 
 
 def _ambient_T(array: SensorArray, readings: Readings) -> FloatArray:

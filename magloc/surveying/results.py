@@ -6,18 +6,17 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, overload
 
 import numpy as np
 from scipy.special import chdtri
 
+from arrays.array import SensorArray
 from arrays.io.lazy import by_name
 from arrays.typing import FloatArray, Vector
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from magloc.surveying.record import SurveyRecord
 
 IRON_Am2_PER_KG = (0.05, 0.3)
 """Moment of a kilogram of iron in the ground: a range, as its remanence and shape are not known."""
@@ -85,6 +84,15 @@ class Target:
         return float(major), float(minor), math.degrees(math.atan2(vectors[0, 1], vectors[1, 1])) % 180.0
 
 
+class SurveyRows(NamedTuple):
+    """Of n rows: time, place (n, 3), anomaly along the ambient field, mean of the sensors, and what targets leave."""
+
+    time_s: FloatArray
+    place_m: FloatArray
+    anomaly_T: FloatArray
+    residual_T: FloatArray
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Survey:
     """What a survey found.
@@ -93,10 +101,10 @@ class Survey:
     ----------
     targets : tuple of Target
         The most significant one first.
-    record : SurveyRecord
-        The rows, in the world frame.
-    residual_T : ndarray, shape (n, C)
-        Anomalies less the targets' fields: geology, drift and noise.
+    array : SensorArray
+        The sensors that were used, and what their pose was taken for.
+    rows : SurveyRows
+        Every row's anomaly, and what the targets leave of it.
     ground_m : float
         Height of the ground in the world frame.
     threshold : float
@@ -104,7 +112,7 @@ class Survey:
     chi2_per_dof : float
         Of all white residuals: 1 where what is stated of the errors is right.
     pose_assumed : bool
-        Whether nothing was stated of the pose's errors, so that they are what the rows tell: `record.array.pose`.
+        Whether nothing was stated of the pose's errors, so that they are what the rows tell: `array.pose`.
     lag_s : float
         How much later the readings were taken for than they were, as the targets showed and as was corrected: 0 where
         they showed nothing.
@@ -122,8 +130,8 @@ class Survey:
     """
 
     targets: tuple[Target, ...]
-    record: SurveyRecord
-    residual_T: FloatArray
+    array: SensorArray
+    rows: SurveyRows
     ground_m: float
     threshold: float
     chi2_per_dof: float
@@ -145,7 +153,7 @@ class Survey:
         return self.targets[index]
 
     def __repr__(self) -> str:
-        return f"Survey: {len(self)} target{'s' * (len(self) != 1)}, {len(self.record)} rows"
+        return f"Survey: {len(self)} target{'s' * (len(self) != 1)}, {len(self.rows.time_s)} rows"
 
     @cached_property
     def position_m(self) -> FloatArray:

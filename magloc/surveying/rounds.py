@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from arrays.typing import FloatArray, IntArray
 from magloc.measurement.pose import PoseErrors
-from magloc.surveying.joint_fit import Background, Bounds, JointFit, Layer, Sources, fit_jointly, residual_of
-from magloc.surveying.record import SurveyRecord
+from magloc.surveying.fit.joint_fit import Background, Bounds, JointFit, Layer, Sources, fit_jointly, residual_of
+from magloc.surveying.fit.record import SurveyRecord
+from magloc.surveying.fit.whitening import Drift
 from magloc.surveying.search import SearchGrid, peaks, search, sources_at
-from magloc.surveying.whitening import Drift
 
 MOST_ROUNDS = 60
-_MOST_IN_VAIN, _MISFIT = 8, 1.5  # rounds where χ² per reading says that no further source is what is missing
+_MOST_IN_VAIN = 4  # rounds: beside strong sources, and at the rims of tiles, there is always something left to try
+_MOST_OF_MISFITS, _MISFIT = 8, 1.5  # and as long as χ² per reading says that something is missing
 _PROGRESS, _WORSE = 0.999, 1.02
 _MOST_AT_ONCE = 8
 _SAME_PLACE_M = 1e-6
@@ -54,7 +54,7 @@ class Model:
     def misfit(self, sources: Sources, group: IntArray) -> float:
         """Minus twice the log-likelihood of some sources, but for a constant; the ground is Gaussian."""
         background = self.background(sources, group)
-        fields = self.record.fields(sources.position_m, sources.moment_Am2)
+        fields = sources.fields(self.record)
         residual = residual_of(self.record, background, fields)
         of_layer = background.Q.T @ residual
         square = float(residual @ residual - of_layer @ of_layer)
@@ -82,10 +82,8 @@ class Model:
         return fit, background
 
 
-def found_in(
-    model: Model, group: IntArray, grid: SearchGrid, known: Sources, most: int, tell: Callable[[int, int], None]
-) -> Sources:
-    """Sources of a record whose rows count in groups, after some rounds; ``tell`` hears of each and of their number."""
+def found_in(model: Model, group: IntArray, grid: SearchGrid, known: Sources, most: int) -> Sources:
+    """Sources of a record whose rows count in groups, after some rounds."""
     stated = model.errors.uncertainty.position_m
     share = max(1.0, _POSE_WHILE_SEARCHING_M / stated) if stated else 1.0
     wide = replace(model, record=replace(model.record, pose_effects=share * model.record.pose_effects))
@@ -93,18 +91,17 @@ def found_in(
     in_vain = 0
     tried: FloatArray = np.zeros((0, 3))
     least = math.inf
-    for number in range(most):
+    for _ in range(most):
         fit, background = wide.fitted(sources, group, _SETTLED_COARSELY)
-        tell(number, len(fit.sources))
         at_once = _MOST_AT_ONCE
         if fit.chi2 > _WORSE * least:
             # Too many at a time led away: back, and one by one from there.
             fit, background = wide.fitted(best, group, _SETTLED_COARSELY)
             at_once = 1
-        elif fit.chi2 < _PROGRESS * least:
+        elif fit.chi2 < min(_PROGRESS * least, least - model.threshold):
             tried, in_vain = np.zeros((0, 3)), 0
         in_vain += 1
-        if in_vain > _MOST_IN_VAIN and fit.chi2 > _MISFIT * fit.residual.size:
+        if in_vain > (_MOST_OF_MISFITS if fit.chi2 > _MISFIT * fit.residual.size else _MOST_IN_VAIN):
             break
         best, least = fit.sources, min(least, fit.chi2)
         candidates = search(wide.record, background, fit, grid)

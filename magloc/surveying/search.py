@@ -10,10 +10,10 @@ import numpy as np
 from numba import get_num_threads
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.surveying.joint_fit import Background, JointFit, Sources, with_free_sources
-from magloc.surveying.record import SurveyRecord
-from magloc.surveying.whitening import Whitening
-from magloc.surveying.whitening_compiled import moment_columns, whiten
+from magloc.surveying.fit.joint_fit import Background, JointFit, Sources, with_free_sources
+from magloc.surveying.fit.record import SurveyRecord
+from magloc.surveying.fit.whitening import Whitening
+from magloc.surveying.fit.whitening_compiled import moment_columns, whiten
 
 N_DISTANCES = 5
 PITCH = 1.8
@@ -68,7 +68,7 @@ class SearchGrid:
 def search(record: SurveyRecord, background: Background, fit: JointFit, grid: SearchGrid) -> Candidates:
     """χ² of one more source at every place of a grid, with the sources so far free to move."""
     white = background.white
-    fields = record.fields(fit.sources.position_m, fit.sources.moment_Am2)
+    fields = fit.sources.fields(record)
     directions = record.directions(fields)
     Q = with_free_sources(record, background, fit.sources)
     left = fit.residual - Q @ (Q.T @ fit.residual)

@@ -3,44 +3,34 @@
 from __future__ import annotations
 
 import logging
-import math
+import os
+import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+from numba import get_num_threads
 from scipy.special import chdtri
 
 from arrays.array import SensorArray
-from arrays.typing import FloatArray, IntArray
 from magloc.blas_threads import one_blas_thread
+from magloc.grids.work import Arrays, workers
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.readings import Readings
-from magloc.surveying.clock import lag_of, taken_earlier
-from magloc.surveying.depth import depth_interval
-from magloc.surveying.joint_fit import Background, Bounds, JointFit, Layer, Sources
-from magloc.surveying.pose_components import with_likeliest_pose
-from magloc.surveying.preparation import record_of, whole_rows
-from magloc.surveying.record import SurveyRecord, joined
-from magloc.surveying.results import Survey, Target
-from magloc.surveying.rounds import MOST_ROUNDS, Model, found_in
-from magloc.surveying.search import PITCH, SearchGrid
-from magloc.surveying.whitening import Drift
+from magloc.surveying.fit.record import joined
+from magloc.surveying.piece import OF_ROWS, Ground, sources_in, strongest_in, targets_in
+from magloc.surveying.preparation import whole_rows
+from magloc.surveying.results import Survey, SurveyRows, Target
+from magloc.surveying.targets import OF_TARGETS
+from magloc.surveying.tiled import TiledSurvey
+from magloc.surveying.tiles import owned
 
 _LOG = logging.getLogger(__name__)
 _TRIALS_PER_M2 = 0.8  # independent ones of a map: 0.65 to 0.9
 _HECTARE_M2 = 1e4
-_FIRST_ROUNDS = 4  # until the clock is looked at
-_DEEPEST = 4.0
-_MARGIN_M = 1.0
-_LARGEST_MOMENT_Am2 = 300.0
-_WEAK = 200.0
-_SETTLED = 1e-3
-_GROUPS_PER_HEIGHT = 4.0
-_NEAR = 1.5
-_MISFIT = 1.5  # χ² per reading
-_MOST_NUMBERS = 2.5e8  # of the columns of the ground: 2 GB
-_MOST_PLACES = 1e6
+_MOST_SWEEPS = 5
+_MISFIT = 2.0
 
 
 @one_blas_thread
@@ -52,7 +42,10 @@ def survey(
     ground_m: float = 0.0,
     shortest_geology_m: float = 15.0,
     false_per_hectare: float = 0.1,
-    progress: Callable[[int, int], None] | None = None,
+    processes: int | None = None,
+    scheduler: str | None = None,
+    unfinished: str | os.PathLike[str] | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> Survey:
     r"""Find all dipoles at rest in the ground that sensors moved over.
 
@@ -61,6 +54,9 @@ def survey(
     changes of the ambient field and of the sensors' offsets (a Kalman filter along time, with the errors of the pose as
     states), and the geology, as an equivalent layer of poles at the depth λ/2.5. Moving sensors do not need to be many:
     one, of either kind, is enough.
+
+    A large survey is cut into tiles with margins, which are surveys of their own. What is found in one is taken from
+    the readings of others that it reaches, and these are searched again, until nothing changes.
 
     Parameters
     ----------
@@ -78,8 +74,14 @@ def survey(
         Shortest wavelength in the field of the ground itself [m]: smaller ones are taken for targets.
     false_per_hectare : float
         False targets that noise alone may make in a hectare, on average: decides how significant one must be.
+    processes : int, optional
+        That work on tiles beside each other; by default as many as compiled code has threads.
+    scheduler : str, optional
+        Address of a dask scheduler, ``tcp://HOST:PORT``, whose workers do it instead.
+    unfinished : str or path-like, optional
+        Folder that keeps what is done of tiles until all are: after an interruption the same call goes on.
     progress : callable, optional
-        Called with the number of every round, and with how many sources are known.
+        Called with a sentence after every tile.
 
     Returns
     -------
@@ -89,13 +91,14 @@ def survey(
     ------
     ValueError
         The readings have no pose or no ambient field, there are too few, or sensors are below the ground.
+    InputError
+        The scheduler cannot be used, or a process died.
 
     Examples
     --------
     >>> import sims
     >>> import magloc
-    >>> from dataclasses import replace
-    >>> scenario = replace(sims.read_scenario("survey-drone"), duration_s=120.0)
+    >>>     >>> scenario = replace(sims.read_scenario("survey-drone"), duration_s=120.0)
     >>> field = sims.simulate(scenario, seed=1)
     >>> found = magloc.survey(field.array, field.readings)
     >>> found[0].position_m.round(1).tolist(), [round(depth, 1) for depth in found[0].depth_interval95_m]
@@ -106,138 +109,72 @@ def survey(
         raise ValueError(f"Input false_per_hectare must be positive; instead received {false_per_hectare:g}.")
     if not shortest_geology_m > 0.0:
         raise ValueError(f"Input shortest_geology_m must be positive; instead received {shortest_geology_m:g}.")
+    if processes is not None and processes < 1:
+        raise ValueError(f"Input processes must be positive; instead received {processes}.")
     rows = readings if isinstance(readings, Readings) else joined(readings)
     assumed = array.pose is None and rows.pose_sigma is None
-    array, rows = whole_rows(array, rows)
-    record, errors = record_of(array, rows)
-    bounds = _bounds(record, prior, ground_m)
-    _refuse_too_large(record, bounds, shortest_geology_m)
     threshold = float(chdtri(3, min(0.5, false_per_hectare / (_HECTARE_M2 * _TRIALS_PER_M2))))
-    height = record.height_m - bounds.high_m[2]
-    group = _groups(record, height / _GROUPS_PER_HEIGHT)
-    spread = float(np.median(np.abs(record.values_T)) * 1.4826)
-    layer = Layer.below(record, shortest_geology_m, max(min(spread, 5e-9), 1e-10))
-    model = Model(record, errors, layer, Drift(), bounds, threshold)
-    grid = SearchGrid.below(record, bounds.low_m, bounds.high_m)
-    tell = progress or (lambda *_: None)
-    strongest = found_in(model, group, grid, Sources.none(), _FIRST_ROUNDS, tell)
-
-    def delayed(lag_s: float) -> SurveyRecord:
-        return record_of(array, taken_earlier(rows, lag_s))[0]
-
-    lag = lag_of(model, strongest, group, delayed)
-    if lag.s:
+    tiled = TiledSurvey.of(*whole_rows(array, rows), Ground(prior, ground_m, shortest_geology_m, threshold))
+    tell: Callable[[str], None] = progress or (lambda _: None)
+    folder = None if unfinished is None else Path(unfinished)
+    every = range(len(tiled.tiles))
+    at_once = min(get_num_threads() if processes is None else processes, len(every))
+    with workers(at_once, scheduler, folder) as each:
+        tiled, lag = tiled.searched(strongest_in, every, each, tell).on_time()
+        if lag.s:
+            _LOG.warning(
+                f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show: taken"
+                " into account"
+            )
+        due: Sequence[int] = every
+        for _ in range(_MOST_SWEEPS):
+            tiled = tiled.searched(sources_in, due, each, tell)
+            due = tiled.changed()
+            if not due:
+                break
+        else:
+            _LOG.warning(f"{len(due)} of {len(every)} tiles do not agree with others on what lies beside them")
+        if assumed:
+            tiled = tiled.with_likeliest_pose()
+        results = tiled.measured(targets_in, each, tell)
+    if folder is not None:
+        shutil.rmtree(folder, ignore_errors=True)
+    chi2_per_dof = float(sum(result["chi2"] for result in results) / sum(result["size"] for result in results))
+    if chi2_per_dof > _MISFIT:
         _LOG.warning(
-            f"the readings are {lag.s:.3f} ± {lag.sigma_s:.3f} s later than their poses, as the targets show: taken"
-            " into account"
+            f"χ² per reading is {chi2_per_dof:.1f}: noise, errors of the pose or changes of the field are larger than"
+            " is stated, and so are the errors of the targets"
         )
-        model = replace(model, record=delayed(lag.s))
-    sources = found_in(model, group, grid, strongest, MOST_ROUNDS, tell)
-    every = np.arange(len(record))
-    if assumed and len(sources):
-        model = with_likeliest_pose(model, model.fitted(sources, every, _SETTLED)[0].sources)
-    record = model.record
-    fit, background = model.fitted(sources, every, _SETTLED)
-    residual = record.values_T - record.predicted(record.fields(fit.sources.position_m, fit.sources.moment_Am2))
-    if fit.chi2 > 2.0 * fit.residual.size:
-        _LOG.warning(
-            f"χ² per reading is {fit.chi2 / fit.residual.size:.1f}: noise, errors of the pose or changes of the field"
-            " are larger than is stated, and so are the errors of the targets"
-        )
-    targets = _targets(model, fit, background, ground_m)
     return Survey(
-        targets,
-        record,
-        residual,
+        _targets(tiled, results),
+        tiled.array,
+        _rows(tiled, results),
         ground_m,
         threshold,
-        fit.chi2 / fit.residual.size,
+        chi2_per_dof,
         assumed,
         lag.s,
         time.monotonic() - began,
     )
 
 
-def _bounds(record: SurveyRecord, prior: SourcePrior, ground_m: float) -> Bounds:
-    low, high = record.sensors_m.min(axis=(0, 1)), record.sensors_m.max(axis=(0, 1))
-    if low[2] <= ground_m:
-        raise ValueError(
-            f"Input ground_m must be below all sensors; instead received {ground_m:g} m with one at {low[2]:g} m."
-        )
-    own_low = np.array([low[0] - _MARGIN_M, low[1] - _MARGIN_M, ground_m - _DEEPEST])
-    own_high = np.array([high[0] + _MARGIN_M, high[1] + _MARGIN_M, ground_m - 0.05])
-    low_m, high_m = (
-        np.where(np.isfinite(given), given, own) for given, own in ((prior.low_m, own_low), (prior.high_m, own_high))
-    )
-    if not (low_m < high_m).all():
-        raise ValueError("Input prior must leave room below the ground; instead received bounds that do not.")
-    return Bounds(low_m, high_m, min(prior.largest_moment_Am2, _LARGEST_MOMENT_Am2))
-
-
-def _refuse_too_large(record: SurveyRecord, bounds: Bounds, shortest_geology_m: float) -> None:
-    """Raise where the ground's columns would not fit into memory, or its places not into a day."""
-    height = record.height_m
-    x, y = (bounds.high_m - bounds.low_m)[:2]
-    pitch = max(height - bounds.high_m[2], 0.3) / PITCH
-    spacing = shortest_geology_m / 3.75
-    numbers = len(record) * record.array.n_channels * (x / spacing + 5.0) * (y / spacing + 5.0)
-    if numbers > _MOST_NUMBERS or x * y / pitch**2 > _MOST_PLACES:
-        raise ValueError(
-            f"Input readings must be cut into smaller pieces; instead received {len(record)} rows over {x:.3g} m by "
-            f"{y:.3g} m, {height - bounds.high_m[2]:.2g} m above the ground."
-        )
-
-
-def _groups(record: SurveyRecord, length_m: float) -> IntArray:
-    """Group of every row (n,): rows that pass within a length count as one."""
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(record.sensors_m.mean(axis=1), axis=0), axis=1))])
-    step = float(np.median(np.diff(way)))
-    together = max(1, math.floor(length_m / step)) if step > 0.0 else 1
-    return np.arange(len(record)) // together
-
-
-def _targets(model: Model, fit: JointFit, background: Background, ground_m: float) -> tuple[Target, ...]:
-    """Targets of a fit, the most significant one first."""
-    if not len(fit.sources):
-        return ()
-    covariance, significance = fit.covariance, fit.significance
-    left = (fit.residual - background.Q @ (background.Q.T @ fit.residual)).reshape(len(background.white.H), -1)
-    order = np.argsort(-significance)
+def _targets(tiled: TiledSurvey, results: Sequence[Arrays]) -> tuple[Target, ...]:
+    """Targets of all tiles, the most significant one first."""
+    kept = owned(tiled.tiles, [result["position_m"] for result in results], tiled.same_m)
+    kept.sort(key=lambda where: -results[where[0]]["significance"][where[1]])
     targets = []
-    for number, j in enumerate(order, start=1):
-        position, own = fit.sources.position_m[j], covariance[6 * j : 6 * j + 6, 6 * j : 6 * j + 6]
-        depth, sigma = ground_m - float(position[2]), math.sqrt(own[2, 2])
-        interval = (max(0.0, depth - 1.96 * sigma), depth + 1.96 * sigma)
-        flags = []
-        if significance[j] < _WEAK:
-            flags.append("weak")
-            interval = depth_interval(model, fit, background, int(j), ground_m)
-        apart = np.linalg.norm(fit.sources.position_m - position, axis=1)
-        apart[j] = math.inf
-        if apart.min() < _NEAR * depth + 0.5:
-            flags.append("near")
-        if _misfit(model, left, position):
-            flags.append("misfit")
-        rim = np.minimum(position - model.bounds.low_m, model.bounds.high_m - position)
-        if (rim[:2] < 0.3).any() or rim[2] < 0.02:
-            flags.append("edge")
-        targets.append(
-            Target(
-                f"t{number}",
-                position,
-                fit.sources.moment_Am2[j],
-                own,
-                depth,
-                interval,
-                float(significance[j]),
-                tuple(flags),
-            )
-        )
+    for number, (t, k) in enumerate(kept, start=1):
+        position, moment, covariance, interval, significance, flags = (results[t][name][k] for name in OF_TARGETS)
+        depth = tiled.ground.ground_m - float(position[2])
+        chi2, words = float(significance), tuple(str(flags).split())
+        interval95 = (float(interval[0]), float(interval[1]))
+        targets.append(Target(f"t{number}", position, moment, covariance, depth, interval95, chi2, words))
     return tuple(targets)
 
 
-def _misfit(model: Model, left: FloatArray, position: FloatArray) -> bool:
-    """Whether rows (n, k) near a target fit worse than one of ten thousand right models, and by more than a half."""
-    apart = np.linalg.norm(model.record.sensors_m.mean(axis=1)[:, :2] - position[:2], axis=1)
-    near = left[apart < _NEAR * (model.record.height_m - position[2])]
-    return bool(np.sum(near**2) > max(float(chdtri(max(near.size, 1), 1e-4)), _MISFIT * near.size))
+def _rows(tiled: TiledSurvey, results: Sequence[Arrays]) -> SurveyRows:
+    """Rows of all tiles in order of time."""
+    which = np.concatenate([tile.rows[tile.own] for tile in tiled.tiles])
+    order = np.argsort(which)
+    place, anomaly, residual = (np.concatenate([result[name] for result in results])[order] for name in OF_ROWS)
+    return SurveyRows(tiled.readings.time_s[which[order]], place, anomaly, residual)

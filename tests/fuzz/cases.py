@@ -32,6 +32,7 @@ LINES: dict[str, tuple[str, ...]] = {
     "magloc survey": (
         "ground.csv --array ground-array.toml --json",
         "ground.csv --array ground-array.toml --ground-m -0.1 --region=z>-2 --out out",
+        "ground.csv --array ground-array.toml --region=z>-0.3 --threads 1 --json",
     ),
     "magloc locate": (
         "readings.csv --array array.toml --json",

@@ -24,7 +24,9 @@ from magloc.convergence.over_starts import StartsMap, StartsScenario
 from magloc.grids.cluster import check_address, computed_by
 from magloc.grids.cube import boxes, computed_here, in_memory
 from magloc.grids.store import Sweep, open_map
+from magloc.grids.work import workers
 from tests.conftest import REPOSITORY
+from tests.magloc.grids.test_work import ITEMS, squared
 
 pytest.importorskip("distributed")
 dask = pytest.importorskip("dask")
@@ -107,6 +109,13 @@ class TestCluster:
             open_map(tmp_path / "here/map.zarr") as here,
         ):
             xr.testing.assert_equal(far, here)
+
+    def test_other_work(self, cluster):
+        """Of a survey's tiles, for instance."""
+        with workers(1, cluster[0], None) as each:
+            done = dict(each(squared, ITEMS))
+        for number, item in enumerate(ITEMS):
+            np.testing.assert_array_equal(done[number]["square"], item**2)
 
     def test_a_worker_that_fails(self, cluster, cube):
         address, _ = cluster

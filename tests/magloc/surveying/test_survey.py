@@ -80,7 +80,7 @@ class TestTargets:
 
     def test_what_is_left_is_the_ground(self) -> None:
         found = surveyed("survey-drone", 901)
-        assert np.abs(found.residual_T).max() < 0.3 * np.abs(found.record.values_T).max()
+        assert np.abs(found.rows.residual_T).max() < 0.3 * np.abs(found.rows.anomaly_T).max()
 
 
 class TestEmptyField:
@@ -135,7 +135,7 @@ class TestHostileWorld:
         values = readings.values_T.copy()
         values[since:, 1] = values[since, 1]
         found = self.check(replace(readings, values_T=values), caplog, "high sticks in")
-        assert (len(found), found.record.array.ids) == (2, ("low",))
+        assert (len(found), found.array.ids) == (2, ("low",))
 
     @pytest.mark.parametrize("share", [0.001, 0.01])
     def test_wild_readings(self, share: float, caplog: pytest.LogCaptureFixture) -> None:
@@ -179,10 +179,21 @@ class TestBadInput:
         self.refused("ambient field in every row", ambient_T=np.zeros((60, 3)))
 
     def test_too_large(self) -> None:
-        """One row that is a thousand kilometres away."""
-        places = simulated("survey-drone", 904, 0).readings[: self.ROWS].array_position_m
+        """Geology of centimetres would need millions of poles."""
+        field = simulated("survey-drone", 904, 0)
+        with pytest.raises(ValueError, match="smaller pieces"):
+            magloc.survey(field.array, field.readings, shortest_geology_m=0.1)
+
+    def test_a_row_far_away(self, caplog: pytest.LogCaptureFixture) -> None:
+        """One row that is a thousand kilometres away is left out."""
+        field = simulated("survey-drone", 904, 0)
+        places = field.readings.array_position_m
         assert places is not None
-        self.refused("smaller pieces", array_position_m=places + np.outer(np.arange(60) == 30, [1e6, 1e6, 0.0]))
+        wild = places + np.outer(np.arange(len(places)) == 30, [1e6, 1e6, 0.0])
+        with caplog.at_level(logging.WARNING):
+            found = magloc.survey(field.array, replace(field.readings, array_position_m=wild))
+        assert "far from all others are left out: 1" in caplog.text
+        assert (len(found), len(found.rows.time_s)) == (0, len(places) - 1)
 
     def test_few_rows(self) -> None:
         self.refused("20 whole rows", values_T=np.full((60, 2), np.nan))
@@ -203,7 +214,7 @@ class TestOutputs:
     def test_table_has_a_line_for_each(self) -> None:
         found = surveyed("survey-drone", 901)
         assert len(found.table().splitlines()) == 2 + len(found)
-        assert repr(found) == f"Survey: 2 targets, {len(found.record)} rows"
+        assert repr(found) == f"Survey: 2 targets, {len(found.rows.time_s)} rows"
 
     def test_geojson_is_where_it_is(self) -> None:
         pytest.importorskip("pymap3d")
@@ -226,7 +237,7 @@ class TestOutputs:
         field = simulated("survey-drone", 901)
         found = magloc.survey(arrays.SensorArray(field.array.sensors), field.readings)
         assert found.pose_assumed
-        assert found.record.array.pose is not None
+        assert found.array.pose is not None
         # 2.4 cm that last 10 s; two targets tell it by a factor of two or so.
-        assert found.record.array.pose.position_m in (0.01, 0.02, 0.04)
-        assert found.record.array.pose.correlation_s >= 2.0
+        assert found.array.pose.position_m in (0.01, 0.02, 0.04)
+        assert found.array.pose.correlation_s >= 2.0

@@ -13,7 +13,7 @@ from arrays.typing import FloatArray
 from magloc.fields import dipole
 from magloc.measurement.pose import PoseErrors
 from magloc.readings import Readings
-from magloc.surveying.record import SurveyRecord, joined, shortest_turns
+from magloc.surveying.fit.record import SurveyRecord, joined, shortest_turns
 
 RNG = np.random.default_rng(3)
 N = 6

@@ -6,7 +6,7 @@ import numpy as np
 
 from arrays.typing import FloatArray
 from magloc.fields import dipole
-from magloc.surveying.whitening_compiled import gains_of, moment_columns, pole_columns, source_columns, whiten
+from magloc.surveying.fit.whitening_compiled import gains_of, moment_columns, pole_columns, source_columns, whiten
 
 N, K, S = 40, 2, 5
 RNG = np.random.default_rng(5)

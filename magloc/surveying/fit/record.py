@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from arrays.array import SensorArray
 from arrays.pose import PoseUncertainty
 from arrays.typing import BoolArray, FloatArray
+from magloc.fields import dipole
 from magloc.fields.dipole_compiled import field_at_points
 from magloc.measurement.pose import LEVER, N_POSE, SHIFT, TURN, PoseErrors, rates_of
 from magloc.navigation.rotations import cross_matrix
@@ -46,6 +47,8 @@ class SurveyRecord:
         Anomalies: calibrated, less what the ambient field alone gives.
     pose_effects : ndarray, shape (n, 9, q)
         Of errors of the pose, of unit variance, on turn, shift and lever arm.
+    beside_T, gradient_beside_T_m : ndarray, shapes (n, N, 3) and (n, N, 3, 3), or 0
+        Field and its gradient of sources that are known: what is fitted adds to them.
     """
 
     array: SensorArray
@@ -55,6 +58,8 @@ class SurveyRecord:
     ambient_T: FloatArray
     values_T: FloatArray
     pose_effects: FloatArray
+    beside_T: FloatArray | float = 0.0
+    gradient_beside_T_m: FloatArray | float = 0.0
 
     @classmethod
     def of(cls, array: SensorArray, readings: Readings, ambient_T: FloatArray, errors: PoseErrors) -> SurveyRecord:
@@ -93,14 +98,20 @@ class SurveyRecord:
         """Channels of vector sensors, three by three."""
         return ~self.array.channel_is_scalar
 
-    def rows(self, which: FloatArray | slice) -> SurveyRecord:
-        """Some of the rows."""
-        parts = (self.time_s, self.sensors_m, self.R_world_from_array, self.ambient_T, self.values_T, self.pose_effects)
-        return SurveyRecord(self.array, *(part[which] for part in parts))
+    def beside(self, position_m: FloatArray, moment_Am2: FloatArray) -> SurveyRecord:
+        """The same rows where more sources (K, 3) are known."""
+        field = self.fields(position_m, moment_Am2)
+        return replace(self, beside_T=field, gradient_beside_T_m=self.gradients(position_m, moment_Am2))
 
     def fields(self, position_m: FloatArray, moment_Am2: FloatArray) -> FloatArray:
-        """Field (n, N, 3) of sources (K, 3) together at the sensors."""
-        return field_at_points(self.sensors_m.reshape(-1, 3), position_m, moment_Am2).reshape(self.sensors_m.shape)
+        """Field (n, N, 3) of sources (K, 3) together at the sensors, and of those that are known."""
+        own = field_at_points(self.sensors_m.reshape(-1, 3), position_m, moment_Am2).reshape(self.sensors_m.shape)
+        return np.asarray(own + self.beside_T)
+
+    def gradients(self, position_m: FloatArray, moment_Am2: FloatArray) -> FloatArray:
+        """Gradients (n, N, 3, 3) of the same."""
+        own = dipole.total_gradient_tensor(self.sensors_m, position_m, moment_Am2)
+        return np.asarray(own + self.gradient_beside_T_m)
 
     def predicted(self, fields_T: FloatArray) -> FloatArray:
         """Anomalies (n, C) of fields (n, N, 3) beside the ambient one."""

@@ -15,11 +15,10 @@ import numpy as np
 from scipy.linalg import cho_factor, solve_triangular
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.fields import dipole
 from magloc.measurement.pose import PoseErrors
-from magloc.surveying.record import SurveyRecord
-from magloc.surveying.whitening import Drift, Whitening
-from magloc.surveying.whitening_compiled import pole_columns, source_columns
+from magloc.surveying.fit.record import SurveyRecord
+from magloc.surveying.fit.whitening import Drift, Whitening
+from magloc.surveying.fit.whitening_compiled import pole_columns, source_columns
 
 _MOST_STEPS = 25
 _SETTLED = 1e-3
@@ -44,6 +43,10 @@ class Sources:
     def some(self, which: BoolArray | IntArray) -> Sources:
         """Those of a mask or of indices."""
         return Sources(self.position_m[which], self.moment_Am2[which])
+
+    def fields(self, record: SurveyRecord) -> FloatArray:
+        """Field (n, N, 3) of these, and of those that a record knows, at its sensors."""
+        return record.fields(self.position_m, self.moment_Am2)
 
     def with_more(self, others: Sources) -> Sources:
         """These and others."""
@@ -114,8 +117,8 @@ class Background:
         group: IntArray,
     ) -> Background:
         """With errors of the pose as the field of the sources makes them felt."""
-        fields = record.fields(sources.position_m, sources.moment_Am2)
-        gradients = dipole.total_gradient_tensor(record.sensors_m, sources.position_m, sources.moment_Am2)
+        fields = sources.fields(record)
+        gradients = record.gradients(sources.position_m, sources.moment_Am2)
         directions = record.directions(fields)
         white = Whitening.of(record, record.by_pose(directions, fields, gradients), errors, drift, group)
         columns = [layer.columns(record, directions, white), white(record.by_sensors(directions))]
@@ -127,7 +130,7 @@ def with_free_sources(record: SurveyRecord, background: Background, sources: Sou
     Q = background.Q
     if not len(sources):
         return Q
-    J = jacobian_of(record, background, sources, record.fields(sources.position_m, sources.moment_Am2))
+    J = jacobian_of(record, background, sources, sources.fields(record))
     J = J - Q @ (Q.T @ J)
     return np.concatenate([Q, orthogonal(_UNKNOWN * J / np.linalg.norm(J, axis=0))], axis=1)
 
@@ -232,7 +235,7 @@ def fit_jointly(
     """Levenberg-Marquardt from some sources, the noise held."""
 
     def cost_of(sources: Sources) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-        fields = record.fields(sources.position_m, sources.moment_Am2)
+        fields = sources.fields(record)
         residual = residual_of(record, background, fields)
         of_layer = background.Q.T @ residual
         return float(residual @ residual - of_layer @ of_layer), residual, of_layer, fields

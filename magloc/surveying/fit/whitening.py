@@ -18,8 +18,8 @@ import numpy as np
 from arrays.typing import FloatArray, IntArray
 from magloc.measurement.nuisances import without_lasting_errors
 from magloc.measurement.pose import PoseErrors
-from magloc.surveying.record import SurveyRecord
-from magloc.surveying.whitening_compiled import gains_of, whiten
+from magloc.surveying.fit.record import SurveyRecord
+from magloc.surveying.fit.whitening_compiled import gains_of, whiten
 
 OFFSET_T = 1e-6
 """Standard deviation of what a sensor's offset may be at first."""

@@ -1,4 +1,4 @@
-"""Compiled loops of :mod:`magloc.surveying.whitening`; tests hold them to whole covariances and to the dipole."""
+"""Compiled loops of :mod:`magloc.surveying.fit.whitening`; tests hold them to whole covariances and to the dipole."""
 
 from __future__ import annotations
 

@@ -1,0 +1,33 @@
+"""Processes of this machine that compute beside each other."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
+
+
+@contextmanager
+def process_pool(processes: int) -> Iterator[ProcessPoolExecutor]:
+    """New interpreters of one thread each, ended at once where the block is left by an exception.
+
+    A fork of a process with threads, such as those of compiled code, may never come back.
+    """
+    pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"), initializer=_prepare)
+    try:
+        yield pool
+    except BaseException:
+        for process in list((pool._processes or {}).values()):  # what a pool has no public name for before 3.14
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _prepare() -> None:
+    """Settings of a process: one thread, and an interruption is the business of the process that started it."""
+    os.environ["NUMBA_NUM_THREADS"] = "1"  # compiled code is not loaded yet
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,0 +1,109 @@
+"""Independent pieces of work: here, in processes or on a cluster, and kept in a folder until all are done."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import pickle
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from importlib.metadata import version
+from itertools import islice
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arrays.io.errors import InputError
+from arrays.io.text import replaced
+from magloc.grids.cluster import check_address, worked_by
+from magloc.grids.pool import process_pool
+
+Arrays = Mapping[str, NDArray[Any]]
+"""What work results in."""
+Work = Callable[[Any], Arrays]
+Each = Callable[[Work, Iterable[Any]], Iterator[tuple[int, Arrays]]]
+"""Numbers of items, in any order, with what some work makes of them."""
+_PER_PROCESS = 2  # items sent ahead: one that it computes, one that it has ready
+
+
+@contextmanager
+def workers(processes: int, scheduler: str | None, folder: Path | None) -> Iterator[Each]:
+    """What does work on many items: in processes, or by the workers of a dask scheduler.
+
+    What is done is kept in a folder; what is there of the same work on the same item is not done again.
+    """
+    with ExitStack() as stack:
+        run: Callable[[Callable[[Any], Any], Iterable[Any]], Iterator[Any]] = map
+        if scheduler is not None:
+            check_address(scheduler)
+            run = partial(worked_by, scheduler)
+        elif processes > 1:
+            run = partial(_pooled, stack.enter_context(process_pool(processes)), _PER_PROCESS * processes)
+        yield partial(_each, run, folder)
+
+
+def _each(run: Callable[..., Iterator[Any]], folder: Path | None, work: Work, items: Iterable[Any]) -> Any:
+    paths: dict[int, Path] = {}
+    before: list[tuple[int, Arrays]] = []
+
+    def not_done() -> Iterator[tuple[int, Any]]:
+        for number, item in enumerate(items):
+            if folder is not None:
+                paths[number] = folder / f"{_key(work, item)}.npz"
+                if (result := _read(paths[number])) is not None:
+                    before.append((number, result))
+                    continue
+            yield number, item
+
+    for number, result in run(partial(_numbered, work), not_done()):
+        if folder is not None:
+            _write(paths[number], result)
+        yield number, result
+    yield from before
+
+
+def _pooled(pool: ProcessPoolExecutor, ahead: int, work: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+    waiting = iter(items)
+    running = {pool.submit(work, item) for item in islice(waiting, ahead)}
+    while running:
+        done, running = wait(running, return_when=FIRST_COMPLETED)
+        try:
+            running |= {pool.submit(work, item) for item in islice(waiting, len(done))}
+            yield from [future.result() for future in done]
+        except BrokenProcessPool:
+            raise InputError("a process died, for want of memory perhaps: ask for fewer processes.") from None
+
+
+def _numbered(work: Work, item: tuple[int, Any]) -> tuple[int, Arrays]:
+    return item[0], work(item[1])
+
+
+def _key(work: Work, item: Any) -> str:
+    """Of all that determines a result."""
+    content = pickle.dumps((version("magloc"), work, item), protocol=5)
+    return hashlib.sha256(content).hexdigest()
+
+
+def _read(path: Path) -> Arrays | None:
+    """A result that was kept; None if it is not there or was cut short."""
+    try:
+        with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
+            return dict(file)
+    except (OSError, ValueError, BadZipFile, EOFError):
+        return None
+
+
+def _write(path: Path, result: Arrays) -> None:
+    """Keep a result: whole or not at all, whenever the process ends."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replaced(path) as written, written.open("wb") as file:
+            np.savez(file, allow_pickle=False, **result)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written ({error.strerror or error}).") from None

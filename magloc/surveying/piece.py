@@ -1,0 +1,167 @@
+"""A tile of a survey, or all of a small one, with what is known of it: what one process works on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from arrays.array import SensorArray
+from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.blas_threads import one_blas_thread
+from magloc.grids.work import Arrays
+from magloc.localization.fit.prior import SourcePrior
+from magloc.readings import Readings
+from magloc.surveying.fit.joint_fit import Bounds, Layer, Sources
+from magloc.surveying.fit.record import SurveyRecord
+from magloc.surveying.fit.whitening import Drift
+from magloc.surveying.preparation import record_of
+from magloc.surveying.rounds import MOST_ROUNDS, Model, found_in
+from magloc.surveying.search import PITCH, SearchGrid
+from magloc.surveying.targets import targets_of
+
+OF_ROWS = ("place_m", "anomaly_T", "residual_T")
+_FIRST_ROUNDS = 4  # until the clock is looked at
+_DEEPEST = 4.0
+_MARGIN_M = 1.0
+_LARGEST_MOMENT_Am2 = 300.0
+_SETTLED = 1e-3
+# Rows that pass within such a part of the distance to the nearest sources count as one.
+WHILE_SEARCHING, AT_LAST = 0.25, 0.05
+_MOST_NUMBERS = 2.5e8  # of the columns of the ground: 2 GB
+_MOST_PLACES = 1e6
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What is known of the ground, and what is looked for in it.
+
+    Attributes
+    ----------
+    prior : SourcePrior
+    ground_m, shortest_geology_m : float
+    threshold : float
+        χ² of 3 degrees of freedom that a target must exceed.
+    """
+
+    prior: SourcePrior
+    ground_m: float
+    shortest_geology_m: float
+    threshold: float
+
+    def bounds(self, record: SurveyRecord) -> Bounds:
+        """Where sources may be that rows show, and how strong."""
+        low, high = record.sensors_m.min(axis=(0, 1)), record.sensors_m.max(axis=(0, 1))
+        if low[2] <= self.ground_m:
+            raise ValueError(
+                f"Input ground_m must be below all sensors; instead received {self.ground_m:g} m with one at"
+                f" {low[2]:g} m."
+            )
+        own_low = np.array([low[0] - _MARGIN_M, low[1] - _MARGIN_M, self.ground_m - _DEEPEST])
+        own_high = np.array([high[0] + _MARGIN_M, high[1] + _MARGIN_M, self.ground_m - 0.05])
+        low_m, high_m = (
+            np.where(np.isfinite(given), given, own)
+            for given, own in ((self.prior.low_m, own_low), (self.prior.high_m, own_high))
+        )
+        if not (low_m < high_m).all():
+            raise ValueError("Input prior must leave room below the ground; instead received bounds that do not.")
+        return Bounds(low_m, high_m, min(self.prior.largest_moment_Am2, _LARGEST_MOMENT_Am2))
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """Rows of one tile, and what is known of the sources.
+
+    Attributes
+    ----------
+    array : SensorArray
+    readings : Readings
+    ground : Ground
+    number : ndarray of int, shape (n,)
+        Of every row among all rows.
+    own : ndarray of bool, shape (n,)
+        Rows of the tile itself, not of its margin.
+    offset_T : ndarray, shape (C,)
+        Of the anomalies.
+    geology_T : float
+        How strong the field of the ground is expected to be.
+    known, outside : Sources
+        Of the piece, and others whose field reaches it.
+    """
+
+    array: SensorArray
+    readings: Readings
+    ground: Ground
+    number: IntArray
+    own: BoolArray
+    offset_T: FloatArray
+    geology_T: float
+    known: Sources
+    outside: Sources
+
+    def model(self) -> Model:
+        """Of the rows, with the field of sources outside."""
+        record, errors = record_of(self.array, self.readings)
+        record = replace(record, values_T=record.values_T - self.offset_T)
+        if len(self.outside):
+            record = record.beside(self.outside.position_m, self.outside.moment_Am2)
+        bounds = self.ground.bounds(record)
+        layer = Layer.below(record, self.ground.shortest_geology_m, self.geology_T)
+        x, y = (bounds.high_m - bounds.low_m)[:2]
+        height = record.height_m - bounds.high_m[2]
+        numbers = (self.groups(record, bounds, AT_LAST)[-1] + 1) * record.array.n_channels * len(layer.places_m)
+        if numbers > _MOST_NUMBERS or x * y / (max(height, 0.3) / PITCH) ** 2 > _MOST_PLACES:
+            raise ValueError(
+                f"Input readings must be cut into smaller pieces; instead received {len(record)} rows over {x:.3g} m by"
+                f" {y:.3g} m, {height:.2g} m above the ground."
+            )
+        return Model(record, errors, layer, Drift(), bounds, self.ground.threshold)
+
+    def groups(self, record: SurveyRecord, bounds: Bounds, part: float) -> IntArray:
+        """Group of every row (n,): neighbours that pass within a part of the distance to sources count as one."""
+        steps = np.linalg.norm(np.diff(record.sensors_m.mean(axis=1), axis=0), axis=1)[np.diff(self.number) == 1]
+        step = float(np.median(steps)) if steps.size else 0.0
+        length = part * (record.height_m - bounds.high_m[2])
+        together = max(1, math.floor(length / step)) if step > 0.0 else 1
+        return np.unique(self.number // together, return_inverse=True)[1]
+
+
+@one_blas_thread
+def strongest_in(piece: Piece) -> Arrays:
+    """The strongest sources, after some rounds."""
+    return _rounds_in(piece, _FIRST_ROUNDS)
+
+
+@one_blas_thread
+def sources_in(piece: Piece) -> Arrays:
+    """All sources that are significant."""
+    return _rounds_in(piece, MOST_ROUNDS)
+
+
+def _rounds_in(piece: Piece, most: int) -> Arrays:
+    model = piece.model()
+    grid = SearchGrid.below(model.record, model.bounds.low_m, model.bounds.high_m)
+    group = piece.groups(model.record, model.bounds, WHILE_SEARCHING)
+    return dict(vars(found_in(model, group, grid, piece.known, most)))
+
+
+@one_blas_thread
+def targets_in(piece: Piece) -> Arrays:
+    """The sources that are known, fitted to all rows: parts of targets, and what is left of the tile's rows."""
+    model = piece.model()
+    group = piece.groups(model.record, model.bounds, AT_LAST)
+    fit, background = model.fitted(piece.known, group, _SETTLED)
+    record = model.record
+    left = record.values_T - record.predicted(fit.sources.fields(record))
+    lines = (
+        record.sensors_m.mean(axis=1),
+        record.along_ambient(record.values_T),
+        record.along_ambient(left),
+    )
+    return {
+        **targets_of(model, fit, background, piece.ground.ground_m),
+        **{name: values[piece.own] for name, values in zip(OF_ROWS, lines, strict=True)},
+        "chi2": np.array(fit.chi2),
+        "size": np.array(fit.residual.size),
+    }

@@ -1,0 +1,89 @@
+"""What a fitted source needs to be a target: covariance, interval of the depth, flags."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from arrays.typing import FloatArray
+from magloc.surveying.fit.joint_fit import Background, JointFit, jacobian_of, with_free_sources
+from magloc.surveying.rounds import Model
+from magloc.surveying.search import WINDOW, normal_equations
+
+OF_TARGETS = ("position_m", "moment_Am2", "covariance", "depth_interval95_m", "significance", "flags")
+_WEAK = 200.0
+_NEAR = 1.5
+_MISFIT = 1.5  # χ² per reading
+_N_DEPTHS = 24
+_SPAN = 3.0  # over and under the depth, as a factor
+_STEPS = 5  # of places on each side, in thirds of a standard deviation of the position
+
+
+def depth_interval(
+    model: Model, fit: JointFit, background: Background, which: int, ground_m: float
+) -> tuple[float, float]:
+    """95 % interval of the depth of a source, place and moment free, the others linear."""
+    record, white = model.record, background.white
+    source = fit.sources.some(np.array([which]))
+    others = fit.sources.some(np.delete(np.arange(len(fit.sources)), which))
+    position = source.position_m[0]
+    height = record.height_m - position[2]
+    middles = record.sensors_m.mean(axis=1)[white.starts[:-1], :2]
+    used = np.flatnonzero(np.all(np.abs(middles - position[:2]) < WINDOW * height, axis=1))
+    near = np.linalg.norm(others.position_m[:, :2] - position[:2], axis=1) < 2.0 * WINDOW * height
+    Q = with_free_sources(record, background, others.some(near))
+    # What the source explains itself is put back, to first order: it is weak.
+    own_field = source.fields(record)
+    own = jacobian_of(record, background, source, own_field)[:, 3:] @ source.moment_Am2[0]
+    left = fit.residual + own
+    left = left - Q @ (Q.T @ left)
+    directions = record.directions(fit.sources.fields(record))
+    depth = ground_m - position[2]
+    lowest = ground_m - model.bounds.high_m[2]
+    depths = np.geomspace(max(lowest, depth / _SPAN), min(ground_m - model.bounds.low_m[2], depth * _SPAN), _N_DEPTHS)
+    sigma = np.sqrt(np.diagonal(fit.covariance)[6 * which : 6 * which + 2])
+    offset = np.linspace(-1.5, 1.5, _STEPS)
+    x, y = position[0] + sigma[0] * offset, position[1] + sigma[1] * offset
+    explained = np.empty(_N_DEPTHS)
+    for i, at in enumerate(depths):
+        places = np.stack(np.meshgrid(x, y, [ground_m - at], indexing="ij"), axis=-1).reshape(-1, 3)
+        _, projected, v = normal_equations(record, white, directions, places, used, Q, left)
+        explained[i] = np.sum(v * np.linalg.solve(projected, v[..., None])[..., 0], axis=1).max()
+    inside = np.flatnonzero(explained > explained.max() - chdtri(1, 0.05))
+    low, high = max(inside[0] - 1, 0), min(inside[-1] + 1, _N_DEPTHS - 1)
+    return float(depths[low]), float(depths[high])
+
+
+def targets_of(model: Model, fit: JointFit, background: Background, ground_m: float) -> dict[str, NDArray[Any]]:
+    """Of all sources of a fit: the parts of targets, an entry for each."""
+    sources, K = fit.sources, len(fit.sources)
+    covariance = fit.covariance.reshape(K, 6, K, 6)[np.arange(K), :, np.arange(K)]
+    significance = fit.significance
+    depth, sigma = ground_m - sources.position_m[:, 2], np.sqrt(covariance[:, 2, 2])
+    interval = np.column_stack([np.maximum(0.0, depth - 1.96 * sigma), depth + 1.96 * sigma])
+    weak = significance < _WEAK
+    for j in np.flatnonzero(weak):
+        interval[j] = depth_interval(model, fit, background, int(j), ground_m)
+    apart = np.linalg.norm(sources.position_m[:, None] - sources.position_m, axis=-1) + np.diag(np.full(K, np.inf))
+    rim = np.minimum(sources.position_m - model.bounds.low_m, model.bounds.high_m - sources.position_m)
+    left = (fit.residual - background.Q @ (background.Q.T @ fit.residual)).reshape(len(background.white.H), -1)
+    middles = model.record.sensors_m.mean(axis=1)[background.white.starts[:-1]]
+    flags = {
+        "weak": weak,
+        "near": apart.min(axis=1, initial=np.inf) < _NEAR * depth + 0.5,
+        "misfit": np.array([_misfit(model, middles, left, place) for place in sources.position_m], np.bool_),
+        "edge": (rim[:, :2] < 0.3).any(axis=1) | (rim[:, 2] < 0.02),
+    }
+    words = np.array([" ".join(name for name, set_ in flags.items() if set_[j]) for j in range(K)], np.str_)
+    parts = (sources.position_m, sources.moment_Am2, covariance, interval, significance, words)
+    return dict(zip(OF_TARGETS, parts, strict=True))
+
+
+def _misfit(model: Model, middles: FloatArray, left: FloatArray, position: FloatArray) -> bool:
+    """Whether groups (g, k) near a target fit worse than one of 10,000 right models, and by more than a half."""
+    apart = np.linalg.norm(middles[:, :2] - position[:2], axis=1)
+    near = left[apart < _NEAR * (model.record.height_m - position[2])]
+    return bool(np.sum(near**2) > max(float(chdtri(max(near.size, 1), 1e-4)), _MISFIT * near.size))

@@ -1,0 +1,190 @@
+"""A survey as tiles that exchange what they find."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from arrays.array import SensorArray
+from arrays.typing import FloatArray
+from magloc.fields.dipole_compiled import field_at_points
+from magloc.grids.work import Arrays, Each, Work
+from magloc.localization.fit.prior import SourcePrior
+from magloc.readings import Readings
+from magloc.surveying.clock import Lag, lag_of, taken_earlier
+from magloc.surveying.fit.joint_fit import Sources
+from magloc.surveying.fit.record import SurveyRecord
+from magloc.surveying.piece import AT_LAST, WHILE_SEARCHING, Ground, Piece
+from magloc.surveying.pose_components import with_likeliest_pose
+from magloc.surveying.preparation import FEWEST_ROWS, record_of
+from magloc.surveying.tiles import Tile, owned, tiles_of
+
+_LOG = logging.getLogger(__name__)
+_SAMPLE = 20_000  # rows that tell what is the same everywhere
+_LEAST_GEOLOGY_T, _MOST_GEOLOGY_T = 1e-10, 5e-9
+_SAME = 0.5  # over the distance to the nearest sources: what two tiles find at a seam is one source
+_FELT, _CHANGED = 0.1, 0.3  # of the noise
+_BESIDE_M = 1.0
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class TiledSurvey:
+    """All rows, in tiles, and the sources that are known so far.
+
+    Attributes
+    ----------
+    array : SensorArray
+    readings : Readings
+    ground : Ground
+    tiles : sequence of Tile
+    margin_m, same_m : float
+        Width of the tiles' margins, and distance within which what two tiles find is the same.
+    offset_T : ndarray, shape (C,)
+    geology_T : float
+        Of the anomalies: their medians, and how large they are.
+    sources : Sources
+    found, outside : sequence of Sources
+        What every tile found last, its margin included, and what had been taken from its readings.
+    """
+
+    array: SensorArray
+    readings: Readings
+    ground: Ground
+    tiles: Sequence[Tile]
+    margin_m: float
+    same_m: float
+    offset_T: FloatArray
+    geology_T: float
+    sources: Sources
+    found: Sequence[Sources]
+    outside: Sequence[Sources]
+
+    @classmethod
+    def of(cls, array: SensorArray, readings: Readings, ground: Ground) -> TiledSurvey:
+        """Nothing is known yet."""
+        sample = record_of(array, readings[:: -(-len(readings) // _SAMPLE)])[0]
+        bounds = ground.bounds(sample)
+        offset = np.median(sample.values_T, axis=0)
+        spread = 1.4826 * float(np.median(np.abs(sample.values_T - offset)))
+        reach = sample.height_m - float(bounds.low_m[2])
+        assert readings.array_position_m is not None
+        tiles, margin_m = tiles_of(readings.array_position_m[:, :2], reach)
+        alone = [tile for tile in tiles if len(tile.rows) < FEWEST_ROWS]
+        if alone:
+            rows = sum(int(tile.own.sum()) for tile in alone)
+            _LOG.warning(f"rows that are far from all others are left out: {rows}")
+        tiles = [t for t in tiles if len(t.rows) >= FEWEST_ROWS and _narrowed(ground.prior, t, margin_m) is not None]
+        if not tiles:
+            raise ValueError(f"Input readings must have {FEWEST_ROWS} rows near each other; instead received none.")
+        return cls(
+            array,
+            readings,
+            ground,
+            tiles,
+            margin_m,
+            _SAME * (sample.height_m - float(bounds.high_m[2])),
+            offset,
+            max(min(spread, _MOST_GEOLOGY_T), _LEAST_GEOLOGY_T),
+            Sources.none(),
+            [Sources.none()] * len(tiles),
+            [Sources.none()] * len(tiles),
+        )
+
+    def piece(self, number: int) -> Piece:
+        """A tile with the sources of all."""
+        tile = self.tiles[number]
+        prior = _narrowed(self.ground.prior, tile, self.margin_m)
+        assert prior is not None
+        known, outside = self._told(tile)
+        readings, ground = self.readings[tile.rows], replace(self.ground, prior=prior)
+        return Piece(self.array, readings, ground, tile.rows, tile.own, self.offset_T, self.geology_T, known, outside)
+
+    def _told(self, tile: Tile) -> tuple[Sources, Sources]:
+        """Sources of a tile, and others whose field is felt there."""
+        position, strength = self.sources.position_m, np.linalg.norm(self.sources.moment_Am2, axis=1)
+        inside = tile.inside_m(position) > -self.margin_m - _BESIDE_M
+        places = self._places(tile)
+        apart = np.linalg.norm(position - np.clip(position, places.min(axis=0), places.max(axis=0)), axis=1)
+        felt = 2e-7 * strength > _FELT * self.array.channel_noise_T.min() * apart**3
+        return self.sources.some(inside), self.sources.some(felt & ~inside)
+
+    def _places(self, tile: Tile) -> FloatArray:
+        assert self.readings.array_position_m is not None
+        return self.readings.array_position_m[tile.rows]
+
+    def searched(self, work: Work, which: Sequence[int], each: Each, tell: Tell) -> TiledSurvey:
+        """After a search of some tiles."""
+        found, outside = list(self.found), list(self.outside)
+        for done, (index, result) in enumerate(each(work, map(self.piece, which)), start=1):
+            number = which[index]
+            found[number] = Sources(**result)
+            outside[number] = self._told(self.tiles[number])[1]
+            tell(f"{done} of {len(which)} tiles searched: {sum(map(len, found))} sources")
+        kept = owned(self.tiles, [sources.position_m for sources in found], self.same_m)
+        sources = Sources.none()
+        for number, k in kept:
+            sources = sources.with_more(found[number].some(np.array([k])))
+        return replace(self, sources=sources, found=found, outside=outside)
+
+    def changed(self) -> list[int]:
+        """Tiles for which others found something else than what they had been told, or found themselves."""
+        return [number for number in range(len(self.tiles)) if self._is_changed(number)]
+
+    def _is_changed(self, number: int) -> bool:
+        tile, before = self.tiles[number], self.outside[number]
+        change = self._told(tile)[1].with_more(Sources(before.position_m, -before.moment_Am2))
+        field = field_at_points(self._places(tile), change.position_m, change.moment_Am2)
+        if np.linalg.norm(field, axis=1).max() > _CHANGED * self.array.channel_noise_T.min():
+            return True
+        own, of_all = (
+            int((tile.inside_m(sources.position_m) > -0.5 * self.margin_m).sum())
+            for sources in (self.found[number], self.sources)
+        )
+        return own != of_all
+
+    def _richest(self) -> int:
+        """The tile with most sources, which tells most of what all tiles have in common."""
+        return int(np.argmax([len(sources) for sources in self.found]))
+
+    def on_time(self) -> tuple[TiledSurvey, Lag]:
+        """Readings that belong to their poses, and by how much they did not."""
+        number = self._richest()
+        piece = self.piece(number)
+        model = piece.model()
+
+        def delayed(lag_s: float) -> SurveyRecord:
+            readings = taken_earlier(self.readings, lag_s)[self.tiles[number].rows]
+            return replace(piece, readings=readings).model().record
+
+        group = piece.groups(model.record, model.bounds, WHILE_SEARCHING)
+        lag = lag_of(model, self.found[number], group, delayed)
+        return (replace(self, readings=taken_earlier(self.readings, lag.s)) if lag.s else self), lag
+
+    def with_likeliest_pose(self) -> TiledSurvey:
+        """With the errors of the pose that the sources of a tile tell."""
+        piece = self.piece(self._richest())
+        model = piece.model()
+        fit, _ = model.fitted(piece.known, piece.groups(model.record, model.bounds, AT_LAST), 1e-3)
+        if not len(fit.sources):
+            return self
+        return replace(self, array=with_likeliest_pose(model, fit.sources).record.array)
+
+    def measured(self, work: Work, each: Each, tell: Tell) -> list[Arrays]:
+        """What some work makes of every tile."""
+        results: list[Arrays] = [{}] * len(self.tiles)
+        for done, (number, result) in enumerate(each(work, map(self.piece, range(len(self.tiles)))), start=1):
+            results[number] = result
+            tell(f"{done} of {len(self.tiles)} tiles measured")
+        return results
+
+
+def _narrowed(prior: SourcePrior, tile: Tile, margin_m: float) -> SourcePrior | None:
+    """Where sources of a tile and its margin may be; None if nowhere."""
+    margin = margin_m + _BESIDE_M
+    low = np.maximum(prior.low_m, [*(tile.low_m - margin), -np.inf])
+    high = np.minimum(prior.high_m, [*(tile.high_m + margin), np.inf])
+    return replace(prior, low_m=tuple(low), high_m=tuple(high)) if (low < high).all() else None

@@ -1,0 +1,79 @@
+"""A large survey in tiles: squares with a margin of rows around them, so that each is a survey of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from arrays.typing import BoolArray, FloatArray, IntArray
+
+_CORE, _MARGIN = 6.0, 2.0  # over the distance from the sensors to the deepest sources
+_SEAM_M = 1.2  # more than a source may stand beside the rows
+
+
+@dataclass(frozen=True, eq=False)
+class Tile:
+    """A rectangle, and the rows in it and around it.
+
+    Attributes
+    ----------
+    low_m, high_m : ndarray, shape (2,)
+        Without an end where there is no other tile.
+    rows : ndarray of int
+    own : ndarray of bool
+        Which of them are in the rectangle, not in the margin.
+    """
+
+    low_m: FloatArray
+    high_m: FloatArray
+    rows: IntArray
+    own: BoolArray
+
+    def inside_m(self, position_m: FloatArray) -> FloatArray:
+        """How far within the rectangle positions (K, 3) are, negative beside it."""
+        xy = position_m[:, :2]
+        return np.asarray(np.minimum(xy - self.low_m, self.high_m - xy).min(axis=1, initial=np.inf))
+
+
+def tiles_of(places_m: FloatArray, reach_m: float) -> tuple[list[Tile], float]:
+    """Tiles of rows at places (n, 2), and the width of their margins: sources are no farther from rows than a reach."""
+    margin = _MARGIN * reach_m
+    low, high = places_m.min(axis=0), places_m.max(axis=0)
+    number = np.maximum(1, np.round((high - low) / (_CORE * reach_m))).astype(np.intp)
+    size = (high - low) / number
+    cell = np.clip(((places_m - low) / np.where(size > 0.0, size, 1.0)).astype(np.intp), 0, number - 1)
+    order = np.argsort(places_m[:, 0], kind="stable")
+    x = places_m[order, 0]
+    tiles = []
+    for own_cell in np.unique(cell, axis=0):
+        start, end = low + own_cell * size, low + (own_cell + 1) * size
+        strip = order[slice(*np.searchsorted(x, [start[0] - margin, end[0] + margin]))]
+        y = places_m[strip, 1]
+        rows = np.sort(strip[(y >= start[1] - margin) & (y <= end[1] + margin)])
+        open_low = np.where(own_cell == 0, -np.inf, start)
+        open_high = np.where(own_cell == number - 1, np.inf, end)
+        tiles.append(Tile(open_low, open_high, rows, np.all(cell[rows] == own_cell, axis=1)))
+    return tiles, margin
+
+
+def owned(tiles: Sequence[Tile], position_m: Sequence[FloatArray], same_m: float) -> list[tuple[int, int]]:
+    """Tile and index of every source that tiles found in (K, 3); one on a seam once, of the tile it lies deeper in."""
+    found = []
+    for t, (tile, places) in enumerate(zip(tiles, position_m, strict=True)):
+        inside = tile.inside_m(places)
+        found += [(float(inside[k]), t, int(k)) for k in np.flatnonzero(inside > -_SEAM_M)]
+    found.sort(key=lambda entry: (-entry[0], entry[1:]))
+    kept: list[tuple[int, int]] = []
+    on_seam: list[tuple[int, FloatArray, set[int]]] = []  # which tiles have them
+    for inside_m, t, k in found:
+        place = position_m[t][k]
+        if inside_m <= _SEAM_M:
+            same = [s for s in on_seam if t not in s[2] and np.linalg.norm(s[1] - place) < same_m]
+            if same:
+                min(same, key=lambda s: float(np.linalg.norm(s[1] - place)))[2].add(t)
+                continue
+            on_seam.append((t, place, {t}))
+        kept.append((t, k))
+    return kept
