@@ -21,6 +21,7 @@ def warm_up(*, common: QuietOptions = QuietOptions()) -> None:  # noqa: B008 - f
     from magloc.cli.app import app
 
     path = magloc.datasets.load("ship").path
+    board = magloc.datasets.load("board").path
     recording = (str(path), "--array", str(path.with_name("ship-array.toml")))
     maps = [["map", "--method", method, "--grid", "2"] for method in ("repeated", "iekf", "damped", "global")]
     maps += [["map", "--over", "sources", "--grid", "3"], ["bounds", "--grid", "3"]]
@@ -32,6 +33,7 @@ def warm_up(*, common: QuietOptions = QuietOptions()) -> None:  # noqa: B008 - f
             ["track", *recording, "--speed-m-s", "2", "--smooth"],
             ["simulate", "weaving", "--out", plain[0]],
             ["track", plain[0], "--array", plain[1], "--speed-m-s", "0.1"],
+            ["track", str(board), "--array", str(board.with_name("board-array.toml")), "--sources", "2"],
             *([*tokens, "--out", str(Path(folder) / str(i))] for i, tokens in enumerate(maps)),
         ]
         framework.warm_up(app, calls, common)

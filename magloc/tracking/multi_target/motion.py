@@ -71,17 +71,15 @@ class FreeMotion:
         Q[:, P_, P_], Q[:, V_, V_] = of_p_v[0, 0] * one, of_p_v[1, 1] * one
         Q[:, P_, V_] = Q[:, V_, P_] = of_p_v[0, 1] * one
         Q[:, W_, W_] = of_c_w[1, 1] * one
-        moments = np.empty((K, 3))
-        for k, (moment, rate) in enumerate(zip(state.moment_Am2, state.rate_rad_s, strict=True)):
-            angle = turn_lasts_s * rate
-            R = rotation_matrix(angle)
-            moments[k] = R @ moment
-            u = moments[k] / math.sqrt(float(moment @ moment))
-            turned = -cross_matrix(u)  # what a small turn changes of u
-            F[k, C_, C_], F[k, C_, W_] = R, turn_lasts_s * turned @ turn_of_change(angle)
-            Q[k, C_, C_] = of_c_w[0, 0] * (one - np.outer(u, u)) + self.strength_change**2 * dt_s * np.outer(u, u)
-            Q[k, C_, W_] = of_c_w[0, 1] * turned
-            Q[k, W_, C_] = Q[k, C_, W_].T
+        angle = turn_lasts_s * state.rate_rad_s
+        R = rotation_matrix(angle)
+        moments = (R @ state.moment_Am2[..., None])[..., 0]
+        u = moments / np.sqrt(np.vecdot(moments, moments))[:, None]
+        along, turned = u[..., None] * u[:, None], -cross_matrix(u)  # what a small turn changes of u
+        F[:, C_, C_], F[:, C_, W_] = R, turn_lasts_s * turned @ turn_of_change(angle)
+        Q[:, C_, C_] = of_c_w[0, 0] * (one - along) + self.strength_change**2 * dt_s * along
+        Q[:, C_, W_] = of_c_w[0, 1] * turned
+        Q[:, W_, C_] = -Q[:, C_, W_]
         at = state.of_source
         whole_F, whole_Q = np.eye(len(state.P)), np.zeros_like(state.P)
         whole_F[at[:, :, None], at[:, None, :]] = F

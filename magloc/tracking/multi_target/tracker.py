@@ -17,6 +17,7 @@ from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.rows import check_magnitudes
 from magloc.readings import Readings
 from magloc.tracking.multi_target.explanations import (
+    BIRTH,
     COST_LIMIT,
     MANOEUVRE_AGILITY,
     NAMES_A_ROW,
@@ -254,6 +255,8 @@ class SourcesTracker:
         common, dead, known = best.state.common_alone, best.health.dead, len(best.ids)
         again = problem.found_anew(common, best.state.position_m, best.state.moment_Am2, dead)
         anew = [again, *problem.of_more_sources(common, dead, known)]
+        if known > 1:
+            anew += problem.of_more_sources(common, dead, known - 1)
         if known < self.scene.most_sources:
             anew += problem.of_more_sources(common, dead, known + 1)
             anew += distinct(one for start in (found, again) for one in problem.births(start))
@@ -263,7 +266,10 @@ class SourcesTracker:
         # What the sources' motion tells is still to be learned by them, and was by the best one.
         learned = np.linalg.slogdet(again.update.state.P)[1] - np.linalg.slogdet(best.state.P)[1]
         score, health = best.score - max(0.0, float(learned)), best.health.forgetful
-        restarts = [replace(self._after(problem, best, one), score=score, health=health) for one in tried]
+        restarts = [
+            replace(self._after(problem, best, one), score=score + BIRTH * (len(one.ids) - known), health=health)
+            for one in tried
+        ]
         suspect = best.health.suspect
         if suspect is not None and best.health.may_drift:
             restarts.append(replace(best, health=best.health.without(suspect)))
