@@ -77,7 +77,8 @@ EXPLAINED = {
     "ship-signature": "magloc.track_moment magloc.track_moments magloc.MomentTrack magloc.ObjectPath magloc.PathError"
     " magloc.read_object_path magloc.fit_signature magloc.Signature",
     "single-sensor-ranging": "magloc.SourceLine magloc.fit_source_line magloc.distance_along_line",
-    "star-identification": "adcs.solve_photograph adcs.identify_stars adcs.read_picture adcs.combined_star_fixes adcs.hipparcos_catalogue",
+    "star-identification": "adcs.solve_photograph adcs.identify_stars adcs.read_picture adcs.combined_star_fixes"
+    " adcs.hipparcos_catalogue",
     "table-top-satellite": "adcs.mockup sims.table_run sims.TableScenario sims.CameraErrors sims.rendered_frame"
     " sims.experiments.sky_run sims.experiments.identified_files sims.experiments.fused_runs"
     " sims.experiments.fused_record sims.experiments.zeros_run",
