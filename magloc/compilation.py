@@ -132,7 +132,3 @@ def over_rows(kernel: Callable[..., None], n_rows: int, *arguments: Any) -> None
 def own(values: FloatArray) -> FloatArray:
     """A contiguous copy that may be written: kernels are compiled anew, for seconds, for arrays of any other kind."""
     return np.array(values, order="C")
-
-
-# Numba compiles a function once more for every literal integer that it is called with; a converted one is no literal.
-runtime_int = cast(Callable[[int], int], np.int64)

@@ -66,7 +66,7 @@ LOOKS = re.compile(
 )
 # A change of type, which counts only where types are told apart.
 CONVERSION = re.compile(
-    r"float|int|bool|str|tuple|list|set|frozenset|dict|iter|own|runtime_int|(np\.)?(as\w+|float64|int64)|[A-Z].*"
+    r"float|int|bool|str|tuple|list|set|frozenset|dict|iter|own|(np\.)?(as\w+|float64|int64)|[A-Z].*"
 )
 # Of a tolerance, a small power of ten, the order alone means something; so does that of a choice, which has a name.
 TOLERANCE = 1e-4

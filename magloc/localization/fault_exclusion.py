@@ -395,19 +395,23 @@ class _Examination:
         self, row: IntArray, q: FloatArray, mu: FloatArray, weight: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Squared residuals (f, N) of the sensors after reweighting from starts, and the scale of the noise."""
-        owner = self.array.channel_sensor
+        owner, q, mu, weight = self.array.channel_sensor, q.copy(), mu.copy(), weight.copy()
+        misfit, scale2 = np.empty(weight.shape), np.empty(len(row))
+        live = np.arange(len(row))
         lighter = weighted(self.problem.rows(row), self.raw[row], weight[:, owner])
-        for _ in range(_N_REWEIGHTINGS):
-            misfit = self._squares(lighter, q, mu, weight)
-            scale2 = self._scale2(misfit)
-            new = (DEGREES_OF_FREEDOM + self.count) / (DEGREES_OF_FREEDOM + misfit / scale2[:, None])
+        for last in range(_N_REWEIGHTINGS, -1, -1):
+            misfit[live] = self._squares(lighter, q[live], mu[live], weight[live])
+            scale2[live] = self._scale2(misfit[live])
+            new = (DEGREES_OF_FREEDOM + self.count) / (DEGREES_OF_FREEDOM + misfit[live] / scale2[live, None])
             new = np.clip(new, _LEAST_WEIGHT, None)
-            if np.all(np.abs(new - weight) < 1e-3 * weight):
+            moved = np.any(np.abs(new - weight[live]) >= 1e-3 * weight[live], axis=1)
+            live = live[moved]
+            if not live.size or not last:
                 break
-            weight = new
-            lighter = weighted(self.problem.rows(row), self.raw[row], weight[:, owner])
-            fits = self._refined(lighter, q, mu, max_iterations=8)
-            q, mu = fits.q, fits.mu
+            weight[live] = new[moved]
+            lighter = weighted(self.problem.rows(row[live]), self.raw[row[live]], weight[live][:, owner])
+            fits = self._refined(lighter, q[live], mu[live], max_iterations=8)
+            q[live], mu[live] = fits.q, fits.mu
         return misfit, scale2
 
     def _refined(self, lighter: Weighted, q: FloatArray, mu: FloatArray, max_iterations: int = 60) -> JointFits:
