@@ -12,11 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray, IntArray
 from arrays.whitening import Whitening, whitening
 from magloc.compilation import over_rows
+from magloc.levels import CREDIBLE_FIT
 from magloc.localization.fit.gauss_newton import JointFits
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
@@ -28,6 +30,7 @@ from magloc.measurement.whitened import WhitenedModel
 from magloc.measurement.whitened_compiled import LaneModel, signals
 
 N_UNKNOWNS = 6
+_MORE = 3  # times the starts where none of them explains a row
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +69,7 @@ class SingleSourceSearch:
     array : SensorArray
         Vector sensors only.
     n_starts : int
-        Distinct candidates that are refined.
+        Distinct candidates that are refined; three times as many where none leads to a credible χ².
     apart_rad : float
         Least distance of two candidates, as an angle of their homogeneous coordinates.
     max_iterations : int
@@ -105,12 +108,16 @@ class SingleSourceSearch:
     def optima(self, rows: WhitenedRows) -> list[Optima]:
         """Distinct optima of every row within Δχ² = 20 of its best one that the prior allows."""
         everything = self.prior == NOTHING_KNOWN
-        found = self._search(
-            rows,
-            np.arange(len(rows), dtype=np.intp),
-            np.empty((len(rows), 0, 4)),
-            DISTINCT_WITHIN if everything else math.inf,
-        )
+        keep_within = DISTINCT_WITHIN if everything else math.inf
+        found = self._search(rows, np.arange(len(rows)), np.empty((len(rows), 0, 4)), keep_within, self.n_starts)
+        dof = rows.n_differences - N_UNKNOWNS
+        doubtful = np.flatnonzero(~(found.chi2[:, 0] <= chdtri(dof, 1.0 - CREDIBLE_FIT))) if dof > 0 else []
+        if len(doubtful):
+            some, nothing = rows.chosen(doubtful), np.empty((len(doubtful), 0, 4))
+            more = self._search(some, np.arange(len(some)), nothing, keep_within, _MORE * self.n_starts)
+            for values, others in zip(found, more, strict=True):
+                values[doubtful] = others[:, : values.shape[1]]
+            np.minimum(found.counts[:, 0], self.n_starts, out=found.counts[:, 0])
         unknown = found.counts[:, 0]
         if not everything:
             found = self._known(rows.model, found)
@@ -127,7 +134,7 @@ class SingleSourceSearch:
         """Best optimum of readings (C,) for every start (n, 3) [m], refined beside the candidates; without prior."""
         (rows,) = whitened_rows(self.array, np.asarray(readings_T, dtype=np.float64)[None], None, 1)
         starts = rows.model.homogeneous(np.asarray(starts_m, dtype=np.float64))[:, None]
-        found = self._search(rows, np.zeros(len(starts), dtype=np.intp), starts, DISTINCT_WITHIN)
+        found = self._search(rows, np.zeros(len(starts), dtype=np.intp), starts, DISTINCT_WITHIN, self.n_starts)
         return BestFits(
             position_m=rows.model.position(found.q[:, 0]),
             moment_Am2=rows.model.moment(found.q[:, 0], found.mu[:, 0]),
@@ -147,7 +154,7 @@ class SingleSourceSearch:
         return self._ranking_of[key]
 
     def _search(
-        self, rows: WhitenedRows, reading_of_row: IntArray, first: FloatArray, keep_within: float
+        self, rows: WhitenedRows, reading_of_row: IntArray, first: FloatArray, keep_within: float, n_starts: int
     ) -> kernels.Ends:
         """Optima of some of the rows, from starts of their own and the best candidates."""
         ranking, model = self._ranking(rows.mask), rows.model
@@ -156,7 +163,7 @@ class SingleSourceSearch:
             channels = channels_above_ambient(self.array, rows.mask, rows.readings_T, model.ambient)
             ranked = ranking.whitening.apply(channels)
         best = ranking.candidates[
-            chosen_candidates(ranking.bases, ranked, ranking.candidates, self.n_starts, self.apart_rad)
+            chosen_candidates(ranking.bases, ranked, ranking.candidates, n_starts, self.apart_rad)
         ]
         starts = np.concatenate([first, best[reading_of_row]], axis=1)
         found = kernels.Ends.empty(*starts.shape[:2])
