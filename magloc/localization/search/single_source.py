@@ -111,9 +111,9 @@ class SingleSourceSearch:
         keep_within = DISTINCT_WITHIN if everything else math.inf
         found = self._search(rows, np.arange(len(rows)), np.empty((len(rows), 0, 4)), keep_within, self.n_starts)
         dof = rows.n_differences - N_UNKNOWNS
-        doubtful = np.flatnonzero(~(found.chi2[:, 0] <= chdtri(dof, 1.0 - CREDIBLE_FIT))) if dof > 0 else []
-        if len(doubtful):
-            some, nothing = rows.chosen(doubtful), np.empty((len(doubtful), 0, 4))
+        doubtful = np.flatnonzero(~(found.chi2[:, 0] <= (chdtri(dof, 1.0 - CREDIBLE_FIT) if dof > 0 else math.inf)))
+        if doubtful.size:
+            some, nothing = rows.chosen(doubtful), np.empty((doubtful.size, 0, 4))
             more = self._search(some, np.arange(len(some)), nothing, keep_within, _MORE * self.n_starts)
             for values, others in zip(found, more, strict=True):
                 values[doubtful] = others[:, : values.shape[1]]
