@@ -43,6 +43,8 @@ _FIRST_RANGE_ERROR = 0.06
 # Noise that plain tracks are tried with, in that of the sensors, and rows that they must have.
 _NOISIER = (1.0, 10.0, 100.0)
 _FEWEST_ROWS = 5
+# How far apart, in the logarithm of the range, trajectories are that are compared.
+_APART = 0.01
 _NOTHING = "not acquired: no dipole on this background fits the rows"
 
 
@@ -79,6 +81,7 @@ def track_on_background(
     of_rows = _points(tracker, measurements[passed.rows], passed)
     points[passed.rows] = smoothed(of_rows, passed.steps) if smooth else of_rows
     _warn_of_what_it_takes(tracker, rows[passed.rows], passed, of_rows)
+    _warn_of_a_pull(tracker, measurements[passed.rows], passed)
     return points
 
 
@@ -116,6 +119,40 @@ def _warn_of_what_it_takes(
     if of_both[0] > TAKES_MUCH**2 * of_both[1]:
         factor = math.sqrt(of_both[0] / of_both[1])
         _LOG.warning(f"the background looks like the source: positions are {factor:.0f} times as uncertain as without")
+
+
+def _warn_of_a_pull(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _Passed) -> None:
+    """Warn where the likeliest trajectory need not be in the middle of those that are likely.
+
+    It leaves out how many there are about it, which the determinants of the innovations' covariances tell. They change
+    where a source is farther and stronger, moves more and reads alike: it matters if the range went by more than its σ.
+    """
+    states = [x for x, _ in smoothed_states(passed.steps)]
+    sigma = [tracker._range_error(step.x, step.S, m) for step, m in zip(passed.steps, measurements, strict=True)]
+    log_number = []
+    for apart in (-_APART, _APART):
+        moved = [_farther(state, m, apart) for state, m in zip(states, measurements, strict=True)]
+        steps = _passed(tracker, measurements, 0, moved, passed.used).steps
+        log_number.append(
+            sum(_log_volume(step.prediction.S) - _log_volume(step.S) for step in steps if step.prediction)
+        )
+    pull = abs(log_number[1] - log_number[0]) / (2.0 * _APART) * float(np.median(sigma))
+    if pull > 1.0:
+        _LOG.warning("how the source moves tells where it is: errors may be several times their standard deviations")
+
+
+def _farther(state: FloatArray, measurement: RowMeasurement, log_range: float) -> FloatArray:
+    """A state (n,) whose source is farther and stronger and moves more, so that it reads alike."""
+    n = measurement.n_motion
+    chart = ChartRow.of(measurement).chart(state[None])
+    e = np.zeros((1, state.size))
+    e[0, 0] = log_range
+    return np.concatenate([chart.retracted(e)[0, :n], state[n:]])
+
+
+def _log_volume(S: FloatArray) -> float:
+    """Logarithm of the determinant of a root."""
+    return float(np.linalg.slogdet(S)[1])
 
 
 def steps_at(tracker: Tracker, rows: Sequence[Row], states: Sequence[FloatArray]) -> list[Step]:
