@@ -22,6 +22,7 @@ from magloc.kalman import block_update, whitened_innovation
 from magloc.levels import CONTRADICTION
 from magloc.readings import Readings
 from magloc.tracking.batch import track_record
+from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.steps import charted
 from magloc.tracking.measurement import RowMeasurement
@@ -143,11 +144,11 @@ def _warn_of_a_pull(tracker: Tracker, measurements: Sequence[RowMeasurement], pa
 
 def _farther(state: FloatArray, measurement: RowMeasurement, log_range: float) -> FloatArray:
     """A state (n,) whose source is farther and stronger and moves more, so that it reads alike."""
-    n = measurement.n_motion
-    chart = ChartRow.of(measurement).chart(state[None])
-    e = np.zeros((1, state.size))
-    e[0, 0] = log_range
-    return np.concatenate([chart.retracted(e)[0, :n], state[n:]])
+    n, row = measurement.n_motion, ChartRow.of(measurement)
+    e = np.zeros(n)
+    e[0] = log_range
+    moved = Chart.at(state[:n], row.centroid_m, row.radius_m).retracted(e)
+    return np.concatenate([moved, state[n:]])
 
 
 def _log_volume(S: FloatArray) -> float:
@@ -192,12 +193,12 @@ def _settled(
             with np.errstate(all="ignore"):  # passes may lead out of double precision
                 passed = _passed(tracker, measurements, begin, states, used)
                 later = smoothed_states(passed.steps)
+                sigma = np.array([np.sqrt(np.diagonal(P)[:N_SOURCE]) for _, P in later])
         except np.linalg.LinAlgError:
             return None
         new = [x for x, _ in later]
         if not np.isfinite(new).all():
             return None
-        sigma = np.array([np.sqrt(np.diagonal(P)[:N_SOURCE]) for _, P in later])
         moved = np.abs(np.array(new) - np.array(states))[:, :N_SOURCE]
         states = new
         if np.all(moved <= _SETTLED * sigma):
