@@ -22,6 +22,7 @@ from magloc.kalman import block_update, whitened_innovation
 from magloc.levels import CONTRADICTION
 from magloc.readings import Readings
 from magloc.tracking.batch import track_record
+from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.steps import charted
 from magloc.tracking.measurement import RowMeasurement
@@ -43,6 +44,8 @@ _FIRST_RANGE_ERROR = 0.06
 # Noise that plain tracks are tried with, in that of the sensors, and rows that they must have.
 _NOISIER = (1.0, 10.0, 100.0)
 _FEWEST_ROWS = 5
+# How far apart, in the logarithm of the range, trajectories are that are compared.
+_APART = 0.01
 _NOTHING = "not acquired: no dipole on this background fits the rows"
 
 
@@ -79,6 +82,7 @@ def track_on_background(
     of_rows = _points(tracker, measurements[passed.rows], passed)
     points[passed.rows] = smoothed(of_rows, passed.steps) if smooth else of_rows
     _warn_of_what_it_takes(tracker, rows[passed.rows], passed, of_rows)
+    _warn_of_a_pull(tracker, measurements[passed.rows], passed)
     return points
 
 
@@ -118,6 +122,40 @@ def _warn_of_what_it_takes(
         _LOG.warning(f"the background looks like the source: positions are {factor:.0f} times as uncertain as without")
 
 
+def _warn_of_a_pull(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _Passed) -> None:
+    """Warn where the likeliest trajectory need not be in the middle of those that are likely.
+
+    It leaves out how many there are about it, which the determinants of the innovations' covariances tell. They change
+    where a source is farther and stronger, moves more and reads alike: it matters if the range went by more than its σ.
+    """
+    states = [x for x, _ in smoothed_states(passed.steps)]
+    sigma = [tracker._range_error(step.x, step.S, m) for step, m in zip(passed.steps, measurements, strict=True)]
+    log_number = []
+    for apart in (-_APART, _APART):
+        moved = [_farther(state, m, apart) for state, m in zip(states, measurements, strict=True)]
+        steps = _passed(tracker, measurements, 0, moved, passed.used).steps
+        log_number.append(
+            sum(_log_volume(step.prediction.S) - _log_volume(step.S) for step in steps if step.prediction)
+        )
+    pull = abs(log_number[1] - log_number[0]) / (2.0 * _APART) * float(np.median(sigma))
+    if pull > 1.0:
+        _LOG.warning("how the source moves tells where it is: errors may be several times their standard deviations")
+
+
+def _farther(state: FloatArray, measurement: RowMeasurement, log_range: float) -> FloatArray:
+    """A state (n,) whose source is farther and stronger and moves more, so that it reads alike."""
+    n, row = measurement.n_motion, ChartRow.of(measurement)
+    e = np.zeros(n)
+    e[0] = log_range
+    moved = Chart.at(state[:n], row.centroid_m, row.radius_m).retracted(e)
+    return np.concatenate([moved, state[n:]])
+
+
+def _log_volume(S: FloatArray) -> float:
+    """Logarithm of the determinant of a root."""
+    return float(np.linalg.slogdet(S)[1])
+
+
 def steps_at(tracker: Tracker, rows: Sequence[Row], states: Sequence[FloatArray]) -> list[Step]:
     """Steps of a forward pass that linearises all rows at some states."""
     measurements = [tracker.measurements.of(row) for row in rows]
@@ -155,12 +193,12 @@ def _settled(
             with np.errstate(all="ignore"):  # passes may lead out of double precision
                 passed = _passed(tracker, measurements, begin, states, used)
                 later = smoothed_states(passed.steps)
+                sigma = np.array([np.sqrt(np.diagonal(P)[:N_SOURCE]) for _, P in later])
         except np.linalg.LinAlgError:
             return None
         new = [x for x, _ in later]
         if not np.isfinite(new).all():
             return None
-        sigma = np.array([np.sqrt(np.diagonal(P)[:N_SOURCE]) for _, P in later])
         moved = np.abs(np.array(new) - np.array(states))[:, :N_SOURCE]
         states = new
         if np.all(moved <= _SETTLED * sigma):

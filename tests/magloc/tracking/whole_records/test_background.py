@@ -28,6 +28,7 @@ from arrays.geometries import tetrahedron
 from arrays.typing import FloatArray
 from magloc.measurement.nuisances import Drift
 from magloc.readings import Readings
+from magloc.tracking.innovations import THRESHOLD
 from magloc.tracking.results import rows_of
 from magloc.tracking.track import Track
 from magloc.tracking.tracker import Tracker
@@ -110,8 +111,8 @@ class TestConsistency:
             found.append(judged.nees_per_dimension)
         assert least < np.mean(found) < 1.4
 
-    def test_a_target_that_weaves_on_unknown_offsets(self) -> None:
-        """With a motion that keeps its speed, as it does; a random walk claims too much."""
+    def test_a_target_that_weaves_on_unknown_offsets(self, caplog: pytest.LogCaptureFixture) -> None:
+        """With a motion that keeps its speed, as it does; a random walk claims too much, is flagged and warned of."""
         weaving = sims.read_scenario("weaving")
         motion = magloc.OrnsteinUhlenbeck(0.1, math.radians(1.2))
         found = []
@@ -120,12 +121,20 @@ class TestConsistency:
             track = magloc.track(simulation.array, high_passed(simulation.readings), motion=motion)
             found.append(track.consistency(simulation.truth).nees_per_dimension)
         assert np.mean(found) < 2.0
+        caplog.clear()
+        with caplog.at_level(logging.WARNING, logger="magloc"):
+            walk = magloc.RandomWalk(motion.speed_m_s, motion.turn_rad_s)
+            track = magloc.track(simulation.array, high_passed(simulation.readings), motion=walk)
+        assert track.innovations.z_lag1 > THRESHOLD
+        assert "how the source moves tells where it is" in caplog.text
 
 
 class TestTrack:
-    def test_lines_of_any_slope_are_one(self) -> None:
+    def test_lines_of_any_slope_are_one(self, caplog: pytest.LogCaptureFixture) -> None:
         """The slopes are unknown: the same track with other ones, within what the prior of 10⁵ σ leaves."""
-        _, flat = run(none, Readings.detrended, 1)
+        with caplog.at_level(logging.WARNING, logger="magloc"):
+            _, flat = run(none, Readings.detrended, 1)
+        assert "how the source moves" not in caplog.text  # it is at rest
         _, steep = run(lines, Readings.detrended, 1)
         np.testing.assert_array_equal(steep.tracked, flat.tracked)
         np.testing.assert_allclose(steep.position_m[-1], flat.position_m[-1], atol=1e-4)
