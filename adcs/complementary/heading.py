@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 _BLOCK_S = 0.035
 """How long readings are averaged: within it a hand turns by a few degrees."""
 _START_S = 1.0
+_TOLD = np.array([0, 5, 6, 7])  # heading and offset, of the state
 
 
 @dataclass(frozen=True)
@@ -168,12 +169,12 @@ def heading_track(
     # A block is known at its end; before the first one there is the start.
     last = np.searchsorted(ends, np.arange(len(time_s)), side="left" if offline else "right") - (not offline)
     last = np.clip(last, 0, m - 1)
-    deviations = np.sqrt(np.diagonal(Ps, axis1=1, axis2=2))[last]
+    deviations = np.sqrt(Ps[:, _TOLD, _TOLD])[last]
     return HeadingTrack(
         heading_rad=xs[last, 0],
         sigma_rad=deviations[:, 0],
         offset_T=xs[last, 5:8],
-        offset_sigma_T=deviations[:, 5:8],
+        offset_sigma_T=deviations[:, 1:],
         left_out=used[last] == 0,
         changes=ends[known == 2],
     )

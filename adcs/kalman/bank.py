@@ -9,17 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from adcs import quaternion
-from adcs.kalman.constant_gain import run_constant_gain
 from adcs.kalman.diagnostics import COLLINEAR, collinear_rows, unseen_torque_Nm, warnings_of
 from adcs.kalman.error_state import AttitudeTracks, FilterSettings, Start, sensor_set, tuned_noise
-from adcs.kalman.gyro_driven import run_reduced
 from adcs.kalman.initialisation import any_start, first_told, vector_start
 from adcs.kalman.mekf import closed_loop_jacobian, run_filter, run_readable
 from adcs.kalman.names import FILTERS, Filter, StartKind
 from adcs.kalman.results import sigma_by_state
-from adcs.kalman.self_tuning import run_self_tuned
-from adcs.kalman.separate_bias import run_parallel
 from adcs.kalman.smoother import smoothed
+from adcs.kalman.variants.constant_gain import run_constant_gain
+from adcs.kalman.variants.gyro_driven import run_reduced
+from adcs.kalman.variants.self_tuning import run_self_tuned
+from adcs.kalman.variants.separate_bias import run_parallel
 from adcs.satellite.attitude_track import AttitudeTrack, joined
 from adcs.satellite.conventions import check_conventions
 from adcs.satellite.satellite import Satellite

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,9 +14,9 @@ from arrays.typing import FloatArray
 from magloc.plots import style
 
 _STYLES = {
-    "explicit": ("#d55e00", "--", "explicit"),
-    "gauss-newton": ("#0072b2", "-", "with measured quaternion"),
-    "adaptive": ("#009e73", "-", "adaptive error-state"),
+    "explicit": (style.ORANGE, "--", "explicit"),
+    "gauss-newton": (style.BLUE, "-", "with measured quaternion"),
+    "adaptive": (style.BLACK, ":", "adaptive error-state"),
 }
 _MOST_POINTS = 3000
 
@@ -36,35 +37,33 @@ class ComplementaryPicture:
 
 def complementary_figure(picture: ComplementaryPicture) -> Figure:
     """Errors of the three axes, one below the other, and the length of the error of every filter on a log scale."""
-    figure = Figure(figsize=(11.0, 9.0), layout="constrained")
+    figure = style.new_figure(5.8)
     axes = figure.subplots(4, 1, sharex=True)
+    lengths = {name: np.linalg.norm(errors, axis=1) for name, errors in picture.errors_deg.items()}
     for axis, ax, label in zip(range(3), axes, ("roll", "pitch", "yaw"), strict=False):
-        for name, errors in picture.errors_deg.items():
-            _draw(ax, picture.orbits, errors[:, axis], name)
-        ax.axhline(0.0, color="grey", lw=0.5)
-        ax.set(ylabel=f"{label} error [°]")
+        _draw(ax, picture, {name: errors[:, axis] for name, errors in picture.errors_deg.items()})
         ax.set_ylim(*_limits(picture, axis))
-    for name, errors in picture.errors_deg.items():
-        _draw(axes[3], picture.orbits, np.linalg.norm(errors, axis=1), name)
-    axes[3].set(ylabel="angle of error [°]", xlabel="orbits", yscale="log")
-    for ax in axes:
-        ax.grid(alpha=0.3)
-        ax.set_xlim(picture.orbits[0], picture.orbits[-1])
-        if picture.step_orbits < picture.orbits[-1]:
-            ax.axvline(picture.step_orbits, color="black", lw=1.0, ls=":")
-        if picture.outage_orbits is not None:
-            ax.axvspan(picture.outage_orbits, picture.orbits[-1], color="grey", alpha=0.12, lw=0)
+        style.dress(ax, "", f"{label} error [°]")
+    _draw(axes[3], picture, lengths)
+    axes[3].set_yscale("log")
+    style.dress(axes[3], "orbits", "angle of error [°]")
+    axes[3].set_xlim(picture.orbits[0], picture.orbits[-1])
     _mark(axes[0], picture)
-    handles = axes[0].get_lines()[: len(picture.errors_deg)]
-    figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
-    figure.suptitle(textwrap.fill(picture.title, 110), fontsize=11)
+    style.legend(figure, handles=axes[0].get_lines()[: len(picture.errors_deg)], loc="outside lower center", ncols=3)
+    style.headline(figure, textwrap.fill(picture.title, 100))
     return figure
 
 
-def _draw(ax: Axes, orbits: FloatArray, values: FloatArray, name: str) -> None:
-    colour, line, label = _STYLES[name]
-    keep = slice(None, None, max(1, len(orbits) // _MOST_POINTS))
-    ax.plot(orbits[keep], values[keep], color=colour, ls=line, lw=1.0, label=label, alpha=0.85)
+def _draw(ax: Axes, picture: ComplementaryPicture, values: dict[str, FloatArray]) -> None:
+    """A curve of every filter, where the bias steps, and where the Sun sensor is out."""
+    every = slice(None, None, max(1, len(picture.orbits) // _MOST_POINTS))
+    for name, of_filter in values.items():
+        colour, line, label = _STYLES[name]
+        ax.plot(picture.orbits[every], of_filter[every], color=colour, ls=line, lw=0.9, label=label)
+    if picture.step_orbits < picture.orbits[-1]:
+        ax.axvline(picture.step_orbits, color=style.GREY, lw=0.8)
+    if picture.outage_orbits is not None:
+        ax.axvspan(picture.outage_orbits, picture.orbits[-1], color=style.LIGHT_GREY, alpha=0.5, lw=0)
 
 
 def _limits(picture: ComplementaryPicture, axis: int) -> tuple[float, float]:
@@ -74,11 +73,14 @@ def _limits(picture: ComplementaryPicture, axis: int) -> tuple[float, float]:
 
 
 def _mark(ax: Axes, picture: ComplementaryPicture) -> None:
-    top = ax.get_xaxis_transform()
+    words: dict[str, Any] = {
+        "transform": ax.get_xaxis_transform(),
+        "fontsize": style.SMALL_LETTERS,
+        "ha": "center",
+        "va": "bottom",
+    }
     if picture.step_orbits < picture.orbits[-1]:
-        ax.text(
-            picture.step_orbits, 1.02, "bias steps by 0.02 °/s", transform=top, fontsize=9, ha="center", va="bottom"
-        )
+        ax.text(picture.step_orbits, 1.02, "bias steps by 0.02 °/s", **words)
     if picture.outage_orbits is not None:
         middle = 0.5 * (picture.outage_orbits + picture.orbits[-1])
-        ax.text(middle, 1.02, "without Sun sensor", transform=top, fontsize=9, ha="center", va="bottom")
+        ax.text(middle, 1.02, "without Sun sensor", **words)

@@ -209,7 +209,7 @@ def _write_picture(options: ComplementaryOptions, runs: SatelliteRuns, out: Path
         runs.scenario.step_orbits,
         runs.scenario.outage_orbits,
     )
-    style.save(complementary_figure(picture), out / "complementary.png", dpi=130)
+    style.save(complementary_figure(picture), out / "complementary.png")
     columns = [f"{name.replace('-', '_')}_{axis}_deg" for name in names for axis in ("roll", "pitch", "yaw")]
     write_table(
         out / "complementary.csv",

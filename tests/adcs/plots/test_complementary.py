@@ -26,7 +26,8 @@ def test_a_step_is_marked_where_it_is_shown(step_orbits: float, is_drawn: bool) 
 def test_an_outage_is_shaded_from_its_begin_to_the_end(outage_orbits: float | None) -> None:
     for ax in complementary_figure(picture(0.5, outage_orbits)).axes:
         shaded = [patch.get_extents().transformed(ax.transData.inverted()) for patch in ax.patches]
-        assert [(box.x0, box.x1) for box in shaded] == ([] if outage_orbits is None else [(1.5, 2.0)])
+        edges = [edge for box in shaded for edge in (box.x0, box.x1)]
+        assert edges == pytest.approx([] if outage_orbits is None else [1.5, 2.0], rel=1e-12)
 
 
 def test_errors_are_drawn_by_axis_and_by_their_length() -> None:

@@ -1,4 +1,4 @@
-"""Tests of adcs.kalman.separate_bias: acceptance figures, the printed form that fails.
+"""Tests of adcs.kalman.variants.separate_bias: acceptance figures, the printed form that fails.
 
 The optimum it must agree with.
 """
@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adcs.kalman import separate_bias
 from adcs.kalman.mekf import run_filter
-from adcs.kalman.separate_bias import run_parallel
+from adcs.kalman.variants import separate_bias
+from adcs.kalman.variants.separate_bias import run_parallel
 from sims.attitude.simulation import simulate
 from sims.experiments.accuracy import normalised_error_squared
 from tests.adcs.filter_runs import SEEDS, evaluate, runs_for, scenario_for, settings, start_of

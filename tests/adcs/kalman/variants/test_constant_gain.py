@@ -1,4 +1,4 @@
-"""Tests of adcs.kalman.constant_gain and adcs.kalman.gyro_driven: the acceptance figures and what the gain must be."""
+"""Filters with one gain, and of attitude and gyro bias alone: the acceptance figures and what the gain must be."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from adcs.kalman.constant_gain import converged_gain, run_constant_gain
-from adcs.kalman.gyro_driven import run_reduced
 from adcs.kalman.mekf import predicted, run_filter, stacked_residuals
+from adcs.kalman.variants.constant_gain import converged_gain, run_constant_gain
+from adcs.kalman.variants.gyro_driven import run_reduced
 from tests.adcs.filter_runs import evaluate, runs_for, settings
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from adcs.kalman.mekf import run_filter
-from adcs.kalman.self_tuning import DISTURBANCES_S2, mixture, run_self_tuned, weights
+from adcs.kalman.variants.self_tuning import DISTURBANCES_S2, mixture, run_self_tuned, weights
 from magloc.chi_square import normalised_square
 from sims.attitude.simulation import AttitudeRuns, simulate
 from sims.experiments.accuracy import errors
