@@ -289,11 +289,9 @@ def read_readings(
     return readings
 
 
-def readings_of_text(
-    text: str, name: str, array: SensorArray, *, sensors: Sequence[str] | None = None, first_line: int = 2
-) -> Readings:
-    """Readings as :func:`read_readings`, from CSV text called `name` in errors, its first row on line `first_line`."""
-    return readings_of_table(table_of_text(text, name, EXPECTED_HEADER, first_line=first_line), array, sensors)
+def readings_below(head: Table, text: str, array: SensorArray, first_line: int) -> Readings:
+    """Readings of CSV rows below a header that :func:`readings_of_table` has taken already, for the same sensors."""
+    return _of_checked(table_of_text(text, head.path, EXPECTED_HEADER, first_line=first_line, head=head), array)
 
 
 def readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] | None) -> Readings:
@@ -302,6 +300,12 @@ def readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] |
         array = array.subset(sensors)
     channels = [f"{name}_nT" for name in array.channel_names]
     _check_sensor_columns(table, array, channels, ignore_others=sensors is not None)
+    return _of_checked(table, array)
+
+
+def _of_checked(table: Table, array: SensorArray) -> Readings:
+    """Readings of a table whose header is that of the array."""
+    channels = [f"{name}_nT" for name in array.channel_names]
     time_s = table.complete_and_distinct("time_s")
     position_m = rotation = ambient_T = pose_sigma = None
     if table.has_group(POSITION_COLUMNS + ROTATION_COLUMNS):

@@ -14,6 +14,7 @@ import math
 from array import array as packed
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Any, Protocol
@@ -58,6 +59,10 @@ class Table:
         """Where a cell is, for the start of an error's sentence."""
         return f"{self.row_place(row)}, column {column}"
 
+    @cached_property
+    def _index(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.header)}
+
     def header_place(self, column: str) -> str:
         """Where a column's name is, or should be, for the start of an error's sentence."""
         line = "" if self.header_line is None else f", line {self.header_line}"
@@ -92,14 +97,14 @@ class Table:
 
     def finite_or_missing(self, columns: Sequence[str], largest: float = LARGEST) -> FloatArray:
         """Values of some columns (n, k); an infinite one, or one above the largest, is an InputError."""
-        values = self.values[:, [self.header.index(name) for name in columns]]
+        values = self.values[:, [self._index[name] for name in columns]]
         self.refuse(np.isinf(values), columns, "found an infinite number, expected a finite number or an empty cell")
         self._refuse_larger(values, columns, largest)
         return values
 
     def complete(self, columns: Sequence[str], largest: float = LARGEST) -> FloatArray:
         """Values of some columns (n, k); a missing or infinite one, or one above the largest, is an InputError."""
-        values = self.values[:, [self.header.index(name) for name in columns]]
+        values = self.values[:, [self._index[name] for name in columns]]
         self.refuse(np.isnan(values), columns, "found no value, expected a number")
         self.refuse(np.isinf(values), columns, "found an infinite number, expected a finite number")
         self._refuse_larger(values, columns, largest)
@@ -187,19 +192,26 @@ def table_of_text(
     instants: Collection[str] = (),
     separator: str = ",",
     decimal: str = ".",
+    head: Table | None = None,
 ) -> Table:
-    """As :func:`read_table`, from text that errors call `name` and whose rows begin at `first_line` of a longer one."""
+    """As :func:`read_table`, from text that errors call `name` and whose rows begin at `first_line` of a longer one.
+
+    ``head``: the table whose header the rows have; the text has none then.
+    """
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
         raise InputError(f"{name}, line {line}: found a NUL byte, expected UTF-8 text.")
     rows = _csv_rows(name, text, separator)
-    header_line, cells = next(rows, (1, []))
-    if not cells:
-        raise InputError(f"{name} is empty, expected {expected_header}.")
-    header = _checked_header(f"{name}, line {header_line}", cells, expected_header)
+    if head is not None:
+        header, header_line = head.header, 0
+    else:
+        header_line, cells = next(rows, (1, []))
+        if not cells:
+            raise InputError(f"{name} is empty, expected {expected_header}.")
+        header = _checked_header(f"{name}, line {header_line}", cells, expected_header)
     # float() would also take 1_000 and digits of other scripts: only text without them may go through it directly.
-    read = float if text.isascii() and "_" not in text[text.find("\n") :] else _number
+    read = float if text.isascii() and "_" not in text[text.find("\n") if head is None else 0 :] else _number
     kept = [i for i, column in enumerate(header) if only is None or column in only]
     chosen = tuple(header[i] for i in kept)
     timed = [i for i, column in enumerate(chosen) if column in instants]

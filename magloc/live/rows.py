@@ -8,10 +8,10 @@ from typing import Any
 import msgspec
 
 from arrays.array import SensorArray
-from arrays.io.csv import table_of_header
+from arrays.io.csv import Table, table_of_header
 from arrays.io.errors import InputError
 from magloc.live.tally import Tally
-from magloc.readings import EXPECTED_HEADER, Readings, readings_of_table, readings_of_text
+from magloc.readings import EXPECTED_HEADER, Readings, readings_below, readings_of_table
 
 _LINES_WITHOUT_HEADER = 100
 _TIME = "time_s"
@@ -44,8 +44,9 @@ class RowParser:
                 " readings file, and an array without it."
             )
         self._array, self._name, self._tally, self._sensors = array, name, tally, sensors
+        self._used = array
         self._header = ""
-        self._columns: tuple[str, ...] = ()
+        self._head: Table | None = None
         self._n_lines = 0
 
     @property
@@ -101,10 +102,12 @@ class RowParser:
             raise GarbledError("found an object without time_s")
         if not self._header:
             self._take_header(",".join(of_name))
-        unknown = [name for name in of_name if name not in self._columns]
+        assert self._head is not None
+        columns = self._head.header
+        unknown = [name for name in of_name if name not in columns]
         if unknown:
             raise GarbledError(f"found column {unknown[0]}, which the first row does not have")
-        cells = (of_name.get(name) for name in self._columns)
+        cells = (of_name.get(name) for name in columns)
         return ",".join("" if cell is None else str(cell) for cell in cells)
 
     def _take_header(self, text: str) -> None:
@@ -119,15 +122,15 @@ class RowParser:
                 raise
             self._tally.name("garbled", str(error))
             return
-        self._header, self._columns = text, table.header
+        self._header, self._head = text, table
+        self._used = self._array if self._sensors is None else self._array.subset(self._sensors)
 
     def _readings(self, rows: list[str], first_line: int) -> Iterator[Readings]:
         """Readings of successive lines; of halves of them where they are no table, until all garbled ones are found."""
-        if not rows:
+        if not rows or self._head is None:
             return
         try:
-            text = "\n".join([self._header, *rows])
-            readings = readings_of_text(text, self._name, self._array, sensors=self._sensors, first_line=first_line)
+            readings = readings_below(self._head, "\n".join(rows), self._used, first_line)
             if len(readings) == len(rows):
                 yield readings
                 return

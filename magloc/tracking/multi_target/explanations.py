@@ -182,7 +182,7 @@ class RowProblem:
         self, found: Explanation, sources: Sequence[int], pairs: Sequence[tuple[int, int]]
     ) -> Iterator[Explanation]:
         """Without each of some sources, and with one source in place of each of some pairs."""
-        prior, state, ids, penalty = found.prior, found.update.state, found.ids, found.penalty - BIRTH
+        prior, state, ids, penalty = found.prior, found.update.found, found.ids, found.penalty - BIRTH
         for k in sources:
             yield self.updated(prior.without(k), ids[:k] + ids[k + 1 :], found.out, penalty)
         for first, second in pairs:
@@ -218,7 +218,7 @@ class RowProblem:
             place_m = self.row.origin_m + self.row.R_world_from_array @ self._cells.position_m[cell]
             moment = found.update.row.moment_at(place_m, found.update.innovation, found.update.linear)
             ids = (*found.ids, self._first_id + born)
-            start = joint_update(self.with_source(found.prior, place_m, moment), found.update.row).state
+            start = joint_update(self.with_source(found.prior, place_m, moment), found.update.row).found
             # Where it is found, not where it was looked for, is what the next event starts from.
             prior = self.with_source(found.prior, start.position_m[-1], start.moment_Am2[-1])
             child = self.updated(prior, ids, found.out, found.penalty + BIRTH)
@@ -235,11 +235,11 @@ class RowProblem:
         A single sensor that sees it may be at fault; one so far away that it is much stronger than the others is a
         gradient of the ambient field.
         """
-        position, moment = update.state.position_m[-1], update.state.moment_Am2[-1]
+        position, moment = update.found.position_m[-1], update.found.moment_Am2[-1]
         in_array = self.row.R_world_from_array.T @ (position - self.row.origin_m)
         if not (self.scene.prior.allows_position(in_array) and self.scene.prior.allows_moment(moment)):
             return False
-        strength = np.linalg.norm(update.state.moment_Am2, axis=1)
+        strength = np.linalg.norm(update.found.moment_Am2, axis=1)
         if strength.max() > _MUCH_STRONGER * strength.min():
             return False
         energy = update.row.energy_of(position, moment)

@@ -56,7 +56,8 @@ _MEMORIES = np.array([10.0, 80.0])
 _POOR = 5.0 / np.sqrt(2.0 * _MEMORIES - 1.0)
 # By how much it must be likelier in the end, or at once.
 _MUST_GAIN, _CLEAR_GAIN = 20.0, 60.0
-_SAME_SIGMA2 = 1.0
+# Squared distances, in units of their covariance, below which two states are one, and two places may be of one source.
+_SAME_SIGMA2, _ANOTHER_SIGMA2 = 1.0, 25.0
 # What a row costs at most that nothing explains.
 _UNBEARABLE = 1000.0
 
@@ -356,11 +357,19 @@ def _moments(states: list[JointState], weights: FloatArray, source: int) -> tupl
 
 
 def _old_names(restart: Hypothesis, before: Hypothesis) -> tuple[int, ...]:
-    """Names of a restart's sources: those of the nearest ones before it, as far as there are."""
-    apart = np.linalg.norm(restart.state.position_m[:, None] - before.state.position_m, axis=-1)
+    """Names of a restart's sources: those of the nearest ones before it, where they may be the same.
+
+    One that was taken for somewhere else is another source to whoever followed it.
+    """
+    offset = restart.state.position_m[:, None] - before.state.position_m
+    P, Q = (
+        one.state.P[at[:, :, None], at[:, None]] for one in (restart, before) for at in [one.state.of_source[:, :3]]
+    )
+    apart = np.vecdot(offset, np.linalg.solve(P[:, None] + Q, offset[..., None])[..., 0])
     names = list(restart.ids)
-    for new, old in zip(*linear_sum_assignment(apart), strict=True):
-        names[new] = before.ids[old]
+    for new, old in zip(*linear_sum_assignment(np.linalg.norm(offset, axis=-1)), strict=True):
+        if apart[new, old] < _ANOTHER_SIGMA2:
+            names[new] = before.ids[old]
     return tuple(names)
 
 

@@ -12,46 +12,76 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from arrays.typing import BoolArray, FloatArray
 from magloc.tracking.multi_target.measurement import JointRow
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
-from magloc.tracking.multi_target.update_compiled import iterate
+from magloc.tracking.multi_target.update_compiled import iterate, over_root
 
 
 @dataclass(frozen=True, eq=False)
 class JointUpdate:
-    r"""A state after a row.
+    r"""What a row's readings make of a prediction.
 
     Attributes
     ----------
-    state : JointState
+    prior : JointState
+        The prediction.
     row : JointRow
+    L, R : ndarray, shape (6 K + 3, 6 K + 3)
+        Lower roots of :math:`P_{oo}`, and of I + Lᵀ N L at the end.
+    y : ndarray, shape (6 K + 3,)
+        The error e = L y that was found.
     residual : ndarray, shape (C,)
-        Of whitened readings at the state.
-    seen : ndarray, shape (C, 6 K + 3)
-        A root of what the state's uncertainty makes of the predicted readings: A P⁺ Aᵀ.
-    innovation : ndarray, shape (C,)
-        The same at the prediction.
-    linear : ndarray, shape (C, 6 K + 3)
+        Of whitened readings there.
+    HL : ndarray, shape (C, 6 K + 3)
         A root of what the prediction's uncertainty makes of the predicted readings, there.
+    innovation : ndarray, shape (C,)
+        The residual at the prediction.
+    linear : ndarray, shape (C, 6 K + 3)
+        The root at the prediction.
     cost : float
         :math:`J = |r|^2 + e^T P^{-1} e`, χ² of the innovation with the number of readings as degrees of freedom.
-    log_volume : float
-        :math:`\log |I + N P_{oo}|`.
     converged : bool
     """
 
-    state: JointState
+    prior: JointState
     row: JointRow
+    L: FloatArray
+    R: FloatArray
+    y: FloatArray
     residual: FloatArray
-    seen: FloatArray
+    HL: FloatArray
     innovation: FloatArray
     linear: FloatArray
     cost: float
-    log_volume: float
     converged: bool
+
+    @cached_property
+    def log_volume(self) -> float:
+        """Logarithm of the determinant of I + N P_oo."""
+        return 2.0 * float(np.sum(np.log(np.diagonal(self.R))))
+
+    @cached_property
+    def found(self) -> JointState:
+        """The state after the row as far as the row sees it: motion and covariance are those of the prediction."""
+        return self.prior.moved(self.L @ self.y)
+
+    @cached_property
+    def state(self) -> JointState:
+        """The state after the row, with its covariance in its own chart."""
+        P, d = self.prior.P, self.prior.n_seen
+        rest = over_root(P[d:, :d], self.L)
+        W = np.concatenate([self.L, rest])
+        root = over_root(W, self.R)
+        after = root @ root.T
+        after[d:, d:] += P[d:, d:] - rest @ rest.T
+        return self.prior.moved_with(W @ self.y, after)
+
+    @cached_property
+    def seen(self) -> FloatArray:
+        """A root (C, 6 K + 3) of what the state's uncertainty makes of the predicted readings: A P⁺ Aᵀ."""
+        return over_root(self.HL, self.R)
 
     @cached_property
     def standardised(self) -> FloatArray:
@@ -90,23 +120,7 @@ def joint_update(prior: JointState, row: JointRow) -> JointUpdate:
     y, R, residuals, HLs = np.zeros(d), np.eye(d), np.empty((2, n)), np.zeros((2, n, d))
     residuals[:] = row.z
     cost, converged = iterate(prior.means, L, row.parts, y, residuals, HLs, R)
-    after, seen = _updated(prior, L, R, HLs[1], y)
-    log_volume = 2.0 * float(np.sum(np.log(np.diagonal(R))))
-    return JointUpdate(after, row, residuals[1], seen, residuals[0], HLs[0], cost, log_volume, converged)
-
-
-def _updated(
-    prior: JointState, L: FloatArray, R: FloatArray, HL: FloatArray, y: FloatArray
-) -> tuple[JointState, FloatArray]:
-    """State and covariance after the last linearisation, in the chart of the new state, and a root of A P⁺ Aᵀ."""
-    d = prior.n_seen
-    rest = solve_triangular(L, prior.P[:d, d:], lower=True, check_finite=False).T
-    W = np.concatenate([L, rest])
-    root = solve_triangular(R, W.T, lower=True, check_finite=False).T
-    P = root @ root.T
-    P[d:, d:] += prior.P[d:, d:] - rest @ rest.T
-    seen = solve_triangular(R, HL.T, lower=True, check_finite=False).T
-    return prior.moved_with(W @ y, P), seen
+    return JointUpdate(prior, row, L, R, y, residuals[1], HLs[1], residuals[0], HLs[0], cost, converged)
 
 
 def innovation_chi2(state: JointState, row: JointRow, sensors: BoolArray) -> FloatArray:

@@ -141,6 +141,20 @@ def _solve(R: FloatArray, b: FloatArray) -> None:
 
 
 @compiled
+def over_root(rows: FloatArray, root: FloatArray) -> FloatArray:
+    """Rows (n, d) times the inverse of a lower root's transpose: with root rootᵀ = A, a root of rows A⁻¹ rowsᵀ."""
+    n, d = rows.shape
+    found = np.empty((n, d))
+    for r in range(n):
+        for i in range(d):
+            t = rows[r, i]
+            for k in range(i):
+                t -= root[i, k] * found[r, k]
+            found[r, i] = t / root[i, i]
+    return found
+
+
+@compiled
 def _along(HL: FloatArray, step: FloatArray, along: FloatArray) -> float:
     """Fill HL @ step (C,); its square."""
     square = 0.0
