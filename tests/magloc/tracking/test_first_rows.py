@@ -64,6 +64,14 @@ def judged(motion: MotionModel, n: int, seeds: range) -> FloatArray:
     return result
 
 
+def test_the_true_place_is_kept_beside_another() -> None:
+    """A source at 8 m whose first rows fit one at 4.6 m, too: all rows together once led there for a minute."""
+    _, rows = drawn(WALK, 60, 30027)
+    tracker = Tracker(ARRAY, WALK)
+    ranges = [np.linalg.norm(point.position_m - ARRAY.centroid) for point in tracker.run(rows[:25])]
+    assert min(ranges[1:]) > 6.5
+
+
 @pytest.mark.parametrize("motion", [WALK, VELOCITY], ids=["random walk", "constant velocity"])
 class TestFromTheFirstRow:
     def test_every_row_has_an_answer_that_holds_the_truth(self, motion: MotionModel) -> None:
