@@ -19,14 +19,12 @@ from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import consistency
 from magloc.tracking.motion import CoordinatedTurn, MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
-from magloc.tracking.sensor_health import ROWS_TO_RETURN, Suspects
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.smoother import smoothed
 from tests.oracles import magpylib_field
 from tests.passing_source import (
     ARRAY,
     MOMENT,
-    NOISE_T,
     POSITION,
     SLOW,
     followed,
@@ -303,48 +301,6 @@ class TestGapsAndOutliers:
         time_s, p, m = moving_source(400, dt_s=0.05)
         points = track_record(Tracker(ARRAY, SLOW), rows_from(time_s, readings_of(ARRAY, p, m)))
         assert "outlier" not in statuses(points)
-
-
-class TestFaultySensor:
-    """One sensor of four is wrong for a while in the middle of a track."""
-
-    @pytest.mark.parametrize("fault", ["stuck", "zero", "noisy"])
-    def test_is_named_left_out_and_taken_back(self, fault: str) -> None:
-        """From its second wrong row on (a stuck one may read right at first), as if its readings were missing."""
-        time_s, p, m = moving_source(120, dt_s=0.1)
-        good = readings_of(ARRAY, p, m)
-        wrong, missing = good.copy(), good.copy()
-        noise = 20.0 * NOISE_T * np.random.default_rng(1).normal(size=(30, 3))
-        wrong[20:50, 6:9] = {"stuck": good[10, 6:9], "zero": 0.0, "noisy": good[20:50, 6:9] + noise}[fault]
-        points = track_record(Tracker(ARRAY, SLOW), rows_from(time_s, wrong))
-        dropped = [point.dropped_sensors for point in points]
-        assert set(dropped[:20]) == {()}
-        assert set(dropped[22:49]) == {("s3",)}
-        back = max(row for row, names in enumerate(dropped) if names) + 1
-        assert 49 + ROWS_TO_RETURN <= back <= 50 + ROWS_TO_RETURN
-        assert set(dropped) == {(), ("s3",)}
-        missing[20:back, 6:9] = np.nan
-        told = track_record(Tracker(ARRAY, SLOW), rows_from(time_s, missing))
-        assert all(point.position_m is not None for point in points)
-        np.testing.assert_allclose(positions(points[25:]), positions(told[25:]), atol=2e-3)
-
-    def test_a_spike_is_left_out_of_its_row_alone(self) -> None:
-        time_s, p, m = moving_source(20)
-        spiked = readings_of(ARRAY, p, m)
-        missing = spiked.copy()
-        spiked[10, 4] += 5e-7
-        missing[10, 3:6] = np.nan
-        points = followed(Tracker(ARRAY, SLOW), rows_from(time_s, spiked))
-        told = followed(Tracker(ARRAY, SLOW), rows_from(time_s, missing))
-        assert [row for row, point in enumerate(points) if point.dropped_sensors] == [10]
-        assert points[10].dropped_sensors == ("s2",)
-        np.testing.assert_array_equal(positions(points), positions(told))
-
-    def test_which_of_several_it_is_later_rows_tell(self) -> None:
-        suspects = Suspects.of(3).after(np.array([4.0, 3.0, 60.0]))
-        assert suspects.culprit is None
-        assert suspects.after(np.array([3.0, 20.0, 50.0])).culprit == 0
-        assert suspects.forgotten.excess[0] < suspects.excess[0]
 
 
 class TestLossOfTrack:
