@@ -299,6 +299,9 @@ def track(
         print_consistency(result.lines(), jsonl=jsonl)
     if not (json or jsonl or common.quiet):
         print_note(f"{found.tracked.sum()} of {len(found)} rows tracked")
+    dropped = sorted({name for names in found.dropped_sensors for name in names})
+    if dropped and not common.quiet:
+        print_note(f"sensors left out of some rows: {', '.join(dropped)}")
     if jsonl and found.innovations.flagged:
         print_note(found.innovations.reason)
 

@@ -19,10 +19,10 @@ from magloc.tracking.chart.steps import LARGEST_GROWTH, LARGEST_WIDTH
 from magloc.tracking.chart.update import LEAST_GAIN, LEAST_SHARE, MOST_ITERATIONS, ROUNDING, TOLERANCE
 from magloc.tracking.motion import N_SOURCE, LinearMotion
 from magloc.tracking.results import Prediction, Row, Step, TrackPoint
-from magloc.tracking.tracker import ROWS_TO_LOSE, Tracker, learned
+from magloc.tracking.tracker import Tracker, learned
 
 _MOST_AT_ONCE = 64
-_STATUS = {kernels.TRACKED: "tracked", kernels.PREDICTED: "predicted", kernels.OUTLIER: "outlier"}
+_STATUS = {kernels.TRACKED: "tracked", kernels.PREDICTED: "predicted"}
 
 
 def track_record(
@@ -108,7 +108,6 @@ class _CompiledSteps:
             firm=FIRM,
             full=tracker.filter.n_differences,
             largest_growth=LARGEST_GROWTH,
-            rows_to_lose=ROWS_TO_LOSE,
             largest_width=LARGEST_WIDTH,
             radius=array.circumradius,
         )
@@ -124,7 +123,7 @@ class _CompiledSteps:
         )
 
     def follow(self, begin: int) -> list[TrackPoint]:
-        """Points from a row to the one before the first that a track must start from, or that goes back in time."""
+        """Points from a row to the one before the first that they do not explain, or that goes back in time."""
         tracker, times, before = self.tracker, self.times, self.times_before
         given, out = self.given, self.out
         known = tracker.known
@@ -133,11 +132,10 @@ class _CompiledSteps:
         state = kernels.State(
             mixture.x[0].copy(), mixture.S[0].copy(), mixture.centroid_m.copy(), known.open_loop.copy()
         )
-        end, contradictions = kernels.follow(
+        end = kernels.follow(
             begin,
             next((i for i in range(begin, len(times)) if times[i] <= before[i]), len(times)),
             state,
-            known.contradictions,
             self.channels,
             given,
             self.steps,
@@ -150,6 +148,8 @@ class _CompiledSteps:
         centroids = given.origins[rows] + given.rotations[rows] @ tracker.array.centroid
         steps = self._steps(rows, centroids) if tracker.keep_steps else []
         after = replace(mixture, x=state.x[None], S=state.S[None], centroid_m=state.centroid)
+        explained = bool((out.status[rows] == kernels.TRACKED).any())
+        contradictions = 0 if explained else known.contradictions
         resumed = replace(known, mixture=after, open_loop=state.open_loop, contradictions=contradictions)
         tracker.resume(resumed, times[end - 1], end - begin, steps)
         means, covariances = component_moments(

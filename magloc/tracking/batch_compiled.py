@@ -21,7 +21,7 @@ from magloc.linalg_compiled import orthonormalise, put, put_rows
 from magloc.tracking.chart.coordinates_compiled import fill_chart, into_chart, is_firm, move
 
 IntArray = NDArray[np.int64]
-TRACKED, PREDICTED, OUTLIER = 0, 1, 2
+TRACKED, PREDICTED = 0, 1
 
 
 class Channels(NamedTuple):
@@ -68,7 +68,6 @@ class Rules(NamedTuple):
     firm: float
     full: int
     largest_growth: float
-    rows_to_lose: int
     largest_width: float
     radius: float
 
@@ -200,16 +199,15 @@ def follow(
     begin: int,
     end: int,
     state: State,
-    contradictions: int,
     array: Channels,
     given: Rows,
     steps: Steps,
     rules: Rules,
     out: Followed,
-) -> tuple[int, int]:
-    """Follow a track from a state before row begin, which is changed, to the first row that must be started from.
+) -> int:
+    """Follow a track from a state before row begin, which is changed, to the first row that it does not explain.
 
-    Returns that row, or end, and the number of contradictions so far. Outputs of rows before it are filled.
+    Returns that row, or end. Outputs of rows before it are filled.
     """
     x, S, centroid, open_loop = state
     n = x.size
@@ -260,7 +258,7 @@ def follow(
         if given.n_differences[row] == 0:
             status = PREDICTED
         elif _widest(S_before) > rules.largest_width:
-            return row, contradictions
+            return row
         else:
             w, a = given.transform_of_row[row], given.ambient_of_row[row]
             transform, ambient = given.transforms[w], given.ambients[a]
@@ -338,12 +336,7 @@ def follow(
                     share *= 0.5
             nis = cost
             if not converged or not nis <= rules.nis_limits[given.n_differences[row]]:
-                if contradictions + 1 >= rules.rows_to_lose:
-                    return row, contradictions
-                contradictions += 1
-                status, iterations = OUTLIER, 0
-            else:
-                contradictions = 0
+                return row
         if status == TRACKED:
             # U R⁻¹, seen from the new state: L is that at e.
             for i in range(n):
@@ -359,7 +352,7 @@ def follow(
             put(here, x_before)
             put_rows(product, S_before)
         if _widest(product) > rules.largest_width:
-            return row, contradictions
+            return row
         _product(steps.F[s], open_loop, solution)
         for i in range(n):
             for j in range(n):
@@ -378,7 +371,7 @@ def follow(
         put(out.predicted_x[row], x_before)
         put_rows(out.predicted_S[row], S_before)
         out.nis[row], out.iterations[row], out.status[row] = nis, iterations, status
-    return end, contradictions
+    return end
 
 
 @compiled

@@ -63,6 +63,7 @@ def lines_of_track(points: Sequence[TrackPoint], *, most: int | None = None) -> 
             rows.append([f"{point.time_s:.10g}", *["-"] * 8, point.status])
             continue
         deviations = np.sqrt(np.diagonal(point.covariance)[:3])
+        unsure = "" if point.range_observable or point.centroid_m is None else ", range?"
         rows.append(
             [
                 f"{point.time_s:.10g}",
@@ -70,7 +71,7 @@ def lines_of_track(points: Sequence[TrackPoint], *, most: int | None = None) -> 
                 *(f"{value:.2g}" for value in deviations),
                 f"{np.linalg.norm(point.moment_Am2):.4g}",
                 f"{point.nis:.1f}/{point.nis_dof}" if np.isfinite(point.nis) else "-",
-                point.status if point.range_observable or point.centroid_m is None else f"{point.status}, range?",
+                "".join((point.status, *(f", without {name}" for name in point.dropped_sensors), unsure)),
             ]
         )
     widths = [max(len(row[i]) for row in rows) for i in range(len(header) - 1)]
@@ -98,6 +99,7 @@ def json_entry(point: TrackPoint) -> dict[str, object]:
         "nis": point.nis,
         "nis_dof": point.nis_dof,
         "status": point.status,
+        "dropped_sensors": point.dropped_sensors,
         "range_observable": point.range_observable,
         "range_interval95_m": point.range_interval_m,
         "gaussian": point.gaussian if tracked else None,

@@ -116,6 +116,8 @@ class TrackPoint:
     lag1 : float
         Product of the whitened innovations of this row and of the one before, on average zero for a right model; its
         variance is `nis_dof`. NaN where there is none before, or of other differences.
+    dropped_sensors : tuple of str
+        Sensors that contradict the others, and are left out.
     mixture : Mixture, optional
         All that is known of position and moment, in the coordinates in which it is Gaussian; None of a track that is
         read from a file.
@@ -136,6 +138,7 @@ class TrackPoint:
     radius_m: float = math.nan
     lag1: float = math.nan
     mixture: Mixture | None = None
+    dropped_sensors: tuple[str, ...] = ()
 
     @cached_property
     def range_interval_m(self) -> Intervals | None:

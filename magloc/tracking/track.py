@@ -119,6 +119,11 @@ class TrackColumns(Sequence[TrackPoint]):
         return [point.status for point in self]
 
     @property
+    def dropped_sensors(self) -> list[tuple[str, ...]]:
+        """Sensors that contradict the others and are left out, of every row."""
+        return [point.dropped_sensors for point in self]
+
+    @property
     def tracked(self) -> BoolArray:
         """Whether the source is tracked (n,)."""
         return np.array([point.position_m is not None for point in self], dtype=bool)

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from arrays.array import SensorArray
-from arrays.typing import FloatArray
+from arrays.typing import BoolArray, FloatArray
 from magloc.blas_threads import one_blas_thread
 from magloc.kalman import (
     block_update,
@@ -37,10 +37,11 @@ from magloc.tracking.acquisition import STACKED_POSITION_ERROR, Acquisition
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import prior_root
-from magloc.tracking.chart.steps import LARGEST_WIDTH, ChartFilter, Known, cartesian, charted, width_of
+from magloc.tracking.chart.steps import LARGEST_WIDTH, ChartFilter, Known, RowUpdate, cartesian, charted, width_of
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.results import Innovation, Prediction, Row, Step, TrackPoint, moving, next_row
+from magloc.tracking.sensor_health import SENSOR_LIMIT, SensorHealth, Suspects
 
 ROWS_TO_LOSE = 3
 """Contradicting rows in a row that end a track."""
@@ -122,6 +123,8 @@ class Tracker:
         self._n_rows = 0
         self._last: Innovation | None = None
         self._row_before: Row | None = None
+        self._health = SensorHealth.of(array.n_sensors)
+        self._suspects = Suspects.of(array.n_sensors)
 
     @one_blas_thread
     def update(self, row: Row | Readings) -> TrackPoint:
@@ -142,10 +145,13 @@ class Tracker:
             row, self._row_before = moving(row, self._row_before), row
         dt_s, self._time_s = row.time_s - self._time_s, row.time_s
         index, self._n_rows = self._n_rows, self._n_rows + 1
-        measurement = self.measurements.of(row)
+        out = self._health.dead
         if self._known is None:
-            return self._started(measurement, index)
-        return self._followed(self._known, measurement, index, dt_s)
+            point = self._started(self._measured(row, out), index)
+        else:
+            out, point = self._followed(self._known, row, index, dt_s)
+        names = (name for name, is_out in zip(self.array.ids, out, strict=True) if is_out)
+        return replace(point, dropped_sensors=tuple(names)) if out.any() else point
 
     def run(
         self, rows: Iterable[Row | Readings], progress: Callable[[int], None] | None = None
@@ -168,8 +174,9 @@ class Tracker:
 
     @property
     def is_tracking(self) -> bool:
-        """Whether the next row continues a track that is no longer young, of one place."""
-        return self._known is not None and not self._known.young and len(self._known.mixture) == 1
+        """Whether the next row continues a track that is no longer young, of one place and with all sensors."""
+        known = self._known
+        return known is not None and not known.young and len(known.mixture) == 1 and self._health.is_well
 
     def resume(self, known: Known, time_s: float, n_rows: int = 0, steps: Sequence[Step] = ()) -> None:
         """Go on from what is known at a time, after so many rows more."""
@@ -278,32 +285,55 @@ class Tracker:
         known = self.filter.refitted(Known(mixture, open_loop, young=((row, self.motion),)))
         return self._kept(measurement, index, known, None, status="acquired")
 
-    def _followed(self, before: Known, measurement: RowMeasurement, index: int, dt_s: float) -> TrackPoint:
-        """A track after one more row."""
-        row = ChartRow.of(measurement)
-        predicted = self.filter.predicted(before.mixture, self.motion, dt_s, row)
+    def _measured(self, row: Row, out: BoolArray) -> RowMeasurement:
+        """What a row says without some of its sensors (N,)."""
+        readings = np.where(out[self.array.channel_sensor], np.nan, row.readings_T)
+        return self.measurements.of(replace(row, readings_T=readings) if out.any() else row)
+
+    def _followed(self, before: Known, row: Row, index: int, dt_s: float) -> tuple[BoolArray, TrackPoint]:
+        """A track after one more row, and the sensors (N,) that were left out of it."""
+        dead = self._health.dead
+        measurement = self._measured(row, dead)
+        predicted = self.filter.predicted(before.mixture, self.motion, dt_s, ChartRow.of(measurement))
         x = before.mixture.x[np.argmax(before.mixture.log_weight)]
         known = replace(before, mixture=predicted, open_loop=self.open_loop(before.open_loop, x, dt_s))
         prediction = self.predicted(*cartesian(before.mixture), dt_s) if self.keep_steps else None
-        if not row.z.size:
-            return self._kept(measurement, index, known, prediction, status="predicted")
+        if not measurement.z.size:
+            return dead, self._kept(measurement, index, known, prediction, status="predicted")
         if width_of(predicted) > LARGEST_WIDTH:
             # The prediction says too little for an iteration to start from it.
-            if self.filter.is_detected(row):
-                return self._started(measurement, index, predicted.matched())
-            return self._kept(measurement, index, known, prediction, status="predicted")
-        update = self.filter.updated(before.mixture, predicted, dt_s, row)
+            if self.filter.is_detected(ChartRow.of(measurement)):
+                return dead, self._started(measurement, index, predicted.matched())
+            return dead, self._kept(measurement, index, known, prediction, status="predicted")
+
+        def updated(out: BoolArray) -> RowUpdate:
+            return self.filter.updated(before.mixture, predicted, dt_s, ChartRow.of(self._measured(row, out)))
+
+        update, out, of_sensor = updated(dead), dead, False
+        if update.mixture is None:
+            out, update, of_sensor = self._without_one(update, updated)
+            measurement = self._measured(row, out)
+        else:
+            self._suspects = self._suspects.forgotten
         innovation = Innovation(measurement.row.available, update.innovation)
         if update.mixture is None:
-            if before.contradictions + 1 >= ROWS_TO_LOSE:
-                return self._started(measurement, index)
-            known = replace(known, contradictions=before.contradictions + 1)
+            contradictions = before.contradictions + (not of_sensor)
+            if contradictions >= ROWS_TO_LOSE:
+                return dead, self._started(measurement, index)
+            known = replace(known, contradictions=contradictions)
             point = self._kept(measurement, index, known, prediction, status="outlier", innovation=innovation)
-            return replace(point, nis=update.nis)
+            return dead, replace(point, nis=update.nis)
+        of_dead = np.full(len(dead), np.inf)
+        for sensor in np.flatnonzero(dead):
+            others = out & (np.arange(len(out)) != sensor)
+            if np.isfinite(self._measured(row, others).row.readings_T).sum() > innovation.available.sum():
+                of_dead[sensor] = updated(others).nis - update.nis
+        self._health = self._health.after(np.full((len(dead), 3), np.nan), out, of_dead)
         known = replace(known, mixture=update.mixture, contradictions=0)
         if before.young:
-            known = self.filter.refitted(replace(known, young=(*before.young, (row, self.motion))))
-        return self._kept(
+            young = (*before.young, (ChartRow.of(measurement), self.motion))
+            known = self.filter.refitted(replace(known, young=young, nis=before.nis + update.nis))
+        return out, self._kept(
             measurement,
             index,
             known,
@@ -312,6 +342,21 @@ class Tracker:
             innovation=innovation,
             iterations=update.iterations,
         )
+
+    def _without_one(
+        self, update: RowUpdate, updated: Callable[[BoolArray], RowUpdate]
+    ) -> tuple[BoolArray, RowUpdate, bool]:
+        """A row that contradicts a track without the one sensor that is at fault, and whether one may be."""
+        dead, own = self._health.dead, np.eye(self.array.n_sensors, dtype=bool)
+        found = {sensor: updated(dead | own[sensor]) for sensor in np.flatnonzero(~dead).tolist()}
+        if all(one.mixture is None for one in found.values()):
+            return dead, update, False
+        chi2 = np.array([found[sensor].nis if sensor in found else np.inf for sensor in range(len(dead))])
+        self._suspects = self._suspects.after(chi2)
+        sensor = self._suspects.culprit
+        if sensor is None or found[sensor].mixture is None or found[sensor].nis > update.nis - SENSOR_LIMIT:
+            return dead, update, True
+        return dead | own[sensor], found[sensor], True
 
     def _kept(
         self,

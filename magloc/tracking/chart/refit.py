@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from arrays.typing import BoolArray, FloatArray
+from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.measurement.nuisances import SensorErrors
 from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.mixture import Mixture
@@ -33,6 +33,22 @@ _LONGEST = 0.5
 
 
 @dataclass(frozen=True, eq=False)
+class Cells:
+    """What is known of the log-range of components before the first row: mean and standard deviation (K,)."""
+
+    log_range: FloatArray
+    sigma: FloatArray
+
+    def about(self, chart: Chart) -> Cells:
+        """Means counted from the ranges of components in the first row."""
+        return replace(self, log_range=self.log_range + np.log(chart.length))
+
+    def take(self, index: BoolArray) -> Cells:
+        """Of some of the components."""
+        return Cells(self.log_range[index], self.sigma[index])
+
+
+@dataclass(frozen=True, eq=False)
 class Refitted:
     """Components fitted to all rows of a track.
 
@@ -41,18 +57,25 @@ class Refitted:
     mixture : Mixture
         Those that converged, after the last row, not yet weighed against each other.
     nis : ndarray, shape (K,)
-        χ² of all rows, of each of them.
+        χ² of all rows but the first, of each of them.
+    origin : ndarray of int, shape (K,)
+        Which of the components that were to be fitted each of them was.
     decided : ndarray of bool, shape (n,)
         Which of the components that were to be fitted converged, or are far less likely than one that did.
     """
 
     mixture: Mixture
     nis: FloatArray
+    origin: IntArray
     decided: BoolArray
 
 
 def refitted(
-    mixture: Mixture, measurements: Sequence[ChartRow], motions: Sequence[MotionModel], errors: SensorErrors
+    mixture: Mixture,
+    measurements: Sequence[ChartRow],
+    motions: Sequence[MotionModel],
+    errors: SensorErrors,
+    cells: Cells | None = None,
 ) -> Refitted:
     """Components fitted to the rows, each on its own, and given up where it is far less likely than the best one."""
     rows, K, N = _Rows(measurements, motions, errors), len(mixture), mixture.x.shape[1]
@@ -61,10 +84,11 @@ def refitted(
     nis, log_evidence = np.full(K, np.inf), np.full(K, -np.inf)
     converged, decided = np.zeros((2, K), dtype=bool)
     live, track = np.arange(K), rows.backwards(mixture.x)
+    prior = None if cells is None else cells.about(rows.chart(track, 0))
     share, last = np.ones(K), np.zeros((K, n))
     for passes in range(_MOST_PASSES):
         with np.errstate(all="ignore"):  # a trajectory may lead out of double precision: it is not kept
-            found = rows.passed(track)
+            found = rows.passed(track, prior)
             largest = np.abs(found.offset[:, :, :3]).max(axis=(0, 2))
             length = np.minimum(1.0, _LONGEST / np.maximum(largest, _LONGEST))
             sigma = np.sqrt(np.diagonal(found.P, axis1=1, axis2=2))[:, :n]
@@ -85,12 +109,13 @@ def refitted(
             decided[live[behind]] = True
             left &= ~behind
         live, track, share, last = live[left], track[:, left], share[left], last[left]
+        prior = None if prior is None else prior.take(left)
         if not live.size:
             break
     S = np.array([np.linalg.cholesky(of_one[::-1, ::-1])[::-1, ::-1] for of_one in P[converged]]).reshape(-1, N, N)
     end = measurements[-1]
     after = Mixture(x[converged], S, log_evidence[converged], n, end.centroid_m, end.radius_m, end.n_pose)
-    return Refitted(after, nis[converged], converged | decided)
+    return Refitted(after, nis[converged], np.flatnonzero(converged), converged | decided)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +163,7 @@ class _Rows:
         """Trajectories at offsets (rows, K, n) in the charts about others."""
         return np.array([self.chart(track, row).retracted(offset[row]) for row in range(len(track))])
 
-    def passed(self, track: FloatArray) -> _Passed:
+    def passed(self, track: FloatArray, prior: Cells | None) -> _Passed:
         """A filter and a smoother that linearise along trajectories (rows, K, n).
 
         The smoother is Bryson and Frazier's: it carries the gradient of what later rows cost, and inverts nothing.
@@ -153,6 +178,8 @@ class _Rows:
         mean[:, N_SOURCE:n] = chart.coordinates(before)[:, N_SOURCE:]
         P[:, :n, :n] = root @ _T(root)
         P[:, np.arange(n, N), np.arange(n, N)] = self.errors.sigma**2
+        if prior is not None:
+            mean[:, 0], P[:, 0, 0] = prior.log_range - np.log(chart.length), prior.sigma**2
         nis, log_evidence = np.zeros(K), np.zeros(K)
         steps: list[_FilteredRow] = []
         transition = np.zeros((K, n, n))
@@ -171,7 +198,7 @@ class _Rows:
             J, gain, left = white[..., :N], white[..., N:-1], white[..., -1:]
             steps.append(_FilteredRow(mean, P[:, :n], transition, J, gain, left))
             square = np.sum(left[..., 0] ** 2, axis=1)
-            nis = nis + square
+            nis = nis + (square if row else 0.0)
             log_evidence -= 0.5 * square + np.sum(np.log(np.diagonal(L_S, axis1=1, axis2=2)), axis=1)
             mean = mean + (_T(gain) @ left)[..., 0]
             P = P - _T(gain) @ gain

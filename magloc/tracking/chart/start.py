@@ -32,10 +32,10 @@ from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.update import Updated, updated
 from magloc.tracking.motion import N_SOURCE, MotionModel
 
+OF_PITCH = 0.6
+"""Standard deviations of a cell, in units of the grid's pitch: neighbours add up to an even density."""
 _N_DIRECTIONS, _N_RANGES = 100, 14
 _PITCH = math.log(FARTHEST / NEAREST) / (_N_RANGES - 1)
-# Standard deviations of a cell, in units of the grid's pitch: neighbours add up to an even density.
-_OF_PITCH = 0.6
 _SPACING = math.sqrt(4.0 * math.pi / _N_DIRECTIONS)
 # Cells that explain so much less than the best one, as a rise of χ², are taken only where they are local peaks.
 _WITHIN = 20.0
@@ -45,8 +45,8 @@ _UNKNOWN_MOMENT = 10.0
 # Of a cell's standard deviation: a component that is narrower is the row's own.
 _NARROW = 0.5
 # The even density of all cells over the density of one at its centre, as a logarithm, along one coordinate.
-_EVEN = math.log(_OF_PITCH * math.sqrt(2.0 * math.pi))
-_CELL = _OF_PITCH * np.array([_PITCH, _SPACING, _SPACING])
+_EVEN = math.log(OF_PITCH * math.sqrt(2.0 * math.pi))
+_CELL = OF_PITCH * np.array([_PITCH, _SPACING, _SPACING])
 _SIGMA_PRIOR = (math.log(FARTHEST / NEAREST) / math.sqrt(12.0), 1.0, 1.0)
 NOT_ALLOWED = "not acquired: no source of the stated region and moment explains the readings"
 
@@ -210,9 +210,10 @@ def _centred(seeds: _Seeds, found: Updated, measurement: ChartRow) -> _Seeds:
     )
 
 
-def once(mixture: Mixture, cell: IntArray) -> IntArray:
+def once(mixture: Mixture, cell: IntArray | None = None) -> IntArray:
     """Components, heaviest first, without those that another one with the same share of the even density has found."""
     source = mixture.of_source()
+    cell = np.zeros((len(source), 1), dtype=np.intp) if cell is None else cell.reshape(len(source), -1)
     chart, left, kept = source.chart, np.argsort(-mixture.log_weight, kind="stable"), []
     limit = chdtri(N_SOURCE, 1.0 - CREDIBLE_ROW)
     while left.size:

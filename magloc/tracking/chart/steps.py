@@ -8,6 +8,7 @@ the motion stand the errors of the array's pose, and behind them those of its se
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,9 +24,9 @@ from magloc.measurement.pose import PoseErrors
 from magloc.tracking.chart.coordinates import mirrored
 from magloc.tracking.chart.mixture import Mixture, block_root, root_of
 from magloc.tracking.chart.posed_motion import PosedMotion
-from magloc.tracking.chart.refit import refitted
+from magloc.tracking.chart.refit import Cells, refitted
 from magloc.tracking.chart.row import ChartRow
-from magloc.tracking.chart.start import Start, once
+from magloc.tracking.chart.start import OF_PITCH, Start, once
 from magloc.tracking.chart.update import Move, predicted_root, updated
 from magloc.tracking.motion import N_SOURCE, MotionModel
 
@@ -38,6 +39,8 @@ LARGEST_WIDTH = 0.4
 SETTLED = 0.05
 """A young track is old when fitting it as a whole changes its state by less, in squares of σ per number, and it is
 narrow."""
+WIDER = 1.2
+"""A filter's own component knows too much if a fit to all of its rows is wider by more."""
 OLD_WIDTH = 0.03
 """Standard deviation of log-range or direction with which a track grows old."""
 SEEDS = 6
@@ -46,6 +49,10 @@ LARGEST_REFIT_WIDTH = 0.25
 """Width of a component that is fitted to all rows of a young track."""
 MOST_YOUNG_ROWS = 100
 """Rows up to which a track is fitted anew as a whole."""
+BENT_RANGE = 0.05
+"""Standard deviation of the log-range above which a mode and its curvature do not tell of the rows' whole valley."""
+N_CELLS, CELL_PITCH = 9, 0.7
+"""Ranges at which it is fitted then, and how far they are apart, in that standard deviation."""
 FIRST_REFIT, REFITS_GROW = 3, 1.6
 """Number of rows of the first such fit, and how much larger it is each time."""
 
@@ -63,6 +70,8 @@ class Known:
         Contradicting rows before the next one.
     young : tuple of (ChartRow, MotionModel)
         Rows of a track that are still fitted together, and the motion that led to each; `next_refit`, after how many.
+    nis : float
+        Of all of them but the first, as the filter found it row by row.
     """
 
     mixture: Mixture
@@ -70,6 +79,7 @@ class Known:
     contradictions: int = 0
     young: tuple[tuple[ChartRow, MotionModel], ...] = ()
     next_refit: int = FIRST_REFIT
+    nis: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,10 +112,13 @@ class ChartFilter:
 
     def started(self, row: ChartRow, motion: MotionModel, near: Mixture | None = None) -> tuple[Mixture | None, str]:
         """What one row says of a source, weighed by a prediction of its place if there is one, or why there is none."""
-        mixture, reason = self._start.mixture(row, PosedMotion.of(motion, self.pose_errors))
+        mixture, reason = self._start.mixture(row, self._posed(motion))
         if mixture is not None and near is not None:
             mixture = _near(mixture, near).reduced()
         return mixture, reason
+
+    def _posed(self, motion: MotionModel) -> MotionModel:
+        return PosedMotion.of(motion, self.pose_errors)
 
     def is_detected(self, row: ChartRow) -> bool:
         """Whether a row shows that there is a source."""
@@ -113,7 +126,7 @@ class ChartFilter:
 
     def predicted(self, mixture: Mixture, motion: MotionModel, dt_s: float, row: ChartRow) -> Mixture:
         """What is known after a time without readings, as seen from a row's array."""
-        n, posed = mixture.n_motion, PosedMotion.of(motion, self.pose_errors)
+        n, posed = mixture.n_motion, self._posed(motion)
         steps = [posed.step(x, dt_s) for x in mixture.x[:, :n]]
         kept, added = self.errors.step(dt_s)
         x = mixture.x.copy()
@@ -147,36 +160,67 @@ class ChartFilter:
             return replace(known, young=())
         if n_rows < known.next_refit or mixture.widths.max() > LARGEST_REFIT_WIDTH:
             return known
-        rows, motions = zip(*known.young, strict=True)
-        seeds = mixture.take(once(mixture, np.zeros((len(mixture), 2), dtype=np.intp))[:SEEDS])
+        seeds = mixture.take(once(mixture)[:SEEDS])
         n_seeds = len(seeds)
         if known.next_refit == FIRST_REFIT:
             x = mirrored(seeds.x, seeds.centroid_m).reshape(-1, seeds.x.shape[1])
             seeds = replace(seeds, x=x, S=np.tile(seeds.S, (4, 1, 1)), log_weight=np.zeros(len(x)))
+        rows = [row for row, _ in known.young]
+        motions = [self._posed(motion) for _, motion in known.young]
         known = replace(known, next_refit=int(REFITS_GROW * n_rows))
-        fit = refitted(seeds, rows, [PosedMotion.of(m, self.pose_errors) for m in motions], self.errors)
-        found = fit.mixture
+        fit = refitted(seeds, rows, motions, self.errors)
         # A component that is not fitted to its end may be the true one: then the filter goes on with all of them.
-        if not fit.decided[:n_seeds].all() or not _believed(found, fit.nis, rows):
+        if not fit.decided[:n_seeds].all() or not _believed(fit.mixture, fit.nis, rows):
             return known
-        found = found.take(once(found, np.zeros((len(found), 2), dtype=np.intp))).reduced()
+        found = fit.mixture.take(once(fit.mixture)).reduced()
+        n, heaviest = mixture.n_motion, np.repeat(np.argmax(mixture.log_weight), len(found))
+        elsewhere = _offset(found, mixture.x[heaviest]).min() > chdtri(n, CONTRADICTION)
+        if elsewhere and fit.nis.min() > known.nis:
+            # The iteration has left the filter's place for one that explains the rows less well.
+            return known
         if len(found) == 1 and len(mixture) == 1:
-            n = mixture.n_motion
-            e = mixture.chart.coordinates(found.x[:, :n])[0]
-            change = np.sum(np.linalg.solve(root_of(mixture.S[0, :n]), e) ** 2)
+            change = _offset(mixture, found.x)[0]
             if change < SETTLED * n and found.widths[0] < OLD_WIDTH:
                 known = replace(known, young=())
-            if change < n:
-                # The mode of all states together stands nearer than the source does on average: the filter's own stays.
+            if change < n and found.widths[0] < WIDER * mixture.widths[0]:
+                # The mode of all states together stands nearer than the source does on average: the filter's own stays,
+                # unless it claims to know more than all rows together tell.
                 return known
-        return replace(known, mixture=found)
+        return replace(known, mixture=self._along_the_range(found, rows, motions))
+
+    def _along_the_range(self, found: Mixture, rows: Sequence[ChartRow], motions: Sequence[MotionModel]) -> Mixture:
+        """Where ranges are open, components fitted anew in cells of the range, as at the start, each with its evidence.
+
+        The valley of ranges is bent, and how much room there is beside it differs along it: one mode would be too near.
+        A source that moves by more than its range is open makes every row a valley of its own.
+        """
+        sigma, span_s = np.linalg.norm(found.S[:, 0], axis=1), rows[-1].row.time_s - rows[0].row.time_s
+        S_q = np.stack([motions[-1].step(x, span_s)[2] for x in found.x[:, : found.n_motion]])
+        added = np.linalg.norm((found.chart.inverse_jacobian() @ S_q)[:, 0], axis=1)
+        if not ((sigma > BENT_RANGE) & (sigma > added)).any():
+            return found
+        k, cell = np.divmod(np.arange(len(sigma) * N_CELLS), N_CELLS)
+        pitch = CELL_PITCH * sigma[k]
+        cells = Cells((cell - N_CELLS // 2) * pitch, OF_PITCH * pitch)
+        fit = refitted(found.take(k), rows, motions, self.errors, cells)
+        if not fit.decided.all() or not len(fit.mixture):
+            return found
+        spread = replace(fit.mixture, log_weight=fit.mixture.log_weight + np.log(pitch[fit.origin]))
+        return spread.take(once(spread, cell[fit.origin])).reduced()
 
 
-def _believed(found: Mixture, nis: FloatArray, rows: tuple[ChartRow, ...]) -> bool:
+def _offset(mixture: Mixture, x: FloatArray) -> FloatArray:
+    """Squared distances (K,) of states (K, N) from components, each of its own, in units of their covariances."""
+    n = mixture.n_motion
+    e = mixture.chart.coordinates(x[:, :n])
+    return np.asarray(np.sum(np.linalg.solve(root_of(mixture.S[:, :n]), e[..., None])[..., 0] ** 2, axis=1))
+
+
+def _believed(found: Mixture, nis: FloatArray, rows: Sequence[ChartRow]) -> bool:
     """Whether sources that were fitted to rows explain them, and are determined by them."""
     if not len(found):
         return False
-    dof = sum(row.z.size for row in rows) - N_SOURCE
+    dof = sum(row.z.size for row in rows[1:])
     best = int(np.argmax(found.log_weight))
     return bool(dof > 0 and nis[best] <= chdtri(dof, CONTRADICTION) and found.widths[best] < LARGEST_REFIT_WIDTH)
 

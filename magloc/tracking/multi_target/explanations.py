@@ -17,9 +17,8 @@ from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.state import JointState
 from magloc.tracking.multi_target.update import JointUpdate, joint_update
 from magloc.tracking.results import Row
+from magloc.tracking.sensor_health import SENSOR_LIMIT
 
-SENSOR_LIMIT = 32.0
-"""χ² with three degrees of freedom of a sensor's post-fit residual above which it contradicts the others: 5e-7."""
 BIRTH_LIMIT = 45.0
 """Energy, of three degrees of freedom, in one of some hundred cells above which another source is there."""
 COST_LIMIT = 5.0

@@ -29,11 +29,11 @@ from magloc.tracking.multi_target.explanations import (
 from magloc.tracking.multi_target.measurement import Channels
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.results import SourcePoint, SourcesPoint
-from magloc.tracking.multi_target.sensor_health import SensorHealth
 from magloc.tracking.multi_target.splitting import split
 from magloc.tracking.multi_target.state import N_COMMON, N_SEEN, JointState
 from magloc.tracking.multi_target.update import innovation_chi2
 from magloc.tracking.results import Row, next_row
+from magloc.tracking.sensor_health import SensorHealth
 
 ROWS_TO_REPORT = 10
 """Rows after its birth in which a source is not yet told, unless there is no other: one taken for two dies sooner."""
@@ -223,11 +223,13 @@ class SourcesTracker:
     def _after(self, problem: RowProblem, before: Hypothesis, found: Explanation) -> Hypothesis:
         """A hypothesis after an explanation of the row."""
         of_dead = innovation_chi2(found.update.state, problem.measured, before.health.dead)
+        used = found.update.row.used.reshape(-1, 3)
+        residuals = np.where(used.all(axis=1, keepdims=True), found.update.standardised, np.nan)
         after = replace(
             before,
             state=found.update.state,
             ids=found.ids,
-            health=before.health.after(found.update, found.out, of_dead),
+            health=before.health.after(residuals, found.out, of_dead),
             score=before.score + found.score,
             judged=max(0, before.judged - 1),
         )

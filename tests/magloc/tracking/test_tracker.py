@@ -283,10 +283,11 @@ class TestGapsAndOutliers:
         assert np.linalg.norm(positions(points) - p, axis=1)[1:].max() < 0.1
 
     def test_an_outlier_is_named_and_not_used(self) -> None:
+        """Two sensors are wrong: none alone is at fault."""
         time_s, p, m = moving_source(20)
         clean = readings_of(ARRAY, p, m)
         spiked, empty = clean.copy(), clean.copy()
-        spiked[10, 4] += 5e-7
+        spiked[10, [4, 7]] += [5e-7, -3e-7]
         empty[10] = np.nan
         points = followed(Tracker(ARRAY, SLOW), rows_from(time_s, spiked))
         without = followed(Tracker(ARRAY, SLOW), rows_from(time_s, empty))

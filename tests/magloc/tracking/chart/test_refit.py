@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from magloc.measurement.differences import predicted_channels
 from magloc.tracking.chart.mixture import Mixture
-from magloc.tracking.chart.refit import refitted
+from magloc.tracking.chart.refit import Cells, refitted
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.motion import OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.results import Row
@@ -57,6 +57,29 @@ class TestRefitted:
         found = refitted(both, measurements, [tracker.motion] * 5, tracker.errors)
         assert found.decided.all()
         assert len(found.mixture) == 1
+
+
+class TestCells:
+    """Cells of the range before the first row."""
+
+    def test_together_are_the_fit_without_them(self) -> None:
+        """Where the readings are nearly linear: 15 cells, 0.6 of their pitch wide, are even to 1 %, and so are sums."""
+        tracker = Tracker(ARRAY, RandomWalk(1e-9, 1e-9))
+        rows = rows_of(np.linspace([-3.0, 0.0, 0.0], [0.0, 0.0, 0.0], 5))
+        measurements = [ChartRow.of(tracker.measurements.of(row)) for row in rows]
+        motions = [tracker.motion] * 5
+        mode = refitted(seed_of(tracker, rows[-1]), measurements, motions, tracker.errors).mixture
+        sigma = np.linalg.norm(mode.S[0, 0])
+        pitch = 0.7 * sigma
+        seeds = mode.take(np.zeros(15, dtype=np.intp))
+        cells = Cells(pitch * np.arange(-7, 8), np.full(15, 0.6 * pitch))
+        found = refitted(seeds, measurements, motions, tracker.errors, cells)
+        assert found.decided.all()
+        np.testing.assert_array_equal(found.origin, np.arange(15))
+        assert np.all(np.diff(found.mixture.chart.length) > 0.0)
+        one = found.mixture.take(np.arange(15)).matched()
+        assert np.linalg.norm(np.linalg.solve(mode.S[0], mode.chart.coordinates(one.x)[0])) < 0.05
+        np.testing.assert_allclose(one.S[0] @ one.S[0].T, mode.S[0] @ mode.S[0].T, rtol=0.05, atol=1e-3 * sigma**2)
 
 
 class TestPrior:

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 import arrays
 import magloc
-from magloc.tracking.multi_target.sensor_health import ROWS_TO_RETURN
 from magloc.tracking.multi_target.tracker import ROWS_TO_REPORT
+from magloc.tracking.sensor_health import ROWS_TO_RETURN
 from tests.moving_magnets import FAULTS, NOISE_T, RATE_HZ, Magnets, board, followed, judged, with_fault
 
 BOARD = board()

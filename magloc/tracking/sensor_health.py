@@ -7,8 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.tracking.multi_target.update import JointUpdate
 
+SENSOR_LIMIT = 32.0
+"""χ² with three degrees of freedom of a sensor's residual above which it contradicts the others: 5e-7."""
+RIVAL_WITHIN = 9.0
+"""A sensor is at fault only where χ² of the rows without it is less than without any other by this at least."""
 ROWS_TO_DIE = 3.0
 """Rows in which a sensor is left out before it is named: single spikes are none of its death."""
 ROWS_TO_RETURN = 50
@@ -20,6 +23,8 @@ MOST_DRIFTING = 2
 _GOOD = 16.27  # one good row in a thousand is worse
 # How much a row that is well undoes of one that is not.
 _FORGIVEN = 0.25
+# What a row that needs no sensor at fault leaves of a suspicion.
+_REMEMBERED = 0.9
 # Rows over which residuals are averaged.
 _MEMORIES = np.array([4.0, 16.0, 64.0, 256.0])
 
@@ -61,6 +66,11 @@ class SensorHealth:
         )
 
     @property
+    def is_well(self) -> bool:
+        """Whether no sensor is dead, or was left out of late."""
+        return not (self.dead.any() or self.strikes.any())
+
+    @property
     def suspect(self) -> int | None:
         """The sensor whose mean residual is beyond noise, the worst one if there are several."""
         chi2 = np.max(np.vecdot(self.sums, self.sums) / np.maximum(self.weight, 1e-300), axis=0)
@@ -72,11 +82,15 @@ class SensorHealth:
         """Whether another sensor may be said to drift."""
         return int(np.count_nonzero(self.drifting)) < MOST_DRIFTING
 
-    def after(self, update: JointUpdate, out: BoolArray, of_dead: FloatArray) -> SensorHealth:
-        """After one more row: sensors (N,) that were left out of it, and χ² (N,) of the dead against the others."""
-        read: BoolArray = np.asarray(update.row.used.reshape(-1, 3).all(axis=1), dtype=np.bool_)
+    def after(self, residuals: FloatArray, out: BoolArray, of_dead: FloatArray) -> SensorHealth:
+        """After one more row.
+
+        Standardised residuals (N, 3), NaN of sensors of which there are none; sensors (N,) that were left out of the
+        row, and χ² (N,) of the dead against the others.
+        """
+        read = np.isfinite(residuals[:, 0])
         keep = (1.0 - 1.0 / _MEMORIES)[:, None]
-        sums = np.where(read[:, None], keep[..., None] * self.sums + update.standardised, self.sums)
+        sums = np.where(read[:, None], keep[..., None] * self.sums + residuals, self.sums)
         weight = np.where(read, keep**2 * self.weight + 1.0, self.weight)
         strikes = np.where(out & ~self.dead, self.strikes + 1.0, np.maximum(0.0, self.strikes - _FORGIVEN))
         good = np.where(self.dead & (of_dead < _GOOD), self.good + 1, 0)
@@ -102,3 +116,37 @@ class SensorHealth:
     def forgetful(self) -> SensorHealth:
         """With no memory of residuals, which were those of another state."""
         return replace(self, sums=np.zeros_like(self.sums), weight=np.zeros_like(self.weight))
+
+
+@dataclass(frozen=True, eq=False)
+class Suspects:
+    """Which sensor is at fault, where a row alone may be explained without any one of several.
+
+    Attributes
+    ----------
+    excess : ndarray, shape (N,)
+        Of late rows, χ² without each sensor above that without the likeliest one.
+    """
+
+    excess: FloatArray
+
+    @classmethod
+    def of(cls, n_sensors: int) -> Suspects:
+        """No row yet."""
+        return cls(np.zeros(n_sensors))
+
+    def after(self, chi2: FloatArray) -> Suspects:
+        """After a row that χ² (N,) has without each of the sensors."""
+        return Suspects(self.excess + chi2 - chi2.min())
+
+    @property
+    def forgotten(self) -> Suspects:
+        """After a row that needs no sensor at fault."""
+        return Suspects(_REMEMBERED * self.excess)
+
+    @property
+    def culprit(self) -> int | None:
+        """The sensor at fault, if one is far likelier than all others."""
+        first = int(np.argmin(self.excess))
+        others = np.delete(self.excess, first)
+        return first if others.size and others.min() - self.excess[first] > RIVAL_WITHIN else None
