@@ -1,8 +1,8 @@
 """Magnets that move over a board, and their tracks: ``python -m tests.moving_magnets --sources 3 --seeds 20``.
 
 Prints every run, and of all of them: swaps, births and losses, NEES per dimension, sensors that were named, and the
-processor time of a row. Paths are sums of sinusoids, rates of turn Ornstein-Uhlenbeck processes; a path is drawn anew where two
-magnets come nearer than ``--gap-mm``.
+processor time of a row. Paths are sums of sinusoids, rates of turn Ornstein-Uhlenbeck processes; a path is drawn anew
+where two magnets come nearer than ``--gap-mm``.
 """
 
 from __future__ import annotations
