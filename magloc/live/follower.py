@@ -42,7 +42,7 @@ class LivePoint(TrackPoint):
     ----------
     time_s, position_m, moment_Am2, covariance, estimability, iterations
         As of every point of a track.
-    nis, nis_dof, status, weight, rivals, centroid_m, radius_m, lag1, mixture
+    nis, nis_dof, status, weight, rivals, centroid_m, radius_m, lag1, dropped_sensors, mixture
         The same.
     row : Row
         Readings and pose that it was found from, without the background of a rest.
