@@ -9,6 +9,7 @@ from html import escape
 Colour = tuple[int, int, int]
 ABOVE_THE_PLAYER = "4em"
 """Where the legend stands on a page that plays."""
+_NARROW_PX = 600  # of a page whose legend is folded at first, for it would hide the scene
 
 
 @dataclass(frozen=True)
@@ -68,13 +69,15 @@ def with_legend(
     bottom: str = ".8em",
     script: str = "",
 ) -> str:
-    """A static page as viser makes it, without a panel, with title and legend in its corner, and a script."""
+    """A static page as viser makes it, without a panel, with a legend that folds in its corner, and a script."""
     box = (
-        f'<div style="position:fixed;bottom:{bottom};left:.8em;z-index:1000;max-width:19rem;'
+        f'<details id="legend" open style="position:fixed;bottom:{bottom};left:.8em;z-index:1000;max-width:19rem;'
         "background:rgba(255,255,255,.9);"
         "color:#222;border-radius:.4em;box-shadow:0 1px 4px rgba(0,0,0,.25);font-family:sans-serif;"
-        f'pointer-events:none"><div style="font-weight:600;padding:.5em .6em .2em">{escape(title)}</div>'
-        f"{legend_html(entries, notes)}</div>"
+        'pointer-events:none">'
+        '<summary style="font-weight:600;padding:.5em .6em .2em;pointer-events:auto;cursor:pointer">'
+        f"{escape(title)}</summary>{legend_html(entries, notes)}</details>"
+        f"<script>document.getElementById('legend').open = innerWidth > {_NARROW_PX}</script>"
     )
     before, end, after = page.rpartition("</body>")
     if script:
