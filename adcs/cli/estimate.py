@@ -59,7 +59,7 @@ def estimate(
     scenario = adcs.read_scenario(str(config))
     scenario = scenario.changed({"estimate": options.estimate(scenario.estimate.states)})
     settings = scenario.estimator(f"{config}, table estimate")
-    record = _log(telemetry, scenario)
+    record = read_log(telemetry, scenario)
     with naming(str(telemetry)):
         track = adcs.estimate(record, scenario.satellite, sensors=settings)
     columns = estimate_columns(track)
@@ -82,7 +82,7 @@ def estimate(
         print("\n".join(summary_lines(track)))
 
 
-def _log(path: Path, scenario: AttitudeFile) -> adcs.Telemetry:
+def read_log(path: Path, scenario: AttitudeFile) -> adcs.Telemetry:
     """Log of a table, or of an attitude ephemeris message."""
     if path.suffix.lower() != ".aem":
         return adcs.read_telemetry(path, scenario.step_s, layout=scenario.log)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import adcs
 from adcs.cli.options import print_note
@@ -13,6 +13,9 @@ from arrays.io.arguments import Flag
 from arrays.io.errors import naming
 from arrays.io.outputs import make_folder, refuse_file
 from magloc.cli.framework import QuietOptions, print_json
+
+if TYPE_CHECKING:
+    from adcs.io.imu_files import ImuLog
 
 _MAGNETS: dict[str, Magnet] = {"auto": "auto", "plain": "kept", "reject": "rejected", "subtract": "subtracted"}
 
@@ -59,18 +62,8 @@ def imu(
     if out is not None:
         refuse_file(out, "--out")
     data = adcs.read_imu(log, config)
-    record = data.record
     began = time.perf_counter()
-    with naming(str(log)):
-        track = adcs.inertial_magnetic_filter(
-            record.time_s,
-            record.rate_rad_s,
-            record.acceleration_m_s2,
-            record.field_T,
-            magnet=_MAGNETS[method],
-            gyro_samples=record.gyro_samples,
-            offline=offline,
-        )
+    track = inertial_attitude(log, data, _MAGNETS[method], offline=offline)
     summary: dict[str, Any] = {**imu_summary(track, data), "seconds": time.perf_counter() - began}
     if not common.quiet:
         for text in track.warnings:
@@ -89,3 +82,13 @@ def imu(
         print_json(summary)
     else:
         print("\n".join(summary_words(summary)))
+
+
+def inertial_attitude(log: Path, data: ImuLog, magnet: Magnet = "auto", *, offline: bool = False) -> adcs.AttitudeTrack:
+    """Attitude of a log; errors name its file."""
+    record = data.record
+    readings = (record.time_s, record.rate_rad_s, record.acceleration_m_s2, record.field_T)
+    with naming(str(log)):
+        return adcs.inertial_magnetic_filter(
+            *readings, magnet=magnet, gyro_samples=record.gyro_samples, offline=offline
+        )

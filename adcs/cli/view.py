@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-from cyclopts import Parameter
-from cyclopts.validators import Number
+from typing import TYPE_CHECKING, Any
 
 import adcs
+from adcs.cli.estimate import read_log
+from adcs.cli.imu import inertial_attitude
 from adcs.cli.options import print_note
-from arrays.io.arguments import Flag, whole_number
+from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.io.text import read_text
 from magloc.cli.framework import QuietOptions
-from magloc.cli.options import naming_outputs
+from magloc.cli.options import Port, naming_outputs
 
 if TYPE_CHECKING:
     from arrays.typing import FloatArray
@@ -33,7 +32,7 @@ def view(
     html: Path | None = None,
     png: Path | None = None,
     movie: Path | None = None,
-    port: Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, lte=65535))] = 8080,
+    port: Port = 8080,
     open: Flag = False,
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
 ) -> None:
@@ -45,7 +44,8 @@ def view(
     Parameters
     ----------
     log : Path
-        Telemetry as of `adcs estimate`, such as `adcs run --out` writes, or a log as of `adcs imu`.
+        Telemetry or an attitude message (.aem) as of `adcs estimate`, such as `adcs run --out` writes, or a log as of
+        `adcs imu`.
     config : Path, optional
         Scenario file of the satellite; or the layout of an inertial unit's log, a file with the table log alone.
     truth : Path, optional
@@ -65,10 +65,10 @@ def view(
         Common options.
     """
     from magloc.cli.view import written_or_served
-    from magloc.viewer.view import is_static
+    from magloc.viewer.outputs import check_outputs
 
     with naming_outputs():
-        is_static(html, png, movie)
+        check_outputs(html, png, movie)
     track, *made_of, q_true = (
         _of_inertial_unit(log, config, truth) if _is_layout(config) else _of_satellite(log, config, truth)
     )
@@ -101,16 +101,12 @@ def _of_inertial_unit(log: Path, config: Path | None, truth: Path | None) -> tup
             f"--truth {truth}: found it with the log of an inertial unit, expected the truth in its columns."
         )
     data = adcs.read_imu(log, config)
-    record = data.record
-    with naming(str(log)):
-        readings = (record.time_s, record.rate_rad_s, record.acceleration_m_s2, record.field_T)
-        track = adcs.inertial_magnetic_filter(*readings, gyro_samples=record.gyro_samples)
-    return track, data, None, data.q_true
+    return inertial_attitude(log, data), data, None, data.q_true
 
 
 def _of_satellite(log: Path, config: Path | None, truth: Path | None) -> tuple[Any, ...]:
     scenario = adcs.read_scenario(str(config))
-    telemetry = adcs.read_telemetry(log, scenario.step_s, layout=scenario.log)
+    telemetry = read_log(log, scenario)
     q_true = None if truth is None else _truth(truth, telemetry.time_s)
     with naming(str(log)):
         track = adcs.estimate(telemetry, scenario.satellite, sensors=scenario.estimator(f"{config}, table estimate"))

@@ -7,18 +7,13 @@ import viser
 
 from adcs.viewer.attitude_replay import ENLARGEMENTS, AttitudeReplay
 from adcs.viewer.attitude_scene import AttitudeScene, scene_entries, scene_extent
+from adcs.viewer.enlargement import enlargement_dropdown
 from magloc.viewer.pages import words
 from magloc.viewer.pages.pages import Page, Playing
-from magloc.viewer.panels.inputs import SharedInput
-from magloc.viewer.panels.latest import Latest
-from magloc.viewer.panels.played_time import PlayedTime, speed_text, time_strip
+from magloc.viewer.panels.played_time import PlayedTime, time_strip
 from magloc.viewer.scene.framing import prepare
-from magloc.viewer.scene.glyphs import FIT_COLOUR, OTHER_COLOUR, round_length
+from magloc.viewer.scene.glyphs import FIT_COLOUR, OTHER_COLOUR
 from magloc.viewer.scene.legend import legend_html
-
-_SPEEDS = (0.1, 0.5, 1.0, 2.0, 5.0, 10.0, 50.0, 200.0, 1000.0)
-_STEPS_OF_SLIDER = 1000.0
-_WATCHED_S = 30.0
 
 
 class AttitudePlayer(PlayedTime):
@@ -42,10 +37,7 @@ class AttitudePlayer(PlayedTime):
         self._server, self._replay, self._scene = server, replay, scene
         self._since_first_s = replay.time_s - replay.time_s[0]
         self.row = len(replay.time_s) - 1
-        self._follow = Latest(self._show)
         self._add_panels(server.gui)
-        span = float(self._since_first_s[-1])
-        super().__init__(span, self._follow, self.play_button, self.speed_dropdown, "adcs-attitude-player")
         self.show_row(self.row)
 
     def show_row(self, row: int) -> None:
@@ -53,36 +45,17 @@ class AttitudePlayer(PlayedTime):
         self.move_to(float(self._since_first_s[row]))
 
     def _add_panels(self, gui: viser.GuiApi) -> None:
-        span = float(self._since_first_s[-1])
-        step = round_length(span / _STEPS_OF_SLIDER) if span > 0.0 else 1.0
-        suitable = max((s for s in _SPEEDS if s <= max(1.0, span / _WATCHED_S)), default=1.0)
         with gui.add_folder("Time"):
-            self.time_slider = gui.add_slider(
-                "Time [s]", 0.0, max(span, step), step, 0.0, disabled=span == 0.0, hint="since the first row"
-            )
-            self.play_button = gui.add_button("Play", disabled=span == 0.0)
-            self.speed_dropdown = gui.add_dropdown(
-                "Speed", [speed_text(s) for s in _SPEEDS], initial_value=speed_text(suitable)
-            )
-            self.enlarge_dropdown = gui.add_dropdown(
-                "Errors",
-                [f"{value:g} ×" for value in ENLARGEMENTS],
-                initial_value=f"{self._scene.enlarged:g} ×",
-                hint="how many times larger the scene shows errors and cones",
-            )
+            super().__init__(gui, float(self._since_first_s[-1]), self._show, "adcs-attitude-player")
+            hint = "how many times larger the scene shows errors and cones"
+            self.enlarge_dropdown = enlargement_dropdown(gui, self._scene, ENLARGEMENTS, hint, self._follow)
         with gui.add_folder("At this time"):
             self.row_panel = gui.add_html("")
         with gui.add_folder("Readings"):
             self.strips_panel = gui.add_html(strips(self._replay))
-        self._time = SharedInput(self.time_slider, lambda: self.move_to(float(self.time_slider.value)))
-        self.enlarge_dropdown.on_update(self._enlarged)
-
-    def _enlarged(self, _: object) -> None:
-        self._scene.enlarged = float(self.enlarge_dropdown.value.split()[0])
-        self._follow()
 
     def _show(self) -> None:
-        last = int(np.searchsorted(self._since_first_s, self.now_s + 1e-9, side="right")) - 1
+        last = int(np.searchsorted(self._since_first_s, self.now_s, side="right")) - 1
         self.row = max(0, last)
         with self._server.atomic():
             self._scene.show(self.row)

@@ -16,16 +16,13 @@ import numpy as np
 import viser
 
 from adcs.viewer.drive import Drive
+from adcs.viewer.enlargement import enlargement_dropdown
 from adcs.viewer.error_dial import ErrorDial, words_of
 from adcs.viewer.frame_image import marked_image, named_stars
 from adcs.viewer.table_scene import ENLARGEMENTS, TableScene
 from magloc.viewer.pages import words
-from magloc.viewer.panels.inputs import SharedInput
-from magloc.viewer.panels.latest import Latest
-from magloc.viewer.panels.played_time import PlayedTime, speed_text
+from magloc.viewer.panels.played_time import PlayedTime
 
-_SPEEDS = (0.2, 0.5, 1.0, 2.0, 5.0, 10.0)
-_STEP_S = 0.05
 _FRAMES_KEPT = 32
 _JPEG_QUALITY = 85
 
@@ -55,25 +52,14 @@ class DrivePlayer(PlayedTime):
         self._frame_of = lru_cache(_FRAMES_KEPT)(drive.frame_of)
         self._dial = ErrorDial(drive)
         self._pictured: int | None = None
-        self._follow = Latest(self._show)
         self._add_panels(server.gui)
-        super().__init__(drive.duration_s, self._follow, self.play_button, self.speed_dropdown, "adcs-drive-player")
         self.move_to(0.0)
 
     def _add_panels(self, gui: viser.GuiApi) -> None:
-        duration = self._drive.duration_s
         with gui.add_folder("Time"):
-            self.time_slider = gui.add_slider("Time [s]", 0.0, duration, _STEP_S, 0.0)
-            self.play_button = gui.add_button("Play")
-            self.speed_dropdown = gui.add_dropdown(
-                "Speed", [speed_text(s) for s in _SPEEDS], initial_value=speed_text(2.0)
-            )
-            self.enlarge_dropdown = gui.add_dropdown(
-                "Errors",
-                [f"{value:g} ×" for value in ENLARGEMENTS],
-                initial_value=f"{self._scene.enlarged:g} ×",
-                hint="how many times larger the scene shows the estimate's error and its ellipse",
-            )
+            super().__init__(gui, self._drive.duration_s, self._show, "adcs-drive-player")
+            hint = "how many times larger the scene shows the estimate's error and its ellipse"
+            self.enlarge_dropdown = enlargement_dropdown(gui, self._scene, ENLARGEMENTS, hint, self._follow)
         self.row_panel = gui.add_html("")
         tabs = gui.add_tab_group()
         with tabs.add_tab("Camera"):
@@ -83,12 +69,6 @@ class DrivePlayer(PlayedTime):
             self.frame_panel = gui.add_html("")
         with tabs.add_tab("Error"):
             self.dial_panel = gui.add_html("")
-        self._time = SharedInput(self.time_slider, lambda: self.move_to(float(self.time_slider.value)))
-        self.enlarge_dropdown.on_update(self._enlarged)
-
-    def _enlarged(self, _: object) -> None:
-        self._scene.enlarged = float(self.enlarge_dropdown.value.split()[0])
-        self._follow()
 
     def _show(self) -> None:
         drive = self._drive
@@ -96,7 +76,7 @@ class DrivePlayer(PlayedTime):
         fix = drive.last_fix(row)
         frame = None if fix is None else self._frame_of(fix)
         self._scene.show(row, frame)
-        self._time.show(round(float(drive.truth.time_s[row]) / _STEP_S) * _STEP_S)
+        self._time.show(float(drive.truth.time_s[row]))
         self.row_panel.content = words.panel(words_of(drive, row))
         believed = "" if drive.sigma_m is None else ", with its 3σ ellipse"
         self.dial_panel.content = self._dial.svg(row) + words.panel(

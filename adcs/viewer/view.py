@@ -12,8 +12,9 @@ from adcs.satellite.telemetry import Telemetry
 from adcs.viewer.attitude_page import attitude_page
 from adcs.viewer.attitude_replay import replay_of
 from arrays.typing import FloatArray
+from magloc.viewer.outputs import check_outputs
 from magloc.viewer.server import FIRST_PORT
-from magloc.viewer.view import View, is_static, shown
+from magloc.viewer.view import View, shown
 
 
 def view(
@@ -69,7 +70,7 @@ def view(
     >>> track = adcs.estimate(log.telemetry, log.satellite, sensors="mag+sun+gyro")
     >>> view = adcs.view(track, log.telemetry, log.satellite, html="attitude.html")
     """
-    is_static(html, png, movie)  # or why it cannot be written, before the work
+    check_outputs(html, png, movie)
     if isinstance(readings, ImuLog):
         truth = readings.q_true if truth is None else truth
         readings = readings.record

@@ -13,8 +13,7 @@ from cyclopts import Parameter
 from arrays.io.arguments import Flag
 from arrays.io.errors import LARGEST, InputError, naming
 from magloc.cli.framework import QuietOptions, print_json
-from magloc.cli.options import STREAM, KnownOptions, MotionOptions, naming_options, naming_place, print_note
-from magloc.cli.view import Port
+from magloc.cli.options import STREAM, KnownOptions, MotionOptions, Port, naming_options, naming_place, print_note
 
 if TYPE_CHECKING:
     from magloc.live.follower import Follower, LivePoint

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from magloc.tracking.motion import MotionModel
 
 
+Port = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, lte=65535))]
+
 STREAM = "-"
 """In place of a file: standard input."""
 

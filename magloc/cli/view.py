@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
-from cyclopts.validators import Number
 
 import arrays
-from arrays.io.arguments import Flag, whole_number
+from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from magloc.cli.framework import CommonOptions, progress
-from magloc.cli.options import STREAM, naming_outputs, print_note
+from magloc.cli.options import STREAM, Port, naming_outputs, print_note
 
 if TYPE_CHECKING:
     from arrays.array import SensorArray
@@ -22,9 +21,6 @@ if TYPE_CHECKING:
     from magloc.readings import Readings
     from magloc.viewer.pages.open_result import ReadingsResult, Result
     from magloc.viewer.view import View
-
-
-Port = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, lte=65535))]
 
 
 def view(
@@ -71,9 +67,8 @@ def view(
     if str(path).startswith("-") and str(path) != STREAM:
         raise InputError(f"Unknown option: {path}.")
     import magloc
-    from magloc.viewer.film import refuse_format
+    from magloc.viewer.outputs import check_outputs
     from magloc.viewer.pages.open_result import ReadingsResult, read_result
-    from magloc.viewer.server import check_outputs
 
     if str(path) == STREAM:
         if array is None or any(file is not None for file in (readings, html, png, movie)):
@@ -82,8 +77,6 @@ def view(
         return
 
     with naming_outputs():
-        if movie is not None:
-            refuse_format(movie)
         check_outputs(html, png, movie)
     result = read_result(path, array)
     sensors, rows = _with_track(result, array, readings)

@@ -13,23 +13,14 @@ from scipy.spatial.transform import Rotation
 from arrays.io.errors import InputError
 from arrays.io.text import replaced
 from arrays.typing import FloatArray
+from magloc.viewer.outputs import FILM_FORMATS
 from magloc.viewer.pages.pages import Page
 from magloc.viewer.server import opened_page
 
-_FORMATS = {".gif": "GIF", ".apng": "PNG"}
-_NO_MP4 = "MP4 is not written, for the encoders that come as Python packages bring code under the GPL"
 _MOST_FRAMES = 60
 _TURN_S = 6.0
 _FILM_PX = (960, 600)
 _PALETTE_OF = 4  # lines, of which one tells the colours
-
-
-def refuse_format(path: Path) -> None:
-    """Refuse a film that cannot be written by its name."""
-    suffix = path.suffix.lower()
-    if suffix not in _FORMATS:
-        why = f": {_NO_MP4}" if suffix == ".mp4" else ""
-        raise InputError(f"Input movie {path}: found a name that ends with {suffix!r}, expected .gif or .apng{why}.")
 
 
 def write_film(
@@ -50,7 +41,7 @@ def write_film(
             pictures.append(Image.fromarray(np.asarray(shot)[..., :3]))
             if progress is not None:
                 progress(1)
-    kind = _FORMATS[path.suffix.lower()]
+    kind = FILM_FORMATS[path.suffix.lower()]
     if kind == "GIF":
         # One palette of all: colours that changed from frame to frame would seem to mean something.
         every = Image.fromarray(np.concatenate([np.asarray(picture)[::_PALETTE_OF] for picture in pictures]))

@@ -14,9 +14,8 @@ import rich
 import viser
 
 from arrays.io.errors import InputError
-from arrays.io.outputs import refuse_unwritable
 from arrays.io.text import replaced, write_text
-from magloc.viewer.chromium import BrowserError, Chromium, find_chromium
+from magloc.viewer.chromium import BrowserError, Chromium
 from magloc.viewer.origin import guarded_server
 from magloc.viewer.scene.legend import ABOVE_THE_PLAYER, with_legend
 
@@ -41,22 +40,6 @@ const player = setInterval(() => {
 }, 20);
 """
 _CLOSE_NOTICES = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(button => button.click())"
-
-
-def check_outputs(html: str | Path | None, png: str | Path | None, movie: str | Path | None = None) -> None:
-    """Refuse, before long work, files that cannot be written, and a picture or a film without a browser."""
-    if html is not None:
-        refuse_unwritable(Path(html), "Input html")
-    if png is not None:
-        refuse_unwritable(Path(png), "Input png", ".png")
-    if movie is not None:
-        refuse_unwritable(Path(movie), "Input movie")
-    for name, path in (("png", png), ("movie", movie)):
-        if path is not None:
-            try:
-                find_chromium()
-            except InputError as error:
-                raise InputError(f"Input {name}: {error}") from None
 
 
 def free_port(wanted: int) -> int:

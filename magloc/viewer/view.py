@@ -19,13 +19,13 @@ from magloc.localization.fit.fixes import Fixes
 from magloc.readings import Readings
 from magloc.tracking.results import TrackResult
 from magloc.truth import Truth
-from magloc.viewer.film import refuse_format, write_film
+from magloc.viewer.film import write_film
+from magloc.viewer.outputs import check_outputs
 from magloc.viewer.pages.open_result import MapResult, map_of, path_of_truth
 from magloc.viewer.pages.pages import Page, array_page, map_page, readings_page, track_page
 from magloc.viewer.server import (
     FIRST_PORT,
     address,
-    check_outputs,
     free_port,
     opened,
     page_html,
@@ -146,18 +146,16 @@ def view(
     >>> import magloc
     >>> view = magloc.view(arrays.grid(3, 3, 0.1), html="board.html", title="board")
     """
-    static = is_static(html, png, movie)
-    fill = _filling(array, result, readings, progress, None if file is None else Path(file), live=not static)
+    check_outputs(html, png, movie)
+    live = not _is_static(html, png, movie)
+    fill = _filling(array, result, readings, progress, None if file is None else Path(file), live=live)
     called = title or (array.name if array is not None else "") or "view"
     return shown(f"magloc · {called}", fill, html=html, png=png, movie=movie, open=open, port=port)
 
 
-def is_static(html: str | Path | None, png: str | Path | None, movie: str | Path | None) -> bool:
-    """Whether a view is written or put into a notebook and not served; InputError for what cannot be written."""
-    if movie is not None:
-        refuse_format(Path(movie))
-    check_outputs(html, png, movie)
-    return any(path is not None for path in (html, png, movie)) or _in_notebook()
+def _is_static(*files: str | Path | None) -> bool:
+    """Whether a view is written or put into a notebook and not served."""
+    return any(file is not None for file in files) or _in_notebook()
 
 
 def shown(
@@ -170,8 +168,8 @@ def shown(
     open: bool,
     port: int,
 ) -> View:
-    """A scene that `fill` fills, served and opened, or written."""
-    static = is_static(html, png, movie)
+    """A scene that `fill` fills, served and opened, or written into files that have been checked."""
+    static = _is_static(html, png, movie)
     view = View(title, fill, 0 if static else port)
     if not static:
         if open:

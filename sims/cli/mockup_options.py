@@ -29,7 +29,6 @@ MatcherName = Literal["paper", "robust", "odds"]
 StarFinder = Literal["bright", "faint", "level"]
 FusionName = Literal[Method, "all"]
 Number0 = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0))]
-Port = Annotated[int, Parameter(converter=whole_number, validator=Number(gte=0, lte=65535))]
 _EVERYWHERE = {"part", "seeds", "seed"}
 _OF_THE_CAMERA = (
     *("matcher", "lost", "spurious", "hot_pixels", "noise_dn", "footprint_m", "k1", "believed_k1", "stars", "sky"),

@@ -12,8 +12,8 @@ from cyclopts import Parameter
 from adcs.cli.options import print_note
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
-from magloc.cli.options import naming_outputs
-from sims.cli.mockup_options import MockupOptions, Port
+from magloc.cli.options import Port, naming_outputs
+from sims.cli.mockup_options import MockupOptions
 from sims.experiments.mockup_settings import METHOD_WORDS
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 def check_places(replay: ReplayOptions) -> None:
     """Refuse, before long work, files that cannot be written, and a picture without a browser."""
-    from magloc.viewer.server import check_outputs
+    from magloc.viewer.outputs import check_outputs
 
     with naming_outputs():
         check_outputs(replay.html, replay.png)

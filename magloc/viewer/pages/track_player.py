@@ -28,15 +28,12 @@ from numpy.typing import NDArray
 from arrays.typing import ByteArray, FloatArray
 from magloc.tracking.results import TrackPoint, stacked
 from magloc.viewer.pages import words
-from magloc.viewer.panels.inputs import SharedInput
-from magloc.viewer.panels.latest import Latest
-from magloc.viewer.panels.played_time import PlayedTime, speed_text, time_strip
+from magloc.viewer.panels.played_time import PlayedTime, time_strip
 from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
     TRACK_COLOUR,
     DipoleGlyph,
     length_text,
-    round_length,
     screen_label,
     screen_lines,
 )
@@ -44,9 +41,6 @@ from magloc.viewer.scene.ruler import DropLines
 from magloc.viewer.scene.track_glyph import TrackGlyph, track_segments
 
 Poses = tuple[FloatArray, FloatArray]
-_SPEEDS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 1000.0)
-_SUITABLE_DURATION_S = 30.0
-_STEPS_OF_SLIDER = 1000.0
 _BRIGHTEST = 0.88
 _WHOLE_COLOUR = (190, 196, 203)
 
@@ -110,9 +104,7 @@ class TrackPlayer(PlayedTime):
         tracked = np.flatnonzero(self._tracked)
         self._ends = {int(row) for row in tracked[[0, -1]]} if tracked.size else set()  # which have times of their own
         self.index = int(tracked[-1]) if self._tracked.any() else 0
-        self._follow = Latest(self._show)
-        self._add_panels(server)
-        super().__init__(self._span_s, self._follow, self.play_button, self.speed_dropdown, "magloc-track-player")
+        self._add_panels(server.gui)
         self.show_row(self.index)
 
     def show_row(self, index: int) -> None:
@@ -126,33 +118,21 @@ class TrackPlayer(PlayedTime):
         index = min(max(index, 0), len(self.points) - 1)
         self.move_to(float(self._since_first_s[index]))
 
-    def _add_panels(self, server: viser.ViserServer) -> None:
-        gui, span = server.gui, self._span_s
-        step = round_length(span / _STEPS_OF_SLIDER) if span > 0.0 else 1.0
-        self._step_s, still = step, span == 0.0
-        speeds = [speed_text(speed) for speed in _SPEEDS]
-        suitable = next((s for s in reversed(_SPEEDS) if s <= max(1.0, span / _SUITABLE_DURATION_S)), 1.0)
+    def _add_panels(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Time"):
             self.strip_panel = gui.add_html(_strip(self._since_first_s, self._tracked))
-            self.time_slider = gui.add_slider(
-                "Time [s]", 0.0, max(span, step), step, 0.0, disabled=still, hint="since the first row"
-            )
-            self.play_button = gui.add_button("Play", disabled=still)
+            super().__init__(gui, self._span_s, self._show, "magloc-track-player")
             self.row_buttons = gui.add_button_group("Row", ("previous", "next"))
-            self.speed_dropdown = gui.add_dropdown("Speed", speeds, initial_value=speed_text(suitable))
+            longest, still = self.time_slider.max, self.time_slider.disabled
             self.tail_slider = gui.add_slider(
-                "Tail [s]", 0.0, max(span, step), step, max(span, step), disabled=still, hint="length of the tail"
+                "Tail [s]", 0.0, longest, self.step_s, longest, disabled=still, hint="length of the tail"
             )
             self.whole_checkbox = gui.add_checkbox("Whole track", True, hint="a thin line, of all times")
         with gui.add_folder("At this time"):
             self.row_panel = gui.add_html("")
-        self._time = SharedInput(self.time_slider, self._time_moved)
         self.row_buttons.on_click(lambda _: self._step_row(self.row_buttons.value))
         self.tail_slider.on_update(self._follow)
         self.whole_checkbox.on_update(self._follow)
-
-    def _time_moved(self) -> None:
-        self.move_to(float(self.time_slider.value) + 0.5 * self._step_s)
 
     def _step_row(self, direction: str) -> None:
         self.pause()

@@ -1,7 +1,8 @@
-"""A time that runs when it is played: what a play button, a slider and a speed move together."""
+"""A time that runs when it is played: a slider, a play button and a speed that move together."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from threading import Event, Lock, Thread, current_thread
 from time import perf_counter
 
@@ -9,11 +10,17 @@ import numpy as np
 import viser
 
 from arrays.typing import BoolArray, FloatArray
+from magloc.viewer.panels.inputs import SharedInput
 from magloc.viewer.panels.latest import Latest
+from magloc.viewer.scene.glyphs import round_length
 from magloc.viewer.scene.legend import Colour, css
 
-_STRIP_PARTS, _ROUNDING = 200, 1e-9  # of a part; even times have one each
+_STRIP_PARTS = 200
+_ROUNDING = 1e-6  # of a part, or of a step of the slider; even times have one part each
 _FRAMES_PER_SECOND = 15.0
+_SPEEDS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 1000.0)
+_STEPS_OF_SLIDER = 1000.0
+_WATCHED_S = 30.0  # how long the whole is played at first, at most
 
 
 def time_strip(since_first_s: FloatArray, found: BoolArray, colour: Colour) -> str:
@@ -27,23 +34,16 @@ def time_strip(since_first_s: FloatArray, found: BoolArray, colour: Colour) -> s
     return f'<div style="display:flex;height:0.6em;margin-top:0.4em">{cells}</div>'
 
 
-def speed_text(speed: float) -> str:
-    """A speed as an entry of a dropdown."""
-    return f"{speed:g} ×"
-
-
 class PlayedTime:
     """A time between 0 and a duration, which a thread of its own moves while it is played.
 
     Parameters
     ----------
+    gui : viser.GuiApi
+        The slider, the button and the speed are added where it is at present.
     duration_s : float
-    follow : Latest
-        Called whenever the time has moved.
-    button : viser.GuiButtonHandle
-        Plays and pauses, and says which.
-    speed : viser.GuiDropdownHandle
-        Its entries are made by :func:`speed_text`.
+    show : callable
+        Called whenever the time has moved, and never twice at once.
     name : str
         Of the thread.
 
@@ -51,23 +51,32 @@ class PlayedTime:
     ----------
     now_s : float
         The time that is wanted.
+    step_s : float
+        Of the slider.
     """
 
-    def __init__(
-        self,
-        duration_s: float,
-        follow: Latest,
-        button: viser.GuiButtonHandle,
-        speed: viser.GuiDropdownHandle[str],
-        name: str,
-    ) -> None:
+    def __init__(self, gui: viser.GuiApi, duration_s: float, show: Callable[[], None], name: str) -> None:
         self.now_s = 0.0
-        self._duration_s, self._follow, self._name = duration_s, follow, name
-        self._button, self._speed = button, speed
+        self._duration_s, self._follow, self._name = duration_s, Latest(show), name
         self._lock = Lock()
         self._stop = Event()
         self._thread: Thread | None = None
-        button.on_click(lambda _: self.pause() if self.is_playing else self.play())
+        still = duration_s == 0.0
+        self.step_s = 1.0 if still else round_length(duration_s / _STEPS_OF_SLIDER)
+        self.time_slider = gui.add_slider(
+            "Time [s]", 0.0, max(duration_s, self.step_s), self.step_s, 0.0, disabled=still, hint="since the first row"
+        )
+        self.play_button = gui.add_button("Play", disabled=still)
+        suitable = max(speed for speed in _SPEEDS if speed <= max(1.0, duration_s / _WATCHED_S))
+        self.speed_dropdown = gui.add_dropdown(
+            "Speed", [f"{speed:g} ×" for speed in _SPEEDS], initial_value=f"{suitable:g} ×"
+        )
+        self._time = SharedInput(self.time_slider, self._slid)
+        self.play_button.on_click(lambda _: self.pause() if self.is_playing else self.play())
+
+    def _slid(self) -> None:
+        # The slider rounds: a row at its time is not to be missed by that.
+        self.move_to(float(self.time_slider.value) + _ROUNDING * self.step_s)
 
     @property
     def is_playing(self) -> bool:
@@ -89,7 +98,7 @@ class PlayedTime:
             # An event of its own for every thread: one that is about to end must not go on with the next.
             self._stop = Event()
             self._thread = Thread(target=self._run, args=(self._stop,), name=self._name, daemon=True)
-            self._button.label = "Pause"
+            self.play_button.label = "Pause"
             self._thread.start()
 
     def pause(self) -> None:
@@ -97,7 +106,7 @@ class PlayedTime:
         with self._lock:
             thread, self._thread = self._thread, None
             self._stop.set()
-            self._button.label = "Play"
+            self.play_button.label = "Play"
         if thread is not None and thread is not current_thread():
             thread.join()
 
@@ -106,7 +115,7 @@ class PlayedTime:
         try:
             while self.now_s < self._duration_s and not stop.wait(1.0 / _FRAMES_PER_SECOND):
                 now = perf_counter()
-                self.now_s += (now - last) * float(self._speed.value.split()[0])
+                self.now_s += (now - last) * float(self.speed_dropdown.value.split()[0])
                 last = now
                 self._follow()
         finally:

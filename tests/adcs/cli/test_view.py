@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import adcs as library
@@ -29,6 +30,16 @@ class TestPage:
         page = (tmp_path / "a.html").read_text(encoding="utf-8")
         for words in ("true body axes", "3σ cones", "field: thick as measured", "the bar below plays the rows"):
             assert words in page
+
+    def test_an_ephemeris_message_as_of_estimate(self, adcs, satellite, tmp_path):
+        """Read as `adcs estimate` reads it: a message holds attitudes alone."""
+        utc = np.datetime64("2014-09-01T00:00:00", "ms") + 1000 * np.arange(30).astype("timedelta64[ms]")
+        library.write_aem(tmp_path / "a.aem", utc, np.tile([0.0, 0.0, 0.0, 1.0], (30, 1)))
+        text = config_of(satellite).read_text(encoding="utf-8")
+        (tmp_path / "a.toml").write_text(text.replace('"st+gyro+mag+sun"', '"st"'), encoding="utf-8")
+        outcome = adcs("view", tmp_path / "a.aem", "--config", tmp_path / "a.toml", "--html", tmp_path / "a.html")
+        assert outcome.status == 0, outcome.err
+        assert "3σ cones" in (tmp_path / "a.html").read_text(encoding="utf-8")
 
     def test_inertial_unit(self, adcs, tmp_path):
         log = library.datasets.load("imu").path

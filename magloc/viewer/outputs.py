@@ -1,0 +1,36 @@
+"""Files that a view is written into: refused before long work where they cannot be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from arrays.io.errors import InputError
+from arrays.io.outputs import refuse_unwritable
+from magloc.viewer.chromium import find_chromium
+
+FILM_FORMATS = {".gif": "GIF", ".apng": "PNG"}
+_NO_MP4 = "MP4 is not written, for the encoders that come as Python packages bring code under the GPL"
+
+
+def check_outputs(html: str | Path | None, png: str | Path | None, movie: str | Path | None = None) -> None:
+    """Refuse files that cannot be written, and a picture or a film without a browser."""
+    if html is not None:
+        refuse_unwritable(Path(html), "Input html")
+    if png is not None:
+        refuse_unwritable(Path(png), "Input png", ".png")
+    if movie is not None:
+        _refuse_format(Path(movie))
+        refuse_unwritable(Path(movie), "Input movie")
+    for name, path in (("png", png), ("movie", movie)):
+        if path is not None:
+            try:
+                find_chromium()
+            except InputError as error:
+                raise InputError(f"Input {name}: {error}") from None
+
+
+def _refuse_format(path: Path) -> None:
+    suffix = path.suffix.lower()
+    if suffix not in FILM_FORMATS:
+        why = f": {_NO_MP4}" if suffix == ".mp4" else ""
+        raise InputError(f"Input movie {path}: found a name that ends with {suffix!r}, expected .gif or .apng{why}.")
