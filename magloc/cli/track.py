@@ -25,7 +25,7 @@ from magloc.cli.moments.known_path import (
     write_moment_track,
     write_moment_tracks,
 )
-from magloc.cli.multi_target.sources_track import SourcesWanted, follow_sources, stream_sources
+from magloc.cli.multi_target.sources_track import SourcesOutputs, SourcesWanted, follow_sources, stream_sources
 from magloc.cli.options import (
     STREAM,
     KnownOptions,
@@ -232,7 +232,7 @@ def track(
         refuse_bounds(known)
     several = motion.several(prior)
     if several is not None:
-        others = {"--smooth": smooth or None, "--truth": truth, "--out": out, "--position": path, **maps.outputs}
+        others = {"--smooth": smooth or None, "--truth": truth, "--position": path, **maps.outputs}
         for option in (name for name, value in others.items() if value is not None):
             raise InputError(f"{option}: found it together with --sources, expected one of them.")
     if str(readings) == STREAM:
@@ -249,7 +249,7 @@ def track(
     rows, used = conditioning.apply(rows, used, readings)
     used, rows = _in_ambient_field(used, rows, where)
     if several is not None:
-        follow_sources(used, rows, several, str(readings), json=json, jsonl=jsonl, quiet=common.quiet)
+        follow_sources(used, rows, several, str(readings), SourcesOutputs(out, json, jsonl, common.quiet))
         return
     if path is not None:
         outputs = MomentOutputs(json, jsonl, maps, out, truth, common.quiet)

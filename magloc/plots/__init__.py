@@ -18,6 +18,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "residuals": "magloc.plots.localization",
         "save": "magloc.plots.style",
         "signature": "magloc.plots.signatures:signature_figure",
+        "source_tracks": "magloc.plots.tracks:sources_figure",
         "sources": "magloc.plots.maps",
         "survey": "magloc.plots.surveys:survey_figure",
         "track": "magloc.plots.tracks:track_figure",

@@ -19,4 +19,5 @@ consistency = _tracks.consistency_figure
 cramer_rao_bounds = _bounds.bounds_figure
 signature = _signatures.signature_figure
 survey = _surveys.survey_figure
+source_tracks = _tracks.sources_figure
 track = _tracks.track_figure

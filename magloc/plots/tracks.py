@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,10 +15,11 @@ from arrays.io.outputs import make_folder
 from arrays.typing import FloatArray, IntArray
 from magloc.plots import style
 from magloc.plots.style import save
-from magloc.tracking.results import TrackPoint, stacked
+from magloc.tracking.results import TrackPoint, TrackResult, stacked
 from magloc.truth import STATE_COLUMNS, state_columns
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
 _LOG = logging.getLogger(__name__)
@@ -64,10 +65,31 @@ def write_picture(
     _LOG.info(f"wrote track.png, consistency.png and track.csv into {folder}/")
 
 
+def write_sources(result: TrackResult, folder: Path, array_m: FloatArray | None = None) -> None:
+    """Write track.png, as :func:`sources_figure`, and track.csv with a row for every source in every row."""
+    make_folder(folder, "--out")
+    named = [
+        (id, point)
+        for id, track in zip(result.ids or (1,), result.tracks, strict=True)
+        for point in track
+        if point.position_m is not None
+    ]
+    named.sort(key=lambda pair: pair[1].time_s)
+    time, position, moment, covariance = _columns_of([point for _, point in named])
+    columns: dict[str, Column] = {"time_s": time, "id": np.array([id for id, _ in named])}
+    columns |= state_columns(position, moment, covariance)
+    columns["status"] = [point.status for _, point in named]
+    write_columns(columns, folder / "track.csv")
+    save(sources_figure(result, array_m), folder / "track.png")
+    _LOG.info(f"wrote track.png and track.csv into {folder}/")
+
+
 # Least and largest height of the plan, and its width [in].
 _PLAN_IN = (1.2, 3.4, 6.2)
 # Least ratio of the plan's sides.
 _NARROWEST = 0.2
+# Of several sources, the first that of estimates; told apart by colour-blind readers too.
+_SOURCES = (style.ESTIMATE, style.ORANGE, "#009e73", "#cc79a7", "#56b4e9")
 
 
 def track_figure(
@@ -90,10 +112,39 @@ def track_figure(
     >>> track = magloc.track(diver.array, diver.readings)
     >>> figure = magloc.plots.track(track.points, diver.truth.position_m)
     """
-    time, position, moment, covariance = _columns_of(points)
-    sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    return _figure({"track": points}, truth_m, array_m)
+
+
+def sources_figure(result: TrackResult, array_m: FloatArray | None = None) -> Figure:
+    """Tracks of several sources from above, and their coordinates and strengths through time, as of one.
+
+    Parameters
+    ----------
+    result : TrackResult
+        As :attr:`magloc.SourcesTrack.as_result`, or read from a file.
+    array_m : ndarray, shape (n, 3), optional
+        Origin of the array's frame in every row [m]; without it the array stands at the origin.
+
+    Examples
+    --------
+    >>> import magloc
+    >>> board = magloc.datasets.load("board")
+    >>> track = magloc.track_sources(board.array, board.readings[:20], sources=1)
+    >>> figure = magloc.plots.source_tracks(track.as_result)
+    """
+    if not result.ids:
+        return _figure({"track": result.points}, None, array_m)
+    return _figure({f"source {id}": track for id, track in zip(result.ids, result.tracks, strict=True)}, None, array_m)
+
+
+def _figure(
+    tracks: Mapping[str, Sequence[TrackPoint]], truth_m: FloatArray | None, array_m: FloatArray | None
+) -> Figure:
+    """Sources by their names, of which a single one has its truth."""
+    columns = {name: _columns_of(points) for name, points in tracks.items()}
+    tracked = np.any([np.isfinite(position[:, 0]) for _, position, _, _ in columns.values()], axis=0)
     origin_m = np.zeros((1, 3)) if array_m is None else array_m
-    extent = [position] + ([] if truth_m is None else [truth_m])
+    extent = [position for _, position, _, _ in columns.values()] + ([] if truth_m is None else [truth_m])
     across, up = (style.limits_of([part[:, i] for part in extent], [origin_m[:, i]]) for i in (0, 1))
     widest = max(across[1] - across[0], up[1] - up[0])
     across, up = (_at_least(_NARROWEST * widest, *limits) for limits in (across, up))
@@ -102,32 +153,36 @@ def track_figure(
     figure = style.new_figure(plan_in + 4.2)
     grid = figure.add_gridspec(3, 2, height_ratios=[plan_in + 0.5, 1.4, 1.4])
     plan = figure.add_subplot(grid[0, :])
-    _plan(plan, points, truth_m, origin_m, unit, per_m)
+    _plan(plan, tracks, truth_m, origin_m, unit, per_m)
     plan.set_xlim(per_m * across[0], per_m * across[1])
     plan.set_ylim(per_m * up[0], per_m * up[1])
     first: Axes | None = None
     for i, name in enumerate("xyz"):
         ax = figure.add_subplot(grid[1 + i // 2, i % 2], sharex=first)
         first = ax if first is None else first
-        _through_time(ax, time, per_m * position[:, i], per_m * sigma[:, i])
+        for source, (time, position, _, covariance) in columns.items():
+            sigma = np.sqrt(covariance[:, i, i])
+            _through_time(ax, time, per_m * position[:, i], per_m * sigma, source, _colour(columns, source))
+        style.shade_gaps(ax, time, tracked, "not tracked")
         if truth_m is not None:
             ax.plot(time, per_m * truth_m[:, i], color=style.TRUTH, lw=0.8, ls="--", label="truth")
         ax.set_ylim(style.limits_of([per_m * part[:, i] for part in extent], margin=0.15))
         style.dress(ax, "time [s]", f"{name} [{unit}]")
     strength = figure.add_subplot(grid[2, 1], sharex=first)
-    modulus = np.linalg.norm(moment, axis=1)
-    along = moment / np.where(modulus > 0.0, modulus, np.nan)[:, None]
-    spread = np.sqrt(np.einsum("ni,nij,nj->n", along, covariance[:, 3:, 3:], along))
-    _through_time(strength, time, modulus, spread)
-    strength.set_ylim(
-        style.limits_of([modulus - style.SIGMAS_95 * spread, modulus + style.SIGMAS_95 * spread], share=0.95)
-    )
+    ends: list[FloatArray] = []
+    for source, (time, _, moment, covariance) in columns.items():
+        modulus = np.linalg.norm(moment, axis=1)
+        along = moment / np.where(modulus > 0.0, modulus, np.nan)[:, None]
+        spread = np.sqrt(np.einsum("ni,nij,nj->n", along, covariance[:, 3:, 3:], along))
+        _through_time(strength, time, modulus, spread, source, _colour(columns, source))
+        ends += [modulus - style.SIGMAS_95 * spread, modulus + style.SIGMAS_95 * spread]
+    style.shade_gaps(strength, time, tracked, "not tracked")
+    strength.set_ylim(style.limits_of(ends, share=0.95))
     style.dress(strength, "time [s]", "moment [A·m²]")
-    entries = {
-        label: handle
-        for ax in (plan, strength if first is None else first)
-        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)
-    }
+    entries: dict[str, Artist] = {}
+    for ax in (plan, strength if first is None else first):
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            entries.setdefault(label, handle)
     style.legend(
         figure,
         handles=entries.values(),
@@ -184,7 +239,7 @@ def consistency_figure(
         ax.set_ylim(-0.03, 1.03)
         style.dress(ax, "time [s]", f"estimability\nof the {what} [1]")
         style.legend(ax)
-    axes[-2].set_title("what one row's readings teach: 1 - σ after / σ before", fontsize=style.LETTERS, loc="left")
+    axes[-2].set_title("what the readings taught: 1 - σ / σ without any of them", fontsize=style.LETTERS, loc="left")
     for ax in axes:
         style.shade_gaps(ax, time, tracked, "not tracked")
         if ax is not axes[-1]:
@@ -210,25 +265,26 @@ def _at_least(width: float, low: float, high: float) -> tuple[float, float]:
 
 def _plan(
     ax: Axes,
-    points: Sequence[TrackPoint],
+    tracks: Mapping[str, Sequence[TrackPoint]],
     truth_m: FloatArray | None,
     origin_m: FloatArray,
     unit: str,
     per_m: float,
 ) -> None:
     """Seen from above, with the array."""
-    _, position, _, covariance = _columns_of(points)
-    shown = per_m * position
     if truth_m is not None:
         style.draw_truth(ax, per_m * truth_m[:, 0], per_m * truth_m[:, 1])
-    ax.plot(shown[:, 0], shown[:, 1], color=style.ESTIMATE, lw=1.2, label="track", zorder=2.2)
-    tracked = np.flatnonzero(np.isfinite(position[:, 0]))
-    label = "95 % ellipses"
-    for i in style.some_of(tracked):
-        ax.add_patch(style.ellipse95(shown[i, :2], per_m**2 * covariance[i, :2, :2], label=label))
-        label = "_"
-    begun = [i for i, point in enumerate(points) if point.status == "acquired"]
-    ax.plot(shown[begun, 0], shown[begun, 1], "o", ms=4.5, mfc="none", mec=style.BLACK, label="track begins")
+    edges = {} if len(tracks) == 1 else {source: {"edgecolor": _colour(tracks, source)} for source in tracks}
+    for source, points in tracks.items():
+        _, position, _, covariance = _columns_of(points)
+        shown = per_m * position
+        ax.plot(shown[:, 0], shown[:, 1], color=_colour(tracks, source), lw=1.2, label=source, zorder=2.2)
+        for i in style.some_of(np.flatnonzero(np.isfinite(position[:, 0]))):
+            edge = edges.get(source, {})
+            ax.add_patch(style.ellipse95(shown[i, :2], per_m**2 * covariance[i, :2, :2], label="95 % ellipses", **edge))
+        begun = [i for i, point in enumerate(points) if point.status == "acquired"]
+        if begun:
+            ax.plot(shown[begun, 0], shown[begun, 1], "o", ms=4.5, mfc="none", mec=style.BLACK, label="track begins")
     origin = per_m * origin_m
     if len(origin) > 1:
         ax.plot(origin[:, 0], origin[:, 1], color=style.GREY, lw=1.0, ls="-.", label="path of the array")
@@ -237,12 +293,16 @@ def _plan(
     style.dress(ax, f"x [{unit}]", f"y [{unit}]", "from above")
 
 
-def _through_time(ax: Axes, time: FloatArray, value: FloatArray, sigma: FloatArray) -> None:
+def _through_time(ax: Axes, time: FloatArray, value: FloatArray, sigma: FloatArray, name: str, colour: str) -> None:
     """A number of every row with its 95 % band."""
     low, high = value - style.SIGMAS_95 * sigma, value + style.SIGMAS_95 * sigma
-    ax.fill_between(time, low, high, color=style.ESTIMATE, alpha=0.25, lw=0.0, label="95 % band")
-    ax.plot(time, value, color=style.ESTIMATE, lw=1.0, label="track")
-    style.shade_gaps(ax, time, np.isfinite(value), "not tracked")
+    ax.fill_between(time, low, high, color=colour, alpha=0.25, lw=0.0, label="95 % band")
+    ax.plot(time, value, color=colour, lw=1.0, label=name)
+
+
+def _colour(tracks: Mapping[str, object], source: str) -> str:
+    """A colour of its own for every source; of a single one that of estimates."""
+    return _SOURCES[list(tracks).index(source) % len(_SOURCES)]
 
 
 def _errors(

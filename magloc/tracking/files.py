@@ -225,10 +225,30 @@ def _read_track(path: Path) -> TrackResult:
         raise InputError(
             f"{path}: found fixes of `magloc locate`, expected a track; give its readings to see the fixes."
         )
-    points = tuple(_track_point(f"{path}, result {i}", entry) for i, entry in enumerate(entries, start=1))
-    if not any(point.position_m is not None for point in points):
+    tracks = _tracks(path, entries)
+    if not any(point.position_m is not None for track in tracks.values() for point in track):
         raise InputError(f"{path}: found no row where the source is tracked, expected one at least.")
-    return TrackResult(points, is_truth=False)
+    points, *others = tracks.values()
+    return TrackResult(points, is_truth=False, ids=tuple(tracks) if others else (), others=tuple(others))
+
+
+def _tracks(path: Path, entries: Sequence[dict[str, Any]]) -> dict[int, tuple[TrackPoint, ...]]:
+    """Points of every source by its id; one without an id where the rows have no key tracks."""
+    own: list[dict[int, dict[str, Any]]] = []
+    for i, entry in enumerate(entries, start=1):
+        tracks = entry.get("tracks", [entry | {"id": 0}])
+        if not isinstance(tracks, list) or not all(isinstance(t, dict) and type(t.get("id")) is int for t in tracks):
+            raise InputError(f"{path}, result {i}, key tracks: found something else, expected objects with an id.")
+        own.append({track["id"]: track for track in tracks})
+    ids = sorted({id for of_id in own for id in of_id}) or [0]
+    rows = [{"time_s": entry.get("time_s"), "status": entry.get("status", "")} for entry in entries]
+    return {
+        id: tuple(
+            _track_point(f"{path}, result {i}", row | of_id.get(id, {}))
+            for i, (row, of_id) in enumerate(zip(rows, own, strict=True), start=1)
+        )
+        for id in ids
+    }
 
 
 def _track_point(place: str, entry: dict[str, Any]) -> TrackPoint:

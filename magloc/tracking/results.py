@@ -242,14 +242,25 @@ def stacked(points: Sequence[TrackPoint], name: str, *shape: int) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class TrackResult:
-    """A track, or a truth.
+    """Tracks of one source or of several, or a truth.
 
     Attributes
     ----------
     points : tuple of TrackPoint
-        With one at least that has a position. A truth has no covariances.
+        Of the one source, or the first. A truth has no covariances.
     is_truth : bool
+    ids : tuple of int
+        Of several sources; none where there is but one.
+    others : tuple of tuple of TrackPoint
+        Of the further sources, in the same rows.
     """
 
     points: tuple[TrackPoint, ...]
     is_truth: bool
+    ids: tuple[int, ...] = ()
+    others: tuple[tuple[TrackPoint, ...], ...] = ()
+
+    @property
+    def tracks(self) -> tuple[tuple[TrackPoint, ...], ...]:
+        """Of every source; some row of one of them at least has a position."""
+        return (self.points, *self.others)

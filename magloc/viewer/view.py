@@ -37,6 +37,7 @@ from magloc.viewer.server import (
 if TYPE_CHECKING:
     import xarray as xr
 
+    from magloc.tracking.multi_target.track import SourcesTrack
     from magloc.tracking.track import Track
 
 _MOST_ROWS = 2000
@@ -91,7 +92,7 @@ class View(Closing):
 
 def view(
     array: SensorArray | None,
-    result: Readings | Fixes | Track | TrackResult | Truth | xr.Dataset | MapResult | None = None,
+    result: Readings | Fixes | Track | SourcesTrack | TrackResult | Truth | xr.Dataset | MapResult | None = None,
     *,
     readings: Readings | None = None,
     html: str | Path | None = None,
@@ -112,7 +113,7 @@ def view(
     ----------
     array : SensorArray, optional
         None for a map or a Track, which have their own, and for a path without an array.
-    result : Readings, Fixes, Track, TrackResult, Truth or xarray.Dataset, optional
+    result : Readings, Fixes, Track, SourcesTrack, TrackResult, Truth or xarray.Dataset, optional
         Of the array; a Dataset is a map over starts or sources. Readings are located first, 2000 rows at most, evenly.
         Without it the array alone is seen, with a dipole to be dragged.
     readings : Readings, optional
@@ -204,12 +205,15 @@ def _filling(
     """What fills the scene; all that can be wrong is found, and all that is slow is done, before it is opened."""
     if isinstance(result, Truth):
         result = path_of_truth(result)
-    if hasattr(result, "tracker"):
+    if hasattr(result, "as_result"):
+        readings = result.readings if readings is None else readings
+        result = result.as_result
+    elif hasattr(result, "tracker"):
         array = result.tracker.array if array is None else array
         readings = result.readings if readings is None else readings
         result = TrackResult(result.points, is_truth=False)
     if isinstance(result, TrackResult):
-        if all(point.position_m is None for point in result.points):
+        if all(point.position_m is None for track in result.tracks for point in track):
             raise ValueError("Input result must have a row where the source is tracked; instead received none.")
         return lambda server: track_page(server, result, array, readings)
     if not isinstance(result, MapResult | Readings | Fixes | None):

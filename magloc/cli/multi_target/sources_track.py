@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import magloc
@@ -54,12 +55,23 @@ class SourcesWanted:
         return point
 
 
+@dataclass(frozen=True)
+class SourcesOutputs:
+    """What is written and printed of the tracks."""
+
+    out: Path | None
+    json: bool
+    jsonl: bool
+    quiet: bool
+
+
 def follow_sources(
-    array: SensorArray, rows: Readings, wanted: SourcesWanted, name: str, *, json: bool, jsonl: bool, quiet: bool
+    array: SensorArray, rows: Readings, wanted: SourcesWanted, name: str, outputs: SourcesOutputs
 ) -> None:
     """Follow sources through a file of readings; none in any row is an InputError."""
     from magloc.tracking.multi_target.files import json_of_sources
 
+    json, jsonl, quiet = outputs.json, outputs.jsonl, outputs.quiet
     if rows.background:
         raise InputError("--sources: found it together with --detrend or --high-pass-hz, expected one of them.")
     with progress(len(rows), "rows", quiet=quiet) as advance, naming(name), wanted.named():
@@ -76,6 +88,10 @@ def follow_sources(
         print_json({"results": [json_of_sources(point, single=wanted.sources == 1) for point in found]})
     if not found.ids:
         raise no_source(name, found)
+    if outputs.out is not None:
+        from magloc.plots.tracks import write_sources
+
+        write_sources(found.as_result, outputs.out, rows.array_position_m)
     if not json and not jsonl:
         print(found.table())
     if not (json or jsonl or quiet):

@@ -6,11 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from html import escape
-from typing import Literal, overload
+from typing import TYPE_CHECKING, Literal, overload
 
 from numpy.typing import ArrayLike
 
 from arrays.array import SensorArray
+from arrays.io.lazy import by_name
 from arrays.typing import FloatArray
 from magloc.ambient import in_world_field
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
@@ -19,8 +20,11 @@ from magloc.tracking.multi_target.files import lines_of_sources
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.results import SourcesPoint
 from magloc.tracking.multi_target.tracker import SourcesTracker
-from magloc.tracking.results import TrackPoint, rows_of
+from magloc.tracking.results import TrackPoint, TrackResult, rows_of
 from magloc.tracking.track import TrackColumns
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -97,6 +101,17 @@ class SourcesTrack(Sequence[SourcesPoint]):
             own = [track for track in point.tracks if track.id == id]
             points.append(own[0] if own else TrackPoint(point.time_s, status=point.status))
         return SourceTrack(tuple(points), self.readings, id)
+
+    @property
+    def as_result(self) -> TrackResult:
+        """The tracks of all sources, as they are drawn."""
+        tracks = [self.of(id).points for id in self.ids] or [tuple(TrackPoint(point.time_s) for point in self)]
+        ids = self.ids if len(tracks) > 1 else ()
+        return TrackResult(tracks[0], is_truth=False, ids=ids, others=tuple(tracks[1:]))
+
+    def plot(self) -> Figure:
+        """Places and strengths of all sources through time."""
+        return by_name("magloc.plots.tracks:sources_figure")(self.as_result, self.readings.array_position_m)
 
     def table(self) -> str:
         """The table that ``magloc track --sources`` prints."""

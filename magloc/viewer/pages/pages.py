@@ -21,7 +21,7 @@ from magloc.viewer.pages.fixes import FixView, best_positions
 from magloc.viewer.pages.live import LivePage
 from magloc.viewer.pages.map import MapControls, MapView
 from magloc.viewer.pages.open_result import MapResult
-from magloc.viewer.pages.track_player import TrackPlayer, time_colours
+from magloc.viewer.pages.track_player import TrackPlayer, source_colours, time_colours
 from magloc.viewer.panels.readings_plot import ReadingsPlot
 from magloc.viewer.scene.framing import Extent, aim, corners_of, extent_of, prepare
 from magloc.viewer.scene.glyphs import (
@@ -172,18 +172,13 @@ def readings_page(server: viser.ViserServer, array: SensorArray, fixes: Sequence
 def track_page(
     server: viser.ViserServer, result: TrackResult, array: SensorArray | None, rows: Readings | None
 ) -> Page:
-    """A track, with the array that found it and its readings, if they are given."""
+    """Tracks, with the array that found them and its readings, if they are given."""
     points, gui = result.points, server.gui
-    positions = stacked(points, "position_m", 3)
+    each = [stacked(track, "position_m", 3) for track in result.tracks]
+    positions = np.concatenate(each)
     legend = gui.add_folder("Legend")
     name = "true path" if result.is_truth else "track"
-    ellipsoids = "" if result.is_truth else ", with 95 % ellipsoids"
-    shades = time_colours(np.linspace(0.0, 1.0, _SHADES)).tolist()
-    colours = tuple((red, green, blue) for red, green, blue in shades)
-    entries: list[Entry] = [
-        ColourScale(f"{name}{ellipsoids}, by time", f"{points[0].time_s:.6g} s", f"{points[-1].time_s:.6g} s", colours),
-        Swatch(DIPOLE_COLOUR, "direction of the moment at this time"),
-    ]
+    entries = [*_line_entries(result, name), Swatch(DIPOLE_COLOUR, "direction of the moment at this time")]
     seen = [positions]
     poses = on_pose = None
     if array is not None:
@@ -199,18 +194,33 @@ def track_page(
     if array is not None:
         entries += _array_entries(server, glyphs, rows, ball)
     followers: list[Callable[[int], None]] = []
-    player = TrackPlayer(server, points, 0.2 * ball.radius_m, array_poses=poses, on_pose=on_pose, on_row=followers)
+    player = TrackPlayer(server, result, 0.2 * ball.radius_m, array_poses=poses, on_pose=on_pose, on_row=followers)
     if array is not None and rows is not None:
         plot = ReadingsPlot(server, rows, array)
         of_point = _nearest_rows(rows, points)
         plot.show_row(int(of_point[player.index]))
         followers.append(lambda index: plot.show_row(int(of_point[index])))
-    tracked = np.flatnonzero(np.isfinite(positions).all(axis=1))
-    for i in dict.fromkeys((tracked[0], tracked[-1])):
-        below = positions[i] - np.array([0.0, 0.0, 0.14 * ball.radius_m])  # above, the arrow of the moment may be
-        screen_label(server.scene, f"/times/{i}", f"{points[i].time_s:.6g} s", below)
+    nodes = [f"/times/of-{id}" for id in result.ids] or ["/times"]
+    for node, place in zip(nodes, each, strict=True):
+        tracked = np.flatnonzero(np.isfinite(place).all(axis=1))
+        for i in dict.fromkeys(tracked[[0, -1]].tolist() if tracked.size else ()):
+            below = place[i] - np.array([0.0, 0.0, 0.14 * ball.radius_m])  # above, the arrow of the moment may be
+            screen_label(server.scene, f"{node}/{i}", f"{points[i].time_s:.6g} s", below)
+    drops = [trail.drop for trail in player.trails]
     playing = Playing.of(stacked(points, "time_s"), player.show_row, player.index) if len(points) > 1 else None
-    return _finished(server, legend, ball, name, entries, close=player.pause, drops=[player.drop], playing=playing)
+    return _finished(server, legend, ball, name, entries, close=player.pause, drops=drops, playing=playing)
+
+
+def _line_entries(result: TrackResult, name: str) -> list[Entry]:
+    """Lines of the legend for the tracks: one by time, several by source."""
+    ellipsoids = "" if result.is_truth else ", with 95 % ellipsoids"
+    if result.ids:
+        sources = zip(result.ids, source_colours(result), strict=True)
+        return [Swatch(colour, f"source {id}{ellipsoids}") for id, colour in sources if colour is not None]
+    shades = time_colours(np.linspace(0.0, 1.0, _SHADES)).tolist()
+    colours = tuple((red, green, blue) for red, green, blue in shades)
+    first, last = (f"{result.points[i].time_s:.6g} s" for i in (0, -1))
+    return [ColourScale(f"{name}{ellipsoids}, by time", first, last, colours)]
 
 
 def live_page(server: viser.ViserServer, array: SensorArray, live: LivePage) -> Page:

@@ -1,10 +1,10 @@
-"""A track played through time: slider, play and pause, speed, tail.
+"""Tracks played through time: slider, play and pause, speed, tail.
 
 Use, inside a tab or folder of the GUI::
 
     player = TrackPlayer(
         server,
-        points,                              # sequence of TrackPoint in the order of time, one for every row
+        TrackResult(points, is_truth=False), # of one source or of several
         size_m,                              # length of the arrow [m]
         array_poses=(position_m (n, 3), rotation_xyzw (n, 4)) or None,     # where the readings hold them, row by row
         on_pose=glyphs.set_pose,             # called with (position_m, rotation_xyzw) of the row
@@ -19,19 +19,24 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from html import escape
+from itertools import cycle
 
 import numpy as np
 import viser
 from matplotlib import colormaps
 from numpy.typing import NDArray
 
-from arrays.typing import ByteArray, FloatArray
-from magloc.tracking.results import TrackPoint, stacked
+from arrays.typing import BoolArray, ByteArray, FloatArray
+from magloc.tracking.results import TrackPoint, TrackResult, stacked
 from magloc.viewer.pages import words
 from magloc.viewer.panels.played_time import PlayedTime, time_strip
 from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
+    FIELD_LINE_COLOUR,
+    OTHER_COLOUR,
+    REGION_COLOUR,
     TRACK_COLOUR,
+    Colour,
     DipoleGlyph,
     length_text,
     screen_label,
@@ -43,67 +48,116 @@ from magloc.viewer.scene.track_glyph import TrackGlyph, track_segments
 Poses = tuple[FloatArray, FloatArray]
 _BRIGHTEST = 0.88
 _WHOLE_COLOUR = (190, 196, 203)
+_SOURCE_COLOURS: tuple[Colour, ...] = (TRACK_COLOUR, FIELD_LINE_COLOUR, (0, 158, 115), OTHER_COLOUR, REGION_COLOUR)
+
+
+class Trail:
+    """A source in the scene: its whole track as a thin line, and tail, ellipsoid, moment and place at one time.
+
+    Parameters
+    ----------
+    scene : viser.SceneApi
+    name : str
+        Of the node that holds it all.
+    points : sequence of TrackPoint
+    size_m : float
+        Length of the moment's arrow [m].
+    colour : tuple of 3 ints, optional
+        By default the line is coloured by time.
+    """
+
+    def __init__(
+        self, scene: viser.SceneApi, name: str, points: Sequence[TrackPoint], size_m: float, colour: Colour | None
+    ) -> None:
+        positions, self._moments = stacked(points, "position_m", 3), stacked(points, "moment_Am2", 3)
+        self.tracked: BoolArray = np.array(np.isfinite(positions).all(axis=1))
+        self._whole_m = positions[track_segments(positions, 0, len(positions) - 1)]
+        self.whole = screen_lines(scene, f"{name}/whole", self._whole_m, _WHOLE_COLOUR, 1.0)
+        has_any = any(point.covariance is not None for point in points)
+        covariances = stacked(points, "covariance", 6, 6)[:, :3, :3] if has_any else None
+        shades = time_colours(stacked(points, "time_s")) if colour is None else None
+        self.glyph = TrackGlyph(
+            scene,
+            f"{name}/tail",
+            positions,
+            covariances,
+            size_m=0.15 * size_m,
+            colour=TRACK_COLOUR if colour is None else colour,
+            colours=shades,
+        )
+        self.dipole = DipoleGlyph(scene, f"{name}/moment", size_m, DIPOLE_COLOUR)
+        self.drop = DropLines(scene, f"{name}/drop", DIPOLE_COLOUR)
+        self.label = screen_label(scene, f"{name}/now", "", np.zeros(3), "center-left")
+
+    def show(self, first: int, last: int, text: str) -> None:
+        """Show the rows of the tail, and the source at the last of them with a label; "": none."""
+        positions = self.glyph.positions_m
+        self.glyph.show_until(last, last - first)
+        self.dipole.show(positions[last], self._moments[last])
+        self.drop.show(positions[last])
+        self.label.visible = bool(self.tracked[last]) and bool(text)
+        if self.label.visible:
+            self.label.text, self.label.position = f"   {text}", positions[last]
+
+    def show_rest(self, first: int, last: int, *, visible: bool) -> None:
+        """The thin line before and after the tail, not through it."""
+        positions = self.glyph.positions_m
+        parts = ((0, first), (last, len(positions) - 1))
+        ends = np.concatenate([track_segments(positions, *part) for part in parts])
+        self.whole.visible = visible and bool(len(ends))
+        if len(ends):
+            self.whole.points = positions[ends].astype(np.float32)
 
 
 class TrackPlayer(PlayedTime):
-    """A track in the scene at one time, and the panels that move the time.
+    """Tracks in the scene at one time, and the panels that move the time.
 
     Parameters
     ----------
     server : viser.ViserServer
         The panels are added where its GUI is at present.
-    points : sequence of TrackPoint
-        In the order of time.
+    result : TrackResult
+        Its points in the order of time.
     size_m : float
-        Length of the moment's arrow [m].
+        Length of the moments' arrows [m].
     array_poses : tuple of ndarrays, shapes (n, 3) and (n, 4), optional
         Position [m] and rotation (xyzw) of the array in every row.
     on_pose : callable, optional
         Called with the pose of the array in the row that is shown.
     on_row : sequence of callable
         Called with the index of the row that is shown.
-    name : str
-        Of the scene node that holds the track.
 
     Attributes
     ----------
     index : int
         Row that is shown.
-    drop : DropLines
-        From the source at this time to the floor.
+    trails : tuple of Trail
+        Of every source.
     """
 
     def __init__(
         self,
         server: viser.ViserServer,
-        points: Sequence[TrackPoint],
+        result: TrackResult,
         size_m: float,
         *,
         array_poses: Poses | None = None,
         on_pose: Callable[[FloatArray, FloatArray], None] | None = None,
         on_row: Sequence[Callable[[int], None]] = (),
-        name: str = "/track",
     ) -> None:
-        self._server, self.points = server, points
+        self._server, self._result, points = server, result, result.points
         self._poses, self._on_pose, self._on_row = array_poses, on_pose, on_row
         time = stacked(points, "time_s")
         self._since_first_s = time - time[0]
         self._span_s = float(self._since_first_s[-1])
-        positions, self._moments = stacked(points, "position_m", 3), stacked(points, "moment_Am2", 3)
-        self._tracked = np.array([point.position_m is not None for point in points])
-        whole = positions[track_segments(positions, 0, len(positions) - 1)]
-        self.whole = screen_lines(server.scene, f"{name}/whole", whole, _WHOLE_COLOUR, 1.0)
-        has_any = any(point.covariance is not None for point in points)
-        covariances = stacked(points, "covariance", 6, 6)[:, :3, :3] if has_any else None
-        self.glyph = TrackGlyph(
-            server.scene, f"{name}/tail", positions, covariances, size_m=0.15 * size_m, colours=time_colours(time)
+        nodes = [f"/track-{id}" for id in result.ids] or ["/track"]
+        self.trails = tuple(
+            Trail(server.scene, name, track, size_m, colour)
+            for name, track, colour in zip(nodes, result.tracks, source_colours(result), strict=True)
         )
-        self.dipole = DipoleGlyph(server.scene, f"{name}/moment", size_m, DIPOLE_COLOUR)
-        self.drop = DropLines(server.scene, f"{name}/drop", DIPOLE_COLOUR)
-        self.time_label = screen_label(server.scene, f"{name}/now", "", np.zeros(3), "center-left")
-        tracked = np.flatnonzero(self._tracked)
+        tracked = np.flatnonzero(np.any([trail.tracked for trail in self.trails], axis=0))
         self._ends = {int(row) for row in tracked[[0, -1]]} if tracked.size else set()  # which have times of their own
-        self.index = int(tracked[-1]) if self._tracked.any() else 0
+        self.index = int(tracked[-1]) if tracked.size else 0
         self._add_panels(server.gui)
         self.show_row(self.index)
 
@@ -115,12 +169,13 @@ class TrackPlayer(PlayedTime):
         index : int
             Rows before the first and after the last are those.
         """
-        index = min(max(index, 0), len(self.points) - 1)
+        index = min(max(index, 0), len(self._since_first_s) - 1)
         self.move_to(float(self._since_first_s[index]))
 
     def _add_panels(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Time"):
-            self.strip_panel = gui.add_html(_strip(self._since_first_s, self._tracked))
+            tracked = np.any([trail.tracked for trail in self.trails], axis=0)
+            self.strip_panel = gui.add_html(_strip(self._since_first_s, tracked))
             super().__init__(gui, self._span_s, self._show, "magloc-track-player")
             self.row_buttons = gui.add_button_group("Row", ("previous", "next"))
             longest, still = self.time_slider.max, self.time_slider.disabled
@@ -138,31 +193,24 @@ class TrackPlayer(PlayedTime):
         self.pause()
         self.show_row(self.index + (1 if direction == "next" else -1))
 
-    def _show_rest(self, first: int, last: int) -> None:
-        """The thin line before and after the tail, not through it."""
-        positions = self.glyph.positions_m
-        parts = ((0, first), (last, len(positions) - 1))
-        ends = np.concatenate([track_segments(positions, *part) for part in parts])
-        self.whole.visible = self.whole_checkbox.value and bool(len(ends))
-        if len(ends):
-            self.whole.points = positions[ends].astype(np.float32)
+    def _label(self, source: int) -> str:
+        """What stands beside a source: its id, or of a single one the time, but where that stands already."""
+        if self._result.ids:
+            return str(self._result.ids[source])
+        return "" if self.index in self._ends else f"{self._result.points[self.index].time_s:.6g} s"
 
     def _show(self) -> None:
         index = max(0, int(np.searchsorted(self._since_first_s, self.now_s, side="right")) - 1)
-        self.index, point, now = index, self.points[index], float(self._since_first_s[index])
+        self.index, now = index, float(self._since_first_s[index])
         first = int(np.searchsorted(self._since_first_s, now - self.tail_slider.value - 1e-9 * self._span_s))
         with self._server.atomic():
-            self.glyph.show_until(index, index - first)
-            self._show_rest(first, index)
-        self.dipole.show(self.glyph.positions_m[index], self._moments[index])
-        self.drop.show(self.glyph.positions_m[index])
-        self.time_label.visible = bool(self._tracked[index]) and index not in self._ends
-        if self.time_label.visible:
-            self.time_label.text, self.time_label.position = f"   {point.time_s:.6g} s", self.glyph.positions_m[index]
+            for source, trail in enumerate(self.trails):
+                trail.show(first, index, self._label(source))
+                trail.show_rest(first, index, visible=self.whole_checkbox.value)
         if self._poses is not None and self._on_pose is not None:
             self._on_pose(self._poses[0][index], self._poses[1][index])
         self._time.show(now)
-        self.row_panel.content = row_words(point, index, len(self.points))
+        self.row_panel.content = row_words(self._result, index)
         for follow in self._on_row:
             follow(index)
 
@@ -175,9 +223,19 @@ def time_colours(time_s: FloatArray) -> ByteArray:
     return np.asarray(colormaps["viridis"](_BRIGHTEST * share, bytes=True)[:, :3], dtype=np.uint8)
 
 
-def row_words(point: TrackPoint, index: int, n_rows: int) -> str:
-    """What is known of the source in one row, as HTML."""
-    return point_words(point, f"row {index + 1} of {n_rows}, time {point.time_s:.3f} s")
+def source_colours(result: TrackResult) -> list[Colour | None]:
+    """A colour for every source of a result; of a single one None, as time is its colour."""
+    return [colour for colour, _ in zip(cycle(_SOURCE_COLOURS), result.ids, strict=False)] or [None]
+
+
+def row_words(result: TrackResult, index: int) -> str:
+    """What is known of the sources in one row, as HTML."""
+    when = f"row {index + 1} of {len(result.points)}, time {result.points[index].time_s:.3f} s"
+    if not result.ids:
+        return point_words(result.points[index], when)
+    now = [(id, track[index]) for id, track in zip(result.ids, result.tracks, strict=True)]
+    known = [point_words(point, f"source {id}") for id, point in now if point.position_m is not None]
+    return "".join([words.panel([when]), *known])
 
 
 def point_words(point: TrackPoint, when: str) -> str:

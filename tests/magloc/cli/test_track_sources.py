@@ -12,7 +12,9 @@ import pytest
 
 import arrays
 from magloc.readings import Readings, write_readings
+from magloc.tracking.results import TrackResult
 from magloc.truth import read_truth
+from magloc.viewer.pages.open_result import read_result
 from tests.command_line import Run, assert_refused
 from tests.moving_magnets import RATE_HZ, Magnets, board
 
@@ -64,6 +66,28 @@ class TestOutput:
         assert len(lines) == 1 + 2 * N_ROWS
         assert f"{N_ROWS} of {N_ROWS} rows with a source, 2 sources in all" in outcome.err
 
+    def test_folder_and_page(self, run: Run, files: tuple[Path, Path], tmp_path: Path) -> None:
+        """The folder's file has a row for every source in every row, and a page is made of what is printed."""
+        found = run("track", files[0], "--array", files[1], "--sources", 2, "--json", "--out", tmp_path / "out")
+        rows = (tmp_path / "out" / "track.csv").read_text().splitlines()
+        assert [row.split(",")[1] for row in rows] == ["id"] + N_ROWS * ["1", "2"]
+        entry = json.loads(found.out)["results"][-1]["tracks"][1]
+        assert [float(cell) for cell in rows[-1].split(",")[2:8]] == entry["position_m"] + entry["moment_Am2"]
+        assert (tmp_path / "out" / "track.png").read_bytes().startswith(b"\x89PNG")
+        (tmp_path / "track.json").write_text(found.out)
+        result = read_result(tmp_path / "track.json")
+        assert isinstance(result, TrackResult)
+        assert result.ids == (1, 2)
+        assert [track[-1].status for track in result.tracks] == ["tracked", "tracked"]
+        assert run("view", tmp_path / "track.json", "--html", tmp_path / "a.html").status == 0
+        assert "source 2, with 95 % ellipsoids" in (tmp_path / "a.html").read_text()
+
+    @pytest.mark.parametrize("tracks", ['{"id": 1}', "[1]", '[{"id": "a"}]', '[{"id": 1, "position_m": [1, 2]}]'])
+    def test_a_page_of_something_else(self, run: Run, tmp_path: Path, tracks: str) -> None:
+        (tmp_path / "track.json").write_text(f'{{"results": [{{"time_s": 0, "tracks": {tracks}}}]}}')
+        outcome = run("view", tmp_path / "track.json", "--html", tmp_path / "a.html")
+        assert_refused(outcome, "track.json, result 1, key ", "expected")
+
     def test_stream(self, run: Run, files: tuple[Path, Path]) -> None:
         command = [sys.executable, "-m", "magloc.cli", "track", "-", "--array", files[1], "--sources", "2", "--jsonl"]
         with files[0].open() as readings:
@@ -86,7 +110,7 @@ class TestOutput:
 
 
 class TestBadInput:
-    @pytest.mark.parametrize("option", [("--smooth",), ("--truth", "t.csv"), ("--out", "out"), ("--position", 0, 0, 1)])
+    @pytest.mark.parametrize("option", [("--smooth",), ("--truth", "t.csv"), ("--position", 0, 0, 1)])
     def test_what_several_sources_do_not_have(
         self, run: Run, files: tuple[Path, Path], option: tuple[object, ...]
     ) -> None:

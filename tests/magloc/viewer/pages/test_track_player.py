@@ -19,7 +19,7 @@ from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.sensor import Sensor
 from magloc.readings import Readings
-from magloc.tracking.results import TrackPoint
+from magloc.tracking.results import TrackPoint, TrackResult
 from magloc.viewer.pages.dipole_editor import direction_of
 from magloc.viewer.pages.track_player import TrackPlayer
 from magloc.viewer.panels.inputs import set_value
@@ -31,7 +31,7 @@ from magloc.viewer.panels.readings_plot import (
     thinned,
     with_mark,
 )
-from magloc.viewer.scene.glyphs import ArrayGlyphs
+from magloc.viewer.scene.glyphs import FIELD_LINE_COLOUR, TRACK_COLOUR, ArrayGlyphs
 from magloc.viewer.server import free_port, opened
 from tests.waiting import wait_for
 
@@ -83,9 +83,13 @@ def server() -> Iterator[viser.ViserServer]:
     wait_for(lambda: set(threading.enumerate()) <= before)
 
 
+def of_one(points: list[TrackPoint]) -> TrackResult:
+    return TrackResult(tuple(points), is_truth=False)
+
+
 @pytest.fixture
 def player(server) -> Iterator[TrackPlayer]:
-    player = TrackPlayer(server, track(), 0.5)
+    player = TrackPlayer(server, of_one(track()), 0.5)
     yield player
     player.pause()
 
@@ -152,7 +156,7 @@ class TestTrackPlayer:
 
     def test_it_starts_at_the_last_row_that_is_tracked(self, server):
         points = track()[:45]
-        player = TrackPlayer(server, points, 0.5)
+        player = TrackPlayer(server, of_one(points), 0.5)
         assert player.index == 39
 
     def test_buttons_step_from_row_to_row(self, player):
@@ -169,7 +173,7 @@ class TestTrackPlayer:
         turn = Rotation.random(N, random_state=1).as_quat()
         rows: list[int] = []
         player = TrackPlayer(
-            server, track(), 0.5, array_poses=(place, turn), on_pose=glyphs.set_pose, on_row=[rows.append]
+            server, of_one(track()), 0.5, array_poses=(place, turn), on_pose=glyphs.set_pose, on_row=[rows.append]
         )
         player.show_row(45)  # the array moves where the source is not tracked, too
         np.testing.assert_allclose(glyphs.frame.position, place[45])
@@ -222,7 +226,7 @@ class TestTrackPlayer:
 
     def test_a_truth_has_no_ellipsoids_and_one_row_does_not_play(self, server):
         truth = [TrackPoint(5.0, np.array([1.0, 2.0, 0.0]), status="truth")]
-        player = TrackPlayer(server, truth, 0.5)
+        player = TrackPlayer(server, of_one(truth), 0.5)
         player.play()
         assert not player.is_playing
         assert player.time_slider.disabled
@@ -231,9 +235,44 @@ class TestTrackPlayer:
         assert "truth at (1.000, 2.000, 0.000) m" in player.row_panel.content
 
     def test_a_track_without_any_position_is_shown_as_such(self, server):
-        player = TrackPlayer(server, [TrackPoint(float(i), status="silent") for i in range(3)], 0.5)
+        player = TrackPlayer(server, of_one([TrackPoint(float(i), status="silent") for i in range(3)]), 0.5)
         assert player.index == 0
         assert "<b>not tracked</b>: silent" in player.row_panel.content
+
+
+class TestSeveralSources:
+    @pytest.fixture
+    def player(self, server) -> Iterator[TrackPlayer]:
+        first = track()
+        second = [
+            TrackPoint(point.time_s)
+            if point.position_m is None
+            else replace(point, position_m=point.position_m + np.array([0.0, 0.0, 1.0]))
+            for point in first[:30]
+        ] + [TrackPoint(point.time_s) for point in first[30:]]
+        player = TrackPlayer(
+            server, TrackResult(tuple(first), is_truth=False, ids=(1, 4), others=(tuple(second),)), 0.5
+        )
+        yield player
+        player.pause()
+
+    def test_each_is_where_it_is_and_has_its_id_and_colour(self, server, player):
+        player.show_row(20)
+        for id, up, colour in ((1, 0.0, TRACK_COLOUR), (4, 1.0, FIELD_LINE_COLOUR)):
+            place = positions()[20] + np.array([0.0, 0.0, up])
+            mark = node(server, f"/track-{id}/tail/mark")
+            np.testing.assert_allclose(mark.position, place)
+            assert tuple(mark.color) == colour
+            assert node(server, f"/track-{id}/now").text.strip() == str(id)
+        assert "source 1" in player.row_panel.content
+        assert "source 4" in player.row_panel.content
+
+    def test_one_that_is_lost_is_gone(self, server, player):
+        player.show_row(35)
+        assert node(server, "/track-1/tail/mark").visible
+        for part in ("tail/mark", "moment", "now"):
+            assert not node(server, f"/track-4/{part}").visible
+        assert "source 4" not in player.row_panel.content
 
 
 class TestReadingsPlot:
