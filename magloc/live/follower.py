@@ -200,7 +200,7 @@ class Follower:
         while rows:
             answers = self._next_answers(rows, waits=waits)
             for row, point in answers:
-                self.tally.tracked += point.position_m is not None
+                self.tally.tracked += point.is_on_track
                 latency_s = time.perf_counter() - arrived
                 self.tally.latencies_s.append(latency_s)
                 known = {name: getattr(point, name) for name in _OF_POINT}

@@ -34,13 +34,14 @@ from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.nuisances import Drift
 from magloc.readings import Readings
 from magloc.tracking.acquisition import STACKED_POSITION_ERROR, Acquisition
+from magloc.tracking.acquisition import Start as RowsStart
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import prior_root
 from magloc.tracking.chart.steps import LARGEST_WIDTH, ChartFilter, Known, RowUpdate, cartesian, charted, width_of
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import Innovation, Prediction, Row, Step, TrackPoint, moving, next_row
+from magloc.tracking.results import UNDETERMINED, Innovation, Prediction, Row, Step, TrackPoint, moving, next_row
 from magloc.tracking.sensor_health import SENSOR_LIMIT, SensorHealth, Suspects
 
 ROWS_TO_LOSE = 3
@@ -382,24 +383,36 @@ class Tracker:
         return replace(point, status=status, iterations=iterations, **told)
 
     def _acquired(self, seen: ChartRow, index: int) -> TrackPoint:
-        """A new track from several rows of which one alone does not determine the source."""
-        row = seen.row
-        start = self._acquisition.start(row)
-        if start is None:
-            return self._lost(row, "not acquired: one row does not determine the source")
+        """A new track from several rows of which one alone does not determine the source; else what this one says."""
+        start = self._acquisition.start(seen.row)
+        known = None if start is None else self._found(start, seen)
+        if start is None or known is None:
+            return self._undetermined(seen)
+        self._acquisition.forget()
+        solution = start.solution
+        point = self._kept(seen.row, index, known, None, status="acquired", iterations=solution.iterations)
+        return replace(point, weight=solution.weight, rivals=start.rivals)
+
+    def _found(self, start: RowsStart, seen: ChartRow) -> Known | None:
+        """What is known of a source that several rows show, the last of them as it is seen, if it is known well."""
         solution = start.solution
         source = np.concatenate([solution.position_m, solution.moment_Am2])
         found = self.start(source, solution.covariance, start.rows)
         if found is None:
-            return self._lost(row, "not acquired: no dipole fits the latest rows together")
-        x, S = found.x, found.S
-        offset, root = seen.measurement.place_in_array(x, S)
+            return None
+        offset, root = seen.measurement.place_in_array(found.x, found.S)
         if float(np.linalg.norm(root)) > STACKED_POSITION_ERROR * float(np.linalg.norm(offset)):
-            return self._lost(row, "not acquired: the range is not certain enough")
-        self._acquisition.forget()
-        known = Known(charted(x, S, seen), self.known_before(seen, x))
-        point = self._kept(row, index, known, None, status="acquired", iterations=solution.iterations)
-        return replace(point, weight=solution.weight, rivals=start.rivals)
+            return None
+        return Known(charted(found.x, found.S, seen), self.known_before(seen, found.x))
+
+    def _undetermined(self, seen: ChartRow) -> TrackPoint:
+        """What a row says alone that shows a source and does not determine it."""
+        mixture, reason = self.filter.of_row(seen, self.motion)
+        if mixture is None:
+            return self._lost(seen.row, reason)
+        heaviest = mixture.x[np.argmax(mixture.log_weight)]
+        point = of_mixture(seen.row.time_s, mixture, np.diagonal(self.known_before(seen, heaviest)))
+        return replace(point, status=UNDETERMINED)
 
     def _range_error(self, x: FloatArray, S: FloatArray, measurement: RowMeasurement) -> float:
         """Standard deviation of the range over the range."""
