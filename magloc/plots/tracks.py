@@ -87,8 +87,8 @@ def track_figure(
     --------
     >>> import magloc
     >>> diver = magloc.datasets.load("diver")
-    >>> track = magloc.track(diver.array, diver.readings)
-    >>> figure = magloc.plots.track(track.points, diver.truth.position_m)
+    >>> track = magloc.track(diver.array, diver.readings[90:])
+    >>> figure = magloc.plots.track(track.points, diver.truth.position_m[90:])
     """
     time, position, moment, covariance = _columns_of(points)
     sigma = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
@@ -162,7 +162,7 @@ def consistency_figure(
     --------
     >>> import magloc
     >>> diver = magloc.datasets.load("diver")
-    >>> track = magloc.track(diver.array, diver.readings)
+    >>> track = magloc.track(diver.array, diver.readings[90:])
     >>> figure = magloc.plots.consistency(track.points)
     """
     time, position, _, covariance = _columns_of(points)
