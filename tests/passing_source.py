@@ -16,7 +16,9 @@ from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.mixture import Mixture, root_of
 from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
+from magloc.tracking.track import Track
 from magloc.tracking.tracker import Known, Tracker
+from sims.magnetics.simulation import Simulation
 
 FloatArray = NDArray[np.float64]
 EDGE_M, NOISE_T = 1.5, 2e-10
@@ -61,3 +63,12 @@ def followed(tracker: Tracker, rows: list[Row]) -> list[TrackPoint]:
 
 def positions(points: list[TrackPoint]) -> FloatArray:
     return np.array([np.full(3, np.nan) if point.position_m is None else point.position_m for point in points])
+
+
+def nees(simulation: Simulation, track: Track) -> float:
+    """Of the last row, six numbers."""
+    truth = simulation.truth
+    assert truth.moment_Am2 is not None
+    true = np.concatenate([truth.position_m[-1], truth.moment_Am2[-1]])
+    error = true - np.concatenate([track.position_m[-1], track.moment_Am2[-1]])
+    return float(error @ np.linalg.solve(track.covariance[-1], error))

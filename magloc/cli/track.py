@@ -277,7 +277,7 @@ def track(
             found = magloc.Track(tuple(_printed_points(tracker, list(rows_of(rows)), advance)), rows, tracker)
         else:
             found = magloc.track(used, rows, motion=model, smooth=smooth, prior=prior, progress=advance)
-    if not found.tracked.any():
+    if not any(point.is_on_track for point in found):
         _print_track(found, None, json=json, jsonl=jsonl, printed=printed)
         few = used.n_channels <= _FEW_CHANNELS and rows.array_rotation is not None
         raise _no_track(str(readings), found.status, _USE_SURVEY if few else "")

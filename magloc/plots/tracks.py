@@ -109,8 +109,8 @@ def track_figure(
     --------
     >>> import magloc
     >>> diver = magloc.datasets.load("diver")
-    >>> track = magloc.track(diver.array, diver.readings)
-    >>> figure = magloc.plots.track(track.points, diver.truth.position_m)
+    >>> track = magloc.track(diver.array, diver.readings[90:])
+    >>> figure = magloc.plots.track(track.points, diver.truth.position_m[90:])
     """
     return _figure({"track": points}, truth_m, array_m)
 
@@ -217,7 +217,7 @@ def consistency_figure(
     --------
     >>> import magloc
     >>> diver = magloc.datasets.load("diver")
-    >>> track = magloc.track(diver.array, diver.readings)
+    >>> track = magloc.track(diver.array, diver.readings[90:])
     >>> figure = magloc.plots.consistency(track.points)
     """
     time, position, _, covariance = _columns_of(points)

@@ -156,26 +156,29 @@ class _CompiledSteps:
             Chart.at(out.x[rows, :N_SOURCE], centroids, mixture.radius_m), out.S[rows]
         )
         estimability = learned(np.diagonal(covariances, axis1=1, axis2=2), out.open_loop[rows, :N_SOURCE])
-        roots, single = root_of(out.S[rows, :N_SOURCE]), np.zeros(1)
+        of_source, single, radius_m = out.S[rows, :N_SOURCE], np.zeros(1), mixture.radius_m
+        roots = of_source if of_source.shape[2] == N_SOURCE else root_of(of_source)
+        sources = zip(out.x[rows, None, :N_SOURCE], roots[:, None], centroids, strict=True)
+        told = (of_row[rows].tolist() for of_row in (out.iterations, out.nis, given.n_differences, out.status))
         return [
             TrackPoint(
-                times[i],
-                means[j, :3],
-                means[j, 3:],
-                covariances[j],
-                estimability[j],
-                int(out.iterations[i]),
-                float(out.nis[i]),
-                int(given.n_differences[i]),
-                status=_STATUS[int(out.status[i])],
+                time_s,
+                mean[:3],
+                mean[3:],
+                covariance,
+                estimable,
+                iterations,
+                nis,
+                dof,
+                status=_STATUS[status],
                 weight=1.0,
-                centroid_m=centroids[j],
-                radius_m=mixture.radius_m,
-                mixture=Mixture(
-                    out.x[i, None, :N_SOURCE], roots[j, None], single, N_SOURCE, centroids[j], mixture.radius_m
-                ),
+                centroid_m=centroid_m,
+                radius_m=radius_m,
+                mixture=Mixture(x, S, single, N_SOURCE, centroid_m, radius_m),
             )
-            for j, i in enumerate(range(begin, end))
+            for time_s, mean, covariance, estimable, (x, S, centroid_m), iterations, nis, dof, status in zip(
+                times[rows], means, covariances, estimability, sources, *told, strict=True
+            )
         ]
 
     def _steps(self, rows: slice, centroids: FloatArray) -> list[Step]:

@@ -205,6 +205,7 @@ class RowMeasurements:
         self.pose_errors = PoseErrors.of_array(array)
         self._lever_arm_m = np.array(self.pose_errors.uncertainty.lever_arm_m)
         self._array = without_lasting_errors(array)
+        self._noise_varies = self._array.noise_depends_on_reading
         self._n_motion = n_motion
         self._differences: dict[bytes, Differences] = {}
 
@@ -225,7 +226,7 @@ class RowMeasurements:
     def differences(self, row: Row) -> Differences:
         """The independent differences that a row's readings give."""
         available = np.isfinite(row.readings_T)
-        if self._array.noise_depends_on_reading:
+        if self._noise_varies:
             covariance = reading_covariance(self._array, row.readings_T)
             return decorrelated_differences(self._array, available, covariance_T2=covariance)
         key = available.tobytes()

@@ -20,6 +20,9 @@ from magloc.measurement.pose import ArrayPose, rates_of
 from magloc.readings import Readings, without_saturated
 from magloc.tracking.chart.mixture import Mixture
 
+UNDETERMINED = "undetermined"
+"""Status of a row before a track that shows a source and does not determine it: what it says alone."""
+
 
 @dataclass(frozen=True, eq=False)
 class Row:
@@ -104,7 +107,8 @@ class TrackPoint:
         Normalised innovation squared, and `nis_dof` its degrees of freedom. NaN for rows that the track started from.
     status : str
         "tracked", "acquired" (a new track started here), "predicted" (no readings), "outlier" (readings that contradict
-        the track, not used), or why there is no track.
+        the track, not used), "undetermined" (no track yet: what this row of few readings says alone), or why there is
+        no track.
     weight : float
         How likely the place is the right one of all that explain the readings so far. NaN without a track.
     rivals : tuple of Solution
@@ -139,6 +143,11 @@ class TrackPoint:
     lag1: float = math.nan
     mixture: Mixture | None = None
     dropped_sensors: tuple[str, ...] = ()
+
+    @property
+    def is_on_track(self) -> bool:
+        """Whether the source is known, and not by this row alone."""
+        return self.position_m is not None and self.status != UNDETERMINED
 
     @cached_property
     def range_interval_m(self) -> Intervals | None:

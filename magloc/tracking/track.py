@@ -190,9 +190,9 @@ class Track(TrackColumns):
     --------
     >>> import magloc
     >>> diver = magloc.datasets.load("diver")
-    >>> track = magloc.track(diver.array, diver.readings)
+    >>> track = magloc.track(diver.array, diver.readings[90:])
     >>> int(track.tracked.sum()), len(track), track.status[-1], track.frame
-    (120, 141, 'tracked', 'world')
+    (51, 51, 'tracked', 'world')
     """
 
     points: tuple[TrackPoint, ...]
@@ -283,7 +283,7 @@ def track(
     >>> import magloc
     >>> diver = magloc.datasets.load("diver")
     >>> motion = magloc.RandomWalk(speed_m_s=1e-3, turn_rad_s=1e-3)
-    >>> track = magloc.track(diver.array, diver.readings, motion=motion)
+    >>> track = magloc.track(diver.array, diver.readings[90:], motion=motion)
     >>> round(float(track.position_m[-1, 2]), 1)
     -0.6
     """

@@ -34,13 +34,14 @@ from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.nuisances import Drift
 from magloc.readings import Readings
 from magloc.tracking.acquisition import STACKED_POSITION_ERROR, Acquisition
+from magloc.tracking.acquisition import Start as RowsStart
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.start import prior_root
 from magloc.tracking.chart.steps import LARGEST_WIDTH, ChartFilter, Known, RowUpdate, cartesian, charted, width_of
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel
-from magloc.tracking.results import Innovation, Prediction, Row, Step, TrackPoint, moving, next_row
+from magloc.tracking.results import UNDETERMINED, Innovation, Prediction, Row, Step, TrackPoint, moving, next_row
 from magloc.tracking.sensor_health import SENSOR_LIMIT, SensorHealth, Suspects
 
 ROWS_TO_LOSE = 3
@@ -147,7 +148,7 @@ class Tracker:
         index, self._n_rows = self._n_rows, self._n_rows + 1
         out = self._health.dead
         if self._known is None:
-            point = self._started(self._measured(row, out), index)
+            point = self._started(self._seen(row, out), index)
         else:
             out, point = self._followed(self._known, row, index, dt_s)
         names = (name for name, is_out in zip(self.array.ids, out, strict=True) if is_out)
@@ -212,9 +213,9 @@ class Tracker:
         S_q[n + noisy, S_q_motion.shape[1] + np.arange(noisy.size)] = added[noisy]
         return Prediction(np.concatenate([moved, kept * x[n:]]), predict_square_root(S, F, S_q), F)
 
-    def known_before(self, measurement: RowMeasurement, x: FloatArray) -> FloatArray:
+    def known_before(self, seen: ChartRow, x: FloatArray) -> FloatArray:
         """Covariance (n, n) of the motion's states of a source at x before its first row."""
-        root = prior_root(ChartRow.of(measurement).chart(x[:N_SOURCE]))
+        root = prior_root(seen.chart(x[:N_SOURCE]))
         _, S = self.motion.start(x[:N_SOURCE], root)
         return S @ S.T
 
@@ -272,69 +273,68 @@ class Tracker:
         centroid_m = row.origin_m + row.R_world_from_array @ self.array.centroid
         return TrackPoint(row.time_s, status=reason, centroid_m=centroid_m, radius_m=self.array.circumradius)
 
-    def _started(self, measurement: RowMeasurement, index: int, near: Mixture | None = None) -> TrackPoint:
+    def _started(self, seen: ChartRow, index: int, near: Mixture | None = None) -> TrackPoint:
         """A new track, if one can be started."""
         self._known = None
-        if measurement.z.size < N_SOURCE:
-            return self._acquired(measurement, index)
-        row = ChartRow.of(measurement)
-        mixture, reason = self.filter.started(row, self.motion, near)
+        if seen.z.size < N_SOURCE:
+            return self._acquired(seen, index)
+        mixture, reason = self.filter.started(seen, self.motion, near)
         if mixture is None:
-            return self._lost(measurement.row, reason)
-        open_loop = self.known_before(measurement, mixture.matched().x[0])
-        known = self.filter.refitted(Known(mixture, open_loop, young=((row, self.motion),)))
-        return self._kept(measurement, index, known, None, status="acquired")
+            return self._lost(seen.row, reason)
+        open_loop = self.known_before(seen, mixture.matched().x[0])
+        known = self.filter.refitted(Known(mixture, open_loop, young=((seen, self.motion),)))
+        return self._kept(seen.row, index, known, None, status="acquired")
 
-    def _measured(self, row: Row, out: BoolArray) -> RowMeasurement:
+    def _seen(self, row: Row, out: BoolArray) -> ChartRow:
         """What a row says without some of its sensors (N,)."""
         readings = np.where(out[self.array.channel_sensor], np.nan, row.readings_T)
-        return self.measurements.of(replace(row, readings_T=readings) if out.any() else row)
+        return ChartRow.of(self.measurements.of(replace(row, readings_T=readings) if out.any() else row))
 
     def _followed(self, before: Known, row: Row, index: int, dt_s: float) -> tuple[BoolArray, TrackPoint]:
         """A track after one more row, and the sensors (N,) that were left out of it."""
         dead = self._health.dead
-        measurement = self._measured(row, dead)
-        predicted = self.filter.predicted(before.mixture, self.motion, dt_s, ChartRow.of(measurement))
+        seen = self._seen(row, dead)
+        predicted = self.filter.predicted(before.mixture, self.motion, dt_s, seen)
         x = before.mixture.x[np.argmax(before.mixture.log_weight)]
         known = replace(before, mixture=predicted, open_loop=self.open_loop(before.open_loop, x, dt_s))
         prediction = self.predicted(*cartesian(before.mixture), dt_s) if self.keep_steps else None
-        if not measurement.z.size:
-            return dead, self._kept(measurement, index, known, prediction, status="predicted")
+        if not seen.z.size:
+            return dead, self._kept(seen.row, index, known, prediction, status="predicted")
         if width_of(predicted) > LARGEST_WIDTH:
             # The prediction says too little for an iteration to start from it.
-            if self.filter.is_detected(ChartRow.of(measurement)):
-                return dead, self._started(measurement, index, predicted.matched())
-            return dead, self._kept(measurement, index, known, prediction, status="predicted")
+            if self.filter.is_detected(seen):
+                return dead, self._started(seen, index, predicted.matched())
+            return dead, self._kept(seen.row, index, known, prediction, status="predicted")
 
-        def updated(out: BoolArray) -> RowUpdate:
-            return self.filter.updated(before.mixture, predicted, dt_s, ChartRow.of(self._measured(row, out)))
+        def updated(of_row: ChartRow) -> RowUpdate:
+            return self.filter.updated(before.mixture, predicted, dt_s, of_row)
 
-        update, out, of_sensor = updated(dead), dead, False
+        update, out, of_sensor = updated(seen), dead, False
         if update.mixture is None:
-            out, update, of_sensor = self._without_one(update, updated)
-            measurement = self._measured(row, out)
+            out, update, of_sensor = self._without_one(update, lambda out: updated(self._seen(row, out)))
+            seen = self._seen(row, out)
         else:
             self._suspects = self._suspects.forgotten
-        innovation = Innovation(measurement.row.available, update.innovation)
+        innovation = Innovation(seen.row.available, update.innovation)
         if update.mixture is None:
             contradictions = before.contradictions + (not of_sensor)
             if contradictions >= ROWS_TO_LOSE:
-                return dead, self._started(measurement, index)
+                return dead, self._started(seen, index)
             known = replace(known, contradictions=contradictions)
-            point = self._kept(measurement, index, known, prediction, status="outlier", innovation=innovation)
+            point = self._kept(seen.row, index, known, prediction, status="outlier", innovation=innovation)
             return dead, replace(point, nis=update.nis)
         of_dead = np.full(len(dead), np.inf)
         for sensor in np.flatnonzero(dead):
-            others = out & (np.arange(len(out)) != sensor)
-            if np.isfinite(self._measured(row, others).row.readings_T).sum() > innovation.available.sum():
-                of_dead[sensor] = updated(others).nis - update.nis
+            with_it = self._seen(row, out & (np.arange(len(out)) != sensor))
+            if with_it.row.available.sum() > innovation.available.sum():
+                of_dead[sensor] = updated(with_it).nis - update.nis
         self._health = self._health.after(np.full((len(dead), 3), np.nan), out, of_dead)
         known = replace(known, mixture=update.mixture, contradictions=0)
         if before.young:
-            young = (*before.young, (ChartRow.of(measurement), self.motion))
+            young = (*before.young, (seen, self.motion))
             known = self.filter.refitted(replace(known, young=young, nis=before.nis + update.nis))
         return out, self._kept(
-            measurement,
+            seen.row,
             index,
             known,
             prediction,
@@ -360,7 +360,7 @@ class Tracker:
 
     def _kept(
         self,
-        measurement: RowMeasurement,
+        row: Row,
         index: int,
         known: Known,
         prediction: Prediction | None,
@@ -369,7 +369,7 @@ class Tracker:
         innovation: Innovation | None = None,
         iterations: int = 0,
     ) -> TrackPoint:
-        row, mixture = measurement.row, known.mixture
+        mixture = known.mixture
         tracked = status == "tracked"
         told = {} if innovation is None else innovation.after(self._last if tracked else None)
         self._last = innovation if tracked else None
@@ -382,25 +382,37 @@ class Tracker:
         point = of_mixture(row.time_s, mixture, np.diagonal(known.open_loop))
         return replace(point, status=status, iterations=iterations, **told)
 
-    def _acquired(self, measurement: RowMeasurement, index: int) -> TrackPoint:
-        """A new track from several rows of which one alone does not determine the source."""
-        row = measurement.row
-        start = self._acquisition.start(row)
-        if start is None:
-            return self._lost(row, "not acquired: one row does not determine the source")
+    def _acquired(self, seen: ChartRow, index: int) -> TrackPoint:
+        """A new track from several rows of which one alone does not determine the source; else what this one says."""
+        start = self._acquisition.start(seen.row)
+        known = None if start is None else self._found(start, seen)
+        if start is None or known is None:
+            return self._undetermined(seen)
+        self._acquisition.forget()
+        solution = start.solution
+        point = self._kept(seen.row, index, known, None, status="acquired", iterations=solution.iterations)
+        return replace(point, weight=solution.weight, rivals=start.rivals)
+
+    def _found(self, start: RowsStart, seen: ChartRow) -> Known | None:
+        """What is known of a source that several rows show, the last of them as it is seen, if it is known well."""
         solution = start.solution
         source = np.concatenate([solution.position_m, solution.moment_Am2])
         found = self.start(source, solution.covariance, start.rows)
         if found is None:
-            return self._lost(row, "not acquired: no dipole fits the latest rows together")
-        x, S = found.x, found.S
-        offset, root = measurement.place_in_array(x, S)
+            return None
+        offset, root = seen.measurement.place_in_array(found.x, found.S)
         if float(np.linalg.norm(root)) > STACKED_POSITION_ERROR * float(np.linalg.norm(offset)):
-            return self._lost(row, "not acquired: the range is not certain enough")
-        self._acquisition.forget()
-        known = Known(charted(x, S, ChartRow.of(measurement)), self.known_before(measurement, x))
-        point = self._kept(measurement, index, known, None, status="acquired", iterations=solution.iterations)
-        return replace(point, weight=solution.weight, rivals=start.rivals)
+            return None
+        return Known(charted(found.x, found.S, seen), self.known_before(seen, found.x))
+
+    def _undetermined(self, seen: ChartRow) -> TrackPoint:
+        """What a row says alone that shows a source and does not determine it."""
+        mixture, reason = self.filter.of_row(seen, self.motion)
+        if mixture is None:
+            return self._lost(seen.row, reason)
+        heaviest = mixture.x[np.argmax(mixture.log_weight)]
+        point = of_mixture(seen.row.time_s, mixture, np.diagonal(self.known_before(seen, heaviest)))
+        return replace(point, status=UNDETERMINED)
 
     def _range_error(self, x: FloatArray, S: FloatArray, measurement: RowMeasurement) -> float:
         """Standard deviation of the range over the range."""

@@ -133,11 +133,14 @@ class Start:
         if not measurement.is_detected(self.errors.sigma):
             return None, "not acquired: no signal stands out of noise"
         seeds = self._seeds(measurement)
-        if len(seeds.cell):
-            seeds = _centred(seeds, self._components(measurement, motion, seeds), measurement)
         if not len(seeds.cell):
             return None, NOT_ALLOWED
         found = self._components(measurement, motion, seeds)
+        centred = _centred(seeds, found, measurement)
+        if not len(centred.cell):
+            return None, NOT_ALLOWED
+        if centred is not seeds:
+            seeds, found = centred, self._components(measurement, motion, centred)
         row = measurement.row
         position = (found.x[:, :3] - row.origin_m) @ row.R_world_from_array
         sound = self.prior.allows_position(position) & self.prior.allows_moment(found.x[:, 3:6])
@@ -149,7 +152,7 @@ class Start:
             return None, "not acquired: no dipole fits the readings"
         log_weight = found.log_evidence + _EVEN * ((seeds.cell < 0) @ np.array([1.0, 2.0]))
         mixture = _mixture(found, log_weight, measurement)
-        return mixture.take(sound).take(once(mixture.take(sound), seeds.cell[sound])).reduced(), ""
+        return mixture.take(sound).take(once(mixture.take(sound), seeds.cell[sound])), ""
 
     def _seeds(self, measurement: ChartRow) -> _Seeds:
         """Chosen cells, and the row's best fits."""
@@ -196,6 +199,8 @@ def _centred(seeds: _Seeds, found: Updated, measurement: ChartRow) -> _Seeds:
     sigma = np.sqrt(np.sum(found.S[:, :3] ** 2, axis=2))
     narrow = sigma < _NARROW * _CELL
     narrow = np.stack([narrow[:, 0], narrow[:, 1] & narrow[:, 2]], axis=1)
+    if not narrow.any() and (seeds.cell >= 0).all():
+        return seeds
     old, new = (Chart.at(x, measurement.centroid_m, measurement.radius_m) for x in (seeds.position_m, found.x[:, :3]))
     seen = found.x[:, 3:6] / new.length[:, None] ** 4
     offset = np.where(narrow[:, 1:], new.u, old.u)
@@ -214,14 +219,17 @@ def once(mixture: Mixture, cell: IntArray | None = None) -> IntArray:
     """Components, heaviest first, without those that another one with the same share of the even density has found."""
     source = mixture.of_source()
     cell = np.zeros((len(source), 1), dtype=np.intp) if cell is None else cell.reshape(len(source), -1)
-    chart, left, kept = source.chart, np.argsort(-mixture.log_weight, kind="stable"), []
+    _, share, n_alike = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    chart, left = source.chart, np.argsort(-mixture.log_weight, kind="stable")
+    alone = n_alike[share[left]] == 1
+    kept, left = left[alone].tolist(), left[~alone]
     limit = chdtri(N_SOURCE, 1.0 - CREDIBLE_ROW)
     while left.size:
         first, others = left[0], left[1:]
         kept.append(first)
-        same = others[(cell[others] == cell[first]).all(axis=1)]
+        same = others[share[others] == share[first]]
         about = chart.take(same)
         e = about.coordinates(np.repeat(source.x[first][None], len(same), axis=0))
         square = np.sum(np.linalg.solve(source.S[same], e[..., None])[..., 0] ** 2, axis=1)
         left = others[~np.isin(others, same[square < limit])]
-    return np.array(kept)
+    return np.array(sorted(kept, key=lambda k: -mixture.log_weight[k]))

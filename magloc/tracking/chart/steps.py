@@ -112,10 +112,14 @@ class ChartFilter:
 
     def started(self, row: ChartRow, motion: MotionModel, near: Mixture | None = None) -> tuple[Mixture | None, str]:
         """What one row says of a source, weighed by a prediction of its place if there is one, or why there is none."""
-        mixture, reason = self._start.mixture(row, self._posed(motion))
-        if mixture is not None and near is not None:
-            mixture = _near(mixture, near).reduced()
+        mixture, reason = self.of_row(row, motion)
+        if mixture is not None:
+            mixture = (mixture if near is None else _near(mixture.reduced(), near)).reduced()
         return mixture, reason
+
+    def of_row(self, row: ChartRow, motion: MotionModel) -> tuple[Mixture | None, str]:
+        """What one row alone says of a source, by every cell that explains it, or why it says nothing."""
+        return self._start.mixture(row, self._posed(motion))
 
     def _posed(self, motion: MotionModel) -> MotionModel:
         return PosedMotion.of(motion, self.pose_errors)

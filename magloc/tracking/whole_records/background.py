@@ -252,7 +252,7 @@ def _points(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _P
     """What is known of every row, from the first one on that knows the range."""
     points: list[TrackPoint] = []
     tracked, last = False, None
-    open_loop = tracker.known_before(measurements[0], passed.steps[0].x)
+    open_loop = tracker.known_before(ChartRow.of(measurements[0]), passed.steps[0].x)
     for j, (measurement, step) in enumerate(zip(measurements, passed.steps, strict=True)):
         row, innovation = measurement.row, passed.innovations[j]
         if j:

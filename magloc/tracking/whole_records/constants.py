@@ -34,7 +34,7 @@ def constants_score(tracker: Tracker, rows: Sequence[Row], points: Sequence[Trac
     usual = PoseUncertainty()
     constants = {key: getattr(usual, key) for key in ("position_constant_m", "attitude_constant_rad")}
     wider = Tracker(replace(tracker.array, pose=replace(stated, **constants)), tracker.motion)
-    known = [i for i, point in enumerate(points) if point.position_m is not None]
+    known = [i for i, point in enumerate(points) if point.is_on_track]
     if not known:
         return math.nan
     begin = max(i for i in known if points[i].status == "acquired" or i == known[0])

@@ -21,6 +21,7 @@ from sims.magnetics.paths import Attitude, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
 from sims.magnetics.sensors import SensorModel
 from sims.magnetics.simulation import Simulation, simulate
+from tests.passing_source import nees
 
 NOISE_T = 1e-10
 PLACES = np.random.default_rng(4).uniform(-0.75, 0.75, (8, 3)).tolist()
@@ -46,15 +47,6 @@ def run(seed: int, constant_T: float, white_T: float = 0.0, *, stated: bool = Tr
     simulation = simulate(replace(SCENARIO, array=errs), seed)
     exact = replace(simulation.array, ambient_uncertainty_T=0.0, ambient_uncertainty_white_T=0.0)
     return simulation, magloc.track(simulation.array if stated else exact, simulation.readings, motion=REST)
-
-
-def nees(simulation: Simulation, track: Track) -> float:
-    """Of the last row, six numbers."""
-    truth = simulation.truth
-    assert truth.moment_Am2 is not None
-    true = np.concatenate([truth.position_m[-1], truth.moment_Am2[-1]])
-    error = true - np.concatenate([track.position_m[-1], track.moment_Am2[-1]])
-    return float(error @ np.linalg.solve(track.covariance[-1], error))
 
 
 class TestStated:

@@ -25,6 +25,7 @@ from sims.magnetics.paths import Attitude, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
 from sims.magnetics.sensors import SensorModel
 from sims.magnetics.simulation import Simulation, simulate
+from tests.passing_source import nees
 
 WHITE = PoseUncertainty(0.02, math.radians(0.3), 0.02, 0.0, 0.0, 0.0)
 ALL = replace(WHITE, correlation_s=10.0, position_constant_m=0.05, attitude_constant_rad=math.radians(0.5))
@@ -49,15 +50,6 @@ def run(
     simulation = simulate(replace(scenario, pose=pose), seed)
     array = simulation.array if stated is None else replace(simulation.array, pose=stated)
     return simulation, magloc.track(array, simulation.readings, motion=REST)
-
-
-def nees(simulation: Simulation, track: Track) -> float:
-    """Of the last row."""
-    truth = simulation.truth
-    assert truth.moment_Am2 is not None
-    true = np.concatenate([truth.position_m[-1], truth.moment_Am2[-1]])
-    error = true - np.concatenate([track.position_m[-1], track.moment_Am2[-1]])
-    return float(error @ np.linalg.solve(track.covariance[-1], error))
 
 
 @pytest.mark.slow
