@@ -65,10 +65,15 @@ class Field(NamedTuple):
     seconds: float
     chi2_per_dof: float
 
+    @property
+    def all_chi2(self) -> list[float]:
+        """At the true places of all targets."""
+        return self.missed_chi2 + [pair.visible_chi2 for pair in self.pairs]
 
-def judged(field: Simulation) -> Field:
+
+def judged(field: Simulation, false_per_hectare: float = 0.1) -> Field:
     """A simulated field surveyed, and its targets paired with the true ones."""
-    found = magloc.survey(field.array, field.readings)
+    found = magloc.survey(field.array, field.readings, false_per_hectare=false_per_hectare)
     truth = Sources(field.target_position_m, field.target_moment_Am2)
     everywhere = Bounds(np.full(3, -1e4), np.full(3, 1e4), np.inf)
     record, errors = record_of(found.array, whole_rows(field.array, field.readings)[1])
@@ -119,14 +124,28 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=200)
     parser.add_argument("--seeds", type=int, default=12)
     parser.add_argument("--edge-m", type=float, help="of the square, in place of the scenario's")
+    parser.add_argument("--targets", type=int, help="in place of the scenario's")
+    parser.add_argument("--within-m", type=float, help="edge of the square in the middle with all targets")
+    parser.add_argument("--gap-m", type=float, help="least gap between targets")
+    parser.add_argument("--false-per-hectare", type=float, default=0.1)
     given = parser.parse_args()
     scenario = sims.read_scenario(given.scenario)
     assert isinstance(scenario, MagneticScenario)
+    assert scenario.targets is not None
     if given.edge_m:
         scenario = enlarged(scenario, given.edge_m)
+        assert scenario.targets is not None
+    targets, half = scenario.targets, 0.5 * (given.within_m or 0.0)
+    if given.within_m:
+        targets = replace(targets, x_m=(-half, half), y_m=(-half, half))
+    if given.gap_m:
+        targets = replace(targets, gap_m=given.gap_m)
+    if given.targets:
+        targets = replace(targets, number=given.targets)
+    scenario = replace(scenario, targets=None if given.targets == 0 else targets)
     fields = []
     for seed in range(given.first, given.first + given.seeds):
-        fields.append(judged(sims.simulate(scenario, seed=seed)))
+        fields.append(judged(sims.simulate(scenario, seed=seed), given.false_per_hectare))
         last = fields[-1]
         print(
             f"seed {seed}: found {len(last.pairs)}, missed {[round(chi2) for chi2 in last.missed_chi2]} (χ²),"
@@ -137,7 +156,12 @@ def main() -> None:
     visible = sum(pair.visible_chi2 > 2.0 * fields[0].threshold for pair in pairs)
     lost = sum(chi2 > 2.0 * fields[0].threshold for field in fields for chi2 in field.missed_chi2)
     n_false = sum(field.n_false for field in fields)
-    print(f"found {visible} of {visible + lost} visible, {n_false / len(fields):.2f} false a field")
+    print(f"found {visible} of {visible + lost} visible, {n_false} false in {len(fields)} fields")
+    all_visible = [field for field in fields if min(field.all_chi2, default=0.0) > 2.0 * field.threshold]
+    whole = sum(not field.missed_chi2 for field in all_visible)
+    print(f"all targets are visible in {len(all_visible)} fields, and found in {whole} of these")
+    if not pairs:
+        return
     print(summary(pairs))
     for low, high in CLASSES:
         some = [pair for pair in pairs if low <= pair.significance < high]

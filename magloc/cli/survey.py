@@ -57,6 +57,7 @@ def survey(
     *,
     array: Path,
     known: KnownOptions = KnownOptions(),  # noqa: B008 - frozen
+    base: Path | None = None,
     ground: GroundOptions = GroundOptions(),
     maps: MapOptions = MapOptions(),  # noqa: B008 - frozen
     scheduler: str | None = None,
@@ -80,6 +81,9 @@ def survey(
         Array file (TOML).
     known : KnownOptions
         What is known of the sensors, of the targets, in the world frame, and of the ambient field.
+    base : Path
+        Readings of a base station (CSV): time_s, at the clock of the readings, and base_nT, the modulus there. The
+        ambient field varies as it does.
     ground : GroundOptions
         What is known of the ground.
     maps : MapOptions
@@ -106,10 +110,13 @@ def survey(
     parts = [magloc.read_readings(path, used, sensors=known.ids, ordered=True) for path in readings]
     fields = [ambient_field(used, part, where) for part in parts]
     used, rows = fields[0][0], [replace(part, ambient_T=own) for part, (_, own) in zip(parts, fields, strict=True)]
+    at_base = arrays.SensorArray((arrays.Sensor("base", "scalar", (0.0, 0.0, 0.0), 1e-10),))
+    station = None if base is None else magloc.read_readings(base, at_base, ordered=True)
     with _naming(", ".join(map(str, readings))), naming_scheduler():
         found = magloc.survey(
             used,
             rows,
+            base=station,
             prior=known.prior,
             ground_m=ground.ground_m,
             shortest_geology_m=ground.shortest_geology_m,
@@ -137,7 +144,7 @@ def survey(
 def _naming(readings: str) -> Iterator[None]:
     """Let errors of the library speak of the options and of the file."""
     try:
-        with naming_options("ground_m"):
+        with naming_options("ground_m", "base"):
             yield
     except ValueError as error:
         if isinstance(error, InputError):

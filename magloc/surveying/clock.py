@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from arrays.typing import IntArray
+from arrays.typing import FloatArray, IntArray
 from magloc.navigation.poses import vectors_at
 from magloc.readings import Readings
 from magloc.surveying.fit.joint_fit import Sources
@@ -56,6 +56,14 @@ def lag_of(model: Model, sources: Sources, group: IntArray, delayed: Callable[[f
         return Lag(0.0, math.inf)
     around = [cost(found.x + sign * step) for sign in (-1.0, 1.0)]
     return Lag(float(found.x), step * math.sqrt(2.0 / (sum(around) - 2.0 * found.fun)))
+
+
+def rows_around(time_s: FloatArray, rows: IntArray) -> IntArray:
+    """Some rows of a record, with those that a lag of them reaches and the next ones to these."""
+    first = np.maximum(np.searchsorted(time_s, time_s[rows] - _MOST_S) - 1, 0)
+    end = np.minimum(np.searchsorted(time_s, time_s[rows] + _MOST_S) + 1, len(time_s))
+    size = len(time_s) + 1
+    return np.flatnonzero(np.cumsum(np.bincount(first, minlength=size) - np.bincount(end, minlength=size)))
 
 
 def taken_earlier(readings: Readings, lag_s: float) -> Readings:

@@ -13,6 +13,7 @@ from arrays.array import SensorArray
 from arrays.typing import BoolArray, FloatArray
 from magloc.measurement.pose import PoseErrors, with_stated_pose
 from magloc.measurement.rows import check_magnitudes
+from magloc.navigation.poses import vectors_at
 from magloc.readings import Readings, without_saturated
 from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.pose_components import UNSTATED
@@ -24,8 +25,11 @@ _MOST_WILD = 0.25  # of all readings: more are not
 _LONGEST_RUN = 25  # of the same reading, over what the liveliest sensor repeats
 
 
-def whole_rows(array: SensorArray, readings: Readings) -> tuple[SensorArray, Readings]:
-    """Rows where all sensors read, without the sensors that would cost more rows than they are worth."""
+def whole_rows(array: SensorArray, readings: Readings, base: Readings | None = None) -> tuple[SensorArray, Readings]:
+    """Rows where all sensors read, without the sensors that would cost more rows than they are worth.
+
+    Their ambient field varies as the modulus at a base station.
+    """
     if readings.array_rotation is None:
         raise ValueError("Input readings must have the pose of the array in every row; instead received none.")
     check_magnitudes(array)
@@ -57,7 +61,8 @@ def whole_rows(array: SensorArray, readings: Readings) -> tuple[SensorArray, Rea
     array = replace(array, sensors=tuple(array.sensors[i] for i in kept))
     array = with_stated_pose(array, readings)
     array = replace(array, pose=UNSTATED) if array.pose is None else array
-    return array, replace(readings, ambient_T=_ambient_T(array, readings))
+    ambient = _ambient_T(array, readings)
+    return array, replace(readings, ambient_T=ambient if base is None else varying(ambient, readings.time_s, base))
 
 
 def stuck_readings(array: SensorArray, values: FloatArray) -> BoolArray:
@@ -98,6 +103,21 @@ def record_of(array: SensorArray, readings: Readings) -> tuple[SurveyRecord, Pos
     errors = PoseErrors.of(array.pose)
     assert readings.ambient_T is not None
     return SurveyRecord.of(array, readings, readings.ambient_T, errors), errors
+
+
+def varying(ambient_T: FloatArray, time_s: FloatArray, base: Readings) -> FloatArray:
+    """Ambient field (n, 3) whose modulus changes as that at a base station, whose median belongs to what is given."""
+    if base.values_T.shape[1] != 1:
+        raise ValueError(f"Input base must have one channel; instead received {base.values_T.shape[1]}.")
+    read = base[np.isfinite(base.values_T[:, 0])]
+    if not len(read) or time_s[0] < read.time_s.min() or time_s[-1] > read.time_s.max():
+        ends = f"{read.time_s.min():.15g} to {read.time_s.max():.15g} s" if len(read) else "nothing"
+        raise ValueError(
+            f"Input base must read from {time_s[0]:.15g} to {time_s[-1]:.15g} s, as the survey does; instead received"
+            f" {ends}."
+        )
+    change = vectors_at(time_s, read.time_s, read.values_T - np.median(read.values_T))
+    return np.asarray(ambient_T * (1.0 + change / np.linalg.norm(ambient_T, axis=1, keepdims=True)))
 
 
 def _ambient_T(array: SensorArray, readings: Readings) -> FloatArray:

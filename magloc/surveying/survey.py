@@ -38,6 +38,7 @@ def survey(
     array: SensorArray,
     readings: Readings | Sequence[Readings],
     *,
+    base: Readings | None = None,
     prior: SourcePrior = NOTHING_KNOWN,
     ground_m: float = 0.0,
     shortest_geology_m: float = 15.0,
@@ -65,6 +66,9 @@ def survey(
         large the errors of the pose are and how long they last is estimated from the targets' own fields.
     readings : Readings or sequence of them
         In order of time, with the pose of the array, and for scalar sensors with the ambient field.
+    base : Readings, optional
+        The modulus of the field at a base station, one channel, at the same clock and for as long: the ambient field
+        varies as it does. Without it slow variations are estimated from the survey itself.
     prior : SourcePrior
         Where sources may be, in the world frame, and how strong; by default from 5 cm to 4 m below the ground, up to
         1 m beside the sensors, and up to 300 A·m².
@@ -90,7 +94,8 @@ def survey(
     Raises
     ------
     ValueError
-        The readings have no pose or no ambient field, there are too few, or sensors are below the ground.
+        The readings have no pose or no ambient field, there are too few, sensors are below the ground, or the base
+        station does not read as long as they do.
     InputError
         The scheduler cannot be used, or a process died.
 
@@ -115,7 +120,7 @@ def survey(
     rows = readings if isinstance(readings, Readings) else joined(readings)
     assumed = array.pose is None and rows.pose_sigma is None
     threshold = float(chdtri(3, min(0.5, false_per_hectare / (_HECTARE_M2 * _TRIALS_PER_M2))))
-    tiled = TiledSurvey.of(*whole_rows(array, rows), Ground(prior, ground_m, shortest_geology_m, threshold))
+    tiled = TiledSurvey.of(*whole_rows(array, rows, base), Ground(prior, ground_m, shortest_geology_m, threshold))
     tell: Callable[[str], None] = progress or (lambda _: None)
     folder = None if unfinished is None else Path(unfinished)
     every = range(len(tiled.tiles))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ OF_TARGETS = ("position_m", "moment_Am2", "covariance", "depth_interval95_m", "s
 _WEAK = 200.0
 _NEAR = 1.5
 _MISFIT = 1.5  # χ² per reading
-_N_DEPTHS = 24
+_N_DEPTHS = 16
 _SPAN = 3.0  # over and under the depth, as a factor
 _STEPS = 5  # of places on each side, in thirds of a standard deviation of the position
 
@@ -30,10 +31,11 @@ def depth_interval(
     source = fit.sources.some(np.array([which]))
     others = fit.sources.some(np.delete(np.arange(len(fit.sources)), which))
     position = source.position_m[0]
-    height = record.height_m - position[2]
     middles = record.sensors_m.mean(axis=1)[white.starts[:-1], :2]
-    used = np.flatnonzero(np.all(np.abs(middles - position[:2]) < WINDOW * height, axis=1))
-    near = np.linalg.norm(others.position_m[:, :2] - position[:2], axis=1) < 2.0 * WINDOW * height
+    # Twice as far as a search looks: what the ground imitates is told from a target by its farthest tail.
+    reach = 2.0 * WINDOW * (record.height_m - position[2])
+    used = np.flatnonzero(np.all(np.abs(middles - position[:2]) < reach, axis=1))
+    near = np.linalg.norm(others.position_m[:, :2] - position[:2], axis=1) < reach
     Q = with_free_sources(record, background, others.some(near))
     # What the source explains itself is put back, to first order: it is weak.
     own_field = source.fields(record)
@@ -52,9 +54,13 @@ def depth_interval(
         places = np.stack(np.meshgrid(x, y, [ground_m - at], indexing="ij"), axis=-1).reshape(-1, 3)
         _, projected, v = normal_equations(record, white, directions, places, used, Q, left)
         explained[i] = np.sum(v * np.linalg.solve(projected, v[..., None])[..., 0], axis=1).max()
-    inside = np.flatnonzero(explained > explained.max() - chdtri(1, 0.05))
-    low, high = max(inside[0] - 1, 0), min(inside[-1] + 1, _N_DEPTHS - 1)
-    return float(depths[low]), float(depths[high])
+    level = explained.max() - chdtri(1, 0.05)
+    inside = np.flatnonzero(explained > level)
+    low, high = (
+        math.exp(np.interp(level, explained[[beyond, last]], np.log(depths[[beyond, last]])))
+        for beyond, last in ((max(inside[0] - 1, 0), inside[0]), (min(inside[-1] + 1, _N_DEPTHS - 1), inside[-1]))
+    )
+    return low, high
 
 
 def targets_of(model: Model, fit: JointFit, background: Background, ground_m: float) -> dict[str, NDArray[Any]]:

@@ -14,7 +14,7 @@ from magloc.fields.dipole_compiled import field_at_points
 from magloc.grids.work import Arrays, Each, Work
 from magloc.localization.fit.prior import SourcePrior
 from magloc.readings import Readings
-from magloc.surveying.clock import Lag, lag_of, taken_earlier
+from magloc.surveying.clock import Lag, lag_of, rows_around, taken_earlier
 from magloc.surveying.fit.joint_fit import Sources
 from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.piece import AT_LAST, WHILE_SEARCHING, Ground, Piece
@@ -155,10 +155,11 @@ class TiledSurvey:
         number = self._richest()
         piece = self.piece(number)
         model = piece.model()
+        around = rows_around(self.readings.time_s, self.tiles[number].rows)
+        readings, own = self.readings[around], np.searchsorted(around, self.tiles[number].rows)
 
         def delayed(lag_s: float) -> SurveyRecord:
-            readings = taken_earlier(self.readings, lag_s)[self.tiles[number].rows]
-            return replace(piece, readings=readings).model().record
+            return replace(piece, readings=taken_earlier(readings, lag_s)[own]).model().record
 
         group = piece.groups(model.record, model.bounds, WHILE_SEARCHING)
         lag = lag_of(model, self.found[number], group, delayed)

@@ -131,13 +131,20 @@ def with_free_sources(record: SurveyRecord, background: Background, sources: Sou
     if not len(sources):
         return Q
     J = jacobian_of(record, background, sources, sources.fields(record))
-    J = J - Q @ (Q.T @ J)
-    return np.concatenate([Q, orthogonal(_UNKNOWN * J / np.linalg.norm(J, axis=0))], axis=1)
+    J *= _UNKNOWN / np.linalg.norm(J, axis=0)
+    # What is left of J is J' = (1 - QQᵀ) J, and its square JᵀJ', not J'ᵀJ': the ground is Gaussian, not free.
+    left = J - Q @ (Q.T @ J)
+    return np.concatenate([Q, _times_root_of_inverse(left, J.T @ left)], axis=1)
 
 
 def orthogonal(L: FloatArray) -> FloatArray:
     """``Q`` with ``Q Qᵀ = L (LᵀL + 1)⁻¹ Lᵀ``."""
-    factor = cho_factor(L.T @ L + np.eye(L.shape[1]), lower=True)[0]
+    return _times_root_of_inverse(L, L.T @ L)
+
+
+def _times_root_of_inverse(L: FloatArray, square: FloatArray) -> FloatArray:
+    """``Q`` with ``Q Qᵀ = L (A + 1)⁻¹ Lᵀ`` of some symmetric matrix ``A``."""
+    factor = cho_factor(square + np.eye(L.shape[1]), lower=True)[0]
     return np.asarray(solve_triangular(factor, L.T, lower=True, check_finite=False).T)
 
 

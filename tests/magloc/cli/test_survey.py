@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from pathlib import Path
 
 import pytest
@@ -100,6 +101,29 @@ class TestSurvey:
             for files in ([folder / "ground.csv"], parts)
         )
         assert whole == both
+
+    def test_base_station(self, folder: Path, tmp_path: Path, run: Run) -> None:
+        """A storm at the sensors and at the base station changes nothing."""
+        head, *rows = (folder / "ground.csv").read_text().splitlines()
+        columns, storm = head.split(","), []
+        base = ["time_s,base_nT"]
+        for row in rows:
+            cells = dict(zip(columns, map(float, row.split(",")), strict=True))
+            change = 80.0 * math.sin(cells["time_s"] / 3.0)
+            cells |= {name: cells[name] + change for name in ("low_nT", "high_nT")}
+            storm.append(",".join(map(repr, cells.values())))
+            base.append(f"{cells['time_s']!r},{48000.0 + change!r}")
+        (tmp_path / "storm.csv").write_text("\n".join([head, *storm, ""]))
+        (tmp_path / "base.csv").write_text("\n".join([*base, ""]))
+        line = ("--array", folder / "ground-array.toml", "--json")
+        quiet = run("survey", folder / "ground.csv", *line)
+        done = run("survey", tmp_path / "storm.csv", *line, "--base", tmp_path / "base.csv")
+        (target,), (expected,) = (json.loads(each.out)["targets"] for each in (done, quiet))
+        assert target["position_m"] == pytest.approx(expected["position_m"], abs=1e-3)
+        (tmp_path / "short.csv").write_text("\n".join([*base[:100], ""]))
+        assert_refused(
+            run("survey", tmp_path / "storm.csv", *line, "--base", tmp_path / "short.csv"), "--base must read"
+        )
 
     def test_bad_input(self, folder: Path, run: Run) -> None:
         line = ("survey", folder / "ground.csv", "--array", folder / "ground-array.toml")

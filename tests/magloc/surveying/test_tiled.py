@@ -12,6 +12,7 @@ import pytest
 import magloc
 import sims
 from magloc.grids.work import workers
+from magloc.surveying.clock import rows_around, taken_earlier
 from magloc.surveying.piece import Ground, strongest_in
 from magloc.surveying.preparation import whole_rows
 from magloc.surveying.tiled import TiledSurvey
@@ -107,6 +108,18 @@ class TestTwoTiles:
             magloc.survey(field().array, field().readings, progress=interrupt, **arguments)
         assert first.stat().st_mtime_ns == before
         assert len(list(kept.iterdir())) == 2
+
+
+class TestOnTime:
+    @pytest.mark.parametrize("lag_s", [-0.95, 0.07, 1.0])
+    def test_the_rows_of_a_tile_move_as_in_all(self, lag_s: float) -> None:
+        rows, readings = tiled().tiles[0].rows, tiled().readings
+        around = rows_around(readings.time_s, rows)
+        assert len(rows) < len(around) < len(readings)
+        own = taken_earlier(readings[around], lag_s)[np.searchsorted(around, rows)]
+        of_all = taken_earlier(readings, lag_s)[rows]
+        np.testing.assert_allclose(own.array_position_m, of_all.array_position_m, atol=1e-12)
+        np.testing.assert_allclose(own.ambient_T, of_all.ambient_T, rtol=1e-12)
 
 
 class TestBadInput:
