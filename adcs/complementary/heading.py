@@ -70,18 +70,18 @@ class HeadingModel:
     0.01
     """
 
-    noise_T: float = 1e-6
+    noise_T: float = 2e-6
     offset_T: float = 0.3e-6
     offset_T_rts: float = 0.02e-6
     room_T: float = 0.4e-6
-    room_s: float = 40.0
+    room_s: float = 100.0
     local_T: float = 2e-6
     local_s: float = 0.3
     gyro_drift_rad_s: float = 0.0007
     gyro_drift_s: float = 20.0
     gyro_scale: float = 0.005
     gyro_walk_rad_rts: float = 0.0003
-    start_rad: float = 0.02
+    start_rad: float = 0.01
     turning_rad_s: float = math.radians(3.0)
     gap_rad_s: float = 0.1
     jump_T: float = 20e-6

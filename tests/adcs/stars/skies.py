@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 
+HARD = {"gradient": 1.0, "vignetting": 0.8, "hot": 20}
+
 
 def photograph(sky, camera, R, rng, gradient=0.0, vignetting=0.0, hot=0, trail_px=0.0):
     """Grey picture (height, width) of 16 bits, first row at the top: lights of 1.2 pixels on a glow of 2,000 ± 20."""

@@ -23,12 +23,11 @@ from adcs.stars.pictures import find_picture_stars, read_picture
 from adcs.stars.pose import UNKNOWN_LENS, LensPrior
 from adcs.stars.unknown_scale import identify_at_unknown_scale, solve_photograph
 from arrays.io.errors import InputError
-from tests.adcs.stars.skies import photograph
+from tests.adcs.stars.skies import HARD, photograph
 from tests.adcs.stars.test_identification import random_sky
 
 CAMERA = StarCamera(640, 480, math.radians(60.0 / 3600.0))
 SKY = random_sky(30_000)
-HARD = {"gradient": 1.0, "vignetting": 0.8, "hot": 20}
 
 
 def fits_bytes(values, bitpix, bzero=0.0):
