@@ -13,6 +13,7 @@ __getattr__, __dir__, __all__ = lazy_names(
         "EstimatorSettings": "adcs.kalman.bank",
         "Gains": "adcs.complementary.explicit",
         "HeadingModel": "adcs.complementary.heading",
+        "HysteresisRods": "adcs.satellite.magnetic_control",
         "MagnetometerPrior": "adcs.satellite.magnetometer_calibration",
         "OwnFields": "adcs.satellite.own_fields",
         "Satellite": "adcs.satellite.satellite",

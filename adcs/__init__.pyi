@@ -20,6 +20,7 @@ from adcs.kalman.bank import EstimatorSettings as EstimatorSettings
 from adcs.kalman.bank import estimate as estimate
 from adcs.satellite.attitude_track import AttitudeTrack as AttitudeTrack
 from adcs.satellite.magnetic_control import BDot as BDot
+from adcs.satellite.magnetic_control import HysteresisRods as HysteresisRods
 from adcs.satellite.magnetic_control import b_dot_gain as b_dot_gain
 from adcs.satellite.magnetic_control import detumbled as detumbled
 from adcs.satellite.magnetometer_calibration import MagnetometerPrior as MagnetometerPrior

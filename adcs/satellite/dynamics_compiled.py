@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adcs.satellite.dynamics import RigidBody, WheelControl
+from adcs.satellite.magnetic_control import MU0, HysteresisRods
 from magloc.compilation import compiled
 
 Array = NDArray[np.float64]
+_MU0 = MU0
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
@@ -49,6 +51,23 @@ class Control(NamedTuple):
         """In the layout of the compiled code."""
         gains = vector_at(control.attitude_gain_Nm), vector_at(control.rate_gain_Nms)
         return cls(*gains, control.torque_limit_Nm, control.momentum_limit_Nms, quaternion_at(q_reference))
+
+
+class Rods(NamedTuple):
+    """Hysteresis rods: axes (K, 3), H_c, k of their loop, and the moment of the largest flux times 2/π."""
+
+    axes: Array
+    coercivity: float
+    steepness: float
+    strength: float
+
+    @classmethod
+    def of(cls, rods: HysteresisRods | None) -> Rods:
+        """In the layout of the compiled code; without rods no axes."""
+        if rods is None:
+            return cls(np.empty((0, 3)), 0.0, 0.0, 0.0)
+        strength = 2.0 / np.pi * rods.saturation_T * rods.volume_m3 / MU0
+        return cls(np.ascontiguousarray(rods.axes), rods.coercivity_A_m, rods.steepness_m_A, strength)
 
 
 class Surroundings(NamedTuple):
@@ -300,6 +319,22 @@ def commanded_torque(
 
 
 @compiled
+def rods_moment(rods: Rods, state: Array, b: Vector) -> Vector:
+    """Moment of rods after they have followed a field in body axes; ``state`` (2, K), H and z of each, goes on."""
+    moment = (0.0, 0.0, 0.0)
+    for i in range(len(rods.axes)):
+        axis = vector_at(rods.axes[i])
+        H = (axis[0] * b[0] + axis[1] * b[1] + axis[2] * b[2]) / _MU0
+        way = -1.0 if state[0, i] > H else 1.0
+        s = 0.5 + 0.5 * way * (state[0, i] - state[1, i]) / rods.coercivity
+        t = np.tanh(0.5 * abs(H - state[0, i]) / rods.coercivity)
+        state[0, i] = H
+        state[1, i] = H - way * rods.coercivity * (2.0 * (s + t) / (1.0 + s * t) - 1.0)
+        moment = combined(moment, rods.strength * np.arctan(rods.steepness * state[1, i]), axis)
+    return moment
+
+
+@compiled
 def run(
     begin: int,
     end: int,
@@ -308,6 +343,7 @@ def run(
     control: Control,
     torque: Array,
     dipole: Array,
+    rods: Rods,
     around: Surroundings,
     dt: float,
 ) -> None:
@@ -315,7 +351,8 @@ def run(
 
     The first rows of the motion hold the start of attitude, rate and momentum, and the others are filled; the wheels'
     torque is what is held from each instant to the next (the last row: what would be). ``torque`` and ``dipole``
-    (R, n, 3), besides the residual one, are held likewise; surroundings are those at the start of every step.
+    (R, n, 3), besides the residual one, are held likewise; surroundings are those at the start of every step. The
+    rods' moment is held too, that of the field at the middle of the step, or they would lag by half of it more.
     """
     q, w, momentum, wheel_torque = motion
     n = q.shape[1]
@@ -323,6 +360,7 @@ def run(
         q_now = quaternion_at(q[r, 0])
         w_now = vector_at(w[r, 0])
         k_now = vector_at(momentum[r, 0])
+        iron = np.zeros((2, len(rods.axes)))
         for i in range(n):
             rate = around.orbital_rate[r, i]
             u = commanded_torque(body.J, control, q_now, w_now, k_now, rate, dt)
@@ -333,5 +371,8 @@ def run(
             if i == n - 1:
                 break
             outside, b_orbital = vector_at(torque[r, i]), vector_at(around.b_orbital[r, i])
-            now, gravity = with_dipole(body, vector_at(dipole[r, i])), around.gravity[r, i]
+            b = rotate_back(q_now, b_orbital)
+            own = rods_moment(rods, iron, combined(b, 0.5 * dt, cross(b, w_now)))
+            now = with_dipole(body, combined(own, 1.0, vector_at(dipole[r, i])))
+            gravity = around.gravity[r, i]
             q_now, w_now, k_now = step(now, q_now, w_now, k_now, u, outside, rate, gravity, b_orbital, dt)

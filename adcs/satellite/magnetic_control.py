@@ -1,20 +1,23 @@
-r"""Control by torquers: B-dot, which takes the rate out of a tumbling satellite by its magnetometer alone.
+r"""Magnetic control: B-dot, which takes the rate out of a tumbling satellite, and rods that do so without any power.
 
 The field in body axes changes as the body turns, dB/dt ≈ B×ω. A moment against it, m = -k Ḃ/B², has the torque
 m×B ≈ -k ω⊥: it brakes what turns across the field, and the field turns along the orbit. With k = 4 n I the rate decays
-within a quarter of a radian of the orbit; torquers saturate long before.
+within a quarter of a radian of the orbit; torquers saturate long before. Rods of soft iron lag behind the field, and
+each turn in it costs the energy of a loop.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from arrays.io.errors import check_positive
 from arrays.typing import FloatArray
+from magloc.fields.dipole import MU0_OVER_4PI
 
+MU0 = 4.0 * np.pi * MU0_OVER_4PI
 _MEAN_OF_A_CUBE = 1.2
 """Largest moment across a field, of three torquers, each within its limit: its mean over directions, of that of one."""
 
@@ -65,9 +68,129 @@ class BDot:
             Between them.
         """
         now = np.asarray(now_T, dtype=np.float64)
-        change = (now - np.asarray(before_T, dtype=np.float64)) / step_s
-        wanted = -self.gain_Nms * change / np.sum(now * now, axis=-1, keepdims=True)
+        return self._limited(now, (now - np.asarray(before_T, dtype=np.float64)) / step_s)
+
+    def moment_by_rate_Am2(self, field_T: ArrayLike, rate_rad_s: ArrayLike) -> FloatArray:
+        """Moment (..., 3) by an estimate of the rate, dB/dt = B×ω: no noise of two readings, nor the orbit's turn.
+
+        Parameters
+        ----------
+        field_T : array_like, shape (..., 3)
+            In body axes: the last reading, or the model's in the attitude that is estimated.
+        rate_rad_s : array_like, shape (..., 3)
+            To be taken out, body axes: against inertial space, or the orbital frame.
+        """
+        b = np.asarray(field_T, dtype=np.float64)
+        return self._limited(b, np.cross(b, np.asarray(rate_rad_s, dtype=np.float64)))
+
+    def _limited(self, b: FloatArray, change_T_s: FloatArray) -> FloatArray:
+        wanted = -self.gain_Nms * change_T_s / np.sum(b * b, axis=-1, keepdims=True)
         return np.clip(np.nan_to_num(wanted), -self.largest_Am2, self.largest_Am2)
+
+
+@dataclass(frozen=True, eq=False)
+class HysteresisRods:
+    r"""Rods of soft iron across a satellite's magnet, which take its rate out without power.
+
+    The model of Flatley and Henretty, solved: the flux is :math:`B = \frac{2 B_s}{\pi} \arctan(k z)` with
+    :math:`k = \tan(\pi B_r / 2 B_s) / H_c`, of a field z that lags behind H by up to H_c:
+
+    .. math::
+
+        \frac{dz}{dH} = s^2, \quad s = \frac12 \pm \frac{H - z}{2 H_c} \quad\Rightarrow\quad
+        s = \tanh\left(\operatorname{artanh} s_0 + \frac{|H - H_0|}{2 H_c}\right),
+
+    \+ where H rises and - where it falls, which holds from each turn of H to the next. A loop to saturation costs
+    :math:`4 H_c B_s`, a small one a share that falls with the cube of its size. The numbers are apparent ones, of rods
+    as they are mounted: a rod demagnetises itself, and is far from what its material does in a ring. The default ones
+    are in use for rods of HyMu-80 of 95 mm by 1 mm on satellites of three units, of which 1 cm³ is thirteen.
+
+    Attributes
+    ----------
+    axes : ndarray, shape (K, 3)
+        Unit vectors along the rods, body axes.
+    volume_m3 : float
+        Of all rods along each of them.
+    coercivity_A_m, remanence_T, saturation_T : float
+        H_c, B_r and B_s.
+
+    Raises
+    ------
+    ValueError
+        An axis has no direction, a number is not positive, or the remanence not below saturation.
+
+    Examples
+    --------
+    >>> import adcs
+    >>> rods = adcs.HysteresisRods(volume_m3=1e-6)
+    >>> state = rods.followed(rods.demagnetised(), [30e-6, 0.0, 0.0])
+    >>> rods.moment_Am2(state).round(5)
+    array([0.00368, 0.     , 0.     ])
+    """
+
+    axes: FloatArray = field(default_factory=lambda: np.eye(3)[:2])
+    volume_m3: float = 1e-6
+    coercivity_A_m: float = 12.0
+    remanence_T: float = 0.004
+    saturation_T: float = 0.027
+
+    def __post_init__(self) -> None:
+        axes = np.atleast_2d(np.asarray(self.axes, dtype=np.float64))
+        lengths = np.linalg.norm(axes, axis=-1, keepdims=True)
+        if axes.shape[1:] != (3,) or not (np.isfinite(lengths).all() and (lengths > 0.0).all()):
+            raise ValueError(f"Input axes must be directions, shape (K, 3); instead received {axes.tolist()}.")
+        object.__setattr__(self, "axes", axes / lengths)
+        check_positive(
+            volume_m3=self.volume_m3,
+            coercivity_A_m=self.coercivity_A_m,
+            remanence_T=self.remanence_T,
+            saturation_T=self.saturation_T,
+        )
+        if not self.remanence_T < self.saturation_T:
+            raise ValueError(
+                f"Input remanence_T must be below saturation_T, {self.saturation_T:g}; "
+                f"instead received {self.remanence_T:g}."
+            )
+
+    def demagnetised(self) -> FloatArray:
+        """State (2, K) of rods that no field has met."""
+        return np.zeros((2, len(self.axes)))
+
+    def followed(self, state_A_m: ArrayLike, field_T: ArrayLike) -> FloatArray:
+        """State (..., 2, K) of the rods, H and z of each, after the field has come to a new value without turning.
+
+        Parameters
+        ----------
+        state_A_m : array_like, shape (..., 2, K)
+            The same before.
+        field_T : array_like, shape (..., 3)
+            Field from outside, body axes.
+        """
+        before, z = np.moveaxis(np.asarray(state_A_m, dtype=np.float64), -2, 0)
+        H = np.asarray(field_T, dtype=np.float64) @ self.axes.T / MU0
+        way = np.where(before > H, -1.0, 1.0)
+        s, t = (
+            0.5 + 0.5 * way * (before - z) / self.coercivity_A_m,
+            np.tanh(0.5 * np.abs(H - before) / self.coercivity_A_m),
+        )
+        return np.stack([H, H - way * self.coercivity_A_m * (2.0 * (s + t) / (1.0 + s * t) - 1.0)], axis=-2)
+
+    def moment_Am2(self, state_A_m: ArrayLike) -> FloatArray:
+        """Moment (..., 3) of all rods, B V/μ₀ along each, body axes.
+
+        Parameters
+        ----------
+        state_A_m : array_like, shape (..., 2, K)
+            Of :meth:`followed`.
+        """
+        z = np.asarray(state_A_m, dtype=np.float64)[..., 1, :]
+        flux_T = 2.0 / np.pi * self.saturation_T * np.arctan(self.steepness_m_A * z)
+        return self.volume_m3 / MU0 * (flux_T @ self.axes)
+
+    @property
+    def steepness_m_A(self) -> float:
+        """k, of the arc tangent of the loop."""
+        return float(np.tan(0.5 * np.pi * self.remanence_T / self.saturation_T) / self.coercivity_A_m)
 
 
 def b_dot_gain(inertia_kgm2: ArrayLike, orbital_rate_rad_s: float) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from adcs.satellite.magnetic_control import HysteresisRods
 from adcs.satellite.satellite import Satellite
 from arrays.io.errors import check_not_negative
 
@@ -61,6 +62,8 @@ class AttitudeScenario:
         standard deviation; infinite = constant.
     dipole_Am2 : tuple of 3 floats
         Magnetic dipole in the body that filters are not told, besides the residual one of the satellite.
+    rods : HysteresisRods or None
+        On board, across a magnet; filters are not told of them.
     wild_share : float
         Share of the readings of every sensor that are anything at all.
     start_attitude_rad, start_rate_rad_s : float
@@ -93,6 +96,7 @@ class AttitudeScenario:
     field_error_T: float = 0.0
     field_error_correlation_s: float = math.inf
     dipole_Am2: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rods: HysteresisRods | None = None
     wild_share: float = 0.0
     start_attitude_rad: float = math.radians(1.0)
     start_rate_rad_s: float = math.radians(0.01)

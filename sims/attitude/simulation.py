@@ -8,7 +8,7 @@ was set. Where the loop shall be closed by an estimate, :func:`prepare` gives ev
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +30,8 @@ _SENSORS = ("star", "gyro", "field", "sun")
 _WILD_RAD_S, _WILD_T = math.radians(2.0), 30e-6
 """Standard deviations of a wild reading of a component, of gyro and magnetometer."""
 State = tuple[FloatArray, FloatArray, FloatArray]
+Command = Callable[[Record, int], FloatArray]
+"""Moment (runs, 3) until the next instant, from a record that ends with the readings of an instant."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +174,7 @@ def moved(prepared: Prepared) -> AttitudeRuns:
         rigid_body.Control.of(scenario.satellite.control, quaternion.IDENTITY),
         prepared.torque_Nm,
         prepared.dipole_Am2 + prepared.torquers_Am2,
+        rigid_body.Rods.of(scenario.rods),
         rigid_body.Surroundings(around.orbital_rate_rad_s, around.gravity_s2, prepared.true_field_orbital_T),
         scenario.dt_s,
     )
@@ -244,6 +247,33 @@ def advance(prepared: Prepared, state: State, wheel_torque_Nm: FloatArray, row: 
         prepared.scenario.dt_s,
         prepared.dipole_Am2[:, row] + prepared.torquers_Am2[:, row],
     )
+
+
+def controlled(
+    prepared: Prepared,
+    command: Command,
+    advanced: Callable[[int], None] | None = None,
+) -> AttitudeRuns:
+    """Truth and readings from the start of prepared runs, without wheels; what is commanded goes into the record."""
+    runs, n = prepared.torque_Nm.shape[:2]
+    none = np.zeros((runs, 3))
+    record = AttitudeRuns.of(prepared, np.tile(quaternion.IDENTITY, (runs, n, 1)), *np.zeros((3, runs, n, 3)))
+    read = [getattr(record.readings, name) for name in ("star", "gyro_rad_s", "field_T", "sun")]
+    for values in read:
+        values[:] = np.nan
+    state = (prepared.q, prepared.w, prepared.momentum_Nms)
+    for row in range(n):
+        only = slice(row, row + 1)
+        record.q[:, row], record.w[:, row] = state[:2]
+        now = sense(prepared, record.q[:, only], record.w[:, only], only)
+        for values, reading in zip(read, (now.star, now.gyro_rad_s, now.field_T, now.sun), strict=True):
+            values[:, only] = reading
+        prepared.torquers_Am2[:, row] = command(record, row)
+        if row < n - 1:
+            state = advance(prepared, state, none, row)
+        if advanced is not None:
+            advanced(1)
+    return record
 
 
 def start_estimates(

@@ -1,8 +1,8 @@
-"""``adcs run detumbling``: B-dot of a satellite that tumbles."""
+"""``adcs run detumbling``: a satellite that tumbles, braked by torquers or by rods."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from cyclopts import Parameter
@@ -11,32 +11,41 @@ from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import InputError
 from magloc.cli.framework import QuietOptions, print_result, progress
 
-_LONGEST_S = 50_000.0
+_LONGEST_S, _MOST_S = 200_000.0, 2_000_000.0
+_STRONGEST_AM2 = 10.0
 
 
 def detumbling(
     *,
+    damping: Literal["readings", "estimate", "rods"] = "readings",
     rate_deg_s: float = 10.0,
     moment_Am2: Annotated[float, Parameter(name="--moment-Am2")] = 0.2,
     duty: float = 0.8,
+    magnet_Am2: Annotated[float, Parameter(name="--magnet-Am2")] = 0.0,
     seeds: Annotated[Count, Parameter(name=["--seeds", "--runs"])] = 40,
     seed: Seed = 0,
     duration: float = 5000.0,
     json: Flag = False,
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
 ) -> None:
-    """Take the rate out of a tumbling satellite of three units by torquers, with B-dot of its magnetometer's readings.
+    """Take the rate out of a tumbling satellite of three units, by torquers with B-dot or by rods that lag behind.
 
-    Printed is how long it takes until the rate stays below 0.5°/s, beside what the mean torque along the orbit says.
+    Printed is how long it takes until the rate stays below 0.5°/s, beside what the mean torque of torquers along the
+    orbit says, the rate that is left, and how far a magnet's axis is off the field then.
 
     Parameters
     ----------
+    damping : str
+        By torquers from the magnetometer's "readings", or from the "estimate" of a filter of magnetometer, Sun sensor
+        and gyro, which is told what is commanded; or by hysteresis "rods" along x and y, 1 cm³ each.
     rate_deg_s : float
         At the start, about any axis.
     moment_Am2 : float
         Largest moment of each of three torquers.
     duty : float
         Part of each second in which they are on; the magnetometer is read while they are off.
+    magnet_Am2 : float
+        Of a magnet along the axis z, which the field turns towards itself.
     seeds : int
         Number of runs.
     seed : int
@@ -50,8 +59,9 @@ def detumbling(
     """
     from sims import experiments
 
-    if not 1.0 <= duration <= _LONGEST_S:
-        raise InputError(f"--duration: found {duration:g}, expected 1 to {_LONGEST_S:g}.")
+    longest_s = min(_LONGEST_S, _MOST_S / seeds)
+    if not 1.0 <= duration <= longest_s:
+        raise InputError(f"--duration: found {duration:g}, expected 1 to {longest_s:g} of {seeds} runs.")
     for name, value, most in (
         ("--rate-deg-s", rate_deg_s, 30.0),
         ("--moment-Am2", moment_Am2, 100.0),
@@ -59,32 +69,44 @@ def detumbling(
     ):
         if not 0.0 < value <= most:
             raise InputError(f"{name}: found {value:g}, expected more than 0 and at most {most:g}.")
+    if not 0.0 <= magnet_Am2 <= _STRONGEST_AM2:
+        raise InputError(f"--magnet-Am2: found {magnet_Am2:g}, expected 0 to {_STRONGEST_AM2:g}.")
     with progress(round(duration) + 1, "seconds", quiet=common.quiet) as advanced:
         found = experiments.detumbling(
             range(seed, seed + seeds),
+            damping=damping,
             rate_deg_s=rate_deg_s,
             largest_Am2=moment_Am2,
             duty=duty,
+            magnet_Am2=magnet_Am2,
             duration_s=duration,
             advanced=advanced,
         )
     # A slow spin about the axis of the smallest moment has a momentum that is below from the start.
-    done = np.isfinite(found.time_s) & (found.theory_s > 0.0)
-    ratio = found.time_s[done] / found.theory_s[done]
+    compared = np.isfinite(found.time_s) & (found.theory_s > 0.0)
+    ratio = found.time_s[compared] / found.theory_s[compared]
+    done = compared if compared.any() else np.isfinite(found.time_s)
     numbers = {
         "time_s": float(np.median(found.time_s[done])) if done.any() else None,
-        "theory_s": float(np.median(found.theory_s[done])) if done.any() else None,
-        "ratio": float(np.median(ratio)) if done.any() else None,
-        "within_20_percent": float(np.mean(np.abs(ratio - 1.0) <= 0.2)) if done.any() else None,
+        "theory_s": float(np.median(found.theory_s[compared])) if compared.any() else None,
+        "ratio": float(np.median(ratio)) if compared.any() else None,
+        "within_20_percent": float(np.mean(np.abs(ratio - 1.0) <= 0.2)) if compared.any() else None,
         "detumbled_runs": int(np.isfinite(found.time_s).sum()),
         "runs": seeds,
+        "last_rate_deg_s": float(np.median(found.last_rate_deg_s)),
+        "last_off_field_deg": float(np.median(found.last_off_field_deg)) if magnet_Am2 else None,
     }
-    lines = [f"detumbling: {seeds} runs of {duration:g} s from {rate_deg_s:g}°/s; {moment_Am2:g} A·m², duty {duty:g}"]
+    by = "rods" if damping == "rods" else f"{moment_Am2:g} A·m² by {damping}, duty {duty:g}"
+    lines = [f"detumbling: {seeds} runs of {duration:g} s from {rate_deg_s:g}°/s; {by}"]
     if done.any():
+        lines.append(f"{'below 0.5°/s after, median':34s}{numbers['time_s']:.0f} s")
+    if compared.any():
         lines += [
-            f"{'below 0.5°/s after, median':34s}{numbers['time_s']:.0f} s",
             f"{'by the mean torque':34s}{numbers['theory_s']:.0f} s",
             f"{'ratio, median':34s}{numbers['ratio']:.3g}, {numbers['within_20_percent']:.0%} within 20 %",
         ]
     lines.append(f"{'runs that are slow in the end':34s}{numbers['detumbled_runs']}")
+    lines.append(f"{'rate of the last ten minutes':34s}{numbers['last_rate_deg_s']:.2g}°/s")
+    if magnet_Am2:
+        lines.append(f"{'magnet off the field, last orbit':34s}{numbers['last_off_field_deg']:.2g}°")
     print_result(numbers, lines, as_json=json)

@@ -1,24 +1,33 @@
-"""A satellite of three units that tumbles, and B-dot by its own readings: ``adcs run detumbling``."""
+"""A satellite of three units that tumbles, and is braked by torquers or by rods: ``adcs run detumbling``."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adcs import quaternion
 from adcs.environment.orbit import circular_orbit
-from adcs.satellite.magnetic_control import BDot, b_dot_gain, detumbled
+from adcs.kalman.error_state import FilterSettings, State, sensor_set, tuned_noise
+from adcs.kalman.initialisation import vector_start
+from adcs.kalman.mekf import corrected, first_state, predicted
+from adcs.satellite.dynamics import WheelControl, relative_rate
+from adcs.satellite.magnetic_control import BDot, HysteresisRods, b_dot_gain, detumbled
 from adcs.satellite.satellite import Satellite
-from adcs.satellite.telemetry import orbital_from_eci
-from arrays.typing import FloatArray
+from adcs.satellite.telemetry import Record, is_read, orbital_from_eci, part
+from arrays.typing import BoolArray, FloatArray
 from sims.attitude.scenario import AttitudeScenario, StartConditions
-from sims.attitude.simulation import AttitudeRuns, advance, prepare, sense
+from sims.attitude.simulation import AttitudeRuns, Command, Prepared, controlled, moved, prepare
 from sims.noise import stream
 
+Damping = Literal["readings", "estimate", "rods"]
 INERTIA_KGM2 = np.diag([0.041, 0.041, 0.007])
+ORBIT = circular_orbit(altitude_m=550e3, inclination_deg=97.6, epoch="2026-11-21", local_time_h=10.5)
+RODS = HysteresisRods()
 SLOW_RAD_S = math.radians(0.5)
 
 
@@ -32,33 +41,58 @@ class Detumbling:
         Truth, readings, and the moments that were commanded: their mean over each cycle.
     time_s, theory_s : ndarray, shape (runs,)
         Until the rate stays below 0.5 °/s for a minute, and what the equation of the mean torque says; NaN where not
-        within the run.
+        within the run, and without torquers.
     """
 
     runs: AttitudeRuns
     time_s: FloatArray
     theory_s: FloatArray
 
+    @property
+    def last_rate_deg_s(self) -> FloatArray:
+        """Rms over the last ten minutes of every run's rate against inertial space, shape (runs,)."""
+        return np.degrees(np.sqrt(np.mean(np.sum(self._last(self.runs.w) ** 2, axis=-1), axis=1)))
+
+    @property
+    def last_off_field_deg(self) -> FloatArray:
+        """Median over the last orbit of the angle between the axis z and the field, shape (runs,)."""
+        b = quaternion.rotate_back(self.runs.q, self.runs.prepared.true_field_orbital_T)
+        cosine = b[..., 2] / np.linalg.norm(b, axis=-1)
+        return np.degrees(np.median(np.arccos(np.clip(self._last(cosine, ORBIT.period_s), -1.0, 1.0)), axis=1))
+
+    def _last(self, values: FloatArray, seconds: float = 600.0) -> FloatArray:
+        return values[:, -round(seconds / self.runs.dt_s) :]
+
 
 def detumbling(
     seeds: Sequence[int],
     *,
+    damping: Damping = "readings",
     rate_deg_s: float = 10.0,
     largest_Am2: float = 0.2,
     duty: float = 0.8,
+    magnet_Am2: float = 0.0,
+    rods: HysteresisRods = RODS,
     duration_s: float = 6000.0,
     advanced: Callable[[int], None] | None = None,
 ) -> Detumbling:
-    """Runs from rates in random directions, with a law that is told the magnetometer's readings and nothing else.
+    """Runs from rates in random directions, with a law that is told readings, or an estimate from them, or with rods.
 
     Parameters
     ----------
     seeds : sequence of int
         One for each run.
+    damping : str
+        ``readings``: torquers by two readings of the magnetometer; ``estimate``: torquers by the rate of a filter of
+        magnetometer, Sun sensor and gyro, once it has seen the Sun; ``rods``: no torquers.
     rate_deg_s : float
         At the start, of any direction.
     largest_Am2, duty : float
         Of the torquers; a cycle takes a second.
+    magnet_Am2 : float
+        Of a magnet along the axis z.
+    rods : HysteresisRods
+        Used where they damp.
     duration_s : float
         Of every run.
     advanced : callable, optional
@@ -71,42 +105,101 @@ def detumbling(
     >>> bool(found.time_s[0] < 1500.0)
     True
     """
-    orbit = circular_orbit(altitude_m=550e3, inclination_deg=97.6, epoch="2026-11-21", local_time_h=10.5)
+    satellite = Satellite(
+        inertia_kgm2=INERTIA_KGM2,
+        orbit=ORBIT,
+        residual_dipole_Am2=(0.0, 0.0, magnet_Am2),
+        control=WheelControl(np.zeros(3), np.zeros(3), torque_limit_Nm=1e-15),
+    )
     scenario = AttitudeScenario(
-        Satellite(inertia_kgm2=INERTIA_KGM2, orbit=orbit),
+        satellite,
         conditions=StartConditions(sunlit=False, least_separation_rad=0.0, least_field_T=0.0),
         duration_s=duration_s,
         torque_Nm=1e-8,
+        torque_period_s=1000.0,  # a constant one about the magnet would spin the satellite up for days
+        gyro_bias_rad_s=math.radians(0.02),
+        rods=rods if damping == "rods" else None,
         start_attitude_rad=2.0,
     )
-    prepared = prepare(scenario, seeds)
-    around, n = prepared.environment, scenario.n_instants
     directions = np.stack([stream(seed, "tumbling").standard_normal(3) for seed in seeds])
     w = math.radians(rate_deg_s) * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    law = BDot(b_dot_gain(INERTIA_KGM2, float(around.orbital_rate_rad_s[0, 0])), largest_Am2, duty)
-    state, before = (prepared.q, w, prepared.momentum_Nms), np.full((len(seeds), 3), np.nan)
-    q_all, w_all = np.empty((len(seeds), n, 4)), np.empty((len(seeds), n, 3))
-    none = np.zeros((len(seeds), 3))
-    for row in range(n):
-        q_all[:, row], w_all[:, row] = state[:2]
-        only = slice(row, row + 1)
-        now = sense(prepared, q_all[:, only], w_all[:, only], only).field_T[:, 0]
-        # What acts over the cycle is the mean over it: on for a part of it.
-        prepared.torquers_Am2[:, row] = law.duty * law.moment_Am2(before, now, scenario.dt_s)
-        before = now
-        if row < n - 1:
-            state = advance(prepared, state, none, row)
-        if advanced is not None:
-            advanced(1)
-    runs = AttitudeRuns.of(prepared, q_all, w_all, *np.zeros((2, len(seeds), n, 3)))
-    eci_from_orbital = quaternion.conjugate(orbital_from_eci(around))
+    prepared = replace(prepare(scenario, seeds), w=w)
+    law = BDot(b_dot_gain(INERTIA_KGM2, float(prepared.environment.orbital_rate_rad_s[0, 0])), largest_Am2, duty)
+    if damping == "rods":
+        runs = moved(prepared)
+    else:
+        command = _by_readings(law) if damping == "readings" else _by_estimate(law)
+        runs = controlled(prepared, command, advanced)
+    return Detumbling(
+        runs,
+        _time_below(np.linalg.norm(runs.w, axis=-1), scenario.dt_s),
+        np.full(len(w), np.nan) if damping == "rods" else _time_below(_by_mean_torque(prepared, law), scenario.dt_s),
+    )
+
+
+def _by_readings(law: BDot) -> Command:
+    """What acts over a cycle is the mean over it: on for a part of it."""
+
+    def command(record: Record, row: int) -> FloatArray:
+        field_T = record.readings.field_T
+        before = field_T[:, row - 1] if row else np.full_like(field_T[:, 0], np.nan)
+        return law.duty * law.moment_Am2(before, field_T[:, row], record.dt_s)
+
+    return command
+
+
+def _by_estimate(law: BDot) -> Command:
+    """By the rate against the orbital frame that a filter estimates, and by readings until it has started."""
+    used = sensor_set("mag+sun+gyro", ["gyro-bias"])
+    on_board, by_readings = _OnBoard(FilterSettings(used, tuned_noise(used))), _by_readings(law)
+
+    def command(record: Record, row: int) -> FloatArray:
+        state, started = on_board.take(record, row)
+        around = record.environment
+        b = quaternion.rotate_back(state.q, around.b_orbital_T[:, row])
+        rate = relative_rate(state.q, state.w, around.orbital_rate_rad_s[:, row])
+        return np.where(started[:, None], law.duty * law.moment_by_rate_Am2(b, rate), by_readings(record, row))
+
+    return command
+
+
+def _by_mean_torque(prepared: Prepared, law: BDot) -> FloatArray:
+    """Rate (runs, n) of the equation of the mean torque."""
+    eci_from_orbital = quaternion.conjugate(orbital_from_eci(prepared.environment))
     b_eci = quaternion.rotate(eci_from_orbital, prepared.true_field_orbital_T)
     eci_from_body = quaternion.multiply(eci_from_orbital[:, 0], prepared.q)
-    H = quaternion.rotate(eci_from_body, w @ INERTIA_KGM2)
-    theory = detumbled(law, H, b_eci, INERTIA_KGM2, scenario.dt_s) / INERTIA_KGM2.max()
-    return Detumbling(
-        runs, _time_below(np.linalg.norm(w_all, axis=-1), scenario.dt_s), _time_below(theory, scenario.dt_s)
-    )
+    H = quaternion.rotate(eci_from_body, prepared.w @ INERTIA_KGM2)
+    return detumbled(law, H, b_eci, INERTIA_KGM2, prepared.scenario.dt_s) / INERTIA_KGM2.max()
+
+
+class _OnBoard:
+    """Error-state filter, without a gate, that goes along with runs; each starts where it first sees field and Sun."""
+
+    def __init__(self, settings: FilterSettings) -> None:
+        self.settings = settings
+        self.started: BoolArray | None = None
+        self.state: State | None = None
+
+    def take(self, record: Record, row: int) -> tuple[State, BoolArray]:
+        """Estimate after the readings of an instant, of which none may be left out, and which runs have started."""
+        settings, readings = self.settings, record.readings
+        both = is_read(readings.field_T[:, row]) & is_read(readings.sun[:, row])
+        if self.state is None or self.started is None:
+            state, begins = self._begun(record, row, np.arange(len(both))), both
+            self.started = both
+        else:
+            state, begins = predicted(record, row - 1, self.state, settings)[0], both & ~self.started
+            self.started = self.started | both
+        if begins.any():
+            fresh = self._begun(record, row, np.flatnonzero(begins))
+            state.q[begins], state.w[begins], state.P[begins] = fresh.q, fresh.w, fresh.P
+            for name, values in fresh.optional.items():
+                state.optional[name][begins] = values
+        self.state, _ = corrected(record, row, state, settings)
+        return self.state, self.started
+
+    def _begun(self, record: Record, row: int, runs: NDArray[np.intp]) -> State:
+        return first_state(self.settings, vector_start(part(record, runs, slice(row, row + 1)), self.settings))
 
 
 def _time_below(rate: FloatArray, step_s: float) -> FloatArray:
