@@ -131,8 +131,13 @@ def search_rows(
     """
     n_starts = starts.shape[1]
     reading = np.repeat(reading_of_row[begin:end], n_starts)
-    near = _refined(signal, reading, starts[begin:end].reshape(-1, 4), model, _NEAR_TOLERANCE, max_iterations)
-    row_of_end, n = np.empty(len(reading), np.intp), 0
+    n = len(reading)
+    near = Refined(
+        np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_)
+    )  # fmt: skip
+    of_block = starts[begin:end].reshape(n, 4)
+    refine(signal, reading, of_block, model, 1.0, _NEAR_TOLERANCE, max_iterations, near)
+    row_of_end, n = np.empty(n, np.intp), 0
     for row in range(begin, end):
         first, n_before = (row - begin) * n_starts, n
         lowest = math.inf
@@ -152,7 +157,10 @@ def search_rows(
                 near.chi2[n], near.iterations[n] = near.chi2[k], near.iterations[k]
                 row_of_end[n], reading[n] = row, reading_of_row[row]
                 n += 1
-    ends = _refined(signal, reading[:n], near.q[:n], model, OPTIMUM_TOLERANCE, max_iterations)
+    ends = Refined(
+        np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_)
+    )  # fmt: skip
+    refine(signal, reading[:n], near.q[:n], model, 1.0, OPTIMUM_TOLERANCE, max_iterations, ends)
     first = 0
     for row in range(begin, end):
         last = first
@@ -163,18 +171,6 @@ def search_rows(
             last += 1
         _distinct(ends, first, last, keep_within, row, out)
         first = last
-
-
-@compiled
-def _refined(
-    signal: FloatArray, reading: IntArray, starts: FloatArray, model: LaneModel, tolerance: float, max_iterations: int
-) -> Refined:
-    n = len(starts)
-    out = Refined(
-        np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_)
-    )  # fmt: skip
-    refine(signal, reading, starts, model, 1.0, tolerance, max_iterations, out)
-    return out
 
 
 @compiled
