@@ -17,28 +17,32 @@ from arrays.typing import BoolArray, FloatArray
 class Whitening:
     """The differences' likelihood as a projection: ``w = e - Q (g ∘ Qᵀ e)``, ``e = L⁻¹ y``, noise covariance ``L Lᵀ``.
 
-    ``wᵀ w`` equals the χ² of :class:`Differences`, for the same readings.
+    ``wᵀ w`` equals the χ² of :class:`Differences`, for the same readings. Of many rows, one for every row along leading
+    axes.
 
     Attributes
     ----------
-    root : ndarray, shape (C, C)
+    root : ndarray, shape (..., C, C)
         ``L⁻¹`` [1/T], block-diagonal by sensor: 1/σ of every channel where the channels' noise is independent. Rows and
         columns of missing channels are zero; a sensor's other channels keep the covariance that they have without them.
-    basis : ndarray, shape (C, q)
+    gain : ndarray, shape (..., C, 3)
+        Of every channel in units of the noise: ``L⁻¹`` times the array's [1/T].
+    basis : ndarray, shape (..., C, q)
         Orthonormal basis of the common field in channels of unit noise.
-    shrinkage : ndarray, shape (q,)
+    shrinkage : ndarray, shape (..., q)
         1 where the common field is unknown, less where a prior bounds it.
     n_differences : int
         Number of independent scalars in w.
     """
 
     root: FloatArray
+    gain: FloatArray
     basis: FloatArray
     shrinkage: FloatArray
     n_differences: int
 
     def apply(self, channels: FloatArray) -> FloatArray:
-        """Whitened channels (..., C) of readings without offset, predictions or columns of a Jacobian [T].
+        """Whitened channels (..., C) of readings without offset, predictions or columns of a Jacobian [T], of one row.
 
         Residuals have unit variance once the common field is projected out. Missing entries must be finite; they do not
         count.
@@ -58,34 +62,36 @@ def whitening(
     mask, covariance = _channels(array, available, covariance_T2)
     if covariance_T2 is None:
         return _of_constant_noise(array, mask.tobytes())
-    return whitenings(array, mask, covariance[None])[0]
+    return whitenings(array, mask, covariance)
 
 
 @lru_cache(maxsize=16)  # readings that come one by one miss the same channels
 def _of_constant_noise(array: SensorArray, available: bytes) -> Whitening:
     """Whitening of the channels of a mask, with the noise that the array states."""
     mask, covariance = _channels(array, np.frombuffer(available, dtype=np.bool_), None)
-    return whitenings(array, mask, covariance[None])[0]
+    return whitenings(array, mask, covariance)
 
 
-def whitenings(array: SensorArray, available: BoolArray, covariances_T2: FloatArray) -> list[Whitening]:
-    """:func:`whitening` of each of n covariances (n, C, C) [T²] at once, for rows that have the same readings."""
-    n_rows, n = len(covariances_T2), array.n_channels
+def whitenings(array: SensorArray, available: BoolArray, covariances_T2: FloatArray) -> Whitening:
+    """:func:`whitening` of covariances (..., C, C) [T²], for rows that have the same readings."""
+    n = array.n_channels
     root = _inverse_root(array, available, covariances_T2)
     gain = root @ array.channel_gain
-    basis, shrinkage, keep = np.zeros((n_rows, n, 0)), np.zeros((n_rows, 0)), np.zeros((n_rows, 0), dtype=np.bool_)
+    prior = np.inf if array.common_field_T is None else array.common_field_T
+    bases, shrinkages, lost = [np.zeros((*root.shape[:-1], 0))], [np.zeros((*root.shape[:-2], 0))], 0
     for group in _groups(array, available):
         q, s, _ = np.linalg.svd(_common_field(array, group, gain), full_matrices=False)
-        of_group = np.zeros((n_rows, n, s.shape[1]))
-        of_group[:, group] = q
-        basis = np.concatenate([basis, of_group], axis=2)
-        keep = np.concatenate([keep, s > s.max(axis=1, keepdims=True, initial=0.0) * 1e-10], axis=1)
-        prior = np.inf if array.common_field_T is None else array.common_field_T
+        keep = s > s.max(axis=-1, keepdims=True, initial=0.0) * 1e-10
+        some = keep.reshape(-1, keep.shape[-1]).any(axis=0)
+        basis = np.zeros((*root.shape[:-2], n, int(some.sum())))
+        basis[..., group, :] = q[..., some]
         with np.errstate(invalid="ignore"):  # zero times infinity, for what is not kept
-            shrinkage = np.concatenate([shrinkage, 1.0 - 1.0 / np.sqrt(1.0 + (s * prior) ** 2)], axis=1)
-    lost = keep.sum(axis=1) if array.common_field_T is None else np.zeros(n_rows, dtype=np.intp)
-    n_differences = (int(available.sum()) - lost).tolist()
-    return [Whitening(root[i], basis[i][:, keep[i]], shrinkage[i, keep[i]], n_differences[i]) for i in range(n_rows)]
+            shrinkage = np.where(keep, 1.0 - 1.0 / np.sqrt(1.0 + (s * prior) ** 2), 0.0)[..., some]
+        bases.append(basis)
+        shrinkages.append(shrinkage)
+        lost += basis.shape[-1] if array.common_field_T is None else 0
+    basis, shrinkage = np.concatenate(bases, axis=-1), np.concatenate(shrinkages, axis=-1)
+    return Whitening(root, gain, basis, shrinkage, int(available.sum()) - lost)
 
 
 def _inverse_root(array: SensorArray, mask: BoolArray, covariance: FloatArray) -> FloatArray:

@@ -159,7 +159,7 @@ class SourcesMap(CubeMap):
     @cached_property
     def _model(self) -> WhitenedModel:
         array = self.scenario.array
-        return WhitenedModel.of(array, [whitening(array)], array.ambient_fields[None])
+        return WhitenedModel.of(array, whitening(array), array.ambient_fields[None])
 
     @property
     def point_s(self) -> float:

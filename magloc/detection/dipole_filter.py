@@ -53,7 +53,7 @@ class DipoleFilter:
         self.array = array
         self.whitening: Whitening = whitening(array)
         check_differences(self.whitening.n_differences, 3, "the three components of a moment")
-        self._problem = WhitenedModel.of(array, [self.whitening], array.ambient_fields[None])
+        self._problem = WhitenedModel.of(array, self.whitening, array.ambient_fields[None])
         self._gain: FloatArray = self._problem.linear_gain(np.zeros((1, array.n_sensors, 3)))[0]
         if not np.any(self._gain[array.channel_is_scalar]) and array.channel_is_scalar.any():
             raise ValueError("Input array must have an ambient field for its scalar sensors; instead it has none.")

@@ -168,7 +168,7 @@ class _Examination:
         self.refit, self.of_all = refit, rows
         self.free_position = free_position
         of_rows = whitenings_of(array, mask, readings)
-        self.n_differences = of_rows[0].n_differences
+        self.n_differences = of_rows.n_differences
         self.problem, self.raw = whitened_model(array, mask, readings, of_rows, ambient)
         self.count = np.bincount(array.channel_sensor[mask], minlength=array.n_sensors)
         level = 1.0 - SENSOR_FALSE_ALARM / array.n_sensors

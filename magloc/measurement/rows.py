@@ -93,7 +93,7 @@ def whitened_rows(
             readings, ambient = readings_T[index], None if ambient_T is None else ambient_T[index]
             of_rows = whitenings_of(array, mask, readings)
             model, raw = whitened_model(array, mask, readings, of_rows, ambient)
-            yield WhitenedRows(index, mask, readings, model, raw, model.whitened(raw), of_rows[0].n_differences)
+            yield WhitenedRows(index, mask, readings, model, raw, model.whitened(raw), of_rows.n_differences)
 
 
 def checked_rows(array: SensorArray, readings_T: ArrayLike) -> FloatArray:
@@ -116,10 +116,10 @@ def rows_of_equal_mask(available: NDArray[np.bool_]) -> Iterator[tuple[NDArray[n
         yield mask, np.flatnonzero(of_row.ravel() == i)
 
 
-def whitenings_of(array: SensorArray, mask: NDArray[np.bool_], readings_T: FloatArray) -> list[Whitening]:
-    """Whitening of every row of readings (n, C) with the channels of a mask: one object where the noise is constant."""
+def whitenings_of(array: SensorArray, mask: NDArray[np.bool_], readings_T: FloatArray) -> Whitening:
+    """Whitening of rows of readings (..., C) with the channels of a mask: that of all where the noise is constant."""
     if not array.noise_depends_on_reading:
-        return [whitening(array, mask)] * len(readings_T)
+        return whitening(array, mask)
     return whitenings(array, mask, reading_covariance(array, readings_T))
 
 
@@ -148,21 +148,19 @@ def whitened_model(
     array: SensorArray,
     mask: BoolArray,
     readings_T: FloatArray,
-    whitenings: list[Whitening],
+    whitening: Whitening,
     ambient_T: FloatArray | None,
 ) -> tuple[WhitenedModel, FloatArray]:
     """Exact model of rows of readings (n, C), and their channels (n, C) divided by the noise.
 
-    :meth:`WhitenedModel.whitened` frees these from the common field. There is one whitening for every row, and
+    :meth:`WhitenedModel.whitened` frees these from the common field. The whitening is that of every row or of all, and
     `ambient_T` (n, 3) stands in place of the array's ambient field.
     """
     fields = ambient_fields(array, len(readings_T), ambient_T)
     channels = channels_above_ambient(array, mask, readings_T, fields)
-    if len(set(map(id, whitenings))) == 1:
-        raw = channels @ whitenings[0].root.T
-    else:
-        raw = np.stack([w.root @ row for w, row in zip(whitenings, channels, strict=True)])
-    return WhitenedModel.of(array, whitenings, fields), raw
+    root = whitening.root
+    raw = channels @ root.T if root.ndim == 2 else (root @ channels[..., None])[..., 0]
+    return WhitenedModel.of(array, whitening, fields), raw
 
 
 def check_magnitudes(array: SensorArray) -> None:

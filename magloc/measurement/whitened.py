@@ -89,18 +89,12 @@ class WhitenedModel(ScaledSensors):
     known: KnownMoment | None = None
 
     @classmethod
-    def of(cls, array: SensorArray, whitenings: list[Whitening], ambient_T: FloatArray) -> WhitenedModel:
-        """Model of b sets of readings, each with its whitening and its ambient field (b, N, 3)."""
-        # One whitening for all rows, as where the noise is constant, is kept once.
+    def of(cls, array: SensorArray, whitening: Whitening, ambient_T: FloatArray) -> WhitenedModel:
+        """Model of b sets of readings with their ambient fields (b, N, 3); the whitening is that of each or of all."""
         radius = array.circumradius or 1.0  # of one sensor alone any length will do
-        shared = len(set(map(id, whitenings))) == 1
-        distinct = whitenings[:1] if shared else whitenings
 
-        def of_rows(values: list[FloatArray]) -> FloatArray:
-            stacked = np.stack(values)
-            if len(distinct) == len(whitenings):
-                return stacked
-            return np.broadcast_to(stacked, (len(whitenings), *stacked.shape[1:]))
+        def of_rows(values: FloatArray, n_axes: int) -> FloatArray:
+            return np.broadcast_to(values, (len(ambient_T), *values.shape[-n_axes:]))
 
         return cls(
             centroid=array.centroid,
@@ -108,10 +102,10 @@ class WhitenedModel(ScaledSensors):
             sensors=(array.positions - array.centroid) / radius,
             channel_sensor=array.channel_sensor.astype(np.intp),
             channel_is_scalar=array.channel_is_scalar,
-            gain=of_rows([w.root @ array.channel_gain for w in distinct]),
+            gain=of_rows(whitening.gain, 2),
             ambient=np.asarray(ambient_T, dtype=np.float64),
-            basis=of_rows([w.basis for w in distinct]),
-            shrinkage=of_rows([w.shrinkage for w in distinct]),
+            basis=of_rows(whitening.basis, 2),
+            shrinkage=of_rows(whitening.shrinkage, 1),
         )
 
     def __len__(self) -> int:

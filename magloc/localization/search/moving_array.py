@@ -76,7 +76,7 @@ def stacked_errors(
     array = poses.array
     fields = ambient_fields(array, len(readings_T), ambient_T)
     masks = np.isfinite(readings_T)
-    roots = [whitenings_of(array, mask, row[None])[0].root for mask, row in zip(masks, readings_T, strict=True)]
+    roots = [whitenings_of(array, mask, row).root for mask, row in zip(masks, readings_T, strict=True)]
 
     def errors(source: FloatArray) -> FloatArray:
         columns = poses.channel_errors(source, fields)
@@ -94,7 +94,7 @@ def stacked_rows(
 ) -> WhitenedRows:
     """Rows (n, C) of an array whose pose in the world is known as one row of a large array in the world frame."""
     n, available = len(readings_T), np.isfinite(readings_T)
-    whitenings = [whitenings_of(array, mask, row[None])[0] for mask, row in zip(available, readings_T, strict=True)]
+    whitenings = [whitenings_of(array, mask, row) for mask, row in zip(available, readings_T, strict=True)]
     fields = ambient_fields(array, n, ambient_T)
     channels = channels_above_ambient(array, available, readings_T, fields)
     raw = np.concatenate([w.root @ row for w, row in zip(whitenings, channels, strict=True)])

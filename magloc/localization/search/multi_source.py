@@ -72,7 +72,7 @@ class MultiSourceSearch:
         seed: int = 0,
     ) -> None:
         check_magnitudes(array)
-        whitening = whitenings_of(array, np.ones(array.n_channels, dtype=bool), np.zeros((1, array.n_channels)))[0]
+        whitening = whitenings_of(array, np.ones(array.n_channels, dtype=bool), np.zeros(array.n_channels))
         if whitening.n_differences < N_UNKNOWNS:
             raise ValueError(
                 f"Input array must give {N_UNKNOWNS} independent differences at least for a position and a moment;"

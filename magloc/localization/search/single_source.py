@@ -147,7 +147,7 @@ class SingleSourceSearch:
         if key not in self._ranking_of:
             self._ranking_of.clear()  # bases are large, and rows come sorted by their mask
             of_mask = whitening(self.array, mask)
-            model = WhitenedModel.of(self.array, [of_mask], self.array.ambient_fields[None])
+            model = WhitenedModel.of(self.array, of_mask, self.array.ambient_fields[None])
             candidates = model.homogeneous(self._candidates)
             bases = linear_bases(model, model.gain[0], 0, candidates)
             self._ranking_of[key] = _Ranking(of_mask, candidates, bases)

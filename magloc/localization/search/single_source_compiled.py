@@ -7,17 +7,20 @@ The readable twin is :mod:`magloc.localization.search.single_source`, that of th
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray, IntArray
-from magloc.compilation import compiled
+from magloc.compilation import compiled, inlined
 from magloc.linalg_compiled import put
 from magloc.localization.fit.linearisation_compiled import LANES
 from magloc.localization.fit.variable_projection_compiled import OPTIMUM_TOLERANCE, Refined, refine, same_optimum
 from magloc.measurement.whitened_compiled import LaneModel
+
+# Gauss-Newton gain in χ² at which a start is so near an optimum that others are known to lead to the same.
+_NEAR_TOLERANCE = 1e-2
 
 
 class Ends(NamedTuple):
@@ -56,35 +59,58 @@ def choose_rows(
 ) -> None:
     """Candidates (n, 4) that explain most of rows begin to end, some angle apart; the best again if none is left.
 
-    Components (3, n, rows) are those of the readings along the candidates' bases. Rows are lanes.
+    Components (3, n, rows) are those of the readings along the candidates' bases. Rows are lanes. Four candidates are
+    compared before the best so far is: a processor waits for that from one comparison to the next.
     """
     n, apart = len(candidates), np.float32(cos_apart)
-    score = np.empty((n, LANES), np.float32)
+    n_fours = -(-n // 4)
+    fours = np.zeros((n_fours, 4, 4), np.float32)
+    fours.reshape(-1, 4)[:n] = candidates
+    score = np.full((n_fours, 4 * LANES), np.float32(-1.0))
+    each = score.reshape(-1, LANES)
     w = np.empty(6 * LANES, np.float32)  # coordinates of the last choice (4), best score, its candidate
     for block in range(begin, end, LANES):
         width = min(LANES, end - block)
         for j in range(n):
             x, y, z = components[0, j, block:], components[1, j, block:], components[2, j, block:]
             for i in range(width):
-                score[j, i] = x[i] * x[i] + y[i] * y[i] + z[i] * z[i]
+                each[j, i] = x[i] * x[i] + y[i] * y[i] + z[i] * z[i]
         w[: 4 * LANES] = 0.0
         for k in range(chosen.shape[1]):
             w[4 * LANES :] = 0.0
-            for j in range(n):
-                c0, c1, c2, c3 = candidates[j, 0], candidates[j, 1], candidates[j, 2], candidates[j, 3]
-                s, place = score[j], np.float32(j)
+            for j in range(n_fours):
+                s, place = score[j], np.float32(4 * j)
+                c0, c1, c2, c3 = _four(fours[j], 0), _four(fours[j], 1), _four(fours[j], 2), _four(fours[j], 3)
                 for i in range(LANES):
-                    t = c0 * w[i] + c1 * w[LANES + i] + c2 * w[2 * LANES + i] + c3 * w[3 * LANES + i]
-                    value = np.float32(-1.0) if abs(t) > apart else s[i]
-                    s[i] = value
+                    q = (w[i], w[LANES + i], w[2 * LANES + i], w[3 * LANES + i])
+                    v0, v1 = _left(c0, q, apart, s[i]), _left(c1, q, apart, s[LANES + i])
+                    v2, v3 = _left(c2, q, apart, s[2 * LANES + i]), _left(c3, q, apart, s[3 * LANES + i])
+                    s[i], s[LANES + i], s[2 * LANES + i], s[3 * LANES + i] = v0, v1, v2, v3
+                    p01, v01 = np.float32(1.0) if v1 > v0 else np.float32(0.0), v1 if v1 > v0 else v0
+                    p23, v23 = np.float32(3.0) if v3 > v2 else np.float32(2.0), v3 if v3 > v2 else v2
+                    which, value = p23 if v23 > v01 else p01, v23 if v23 > v01 else v01
                     better = value > w[4 * LANES + i]
                     w[4 * LANES + i] = value if better else w[4 * LANES + i]
-                    w[5 * LANES + i] = place if better else w[5 * LANES + i]
+                    w[5 * LANES + i] = place + which if better else w[5 * LANES + i]
             for i in range(width):
                 of_row = chosen[block + i]
                 of_row[k] = int(w[5 * LANES + i]) if w[4 * LANES + i] > 0.0 else of_row[0] if k > 0 else 0
                 for d in range(4):
                     w[d * LANES + i] = candidates[of_row[k], d]
+
+
+@inlined
+def _four(candidates: NDArray[np.float32], k: int) -> tuple[float, float, float, float]:
+    return candidates[k, 0], candidates[k, 1], candidates[k, 2], candidates[k, 3]
+
+
+@inlined
+def _left(
+    candidate: tuple[float, float, float, float], q: tuple[float, float, float, float], cos_apart: Any, score: float
+) -> Any:
+    """Score of a candidate, or less than any where it is near q."""
+    t = candidate[0] * q[0] + candidate[1] * q[1] + candidate[2] * q[2] + candidate[3] * q[3]
+    return np.float32(-1.0) if abs(t) > cos_apart else score
 
 
 @compiled
@@ -103,32 +129,57 @@ def search_rows(
 
     Starts (rows, k, 4) of a row are refined on the signal (readings, s, 3) of its reading.
     """
-    n_rows, n_starts = end - begin, starts.shape[1]
-    n = n_rows * n_starts
-    refined = Refined(
+    n_starts = starts.shape[1]
+    reading = np.repeat(reading_of_row[begin:end], n_starts)
+    n = len(reading)
+    near = Refined(
         np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_)
     )  # fmt: skip
-    reading = np.repeat(reading_of_row[begin:end], n_starts)
-    refine(
-        signal, reading, starts[begin:end].reshape(n, 4), model, 1.0, OPTIMUM_TOLERANCE, max_iterations, refined
-    )  # fmt: skip
+    of_block = starts[begin:end].reshape(n, 4)
+    refine(signal, reading, of_block, model, 1.0, _NEAR_TOLERANCE, max_iterations, near)
+    row_of_end, n = np.empty(n, np.intp), 0
     for row in range(begin, end):
-        _distinct(refined, (row - begin) * n_starts, keep_within, row, out)
+        first, n_before = (row - begin) * n_starts, n
+        lowest = math.inf
+        out.counts[row, 1] = out.counts[row, 2] = 0
+        for k in range(first, first + n_starts):
+            out.counts[row, 1] += 0 if near.converged[k] else 1
+            out.counts[row, 2] += near.iterations[k]
+            lowest = min(lowest, near.chi2[k] if near.converged[k] else math.inf)
+        for k in range(first, first + n_starts):
+            if not near.converged[k] or near.chi2[k] > lowest + keep_within + 1.0:
+                continue
+            known = False
+            for j in range(n_before, n):
+                known = known or same_optimum(near.q[k], near.chi2[k], near.q[j], near.chi2[j])
+            if not known:
+                put(near.q[n], near.q[k])
+                near.chi2[n], near.iterations[n] = near.chi2[k], near.iterations[k]
+                row_of_end[n], reading[n] = row, reading_of_row[row]
+                n += 1
+    ends = Refined(
+        np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_)
+    )  # fmt: skip
+    refine(signal, reading[:n], near.q[:n], model, 1.0, OPTIMUM_TOLERANCE, max_iterations, ends)
+    first = 0
+    for row in range(begin, end):
+        last = first
+        while last < n and row_of_end[last] == row:
+            out.counts[row, 1] += 0 if ends.converged[last] else 1
+            out.counts[row, 2] += ends.iterations[last]
+            ends.iterations[last] += near.iterations[last]
+            last += 1
+        _distinct(ends, first, last, keep_within, row, out)
+        first = last
 
 
 @compiled
-def _distinct(refined: Refined, first: int, keep_within: float, row: int, out: Ends) -> None:
-    """Optima of a row, best first, without those that are known already."""
-    n_starts = out.chi2.shape[1]
-    counts = out.counts[row]
+def _distinct(refined: Refined, first: int, last: int, keep_within: float, row: int, out: Ends) -> None:
+    """Optima of a row among ends first to last, best first, without those that are known already."""
     kept = 0
-    counts[1] = counts[2] = 0
-    for k in range(first, first + n_starts):
-        counts[1] += 0 if refined.converged[k] else 1
-        counts[2] += refined.iterations[k]
     while True:
         best = -1
-        for k in range(first, first + n_starts):
+        for k in range(first, last):
             if refined.converged[k] and (best < 0 or refined.chi2[k] < refined.chi2[best]):
                 best = k
         if best < 0 or refined.chi2[best] > (out.chi2[row, 0] if kept else math.inf) + keep_within:
@@ -142,4 +193,4 @@ def _distinct(refined: Refined, first: int, keep_within: float, row: int, out: E
             put(out.mu[row, kept], refined.mu[best])
             out.chi2[row, kept], out.iterations[row, kept] = refined.chi2[best], refined.iterations[best]
             kept += 1
-    counts[0] = kept
+    out.counts[row, 0] = kept

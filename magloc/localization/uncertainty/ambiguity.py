@@ -15,6 +15,8 @@ from magloc.localization.uncertainty.range_interval import levels, ranges_of, re
 
 LARGEST_GAUSSIAN_SIGMA = 0.04
 """Standard deviations of position and moment, over range and moment, up to which their errors are Gaussian."""
+LARGEST_BEND = 0.5
+"""By how much the rise of χ² at one standard deviation may differ from one where errors are Gaussian."""
 
 
 def log_evidence_volume(

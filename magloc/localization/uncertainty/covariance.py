@@ -7,13 +7,16 @@ Several sources have no common range: each has its own ranges in each solution, 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, chdtri
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.compilation import over_rows
+from magloc.chi_square import energy_threshold
+from magloc.compilation import over_rows, own
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.levels import CERTAIN_WEIGHT, DELTA_CHI2_95, MISFIT
 from magloc.localization.fit.columns import Solutions
@@ -21,6 +24,7 @@ from magloc.localization.fit.gauss_newton import covariances
 from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.results import is_misfit, is_observable
 from magloc.localization.uncertainty.ambiguity import (
+    LARGEST_BEND,
     LARGEST_GAUSSIAN_SIGMA,
     Rivals,
     log_evidence_volume,
@@ -29,16 +33,13 @@ from magloc.localization.uncertainty.ambiguity import (
     weights,
     widened,
 )
-from magloc.localization.uncertainty.covariance_compiled import covariance_rows
 from magloc.localization.uncertainty.moment_covariance import moment_covariances
-from magloc.localization.uncertainty.range_interval import relative_range_sigma
+from magloc.localization.uncertainty.range_interval import left_of_detected, relative_range_sigma
 from magloc.localization.uncertainty.range_profile import profile_stretches, ranges_within
-from magloc.localization.uncertainty.range_profile_compiled import profile_rows
+from magloc.localization.uncertainty.range_profile_compiled import FlatFits
+from magloc.localization.uncertainty.single_source_compiled import Certainties, Levels, certainty_rows
 from magloc.measurement.whitened import WhitenedModel
 from magloc.measurement.whitened_compiled import LaneModel, ModelRows, signals
-
-# By how much the rise of χ² at one standard deviation may differ from one where errors are Gaussian.
-_BEND = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +61,8 @@ def solutions_of(optima: Optima, energy: FloatArray, detected: BoolArray) -> Sol
         position = optima.position_m[of_row]
         known = _of_known_position(optima, optima.position_m, moment)
     elif n_sources == 1:
-        known = _of_one(optima, energy)
+        lanes = not model.channel_is_scalar.any() and model.known is None
+        known = (known_of_one_compiled if lanes else known_of_one)(optima, energy)
     else:
         known = _of_several(optima, detected)
     of_moments, n_known = np.zeros(n_fits), 0
@@ -103,11 +105,11 @@ def covariance_is_valid(optima: Optima, covariance: FloatArray, which: IntArray)
         q = problem.homogeneous(position + side[:, :, 0])
         mu = problem.scaled_moment(q, moment + side[:, :, 1])
         residual = problem.residual(y, q, mu, problem.source_fields(q, mu))
-        described &= np.abs(np.sum(residual**2, axis=1) - fits.chi2 - 1.0) <= _BEND
+        described &= np.abs(np.sum(residual**2, axis=1) - fits.chi2 - 1.0) <= LARGEST_BEND
     return np.asarray(described)
 
 
-def _of_one(optima: Optima, energy: FloatArray) -> _Known:
+def known_of_one(optima: Optima, energy: FloatArray) -> _Known:
     """What is known of single sources, all solutions of a row together."""
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
     model, n_rows = rows.model, len(rows)
@@ -120,17 +122,8 @@ def _of_one(optima: Optima, energy: FloatArray) -> _Known:
 
     q, mu, chi2 = table(fits.q[:, 0], np.nan), table(fits.mu[:, 0], np.nan), table(fits.chi2, np.inf)
     offset, moment = model.position(q) - model.centroid, model.moment(q, mu)
-    compiled = not model.channel_is_scalar.any() and model.known is None
-    if compiled:
-        counts = np.bincount(of_row, minlength=n_rows)[:, None]
-        scaled = np.full((*shape, 6, 6), np.nan)
-        over_rows(covariance_rows, n_rows, ModelRows.of(model), q, mu, counts, scaled)
-        unit = np.repeat([model.radius, model.radius**3 / MU0_OVER_4PI], 3)
-        covariance = scaled * np.outer(unit, unit)
-    else:
-        covariance = table(covariances(model.rows(of_row), fits), np.nan)
     understated = _understated(chi2[:, 0], optima)
-    covariance *= understated[:, None, None, None]
+    covariance = table(covariances(model.rows(of_row), fits), np.nan) * understated[:, None, None, None]
     rivals = Rivals.of(
         chi2 / understated[:, None],
         covariance,
@@ -142,22 +135,49 @@ def _of_one(optima: Optima, energy: FloatArray) -> _Known:
     )
     rise = rivals.rise * understated
     alpha = np.full((*shape, 2), np.nan)
-    if compiled:
-        signal, in_lanes = signals(model, rows.y), LaneModel.of(model)
-        over_rows(profile_rows, n_rows, signal, rise, in_lanes, q, chi2, counts, scaled, alpha)
-    else:
-        left = rise[of_row] - (fits.chi2 - chi2[of_row, 0])
-        inside = np.flatnonzero((left > 0.0) & np.isfinite(left))
-        sigma = relative_range_sigma(covariance[at], offset[at])
-        alpha[of_row[inside], at[1][inside]] = profile_stretches(
-            model.rows(of_row[inside]), rows.y[of_row[inside]], fits.rows(inside), 0, sigma[inside], left[inside]
-        )
+    left = rise[of_row] - (fits.chi2 - chi2[of_row, 0])
+    inside = np.flatnonzero((left > 0.0) & np.isfinite(left))
+    sigma = relative_range_sigma(covariance[at], offset[at])
+    alpha[of_row[inside], at[1][inside]] = profile_stretches(
+        model.rows(of_row[inside]), rows.y[of_row[inside]], fits.rows(inside), 0, sigma[inside], left[inside]
+    )
     ranges = rivals.ranges(alpha, model.radius)
     gaussian = ranges.gaussian[at]
     claimed = np.flatnonzero(gaussian)
     if claimed.size:
         gaussian[claimed] = covariance_is_valid(optima, covariance[at][claimed], claimed)
     return _Known(ranges.sets[of_row, None], ranges.covariance[at], gaussian[:, None], rivals.weight[at])
+
+
+def known_of_one_compiled(optima: Optima, energy: FloatArray) -> _Known:
+    """:func:`known_of_one` of vector sensors."""
+    rows, fits, of_row = optima.rows, optima.fits, optima.of_row
+    model, n_rows = rows.model, len(rows)
+    first = np.searchsorted(of_row, np.arange(n_rows + 1))
+    found = Certainties.empty(len(of_row), n_rows, int(np.diff(first).max(initial=1)))
+    over_rows(
+        certainty_rows,
+        n_rows,
+        FlatFits(first, own(fits.q[:, 0]), own(fits.mu[:, 0]), own(fits.chi2)),
+        own(energy),
+        own(rows.y),
+        signals(model, rows.y),
+        ModelRows.of(model),
+        LaneModel.of(model),
+        levels_of(rows.n_differences, optima.dof),
+        found,
+    )
+    unit = np.repeat([model.radius, model.radius**3 / MU0_OVER_4PI], 3)
+    sets = model.radius * found.sets[:, : max(1, int(found.n_sets.max(initial=1)))]
+    return _Known(sets[of_row, None], found.covariance * np.outer(unit, unit), found.gaussian[:, None], found.weight)
+
+
+@lru_cache(maxsize=64)
+def levels_of(n_differences: int, dof: int) -> Levels:
+    """What the compiled code compares with."""
+    misfit = float(chdtri(dof, MISFIT)) if dof > 0 else math.inf
+    strength, left = left_of_detected(n_differences)
+    return Levels(energy_threshold(n_differences), misfit, float(dof), strength, -left)
 
 
 def _understated(chi2: FloatArray, optima: Optima) -> FloatArray:

@@ -5,29 +5,27 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
 from magloc.compilation import compiled
 from magloc.linalg_compiled import orthonormalise
 from magloc.measurement.whitened_compiled import (
     ModelRow,
-    ModelRows,
     _project_common,
     homogeneous_jacobian,
-    row_at,
     unit_basis,
 )
 
 
 @compiled
-def _scaled_covariance(
-    q: FloatArray,
-    mu: FloatArray,
-    row: ModelRow,
-    covariance: FloatArray,
-) -> bool:
-    """Inverse information of (ρ, μ), ρ = u/s and μ scaled at s = 1, by QR of the whitened Jacobian."""
+def covariance_and_volume(
+    q: FloatArray, mu: FloatArray, row: ModelRow, variance: float, covariance: FloatArray
+) -> float:
+    """Covariance of (ρ, μ), ρ = u/s and μ scaled at s = 1, by QR of the whitened Jacobian, of noise of some variance.
+
+    The result is :func:`magloc.localization.uncertainty.ambiguity.log_evidence_volume`, NaN where it is singular: then
+    the covariance is left alone.
+    """
     n = row.channel_sensor.size
     rho, mu1 = np.empty(4), np.empty(3)
     for d in range(4):
@@ -48,15 +46,16 @@ def _scaled_covariance(
             t += rows[j, c] * rows[j, c]
         scale[j] = math.sqrt(t)
         if not (scale[j] > 0.0 and math.isfinite(scale[j])):
-            return False
+            return math.nan
         for c in range(n):
             rows[j, c] /= scale[j]
     triangle = np.zeros((6, 6))
     orthonormalise(rows, triangle)
-    inverse_triangle = np.zeros((6, 6))
+    inverse_triangle, log_root = np.zeros((6, 6)), 3.0 * math.log(variance)
     for j in range(6):
         if not triangle[j, j] > 1e-13:
-            return False
+            return math.nan
+        log_root -= math.log(triangle[j, j] * scale[j])
         inverse_triangle[j, j] = 1.0 / triangle[j, j]
         for i in range(j - 1, -1, -1):
             t = 0.0
@@ -68,22 +67,11 @@ def _scaled_covariance(
             t = 0.0
             for k in range(max(i, j), 6):
                 t += inverse_triangle[i, k] * inverse_triangle[j, k]
-            covariance[(i + 3) % 6, (j + 3) % 6] = t / (scale[i] * scale[j])
-    return True
-
-
-@compiled
-def covariance_rows(
-    begin: int,
-    end: int,
-    rows: ModelRows,
-    q: FloatArray,
-    mu: FloatArray,
-    counts: NDArray[np.int64],
-    out_covariance: FloatArray,
-) -> None:
-    """Scaled covariances (rows, starts, 6, 6) of the optima of :func:`search_rows`, left alone where singular."""
-    for row in range(begin, end):
-        model = row_at(rows, row)
-        for j in range(counts[row, 0]):
-            _scaled_covariance(q[row, j], mu[row, j], model, out_covariance[row, j])
+            covariance[(i + 3) % 6, (j + 3) % 6] = variance * t / (scale[i] * scale[j])
+    rho2 = rho[0] * rho[0] + rho[1] * rho[1] + rho[2] * rho[2]
+    moment2 = mu1[0] * mu1[0] + mu1[1] * mu1[1] + mu1[2] * mu1[2]
+    along = 0.0
+    for i in range(3):
+        for j in range(3):
+            along += rho[i] * covariance[i, j] * rho[j]
+    return log_root - 1.5 * math.log(rho2 * moment2) - 0.5 * math.log(max(along / (rho2 * rho2), 1.0))

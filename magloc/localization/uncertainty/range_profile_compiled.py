@@ -7,11 +7,11 @@ search, then all that have not ended are refined side by side.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from arrays.typing import FloatArray
+from arrays.typing import FloatArray, IntArray
 from magloc.compilation import compiled
 from magloc.linalg_compiled import put
 from magloc.localization.fit.variable_projection_compiled import Refined, refine
@@ -26,6 +26,15 @@ _MOST_STEPS = 100
 # Columns of the state of a search: its optimum's α and χ², the rise that is wanted, the direction of the search, the α
 # that is tried, the last ones within and beyond the rise with their χ², less that, and the last step.
 _OPTIMUM, _CHI2, _RISE, _TOWARD, _TRIED, _INSIDE, _F_INSIDE, _OUTSIDE, _F_OUTSIDE, _LAST_STEP, _COLUMNS = range(11)
+
+
+class FlatFits(NamedTuple):
+    """Fits of rows, one after the other: the first one of every row (n + 1,), q (f, 4), scaled moments (f, 3), χ²."""
+
+    first: IntArray
+    q: FloatArray
+    mu: FloatArray
+    chi2: FloatArray
 
 
 @compiled
@@ -119,32 +128,28 @@ def profile_rows(
     signal: FloatArray,
     rise: FloatArray,
     model: LaneModel,
-    q: FloatArray,
-    chi2: FloatArray,
-    counts: NDArray[np.int64],
+    fits: FlatFits,
     covariance: FloatArray,
     out_alpha: FloatArray,
 ) -> None:
-    """Ends of the profiles of the optima of :func:`search_rows`, rows begin to end, into (rows, starts, 2).
+    """Ends of the profiles of the fits of rows begin to end, into (f, 2).
 
-    rise (rows,) is how far they may rise above the χ² of a row's first optimum. The least and the largest α of every
-    optimum are left as they are where its own χ² is higher than that, or where rise is infinite: then nothing bounds
-    the range. The scaled covariances serve for the first steps.
+    rise (rows,) is how far they may rise above the χ² of a row's first fit. The least and the largest α of every fit
+    are left as they are where its own χ² is higher than that, or where rise is infinite: then nothing bounds the range.
+    The scaled covariances serve for the first steps.
     """
-    n = 0
-    for row in range(begin, end):
-        n += 2 * counts[row, 0]
+    n = 2 * (fits.first[end] - fits.first[begin])
     state, direction, place = np.empty((n, _COLUMNS)), np.empty((n, 3)), np.empty((n, 3), np.intp)
     n = 0
     for row in range(begin, end):
-        for j in range(counts[row, 0]):
-            left = rise[row] - (chi2[row, j] - chi2[row, 0])
+        for k in range(fits.first[row], fits.first[row + 1]):
+            left = rise[row] - (fits.chi2[k] - fits.chi2[fits.first[row]])
             if not (left > 0.0 and math.isfinite(left)):
                 continue
-            step = _gaussian_step(q[row, j], covariance[row, j], left)
+            step = _gaussian_step(fits.q[k], covariance[k], left)
             for side in range(2):
-                _begin(q[row, j], chi2[row, j], left, 2.0 * side - 1.0, step, state[n], direction[n])
-                place[n, 0], place[n, 1], place[n, 2] = row, j, side
+                _begin(fits.q[k], fits.chi2[k], left, 2.0 * side - 1.0, step, state[n], direction[n])
+                place[n, 0], place[n, 1], place[n, 2] = row, k, side
                 n += 1
     live, n_live = np.arange(n), n
     starts, reading = np.empty((n, 4)), np.empty(n, np.intp)
@@ -164,7 +169,7 @@ def profile_rows(
             k = live[i]
             ended, within = _next(state[k], ends.chi2[i])
             if ended:
-                out_alpha[place[k, 0], place[k, 1], place[k, 2]] = state[k, _TRIED]
+                out_alpha[place[k, 1], place[k, 2]] = state[k, _TRIED]
                 continue
             if within:
                 put(direction[k], ends.q[i, :3])
@@ -175,4 +180,4 @@ def profile_rows(
             n_live += 1
     for i in range(n_live):
         k = live[i]
-        out_alpha[place[k, 0], place[k, 1], place[k, 2]] = state[k, _INSIDE]
+        out_alpha[place[k, 1], place[k, 2]] = state[k, _INSIDE]

@@ -43,10 +43,10 @@ class JointRow:
     @classmethod
     def of(cls, array: SensorArray, row: Row, root: FloatArray | None = None) -> JointRow:
         """A row with all of its readings; `root` (C, C) is their whitening, where that is known already."""
-        used, readings = row.available, row.readings_T[None]
-        root = whitenings_of(array, used, readings)[0].root if root is None else root
+        used = row.available
+        root = whitenings_of(array, used, row.readings_T).root if root is None else root
         ambient = ambient_fields(array, 1, None if row.ambient_T is None else row.ambient_T[None])
-        above = channels_above_ambient(array, used, readings, ambient)[0]
+        above = channels_above_ambient(array, used, row.readings_T[None], ambient)[0]
         R = row.R_world_from_array
         gain = root @ array.channel_gain @ R.T
         return cls(root @ above, gain, row.origin_m + array.positions @ R.T, array.channel_sensor, used)
@@ -163,7 +163,7 @@ class Channels:
         if key not in self._known:
             if len(self._known) == _MOST_MASKS:
                 self._known.clear()
-            root = whitenings_of(self.array, row.available, row.readings_T[None])[0].root
+            root = whitenings_of(self.array, row.available, row.readings_T).root
             self._known[key] = root, Cells.of(self.array, root)
         return self._known[key]
 

@@ -71,7 +71,7 @@ class TestDerivatives:
     @pytest.mark.parametrize("value", [(2.0,), (1.0, -0.5, 2.0)])
     def test_by_place_and_moment(self, value):
         array = tetrahedron(1.0)
-        model = WhitenedModel.of(array, [whitening(array)], array.ambient_fields[None])
+        model = WhitenedModel.of(array, whitening(array), array.ambient_fields[None])
         known = KnownMoment(value, 0.3)
         model = WhitenedModel(**{**vars(model), "known": known})
         q, mu = model.homogeneous([[1.0, 2.0, 3.0]])[None], np.array([[[1e-9, 2e-9, -1e-9]]])

@@ -208,7 +208,7 @@ class TestUncertainty:
         rng = np.random.default_rng(8)
         p, m = random_sources(rng, 4, 3.0, 6.0)
         readings = noisy_readings(TETRAHEDRON, p, m, rng)
-        problem = WhitenedModel.of(TETRAHEDRON, [whitening(TETRAHEDRON)], TETRAHEDRON.ambient_fields[None])
+        problem = WhitenedModel.of(TETRAHEDRON, whitening(TETRAHEDRON), TETRAHEDRON.ambient_fields[None])
         for row, fix in zip(readings, plain_locator(TETRAHEDRON).fit_rows(readings), strict=True):
             y = whitening(TETRAHEDRON).apply(row)
             s = fix.solutions[0]
@@ -389,7 +389,7 @@ class TestReadableTwin:
     """magloc.localization.search.single_source_compiled against magloc.measurement.whitened."""
 
     problem = WhitenedModel.of(
-        random_array(2, 6), [whitening(random_array(2, 6))], random_array(2, 6).ambient_fields[None]
+        random_array(2, 6), whitening(random_array(2, 6)), random_array(2, 6).ambient_fields[None]
     )
 
     white = whitening(random_array(2, 6))

@@ -142,7 +142,7 @@ class Sphere:
 
     def __init__(self, array: SensorArray, n_directions: int = 250) -> None:
         self.whitening = whitening(array)
-        self.problem = WhitenedModel.of(array, [self.whitening], array.ambient_fields[None])
+        self.problem = WhitenedModel.of(array, self.whitening, array.ambient_fields[None])
         self.directions = fibonacci_directions(n_directions)
 
     def chi2(self, readings_T: FloatArray, range_m: float) -> float:
