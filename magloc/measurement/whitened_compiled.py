@@ -126,7 +126,7 @@ def row_at(rows: ModelRows, i: int) -> ModelRow:
 
 
 @compiled
-def _project_common(rows: FloatArray, n_rows: int, row: ModelRow) -> None:
+def project_common(rows: FloatArray, n_rows: int, row: ModelRow) -> None:
     """Remove the common field from whitened rows (k, c) in place."""
     common, shrinkage = row.common, row.shrinkage
     for j in range(n_rows):
@@ -164,7 +164,7 @@ def unit_basis(
         basis[0, c] = (t * n0 - g0) * r3
         basis[1, c] = (t * n1 - g1) * r3
         basis[2, c] = (t * n2 - g2) * r3
-    _project_common(basis, 3, row)
+    project_common(basis, 3, row)
 
 
 @compiled
