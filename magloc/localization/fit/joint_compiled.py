@@ -19,9 +19,8 @@ from magloc.measurement.whitened_compiled import (
     ModelRow,
     ModelRows,
     homogeneous_jacobian,
-    project_common,
     row_at,
-    unit_basis,
+    unit_readings,
 )
 
 # A ridge of columns of unit norm: below it they are one column to rounding.
@@ -123,7 +122,8 @@ def refine_rows(
 def _fit_moments(q: FloatArray, row: ModelRow, y: FloatArray, w: _Workspace) -> float:
     """Basis, moments and residual of sources at q (K, 4); χ²."""
     for k in range(len(q)):
-        unit_basis(q[k], row, w.basis[3 * k : 3 * k + 3])
+        unit_readings(q[k], row, w.basis[3 * k : 3 * k + 3])
+    _project_common(w.basis, row)
     for j in range(len(w.basis)):
         column, square = w.basis[j], 0.0
         for c in range(y.size):
@@ -150,6 +150,16 @@ def _fit_moments(q: FloatArray, row: ModelRow, y: FloatArray, w: _Workspace) -> 
 
 
 @compiled
+def _project_common(rows: FloatArray, row: ModelRow) -> None:
+    """Remove the common field, which may have many columns, from whitened rows (n, C) in place."""
+    along = np.dot(rows, row.common.T)
+    for j in range(len(along)):
+        for k in range(row.shrinkage.size):
+            along[j, k] *= row.shrinkage[k]
+    rows -= np.dot(along, row.common)
+
+
+@compiled
 def _keep_moments(w: _Workspace, mu: FloatArray) -> None:
     """Scaled moments (K, 3)."""
     for j in range(len(w.mu)):
@@ -173,7 +183,7 @@ def _linearise(q: FloatArray, row: ModelRow, free: FloatArray, w: _Workspace) ->
                     + t[2] * w.homogeneous[2, c]
                     + t[3] * w.homogeneous[3, c]
                 )
-    project_common(w.jacobian, len(w.jacobian), row)
+    _project_common(w.jacobian, row)
     np.dot(w.basis, w.jacobian.T, w.along)
     solve_cholesky(w.root, w.along)
     w.jacobian[:] -= np.dot(w.along.T, w.basis)

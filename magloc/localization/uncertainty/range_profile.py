@@ -19,6 +19,8 @@ _SMALLEST_ALPHA = 1e-6
 # Steps outwards in standard deviations of a Gaussian profile, about the one where it would have risen enough.
 _STEPS = np.array([1.0, 1.5, 2.2, 4.0, 9.0, 25.0, 80.0])
 _ROUNDS = 3
+# By how much χ² of a point of the profile may be too high.
+_PROMISE = 1e-4
 
 
 def profile_stretches(
@@ -103,7 +105,7 @@ def _rises(
     q[:, source] = np.concatenate([direction * np.cos(at), sign * np.sin(at)], axis=-1)
     free = np.ones((q.shape[1], 3), dtype=bool)
     free[source, 2] = False
-    profile = refine(problem.rows(row), y[row], q, mu, free=free, max_iterations=40)
+    profile = refine(problem.rows(row), y[row], q, mu, free=free, max_iterations=40, promise=_PROMISE)
     # A refinement that did not end says nothing of the profile: the points beyond it decide.
     chi2 = np.where(profile.converged, profile.chi2, -np.inf)
     return np.asarray(chi2 - fits.chi2[row])
