@@ -34,6 +34,42 @@ def orthonormalise(rows: FloatArray, triangle: FloatArray) -> None:
 
 
 @compiled
+def cholesky(matrix: FloatArray, ridge: float) -> None:
+    """Upper root R of a positive matrix of unit diagonal, RᵀR, in place; the ridge is added, and the least pivot."""
+    n = len(matrix)
+    for j in range(n):
+        pivot = matrix[j, j] + ridge
+        root = math.sqrt(pivot if pivot > ridge else ridge)
+        matrix[j, j] = root
+        for k in range(j + 1, n):
+            matrix[j, k] /= root
+        for i in range(j + 1, n):
+            t = matrix[j, i]
+            for k in range(i, n):
+                matrix[i, k] -= t * matrix[j, k]
+
+
+@compiled
+def solve_cholesky(root: FloatArray, columns: FloatArray) -> None:
+    """Solve RᵀR x = b for columns (n, m) in place."""
+    n, m = columns.shape
+    for i in range(n):
+        for j in range(i):
+            t = root[j, i]
+            for c in range(m):
+                columns[i, c] -= t * columns[j, c]
+        for c in range(m):
+            columns[i, c] /= root[i, i]
+    for i in range(n - 1, -1, -1):
+        for j in range(i + 1, n):
+            t = root[i, j]
+            for c in range(m):
+                columns[i, c] -= t * columns[j, c]
+        for c in range(m):
+            columns[i, c] /= root[i, i]
+
+
+@compiled
 def put(target: FloatArray, source: FloatArray) -> None:
     """Copy a vector. A slice's assignment would do, but it compiles an error sentence of its own every time."""
     for i in range(target.size):

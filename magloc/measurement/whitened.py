@@ -114,7 +114,7 @@ class WhitenedModel(ScaledSensors):
     @property
     def shares_whitening(self) -> bool:
         """Whether all rows have one whitening, kept once."""
-        return len(self) == 1 or self.gain.strides[0] == 0
+        return len(self) == 1 or self.gain.strides[0] == self.basis.strides[0] == 0
 
     def rows(self, index: NDArray[np.intp]) -> WhitenedModel:
         """Model of some of the readings, repeated at will."""

@@ -126,7 +126,7 @@ def row_at(rows: ModelRows, i: int) -> ModelRow:
 
 
 @compiled
-def _project_common(rows: FloatArray, n_rows: int, row: ModelRow) -> None:
+def project_common(rows: FloatArray, n_rows: int, row: ModelRow) -> None:
     """Remove the common field from whitened rows (k, c) in place."""
     common, shrinkage = row.common, row.shrinkage
     for j in range(n_rows):
@@ -146,6 +146,17 @@ def unit_basis(
     basis: FloatArray,
 ) -> None:
     """Whitened readings of the three unit moments at q, into basis (3, c)."""
+    unit_readings(q, row, basis)
+    project_common(basis, 3, row)
+
+
+@compiled
+def unit_readings(
+    q: FloatArray,
+    row: ModelRow,
+    basis: FloatArray,
+) -> None:
+    """:func:`unit_basis` before the common field is removed."""
     sensors, channel_sensor, gain = row.sensors, row.channel_sensor, row.gain
     last = -1
     n0 = n1 = n2 = r3 = 0.0
@@ -164,7 +175,6 @@ def unit_basis(
         basis[0, c] = (t * n0 - g0) * r3
         basis[1, c] = (t * n1 - g1) * r3
         basis[2, c] = (t * n2 - g2) * r3
-    _project_common(basis, 3, row)
 
 
 @compiled

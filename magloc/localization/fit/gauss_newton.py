@@ -15,8 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
+from magloc.compilation import over_rows, own
 from magloc.fields.dipole import MU0_OVER_4PI
+from magloc.localization.fit.joint_compiled import JointEnds, refine_rows
 from magloc.measurement.whitened import WhitenedModel
+from magloc.measurement.whitened_compiled import ModelRows
 
 # A refinement has converged where the linearised model promises to lower χ² by less than this, absolute and relative.
 PROMISE_ABSOLUTE = 1e-8
@@ -183,13 +186,35 @@ def refine(
     *,
     free: NDArray[np.bool_] | None = None,
     max_iterations: int = 60,
+    promise: float = PROMISE_ABSOLUTE,
 ) -> JointFits:
     """Positions and moments from starts (b, K, 4) and (b, K, 3): damped Gauss-Newton that never raises χ².
 
     y (b, C) are whitened readings, `free` (K, 3) says which :func:`tangents` of a source may change: without the third
-    its range stays.
+    its range stays. It has converged where the linearised model promises to lower χ² by less than `promise`. Of
+    vector sensors whose source's moment is free the compiled twin does it, which begins with the moments that fit best.
     """
     free = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
+    if problem.known is None and not problem.channel_is_scalar.any() and free.any():
+        ends = JointEnds(own(q), own(mu), np.empty(len(q)), np.empty(len(q), dtype=np.int64))
+        small = (promise, PROMISE_RELATIVE)
+        over_rows(
+            refine_rows, len(q), own(y), free.astype(np.float64), ModelRows.of(problem), small, max_iterations, ends
+        )
+        return JointFits(*ends)
+    return damped_gauss_newton(problem, y, q, mu, free, max_iterations, promise)
+
+
+def damped_gauss_newton(
+    problem: WhitenedModel,
+    y: FloatArray,
+    q: FloatArray,
+    mu: FloatArray,
+    free: NDArray[np.bool_],
+    max_iterations: int = 60,
+    promise: float = PROMISE_ABSOLUTE,
+) -> JointFits:
+    """:func:`refine` of any sensors, and of moments that are known."""
     n_fits, n_sources = q.shape[:2]
     columns = np.flatnonzero(free.ravel())
     # Without free positions the moments themselves are what has to be damped.
@@ -237,7 +262,7 @@ def refine(
         with np.errstate(invalid="ignore"):
             accepted = new_chi2 < current
             gained = current - new_chi2
-            small = np.abs(reachable) < PROMISE_ABSOLUTE + PROMISE_RELATIVE * current
+            small = np.abs(reachable) < promise + PROMISE_RELATIVE * current
             # A step that rounding refuses is the end too, if next to nothing was promised.
             ended = small | (~accepted & (damping > _LARGEST_DAMPING))
             at_optimum = small | (np.abs(reachable) < 1e-6 * (1.0 + current))

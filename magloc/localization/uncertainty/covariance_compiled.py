@@ -11,8 +11,8 @@ from magloc.compilation import compiled
 from magloc.linalg_compiled import orthonormalise
 from magloc.measurement.whitened_compiled import (
     ModelRow,
-    _project_common,
     homogeneous_jacobian,
+    project_common,
     unit_basis,
 )
 
@@ -36,7 +36,7 @@ def covariance_and_volume(
     rows, basis, jacobian = np.empty((6, n)), np.empty((3, n)), np.empty((4, n))
     unit_basis(rho, row, basis)
     homogeneous_jacobian(rho, mu1, row, jacobian)
-    _project_common(jacobian, 3, row)
+    project_common(jacobian, 3, row)
     scale = np.empty(6)
     # Moment first: its three columns are the well-conditioned part.
     for j in range(6):

@@ -17,8 +17,10 @@ from magloc.measurement.whitened import WhitenedModel
 
 _SMALLEST_ALPHA = 1e-6
 # Steps outwards in standard deviations of a Gaussian profile, about the one where it would have risen enough.
-_STEPS = np.array([0.6, 0.85, 1.0, 1.15, 1.5, 2.2, 4.0, 9.0, 25.0, 80.0])
+_STEPS = np.array([1.0, 1.5, 2.2, 4.0, 9.0, 25.0, 80.0])
 _ROUNDS = 3
+# By how much χ² of a point of the profile may be too high.
+_PROMISE = 1e-4
 
 
 def profile_stretches(
@@ -49,20 +51,24 @@ def profile_stretches(
     grid = at_optimum[:, None] + (sign * step[rows])[:, None] * np.append(_STEPS, np.inf)
     grid = np.clip(grid, _SMALLEST_ALPHA - 0.5 * np.pi, 0.5 * np.pi - _SMALLEST_ALPHA)
     grid = np.where(np.abs(grid) < _SMALLEST_ALPHA, _SMALLEST_ALPHA, grid)
-    risen = _rises(problem, y, fits, source, rows, grid)
-    above = risen > allowed[:, None]
-    first, found, each = np.argmax(above, axis=1), above.any(axis=1), np.arange(2 * n)
-    before = np.maximum(first - 1, 0)
-    outside, f_outside = grid[each, first], risen[each, first]
-    inside = np.where(first > 0, grid[each, before], at_optimum)
-    f_inside = np.where(first > 0, risen[each, before], 0.0)
+    inside, f_inside = at_optimum.copy(), np.zeros(2 * n)
+    outside, f_outside = at_optimum.copy(), np.full(2 * n, -np.inf)
+    for k in range(grid.shape[1]):
+        left = np.flatnonzero(f_outside <= allowed)
+        if not left.size:
+            break
+        if k:
+            inside[left], f_inside[left] = outside[left], f_outside[left]
+        outside[left] = grid[left, k]
+        f_outside[left] = _rises(problem, y, fits, source, rows[left], outside[left])
+    found = f_outside > allowed
     for _ in range(_ROUNDS):
         # The profile is nearly a parabola: interpolate its square root.
         a, b = np.sqrt(np.clip(f_inside, 0.0, None)), np.sqrt(np.clip(f_outside, 0.0, 1e6))
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.clip((np.sqrt(allowed) - a) / (b - a), 0.05, 0.95)
         middle = inside + np.nan_to_num(share, nan=0.5) * (outside - inside)
-        f = _rises(problem, y, fits, source, rows, middle[:, None])[:, 0]
+        f = _rises(problem, y, fits, source, rows, middle)
         higher = f > allowed
         outside, f_outside = np.where(higher, middle, outside), np.where(higher, f, f_outside)
         inside, f_inside = np.where(higher, inside, middle), np.where(higher, f_inside, f)
@@ -85,15 +91,13 @@ def ranges_within(
 
 
 def _rises(
-    problem: WhitenedModel, y: FloatArray, fits: JointFits, source: int, rows: NDArray[np.intp], alpha: FloatArray
+    problem: WhitenedModel, y: FloatArray, fits: JointFits, source: int, row: NDArray[np.intp], alpha: FloatArray
 ) -> FloatArray:
-    """Rise of χ² above the optima of rows (r,) at ranges (r, g), everything else fitted anew from the optimum."""
-    n, n_grid = alpha.shape
-    row = np.repeat(rows, n_grid)
+    """Rise of χ² above the optima of rows (r,) at ranges (r,), everything else fitted anew from the optimum."""
     q, mu = fits.q[row].copy(), fits.mu[row].copy()
     u = q[:, source, :3]
     length = np.linalg.norm(u, axis=-1, keepdims=True)
-    at = alpha.ravel()[:, None]
+    at = alpha[:, None]
     sign = np.where(q[:, source, 3:] < 0.0, -1.0, 1.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         direction = np.where(length > 1e-12, u / length, [0.0, 0.0, 1.0])
@@ -101,7 +105,7 @@ def _rises(
     q[:, source] = np.concatenate([direction * np.cos(at), sign * np.sin(at)], axis=-1)
     free = np.ones((q.shape[1], 3), dtype=bool)
     free[source, 2] = False
-    profile = refine(problem.rows(row), y[row], q, mu, free=free, max_iterations=40)
+    profile = refine(problem.rows(row), y[row], q, mu, free=free, max_iterations=40, promise=_PROMISE)
     # A refinement that did not end says nothing of the profile: the points beyond it decide.
     chi2 = np.where(profile.converged, profile.chi2, -np.inf)
-    return chi2.reshape(n, n_grid) - fits.chi2[rows, None]
+    return np.asarray(chi2 - fits.chi2[row])

@@ -26,7 +26,15 @@ from arrays.array import SensorArray
 from arrays.differences import decorrelated_differences
 from arrays.geometries import cube, tetrahedron
 from arrays.sensor import Sensor
-from magloc.localization.fit.gauss_newton import JointFits, covariances, fit_moments, refine, refine_moments, tangents
+from magloc.localization.fit.gauss_newton import (
+    JointFits,
+    covariances,
+    damped_gauss_newton,
+    fit_moments,
+    refine,
+    refine_moments,
+    tangents,
+)
 from magloc.localization.uncertainty.range_profile import ranges_within
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.rows import whitened_model, whitenings_of
@@ -563,3 +571,37 @@ class TestLocator:
             assert_allclose(covariance[i] / np.outer(sigma, sigma), s.covariance / np.outer(sigma, sigma), atol=0.02)
             low, high = s.range_interval_m[0]
             assert_allclose(ends[i], [low, np.inf if high is None else high], rtol=0.01)
+
+
+class TestCompiledTwin:
+    """Of vector sensors the compiled refinement ends where the readable one does."""
+
+    @pytest.mark.parametrize("n_sources", [1, 2, 3])
+    @pytest.mark.parametrize("held", [False, True])
+    def test_optima(self, n_sources, held):
+        """From 10 cm beside the truth, and with the first source held at a range that is wrong."""
+        array = replace(array_of("vector", 31), common_field_T=5e-8)
+        rng = np.random.default_rng(31)
+        p, m = random_sources(rng, 8, n_sources)
+        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        q = problem.homogeneous(p + 0.1 * rng.normal(size=p.shape))
+        mu, free = problem.scaled_moment(q, m), np.ones((n_sources, 3), dtype=bool)
+        free[0, 2] = not held
+        ours, twin = refine(problem, y, q, mu, free=free), damped_gauss_newton(problem, y, q, mu, free, 200)
+        assert twin.converged.all()
+        assert_allclose(ours.chi2, twin.chi2, rtol=1e-9, atol=1e-7)
+        assert_allclose(ours.q, twin.q, atol=1e-5)
+        assert_allclose(ours.mu, twin.mu, rtol=1e-2, atol=1e-2 * np.abs(twin.mu).max())
+
+    def test_rows_that_differ_in_their_common_field_alone(self):
+        """Errors that are marginalised row by row leave the gains of all rows the same ones."""
+        array = array_of("vector", 32)
+        rng = np.random.default_rng(32)
+        p, m = random_sources(rng, 4, 1)
+        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        problem = problem.marginalised(rng.normal(size=(4, array.n_channels, 2)))
+        y = problem.whitened(y)
+        q = problem.homogeneous(p)
+        mu = problem.scaled_moment(q, m)
+        ours, twin = refine(problem, y, q, mu), damped_gauss_newton(problem, y, q, mu, np.ones((1, 3), dtype=bool))
+        assert_allclose(ours.chi2, twin.chi2, rtol=1e-9)
