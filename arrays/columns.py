@@ -42,8 +42,8 @@ class LogColumns:
         "comma", "semicolon", "tab" or "space".
     decimal : str
         "." or ",", of its numbers.
-    time : str
-        Name of the column with the time.
+    time : str or tuple of 2 str
+        Name of the column with the time, or with "iso" those of the date and of the time.
     time_unit : str
         "s", "ms", "us", or "iso" for instants such as 2026-11-21T12:00:00.5, UTC where they say nothing else.
     unit : str or float
@@ -81,7 +81,7 @@ class LogColumns:
 
     separator: str = "comma"
     decimal: str = "."
-    time: str = "time_s"
+    time: str | tuple[str, str] = "time_s"
     time_unit: str = "s"
     unit: str | float = "nT"
     sensors: dict[str, str | tuple[str, ...]] = field(default_factory=dict, hash=False)
@@ -99,6 +99,8 @@ class LogColumns:
         if self.unit not in _NANOTESLA and not (isinstance(self.unit, float | int) and 0.0 < self.unit < math.inf):
             expected = f"one of {', '.join(_NANOTESLA)}, or how many nT a count is"
             raise ValueError(f"Input unit must be {expected}; instead received {self.unit!r}.")
+        if len(self.clock) > 1 and self.time_unit != "iso":
+            raise ValueError(f"Input time_unit must be iso for a date and a time; instead received {self.time_unit!r}.")
         if self.decimal == "," and self.separator == "comma":
             raise ValueError("Input decimal must not be ',' beside the separator comma.")
         for first, second in (("position", "geodetic"), ("quaternion", "angles")):
@@ -117,6 +119,11 @@ class LogColumns:
         numbers = (self.pose_latency_s, *(self.origin or ()))
         if not np.isfinite(numbers).all():
             raise ValueError(f"Inputs origin and pose_latency_s must be finite; instead received {numbers}.")
+
+    @property
+    def clock(self) -> tuple[str, ...]:
+        """Column of the time, or those of date and time."""
+        return (self.time,) if isinstance(self.time, str) else self.time
 
     @property
     def place(self) -> tuple[str, ...]:
@@ -146,7 +153,7 @@ class ColumnsTable(Table, kw_only=True):
 
     separator: str = "comma"
     decimal: str = "."
-    time: str = "time_s"
+    time: str | tuple[str, str] = "time_s"
     time_unit: str = "s"
     unit: str | float = "nT"
     sensors: dict[str, str | list[str]] = msgspec.field(default_factory=dict)
@@ -200,14 +207,14 @@ def read_log(
     if columns is None:
         return read_table(path, expected)
     named = columns.of_sensors(channels)
-    theirs = (columns.time, *named.values(), *columns.place, *columns.attitude)
+    theirs = (*columns.clock, *named.values(), *columns.place, *columns.attitude)
     own = {name for of_sensor in channels.values() for name in of_sensor}
     table = table_of_text(
         read_text(path, "a CSV file"),
         str(path),
         expected,
         only={*theirs, *own, *others},
-        instants=[columns.time] if columns.time_unit == "iso" else [],
+        instant=columns.clock if columns.time_unit == "iso" else (),
         separator=_SEPARATORS[columns.separator],
         decimal=columns.decimal,
     )
@@ -217,7 +224,7 @@ def read_log(
     found |= {ours: table.values[:, table.header.index(logged)] for ours, logged in named.items()}
     unit = columns.unit if isinstance(columns.unit, float | int) else _NANOTESLA[columns.unit]
     found |= {name: unit * found[name] for name in own & found.keys()}
-    found["time_s"] = _SECONDS[columns.time_unit] * table.complete_and_distinct(columns.time)
+    found["time_s"] = _SECONDS[columns.time_unit] * table.complete_and_distinct(columns.clock[0])
     if columns.place:
         found |= zip(POSITION_COLUMNS, _position(table, columns).T, strict=True)
     if columns.attitude or (columns.place and not set(ROTATION_COLUMNS) & found.keys()):

@@ -81,7 +81,7 @@ def read_telemetry(
 def read_named(path: str | PathLike[str], expected: str, layout: LogLayout, more: Sequence[str] = ()) -> Table:
     """Table of the columns that a layout names, and of some more."""
     names = [layout.time, *(name for one in layout.columns.values() for name in one.columns), *more]
-    table = read_table(path, expected, only=names, instants=[layout.time] if layout.time_format == "utc" else [])
+    table = read_table(path, expected, only=names, instant=[layout.time] if layout.time_format == "utc" else [])
     for name in names:
         table.require(name, names)
     return table

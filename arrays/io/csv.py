@@ -11,6 +11,7 @@ import datetime
 import difflib
 import io
 import math
+import re
 from array import array as packed
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -147,14 +148,14 @@ def read_table(
     expected_header: str,
     *,
     only: Collection[str] | None = None,
-    instants: Collection[str] = (),
+    instant: Sequence[str] = (),
 ) -> Table:
     """Table, of one row at least, of a CSV file of numbers; `expected_header` says in words what it should have.
 
-    ``only``: columns that are read, others may hold anything. ``instants``: columns of ISO 8601 times, UTC unless they
-    say otherwise, which become seconds since 1970.
+    ``only``: columns that are read, others may hold anything. ``instant``: a column of ISO 8601 times, UTC unless they
+    say otherwise, or two of dates and of times; the first one becomes seconds since 1970.
     """
-    return table_of_text(read_text(path, "a CSV file"), str(path), expected_header, only=only, instants=instants)
+    return table_of_text(read_text(path, "a CSV file"), str(path), expected_header, only=only, instant=instant)
 
 
 class Columns(Protocol):
@@ -189,7 +190,7 @@ def table_of_text(
     *,
     first_line: int | None = None,
     only: Collection[str] | None = None,
-    instants: Collection[str] = (),
+    instant: Sequence[str] = (),
     separator: str = ",",
     decimal: str = ".",
     head: Table | None = None,
@@ -214,7 +215,7 @@ def table_of_text(
     read = float if text.isascii() and "_" not in text[text.find("\n") if head is None else 0 :] else _number
     kept = [i for i, column in enumerate(header) if only is None or column in only]
     chosen = tuple(header[i] for i in kept)
-    timed = [i for i, column in enumerate(chosen) if column in instants]
+    timed = [chosen.index(column) for column in instant if column in chosen]
     values, line_numbers = packed("d"), packed("q")
     shift = 0 if first_line is None else first_line - header_line - 1
     for row_line, cells in rows:
@@ -225,8 +226,10 @@ def table_of_text(
             cells = [cells[i] for i in kept]
         if decimal != ".":
             cells = [cell if i in timed else cell.replace(decimal, ".") for i, cell in enumerate(cells)]
-        for i in timed:
-            cells[i] = _unix_seconds(f"{name}, line {line}, column {chosen[i]}", cells[i])
+        if timed:
+            place = f"{name}, line {line}, column {', '.join(instant)}"
+            cells[timed[0]] = _unix_seconds(place, "T".join(cells[i].strip() for i in timed))
+            cells[timed[-1]] = cells[timed[0]]
         try:
             numbers = [read(cell or "nan") for cell in cells]
         except ValueError:
@@ -247,9 +250,9 @@ def table_of_header(line: str, name: str, expected_header: str, *, number: int =
 
 
 def _unix_seconds(place: str, cell: str) -> str:
-    """Seconds since 1970 of an instant, as text."""
+    """Seconds since 1970 of an instant, as text; 2026/11/21T7:00:00 is taken too."""
     try:
-        instant = datetime.datetime.fromisoformat(cell.strip())
+        instant = datetime.datetime.fromisoformat(re.sub(r"T(?=\d:)", "T0", cell.strip().replace("/", "-")))
     except ValueError:
         found = repr(cell.strip()[:_SHOWN_CHARACTERS])
         raise InputError(f"{place}: found {found}, expected a time such as 2026-11-21T12:00:00.5 (UTC).") from None

@@ -52,6 +52,17 @@ class TestValues:
         found = read(tmp_path, array_of(tmp_path, columns), text)
         assert np.diff(found.time_s).tolist() == [1.25]
 
+    @pytest.mark.parametrize("decimal", [".", ","])
+    def test_date_and_time(self, decimal: str, tmp_path: Path) -> None:
+        """In two columns, in any order, as some loggers write them."""
+        columns = f'[columns]\nseparator = "semicolon"\ndecimal = "{decimal}"\ntime = ["D", "T"]\ntime_unit = "iso"\n'
+        text = "T;D;low_nT;high_nT\n7:59:59.5;2026/11/21;1;2\n08:00:00.75;2026-11-21;1;2\n"
+        array = array_of(tmp_path, columns)
+        found = read(tmp_path, array, text)
+        assert found.time_s.tolist() == [1795247999.5, 1795248000.75]
+        with pytest.raises(arrays.InputError, match=r"line 2, column D, T: found 'todayT7:59:59.5', expected a time"):
+            read(tmp_path, array, text.replace("2026/11/21", "today"))
+
     @pytest.mark.parametrize(("unit", "of_nT"), [("nT", 1e-9), ("µT", 1e-6), ("mG", 1e-7), ("G", 1e-4), ("T", 1.0)])
     def test_units(self, unit: str, of_nT: float, tmp_path: Path) -> None:
         found = read(
@@ -195,6 +206,7 @@ class TestFile:
             ('separator = "|"', "separator"),
             ('decimal = ","', "separator comma"),
             ('time_unit = "h"', "time_unit"),
+            ('time = ["D", "T"]', "time_unit must be iso"),
             ('angles = ["Yaw"]', "position or geodetic"),
             ('position = ["a", "b", "c"]\ngeodetic = ["a", "b", "c"]', "geodetic"),
             ('position = ["a", "b", "c"]\nangles = ["a", "b"]', "angles"),
