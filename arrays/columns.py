@@ -10,15 +10,13 @@ import json
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from os import PathLike
 
 import msgspec
 import numpy as np
 
 from arrays.io.csv import Table as CsvTable
-from arrays.io.csv import read_table, table_of_text
+from arrays.io.csv import table_of_header, table_of_text
 from arrays.io.errors import InputError, naming, of_extra
-from arrays.io.text import read_text
 from arrays.io.toml import Table
 from arrays.typing import FloatArray, Vector
 
@@ -196,42 +194,88 @@ def _toml(value: object) -> str:
     return json.dumps(list(value) if isinstance(value, tuple) else value, ensure_ascii=False)
 
 
-def read_log(
-    path: str | PathLike[str],
-    channels: Mapping[str, Sequence[str]],
-    columns: LogColumns | None,
-    expected: str,
-    others: Collection[str],
-) -> CsvTable:
-    """Table of a readings file, or of a log, with the columns ``channels`` of every sensor and those of ``others``."""
-    if columns is None:
-        return read_table(path, expected)
-    named = columns.of_sensors(channels)
-    theirs = (*columns.clock, *named.values(), *columns.place, *columns.attitude)
-    own = {name for of_sensor in channels.values() for name in of_sensor}
-    table = table_of_text(
-        read_text(path, "a CSV file"),
-        str(path),
-        expected,
-        only={*theirs, *own, *others},
-        instant=columns.clock if columns.time_unit == "iso" else (),
-        separator=_SEPARATORS[columns.separator],
-        decimal=columns.decimal,
-    )
-    for name in theirs:
-        table.require(name, theirs)
-    found = {name: table.values[:, i] for i, name in enumerate(table.header) if name in own or name in others}
-    found |= {ours: table.values[:, table.header.index(logged)] for ours, logged in named.items()}
-    unit = columns.unit if isinstance(columns.unit, float | int) else _NANOTESLA[columns.unit]
-    found |= {name: unit * found[name] for name in own & found.keys()}
-    found["time_s"] = _SECONDS[columns.time_unit] * table.complete_and_distinct(columns.clock[0])
-    if columns.place:
-        found |= zip(POSITION_COLUMNS, _position(table, columns).T, strict=True)
-    if columns.attitude or (columns.place and not set(ROTATION_COLUMNS) & found.keys()):
-        found |= zip(ROTATION_COLUMNS, _quaternion(table, columns).T, strict=True)
-    return CsvTable(
-        table.path, tuple(found), table.header_line, np.stack([*found.values()], axis=1), table.line_numbers
-    )
+@dataclass(frozen=True)
+class LogFormat:
+    """How the text of a readings file, or of a log, becomes a table with the names and units of a readings file.
+
+    Attributes
+    ----------
+    channels : dict
+        Columns of a readings file for every sensor, by its id.
+    columns : LogColumns, optional
+        Of a log; None: of a readings file.
+    expected : str
+        What the header should have, in words.
+    others : collection of str
+        Further columns of a readings file that are taken as they are.
+    """
+
+    channels: Mapping[str, Sequence[str]]
+    columns: LogColumns | None
+    expected: str
+    others: Collection[str]
+
+    @property
+    def separator(self) -> str:
+        """Between the cells of a row."""
+        return "," if self.columns is None else _SEPARATORS[self.columns.separator]
+
+    def begins(self, line: str) -> bool:
+        """Whether a line names columns, the time among them."""
+        if self.columns is None:
+            return "time_s" in line
+        return self.columns.clock[0] in (cell.strip().strip('"') for cell in line.split(self.separator))
+
+    def header(self, line: str, name: str, number: int) -> CsvTable:
+        """Table without rows, as the log names its columns, from its first line."""
+        return table_of_header(line, name, self.expected, number=number, separator=self.separator)
+
+    def table(self, text: str, name: str, *, first_line: int | None = None, head: CsvTable | None = None) -> CsvTable:
+        """Table of a text; rows that begin at a line below a header `head` have none of their own."""
+        columns = self.columns
+        if columns is None:
+            return table_of_text(text, name, self.expected, first_line=first_line, head=head)
+        table = table_of_text(
+            text,
+            name,
+            self.expected,
+            first_line=first_line,
+            only={*self._theirs(columns), *self._own, *self.others},
+            instant=columns.clock if columns.time_unit == "iso" else (),
+            separator=self.separator,
+            decimal=columns.decimal,
+            head=head,
+        )
+        return self.translated(table)
+
+    def translated(self, logged: CsvTable) -> CsvTable:
+        """The table with the names and units of a readings file."""
+        columns = self.columns
+        if columns is None:
+            return logged
+        theirs, own = self._theirs(columns), self._own
+        for name in theirs:
+            logged.require(name, theirs)
+        index = {name: i for i, name in enumerate(logged.header)}
+        found = {name: logged.values[:, i] for name, i in index.items() if name in own or name in self.others}
+        named = columns.of_sensors(self.channels)
+        found |= {ours: logged.values[:, index[in_log]] for ours, in_log in named.items()}
+        unit = columns.unit if isinstance(columns.unit, float | int) else _NANOTESLA[columns.unit]
+        found |= {name: unit * found[name] for name in own & found.keys()}
+        found["time_s"] = _SECONDS[columns.time_unit] * logged.complete_and_distinct(columns.clock[0])
+        if columns.place:
+            found |= zip(POSITION_COLUMNS, _position(logged, columns).T, strict=True)
+        if columns.attitude or (columns.place and not set(ROTATION_COLUMNS) & found.keys()):
+            found |= zip(ROTATION_COLUMNS, _quaternion(logged, columns).T, strict=True)
+        values = np.stack([*found.values()], axis=1)
+        return CsvTable(logged.path, tuple(found), logged.header_line, values, logged.line_numbers)
+
+    @property
+    def _own(self) -> set[str]:
+        return {name for of_sensor in self.channels.values() for name in of_sensor}
+
+    def _theirs(self, columns: LogColumns) -> tuple[str, ...]:
+        return (*columns.clock, *columns.of_sensors(self.channels).values(), *columns.place, *columns.attitude)
 
 
 def _position(table: CsvTable, columns: LogColumns) -> FloatArray:

@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from arrays.array import AMBIENT_CHANNELS, SensorArray
-from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS, read_log
-from arrays.io.csv import Columns, Table, table_of_columns, table_of_text
+from arrays.columns import POSITION_COLUMNS, ROTATION_COLUMNS, LogFormat
+from arrays.io.csv import Columns, Table, table_of_columns
 from arrays.io.errors import InputError
-from arrays.io.text import write_text
+from arrays.io.text import read_text, write_text
 from arrays.sensor import Sensor
 from arrays.typing import FloatArray, IntArray
 from magloc.conditioning import NO_BACKGROUND, Background, without_hum
@@ -275,8 +275,7 @@ def read_readings(
     >>> magloc.read_readings(board.path, board.array).values_T.shape
     (101, 90)
     """
-    channels = {of.id: _columns_of(of) for of in array.sensors if sensors is None or of.id in sensors}
-    table = read_log(path, channels, array.columns, EXPECTED_HEADER, _OPTIONAL_COLUMNS)
+    table = log_format(array, sensors).table(read_text(path, "a CSV file"), str(path))
     readings = readings_of_table(table, array, sensors)
     if array.columns is not None and array.columns.pose_latency_s:
         readings = readings.posed_later(array.columns.pose_latency_s)
@@ -289,9 +288,10 @@ def read_readings(
     return readings
 
 
-def readings_below(head: Table, text: str, array: SensorArray, first_line: int) -> Readings:
-    """Readings of CSV rows below a header that :func:`readings_of_table` has taken already, for the same sensors."""
-    return _of_checked(table_of_text(text, head.path, EXPECTED_HEADER, first_line=first_line, head=head), array)
+def log_format(array: SensorArray, sensors: Sequence[str] | None) -> LogFormat:
+    """How the text of a file or stream of some sensors, or of all, is read."""
+    channels = {of.id: _columns_of(of) for of in array.sensors if sensors is None or of.id in sensors}
+    return LogFormat(channels, array.columns, EXPECTED_HEADER, _OPTIONAL_COLUMNS)
 
 
 def readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] | None) -> Readings:
@@ -300,11 +300,11 @@ def readings_of_table(table: Table, array: SensorArray, sensors: Sequence[str] |
         array = array.subset(sensors)
     channels = [f"{name}_nT" for name in array.channel_names]
     _check_sensor_columns(table, array, channels, ignore_others=sensors is not None)
-    return _of_checked(table, array)
+    return readings_of_checked(table, array)
 
 
-def _of_checked(table: Table, array: SensorArray) -> Readings:
-    """Readings of a table whose header is that of the array."""
+def readings_of_checked(table: Table, array: SensorArray) -> Readings:
+    """Readings of a table whose header is that of the array, as :func:`readings_of_table` has found."""
     channels = [f"{name}_nT" for name in array.channel_names]
     time_s = table.complete_and_distinct("time_s")
     position_m = rotation = ambient_T = pose_sigma = None

@@ -242,9 +242,9 @@ def table_of_text(
     return Table(name, chosen, header_line, table, np.array(line_numbers, dtype=np.int64))
 
 
-def table_of_header(line: str, name: str, expected_header: str, *, number: int = 1) -> Table:
+def table_of_header(line: str, name: str, expected_header: str, *, number: int = 1, separator: str = ",") -> Table:
     """Table without rows from the line that names its columns; `name` and `number` are what errors call it."""
-    _, cells = next(_csv_rows(name, line), (1, [""]))
+    _, cells = next(_csv_rows(name, line, separator), (1, [""]))
     header = _checked_header(f"{name}, line {number}", cells, expected_header)
     return Table(name, header, number, np.zeros((0, len(header))), np.zeros(0, dtype=np.int64))
 

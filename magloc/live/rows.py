@@ -8,13 +8,12 @@ from typing import Any
 import msgspec
 
 from arrays.array import SensorArray
-from arrays.io.csv import Table, table_of_header
+from arrays.io.csv import Table
 from arrays.io.errors import InputError
 from magloc.live.tally import Tally
-from magloc.readings import EXPECTED_HEADER, Readings, readings_below, readings_of_table
+from magloc.readings import EXPECTED_HEADER, Readings, log_format, readings_of_checked, readings_of_table
 
 _LINES_WITHOUT_HEADER = 100
-_TIME = "time_s"
 _AROUND = "\ufeff \t\r"
 
 
@@ -38,11 +37,11 @@ class RowParser:
     """
 
     def __init__(self, array: SensorArray, name: str, tally: Tally, sensors: Sequence[str] | None = None) -> None:
-        if array.columns is not None:
+        if array.columns is not None and array.columns.pose_latency_s:
             raise InputError(
-                f"{name}: found a table [columns] in the array file, which is for logs in files; expected rows as of a"
-                " readings file, and an array without it."
+                f"{name}: found columns.pose_latency_s in the array file, expected a stream whose poses are not late."
             )
+        self._format = log_format(array, sensors)
         self._array, self._name, self._tally, self._sensors = array, name, tally, sensors
         self._used = array
         self._header = ""
@@ -67,11 +66,11 @@ class RowParser:
             except GarbledError as error:
                 self._tally.name("garbled", f"{self._name}, line {self._n_lines}: {error}")
                 row = None
-            if row is None or _TIME in row:
+            if row is None or self._format.begins(row):
                 yield from self._readings(rows, self._n_lines - len(rows))
                 rows = []
             if row is not None:
-                if _TIME in row:
+                if self._format.begins(row):
                     self._take_header(row)
                 else:
                     rows.append(row)
@@ -87,7 +86,7 @@ class RowParser:
             return self._row_of_object(text)
         if text.count('"') % 2:
             raise GarbledError("found a quotation mark without another, expected cells")
-        if text and not self._header and _TIME not in text:
+        if text and not self._header and not self._format.begins(text):
             if self._n_lines >= _LINES_WITHOUT_HEADER:
                 raise InputError(f"{self._name}: found no header in {self._n_lines} lines, expected {EXPECTED_HEADER}.")
             raise GarbledError(f"found no header yet, expected {EXPECTED_HEADER}")
@@ -98,25 +97,27 @@ class RowParser:
             of_name: Any = msgspec.json.decode(text)
         except (msgspec.DecodeError, RecursionError) as error:
             raise GarbledError(f"found what is not JSON ({str(error).lower()})") from None
-        if _TIME not in of_name:
-            raise GarbledError("found an object without time_s")
+        time = "time_s" if self._array.columns is None else self._array.columns.clock[0]
+        if time not in of_name:
+            raise GarbledError(f"found an object without {time}")
+        between = self._format.separator
         if not self._header:
-            self._take_header(",".join(of_name))
+            self._take_header(between.join(of_name))
         assert self._head is not None
         columns = self._head.header
         unknown = [name for name in of_name if name not in columns]
         if unknown:
             raise GarbledError(f"found column {unknown[0]}, which the first row does not have")
         cells = (of_name.get(name) for name in columns)
-        return ",".join("" if cell is None else str(cell) for cell in cells)
+        return between.join("" if cell is None else str(cell) for cell in cells)
 
     def _take_header(self, text: str) -> None:
         """Use a line that names columns from here on; one that is sent again changes nothing."""
         if text == self._header:
             return
         try:
-            table = table_of_header(text, self._name, EXPECTED_HEADER, number=self._n_lines)
-            readings_of_table(table, self._array, self._sensors)
+            table = self._format.header(text, self._name, self._n_lines)
+            readings_of_table(self._format.translated(table), self._array, self._sensors)
         except InputError as error:
             if not self._header:
                 raise
@@ -130,7 +131,8 @@ class RowParser:
         if not rows or self._head is None:
             return
         try:
-            readings = readings_below(self._head, "\n".join(rows), self._used, first_line)
+            table = self._format.table("\n".join(rows), self._head.path, first_line=first_line, head=self._head)
+            readings = readings_of_checked(table, self._used)
             if len(readings) == len(rows):
                 yield readings
                 return

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from arrays.columns import LogColumns
 from arrays.io.errors import InputError
@@ -158,12 +159,83 @@ class TestHeader:
         assert len(found) == N_ROWS
         assert tally.garbled == 1
 
-    def test_of_a_log_of_another_program_is_refused(self) -> None:
-        """It may count in another unit under the same names."""
-        array = replace(ARRAY, columns=LogColumns(unit="uT"))
-        with pytest.raises(InputError, match=r"found a table \[columns\] in the array file"):
+    def test_whose_poses_are_late_is_refused(self) -> None:
+        """The pose of a row comes after it."""
+        array = replace(ARRAY, columns=LogColumns(position=("E", "N", "U"), pose_latency_s=0.1))
+        with pytest.raises(InputError, match=r"found columns\.pose_latency_s"):
             RowParser(array, "the stream", Tally())
 
     def test_that_never_comes(self, lines: list[str]) -> None:
         with pytest.raises(InputError, match="found no header in 100 lines"):
             parsed([lines[1:2] * 200])
+
+
+class TestColumnsOfAnotherProgram:
+    """Rows are those of a file of the same lines."""
+
+    ARRAY = replace(
+        ARRAY,
+        columns=LogColumns(
+            separator="semicolon",
+            decimal=",",
+            time="T",
+            time_unit="iso",
+            unit="uT",
+            sensors={"s1": ("Ax", "Ay", "Az")},
+            position=("E", "N", "U"),
+        ),
+    )
+    NAMES = ("T", "Ax", "Ay", "Az", *(f"{name}_nT" for name in ARRAY.channel_names[3:]), "E", "N", "U", "battery")
+    TEXT = ";".join(NAMES)
+
+    def rows(self, n: int) -> list[str]:
+        rng = np.random.default_rng(3)
+        cells = rng.normal(size=(n, len(self.NAMES) - 2)).round(3).astype(str)
+        return [
+            ";".join([f"2026-11-21T12:00:{i:02}.5", *(cell.replace(".", ",") for cell in row), "full"])
+            for i, row in enumerate(cells)
+        ]
+
+    def parsed(self, lines: Sequence[str]) -> tuple[Readings, Tally]:
+        tally = Tally()
+        parser = RowParser(self.ARRAY, "the stream", tally)
+        pieces = [piece for line in lines for piece in parser.rows_of([line.encode()])]
+        names = ("values_T", "time_s", "array_position_m")
+        values, time_s, place = (np.concatenate([getattr(piece, name) for piece in pieces]) for name in names)
+        turns = Rotation.concatenate([piece.array_rotation for piece in pieces if piece.array_rotation is not None])
+        return Readings(values, time_s=time_s, array_position_m=place, array_rotation=turns), tally
+
+    def test_as_of_a_file(self, tmp_path: Path) -> None:
+        rows = self.rows(12)
+        (tmp_path / "log.csv").write_text("\n".join([self.TEXT, *rows]) + "\n", encoding="utf-8")
+        whole = read_readings(tmp_path / "log.csv", self.ARRAY)
+        found, tally = self.parsed([self.TEXT, *rows])
+        np.testing.assert_array_equal(found.values_T, whole.values_T)
+        np.testing.assert_array_equal(found.time_s, whole.time_s)
+        np.testing.assert_array_equal(found.array_position_m, whole.array_position_m)
+        assert tally.garbled == 0
+
+    def test_garbled_and_repeated_lines(self, caplog: pytest.LogCaptureFixture) -> None:
+        """A header that is sent again changes nothing, and a line that is none is named by the log's own columns."""
+        rows = self.rows(6)
+        bad = rows[2].replace("2026-11-21T12:00:02.5", "noon")
+        with caplog.at_level("INFO"):
+            found, tally = self.parsed([self.TEXT, *rows[:2], bad, self.TEXT, *rows[3:]])
+        assert len(found) == 5
+        assert tally.garbled == 1
+        assert "line 4, column T: found 'noon'" in caplog.text
+
+    def test_objects(self) -> None:
+        rows = self.rows(4)
+        objects = []
+        for row in rows:
+            time, *cells, battery = row.split(";")
+            numbers = (float(cell.replace(",", ".")) for cell in cells)
+            objects.append(json.dumps(dict(zip(self.NAMES, (time, *numbers, battery), strict=True))))
+        found, _ = self.parsed(objects)
+        expected, _ = self.parsed([self.TEXT, *rows])
+        np.testing.assert_array_equal(found.values_T, expected.values_T)
+
+    def test_a_header_without_a_sensor(self) -> None:
+        with pytest.raises(InputError, match="line 1, column Ay: found no such column"):
+            self.parsed([self.TEXT.replace("Ay", "By"), *self.rows(2)])
