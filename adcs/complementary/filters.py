@@ -214,14 +214,16 @@ def _for(magnet: Magnet, model: HeadingModel) -> HeadingModel:
 
 def _body_sigma(q: FloatArray, of_tilt: FloatArray, of_heading: FloatArray) -> FloatArray:
     """Standard deviations (n, 3) about the body's axes."""
-    up = quaternion.rotate_back(q, [0.0, 0.0, 1.0])
-    return np.sqrt(of_tilt[:, None] ** 2 * (1.0 - up**2) + of_heading[:, None] ** 2 * up**2)
+    w, x, y, z = q.T
+    up = np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)], axis=-1)
+    tilt = (of_tilt * of_tilt)[:, None]
+    return np.sqrt(tilt + ((of_heading * of_heading)[:, None] - tilt) * up * up)
 
 
 def _minutes(time_s: FloatArray, left_out: BoolArray) -> tuple[str, ...]:
     """One sentence for each minute in which the gyro alone held the heading for a second or more."""
-    minute = ((time_s - time_s[0]) // 60.0).astype(np.intp)
-    seconds = np.bincount(minute, weights=np.where(left_out, steps_s(time_s), 0.0))
+    minute = ((time_s[left_out] - time_s[0]) // 60.0).astype(np.intp)
+    seconds = np.bincount(minute, weights=steps_s(time_s)[left_out])
     return tuple(
         f"minute {i + 1}: the field was left out for {seconds[i]:.0f} s, the gyro alone held the heading"
         for i in np.flatnonzero(seconds >= 1.0)

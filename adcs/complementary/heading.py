@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adcs import quaternion
+from adcs.satellite.telemetry import is_read
 from adcs.satellite.vector_record import GAP_STEPS, steps_s
 from arrays.typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
-    from adcs.complementary.heading_compiled import Blocks
+    from adcs.complementary.heading_compiled import Blocks, Noise
 
 _BLOCK_S = 0.035
 """How long readings are averaged: within it a hand turns by a few degrees."""
 _START_S = 1.0
-_TOLD = np.array([0, 5, 6, 7])  # heading and offset, of the state
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def heading_track(
     blocks = blocks._replace(start_T=np.array([0.0, math.hypot(start[0], start[1]), start[2]]))
     P = np.diag(model.deviations() ** 2)
     m = len(ends)
-    xs, Ps, used, known = np.empty((m, 14)), np.empty((m, 14, 14)), np.zeros(m, np.int64), np.zeros(m, np.int64)
+    told, variances, used, known = np.empty((m, 4)), np.empty((m, 4)), np.zeros(m, np.int64), np.zeros(m, np.int64)
     noise = Noise(
         model.noise_T,
         model.gyro_walk_rad_rts,
@@ -162,20 +162,21 @@ def heading_track(
     tests = Tests(
         model.gate, model.mean_nis, model.memory, model.patience_s, model.jump_T, model.evidence, model.trial_s
     )
-    run(x, P, blocks, noise, anywhere, tests, xs, Ps, used, known)
+    run(x.copy(), P.copy(), blocks, noise, anywhere, tests, told, variances, used, known)
     if offline:
-        smooth(x, P, blocks, noise, model.jump_T, known, xs, Ps)
+        smooth(x, P, blocks, noise, model.jump_T, known, told, variances)
         used = known
     # A block is known at its end; before the first one there is the start.
-    last = np.searchsorted(ends, np.arange(len(time_s)), side="left" if offline else "right") - (not offline)
-    last = np.clip(last, 0, m - 1)
-    deviations = np.sqrt(Ps[:, _TOLD, _TOLD])[last]
+    ended = np.zeros(len(time_s), np.intp)
+    ended[ends] = 1
+    last = np.clip(np.cumsum(ended) - (ended if offline else 1), 0, m - 1)
+    sigma = np.sqrt(variances)
     return HeadingTrack(
-        heading_rad=xs[last, 0],
-        sigma_rad=deviations[:, 0],
-        offset_T=xs[last, 5:8],
-        offset_sigma_T=deviations[:, 1:],
-        left_out=used[last] == 0,
+        heading_rad=told[last, 0],
+        sigma_rad=sigma[last, 0],
+        offset_T=told[last, 1:],
+        offset_sigma_T=sigma[last, 1:],
+        left_out=(used == 0)[last],
         changes=ends[known == 2],
     )
 
@@ -185,9 +186,11 @@ def _blocks(
 ) -> tuple[Blocks, NDArray[np.intp]]:
     """Means over short times, and the instants (m,) that end them; ``start_T`` is in the level frame still."""
     from adcs.complementary.heading_compiled import Blocks
+    from adcs.complementary.inertial_magnetic_compiled import rotated
 
-    rows = np.flatnonzero(np.isfinite(field_T).all(axis=1))
-    level = quaternion.rotate(q_level[rows], field_T[rows])
+    level = rotated(q_level, field_T)
+    rows = np.flatnonzero(is_read(level))
+    level = level[rows]
     starting = time_s[rows] < time_s[0] + _START_S
     if not starting.any():
         raise ValueError("Input field_T must be there within the first second; instead received none.")
@@ -211,8 +214,34 @@ def _blocks(
     return blocks, ends
 
 
+def transition(i: int, blocks: Blocks, noise: Noise) -> tuple[FloatArray, FloatArray]:
+    """Readable twin of :func:`adcs.complementary.heading_compiled.predict`: Φ (14, 14) and Q (14, 14) of a block."""
+    h, turns, Phi = blocks.dt_s[i], blocks.turns[i], np.eye(14)
+    lasting_s = np.repeat([noise.drift_s, noise.room_s, noise.local_s], [1, 3, 3])
+    decaying = np.array([1, *range(8, 14)])
+    keeps = np.exp(-h * np.array([turns] * 4 + [1.0] * 3) / lasting_s)
+    Phi[decaying, decaying] = keeps
+    Phi[0, 1] = h * turns
+    Phi[0, 2:5] = h * blocks.R_level[i, 2] * blocks.rate_rad_s[i]
+    local = [noise.local_T, noise.local_T, noise.local_up_T]
+    variance = np.zeros(14)
+    variance[0] = noise.walk_rad_rts**2 * h * turns + (noise.gap_rad_s * blocks.gap_s[i]) ** 2
+    variance[5:8] = noise.offset_T_rts**2 * h
+    variance[decaying] = np.square([noise.drift_rad_s, *[noise.room_T] * 3, *local]) * (1.0 - keeps**2)
+    return Phi, np.diag(variance)
+
+
+def expected_field(x: FloatArray, i: int, blocks: Blocks) -> tuple[FloatArray, FloatArray]:
+    """Readable twin of :func:`adcs.complementary.heading_compiled.innovation`: level field (3,), derivative (3, 14)."""
+    c, s = np.cos(x[0]), np.sin(x[0])
+    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    level, R = turn @ (blocks.start_T + x[8:11] + x[11:14]), blocks.R_level[i]
+    of_heading = np.array([[-level[1]], [level[0]], [0.0]])
+    return level + R @ x[5:8], np.hstack([of_heading, np.zeros((3, 4)), R, turn, turn])
+
+
 def turned_to_north(q_level: FloatArray, heading_rad: FloatArray) -> FloatArray:
     """East, north, up from body: the level attitude (n, 4) turned back by the heading (n,)."""
-    zero = np.zeros_like(heading_rad)
-    half = -0.5 * heading_rad
-    return quaternion.multiply(np.stack([np.cos(half), zero, zero, np.sin(half)], axis=-1), q_level)
+    c, s = np.cos(0.5 * heading_rad), np.sin(0.5 * heading_rad)
+    w, x, y, z = q_level.T
+    return np.stack([c * w + s * z, c * x + s * y, c * y - s * x, c * z - s * w], axis=-1)

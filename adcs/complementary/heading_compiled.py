@@ -12,6 +12,8 @@ from magloc.compilation import compiled
 Array = NDArray[np.float64]
 SIZE = 14
 """Numbers of the state: heading, drift; gyro's scales, sensor's offset, room's slow and quick variation, 3 each."""
+TOLD = (0, 5, 6, 7)
+"""Those that are told: heading and offset."""
 
 
 class Noise(NamedTuple):
@@ -54,62 +56,121 @@ class Tests(NamedTuple):
     trial_s: float
 
 
-@compiled
-def predict(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise) -> tuple[Array, Array, Array]:
-    """State, covariance and Φ of block i from those of the block before."""
-    h, turns = blocks.dt_s[i], blocks.turns[i]
-    F, Q = np.eye(SIZE), np.zeros(SIZE)
-    F[0, 1] = h * turns
-    F[0, 2:5] = h * blocks.R_level[i, 2] * blocks.rate_rad_s[i]
-    Q[0] = noise.walk_rad_rts**2 * h * turns + (noise.gap_rad_s * blocks.gap_s[i]) ** 2
-    keeps = np.exp(-h * turns / noise.drift_s)
-    F[1, 1], Q[1] = keeps, noise.drift_rad_s**2 * (1.0 - keeps**2)
-    Q[5:8] = noise.offset_T_rts**2 * h
-    keeps = np.exp(-h * turns / noise.room_s)
-    for k in range(8, 11):
-        F[k, k], Q[k] = keeps, noise.room_T**2 * (1.0 - keeps**2)
-    keeps = np.exp(-h / noise.local_s)
-    for k in range(11, 14):
-        sigma = noise.local_up_T if k == 13 else noise.local_T
-        F[k, k], Q[k] = keeps, sigma**2 * (1.0 - keeps**2)
-    P = F @ P @ F.T
-    for k in range(SIZE):
-        P[k, k] += Q[k]
-    return F @ x, P, F
+class Step(NamedTuple):
+    """What one block makes of the state, written anew for each."""
+
+    turn: Array  # (14,): what each state adds to the heading,
+    keeps: Array  # (14,): and what is left of it: Φ has zeros elsewhere
+    H: Array  # (3, 14)
+    HP: Array  # (3, 14)
+    gain: Array  # (3, 14): Kalman's, transposed
+    nu: Array  # (3,): innovation
+    S: Array  # (3, 3): its covariance
+    S_inverse: Array  # (3, 3)
 
 
 @compiled
-def innovation(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise) -> tuple[Array, Array, Array, float]:
-    """Innovation (3,), its covariance, H, and its normalised square."""
+def new_step() -> Step:
+    """Room for one."""
+    wide, small = np.zeros((3, 3, SIZE)), np.zeros((2, 3, 3))
+    return Step(np.zeros(SIZE), np.ones(SIZE), wide[0], wide[1], wide[2], np.zeros(3), small[0], small[1])
+
+
+@compiled
+def predict(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise, step: Step) -> None:
+    """State and covariance of block i, in place of those of the block before."""
+    h, turns, turn, keeps = blocks.dt_s[i], blocks.turns[i], step.turn, step.keeps
+    turn[1] = h * turns
+    for k in range(3):
+        turn[2 + k] = h * blocks.R_level[i, 2, k] * blocks.rate_rad_s[i, k]
+    keeps[1] = np.exp(-h * turns / noise.drift_s)
+    keeps[8:11] = np.exp(-h * turns / noise.room_s)
+    keeps[11:14] = np.exp(-h / noise.local_s)
+    for k in range(1, 5):
+        x[0] += turn[k] * x[k]
+        P[0, 0] += turn[k] * P[0, k]
+    for k in range(1, 5):
+        for j in range(1, SIZE):
+            P[0, j] += turn[k] * P[k, j]
+    for k in range(1, 5):
+        P[0, 0] += turn[k] * P[0, k]
+    P[1:, 0] = P[0, 1:]
+    for j in range(SIZE):
+        x[j] *= keeps[j]
+        for k in range(SIZE):
+            P[j, k] *= keeps[j] * keeps[k]
+    P[0, 0] += noise.walk_rad_rts**2 * h * turns + (noise.gap_rad_s * blocks.gap_s[i]) ** 2
+    P[1, 1] += noise.drift_rad_s**2 * (1.0 - keeps[1] ** 2)
+    for k in range(3):
+        local_T = noise.local_up_T if k == 2 else noise.local_T
+        P[5 + k, 5 + k] += noise.offset_T_rts**2 * h
+        P[8 + k, 8 + k] += noise.room_T**2 * (1.0 - keeps[8] ** 2)
+        P[11 + k, 11 + k] += local_T**2 * (1.0 - keeps[11] ** 2)
+
+
+@compiled
+def innovation(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise, step: Step) -> float:
+    """Normalised square of a block's innovation."""
     c, s = np.cos(x[0]), np.sin(x[0])
-    room = blocks.start_T + x[8:11] + x[11:14]
-    level = np.array([c * room[0] - s * room[1], s * room[0] + c * room[1], room[2]])
-    R = blocks.R_level[i]
-    H = np.zeros((3, SIZE))
+    H, HP, nu, S, R = step.H, step.HP, step.nu, step.S, blocks.R_level[i]
+    east, north = blocks.start_T[0] + x[8] + x[11], blocks.start_T[1] + x[9] + x[12]
+    level = (c * east - s * north, s * east + c * north, blocks.start_T[2] + x[10] + x[13])
     H[0, 0], H[1, 0] = -level[1], level[0]
     H[:, 5:8] = R
     for k in (8, 11):
         H[0, k], H[0, k + 1], H[1, k], H[1, k + 1], H[2, k + 2] = c, -s, s, c, 1.0
-    nu = blocks.field_T[i] - level - R @ x[5:8].copy()
-    S = H @ P @ H.T + noise.reading_T**2 * np.eye(3)
-    return nu, S, H, nu @ np.linalg.solve(S, nu)
+    HP[:] = 0.0
+    for a in range(3):
+        nu[a] = blocks.field_T[i, a] - level[a] - R[a, 0] * x[5] - R[a, 1] * x[6] - R[a, 2] * x[7]
+        for k in range(SIZE):
+            if H[a, k] != 0.0:
+                for j in range(SIZE):
+                    HP[a, j] += H[a, k] * P[k, j]
+        for b in range(3):
+            S[a, b] = noise.reading_T**2 if a == b else 0.0
+            for j in range(SIZE):
+                S[a, b] += HP[a, j] * H[b, j]
+    determinant = _determinant(S)
+    nis = 0.0
+    for a in range(3):
+        b, d = (a + 1) % 3, (a + 2) % 3
+        for k in range(3):
+            m, n = (k + 1) % 3, (k + 2) % 3
+            step.S_inverse[a, k] = (S[b, m] * S[d, n] - S[b, n] * S[d, m]) / determinant
+            nis += nu[a] * step.S_inverse[a, k] * nu[k]
+    return nis
 
 
 @compiled
-def update(x: Array, P: Array, nu: Array, S: Array, H: Array) -> tuple[Array, Array]:
-    """Kalman's update."""
-    K = np.linalg.solve(S, H @ P).T
-    P = P - K @ S @ K.T
-    return x + K @ nu, 0.5 * (P + P.T)
+def _determinant(S: Array) -> float:
+    return (
+        S[0, 0] * (S[1, 1] * S[2, 2] - S[1, 2] * S[2, 1])
+        + S[0, 1] * (S[1, 2] * S[2, 0] - S[1, 0] * S[2, 2])
+        + S[0, 2] * (S[1, 0] * S[2, 1] - S[1, 1] * S[2, 0])
+    )
 
 
 @compiled
-def tried(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise) -> tuple[Array, Array, float]:
-    """State and covariance with reading i, whatever it is, and its logarithmic likelihood, not less than -50."""
-    x, P, _ = predict(x, P, i, blocks, noise)
-    nu, S, H, nis = innovation(x, P, i, blocks, noise)
-    x, P = update(x, P, nu, S, H)
-    return x, P, max(-0.5 * (nis + np.log(np.linalg.det(S * 1e12))), -50.0)
+def update(x: Array, P: Array, step: Step) -> None:
+    """Kalman's update, in place."""
+    gain, HP, nu, inverse = step.gain, step.HP, step.nu, step.S_inverse
+    for j in range(SIZE):
+        for a in range(3):
+            gain[a, j] = inverse[a, 0] * HP[0, j] + inverse[a, 1] * HP[1, j] + inverse[a, 2] * HP[2, j]
+        x[j] += gain[0, j] * nu[0] + gain[1, j] * nu[1] + gain[2, j] * nu[2]
+    for j in range(SIZE):
+        for k in range(j, SIZE):
+            P[j, k] -= HP[0, j] * gain[0, k] + HP[1, j] * gain[1, k] + HP[2, j] * gain[2, k]
+            P[k, j] = P[j, k]
+
+
+@compiled
+def tried(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise, step: Step) -> float:
+    """Go on with reading i, whatever it is; its logarithmic likelihood, not less than -50."""
+    predict(x, P, i, blocks, noise, step)
+    nis = innovation(x, P, i, blocks, noise, step)
+    update(x, P, step)
+    return max(-0.5 * (nis + np.log(1e36 * _determinant(step.S))), -50.0)
 
 
 @compiled
@@ -120,12 +181,12 @@ def run(
     noise: Noise,
     anywhere: Noise,
     tests: Tests,
-    xs: Array,
-    Ps: Array,
+    told: Array,
+    variances: Array,
     used: NDArray[np.int64],
     known: NDArray[np.int64],
 ) -> None:
-    """The filter over all blocks: states (m, 14), covariances, which readings were used, and which are in hindsight.
+    """The filter over all blocks: states (m, 4), variances, which readings were used, and which are in hindsight.
 
     A reading is left out where it, or the mean of the last ones, contradicts the state. When that goes on for a while,
     three others run beside the filter from there: one whose sensor's offset changed, one whose room's field did, and
@@ -133,16 +194,18 @@ def run(
     others, which only turns can make them do; ``known`` is 2 where it began then. All end when the filter agrees with
     its readings again.
     """
+    step = new_step()
     smoothed, wrong_s, right_s, trial_s, began = 0.0, 0.0, 0.0, -1.0, 0
     others, covariances, odds = np.empty((3, SIZE)), np.empty((3, SIZE, SIZE)), np.zeros(3)
-    for i in range(len(xs)):
+    x_before, P_before = x.copy(), P.copy()
+    for i in range(len(told)):
         h = blocks.dt_s[i]
-        x_before, P_before = x, P
-        x, P, _ = predict(x, P, i, blocks, noise)
-        nu, S, H, nis = innovation(x, P, i, blocks, noise)
+        x_before[:], P_before[:] = x, P
+        predict(x, P, i, blocks, noise, step)
+        nis = innovation(x, P, i, blocks, noise, step)
         smoothed = tests.memory * smoothed + (1.0 - tests.memory) * min(nis, 2.0 * tests.gate) / 3.0
         if nis <= tests.gate and smoothed <= tests.mean_nis:
-            x, P = update(x, P, nu, S, H)
+            update(x, P, step)
             used[i], known[i] = 1, 1
             right_s += h
             wrong_s = wrong_s if right_s < tests.patience_s else 0.0
@@ -159,21 +222,69 @@ def run(
             trial_s += h
             for other in range(3):
                 with_noise = noise if other < 2 else anywhere
-                others[other], covariances[other], likelihood = tried(
-                    others[other].copy(), covariances[other].copy(), i, blocks, with_noise
-                )
-                odds[other] += likelihood
+                odds[other] += tried(others[other], covariances[other], i, blocks, with_noise, step)
             against = odds[0] - max(odds[1], odds[2])
             if right_s > 3.0 * tests.patience_s:
                 trial_s, wrong_s = -1.0, 0.0
             elif against > tests.evidence and trial_s > tests.patience_s:
-                x, P = others[0].copy(), covariances[0].copy()
+                x[:], P[:] = others[0], covariances[0]
                 known[began : i + 1] = 1
                 known[began] = 2
                 smoothed, trial_s, wrong_s = 0.0, -1.0, 0.0
             elif against < -abs(tests.evidence) or trial_s > tests.trial_s:
                 trial_s = -1.0
-        xs[i], Ps[i] = x, P
+        for k in range(4):
+            told[i, k], variances[i, k] = x[TOLD[k]], P[TOLD[k], TOLD[k]]
+
+
+@compiled
+def _forward(x: Array, P: Array, i: int, blocks: Blocks, noise: Noise, jump_T: float, known: int, step: Step) -> None:
+    """Predict and update, of what is known of a reading in hindsight."""
+    if known == 2:
+        for k in range(5, 8):
+            P[k, k] += jump_T**2
+    predict(x, P, i, blocks, noise, step)
+    if known > 0:
+        innovation(x, P, i, blocks, noise, step)
+        update(x, P, step)
+
+
+@compiled
+def _back(score: Array, information: Array, known: int, step: Step) -> None:
+    """Take what later readings say of a block to the one before, with what its own reading says."""
+    H, gain, turn, keeps = step.H, step.gain, step.turn, step.keeps
+    if known > 0:
+        # (I - KH)ᵀ Λ (I - KH) + HᵀS⁻¹H = Λ + HᵀM + MᵀH
+        M, of_reading = step.HP, np.zeros(3)
+        M[:] = 0.0
+        for a in range(3):
+            for k in range(SIZE):
+                of_reading[a] += gain[a, k] * score[k]
+                for j in range(SIZE):
+                    M[a, j] -= gain[a, k] * information[k, j]
+            for b in range(3):
+                of_reading[a] += step.S_inverse[a, b] * step.nu[b]
+        halves = 0.5 * step.S_inverse
+        for a in range(3):
+            for b in range(3):
+                for k in range(SIZE):
+                    halves[a, b] -= 0.5 * M[a, k] * gain[b, k]
+        for a in range(3):
+            for b in range(3):
+                for k in range(SIZE):
+                    M[a, k] += halves[a, b] * H[b, k]
+        for j in range(SIZE):
+            for a in range(3):
+                score[j] -= H[a, j] * of_reading[a]
+                for k in range(SIZE):
+                    information[j, k] += H[a, j] * M[a, k] + M[a, j] * H[a, k]
+    for k in range(1, SIZE):
+        score[k] = keeps[k] * score[k] + turn[k] * score[0]
+        for j in range(SIZE):
+            information[k, j] = keeps[k] * information[k, j] + turn[k] * information[0, j]
+    for j in range(SIZE):
+        for k in range(1, SIZE):
+            information[j, k] = keeps[k] * information[j, k] + turn[k] * information[j, 0]
 
 
 @compiled
@@ -184,25 +295,29 @@ def smooth(
     noise: Noise,
     jump_T: float,
     known: NDArray[np.int64],
-    xs: Array,
-    Ps: Array,
+    told: Array,
+    variances: Array,
 ) -> None:
-    """Rauch-Tung-Striebel smoother, of the readings that are used in hindsight: states (m, 14) and covariances."""
-    n = len(xs)
-    before, P_before, Phi = np.empty_like(xs), np.empty_like(Ps), np.empty_like(Ps)
+    """Smoother of the readings that are used in hindsight: states (m, 4) and variances.
+
+    After Bryson and Frazier: what later readings say of a state is a score (14,) and an information (14, 14) that are
+    carried backwards, so that nothing larger than an innovation's covariance is inverted.
+    """
+    step, n = new_step(), len(told)
+    xs, Ps = np.empty((n, SIZE)), np.empty((n, SIZE, SIZE))
     for i in range(n):
-        if known[i] == 2:
-            P = P.copy()
-            for k in range(5, 8):
-                P[k, k] += jump_T**2
-        x, P, Phi[i] = predict(x, P, i, blocks, noise)
-        before[i], P_before[i] = x, P
-        if known[i] > 0:
-            nu, S, H, _ = innovation(x, P, i, blocks, noise)
-            x, P = update(x, P, nu, S, H)
+        _forward(x, P, i, blocks, noise, jump_T, known[i], step)
         xs[i], Ps[i] = x, P
-    for i in range(n - 2, -1, -1):
-        C = np.linalg.solve(P_before[i + 1], Phi[i + 1] @ Ps[i]).T
-        xs[i] = xs[i] + C @ (xs[i + 1] - before[i + 1])
-        P = Ps[i] + C @ (Ps[i + 1] - P_before[i + 1]) @ C.T
-        Ps[i] = 0.5 * (P + P.T)
+    score, information = np.zeros(SIZE), np.zeros((SIZE, SIZE))
+    for i in range(n - 1, -1, -1):
+        for k in range(4):
+            row = Ps[i, TOLD[k]]
+            told[i, k], variances[i, k] = xs[i, TOLD[k]], row[TOLD[k]]
+            for a in range(SIZE):
+                told[i, k] -= row[a] * score[a]
+                for b in range(SIZE):
+                    variances[i, k] -= row[a] * information[a, b] * row[b]
+        if i > 0:
+            x[:], P[:] = xs[i - 1], Ps[i - 1]
+            _forward(x, P, i, blocks, noise, jump_T, known[i], step)
+            _back(score, information, known[i], step)

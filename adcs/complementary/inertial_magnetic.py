@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adcs import quaternion
-from adcs.complementary.explicit import Gains, explicit_track
 from adcs.complementary.heading import HeadingModel
-from adcs.satellite.vector_record import GAP_STEPS, GyroSamples, VectorRecord, step_rates, steps_s
+from adcs.satellite.vector_record import GAP_STEPS, GyroSamples, step_rates, steps_s
 from arrays.typing import BoolArray, FloatArray
 
 GRAVITY_TIME_S = 3.0
@@ -22,10 +21,12 @@ GRAVITY_TIME_S = 3.0
 _TILT_FLOOR_RAD = math.radians(0.4)
 _TURN_S = 0.5  # for how long a hand turns one way
 _UP_STEP = 0.15  # part of the tilt's error that a step corrects: the direction up is smooth already
+_LONGEST_UP_STEP = 0.5 / _UP_STEP  # of usual ones: after a gap half of it is corrected
 _REST_S = 1.5
 _REST_RATE_RAD_S = math.radians(0.5)
 _REST_ACCELERATION_M_S2 = 0.15
 _LAG_WINDOW_S = 0.2
+_LAG_EVERY_S = 0.01  # readings closer than that say the same
 _LONGEST_LAG_S = 0.04
 _USUAL_LENGTH = 0.1  # relative difference of a field's length
 _LARGEST = {"rate_rad_s": 1e4, "acceleration_m_s2": 1e6, "field_T": 1.0}  # of a reading: more is something else
@@ -94,9 +95,14 @@ def rest_bias(record: InertialMagneticRecord) -> FloatArray:
 
     Returns (n, 3): zero where the sensor never rests [rad/s].
     """
+    from adcs.complementary.inertial_magnetic_compiled import window_scatter
+
     window = np.floor((record.time_s - record.time_s[0]) / _REST_S * (1.0 + 1e-9)).astype(np.intp)
-    rate, scatter = _by_window(record.rate_rad_s, window)
-    rest = (scatter < _REST_RATE_RAD_S) & (_by_window(record.acceleration_m_s2, window)[1] < _REST_ACCELERATION_M_S2)
+    rate, *of_rate = window_scatter(record.rate_rad_s, window)
+    _, *of_acceleration = window_scatter(record.acceleration_m_s2, window)
+    rest = np.ones(len(rate), dtype=np.bool_)
+    for (scatter, counts), most in ((of_rate, _REST_RATE_RAD_S), (of_acceleration, _REST_ACCELERATION_M_S2)):
+        rest &= (scatter < most) & (2 * counts >= np.median(counts))
     found = rate[rest]
     if len(found) == 0:
         return np.zeros((len(record), 3))
@@ -104,20 +110,6 @@ def rest_bias(record: InertialMagneticRecord) -> FloatArray:
     # A rest is known at its end.
     latest = np.maximum(np.cumsum(np.concatenate([[False], rest[:-1]])) - 1, 0)
     return means[latest[window]]
-
-
-def _by_window(values: FloatArray, window: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-    """Means (k, 3) and the largest standard deviation (k,) of each window's readings; inf where half of them miss."""
-    seen = np.isfinite(values).all(axis=1)
-    counts = np.bincount(window[seen], minlength=window[-1] + 1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        means, squares = (
-            np.stack([np.bincount(window[seen], column[seen], window[-1] + 1) / counts for column in array.T], axis=1)
-            for array in (values, (values - values[seen].mean(axis=0)) ** 2)
-        )
-        variance = squares - (means - values[seen].mean(axis=0)) ** 2
-    scatter = np.sqrt(np.maximum(variance, 0.0).max(axis=1))
-    return means, np.where(2 * counts < np.median(counts), np.inf, scatter)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +123,6 @@ class Prepared:
     time_s: FloatArray  # (n,)
     rate_rad_s: FloatArray  # (n, 3): less the bias, the mean over the step that ends at each instant
     bias_rad_s: FloatArray  # (n, 3)
-    up: FloatArray  # (n, 3): unit vector, body axes
     field_T: FloatArray  # (n, 3): turned by the gyro to where it would be without the magnetometer's lag
     q_level: FloatArray
     lag_s: float  # of the magnetometer behind the gyro
@@ -149,49 +140,42 @@ def prepare(record: InertialMagneticRecord, model: HeadingModel = HeadingModel()
     Everything but the lag, for which the whole record is used, is what can be known at the time, or, offline, what the
     whole record tells.
     """
-    bias = rest_bias(record)
-    rate = step_rates(record.rate_rad_s - bias, record.dt_s, record.gyro_samples)
-    missing = np.full_like(rate, np.nan)
-    gyro_alone = _vector_record(record.time_s, rate, missing, missing)
-    q_gyro = explicit_track(gyro_alone, Gains(0.0, 0.0)).q[0]
-    up = _up(q_gyro, record, offline)
+    from adcs.complementary.inertial_magnetic_compiled import gyro_attitudes, levelled
+
+    dt_s, bias = record.dt_s, rest_bias(record)
+    rate = step_rates(record.rate_rad_s - bias, dt_s, record.gyro_samples)
+    q_gyro = gyro_attitudes(rate, dt_s)
+    steady = _steady_up(q_gyro, record, dt_s, offline)
     lag = _lag_s(q_gyro, record)
     field_T = _without_lag(q_gyro, record.time_s, record.field_T, lag)
-    vectors = _vector_record(record.time_s, rate, missing, up)
-    gains = Gains(1.0, 0.0, second_weight=_UP_STEP / vectors.usual_dt_s)
-    q_level = explicit_track(vectors, gains, q_start=_attitude(up[0], _across(up[0]))).q[0]
-    return Prepared(record.time_s, rate, bias, up, field_T, q_level, lag, _tilt_sigma_rad(record, rate, model))
+    usual = float(np.median(dt_s))
+    part = _UP_STEP * np.minimum(dt_s / usual, _LONGEST_UP_STEP)
+    q_level = levelled(q_gyro, steady, part, _attitude(steady[0], _across(steady[0])))
+    return Prepared(record.time_s, rate, bias, field_T, q_level, lag, _tilt_sigma_rad(dt_s, rate, model))
 
 
-def _tilt_sigma_rad(record: InertialMagneticRecord, rate: FloatArray, model: HeadingModel) -> FloatArray:
+def _tilt_sigma_rad(dt_s: FloatArray, rate: FloatArray, model: HeadingModel) -> FloatArray:
     """What an accelerometer at rest leaves, and what the gyro's scale makes of turns while the low-pass is behind."""
     from adcs.complementary.inertial_magnetic_compiled import low_pass
 
-    dt_s = record.dt_s
     gap_rad_s = model.gap_rad_s * np.where(dt_s > GAP_STEPS * np.median(dt_s), dt_s, 0.0) / _TURN_S
-    squares = (model.gyro_scale * rate) ** 2 + gap_rad_s[:, None] ** 2 / 3.0
-    smooth = low_pass(squares, dt_s, GRAVITY_TIME_S, squares[0]).sum(axis=1)
+    squares = (model.gyro_scale**2 * np.einsum("ni,ni->n", rate, rate) + gap_rad_s**2)[:, None]
+    smooth = low_pass(squares, dt_s, GRAVITY_TIME_S, squares[0])[:, 0]
     return np.sqrt(_TILT_FLOOR_RAD**2 + _TURN_S**2 * np.maximum(smooth, 0.0))
 
 
-def _vector_record(time_s: FloatArray, rate: FloatArray, first: FloatArray, up: FloatArray) -> VectorRecord:
-    north, zenith = (np.tile(axis, (len(rate), 1)) for axis in ([0.0, 1.0, 0.0], [0.0, 0.0, 1.0]))
-    return VectorRecord(steps_s(time_s), rate, first, up, north, zenith, np.zeros_like(rate))
+def _steady_up(q_gyro: FloatArray, record: InertialMagneticRecord, dt_s: FloatArray, offline: bool) -> FloatArray:
+    """Upward unit vectors (n, 3) in the gyro's frame; offline the mean of a low-pass from either end, never late."""
+    from adcs.complementary.inertial_magnetic_compiled import low_pass, rotated
 
-
-def _up(q_gyro: FloatArray, record: InertialMagneticRecord, offline: bool) -> FloatArray:
-    """Upward unit vectors (n, 3) in body axes; offline the mean of a low-pass from either end, which is not late."""
-    from adcs.complementary.inertial_magnetic_compiled import low_pass
-
-    steady = quaternion.rotate(q_gyro, record.acceleration_m_s2)
-    smooth = low_pass(steady, record.dt_s, GRAVITY_TIME_S, np.nanmean(steady[record.starting], axis=0))
+    steady = rotated(q_gyro, record.acceleration_m_s2)
+    smooth = low_pass(steady, dt_s, GRAVITY_TIME_S, np.nanmean(steady[record.starting], axis=0))
     if offline:
         seen = steady[np.isfinite(steady).all(axis=1)]
         end = seen[-np.count_nonzero(record.starting) :].mean(axis=0)
-        steps = np.concatenate([record.dt_s[:1], record.dt_s[:0:-1]])
-        smooth = 0.5 * (smooth + low_pass(steady[::-1], steps, GRAVITY_TIME_S, end)[::-1])
-    up = quaternion.rotate_back(q_gyro, smooth)
-    return up / np.linalg.norm(up, axis=1, keepdims=True)
+        steps = np.concatenate([dt_s[:1], dt_s[:0:-1]])
+        smooth = 0.5 * (smooth + low_pass(steady[::-1].copy(), steps, GRAVITY_TIME_S, end)[::-1])
+    return smooth / np.sqrt(np.einsum("ni,ni->n", smooth, smooth))[:, None]
 
 
 def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
@@ -199,20 +183,18 @@ def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
 
     Readings whose length is not that of the first second are left out: a magnet on the sensor turns with it.
     """
-    from adcs.complementary.inertial_magnetic_compiled import without_turns
+    from adcs.complementary.inertial_magnetic_compiled import change_without_turns
 
-    lengths = np.linalg.norm(record.field_T, axis=1)
+    time_s, field_T = record.time_s, record.field_T
+    lengths = np.sqrt(np.einsum("ni,ni->n", field_T, field_T))
     usual = np.nanmedian(lengths[record.starting])
     rows = np.flatnonzero(np.isfinite(lengths))
     step = float(np.median(record.dt_s))
-    apart = max(1, round(_LAG_WINDOW_S / float(np.median(np.diff(record.time_s[rows])))))
+    rows = rows[:: max(1, round(_LAG_EVERY_S / float(np.median(np.diff(time_s[rows])))))]
+    apart = max(1, round(_LAG_WINDOW_S / float(np.median(np.diff(time_s[rows])))))
     good = np.abs(lengths[rows] - usual) < _USUAL_LENGTH * usual
-    pairs = np.flatnonzero(good[apart:] & good[:-apart])
     most = round(_LONGEST_LAG_S / step)
-    changes = []
-    for lag in range(most + 1):
-        field_T = without_turns(q_gyro, record.time_s, rows, record.field_T, lag * step)
-        changes.append(float(np.sum((field_T[pairs + apart] - field_T[pairs]) ** 2)))
+    changes = [change_without_turns(q_gyro, time_s, rows, field_T, good, apart, lag * step) for lag in range(most + 1)]
     least = int(np.argmin(changes))
     if not 0 < least < most:
         return least * step
@@ -221,9 +203,10 @@ def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
 
 
 def _without_lag(q_gyro: FloatArray, time_s: FloatArray, field_T: FloatArray, lag_s: float) -> FloatArray:
-    from adcs.complementary.inertial_magnetic_compiled import without_turns
+    from adcs.complementary.inertial_magnetic_compiled import rotated, without_turns
 
-    return quaternion.rotate_back(q_gyro, without_turns(q_gyro, time_s, np.arange(len(time_s)), field_T, lag_s))
+    steady = without_turns(q_gyro, time_s, np.arange(len(time_s)), field_T, lag_s)
+    return rotated(quaternion.conjugate(q_gyro), steady)
 
 
 def turned_back(

@@ -39,8 +39,10 @@ def step_rates(rate_rad_s: FloatArray, dt_s: FloatArray, samples: GyroSamples = 
     until = np.cumsum(dt_s)
     span = np.diff(until[rows], prepend=until[0] - dt_s[0])
     means = read.copy()
-    between = np.ones(len(rows), dtype=np.bool_) if samples == "point" else span > GAP_STEPS * np.median(span)
-    means[1:][between[1:]] = 0.5 * (read[:-1] + read[1:])[between[1:]]
+    between = 1 + np.flatnonzero((samples == "point") | (span[1:] > GAP_STEPS * np.median(span)))
+    means[between] = 0.5 * (read[between - 1] + read[between])
+    if len(rows) == len(rate_rad_s):
+        return means
     last = np.searchsorted(rows, np.arange(len(rate_rad_s)), side="right") - 1
     found = read[last]
     held = span - dt_s[rows]

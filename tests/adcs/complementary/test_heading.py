@@ -9,8 +9,16 @@ from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
 from scipy.differentiate import jacobian
 
 from adcs import quaternion
-from adcs.complementary.heading import HeadingModel, _blocks, heading_track, turned_to_north
-from adcs.complementary.heading_compiled import Noise, innovation, predict, smooth
+from adcs.complementary.heading import (
+    HeadingModel,
+    _blocks,
+    expected_field,
+    heading_track,
+    transition,
+    turned_to_north,
+)
+from adcs.complementary.heading_compiled import TOLD, Noise, run, smooth
+from adcs.complementary.heading_compiled import Tests as Limits
 
 MODEL = HeadingModel()
 STEP_S, FIELD_T = 0.02, np.array([0.0, 18e-6, -45e-6])
@@ -55,58 +63,53 @@ def room(seconds=60.0, seed=0, turning=1.0, **changes):
 
 class TestParts:
     def test_against_filterpy(self):
-        """Predictions, updates and the smoother of a record without anything wrong."""
+        """Filter and smoother of a record without anything wrong, with Φ, Q and H of the readable twins."""
         time_s, rate, q_level, field, _ = room(10.0)
         blocks, _ = _blocks(time_s, rate, q_level, field, MODEL)
         x, P = 1e-3 * np.arange(14.0) * [1, 1, 1, 1, 1, *[1e-4] * 9], np.diag(MODEL.deviations() ** 2)
         other = ExtendedKalmanFilter(14, 3)
         other.x, other.P, other.R = x.copy(), P.copy(), NOISE.reading_T**2 * np.eye(3)
         m = len(blocks.dt_s)
-        xs, Ps = np.empty((m, 14)), np.empty((m, 14, 14))
-        smooth(x, P, blocks, NOISE, 0.0, np.ones(m, np.int64), xs, Ps)
-
-        def predicted(state, i):
-            c, s = np.cos(state[0]), np.sin(state[0])
-            at = blocks.start_T + state[8:11] + state[11:14]
-            return np.array([c * at[0] - s * at[1], s * at[0] + c * at[1], at[2]]) + blocks.R_level[i] @ state[5:8]
-
+        told, variances, flags = np.empty((2, m, 4)), np.empty((2, m, 4)), np.ones((2, m), np.int64)
+        everything = Limits(math.inf, math.inf, 0.9, 1.0, 0.0, math.inf, 1.0)
+        run(x.copy(), P.copy(), blocks, NOISE, NOISE, everything, told[0], variances[0], flags[0], flags[1])
+        smooth(x, P, blocks, NOISE, 0.0, flags[1], told[1], variances[1])
         filtered = []
         for i in range(m):
-            _, before, F = predict(other.x, other.P, i, blocks, NOISE)
-            other.F, other.Q = F, before - F @ other.P @ F.T
+            other.F, other.Q = transition(i, blocks, NOISE)
             other.predict()
-            _, _, H, _ = innovation(other.x, other.P, i, blocks, NOISE)
-            other.update(blocks.field_T[i], lambda _, H=H: H, lambda state, i=i: predicted(state, i))
+            other.update(
+                blocks.field_T[i],
+                lambda state, i=i: expected_field(state, i, blocks)[1],
+                lambda state, i=i: expected_field(state, i, blocks)[0],
+            )
             filtered.append((other.x, other.P, other.F, other.Q))
-        columns = (np.array(column) for column in zip(*filtered, strict=True))
-        smoothed, covariances, *_ = KalmanFilter(14, 3).rts_smoother(*columns)
-        np.testing.assert_allclose(xs, smoothed, rtol=1e-5, atol=1e-9)
-        np.testing.assert_allclose(np.diagonal(Ps, 0, 1, 2), np.diagonal(covariances, 0, 1, 2), rtol=1e-4)
-        np.testing.assert_allclose(xs[-1], other.x, rtol=1e-6, atol=1e-12)
-        np.testing.assert_allclose(np.diag(Ps[-1]), np.diag(other.P), rtol=1e-6)
+        xs, Ps, *system = (np.array(column) for column in zip(*filtered, strict=True))
+        smoothed, covariances, *_ = KalmanFilter(14, 3).rts_smoother(xs, Ps, *system)
+        for k, (states, matrices) in enumerate(((xs, Ps), (smoothed, covariances))):
+            np.testing.assert_allclose(told[k], states[:, TOLD], rtol=1e-5, atol=1e-9)
+            np.testing.assert_allclose(variances[k], np.diagonal(matrices, 0, 1, 2)[:, TOLD], rtol=1e-4)
 
     def test_derivatives(self):
         time_s, rate, q_level, field, _ = room(8.0)
         blocks, _ = _blocks(time_s, rate, q_level, field, MODEL)
-        x, P = np.array([0.4, *[0.0] * 4, *[1e-6] * 9]), np.diag(MODEL.deviations() ** 2)
-        _, _, H, _ = innovation(x, P, 150, blocks, NOISE)
+        x = np.array([0.4, *[0.0] * 4, *[1e-6] * 9])
 
-        def residual(states):
-            flat = states.reshape(14, -1)
-            found = [innovation(state.copy(), P, 150, blocks, NOISE)[0] for state in flat.T]
+        def expected(states):
+            found = [expected_field(state, 150, blocks)[0] for state in states.reshape(14, -1).T]
             return np.array(found).T.reshape(3, *states.shape[1:])
 
         scale = np.array([1.0] * 5 + [1e-6] * 9)
-        numerical = jacobian(lambda z: residual(z * scale.reshape(14, *[1] * (z.ndim - 1))), x / scale).df
-        np.testing.assert_allclose(-numerical, H * scale, atol=1e-11)
+        numerical = jacobian(lambda z: expected(z * scale.reshape(14, *[1] * (z.ndim - 1))), x / scale).df
+        np.testing.assert_allclose(numerical, expected_field(x, 150, blocks)[1] * scale, atol=1e-11)
 
     def test_the_gyros_scale_turns_the_heading(self):
         """Φ against a rotation by quaternions with gains that are wrong."""
         time_s, rate, q_level, field, _ = room(8.0)
         blocks, _ = _blocks(time_s, rate, q_level, field, MODEL)
-        x, P = np.zeros(14), np.eye(14)
+        x = np.zeros(14)
         x[2:5] = 0.01, -0.02, 0.03
-        after, _, _ = predict(x, P, 160, blocks, NOISE)
+        after = transition(160, blocks, NOISE)[0] @ x
         h = blocks.dt_s[160]
         R = blocks.R_level[160]
         extra = R @ (x[2:5] * blocks.rate_rad_s[160]) * h

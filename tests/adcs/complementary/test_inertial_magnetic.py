@@ -9,18 +9,29 @@ from scipy import signal
 from scipy.spatial.transform import Rotation
 
 from adcs import quaternion
+from adcs.complementary.explicit import Gains, explicit_track
 from adcs.complementary.filters import LEFT_OUT, SUBTRACTED, inertial_magnetic_filter
 from adcs.complementary.heading import heading_track
 from adcs.complementary.inertial_magnetic import InertialMagneticRecord, prepare, rest_bias, turned_back
-from adcs.complementary.inertial_magnetic_compiled import low_pass, without_turns
+from adcs.complementary.inertial_magnetic_compiled import (
+    change_without_turns,
+    gyro_attitudes,
+    levelled,
+    low_pass,
+    rotated,
+    window_scatter,
+    without_turns,
+)
 from adcs.complementary.names import MAGNETS
 from adcs.complementary.orientation_errors import error_angles, orientation_errors
 from adcs.io.imu_files import read_imu
+from adcs.satellite.vector_record import VectorRecord
 from tests.adcs.attitudes import random_attitudes
 
 DT = 0.01
 FIELD_T = np.array([0.0, 18e-6, -45e-6])
 BIAS = np.radians([0.3, -0.2, 0.1])
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def motion(seconds=60.0, seed=0, lag=0, magnet=None):
@@ -80,7 +91,8 @@ class TestParts:
 
     def test_up(self):
         record, q, _ = motion()
-        np.testing.assert_allclose(prepare(record).up, quaternion.rotate_back(q, [0.0, 0.0, 1.0]), atol=0.02)
+        up = quaternion.rotate_back(prepare(record).q_level, UP)
+        np.testing.assert_allclose(up, quaternion.rotate_back(q, UP), atol=0.02)
 
     def test_the_lag_with_a_magnet_on_the_sensor(self):
         """It turns with the sensor, and says nothing of the lag."""
@@ -93,8 +105,8 @@ class TestParts:
         drifting = replace(record, rate_rad_s=record.rate_rad_s + np.where(moving[:, None], 0.01, 0.0))
         errors = []
         for offline in (False, True):
-            up = prepare(drifting, offline=offline).up[1500:-500]
-            errors.append(np.linalg.norm(up - quaternion.rotate_back(q, [0.0, 0.0, 1.0])[1500:-500], axis=1).mean())
+            up = quaternion.rotate_back(prepare(drifting, offline=offline).q_level, UP)
+            errors.append(np.linalg.norm(up - quaternion.rotate_back(q, UP), axis=1)[1500:-500].mean())
         assert errors[1] < 0.7 * errors[0]
 
 
@@ -104,9 +116,39 @@ class TestCompiled:
         time_s = np.cumsum(rng.uniform(0.005, 0.015, 200))
         q = quaternion.exp(np.cumsum(0.05 * rng.standard_normal((200, 3)), axis=0))
         rows, field = np.arange(0, 200, 3), rng.standard_normal((200, 3))
+        good = rng.random(len(rows)) < 0.7
+        pairs = np.flatnonzero(good[4:] & good[:-4])
         for lag_s in (0.0, 0.013, 0.3):
-            args = q, time_s, rows, field, lag_s
-            np.testing.assert_allclose(without_turns(*args), turned_back(*args), atol=1e-12)
+            steady = turned_back(q, time_s, rows, field, lag_s)
+            np.testing.assert_allclose(without_turns(q, time_s, rows, field, lag_s), steady, atol=1e-12)
+            change = change_without_turns(q, time_s, rows, field, good, 4, lag_s)
+            assert change == pytest.approx(np.sum((steady[pairs + 4] - steady[pairs]) ** 2))
+        np.testing.assert_allclose(rotated(q, field), quaternion.rotate(q, field), atol=1e-14)
+
+    def test_level_is_the_explicit_filters(self):
+        """With one vector, in steps that jitter: it corrects the same part of the angle, in another frame."""
+        rng = np.random.default_rng(3)
+        dt_s, rate = rng.uniform(0.005, 0.015, 500), rng.standard_normal((500, 3)).cumsum(axis=0) * 0.1
+        missing, still = np.full((500, 3), np.nan), np.zeros((500, 3))
+        axes = np.tile([0.0, 1.0, 0.0], (500, 1)), np.tile(UP, (500, 1))
+        q_gyro = gyro_attitudes(rate, dt_s)
+        alone = VectorRecord(dt_s, rate, missing, missing, *axes, still)
+        np.testing.assert_allclose(q_gyro, explicit_track(alone, Gains(0.0, 0.0)).q[0], atol=1e-12)
+        steady, start = UP + 0.2 * rng.standard_normal((500, 3)), quaternion.exp([0.3, -0.2, 0.1])
+        record = VectorRecord(dt_s, rate, missing, quaternion.rotate_back(q_gyro, steady), *axes, still)
+        gains = Gains(1.0, 0.0, second_weight=3.0)
+        expected = explicit_track(record, gains, q_start=start).q[0]
+        np.testing.assert_allclose(levelled(q_gyro, steady, 3.0 * dt_s, start), expected, atol=1e-12)
+
+    def test_scatter_within_windows(self):
+        values, window = np.random.default_rng(4).standard_normal((100, 3)), np.repeat([0, 1, 2], [50, 30, 20])
+        values[::7, 1] = np.nan
+        means, scatter, counts = window_scatter(values, window)
+        for i in range(3):
+            seen = values[window == i][np.isfinite(values[window == i]).all(axis=1)]
+            assert counts[i] == len(seen)
+            np.testing.assert_allclose(means[i], seen.mean(axis=0))
+            assert scatter[i] == pytest.approx(seen.std(axis=0).max())
 
     def test_low_pass_is_scipys_butterworth(self):
         """On equal steps, against the bilinear transform, whose error falls with the square of the step."""
@@ -292,4 +334,6 @@ class TestInput:
         record, _, _ = motion(15.0)
         prepared = prepare(record)
         with pytest.raises(ValueError, match="within the first second"):
-            heading_track(prepared.time_s, prepared.rate_rad_s, prepared.q_level, np.full_like(prepared.up, np.nan))
+            heading_track(
+                prepared.time_s, prepared.rate_rad_s, prepared.q_level, np.full_like(prepared.field_T, np.nan)
+            )
