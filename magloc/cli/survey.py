@@ -91,8 +91,8 @@ def survey(
     scheduler : str
         Address of a dask scheduler (tcp://HOST:PORT) whose workers search the tiles of a large survey.
     out : Path
-        Folder for targets.csv, residual.csv and the map; of a large survey it keeps what is done, until all is: the
-        same command goes on with one that was interrupted.
+        Folder for targets.csv, residual.csv, reach.csv (the least moment seen) and the map; of a large survey it keeps
+        what is done, until all is: the same command goes on with one that was interrupted.
     json : bool
         Print one JSON object in place of the table.
     common : CommonOptions
@@ -153,14 +153,15 @@ def _naming(readings: str) -> Iterator[None]:
 
 
 def _write(found: Survey, folder: Path) -> None:
-    """targets.csv, residual.csv, and the map."""
+    """targets.csv, residual.csv, reach.csv, and the map."""
     from arrays.io.csv import write_columns
     from magloc.plots import save
     from magloc.plots.surveys import survey_figure
-    from magloc.surveying.files import columns_of_survey, residual_columns
+    from magloc.surveying.files import columns_of_survey, reach_columns, residual_columns
 
     make_folder(folder, "--out")
     write_columns(columns_of_survey(found), folder / "targets.csv")
     write_columns(residual_columns(found), folder / "residual.csv")
+    write_columns(reach_columns(found), folder / "reach.csv")
     save(survey_figure(found), folder / "survey.png")
-    print_note(f"wrote targets.csv, residual.csv and survey.png into {folder}/")
+    print_note(f"wrote targets.csv, residual.csv, reach.csv and survey.png into {folder}/")

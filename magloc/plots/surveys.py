@@ -1,7 +1,8 @@
-"""A survey from above: the anomaly as measured, what the targets leave of it, and the targets."""
+"""A survey from above: the anomaly, what the targets leave of it, the targets, and what could have been found."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +14,7 @@ from magloc.plots import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.collections import Collection
 
     from magloc.surveying.results import Survey, Target
 
@@ -21,7 +23,7 @@ _ACROSS, _UP = "x, east [m]", "y, north [m]"
 
 
 def survey_figure(found: Survey) -> Figure:
-    """Map of the anomaly along the ambient field, of what the targets leave of it, and the targets.
+    """Maps of the anomaly along the ambient field, of what the targets leave of it, and of the least moments seen.
 
     Parameters
     ----------
@@ -43,9 +45,9 @@ def survey_figure(found: Survey) -> Figure:
     """
     x, y, _ = found.rows.place_m.T
     height = style.WIDTH_IN * 0.5 * float(np.clip(np.ptp(y) / max(np.ptp(x), 1e-9), 0.4, 1.6)) + 1.0
-    figure = style.new_figure(height)
+    figure = style.new_figure(2.0 * height)
     rows = slice(None, None, -(-len(x) // _MOST_POINTS))
-    both = figure.subplots(1, 2, sharex=True, sharey=True)
+    both, reach = figure.subplots(2, 2, sharex=True, sharey=True)
     before, after = (values[rows] * 1e9 for values in (found.rows.anomaly_T, found.rows.residual_T))
     for ax, values, title in zip(both, (before, after), ("anomaly", "less the targets' fields"), strict=True):
         _draw_values(figure, ax, x[rows], y[rows], values)
@@ -54,7 +56,22 @@ def survey_figure(found: Survey) -> Figure:
     for target in found:
         _draw_target(both[0], target, named=False)
         _draw_target(both[1], target, named=True)
+    depths = found.ground_m - found.reach.place_m[:, 2]
+    for ax, depth in zip(reach, (depths.min(initial=np.inf), depths.max(initial=0.0)), strict=True):
+        at = np.isclose(depths, depth)
+        _draw_reach(figure, ax, found.reach.place_m[at], found.reach.moment_Am2[at])
+        style.dress(ax, _ACROSS, _UP, f"least moment seen, {depth:.2g} m deep" if at.any() else "")
+        ax.set_aspect("equal")
     return figure
+
+
+def _draw_reach(figure: Figure, ax: Axes, places_m: FloatArray, moments_Am2: FloatArray) -> None:
+    """Moments between places, on a logarithmic scale."""
+    x, y, _ = places_m.T
+    if min(len(set(x)), len(set(y))) < 2:
+        return  # a single line of places has no map
+    surface = ax.tripcolor(x, y, moments_Am2, norm="log", cmap="viridis", shading="gouraud", rasterized=True)
+    _draw_bar(figure, ax, surface, np.geomspace(moments_Am2.min(), moments_Am2.max(), 4).tolist(), "A·m²")
 
 
 def _draw_values(figure: Figure, ax: Axes, x: FloatArray, y: FloatArray, values_nT: FloatArray) -> None:
@@ -63,12 +80,15 @@ def _draw_values(figure: Figure, ax: Axes, x: FloatArray, y: FloatArray, values_
     usual = float(np.quantile(np.abs(values_nT), 0.8))
     norm = SymLogNorm(max(usual, 1e-3 * most, 1e-6), vmin=-most, vmax=most)
     points = ax.scatter(x, y, c=values_nT, s=1.5, lw=0.0, cmap="RdBu_r", norm=norm, rasterized=True)
-    bar = figure.colorbar(points, ax=ax, orientation="horizontal", shrink=0.8, aspect=30)
-    ticks = [-most, -norm.linthresh, 0.0, norm.linthresh, most]
+    _draw_bar(figure, ax, points, [-most, -norm.linthresh, 0.0, norm.linthresh, most], "nT")
+
+
+def _draw_bar(figure: Figure, ax: Axes, shown: Collection, ticks: Sequence[float], unit: str) -> None:
+    bar = figure.colorbar(shown, ax=ax, orientation="horizontal", shrink=0.8, aspect=30)
     bar.set_ticks(ticks, labels=[f"{tick:.2g}" for tick in ticks])
     bar.minorticks_off()
     bar.ax.tick_params(labelsize=style.SMALL_LETTERS)
-    bar.set_label("nT", fontsize=style.LETTERS)
+    bar.set_label(unit, fontsize=style.LETTERS)
 
 
 def _draw_target(ax: Axes, target: Target, *, named: bool) -> None:

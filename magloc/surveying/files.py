@@ -66,6 +66,12 @@ def residual_columns(found: Survey) -> dict[str, Column]:
     return columns
 
 
+def reach_columns(found: Survey) -> dict[str, Column]:
+    """Columns of ``reach.csv``: places, and the least moment that is seen there."""
+    x, y, z = found.reach.place_m.T
+    return {"x_m": x, "y_m": y, "depth_m": found.ground_m - z, "moment_Am2": found.reach.moment_Am2}
+
+
 def geojson_of_survey(found: Survey, origin: Vector) -> dict[str, Any]:
     """:meth:`magloc.surveying.results.Survey.to_geojson`."""
     entries = json_of_survey(found)["targets"]

@@ -17,6 +17,7 @@ from magloc.surveying.fit.joint_fit import Bounds, Layer, Sources
 from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.fit.whitening import Drift
 from magloc.surveying.preparation import record_of
+from magloc.surveying.reach import least_moments
 from magloc.surveying.rounds import MOST_ROUNDS, Model, found_in
 from magloc.surveying.search import PITCH, SearchGrid
 from magloc.surveying.targets import targets_of
@@ -148,7 +149,7 @@ def _rounds_in(piece: Piece, most: int) -> Arrays:
 
 @one_blas_thread
 def targets_in(piece: Piece) -> Arrays:
-    """The sources that are known, fitted to all rows: parts of targets, and what is left of the tile's rows."""
+    """The sources that are known, fitted to all rows: parts of targets, reach, and what is left of the tile's rows."""
     model = piece.model()
     group = piece.groups(model.record, model.bounds, AT_LAST)
     fit, background = model.fitted(piece.known, group, _SETTLED)
@@ -159,7 +160,12 @@ def targets_in(piece: Piece) -> Arrays:
         record.along_ambient(record.values_T),
         record.along_ambient(left),
     )
+    places, moments = least_moments(
+        model, fit, background, record.sensors_m[piece.own].mean(axis=1), piece.ground.ground_m
+    )
     return {
+        "reach_m": places,
+        "reach_Am2": moments,
         **targets_of(model, fit, background, piece.ground.ground_m),
         **{name: values[piece.own] for name, values in zip(OF_ROWS, lines, strict=True)},
         "chi2": np.array(fit.chi2),

@@ -93,6 +93,13 @@ class SurveyRows(NamedTuple):
     residual_T: FloatArray
 
 
+class Reach(NamedTuple):
+    """What could have been found: places (k, 3), and the moments (k,) seen there with 95 %, however they point."""
+
+    place_m: FloatArray
+    moment_Am2: FloatArray
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Survey:
     """What a survey found.
@@ -105,6 +112,8 @@ class Survey:
         The sensors that were used, and what their pose was taken for.
     rows : SurveyRows
         Every row's anomaly, and what the targets leave of it.
+    reach : Reach
+        The least moments that the lines as flown show, 0.5, 1 and 2 m below the ground.
     ground_m : float
         Height of the ground in the world frame.
     threshold : float
@@ -132,6 +141,7 @@ class Survey:
     targets: tuple[Target, ...]
     array: SensorArray
     rows: SurveyRows
+    reach: Reach
     ground_m: float
     threshold: float
     chi2_per_dof: float

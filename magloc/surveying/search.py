@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -54,14 +55,20 @@ class SearchGrid:
         """Of a box, at distances from the lowest sensors in geometric steps."""
         height = record.height_m
         nearest, farthest = max(height - high_m[2], 0.3), height - low_m[2]
+        distances = np.geomspace(nearest * 1.1, max(farthest, nearest * 1.2), N_DISTANCES)
+        return cls.of(low_m, high_m, height, distances.tolist())
+
+    @classmethod
+    def of(cls, low_m: FloatArray, high_m: FloatArray, height_m: float, distances_m: Sequence[float]) -> SearchGrid:
+        """Of a rectangle, at some distances below a height."""
         tiles = []
-        for distance in np.geomspace(nearest * 1.1, max(farthest, nearest * 1.2), N_DISTANCES):
+        for distance in distances_m:
             pitch = distance / PITCH
             x, y = (np.arange(low_m[a] + 0.5 * pitch, high_m[a] + 0.5 * pitch, pitch) for a in range(2))
             for i in range(0, len(x), _CHUNK):
                 for j in range(0, len(y), _CHUNK):
-                    square = np.meshgrid(x[i : i + _CHUNK], y[j : j + _CHUNK], [height - distance], indexing="ij")
-                    tiles.append((float(distance), np.stack(square, axis=-1).reshape(-1, 3)))
+                    square = np.meshgrid(x[i : i + _CHUNK], y[j : j + _CHUNK], [height_m - distance], indexing="ij")
+                    tiles.append((distance, np.stack(square, axis=-1).reshape(-1, 3)))
         return cls(tiles)
 
 
@@ -72,11 +79,10 @@ def search(record: SurveyRecord, background: Background, fit: JointFit, grid: Se
     directions = record.directions(fields)
     Q = with_free_sources(record, background, fit.sources)
     left = fit.residual - Q @ (Q.T @ fit.residual)
-    middles = record.sensors_m.mean(axis=1)[white.starts[:-1]]
 
     def explained(tile: tuple[float, FloatArray]) -> tuple[FloatArray, ...]:
         distance, places = tile
-        used = np.flatnonzero(_near(middles, places, WINDOW * distance))
+        used = groups_near(record, white, places, WINDOW * distance)
         alone, projected, v = normal_equations(record, white, directions, places, used, Q, left)
         # Of a source that others nearly imitate rounding and the window's edge are left, which must not count.
         least = np.maximum(_LEAST_SEEN * np.trace(alone, axis1=1, axis2=2), _TINY)[:, None, None] * np.eye(3)
@@ -130,9 +136,11 @@ def _stands_beside(found: Candidates, i: int, stronger: int) -> bool:
     return bool(apart > _SKIRT * h or found.chi2[i] > _SKIRT_SHARE * found.chi2[stronger])
 
 
-def _near(points: FloatArray, places: FloatArray, window_m: float) -> BoolArray:
-    low, high = places.min(axis=0) - window_m, places.max(axis=0) + window_m
-    return np.asarray(np.all((points[:, :2] >= low[:2]) & (points[:, :2] <= high[:2]), axis=1))
+def groups_near(record: SurveyRecord, white: Whitening, places: FloatArray, window_m: float) -> IntArray:
+    """Groups of rows within some distance of places (m, 3), on the map."""
+    middles = record.sensors_m.mean(axis=1)[white.starts[:-1], :2]
+    low, high = places[:, :2].min(axis=0) - window_m, places[:, :2].max(axis=0) + window_m
+    return np.flatnonzero(np.all((middles >= low) & (middles <= high), axis=1))
 
 
 def sources_at(found: Candidates, which: IntArray) -> Sources:

@@ -21,7 +21,7 @@ from magloc.readings import Readings
 from magloc.surveying.fit.record import joined
 from magloc.surveying.piece import OF_ROWS, Ground, sources_in, strongest_in, targets_in
 from magloc.surveying.preparation import whole_rows
-from magloc.surveying.results import Survey, SurveyRows, Target
+from magloc.surveying.results import Reach, Survey, SurveyRows, Target
 from magloc.surveying.targets import OF_TARGETS
 from magloc.surveying.tiled import TiledSurvey
 from magloc.surveying.tiles import owned
@@ -155,6 +155,7 @@ def survey(
         _targets(tiled, results),
         tiled.array,
         _rows(tiled, results),
+        Reach(*(np.concatenate([result[name] for result in results]) for name in ("reach_m", "reach_Am2"))),
         ground_m,
         threshold,
         chi2_per_dof,

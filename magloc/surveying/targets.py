@@ -12,7 +12,7 @@ from scipy.special import chdtri
 from arrays.typing import FloatArray
 from magloc.surveying.fit.joint_fit import Background, JointFit, jacobian_of, with_free_sources
 from magloc.surveying.rounds import Model
-from magloc.surveying.search import WINDOW, normal_equations
+from magloc.surveying.search import WINDOW, groups_near, normal_equations
 
 OF_TARGETS = ("position_m", "moment_Am2", "covariance", "depth_interval95_m", "significance", "flags")
 _WEAK = 200.0
@@ -31,10 +31,9 @@ def depth_interval(
     source = fit.sources.some(np.array([which]))
     others = fit.sources.some(np.delete(np.arange(len(fit.sources)), which))
     position = source.position_m[0]
-    middles = record.sensors_m.mean(axis=1)[white.starts[:-1], :2]
     # Twice as far as a search looks: what the ground imitates is told from a target by its farthest tail.
     reach = 2.0 * WINDOW * (record.height_m - position[2])
-    used = np.flatnonzero(np.all(np.abs(middles - position[:2]) < reach, axis=1))
+    used = groups_near(record, white, source.position_m, reach)
     near = np.linalg.norm(others.position_m[:, :2] - position[:2], axis=1) < reach
     Q = with_free_sources(record, background, others.some(near))
     # What the source explains itself is put back, to first order: it is weak.

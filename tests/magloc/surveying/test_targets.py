@@ -1,4 +1,4 @@
-"""What is said of a target: the interval of its depth against fits with the depth held."""
+"""What is said of targets: depth intervals against fits with the depth held, and which moments could be seen."""
 
 from __future__ import annotations
 
@@ -8,20 +8,24 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.stats import ncx2
 
 import magloc
 import sims
 from arrays.typing import FloatArray
 from magloc.surveying.fit.joint_fit import (
     Background,
+    Bounds,
     JointFit,
     Sources,
+    fit_jointly,
     jacobian_of,
     residual_of,
     with_free_sources,
 )
 from magloc.surveying.piece import AT_LAST, Ground
 from magloc.surveying.preparation import whole_rows
+from magloc.surveying.reach import DEPTHS_M, least_moments
 from magloc.surveying.rounds import Model
 from magloc.surveying.targets import depth_interval
 from magloc.surveying.tiled import TiledSurvey
@@ -76,3 +80,24 @@ def test_at_its_ends_a_depth_interval_costs_what_chance_does() -> None:
     for depth in depth_interval(model, fit, background, 0, 0.0):
         there = least_squares(residual, np.delete(found, 2), x_scale="jac", args=(depth,))
         assert 2.0 * there.cost - fit.chi2 == pytest.approx(3.84, abs=0.5)
+
+
+def test_the_least_moment_is_seen_with_95_percent() -> None:
+    """Its χ², as of a source of a joint fit, has the tail that is promised in the worst of 300 directions."""
+    model, fit, background = fitted()
+    rows = model.record.sensors_m.mean(axis=1)
+    places, moments = least_moments(model, fit, background, rows, 0.0)
+    assert sorted(set((-places[:, 2]).round(6))) == list(DEPTHS_M)
+    directions = np.random.default_rng(1).normal(size=(300, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    everywhere = Bounds(np.full(3, -np.inf), np.full(3, np.inf))
+    for at in np.linspace(0, len(places) - 1, 5).astype(int):
+        with_one = fit.sources.with_more(Sources(places[[at]], moments[at] * directions[:1]))
+        there = fit_jointly(model.record, background, with_one, everywhere, most=0)
+        own, others = np.arange(15, 18), np.arange(12)
+        cross = there.information[np.ix_(others, own)]
+        known = np.linalg.solve(there.information[np.ix_(others, others)], cross)
+        left = there.information[np.ix_(own, own)] - cross.T @ known
+        chi2 = moments[at] ** 2 * np.einsum("ki,ij,kj->k", directions, left, directions).min()
+        # More than promised, as a search looks at near rows only, but not by much.
+        assert 0.949 < ncx2(3, chi2).sf(model.threshold) < 0.99
