@@ -15,7 +15,7 @@ import arrays
 import magloc
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
-from arrays.io.outputs import make_folder, refuse_file, refuse_one_for_two
+from arrays.io.outputs import make_folder, refuse_file, refuse_one_for_two, refuse_unwritable
 from magloc.cli.framework import CommonOptions, print_json
 from magloc.cli.options import (
     KnownOptions,
@@ -62,6 +62,7 @@ def survey(
     maps: MapOptions = MapOptions(),  # noqa: B008 - frozen
     scheduler: str | None = None,
     out: Path | None = None,
+    html: Path | None = None,
     json: Flag = False,
     common: CommonOptions = CommonOptions(),  # noqa: B008 - frozen
 ) -> None:
@@ -93,6 +94,8 @@ def survey(
     out : Path
         Folder for targets.csv, residual.csv, reach.csv (the least moment seen) and the map; of a large survey it keeps
         what is done, until all is: the same command goes on with one that was interrupted.
+    html : Path
+        Write the survey in three dimensions, lines, ground and targets, as one page that needs no server.
     json : bool
         Print one JSON object in place of the table.
     common : CommonOptions
@@ -101,7 +104,9 @@ def survey(
     maps.refuse(known.place)
     if out is not None:
         refuse_file(out, "--out")
-    refuse_one_for_two({"--out": out, **maps.outputs})
+    refuse_one_for_two({"--out": out, "--html": html, **maps.outputs})
+    if html is not None:
+        refuse_unwritable(html, "--html")
     refuse_not_positive(ground, "shortest_geology_m", "false_per_hectare")
     if not math.isfinite(ground.ground_m):
         raise InputError(f"--ground-m: found {ground.ground_m:g}, expected a finite number.")
@@ -128,6 +133,8 @@ def survey(
     maps.write(found, known.place)
     if out is not None:
         _write(found, out)
+    if html is not None:
+        magloc.view(None, found, html=html, title="survey")
     if json:
         from magloc.surveying.files import json_of_survey
 

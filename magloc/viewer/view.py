@@ -17,12 +17,13 @@ from arrays.array import SensorArray
 from arrays.io.closing import Closing
 from magloc.localization.fit.fixes import Fixes
 from magloc.readings import Readings
+from magloc.surveying.results import Survey
 from magloc.tracking.results import TrackResult
 from magloc.truth import Truth
 from magloc.viewer.film import write_film
 from magloc.viewer.outputs import check_outputs
 from magloc.viewer.pages.open_result import MapResult, map_of, path_of_truth
-from magloc.viewer.pages.pages import Page, array_page, map_page, readings_page, track_page
+from magloc.viewer.pages.pages import Page, array_page, map_page, readings_page, survey_page, track_page
 from magloc.viewer.server import (
     FIRST_PORT,
     address,
@@ -92,7 +93,9 @@ class View(Closing):
 
 def view(
     array: SensorArray | None,
-    result: Readings | Fixes | Track | SourcesTrack | TrackResult | Truth | xr.Dataset | MapResult | None = None,
+    result: (
+        Readings | Fixes | Track | SourcesTrack | TrackResult | Truth | Survey | xr.Dataset | MapResult | None
+    ) = None,
     *,
     readings: Readings | None = None,
     html: str | Path | None = None,
@@ -112,8 +115,8 @@ def view(
     Parameters
     ----------
     array : SensorArray, optional
-        None for a map or a Track, which have their own, and for a path without an array.
-    result : Readings, Fixes, Track, SourcesTrack, TrackResult, Truth or xarray.Dataset, optional
+        None for a map, a Survey or a Track, which have their own, and for a path without an array.
+    result : Readings, Fixes, Track, SourcesTrack, TrackResult, Truth, Survey or xarray.Dataset, optional
         Of the array; a Dataset is a map over starts or sources. Readings are located first, 2000 rows at most, evenly.
         Without it the array alone is seen, with a dipole to be dragged.
     readings : Readings, optional
@@ -212,6 +215,8 @@ def _filling(
         array = result.tracker.array if array is None else array
         readings = result.readings if readings is None else readings
         result = TrackResult(result.points, is_truth=False)
+    if isinstance(result, Survey):
+        return lambda server: survey_page(server, result)
     if isinstance(result, TrackResult):
         if all(point.position_m is None for track in result.tracks for point in track):
             raise ValueError("Input result must have a row where the source is tracked; instead received none.")
@@ -219,7 +224,7 @@ def _filling(
     if not isinstance(result, MapResult | Readings | Fixes | None):
         if not hasattr(result, "data_vars"):
             raise ValueError(
-                "Input result must be readings, fixes, a track, a truth or a map; instead received "
+                "Input result must be readings, fixes, a track, a truth, a survey or a map; instead received "
                 f"{type(result).__name__}."
             )
         result = map_of(result)

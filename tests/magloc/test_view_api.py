@@ -21,8 +21,9 @@ from magloc.localization.fit.fixes import Fixes
 from magloc.localization.locator import locate
 from magloc.measurement.differences import predicted_channels
 from magloc.readings import Readings
+from magloc.surveying.results import Reach, SurveyRows
 from magloc.tracking.results import TrackPoint, TrackResult
-from magloc.viewer.pages.pages import readings_page
+from magloc.viewer.pages.pages import readings_page, survey_page
 from magloc.viewer.server import address, free_port, opened
 from magloc.viewer.view import View, thinned
 from tests.browser.browser import Browser
@@ -109,6 +110,21 @@ class TestInline:
     def test_readings_that_cannot_be_located_are_seen_all_the_same(self) -> None:
         two = ARRAY.subset(ARRAY.ids[:2])
         assert "one square of the floor" in self.page(magloc.view(two, Readings(VALUES_T[:, :6])))
+
+    def test_a_survey(self) -> None:
+        """Targets stand where they are, named with their depths; all rows are there."""
+        position, rows = np.array([1.0, 2.0, -0.6]), np.random.default_rng(1).uniform(1.0, 7.0, (40, 3))
+        target = magloc.Target("t1", position, np.array([0.0, 1.0, 2.0]), 1e-4 * np.eye(6), 0.6, (0.5, 0.7), 900.0)
+        values = SurveyRows(np.arange(40.0), rows, 1e-9 * rows[:, 0], 0.0 * rows[:, 0])
+        reach = Reach(np.zeros((0, 3)), np.zeros(0))
+        survey = magloc.Survey((target,), ARRAY, values, reach, 0.0, 26.0, 1.0, False, 0.0, 1.0)
+        assert "95 % ellipsoids of their positions" in self.page(magloc.view(None, survey))
+        with opened(0, "survey") as server:
+            survey_page(server, survey)
+            nodes = server.scene._handle_from_node_name
+            np.testing.assert_allclose(nodes["/t1"].position, position)
+            assert nodes["/t1-text"].text == "t1: 0.60 m"
+            np.testing.assert_allclose(nodes["/rows"].points, rows, atol=1e-6)
 
     def test_several_sources_are_all_seen(self) -> None:
         array = cube(1.5)

@@ -14,6 +14,7 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.localization.fit.results import Fix
 from magloc.readings import Readings
+from magloc.surveying.results import Survey
 from magloc.tracking.results import TrackPoint, TrackResult, stacked
 from magloc.viewer.pages import words
 from magloc.viewer.pages.field_panel import FieldPanel
@@ -21,6 +22,7 @@ from magloc.viewer.pages.fixes import FixView, best_positions
 from magloc.viewer.pages.live import LivePage
 from magloc.viewer.pages.map import MapControls, MapView
 from magloc.viewer.pages.open_result import MapResult
+from magloc.viewer.pages.survey import add_survey
 from magloc.viewer.pages.track_player import TrackPlayer, source_colours, time_colours
 from magloc.viewer.panels.readings_plot import ReadingsPlot
 from magloc.viewer.scene.framing import Extent, aim, corners_of, extent_of, prepare
@@ -253,6 +255,13 @@ def map_page(server: viser.ViserServer, result: MapResult) -> Page:
     return _finished(server, legend, ball, result.title, entries, notes, ruler=False)  # its box has numbers
 
 
+def survey_page(server: viser.ViserServer, found: Survey) -> Page:
+    """A survey: rows, ground and targets."""
+    legend = server.gui.add_folder("Legend")
+    entries, points = add_survey(server, found)
+    return _finished(server, legend, extent_of(points), repr(found), entries, of_array=False)
+
+
 def _finished(
     server: viser.ViserServer,
     legend: viser.GuiFolderHandle,
@@ -264,6 +273,7 @@ def _finished(
     *,
     drops: Sequence[DropLines] = (),
     ruler: bool = True,
+    of_array: bool = True,
     playing: Playing | None = None,
 ) -> Page:
     """Floor, light, camera, axes, what stands on the floor, and legend."""
@@ -273,7 +283,7 @@ def _finished(
     for lines in drops:
         lines.stand_on(floor, ball)
     height = f"floor at z = {length_text(floor.height_m)}"
-    all_notes = (*notes, AXES_WORDS, height, f"one square of the floor: {length_text(floor.cell_m)}")
+    all_notes = (*notes, *[AXES_WORDS] * of_array, height, f"one square of the floor: {length_text(floor.cell_m)}")
     with legend:
         server.gui.add_html(legend_html(entries, all_notes))
     return Page(title, tuple(entries), all_notes, close, playing)

@@ -77,7 +77,16 @@ class TestSurvey:
 
     def test_files(self, folder: Path, tmp_path: Path, run: Run) -> None:
         pytest.importorskip("pymap3d")
-        outputs = ("--out", tmp_path / "out", "--geojson", tmp_path / "t.json", "--kml", tmp_path / "t.kml")
+        outputs = (
+            "--out",
+            tmp_path / "out",
+            "--html",
+            tmp_path / "t.html",
+            "--geojson",
+            tmp_path / "t.json",
+            "--kml",
+            tmp_path / "t.kml",
+        )
         array = folder / "ground-array.toml"
         done = run("survey", folder / "ground.csv", "--array", array, *outputs, "--place", 48, 11, 500)
         assert done.status == 0, done.err
@@ -88,6 +97,7 @@ class TestSurvey:
             "targets.csv",
         ]
         assert len(json.loads((tmp_path / "t.json").read_text())["features"]) == 1
+        assert "__VISER_EMBED_DATA__" in (tmp_path / "t.html").read_text()
         assert "<Placemark>" in (tmp_path / "t.kml").read_text()
         assert "t1" in done.out
 

@@ -1,0 +1,70 @@
+"""A survey in a scene: rows coloured by their anomaly, and below the ground its targets with their ellipsoids."""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+from matplotlib import colormaps
+
+from arrays.typing import ByteArray, FloatArray
+from magloc.surveying.results import Survey
+from magloc.viewer.scene.glyphs import (
+    DIPOLE_COLOUR,
+    REGION_COLOUR,
+    DipoleGlyph,
+    dots,
+    screen_label,
+    screen_lines,
+    solid,
+)
+from magloc.viewer.scene.legend import ColourScale, Entry, Swatch
+from magloc.viewer.scene.shapes import Surface, ellipsoid, joined
+
+_MOST_POINTS = 20_000
+_SCALE = colormaps["RdBu_r"]
+_GROUND_COLOUR = (150, 120, 90)
+_SHADES = 9
+
+
+def add_survey(server: viser.ViserServer, found: Survey) -> tuple[list[Entry], FloatArray]:
+    """Rows, ground and targets in a scene; lines of the legend, and points (k, 3) that should be in view."""
+    scene = server.scene
+    rows = slice(None, None, -(-len(found.rows.time_s) // _MOST_POINTS))
+    places, anomaly = found.rows.place_m[rows], found.rows.anomaly_T[rows]
+    usual, most = float(np.quantile(np.abs(anomaly), 0.8)), float(np.abs(anomaly).max())
+    shades = 0.5 + 0.5 * np.arcsinh(anomaly / usual) / np.arcsinh(most / usual) if usual else np.full(len(anomaly), 0.5)
+    low, high = places.min(axis=0), places.max(axis=0)
+    size = 0.04 * float(np.linalg.norm(high - low))
+    dots(scene, "/rows", places, _colours(shades), 0.12 * size)
+    corners = np.array([[x, y, found.ground_m] for x in (low[0], high[0]) for y in (low[1], high[1])])
+    ground = Surface(corners.astype(np.float32), np.array([[0, 2, 1], [1, 2, 3]], dtype=np.uint32))
+    solid(scene, "/ground", ground, _GROUND_COLOUR, flat=True, opacity=0.3)
+    scale = tuple((int(r), int(g), int(b)) for r, g, b in _colours(np.linspace(0.0, 1.0, _SHADES)))
+    entries: list[Entry] = [
+        ColourScale(
+            f"anomaly, linear up to {1e9 * usual:.2g} nT, then logarithmic",
+            f"{-1e9 * most:.3g} nT",
+            f"{1e9 * most:.3g} nT",
+            scale,
+        ),
+        Swatch(_GROUND_COLOUR, "ground"),
+    ]
+    if len(found):
+        for target in found:
+            DipoleGlyph(scene, f"/{target.id}", size).show(target.position_m, target.moment_Am2)
+            above = np.array([*target.position_m[:2], found.ground_m])
+            screen_label(scene, f"/{target.id}-text", f"{target.id}: {target.depth_m:.2f} m", above, "bottom-center")
+        ends = np.stack([found.position_m, found.position_m * [1.0, 1.0, 0.0] + [0.0, 0.0, found.ground_m]], axis=1)
+        screen_lines(scene, "/depths", ends, DIPOLE_COLOUR, 1.0)
+        regions = joined(ellipsoid(target.position_m, target.covariance[:3, :3]) for target in found)
+        solid(scene, "/ellipsoids", regions, REGION_COLOUR, opacity=0.4)
+        entries.append(
+            Swatch(DIPOLE_COLOUR, f"{len(found)} targets: arrows along the moments, and depths below the ground")
+        )
+        entries.append(Swatch(REGION_COLOUR, "95 % ellipsoids of their positions"))
+    return entries, np.vstack([places, corners, found.position_m])
+
+
+def _colours(shades: FloatArray) -> ByteArray:
+    """Colours (n, 3) of shades from 0 to 1."""
+    return np.asarray(255.0 * _SCALE(shades)[:, :3]).astype(np.uint8)
