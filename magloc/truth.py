@@ -89,11 +89,16 @@ def rows_of_same_time(readings: Readings, truth: Truth) -> tuple[IntArray, IntAr
     """Rows (k,) of readings and of a truth that have the same time, to a microsecond, in the order of the readings."""
     order = np.argsort(truth.time_s, kind="stable")
     times = truth.time_s[order]
-    after = np.clip(np.searchsorted(times, readings.time_s), 1, max(1, len(times) - 1))
-    before, after = after - 1, np.minimum(after, len(times) - 1)
-    nearest = np.where(np.abs(times[before] - readings.time_s) <= np.abs(times[after] - readings.time_s), before, after)
+    nearest = nearest_rows(readings.time_s, times)
     same = np.abs(times[nearest] - readings.time_s) <= SAME_TIME_S
     return np.flatnonzero(same), order[nearest[same]]
+
+
+def nearest_rows(wanted_s: FloatArray, time_s: FloatArray) -> IntArray:
+    """Row (k,) of the ascending times (n,) that is nearest to each wanted one, the earlier of two."""
+    after = np.clip(np.searchsorted(time_s, wanted_s), 1, max(1, len(time_s) - 1))
+    before, after = after - 1, np.minimum(after, len(time_s) - 1)
+    return np.where(np.abs(wanted_s - time_s[before]) <= np.abs(time_s[after] - wanted_s), before, after)
 
 
 def truth_of_rows(readings: Readings, truth: Truth) -> tuple[FloatArray, FloatArray | None]:

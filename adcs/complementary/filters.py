@@ -148,7 +148,7 @@ def inertial_magnetic_filter(
     gyro_samples : str
         As of :func:`adcs.complementary_filter`.
     offline : bool
-        Use the whole log for every instant (Rauch-Tung-Striebel), not only what was read up to it.
+        Use the whole log for every instant, not only what was read up to it.
     model : HeadingModel
         Noise and limits of the heading's filter.
 

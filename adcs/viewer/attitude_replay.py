@@ -16,6 +16,7 @@ from adcs.satellite.attitude_track import AttitudeTrack
 from adcs.satellite.satellite import Satellite
 from adcs.satellite.telemetry import Telemetry
 from arrays.typing import BoolArray, FloatArray, IntArray
+from magloc.truth import nearest_rows
 
 ENLARGEMENTS = (1.0, 10.0, 100.0, 1e3, 1e4)
 _SEEN_DEG = 10.0  # what an enlarged error or cone is at most, usually
@@ -162,9 +163,7 @@ def replay_of(
 
 def rows_at(wanted_s: FloatArray, time_s: FloatArray) -> IntArray:
     """Row of each wanted instant, −1 where there is none."""
-    after = np.clip(np.searchsorted(time_s, wanted_s), 1, max(1, len(time_s) - 1))
-    before, after = after - 1, np.minimum(after, len(time_s) - 1)
-    nearest = np.where(wanted_s - time_s[before] <= time_s[after] - wanted_s, before, after)
+    nearest = nearest_rows(wanted_s, time_s)
     same = np.abs(time_s[nearest] - wanted_s) <= _SAME_INSTANT * np.maximum(np.abs(wanted_s), 1.0)
     return np.where(same, nearest, -1)
 

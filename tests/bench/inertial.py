@@ -1,0 +1,99 @@
+"""Attitude of an inertial unit on trials of the BROAD benchmark, beside VQF and Madgwick's filter of ahrs."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import adcs
+from adcs import quaternion
+from adcs.complementary.inertial_magnetic import InertialMagneticRecord
+from adcs.complementary.orientation_errors import orientation_errors
+from adcs.io.imu_files import ImuLog
+from arrays.typing import FloatArray
+from tests.bench.table import Row
+from tests.bench.timing import Contestant, Size, Timing, installed, interleaved
+
+TITLE = "inertial unit near magnets: a trial of BROAD, three minutes, 1 thread"
+
+Solver = Callable[[InertialMagneticRecord], FloatArray]
+
+
+def rows(size: Size) -> Iterator[Row]:
+    """Errors in all and of inclination, the mean of the trials; skipped with a notice if they are not there."""
+    files = sorted((Path(os.environ.get("MAGLOC_DATA", "../shared/data")) / "broad").glob("*.mat"))[: size.problems]
+    if not files:
+        yield Row("a trial", note="skipped: the recording is not there (set MAGLOC_DATA)")
+        return
+    logs = [adcs.read_imu(path) for path in files]
+    for what, solvers in (
+        ("in real time", {"ours": _ours(offline=False), "vqf": _vqf}),
+        ("offline", {"ours": _ours(offline=True), "vqf": _offline_vqf}),
+    ):
+        if not installed("vqf"):
+            del solvers["vqf"]
+        timings = interleaved(
+            {name: Contestant(partial(solve, logs[0].record)) for name, solve in solvers.items()}, size.rounds
+        )
+        said = {name: _errors([solve(log.record) for log in logs], logs) for name, solve in solvers.items()}
+        note = said["ours"] + (f"; peer {said['vqf']}" if "vqf" in said else "")
+        yield Row(f"a trial, {what}", timings["ours"], "vqf", timings.get("vqf"), note)
+        if what == "in real time" and installed("ahrs"):
+            began = time.perf_counter()
+            found = [_madgwick(log.record) for log in logs]
+            # Seconds a trial: once is enough.
+            once = Timing(((time.perf_counter() - began) / len(logs),))
+            note = f"peer {_errors(found, logs)}"
+            yield Row("the same", Timing(timings["ours"].seconds[:1]), "ahrs, Madgwick", once, note)
+
+
+def _errors(found: list[FloatArray], logs: list[ImuLog]) -> str:
+    """Root mean squares, the mean of the trials."""
+    errors = []
+    for q, log in zip(found, logs, strict=True):
+        assert log.q_true is not None
+        rms = orientation_errors(q, log.q_true, log.moving)
+        errors.append([rms.total, rms.inclination])
+    total, inclination = np.degrees(np.mean(errors, axis=0))
+    return f"{total:.2f}°, {inclination:.2f}°"
+
+
+def _ours(*, offline: bool) -> Solver:
+    def solve(record: InertialMagneticRecord) -> FloatArray:
+        readings = record.rate_rad_s, record.acceleration_m_s2, record.field_T
+        return adcs.inertial_magnetic_filter(record.time_s, *readings, offline=offline).q
+
+    return solve
+
+
+def _readings(record: InertialMagneticRecord) -> tuple[Any, ...]:
+    """As VQF wants them."""
+    values = record.rate_rad_s, record.acceleration_m_s2, 1e6 * record.field_T
+    return tuple(np.ascontiguousarray(one) for one in values)
+
+
+def _vqf(record: InertialMagneticRecord) -> FloatArray:
+    import vqf
+
+    return np.asarray(vqf.VQF(float(np.median(record.dt_s))).updateBatch(*_readings(record))["quat9D"])
+
+
+def _offline_vqf(record: InertialMagneticRecord) -> FloatArray:
+    import vqf
+
+    return np.asarray(vqf.offlineVQF(*_readings(record), float(np.median(record.dt_s)))["quat9D"])
+
+
+def _madgwick(record: InertialMagneticRecord) -> FloatArray:
+    """With the gain of ahrs; its first axis is north."""
+    from ahrs.filters import Madgwick
+
+    readings = {"gyr": record.rate_rad_s, "acc": record.acceleration_m_s2, "mag": 1e9 * record.field_T}
+    q = Madgwick(**readings, frequency=1.0 / float(np.median(record.dt_s))).Q
+    return quaternion.multiply(quaternion.exp([0.0, 0.0, 0.5 * np.pi]), q)
