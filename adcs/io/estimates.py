@@ -26,6 +26,8 @@ def estimate_columns(track: AttitudeTrack) -> dict[str, Any]:
             for prefix, values in (("", track.states), ("sigma_", track.sigma)):
                 if state in values:
                     columns[prefix + name] = shown.scale * values[state][:, i]
+    if track.tuned_disturbance_s2 is not None:
+        columns["tuned_disturbance_s2"] = track.tuned_disturbance_s2
     for sensor, nis in track.nis.items():
         if not np.isnan(nis).all():
             columns[f"nis_{_NAMES[sensor]}"] = nis
@@ -53,6 +55,8 @@ def summary_lines(track: AttitudeTrack) -> list[str]:
             lines.append(f"{shown.words:27s}{values} {shown.unit} (1σ {sigma:.2g})")
         else:
             lines.append(f"{shown.words + ', 1σ':27s}{sigma:.2g} {shown.unit}")
+    if track.tuned_disturbance_s2 is not None:
+        lines.append(f"{'disturbance, 1σ found':27s}{track.tuned_disturbance_s2[-1]:.2g} 1/s²")
     for sensor, name in _NAMES.items():
         numbers = NIS_SIZES[sensor]
         if f"nis_{name}" in columns:

@@ -197,6 +197,7 @@ def _track(
         gated=dict(zip(SENSORS, tracks.rejected[0].T, strict=True)),
         degraded={COLLINEAR: collinear_rows(record, used, 0)},
         unseen_torque_Nm=unseen_torque_Nm(record, tracks, 0),
+        tuned_disturbance_s2=None if tracks.tuned_disturbance_s2 is None else tracks.tuned_disturbance_s2[0],
     )
 
 

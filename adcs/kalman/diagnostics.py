@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from adcs.environment.environment import Environment
-from adcs.kalman.error_state import AttitudeTracks, SensorSet, State
+from adcs.kalman.error_state import AttitudeTracks, FilterSettings, SensorSet, State
 from adcs.kalman.mekf import deviations, residuals
 from adcs.quaternion import rotate_back
 from adcs.satellite.sensors import NIS_SIZES, SENSOR_WORDS
@@ -53,6 +53,7 @@ def problems_of(record: Record, estimates: AttitudeTracks) -> tuple[tuple[Proble
     - one direction with a biased gyro,
     - readings that contradict the rest,
     - a field that does not fit its model: an error of the model, or the satellite's own field,
+    - an error of the field's model that is stated, and taken for noise of single readings,
     - innovations that the covariance does not explain,
     - residuals that last: something turns the satellite that is not in the model.
     """
@@ -67,6 +68,7 @@ def problems_of(record: Record, estimates: AttitudeTracks) -> tuple[tuple[Proble
             # The estimate is none the worse for a reading that is left out.
             *(Problem(text, ~always) for text in _rejected(estimates, run)),
             *(Problem(text, always) for text in _field_model(record, estimates, run)),
+            *(Problem(text, ~always) for text in _error_as_noise(estimates.settings)),
             *(Problem(text, always) for text in _innovations(estimates, run)),
             *(Problem(text, always) for text in _lasting(record, estimates, run)),
         )
@@ -203,6 +205,16 @@ def _field_model(record: Record, estimates: AttitudeTracks, run: int) -> list[st
     return [
         f"field differs from its model by {1e9 * largest_T:.0f} nT in modulus or angle with the Sun: error of the "
         f"model, bias or the satellite's own field; {effect}"
+    ]
+
+
+def _error_as_noise(settings: FilterSettings) -> list[str]:
+    used = settings.sensors
+    if not (used.magnetometer and settings.field_error_T > 0.0) or used.star or "field-model" in used.states:
+        return []
+    return [
+        f"an error of the field's model of {1e9 * settings.field_error_T:.0f} nT is taken for noise, which averages "
+        "out: the deviations are too small for one that lasts, which the state field-model is for"
     ]
 
 

@@ -382,6 +382,8 @@ class AttitudeTracks:
     log_det : ndarray, shape (runs, n, 4)
         Logarithm of the determinant of the innovations' covariance over that of the noise; NaN of other filters than
         the error-state filter itself.
+    tuned_disturbance_s2 : ndarray, shape (runs, n), or None
+        Standard deviation that a bank of filters has found for the disturbance; None of one filter.
     """
 
     settings: FilterSettings
@@ -392,6 +394,7 @@ class AttitudeTracks:
     nis: FloatArray
     rejected: BoolArray
     log_det: FloatArray
+    tuned_disturbance_s2: FloatArray | None = None
 
     @property
     def sigma(self) -> FloatArray:

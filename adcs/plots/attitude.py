@@ -39,6 +39,7 @@ class StatesPicture:
     values: FloatArray
     sigma: FloatArray  # (n, 30): standard deviations that the filter gives
     are_errors: bool  # whether values are errors: their band is around zero
+    tuned_disturbance_s2: FloatArray | None = None  # (n,): 1 σ of the disturbance that a bank of filters expects
     gaps: Sequence[tuple[str, BoolArray]] = ()  # (n,): what was missing, and whether it was there
 
 
@@ -58,7 +59,17 @@ def track_figure(track: AttitudeTrack, name: str = "") -> Figure:
     sigma = in_units(track.sigma) if track.sigma else np.full_like(values, np.nan)
     gaps = gaps_of(track.seen, track.used, track.degraded)
     title = f"{name}: {track.title}" if name else track.title
-    return states_figure(StatesPicture(title, track.time_s, values, sigma, are_errors=False, gaps=gaps))
+    return states_figure(
+        StatesPicture(
+            title,
+            track.time_s,
+            values,
+            sigma,
+            are_errors=False,
+            tuned_disturbance_s2=track.tuned_disturbance_s2,
+            gaps=gaps,
+        )
+    )
 
 
 def states_figure(picture: StatesPicture) -> Figure:
@@ -93,6 +104,16 @@ def states_figure(picture: StatesPicture) -> Figure:
                 lw=0.8,
                 label="error" if picture.are_errors else "estimate",
             )
+            if state == "disturbance" and not picture.are_errors and picture.tuned_disturbance_s2 is not None:
+                for way in (-scale, scale):
+                    ax.plot(
+                        picture.time_s,
+                        way * picture.tuned_disturbance_s2,
+                        color=style.ORANGE,
+                        lw=0.8,
+                        ls="--",
+                        label="±1σ that the bank found" if way > 0.0 else "_",
+                    )
             for gap, there in picture.gaps:
                 style.shade_gaps(ax, picture.time_s, there, gap)
             outside = float(np.mean(np.abs(values[settled, axis]) > wide[settled, axis]))
@@ -122,8 +143,7 @@ def states_figure(picture: StatesPicture) -> Figure:
         if len(picture.time_s) > 1:
             ax.set_xlim(picture.time_s[0], picture.time_s[-1])
         ax.xaxis.set_major_locator(MaxNLocator(4))
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    named = dict(zip(labels, handles, strict=True))
+    named = {label: handle for ax in axes[:, 0] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     style.legend(figure, handles=named.values(), labels=named.keys(), loc="outside lower center", ncols=6)
     style.headline(figure, picture.title)
     return figure

@@ -56,6 +56,8 @@ class AttitudeTrack:
         What is there and yet of little use, in words, and where.
     unseen_torque_Nm : mapping of float to float
         Amplitude of a torque below which the readings do not show it, by its period [s]; empty where not known.
+    tuned_disturbance_s2 : ndarray, shape (n,), optional
+        Standard deviation that the filter ``self-tuning`` has found for the disturbing acceleration.
 
     Examples
     --------
@@ -80,6 +82,7 @@ class AttitudeTrack:
     gated: Mapping[str, BoolArray] = field(default_factory=dict)
     degraded: Mapping[str, BoolArray] = field(default_factory=dict)
     unseen_torque_Nm: Mapping[float, float] = field(default_factory=dict)
+    tuned_disturbance_s2: FloatArray | None = None
 
     def __len__(self) -> int:
         """Return the number of instants."""
@@ -126,7 +129,7 @@ def joined(tracks: Sequence[AttitudeTrack], warning: str) -> AttitudeTrack:
 
     texts = list(dict.fromkeys(text for track in tracks for text in track.warnings))
     more = (f"and {len(texts) - _MOST_WARNINGS} more like these",) if len(texts) > _MOST_WARNINGS else ()
-    arrays = ("time_s", "q", "states", "seen", "sigma", "nis", "q_orbital", "gated", "degraded")
+    arrays = ("time_s", "q", "states", "seen", "sigma", "nis", "q_orbital", "gated", "degraded", "tuned_disturbance_s2")
     return replace(
         first,
         rows=np.concatenate([track.rows + n for track, n in zip(tracks, before, strict=True)]),

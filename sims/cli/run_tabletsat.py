@@ -169,5 +169,7 @@ def summary_lines(file: AttitudeFile, estimate: EstimatorSettings, numbers: dict
         lines.append(f"{'readings that are not used':34s}{numbers['rejected']}, {good}")
     lines.append(f"{'NEES / numbers (1 is consistent)':34s}{numbers['nees_per_dimension']:.3g}")
     lines.append(f"{'diverged runs':34s}{numbers['diverged_runs']}")
+    if numbers["tuned_disturbance_s2"] is not None:
+        lines.append(f"{'disturbance, 1σ found, median':34s}{numbers['tuned_disturbance_s2']:.2g} 1/s²")
     lines += unseen_line({period: numbers[f"unseen_torque_{period:g}s_Nm"] for period in PERIODS_S})
     return lines

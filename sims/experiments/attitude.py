@@ -62,6 +62,8 @@ class Outcome:
         NaN where nothing is.
     rejected, rejected_good : ndarray of int, shape (runs,)
         Readings that the filter did not use, and those of them that are not wild.
+    tuned_disturbance_s2 : ndarray, shape (runs,)
+        What the filter ``self-tuning`` has found at the end, 1 σ; NaN of others.
     unseen_torque_Nm : dict of float to float
         Amplitude below which a torque does not show in the readings, by its period [s]; the largest of all runs.
     warnings : list of list of str
@@ -79,6 +81,7 @@ class Outcome:
     worst_deg: FloatArray
     rejected: NDArray[np.int64]
     rejected_good: NDArray[np.int64]
+    tuned_disturbance_s2: FloatArray
     unseen_torque_Nm: dict[float, float]
     warnings: list[list[str]]
 
@@ -101,7 +104,7 @@ class Outcome:
 
     def numbers(self) -> dict[str, Any]:
         """What ``--json`` prints: every axis' mean over the runs, and of these the worst axis."""
-        mean = worst_axis(self.axis_rms.mean(axis=0))
+        mean, tuned = worst_axis(self.axis_rms.mean(axis=0)), np.median(self.tuned_disturbance_s2)
         names = (
             *("angle_rms_deg", "rate_rms_deg_s", "gyro_bias_rms_deg_s"),
             *(
@@ -120,6 +123,7 @@ class Outcome:
             "worst_deg": None if np.isnan(self.worst_deg).all() else float(np.nanmax(self.worst_deg)),
             "rejected": int(self.rejected.sum()),
             "rejected_good": int(self.rejected_good.sum()),
+            "tuned_disturbance_s2": None if np.isnan(tuned) else float(tuned),
             **{f"unseen_torque_{period:g}s_Nm": torque for period, torque in self.unseen_torque_Nm.items()},
         }
 
@@ -204,7 +208,8 @@ def run_scenario(
         if advance is not None:
             advance(len(outcome.seeds))
         del part, outcome  # or two would be in memory while the next one is made
-    of_runs = ("seeds", "axis_rms", "nees", "nis", "error_deg", "diverged", "worst_deg", "rejected", "rejected_good")
+    of_runs: tuple[str, ...] = ("seeds", "axis_rms", "nees", "nis", "error_deg", "diverged", "worst_deg", "rejected")
+    of_runs += ("rejected_good", "tuned_disturbance_s2")
     joined: dict[str, Any] = {name: np.concatenate([getattr(one, name) for one in outcomes]) for name in of_runs}
     joined["unseen_torque_Nm"] = _largest(one.unseen_torque_Nm for one in outcomes)
     return replace(outcomes[0], **joined, warnings=[texts for one in outcomes for texts in one.warnings])
@@ -242,6 +247,9 @@ def outcome_of(part: Part) -> Outcome:
         worst_deg=np.array([_worst(*of_run, first) for of_run in zip(error_deg, problems, strict=True)]),
         rejected=estimates.rejected.sum(axis=(1, 2)),
         rejected_good=(estimates.rejected & ~wild).sum(axis=(1, 2)),
+        tuned_disturbance_s2=np.full(len(runs.q), np.nan)
+        if estimates.tuned_disturbance_s2 is None
+        else estimates.tuned_disturbance_s2[:, -1],
         unseen_torque_Nm=_largest(unseen_torque_Nm(runs, estimates, run) for run in range(len(runs.q))),
         warnings=[[problem.text for problem in of_run] for of_run in problems],
     )

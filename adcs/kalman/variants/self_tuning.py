@@ -39,7 +39,7 @@ def run_self_tuned(record: Record, settings: FilterSettings, start: Start) -> At
     noise = replace(settings.noise, rate_rad_s=_RATE_NOISE_RAD_S, disturbance_s2=0.0)
     one = replace(settings, noise=noise, disturbance_correlation_s=CORRELATION_S)
     bank = [run_filter(record, replace(one, disturbance_sigma_s2=float(sigma)), start) for sigma in DISTURBANCES_S2]
-    return mixture(bank, weights(bank, record))
+    return mixture(bank, weights(bank, record), DISTURBANCES_S2)
 
 
 def weights(bank: list[AttitudeTracks], record: Record) -> FloatArray:
@@ -52,8 +52,11 @@ def weights(bank: list[AttitudeTracks], record: Record) -> FloatArray:
     return np.asarray(softmax(log_weight, axis=0))
 
 
-def mixture(bank: list[AttitudeTracks], weight: FloatArray) -> AttitudeTracks:
-    """Mean and covariance of the estimates of filters with weights (filters, runs, n)."""
+def mixture(bank: list[AttitudeTracks], weight: FloatArray, deviations_s2: FloatArray) -> AttitudeTracks:
+    """Mean and covariance of the estimates of filters with weights (filters, runs, n).
+
+    ``deviations_s2`` (filters,): of the disturbance that each expects.
+    """
     settings, first = bank[0].settings, bank[len(bank) // 2]
     names = settings.sensors.states
     off = np.stack(
@@ -85,4 +88,6 @@ def mixture(bank: list[AttitudeTracks], weight: FloatArray) -> AttitudeTracks:
         np.sum(weight[..., None] * nis, axis=0),
         np.take_along_axis(np.stack([one.rejected for one in bank]), best, axis=0)[0],
         np.full(nis.shape[1:], np.nan),
+        # The weighted mean of the decades, as the bank's steps are alike in them.
+        np.exp(np.tensordot(np.log(deviations_s2), weight, axes=1)),
     )

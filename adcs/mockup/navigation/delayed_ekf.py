@@ -55,10 +55,8 @@ class FilterSettings:
     fix_gate : float
         Largest normalised innovation squared of a fix, a χ² of 3 numbers: 25 rejects one good fix in 65,000.
     reacquire_after : int
-        Rejected fixes in a row that make the filter give up.
-    agree_rad, agree_m, agree_m_s : float
-        Fixes agree where the heading between them changes as the gyro says but for ``agree_rad``, and the position by
-        no more than ``agree_m`` and ``agree_m_s`` times the time between them.
+        A rejected fix begins a second hypothesis, in which it is right; it is believed once it has taken so many fixes
+        in a row, of the last ``buffer_s``, which the estimate rejects.
     buffer_s : float
         How old a fix may be.
     """
@@ -78,9 +76,6 @@ class FilterSettings:
     fix_rad: float = math.radians(0.1)
     fix_gate: float = 25.0
     reacquire_after: int = 3
-    agree_rad: float = math.radians(2.0)
-    agree_m: float = 0.01
-    agree_m_s: float = 0.5
     buffer_s: float = 10.0
     sample_gate: Gate = Gate()  # noqa: RUF009 - frozen
 
@@ -128,7 +123,7 @@ class StartSigma:
 
 
 LOST = StartSigma(position_m=10.0, velocity_m_s=0.5, heading_rad=math.pi)
-"""Where the filter gives up: position, velocity and heading of this are put in place of the estimate's."""
+"""Of position, velocity and heading of a second hypothesis, before the fix that begins it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,11 +191,10 @@ def predicted(
 
 @dataclass(eq=False)
 class _Taken:
-    """A fix of the history, what became of it, and the heading that was predicted for it."""
+    """A fix of the history, and what became of it."""
 
     fix: Fix
     outcome: Outcome
-    heading_rad: float
 
 
 class DelayedFilter:
@@ -327,7 +321,7 @@ class DelayedFilter:
         if fix.time_s < now - self.settings.buffer_s or fix.time_s <= self._time_s[0]:
             return Outcome.TOO_OLD
         row = self._row_at(fix.time_s) - 1
-        taken = _Taken(fix, Outcome.USED, math.nan)
+        taken = _Taken(fix, Outcome.USED)
         place = bisect_left(self._history, fix.time_s, key=lambda entry: entry.fix.time_s)
         self._history.insert(place, taken)
         for later in range(place, len(self._history)):
@@ -342,48 +336,62 @@ class DelayedFilter:
 
     def _correct(self, row: int, place: int) -> float:
         """Correct the estimate of a row by a fix of the history, or leave the fix out; its normalised innovation²."""
-        s, taken = self.settings, self._history[place]
-        fix, x = taken.fix, self._x[row]
-        taken.heading_rad = float(x[4])
-        innovation = np.append(fix.position_m - x[0:2], wrapped(fix.heading_rad - x[4]))
-        variance = np.square([s.fix_m, s.fix_m, s.fix_rad] if fix.sigma is None else fix.sigma)
-        S = symmetric_square_root(self._P[row])
-        nis = normalised_innovation_squared(S, H_FIX, innovation, variance)
+        taken = self._history[place]
+        x, P, nis = self._with_fix(self._x[row], self._P[row], taken.fix)
         taken.outcome = Outcome.USED
-        if not nis <= s.fix_gate:
-            taken.outcome = Outcome.REACQUIRED if self._is_lost(place) else Outcome.REJECTED
-        if taken.outcome is Outcome.REJECTED:
-            return nis
-        if taken.outcome is Outcome.REACQUIRED:
-            P = LOST.covariance
-            P[5:, 5:] = self._P[row, 5:, 5:]
-            S = symmetric_square_root(P)
-        self._x[row], S = block_update(x, S, H_FIX, innovation, variance)
-        self._P[row] = S @ S.T
+        if not nis <= self.settings.fix_gate:
+            second = self._second(place)
+            taken.outcome = Outcome.REJECTED if second is None else Outcome.REACQUIRED
+            if second is None:
+                return nis
+            x, P = second
+        self._x[row], self._P[row] = x, P
         return nis
 
-    def _is_lost(self, place: int) -> bool:
-        """Whether a rejected fix and those before it were rejected in a row, and agree."""
+    def _with_fix(self, x: FloatArray, P: FloatArray, fix: Fix) -> tuple[FloatArray, FloatArray, float]:
+        """Estimate and covariance with a fix, and its normalised innovation²."""
         s = self.settings
-        first = place - s.reacquire_after + 1
-        if first < 0 or any(entry.outcome is not Outcome.REJECTED for entry in self._history[first:place]):
-            return False
-        row = self._history[first : place + 1]
-        for one, two in pairwise(row):
-            turn = two.fix.heading_rad - one.fix.heading_rad - (two.heading_rad - one.heading_rad)
-            moved = float(np.linalg.norm(two.fix.position_m - one.fix.position_m))
-            reach = s.agree_m + s.agree_m_s * (two.fix.time_s - one.fix.time_s)
-            if abs(float(wrapped(turn))) > s.agree_rad or moved > reach:
-                return False
-        return True
+        innovation = np.append(fix.position_m - x[0:2], wrapped(fix.heading_rad - x[4]))
+        variance = np.square([s.fix_m, s.fix_m, s.fix_rad] if fix.sigma is None else fix.sigma)
+        S = symmetric_square_root(P)
+        nis = normalised_innovation_squared(S, H_FIX, innovation, variance)
+        x, S = block_update(x, S, H_FIX, innovation, variance)
+        return x, S @ S.T, nis
 
-    def _predict(self, first: int, last: int) -> None:
-        """Predict rows, with the noises of what is lost in each of them."""
+    def _second(self, place: int) -> tuple[FloatArray, FloatArray] | None:
+        """The hypothesis that the first of the last rejected fixes began, if it has taken all of them; else None.
+
+        It is run when it is asked for: fixes arrive late, and change the order of those that were rejected.
+        """
+        first = place - self.settings.reacquire_after + 1
+        rejected = self._history[max(first, 0) : place]
+        if first < 0 or any(entry.outcome is not Outcome.REJECTED for entry in rejected):
+            return None
+        row = self._row_at(self._history[first].fix.time_s)
+        P = LOST.covariance
+        P[5:, 5:] = self._P[row, 5:, 5:]
+        x, P, _ = self._with_fix(self._x[row], P, self._history[first].fix)
+        for taken in self._history[first + 1 : place + 1]:
+            later = self._row_at(taken.fix.time_s)
+            rows_x, rows_P = np.empty((later - row + 1, N)), np.empty((later - row + 1, N, N))
+            rows_x[0], rows_P[0] = x, P
+            self._predict(row, later, rows_x, rows_P)
+            x, P, nis = self._with_fix(rows_x[-1], rows_P[-1], taken.fix)
+            if not nis <= self.settings.fix_gate:
+                return None
+            row = later
+        return x, P
+
+    def _predict(self, first: int, last: int, x: FloatArray | None = None, P: FloatArray | None = None) -> None:
+        """Predict rows, of the estimate or of another that begins with the first, with the noises of what is lost."""
+        rows = slice(first, last + 1)
+        x, P = self._x[rows] if x is None else x, self._P[rows] if P is None else P
         lost = self._lost[first + 1 : last + 1]
-        changes = first + 1 + np.flatnonzero((lost[1:] != lost[:-1]).any(axis=1))
-        for begin, end in pairwise([first, *changes.tolist(), last]):
-            densities = self._densities[*self._lost[end].astype(np.intp)]
-            predict_rows(begin, end, self._time_s, self._readings, self._there, densities, self._x, self._P)
+        changes = 1 + np.flatnonzero((lost[1:] != lost[:-1]).any(axis=1))
+        read = self._time_s[rows], self._readings[rows], self._there[rows]
+        for begin, end in pairwise([0, *changes.tolist(), last - first]):
+            densities = self._densities[*self._lost[first + end].astype(np.intp)]
+            predict_rows(begin, end, *read, densities, x, P)
 
     def _row_at(self, time_s: float) -> int:
         """Row of an instant; an interval that holds it is cut there."""
@@ -413,4 +421,4 @@ class DelayedFilter:
             setattr(self, name, new)
         self._n = kept
         forgotten = bisect_right(self._history, self._time_s[0], key=lambda entry: entry.fix.time_s)
-        del self._history[: max(0, forgotten - self.settings.reacquire_after)]
+        del self._history[:forgotten]

@@ -600,6 +600,9 @@ class TestProblems:
         assert np.mean(named) > 0.9
         inflated = run_filter(runs, replace(chosen, field_error_T=400e-9), start_of(runs))
         assert (evaluate(runs, inflated)["nees_per_dimension"] or 9e9) < 0.5 * (reached["nees_per_dimension"] or 0.0)
+        sentence = "an error of the field's model of 400 nT is taken for noise"
+        assert all(any(sentence in one for one in of_run) for of_run in warnings_of(runs, inflated))
+        assert not any(sentence in one for of_run in warnings_of(runs, estimates) for one in of_run)
 
     def test_star_tracker_over_rate_and_blinded(self) -> None:
         fast = replace(tabletsat(100.0), start_rate_rad_s=math.radians(2.5))

@@ -34,6 +34,7 @@ KEYS = [
     "worst_deg",
     "rejected",
     "rejected_good",
+    "tuned_disturbance_s2",
     "unseen_torque_100s_Nm",
     "unseen_torque_300s_Nm",
     "unseen_torque_1000s_Nm",
@@ -50,7 +51,7 @@ def numbers(outcome):
 class TestNumbers:
     def test_keys_and_nulls(self, adcs):
         found = numbers(adcs("run", "tabletsat", "--json", "--seeds", "2", "--sensors", "st"))
-        assert [key for key in KEYS if found[key] is None] == [*KEYS[2:8], "worst_deg"]
+        assert [key for key in KEYS if found[key] is None] == [*KEYS[2:8], "worst_deg", "tuned_disturbance_s2"]
         assert (found["runs"], found["diverged_runs"]) == (2, 0)
 
     def test_text_tells_every_number_that_there_is(self, adcs):
@@ -152,6 +153,7 @@ class TestNumbers:
             "worst_deg": None,
             "rejected": 0,
             "rejected_good": 0,
+            "tuned_disturbance_s2": None,
             "unseen_torque_100s_Nm": unseen[0],
             "unseen_torque_300s_Nm": unseen[1],
             "unseen_torque_1000s_Nm": unseen[2],

@@ -13,6 +13,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import adcs
+from adcs.io.estimates import estimate_columns
 from adcs.kalman.mekf import run_filter
 from adcs.kalman.variants.self_tuning import DISTURBANCES_S2, mixture, run_self_tuned, weights
 from magloc.chi_square import normalised_square
@@ -53,6 +55,22 @@ class TestConsistency:
         assert normalised_square(error, tracks.covariance[:, 240:, :3, :3]).mean() / 3.0 > 4.0
 
 
+class TestResult:
+    def test_what_was_found_is_in_the_result(self) -> None:
+        """Of swings of 8e-7 N·m on 0.5 to 0.7 kg·m², 8e-7 s⁻² rms, within a step or two; one filter finds none."""
+        runs = runs_with(8e-7, 100.0, 600.0, 1)
+        log, satellite = adcs.Telemetry.of(runs, runs.satellite.start), runs.satellite
+        track = adcs.estimate(log, satellite, sensors="st", filter="self-tuning")
+        assert track.tuned_disturbance_s2 is not None
+        assert 2e-7 < track.tuned_disturbance_s2[-1] < 4e-6
+        assert f"disturbance, 1σ found      {track.tuned_disturbance_s2[-1]:.2g} 1/s²" in repr(track)
+        assert "tuned_disturbance_s2" in estimate_columns(track)
+        assert "±1σ that the bank found" in {text.get_text() for text in track.plot().legends[0].get_texts()}
+        one = adcs.estimate(log, satellite, sensors="st", states=["disturbance"])
+        assert one.tuned_disturbance_s2 is None
+        assert "1σ found" not in repr(one)
+
+
 class TestBank:
     def test_a_larger_torque_is_found_to_be_larger(self) -> None:
         chosen, largest = settings("st", ["disturbance"]), []
@@ -78,10 +96,12 @@ class TestBank:
         one = run_filter(runs, chosen, start_of(runs))
         other = replace(one, w=one.w + np.array([2e-3, 0.0, 0.0]))
         weight = np.stack([np.full(one.w.shape[:2], share) for share in (0.25, 0.75)])
-        mean = mixture([one, other], weight)
+        mean = mixture([one, other], weight, np.array([1e-7, 1e-5]))
         np.testing.assert_allclose(mean.w - one.w, np.broadcast_to([1.5e-3, 0.0, 0.0], one.w.shape), atol=1e-15)
         np.testing.assert_allclose(mean.covariance[..., 3, 3] - one.covariance[..., 3, 3], 0.75e-6, rtol=1e-9)
         np.testing.assert_allclose(mean.q, one.q, atol=1e-15)
+        # Three quarters of the way from 1e-7 to 1e-5, in decades.
+        np.testing.assert_allclose(mean.tuned_disturbance_s2, 10.0**-5.5, rtol=1e-12)
 
     def test_needs_a_disturbance(self) -> None:
         runs = runs_with(8e-7, math.inf, 5.0, 1)

@@ -369,6 +369,15 @@ class TestFalseFixes:
         assert outcomes[5:11] == (Outcome.REJECTED,) * 6
         assert set(outcomes[11:]) == {Outcome.USED}
 
+    def test_false_fixes_that_move_as_nothing_can_do_not_either(self) -> None:
+        """Right headings, and places that jump to and fro by 0.2 m: no velocity takes three of them."""
+        _, _, imu, fixes = self.world()
+        position = fixes.position_m.copy()
+        position[5:11] += 0.3 + 0.1 * (-1.0) ** np.arange(6)[:, None]
+        outcomes = fuse(DelayedFilter(START, 0.0), imu, replace(fixes, position_m=position)).outcomes
+        assert outcomes[5:11] == (Outcome.REJECTED,) * 6
+        assert set(outcomes[11:]) == {Outcome.USED}
+
 
 class TestArrival:
     def test_duplicates_old_ones_and_those_ahead(self) -> None:
