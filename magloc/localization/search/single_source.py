@@ -27,7 +27,6 @@ from magloc.localization.search import single_source_compiled as kernels
 from magloc.localization.search.candidates import SingleArray, allowed_positions, chosen_candidates, linear_bases
 from magloc.measurement.rows import WhitenedRows, channels_above_ambient, check_magnitudes, whitened_rows
 from magloc.measurement.whitened import WhitenedModel
-from magloc.measurement.whitened_compiled import LaneModel, signals
 
 N_UNKNOWNS = 6
 _MORE = 3  # times the starts where none of them explains a row
@@ -170,12 +169,12 @@ class SingleSourceSearch:
         over_rows(
             kernels.search_rows,
             len(starts),
-            signals(model, rows.y),
+            rows.signal,
             reading_of_row,
             starts,
             keep_within,
             self.max_iterations,
-            LaneModel.of(model),
+            rows.lanes,
             found,
         )
         return found
