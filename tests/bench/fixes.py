@@ -82,12 +82,13 @@ def growth(size: Size) -> Iterator[Row]:
     The slope is that of the logarithms: 0 where a row costs the same, 1 where it grows in proportion.
     """
     rng = np.random.default_rng(5)
-    of_sensors, numbers = {n: on_a_sphere(n) for n in (4, 8, 16, 32, 64)}, (1, 10, 100, 1000)
+    of_sensors, numbers = (
+        {n: on_a_sphere(n) for n in (4, 8, 16, 32, 64)},
+        sorted({min(n, size.rows) for n in (1, 10, 100, 1000)}),
+    )
     four = of_sensors[4]
     several, few = simulated(four, size.rows, rng)[1], max(1, size.rows // 10)
-    yield from _grown(
-        "rows at once", {n: stages(four.array, several[:n]) for n in numbers if n <= size.rows}, size.rounds
-    )
+    yield from _grown("rows at once", {n: stages(four.array, several[:n]) for n in numbers}, size.rounds)
     yield from _grown(
         "sensors",
         {n: stages(of_n.array, simulated(of_n, few, rng)[1]) for n, of_n in of_sensors.items()},

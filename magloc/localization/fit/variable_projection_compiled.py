@@ -37,7 +37,7 @@ from magloc.measurement.whitened_compiled import SMALLEST_S, LaneModel, signals
 # How a refinement ends.
 RUNNING, CONVERGED, FAILED = 0.0, 1.0, 2.0
 # Gauss-Newton gain in χ² at which an optimum is one: the position is then within 1e-5 σ of it.
-OPTIMUM_TOLERANCE = 1e-11
+OPTIMUM_TOLERANCE = 1e-10
 # Two ends are one optimum 0.01 rad apart on the sphere of homogeneous coordinates, at the same χ².
 SAME_COS, SAME_CHI2 = 0.99995, 0.01
 

@@ -72,7 +72,8 @@ class SingleSourceSearch:
     apart_rad : float
         Least distance of two candidates, as an angle of their homogeneous coordinates.
     max_iterations : int
-        Linearisations of one refinement at most; a refinement that needs more did not converge.
+        Linearisations of one refinement to near an optimum at most, and three times as many from there on; a refinement
+        that needs more did not converge.
     prior : SourcePrior
         Bounds of the source's position and moment.
 

@@ -21,6 +21,8 @@ from magloc.measurement.whitened_compiled import LaneModel
 
 # Gauss-Newton gain in χ² at which a start is so near an optimum that others are known to lead to the same.
 _NEAR_TOLERANCE = 1e-2
+# Times the linearisations that one of these may take from there on: along a flat valley steps hardly get shorter.
+_LONGER = 3.0
 
 
 class Ends(NamedTuple):
@@ -168,7 +170,7 @@ def search_rows(
     ends = Refined(
         np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_)
     )  # fmt: skip
-    refine(signal, reading[:n], near.q[:n], model, 1.0, OPTIMUM_TOLERANCE, float(max_iterations), ends)
+    refine(signal, reading[:n], near.q[:n], model, 1.0, OPTIMUM_TOLERANCE, _LONGER * max_iterations, ends)
     for row in range(begin, end):
         first, last = first_end[row - begin], first_end[row - begin + 1]
         for k in range(first, last):
