@@ -18,6 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -117,14 +118,26 @@ def block_update(
     :math:`S^+ = S (I - Φ^T L^{-T} (L + I)^{-1} Φ)`: A. Andrews, "A square root formulation of the Kalman covariance
     equations", AIAA Journal 6 (1968) 1165. For one scalar it is Potter's.
     """
-    sigma = np.sqrt(variance)
-    phi = (H / sigma[:, None]) @ S
+    return _whitening_update(x, S, H, innovation, variance)[:2]
+
+
+def _whitening_update(
+    x: FloatArray, S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """:func:`block_update`, and the :func:`whitened_innovation` that it needs."""
+    phi, L = _scaled_innovation_root(S, H, variance)
+    unit = np.eye(len(L))
+    solved = np.linalg.solve(L, np.concatenate([phi, (innovation / np.sqrt(variance))[:, None]], axis=1))
+    spread, whitened = S @ solved[:, :-1].T, solved[:, -1]
+    return x + spread @ whitened, S - spread @ np.linalg.solve(L + unit, phi), whitened
+
+
+def _scaled_innovation_root(S: FloatArray, H: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """:math:`Φ = R^{-1/2} H S`, and the lower triangular L of :math:`L L^T = I + Φ Φ^T`."""
+    phi = (H / np.sqrt(variance)[:, None]) @ S
     # By an orthogonal factorisation: I + Φ Φᵀ itself would lose the digits of a prediction that is hardly known.
-    upper = np.asarray(np.linalg.qr(np.concatenate([np.eye(sigma.size), phi.T]), mode="r"))
-    L = upper.T * np.sign(np.diagonal(upper))
-    solved = np.linalg.solve(L, np.column_stack([phi, innovation / sigma]))
-    spread = S @ solved[:, :-1].T
-    return x + spread @ solved[:, -1], S - spread @ np.linalg.solve(L + np.eye(sigma.size), phi)
+    upper = np.asarray(np.linalg.qr(np.concatenate([np.eye(len(phi)), phi.T]), mode="r"))
+    return phi, upper.T * np.sign(np.diagonal(upper))
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,31 +217,24 @@ def iterated_update(
     """
     x_k, predicted = x, Hx(x)
     innovation = z - predicted
-    S_k, H, linearised = S, np.zeros((len(z), len(x))), innovation
+    S_k, whitened = S, innovation / np.sqrt(variance)
     iteration, change, length = 0, np.inf, 1.0
     while iteration < max_iterations and np.isfinite(predicted).all() and not change < tolerance:
         iteration += 1
         H = HJacobian(x_k)
-        linearised = z - predicted - H @ (x - x_k)
-        optimum, S_k = block_update(x, S, H, linearised, variance)
+        optimum, S_k, whitened = _whitening_update(x, S, H, z - predicted - H @ (x - x_k), variance)
         x_k = optimum if length == 1.0 else x_k + length * (optimum - x_k)
         before, predicted = predicted, Hx(x_k)
         change_before, change = change, float(np.linalg.norm(predicted - before)) / length
         if change >= change_before:
             length *= shrink
-    whitened = whitened_innovation(S, H, linearised, variance)
-    nis = float(whitened @ whitened)
-    return IteratedUpdate(x_k, S_k, iteration, change < tolerance, innovation, nis, whitened)
+    return IteratedUpdate(x_k, S_k, iteration, change < tolerance, innovation, float(whitened @ whitened), whitened)
 
 
 def whitened_innovation(S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray) -> FloatArray:
     """``L⁻¹ ν`` (k,) of an innovation ν with its covariance ``L Lᵀ = H S Sᵀ Hᵀ + R``, L lower triangular."""
-    sigma = np.sqrt(variance)
-    # As in block_update, so that a prediction that is hardly known does not swallow the noise.
-    phi = (H / sigma[:, None]) @ S
-    upper = np.asarray(np.linalg.qr(np.concatenate([np.eye(sigma.size), phi.T]), mode="r"))
-    L = upper.T * np.sign(np.diagonal(upper))
-    return np.asarray(np.linalg.solve(L, innovation / sigma))
+    _, L = _scaled_innovation_root(S, H, variance)
+    return np.asarray(np.linalg.solve(L, innovation / np.sqrt(variance)))
 
 
 def normalised_innovation_squared(S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray) -> float:
@@ -383,22 +389,15 @@ class IteratedExtendedKalmanFilter:
         noise = np.asarray(self.R if R is None else R, dtype=np.float64)
         covariance = noise if noise.ndim == 2 else np.diag(np.broadcast_to(noise, z.shape))
         variance = np.diagonal(covariance)
-        T = np.eye(z.size)
-        if np.count_nonzero(covariance - np.diag(variance)):
-            variance, vectors = np.linalg.eigh(covariance)
-            T = vectors.T
-        result = iterated_update(
-            self.x,
-            self.S,
-            T @ z,
-            variance,
-            lambda x: T @ Hx(x),
-            lambda x: T @ HJacobian(x),
-            tolerance=self.tolerance,
-            max_iterations=self.max_iterations,
-        )
-        self.x, self.S = result.x, result.S
-        self.y, self.nis = T.T @ result.innovation, result.nis
+        update = partial(iterated_update, self.x, self.S, tolerance=self.tolerance, max_iterations=self.max_iterations)
+        if np.count_nonzero(covariance) == np.count_nonzero(variance):
+            result = update(z, variance, Hx, HJacobian)
+            self.y = result.innovation
+        else:
+            variance, T = np.linalg.eigh(covariance)
+            result = update(T.T @ z, variance, lambda x: T.T @ Hx(x), lambda x: T.T @ HJacobian(x))
+            self.y = T @ result.innovation
+        self.x, self.S, self.nis = result.x, result.S, result.nis
         self.iterations, self.converged = result.iterations, result.converged
         self.x_post, self.P_post = self.x.copy(), self.P
 
@@ -410,7 +409,7 @@ def symmetric_square_root(covariance: FloatArray) -> FloatArray:
     deviation = np.sqrt(np.clip(np.diagonal(covariance), 0.0, None))
     scale = np.where(deviation > 0.0, deviation, 1.0)
     correlation = covariance / np.outer(scale, scale)
-    if not np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-9):
+    if not np.abs(correlation - correlation.T).max(initial=0.0) <= 1e-9:
         raise ValueError("Input covariance must be symmetric; instead received a matrix that is not.")
     eigenvalue, eigenvector = np.linalg.eigh(correlation)
     if eigenvalue[0] < -1e-9 * max(1.0, eigenvalue[-1]):

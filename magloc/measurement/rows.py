@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +15,7 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from arrays.whitening import Whitening, whitening, whitenings
 from magloc.measurement.known_moment import KnownMoment
 from magloc.measurement.whitened import WhitenedModel
+from magloc.measurement.whitened_compiled import LaneModel, signals
 
 NO_SIGNAL = "the sensors' readings do not differ: no signal"
 # Mean square of whitened differences below which they are rounding errors rather than noise.
@@ -68,6 +70,16 @@ class WhitenedRows:
     def knowing(self, moment: KnownMoment | None) -> WhitenedRows:
         """The same where the moment of every source is known."""
         return replace(self, model=replace(self.model, known=moment)) if moment is not None else self
+
+    @cached_property
+    def lanes(self) -> LaneModel:
+        """The model for compiled kernels."""
+        return LaneModel.of(self.model)
+
+    @cached_property
+    def signal(self) -> FloatArray:
+        """Whitened readings for compiled kernels: (b, s, 3)."""
+        return signals(self.model, self.y)
 
     @property
     def silent(self) -> BoolArray:

@@ -103,6 +103,9 @@ def signals(model: WhitenedModel, y: FloatArray) -> FloatArray:
     """Whitened readings (b, C) as those of a :class:`LaneModel`: (b, s, 3)."""
     place, known, n_sensors = _threes(model)
     result = np.zeros((len(y), 3 * n_sensors))
+    if not known.size:
+        result[:, place] = y
+        return result.reshape(len(y), n_sensors, 3)
     basis, shrinkage = model.basis[:, :, known], model.shrinkage[:, known]
     along = np.einsum("bck,bc->bk", basis, y)
     result[:, place] = y - np.einsum("bck,bk->bc", basis, shrinkage * along)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+import math
+from collections.abc import Iterator, Mapping, Sequence
 
 import numba
 import numpy as np
@@ -13,7 +13,11 @@ from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
 from arrays.sensor import Sensor
 from magloc.directions import fibonacci_directions
+from magloc.localization.search.candidates import candidate_positions
+from magloc.localization.search.single_source import SingleSourceSearch
+from magloc.localization.uncertainty.covariance import solutions_of
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
+from magloc.measurement.rows import whitened_rows
 from tests.bench.table import Row
 from tests.bench.timing import Contestant, Size, interleaved
 from tests.plain_locator import plain_locator
@@ -73,32 +77,62 @@ def rows(size: Size) -> Iterator[Row]:
 
 
 def growth(size: Size) -> Iterator[Row]:
-    """How the time of a fix grows with the rows that are fitted at once, and with the sensors.
+    """How the time that a row takes in every stage of a fix grows with the rows at once, the sensors and the grid.
 
-    The slope is that of the logarithms: 0 where a fix costs the same, 1 where it grows in proportion.
+    The slope is that of the logarithms: 0 where a row costs the same, 1 where it grows in proportion.
     """
-    measurement = DifferenceMeasurement.of(tetrahedron(1.5, noise_T=1e-9))
-    _, readings = simulated(measurement, size.rows, np.random.default_rng(5))
-    locator = plain_locator(measurement.array)
-    numbers = sorted({min(n, size.rows) for n in (1, 10, 100, 1000)})
-    yield from _grown("rows at once", [(n, partial(locator.fit_rows, readings[:n]), n) for n in numbers], size.rounds)
-    runs = []
-    for n in (4, 8, 16, 32, 64):
-        places = 1.5 * fibonacci_directions(n)
-        sensors = [Sensor(id=f"s{i}", kind="vector", position_m=p, noise_T=1e-9) for i, p in enumerate(places)]
-        of_n = DifferenceMeasurement.of(SensorArray(tuple(sensors), noise_fraction=1e-4))
-        _, of_rows = simulated(of_n, max(1, size.rows // 10), np.random.default_rng(6))
-        runs.append((n, partial(plain_locator(of_n.array, body_length_m=0.0).fit_rows, of_rows), len(of_rows)))
-    yield from _grown("sensors, noise of its own in every row", runs, size.rounds)
+    rng = np.random.default_rng(5)
+    of_sensors, numbers = (
+        {n: on_a_sphere(n) for n in (4, 8, 16, 32, 64)},
+        sorted({min(n, size.rows) for n in (1, 10, 100, 1000)}),
+    )
+    four = of_sensors[4]
+    several, few = simulated(four, size.rows, rng)[1], max(1, size.rows // 10)
+    yield from _grown("rows at once", {n: stages(four.array, several[:n]) for n in numbers}, size.rounds)
+    yield from _grown(
+        "sensors",
+        {n: stages(of_n.array, simulated(of_n, few, rng)[1]) for n, of_n in of_sensors.items()},
+        size.rounds,
+    )
+    grids = [candidate_positions(four.array, n_directions=n) for n in (50, 150, 450, 1350)]
+    yield from _grown("candidates", {len(c): stages(four.array, several[:few], c) for c in grids}, size.rounds)
 
 
-def _grown(what: str, runs: Sequence[tuple[int, Callable[[], object], int]], rounds: int) -> Iterator[Row]:
-    """A row for every number of something, its run and the fixes of that; the last with the slope over all of them."""
-    timings = interleaved({str(n): Contestant(run, 1, count) for n, run, count in runs}, rounds)
-    numbers = [n for n, _, _ in runs]
-    slope = float(np.polyfit(np.log(numbers), np.log([timings[str(n)].best for n in numbers]), 1)[0])
-    for n in numbers:
-        yield Row(f"a fix, {n:,} {what}", timings[str(n)], note=f"slope {slope:.2f}" if n == numbers[-1] else "")
+def on_a_sphere(n: int) -> DifferenceMeasurement:
+    """Sensors whose noise grows with the field, so that every row has a whitening of its own."""
+    places = 1.5 * fibonacci_directions(n)
+    sensors = [Sensor(id=f"s{i}", kind="vector", position_m=p, noise_T=1e-9) for i, p in enumerate(places)]
+    return DifferenceMeasurement.of(SensorArray(tuple(sensors), noise_fraction=1e-4))
+
+
+def stages(array: SensorArray, readings: np.ndarray, candidates: np.ndarray | None = None) -> dict[str, Contestant]:
+    """What makes fixes of readings (n, C), alone and all together, with other candidates (k, 3) if they are given."""
+    locator = plain_locator(array, body_length_m=0.0)
+    search = locator._search
+    assert isinstance(search, SingleSourceSearch)
+    if candidates is not None:
+        search._candidates = candidates
+    (rows,) = whitened_rows(array, readings, None, len(readings))
+    (optima,) = search.optima(rows)
+    starts, n = search.starts(rows), len(readings)
+    return {
+        "whitening": Contestant(lambda: list(whitened_rows(array, readings, None, n)), 1, n),
+        "choice of starts": Contestant(lambda: search.starts(rows), 1, n),
+        "refinement": Contestant(lambda: search.ends(rows, np.arange(n), starts, math.inf), 1, n),
+        "uncertainty": Contestant(lambda: solutions_of(optima, rows.energy, np.ones(n, dtype=bool)), 1, n),
+        "a fix": Contestant(lambda: locator.fit_rows(readings), 1, n),
+    }
+
+
+def _grown(what: str, runs: Mapping[int, Mapping[str, Contestant]], rounds: int) -> Iterator[Row]:
+    """A row for every stage: its time at the largest number of something, and those at all numbers with the slope."""
+    timings = interleaved({f"{n} {stage}": run for n, of_n in runs.items() for stage, run in of_n.items()}, rounds)
+    for stage in next(iter(runs.values())):
+        of_stage = [timings[f"{n} {stage}"] for n in runs]
+        best = [timing.best for timing in of_stage]
+        slope = float(np.polyfit(np.log(list(runs)), np.log(best), 1)[0])
+        note = ", ".join(f"{n}: {1e6 * t:.3g} µs" for n, t in zip(runs, best, strict=True))
+        yield Row(f"{stage}, {max(runs):,} {what}", of_stage[-1], note=f"slope {slope:.2f} ({note})")
 
 
 def simulated(measurement: DifferenceMeasurement, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

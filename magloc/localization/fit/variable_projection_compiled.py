@@ -37,7 +37,7 @@ from magloc.measurement.whitened_compiled import SMALLEST_S, LaneModel, signals
 # How a refinement ends.
 RUNNING, CONVERGED, FAILED = 0.0, 1.0, 2.0
 # Gauss-Newton gain in χ² at which an optimum is one: the position is then within 1e-5 σ of it.
-OPTIMUM_TOLERANCE = 1e-11
+OPTIMUM_TOLERANCE = 1e-10
 # Two ends are one optimum 0.01 rad apart on the sphere of homogeneous coordinates, at the same χ².
 SAME_COS, SAME_CHI2 = 0.99995, 0.01
 
@@ -58,7 +58,7 @@ def refined(model: WhitenedModel, y: FloatArray, starts: FloatArray, max_iterati
     out = Refined(np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_))
     each = np.arange(n)
     refine(
-        signals(model, y), each, own(starts), LaneModel.of(model), 1.0, OPTIMUM_TOLERANCE, max_iterations, out
+        signals(model, y), each, own(starts), LaneModel.of(model), 1.0, OPTIMUM_TOLERANCE, float(max_iterations), out
     )  # fmt: skip
     return out
 
@@ -78,14 +78,14 @@ def refine(
     model: LaneModel,
     free_range: float,
     tolerance: float,
-    max_iterations: int,
+    max_iterations: float,
     out: Refined,
 ) -> None:
     """Damped Gauss-Newton on the projected cost from starts q (n, 4) of the signals (rows, sensors, 3) of a row each.
 
     It moves on the sphere of homogeneous coordinates, or, where `free_range` is 0 instead of 1, at one range. Every
     accepted step decreases χ². It ends where a further Gauss-Newton step would gain less than the tolerance. A lane
-    whose start has ended takes the next one.
+    whose start has ended takes the next one. The iterations are no integer: a literal one would be compiled for itself.
     """
     n, n_sensors, n_triples = len(starts), len(model.sensors), model.common.shape[1]
     w, rows = np.zeros(WORKSPACE), np.zeros((n_sensors, SENSOR_ROWS))
@@ -119,7 +119,7 @@ def refine(
         if active == 0:
             return
         linearise(model.sensors, w, rows, common, dots, free_range)
-        _judge(w, tolerance, float(max_iterations))
+        _judge(w, tolerance, max_iterations)
         _step(w, free_range)
 
 

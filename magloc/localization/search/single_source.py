@@ -27,7 +27,6 @@ from magloc.localization.search import single_source_compiled as kernels
 from magloc.localization.search.candidates import SingleArray, allowed_positions, chosen_candidates, linear_bases
 from magloc.measurement.rows import WhitenedRows, channels_above_ambient, check_magnitudes, whitened_rows
 from magloc.measurement.whitened import WhitenedModel
-from magloc.measurement.whitened_compiled import LaneModel, signals
 
 N_UNKNOWNS = 6
 _MORE = 3  # times the starts where none of them explains a row
@@ -73,7 +72,8 @@ class SingleSourceSearch:
     apart_rad : float
         Least distance of two candidates, as an angle of their homogeneous coordinates.
     max_iterations : int
-        Linearisations of one refinement at most; a refinement that needs more did not converge.
+        Linearisations of one refinement to near an optimum at most, and three times as many from there on; a refinement
+        that needs more did not converge.
     prior : SourcePrior
         Bounds of the source's position and moment.
 
@@ -109,12 +109,12 @@ class SingleSourceSearch:
         """Distinct optima of every row within Δχ² = 20 of its best one that the prior allows."""
         everything = self.prior == NOTHING_KNOWN
         keep_within = DISTINCT_WITHIN if everything else math.inf
-        found = self._search(rows, np.arange(len(rows)), np.empty((len(rows), 0, 4)), keep_within, self.n_starts)
+        found = self.ends(rows, np.arange(len(rows)), self.starts(rows), keep_within)
         dof = rows.n_differences - N_UNKNOWNS
         doubtful = np.flatnonzero(~(found.chi2[:, 0] <= (chdtri(dof, 1.0 - CREDIBLE_FIT) if dof > 0 else math.inf)))
         if doubtful.size:
-            some, nothing = rows.chosen(doubtful), np.empty((doubtful.size, 0, 4))
-            more = self._search(some, np.arange(len(some)), nothing, keep_within, _MORE * self.n_starts)
+            some = rows.chosen(doubtful)
+            more = self.ends(some, np.arange(len(some)), self.starts(some, _MORE * self.n_starts), keep_within)
             for values, others in zip(found, more, strict=True):
                 values[doubtful] = others[:, : values.shape[1]]
             np.minimum(found.counts[:, 0], self.n_starts, out=found.counts[:, 0])
@@ -133,8 +133,10 @@ class SingleSourceSearch:
     def optima_from(self, readings_T: ArrayLike, starts_m: ArrayLike) -> BestFits:
         """Best optimum of readings (C,) for every start (n, 3) [m], refined beside the candidates; without prior."""
         (rows,) = whitened_rows(self.array, np.asarray(readings_T, dtype=np.float64)[None], None, 1)
-        starts = rows.model.homogeneous(np.asarray(starts_m, dtype=np.float64))[:, None]
-        found = self._search(rows, np.zeros(len(starts), dtype=np.intp), starts, DISTINCT_WITHIN, self.n_starts)
+        first = rows.model.homogeneous(np.asarray(starts_m, dtype=np.float64))[:, None]
+        reading_of_row = np.zeros(len(first), dtype=np.intp)
+        starts = np.concatenate([first, self.starts(rows)[reading_of_row]], axis=1)
+        found = self.ends(rows, reading_of_row, starts, DISTINCT_WITHIN)
         return BestFits(
             position_m=rows.model.position(found.q[:, 0]),
             moment_Am2=rows.model.moment(found.q[:, 0], found.mu[:, 0]),
@@ -153,29 +155,32 @@ class SingleSourceSearch:
             self._ranking_of[key] = _Ranking(of_mask, candidates, bases)
         return self._ranking_of[key]
 
-    def _search(
-        self, rows: WhitenedRows, reading_of_row: IntArray, first: FloatArray, keep_within: float, n_starts: int
-    ) -> kernels.Ends:
-        """Optima of some of the rows, from starts of their own and the best candidates."""
-        ranking, model = self._ranking(rows.mask), rows.model
+    def starts(self, rows: WhitenedRows, n_starts: int | None = None) -> FloatArray:
+        """Distinct candidates (b, n_starts, 4) that explain most of every row."""
+        ranking = self._ranking(rows.mask)
         ranked = rows.y
         if self.array.noise_depends_on_reading:
-            channels = channels_above_ambient(self.array, rows.mask, rows.readings_T, model.ambient)
+            channels = channels_above_ambient(self.array, rows.mask, rows.readings_T, rows.model.ambient)
             ranked = ranking.whitening.apply(channels)
-        best = ranking.candidates[
-            chosen_candidates(ranking.bases, ranked, ranking.candidates, n_starts, self.apart_rad)
-        ]
-        starts = np.concatenate([first, best[reading_of_row]], axis=1)
+        number = self.n_starts if n_starts is None else n_starts
+        chosen = chosen_candidates(ranking.bases, ranked, ranking.candidates, number, self.apart_rad)
+        best: FloatArray = ranking.candidates[chosen]
+        return best
+
+    def ends(
+        self, rows: WhitenedRows, reading_of_row: IntArray, starts: FloatArray, keep_within: float
+    ) -> kernels.Ends:
+        """Distinct optima that starts (n, k, 4) lead to, each of the reading of some row."""
         found = kernels.Ends.empty(*starts.shape[:2])
         over_rows(
             kernels.search_rows,
             len(starts),
-            signals(model, rows.y),
+            rows.signal,
             reading_of_row,
             starts,
             keep_within,
             self.max_iterations,
-            LaneModel.of(model),
+            rows.lanes,
             found,
         )
         return found

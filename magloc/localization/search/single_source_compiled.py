@@ -21,6 +21,8 @@ from magloc.measurement.whitened_compiled import LaneModel
 
 # Gauss-Newton gain in χ² at which a start is so near an optimum that others are known to lead to the same.
 _NEAR_TOLERANCE = 1e-2
+# Times the linearisations that one of these may take from there on: along a flat valley steps hardly get shorter.
+_LONGER = 3.0
 
 
 class Ends(NamedTuple):
@@ -64,23 +66,28 @@ def choose_rows(
     """
     n, apart = len(candidates), np.float32(cos_apart)
     n_fours = -(-n // 4)
-    fours = np.zeros((n_fours, 4, 4), np.float32)
-    fours.reshape(-1, 4)[:n] = candidates
-    score = np.full((n_fours, 4 * LANES), np.float32(-1.0))
-    each = score.reshape(-1, LANES)
+    fours = np.zeros((n_fours, 16), np.float32)  # coordinates of four candidates
+    for j in range(n):
+        for d in range(4):
+            fours[j // 4, 4 * (j % 4) + d] = candidates[j, d]
+    score = np.empty((4 * n_fours, LANES), np.float32)
+    for j in range(n, 4 * n_fours):
+        for i in range(LANES):
+            score[j, i] = -1.0
+    scores_of_four = score.reshape(n_fours, 4 * LANES)
     w = np.empty(6 * LANES, np.float32)  # coordinates of the last choice (4), best score, its candidate
     for block in range(begin, end, LANES):
         width = min(LANES, end - block)
         for j in range(n):
             x, y, z = components[0, j, block:], components[1, j, block:], components[2, j, block:]
             for i in range(width):
-                each[j, i] = x[i] * x[i] + y[i] * y[i] + z[i] * z[i]
+                score[j, i] = x[i] * x[i] + y[i] * y[i] + z[i] * z[i]
         w[: 4 * LANES] = 0.0
         for k in range(chosen.shape[1]):
             w[4 * LANES :] = 0.0
             for j in range(n_fours):
-                s, place = score[j], np.float32(4 * j)
-                c0, c1, c2, c3 = _four(fours[j], 0), _four(fours[j], 1), _four(fours[j], 2), _four(fours[j], 3)
+                s, place = scores_of_four[j], np.float32(4 * j)
+                c0, c1, c2, c3 = _four(fours[j], 0), _four(fours[j], 4), _four(fours[j], 8), _four(fours[j], 12)
                 for i in range(LANES):
                     q = (w[i], w[LANES + i], w[2 * LANES + i], w[3 * LANES + i])
                     v0, v1 = _left(c0, q, apart, s[i]), _left(c1, q, apart, s[LANES + i])
@@ -100,8 +107,8 @@ def choose_rows(
 
 
 @inlined
-def _four(candidates: NDArray[np.float32], k: int) -> tuple[float, float, float, float]:
-    return candidates[k, 0], candidates[k, 1], candidates[k, 2], candidates[k, 3]
+def _four(of_four: NDArray[np.float32], at: int) -> tuple[float, float, float, float]:
+    return of_four[at], of_four[at + 1], of_four[at + 2], of_four[at + 3]
 
 
 @inlined
@@ -130,16 +137,18 @@ def search_rows(
     Starts (rows, k, 4) of a row are refined on the signal (readings, s, 3) of its reading.
     """
     n_starts = starts.shape[1]
-    reading = np.repeat(reading_of_row[begin:end], n_starts)
-    n = len(reading)
+    n = (end - begin) * n_starts
+    reading = np.empty(n, np.intp)
+    for k in range(n):
+        reading[k] = reading_of_row[begin + k // n_starts]
     near = Refined(
         np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_)
     )  # fmt: skip
     of_block = starts[begin:end].reshape(n, 4)
-    refine(signal, reading, of_block, model, 1.0, _NEAR_TOLERANCE, max_iterations, near)
-    row_of_end, n = np.empty(n, np.intp), 0
+    refine(signal, reading, of_block, model, 1.0, _NEAR_TOLERANCE, float(max_iterations), near)
+    first_end, n = np.zeros(end - begin + 1, np.intp), 0
     for row in range(begin, end):
-        first, n_before = (row - begin) * n_starts, n
+        first = (row - begin) * n_starts
         lowest = math.inf
         out.counts[row, 1] = out.counts[row, 2] = 0
         for k in range(first, first + n_starts):
@@ -150,27 +159,25 @@ def search_rows(
             if not near.converged[k] or near.chi2[k] > lowest + keep_within + 1.0:
                 continue
             known = False
-            for j in range(n_before, n):
+            for j in range(first_end[row - begin], n):
                 known = known or same_optimum(near.q[k], near.chi2[k], near.q[j], near.chi2[j])
             if not known:
                 put(near.q[n], near.q[k])
                 near.chi2[n], near.iterations[n] = near.chi2[k], near.iterations[k]
-                row_of_end[n], reading[n] = row, reading_of_row[row]
+                reading[n] = reading_of_row[row]
                 n += 1
+        first_end[row - begin + 1] = n
     ends = Refined(
         np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_)
     )  # fmt: skip
-    refine(signal, reading[:n], near.q[:n], model, 1.0, OPTIMUM_TOLERANCE, max_iterations, ends)
-    first = 0
+    refine(signal, reading[:n], near.q[:n], model, 1.0, OPTIMUM_TOLERANCE, _LONGER * max_iterations, ends)
     for row in range(begin, end):
-        last = first
-        while last < n and row_of_end[last] == row:
-            out.counts[row, 1] += 0 if ends.converged[last] else 1
-            out.counts[row, 2] += ends.iterations[last]
-            ends.iterations[last] += near.iterations[last]
-            last += 1
+        first, last = first_end[row - begin], first_end[row - begin + 1]
+        for k in range(first, last):
+            out.counts[row, 1] += 0 if ends.converged[k] else 1
+            out.counts[row, 2] += ends.iterations[k]
+            ends.iterations[k] += near.iterations[k]
         _distinct(ends, first, last, keep_within, row, out)
-        first = last
 
 
 @compiled

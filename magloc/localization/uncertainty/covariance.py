@@ -39,7 +39,7 @@ from magloc.localization.uncertainty.range_profile import profile_stretches, ran
 from magloc.localization.uncertainty.range_profile_compiled import FlatFits
 from magloc.localization.uncertainty.single_source_compiled import Certainties, Levels, certainty_rows
 from magloc.measurement.whitened import WhitenedModel
-from magloc.measurement.whitened_compiled import LaneModel, ModelRows, signals
+from magloc.measurement.whitened_compiled import ModelRows
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,9 +161,9 @@ def known_of_one_compiled(optima: Optima, energy: FloatArray) -> _Known:
         FlatFits(first, own(fits.q[:, 0]), own(fits.mu[:, 0]), own(fits.chi2)),
         own(energy),
         own(rows.y),
-        signals(model, rows.y),
+        rows.signal,
         ModelRows.of(model),
-        LaneModel.of(model),
+        rows.lanes,
         levels_of(rows.n_differences, optima.dof),
         found,
     )

@@ -163,7 +163,7 @@ def profile_rows(
             k = live[i]
             reading[i] = place[k, 0]
             _place(direction[k], state[k, _TRIED], starts[i])
-        refine(signal, reading[:n_live], starts[:n_live], model, 0.0, PROFILE_TOLERANCE, 30, ends)
+        refine(signal, reading[:n_live], starts[:n_live], model, 0.0, PROFILE_TOLERANCE, 30.0, ends)
         n_before, n_live = n_live, 0
         for i in range(n_before):
             k = live[i]

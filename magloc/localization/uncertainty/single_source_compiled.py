@@ -78,7 +78,8 @@ def certainty_rows(
     """What is known of the fits of rows begin to end, in units of the array's radius and of the scaled moment."""
     n_fits = fits.first[end] - fits.first[begin]
     rise, understated = np.empty(end), np.empty(end)
-    alpha, weighed = np.full((fits.first[end], 2), np.nan), np.empty(n_fits)
+    alpha, weighed = np.empty((fits.first[end], 2)), np.empty(n_fits)
+    alpha[:] = math.nan
     for row in range(begin, end):
         first, last = fits.first[row], fits.first[row + 1]
         chi2 = fits.chi2[first] if last > first else 0.0
@@ -87,8 +88,8 @@ def certainty_rows(
         for k in range(first, last):
             log_volume = covariance_and_volume(fits.q[k], fits.mu[k], of_row, understated[row], out.covariance[k])
             weighed[k - fits.first[begin]] = log_volume
-        here = slice(first - fits.first[begin], last - fits.first[begin])
-        level = _weigh(fits.chi2[first:last], weighed[here], understated[row], out.weight[first:last])
+        n = fits.first[begin]
+        level = _weigh(fits.chi2[first:last], weighed[first - n : last - n], understated[row], out.weight[first:last])
         of_energy = energy[row] / understated[row]
         rise[row] = understated[row] * _rise(of_energy, chi2 / understated[row], level, levels)
     profile_rows(begin, end, signal, rise, model, fits, out.covariance, alpha)
@@ -199,7 +200,8 @@ def _unite(alpha: FloatArray, rise: float, sets: FloatArray, n_sets: NDArray[np.
         else:
             sets[kept, 0], sets[kept, 1] = low, high
             kept += 1
-    sets[kept:n] = math.nan
+    for k in range(kept, n):
+        sets[k, 0] = sets[k, 1] = math.nan
     n_sets[0] = kept
 
 
@@ -236,7 +238,8 @@ def _is_gaussian(
     for d in range(3):
         state[d], state[3 + d] = q[d] / q[3], mu[d] / abs(q[3]) ** 3
     for half in range(0, 6, 3):
-        unit[half : half + 3] = math.sqrt(state[half] ** 2 + state[half + 1] ** 2 + state[half + 2] ** 2)
+        size2 = state[half] * state[half] + state[half + 1] * state[half + 1] + state[half + 2] * state[half + 2]
+        unit[half] = unit[half + 1] = unit[half + 2] = math.sqrt(size2)
         variance = covariance[half, half] + covariance[half + 1, half + 1] + covariance[half + 2, half + 2]
         if not math.sqrt(variance) <= LARGEST_GAUSSIAN_SIGMA * unit[half]:
             return False
