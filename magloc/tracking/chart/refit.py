@@ -171,7 +171,7 @@ class _Rows:
         n, n_errors, K = self.n, self.errors.n_states, track.shape[1]
         N = n + n_errors
         chart = self.chart(track, 0)
-        root = chart.inverse_jacobian() @ first_root(chart, self.motions[0])
+        root = chart.inverse_jacobian() @ first_root(chart, self.motions[0], None if prior is None else prior.sigma)
         mean, P = np.zeros((K, N)), np.zeros((K, N, N))
         # Where the source is, the first row alone says; what else moves is known by the prior.
         before = np.stack([self.motions[0].start(x[:N_SOURCE], np.zeros((N_SOURCE, N_SOURCE)))[0] for x in chart.x])
@@ -179,7 +179,7 @@ class _Rows:
         P[:, :n, :n] = root @ _T(root)
         P[:, np.arange(n, N), np.arange(n, N)] = self.errors.sigma**2
         if prior is not None:
-            mean[:, 0], P[:, 0, 0] = prior.log_range - np.log(chart.length), prior.sigma**2
+            mean[:, 0] = prior.log_range - np.log(chart.length)
         nis, log_evidence = np.zeros(K), np.zeros(K)
         steps: list[_FilteredRow] = []
         transition = np.zeros((K, n, n))

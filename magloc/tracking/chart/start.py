@@ -62,9 +62,15 @@ def prior_root(chart: Chart) -> FloatArray:
     return source_root(chart, np.array([*_SIGMA_PRIOR, *[strength] * 3]))
 
 
-def first_root(chart: Chart, motion: MotionModel) -> FloatArray:
-    """Cartesian roots (K, n, n) of sources of which hardly more is known than that they are at x (K, n)."""
-    return _with_motion(chart, motion, np.tile(_SIGMA_PRIOR, (len(chart.x), 1)))
+def first_root(chart: Chart, motion: MotionModel, sigma_range: FloatArray | None = None) -> FloatArray:
+    """Cartesian roots (K, n, n) of sources of which hardly more is known than that they are at x (K, n).
+
+    `sigma_range` (K,) are standard deviations of their log-ranges, if more is known of these.
+    """
+    sigma = np.tile(_SIGMA_PRIOR, (len(chart.x), 1))
+    if sigma_range is not None:
+        sigma[:, 0] = sigma_range
+    return _with_motion(chart, motion, sigma)
 
 
 def _with_motion(chart: Chart, motion: MotionModel, sigma: FloatArray) -> FloatArray:

@@ -49,7 +49,7 @@ LARGEST_REFIT_WIDTH = 0.25
 """Width of a component that is fitted to all rows of a young track."""
 MOST_YOUNG_ROWS = 100
 """Rows up to which a track is fitted anew as a whole."""
-BENT_RANGE = 0.05
+BENT_RANGE = 0.02
 """Standard deviation of the log-range above which a mode and its curvature do not tell of the rows' whole valley."""
 N_CELLS, CELL_PITCH = 9, 0.7
 """Ranges at which it is fitted then, and how far they are apart, in that standard deviation."""

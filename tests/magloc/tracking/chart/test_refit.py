@@ -97,3 +97,19 @@ class TestPrior:
         sigma = np.sqrt(np.diagonal(found.S[0] @ found.S[0].T))[6:9] * found.chart.length[0]
         assert np.abs(found.x[0, 6:9]).max() < 4e-3
         assert sigma.max() < 1.1e-3
+
+    def test_of_a_source_that_moves(self) -> None:
+        """What is known of velocity before the first row goes with the range: cells keep a covariance of both.
+
+        A trajectory at the motion's own speed, whose covariance had no root once its range alone was replaced.
+        """
+        tracker = Tracker(ARRAY, OrnsteinUhlenbeck(0.5, 0.1, correlation_s=10.0))
+        rows = rows_of(np.linspace([-3.0, 0.0, 0.0], [0.0, 0.0, 0.0], 5))
+        measurements = [ChartRow.of(tracker.measurements.of(row)) for row in rows]
+        seed = seed_of(tracker, rows[-1])
+        seed.x[0, 6:9] = 0.5
+        cells = Cells(np.linspace(-0.1, 0.1, 3), np.full(3, 0.1))
+        found = refitted(
+            seed.take(np.zeros(3, dtype=np.intp)), measurements, [tracker.motion] * 5, tracker.errors, cells
+        )
+        assert found.origin.tolist() == [0, 1, 2]
