@@ -158,11 +158,11 @@ class MotionOptions:
         """Characteristic rate of turn of one source."""
         return math.radians(5.0 if self.turn_deg_s is None else self.turn_deg_s)
 
-    def model(self, *, smooth: bool = False) -> MotionModel:
-        """The motion model that the options name."""
+    def model(self, *, lasting: bool = False) -> MotionModel:
+        """The motion model that the options name, or without a name one whose speed lasts, or a random walk."""
         refuse_not_positive(self, "speed_m_s", "turn_deg_s", "correlation_s")
         turn = self.turn_rad_s
-        name = self.motion or ("wandering" if smooth else "unknown")
+        name = self.motion or ("wandering" if lasting else "unknown")
         if name == "unknown":
             return magloc.RandomWalk(self.speed_m_s, turn)
         if name == "wandering":

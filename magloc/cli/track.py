@@ -73,7 +73,7 @@ class PathOptions(MotionOptions):
     motion : {"unknown", "wandering", "turn"}
         unknown: position and moment are random walks, by the speed and the rate times the interval in every row.
         wandering: speed and turn rate are estimated too, and forgotten in --correlation-s. turn: a steady turn about
-        the vertical. By default unknown, and with --smooth wandering.
+        the vertical. By default unknown; with --smooth, --detrend and --high-pass-hz wandering.
     correlation_s : float
         How long a speed lasts, for wandering; by default as long as a turn at the characteristic rate. Of several
         sources 1.5 by default.
@@ -226,7 +226,9 @@ def track(
     maps.refuse(known.place)
     # A place without a date may be there for the map alone.
     where = None if known.place is not None and known.date is None else known.where
-    used, model, prior = known.array(array), motion.model(smooth=smooth), known.prior
+    used, prior = known.array(array), known.prior
+    on_background = conditioning.detrend or conditioning.high_pass_hz is not None
+    model = motion.model(lasting=smooth or on_background)
     path = motion.known_path()
     if path is not None:
         refuse_bounds(known)

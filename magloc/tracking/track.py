@@ -259,8 +259,9 @@ def track(
     readings : Readings or array_like, shape (n, C)
         Raw readings [T], NaN where missing, in the order of time. Those that saturate are not used.
     motion : MotionModel, optional
-        By default :class:`magloc.RandomWalk` of 0.5 m/s and 5°/s; with `smooth` :class:`magloc.OrnsteinUhlenbeck` of
-        the same. Where the readings have measured velocities and rates, a random walk of what is not measured.
+        By default :class:`magloc.RandomWalk` of 0.5 m/s and 5°/s; with `smooth`, or readings with a background,
+        :class:`magloc.OrnsteinUhlenbeck` of the same. Where the readings have measured velocities and rates, a random
+        walk of what is not measured.
     smooth : bool
         Use later rows too: a fixed-interval smoother.
     prior : SourcePrior
@@ -289,7 +290,8 @@ def track(
     """
     used = in_world_field(without_saturated(as_readings(readings), array), array)
     if motion is None:
-        motion = (OrnsteinUhlenbeck if smooth and used.motion is None else RandomWalk)(SPEED_M_S, TURN_RAD_S)
+        lasting = (smooth or used.background) and used.motion is None
+        motion = (OrnsteinUhlenbeck if lasting else RandomWalk)(SPEED_M_S, TURN_RAD_S)
     background = Drift.of(used.background, used.time_s)
     tracker = Tracker(with_stated_pose(array, used), motion, prior=prior, keep_steps=smooth, background=background)
     if background is not None:

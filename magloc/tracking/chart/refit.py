@@ -112,7 +112,10 @@ def refitted(
         prior = None if prior is None else prior.take(left)
         if not live.size:
             break
-    S = np.array([np.linalg.cholesky(of_one[::-1, ::-1])[::-1, ::-1] for of_one in P[converged]]).reshape(-1, N, N)
+    # Where nothing is known along some number, rounding may leave less than nothing: that is no fit.
+    roots, sound = _roots(P[converged][:, ::-1, ::-1])
+    converged[converged] = sound
+    S = roots[sound][:, ::-1, ::-1]
     end = measurements[-1]
     after = Mixture(x[converged], S, log_evidence[converged], n, end.centroid_m, end.radius_m, end.n_pose)
     return Refitted(after, nis[converged], np.flatnonzero(converged), converged | decided)

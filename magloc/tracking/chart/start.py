@@ -6,7 +6,8 @@ them what the row tells. Cells that explain the row as well as the best one does
 better than all around them, and the optima that :class:`magloc.localization.locator.Locator` finds between them.
 
 Where a row tells more than a cell does, the cell's own Gaussian would pull the component and its weight: there it is
-centred anew where the row puts it, and what several cells have found alike counts once.
+centred anew where the row puts it, and what several cells have found alike counts once. Where the valley of ranges that
+it finds bends, it is divided along the range by halves of the grid's pitch.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from magloc.localization.locator import Locator
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.rows import check_magnitudes
 from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart, source_root
-from magloc.tracking.chart.mixture import FARTHEST, NEAREST, Mixture
+from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.update import Updated, updated
 from magloc.tracking.motion import N_SOURCE, MotionModel
@@ -47,6 +48,11 @@ _NARROW = 0.5
 # The even density of all cells over the density of one at its centre, as a logarithm, along one coordinate.
 _EVEN = math.log(OF_PITCH * math.sqrt(2.0 * math.pi))
 _CELL = OF_PITCH * np.array([_PITCH, _SPACING, _SPACING])
+LARGEST_BEND = 0.5
+"""By how much a valley of ranges may bend in a component's standard deviation, in that of the readings' noise."""
+_MOST_BENT = 100.0
+# How far along a valley components stand, in standard deviations of its log-range.
+_VALLEY = 4.0
 _SIGMA_PRIOR = (math.log(FARTHEST / NEAREST) / math.sqrt(12.0), 1.0, 1.0)
 NOT_ALLOWED = "not acquired: no source of the stated region and moment explains the readings"
 
@@ -114,8 +120,9 @@ class _Seeds:
     ----------
     position_m, moment_Am2 : ndarray, shape (n, 3)
         In the world frame.
-    cell : ndarray of int, shape (n, 2)
-        Range and direction on the grid whose share of the even density each stands for, -1 where it is the row's own.
+    cell : ndarray of int, shape (n, 3)
+        Range and direction on the grid whose share of the even density each stands for, -1 where it is the row's own,
+        and how often the pitch of its ranges was halved.
     """
 
     position_m: FloatArray
@@ -142,11 +149,12 @@ class Start:
         if not len(seeds.cell):
             return None, NOT_ALLOWED
         found = self._components(measurement, motion, seeds)
-        centred = _centred(seeds, found, measurement)
-        if not len(centred.cell):
-            return None, NOT_ALLOWED
-        if centred is not seeds:
-            seeds, found = centred, self._components(measurement, motion, centred)
+        for refined in (_centred, _along_valleys):
+            finer = refined(seeds, found, measurement)
+            if not len(finer.cell):
+                return None, NOT_ALLOWED
+            if finer is not seeds:
+                seeds, found = finer, self._components(measurement, motion, finer)
         row = measurement.row
         position = (found.x[:, :3] - row.origin_m) @ row.R_world_from_array
         sound = self.prior.allows_position(position) & self.prior.allows_moment(found.x[:, 3:6])
@@ -156,7 +164,8 @@ class Start:
         dof = measurement.z.size - N_SOURCE
         if dof > 0 and found.chi2[sound].min() > chdtri(dof, CONTRADICTION):
             return None, "not acquired: no dipole fits the readings"
-        log_weight = found.log_evidence + _EVEN * ((seeds.cell < 0) @ np.array([1.0, 2.0]))
+        log_weight = found.log_evidence + _EVEN * ((seeds.cell < 0) @ np.array([1.0, 2.0, 0.0]))
+        log_weight -= math.log(2.0) * seeds.cell[:, 2]
         mixture = _mixture(found, log_weight, measurement)
         return mixture.take(sound).take(once(mixture.take(sound), seeds.cell[sound])), ""
 
@@ -173,12 +182,12 @@ class Start:
         explained[~self.prior.allows_position(cells) | ~(explained > 0.0)] = -np.inf
         chosen = np.flatnonzero(self._grid.chosen(explained))
         position, moment = [world[chosen]], [moments[chosen]]
-        cell = [np.stack(np.divmod(chosen, _N_DIRECTIONS), axis=1)]
+        cell = [np.stack([*np.divmod(chosen, _N_DIRECTIONS), np.zeros_like(chosen)], axis=1)]
         if self._locator is not None and measurement.z.size >= N_SOURCE:
             for solution in self._locator.fit(row.readings_T, row.ambient_T).solutions:
                 position.append(row.origin_m + row.R_world_from_array @ solution.position_m)
                 moment.append(row.R_world_from_array @ solution.moment_Am2)
-                cell.append(np.array([-1, -1]))
+                cell.append(np.array([-1, -1, 0]))
         return _Seeds(np.vstack(position), np.vstack(moment), np.vstack(cell))
 
     def _components(self, measurement: ChartRow, motion: MotionModel, seeds: _Seeds) -> Updated:
@@ -190,7 +199,9 @@ class Start:
         x[:, :3], x[:, 3:6] = seeds.position_m, seeds.moment_Am2
         chart = measurement.chart(x[:, :n])
         S = np.zeros((len(x), n + n_errors, n + n_errors))
-        S[:, :n, :n] = chart.inverse_jacobian() @ _with_motion(chart, motion, np.tile(_CELL, (len(x), 1)))
+        sigma = np.tile(_CELL, (len(x), 1))
+        sigma[:, 0] /= 2.0 ** seeds.cell[:, 2]
+        S[:, :n, :n] = chart.inverse_jacobian() @ _with_motion(chart, motion, sigma)
         S[:, n + np.arange(n_errors), n + np.arange(n_errors)] = self.errors.sigma
         return updated(x, S, measurement, np.zeros(len(x), dtype=bool))
 
@@ -213,12 +224,45 @@ def _centred(seeds: _Seeds, found: Updated, measurement: ChartRow) -> _Seeds:
     range_old, range_new = (np.linalg.norm(chart.x[:, :3] - measurement.centroid_m, axis=1) for chart in (old, new))
     r = np.where(narrow[:, 0], range_new, range_old)
     length = np.maximum(r, measurement.radius_m)
-    cell = np.where(narrow, -1, seeds.cell)
+    cell = seeds.cell.copy()
+    cell[:, :2][narrow] = -1
     # A best fit has no cell whose share it could stand for.
-    sound = np.isfinite(found.log_evidence) & found.converged & ((seeds.cell >= 0) | narrow).all(axis=1)
+    sound = np.isfinite(found.log_evidence) & found.converged & ((seeds.cell[:, :2] >= 0) | narrow).all(axis=1)
     return _Seeds(
         (measurement.centroid_m + r[:, None] * offset)[sound], (seen * length[:, None] ** 4)[sound], cell[sound]
     )
+
+
+def _along_valleys(seeds: _Seeds, found: Updated, measurement: ChartRow) -> _Seeds:
+    """The seeds, and instead of such as found a valley of ranges that bends others along it, as dense as it bends.
+
+    A row that tells much leaves a source in a narrow valley, and a Gaussian in the middle says nothing of its ends.
+    """
+    n = measurement.n_motion
+    sound = np.isfinite(found.log_evidence) & found.converged
+    likely = sound & (found.log_evidence > found.log_evidence[sound].max(initial=-np.inf) + DROPPED_BELOW)
+    own = np.flatnonzero(likely & (seeds.cell[:, 0] < 0))
+    chart, S = measurement.chart(found.x[own, :n]), found.S[own, :n]
+    sigma, log_range = np.linalg.norm(S[:, 0], axis=1), np.log(chart.length / measurement.radius_m)
+    along = (S @ S[:, 0, :, None])[..., 0] / sigma[:, None]
+    ends = [measurement.of_source(chart.retracted(share * along)) for share in (-1.0, 0.0, 1.0)]
+    bend = np.minimum(np.linalg.norm(0.5 * (ends[0] + ends[2]) - ends[1], axis=1), _MOST_BENT)
+    bent = np.flatnonzero((bend > LARGEST_BEND) & (log_range > _VALLEY * sigma))
+    if not bent.size:
+        return seeds
+    straight = np.delete(np.arange(len(sound)), own[bent])
+    position, moment, cell = [seeds.position_m[straight]], [seeds.moment_Am2[straight]], [seeds.cell[straight]]
+    for k in bent.tolist():
+        halvings = max(0, math.ceil(math.log2(_CELL[0] / sigma[k] * math.sqrt(bend[k] / LARGEST_BEND))))
+        pitch, reach = _PITCH / 2.0**halvings, _VALLEY * sigma[k]
+        ranges = np.arange(round((log_range[k] - reach) / pitch), round((log_range[k] + reach) / pitch) + 1)
+        every = np.full(len(ranges), k)
+        e = ((ranges * pitch - log_range[k]) / sigma[k])[:, None] * along[k]
+        state, of_direction = chart.take(every).retracted(e), seeds.cell[own[every], 1]
+        position.append(state[:, :3])
+        moment.append(state[:, 3:6])
+        cell.append(np.stack([_N_RANGES + ranges, of_direction, np.full_like(ranges, halvings)], axis=1))
+    return _Seeds(np.vstack(position), np.vstack(moment), np.vstack(cell))
 
 
 def once(mixture: Mixture, cell: IntArray | None = None) -> IntArray:

@@ -98,7 +98,9 @@ class Updated:
         J, residual = self.J[index], self.residual[index]
         k = len(residual) - J.shape[1]
         G = np.linalg.solve(J[k:].T, J[:k].T).T
-        root = np.linalg.cholesky(np.eye(k) + G @ G.T)
+        # Not of 1 + G Gᵀ, in which a prediction that knows next to nothing leaves nothing of the 1.
+        root = root_of(np.concatenate([np.eye(k), G], axis=1))
+        root *= np.sign(np.diagonal(root))
         return np.asarray(np.linalg.solve(root, residual[:k] - G @ residual[k:]))
 
 

@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 
 from magloc.tracking.chart.coordinates import Chart
 from magloc.tracking.chart.row import ChartRow
-from magloc.tracking.chart.update import updated
+from magloc.tracking.chart.update import Updated, updated
 from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import Row
 from magloc.tracking.tracker import Tracker
@@ -49,3 +49,15 @@ class TestEvidenceOfABentPrediction:
         found, h, J, z = far_update(shift)
         expected = multivariate_normal.logpdf(z, h, np.eye(6) + J @ J.T) + 3.0 * math.log(2.0 * math.pi)
         assert found == pytest.approx(float(expected), abs=0.05)
+
+
+class TestWhitenedInnovation:
+    def test_of_a_prediction_that_knows_next_to_nothing(self) -> None:
+        """Readings that err as it does tell nothing; those at right angles keep their squares."""
+        J = np.array([[[1e9], [1e9], [1.0]]])
+        of_one = np.ones(1)
+        for readings, square in (([1.0, -1.0], 2.0), ([1.0, 1.0], 0.0)):
+            residual = np.array([[*readings, 0.0]])
+            found = Updated(of_one, of_one, of_one, of_one, of_one, of_one, of_one, residual, J)  # type: ignore[arg-type]
+            whitened = found.whitened_innovation(0)
+            assert whitened @ whitened == pytest.approx(square, abs=1e-6)
