@@ -300,8 +300,8 @@ def smooth(
 ) -> None:
     """Smoother of the readings that are used in hindsight: states (m, 4) and variances.
 
-    After Bryson and Frazier, in Bierman's form: what later readings say of a state is a score (14,) and an information (14, 14) that are
-    carried backwards, so that nothing larger than an innovation's covariance is inverted.
+    After Bryson and Frazier, in Bierman's form: what later readings say of a state is a score (14,) and an information
+    (14, 14) that are carried backwards, so that nothing larger than an innovation's covariance is inverted.
     """
     step, n = new_step(), len(told)
     xs, Ps = np.empty((n, SIZE)), np.empty((n, SIZE, SIZE))
