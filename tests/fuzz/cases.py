@@ -48,12 +48,14 @@ LINES: dict[str, tuple[str, ...]] = {
         "moving.csv --array moving-array.toml --truth moving-truth.csv --smooth",
         "- --array array.toml --jsonl",
         "readings.csv --array array.toml --sources auto --jsonl",
+        "readings.csv --array array.toml --sources 2 --out out",
         "passing.csv --array passing-array.toml --object-path passing-path.csv --path-sigma-m 1 --smooth --json",
         "readings.csv --array array.toml --position 3 0.5 0.306 --truth readings-truth.csv",
     ),
     "magloc live": (
         "--array array.toml --from - --speed-m-s 0.1",
         "--array array.toml --from replay:readings.csv --replay-speed 1e6 --rest-s 3",
+        "--array log.toml --from replay:log.csv --replay-speed 1e6",
     ),
     "magloc signature": (
         "passing.csv --array passing-array.toml --object-path passing-path.csv --depth-m 2 --json",
@@ -71,6 +73,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "array.toml --html out.html",
         "readings.csv --array array.toml --html out.html",
         "track.json --array array.toml --readings readings.csv --html out.html",
+        "sources.json --array array.toml --html out.html",
         "readings-truth.csv --html out.html",
         "map --html out.html",
     ),
@@ -295,6 +298,9 @@ def write_files(folder: Path) -> None:
         shutil.rmtree(folder / made)
     with (folder / "track.json").open("w") as file, redirect_stdout(file):
         run("magloc", "track readings.csv --array array.toml --json")
+    with (folder / "sources.json").open("w") as file, redirect_stdout(file):
+        run("magloc", "track readings.csv --array array.toml --sources 1 --json")
+    _write_log(folder)
     rows = Path(adcs.datasets.load("imu").path).read_text(encoding="utf-8").splitlines()
     (folder / "imu.csv").write_text("\n".join(rows[:101]), encoding="utf-8")
     _write_scalars(folder)
@@ -302,6 +308,14 @@ def write_files(folder: Path) -> None:
     write_columns(flight.columns, folder / "loads.csv")
     arrays.write_array(folder / "loads.toml", flight.array)
     _write_stars(folder)
+
+
+def _write_log(folder: Path) -> None:
+    """The readings as another program logs them, and their array."""
+    text = (folder / "readings.csv").read_text()
+    (folder / "log.csv").write_text(text.replace(",", ";").replace(".", ",").replace("time_s", "T"))
+    columns = '\n[columns]\nseparator = "semicolon"\ndecimal = ","\ntime = "T"\nunit = "uT"\n'
+    (folder / "log.toml").write_text((folder / "array.toml").read_text() + columns)
 
 
 def _write_scalars(folder: Path) -> None:
