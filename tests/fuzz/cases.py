@@ -48,7 +48,7 @@ LINES: dict[str, tuple[str, ...]] = {
         "moving.csv --array moving-array.toml --truth moving-truth.csv --smooth",
         "- --array array.toml --jsonl",
         "readings.csv --array array.toml --sources auto --jsonl",
-        "readings.csv --array array.toml --sources 2 --out out",
+        "readings.csv --array array.toml --sources 1 --out out",
         "passing.csv --array passing-array.toml --object-path passing-path.csv --path-sigma-m 1 --smooth --json",
         "readings.csv --array array.toml --position 3 0.5 0.306 --truth readings-truth.csv",
     ),
