@@ -11,7 +11,7 @@ from tests.command_line import refuse_constant
 
 
 def test_numbers_and_text(adcs):
-    arguments = ("run", "detumbling", "--seeds", "2", "--rate-deg-s", "1", "--duration", "1200")
+    arguments = ("run", "detumbling", "--seeds", "2", "--rate-deg-s", "0.7", "--duration", "500")
     outcome = adcs(*arguments, "--json")
     assert outcome.status == 0, outcome.err
     found = json.loads(outcome.out, parse_constant=refuse_constant)
