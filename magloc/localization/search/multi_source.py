@@ -272,7 +272,8 @@ class _Levels:
         problem, draws = self.problem.rows(row[loud]), draws[loud]
         one = refine(problem, draws, q[np.zeros(loud.size, dtype=np.intp)], mu[np.zeros(loud.size, dtype=np.intp)])
         first = best_distinct(one, loud.size, 1)
-        fall = first.chi2[:, 0] - search.one_more(problem, draws, first).chi2[:, 0]
+        with np.errstate(invalid="ignore"):  # where neither has converged
+            fall = first.chi2[:, 0] - search.one_more(problem, draws, first).chi2[:, 0]
         fall = np.sort(fall[np.isfinite(fall)])
         # Another draw falls by more than the k-th largest of n with probability k / (n + 1).
         k = int(FALSE_ALARM * (_N_DRAWS + 1))
