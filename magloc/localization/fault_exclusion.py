@@ -26,7 +26,6 @@ from magloc.localization.fit.fixes import Fixes
 from magloc.localization.fit.gauss_newton import JointFits, refine
 from magloc.localization.fit.model_errors import model_errors
 from magloc.localization.fit.results import Fix
-from magloc.localization.fit.variable_projection_compiled import refined
 from magloc.localization.search.multi_source import NOISE_ALONE
 from magloc.measurement.rows import (
     NO_SIGNAL,
@@ -417,13 +416,8 @@ class _Examination:
     def _refined(self, lighter: Weighted, q: FloatArray, mu: FloatArray, max_iterations: int = 60) -> JointFits:
         """Fits of weighted rows (f,) from sources (f, K, …)."""
         problem, raw = lighter
-        y = problem.whitened(raw)
-        if q.shape[1] > 1 or not self.free_position or problem.known or problem.channel_is_scalar.any():
-            free = np.full((q.shape[1], 3), self.free_position)
-            return refine(problem, y, q, mu, free=free, max_iterations=max_iterations)
-        ends = refined(problem, y, q[:, 0], max_iterations)
-        chi2 = np.where(ends.converged, ends.chi2, np.inf)
-        return JointFits(ends.q[:, None], ends.mu[:, None], chi2, ends.iterations)
+        free = np.full((q.shape[1], 3), self.free_position)
+        return refine(problem, problem.whitened(raw), q, mu, free=free, max_iterations=max_iterations)
 
 
 def weighted(problem: WhitenedModel, raw: FloatArray, weight: FloatArray) -> Weighted:

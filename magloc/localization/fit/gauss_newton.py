@@ -18,6 +18,7 @@ from arrays.typing import FloatArray
 from magloc.compilation import over_rows, own
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.localization.fit.joint_compiled import JointEnds, refine_rows
+from magloc.localization.fit.variable_projection_compiled import refined
 from magloc.measurement.whitened import WhitenedModel
 from magloc.measurement.whitened_compiled import ModelRows
 
@@ -191,11 +192,16 @@ def refine(
     """Positions and moments from starts (b, K, 4) and (b, K, 3): damped Gauss-Newton that never raises χ².
 
     y (b, C) are whitened readings, `free` (K, 3) says which :func:`tangents` of a source may change: without the third
-    its range stays. It has converged where the linearised model promises to lower χ² by less than `promise`. Of
-    vector sensors whose source's moment is free the compiled twin does it, which begins with the moments that fit best.
+    its range stays. It has converged where the linearised model promises to lower χ² by less than `promise`. Of vector
+    sensors whose sources' moments are free compiled twins do it, which begin with the moments that fit best.
     """
     free = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
-    if problem.known is None and not problem.channel_is_scalar.any() and free.any():
+    linear = problem.known is None and not problem.channel_is_scalar.any()
+    if linear and q.shape[1] == 1 and free.all():
+        found = refined(problem, y, q[:, 0], max_iterations)
+        chi2 = np.where(found.converged, found.chi2, np.inf)
+        return JointFits(found.q[:, None], found.mu[:, None], chi2, found.iterations)
+    if linear and free.any():
         ends = JointEnds(own(q), own(mu), np.empty(len(q)), np.empty(len(q), dtype=np.int64))
         small = (promise, PROMISE_RELATIVE)
         over_rows(

@@ -6,7 +6,7 @@ Everything works on b sets of readings of one :class:`magloc.measurement.whitene
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,9 @@ from arrays.typing import FloatArray
 from magloc.directions import hemisphere
 from magloc.localization.fit.gauss_newton import JointFits, fit_moments, refine
 from magloc.localization.search.candidates import (
+    LastBases,
+    SingleArray,
     distinct_best,
-    linear_bases,
     linear_scores,
     modulus_scores,
     modulus_templates,
@@ -30,6 +31,8 @@ _SAME_RAD = 0.02
 _SAME_MOMENT = 0.05
 _SAME_CHI2 = 0.01
 _N_TEMPLATE_DIRECTIONS = 24
+# Starts for every fit that is to be extended by a source.
+_MORE_STARTS = 4
 # A restart draws its new source from this many of the best candidates.
 _RESTART_CANDIDATES = 16
 
@@ -78,9 +81,11 @@ class Search:
     width : int
         Fits kept of every set of readings.
     n_starts : int
-        Starts for every fit that is to be extended by a source.
+        Starts for the first source, and of a restart, for every fit that is kept.
     apart_rad : float
         Least angle between two starts.
+    bases : LastBases
+        Of the candidates.
     """
 
     candidates: FloatArray
@@ -88,6 +93,7 @@ class Search:
     width: int = 3
     n_starts: int = 6
     apart_rad: float = 0.25
+    bases: LastBases = field(default_factory=LastBases)
 
     def first(self, problem: WhitenedModel, y: FloatArray) -> JointFits:
         """One source, from the candidates that explain most."""
@@ -149,9 +155,13 @@ class Search:
     def _linear_scores(self, problem: WhitenedModel, gain: FloatArray, residual: FloatArray) -> FloatArray:
         scores = np.empty((len(residual), len(self.candidates)))
         for rows in rows_of_equal_gain(gain):
-            bases = linear_bases(problem, gain[rows[0]], int(rows[0]), self.candidates)
+            bases = self.bases_of(problem, gain[rows[0]], int(rows[0]))
             scores[rows] = linear_scores(bases, residual[rows])
         return scores
+
+    def bases_of(self, problem: WhitenedModel, gain: FloatArray, row: int) -> SingleArray:
+        """:func:`linear_bases` of the candidates."""
+        return self.bases.of(problem, gain, row, self.candidates)
 
     def _known(self, fits: JointFits) -> JointFits:
         """Fits that agree with what is known of the sources; the others count as none."""
@@ -164,12 +174,12 @@ class Search:
         row = np.repeat(np.arange(len(y)), width)
         q, mu = _filled(beam)
         scores = self.left_scores(problem.rows(row), y[row], q, mu)
-        chosen = distinct_best(scores, self.candidates, width * self.n_starts, self.apart_rad)
+        chosen = distinct_best(scores, self.candidates, width * _MORE_STARTS, self.apart_rad)
         # The best fit, where it stands in for one that there is not, goes on from the candidates that come next.
-        chosen = chosen.reshape(len(y), width, width, self.n_starts)
+        chosen = chosen.reshape(len(y), width, width, _MORE_STARTS)
         turn = np.where(np.isfinite(beam.chi2), 0, np.arange(width))
-        chosen = np.take_along_axis(chosen, turn[:, :, None, None], axis=2).reshape(-1, self.n_starts)
-        fits = self._extended(problem, y, np.repeat(row, self.n_starts), q, mu, chosen)
+        chosen = np.take_along_axis(chosen, turn[:, :, None, None], axis=2).reshape(-1, _MORE_STARTS)
+        fits = self._extended(problem, y, np.repeat(row, _MORE_STARTS), q, mu, chosen)
         return best_distinct(fits, len(y), self.width)
 
     def left_scores(self, problem: WhitenedModel, y: FloatArray, q: FloatArray, mu: FloatArray) -> FloatArray:
@@ -197,17 +207,18 @@ class Search:
         trace = np.trace(normal, axis1=1, axis2=2)
         normal += (1e-12 * trace + 1e-300)[:, None, None] * np.eye(3)
         new_mu = np.linalg.solve(normal, jacobian.transpose(0, 2, 1) @ residual[..., None])[:, None, :, 0]
-        fits = refine(at, y_each, np.concatenate([q[each], new], axis=1), np.concatenate([mu[each], new_mu], axis=1))
+        q, mu = np.concatenate([q[each], new], axis=1), np.concatenate([mu[each], new_mu], axis=1)
+        fits = refine(at, y_each, q, mu)
         return self._known(fits)
 
     def one_less(self, problem: WhitenedModel, y: FloatArray, beam: JointFits) -> JointFits:
-        """Beam without one source: every source of the best fits is left out in turn."""
-        n_sources, width = beam.n_sources, beam.chi2.shape[1]
-        q, mu = _filled(beam)
+        """Beam without one source: every source of the best fit is left out in turn."""
+        n_sources = beam.n_sources
+        q, mu = _filled(beam.rows((slice(None), slice(0, 1))))
         others = np.array([[k for k in range(n_sources) if k != out] for out in range(n_sources)])
         q = q[:, others].reshape(-1, n_sources - 1, 4)
         mu = mu[:, others].reshape(-1, n_sources - 1, 3)
-        row = np.repeat(np.arange(len(y)), width * n_sources)
+        row = np.repeat(np.arange(len(y)), n_sources)
         return best_distinct(self._known(refine(problem.rows(row), y[row], q, mu)), len(y), self.width)
 
     def restarted(self, problem: WhitenedModel, y: FloatArray, beam: JointFits, rng: np.random.Generator) -> JointFits:

@@ -46,6 +46,20 @@ def linear_bases(problem: WhitenedModel, gain: FloatArray, row: int, candidates:
     return bases.transpose(2, 1, 0).astype(np.float32, order="C").reshape(gain.shape[0], -1)
 
 
+class LastBases:
+    """:func:`linear_bases` of the same candidates, kept as long as the rows are whitened alike."""
+
+    def __init__(self) -> None:
+        self._key, self._bases = b"", np.empty((0, 0), dtype=np.float32)
+
+    def of(self, problem: WhitenedModel, gain: FloatArray, row: int, candidates: FloatArray) -> SingleArray:
+        """Those of one row."""
+        key = b"".join(values.tobytes() for values in (gain, problem.basis[row], problem.shrinkage[row]))
+        if key != self._key:
+            self._key, self._bases = key, linear_bases(problem, gain, row, candidates)
+        return self._bases
+
+
 def linear_scores(bases: SingleArray, residual: FloatArray) -> FloatArray:
     """Energy of whitened residuals (b, C) that every candidate's moments explain: (b, n)."""
     components = residual.astype(np.float32) @ bases

@@ -26,12 +26,16 @@ from magloc.localization.fit.optima import Optima
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
 from magloc.localization.search.beam_search import Search, best_distinct, merged
-from magloc.localization.search.candidates import allowed_positions, fine_positions, linear_bases, linear_scores
+from magloc.localization.search.candidates import LastBases, allowed_positions, fine_positions, linear_scores
 from magloc.measurement.rows import WhitenedRows, check_magnitudes, whitenings_of
 
 N_UNKNOWNS = 6
 _N_DRAWS = 5_000
 _MOST_RESTARTS = 20
+# What noise never lowers χ² by: with six degrees of freedom once in 10¹¹ places, of which an array has not a million.
+_BEYOND_NOISE = 60.0
+# Where a source less costs so many times that, restarts do not find a fit that does without it.
+_FAR_BEYOND = 10.0
 # Squares, in units of their covariance, of a moment that is hardly known and of an offset that hardly is one.
 _FAINT = 40.0
 _NEAR = 150.0
@@ -92,16 +96,17 @@ class MultiSourceSearch:
         self.prior = prior
         self.seed = seed
         self._thresholds: dict[int, float] = {}
+        self.bases = LastBases()
         self._candidates = allowed_positions(array, prior, fine_positions(array))
 
     def optima(self, rows: WhitenedRows) -> list[Optima]:
         """Distinct optima with the chosen number of sources: one entry for every number."""
         return _Levels(self, rows.knowing(self.prior.known_moment)).optima()
 
-    def threshold_of(self, levels: _Levels, first: JointFits) -> float:
+    def threshold_of(self, levels: _Levels) -> float:
         """The threshold for another source, drawn once for every number of differences."""
         if levels.n_differences not in self._thresholds:
-            self._thresholds[levels.n_differences] = levels.threshold(first)
+            self._thresholds[levels.n_differences] = levels.threshold()
         return self._thresholds[levels.n_differences]
 
 
@@ -114,37 +119,39 @@ class _Levels:
         self.asked = locator.n_sources
         self.most = min(locator.most, max(1, most_sources(self.n_differences)))
         self.rng = np.random.default_rng(locator.seed)
+        self.penalty = N_UNKNOWNS * math.log(self.n_differences)
 
         # A single source is listed with all its solutions, several ones with those of the beam.
         self.search = Search(
             rows.model.homogeneous(locator._candidates),
             partial(locator.prior.allows, rows.model),
             width=8 if self.most == 1 else 3,
+            bases=locator.bases,
         )
 
     def optima(self) -> list[Optima]:
         """Optima with the chosen number of sources of every row: one entry for every number."""
         everything = np.arange(len(self.y))
-        beams: list[JointFits] = [self._first(everything)]
+        self.one = self._first(everything)
+        beams: list[JointFits] = [self.one]
         level = np.zeros(len(self.y), dtype=np.intp)
-        threshold = self.locator.threshold_of(self, beams[0]) if self.most > 1 else math.inf
-        weak = self._weak(beams[0], threshold)
+        weak = self._weak()
         rows = everything[~weak]
         while len(beams) < self.most:
             if self.asked is None:
-                rows = rows[self._worth_another(rows, beams[-1].rows(rows), threshold)]
+                rows = rows[self._worth_another(rows, beams[-1].rows(rows))]
             if not rows.size:
                 break
             before = beams[-1].rows(rows)
             wider = self.search.one_more(self.problem.rows(rows), self.y[rows], before)
             last = len(beams) + 1 == self.most
-            gained = wider.chi2[:, 0] < before.chi2[:, 0] - threshold
+            gained = self._stands_out(before.chi2[:, 0], wider.chi2[:, 0])
             # Where no number of sources is credible so far, the search failed, at this number or at an earlier one.
             credible = self._quantile(wider.n_sources, CREDIBLE_FIT)
             failed = np.flatnonzero(~(wider.chi2[:, 0] <= credible) & (last | ~gained))
             if failed.size:
                 wider = wider.replaced(failed, self._restarted(rows[failed], wider.rows(failed)))
-                gained = wider.chi2[:, 0] < before.chi2[:, 0] - threshold
+                gained = self._stands_out(before.chi2[:, 0], wider.chi2[:, 0])
             # The other rows have no fit.
             nowhere = JointFits.none((len(self.y), wider.chi2.shape[1]), wider.n_sources)
             beams.append(nowhere.replaced(rows, wider))
@@ -159,10 +166,11 @@ class _Levels:
             fewer = merged(
                 beams[n - 1].rows(at), self.search.one_less(self.problem.rows(at), self.y[at], beams[n].rows(at))
             )
-            if n > 1:
-                fewer = self._restarted(at, fewer, rounds=2)
+            close = np.flatnonzero(fewer.chi2[:, 0] < beams[n].chi2[at, 0] + _FAR_BEYOND * _BEYOND_NOISE)
+            if n > 1 and close.size:
+                fewer = fewer.replaced(close, self._restarted(at[close], fewer.rows(close), rounds=2))
             beams[n - 1] = beams[n - 1].replaced(at, fewer)
-            superfluous = fewer.chi2[:, 0] <= beams[n].chi2[at, 0] + threshold
+            superfluous = ~self._stands_out(fewer.chi2[:, 0], beams[n].chi2[at, 0])
             unresolved = self._has_unresolved_pair(at, beams[n].rows(at))
             level[at[superfluous | unresolved]] = n - 1
             certain[at[unresolved & ~superfluous]] = True
@@ -170,7 +178,7 @@ class _Levels:
         if self.asked is None and self.most > 1:
             # Against the chosen number: a single source may have no fit where several ones stand out.
             chosen = np.array([beams[n].chi2[row, 0] for row, n in enumerate(level)])
-            alone = weak | (np.isfinite(chosen) & (self.rows.energy - chosen <= threshold))
+            alone = weak | (np.isfinite(chosen) & ~self._stands_out(self.rows.energy, chosen))
         return [
             self._listed(
                 n,
@@ -193,14 +201,27 @@ class _Levels:
             beam = beam.replaced(doubtful, merged(beam.rows(doubtful), again))
         return beam
 
-    def _weak(self, beam: JointFits, threshold: float) -> BoolArray:
+    def _stands_out(self, before: FloatArray, after: FloatArray) -> BoolArray:
+        """Whether χ² falls by more than the threshold for another source, which is drawn where some are near to it."""
+        with np.errstate(invalid="ignore"):
+            fall = before - after
+            found: BoolArray = fall > max(self.penalty, _BEYOND_NOISE)
+            near = ~found & (fall > self.penalty)
+        if near.any():
+            found[near] = fall[near] > self.locator.threshold_of(self)
+        return found
+
+    def _weak(self) -> BoolArray:
         """Rows decided without a search for more: neither their energy nor the best source stands out of noise."""
         if self.asked is not None or self.most == 1:
             return np.zeros(len(self.y), dtype=bool)
         energy = self.rows.energy
-        return (energy <= energy_threshold(self.n_differences)) & ~(energy - beam.chi2[:, 0] > threshold)
+        faint = np.flatnonzero(energy <= energy_threshold(self.n_differences))
+        weak = np.zeros(len(self.y), dtype=bool)
+        weak[faint] = ~self._stands_out(energy[faint], self.one.chi2[faint, 0])
+        return weak
 
-    def _worth_another(self, rows: IntArray, beam: JointFits, threshold: float) -> BoolArray:
+    def _worth_another(self, rows: IntArray, beam: JointFits) -> BoolArray:
         """Whether another source might pay: a suspicious χ², or a candidate that explains much of what is left."""
         suspicious = ~(beam.chi2[:, 0] <= self._quantile(beam.n_sources, SUSPICIOUS_FIT))
         clean = np.flatnonzero(~suspicious)
@@ -208,7 +229,7 @@ class _Levels:
             scores = self.search.left_scores(
                 self.problem.rows(rows[clean]), self.y[rows[clean]], beam.q[clean, 0], beam.mu[clean, 0]
             )
-            suspicious[clean] = scores.max(axis=1) > 0.5 * threshold
+            suspicious[clean] = scores.max(axis=1) > 0.5 * self.penalty
         return suspicious
 
     def _restarted(self, rows: IntArray, beam: JointFits, rounds: int = _MOST_RESTARTS) -> JointFits:
@@ -226,16 +247,16 @@ class _Levels:
         dof = self.n_differences - N_UNKNOWNS * n_sources
         return float(chdtri(dof, 1.0 - level)) if dof > 0 else 1e-6
 
-    def threshold(self, beam: JointFits) -> float:
+    def threshold(self) -> float:
         """By how much χ² must fall for another source: what noise reaches in one of a thousand rows, or BIC's penalty.
 
         Noise is drawn around the best fit of all rows; only the loudest draws, where a candidate explains most, are
         searched for a second source: many more than stay above the threshold, as candidates stand far apart.
         """
-        penalty = N_UNKNOWNS * math.log(self.n_differences)
+        beam = self.one
         best = int(np.argmin(beam.chi2[:, 0]))
         if not np.isfinite(beam.chi2[best, 0]):
-            return penalty
+            return self.penalty
         rng = np.random.default_rng(0)
         row = np.full(_N_DRAWS, best)
         problem = self.problem.rows(row)
@@ -244,18 +265,19 @@ class _Levels:
         fields = at.source_fields(q, mu)
         noise = rng.normal(size=(_N_DRAWS, self.y.shape[1])) * np.any(at.gain[0] != 0.0, axis=-1)
         draws = at.predicted(fields) + problem.whitened(noise)
-        bases = linear_bases(at, at.linear_gain(fields)[0], 0, self.search.candidates)
+        bases = self.search.bases_of(at, at.linear_gain(fields)[0], 0)
         loudness = np.concatenate([linear_scores(bases, part).max(axis=1) for part in np.array_split(noise, 20)])
         loud = np.argsort(-loudness)[: int(40 * FALSE_ALARM * _N_DRAWS)]
         search = replace(self.search, width=1)
         problem, draws = self.problem.rows(row[loud]), draws[loud]
         one = refine(problem, draws, q[np.zeros(loud.size, dtype=np.intp)], mu[np.zeros(loud.size, dtype=np.intp)])
         first = best_distinct(one, loud.size, 1)
-        fall = first.chi2[:, 0] - search.one_more(problem, draws, first).chi2[:, 0]
+        with np.errstate(invalid="ignore"):  # where neither has converged
+            fall = first.chi2[:, 0] - search.one_more(problem, draws, first).chi2[:, 0]
         fall = np.sort(fall[np.isfinite(fall)])
         # Another draw falls by more than the k-th largest of n with probability k / (n + 1).
         k = int(FALSE_ALARM * (_N_DRAWS + 1))
-        return max(penalty, float(fall[-k])) if fall.size >= k else penalty
+        return max(self.penalty, float(fall[-k])) if fall.size >= k else self.penalty
 
     def _has_unresolved_pair(self, rows: IntArray, beam: JointFits) -> BoolArray:
         """Whether a source of the best fit is hardly known beside another one, so that other pairs would do as well.

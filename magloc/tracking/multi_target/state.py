@@ -110,6 +110,11 @@ class JointState:
         covariance[3:, 3:] += shorter * np.outer(moment, moment)
         return covariance
 
+    def log_strength_sigma(self, source: int) -> float:
+        """Standard deviation of ln |m| of a source."""
+        at, moment = self.of_source[source, 3:N_SEEN], self.moment_Am2[source]
+        return float(np.sqrt(np.maximum(moment @ self.P[np.ix_(at, at)] @ moment, 0.0)) / np.linalg.norm(moment))
+
     def gap(self, first: int, second: int) -> tuple[float, float]:
         """Distance between two sources, and its standard deviation [m]."""
         offset = self.position_m[first] - self.position_m[second]

@@ -147,7 +147,8 @@ def track_sources(
     readings : Readings or array_like, shape (n, C)
         Raw readings [T], NaN where missing, in the order of time. Those that saturate are not used.
     sources : int or "auto"
-        How many sources there are at most; "auto": five, or as many as the array can tell.
+        How many sources there are at most; "auto": five, or as many as the array can tell. More than five are searched
+        for in the first row as :func:`locate` does, in seconds, and followed from there.
     motion : FreeMotion
         How each of them moves.
     prior : SourcePrior

@@ -14,6 +14,7 @@ from arrays.array import SensorArray
 from arrays.typing import FloatArray
 from magloc.blas_threads import one_blas_thread
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
+from magloc.localization.locator import Locator
 from magloc.measurement.rows import check_magnitudes
 from magloc.readings import Readings
 from magloc.tracking.multi_target.explanations import (
@@ -58,6 +59,8 @@ _POOR = 5.0 / np.sqrt(2.0 * _MEMORIES - 1.0)
 _MUST_GAIN, _CLEAR_GAIN = 20.0, 60.0
 # Squared distances, in units of their covariance, below which two states are one, and two places may be of one source.
 _SAME_SIGMA2, _ANOTHER_SIGMA2 = 1.0, 25.0
+# Standard deviation of ln |m| below which a source is none too many by itself.
+_CERTAIN_STRENGTH = 0.05
 # What a row costs at most that nothing explains.
 _UNBEARABLE = 1000.0
 
@@ -96,7 +99,8 @@ class SourcesTracker:
     array : SensorArray
         Vector sensors.
     sources : int or "auto"
-        How many sources there are at most; "auto": five, or as many as the array can tell.
+        How many sources there are at most; "auto": five, or as many as the array can tell. More than five are searched
+        for in the first row as :func:`locate` does, in seconds, and followed from there.
     motion : FreeMotion
         How each of them moves.
     prior : SourcePrior
@@ -169,7 +173,7 @@ class SourcesTracker:
             self._hypotheses = [replace(one, state=predicted(one.state, dt_s)) for one in self._hypotheses]
             return self._point(problem, "no readings", math.nan)
         if not self._hypotheses:
-            self._hypotheses = [self._nothing_yet(problem)]
+            self._hypotheses = [self._begun(problem)]
         children = [child for one in self._hypotheses for child in self._continued(problem, one, dt_s)]
         self._hypotheses = self._pruned([hypothesis for hypothesis, _ in children])
         best = self._hypotheses[0]
@@ -195,6 +199,22 @@ class SourcesTracker:
         point = self._point(problem, status, found.update.cost)
         self._hypotheses = self._split(problem)
         return point
+
+    def _begun(self, problem: RowProblem) -> Hypothesis:
+        """No source; where there may be many, those that a search finds in the row: one by one they are not told."""
+        nothing, scene, row = self._nothing_yet(problem), self.scene, problem.row
+        if scene.most_sources <= MOST_BY_ITSELF:
+            return nothing
+        locator = Locator(
+            scene.array, sources=scene.most_sources, prior=scene.prior, body_length_m=0.0, exclude_faulty=False
+        )
+        fix, R = locator.fit(row.readings_T, row.ambient_T), row.R_world_from_array
+        if not fix.solutions:
+            return nothing
+        positions_m = np.array([row.origin_m + R @ source.position_m for source in fix.best.sources])
+        moments_Am2 = np.array([R @ source.moment_Am2 for source in fix.best.sources])
+        found = problem.found_anew(nothing.state, positions_m, moments_Am2, nothing.health.dead)
+        return replace(nothing, state=found.prior, ids=found.ids)
 
     def _nothing_yet(self, problem: RowProblem) -> Hypothesis:
         """No source, and a common field that may be as large as the readings."""
@@ -245,7 +265,9 @@ class SourcesTracker:
         It is taken away, or one with another that it is not told apart from: the two may be a single one, and their
         moments then grow against each other.
         """
-        fewer = problem.one_less(found, range(len(best.ids)), merged_pairs(best.state))
+        state = best.state
+        doubtful = [k for k in range(state.n_sources) if state.log_strength_sigma(k) > _CERTAIN_STRENGTH]
+        fewer = problem.one_less(found, doubtful, merged_pairs(state))
         held = [self._after(problem, best, one) for one in fewer if problem.holds(one)]
         return [replace(one, score=best.score, excess=np.zeros(2), judged=_JUDGED_ROWS) for one in held]
 
@@ -257,11 +279,11 @@ class SourcesTracker:
         """
         common, dead, known = best.state.common_alone, best.health.dead, len(best.ids)
         again = problem.found_anew(common, best.state.position_m, best.state.moment_Am2, dead)
-        anew = [again, *problem.of_more_sources(common, dead, known)]
-        if known > 1:
-            anew += problem.of_more_sources(common, dead, known - 1)
+        anew = [again]
+        for number in (known, known - 1, known + 1):  # of many, one by one takes seconds and leads nowhere
+            if 0 < number <= min(self.scene.most_sources, MOST_BY_ITSELF):
+                anew += problem.of_more_sources(common, dead, number)
         if known < self.scene.most_sources:
-            anew += problem.of_more_sources(common, dead, known + 1)
             anew += distinct(one for start in (found, again) for one in problem.births(start))
         tried = [one for one in distinct(anew) if one.update.converged]
         more = [one for one in tried if len(one.ids) > known]

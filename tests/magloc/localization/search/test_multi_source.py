@@ -518,3 +518,21 @@ class TestKnowledge:
     def test_nothing_left_of_the_space_around(self):
         with pytest.raises(ValueError, match="leaves nothing"):
             plain_locator(PLATE, prior=SourcePrior(low_m=(1e6, 1e6, 1e6)), sources="auto")
+
+
+class TestManySources:
+    """Twelve magnets, each over three sensors of its own, that the others see too: found at once from no start."""
+
+    def test_all_are_found(self):
+        wells = np.array([[0.0195 * i, 0.0195 * j, 0.0] for i in range(3) for j in range(4)])
+        triad = np.array([[-2.15e-3, 1.7e-3, 0.0], [2.15e-3, 1.7e-3, 0.0], [0.0, -2.743e-3, 0.0]])
+        places = (wells[:, None] + triad).reshape(-1, 3)
+        sensors = tuple(Sensor(f"w{i}", "vector", tuple(place), 1e-6) for i, place in enumerate(places))
+        array = SensorArray(sensors)
+        rng = np.random.default_rng(107)
+        p = wells + np.array([0.0, 1e-3, -5e-3]) + rng.uniform(-5e-4, 5e-4, wells.shape)
+        m = 2.5e-4 * rng.normal(size=p.shape) + np.array([-2.5e-4, 0.0, 0.0])
+        readings = noisy_readings(array, p[None], m[None], rng)
+        fix = plain_locator(array, sources=12).fit_rows(readings)[0]
+        assert errors_of(fix, p).max() < 1e-3
+        assert fix.best.chi2 < chi2_distribution.ppf(1.0 - 1e-4, fix.best.dof)

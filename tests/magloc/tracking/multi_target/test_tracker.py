@@ -23,6 +23,11 @@ def run_of(seed: int, k: int, n_rows: int = 150, *, come_and_go: bool = False) -
     return truth, truth.readings_T(BOARD, rng)
 
 
+def unit_vectors(rng: np.random.Generator, n: int) -> np.ndarray:
+    directions = rng.normal(size=(n, 3))
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
 class TestTracks:
     def test_two_magnets_keep_their_names(self):
         """NEES of 300 points of 6 numbers that depend on each other: as in the figures' runs."""
@@ -48,6 +53,20 @@ class TestTracks:
         points, took = followed(BOARD, readings, sources=1)
         assert judged(points, truth, took).nees < 2.0
         assert {track.id for point in points for track in point.tracks} == {1}
+
+    def test_many_are_there_from_the_first_row(self):
+        """More than five are searched for at once. NEES of 72 points of 6 numbers that depend on each other."""
+        rng, n_rows = np.random.default_rng(6), 12
+        x, y = np.meshgrid([-0.045, 0.0, 0.045], [-0.025, 0.025], indexing="ij")
+        p = np.stack([x.ravel(), y.ravel(), np.full(6, 0.03)], axis=-1)[:, None].repeat(n_rows, 1)
+        p[..., 0] += 5e-4 * np.sin(np.arange(n_rows) / 4.0)
+        m = 0.05 * unit_vectors(rng, 6)[:, None].repeat(n_rows, 1)
+        truth = Magnets(p, m, np.ones((6, n_rows), dtype=bool))
+        points, took = followed(BOARD, truth.readings_T(BOARD, rng), sources=6)
+        assert [[track.id for track in point.tracks] for point in points] == [[1, 2, 3, 4, 5, 6]] * n_rows
+        found = judged(points, truth, took)
+        assert found.swaps == 0
+        assert found.nees < 2.0
 
     def test_noise_is_no_source(self):
         """100 rows: a false birth in any has a probability below 1e-3."""
