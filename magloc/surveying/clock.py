@@ -52,7 +52,8 @@ def lag_of(model: Model, sources: Sources, group: IntArray, delayed: Callable[[f
     found = minimize_scalar(cost, bounds=(-_MOST_S, _MOST_S), method="bounded", options={"xatol": _TOLERANCE_S})
     size = (int(group[-1]) + 1) * record.array.n_channels
     explained = found.fun < max(_MISFIT * size, _SHARE * here)  # else something is wrong that a lag imitates
-    if not explained or here - found.fun < model.threshold or abs(found.x) > 0.99 * _MOST_S:
+    least = model.threshold * max(1.0, found.fun / size)  # what is not found yet makes chance larger
+    if not explained or here - found.fun < least or abs(found.x) > 0.99 * _MOST_S:
         return Lag(0.0, math.inf)
     around = [cost(found.x + sign * step) for sign in (-1.0, 1.0)]
     return Lag(float(found.x), step * math.sqrt(2.0 / (sum(around) - 2.0 * found.fun)))
