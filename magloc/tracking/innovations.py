@@ -15,6 +15,9 @@ from magloc.tracking.results import TrackPoint
 THRESHOLD = 3.3
 """Standard deviations that a sum may be above its mean: 1 right track in 2,000 is beyond it."""
 
+FEWEST_STARTS = 3
+"""Rows in which tracks begin that say something of the record, and not of its end."""
+
 
 @dataclass(frozen=True)
 class InnovationTest:
@@ -32,23 +35,36 @@ class InnovationTest:
     z_constants : float
         Of the lever arm and the mounting that the rows tell of, where a pose is stated and these count as exact: too
         large, they are not. NaN elsewhere.
+    starts : int
+        Rows in which a track begins.
     """
 
     rows: int
     z_chi2: float
     z_lag1: float
     z_constants: float = math.nan
+    starts: int = 0
+
+    @property
+    def is_disjoint(self) -> bool:
+        """Whether tracks begin in more rows than they go on in, so that no row tells of the next."""
+        return self.starts >= FEWEST_STARTS and self.starts > self.rows
 
     @property
     def flagged(self) -> bool:
-        """Whether one of them is beyond the threshold."""
-        return any(z > THRESHOLD for z in (self.z_chi2, self.z_lag1, self.z_constants))
+        """Whether one of them is beyond the threshold, or rows tell nothing of each other."""
+        return self.is_disjoint or any(z > THRESHOLD for z in (self.z_chi2, self.z_lag1, self.z_constants))
 
     @property
     def reason(self) -> str:
         """What is wrong, in a sentence; empty where nothing is."""
         if not self.flagged:
             return ""
+        if self.is_disjoint:
+            return (
+                f"a track begins in {self.starts} rows and goes on in {self.rows}, no row tells of the next: by the"
+                " times, the speed and the rate of turn the source may be anywhere after a step (are times in seconds?)"
+            )
         if self.z_constants > THRESHOLD:
             what = f"the rows agree on another mounting or lever arm than the exact one (z = {self.z_constants:.1f})"
             why = "position_constant_m and attitude_constant_deg of the pose are stated too small"
@@ -78,6 +94,7 @@ def innovation_test(points: Sequence[TrackPoint]) -> InnovationTest:
         int(known.sum()),
         _standardised(float(np.sum(limited - dof[known])), 2.0 * float(dof[known].sum())),
         _standardised(float(lag1[paired].sum()), float(dof[paired].sum())),
+        starts=sum(point.status == "acquired" for point in points),
     )
 
 
