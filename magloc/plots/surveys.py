@@ -85,7 +85,7 @@ def _draw_values(figure: Figure, ax: Axes, x: FloatArray, y: FloatArray, values_
 
 def _draw_bar(figure: Figure, ax: Axes, shown: Collection, ticks: Sequence[float], unit: str) -> None:
     bar = figure.colorbar(shown, ax=ax, orientation="horizontal", shrink=0.8, aspect=30)
-    bar.set_ticks(ticks, labels=[f"{tick:.2g}" for tick in ticks])
+    bar.set_ticks(ticks, labels=[f"{float(f'{tick:.2g}'):g}" for tick in ticks])
     bar.minorticks_off()
     bar.ax.tick_params(labelsize=style.SMALL_LETTERS)
     bar.set_label(unit, fontsize=style.LETTERS)
