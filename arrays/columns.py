@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 
 import msgspec
 import numpy as np
 
 from arrays.io.csv import Table as CsvTable
-from arrays.io.csv import table_of_header, table_of_text
+from arrays.io.csv import table_of_header, table_of_text, unix_seconds
 from arrays.io.errors import InputError, naming, of_extra
 from arrays.io.toml import Table
 from arrays.typing import FloatArray, Vector
@@ -224,7 +224,26 @@ class LogFormat:
         """Whether a line names columns, the time among them."""
         if self.columns is None:
             return "time_s" in line
-        return self.columns.clock[0] in (cell.strip().strip('"') for cell in line.split(self.separator))
+        return self.columns.clock[0] in self._names(line)
+
+    def clock(self, header: str) -> Callable[[str], float]:
+        """What tells the time [s] of a row below a header; ValueError or IndexError where it has none."""
+        columns, names = self.columns, self._names(header)
+        at = [names.index(name) for name in (("time_s",) if columns is None else columns.clock) if name in names] or [0]
+
+        def seconds(row: str) -> float:
+            cells = row.split(self.separator)
+            told = "T".join(cells[i].strip() for i in at)
+            if columns is None:
+                return float(told)
+            if columns.time_unit == "iso":
+                return float(unix_seconds("", told))
+            return _SECONDS[columns.time_unit] * float(told.replace(columns.decimal, "."))
+
+        return seconds
+
+    def _names(self, line: str) -> list[str]:
+        return [cell.strip().strip('"') for cell in line.split(self.separator)]
 
     def header(self, line: str, name: str, number: int) -> CsvTable:
         """Table without rows, as the log names its columns, from its first line."""
@@ -276,6 +295,10 @@ class LogFormat:
 
     def _theirs(self, columns: LogColumns) -> tuple[str, ...]:
         return (*columns.clock, *columns.of_sensors(self.channels).values(), *columns.place, *columns.attitude)
+
+
+READINGS_FILE = LogFormat({}, None, "", ())
+"""Of a readings file, of whatever sensors."""
 
 
 def _position(table: CsvTable, columns: LogColumns) -> FloatArray:

@@ -228,7 +228,7 @@ def table_of_text(
             cells = [cell if i in timed else cell.replace(decimal, ".") for i, cell in enumerate(cells)]
         if timed:
             place = f"{name}, line {line}, column {', '.join(instant)}"
-            cells[timed[0]] = _unix_seconds(place, "T".join(cells[i].strip() for i in timed))
+            cells[timed[0]] = unix_seconds(place, "T".join(cells[i].strip() for i in timed))
             cells[timed[-1]] = cells[timed[0]]
         try:
             numbers = [read(cell or "nan") for cell in cells]
@@ -249,7 +249,7 @@ def table_of_header(line: str, name: str, expected_header: str, *, number: int =
     return Table(name, header, number, np.zeros((0, len(header))), np.zeros(0, dtype=np.int64))
 
 
-def _unix_seconds(place: str, cell: str) -> str:
+def unix_seconds(place: str, cell: str) -> str:
     """Seconds since 1970 of an instant, as text; 2026/11/21T7:00:00 is taken too."""
     try:
         instant = datetime.datetime.fromisoformat(re.sub(r"T(?=\d:)", "T0", cell.strip().replace("/", "-")))

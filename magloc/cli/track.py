@@ -207,7 +207,8 @@ def track(
     maps : MapOptions
         Files for maps of the world: one point of a source at rest, else the track.
     out : Path
-        Folder for the picture of the track with its 95 % ellipses and the data behind it.
+        Folder for the picture of the track with its 95 % ellipses, its consistency and the data behind both; with
+        --sources for the picture and the data, a row for every source.
     motion : PathOptions
         What is known of the motion.
     conditioning : ConditioningOptions

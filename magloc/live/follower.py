@@ -21,7 +21,7 @@ from magloc.live.transports import Stream, opened, sender_waits
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.measurement.differences import predicted_channels, suitable_dipole
 from magloc.measurement.pose import with_stated_pose
-from magloc.readings import EXPECTED_HEADER, Readings, without_saturated
+from magloc.readings import EXPECTED_HEADER, Readings, log_format, without_saturated
 from magloc.tracking.batch import compiled_motion, next_points
 from magloc.tracking.motion import MotionModel, RandomWalk
 from magloc.tracking.results import Row, TrackPoint, rows_of
@@ -156,7 +156,7 @@ class Follower:
         waits = sender_waits(source)
         if not waits:
             self._load()
-        with opened(source, replay_speed=replay_speed) as stream:
+        with opened(source, replay_speed=replay_speed, form=log_format(self.array, self._sensors)) as stream:
             yield from self._follow_stream(stream, waits=waits)
 
     def _load(self) -> None:

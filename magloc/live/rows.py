@@ -14,7 +14,7 @@ from magloc.live.tally import Tally
 from magloc.readings import EXPECTED_HEADER, Readings, log_format, readings_of_checked, readings_of_table
 
 _LINES_WITHOUT_HEADER = 100
-_AROUND = "\ufeff \t\r"
+_AROUND = "\ufeff \r\t"
 
 
 class GarbledError(ValueError):
@@ -42,6 +42,7 @@ class RowParser:
                 f"{name}: found columns.pose_latency_s in the array file, expected a stream whose poses are not late."
             )
         self._format = log_format(array, sensors)
+        self._around = _AROUND.replace(self._format.separator, "")
         self._array, self._name, self._tally, self._sensors = array, name, tally, sensors
         self._used = array
         self._header = ""
@@ -79,7 +80,7 @@ class RowParser:
     def _row_of(self, line: bytes) -> str | None:
         """A line as one of CSV, None where it is empty."""
         try:
-            text = line.decode().strip(_AROUND)
+            text = line.decode().strip(self._around)
         except UnicodeDecodeError as error:
             raise GarbledError(f"the byte 0x{line[error.start]:02x} is not UTF-8") from None
         if text.startswith("{"):

@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from urllib.parse import SplitResult, urlsplit
 
+from arrays.columns import READINGS_FILE, LogFormat
 from arrays.io.errors import InputError, check_positive, of_extra
 from arrays.io.text import read_bytes
 
@@ -51,8 +52,8 @@ def sender_waits(address: str) -> bool:
 
 
 @contextmanager
-def opened(address: str, *, replay_speed: float = 1.0) -> Iterator[Stream]:
-    """What comes in at an address; InputError if nothing can."""
+def opened(address: str, *, replay_speed: float = 1.0, form: LogFormat = READINGS_FILE) -> Iterator[Stream]:
+    """What comes in at an address, in a form that tells the time of a row; InputError if nothing can."""
     if address == STANDARD_INPUT:
         yield Stream("standard input", _lines(_of_stdin()))
         return
@@ -79,7 +80,7 @@ def opened(address: str, *, replay_speed: float = 1.0) -> Iterator[Stream]:
         case "replay":
             check_positive(replay_speed=replay_speed)
             lines = read_bytes(rest, "a readings file").splitlines()
-            yield Stream(rest, _in_own_time(lines, replay_speed))
+            yield Stream(rest, _in_own_time(lines, replay_speed, form))
         case _:
             raise InputError(f"{address}: found no such kind of source, expected {KINDS}.")
 
@@ -180,15 +181,14 @@ def _of_serial(port: serial.Serial) -> Iterator[bytes]:  # type: ignore[name-def
             return
 
 
-def _in_own_time(lines: list[bytes], speed: float) -> Iterator[list[bytes]]:
+def _in_own_time(lines: list[bytes], speed: float, form: LogFormat) -> Iterator[list[bytes]]:
     """Lines of a readings file, each when its time has come; nobody waits for long pauses."""
-    header = [cell.strip() for cell in lines[0].removeprefix(b"\xef\xbb\xbf").split(b",")] if lines else []
-    column = header.index(b"time_s") if b"time_s" in header else 0
+    seconds_of = form.clock(lines[0].removeprefix(b"\xef\xbb\xbf").decode(errors="replace") if lines else "")
     due_s, last_s = time.monotonic(), math.inf
     waiting: list[bytes] = []
     for line in lines:
         with suppress(IndexError, ValueError):  # what has no time comes with the line before
-            time_s = float(line.split(b",")[column])
+            time_s = seconds_of(line.decode(errors="replace"))
             step_s, last_s = time_s - last_s, time_s
             due_s += step_s / speed if 0.0 < step_s <= _LONGEST_PAUSE_S * speed else 0.0
         if due_s > time.monotonic():

@@ -15,7 +15,7 @@ from arrays.io.outputs import make_folder
 from arrays.typing import FloatArray, IntArray
 from magloc.plots import style
 from magloc.plots.style import save
-from magloc.tracking.results import TrackPoint, TrackResult, stacked
+from magloc.tracking.results import TrackPoint, TrackResult, on_track, stacked
 from magloc.truth import STATE_COLUMNS, state_columns
 
 if TYPE_CHECKING:
@@ -141,6 +141,7 @@ def _figure(
     tracks: Mapping[str, Sequence[TrackPoint]], truth_m: FloatArray | None, array_m: FloatArray | None
 ) -> Figure:
     """Sources by their names, of which a single one has its truth."""
+    tracks = {name: on_track(points) for name, points in tracks.items()}
     columns = {name: _columns_of(points) for name, points in tracks.items()}
     tracked = np.any([np.isfinite(position[:, 0]) for _, position, _, _ in columns.values()], axis=0)
     origin_m = np.zeros((1, 3)) if array_m is None else array_m
@@ -227,7 +228,7 @@ def consistency_figure(
     if truth_m is not None and nees is not None:
         _errors(axes[0], time, position - truth_m, covariance, bound_m)
         style.squares_panel(axes[1], time, *nees, "NEES")
-    tracked = np.array([point.position_m is not None for point in points])
+    tracked = np.array([point.is_on_track for point in points])
     nis = np.array([point.nis for point in points])
     nis_dof = np.array([point.nis_dof for point in points])
     style.squares_panel(axes[-3], time, nis, nis_dof, "NIS")

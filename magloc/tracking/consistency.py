@@ -33,7 +33,7 @@ class Consistency:
     Attributes
     ----------
     rows, tracked_rows : int
-        Rows with truth, and those of them that are tracked.
+        Rows with truth, and those of them that have a position.
     position_rms_m : float
         Root of the mean squared distance from the truth.
     position_bound_m : float
@@ -74,7 +74,7 @@ class Consistency:
     def lines(self) -> list[str]:
         """Errors against the truth, and what they should be."""
         lines = [
-            f"against the truth, {self.tracked_rows} of {self.rows} rows tracked:",
+            f"against the truth, {self.tracked_rows} of {self.rows} rows answered:",
             f"  position rms {self.position_rms_m:.4g} m",
         ]
         if np.isfinite(self.position_bound_m):

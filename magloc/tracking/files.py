@@ -18,7 +18,7 @@ from arrays.io.world_maps import feature, feature_collection, kml, placemark, wo
 from arrays.typing import FloatArray, Vector
 from magloc.levels import FALSE_ALARM
 from magloc.tracking.consistency import Consistency
-from magloc.tracking.results import TrackPoint, TrackResult, stacked
+from magloc.tracking.results import TrackPoint, TrackResult, on_track, stacked
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -84,7 +84,7 @@ def lines_of_track(points: Sequence[TrackPoint], *, most: int | None = None) -> 
 
 
 def json_entry(point: TrackPoint) -> dict[str, object]:
-    """What ``--json`` and ``--jsonl`` print of one row; null where the source is not tracked.
+    """What ``--json`` and ``--jsonl`` print of one row; null where it has no answer.
 
     What is said of the range is then that of the row alone, and its solutions are the rivals.
     """
@@ -118,6 +118,7 @@ def json_of_track(points: Sequence[TrackPoint], consistency: Consistency | None)
 
 def geojson_of_track(points: Sequence[TrackPoint], origin: Vector) -> dict[str, Any]:
     """:meth:`magloc.tracking.track.TrackColumns.to_geojson`."""
+    points = on_track(points)
     rest = at_rest(points)
     if rest is not None:
         return feature_collection([_feature(rest, origin)])
@@ -128,6 +129,7 @@ def geojson_of_track(points: Sequence[TrackPoint], origin: Vector) -> dict[str, 
 
 def kml_of_track(points: Sequence[TrackPoint], origin: Vector) -> str:
     """:meth:`magloc.tracking.track.TrackColumns.to_kml`."""
+    points = on_track(points)
     rest = at_rest(points)
     if rest is not None:
         return kml([_placemark("source", rest, origin)])
@@ -144,7 +146,7 @@ def at_rest(points: Sequence[TrackPoint]) -> TrackPoint | None:
     neighbouring rows go together, which makes true differences smaller still. None for a single row, for a source
     that moves, and without a track.
     """
-    known = [point for point in points if point.position_m is not None and point.covariance is not None]
+    known = [point for point in points if point.is_on_track and point.covariance is not None]
     if len(known) < 2:
         return None
     position, covariance = stacked(known, "position_m", 3), stacked(known, "covariance", 6, 6)[:, :3, :3]
@@ -226,7 +228,7 @@ def _read_track(path: Path) -> TrackResult:
             f"{path}: found fixes of `magloc locate`, expected a track; give its readings to see the fixes."
         )
     tracks = _tracks(path, entries)
-    if not any(point.position_m is not None for track in tracks.values() for point in track):
+    if not any(point.is_on_track for track in tracks.values() for point in track):
         raise InputError(f"{path}: found no row where the source is tracked, expected one at least.")
     points, *others = tracks.values()
     return TrackResult(points, is_truth=False, ids=tuple(tracks) if others else (), others=tuple(others))

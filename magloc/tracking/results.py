@@ -242,6 +242,11 @@ def next_row(row: Row | Readings, array: SensorArray, after_s: float) -> Row:
     return row
 
 
+def on_track(points: Sequence[TrackPoint]) -> Sequence[TrackPoint]:
+    """The points, empty where a row alone is answered."""
+    return [point if point.is_on_track else TrackPoint(point.time_s, status=point.status) for point in points]
+
+
 def stacked(points: Sequence[TrackPoint], name: str, *shape: int) -> FloatArray:
     """A column of a track (n, ...), NaN where there is no track."""
     empty = np.full(shape, np.nan)

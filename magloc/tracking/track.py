@@ -125,8 +125,8 @@ class TrackColumns(Sequence[TrackPoint]):
 
     @property
     def tracked(self) -> BoolArray:
-        """Whether the source is tracked (n,)."""
-        return np.array([point.position_m is not None for point in self], dtype=bool)
+        """Whether the source is tracked (n,), and not answered by a row alone."""
+        return np.array([point.is_on_track for point in self], dtype=bool)
 
     def table(self) -> str:
         """The table that ``magloc track`` prints."""

@@ -218,7 +218,7 @@ def _filling(
     if isinstance(result, Survey):
         return lambda server: survey_page(server, result)
     if isinstance(result, TrackResult):
-        if all(point.position_m is None for track in result.tracks for point in track):
+        if not any(point.is_on_track for track in result.tracks for point in track):
             raise ValueError("Input result must have a row where the source is tracked; instead received none.")
         return lambda server: track_page(server, result, array, readings)
     if not isinstance(result, MapResult | Readings | Fixes | None):

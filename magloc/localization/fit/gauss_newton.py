@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from arrays.typing import FloatArray
 from magloc.compilation import over_rows, own
 from magloc.fields.dipole import MU0_OVER_4PI
-from magloc.localization.fit.joint_compiled import JointEnds, refine_rows
+from magloc.localization.fit.joint_compiled import LARGEST_DAMPING, LARGEST_STEP_RAD, JointEnds, refine_rows
 from magloc.localization.fit.variable_projection_compiled import refined
 from magloc.measurement.whitened import WhitenedModel
 from magloc.measurement.whitened_compiled import ModelRows
@@ -25,8 +25,6 @@ from magloc.measurement.whitened_compiled import ModelRows
 # A refinement has converged where the linearised model promises to lower χ² by less than this, absolute and relative.
 PROMISE_ABSOLUTE = 1e-8
 PROMISE_RELATIVE = 1e-11
-_LARGEST_STEP_RAD = 0.5
-_LARGEST_DAMPING = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,8 +190,9 @@ def refine(
     """Positions and moments from starts (b, K, 4) and (b, K, 3): damped Gauss-Newton that never raises χ².
 
     y (b, C) are whitened readings, `free` (K, 3) says which :func:`tangents` of a source may change: without the third
-    its range stays. It has converged where the linearised model promises to lower χ² by less than `promise`. Of vector
-    sensors whose sources' moments are free compiled twins do it, which begin with the moments that fit best.
+    its range stays. It has converged where the linearised model promises to lower χ² by less than `promise`, of one
+    free source by less than that of :func:`refined`. Of vector sensors whose sources' moments are free compiled twins
+    do it, which begin with the moments that fit best.
     """
     free = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
     linear = problem.known is None and not problem.channel_is_scalar.any()
@@ -270,7 +269,7 @@ def damped_gauss_newton(
             gained = current - new_chi2
             small = np.abs(reachable) < promise + PROMISE_RELATIVE * current
             # A step that rounding refuses is the end too, if next to nothing was promised.
-            ended = small | (~accepted & (damping > _LARGEST_DAMPING))
+            ended = small | (~accepted & (damping > LARGEST_DAMPING))
             at_optimum = small | (np.abs(reachable) < 1e-6 * (1.0 + current))
             well = gained > 0.75 * promised
             badly = gained < 0.5 * promised
@@ -311,7 +310,7 @@ def _moved(
     along[:, columns] = step[:, : columns.size]
     along = along.reshape(n_fits, n_sources, 3)
     longest = np.max(np.linalg.norm(along, axis=-1), axis=-1)
-    share = np.minimum(1.0, _LARGEST_STEP_RAD / np.maximum(longest, 1e-300))
+    share = np.minimum(1.0, LARGEST_STEP_RAD / np.maximum(longest, 1e-300))
     moved = q + (tangent @ (share[:, None, None] * along)[..., None])[..., 0]
     # A step along the tangents lengthens u a little: where the range is held, u keeps its length.
     held = ~np.isin(3 * np.arange(n_sources) + 2, columns)

@@ -1,6 +1,6 @@
 """Compiled variable projection of several dipoles: all moments are linear and eliminated, the positions are searched.
 
-The readable twin is :func:`magloc.localization.fit.gauss_newton.refine`, which takes any sensors.
+The readable twin is :func:`magloc.localization.fit.gauss_newton.damped_gauss_newton`, which takes any sensors.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from magloc.measurement.whitened_compiled import (
 
 # A ridge of columns of unit norm: below it they are one column to rounding.
 _RIDGE = 1e-13
-_LARGEST_STEP_RAD, _LARGEST_DAMPING = 0.5, 1e9
+LARGEST_STEP_RAD, LARGEST_DAMPING = 0.5, 1e9
 
 
 class JointEnds(NamedTuple):
@@ -100,7 +100,7 @@ def refine_rows(
             gained = chi2 - lower
             fresh = gained > 0.0
             small = abs(reachable) < promise[0] + promise[1] * chi2
-            ended = small or (not fresh and damping > _LARGEST_DAMPING)
+            ended = small or (not fresh and damping > LARGEST_DAMPING)
             optimum = small or (ended and abs(reachable) < 1e-6 * (1.0 + chi2))
             if fresh:
                 put_rows(q, w.trial)
@@ -235,7 +235,7 @@ def _move(q: FloatArray, free: FloatArray, w: _Workspace) -> float:
     for k in range(len(q)):
         a, b, c = w.step[3 * k, 0], w.step[3 * k + 1, 0], w.step[3 * k + 2, 0]
         longest = max(longest, math.sqrt(a * a + b * b + c * c))
-    share = _LARGEST_STEP_RAD / longest if longest > _LARGEST_STEP_RAD else 1.0
+    share = LARGEST_STEP_RAD / longest if longest > LARGEST_STEP_RAD else 1.0
     for k in range(len(q)):
         moved, before, after = w.trial[k], 0.0, 0.0
         for d in range(4):

@@ -98,7 +98,7 @@ def _plain_tracks(tracker: Tracker, readings: Readings) -> Iterator[tuple[int, l
             sensors = tuple(replace(sensor, noise_T=times * sensor.noise_T) for sensor in tracker.array.sensors)
             plain = Tracker(replace(tracker.array, sensors=sensors), tracker.motion, prior=tracker.prior)
             points = track_record(plain, list(rows_of(source)))
-            known = np.flatnonzero([point.position_m is not None for point in points])
+            known = np.flatnonzero([point.is_on_track for point in points])
             if len(known) < _FEWEST_ROWS:
                 continue
             sources = np.array([np.concatenate([points[i].position_m, points[i].moment_Am2]) for i in known.tolist()])

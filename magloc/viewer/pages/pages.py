@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from arrays.typing import FloatArray
 from magloc.localization.fit.results import Fix
 from magloc.readings import Readings
 from magloc.surveying.results import Survey
-from magloc.tracking.results import TrackPoint, TrackResult, stacked
+from magloc.tracking.results import TrackPoint, TrackResult, on_track, stacked
 from magloc.viewer.pages import words
 from magloc.viewer.pages.field_panel import FieldPanel
 from magloc.viewer.pages.fixes import FixView, best_positions
@@ -175,6 +175,7 @@ def track_page(
     server: viser.ViserServer, result: TrackResult, array: SensorArray | None, rows: Readings | None
 ) -> Page:
     """Tracks, with the array that found them and its readings, if they are given."""
+    result = replace(result, points=tuple(on_track(result.points)))
     points, gui = result.points, server.gui
     each = [stacked(track, "position_m", 3) for track in result.tracks]
     positions = np.concatenate(each)

@@ -225,6 +225,17 @@ class TestColumnsOfAnotherProgram:
         assert tally.garbled == 1
         assert "line 4, column T: found 'noon'" in caplog.text
 
+    def test_a_tab_before_a_missing_cell(self) -> None:
+        """At either end of a row it is a separator, not what stands around it."""
+        array = replace(ARRAY, columns=LogColumns(separator="tab"))
+        names = [f"{name}_nT" for name in ARRAY.channel_names]
+        parser = RowParser(array, "the stream", tally := Tally())
+        rows = ["\t".join([*map(str, range(11)), "", "0.5"]), "\t".join(["", *map(str, range(11)), "1"])]
+        lines = ["\t".join([*names, "time_s"]), *rows, "\t".join(map(str, range(13))) + "\r"]
+        (found,) = parser.rows_of([line.encode() for line in lines])
+        assert tally.garbled == 0
+        assert np.argwhere(np.isnan(found.values_T)).tolist() == [[0, 11], [1, 0]]
+
     def test_objects(self) -> None:
         rows = self.rows(4)
         objects = []

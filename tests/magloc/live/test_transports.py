@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from arrays.columns import READINGS_FILE, LogColumns, LogFormat
 from arrays.io.errors import InputError
 from magloc.live import transports
 from magloc.live.transports import opened
@@ -137,10 +138,12 @@ class Time:
 
 
 class TestReplay:
-    def arrivals(self, path: Path, monkeypatch: pytest.MonkeyPatch, speed: float = 1.0) -> list[tuple[bytes, float]]:
+    def arrivals(
+        self, path: Path, monkeypatch: pytest.MonkeyPatch, speed: float = 1.0, form: LogFormat = READINGS_FILE
+    ) -> list[tuple[bytes, float]]:
         time = Time()
         monkeypatch.setattr(transports, "time", time)
-        with opened(f"replay:{path}", replay_speed=speed) as stream:
+        with opened(f"replay:{path}", replay_speed=speed, form=form) as stream:
             return [(line, time.now_s - 100.0) for batch in stream.lines for line in batch]
 
     @pytest.mark.parametrize("speed", [1.0, 10.0])
@@ -155,6 +158,32 @@ class TestReplay:
         assert [line.decode() for line, _ in found] == text.split("\n")
         due = [0.0, *(at for _, at in rows), rows[-1][1]]
         assert [at for _, at in found] == pytest.approx([at / speed for at in due])
+
+    @pytest.mark.parametrize(
+        ("columns", "header", "times"),
+        [
+            (LogColumns(time="ms", time_unit="ms"), "A,ms", ("1000", "1500", "3000")),
+            (LogColumns(separator="semicolon", decimal=",", time="T"), "A;T", ("1,0", "1,5", "3,0")),
+            (
+                LogColumns(time="UTC", time_unit="iso"),
+                "A,UTC",
+                tuple(f"2026-11-21T12:00:0{s}" for s in ("1", "1.5", "3")),
+            ),
+            (
+                LogColumns(separator="tab", time=("D", "H"), time_unit="iso"),
+                "A\tD\tH",
+                tuple(f"2026-11-21\t12:00:0{s}" for s in ("1", "1.5", "3")),
+            ),
+        ],
+    )
+    def test_a_log_of_another_program(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, columns: LogColumns, header: str, times: tuple[str, ...]
+    ) -> None:
+        form = LogFormat({}, columns, "", ())
+        rows = [f"48000{form.separator}{time}" for time in times]
+        (tmp_path / "log.csv").write_text("\n".join([header, *rows]))
+        found = self.arrivals(tmp_path / "log.csv", monkeypatch, form=form)
+        assert [at for _, at in found] == pytest.approx([0.0, 0.0, 0.5, 2.0])
 
     def test_a_file_that_is_not_there(self) -> None:
         with pytest.raises(InputError, match=r"nowhere\.csv does not exist, expected a readings file"):

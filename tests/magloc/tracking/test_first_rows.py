@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import magloc
 from arrays.geometries import axial
 from magloc.measurement.differences import predicted_channels
 from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import nees_of
+from magloc.tracking.files import json_entry
 from magloc.tracking.motion import MotionModel, OrnsteinUhlenbeck, RandomWalk
 from magloc.tracking.posterior_bound import posterior_bound
 from magloc.tracking.results import Row
@@ -122,3 +124,14 @@ class TestRowsOfFewReadings:
             ((low, high),) = point.range_interval_m or ((0.0, None),)
             inside += low <= range_m and (high is None or range_m <= high)
         assert inside > 22
+
+    def test_they_are_no_track(self) -> None:
+        """Of one that stands still: not in maps of the world, nor among the rows tracked, but answered in JSON."""
+        rng = np.random.default_rng(1)
+        readings = predicted_channels(self.PAIR, [3.0, 1.0, -2.0], [0.0, 200.0, 0.0])
+        values = readings + 2e-10 * rng.normal(size=(4, 6))
+        found = magloc.track(self.PAIR, values, motion=WALK)
+        assert found.status == ["undetermined"] * 4
+        assert not found.tracked.any()
+        assert found.to_geojson((48.0, 11.0, 0.0))["features"] == []
+        assert all(json_entry(point)["position_m"] is not None for point in found)
