@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from adcs import quaternion
 from adcs.satellite.telemetry import is_read
-from adcs.satellite.vector_record import GAP_STEPS, steps_s
+from adcs.satellite.vector_record import GAP_STEPS, instants_within, steps_s
 from arrays.typing import BoolArray, FloatArray
 
 if TYPE_CHECKING:
@@ -194,7 +194,7 @@ def _blocks(
     starting = time_s[rows] < time_s[0] + _START_S
     if not starting.any():
         raise ValueError("Input field_T must be there within the first second; instead received none.")
-    size = max(1, round(_BLOCK_S / float(np.median(np.diff(time_s[rows])))))
+    size = instants_within(_BLOCK_S, time_s[rows])
     of_block = rows[: len(rows) // size * size].reshape(-1, size)
     ends = of_block[:, -1]
     dt_s = steps_s(time_s)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from adcs import quaternion
 from adcs.complementary.heading import HeadingModel
-from adcs.satellite.vector_record import GAP_STEPS, GyroSamples, step_rates, steps_s
+from adcs.satellite.vector_record import GAP_STEPS, GyroSamples, instants_within, step_rates, steps_s
 from arrays.typing import BoolArray, FloatArray
 
 GRAVITY_TIME_S = 3.0
@@ -190,8 +190,8 @@ def _lag_s(q_gyro: FloatArray, record: InertialMagneticRecord) -> float:
     usual = np.nanmedian(lengths[record.starting])
     rows = np.flatnonzero(np.isfinite(lengths))
     step = float(np.median(record.dt_s))
-    rows = rows[:: max(1, round(_LAG_EVERY_S / float(np.median(np.diff(time_s[rows])))))]
-    apart = max(1, round(_LAG_WINDOW_S / float(np.median(np.diff(time_s[rows])))))
+    rows = rows[:: instants_within(_LAG_EVERY_S, time_s[rows])]
+    apart = instants_within(_LAG_WINDOW_S, time_s[rows])
     good = np.abs(lengths[rows] - usual) < _USUAL_LENGTH * usual
     most = round(_LONGEST_LAG_S / step)
     changes = [change_without_turns(q_gyro, time_s, rows, field_T, good, apart, lag * step) for lag in range(most + 1)]

@@ -23,6 +23,11 @@ def steps_s(time_s: FloatArray) -> FloatArray:
     return np.concatenate([[np.median(steps)], steps])
 
 
+def instants_within(seconds: float, time_s: FloatArray) -> int:
+    """How many of n ascending times are within so many seconds at their usual steps: 1 to n."""
+    return max(1, min(len(time_s), round(seconds / float(np.median(np.diff(time_s)))))) if len(time_s) > 1 else 1
+
+
 def step_rates(rate_rad_s: FloatArray, dt_s: FloatArray, samples: GyroSamples = "mean") -> FloatArray:
     """Mean rates (n, 3) over the steps that end at each instant, of a gyro's samples (n, 3), NaN where it has none.
 

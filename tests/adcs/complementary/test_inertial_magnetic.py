@@ -220,6 +220,17 @@ class TestDoor:
         assert (after[:2] > 5.0 * before[:2]).all()
         assert after[2] > 1.5 * before[2]
 
+    @pytest.mark.parametrize("offline", [False, True])
+    @pytest.mark.parametrize("count", [1, 5])
+    def test_a_magnetometer_that_stops_at_once(self, count, offline):
+        """Readings within some milliseconds tell no lag, and the heading where it lies still."""
+        record, q, _ = motion(10.0)
+        field_T = np.where(np.arange(len(q))[:, None] < count, record.field_T, np.nan)
+        readings = 0.15 * record.time_s, record.rate_rad_s, record.acceleration_m_s2, field_T
+        assert prepare(InertialMagneticRecord(*readings)).lag_s == 0.0
+        track = inertial_magnetic_filter(*readings, offline=offline)
+        assert np.degrees(quaternion.angle_between(track.q, q)).max() < 2.0
+
     def test_refusals(self):
         time_s, ones = DT * np.arange(200), np.ones((200, 3))
         with pytest.raises(ValueError, match=r"magnet must be one of .*; instead received 'left'"):
