@@ -230,7 +230,7 @@ def _with_wild(prepared: Prepared, good: Readings, rows: slice) -> Readings:
 
 
 def advance(prepared: Prepared, state: State, wheel_torque_Nm: FloatArray, row: int) -> State:
-    """True state (q, w, momentum) of all runs at instant ``row`` + 1 from that at ``row``.
+    """True state (q, w, momentum) of all runs at instant ``row`` + 1 from that at ``row``, without rods.
 
     Shape ``state`` (runs, 4), (runs, 3), (runs, 3). ``wheel_torque_Nm`` (runs, 3): as set, by
     :func:`adcs.satellite.dynamics.commanded_torque` of an estimate.
@@ -254,7 +254,14 @@ def controlled(
     command: Command,
     advanced: Callable[[int], None] | None = None,
 ) -> AttitudeRuns:
-    """Truth and readings from the start of prepared runs, without wheels; what is commanded goes into the record."""
+    """Truth and readings from the start of prepared runs, without wheels; what is commanded goes into the record.
+
+    Raises ValueError: the scenario has rods, which only :func:`moved` simulates.
+    """
+    if prepared.scenario.rods is not None:
+        raise ValueError(
+            "Input prepared must have no rods where moments are commanded; instead received a scenario with rods."
+        )
     runs, n = prepared.torque_Nm.shape[:2]
     none = np.zeros((runs, 3))
     record = AttitudeRuns.of(prepared, np.tile(quaternion.IDENTITY, (runs, n, 1)), *np.zeros((3, runs, n, 3)))

@@ -21,7 +21,7 @@ for _name, _where, _help in (
     (
         "detumbling",
         "sims.cli.run_detumbling:detumbling",
-        "Rate of a tumbling satellite taken out by torquers, with B-dot of its magnetometer.",
+        "Rate of a tumbling satellite taken out by torquers, with B-dot of its magnetometer, or by rods.",
     ),
     (
         "ellipsoid",

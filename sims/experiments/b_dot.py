@@ -127,6 +127,8 @@ def detumbling(
     law = BDot(b_dot_gain(INERTIA_KGM2, float(prepared.environment.orbital_rate_rad_s[0, 0])), largest_Am2, duty)
     if damping == "rods":
         runs = moved(prepared)
+        if advanced is not None:
+            advanced(scenario.n_instants)
     else:
         command = _by_readings(law) if damping == "readings" else _by_estimate(law)
         runs = controlled(prepared, command, advanced)

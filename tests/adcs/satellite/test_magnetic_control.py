@@ -18,9 +18,9 @@ from adcs import quaternion
 from adcs.kalman.mekf import run_filter
 from adcs.satellite import dynamics
 from adcs.satellite.magnetic_control import BDot, HysteresisRods, b_dot_gain, detumbled
-from sims.attitude.simulation import advance
+from sims.attitude.simulation import advance, controlled, prepare
 from sims.experiments import accuracy
-from sims.experiments.b_dot import INERTIA_KGM2, Detumbling, detumbling
+from sims.experiments.b_dot import INERTIA_KGM2, Damping, Detumbling, detumbling
 from tests.adcs.filter_runs import settings, start_of
 
 Array = NDArray[np.float64]
@@ -206,6 +206,17 @@ class TestRuns:
         )
         assert (with_rods.last_rate_deg_s < without.last_rate_deg_s).all()
         assert np.median(with_rods.last_rate_deg_s) < 0.8 * np.median(without.last_rate_deg_s)
+
+    @pytest.mark.parametrize("damping", ["readings", "rods"])
+    def test_every_step_is_counted(self, damping: Damping) -> None:
+        steps: list[int] = []
+        detumbling([0], damping=damping, duration_s=60.0, advanced=steps.append)
+        assert sum(steps) == 61
+
+    def test_no_commands_beside_rods(self, few: Detumbling) -> None:
+        with_rods = prepare(replace(few.runs.scenario, rods=HysteresisRods()), [0])
+        with pytest.raises(ValueError, match=r"Input prepared must have no rods .*; instead received"):
+            controlled(with_rods, lambda record, row: np.zeros((1, 3)))
 
     @pytest.mark.slow
     def test_of_forty_starts_at_ten_degrees_a_second(self) -> None:
