@@ -88,6 +88,8 @@ def refine(
     whose start has ended takes the next one. The iterations are no integer: a literal one would be compiled for itself.
     """
     n, n_sensors, n_triples = len(starts), len(model.sensors), model.common.shape[1]
+    if n == 0:  # idle lanes compute the last start
+        return
     w, rows = np.zeros(WORKSPACE), np.zeros((n_sensors, SENSOR_ROWS))
     common, dots = np.zeros((n_sensors, n_triples, 9 * LANES)), np.empty((n_triples, 9 * LANES))
     start_of_lane, set_of_lane = np.full(LANES, -1), np.full(LANES, -1)
