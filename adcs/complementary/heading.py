@@ -171,9 +171,10 @@ def heading_track(
     ended[ends] = 1
     last = np.clip(np.cumsum(ended) - (ended if offline else 1), 0, m - 1)
     sigma = np.sqrt(variances)
+    since = ends[last], np.maximum(time_s - time_s[ends[last]], 0.0)
     return HeadingTrack(
         heading_rad=told[last, 0],
-        sigma_rad=sigma[last, 0],
+        sigma_rad=np.sqrt(variances[last, 0] + _drifted(time_s, rate_rad_s, *since, model)),
         offset_T=told[last, 1:],
         offset_sigma_T=sigma[last, 1:],
         left_out=(used == 0)[last],
@@ -212,6 +213,19 @@ def _blocks(
         start_T=level[starting].mean(axis=0),
     )
     return blocks, ends
+
+
+def _drifted(
+    time_s: FloatArray, rate_rad_s: FloatArray, ends: NDArray[np.intp], since_s: FloatArray, model: HeadingModel
+) -> FloatArray:
+    """What the gyro alone adds to the heading's variance (n,) since the blocks that ended at some instants."""
+    turning = np.linalg.norm(rate_rad_s, axis=1) > model.turning_rad_s
+    turned_s = np.cumsum(turning * steps_s(time_s))
+    of_drift = np.maximum(turned_s - turned_s[ends], 0.0) / model.gyro_drift_s
+    # Of the integral of a bias that is forgotten.
+    drift_s = 2.0 * model.gyro_drift_s**2 * (of_drift + np.expm1(-of_drift))
+    variance: FloatArray = model.gyro_walk_rad_rts**2 * since_s + model.gyro_drift_rad_s**2 * drift_s
+    return variance
 
 
 def transition(i: int, blocks: Blocks, noise: Noise) -> tuple[FloatArray, FloatArray]:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter
 from scipy.differentiate import jacobian
+from scipy.stats import chi2
 
 from adcs import quaternion
 from adcs.complementary.heading import (
@@ -167,6 +168,18 @@ class TestRooms:
         found = heading_track(time_s, rate, q_level, field, replace(MODEL, gyro_scale=1e-6))
         at = np.searchsorted(time_s, [22.0, 40.0, 59.0])
         assert (np.diff(found.sigma_rad[at]) > 0.03 * found.sigma_rad[at[0]]).all()
+
+    @pytest.mark.parametrize("offline", [False, True])
+    def test_sigma_grows_after_the_last_reading(self, offline):
+        """Readings end after 15 of 60 s: the squared errors of 12 rooms are beyond their χ² once in a thousand times."""
+        square = 0.0
+        for seed in range(12):
+            time_s, rate, q_level, field, truth = room(60.0, seed)
+            field[time_s > 15.0] = np.nan
+            track = heading_track(time_s, rate, q_level, field, offline=offline)
+            assert track.sigma_rad[-1] > 1.5 * track.sigma_rad[time_s < 15.0][-1]
+            square += float(np.square((track.heading_rad - truth)[-1] / track.sigma_rad[-1]))
+        assert square < chi2(12).isf(1e-3)
 
     def test_nothing_is_used_before_it_is_read(self):
         time_s, rate, q_level, field, _ = room(20.0)
