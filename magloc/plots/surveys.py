@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.colors import SymLogNorm
 from matplotlib.figure import Figure
+from matplotlib.tri import Triangulation
 
 from arrays.typing import FloatArray
 from magloc.plots import style
+from magloc.surveying.results import linear_and_most
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,7 +20,8 @@ if TYPE_CHECKING:
 
     from magloc.surveying.results import Survey, Target
 
-_MOST_POINTS = 20_000
+_FLAT = 1e-6  # across over along a line
+_GAP = 3.0  # over the usual step between places: nothing is known across it
 _ACROSS, _UP = "x, east [m]", "y, north [m]"
 
 
@@ -46,11 +49,12 @@ def survey_figure(found: Survey) -> Figure:
     x, y, _ = found.rows.place_m.T
     height = style.WIDTH_IN * 0.5 * float(np.clip(np.ptp(y) / max(np.ptp(x), 1e-9), 0.4, 1.6)) + 1.0
     figure = style.new_figure(2.0 * height)
-    rows = slice(None, None, -(-len(x) // _MOST_POINTS))
+    rows = found.rows.thinned()
     both, reach = figure.subplots(2, 2, sharex=True, sharey=True)
-    before, after = (values[rows] * 1e9 for values in (found.rows.anomaly_T, found.rows.residual_T))
-    for ax, values, title in zip(both, (before, after), ("anomaly", "less the targets' fields"), strict=True):
-        _draw_values(figure, ax, x[rows], y[rows], values)
+    for ax, values_T, title in zip(
+        both, (rows.anomaly_T, rows.residual_T), ("anomaly", "less the targets' fields"), strict=True
+    ):
+        _draw_values(figure, ax, rows.place_m, values_T * 1e9)
         style.dress(ax, _ACROSS, _UP, title)
         ax.set_aspect("equal")
     for target in found:
@@ -66,21 +70,26 @@ def survey_figure(found: Survey) -> Figure:
 
 
 def _draw_reach(figure: Figure, ax: Axes, places_m: FloatArray, moments_Am2: FloatArray) -> None:
-    """Moments between places, on a logarithmic scale."""
-    x, y, _ = places_m.T
-    if min(len(set(x)), len(set(y))) < 2:
+    """Moments between places that are neighbours, on a logarithmic scale."""
+    xy = places_m[:, :2]
+    if len(xy) < 3 or np.linalg.matrix_rank(xy - xy.mean(axis=0), rtol=_FLAT) < 2:
         return  # a single line of places has no map
-    surface = ax.tripcolor(x, y, moments_Am2, norm="log", cmap="viridis", shading="gouraud", rasterized=True)
+    between = Triangulation(*xy.T)
+    corners = xy[between.triangles]
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    between.set_mask((sides > _GAP * np.median(sides)).any(axis=1))
+    surface = ax.tripcolor(between, moments_Am2, norm="log", cmap="viridis", shading="gouraud", rasterized=True)
     _draw_bar(figure, ax, surface, np.geomspace(moments_Am2.min(), moments_Am2.max(), 4).tolist(), "A·m²")
 
 
-def _draw_values(figure: Figure, ax: Axes, x: FloatArray, y: FloatArray, values_nT: FloatArray) -> None:
-    """Rows as coloured points; the scale is linear where most of them are, and logarithmic beyond."""
-    most = float(np.abs(values_nT).max())
-    usual = float(np.quantile(np.abs(values_nT), 0.8))
-    norm = SymLogNorm(max(usual, 1e-3 * most, 1e-6), vmin=-most, vmax=most)
-    points = ax.scatter(x, y, c=values_nT, s=1.5, lw=0.0, cmap="RdBu_r", norm=norm, rasterized=True)
-    _draw_bar(figure, ax, points, [-most, -norm.linthresh, 0.0, norm.linthresh, most], "nT")
+def _draw_values(figure: Figure, ax: Axes, places_m: FloatArray, values_nT: FloatArray) -> None:
+    """Rows as coloured points."""
+    linear, most = linear_and_most(values_nT)
+    norm = SymLogNorm(linear, vmin=-most, vmax=most)
+    points = ax.scatter(
+        places_m[:, 0], places_m[:, 1], c=values_nT, s=1.5, lw=0.0, cmap="RdBu_r", norm=norm, rasterized=True
+    )
+    _draw_bar(figure, ax, points, [-most, -linear, 0.0, linear, most], "nT")
 
 
 def _draw_bar(figure: Figure, ax: Axes, shown: Collection, ticks: Sequence[float], unit: str) -> None:

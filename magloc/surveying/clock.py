@@ -68,12 +68,17 @@ def rows_around(time_s: FloatArray, rows: IntArray) -> IntArray:
 
 
 def taken_earlier(readings: Readings, lag_s: float) -> Readings:
-    """Readings with the poses of some time before their own, and the ambient field that belongs to these."""
+    """Readings with the poses of some time before their own, and the direction of the ambient field with these.
+
+    Its modulus stays that of the row's own time, as a base station at the clock of the readings has it.
+    """
     posed = readings.posed_later(-lag_s)
     ambient = readings.ambient_T
-    if ambient is not None:  # in the world it hardly turns: between two directions its modulus would be too small
+    if ambient is not None:  # in the world it hardly turns between two rows
         assert readings.array_rotation is not None
         assert posed.array_rotation is not None
         in_world = vectors_at(readings.time_s - lag_s, readings.time_s, readings.array_rotation.apply(ambient))
-        ambient = posed.array_rotation.inv().apply(in_world)
+        earlier = posed.array_rotation.inv().apply(in_world)
+        own, theirs = (np.linalg.norm(field, axis=1, keepdims=True) for field in (ambient, earlier))
+        ambient = earlier * (own / theirs)
     return replace(posed, ambient_T=ambient)

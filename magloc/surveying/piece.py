@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from arrays.array import SensorArray
-from arrays.typing import BoolArray, FloatArray, IntArray
+from arrays.typing import FloatArray, IntArray
 from magloc.blas_threads import one_blas_thread
 from magloc.grids.work import Arrays
 from magloc.localization.fit.prior import SourcePrior
@@ -21,6 +21,7 @@ from magloc.surveying.reach import least_moments
 from magloc.surveying.rounds import MOST_ROUNDS, Model, found_in
 from magloc.surveying.search import PITCH, SearchGrid
 from magloc.surveying.targets import targets_of
+from magloc.surveying.tiles import Tile
 
 OF_ROWS = ("place_m", "anomaly_T", "residual_T")
 _FIRST_ROUNDS = 4  # until the clock is looked at
@@ -79,10 +80,8 @@ class Piece:
     array : SensorArray
     readings : Readings
     ground : Ground
-    number : ndarray of int, shape (n,)
-        Of every row among all rows.
-    own : ndarray of bool, shape (n,)
-        Rows of the tile itself, not of its margin.
+    tile : Tile
+        Whose rows they are.
     offset_T : ndarray, shape (C,)
         Of the anomalies.
     geology_T : float
@@ -94,8 +93,7 @@ class Piece:
     array: SensorArray
     readings: Readings
     ground: Ground
-    number: IntArray
-    own: BoolArray
+    tile: Tile
     offset_T: FloatArray
     geology_T: float
     known: Sources
@@ -121,11 +119,11 @@ class Piece:
 
     def groups(self, record: SurveyRecord, bounds: Bounds, part: float) -> IntArray:
         """Group of every row (n,): neighbours that pass within a part of the distance to sources count as one."""
-        steps = np.linalg.norm(np.diff(record.sensors_m.mean(axis=1), axis=0), axis=1)[np.diff(self.number) == 1]
+        steps = np.linalg.norm(np.diff(record.sensors_m.mean(axis=1), axis=0), axis=1)[np.diff(self.tile.rows) == 1]
         step = float(np.median(steps)) if steps.size else 0.0
         length = part * (record.height_m - bounds.high_m[2])
         together = max(1, math.floor(length / step)) if step > 0.0 else 1
-        return np.unique(self.number // together, return_inverse=True)[1]
+        return np.unique(self.tile.rows // together, return_inverse=True)[1]
 
 
 @one_blas_thread
@@ -160,14 +158,14 @@ def targets_in(piece: Piece) -> Arrays:
         record.along_ambient(record.values_T),
         record.along_ambient(left),
     )
-    places, moments = least_moments(
-        model, fit, background, record.sensors_m[piece.own].mean(axis=1), piece.ground.ground_m
-    )
+    own = piece.tile.own
+    extent = piece.tile.extent_m(lines[0][own, :2])
+    places, moments = least_moments(model, fit, background, *extent, piece.ground.ground_m)
     return {
         "reach_m": places,
         "reach_Am2": moments,
         **targets_of(model, fit, background, piece.ground.ground_m),
-        **{name: values[piece.own] for name, values in zip(OF_ROWS, lines, strict=True)},
+        **{name: values[own] for name, values in zip(OF_ROWS, lines, strict=True)},
         "chi2": np.array(fit.chi2),
         "size": np.array(fit.residual.size),
     }

@@ -106,7 +106,7 @@ def record_of(array: SensorArray, readings: Readings) -> tuple[SurveyRecord, Pos
 
 
 def varying(ambient_T: FloatArray, time_s: FloatArray, base: Readings) -> FloatArray:
-    """Ambient field (n, 3) whose modulus changes as that at a base station, whose median belongs to what is given."""
+    """Ambient field (n, 3) whose modulus changes as that at a base station about its median over them."""
     if base.values_T.shape[1] != 1:
         raise ValueError(f"Input base must have one channel; instead received {base.values_T.shape[1]}.")
     read = base[np.isfinite(base.values_T[:, 0])]
@@ -116,7 +116,8 @@ def varying(ambient_T: FloatArray, time_s: FloatArray, base: Readings) -> FloatA
             f"Input base must read from {time_s[0]:.15g} to {time_s[-1]:.15g} s, as the survey does; instead received"
             f" {ends}."
         )
-    change = vectors_at(time_s, read.time_s, read.values_T - np.median(read.values_T))
+    there = vectors_at(time_s, read.time_s, read.values_T)
+    change = there - np.median(there)  # over the survey's own time: stations read before and after it
     return np.asarray(ambient_T * (1.0 + change / np.linalg.norm(ambient_T, axis=1, keepdims=True)))
 
 

@@ -12,28 +12,31 @@ from magloc.surveying.search import WINDOW, SearchGrid, groups_near, normal_equa
 
 DEPTHS_M = (0.5, 1.0, 2.0)
 SEEN = 0.95
+_ROUNDING = 1e-12  # of what rows say of all three axes
 
 
 def least_moments(
-    model: Model, fit: JointFit, background: Background, rows_m: FloatArray, ground_m: float
+    model: Model, fit: JointFit, background: Background, low_m: FloatArray, high_m: FloatArray, ground_m: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Places (k, 3) under rows (n, 3), and the moments (k,) that would be found there with 95 %, however they point.
+    """Places (k, 3) below a rectangle (2,), and the moments (k,) that are found there with 95 %, however they point.
 
-    What is found is a noncentral χ² of 3 degrees of freedom, moment·information·moment, above the threshold.
+    What is found is a noncentral χ² of 3 degrees of freedom, moment·information·moment, above the threshold. Where rows
+    show none, however strong, there is no place.
     """
     record = model.record
     Q = with_free_sources(record, background, fit.sources)
     directions = record.directions(fit.sources.fields(record))
-    low = np.maximum(rows_m.min(axis=0), model.bounds.low_m)
-    high = np.minimum(rows_m.max(axis=0), model.bounds.high_m)
+    bounds = model.bounds
+    low, high = np.maximum(low_m, bounds.low_m[:2]), np.minimum(high_m, bounds.high_m[:2])
     needed = chndtrinc(model.threshold, 3, 1.0 - SEEN)
     places, moments = [], []
-    inside = [at for at in DEPTHS_M if model.bounds.low_m[2] <= ground_m - at <= model.bounds.high_m[2]]
-    for distance, at in SearchGrid.of(
-        low, high, record.height_m, [record.height_m - ground_m + d for d in inside]
-    ).tiles:
+    inside = [at for at in DEPTHS_M if bounds.low_m[2] <= ground_m - at <= bounds.high_m[2] and (low <= high).all()]
+    distances = [record.height_m - ground_m + at for at in inside]
+    for distance, at in SearchGrid.of(low, high, record.height_m, distances).tiles:
         used = groups_near(record, background.white, at, WINDOW * distance)
-        projected = normal_equations(record, background.white, directions, at, used, Q, fit.residual)[1]
-        places.append(at)
-        moments.append(np.sqrt(needed / np.maximum(np.linalg.eigvalsh(projected)[:, 0], np.finfo(float).tiny)))
+        alone, projected, _ = normal_equations(record, background.white, directions, at, used, Q, fit.residual)
+        least = np.linalg.eigvalsh(projected)[:, 0]
+        shown = least > _ROUNDING * np.trace(alone, axis1=1, axis2=2)
+        places.append(at[shown])
+        moments.append(np.sqrt(needed / least[shown]))
     return np.concatenate([np.zeros((0, 3)), *places]), np.concatenate([np.zeros(0), *moments])

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 IRON_Am2_PER_KG = (0.05, 0.3)
 """Moment of a kilogram of iron in the ground: a range, as its remanence and shape are not known."""
+_MOST_POINTS = 20_000
+_MOST, _LEAST_LINEAR = 0.8, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +93,17 @@ class SurveyRows(NamedTuple):
     place_m: FloatArray
     anomaly_T: FloatArray
     residual_T: FloatArray
+
+    def thinned(self) -> SurveyRows:
+        """Evenly as many as a picture shows."""
+        return SurveyRows(*(column[:: -(-len(self.time_s) // _MOST_POINTS)] for column in self))
+
+
+def linear_and_most(values: FloatArray) -> tuple[float, float]:
+    """Ends of a scale of values of either sign: linear up to the first, where most of them are, logarithmic beyond."""
+    size = np.abs(values)
+    most = float(size.max()) or 1.0
+    return max(float(np.quantile(size, _MOST)), _LEAST_LINEAR * most), most
 
 
 class Reach(NamedTuple):

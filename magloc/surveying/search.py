@@ -60,11 +60,12 @@ class SearchGrid:
 
     @classmethod
     def of(cls, low_m: FloatArray, high_m: FloatArray, height_m: float, distances_m: Sequence[float]) -> SearchGrid:
-        """Of a rectangle, at some distances below a height."""
+        """Of a rectangle, or of a line along an axis, at some distances below a height."""
         tiles = []
         for distance in distances_m:
             pitch = distance / PITCH
-            x, y = (np.arange(low_m[a] + 0.5 * pitch, high_m[a] + 0.5 * pitch, pitch) for a in range(2))
+            first = low_m[:2] + 0.5 * np.minimum(pitch, high_m[:2] - low_m[:2])
+            x, y = (np.arange(first[a], high_m[a] + 0.5 * pitch, pitch) for a in range(2))
             for i in range(0, len(x), _CHUNK):
                 for j in range(0, len(y), _CHUNK):
                     square = np.meshgrid(x[i : i + _CHUNK], y[j : j + _CHUNK], [height_m - distance], indexing="ij")

@@ -101,7 +101,7 @@ class TiledSurvey:
         assert prior is not None
         known, outside = self._told(tile)
         readings, ground = self.readings[tile.rows], replace(self.ground, prior=prior)
-        return Piece(self.array, readings, ground, tile.rows, tile.own, self.offset_T, self.geology_T, known, outside)
+        return Piece(self.array, readings, ground, tile, self.offset_T, self.geology_T, known, outside)
 
     def _told(self, tile: Tile) -> tuple[Sources, Sources]:
         """Sources of a tile, and others whose field is felt there."""

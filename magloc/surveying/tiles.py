@@ -31,6 +31,11 @@ class Tile:
     rows: IntArray
     own: BoolArray
 
+    def extent_m(self, places_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Ends of the rectangle, where it is open those of places (n, 2) in it."""
+        low = np.where(np.isfinite(self.low_m), self.low_m, places_m.min(axis=0))
+        return low, np.where(np.isfinite(self.high_m), self.high_m, places_m.max(axis=0))
+
     def inside_m(self, position_m: FloatArray) -> FloatArray:
         """How far within the rectangle positions (K, 3) are, negative beside it."""
         xy = position_m[:, :2]

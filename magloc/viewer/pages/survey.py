@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import viser
 from matplotlib import colormaps
+from matplotlib.colors import SymLogNorm
 
 from arrays.typing import ByteArray, FloatArray
-from magloc.surveying.results import Survey
+from magloc.surveying.results import Survey, linear_and_most
 from magloc.viewer.scene.glyphs import (
     DIPOLE_COLOUR,
     REGION_COLOUR,
@@ -20,7 +21,6 @@ from magloc.viewer.scene.glyphs import (
 from magloc.viewer.scene.legend import ColourScale, Entry, Swatch
 from magloc.viewer.scene.shapes import Surface, ellipsoid, joined
 
-_MOST_POINTS = 20_000
 _SCALE = colormaps["RdBu_r"]
 _GROUND_COLOUR = (150, 120, 90)
 _SHADES = 9
@@ -29,22 +29,21 @@ _SHADES = 9
 def add_survey(server: viser.ViserServer, found: Survey) -> tuple[list[Entry], FloatArray]:
     """Rows, ground and targets in a scene; lines of the legend, and points (k, 3) that should be in view."""
     scene = server.scene
-    rows = slice(None, None, -(-len(found.rows.time_s) // _MOST_POINTS))
-    places, anomaly = found.rows.place_m[rows], found.rows.anomaly_T[rows]
-    usual, most = float(np.quantile(np.abs(anomaly), 0.8)), float(np.abs(anomaly).max())
-    shades = 0.5 + 0.5 * np.arcsinh(anomaly / usual) / np.arcsinh(most / usual) if usual else np.full(len(anomaly), 0.5)
+    rows = found.rows.thinned()
+    places, anomaly_nT = rows.place_m, 1e9 * rows.anomaly_T
+    linear, most = linear_and_most(anomaly_nT)
     low, high = places.min(axis=0), places.max(axis=0)
     size = 0.04 * float(np.linalg.norm(high - low))
-    dots(scene, "/rows", places, _colours(shades), 0.12 * size)
+    dots(scene, "/rows", places, _colours(SymLogNorm(linear, vmin=-most, vmax=most)(anomaly_nT)), 0.12 * size)
     corners = np.array([[x, y, found.ground_m] for x in (low[0], high[0]) for y in (low[1], high[1])])
     ground = Surface(corners.astype(np.float32), np.array([[0, 2, 1], [1, 2, 3]], dtype=np.uint32))
     solid(scene, "/ground", ground, _GROUND_COLOUR, flat=True, opacity=0.3)
     scale = tuple((int(r), int(g), int(b)) for r, g, b in _colours(np.linspace(0.0, 1.0, _SHADES)))
     entries: list[Entry] = [
         ColourScale(
-            f"anomaly, linear up to {1e9 * usual:.2g} nT, then logarithmic",
-            f"{-1e9 * most:.3g} nT",
-            f"{1e9 * most:.3g} nT",
+            f"anomaly, linear up to {linear:.2g} nT, then logarithmic",
+            f"{-most:.3g} nT",
+            f"{most:.3g} nT",
             scale,
         ),
         Swatch(_GROUND_COLOUR, "ground"),

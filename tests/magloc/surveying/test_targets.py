@@ -27,6 +27,7 @@ from magloc.surveying.piece import AT_LAST, Ground
 from magloc.surveying.preparation import whole_rows
 from magloc.surveying.reach import DEPTHS_M, least_moments
 from magloc.surveying.rounds import Model
+from magloc.surveying.search import PITCH, WINDOW
 from magloc.surveying.targets import depth_interval
 from magloc.surveying.tiled import TiledSurvey
 from sims.magnetics.paths import Lawnmower, Steered
@@ -85,8 +86,8 @@ def test_at_its_ends_a_depth_interval_costs_what_chance_does() -> None:
 def test_the_least_moment_is_seen_with_95_percent() -> None:
     """Its χ², as of a source of a joint fit, has the tail that is promised in the worst of 300 directions."""
     model, fit, background = fitted()
-    rows = model.record.sensors_m.mean(axis=1)
-    places, moments = least_moments(model, fit, background, rows, 0.0)
+    low, high = model.bounds.low_m[:2] + 1.0, model.bounds.high_m[:2] - 1.0
+    places, moments = least_moments(model, fit, background, low, high, 0.0)
     assert sorted(set((-places[:, 2]).round(6))) == list(DEPTHS_M)
     directions = np.random.default_rng(1).normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -101,3 +102,17 @@ def test_the_least_moment_is_seen_with_95_percent() -> None:
         chi2 = moments[at] ** 2 * np.einsum("ki,ij,kj->k", directions, left, directions).min()
         # More than promised, as a search looks at near rows only, but not by much.
         assert 0.949 < ncx2(3, chi2).sf(model.threshold) < 0.99
+
+
+def test_no_place_where_no_row_is_near() -> None:
+    """Of a rectangle that goes on for 300 m: places beside the rows, where little is seen, and none far from them."""
+    model, fit, background = fitted()
+    far = replace(model, bounds=Bounds(model.bounds.low_m, model.bounds.high_m + 300.0 * np.eye(3)[0]))
+    low, high = far.bounds.low_m[:2], far.bounds.high_m[:2]
+    places, moments = least_moments(far, fit, background, low, high, 0.0)
+    beside_m = places[:, 0] - model.bounds.high_m[0]
+    deepest = model.record.height_m + DEPTHS_M[-1]
+    assert 5.0 < beside_m.max() < (WINDOW + 8.0 / PITCH) * deepest  # squares of 8 by 8 places are searched at once
+    assert np.isfinite(moments).all()
+    assert np.median(moments[beside_m > 5.0]) > 10.0 * np.median(moments[beside_m < 0.0])
+    assert not least_moments(model, fit, background, high, high + 20.0, 0.0)[0].size  # beside all sources

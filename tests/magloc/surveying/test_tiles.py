@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from magloc.surveying.tiles import Tile, owned, tiles_of
 
@@ -37,6 +38,15 @@ class TestTiles:
         tiles, _ = tiles_of(far, REACH_M)
         assert min(len(tile.rows) for tile in tiles) == 1
         assert sum(tile.own.sum() for tile in tiles) == len(far)
+
+    def test_their_extents_leave_no_gap(self) -> None:
+        """Lines 20 m apart: the rows of every tile have less than its rectangle between them."""
+        x, y = (each.ravel() for each in np.meshgrid(np.linspace(0.0, 100.0, 201), np.arange(6) * 20.0))
+        places = np.column_stack([x, y])
+        tiles, _ = tiles_of(places, 5.7)
+        ends = np.array([tile.extent_m(places[tile.rows[tile.own]]) for tile in tiles])
+        assert len(tiles) == 9
+        assert np.prod(ends[:, 1] - ends[:, 0], axis=1).sum() == pytest.approx(1e4)
 
     def test_one_line(self) -> None:
         (tile,), _ = tiles_of(np.column_stack([np.zeros(30), np.arange(30.0) / 10.0]), REACH_M)
