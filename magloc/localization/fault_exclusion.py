@@ -45,8 +45,8 @@ _BEYOND_DOUBT = 10.0
 # A fix that explains the other sensors badly must be better by this factor in χ² per degree of freedom.
 _INCOMPARABLE = 1000.0
 _N_REWEIGHTINGS = 30
-# Sensors in turn left out of a small array: of a larger one where a fit blames them.
-_MOST_LEFT_OUT = 8
+# Sensors of an array of which every two are left out in turn, and every one: of a larger one where a fit blames them.
+_MOST_IN_PAIRS, _MOST_ONE_BY_ONE = 8, 16
 # Fits without one sensor that are kept of a row.
 _MOST_REFINED = 3
 # Sensors of a larger array without which an optimum is searched for anew, of those that a fit blames.
@@ -306,8 +306,9 @@ class _Examination:
         chosen: dict[frozenset[int], list[int]] = {}
         for row in unexplained:
             sets = every
-            if len(standing) > _MOST_LEFT_OUT:
-                sets = [start.without for start in starts[row][1 : 1 + _MOST_SEARCHED]]
+            if len(standing) > _MOST_IN_PAIRS:
+                sets = every[: len(standing)] if len(standing) <= _MOST_ONE_BY_ONE else []
+                sets += [start.without for start in starts[row][1 : 1 + _MOST_SEARCHED]]
                 q, mu = self._fit_of(plain[row])
                 distance = np.linalg.norm(self.array.positions[standing] - self.problem.position(q)[:, None], axis=-1)
                 misfit = self._misfit(np.array([row]), q[None], mu[None], np.ones((1, self.array.n_sensors)))[0]

@@ -30,7 +30,7 @@ class TestDemo:
         assert [call[0] for call in typed(done.out, "magloc")] == ["simulate", "locate", "track", "view"][: 3 + scene]
         assert (tmp_path / "magloc-demo" / "track" / "track.png").stat().st_size > 20_000
         assert (tmp_path / "magloc-demo" / "target.html").exists() == scene
-        assert "321 of 321 rows tracked" in done.out
+        assert "321 of 321 rows answered" in done.out
 
     def test_its_commands_do_what_it_does(self, run: Run, tmp_path: Path) -> None:
         done = run("demo", tmp_path / "a demo")
