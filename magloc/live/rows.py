@@ -67,14 +67,14 @@ class RowParser:
             except GarbledError as error:
                 self._tally.name("garbled", f"{self._name}, line {self._n_lines}: {error}")
                 row = None
-            if row is None or self._format.begins(row):
+            is_header = row is not None and self._format.begins(row)
+            if row is None or is_header:
                 yield from self._readings(rows, self._n_lines - len(rows))
                 rows = []
-            if row is not None:
-                if self._format.begins(row):
-                    self._take_header(row)
-                else:
-                    rows.append(row)
+            if row is not None and is_header:
+                self._take_header(row)
+            elif row is not None:
+                rows.append(row)
         yield from self._readings(rows, self._n_lines - len(rows) + 1)
 
     def _row_of(self, line: bytes) -> str | None:

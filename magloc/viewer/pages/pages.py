@@ -16,6 +16,7 @@ from magloc.localization.fit.results import Fix
 from magloc.readings import Readings
 from magloc.surveying.results import Survey
 from magloc.tracking.results import TrackPoint, TrackResult, on_track, stacked
+from magloc.truth import nearest_rows
 from magloc.viewer.pages import words
 from magloc.viewer.pages.field_panel import FieldPanel
 from magloc.viewer.pages.fixes import FixView, best_positions
@@ -327,10 +328,7 @@ def _centroids(array: SensorArray, rows: Readings | None, n: int) -> FloatArray:
 def _nearest_rows(rows: Readings, points: Sequence[TrackPoint]) -> NDArray[np.intp]:
     """The row of the readings that is nearest in time, for every point of a track."""
     order = np.argsort(rows.time_s, kind="stable")
-    times, wanted = rows.time_s[order], stacked(points, "time_s")
-    after = np.searchsorted(times, wanted).clip(0, len(times) - 1)
-    before = (after - 1).clip(0)
-    return order[np.where(wanted - times[before] <= times[after] - wanted, before, after)]
+    return order[nearest_rows(stacked(points, "time_s"), rows.time_s[order])]
 
 
 def _not_far(positions_m: FloatArray, centroids_m: FloatArray) -> FloatArray:

@@ -31,6 +31,7 @@ from magloc.tracking.results import TrackPoint, TrackResult, stacked
 from magloc.viewer.pages import words
 from magloc.viewer.panels.played_time import PlayedTime, time_strip
 from magloc.viewer.scene.glyphs import (
+    ARROW_COLOUR,
     DIPOLE_COLOUR,
     FIELD_LINE_COLOUR,
     OTHER_COLOUR,
@@ -48,7 +49,7 @@ from magloc.viewer.scene.track_glyph import TrackGlyph, track_segments
 Poses = tuple[FloatArray, FloatArray]
 _BRIGHTEST = 0.88
 _WHOLE_COLOUR = (190, 196, 203)
-_SOURCE_COLOURS: tuple[Colour, ...] = (TRACK_COLOUR, FIELD_LINE_COLOUR, (0, 158, 115), OTHER_COLOUR, REGION_COLOUR)
+_SOURCE_COLOURS: tuple[Colour, ...] = (TRACK_COLOUR, FIELD_LINE_COLOUR, ARROW_COLOUR, OTHER_COLOUR, REGION_COLOUR)
 
 
 class Trail:
@@ -155,7 +156,8 @@ class TrackPlayer(PlayedTime):
             Trail(server.scene, name, track, size_m, colour)
             for name, track, colour in zip(nodes, result.tracks, source_colours(result), strict=True)
         )
-        tracked = np.flatnonzero(np.any([trail.tracked for trail in self.trails], axis=0))
+        self._tracked = np.any([trail.tracked for trail in self.trails], axis=0)
+        tracked = np.flatnonzero(self._tracked)
         self._ends = {int(row) for row in tracked[[0, -1]]} if tracked.size else set()  # which have times of their own
         self.index = int(tracked[-1]) if tracked.size else 0
         self._add_panels(server.gui)
@@ -174,8 +176,7 @@ class TrackPlayer(PlayedTime):
 
     def _add_panels(self, gui: viser.GuiApi) -> None:
         with gui.add_folder("Time"):
-            tracked = np.any([trail.tracked for trail in self.trails], axis=0)
-            self.strip_panel = gui.add_html(_strip(self._since_first_s, tracked))
+            self.strip_panel = gui.add_html(_strip(self._since_first_s, self._tracked))
             super().__init__(gui, self._span_s, self._show, "magloc-track-player")
             self.row_buttons = gui.add_button_group("Row", ("previous", "next"))
             longest, still = self.time_slider.max, self.time_slider.disabled
