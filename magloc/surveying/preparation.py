@@ -21,6 +21,7 @@ from magloc.surveying.pose_components import UNSTATED
 _LOG = logging.getLogger(__name__)
 FEWEST_ROWS = 20
 _WILD, _NEIGHBOURS = 15.0, 20  # over the medians of all rows and of so many on either side
+_MOST_APART = 2.0  # ratio of the fields at two places a day trip apart: more is another unit
 _MOST_WILD = 0.25  # of all readings: more are not
 _LONGEST_RUN = 25  # of the same reading, over what the liveliest sensor repeats
 
@@ -116,9 +117,14 @@ def varying(ambient_T: FloatArray, time_s: FloatArray, base: Readings) -> FloatA
             f"Input base must read from {time_s[0]:.15g} to {time_s[-1]:.15g} s, as the survey does; instead received"
             f" {ends}."
         )
-    there = vectors_at(time_s, read.time_s, read.values_T)
-    change = there - np.median(there)  # over the survey's own time: stations read before and after it
-    return np.asarray(ambient_T * (1.0 + change / np.linalg.norm(ambient_T, axis=1, keepdims=True)))
+    there, modulus = vectors_at(time_s, read.time_s, read.values_T), np.linalg.norm(ambient_T, axis=1, keepdims=True)
+    middle, usual = float(np.median(there)), float(np.median(modulus))  # stations read before and after the survey
+    if not usual / _MOST_APART < middle < usual * _MOST_APART:
+        raise ValueError(
+            f"Input base must read the modulus of the Earth's field, about {1e9 * usual:.0f} nT; instead received"
+            f" {1e9 * middle:.4g} nT in the median."
+        )
+    return np.asarray(ambient_T * (1.0 + (there - middle) / modulus))
 
 
 def _ambient_T(array: SensorArray, readings: Readings) -> FloatArray:

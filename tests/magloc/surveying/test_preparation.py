@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from arrays.typing import FloatArray
 from magloc.readings import Readings
@@ -26,3 +27,9 @@ class TestBaseStation:
         """An hour after the survey, and at a third of its rate."""
         hour = np.arange(0.0, 3600.0, 3.0)
         np.testing.assert_allclose(self.varying(hour), self.varying(self.TIME_S), rtol=0.0, atol=1e-18)
+
+    @pytest.mark.parametrize("unit", [1e-3, 1e3])
+    def test_another_unit_is_refused(self, unit: float) -> None:
+        base = Readings(unit * np.full((100, 1), 47e-6), time_s=self.TIME_S)
+        with pytest.raises(ValueError, match="Input base must read the modulus of the Earth's field, about 44721 nT"):
+            varying(self.AMBIENT_T, self.TIME_S, base)
