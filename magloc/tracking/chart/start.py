@@ -270,6 +270,7 @@ def once(mixture: Mixture, cell: IntArray | None = None) -> IntArray:
     source = mixture.of_source()
     cell = np.zeros((len(source), 1), dtype=np.intp) if cell is None else cell.reshape(len(source), -1)
     _, share, n_alike = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    share = share.ravel()  # numpy 2.0.0 gives a column
     chart, left = source.chart, np.argsort(-mixture.log_weight, kind="stable")
     alone = n_alike[share[left]] == 1
     kept, left = left[alone].tolist(), left[~alone]
