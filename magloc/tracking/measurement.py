@@ -85,6 +85,14 @@ class RowMeasurement:
         """Their Jacobian (k, 6) where the pose has no error."""
         return self._by_source(self._by_array(self.pose.in_array(source), others_T=others_T))
 
+    def with_errors_as_noise(self, sigma: FloatArray) -> RowMeasurement:
+        """The row alone: the sensors' errors, known by their σ (n_errors,), are part of the differences' noise."""
+        lasting, k = self.effect * sigma, len(self.sigma)
+        whiten = np.linalg.inv(np.linalg.cholesky(np.eye(k) + lasting @ lasting.T))
+        differences = Differences(whiten @ (self.model.differences.transform / self.sigma[:, None]), np.ones(k))
+        model = replace(self.model, differences=differences)
+        return replace(self, model=model, sigma=np.ones(k), effect=np.zeros((k, 0)))
+
     def field_T(self, source: FloatArray) -> FloatArray:
         """Field (N, 3) of a source (6,) at the sensors, in the array's axes, where the pose has no error."""
         in_array = self.pose.in_array(source)

@@ -90,9 +90,13 @@ class Mixture:
         """Position and moment alone."""
         return replace(self, x=self.x[:, :N_SOURCE], S=root_of(self.S[:, :N_SOURCE]), n_motion=N_SOURCE, n_pose=0)
 
+    def likely(self) -> Mixture:
+        """Without components of no weight."""
+        return self.take(self.log_weight > self.log_weight.max() + DROPPED_BELOW)
+
     def reduced(self) -> Mixture:
-        """Without components of no weight, and those that are as good as one merged."""
-        kept = self.take(self.log_weight > self.log_weight.max() + DROPPED_BELOW)
+        """The likely components, and those that are as good as one merged."""
+        kept = self.likely()
         if len(kept) == 1:
             return kept
         kept = kept.take(np.argsort(-kept.log_weight, kind="stable"))
@@ -119,7 +123,7 @@ class Mixture:
         rows = np.concatenate(list(spread), axis=1)
         turn = after.inverse_jacobian()[0] @ about.jacobian(mean[None, :n])[0]
         rows[:n] = turn @ rows[:n]
-        return replace(self, x=x[None], S=block_root(rows, n)[None], log_weight=np.zeros(1))
+        return replace(self, x=x[None], S=block_root(rows)[None], log_weight=np.zeros(1))
 
     def moments(self) -> tuple[FloatArray, FloatArray]:
         """Cartesian mean (6,) and covariance (6, 6) of position and moment; a range is log-normal."""
@@ -181,11 +185,10 @@ def root_of(rows: FloatArray) -> FloatArray:
     return np.swapaxes(np.linalg.qr(np.swapaxes(rows, -1, -2), mode="r"), -1, -2)
 
 
-def block_root(rows: FloatArray, n: int) -> FloatArray:
-    """Block-triangular root (N, N) of ``rows rowsᵀ`` whose first n rows are full."""
+def block_root(rows: FloatArray) -> FloatArray:
+    """Upper root (..., N, N) of ``rows rowsᵀ``: block-triangular, wherever its blocks end."""
     # The lower root of the rows in reverse order is an upper one.
-    lower = root_of(rows[::-1])
-    return lower[::-1, ::-1]
+    return root_of(rows[..., ::-1, :])[..., ::-1, ::-1]
 
 
 def _groups(mixture: Mixture) -> list[IntArray]:

@@ -97,6 +97,10 @@ class ChartRow:
         """The row where only some shares (n_pose,) of the pose's errors have an effect."""
         return replace(self, pose_effect=self.pose_effect * lasting) if self.n_pose else self
 
+    def with_errors_as_noise(self, sigma: FloatArray) -> ChartRow:
+        """The row alone: its sensors' errors, known by their σ (n_errors,), are noise."""
+        return replace(self, measurement=self.measurement.with_errors_as_noise(sigma)) if sigma.size else self
+
     def of_source(self, state: FloatArray) -> FloatArray:
         """Predicted differences (..., k) of sources (..., 6) or states, sensors being without errors."""
         error = self._pose_error(state)
@@ -125,22 +129,22 @@ class ChartRow:
         ambient = array.readings_of(array.ambient_fields) - array.channel_offset_T
         return self.z - (self.model.differences.transform @ ambient) / self.sigma
 
-    def whitening(self, sigma_errors: FloatArray) -> FloatArray | None:
-        """``C^{-1/2}`` (k, k) of a row without a source, its sensors' errors known by their σ (n_errors,) alone."""
-        if not sigma_errors.size + self.n_pose:
-            return None
+    @cached_property
+    def whitening(self) -> FloatArray:
+        """``C^{-1/2}`` (k, k) of a row without a source, what its pose's errors make of the ambient field being noise."""
+        if not self.n_pose:
+            return np.eye(len(self.sigma))
         # Sources without a moment: what is left is the ambient field, turned by the pose's errors.
         nowhere = self.pose.in_array(np.zeros(N_SOURCE))
         by_pose = self._by_pose(np.zeros((len(self.sigma), N_SOURCE)), nowhere, np.zeros(N_POSE))
-        lasting = np.concatenate([self.effect * sigma_errors, by_pose], axis=1)
-        return np.linalg.inv(np.linalg.cholesky(np.eye(len(lasting)) + lasting @ lasting.T))
+        return np.linalg.inv(np.linalg.cholesky(np.eye(len(by_pose)) + by_pose @ by_pose.T))
 
     def is_detected(self, sigma_errors: FloatArray) -> bool:
         """Whether the differences stand out of noise and of what the errors of sensors and pose may make of them."""
         if not self.z.size:
             return False
-        whiten = self.whitening(sigma_errors)
-        left = self.without_source if whiten is None else whiten @ self.without_source
+        alone = self.with_errors_as_noise(sigma_errors)
+        left = alone.whitening @ alone.without_source
         return bool(left @ left > energy_threshold(left.size))
 
     def _pose_error(self, state: FloatArray) -> FloatArray | None:

@@ -13,7 +13,7 @@ it finds bends, it is divided along the range by halves of the grid's pitch.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtri
@@ -28,7 +28,7 @@ from magloc.localization.locator import Locator
 from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.rows import check_magnitudes
 from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart, source_root
-from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture
+from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture, block_root
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.update import Updated, updated
 from magloc.tracking.motion import N_SOURCE, MotionModel
@@ -142,19 +142,21 @@ class Start:
             self._locator = Locator(array, prior=prior, body_length_m=0.0, exclude_faulty=False)
 
     def mixture(self, measurement: ChartRow, motion: MotionModel) -> tuple[Mixture | None, str]:
-        """What one row says of a source, or why there is none."""
+        """What one row says of a source and of the pose's errors, or why there is none."""
         if not measurement.is_detected(self.errors.sigma):
             return None, "not acquired: no signal stands out of noise"
-        seeds = self._seeds(measurement)
+        # Before it nothing is known of source and sensors together: the sensors' errors are noise.
+        alone = measurement.with_errors_as_noise(self.errors.sigma)
+        seeds = self._seeds(alone)
         if not len(seeds.cell):
             return None, NOT_ALLOWED
-        found = self._components(measurement, motion, seeds)
+        found = _components(alone, motion, seeds)
         for refined in (_centred, _along_valleys):
             finer = refined(seeds, found, measurement)
             if not len(finer.cell):
                 return None, NOT_ALLOWED
             if finer is not seeds:
-                seeds, found = finer, self._components(measurement, motion, finer)
+                seeds, found = finer, _components(alone, motion, finer)
         row = measurement.row
         position = (found.x[:, :3] - row.origin_m) @ row.R_world_from_array
         sound = self.prior.allows_position(position) & self.prior.allows_moment(found.x[:, 3:6])
@@ -174,9 +176,7 @@ class Start:
         cells, row = self._grid.position_m, measurement.row
         world = row.origin_m + cells @ row.R_world_from_array.T
         columns = measurement.source_jacobian(np.concatenate([world, np.zeros_like(world)], axis=1))[..., 3:]
-        left, whiten = measurement.without_source, measurement.whitening(self.errors.sigma)
-        if whiten is not None:
-            columns, left = whiten @ columns, whiten @ left
+        columns, left = measurement.whitening @ columns, measurement.whitening @ measurement.without_source
         moments = (np.linalg.pinv(columns, rcond=1e-6) @ left[:, None])[..., 0]
         explained = np.sum((columns @ moments[..., None])[..., 0] ** 2, axis=1)
         explained[~self.prior.allows_position(cells) | ~(explained > 0.0)] = -np.inf
@@ -190,20 +190,15 @@ class Start:
                 cell.append(np.array([-1, -1, 0]))
         return _Seeds(np.vstack(position), np.vstack(moment), np.vstack(cell))
 
-    def _components(self, measurement: ChartRow, motion: MotionModel, seeds: _Seeds) -> Updated:
-        """What the row makes of cells about seeds."""
-        n, n_errors = measurement.n_motion, self.errors.n_states
-        state, _ = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
-        x = np.zeros((len(seeds.cell), n + n_errors))
-        x[:, :n] = state
-        x[:, :3], x[:, 3:6] = seeds.position_m, seeds.moment_Am2
-        chart = measurement.chart(x[:, :n])
-        S = np.zeros((len(x), n + n_errors, n + n_errors))
-        sigma = np.tile(_CELL, (len(x), 1))
-        sigma[:, 0] /= 2.0 ** seeds.cell[:, 2]
-        S[:, :n, :n] = chart.inverse_jacobian() @ _with_motion(chart, motion, sigma)
-        S[:, n + np.arange(n_errors), n + np.arange(n_errors)] = self.errors.sigma
-        return updated(x, S, measurement, np.zeros(len(x), dtype=bool))
+def _components(measurement: ChartRow, motion: MotionModel, seeds: _Seeds) -> Updated:
+    """What the row makes of cells about seeds."""
+    state, _ = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
+    x = np.tile(state, (len(seeds.cell), 1))
+    x[:, :3], x[:, 3:6] = seeds.position_m, seeds.moment_Am2
+    chart, sigma = measurement.chart(x), np.tile(_CELL, (len(x), 1))
+    sigma[:, 0] /= 2.0 ** seeds.cell[:, 2]
+    S = chart.inverse_jacobian() @ _with_motion(chart, motion, sigma)
+    return updated(x, S, measurement, np.zeros(len(x), dtype=bool))
 
 
 def _mixture(found: Updated, log_weight: FloatArray, measurement: ChartRow) -> Mixture:
@@ -263,6 +258,24 @@ def _along_valleys(seeds: _Seeds, found: Updated, measurement: ChartRow) -> _See
         moment.append(state[:, 3:6])
         cell.append(np.stack([_N_RANGES + ranges, of_direction, np.full_like(ranges, halvings)], axis=1))
     return _Seeds(np.vstack(position), np.vstack(moment), np.vstack(cell))
+
+
+def with_errors(mixture: Mixture, measurement: ChartRow, sigma: FloatArray) -> Mixture:
+    r"""The same, and behind the states the sensors' errors, known by their σ (n_errors,) before the row alone.
+
+    What the row leaves over where a component stands is of them and of the noise: with :math:`\Phi` of unit errors,
+    :math:`\varepsilon = \sigma \Phi^T (1 + \Phi \Phi^T)^{-1} (z - h(x))`, and its covariance that of a linear model.
+    """
+    if not sigma.size:
+        return mixture
+    n, chart, unit = measurement.n_motion, mixture.chart, measurement.effect * sigma
+    gain = sigma[:, None] * np.linalg.solve(np.eye(len(unit)) + unit @ unit.T, unit).T
+    left = measurement.z - measurement.of_source(mixture.x)
+    H = measurement.along(mixture.x, chart.jacobian(np.zeros_like(mixture.x)))
+    rows = np.zeros((len(mixture), n + sigma.size, n + sigma.size))
+    rows[:, :n, :n], rows[:, n:, :n] = mixture.S, -gain @ (H @ mixture.S)
+    rows[:, n:, n:] = sigma[:, None] * np.linalg.inv(np.linalg.cholesky(np.eye(sigma.size) + unit.T @ unit)).T
+    return replace(mixture, x=np.concatenate([mixture.x, left @ gain.T], axis=1), S=block_root(rows))
 
 
 def once(mixture: Mixture, cell: IntArray | None = None) -> IntArray:

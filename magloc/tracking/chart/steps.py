@@ -26,7 +26,7 @@ from magloc.tracking.chart.mixture import Mixture, block_root, root_of
 from magloc.tracking.chart.posed_motion import PosedMotion
 from magloc.tracking.chart.refit import Cells, refitted
 from magloc.tracking.chart.row import ChartRow
-from magloc.tracking.chart.start import OF_PITCH, Start, once
+from magloc.tracking.chart.start import OF_PITCH, Start, once, with_errors
 from magloc.tracking.chart.update import Move, predicted_root, updated
 from magloc.tracking.motion import N_SOURCE, MotionModel
 
@@ -113,12 +113,13 @@ class ChartFilter:
     def started(self, row: ChartRow, motion: MotionModel, near: Mixture | None = None) -> tuple[Mixture | None, str]:
         """What one row says of a source, weighed by a prediction of its place if there is one, or why there is none."""
         mixture, reason = self.of_row(row, motion)
-        if mixture is not None:
-            mixture = (mixture if near is None else _near(mixture.reduced(), near)).reduced()
-        return mixture, reason
+        if mixture is None:
+            return None, reason
+        mixture = with_errors(mixture.likely(), row, self.errors.sigma)
+        return (mixture if near is None else _near(mixture.reduced(), near)).reduced(), ""
 
     def of_row(self, row: ChartRow, motion: MotionModel) -> tuple[Mixture | None, str]:
-        """What one row alone says of a source, by every cell that explains it, or why it says nothing."""
+        """What one row alone says of a source and the pose, by every cell that explains it, or why it says nothing."""
         return self._start.mixture(row, self._posed(motion))
 
     def _posed(self, motion: MotionModel) -> MotionModel:
@@ -249,7 +250,7 @@ def charted(x: FloatArray, S: FloatArray, row: ChartRow) -> Mixture:
     state, root = np.empty_like(x), np.empty_like(S)
     state[order], root[order] = x, S
     root[:n] = row.chart(state[None, :n]).inverse_jacobian()[0] @ root[:n]
-    S_young = block_root(root, n)
+    S_young = block_root(root)
     return Mixture(state[None], S_young[None], np.zeros(1), n, row.centroid_m, row.radius_m, row.n_pose)
 
 
