@@ -56,7 +56,7 @@ def view(
     png : Path
         Write a picture; needs Chromium or Chrome.
     movie : Path
-        Write a film (.gif or .apng); needs Chromium or Chrome.
+        Write a film (.mp4, .gif or .apng); needs Chromium or Chrome.
     port : int
         Port of the server; the next one that is free if it is in use.
     open : bool

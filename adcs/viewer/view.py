@@ -48,7 +48,7 @@ def view(
         True attitude, scalar first, NaN where unknown, at the rows of the readings: orbital frame from body of
         telemetry, otherwise the frame of the track. By default that of an ImuLog.
     html, png, movie : path, optional
-        Write a static page that plays, a picture or a film (.gif, .apng), the latter two by Chromium; serve nothing.
+        Write a static page that plays or, by Chromium, a picture or a film (.mp4, .gif, .apng); serve nothing.
     open : bool
         Open the browser.
     port : int

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import viser
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from arrays.io.errors import InputError
 from arrays.io.text import replaced
 from arrays.typing import FloatArray
+from magloc.viewer.mp4 import mp4_of
 from magloc.viewer.outputs import FILM_FORMATS
 from magloc.viewer.pages.pages import Page
 from magloc.viewer.server import opened_page
@@ -26,11 +28,14 @@ _PALETTE_OF = 4  # lines, of which one tells the colours
 def write_film(
     server: viser.ViserServer, page: Page, path: Path, progress: Callable[[int], None] | None = None
 ) -> None:
-    """Write what a headless Chromium shows as a GIF or an animated PNG; `progress` is called with frames finished."""
-    from PIL import Image
+    """Write what a headless Chromium shows as a GIF, an animated PNG or an MP4, by the name of the file.
 
+    `progress` is called with the number of frames finished since the last call.
+    """
+    kind = FILM_FORMATS[path.suffix.lower()]
+    seconds = _TURN_S if page.playing is None else page.playing.duration_s
     pictures: list[Image.Image] = []
-    with opened_page(server, _FILM_PX):
+    with opened_page(server, _FILM_PX) as browser:
         client = next(iter(server.get_clients().values()))
         camera = server.initial_camera
         look_at, fov = np.array(camera.look_at), float(camera.fov)
@@ -41,17 +46,20 @@ def write_film(
             pictures.append(Image.fromarray(np.asarray(shot)[..., :3]))
             if progress is not None:
                 progress(1)
-    kind = FILM_FORMATS[path.suffix.lower()]
+        duration_ms = max(20, round(1e3 * seconds / len(pictures)))
+        mp4 = mp4_of(browser, pictures, duration_ms) if kind == "MP4" else b""
     if kind == "GIF":
         # One palette of all: colours that changed from frame to frame would seem to mean something.
         every = Image.fromarray(np.concatenate([np.asarray(picture)[::_PALETTE_OF] for picture in pictures]))
         palette = every.quantize(256, dither=Image.Dither.NONE)
         pictures = [picture.quantize(256, palette=palette, dither=Image.Dither.NONE) for picture in pictures]
-    seconds = _TURN_S if page.playing is None else page.playing.duration_s
-    options: dict[str, Any] = {"duration": max(20, round(1e3 * seconds / len(pictures))), "loop": 0}
+    options: dict[str, Any] = {"duration": duration_ms, "loop": 0}
     try:
         with replaced(path) as written:
-            pictures[0].save(written, format=kind, save_all=True, append_images=pictures[1:], **options)
+            if mp4:
+                written.write_bytes(mp4)
+            else:
+                pictures[0].save(written, format=kind, save_all=True, append_images=pictures[1:], **options)
     except OSError as error:
         raise InputError(f"Input movie {path} cannot be written ({error.strerror}).") from None
 

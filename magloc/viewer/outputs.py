@@ -8,8 +8,7 @@ from arrays.io.errors import InputError
 from arrays.io.outputs import refuse_unwritable
 from magloc.viewer.chromium import find_chromium
 
-FILM_FORMATS = {".gif": "GIF", ".apng": "PNG"}
-_NO_MP4 = "MP4 is not written, for the encoders that come as Python packages bring code under the GPL"
+FILM_FORMATS = {".mp4": "MP4", ".gif": "GIF", ".apng": "PNG"}
 
 
 def check_outputs(html: str | Path | None, png: str | Path | None, movie: str | Path | None = None) -> None:
@@ -32,5 +31,4 @@ def check_outputs(html: str | Path | None, png: str | Path | None, movie: str | 
 def _refuse_format(path: Path) -> None:
     suffix = path.suffix.lower()
     if suffix not in FILM_FORMATS:
-        why = f": {_NO_MP4}" if suffix == ".mp4" else ""
-        raise InputError(f"Input movie {path}: found a name that ends with {suffix!r}, expected .gif or .apng{why}.")
+        raise InputError(f"Input movie {path}: found a name that ends with {suffix!r}, expected .mp4, .gif or .apng.")

@@ -72,7 +72,7 @@ class View(Closing):
         write_picture(self._server, path)
 
     def write_movie(self, path: Path, progress: Callable[[int], None] | None = None) -> None:
-        """Write the rows of the page, or a turn around what it shows, as a film (.gif, .apng)."""
+        """Write the rows of the page, or a turn around what it shows, as a film (.mp4, .gif, .apng)."""
         write_film(self._server, self._page, path, progress)
 
     def wait(self) -> None:
@@ -124,7 +124,7 @@ def view(
     html, png : path, optional
         Write a static page or, by Chromium, a picture, and serve nothing.
     movie : path, optional
-        Write a film by Chromium, GIF or animated PNG (.apng): row by row, or once around an array or a map.
+        Write a film by Chromium, .mp4 (H.264), .gif or .apng: row by row, or once around an array or a map.
     open : bool
         Open the browser.
     port : int

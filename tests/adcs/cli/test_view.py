@@ -61,7 +61,7 @@ class TestRefused:
         assert not (tmp_path / "a.html").exists()
 
     def test_a_film_of_another_kind(self, adcs, satellite):
-        assert_refused(adcs("view", satellite, "--config", config_of(satellite), "--movie", "a.mp4"), ".gif or .apng")
+        assert_refused(adcs("view", satellite, "--config", config_of(satellite), "--movie", "a.avi"), ".gif or .apng")
 
     def test_a_log_of_no_kind(self, adcs, tmp_path):
         (tmp_path / "log.csv").write_text("a,b\n1,2\n", encoding="utf-8")
