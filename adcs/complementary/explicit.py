@@ -114,9 +114,7 @@ class ComplementaryTrack:
 
 
 def explicit_error(
-    q: FloatArray,
-    vectors: list[tuple[FloatArray, FloatArray]],
-    weights: tuple[float, ...] = (1.0, 1.0),
+    q: FloatArray, vectors: list[tuple[FloatArray, FloatArray]], weights: tuple[float, ...] = (1.0, 1.0)
 ) -> FloatArray:
     """Error angle e = Σ weight · v × A(q̂) v_reference.
 

@@ -59,11 +59,7 @@ def high_pass(k, s):
 
 
 class TestPrinciple:
-    @given(
-        k=st.floats(0.0, 1e6),
-        real=st.floats(1e-6, 1e3),
-        imaginary=st.floats(-1e6, 1e6),
-    )
+    @given(k=st.floats(0.0, 1e6), real=st.floats(1e-6, 1e3), imaginary=st.floats(-1e6, 1e6))
     def test_sum_is_one(self, k, real, imaginary):
         """For every gain and every s to the right of the pole."""
         s = complex(real, imaginary)
