@@ -80,11 +80,7 @@ class Differences:
 
 
 def decorrelated_differences(
-    array: SensorArray,
-    available: BoolArray | None = None,
-    *,
-    base: int = -1,
-    covariance_T2: FloatArray | None = None,
+    array: SensorArray, available: BoolArray | None = None, *, base: int = -1, covariance_T2: FloatArray | None = None
 ) -> Differences:
     """Decorrelated differences of an array, equations (16) and (28) for any sensors.
 

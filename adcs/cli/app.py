@@ -37,11 +37,7 @@ for _name, _where, _help in (
         "adcs.cli.estimate:estimate",
         "Estimate attitude and rate from telemetry, with the filters of `adcs run`.",
     ),
-    (
-        "calibrate",
-        "adcs.cli.calibrate:calibrate",
-        "Calibrate the magnetometer of a log by the field along the orbit.",
-    ),
+    ("calibrate", "adcs.cli.calibrate:calibrate", "Calibrate the magnetometer of a log by the field along the orbit."),
     (
         "loads",
         "adcs.cli.loads:loads",

@@ -10,12 +10,12 @@ import numpy as np
 from cyclopts import Parameter
 
 import adcs
-from adcs.cli.options import naming_options, print_note
+from adcs.cli.options import naming_options, tell, warn
 from adcs.satellite.magnetometer_calibration import NAMES, Attitude, MagnetometerCalibration
 from arrays.io.arguments import Flag
 from arrays.io.errors import naming
 from arrays.io.outputs import refuse_unwritable
-from magloc.cli.framework import QuietOptions, print_json
+from magloc.cli.framework import QuietOptions, print_result
 
 _UNITS = {"bias": (1e9, "nT"), "gain": (100.0, "percent"), "time": (1.0, "s")}
 _MISFIT = 5.0
@@ -76,15 +76,9 @@ def calibrate(
         result = adcs.calibrate_magnetometer(log, scenario.satellite, prior=prior, attitude=attitude)
     if out is not None:
         _write(out, log, result)
-    if not common.quiet:
-        for text in warnings_of(result):
-            print_note(f"warning: {text}")
-        if out is not None:
-            print_note(f"wrote {out}")
-    if json:
-        print_json(report(result))
-    else:
-        print("\n".join(lines(result, attitude)))
+        tell(common, f"wrote {out}")
+    warn(common, warnings_of(result))
+    print_result(report(result), lines(result, attitude), as_json=json)
 
 
 def warnings_of(result: MagnetometerCalibration) -> list[str]:

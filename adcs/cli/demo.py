@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from adcs.cli.options import tell
 from magloc.cli import framework
-from magloc.cli.framework import QuietOptions, print_note
+from magloc.cli.framework import QuietOptions
 
 
 def demo(
@@ -31,5 +32,4 @@ def demo(
         ("estimate", telemetry, "--config", scenario, "--out", str(out / "estimates")),
     ]
     framework.demonstrate(app, out, calls, common)
-    if not common.quiet:
-        print_note(f"the picture is {out / 'estimates' / 'estimates.png'}", "adcs")
+    tell(common, f"the picture is {out / 'estimates' / 'estimates.png'}")

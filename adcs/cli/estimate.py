@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import adcs
-from adcs.cli.options import EstimateOptions, print_note
+from adcs.cli.options import EstimateOptions, tell, warn
 from arrays.io.arguments import Flag
 from arrays.io.errors import naming
 from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_json
+from magloc.cli.framework import QuietOptions, print_result
 
 if TYPE_CHECKING:
     from adcs.io.scenario_files import AttitudeFile
@@ -52,10 +52,9 @@ def estimate(
     common : QuietOptions
         Common options.
     """
-    from adcs.io.estimates import estimate_columns, summary_lines
+    from adcs.io.estimates import estimate_columns, rows_of, summary_lines
 
-    if out is not None:
-        refuse_file(out, "--out")
+    refuse_file(out, "--out")
     scenario = adcs.read_scenario(str(config))
     scenario = scenario.changed({"estimate": options.estimate(scenario.estimate.states)})
     settings = scenario.estimator(f"{config}, table estimate")
@@ -63,23 +62,16 @@ def estimate(
     with naming(str(telemetry)):
         track = adcs.estimate(record, scenario.satellite, sensors=settings)
     columns = estimate_columns(track)
-    if not common.quiet:
-        for text in track.warnings:
-            print_note(f"warning: {text}")
+    warn(common, track.warnings)
     if out is not None:
         make_folder(out, "--out")
         _write(out, scenario.name, track, columns)
         utc = adcs.frames.instants(scenario.satellite.start, track.time_s[track.rows])
         adcs.write_aem(out / "attitude.aem", utc, track.rotation[track.rows].as_quat())
         adcs.write_oem(out / "orbit.oem", utc, *scenario.satellite.orbit.position_velocity_eci(utc))
-        if not common.quiet:
-            print_note(f"wrote estimates.csv, attitude.aem, orbit.oem, estimates.png and consistency.png into {out}")
-    if json:
-        rows = zip(*(values.tolist() for values in columns.values()), strict=True)
-        entries = [dict(zip(columns, row, strict=True)) for row in rows]
-        print_json({"results": entries, "warnings": list(track.warnings)})
-    else:
-        print("\n".join(summary_lines(track)))
+        tell(common, f"wrote estimates.csv, attitude.aem, orbit.oem, estimates.png and consistency.png into {out}")
+    result = {"results": rows_of(columns), "warnings": track.warnings}
+    print_result(result, summary_lines(track), as_json=json)
 
 
 def read_log(path: Path, scenario: AttitudeFile) -> adcs.Telemetry:

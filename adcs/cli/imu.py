@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import adcs
-from adcs.cli.options import print_note
+from adcs.cli.options import tell, warn
 from adcs.complementary.names import Magnet
 from arrays.io.arguments import Flag
 from arrays.io.errors import naming
 from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_json
+from magloc.cli.framework import QuietOptions, print_result
 
 if TYPE_CHECKING:
     from adcs.io.imu_files import ImuLog
@@ -59,15 +59,12 @@ def imu(
     """
     from adcs.io.imu_results import attitude_columns, imu_summary, summary_words
 
-    if out is not None:
-        refuse_file(out, "--out")
+    refuse_file(out, "--out")
     data = adcs.read_imu(log, config)
     began = time.perf_counter()
     track = inertial_attitude(log, data, _MAGNETS[method], offline=offline)
     summary: dict[str, Any] = {**imu_summary(track, data), "seconds": time.perf_counter() - began}
-    if not common.quiet:
-        for text in track.warnings:
-            print_note(f"warning: {text}")
+    warn(common, track.warnings)
     if out is not None:
         from adcs.plots.inertial import inertial_figure
         from arrays.io.csv import write_columns
@@ -76,12 +73,8 @@ def imu(
         make_folder(out, "--out")
         write_columns(attitude_columns(track), out / "attitude.csv")
         style.save(inertial_figure(track, log.stem, data.q_true), out / "attitude.png")
-        if not common.quiet:
-            print_note(f"wrote attitude.csv and attitude.png into {out}")
-    if json:
-        print_json(summary)
-    else:
-        print("\n".join(summary_words(summary)))
+        tell(common, f"wrote attitude.csv and attitude.png into {out}")
+    print_result(summary, summary_words(summary), as_json=json)
 
 
 def inertial_attitude(log: Path, data: ImuLog, magnet: Magnet = "auto", *, offline: bool = False) -> adcs.AttitudeTrack:

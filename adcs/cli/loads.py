@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import adcs
 import arrays
-from adcs.cli.options import print_note
+from adcs.cli.options import tell
 from arrays.io.arguments import Flag
 from arrays.io.errors import naming
 from arrays.io.outputs import refuse_unwritable
-from magloc.cli.framework import QuietOptions, print_json
+from magloc.cli.framework import QuietOptions, print_result
 
 if TYPE_CHECKING:
     from arrays.typing import FloatArray
@@ -68,12 +68,8 @@ def loads(
     if out is not None:
         clean_nT = 1e9 * own.subtracted(log.readings_T, log.states)
         write_columns(log.columns | dict(zip(channel_columns(sensors), clean_nT.T, strict=True)), out)
-        if not common.quiet:
-            print_note(f"wrote {out}")
-    if json:
-        print_json(report(own, located))
-    else:
-        print("\n".join(lines(own, located)))
+        tell(common, f"wrote {out}")
+    print_result(report(own, located), lines(own, located), as_json=json)
 
 
 _LEAST_SENSORS = 3

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -20,6 +20,17 @@ from magloc.cli import framework
 def print_note(text: str) -> None:
     """Print one line on stderr, whatever the text."""
     framework.print_note(text, "adcs")
+
+
+def tell(common: framework.QuietOptions, *texts: str) -> None:
+    """Print some lines on stderr, unless it is to be quiet there."""
+    for text in () if common.quiet else texts:
+        print_note(text)
+
+
+def warn(common: framework.QuietOptions, texts: Iterable[str]) -> None:
+    """Print warnings on stderr, unless it is to be quiet there."""
+    tell(common, *(f"warning: {text}" for text in texts))
 
 
 @contextmanager

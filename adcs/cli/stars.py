@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import adcs
-from adcs.cli.options import print_note
+from adcs.cli.options import tell
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.typing import FloatArray
-from magloc.cli.framework import QuietOptions, print_json, progress
+from magloc.cli.framework import QuietOptions, print_result, progress
 
 if TYPE_CHECKING:
     from adcs.stars.catalogue import StarCatalogue
@@ -123,8 +123,7 @@ def _pictures(
     from arrays.io.outputs import make_folder, refuse_file
     from magloc.plots import style
 
-    if out is not None:
-        refuse_file(out, "--out")
+    refuse_file(out, "--out")
     off = None if dark is None else adcs.read_picture(dark)
     rows, solved = [], []
     for path in paths:
@@ -161,13 +160,8 @@ def _pictures(
         make_folder(out, "--out")
         for path, picture, lights, fix in solved:
             style.save(picture_figure(path.name, picture, lights, fix, known), out / f"{path.stem}-stars.png")
-    if json:
-        print_json({"pictures": rows})
-        return
-    for row in rows:
-        print(_picture_line(row))
-    if out is not None and not common.quiet:
-        print_note(f"wrote {len(rows)} pictures with names into {out}")
+        tell(common, f"wrote {len(rows)} pictures with names into {out}")
+    print_result({"pictures": rows}, [_picture_line(row) for row in rows], as_json=json)
 
 
 def _arcsec(angle_rad: float) -> float:
@@ -225,12 +219,8 @@ def _frames(
         "milliseconds_median": float(np.median(milliseconds)),
         "milliseconds_max": float(milliseconds.max()),
     }
-    if json:
-        print_json({"frames": rows, **totals})
-        return
-    for number, row in enumerate(rows):
-        print(_line(number, row))
-    print(_in_words(totals))
+    words = [*(_line(number, row) for number, row in enumerate(rows)), _in_words(totals)]
+    print_result({"frames": rows, **totals}, words, as_json=json)
 
 
 def _row(catalogue: StarCatalogue, image: StarFrame, fix: StarFix | NoFix) -> dict[str, Any]:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import adcs
-from adcs.cli.options import print_note
+from adcs.cli.options import tell
 from adcs.satellite.wahba import VectorMethod
 from arrays.io.arguments import Flag
 from arrays.io.errors import naming
 from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_json
+from magloc.cli.framework import QuietOptions, print_result
 
 
 def vectors(
@@ -40,11 +40,10 @@ def vectors(
     common : QuietOptions
         Common options.
     """
-    from adcs.io.estimates import estimate_columns, summary_lines
+    from adcs.io.estimates import estimate_columns, rows_of, summary_lines
     from arrays.io.csv import write_columns
 
-    if out is not None:
-        refuse_file(out, "--out")
+    refuse_file(out, "--out")
     scenario = adcs.read_scenario(str(config))
     record = adcs.read_telemetry(telemetry, scenario.step_s, layout=scenario.log)
     with naming(str(telemetry)):
@@ -53,10 +52,5 @@ def vectors(
     if out is not None:
         make_folder(out, "--out")
         write_columns(columns, out / "vectors.csv")
-        if not common.quiet:
-            print_note(f"wrote vectors.csv into {out}")
-    if json:
-        rows = zip(*(values.tolist() for values in columns.values()), strict=True)
-        print_json({"results": [dict(zip(columns, row, strict=True)) for row in rows]})
-    else:
-        print("\n".join(summary_lines(track)))
+        tell(common, f"wrote vectors.csv into {out}")
+    print_result({"results": rows_of(columns)}, summary_lines(track), as_json=json)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import adcs
 from adcs.cli.estimate import read_log
 from adcs.cli.imu import inertial_attitude
-from adcs.cli.options import print_note
+from adcs.cli.options import print_note, warn
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError, naming
 from arrays.io.text import read_text
@@ -72,9 +72,7 @@ def view(
     track, *made_of, q_true = (
         _of_inertial_unit(log, config, truth) if _is_layout(config) else _of_satellite(log, config, truth)
     )
-    if not common.quiet:
-        for text in track.warnings:
-            print_note(f"warning: {text}")
+    warn(common, track.warnings)
     files: dict[str, Any] = {"html": html, "png": png, "movie": movie}
     written_or_served(
         lambda used: adcs.view(track, *made_of, truth=q_true, open=open, port=used, title=log.stem, **files),

@@ -89,14 +89,14 @@ class Gains:
                 f"{dt_s:g} s becomes unstable; instead received {self.largest_kp_per_s:g}."
             )
 
-    def warning(self, dt_s: float) -> str | None:
-        """One sentence if the gains are within a tenth of the stability limit, else None."""
+    def warnings(self, dt_s: float) -> tuple[str, ...]:
+        """One sentence if the gains are within a tenth of the stability limit."""
         limit = 2.0 / (LARGEST_EIGENVALUE * dt_s)
         if self.largest_kp_per_s < WARNING_FRACTION * limit:
-            return None
+            return ()
         return (
             f"K_P = {self.largest_kp_per_s:g} 1/s is close to {limit:g} 1/s, where a filter with steps of {dt_s:g} s "
-            "becomes unstable: it amplifies noise."
+            "becomes unstable: it amplifies noise.",
         )
 
 
@@ -114,9 +114,7 @@ class ComplementaryTrack:
 
 
 def explicit_error(
-    q: FloatArray,
-    vectors: list[tuple[FloatArray, FloatArray]],
-    weights: tuple[float, ...] = (1.0, 1.0),
+    q: FloatArray, vectors: list[tuple[FloatArray, FloatArray]], weights: tuple[float, ...] = (1.0, 1.0)
 ) -> FloatArray:
     """Error angle e = Σ weight · v × A(q̂) v_reference.
 

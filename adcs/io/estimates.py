@@ -36,6 +36,11 @@ def estimate_columns(track: AttitudeTrack) -> dict[str, Any]:
     return {name: values[track.rows] for name, values in columns.items()}
 
 
+def rows_of(columns: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """What ``--json`` prints of columns: one entry for every row."""
+    return [dict(zip(columns, row, strict=True)) for row in zip(*map(np.ndarray.tolist, columns.values()), strict=True)]
+
+
 def summary_lines(track: AttitudeTrack) -> list[str]:
     """The result as text: what is known at the end, and how readings fit."""
     if not len(track.rows):

@@ -11,17 +11,7 @@ import numpy as np
 
 from adcs.io.log_layout import LogTable
 from adcs.satellite.sensors import FIVE_HEADS, Gyro, Magnetometer, StarTracker, SunSensor
-from arrays.io.toml import (
-    MAY_BE_INFINITE,
-    File,
-    NotNegative,
-    Positive,
-    RefusalError,
-    Rule,
-    Table,
-    date_such_as,
-    one_of,
-)
+from arrays.io.toml import MAY_BE_INFINITE, File, NotNegative, Positive, RefusalError, Rule, Table, date_such_as, one_of
 from arrays.typing import Vector
 from magloc.fields.geomagnetic import MODELS
 from magloc.levels import CONTRADICTION

@@ -27,11 +27,7 @@ from adcs.satellite.sensors import SENSOR_WORDS, SENSORS
 from adcs.satellite.telemetry import Record, Telemetry, orbital_from_eci, part
 from arrays.io.errors import InputError, naming
 
-IMPLIED_STATES = {
-    "parallel-disturbance": ("disturbance",),
-    "reduced": ("gyro-bias",),
-    "self-tuning": ("disturbance",),
-}
+IMPLIED_STATES = {"parallel-disturbance": ("disturbance",), "reduced": ("gyro-bias",), "self-tuning": ("disturbance",)}
 """What a filter estimates whether it is asked to or not."""
 
 

@@ -104,12 +104,7 @@ def largest_deviation_rad(start: Start) -> FloatArray:
     return 2.0 * np.sqrt(np.linalg.eigvalsh(start.covariance[:, :3, :3])[:, -1])
 
 
-def any_start(
-    record: Record,
-    settings: FilterSettings,
-    turns: int = 36,
-    rate_rad_s: float = RATE_RAD_S,
-) -> Start:
+def any_start(record: Record, settings: FilterSettings, turns: int = 36, rate_rad_s: float = RATE_RAD_S) -> Start:
     """Start from any attitude: :func:`vector_start`, and where it leaves a turn open the best of several hypotheses.
 
     ``turns``: hypotheses, at equal angles about the axis that is left open; :data:`WINDOW_S` or :data:`ALONE_S` of the

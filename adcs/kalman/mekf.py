@@ -14,16 +14,7 @@ import numpy as np
 
 from adcs import quaternion
 from adcs.frames import turned
-from adcs.kalman.error_state import (
-    ALWAYS,
-    SIZES,
-    STATES,
-    AttitudeTracks,
-    FilterSettings,
-    SensorSet,
-    Start,
-    State,
-)
+from adcs.kalman.error_state import ALWAYS, SIZES, STATES, AttitudeTracks, FilterSettings, SensorSet, Start, State
 from adcs.kalman.gate.contest import FIELD, GYRO, SUN, Contest, Fit, begun, eased, patience
 from adcs.quaternion import rotate_back
 from adcs.satellite import dynamics
@@ -69,12 +60,7 @@ def closed_loop_jacobian(record: Record, row: int, state: State) -> FloatArray:
     """
     satellite = record.satellite
     return dynamics.closed_loop_error_jacobian(
-        satellite.body,
-        satellite.control,
-        state.q,
-        state.w,
-        quaternion.IDENTITY,
-        record.environment.gravity_s2[:, row],
+        satellite.body, satellite.control, state.q, state.w, quaternion.IDENTITY, record.environment.gravity_s2[:, row]
     )
 
 
@@ -343,10 +329,7 @@ class _Readable:
 
 
 def run_readable(
-    record: Record,
-    settings: FilterSettings,
-    start: Start,
-    jacobian: Jacobian = known_torque_jacobian,
+    record: Record, settings: FilterSettings, start: Start, jacobian: Jacobian = known_torque_jacobian
 ) -> AttitudeTracks:
     """Filter of whole runs in NumPy, the reference of :func:`run_filter`.
 

@@ -117,12 +117,7 @@ def states_figure(picture: StatesPicture) -> Figure:
             for gap, there in picture.gaps:
                 style.shade_gaps(ax, picture.time_s, there, gap)
             outside = float(np.mean(np.abs(values[settled, axis]) > wide[settled, axis]))
-            style.dress(
-                ax,
-                "",
-                label if axis == 0 else "",
-                "xyz"[axis] if row == rows[0] else "",
-            )
+            style.dress(ax, "", label if axis == 0 else "", "xyz"[axis] if row == rows[0] else "")
             if picture.are_errors and outside > 0.0:
                 ax.text(
                     0.98,

@@ -40,10 +40,7 @@ _FIELD_UNITS = {
 }
 _RATE_UNITS = {"rad/s taken for °/s": 180.0 / math.pi, "°/s taken for rad/s": math.pi / 180.0}
 # Components (w, x, y, z) as read, of columns that are (x, y, z, w), and the other way round.
-_ORDERS = {
-    "scalar last taken for scalar first": [3, 0, 1, 2],
-    "scalar first taken for scalar last": [1, 2, 3, 0],
-}
+_ORDERS = {"scalar last taken for scalar first": [3, 0, 1, 2], "scalar first taken for scalar last": [1, 2, 3, 0]}
 
 
 @dataclass(frozen=True, eq=False)

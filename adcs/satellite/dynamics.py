@@ -265,12 +265,7 @@ def error_jacobian(
 
 
 def closed_loop_error_jacobian(
-    body: RigidBody,
-    control: WheelControl,
-    q: ArrayLike,
-    w: ArrayLike,
-    q_reference: ArrayLike,
-    gravity_s2: ArrayLike,
+    body: RigidBody, control: WheelControl, q: ArrayLike, w: ArrayLike, q_reference: ArrayLike, gravity_s2: ArrayLike
 ) -> FloatArray:
     r"""F of the error as the source paper has it, as if the control saw the true state (``closed_loop_F``).
 

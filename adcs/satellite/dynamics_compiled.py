@@ -252,13 +252,7 @@ def step(
 
 @compiled
 def error_jacobian(
-    body: Body,
-    q: Quaternion,
-    w: Vector,
-    momentum: Vector,
-    gravity: float,
-    b_orbital: Vector,
-    F: Array,
+    body: Body, q: Quaternion, w: Vector, momentum: Vector, gravity: float, b_orbital: Vector, F: Array
 ) -> None:
     """F of the error (δq, δω) for a known wheel torque, into all 36 elements of ``F`` (6, 6).
 
@@ -294,13 +288,7 @@ def _clipped(value: float, limit: float) -> float:
 
 @compiled
 def commanded_torque(
-    J: Matrix,
-    control: Control,
-    q: Quaternion,
-    w: Vector,
-    momentum: Vector,
-    orbital_rate: float,
-    dt: float,
+    J: Matrix, control: Control, q: Quaternion, w: Vector, momentum: Vector, orbital_rate: float, dt: float
 ) -> Vector:
     """Wheel torque of the proportional-derivative control, within its limits."""
     attitude_gain, rate_gain = control.attitude_gain, control.rate_gain

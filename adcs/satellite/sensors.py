@@ -249,12 +249,7 @@ def in_field(sensor: SunSensor, direction_body: ArrayLike) -> BoolArray:
 
 
 def _vector_readings(
-    true: ArrayLike,
-    misalignment_rad: FloatArray,
-    bias: ArrayLike,
-    sigma: float,
-    unit_noise: ArrayLike,
-    largest: float,
+    true: ArrayLike, misalignment_rad: FloatArray, bias: ArrayLike, sigma: float, unit_noise: ArrayLike, largest: float
 ) -> FloatArray:
     in_sensor = quaternion.rotate_back(quaternion.exp(misalignment_rad), true)
     noise = sigma * np.asarray(unit_noise, dtype=np.float64)

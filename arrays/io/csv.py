@@ -144,11 +144,7 @@ class Table:
 
 
 def read_table(
-    path: str | PathLike[str],
-    expected_header: str,
-    *,
-    only: Collection[str] | None = None,
-    instant: Sequence[str] = (),
+    path: str | PathLike[str], expected_header: str, *, only: Collection[str] | None = None, instant: Sequence[str] = ()
 ) -> Table:
     """Table, of one row at least, of a CSV file of numbers; `expected_header` says in words what it should have.
 

@@ -10,8 +10,10 @@ from pathlib import Path
 from arrays.io.errors import InputError
 
 
-def refuse_file(folder: Path, option: str) -> None:
+def refuse_file(folder: Path | None, option: str) -> None:
     """Refuse, before long work and without making it, what cannot become a folder; `option` names it in errors."""
+    if folder is None:  # nothing is to be written
+        return
     place = folder.absolute()
     while not place.exists() and place != place.parent:
         place = place.parent

@@ -23,11 +23,7 @@ def world_place(position_m: FloatArray, origin: Vector) -> list[float]:
 
 def feature(kind: str, coordinates: Sequence[Any], properties: Mapping[str, Any]) -> dict[str, Any]:
     """A feature of GeoJSON: "Point" with one place, "LineString" with several."""
-    return {
-        "type": "Feature",
-        "geometry": {"type": kind, "coordinates": coordinates},
-        "properties": dict(properties),
-    }
+    return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": dict(properties)}
 
 
 def feature_collection(features: Iterable[dict[str, Any]]) -> dict[str, Any]:

@@ -249,11 +249,7 @@ def advance(prepared: Prepared, state: State, wheel_torque_Nm: FloatArray, row: 
     )
 
 
-def controlled(
-    prepared: Prepared,
-    command: Command,
-    advanced: Callable[[int], None] | None = None,
-) -> AttitudeRuns:
+def controlled(prepared: Prepared, command: Command, advanced: Callable[[int], None] | None = None) -> AttitudeRuns:
     """Truth and readings from the start of prepared runs, without wheels; what is commanded goes into the record.
 
     Raises ValueError: the scenario has rods, which only :func:`moved` simulates.

@@ -11,13 +11,13 @@ import numpy as np
 from cyclopts import Parameter
 
 import sims.experiments
-from adcs.cli.options import ScenarioOptions, print_note
+from adcs.cli.options import ScenarioOptions, tell, warn
 from adcs.kalman.names import FILTERS
 from arrays.io.arguments import Flag
 from arrays.io.csv import write_columns
 from arrays.io.errors import InputError
 from arrays.io.outputs import make_folder, refuse_file
-from magloc.cli.framework import QuietOptions, print_json, progress
+from magloc.cli.framework import QuietOptions, print_result, progress
 from sims.cli.run_tabletsat import RunOptions, wanted
 
 if TYPE_CHECKING:
@@ -111,8 +111,7 @@ def compare(
     """
     if not scenarios:
         raise InputError("adcs compare: found no scenario, expected one or more, such as tabletsat eclipse.")
-    if out is not None:
-        refuse_file(out, "--out")
+    refuse_file(out, "--out")
     pairs = [wanted(name, chosen, runs.duration) for name, chosen in product(scenarios, options.combinations())]
     rows = []
     with progress(len(pairs) * runs.seeds, "runs", quiet=common.quiet) as advance:
@@ -125,16 +124,11 @@ def compare(
     if out is not None:
         make_folder(out, "--out")
         _write(out, rows, reports)
-        if not common.quiet:
-            print_note(f"wrote compare.png and compare.csv into {out}")
-    if json:
-        print_json({"rows": reports})
-        return
-    print("\n".join(compare_lines(reports)))
-    if not common.quiet:
+        tell(common, f"wrote compare.png and compare.csv into {out}")
+    print_result({"rows": reports}, compare_lines(reports), as_json=json)
+    if not json:
         for report in reports:
-            for line in report["warnings"]:
-                print_note(f"warning: {report['scenario']}, {report['sensors']}: {line}")
+            warn(common, (f"{report['scenario']}, {report['sensors']}: {line}" for line in report["warnings"]))
 
 
 _COLUMNS = (

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 from cyclopts import Parameter
 
-from adcs.cli.options import print_note
+from adcs.cli.options import tell
 from arrays.io.arguments import Flag
 from arrays.io.errors import InputError
+from magloc.cli.framework import QuietOptions
 from magloc.cli.options import Port, naming_outputs
 from sims.cli.mockup_options import MockupOptions
 from sims.experiments.mockup_settings import METHOD_WORDS
@@ -30,7 +31,7 @@ def check_places(replay: ReplayOptions) -> None:
         check_outputs(replay.html, replay.png)
 
 
-def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions, *, quiet: bool) -> None:
+def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions, common: QuietOptions) -> None:
     """Show the first drive until Ctrl-C, or write it."""
     from adcs.viewer.drive_page import drive_page, write_playing_page
     from magloc.viewer.server import address, free_port, opened, wait_for_interruption, write_picture
@@ -39,8 +40,8 @@ def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions, *,
     at_s = 0.5 * drive.duration_s if replay.at is None else replay.at
     with naming_outputs():
         used = free_port(replay.port) if replay.view else 0
-    if used not in (0, replay.port) and replay.port and not quiet:
-        print_note(f"port {replay.port} is in use, {used} is taken")
+    if used not in (0, replay.port) and replay.port:
+        tell(common, f"port {replay.port} is in use, {used} is taken")
     with opened(used, f"adcs · mockup {runs.method}") as server:
         page, player = drive_page(server, drive, at_s)
         with naming_outputs():
@@ -49,12 +50,10 @@ def show_replay(runs: FusionRuns, camera: TableCamera, replay: ReplayOptions, *,
             if replay.html is not None:
                 write_playing_page(server, page, player, drive, replay.html)
         if not replay.view:
-            if not quiet:
-                print_note(f"wrote {', '.join(str(file) for file in (replay.html, replay.png) if file is not None)}")
+            tell(common, f"wrote {', '.join(str(file) for file in (replay.html, replay.png) if file is not None)}")
             return
         with suppress(KeyboardInterrupt):  # who has the address may press Ctrl-C before the waiting begins
-            if not quiet:
-                print_note("open this address in a browser; Ctrl-C ends the viewer")
+            tell(common, "open this address in a browser; Ctrl-C ends the viewer")
             print(address(server), flush=True)
             wait_for_interruption()
         page.close()

@@ -6,11 +6,7 @@ from cyclopts import App
 
 from sims.cli.run_tabletsat import run_attitude
 
-run = App(
-    name="run",
-    help="Simulate a scenario, estimate its attitude, and say how good that is.",
-    version_flags=[],
-)
+run = App(name="run", help="Simulate a scenario, estimate its attitude, and say how good that is.", version_flags=[])
 run.default(run_attitude)
 for _name, _where, _help in (
     (

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from adcs.cli.options import print_note
+from adcs.cli.options import tell, warn
 from adcs.complementary.names import Method, Rule
-from arrays.io.arguments import Count, Flag
+from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import LARGEST, InputError
-from arrays.io.outputs import refuse_file
+from arrays.io.outputs import make_folder, refuse_file
 from magloc.cli.framework import QuietOptions, print_result, progress
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ class ComplementaryOptions:
     outage: Rule | None = None
     amplitude_deg: float = 5.0
     seeds: Annotated[Count, Parameter(name=["--seeds", "--runs"])] = 1
-    seed: int = 0
+    seed: Seed = 0
     duration: float | None = None
 
     def check(self) -> None:
@@ -79,10 +79,6 @@ class ComplementaryOptions:
             raise InputError(f"--sigma-nT: found {self.sigma_nT:g}, expected a positive number.")
         if not 0.0 <= self.amplitude_deg < 90.0:
             raise InputError(f"--amplitude-deg: found {self.amplitude_deg:g}, expected 0 to less than 90.")
-        if self.seed < 0:
-            raise InputError(f"--seed: found {self.seed}, expected 0 or more.")
-        if self.seeds < 1:
-            raise InputError(f"--seeds: found {self.seeds}, expected a positive number.")
         from sims.attitude.complementary import ORBIT
         from sims.experiments.complementary import OUTAGE_MAX_FROM_ORBITS, RMS_ORBITS
 
@@ -165,8 +161,7 @@ def run_complementary(
     from sims.experiments.complementary import RUN_COLUMNS, errors_deg, row_of_each
 
     options.check()
-    if out is not None:
-        refuse_file(out, "--out")
+    refuse_file(out, "--out")
     rows: list[FloatArray] = []
     last = options.seed + options.seeds
     for begin in range(options.seed, last, _RUNS_AT_ONCE):
@@ -174,7 +169,7 @@ def run_complementary(
         runs = satellite_runs(options.scenario, seeds)
         rows.append(row_of_each(runs.scenario, errors_deg(runs, options.filter, options.gains, options.outage)))
         if out is not None and begin == options.seed:
-            out.mkdir(parents=True, exist_ok=True)
+            make_folder(out, "--out")
             _write_picture(options, runs, out)
         if progress is not None:
             progress(len(seeds))
@@ -258,11 +253,10 @@ def complementary(
         Common options.
     """
     options.check()
-    warning = None if options.filter == "adaptive" else options.gains.warning(1.0)
-    if warning is not None and not common.quiet:
-        print_note(f"warning: {warning}")
+    if options.filter != "adaptive":
+        warn(common, options.gains.warnings(1.0))
     with progress(options.seeds, "runs", quiet=common.quiet) as advance:
         result = run_complementary(options, out, advance)
     print_result(result, summary_lines(options, result), as_json=json)
-    if out is not None and not common.quiet:
-        print_note(f"wrote complementary.png, complementary.csv and complementary-runs.csv into {out}")
+    if out is not None:
+        tell(common, f"wrote complementary.png, complementary.csv and complementary-runs.csv into {out}")

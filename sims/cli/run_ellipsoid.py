@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from adcs.cli.options import print_note
+from adcs.cli.options import tell
 from adcs.ellipsoids.strip import StepRule
-from arrays.io.arguments import Count, Flag
+from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import LARGEST, InputError
-from arrays.io.outputs import refuse_file
+from arrays.io.outputs import make_folder, refuse_file
 from magloc.cli.framework import QuietOptions, print_result, progress
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ class EllipsoidOptions:
     jump: Annotated[bool, Parameter(negative=(), show_default=False)] = False
     closed_loop: Annotated[bool, Parameter(negative=(), show_default=False)] = False
     seeds: Annotated[Count, Parameter(name=["--seeds", "--runs"])] = 300
-    seed: int = 0
+    seed: Seed = 0
     duration: float = 5678.0
 
     def check(self) -> None:
@@ -72,10 +72,6 @@ class EllipsoidOptions:
             raise InputError(f"--duration: found {self.duration:g} s, expected {STEP_S:g} to 1e7 s.")
         if self.jump and self.duration <= JUMP_S:
             raise InputError(f"--duration: found {self.duration:g} s, expected more than the {JUMP_S:g} s of --jump.")
-        if self.seed < 0:
-            raise InputError(f"--seed: found {self.seed}, expected 0 or more.")
-        if self.seeds < 1:
-            raise InputError(f"--seeds: found {self.seeds}, expected a positive number.")
 
     @property
     def n_steps(self) -> int:
@@ -116,15 +112,14 @@ def run_ellipsoid(
     from sims.experiments.ellipsoid import RUN_COLUMNS, ellipsoid_runs, row_of_each
 
     options.check()
-    if out is not None:
-        refuse_file(out, "--out")
+    refuse_file(out, "--out")
     rows: list[FloatArray] = []
     last = options.seed + options.seeds
     for begin in range(options.seed, last, _RUNS_AT_ONCE):
         runs = ellipsoid_runs(options.settings, range(begin, min(begin + _RUNS_AT_ONCE, last)))
         rows.append(row_of_each(runs))
         if out is not None and begin == options.seed:
-            out.mkdir(parents=True, exist_ok=True)
+            make_folder(out, "--out")
             _write_picture(options, runs, out)
         if progress is not None:
             progress(len(runs.seeds))
@@ -229,5 +224,5 @@ def ellipsoid(
     with progress(options.seeds, "runs", quiet=common.quiet) as advance:
         result = run_ellipsoid(options, out, advance)
     print_result(result, summary_lines(options, result), as_json=json)
-    if out is not None and not common.quiet:
-        print_note(f"wrote ellipsoid.png, ellipsoid.csv and ellipsoid-runs.csv into {out}")
+    if out is not None:
+        tell(common, f"wrote ellipsoid.png, ellipsoid.csv and ellipsoid-runs.csv into {out}")

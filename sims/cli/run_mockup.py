@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import sims.experiments
-from adcs.cli.options import naming_options, print_note
+from adcs.cli.options import naming_options, tell, warn
 from arrays.io.arguments import Flag
 from arrays.io.outputs import refuse_file
 from magloc.cli.framework import QuietOptions, print_result, progress
@@ -161,8 +161,7 @@ def mockup(
     """
     options.check()
     replay.check(options, json=json)
-    if out is not None:
-        refuse_file(out, "--out")
+    refuse_file(out, "--out")
     if replay.wanted:
         from sims.cli.mockup_replay import check_places, show_replay
 
@@ -170,20 +169,20 @@ def mockup(
     if options.frames is not None:
         told = _frames(options, options.frames)
     elif options.samples is not None and options.fixes is not None:
-        told = _recording(options.samples, options.fixes, options, quiet=common.quiet)
+        told = _recording(options.samples, options.fixes, options, common)
     else:
         kinds = {"sky": _sky, "zeros": _zeros, "fusion": _drives, "all": _drives}
-        told = kinds[options.part](options, common.quiet)
+        told = kinds[options.part](options, common)
     written = []
     if out is not None:
         from sims.cli.mockup_files import write_files
 
         written = write_files(options, told.run, out)
     print_result(told.result, told.lines, as_json=json)
-    if written and not common.quiet:
-        print_note(f"wrote {', '.join(written)} into {out}")
+    if written:
+        tell(common, f"wrote {', '.join(written)} into {out}")
     if replay.wanted:
-        show_replay(told.run[0], options.table_camera(), replay, quiet=common.quiet)
+        show_replay(told.run[0], options.table_camera(), replay, common)
 
 
 class Told(NamedTuple):
@@ -204,39 +203,37 @@ def _frames(options: MockupOptions, frames: Path) -> Told:
     return Told(results, {"frames": entries, "identified": fixed}, frame_lines(entries))
 
 
-def _recording(samples: Path, fixes: Path, options: MockupOptions, *, quiet: bool) -> Told:
+def _recording(samples: Path, fixes: Path, options: MockupOptions, common: QuietOptions) -> Told:
     from sims.experiments.mockup_recording import record_lines
 
     run = sims.experiments.fused_record(samples, fixes, value_or(options.fusion, "ekf"))
-    if not quiet:
-        for line in run.warnings:
-            print_note(f"warning: {line}")
+    warn(common, run.warnings)
     return Told(run, run.summary(), record_lines(run))
 
 
-def _sky(options: MockupOptions, quiet: bool) -> Told:
+def _sky(options: MockupOptions, common: QuietOptions) -> Told:
     setup, seeds = options.sky_setup(), options.runs(1)
     sky, matcher, finder = options.led_sky, options.sky_matcher(), options.finder()
-    with progress(setup.poses * len(seeds), "frames", quiet=quiet) as advance:
+    with progress(setup.poses * len(seeds), "frames", quiet=common.quiet) as advance:
         run = sims.experiments.sky_run(sky, matcher, setup, seeds, advance, finder)
     result = run.summary()
     return Told(run, result, sky_lines(options, result))
 
 
-def _zeros(options: MockupOptions, quiet: bool) -> Told:
+def _zeros(options: MockupOptions, common: QuietOptions) -> Told:
     seeds, unknowns, start_fixes = options.runs(6), value_or(options.unknowns, "six"), value_or(options.start_fixes, 4)
-    with progress(len(seeds), "runs", quiet=quiet) as advance, naming_options():
+    with progress(len(seeds), "runs", quiet=common.quiet) as advance, naming_options():
         runs = sims.experiments.zeros_run(
             unknowns, seeds, options.duration_s, start_fixes=start_fixes, progress=advance
         )
     return Told(runs, runs.summary(), zeros_lines(runs, options.duration_s))
 
 
-def _drives(options: MockupOptions, quiet: bool) -> Told:
+def _drives(options: MockupOptions, common: QuietOptions) -> Told:
     scenario, seeds = options.table_scenario(), options.runs(6)
     wanted = value_or(options.fusion, "ekf")
     methods: tuple[Method, ...] = METHODS if wanted == "all" else (wanted,)
-    with progress(len(seeds) * len(methods), "runs", quiet=quiet) as advance:
+    with progress(len(seeds) * len(methods), "runs", quiet=common.quiet) as advance:
         simulate = lru_cache(maxsize=len(seeds))(options.table_camera().run) if options.part == "all" else None
         every = [sims.experiments.fused_runs(method, scenario, seeds, advance, simulate) for method in methods]
     if wanted == "all":

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 
 import adcs
 import sims.experiments
-from adcs.cli.options import ScenarioOptions, print_note
+from adcs.cli.options import ScenarioOptions, tell, warn
 from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.errors import InputError
 from arrays.io.outputs import make_folder, refuse_file
@@ -135,17 +135,14 @@ def run_attitude(
             look=None if out is None else parts.append,
             advance=advance,
         )
-    if not common.quiet:
-        for line in outcome.warning_lines():
-            print_note(f"warning: {line}")
+    warn(common, outcome.warning_lines())
     numbers = outcome.numbers()
     if out is not None:
         from sims.cli.attitude_files import write_attitude_files
 
         make_folder(out, "--out")
         written = write_attitude_files(out, file, estimate, parts, outcome)
-        if not common.quiet:
-            print_note(f"wrote {', '.join(written)} into {out}")
+        tell(common, f"wrote {', '.join(written)} into {out}")
     print_result(numbers, summary_lines(file, estimate, numbers), as_json=json)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 import sims.experiments
-from adcs.cli.options import print_note
+from adcs.cli.options import tell
 from arrays.io.arguments import Count, Flag, Seed
 from arrays.io.csv import write_columns
 from arrays.io.errors import InputError
@@ -66,8 +66,7 @@ def tables(
     common : QuietOptions
         Common options.
     """
-    if out is not None:
-        refuse_file(out, "--out")
+    refuse_file(out, "--out")
     if options.duration is not None and not 1.0 <= options.duration <= 1e7:
         raise InputError(f"--duration: found {options.duration:g} s, expected 1 to 1e7 s.")
     rows = sims.experiments.PAPER_ROWS
@@ -81,8 +80,7 @@ def tables(
         make_folder(out, "--out")
         names = list(asdict(compared[0]))
         write_columns({name: [getattr(one, name) for one in compared] for name in names}, out / "tables.csv")
-        if not common.quiet:
-            print_note(f"wrote tables.csv into {out}")
+        tell(common, f"wrote tables.csv into {out}")
     print_result({"rows": [asdict(one) for one in compared]}, table_lines(compared), as_json=json)
 
 

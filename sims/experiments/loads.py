@@ -24,10 +24,7 @@ from sims.noise import stream
 NOISE_T = 15e-9
 GAIN, AXES_RAD, PLACE_M = 0.01, math.radians(0.5), 1e-3
 """Standard deviations of what is not known of a magnetometer: gains, axes, and where it stands, each component."""
-LOADS = {
-    "heater": ((0.02, -0.025, -0.06), (0.012, 0.0, 0.016)),
-    "radio": ((-0.015, 0.02, 0.085), (0.06, -0.08, 0.0)),
-}
+LOADS = {"heater": ((0.02, -0.025, -0.06), (0.012, 0.0, 0.016)), "radio": ((-0.015, 0.02, 0.085), (0.06, -0.08, 0.0))}
 """Place [m] and moment [A·m²] of each load, body axes: 0.02 and 0.1 A·m²."""
 PLACES_M = ((0.045, 0.045, 0.165), (-0.045, 0.045, -0.165), (0.045, -0.045, 0.0), (-0.045, -0.045, 0.12))
 """Of the magnetometers; the first one is that of the attitude."""

@@ -22,12 +22,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from arrays.array import SensorArray
-from arrays.differences import (
-    contrasts,
-    decorrelated_differences,
-    eigen_decorrelation,
-    helmert_decorrelation,
-)
+from arrays.differences import contrasts, decorrelated_differences, eigen_decorrelation, helmert_decorrelation
 from arrays.geometries import tetrahedron
 from arrays.noise import calibration_errors, proportional_noise, reading_covariance, reading_errors
 from arrays.sensor import Calibration, Sensor

@@ -203,12 +203,7 @@ def odds_matcher(catalogue: TriangleCatalogue, camera: Camera) -> FirstFix:
 
 
 def best_fix(
-    odds: PoseOdds,
-    image: ComplexArray,
-    poses: Poses,
-    log_odds: FloatArray,
-    minimum_log_odds: float,
-    minimum_stars: int,
+    odds: PoseOdds, image: ComplexArray, poses: Poses, log_odds: FloatArray, minimum_log_odds: float, minimum_stars: int
 ) -> CameraFix | NoFix:
     """Fix of the best pose, if it stands out.
 

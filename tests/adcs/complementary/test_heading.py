@@ -10,14 +10,7 @@ from scipy.differentiate import jacobian
 from scipy.stats import chi2
 
 from adcs import quaternion
-from adcs.complementary.heading import (
-    HeadingModel,
-    _blocks,
-    expected_field,
-    heading_track,
-    transition,
-    turned_to_north,
-)
+from adcs.complementary.heading import HeadingModel, _blocks, expected_field, heading_track, transition, turned_to_north
 from adcs.complementary.heading_compiled import TOLD, Noise, run, smooth
 from adcs.complementary.heading_compiled import Tests as Limits
 

@@ -99,10 +99,7 @@ def state(runs: AttitudeRuns) -> State:
     sizes = {"disturbance": 1e-6, "dipole": 0.05, "field-model": 2e-7, "field-gain": 0.03}
     optional = {state: size * rng.standard_normal((6, SIZES[state])) for state, size in sizes.items()}
     return replace(
-        first,
-        q=random_attitudes(6, rng),
-        w=0.02 * rng.standard_normal((6, 3)),
-        optional={**first.optional, **optional},
+        first, q=random_attitudes(6, rng), w=0.02 * rng.standard_normal((6, 3)), optional={**first.optional, **optional}
     )
 
 

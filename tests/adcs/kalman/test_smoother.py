@@ -18,11 +18,7 @@ from sims.experiments.accuracy import errors, normalised_error_squared
 from tests.adcs.filter_runs import runs_for, settings, start_of, tabletsat
 
 Array = NDArray[np.float64]
-CASES = [
-    ("st", ("disturbance",)),
-    ("mag+sun", ("disturbance",)),
-    ("mag+sun+gyro", ("gyro-bias", "disturbance")),
-]
+CASES = [("st", ("disturbance",)), ("mag+sun", ("disturbance",)), ("mag+sun+gyro", ("gyro-bias", "disturbance"))]
 
 
 def least_squares(runs: AttitudeRuns, chosen: FilterSettings, start: Start) -> tuple[Array, Array]:

@@ -400,11 +400,7 @@ class TestKernels:
         F = np.full((6, 6), np.nan)
         for i in range(20):
             rigid_body.error_jacobian(
-                rigid_body.Body.of(MAGNETIC),
-                *(tuple(one[i]) for one in (q, w, k)),
-                GRAVITY,
-                tuple(B),
-                F,
+                rigid_body.Body.of(MAGNETIC), *(tuple(one[i]) for one in (q, w, k)), GRAVITY, tuple(B), F
             )
             np.testing.assert_allclose(F, expected[i], rtol=0, atol=1e-16)
 

@@ -22,11 +22,7 @@ from adcs import Telemetry, calibrate_magnetometer, quaternion
 from adcs.environment.environment import environment, field_eci
 from adcs.frames import R_ecef_from_eci, R_orbital_from_eci
 from adcs.satellite import magnetometer_calibration as module
-from adcs.satellite.magnetometer_calibration import (
-    MagnetometerCalibration,
-    MagnetometerPrior,
-    calibrated,
-)
+from adcs.satellite.magnetometer_calibration import MagnetometerCalibration, MagnetometerPrior, calibrated
 from magloc.fields import geomagnetic
 from tests.adcs.filter_runs import tabletsat
 

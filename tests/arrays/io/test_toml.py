@@ -113,15 +113,9 @@ def test_values(tmp_path: Path) -> None:
         ("[several]", "file.toml, key several: found a table, expected a list."),
         ("[[several]]\nsize_m = 1\n[[several]]", "file.toml, several 2: found no key size_m, expected one."),
         ("several = [1]", "file.toml, several 1: found a whole number, expected a table."),
-        (
-            "named = [{id = 'x', weight = -1}]",
-            "file.toml, named x, key weight: found -1, expected a number that",
-        ),
+        ("named = [{id = 'x', weight = -1}]", "file.toml, named x, key weight: found -1, expected a number that"),
         ("named = [{weight = 1}]", "file.toml, named number 1: found no key id, expected one."),
-        (
-            "named = [{id = 'x', weight = -inf}]",
-            "file.toml, named x, key weight: found -inf, expected a fini",
-        ),
+        ("named = [{id = 'x', weight = -inf}]", "file.toml, named x, key weight: found -inf, expected a fini"),
         ("short = {}", "file.toml, key short: found no key offset_m, expected one."),
         ("short = {offset_m = [1]}", "file.toml, key short.offset_m: found a list of length 1, expected a list of le"),
         (

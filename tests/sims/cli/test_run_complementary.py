@@ -142,8 +142,6 @@ class TestFiles:
         ({"filter": "adaptive", "kp": 0.1}, "--kp: found 0.1, expected no gain: --filter adaptive has none."),
         ({"sigma_nT": 0.0}, "--sigma-nT: found 0, expected a positive number."),
         ({"amplitude_deg": 90.0}, "--amplitude-deg: found 90, expected 0 to less than 90."),
-        ({"seeds": 0}, "--seeds: found 0, expected a positive number."),
-        ({"seed": -1}, "--seed: found -1, expected 0 or more."),
         ({"duration": 100.0}, "--duration: found 100 s, expected 29"),
         ({"duration": math.nan}, "--duration: found nan s, expected 29"),
         ({"duration": 8000.0, "outage": "raw"}, "--duration: found 8000 s, expected 117"),

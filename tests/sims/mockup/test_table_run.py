@@ -14,14 +14,7 @@ import pytest
 from scipy import stats
 
 from adcs.mockup.navigation.strapdown import strapdown, turned, wrapped
-from sims.mockup.table_run import (
-    THRUST_M_S2,
-    CameraErrors,
-    ImuErrors,
-    TableScenario,
-    perimeter_drive,
-    table_run,
-)
+from sims.mockup.table_run import THRUST_M_S2, CameraErrors, ImuErrors, TableScenario, perimeter_drive, table_run
 from sims.noise import stream
 
 FALSE_ALARM = 1e-4

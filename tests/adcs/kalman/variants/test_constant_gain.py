@@ -22,8 +22,7 @@ class TestConstantGain:
         assert reached["diverged_runs"] == 0
 
     @pytest.mark.parametrize(
-        ("sensors", "angle", "rate"),
-        [("st", 1.1e-3, 4e-4), ("mag+sun", 0.12, 3.2e-3), ("mag+sun+gyro", 0.25, 2e-3)],
+        ("sensors", "angle", "rate"), [("st", 1.1e-3, 4e-4), ("mag+sun", 0.12, 3.2e-3), ("mag+sun+gyro", 0.25, 2e-3)]
     )
     def test_other_sets(self, sensors: str, angle: float, rate: float) -> None:
         chosen = settings(sensors)
