@@ -131,7 +131,7 @@ class ChartRow:
 
     @cached_property
     def whitening(self) -> FloatArray:
-        """``C^{-1/2}`` (k, k) of a row without a source, what its pose's errors make of the ambient field being noise."""
+        """``C^{-1/2}`` (k, k) of a row without a source: what its pose's errors make of the ambient field is noise."""
         if not self.n_pose:
             return np.eye(len(self.sigma))
         # Sources without a moment: what is left is the ambient field, turned by the pose's errors.

@@ -190,6 +190,7 @@ class Start:
                 cell.append(np.array([-1, -1, 0]))
         return _Seeds(np.vstack(position), np.vstack(moment), np.vstack(cell))
 
+
 def _components(measurement: ChartRow, motion: MotionModel, seeds: _Seeds) -> Updated:
     """What the row makes of cells about seeds."""
     state, _ = motion.start(np.zeros(N_SOURCE), np.zeros((N_SOURCE, N_SOURCE)))
