@@ -19,7 +19,6 @@ from arrays.typing import FloatArray
 SensorKind = Literal["vector", "scalar"]
 FLICKER_DECADES = 3
 """Decades of frequency that 1/f noise is counted in: above them white noise is stronger, below them drift."""
-"""Names of a readings file's columns that no channel may take."""
 _SINGULAR_RTOL = 1e-12
 _UNIT_QUATERNION_ATOL = 1e-6
 

@@ -20,6 +20,7 @@ from adcs.complementary.names import MAGNETS, METHODS, Magnet, Method
 from adcs.satellite.attitude_track import AttitudeTrack
 from adcs.satellite.telemetry import is_read
 from adcs.satellite.vector_record import GyroSamples, VectorRecord, step_rates, steps_s
+from adcs.satellite.wahba import attitude_of_vectors
 from arrays.typing import BoolArray, FloatArray
 
 LEFT_OUT, SUBTRACTED = "field left out", "magnet subtracted"
@@ -246,10 +247,6 @@ def _of_kind(settings: Gains | AdaptiveTuning | None, default: _Settings) -> _Se
 
 def _first_attitude(body: list[FloatArray], frame: list[FloatArray]) -> FloatArray:
     """Quaternion (4,) of the first instant that has both vectors; the identity without one."""
-    from scipy.spatial.transform import Rotation
-
-    both = np.flatnonzero(is_read(body[0]) & is_read(body[1]))
-    if not both.size:
-        return quaternion.IDENTITY
-    seen, there = (np.stack([v[both[0]] / np.linalg.norm(v[both[0]]) for v in pair]) for pair in (body, frame))
-    return quaternion.from_rotation(Rotation.align_vectors(there, seen)[0])
+    both = np.flatnonzero(is_read(body[0]) & is_read(body[1]))[:1]
+    q = attitude_of_vectors([v[both] for v in body], [v[both] for v in frame], [1.0, 1.0]).q
+    return q[0] if np.isfinite(q).all() and both.size else quaternion.IDENTITY

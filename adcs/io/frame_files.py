@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import warnings
 import zlib
+from io import BytesIO
 from os import PathLike
 from pathlib import Path
 
@@ -13,11 +14,11 @@ from PIL import Image, UnidentifiedImageError
 
 from adcs.mockup.vision.camera import Camera
 from adcs.mockup.vision.centroids import checked_frame
-from arrays.io.errors import InputError
-from arrays.io.text import replace_file
+from arrays.io.errors import InputError, naming
+from arrays.io.text import read_bytes, replace_file
 from arrays.typing import ByteArray
 
-_EXPECTED = "expected a grey PNG image of 8 bits"
+_EXPECTED = "a grey PNG image of 8 bits"
 _MODES = {
     "1": "an image of black and white alone",
     "I;16": "an image of more than 8 bits",
@@ -30,35 +31,29 @@ def read_frame(path: str | PathLike[str], camera: Camera = Camera()) -> ByteArra
 
     ``camera``: that took it; gives its size. Returns shape (height_px, width_px).
     """
+    data = read_bytes(path, _EXPECTED)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with Image.open(path, formats=["PNG"]) as opened:
+            with Image.open(BytesIO(data), formats=["PNG"]) as opened:
                 _check_kind(path, opened, camera)
                 image = np.array(opened, dtype=np.uint8)
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist, {_EXPECTED}.") from None
-    except IsADirectoryError:
-        raise InputError(f"{path} is a directory, {_EXPECTED}.") from None
     except UnidentifiedImageError:
-        raise InputError(f"{path}: found no PNG image, {_EXPECTED}.") from None
+        raise InputError(f"{path}: found no PNG image, expected {_EXPECTED}.") from None
     except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         raise InputError(f"{path}: found far too many pixels, expected {_size_of(camera)}.") from None
     except InputError:
         raise
     except (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error) as error:
-        reason = getattr(error, "strerror", None) or str(error).rstrip(".")
-        raise InputError(f"{path}: found a damaged image ({reason}), {_EXPECTED}.") from None
-    try:
+        raise InputError(f"{path}: found a damaged image ({str(error).rstrip('.')}), expected {_EXPECTED}.") from None
+    with naming(str(path)):
         return checked_frame(image)
-    except ValueError as error:
-        raise InputError(f"{path}: {str(error).removeprefix('Input ')}") from None
 
 
 def _check_kind(path: str | PathLike[str], image: Image.Image, camera: Camera) -> None:
     if image.mode != "L":
         found = _MODES.get(image.mode, f"an image with colours or transparency (mode {image.mode})")
-        raise InputError(f"{path}: found {found}, {_EXPECTED}.")
+        raise InputError(f"{path}: found {found}, expected {_EXPECTED}.")
     if image.size != (camera.width_px, camera.height_px):
         raise InputError(f"{path}: found {image.size[0]} × {image.size[1]} pixels, expected {_size_of(camera)}.")
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from adcs.complementary.inertial_magnetic import InertialMagneticRecord
 from adcs.io.log_layout import (
+    ACCELERATION_UNITS,
     TIME_FORMATS,
     GyroColumns,
     LogLayout,
@@ -31,7 +32,6 @@ from arrays.io.errors import InputError, naming
 from arrays.io.toml import File, Table, one_of, read_toml, section_of
 from arrays.typing import BoolArray, FloatArray
 
-ACCELERATION_UNITS = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3}
 MOVING = "moving"
 _BROAD = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4, "opt_pos": 3, "movement": 1}
 
@@ -45,8 +45,7 @@ class AccelerometerColumns(MountedTable, kw_only=True):
 
     def of(self, values: FloatArray) -> FloatArray:
         """[m/s²], body axes, upwards at rest, of cells (n, 3)."""
-        scale = ACCELERATION_UNITS[self.unit] * (1.0 if self.at_rest == "up" else -1.0)
-        return scale * values @ np.array(self.mounting, dtype=np.float64).T
+        return super().of(values if self.at_rest == "up" else -values)
 
 
 class SampledGyroColumns(GyroColumns, kw_only=True):

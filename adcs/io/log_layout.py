@@ -17,6 +17,8 @@ FIELD_UNITS = {"nT": 1e-9, "uT": 1e-6, "µT": 1e-6, "mT": 1e-3, "T": 1.0, "mG": 
 RATE_UNITS = {"deg/s": math.pi / 180.0, "rad/s": 1.0, "mrad/s": 1e-3, "deg/h": math.pi / 648_000.0}
 MOMENTUM_UNITS = {"Nms": 1.0, "mNms": 1e-3}
 MOMENT_UNITS = {"Am2": 1.0, "mAm2": 1e-3}
+ACCELERATION_UNITS = {"m/s2": 1.0, "g": 9.80665, "mg": 9.80665e-3}
+_SI = {**FIELD_UNITS, **RATE_UNITS, **MOMENTUM_UNITS, **MOMENT_UNITS, **ACCELERATION_UNITS}  # no two of one name
 TIME_FORMATS = ("seconds", "utc", "unix")
 ORDERS = ("scalar-first", "scalar-last")
 DIRECTIONS = ("inertial-from-body", "body-from-inertial")
@@ -37,14 +39,9 @@ class MountedTable(Table, kw_only=True):
         if np.linalg.det(matrix) < 0.0:
             raise RefusalError("mounting", "found a mirror (determinant -1), expected a rotation, body from sensor")
 
-    @property
-    def scale(self) -> float:
-        """SI unit in a cell's."""
-        return 1.0
-
     def of(self, values: FloatArray) -> FloatArray:
         """In SI, body axes, of cells (n, 3)."""
-        return self.scale * values @ np.array(self.mounting, dtype=np.float64).T
+        return _SI.get(getattr(self, "unit", ""), 1.0) * values @ np.array(self.mounting, dtype=np.float64).T
 
 
 class StarColumns(MountedTable, kw_only=True):
@@ -71,22 +68,12 @@ class GyroColumns(MountedTable, kw_only=True):
     columns: Three = ("gyro_x_deg_s", "gyro_y_deg_s", "gyro_z_deg_s")
     unit: Annotated[str, one_of(RATE_UNITS)] = "deg/s"
 
-    @property
-    def scale(self) -> float:
-        """[rad/s]."""
-        return RATE_UNITS[self.unit]
-
 
 class MagnetometerColumns(MountedTable, kw_only=True):
     """Fields."""
 
     columns: Three = ("field_x_nT", "field_y_nT", "field_z_nT")
     unit: Annotated[str, one_of(FIELD_UNITS)] = "nT"
-
-    @property
-    def scale(self) -> float:
-        """[T]."""
-        return FIELD_UNITS[self.unit]
 
 
 class SunColumns(MountedTable, kw_only=True):
@@ -101,22 +88,12 @@ class WheelColumns(MountedTable, kw_only=True):
     columns: Three = ("wheels_x_Nms", "wheels_y_Nms", "wheels_z_Nms")
     unit: Annotated[str, one_of(MOMENTUM_UNITS)] = "Nms"
 
-    @property
-    def scale(self) -> float:
-        """[N·m·s]."""
-        return MOMENTUM_UNITS[self.unit]
-
 
 class TorquerColumns(MountedTable, kw_only=True):
     """Commanded magnetic moment."""
 
     columns: Three = ("torquers_x_Am2", "torquers_y_Am2", "torquers_z_Am2")
     unit: Annotated[str, one_of(MOMENT_UNITS)] = "Am2"
-
-    @property
-    def scale(self) -> float:
-        """[A·m²]."""
-        return MOMENT_UNITS[self.unit]
 
 
 class LogTable(Table, kw_only=True):

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from adcs.environment.orbit import Orbit, Sgp4Orbit, circular_orbit
@@ -205,16 +206,12 @@ def _process_noise(place: str, wanted: str | dict[str, Any], used: SensorSet) ->
     if isinstance(wanted, str):
         raise InputError(f"{place}, process_noise: found {wanted!r}, expected {', '.join(NOISES)} or a table.")
     table = section_of(f"{place}, table process_noise", wanted, ProcessNoiseTable)
-    given = {key: getattr(table, key) for key in table.__struct_fields__ if getattr(table, key) is not None}
-    return ProcessNoise(
-        attitude=given.get("half_angle_rad", tuned.attitude),
-        rate_rad_s=given.get("rate_rad_s", tuned.rate_rad_s),
-        field_bias_T=1e-9 * given["field_bias_nT"] if "field_bias_nT" in given else tuned.field_bias_T,
-        gyro_bias_rad_s=given.get("gyro_bias_rad_s", tuned.gyro_bias_rad_s),
-        disturbance_s2=given.get("disturbance_s2", tuned.disturbance_s2),
-        dipole_Am2=given.get("dipole_Am2", tuned.dipole_Am2),
-        field_gain=given.get("field_gain", tuned.field_gain),
-    )
+    given = {key: value for key, value in msgspec.structs.asdict(table).items() if value is not None}
+    if "field_bias_nT" in given:
+        given["field_bias_T"] = 1e-9 * given.pop("field_bias_nT")
+    if "half_angle_rad" in given:
+        given["attitude"] = given.pop("half_angle_rad")
+    return replace(tuned, **given)
 
 
 def _satellite(place: str, section: SatelliteTable) -> tuple[RigidBody, WheelControl]:

@@ -8,18 +8,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
-from adcs.environment.environment import Environment
 from adcs.kalman.error_state import AttitudeTracks, FilterSettings, SensorSet, State
 from adcs.kalman.mekf import deviations, residuals
 from adcs.quaternion import rotate_back
 from adcs.satellite.sensors import NIS_SIZES, SENSOR_WORDS
-from adcs.satellite.telemetry import Readings, Record, is_read
+from adcs.satellite.telemetry import Record, instants_as_runs, is_read
 from arrays.typing import BoolArray, FloatArray
 from magloc.navigation.rotations import cross_matrix
 
@@ -258,17 +256,7 @@ def _lasting(record: Record, estimates: AttitudeTracks, run: int) -> list[str]:
 
 def residuals_after(record: Record, estimates: AttitudeTracks, run: int) -> dict[int, FloatArray]:
     """Residuals (n, 3) of a run's readings from its estimates, by the sensor's place; NaN without a reading."""
-    around, readings = record.environment, record.readings
-    of_run = {one.name: getattr(around, one.name)[run][:, None] for one in fields(around) if one.name != "time_s"}
-    each = Record(
-        record.satellite,
-        record.dt_s,
-        Environment(time_s=around.time_s[:1], **of_run),
-        Readings(*(getattr(readings, one.name)[run][:, None] for one in fields(readings))),
-        record.momentum_Nms[run][:, None],
-        record.wheel_torque_Nm[run][:, None],
-        record.torquers_Am2[run][:, None],
-    )
+    each = instants_as_runs(record, run)
     optional = {name: values[run] for name, values in estimates.optional.items()}
     state = State(estimates.q[run], estimates.w[run], optional, estimates.covariance[run])
     return {sensor: residual for sensor, residual, _ in residuals(each, 0, state, estimates.settings.sensors)}

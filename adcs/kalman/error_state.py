@@ -251,15 +251,8 @@ class FilterSettings:
         check_not_negative(field_error_T=self.field_error_T)
         if not 0.0 <= self.gate < 1.0:
             raise ValueError(f"Input gate must be a probability below 1; instead received {self.gate}.")
-        check_positive(
-            field_bias_sigma_T=self.field_bias_sigma_T,
-            gyro_bias_sigma_rad_s=self.gyro_bias_sigma_rad_s,
-            disturbance_sigma_s2=self.disturbance_sigma_s2,
-            dipole_sigma_Am2=self.dipole_sigma_Am2,
-            field_gain_sigma=self.field_gain_sigma,
-            field_axes_sigma_rad=self.field_axes_sigma_rad,
-            field_correlation_s=self.field_correlation_s,
-        )
+        sigmas = {name: value for name, value in vars(self).items() if "_sigma" in name}
+        check_positive(**sigmas, field_correlation_s=self.field_correlation_s)
         if not self.disturbance_correlation_s > 0.0:
             raise ValueError(
                 f"Input disturbance_correlation_s must be positive; instead received {self.disturbance_correlation_s}."

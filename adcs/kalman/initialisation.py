@@ -2,7 +2,7 @@ r"""Where a filter starts when nobody knows the attitude.
 
 A multiplicative filter that starts tens of degrees off may never find back: its first corrections are linearised at
 the wrong place, and its covariance believes them. With a star tracker, or with two directions, the first readings fix
-the attitude (:func:`vector_start`, Wahba's problem by :meth:`scipy.spatial.transform.Rotation.align_vectors`). With one
+the attitude (:func:`vector_start`, Wahba's problem, :func:`adcs.attitude_of_vectors`). With one
 direction, or two that nearly coincide, the turn about it stays open: then filters start at all turns and the one whose
 innovations are smallest is taken (:func:`any_start`).
 """
@@ -10,7 +10,6 @@ innovations are smallest is taken (:func:`any_start`).
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -18,10 +17,12 @@ from numpy.typing import NDArray
 
 from adcs import quaternion
 from adcs.kalman.error_state import OPEN_RAD, RATE_RAD_S, FilterSettings, SensorSet, Start
+from adcs.kalman.gate.contest import turned_onto
 from adcs.kalman.mekf import deviations, run_filter
 from adcs.quaternion import rotate_back
 from adcs.satellite.dynamics import absolute_rate
 from adcs.satellite.telemetry import Record, is_read, part
+from adcs.satellite.wahba import attitude_of_vectors
 from arrays.typing import FloatArray
 from magloc.navigation.rotations import cross_matrix
 
@@ -50,13 +51,14 @@ def vector_start(record: Record, settings: FilterSettings, rate_rad_s: float = R
     runs = len(b)
     seen_field = is_read(b) & used.magnetometer
     seen_sun = is_read(readings.sun[:, 0]) & used.sun
-    q = np.tile(quaternion.IDENTITY, (runs, 1))
-    for run in np.flatnonzero(seen_field | seen_sun):
-        orbital = np.stack([b_orbital[run] / length_T[run], around.sun_orbital[run, 0]])
-        body = np.stack([b[run] / np.linalg.norm(b[run]), readings.sun[run, 0]])
-        weights = np.array([length_T[run] ** 2 / (sigma[2] ** 2 + constant_T[run] ** 2), 1.0 / sigma[3] ** 2])
-        seen = np.array([seen_field[run], seen_sun[run]])
-        q[run] = _aligned(orbital[seen], body[seen], weights[seen])
+    field = np.where(seen_field[:, None], b, np.nan)
+    sun = np.where(seen_sun[:, None], readings.sun[:, 0], np.nan)
+    directions = [sun, field], [around.sun_orbital[:, 0], b_orbital]
+    q = attitude_of_vectors(*directions, [sigma[3], np.hypot(sigma[2], constant_T) / length_T]).q
+    for body, reference in zip(*directions, strict=True):  # one of them, or both on one line
+        open_runs = np.isnan(q[:, 0]) & is_read(body)
+        q[open_runs] = turned_onto(quaternion.IDENTITY, body[open_runs], reference[open_runs])
+    q[np.isnan(q[:, 0])] = quaternion.IDENTITY
     seen_star = is_read(readings.star[:, 0]) & used.star
     q[seen_star] = readings.star[seen_star, 0]
     information = np.tile(np.eye(3) * (2.0 / OPEN_RAD) ** 2, (runs, 1, 1))
@@ -145,17 +147,3 @@ def _narrowed(start: Start, runs: NDArray[np.intp], axis: FloatArray, deviation_
     along = (0.5 * deviation_rad) ** 2 * axis[:, :, None] * axis[:, None, :]
     covariance[:, :3, :3] = across @ covariance[:, :3, :3] @ across + along
     return Start(start.q[runs], start.w[runs], covariance)
-
-
-def _aligned(orbital: FloatArray, body: FloatArray, weights: FloatArray) -> FloatArray:
-    """Quaternion, orbital from body, of one or two directions (k, 3)."""
-    from scipy.spatial.transform import Rotation
-
-    if len(orbital) == 1:
-        # The shortest turn from one to the other: about one direction every turn is as good.
-        rotation, _ = Rotation.align_vectors(orbital[0], body[0])
-    else:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of directions on one line, which the covariance knows
-            rotation, _ = Rotation.align_vectors(orbital, body, weights=weights / weights.max())
-    return quaternion.from_rotation(rotation)

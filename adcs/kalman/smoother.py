@@ -39,7 +39,7 @@ def smoothed(record: Record, estimates: AttitudeTracks, jacobian: Jacobian = kno
     return collected(settings, states[::-1], estimates.nis, estimates.rejected)
 
 
-def difference(state: State, other: State, used: SensorSet) -> FloatArray:
-    """Error state (runs, N) that :func:`adcs.kalman.mekf.with_error` puts into ``other`` to make it ``state``."""
+def difference(state: State | AttitudeTracks, other: State | AttitudeTracks, used: SensorSet) -> FloatArray:
+    """Error state (..., N) that :func:`adcs.kalman.mekf.with_error` puts into ``other`` to make it ``state``."""
     always = [quaternion.error_vector(other.q, state.q), state.w - other.w]
-    return np.concatenate([*always, *(state.of(name) - other.of(name) for name in used.states)], axis=-1)
+    return np.concatenate([*always, *(state.optional[name] - other.optional[name] for name in used.states)], axis=-1)

@@ -6,9 +6,10 @@ one without it. The leading axis of all arrays is the run, the second the instan
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -107,16 +108,24 @@ class Record:
 
 def part(record: Record, runs: NDArray[np.intp], rows: slice = slice(None)) -> Record:
     """Some runs of a record, each as often as its index comes, and instants that follow one another."""
+    return _taken(record, record.environment.time_s[rows], lambda values: values[runs, rows])
+
+
+def instants_as_runs(record: Record, run: int) -> Record:
+    """Every instant of a run as a run of its own, of that instant alone."""
+    return _taken(record, record.environment.time_s[:1], lambda values: values[run][:, None])
+
+
+def _taken(record: Record, time_s: FloatArray, take: Callable[[Any], Any]) -> Record:
+    """Something of every value (runs, n, …) of a record."""
     around, readings = record.environment, record.readings
-    of_runs = {one.name: getattr(around, one.name)[runs, rows] for one in fields(around) if one.name != "time_s"}
+    of_around = {one.name: take(getattr(around, one.name)) for one in fields(around) if one.name != "time_s"}
     return Record(
         record.satellite,
         record.dt_s,
-        Environment(time_s=around.time_s[rows], **of_runs),
-        Readings(*(getattr(readings, one.name)[runs, rows] for one in fields(readings))),
-        record.momentum_Nms[runs, rows],
-        record.wheel_torque_Nm[runs, rows],
-        record.torquers_Am2[runs, rows],
+        Environment(time_s=time_s, **of_around),
+        Readings(*(take(getattr(readings, one.name)) for one in fields(readings))),
+        *map(take, (record.momentum_Nms, record.wheel_torque_Nm, record.torquers_Am2)),
     )
 
 
@@ -198,9 +207,8 @@ class Telemetry:
             raise ValueError(f"Input time_s must have fewer than {MOST_INSTANTS} steps; instead received {steps:.6g}.")
         quaternions = star if star is None or not hasattr(star, "as_quat") else np.atleast_2d(star.as_quat())
         given = {"star": quaternions, "gyro_rad_s": gyro_rad_s, "field_T": field_T, "sun": sun}
+        given |= {"wheels_Nms": wheels_Nms, "torquers_Am2": torquers_Am2}
         checked = {name: _columns(name, values, len(times)) for name, values in given.items()}
-        checked["wheels_Nms"] = _columns("wheels_Nms", wheels_Nms, len(times))
-        checked["torquers_Am2"] = _columns("torquers_Am2", torquers_Am2, len(times))
         checked["star_covariance_rad2"] = _covariances(star_covariance_rad2, len(times))
         for name, value in ({"time_s": times, "step_s": step_s} | checked).items():
             object.__setattr__(self, name, value)
@@ -230,17 +238,7 @@ class Telemetry:
         """The log, cut where it has no row for longer than that."""
         cuts = np.flatnonzero(np.diff(self.time_s) > max(longest_gap_s, self.step_s)) + 1
         return [
-            Telemetry(
-                self.time_s[rows],
-                star=self.star[rows],
-                gyro_rad_s=self.gyro_rad_s[rows],
-                field_T=self.field_T[rows],
-                sun=self.sun[rows],
-                wheels_Nms=self.wheels_Nms[rows],
-                torquers_Am2=self.torquers_Am2[rows],
-                star_covariance_rad2=self.star_covariance_rad2[rows],
-                step_s=self.step_s,
-            )
+            Telemetry(**{name: values if name == "step_s" else values[rows] for name, values in vars(self).items()})
             for rows in np.split(np.arange(len(self.time_s)), cuts)
         ]
 

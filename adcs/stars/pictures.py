@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from io import BytesIO
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path
@@ -17,6 +18,7 @@ import numpy as np
 from scipy import ndimage
 
 from arrays.io.errors import InputError
+from arrays.io.text import read_bytes
 from arrays.typing import BoolArray, FloatArray
 
 SUFFIXES = (".png", ".tif", ".tiff", ".fits", ".fit", ".jpg", ".jpeg")
@@ -71,14 +73,13 @@ def read_picture(path: str | PathLike[str]) -> FloatArray:
     >>> adcs.read_picture("night.png").shape  # doctest: +SKIP
     (1040, 1392)
     """
-    if not Path(path).is_file():
-        raise InputError(f"{path} does not exist, expected a picture ({', '.join(SUFFIXES)}).")
+    data = read_bytes(path, f"a picture ({', '.join(SUFFIXES)})")
     if Path(path).suffix.lower() in (".fits", ".fit"):
-        return _fits(path)
+        return _fits(path, data)
     from PIL import Image
 
     try:
-        with Image.open(path) as opened:
+        with Image.open(BytesIO(data)) as opened:
             if opened.width * opened.height > _MOST_PIXELS:
                 raise InputError(f"{path}: found {opened.width} × {opened.height} pixels, expected 10⁸ at most.")
             values = np.asarray(opened)
@@ -91,9 +92,8 @@ def read_picture(path: str | PathLike[str]) -> FloatArray:
     return _checked(path, values)
 
 
-def _fits(path: str | PathLike[str]) -> FloatArray:
+def _fits(path: str | PathLike[str], data: bytes) -> FloatArray:
     """First image of a FITS file; its first row is at the bottom."""
-    data = Path(path).read_bytes()
     header: dict[str, str] = {}
     start = 0
     for start in range(0, len(data), _FITS_CARD):

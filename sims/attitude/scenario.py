@@ -109,16 +109,9 @@ class AttitudeScenario:
             raise ValueError(f"Input duration_s must be dt_s or more and finite; instead received {self.duration_s}.")
         if not 0.0 <= self.wild_share <= 1.0:
             raise ValueError(f"Input wild_share must be 0 to 1; instead received {self.wild_share}.")
-        check_not_negative(
-            torque_Nm=self.torque_Nm,
-            gyro_bias_rad_s=self.gyro_bias_rad_s,
-            field_bias_T=self.field_bias_T,
-            field_gain=self.field_gain,
-            field_axes_rad=self.field_axes_rad,
-            field_error_T=self.field_error_T,
-            start_attitude_rad=self.start_attitude_rad,
-            start_rate_rad_s=self.start_rate_rad_s,
-        )
+        sizes = ("torque_Nm", "gyro_bias_rad_s", "field_bias_T", "field_gain", "field_axes_rad", "field_error_T")
+        names = (*sizes, "start_attitude_rad", "start_rate_rad_s")
+        check_not_negative(**{name: getattr(self, name) for name in names})
 
     @property
     def n_instants(self) -> int:

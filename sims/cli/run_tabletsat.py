@@ -39,7 +39,7 @@ class RunOptions:
     seed : int
         Of the first run; the next ones follow.
     duration : float
-        Seconds; by default the scenario's.
+        Seconds; by default the scenario's, or the table's.
     """
 
     seeds: Annotated[Count, Parameter(name=["--seeds", "--runs"])] = 10

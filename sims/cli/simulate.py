@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from arrays.io.arguments import Flag
-from arrays.io.errors import InputError
+from arrays.io.errors import InputError, naming
 from magloc.cli.framework import CommonOptions, print_json
 from magloc.cli.options import print_note
 
@@ -48,10 +48,8 @@ def simulate(
     wanted = read_scenario(scenario)
     for path in files_beside(out, len(wanted.sources), has_targets=wanted.targets is not None).all:
         refuse_unwritable(path, "--out")
-    try:
+    with naming(scenario):
         result = simulated(wanted, common.seed)
-    except ValueError as error:
-        raise InputError(f"{scenario}: {str(error).removeprefix('Input ')}") from None
     files = write_simulation(result, out)
     if json:
         report = {

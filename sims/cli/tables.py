@@ -2,48 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from cyclopts import Parameter
+from typing import TYPE_CHECKING
 
 import sims.experiments
 from adcs.cli.options import tell
-from arrays.io.arguments import Count, Flag, Seed
+from arrays.io.arguments import Flag
 from arrays.io.csv import write_columns
 from arrays.io.errors import InputError
 from arrays.io.outputs import make_folder, refuse_file
 from magloc.cli.framework import QuietOptions, print_result, progress
+from sims.cli.run_tabletsat import RunOptions
 
 if TYPE_CHECKING:
     from sims.experiments.paper_tables import Comparison
 
 
-@Parameter(name="*")
-@dataclass(frozen=True)
-class TableOptions:
-    """Runs.
-
-    Parameters
-    ----------
-    seeds : int
-        Number of runs of every row.
-    seed : int
-        Of the first run; the next ones follow.
-    duration : float
-        Seconds; by default 200 for Table 3 and 600 for the others.
-    """
-
-    seeds: Annotated[Count, Parameter(name=["--seeds", "--runs"])] = 10
-    seed: Seed = 0
-    duration: float | None = None
-
-
 def tables(
     *,
-    options: TableOptions = TableOptions(),
+    options: RunOptions = RunOptions(),  # noqa: B008 - frozen
     out: Path | None = None,
     json: Flag = False,
     common: QuietOptions = QuietOptions(),  # noqa: B008 - frozen
@@ -53,12 +32,12 @@ def tables(
     Process noise and noise of the star tracker are as printed, as far as they can be read. Ours is the standard
     deviation that the filter gives at the end, worst axis, the mean of the runs, and beside it the rms of its errors in
     the last minute. The attitude is half of the angle, as there. A number of ours that is more than three times off has
-    a star, and below it is why.
+    a star, and below it is why. Runs of Table 3 take 200 s and all others 600 s, unless ``--duration`` says otherwise.
 
     Parameters
     ----------
-    options : TableOptions
-        Runs.
+    options : RunOptions
+        Runs of every row.
     out : Path, optional
         Folder for tables.csv.
     json : bool
@@ -70,11 +49,10 @@ def tables(
     if options.duration is not None and not 1.0 <= options.duration <= 1e7:
         raise InputError(f"--duration: found {options.duration:g} s, expected 1 to 1e7 s.")
     rows = sims.experiments.PAPER_ROWS
-    seeds = range(options.seed, options.seed + options.seeds)
     compared: list[Comparison] = []
     with progress(len(rows), "rows", quiet=common.quiet) as advance:
         for row in rows:
-            compared += sims.experiments.compared_with_paper(row, seeds, options.duration)
+            compared += sims.experiments.compared_with_paper(row, options.numbers, options.duration)
             advance(1)
     if out is not None:
         make_folder(out, "--out")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,13 @@ INERTIA_KGM2 = np.diag([0.041, 0.041, 0.007])
 ORBIT = circular_orbit(altitude_m=550e3, inclination_deg=97.6, epoch="2026-11-21", local_time_h=10.5)
 RODS = HysteresisRods()
 SLOW_RAD_S = math.radians(0.5)
+ANYWHERE = StartConditions(sunlit=False, least_separation_rad=0.0, least_field_T=0.0)
+
+
+def three_units(**more: Any) -> Satellite:
+    """The satellite, without wheels, with what else its experiment wants of it."""
+    no_wheels = WheelControl(np.zeros(3), np.zeros(3), torque_limit_Nm=1e-15)
+    return Satellite(inertia_kgm2=INERTIA_KGM2, orbit=ORBIT, control=no_wheels, **more)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,15 +112,9 @@ def detumbling(
     >>> bool(found.time_s[0] < 1500.0)
     True
     """
-    satellite = Satellite(
-        inertia_kgm2=INERTIA_KGM2,
-        orbit=ORBIT,
-        residual_dipole_Am2=(0.0, 0.0, magnet_Am2),
-        control=WheelControl(np.zeros(3), np.zeros(3), torque_limit_Nm=1e-15),
-    )
     scenario = AttitudeScenario(
-        satellite,
-        conditions=StartConditions(sunlit=False, least_separation_rad=0.0, least_field_T=0.0),
+        three_units(residual_dipole_Am2=(0.0, 0.0, magnet_Am2)),
+        conditions=ANYWHERE,
         duration_s=duration_s,
         torque_Nm=1e-8,
         torque_period_s=1000.0,  # a constant one about the magnet would spin the satellite up for days

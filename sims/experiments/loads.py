@@ -8,17 +8,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from adcs.environment.orbit import circular_orbit
 from adcs.quaternion import rotate_back
-from adcs.satellite.dynamics import WheelControl
-from adcs.satellite.satellite import Satellite
 from adcs.satellite.sensors import Magnetometer
 from arrays.array import SensorArray
 from arrays.sensor import Sensor
 from arrays.typing import FloatArray
 from magloc.fields.dipole import total_field
-from sims.attitude.scenario import AttitudeScenario, StartConditions
+from sims.attitude.scenario import AttitudeScenario
 from sims.attitude.simulation import AttitudeRuns, moved, prepare
+from sims.experiments.b_dot import ANYWHERE, three_units
 from sims.noise import stream
 
 NOISE_T = 15e-9
@@ -92,16 +90,10 @@ def switching_loads(seed: int, *, duration_s: float = 2400.0, rate_deg_s: float 
     (61, 12)
     """
     rng = stream(seed, "loads")
-    orbit = circular_orbit(altitude_m=550e3, inclination_deg=97.6, epoch="2026-11-21", local_time_h=10.5)
-    satellite = Satellite(
-        inertia_kgm2=np.diag([0.041, 0.041, 0.007]),
-        orbit=orbit,
-        magnetometer=Magnetometer(sigma_T=NOISE_T),
-        control=WheelControl(np.zeros(3), np.zeros(3), torque_limit_Nm=1e-15),
-    )
+    satellite = three_units(magnetometer=Magnetometer(sigma_T=NOISE_T))
     scenario = AttitudeScenario(
         satellite,
-        conditions=StartConditions(sunlit=False, least_separation_rad=0.0, least_field_T=0.0),
+        conditions=ANYWHERE,
         duration_s=duration_s,
         torque_Nm=1e-8,
         gyro_bias_rad_s=math.radians(0.01),

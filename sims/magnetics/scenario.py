@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from arrays.array import SensorArray
+from arrays.io.errors import check_positive
 from arrays.pose import PoseUncertainty
 from arrays.typing import FloatArray
 from magloc.signature.path import PathError
@@ -175,9 +176,7 @@ class MagneticScenario:
     name: str = ""
 
     def __post_init__(self) -> None:
-        for name in ("duration_s", "rate_Hz"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"Input {name} must be positive and finite; instead received {getattr(self, name)}.")
+        check_positive(duration_s=self.duration_s, rate_Hz=self.rate_Hz)
         if self.duration_s * self.rate_Hz >= MOST_ROWS:
             raise ValueError(
                 f"Inputs duration_s and rate_Hz must give at most {MOST_ROWS} rows; "

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from adcs.mockup.navigation.strapdown import PlanarTrack
 from adcs.mockup.vision.camera import Camera, Pose, image_from_table, in_frame, table_from_image
 from adcs.mockup.vision.sky import LedSky
+from arrays.io.errors import check_not_negative, check_positive
 from arrays.typing import ByteArray, FloatArray
 
 _PSF_REACH = 4.0  # a Gaussian is cut off where it is below 0.04 % of its peak
@@ -68,12 +69,9 @@ class FrameQuality:
     hot_pixels: int = 0
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.psf_px < math.inf:
-            raise ValueError(f"Input psf_px must be a positive number; instead received {self.psf_px}.")
-        for name in ("peak_DN", "background_DN", "noise_DN", "spurious", "hot_pixels"):
-            value = getattr(self, name)
-            if not 0.0 <= value < math.inf:
-                raise ValueError(f"Input {name} must not be negative; instead received {value}.")
+        check_positive(psf_px=self.psf_px)
+        names = ("peak_DN", "background_DN", "noise_DN", "spurious", "hot_pixels")
+        check_not_negative(**{name: getattr(self, name) for name in names})
         if not 0.0 <= self.lost <= 1.0:
             raise ValueError(f"Input lost must be between 0 and 1; instead received {self.lost}.")
 

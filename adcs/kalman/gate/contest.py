@@ -189,7 +189,8 @@ def turned_onto(q: FloatArray, body: FloatArray, reference: FloatArray) -> Float
     turn = np.concatenate([1.0 + cosine, np.cross(body, there) / length], axis=-1)
     # Half a turn is one about any axis across.
     opposite = 1.0 + cosine[..., 0] < 1e-12
-    turn[opposite] = np.concatenate([[0.0], np.cross(body[0], np.eye(3)[np.argmin(np.abs(body[0]))])])
+    across = np.cross(body[opposite], np.eye(3)[np.argmin(np.abs(body[opposite]), axis=-1)])
+    turn[opposite] = np.insert(across, 0, 0.0, axis=-1)
     return quaternion.normalised(quaternion.multiply(q, quaternion.normalised(turn)))
 
 

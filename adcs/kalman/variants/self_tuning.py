@@ -19,6 +19,7 @@ from scipy.special import softmax
 from adcs import quaternion
 from adcs.kalman.error_state import ALWAYS, AttitudeTracks, FilterSettings, Start
 from adcs.kalman.mekf import run_filter
+from adcs.kalman.smoother import difference
 from adcs.satellite.telemetry import Record
 from arrays.typing import FloatArray
 
@@ -59,19 +60,7 @@ def mixture(bank: list[AttitudeTracks], weight: FloatArray, deviations_s2: Float
     """
     settings, first = bank[0].settings, bank[len(bank) // 2]
     names = settings.sensors.states
-    off = np.stack(
-        [
-            np.concatenate(
-                [
-                    quaternion.error_vector(first.q, one.q),
-                    one.w - first.w,
-                    *(one.optional[name] - first.optional[name] for name in names),
-                ],
-                axis=-1,
-            )
-            for one in bank
-        ]
-    )
+    off = np.stack([difference(one, first, settings.sensors) for one in bank])
     mean = np.sum(weight[..., None] * off, axis=0)
     covariance = np.zeros_like(first.covariance)
     for one, each, share in zip(bank, off - mean, weight, strict=True):

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from arrays.io.errors import check_not_negative, check_positive
 from arrays.typing import BoolArray, FloatArray
 
 REFERENCE_RADIUS_PX = 320.0
@@ -88,10 +89,8 @@ class Camera:
             value = getattr(self, name)
             if not (0 < value < math.inf and value == int(value)):
                 raise ValueError(f"Input {name} must be a positive whole number; instead received {value}.")
-        if not 0.0 < self.m_per_px < math.inf:
-            raise ValueError(f"Input m_per_px must be a positive number; instead received {self.m_per_px}.")
-        if not 0.0 <= self.exposure_s < math.inf:
-            raise ValueError(f"Input exposure_s must not be negative; instead received {self.exposure_s}.")
+        check_positive(m_per_px=self.m_per_px)
+        check_not_negative(exposure_s=self.exposure_s)
         centre = self.centre_px or (0.5 * (self.width_px - 1), 0.5 * (self.height_px - 1))
         if len(centre) != 2 or not all(map(math.isfinite, centre)):
             raise ValueError(f"Input centre_px must be two finite numbers; instead received {self.centre_px}.")
