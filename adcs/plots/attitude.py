@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,23 +25,6 @@ _SETTLED = 0.25
 _SENSOR_STYLES = ((style.BLACK, "-"), (style.BLUE, "--"), (style.ORANGE, "-."), ("#009e73", ":"))
 
 
-@dataclass(frozen=True, eq=False)
-class StatesPicture:
-    """One run through time.
-
-    ``values`` (n, 30): errors (estimate minus truth) or estimates, in the units of ``adcs``' files; NaN of a state that
-    is not there.
-    """
-
-    title: str
-    time_s: FloatArray  # (n,)
-    values: FloatArray
-    sigma: FloatArray  # (n, 30): standard deviations that the filter gives
-    are_errors: bool  # whether values are errors: their band is around zero
-    tuned_disturbance_s2: FloatArray | None = None  # (n,): 1 σ of the disturbance that a bank of filters expects
-    gaps: Sequence[tuple[str, BoolArray]] = ()  # (n,): what was missing, and whether it was there
-
-
 def gaps_of(
     seen: Mapping[str, BoolArray], used: Iterable[str], degraded: Mapping[str, BoolArray]
 ) -> list[tuple[str, BoolArray]]:
@@ -60,65 +42,65 @@ def track_figure(track: AttitudeTrack, name: str = "") -> Figure:
     gaps = gaps_of(track.seen, track.used, track.degraded)
     title = f"{name}: {track.title}" if name else track.title
     return states_figure(
-        StatesPicture(
-            title,
-            track.time_s,
-            values,
-            sigma,
-            are_errors=False,
-            tuned_disturbance_s2=track.tuned_disturbance_s2,
-            gaps=gaps,
-        )
+        title, track.time_s, values, sigma, are_errors=False, tuned_disturbance_s2=track.tuned_disturbance_s2, gaps=gaps
     )
 
 
-def states_figure(picture: StatesPicture) -> Figure:
-    """Every state's three axes side by side, with the filter's ±3σ."""
+def states_figure(
+    title: str,
+    time_s: FloatArray,
+    values: FloatArray,
+    sigma: FloatArray,
+    *,
+    are_errors: bool,
+    tuned_disturbance_s2: FloatArray | None = None,
+    gaps: Sequence[tuple[str, BoolArray]] = (),
+) -> Figure:
+    """Every state's three axes side by side, with the filter's ±3σ.
+
+    ``values``, ``sigma`` (n, 30): estimates, or errors, whose band is around zero, in the units of ``adcs``' files; NaN
+    of a state that is not there. ``tuned_disturbance_s2`` (n,): 1 σ that a bank of filters expects. ``gaps``: what was
+    missing, and whether it was there (n,).
+    """
     # Nine numbers of one state are three rows.
     states = [state for state, shown in SHOWN.items() for _ in range(len(shown.axes) // 3)]
-    rows = [row for row in range(len(states)) if not np.isnan(picture.values[:, 3 * row]).all()]
+    rows = [row for row in range(len(states)) if not np.isnan(values[:, 3 * row]).all()]
     figure = style.new_figure(1.25 * len(rows) + 0.75)
     axes = figure.subplots(len(rows), 3, sharex=True, sharey="row", squeeze=False)
-    settled = picture.time_s >= picture.time_s[0] + _SETTLED * np.ptp(picture.time_s)
+    settled = time_s >= time_s[0] + _SETTLED * np.ptp(time_s)
     for across, row in zip(axes, rows, strict=True):
         state, shown = states[row], SHOWN[states[row]]
         scale, unit = (1e6, f"1e-6{shown.unit.removeprefix('1')}") if state == _MILLIONTHS else (1.0, shown.unit)
         part = f" {'xyz'[row - states.index(state)]}" if states.count(state) > 1 else ""
         label = f"{state.replace('-', ' ')}{part} [{unit}]"
         columns = slice(3 * row, 3 * row + 3)
-        values, wide = scale * picture.values[:, columns], 3.0 * scale * picture.sigma[:, columns]
-        middle = np.zeros_like(values) if picture.are_errors else values
+        drawn, wide = scale * values[:, columns], 3.0 * scale * sigma[:, columns]
+        middle = np.zeros_like(drawn) if are_errors else drawn
         for axis, ax in enumerate(across):
             ax.fill_between(
-                picture.time_s,
+                time_s,
                 (middle - wide)[:, axis],
                 (middle + wide)[:, axis],
                 color=style.LIGHT_GREY,
                 lw=0.0,
                 label="±3σ of the filter" if np.isfinite(wide).any() else "_",
             )
-            ax.plot(
-                picture.time_s,
-                values[:, axis],
-                color=style.BLUE,
-                lw=0.8,
-                label="error" if picture.are_errors else "estimate",
-            )
-            if state == "disturbance" and not picture.are_errors and picture.tuned_disturbance_s2 is not None:
+            ax.plot(time_s, drawn[:, axis], color=style.BLUE, lw=0.8, label="error" if are_errors else "estimate")
+            if state == "disturbance" and not are_errors and tuned_disturbance_s2 is not None:
                 for way in (-scale, scale):
                     ax.plot(
-                        picture.time_s,
-                        way * picture.tuned_disturbance_s2,
+                        time_s,
+                        way * tuned_disturbance_s2,
                         color=style.ORANGE,
                         lw=0.8,
                         ls="--",
                         label="±1σ that the bank found" if way > 0.0 else "_",
                     )
-            for gap, there in picture.gaps:
-                style.shade_gaps(ax, picture.time_s, there, gap)
-            outside = float(np.mean(np.abs(values[settled, axis]) > wide[settled, axis]))
+            for gap, there in gaps:
+                style.shade_gaps(ax, time_s, there, gap)
+            outside = float(np.mean(np.abs(drawn[settled, axis]) > wide[settled, axis]))
             style.dress(ax, "", label if axis == 0 else "", "xyz"[axis] if row == rows[0] else "")
-            if picture.are_errors and outside > 0.0:
+            if are_errors and outside > 0.0:
                 ax.text(
                     0.98,
                     0.95,
@@ -130,17 +112,17 @@ def states_figure(picture: StatesPicture) -> Figure:
                 )
             ax.axhline(0.0, color=style.GREY, lw=0.5, zorder=1.5)
         # The band at rest fills half of the panel; errors and bands at the start may leave it, an estimate never.
-        inside = [(middle - wide)[settled], (middle + wide)[settled], values[settled] if picture.are_errors else values]
-        low, high = style.limits_of(inside, share=1.0, margin=0.25 if picture.are_errors else 0.05)
+        inside = [(middle - wide)[settled], (middle + wide)[settled], drawn[settled] if are_errors else drawn]
+        low, high = style.limits_of(inside, share=1.0, margin=0.25 if are_errors else 0.05)
         across[0].set_ylim(low, high)
     for ax in axes[-1]:
         ax.set_xlabel("time [s]", fontsize=style.LETTERS)
-        if len(picture.time_s) > 1:
-            ax.set_xlim(picture.time_s[0], picture.time_s[-1])
+        if len(time_s) > 1:
+            ax.set_xlim(time_s[0], time_s[-1])
         ax.xaxis.set_major_locator(MaxNLocator(4))
     named = {label: handle for ax in axes[:, 0] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     style.legend(figure, handles=named.values(), labels=named.keys(), loc="outside lower center", ncols=6)
-    style.headline(figure, picture.title)
+    style.headline(figure, title)
     return figure
 
 
@@ -148,52 +130,55 @@ def _percent(part: float) -> str:
     return f"{100.0 * part:.0f} %" if part >= 0.01 else f"{100.0 * part:.1g} %"
 
 
-@dataclass(frozen=True, eq=False)
-class ConsistencyPicture:
-    """All runs through time.
+def consistency_figure(
+    title: str,
+    time_s: FloatArray,
+    error_deg: FloatArray,
+    sigma_deg: FloatArray,
+    nees: FloatArray,
+    size: int,
+    nis: FloatArray,
+) -> Figure:
+    """Errors of all runs, NEES and NIS with their bounds.
 
-    ``sigma_deg`` (n,): what the filter believes of it, root of the sum of squares of the axes, in the first run.
+    ``error_deg`` (runs, n): angle between truth and estimate. ``sigma_deg`` (n,): what the filter believes of it, root
+    of the sum of squares of the axes, in the first run. ``nees`` (runs, n): over its numbers, ``size``. ``nis``
+    (runs, n, 4).
     """
-
-    title: str
-    time_s: FloatArray  # (n,)
-    error_deg: FloatArray | None  # (runs, n): angle between truth and estimate
-    sigma_deg: FloatArray | None
-    nees: FloatArray | None  # (runs, n): over its numbers
-    size: int  # numbers of the error state
-    nis: FloatArray  # (runs, n, 4)
-
-
-def consistency_figure(picture: ConsistencyPicture) -> Figure:
-    """Errors of all runs, NEES and NIS with their bounds."""
-    n_panels = 1 + 2 * (picture.error_deg is not None)
-    figure = style.new_figure(1.75 * n_panels + 0.5)
-    axes = list(figure.subplots(n_panels, 1, sharex=True, squeeze=False)[:, 0])
-    if picture.error_deg is not None and picture.nees is not None:
-        _errors(axes[0], picture.time_s, picture.error_deg, picture.sigma_deg)
-        _nees(axes[1], picture.time_s, picture.nees, picture.size)
-    _nis(axes[-1], picture.time_s, picture.nis)
-    for ax in axes:
-        if len(picture.time_s) > 1:
-            ax.set_xlim(picture.time_s[0], picture.time_s[-1])
-        if ax is not axes[-1]:
-            ax.set_xlabel("")
-    style.headline(figure, picture.title)
-    return figure
+    return _through_time(
+        title,
+        time_s,
+        lambda ax: _errors(ax, time_s, error_deg, sigma_deg),
+        lambda ax: _nees(ax, time_s, nees, size),
+        lambda ax: _nis(ax, time_s, nis),
+    )
 
 
 def nis_figure(track: AttitudeTrack, name: str) -> Figure:
     """Innovations of every sensor of a track."""
     nis = np.stack(list(track.nis.values()), axis=-1)[None]
-    return consistency_figure(ConsistencyPicture(f"{name}: {track.title}", track.time_s, None, None, None, 0, nis))
+    return _through_time(f"{name}: {track.title}", track.time_s, lambda ax: _nis(ax, track.time_s, nis))
 
 
-def _errors(ax: Axes, time_s: FloatArray, error_deg: FloatArray, sigma_deg: FloatArray | None) -> None:
+def _through_time(title: str, time_s: FloatArray, *panels: Callable[[Axes], None]) -> Figure:
+    """Panels one below the other."""
+    figure = style.new_figure(1.75 * len(panels) + 0.5)
+    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    for ax, draw in zip(axes, panels, strict=True):
+        draw(ax)
+        if len(time_s) > 1:
+            ax.set_xlim(time_s[0], time_s[-1])
+        if ax is not axes[-1]:
+            ax.set_xlabel("")
+    style.headline(figure, title)
+    return figure
+
+
+def _errors(ax: Axes, time_s: FloatArray, error_deg: FloatArray, sigma_deg: FloatArray) -> None:
     for i, run in enumerate(error_deg):
         ax.plot(time_s, run, color=style.PALE_GREY, lw=0.4, label="each run" if i == 0 else "_", zorder=2.0)
     ax.plot(time_s, np.median(error_deg, axis=0), color=style.BLUE, lw=1.2, label="median")
-    if sigma_deg is not None:
-        ax.plot(time_s, sigma_deg, color=style.ORANGE, lw=1.0, ls="--", label="σ of the filter, first run")
+    ax.plot(time_s, sigma_deg, color=style.ORANGE, lw=1.0, ls="--", label="σ of the filter, first run")
     style.logarithmic(ax, [error_deg[:, 1:], np.empty(0)])
     n = len(error_deg)
     style.dress(ax, "time [s]", "attitude error [°]", f"{n} runs" if n > 1 else "one run")

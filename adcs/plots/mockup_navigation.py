@@ -31,29 +31,18 @@ _FEW_FIXES = 60
 _SHARE, _MARGIN = 0.9, 0.6
 
 
-@dataclass(frozen=True, eq=False)
-class ZerosPicture:
-    """One run whose zeros were found.
-
-    ``truth``, ``before``, ``after``: true, and integrated without and with the zeros that were found.
-    ``position_before_mm``, ``position_after_mm``: distance from the truth, rms.
-    """
-
-    title: str
-    imu: ImuRecord  # as read
-    fixes: FixRecord
-    truth: PlanarTrack
-    before: PlanarTrack
-    after: PlanarTrack
-    position_before_mm: float
-    position_after_mm: float
-
-
-def zeros_figure(picture: ZerosPicture) -> Figure:
-    """Readings, heading, velocities, and positions before and after the fit."""
+def zeros_figure(
+    title: str,
+    imu: ImuRecord,
+    fixes: FixRecord,
+    before: PlanarTrack,
+    after: PlanarTrack,
+    position_before_mm: float,
+    position_after_mm: float,
+) -> Figure:
+    """Readings, heading, velocities, and positions without and with the zeros found, with their rms errors."""
     figure = style.new_figure(6.6)
     axes = figure.subplots(3, 2, sharex=True)
-    imu, fixes = picture.imu, picture.fixes
     keep = _thinned(len(imu))
     for column, (name, colour, line) in enumerate(_BODY_AXES):
         readings = imu.acceleration_m_s2[keep, column]
@@ -62,13 +51,13 @@ def zeros_figure(picture: ZerosPicture) -> Figure:
     style.legend(axes[0, 0])
     axes[0, 1].plot(imu.time_s[keep], np.degrees(imu.rate_rad_s[keep]), color=style.BLUE, lw=0.8)
     style.dress(axes[0, 1], "", "rate [°/s]", "gyro")
-    _heading(axes[1, 0], picture)
-    _velocities(axes[1, 1], picture.after, fixes)
+    _heading(axes[1, 0], imu, fixes, after)
+    _velocities(axes[1, 1], after, fixes)
     style.dress(axes[1, 1], "", "velocity [m/s]", "velocity after the fit")
-    limits = _limits_of_positions(picture)
+    limits = style.limits_of([before.position_m, after.position_m, fixes.position_m], share=1.0)
     for ax, track, text in (
-        (axes[2, 0], picture.before, f"position before the fit: {picture.position_before_mm:.0f} mm rms"),
-        (axes[2, 1], picture.after, f"position after it: {picture.position_after_mm:.2g} mm rms"),
+        (axes[2, 0], before, f"position before the fit: {position_before_mm:.0f} mm rms"),
+        (axes[2, 1], after, f"position after it: {position_after_mm:.2g} mm rms"),
     ):
         _positions(ax, track, fixes)
         ax.set_ylim(*limits)
@@ -77,27 +66,22 @@ def zeros_figure(picture: ZerosPicture) -> Figure:
         ax.set_xlim(imu.begin_s, imu.end_s)
     handles, labels = axes[2, 0].get_legend_handles_labels()
     style.legend(figure, handles=handles, labels=labels, loc="outside lower center", ncols=4)
-    style.headline(figure, picture.title)
+    style.headline(figure, title)
     return figure
 
 
-def _heading(ax: Axes, picture: ZerosPicture) -> None:
-    keep = _thinned(len(picture.after))
-    ax.plot(picture.after.time_s[keep], np.degrees(picture.after.heading_rad[keep]), color=style.BLUE, label="gyro")
-    late = picture.fixes.arrival_s <= picture.imu.end_s
-    arrival_s, exposure_s = picture.fixes.arrival_s[late], picture.fixes.time_s[late]
-    full = np.interp(exposure_s, picture.after.time_s, picture.after.heading_rad)
-    seen = full + wrapped(picture.fixes.heading_rad[late] - full)
+def _heading(ax: Axes, imu: ImuRecord, fixes: FixRecord, after: PlanarTrack) -> None:
+    keep = _thinned(len(after))
+    ax.plot(after.time_s[keep], np.degrees(after.heading_rad[keep]), color=style.BLUE, label="gyro")
+    late = fixes.arrival_s <= imu.end_s
+    arrival_s, exposure_s = fixes.arrival_s[late], fixes.time_s[late]
+    full = np.interp(exposure_s, after.time_s, after.heading_rad)
+    seen = full + wrapped(fixes.heading_rad[late] - full)
     ax.plot(
         arrival_s, np.degrees(seen), ".--", color=style.ORANGE, lw=0.8, ms=_dot(len(seen)), label="camera, on arrival"
     )
     style.dress(ax, "", "heading [°]", "heading")
     style.legend(ax)
-
-
-def _limits_of_positions(picture: ZerosPicture) -> tuple[float, float]:
-    drawn = [picture.before.position_m, picture.after.position_m, picture.fixes.position_m]
-    return style.limits_of(drawn, share=1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,11 +115,12 @@ def fusion_figure(picture: FusionPicture) -> Figure:
     style.dress(velocity, "", "velocity [m/s]", "fused velocity")
     style.dress(position, "", "position [m]", "fused position")
     fixes = picture.fixes.rows(picture.used).in_time_order() if picture.used.any() else picture.fixes
-    fused = _at(track, track.position_m, fixes.time_s)
-    _differences(apart, fixes.time_s, 1e3 * (fused - fixes.position_m), picture.begin_s, "no fixes")
+    _differences(
+        apart, fixes.time_s, 1e3 * (track.at(fixes.time_s).position_m - fixes.position_m), picture.begin_s, "no fixes"
+    )
     style.dress(apart, "", "difference [mm]", "fused position less the camera's, undelayed")
     middle_s, mean = _camera_velocity(fixes)
-    less = 1e3 * (_at(track, track.velocity_m_s, middle_s) - mean)
+    less = 1e3 * (track.at(middle_s).velocity_m_s - mean)
     _differences(slower, middle_s, less, picture.begin_s, "no two fixes")
     style.dress(slower, "time [s]", "difference [mm/s]", "fused velocity less that of two fixes in a row")
     for ax in (velocity, position, apart, slower):
@@ -283,10 +268,6 @@ def _camera_velocity(fixes: FixRecord) -> tuple[FloatArray, FloatArray]:
     apart = step_s > 0.0
     mean = (np.diff(fixes.position_m, axis=0)[apart].T / step_s[apart]).T
     return 0.5 * (fixes.time_s[1:] + fixes.time_s[:-1])[apart], mean
-
-
-def _at(track: PlanarTrack, values: FloatArray, time_s: FloatArray) -> FloatArray:
-    return np.stack([np.interp(time_s, track.time_s, column) for column in values.T], axis=1)
 
 
 def _thinned(n: int) -> slice:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
-from numpy.typing import NDArray
 
 from adcs.mockup.vision.camera import Camera, Pose, footprint
 from adcs.mockup.vision.paper_matcher import CameraFix
@@ -21,7 +20,7 @@ from magloc.plots import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-from arrays.typing import BoolArray, FloatArray, IntArray
+from arrays.typing import BoolArray, ByteArray, FloatArray, IntArray
 
 _FOUND = "#009e73"
 _NONE = style.ORANGE
@@ -30,46 +29,34 @@ _PER_SIDE = 12
 _BRIGHT_DN = 120
 
 
-@dataclass(frozen=True, eq=False)
-class FramePicture:
-    """A frame and its fix."""
-
-    title: str
-    image: NDArray[np.uint8]  # (height, width)
-    stars_px: FloatArray  # (f, 2): column and row of the stars that were found
-    fix: CameraFix | NoFix
-    lights_m: FloatArray  # (n, 2): the sky
-    camera: Camera  # as it is believed to be
-
-
-def frame_figure(picture: FramePicture) -> Figure:
-    """The frame with its stars, and the ceiling with what it shows of it."""
+def frame_figure(
+    title: str, image: ByteArray, stars_px: FloatArray, fix: CameraFix | NoFix, lights_m: FloatArray, camera: Camera
+) -> Figure:
+    """The frame with its stars (f, 2), and the ceiling with what a believed camera shows of its lights (n, 2)."""
     figure = style.new_figure(3.4)
     frame, ceiling = figure.subplots(1, 2)
-    fix = picture.fix
     stars = fix.stars if isinstance(fix, CameraFix) else np.empty((0, 2), dtype=np.intp)
-    named = np.isin(np.arange(len(picture.stars_px)), stars[:, 0])
+    named = np.isin(np.arange(len(stars_px)), stars[:, 0])
     # Lights of the real camera are faint too: half of the range shows them.
-    frame.imshow(picture.image, cmap="gray", vmin=0, vmax=_BRIGHT_DN)
+    frame.imshow(image, cmap="gray", vmin=0, vmax=_BRIGHT_DN)
     for rows, colour, mark, name in ((named, _FOUND, "o", "identified"), (~named, _NONE, "s", "not identified")):
         if rows.any():
-            frame.plot(*picture.stars_px[rows].T, mark, color=colour, mfc="none", ms=9.0, mew=1.0, label=name)
+            frame.plot(*stars_px[rows].T, mark, color=colour, mfc="none", ms=9.0, mew=1.0, label=name)
     for star, light in stars:
-        x, y = picture.stars_px[star]
-        inside = x < 0.9 * picture.image.shape[1]
+        x, y = stars_px[star]
+        inside = x < 0.9 * image.shape[1]
         frame.text(
             x + (12.0 if inside else -12.0), y, str(light), color="white", fontsize=5.5, va="center",
             ha="left" if inside else "right",
         )  # fmt: skip
-    frame.set_xlim(-0.5, picture.image.shape[1] - 0.5)
-    frame.set_ylim(picture.image.shape[0] - 0.5, -0.5)
+    frame.set_xlim(-0.5, image.shape[1] - 0.5)
+    frame.set_ylim(image.shape[0] - 0.5, -0.5)
     style.dress(frame, "column [px]", "row [px]", "frame, with numbers of the lights")
     frame.grid(visible=False)
-    lights = picture.lights_m
-    ceiling.plot(*lights.T, ".", color=style.PALE_GREY, ms=3.0)
+    ceiling.plot(*lights_m.T, ".", color=style.PALE_GREY, ms=3.0)
     if isinstance(fix, CameraFix):
-        ceiling.plot(*lights[stars[:, 1]].T, "o", color=_FOUND, ms=4.0)
-        draw_footprint(ceiling, picture.camera, fix)
+        ceiling.plot(*lights_m[stars[:, 1]].T, "o", color=_FOUND, ms=4.0)
+        draw_footprint(ceiling, camera, fix)
         x, y = 1e3 * fix.position_m
         words = f"ceiling: X {x:.1f} mm, Y {y:.1f} mm, heading {np.degrees(fix.heading_rad):.2f}°"
     else:
@@ -79,7 +66,7 @@ def frame_figure(picture: FramePicture) -> Figure:
     handles, labels = frame.get_legend_handles_labels()
     if handles:
         style.legend(figure, handles=handles, labels=labels, loc="outside lower center", ncols=2)
-    style.headline(figure, picture.title)
+    style.headline(figure, title)
     return figure
 
 
@@ -173,48 +160,42 @@ def _by_stars(ax: Axes, picture: SkyPicture) -> None:
     style.legend(ax)
 
 
-@dataclass(frozen=True, eq=False)
-class DrivePicture:
-    """A drive along the perimeter, and a satellite at rest, seen by the camera.
+def drive_figure(
+    title: str,
+    lights_m: FloatArray,
+    truth_m: FloatArray,
+    fixes_m: FloatArray,
+    rest_s: FloatArray,
+    rest_m: FloatArray,
+    rest_truth_m: FloatArray,
+) -> Figure:
+    """A drive along the perimeter as the camera sees it, and X and Y at rest.
 
-    ``truth_m``, ``fixes_m`` (p, 2): of the frames of the drive; fixes NaN where there is none.
+    ``truth_m``, ``fixes_m`` (p, 2): of the frames of the drive, NaN without a fix. ``rest_s`` (r,), ``rest_m`` (r, 2),
+    ``rest_truth_m`` (2,): of the frames at rest.
     """
-
-    title: str
-    lights_m: FloatArray  # (n, 2)
-    truth_m: FloatArray
-    fixes_m: FloatArray
-    rest_s: FloatArray  # (r,): times of the frames at rest
-    rest_m: FloatArray  # (r, 2)
-    rest_truth_m: FloatArray  # (2,)
-
-
-def drive_figure(picture: DrivePicture) -> Figure:
-    """The path as the camera sees it, and X and Y at rest."""
     figure = style.new_figure(3.7)
     panels = figure.subplot_mosaic([["path", "X"], ["path", "Y"]], width_ratios=[1.35, 1.0])
     path = panels["path"]
-    seen = np.isfinite(picture.fixes_m).all(axis=1)
-    path.plot(*picture.lights_m.T, ".", color=style.LIGHT_GREY, ms=2.5, label="lights", zorder=1.5)
-    style.draw_truth(path, *picture.truth_m.T)
-    path.plot(*picture.fixes_m[seen].T, ".", color=style.BLUE, ms=4.0, label="fixes")
+    seen = np.isfinite(fixes_m).all(axis=1)
+    path.plot(*lights_m.T, ".", color=style.LIGHT_GREY, ms=2.5, label="lights", zorder=1.5)
+    style.draw_truth(path, *truth_m.T)
+    path.plot(*fixes_m[seen].T, ".", color=style.BLUE, ms=4.0, label="fixes")
     if not seen.all():
-        path.plot(
-            *picture.truth_m[~seen].T, "s", color=_NONE, ms=4.5, mfc="none", label=f"no fix: {int((~seen).sum())}"
-        )
+        path.plot(*truth_m[~seen].T, "s", color=_NONE, ms=4.5, mfc="none", label=f"no fix: {int((~seen).sum())}")
     path.set_aspect("equal")
-    error_mm = 1e3 * np.linalg.norm((picture.fixes_m - picture.truth_m)[seen], axis=1)
+    error_mm = 1e3 * np.linalg.norm((fixes_m - truth_m)[seen], axis=1)
     text = f": {np.sqrt(np.mean(error_mm**2)):.2g} mm rms" if error_mm.size else ""
     style.dress(path, "X [m]", "Y [m]", f"perimeter drive{text}")
     style.legend(path, loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=4, columnspacing=1.0, handletextpad=0.5)
     for column, name in enumerate("XY"):
         ax = panels[name]
-        apart_mm = 1e3 * (picture.rest_m[:, column] - picture.rest_truth_m[column])
+        apart_mm = 1e3 * (rest_m[:, column] - rest_truth_m[column])
         known = np.isfinite(apart_mm)
-        ax.plot(picture.rest_s[known], apart_mm[known], ".-", color=style.BLUE, lw=0.6, ms=3.0)
+        ax.plot(rest_s[known], apart_mm[known], ".-", color=style.BLUE, lw=0.6, ms=3.0)
         ax.axhline(0.0, color=style.TRUTH, lw=0.7, ls="--")
         spread = f": σ {np.std(apart_mm[known]):.2g} mm" if known.any() else ""
-        middle = f"{picture.rest_truth_m[column]:.4f} m"
+        middle = f"{rest_truth_m[column]:.4f} m"
         style.dress(ax, "time [s]" if name == "Y" else "", f"{name} less\n{middle} [mm]", f"{name} at rest{spread}")
-    style.headline(figure, picture.title)
+    style.headline(figure, title)
     return figure

@@ -28,7 +28,7 @@ def write_attitude_files(
     out: Path, file: AttitudeFile, estimate: EstimatorSettings, parts: Sequence[Part], outcome: Outcome
 ) -> list[str]:
     """Write everything of some runs into a folder."""
-    from adcs.plots.attitude import ConsistencyPicture, StatesPicture, consistency_figure, gaps_of, states_figure
+    from adcs.plots.attitude import consistency_figure, gaps_of, states_figure
     from magloc.plots import style
 
     first = parts[0]
@@ -42,13 +42,11 @@ def write_attitude_files(
     degraded = {COLLINEAR: collinear_rows(first.runs, used, 0)}
     gaps = gaps_of(seen, used.sensors.split("+"), degraded)
     seed = int(outcome.seeds[0])
-    picture = StatesPicture(f"{title}; seed {seed}", time_s, errors, sigma, are_errors=True, gaps=gaps)
-    style.save(states_figure(picture), out / f"{name}-errors.png")
+    figure = states_figure(f"{title}; seed {seed}", time_s, errors, sigma, are_errors=True, gaps=gaps)
+    style.save(figure, out / f"{name}-errors.png")
     sigma_deg = np.sqrt(np.sum(sigma[:, :3] ** 2, axis=1))
-    consistency = ConsistencyPicture(
-        title, time_s, outcome.error_deg, sigma_deg, outcome.nees, outcome.size, outcome.nis
-    )
-    style.save(consistency_figure(consistency), out / f"{name}-consistency.png")
+    figure = consistency_figure(title, time_s, outcome.error_deg, sigma_deg, outcome.nees, outcome.size, outcome.nis)
+    style.save(figure, out / f"{name}-consistency.png")
     columns: dict[str, Any] = {"time_s": time_s}
     columns |= {f"error_{key}": errors[:, i] for i, key in enumerate(STATE_COLUMNS) if not np.isnan(errors[:, i]).all()}
     columns |= {f"sigma_{key}": sigma[:, i] for i, key in enumerate(STATE_COLUMNS) if not np.isnan(sigma[:, i]).all()}

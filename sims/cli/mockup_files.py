@@ -94,7 +94,7 @@ def sky_files(options: MockupOptions, run: SkyRun) -> Iterator[File]:
     result = frame_result(image, setup.believed_camera, options.sky_matcher(), options.finder())
     title = f"{result.matched} of {len(result.stars)} stars identified in {1e3 * result.identify_s:.1f} ms"
     yield _picture("mockup-frame.png", _frame_figure(options, title, image, result))
-    yield _picture("mockup-drive.png", mockup_vision.drive_figure(drive_picture(options, sky)))
+    yield _picture("mockup-drive.png", _drive_figure(options, sky))
     yield _columns(
         "mockup-sky.csv",
         {
@@ -119,12 +119,10 @@ def sky_files(options: MockupOptions, run: SkyRun) -> Iterator[File]:
 
 def _frame_figure(options: MockupOptions, title: str, image: Any, result: FrameResult) -> Figure:
     stars_px, lights_m = result.stars.positions_px, options.led_sky.positions_m
-    return mockup_vision.frame_figure(
-        mockup_vision.FramePicture(title, image, stars_px, result.fix, lights_m, options.camera())
-    )
+    return mockup_vision.frame_figure(title, image, stars_px, result.fix, lights_m, options.camera())
 
 
-def drive_picture(options: MockupOptions, sky: LedSky) -> mockup_vision.DrivePicture:
+def _drive_figure(options: MockupOptions, sky: LedSky) -> Figure:
     """Frames along a drive around the table, at its speed, and at rest, all identified."""
     setup, matcher, finder, seed = options.sky_setup(), options.sky_matcher(), options.finder(), options.seed
     truth = table_run(TableScenario(duration_s=_DRIVE_S), seed).truth
@@ -137,7 +135,7 @@ def drive_picture(options: MockupOptions, sky: LedSky) -> mockup_vision.DrivePic
 
     fixes_m = np.array([place(*pose_and_motion(truth, at_s)) for at_s in driven.time_s.tolist()])
     rest_m = np.array([place(Pose(*_REST_M, _REST_RAD), Motion()) for _ in range(_REST_FRAMES)])
-    return mockup_vision.DrivePicture(
+    return mockup_vision.drive_figure(
         f"Position by the camera alone, matcher {options.matcher_name}",
         sky.positions_m,
         driven.position_m,
@@ -183,11 +181,9 @@ def zeros_files(runs: ZerosRuns) -> Iterator[File]:
         f"zeros {x:.4f}, {y:.4f} m/s² found, {true_x:.4f}, {true_y:.4f} true {when}; "
         f"unknowns {runs.unknowns}, seed {first.seed}"
     ).replace("-", "\N{MINUS SIGN}")
-    picture = mockup_navigation.ZerosPicture(
-        title, first.run.imu, first.run.fixes, first.run.truth, first.before, first.after,
-        first.position_before_mm, first.position_rms_mm,
-    )  # fmt: skip
-    yield _picture("mockup-zeros.png", mockup_navigation.zeros_figure(picture))
+    rms_mm = first.position_before_mm, first.position_rms_mm
+    figure = mockup_navigation.zeros_figure(title, first.run.imu, first.run.fixes, first.before, first.after, *rms_mm)
+    yield _picture("mockup-zeros.png", figure)
     samples = _imu_columns(first.run.imu)
     for prefix, track in (("true_", first.run.truth), ("before_", first.before), ("after_", first.after)):
         samples |= {f"{prefix}x_m": track.position_m[:, 0], f"{prefix}y_m": track.position_m[:, 1]}

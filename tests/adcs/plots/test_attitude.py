@@ -6,26 +6,26 @@ import numpy as np
 import pytest
 
 import adcs
-from adcs.plots.attitude import StatesPicture, gaps_of, states_figure
+from adcs.plots.attitude import gaps_of, states_figure
 
 
-def picture(are_errors):
+def figure(are_errors):
     """A start of 90° that falls to 0.1° within the first tenth."""
     time_s = np.arange(200.0)
     values = np.full((200, 30), np.nan)
     values[:, :6] = (90.0 * np.exp(-time_s / 3.0) + 0.1)[:, None]
-    return StatesPicture("", time_s, values, np.full((200, 30), 0.05), are_errors)
+    return states_figure("", time_s, values, np.full((200, 30), 0.05), are_errors=are_errors)
 
 
 class TestLimits:
     def test_an_estimate_is_never_cut(self):
-        for ax in states_figure(picture(are_errors=False)).axes:
+        for ax in figure(are_errors=False).axes:
             low, high = ax.get_ylim()
             assert low < 0.1
             assert high > 90.1
 
     def test_an_error_may_leave_the_panel_at_the_start(self):
-        for ax in states_figure(picture(are_errors=True)).axes:
+        for ax in figure(are_errors=True).axes:
             assert ax.get_ylim()[1] < 1.0
 
 
