@@ -1,24 +1,24 @@
 """Tracks where the array's pose errs, stated or not, or the ambient field: ``python -m tests.stated_pose diver walk``.
 
-The source is known to rest. Prints every seed and their means: rows that are tracked; NEES per dimension and rms error
-over the bound that has the errors as nuisance, over the tracked rows and of the last one; and what the tests of the
-innovations say.
+The source is known to rest. Prints of every seed, and of all: rows that have an answer; NEES per dimension and rms error
+over the bound that has the errors as nuisance, over the answered rows and of the last one; and what the tests of the
+innovations say. With ``--kept FILE`` seeds that stand there are not run again.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import math
-from dataclasses import replace
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
 
 import numpy as np
 
 import magloc
 import sims
 from arrays.pose import PoseUncertainty
-from magloc.tracking.posterior_bound import posterior_bound
-from magloc.tracking.results import rows_of
-from sims.magnetics.simulation import Simulation
+from sims.magnetics.scenario import MagneticScenario
 from tests.magloc.tracking.test_ambient_uncertainty import SCENARIO
 
 REST = magloc.RandomWalk(1e-5, 1e-5)
@@ -40,6 +40,25 @@ CASES: dict[str, tuple[PoseUncertainty | None, PoseUncertainty | None]] = {
 AMBIENT_T = {"ambient-50": 50e-9, "ambient-500": 500e-9}
 
 
+@dataclass(frozen=True)
+class Run:
+    """One seed: rows answered and on the track; NEES per dimension, rms error and bound [m], also of the last row."""
+
+    seed: int
+    answered: float
+    tracked: float
+    nees: float = math.nan
+    rms_m: float = math.nan
+    bound_m: float = math.nan
+    last_nees: float = math.nan
+    last_m: float = math.nan
+    last_bound_m: float = math.nan
+    z_chi2: float = math.nan
+    z_lag1: float = math.nan
+    z_constants: float = math.nan
+    flagged: float = 0.0
+
+
 def main() -> None:
     """Measure one case of one scenario."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -47,50 +66,79 @@ def main() -> None:
     parser.add_argument("case", choices=[*CASES, *AMBIENT_T])
     parser.add_argument("--first", type=int, default=1000)
     parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--kept", type=Path, help="table of the seeds so far")
     given = parser.parse_args()
     errs, stated = CASES.get(given.case, (None, None))
     scenario = SCENARIO if given.scenario == "moduli" else sims.read_scenario(given.scenario)
     of_field = replace(scenario.array, ambient_uncertainty_T=AMBIENT_T.get(given.case, 0.0))
     scenario = replace(scenario, array=of_field, pose=errs)
+    kept = runs_of(given.kept)
     found = []
     for seed in range(given.first, given.first + given.seeds):
-        simulation = sims.simulate(scenario, seed)
-        track = magloc.track(replace(simulation.array, pose=stated), simulation.readings, motion=REST)
-        rows, test = int(track.tracked.sum()), track.innovations
-        judged = track.consistency(simulation.truth) if rows else None
-        nees, rms, bound = (
-            (judged.nees_per_dimension, judged.position_rms_m, judged.position_bound_m) if judged else (math.nan,) * 3
-        )
-        last = last_row(simulation, track)
-        found.append((rows, nees, rms, bound, test.flagged, *last))
-        print(
-            f"seed {seed}: {rows} of {len(track)} rows, NEES {nees:.2f}, rms {rms:.4f} m, bound {bound:.4f} m,"
-            f" last {last[0]:.2f}, {last[1]:.4f} and {last[2]:.4f} m,"
-            f" z {test.z_chi2:.1f} and {test.z_lag1:.1f}{' flagged' if test.flagged else ''}",
-            flush=True,
-        )
-    rows, nees, rms, bound, flagged, last_nees, last_off, last_bound = np.array(found, dtype=np.float64).T
-    ratio, last_ratio = (
-        math.sqrt(float(np.nanmean(of**2) / np.nanmean(least**2)))
-        for of, least in ((rms, bound), (last_off, last_bound))
-    )
-    print(
-        f"{given.scenario}, {given.case}, {len(found)} seeds: {rows.mean():.0f} rows, NEES {np.nanmean(nees):.2f},"
-        f" median {np.nanmedian(nees):.2f}, rms over bound {ratio:.2f}; last row {np.nanmean(last_nees):.2f} and"
-        f" {last_ratio:.2f}; flagged {int(flagged.sum())}"
+        if seed not in kept:
+            kept[seed] = run(scenario, seed, stated)
+            if given.kept is not None:
+                append(given.kept, kept[seed])
+        found.append(kept[seed])
+        print(", ".join(f"{name} {value:.4g}" for name, value in asdict(found[-1]).items()), flush=True)
+    print(f"{given.scenario}, {given.case}, {len(found)} seeds: {summary(found)}")
+
+
+def run(scenario: MagneticScenario, seed: int, stated: PoseUncertainty | None) -> Run:
+    """Track one seed, and judge the track."""
+    simulation = sims.simulate(scenario, seed)
+    track = magloc.track(replace(simulation.array, pose=stated), simulation.readings, motion=REST)
+    of_track = Run(seed, np.isfinite(track.position_m[:, 0]).sum(), track.tracked.sum())
+    if not of_track.answered:
+        return of_track
+    judged, test = track.consistency(simulation.truth), track.innovations
+    return replace(
+        of_track,
+        nees=judged.nees_per_dimension,
+        rms_m=judged.position_rms_m,
+        bound_m=judged.position_bound_m,
+        last_nees=judged.nees[-1] / judged.nees_dof[-1] if judged.nees_dof[-1] else math.nan,
+        last_m=float(np.linalg.norm(track.position_m[-1] - judged.true_position_m[-1])),
+        last_bound_m=math.nan if judged.bound_m is None else judged.bound_m[-1],
+        z_chi2=test.z_chi2,
+        z_lag1=test.z_lag1,
+        z_constants=test.z_constants,
+        flagged=test.flagged,
     )
 
 
-def last_row(simulation: Simulation, track: magloc.Track) -> tuple[float, float, float]:
-    """NEES per dimension, error and bound [m] of the last row; NaN where it is not tracked."""
-    truth = simulation.truth
-    if not track.tracked[-1] or truth.moment_Am2 is None:
-        return (math.nan,) * 3
-    bound = posterior_bound(track.tracker, list(rows_of(track.readings)), truth.position_m, truth.moment_Am2)
-    true = np.concatenate([truth.position_m[-1], truth.moment_Am2[-1]])
-    error = np.concatenate([track.position_m[-1], track.moment_Am2[-1]]) - true
-    nees = float(error @ np.linalg.solve(track.covariance[-1], error)) / 6.0
-    return nees, float(np.linalg.norm(error[:3])), float(bound[-1])
+def summary(runs: list[Run]) -> str:
+    """Means over seeds; rms errors over bounds are pooled."""
+    of = {name: np.array([getattr(one, name) for one in runs], dtype=np.float64) for name in asdict(runs[0])}
+
+    def ratio(error: str, bound: str) -> float:
+        return math.sqrt(float(np.nanmean(of[error] ** 2) / np.nanmean(of[bound] ** 2)))
+
+    return (
+        f"{of['answered'].mean():.0f} rows, {of['tracked'].mean():.0f} on the track,"
+        f" NEES {np.nanmean(of['nees']):.2f}, median {np.nanmedian(of['nees']):.2f},"
+        f" rms over bound {ratio('rms_m', 'bound_m'):.2f}; last row {np.nanmean(of['last_nees']):.2f} and"
+        f" {ratio('last_m', 'last_bound_m'):.2f}; flagged {int(of['flagged'].sum())}"
+    )
+
+
+def runs_of(table: Path | None) -> dict[int, Run]:
+    """Runs that a table has, by their seeds."""
+    if table is None or not table.exists():
+        return {}
+    with table.open(encoding="utf-8", newline="") as file:
+        rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+    return {int(row["seed"]): Run(**{**row, "seed": int(row["seed"])}) for row in rows}  # type: ignore[arg-type]
+
+
+def append(table: Path, one: Run) -> None:
+    """One more row of a table."""
+    begins = not table.exists()
+    with table.open("a", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, [field.name for field in fields(Run)])
+        if begins:
+            writer.writeheader()
+        writer.writerow({name: float(value) for name, value in asdict(one).items()})
 
 
 if __name__ == "__main__":
