@@ -1,8 +1,8 @@
 """Tracks where the array's pose errs, stated or not, or the ambient field: ``python -m tests.stated_pose diver walk``.
 
-The source is known to rest. Prints of every seed, and of all: rows that have an answer; NEES per dimension and rms error
-over the bound that has the errors as nuisance, over the answered rows and of the last one; and what the tests of the
-innovations say. With ``--kept FILE`` seeds that stand there are not run again.
+The source is known to rest. Prints of every seed, and of all: rows that have an answer; NEES per dimension and rms
+error over the bound that has the errors as nuisance, over the answered rows and of the last one; and what the tests of
+the innovations say. With ``--kept FILE`` seeds that stand there are not run again.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ import magloc
 import sims
 from arrays.pose import PoseUncertainty
 from sims.magnetics.scenario import MagneticScenario
-from tests.magloc.tracking.test_ambient_uncertainty import SCENARIO
+from tests.magloc.tracking import test_ambient_uncertainty, test_pose
+from tests.magloc.tracking.test_pose import REST, WHITE
 
-REST = magloc.RandomWalk(1e-5, 1e-5)
-WHITE = PoseUncertainty(0.02, math.radians(0.3), 0.02, 0.0, 0.0, 0.0)
+SCENARIOS = {"tetrahedron": test_pose.SCENARIO, "moduli": test_ambient_uncertainty.SCENARIO}
 WALK = replace(WHITE, correlation_s=10.0)
 MOUNTING = {"position_constant_m": 0.05, "attitude_constant_rad": math.radians(0.5)}
 SMALL = PoseUncertainty(0.002, math.radians(0.03), 0.0, 0.0, 0.0, 0.0)
@@ -35,6 +35,7 @@ CASES: dict[str, tuple[PoseUncertainty | None, PoseUncertainty | None]] = {
     "walk-mounting": (replace(WALK, **MOUNTING), replace(WALK, **MOUNTING)),
     "unstated": (SMALL, None),
     "walk-as-white": (WALK, WHITE),
+    "mounting-as-exact": (replace(WHITE, **MOUNTING), WHITE),
 }
 # σ of the ambient field, which is stated, for a scenario of moduli.
 AMBIENT_T = {"ambient-50": 50e-9, "ambient-500": 500e-9}
@@ -62,14 +63,14 @@ class Run:
 def main() -> None:
     """Measure one case of one scenario."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scenario", help="of magloc simulate, or moduli: eight scalar sensors")
+    parser.add_argument("scenario", help=f"of magloc simulate, or one of {', '.join(SCENARIOS)}")
     parser.add_argument("case", choices=[*CASES, *AMBIENT_T])
     parser.add_argument("--first", type=int, default=1000)
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--kept", type=Path, help="table of the seeds so far")
     given = parser.parse_args()
     errs, stated = CASES.get(given.case, (None, None))
-    scenario = SCENARIO if given.scenario == "moduli" else sims.read_scenario(given.scenario)
+    scenario = SCENARIOS.get(given.scenario) or sims.read_scenario(given.scenario)
     of_field = replace(scenario.array, ambient_uncertainty_T=AMBIENT_T.get(given.case, 0.0))
     scenario = replace(scenario, array=of_field, pose=errs)
     kept = runs_of(given.kept)

@@ -23,6 +23,7 @@ from magloc.tracking.track import Track
 from magloc.tracking.tracker import Tracker
 from sims.magnetics.paths import Attitude, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
+from sims.magnetics.scenario_files import read_scenario
 from sims.magnetics.sensors import SensorModel
 from sims.magnetics.simulation import Simulation, simulate
 from tests.passing_source import nees
@@ -94,6 +95,12 @@ class TestExactMounting:
         seen = [test for test in tests if test.z_constants > THRESHOLD]
         assert len(seen) >= least
         assert all("another mounting or lever arm" in test.reason for test in seen)
+
+    def test_first_rows_that_do_not_know_the_range_do_not_count(self) -> None:
+        """A diver, whose first answers are metres off: with these nothing settled, and nothing was said."""
+        diver = read_scenario("diver")
+        right, wrong = (run(pose, 0, WHITE, diver)[1].innovations for pose in (WHITE, replace(ALL, correlation_s=0.0)))
+        assert right.z_constants < THRESHOLD < wrong.z_constants
 
 
 class TestTrack:

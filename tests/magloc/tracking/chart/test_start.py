@@ -1,4 +1,4 @@
-"""What the first row says of a source: eight moduli of 0.1 nT, four metres from 54 A·m². The seeds are not chosen."""
+"""What the first row says of a source. The seeds are not chosen."""
 
 from __future__ import annotations
 
@@ -7,16 +7,49 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.linalg import block_diag
 
 from magloc.ambient import in_world_field
+from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.start import with_errors
+from magloc.tracking.chart.update import updated
 from magloc.tracking.results import rows_of
 from magloc.tracking.tracker import Tracker
+from sims.magnetics.scenario_files import read_scenario
 from sims.magnetics.simulation import simulate
 from tests.magloc.tracking.test_ambient_uncertainty import REST, SCENARIO
 
 
+class TestErrorsOfSensors:
+    def test_they_are_what_a_joint_update_finds(self) -> None:
+        """A diver's fluxgates, near the source: components found alone, and with sixty errors as states throughout."""
+        simulation = simulate(read_scenario("diver"), 0)
+        tracker, truth = Tracker(simulation.array, REST), simulation.truth
+        row = ChartRow.of(tracker.measurements.of(list(rows_of(simulation.readings))[120]))
+        assert truth.moment_Am2 is not None
+        x = np.concatenate([truth.position_m[120], truth.moment_Am2[120]]) * np.array([[1.0], [1.02], [0.99]])
+        sigma, bends = tracker.errors.sigma, np.zeros(3, dtype=bool)
+        S = np.broadcast_to(
+            np.diag([0.3, 0.2, 0.2, *np.full(3, np.linalg.norm(x[0, 3:]) / row.radius_m**4)]), (3, 6, 6)
+        )
+        alone = updated(x, S, row.with_errors_as_noise(sigma), bends)
+        mixture = Mixture(alone.x, alone.S, np.zeros(3), 6, row.centroid_m, row.radius_m)
+        found = with_errors(mixture, row, sigma)
+        zero = np.zeros((3, sigma.size))
+        S_joint = np.stack([block_diag(S[0], np.diag(sigma))] * 3)
+        joint = updated(np.concatenate([x, zero], axis=1), S_joint, row, bends)
+        unit = np.maximum(np.linalg.norm(joint.S, axis=2), 1e-100)  # drift has not begun
+        np.testing.assert_allclose((found.x - joint.x) / unit, 0.0, atol=1e-5)
+        P, P_joint = (root @ np.swapaxes(root, 1, 2) for root in (found.S, joint.S))
+        units = unit[:, :, None] * unit[:, None, :]
+        np.testing.assert_allclose((P - P_joint) / units, 0.0, atol=1e-6)
+        assert np.abs(P_joint / units)[:, :6, 6:].max() > 0.1
+
+
 class TestValleyOfRangesThatBends:
+    """Eight moduli of 0.1 nT, four metres from 54 A·m²."""
+
     @pytest.mark.parametrize("seed", range(5))
     def test_the_truth_is_in_one_of_its_parts(self, seed: int) -> None:
         """χ² of six numbers, once in 100,000 each; of the one Gaussian in its middle 106, 8,428 and 980 in three."""
