@@ -300,8 +300,9 @@ class SensorArray:
             )
         seen = fields[..., self.channel_sensor, :]
         scalar = self.channel_is_scalar
-        readings: FloatArray = np.einsum("...cj,cj->...c", seen, self.channel_gain)
-        readings[..., scalar] = self.channel_gain[scalar, 0] * np.linalg.norm(seen[..., scalar, :], axis=-1)
+        readings: FloatArray = np.vecdot(seen, self.channel_gain)
+        if scalar.any():
+            readings[..., scalar] = self.channel_gain[scalar, 0] * np.linalg.norm(seen[..., scalar, :], axis=-1)
         return readings + self.channel_offset_T
 
     def calibrated_field(self, readings: ArrayLike) -> FloatArray:

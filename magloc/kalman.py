@@ -17,15 +17,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg.lapack import dgeqrf, dtrtrs
 
 from arrays.typing import FloatArray
 
 MeasurementFunction = Callable[[FloatArray], FloatArray]
+_ones_below = cache(np.tri)
 
 
 def predict_square_root(S: FloatArray, F: FloatArray, S_q: FloatArray) -> FloatArray:
@@ -45,8 +47,16 @@ def predict_square_root(S: FloatArray, F: FloatArray, S_q: FloatArray) -> FloatA
     ndarray, shape (n, n)
         Lower triangular, by an orthogonal factorisation: the covariance itself is never formed.
     """
-    upper = np.asarray(np.linalg.qr(np.concatenate([F @ S, S_q], axis=1).T, mode="r"))
-    return upper.T.copy()
+    return _factored(np.concatenate([F @ S, S_q], axis=1)) * _ones_below(len(S))
+
+
+def _factored(rows: FloatArray) -> FloatArray:
+    """Lower root L (n, n) of ``L Lᵀ = rows rowsᵀ``, rows (n, m ≥ n), which are spoilt; above its diagonal is anything.
+
+    LAPACK itself: the checks of NumPy's form take several times longer than so small a factorisation.
+    """
+    lower: FloatArray = dgeqrf(rows.T, overwrite_a=True)[0][: len(rows)].T
+    return lower
 
 
 def scalar_update(
@@ -118,26 +128,25 @@ def block_update(
     :math:`S^+ = S (I - Φ^T L^{-T} (L + I)^{-1} Φ)`: A. Andrews, "A square root formulation of the Kalman covariance
     equations", AIAA Journal 6 (1968) 1165. For one scalar it is Potter's.
     """
-    return _whitening_update(x, S, H, innovation, variance)[:2]
-
-
-def _whitening_update(
-    x: FloatArray, S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """:func:`block_update`, and the :func:`whitened_innovation` that it needs."""
     phi, L = _scaled_innovation_root(S, H, variance)
     unit = np.eye(len(L))
-    solved = np.linalg.solve(L, np.concatenate([phi, (innovation / np.sqrt(variance))[:, None]], axis=1))
+    solved = _solved(L, np.concatenate([phi, (innovation / np.sqrt(variance))[:, None]], axis=1))
     spread, whitened = S @ solved[:, :-1].T, solved[:, -1]
-    return x + spread @ whitened, S - spread @ np.linalg.solve(L + unit, phi), whitened
+    return x + spread @ whitened, S - spread @ _solved(L + unit, phi)
 
 
 def _scaled_innovation_root(S: FloatArray, H: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """:math:`Φ = R^{-1/2} H S`, and the lower triangular L of :math:`L L^T = I + Φ Φ^T`."""
+    """:math:`Φ = R^{-1/2} H S`, and the root L of :math:`L L^T = I + Φ Φ^T` in a lower triangle; above it anything."""
     phi = (H / np.sqrt(variance)[:, None]) @ S
-    # By an orthogonal factorisation: I + Φ Φᵀ itself would lose the digits of a prediction that is hardly known.
-    upper = np.asarray(np.linalg.qr(np.concatenate([np.eye(len(phi)), phi.T]), mode="r"))
-    return phi, upper.T * np.sign(np.diagonal(upper))
+    # I + Φ Φᵀ itself would lose the digits of a prediction that is hardly known.
+    L = _factored(np.concatenate([np.eye(len(phi)), phi], axis=1))
+    return phi, L * np.sign(L.diagonal())
+
+
+def _solved(L: FloatArray, columns: FloatArray) -> FloatArray:
+    """``L⁻¹`` columns, of the lower triangle of L alone."""
+    solved: FloatArray = dtrtrs(L, columns, lower=True)[0]
+    return solved
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,9 +168,7 @@ class IteratedUpdate:
     nis : float
         Normalised innovation squared, of the last linearisation: where the iteration converged it is the smallest sum
         of squares of residual and correction in units of their noise, a χ² of k numbers for curved measurements too.
-    whitened : ndarray, shape (k,)
-        That innovation freed of correlations: its components are independent and of unit variance for a right
-        prediction. Empty where it is not asked for.
+        NaN without a linearisation.
     """
 
     x: FloatArray
@@ -170,7 +177,6 @@ class IteratedUpdate:
     converged: bool
     innovation: FloatArray
     nis: float
-    whitened: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
 def iterated_update(
@@ -209,32 +215,55 @@ def iterated_update(
     tolerance : float
         In the unit of z; a fraction of the sensors' noise.
     max_iterations : int
-        Linearisations at most.
+        Linearisations at most; after the last of them the stop rule is not asked. 1: an extended Kalman filter.
     shrink : float
         What the length of the steps is multiplied by whenever one changes the prediction no less than the one before:
         Gauss-Newton steps may swing to and fro about an optimum in a strongly curved direction. 1: they are whole, as
         in the paper.
     """
+    sigma = np.sqrt(variance)
     x_k, predicted = x, Hx(x)
     innovation = z - predicted
-    S_k, whitened = S, innovation / np.sqrt(variance)
+    S_k, nis = S, np.nan
     iteration, change, length = 0, np.inf, 1.0
-    while iteration < max_iterations and np.isfinite(predicted).all() and not change < tolerance:
+    while np.isfinite(predicted).all() and not change < tolerance:
         iteration += 1
         H = HJacobian(x_k)
-        optimum, S_k, whitened = _whitening_update(x, S, H, z - predicted - H @ (x - x_k), variance)
+        optimum, S_k, nis = _least_squares_update(x, S, H, z - predicted - H @ (x - x_k), sigma)
         x_k = optimum if length == 1.0 else x_k + length * (optimum - x_k)
+        if iteration == max_iterations:
+            break
         before, predicted = predicted, Hx(x_k)
-        change_before, change = change, float(np.linalg.norm(predicted - before)) / length
+        step = predicted - before
+        change_before, change = change, math.sqrt(step @ step) / length
         if change >= change_before:
             length *= shrink
-    return IteratedUpdate(x_k, S_k, iteration, change < tolerance, innovation, float(whitened @ whitened), whitened)
+    return IteratedUpdate(x_k, S_k, iteration, change < tolerance, innovation, nis)
+
+
+def _least_squares_update(
+    x: FloatArray, S: FloatArray, H: FloatArray, innovation: FloatArray, sigma: FloatArray
+) -> tuple[FloatArray, FloatArray, float]:
+    r"""Updated x (n,) and root S (n, n) by all scalars (k,) of one linearisation, and their NIS.
+
+    Least squares in units of the prior, :math:`x^+ = x + S e`: e minimises :math:`|Φ e - ν|^2 + |e|^2` with
+    :math:`Φ = R^{-1/2} H S`. The triangle :math:`[U, b; 0, ρ]` of the rows :math:`[Φ, ν; I, 0]` has it all:
+    :math:`S^+ = S U^{-1}`, :math:`x^+ = x + S^+ b`, NIS = :math:`ρ^2`. Bierman's square-root information filter; the
+    root is not that of :func:`block_update`, the covariance is.
+    """
+    k, n = H.shape
+    rows = np.eye(k + n, n + 1, -k, order="F")
+    rows[:k, :n], rows[:k, n] = H @ S, innovation
+    rows[:k] /= sigma[:, None]
+    triangle = dgeqrf(rows, overwrite_a=True)[0]
+    root = dtrtrs(triangle[:n, :n], S.T, trans=1)[0].T
+    return x + root @ triangle[:n, n], root, float(triangle[n, n]) ** 2
 
 
 def whitened_innovation(S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray) -> FloatArray:
     """``L⁻¹ ν`` (k,) of an innovation ν with its covariance ``L Lᵀ = H S Sᵀ Hᵀ + R``, L lower triangular."""
     _, L = _scaled_innovation_root(S, H, variance)
-    return np.asarray(np.linalg.solve(L, innovation / np.sqrt(variance)))
+    return _solved(L, innovation / np.sqrt(variance))
 
 
 def normalised_innovation_squared(S: FloatArray, H: FloatArray, innovation: FloatArray, variance: FloatArray) -> float:
@@ -322,7 +351,7 @@ class IteratedExtendedKalmanFilter:
         Innovation of the last update at the predicted state, and its normalised square.
     iterations, converged : int, bool
         Of the last update.
-    x_prior, P_prior, x_post, P_post : ndarray
+    x_prior, S_prior, P_prior, x_post, S_post, P_post : ndarray
         Copies after the last `predict` and the last `update`.
 
     Examples
@@ -345,13 +374,14 @@ class IteratedExtendedKalmanFilter:
         self.S: FloatArray = np.eye(dim_x)
         self.F: FloatArray = np.eye(dim_x)
         self.Q: FloatArray = np.zeros((dim_x, dim_x))
+        self._S_q, self._factored_Q = self.Q.copy(), self.Q.tobytes()
         self.R: FloatArray = np.eye(dim_z)
         self.y: FloatArray = np.zeros(dim_z)
         self.nis = np.nan
         self.iterations = 0
         self.converged = False
-        self.x_prior, self.P_prior = self.x.copy(), self.P
-        self.x_post, self.P_post = self.x.copy(), self.P
+        self.x_prior = self.x_post = self.x.copy()
+        self.S_prior = self.S_post = self.S.copy()
 
     @property
     def P(self) -> FloatArray:
@@ -362,11 +392,24 @@ class IteratedExtendedKalmanFilter:
     def P(self, covariance: ArrayLike) -> None:
         self.S = symmetric_square_root(np.broadcast_to(np.asarray(covariance, dtype=np.float64), (self.dim_x,) * 2))
 
+    @property
+    def P_prior(self) -> FloatArray:
+        """Covariance after the last :meth:`predict`, shape (n, n)."""
+        return self.S_prior @ self.S_prior.T
+
+    @property
+    def P_post(self) -> FloatArray:
+        """Covariance after the last :meth:`update`, shape (n, n)."""
+        return self.S_post @ self.S_post.T
+
     def predict(self) -> None:
         """Time update: ``x = F x``, ``P = F P Fᵀ + Q``."""
         self.x = self.F @ self.x
-        self.S = predict_square_root(self.S, self.F, symmetric_square_root(self.Q))
-        self.x_prior, self.P_prior = self.x.copy(), self.P
+        key = np.asarray(self.Q, dtype=np.float64).tobytes()
+        if key != self._factored_Q:
+            self._S_q, self._factored_Q = symmetric_square_root(self.Q), key
+        self.S = predict_square_root(self.S, self.F, self._S_q)
+        self.x_prior, self.S_prior = self.x.copy(), self.S.copy()
 
     def update(
         self,
@@ -388,7 +431,7 @@ class IteratedExtendedKalmanFilter:
         z = np.atleast_1d(np.asarray(z, dtype=np.float64))
         noise = np.asarray(self.R if R is None else R, dtype=np.float64)
         covariance = noise if noise.ndim == 2 else np.diag(np.broadcast_to(noise, z.shape))
-        variance = np.diagonal(covariance)
+        variance = covariance.diagonal()
         update = partial(iterated_update, self.x, self.S, tolerance=self.tolerance, max_iterations=self.max_iterations)
         if np.count_nonzero(covariance) == np.count_nonzero(variance):
             result = update(z, variance, Hx, HJacobian)
@@ -399,7 +442,7 @@ class IteratedExtendedKalmanFilter:
             self.y = T @ result.innovation
         self.x, self.S, self.nis = result.x, result.S, result.nis
         self.iterations, self.converged = result.iterations, result.converged
-        self.x_post, self.P_post = self.x.copy(), self.P
+        self.x_post, self.S_post = self.x.copy(), self.S.copy()
 
 
 def symmetric_square_root(covariance: FloatArray) -> FloatArray:

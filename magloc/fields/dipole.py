@@ -31,6 +31,7 @@ from arrays.io.errors import _vectors
 Array = NDArray[np.float64]
 MU0_OVER_4PI = 1e-7
 """Magnetic constant over 4 pi, T m/A: exact until the SI of 2019, and 1.3e-10 above the measured value since."""
+_IDENTITY = np.eye(3)
 
 
 def potential(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> Array:
@@ -111,8 +112,7 @@ def field_matrix(points: ArrayLike, source: ArrayLike) -> Array:
     ValueError
         If an argument is not an array of 3-vectors, or the leading axes do not broadcast.
     """
-    n, r = _direction_and_distance(points, source)
-    return (MU0_OVER_4PI / (r * r * r))[..., None] * (3.0 * _outer(n, n) - np.eye(3))
+    return _field_matrix(*_direction_and_distance(points, source))
 
 
 def gradient_tensor(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> Array:
@@ -140,12 +140,7 @@ def gradient_tensor(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> 
     ValueError
         If an argument is not an array of 3-vectors, or the leading axes do not broadcast.
     """
-    n, r = _direction_and_distance(points, source)
-    m = _vectors("moment", moment)
-    radial = _dot(n, m)[..., None, None]
-    mixed = _outer(n, m)
-    shape = radial * np.eye(3) + (mixed + mixed.mT) - 5.0 * radial * _outer(n, n)
-    return (3.0 * MU0_OVER_4PI / (r * r * r * r))[..., None] * shape
+    return _gradient_tensor(*_direction_and_distance(points, source), _vectors("moment", moment))
 
 
 def modulus_gradient(
@@ -208,8 +203,9 @@ def field_jacobian(points: ArrayLike, source: ArrayLike, moment: ArrayLike) -> A
     ValueError
         If an argument is not an array of 3-vectors, or the leading axes do not broadcast.
     """
-    by_position = -gradient_tensor(points, source, moment)
-    by_moment = np.broadcast_to(field_matrix(points, source), by_position.shape)
+    n, r = _direction_and_distance(points, source)
+    by_position = -_gradient_tensor(n, r, _vectors("moment", moment))
+    by_moment = np.broadcast_to(_field_matrix(n, r), by_position.shape)
     return np.concatenate([by_position, by_moment], axis=-1)
 
 
@@ -293,6 +289,19 @@ def _sum_over_dipoles(
     for j in range(p.shape[-2]):
         total += quantity(s, p[..., j, :], m[..., j, :])
     return total
+
+
+def _field_matrix(n: Array, r: Array) -> Array:
+    """:func:`field_matrix` of directions (..., 3) and distances (..., 1)."""
+    return (MU0_OVER_4PI / (r * r * r))[..., None] * (3.0 * _outer(n, n) - _IDENTITY)
+
+
+def _gradient_tensor(n: Array, r: Array, m: Array) -> Array:
+    """:func:`gradient_tensor` of moments (..., 3), at directions (..., 3) and distances (..., 1)."""
+    radial = _dot(n, m)[..., None, None]
+    mixed = _outer(n, m)
+    shape = radial * _IDENTITY + (mixed + mixed.mT) - 5.0 * radial * _outer(n, n)
+    return (3.0 * MU0_OVER_4PI / (r * r * r * r))[..., None] * shape
 
 
 def _direction_and_distance(points: ArrayLike, source: ArrayLike) -> tuple[Array, Array]:

@@ -47,7 +47,9 @@ def channel_jacobian(
     p = np.asarray(position_m, dtype=np.float64)[..., None, :]
     m = np.asarray(moment_Am2, dtype=np.float64)[..., None, :]
     jacobian = dipole.field_jacobian(array.positions, p, m)
-    rows = array.linear_gain(fields_at_sensors(array, position_m, moment_Am2, ambient_T))
+    rows = array.channel_gain
+    if array.channel_is_scalar.any():
+        rows = array.linear_gain(fields_at_sensors(array, position_m, moment_Am2, ambient_T))
     return np.einsum("...ci,...cij->...cj", rows, jacobian[..., array.channel_sensor, :, :])
 
 

@@ -238,6 +238,30 @@ def _solve_extended(a, b):
     return b
 
 
+class TestOneLinearisationIsAnExtendedKalmanFilter:
+    """With one iteration the prediction is asked once, and the update is that of filterpy, also of a vague prior."""
+
+    @pytest.mark.parametrize("prior", [(0.3, 20.0), (300.0, 1e6)])
+    def test_filterpy(self, prior):
+        x, S, z, r, h, H = dipole_problem([5.2, 0.1, 0.4, 55.0, 50.0, 60.0], prior=prior)
+        asked = []
+        ours = iterated_update(x, S, z, r, lambda y: asked.append(y) or h(y), H, tolerance=1e-9, max_iterations=1)
+        linear, S_turn = sequential_update(x, S, H(x), z - h(x), r)
+        assert (len(asked), ours.iterations, ours.converged) == (1, 1, False)
+        np.testing.assert_allclose((ours.x - x) / prior[0], (linear - x) / prior[0], rtol=0.0, atol=1e-7)
+        P, scale = ours.S @ ours.S.T, np.linalg.norm(S_turn, axis=1)
+        np.testing.assert_allclose(P / np.outer(scale, scale), S_turn @ S_turn.T / np.outer(scale, scale), atol=1e-8)
+        rows = np.concatenate([H(x) / np.sqrt(r)[:, None] @ S, np.eye(6)])
+        _, nis, *_ = np.linalg.lstsq(rows, np.concatenate([(z - h(x)) / np.sqrt(r), np.zeros(6)]))
+        assert ours.nis == pytest.approx(nis[0], rel=1e-9)
+        if prior[0] == 0.3:
+            peer = filterpy.kalman.ExtendedKalmanFilter(dim_x=6, dim_z=9)
+            peer.x, peer.P, peer.R = x, S @ S.T, np.diag(r)
+            peer.update(z, H, h)
+            np.testing.assert_allclose(ours.x, peer.x, rtol=1e-7)
+            np.testing.assert_allclose(P, peer.P, rtol=1e-6, atol=1e-8 * scale.max() ** 2)
+
+
 class TestPlainFormIsUnchanged:
     """Without shrinking it is Gauss-Newton, scalar by scalar, to rounding."""
 
@@ -353,6 +377,15 @@ class TestFilterpyNames:
         np.testing.assert_allclose(ours.P, peer.P, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(ours.y, peer.y.ravel(), rtol=1e-9)
         np.testing.assert_allclose(ours.P_prior, peer.P_prior, rtol=1e-9, atol=1e-12)
+
+    def test_process_noise_may_change_in_place(self):
+        """Its root is kept from step to step."""
+        kf = IteratedExtendedKalmanFilter(2, 1, tolerance=1e-9)
+        for variance in (0.0, 3.0, 5.0):
+            kf.P, kf.Q[1, 1] = np.eye(2), variance
+            kf.predict()
+            np.testing.assert_allclose(kf.P, np.diag([1.0, 1.0 + variance]), rtol=1e-12)
+            np.testing.assert_array_equal(kf.P_prior, kf.P)
 
     def test_correlated_noise_is_decorrelated_first(self):
         x, S, H, nu, _ = random_problem(7, n=4, k=3)
