@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 _LONGEST_BODY_M = 1e4
-# A search for several sources, or by moduli, takes its rows in smaller blocks.
+# A search for several sources, or with known moments, takes its rows in smaller blocks.
 _ROWS_AT_ONCE, _ROWS_OF_SEVERAL = 1024, 64
 # Numbers of the whitenings of a block, where each row has its own.
 _MOST_NUMBERS = 8_000_000
@@ -109,11 +109,13 @@ class Locator:
         self.body_length_m = body_length_m
         self.exclude_faulty = exclude_faulty
         self._at_once = min(_ROWS_AT_ONCE, max(_ROWS_OF_SEVERAL, _MOST_NUMBERS // array.n_channels**2))
+        free = sources == 1 and position_m is None and prior.known_moment_Am2 is None
+        self._searched_at_once = self._at_once if free else _ROWS_OF_SEVERAL
         self._search: SingleSourceSearch | MultiSourceSearch | MomentSearch
         if position_m is not None:
             self._search = MomentSearch(array, position_m, prior=prior)
             self._fewest = 3 * self._search.position_m.shape[1]
-        elif sources == 1 and not array.channel_is_scalar.any() and prior.known_moment_Am2 is None:
+        elif free and not array.channel_is_scalar.any():
             self._search, self._fewest = SingleSourceSearch(array, prior=prior), 6
         else:
             number = None if sources == "auto" else int(sources)
@@ -185,9 +187,8 @@ class Locator:
         search = self._search
         if isinstance(search, MomentSearch):
             search = search.of_rows(index)
-        at_once = self._at_once if isinstance(search, SingleSourceSearch) else _ROWS_OF_SEVERAL
         found = _Rows(len(readings), self.body_length_m, self.array.row_ambient_uncertainty_T)
-        for rows in whitened_rows(self.array, readings, ambient, at_once):
+        for rows in whitened_rows(self.array, readings, ambient, self._searched_at_once):
             if rows.n_differences < self._fewest:
                 found.refuse(
                     rows.index,

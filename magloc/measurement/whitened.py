@@ -224,6 +224,11 @@ class WhitenedModel(ScaledSensors):
             gain[:, scalar] = self.gain[:, scalar, :1] * np.where(modulus > 0.0, total / modulus, 0.0)
         return gain
 
+    def linearised(self, source_fields: FloatArray) -> WhitenedModel:
+        """The same where moduli read components, along the sum with the ambient field of some fields (b, N, 3)."""
+        components = np.zeros_like(self.channel_is_scalar)
+        return replace(self, gain=self.linear_gain(source_fields), channel_is_scalar=components)
+
     def moment_jacobian(self, q: FloatArray, gain: FloatArray) -> FloatArray:
         """Derivative of the predictions with respect to μ: (b, C, 3 K)."""
         n, inverse3 = (x[:, :, self.channel_sensor] for x in self._directions(q))

@@ -25,6 +25,8 @@ from magloc.measurement.whitened_compiled import ModelRows
 # A refinement has converged where the linearised model promises to lower χ² by less than this, absolute and relative.
 PROMISE_ABSOLUTE = 1e-8
 PROMISE_RELATIVE = 1e-11
+# Linearisations of moduli at most before steps are damped.
+_MOST_ROUNDS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,15 +193,38 @@ def refine(
 
     y (b, C) are whitened readings, `free` (K, 3) says which :func:`tangents` of a source may change: without the third
     its range stays. It has converged where the linearised model promises to lower χ² by less than `promise`, of one
-    free source by less than that of :func:`refined`. Of vector sensors whose sources' moments are free compiled twins
-    do it, which begin with the moments that fit best.
+    free source by less than that of :func:`refined`. Where the sources' moments are free compiled twins do it: of
+    vector sensors, which begin with the moments that fit best, and of one source by any sensors.
     """
+    fits = most_refined(problem, y, q, mu, free=free, max_iterations=max_iterations, promise=promise)
+    lost = np.flatnonzero(~fits.converged)
+    if lost.size and problem.channel_is_scalar.any():
+        every = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
+        at, left = problem.rows(lost), fits.rows(lost)
+        fits.put(lost, damped_gauss_newton(at, y[lost], left.q, left.mu, every, max_iterations, promise))
+    return fits
+
+
+def most_refined(
+    problem: WhitenedModel,
+    y: FloatArray,
+    q: FloatArray,
+    mu: FloatArray,
+    *,
+    free: NDArray[np.bool_] | None = None,
+    max_iterations: int = 60,
+    promise: float = PROMISE_ABSOLUTE,
+) -> JointFits:
+    """:func:`refine`, but one source by moduli that are far from linear may be left where it stands."""
     free = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
     linear = problem.known is None and not problem.channel_is_scalar.any()
-    if linear and q.shape[1] == 1 and free.all():
-        found = refined(problem, y, q[:, 0], max_iterations)
-        chi2 = np.where(found.converged, found.chi2, np.inf)
-        return JointFits(found.q[:, None], found.mu[:, None], chi2, found.iterations)
+    if problem.known is None and q.shape[1] == 1 and free[0, :2].all():
+        if not linear:
+            return _relinearised(problem, y, q, mu, float(free[0, 2]), max_iterations, promise)
+        if free.all():
+            found = refined(problem, y, q[:, 0], max_iterations)
+            chi2 = np.where(found.converged, found.chi2, np.inf)
+            return JointFits(found.q[:, None], found.mu[:, None], chi2, found.iterations)
     if linear and free.any():
         ends = JointEnds(own(q), own(mu), np.empty(len(q)), np.empty(len(q), dtype=np.int64))
         small = (promise, PROMISE_RELATIVE)
@@ -208,6 +233,48 @@ def refine(
         )
         return JointFits(*ends)
     return damped_gauss_newton(problem, y, q, mu, free, max_iterations, promise)
+
+
+def _relinearised(
+    problem: WhitenedModel,
+    y: FloatArray,
+    q: FloatArray,
+    mu: FloatArray,
+    free_range: float,
+    max_iterations: int,
+    promise: float,
+) -> JointFits:
+    """:func:`most_refined` of one source: moduli are linear about where it stands, and where these lead it stands next.
+
+    The error of a modulus is of second order in the change of the field, so that a few rounds do. A fit has not
+    converged where one raises χ²: :func:`damped_gauss_newton` goes on from there.
+    """
+    q, mu = q.copy(), mu.copy()
+    fields = problem.source_fields(q, mu)
+    left = y - problem.predicted(fields)
+    current = _squares(left)
+    chi2, iterations = np.full(len(q), np.inf), np.zeros(len(q), dtype=np.int64)
+    live, at = np.arange(len(q)), problem
+    for _ in range(_MOST_ROUNDS):
+        if not live.size:
+            break
+        linear = at.linearised(fields)
+        left += linear.predicted(fields)
+        found = refined(linear, left, q[live, 0], max_iterations, free_range, 0.01 * promise)
+        new_q, new_mu = found.q[:, None], found.mu[:, None]
+        fields = at.source_fields(new_q, new_mu)
+        left = y[live] - at.predicted(fields)
+        new = _squares(left)
+        iterations[live] += found.iterations
+        with np.errstate(invalid="ignore"):
+            gained = np.where(found.converged, current[live] - new, -np.inf)
+        better = gained > 0.0
+        q[live[better]], mu[live[better]], current[live[better]] = new_q[better], new_mu[better], new[better]
+        settled = np.abs(gained) < promise + PROMISE_RELATIVE * new
+        chi2[live[settled]] = current[live[settled]]
+        stay = np.flatnonzero(better & ~settled)
+        live, at, fields, left = live[stay], at.rows(stay), fields[stay], left[stay]
+    return JointFits(q, mu, chi2, iterations)
 
 
 def damped_gauss_newton(

@@ -52,14 +52,28 @@ class Refined(NamedTuple):
     converged: NDArray[np.bool_]
 
 
-def refined(model: WhitenedModel, y: FloatArray, starts: FloatArray, max_iterations: int = 100) -> Refined:
+def refined(
+    model: WhitenedModel,
+    y: FloatArray,
+    starts: FloatArray,
+    max_iterations: int = 100,
+    free_range: float = 1.0,
+    tolerance: float = OPTIMUM_TOLERANCE,
+) -> Refined:
     """:func:`refine` of one start (b, 4) of every row of whitened readings (b, C)."""
     n = len(starts)
     out = Refined(np.empty((n, 4)), np.empty((n, 3)), np.empty(n), np.empty(n, np.intp), np.empty(n, np.bool_))
     each = np.arange(n)
     refine(
-        signals(model, y), each, own(starts), LaneModel.of(model), 1.0, OPTIMUM_TOLERANCE, float(max_iterations), out
-    )  # fmt: skip
+        signals(model, y),
+        each,
+        own(starts),
+        LaneModel.of(model),
+        free_range,
+        tolerance,
+        float(max_iterations),
+        out,
+    )
     return out
 
 

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
 from magloc.directions import hemisphere
-from magloc.localization.fit.gauss_newton import JointFits, fit_moments, refine
+from magloc.localization.fit.gauss_newton import JointFits, fit_moments, most_refined, refine
 from magloc.localization.search.candidates import (
     LastBases,
     SingleArray,
+    chosen_candidates,
     distinct_best,
     linear_scores,
     modulus_scores,
@@ -31,6 +32,8 @@ _SAME_RAD = 0.02
 _SAME_MOMENT = 0.05
 _SAME_CHI2 = 0.01
 _N_TEMPLATE_DIRECTIONS = 24
+# Rows that are scored by templates at once: their scores are many.
+_ROWS_OF_TEMPLATES = 64
 # Starts for every fit that is to be extended by a source.
 _MORE_STARTS = 4
 # A restart draws its new source from this many of the best candidates.
@@ -81,7 +84,7 @@ class Search:
     width : int
         Fits kept of every set of readings.
     n_starts : int
-        Starts for the first source, and of a restart, for every fit that is kept.
+        Starts of a restart for every fit that is kept; half as many again for the first source.
     apart_rad : float
         Least angle between two starts.
     bases : LastBases
@@ -97,39 +100,57 @@ class Search:
 
     def first(self, problem: WhitenedModel, y: FloatArray) -> JointFits:
         """One source, from the candidates that explain most."""
+        bent = self._needs_templates(problem, y)
+        if not bent.any() or bent.all():
+            return self._first(problem, y, bool(bent.any()))
+        fits = JointFits.none((len(y), self.width), 1)
+        for templates in (False, True):
+            rows = np.flatnonzero(bent == templates)
+            fits.put(rows, self._first(problem.rows(rows), y[rows], templates))
+        return fits
+
+    def _first(self, problem: WhitenedModel, y: FloatArray, templates: bool) -> JointFits:
+        """:meth:`first` of rows all of which start from templates too, or none."""
         silent = np.zeros_like(problem.ambient)
         gain = problem.linear_gain(silent)
         residual = y - problem.predicted(silent)
         starts: list[tuple[FloatArray, FloatArray]] = []
         if np.any(gain):
-            scores = self._linear_scores(problem, gain, residual)
-            q = self.candidates[distinct_best(scores, self.candidates, self.n_starts, self.apart_rad)]
-            row = np.repeat(np.arange(len(y)), self.n_starts)
+            n_starts = 3 * self.n_starts // 2
+            chosen = np.empty((len(y), n_starts), dtype=np.intp)
+            for rows in rows_of_equal_gain(gain):
+                bases = self.bases_of(problem, gain[rows[0]], int(rows[0]))
+                chosen[rows] = chosen_candidates(bases, residual[rows], self.candidates, n_starts, self.apart_rad)
+            q = self.candidates[chosen]
+            row = np.repeat(np.arange(len(y)), n_starts)
             mu = fit_moments(problem.rows(row), y[row], q.reshape(-1, 1, 4))
-            starts.append((q, mu.reshape(len(y), self.n_starts, 3)))
+            starts.append((q, mu.reshape(len(y), n_starts, 3)))
             if problem.known is not None:
                 starts.append(
                     starts_of_known_moment(
                         problem, problem.known, residual, self.candidates, self.n_starts, self.apart_rad
                     )
                 )
-        if self._needs_templates(problem, y):
+        if templates:
             starts.append(self._template_starts(problem, y))
         q, mu = (np.concatenate(parts, axis=1) for parts in zip(*starts, strict=True))
         row = np.repeat(np.arange(len(y)), q.shape[1])
-        fits = refine(problem.rows(row), y[row], q.reshape(-1, 1, 4), mu.reshape(-1, 1, 3))
+        fits = most_refined(problem.rows(row), y[row], q.reshape(-1, 1, 4), mu.reshape(-1, 1, 3))
+        # Far from linear every start counts, else where none has led anywhere.
+        nowhere = ~fits.converged.reshape(len(y), -1).any(axis=1)
+        left = np.flatnonzero(~fits.converged & (templates | nowhere[row]))
+        if left.size:
+            fits.put(left, refine(problem.rows(row[left]), y[row[left]], fits.q[left], fits.mu[left]))
         if problem.is_even:
             fits = fits.with_opposite_moments(len(y))
         return best_distinct(self._known(fits), len(y), self.width)
 
-    def _needs_templates(self, problem: WhitenedModel, y: FloatArray) -> bool:
-        """Whether some moduli are far from linear: their source's field is not small against the ambient field."""
+    def _needs_templates(self, problem: WhitenedModel, y: FloatArray) -> NDArray[np.bool_]:
+        """Rows (b,) with moduli far from linear: their source's field is not small against the ambient field."""
         scalar = problem.channel_is_scalar
-        if not scalar.any():
-            return False
         ambient = np.linalg.norm(problem.ambient[:, problem.channel_sensor[scalar]], axis=-1)
         signal = np.abs(y[:, scalar])
-        return bool(np.any(signal > 0.2 * ambient * np.abs(problem.gain[:, scalar, 0])))
+        return np.asarray(np.any(signal > 0.2 * ambient * np.abs(problem.gain[:, scalar, 0]), axis=1))
 
     def _template_starts(self, problem: WhitenedModel, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         directions = hemisphere(_N_TEMPLATE_DIRECTIONS)
@@ -139,7 +160,8 @@ class Search:
         best = np.empty(scores.shape, dtype=np.intp)
         for rows in rows_of_equal_gain(problem.gain):
             templates = modulus_templates(problem, int(rows[0]), self.candidates, directions)
-            scores[rows], best[rows] = modulus_scores(templates, y[rows])
+            for some in np.array_split(rows, -(-rows.size // _ROWS_OF_TEMPLATES)):
+                scores[some], best[some] = modulus_scores(templates, y[some])
         n_starts = 3 * self.n_starts
         chosen = distinct_best(scores, self.candidates, n_starts, self.apart_rad)
         q = self.candidates[chosen]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
 from magloc.levels import DELTA_CHI2_95
-from magloc.localization.fit.gauss_newton import JointFits, refine
+from magloc.localization.fit.gauss_newton import JointFits, most_refined, refine
 from magloc.localization.uncertainty.range_interval import ranges_of, relative_range_sigma
 from magloc.measurement.whitened import WhitenedModel
 
@@ -105,7 +105,8 @@ def _rises(
     q[:, source] = np.concatenate([direction * np.cos(at), sign * np.sin(at)], axis=-1)
     free = np.ones((q.shape[1], 3), dtype=bool)
     free[source, 2] = False
-    profile = refine(problem.rows(row), y[row], q, mu, free=free, max_iterations=40, promise=_PROMISE)
+    refined = most_refined if problem.ambient.any() else refine
+    profile = refined(problem.rows(row), y[row], q, mu, free=free, max_iterations=100, promise=_PROMISE)
     # A refinement that did not end says nothing of the profile: the points beyond it decide.
     chi2 = np.where(profile.converged, profile.chi2, -np.inf)
     return np.asarray(chi2 - fits.chi2[row])

@@ -31,6 +31,7 @@ from magloc.localization.fit.gauss_newton import (
     covariances,
     damped_gauss_newton,
     fit_moments,
+    most_refined,
     refine,
     refine_moments,
     tangents,
@@ -574,7 +575,7 @@ class TestLocator:
 
 
 class TestCompiledTwin:
-    """Of vector sensors the compiled refinement ends where the readable one does."""
+    """The compiled refinements end where the readable one does."""
 
     @pytest.mark.parametrize("n_sources", [1, 2, 3])
     @pytest.mark.parametrize("held", [False, True])
@@ -592,6 +593,23 @@ class TestCompiledTwin:
         assert_allclose(ours.chi2, twin.chi2, rtol=1e-9, atol=1e-7)
         assert_allclose(ours.q, twin.q, atol=1e-5)
         assert_allclose(ours.mu, twin.mu, rtol=1e-2, atol=1e-2 * np.abs(twin.mu).max())
+
+    @pytest.mark.parametrize("kind", ["scalar", "scalar in ambient", "mixed in ambient"])
+    @pytest.mark.parametrize("held", [False, True])
+    def test_moduli_linear_again_and_again(self, kind, held):
+        """From 10 cm beside the truth, of the exact modulus; without an ambient field some are left to damping."""
+        array = array_of(kind, 33)
+        rng = np.random.default_rng(33)
+        p, m = random_sources(rng, 8, 1)
+        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        q = problem.homogeneous(p + 0.1 * rng.normal(size=p.shape))
+        mu, free = problem.scaled_moment(q, m), np.array([[True, True, not held]])
+        ours, twin = most_refined(problem, y, q, mu, free=free), damped_gauss_newton(problem, y, q, mu, free, 400)
+        both = ours.converged & twin.converged
+        assert both.sum() >= (7 if "ambient" in kind else 4)
+        assert refine(problem, y, q, mu, free=free, max_iterations=400).converged.all()
+        assert_allclose(ours.chi2[both], twin.chi2[both], rtol=1e-9, atol=1e-7)
+        assert_allclose(np.abs(np.sum(ours.q * twin.q, axis=-1))[both], 1.0, rtol=1e-9)
 
     def test_rows_that_differ_in_their_common_field_alone(self):
         """Errors that are marginalised row by row leave the gains of all rows the same ones."""

@@ -224,6 +224,18 @@ class TestFirstSource:
         best = refined_from(problem, y, p, m)
         assert (beam.chi2[:, 0] < best.chi2 + 1e-3).all()
 
+    def test_a_row_far_from_linear_does_not_change_what_the_others_find(self):
+        """It begins from templates: a source a thousand times as strong, its field not small beside the ambient one."""
+        array = scalar_cloud(9)
+        rng = np.random.default_rng(9)
+        p, m = random_sources(rng, 4, 1)
+        m[2] *= 1000.0
+        problem, y = problem_of(array, noisy_readings(array, p, m, rng))
+        together, others = search_for(array, problem).first(problem, y), np.array([0, 1, 3])
+        alone = search_for(array, problem).first(problem.rows(others), y[others])
+        np.testing.assert_array_equal(together.chi2[others], alone.chi2)
+        assert together.chi2[2, 0] < refined_from(problem, y, p, m).chi2[2] + 1e-3
+
     def test_moduli_without_ambient_field_come_with_both_signs(self):
         array = scalar_cloud(8, ambient_T=None)
         rng = np.random.default_rng(8)
