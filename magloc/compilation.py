@@ -12,6 +12,7 @@ This module holds the one set of compiler options that all kernels share:
 from __future__ import annotations
 
 import atexit
+import gc
 import logging
 import os
 import shutil
@@ -19,7 +20,7 @@ import tempfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from typing import Any, TypeVar, cast
 
@@ -34,22 +35,34 @@ _LOG = logging.getLogger(__name__)
 COMPILING = "compiling for this machine, up to a minute; later calls start at once, and warm-up does it ahead"
 
 
-class _Announcement(event.Listener):
-    """Says once a process that something is compiled, which nobody should have to guess from a minute of silence."""
+class _Compiling(event.Listener):
+    """Says once a process that something is compiled, which nobody should have to guess from a minute of silence.
 
-    said = False
+    Garbage is not collected meanwhile: of all that the compiler makes hardly anything is, and the search for it takes a
+    tenth of the time. A kernel waits for those that it calls, so that events are nested.
+    """
+
+    said = collects = False
+    depth = 0
 
     def on_start(self, event: event.Event) -> None:
         """Say so, the first time."""
         if not self.said:
             self.said = True
             _LOG.info(COMPILING)
+        if self.depth == 0:
+            self.collects = gc.isenabled()
+            gc.disable()
+        self.depth += 1
 
     def on_end(self, event: event.Event) -> None:
-        """Say nothing."""
+        """Collect garbage again, if that was so before."""
+        self.depth -= 1
+        if self.depth == 0 and self.collects:
+            gc.enable()
 
 
-event.register("numba:compile", _Announcement())  # type: ignore[no-untyped-call]
+event.register("numba:compile", _Compiling())  # type: ignore[no-untyped-call]
 
 
 _NumbasCache: Any = caching.FunctionCache  # which has no types
@@ -97,19 +110,26 @@ def cached(made: Any) -> Any:
     return made
 
 
+# No kernel is called through a C pointer, for which numba would compile a wrapper of each.
+_njit = partial(cast(Any, njit), error_model="numpy", fastmath={"contract"}, no_cfunc_wrapper=True)
+
+
 def compiled(function: Function) -> Function:
     """Compile a serial kernel. Inside another kernel it is inlined, as a C function would be."""
-    return cast(Function, cached(njit(nogil=True, error_model="numpy", fastmath={"contract"})(function)))
+    return cast(Function, cached(_njit(nogil=True)(function)))
 
 
 def inlined(function: Function) -> Function:
-    """Compile a piece of a loop over lanes: a call that remained one would keep the loop from being vectorised."""
-    return cast(Function, cached(njit(error_model="numpy", fastmath={"contract"}, forceinline=True)(function)))
+    """Compile a piece of a loop over lanes: a call that remained one would keep the loop from being vectorised.
+
+    Python cannot call it.
+    """
+    return cast(Function, cached(_njit(forceinline=True, no_cpython_wrapper=True)(function)))
 
 
 def compiled_parallel(function: Function) -> Function:
     """Compile a kernel whose ``prange`` loops run on numba's threads."""
-    return cast(Function, cached(njit(parallel=True, error_model="numpy", fastmath={"contract"})(function)))
+    return cast(Function, cached(_njit(parallel=True)(function)))
 
 
 def over_rows(kernel: Callable[..., None], n_rows: int, *arguments: Any) -> None:

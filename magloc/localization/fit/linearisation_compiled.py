@@ -8,15 +8,18 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from arrays.typing import FloatArray
 from magloc.compilation import compiled, inlined
 
-LANES = 16
+# No int, here and in all that follows from it: numba compiles a function anew for each literal that it is given.
+LANES: int = np.int64(16)  # type: ignore[assignment]
 # A column of which less is left, squared and relative, consists of rounding alone.
 _LOST = 1e-26
 
 # Rows of a sensor, as offsets: what its three channels read.
-GAIN = 0  # (channel, axis)
+GAIN = 0 * LANES  # (channel, axis)
 SIGNAL = 9 * LANES
 BASIS = 12 * LANES  # (channel, component of the moment), orthogonal in the end
 RESIDUAL = 21 * LANES
@@ -24,7 +27,7 @@ DIRECTION = 24 * LANES  # from the source, and one over the distance
 JACOBIAN = 28 * LANES  # (channel, tangent)
 SENSOR_ROWS = 37 * LANES
 # Rows of the workspace: the state with its moment, χ² and linearisation, and the same at the trial state.
-STATE = 0
+STATE = 0 * LANES
 NORMAL = 8 * LANES  # JᵀJ (00, 01, 02, 11, 12, 22), Jᵀr
 TRIAL = 17 * LANES
 MOMENT = 4 * LANES  # from either

@@ -71,18 +71,32 @@ class TestCompiling:
     def test_is_said_once_where_somebody_watches(
         self, watched: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        listener = compilation._Announcement()
+        listener = compilation._Compiling()
         monkeypatch.setattr(sys.stderr, "isatty", lambda: watched)
         with framework._notes_of_the_library(app.app.name[0]):
-            listener.on_start(None)  # type: ignore[arg-type]  # what is compiled does not matter
-            listener.on_start(None)  # type: ignore[arg-type]
+            for happens in (listener.on_start, listener.on_start, listener.on_end, listener.on_end):
+                happens(None)  # type: ignore[arg-type]  # what is compiled does not matter
         assert capsys.readouterr().err.count(compilation.COMPILING) == watched
 
     def test_numba_says_when_it_compiles(self, caplog: pytest.LogCaptureFixture) -> None:
         from numba import njit
         from numba.core import event
 
-        listener = compilation._Announcement()
+        listener = compilation._Compiling()
         with caplog.at_level(logging.INFO, "magloc"), event.install_listener("numba:compile", listener):
             assert njit(lambda x: x + 1)(1) == 2
         assert listener.said
+
+    @pytest.mark.parametrize("collects", [True, False])
+    def test_garbage_waits_until_a_kernel_and_those_that_it_calls_are_compiled(
+        self, collects: bool, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        listener, state = compilation._Compiling(), [collects]
+        monkeypatch.setattr(compilation.gc, "isenabled", lambda: state[-1])
+        monkeypatch.setattr(compilation.gc, "disable", lambda: state.append(False))
+        monkeypatch.setattr(compilation.gc, "enable", lambda: state.append(True))
+        for happens in (listener.on_start, listener.on_start, listener.on_end):
+            happens(None)  # type: ignore[arg-type]
+            assert not state[-1]
+        listener.on_end(None)  # type: ignore[arg-type]
+        assert state[-1] == collects
