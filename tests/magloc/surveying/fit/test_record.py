@@ -104,6 +104,39 @@ class TestDerivatives:
             np.testing.assert_allclose(found, numeric, rtol=1e-2, atol=1e-2 * np.abs(numeric).max())
 
 
+class TestSquaredShift:
+    """What the square of a shift adds to fields, which first order does not know."""
+
+    SIGMA_M = 1e-3
+
+    def columns(self, least_T: float) -> tuple[SurveyRecord, FloatArray]:
+        array = replace(SCALAR, pose=arrays.PoseUncertainty(self.SIGMA_M, 0.01, 0.0, 5.0))
+        record = record_of(array, readings_of(array, PLACES, TURNS))
+        return record, record.by_squared_shift(record.directions(record.fields(*SOURCE)), *SOURCE, least_T)
+
+    def test_covariance(self) -> None:
+        """That of the even part of the field over shifts that are Gaussian, by quadrature."""
+        record, found = self.columns(1e-18)
+        directions = record.directions(record.fields(*SOURCE))
+        node, weight = np.polynomial.hermite_e.hermegauss(4)
+        shifts = self.SIGMA_M * np.stack(np.meshgrid(node, node, node), axis=-1).reshape(-1, 3)
+        weights = np.prod(np.stack(np.meshgrid(weight, weight, weight), axis=-1), axis=-1).ravel() / weight.sum() ** 3
+        here = dipole.total_field(record.sensors_m, *SOURCE)
+        ends = [[dipole.total_field(record.sensors_m + s * shift, *SOURCE) for shift in shifts] for s in (1.0, -1.0)]
+        even = np.einsum("nci,qnci->qnc", directions, 0.5 * np.sum(ends, axis=0) - here)
+        expected = np.einsum("q,qna,qnb->nab", weights, even, even)
+        np.testing.assert_allclose(found @ found.mT, expected, rtol=1e-3, atol=1e-4 * expected.max())
+        np.testing.assert_allclose(weights @ even.reshape(len(weights), -1), 0.0, atol=1e-4 * np.abs(even).max())
+
+    def test_where_it_is_negligible(self) -> None:
+        """There are no columns, and none is left out that is larger than what is said."""
+        _, found = self.columns(1e-18)
+        largest = np.linalg.norm(found, axis=2).max()
+        assert self.columns(10.0 * largest)[1].shape[2] == 0
+        kept = self.columns(0.5 * largest)[1]
+        assert np.linalg.norm(found - kept, axis=2).max() < 0.5 * largest
+
+
 class TestTurns:
     def test_lay_one_along_the_other(self) -> None:
         a, b = RNG.standard_normal((2, 50, 3))
