@@ -150,8 +150,8 @@ def _rounds_in(piece: Piece, most: int) -> Arrays:
 def targets_in(piece: Piece) -> Arrays:
     """The sources that are known, fitted to all rows: parts of targets, reach, and what is left of the tile's rows."""
     model = piece.model()
-    group = piece.groups(model.record, AT_LAST * model.nearest_m)
-    fit, background = model.fitted(piece.known, group, _SETTLED)
+    groups = partial(piece.groups, model.record)
+    fit, background = model.fitted(piece.known, groups(AT_LAST * model.nearest_m), _SETTLED)
     record = model.record
     left = record.values_T - record.predicted(fit.sources.fields(record))
     lines = (
@@ -161,7 +161,7 @@ def targets_in(piece: Piece) -> Arrays:
     )
     own = piece.tile.own
     extent = piece.tile.extent_m(lines[0][own, :2])
-    places, moments = least_moments(model, fit, background, *extent, piece.ground.ground_m)
+    places, moments = least_moments(model, fit.sources, groups, *extent, piece.ground.ground_m)
     return {
         "reach_m": places,
         "reach_Am2": moments,

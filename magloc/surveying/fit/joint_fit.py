@@ -152,7 +152,7 @@ def orthogonal(L: FloatArray) -> FloatArray:
 def _times_root_of_inverse(L: FloatArray, square: FloatArray) -> FloatArray:
     """``Q`` with ``Q Qᵀ = L (A + 1)⁻¹ Lᵀ`` of some symmetric matrix ``A``."""
     factor = cho_factor(square + np.eye(L.shape[1]), lower=True)[0]
-    return np.asarray(solve_triangular(factor, L.T, lower=True, check_finite=False).T)
+    return np.asarray(L @ solve_triangular(factor, np.eye(len(factor)), lower=True, check_finite=False).T)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from scipy.stats import ncx2
 
 import magloc
 import sims
-from arrays.typing import FloatArray
+from arrays.typing import FloatArray, IntArray
 from magloc.fields import dipole
 from magloc.surveying.fit.joint_fit import (
     Background,
@@ -26,7 +26,7 @@ from magloc.surveying.fit.joint_fit import (
     residual_of,
     with_free_sources,
 )
-from magloc.surveying.piece import Ground
+from magloc.surveying.piece import Ground, Piece
 from magloc.surveying.preparation import whole_rows
 from magloc.surveying.reach import DEPTHS_M, least_moments
 from magloc.surveying.rounds import AT_LAST, Model
@@ -42,8 +42,8 @@ STRONG = ((3.0, -2.0, -0.6), (6.0, 5.0, -8.0))
 
 
 @cache
-def fitted() -> Fitted:
-    """A weak target 5 m from a strong one, fitted where they are."""
+def plot() -> Piece:
+    """A weak target 5 m from a strong one, both known."""
     whole = sims.read_scenario("survey-drone")
     assert isinstance(whole, MagneticScenario)
     assert isinstance(whole.carrier.path, Lawnmower)
@@ -54,7 +54,18 @@ def fitted() -> Fitted:
     field = sims.simulate(scenario, seed=912)
     tiled = TiledSurvey.of(*whole_rows(field.array, field.readings), Ground(magloc.SourcePrior(), 0.0, 15.0, 25.0))
     place, moment = np.array([WEAK, STRONG]).transpose(1, 0, 2)
-    piece = replace(tiled, sources=Sources(place, moment)).piece(0)
+    return replace(tiled, sources=Sources(place, moment)).piece(0)
+
+
+def groups(length_m: float) -> IntArray:
+    """Rows within a length."""
+    return plot().groups(fitted()[0].record, length_m)
+
+
+@cache
+def fitted() -> Fitted:
+    """The two fitted where they are."""
+    piece = plot()
     model = piece.model()
     return model, *model.fitted(piece.known, piece.groups(model.record, AT_LAST * model.nearest_m), 1e-3)
 
@@ -91,7 +102,7 @@ def test_the_least_moment_is_seen_with_95_percent() -> None:
     """Its χ², as of a source of a joint fit, has the tail that is promised in the worst of 300 directions."""
     model, fit, background = fitted()
     low, high = model.bounds.low_m[:2] + 1.0, model.bounds.high_m[:2] - 1.0
-    places, moments = least_moments(model, fit, background, low, high, 0.0)
+    places, moments = least_moments(model, fit.sources, groups, low, high, 0.0)
     assert sorted(set((-places[:, 2]).round(6))) == list(DEPTHS_M)
     directions = np.random.default_rng(1).normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -110,16 +121,16 @@ def test_the_least_moment_is_seen_with_95_percent() -> None:
 
 def test_no_place_where_no_row_is_near() -> None:
     """Of a rectangle that goes on for 300 m: places beside the rows, where little is seen, and none far from them."""
-    model, fit, background = fitted()
+    model, fit, _ = fitted()
     far = replace(model, bounds=Bounds(model.bounds.low_m, model.bounds.high_m + 300.0 * np.eye(3)[0]))
     low, high = far.bounds.low_m[:2], far.bounds.high_m[:2]
-    places, moments = least_moments(far, fit, background, low, high, 0.0)
+    places, moments = least_moments(far, fit.sources, groups, low, high, 0.0)
     beside_m = places[:, 0] - model.bounds.high_m[0]
     deepest = model.record.height_m + DEPTHS_M[-1]
     assert 5.0 < beside_m.max() < (WINDOW + 8.0 / PITCH) * deepest  # squares of 8 by 8 places are searched at once
     assert np.isfinite(moments).all()
     assert np.median(moments[beside_m > 5.0]) > 10.0 * np.median(moments[beside_m < 0.0])
-    assert not least_moments(model, fit, background, high, high + 20.0, 0.0)[0].size  # beside all sources
+    assert not least_moments(model, fit.sources, groups, high, high + 20.0, 0.0)[0].size  # beside all sources
 
 
 def plot_of(seen: Callable[[FloatArray], FloatArray], start: Sources, body_length_m: float = 0.0) -> Fitted:
