@@ -160,21 +160,28 @@ class SurveyRecord:
     def by_sensors(self, directions: FloatArray) -> FloatArray:
         """Derivative (n, C, q) of the channels by what is wrong with the sensors, of unit variance.
 
-        Stray fields that turn with the array, and gains and axes of vector sensors in the ambient field.
+        Stray fields that turn with the array, what the ambient field induces in its carrier, and gains and axes of
+        vector sensors in that field: Tolles and Lawson's terms among them, of every sensor.
         """
         R, owner = self.R_world_from_array, self.array.channel_sensor
         by_field = directions @ R  # of a field in the array's axes
         body = np.einsum("nji,nj->ni", R, self.ambient_T)
+        rate = np.gradient(body, self.time_s, axis=0)
         columns = []
         for i, sensor in enumerate(self.array.sensors):
             own = (owner == i)[:, None]
             if sensor.offset_uncertainty_T:
                 columns.append(sensor.offset_uncertainty_T * np.where(own, by_field, 0.0))
-            if sensor.kind == "vector" and (sensor.misalignment_rad or sensor.gain_uncertainty):
-                size = np.full((3, 3), sensor.misalignment_rad)
-                np.fill_diagonal(size, sensor.gain_uncertainty)
-                nine = np.where(own[..., None], by_field[..., None] * (size * body[:, None, None]), 0.0)
-                columns.append(nine.reshape(len(self), -1, 9))
+            axes = np.full((3, 3), sensor.misalignment_rad)
+            np.fill_diagonal(axes, sensor.gain_uncertainty if sensor.kind == "vector" else 0.0)
+            for size, field in (
+                (axes, body),
+                (np.full((3, 3), sensor.induced_uncertainty), body),
+                (np.full((3, 3), sensor.eddy_uncertainty_s), rate),
+            ):
+                if size.any():
+                    nine = np.where(own[..., None], by_field[..., None] * (size * field[:, None, None]), 0.0)
+                    columns.append(nine.reshape(len(self), -1, 9))
         return np.concatenate(columns, axis=2) if columns else np.zeros((len(self), len(owner), 0))
 
     def by_pose(self, directions: FloatArray, fields_T: FloatArray, gradients: FloatArray) -> FloatArray:

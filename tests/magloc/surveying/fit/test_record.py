@@ -104,6 +104,44 @@ class TestDerivatives:
             np.testing.assert_allclose(found, numeric, rtol=1e-2, atol=1e-2 * np.abs(numeric).max())
 
 
+class TestCarrier:
+    """Tolles and Lawson's terms: what carries the sensors is magnetised by the field that it turns in."""
+
+    @pytest.mark.parametrize("kind", ["scalar", "vector"])
+    def test_columns_are_what_readings_have_more(self, kind: str) -> None:
+        """Permanent, induced and eddy-current fields of random coefficients, in closed form."""
+        sensor = arrays.Sensor(
+            "s",
+            kind,  # type: ignore[arg-type]  # one of the two
+            (0.0, 0.0, 0.0),
+            noise_T=1e-10,
+            offset_uncertainty_T=2e-9,
+            induced_uncertainty=1e-4,
+            eddy_uncertainty_s=3e-4,
+        )
+        array = arrays.SensorArray((sensor,), pose=POSE)
+        ambient = TURNS.inv().apply(np.tile(AMBIENT, (N, 1)))
+        coefficients = np.random.default_rng(7).standard_normal(21)
+        p, A, E = 2e-9 * coefficients[:3], 1e-4 * coefficients[3:12], 3e-4 * coefficients[12:]
+        more = p + ambient @ A.reshape(3, 3).T + np.gradient(ambient, TIME, axis=0) @ E.reshape(3, 3).T
+        rows = Readings(
+            array.readings_of((ambient + more)[:, None]),
+            time_s=TIME,
+            array_position_m=PLACES,
+            array_rotation=TURNS,
+            ambient_T=ambient,
+        )
+        record = SurveyRecord.of(array, rows, ambient, PoseErrors.of(POSE))
+        columns = record.by_sensors(record.directions(np.zeros((N, 1, 3)))) @ coefficients
+        unit = AMBIENT / np.linalg.norm(AMBIENT)
+        if kind == "vector":  # across the ambient field the mean of the sensors is zero in the turned axes
+            columns, values = columns @ unit, record.values_T @ unit
+        else:
+            columns, values = columns[:, 0], record.values_T[:, 0]
+        # But for the square of what is added over the ambient field.
+        np.testing.assert_allclose(columns, values, atol=1e-3 * np.abs(values).max())
+
+
 class TestSquaredShift:
     """What the square of a shift adds to fields, which first order does not know."""
 
