@@ -13,8 +13,10 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
     offset_uncertainty_nT = 0.5     # optional, unknown field fixed to the array, 1 sigma per axis
     flicker_nT = 0.01               # optional, 1/f noise: 1 sigma in every decade of frequency
     drift_nT_rth = 0.1              # optional, random walk of the offset: 1 sigma after an hour
+    induced_uncertainty = 1e-4      # optional, what the ambient field induces in the carrier, over it: 1 sigma
+    eddy_uncertainty_s = 1e-4       # optional, the same over the field's derivative in the array's axes
 
-    [[sensor]]                      # in place of geometry, its size, and the keys from kind to drift_nT_rth
+    [[sensor]]                      # in place of geometry, its size, and the keys from kind to eddy_uncertainty_s
     id = "s1"
     kind = "vector"
     position_m = [0.0, 0.0, 0.918]  # array frame
@@ -27,6 +29,8 @@ Either a geometry by name (:data:`arrays.geometries.GEOMETRIES`) with its size, 
     offset_uncertainty_nT = 0.5
     flicker_nT = 0.01
     drift_nT_rth = 0.1
+    induced_uncertainty = 1e-4
+    eddy_uncertainty_s = 1e-4
     noise_fraction = 0.01           # optional, in place of the array's
     [sensor.calibration]            # optional, reading = scale · (field in sensor axes) + offset
     scale = 1.0                     # a number, 3 numbers or a 3×3 matrix
@@ -106,6 +110,8 @@ class _Quality(Table, kw_only=True):
     offset_uncertainty_nT: _NotNegative = 0
     flicker_nT: _NotNegative = 0
     drift_nT_rth: _NotNegative = 0
+    induced_uncertainty: _NotNegative = 0
+    eddy_uncertainty_s: _NotNegative = 0
 
 
 class _GeometryFile(_Header, kw_only=True):

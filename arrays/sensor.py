@@ -126,12 +126,17 @@ class Sensor:
         Random walk of the offset, per channel: its standard deviation after an hour [T/√h].
     noise_fraction : float, optional
         Noise proportional to the field, in place of the array's: variance = noise² + (fraction · |B|)².
+    induced_uncertainty : float
+        Standard deviation of every component of what the ambient field induces in the carrier, as seen at the sensor in
+        the array's axes, over that field; surveys take it into account.
+    eddy_uncertainty_s : float
+        The same of eddy currents: over the derivative of the ambient field in the array's axes [s].
 
     Raises
     ------
     ValueError
         A number is not finite, a shape is wrong, the noise or the saturation is not positive, the misalignment or the
-        gain's uncertainty is negative or not below 1, one of the last four is negative, a scalar sensor has a
+        gain's uncertainty is negative or not below 1, one of the last six is negative, a scalar sensor has a
         misalignment, the quaternion's norm differs from 1 by more than 1e-6, or the id cannot name a column.
 
     Examples
@@ -155,6 +160,8 @@ class Sensor:
     flicker_T: float = 0.0
     drift_T_rth: float = 0.0
     noise_fraction: float | None = None
+    induced_uncertainty: float = 0.0
+    eddy_uncertainty_s: float = 0.0
 
     def __post_init__(self) -> None:
         _check_id(self.id)
@@ -170,7 +177,14 @@ class Sensor:
             object.__setattr__(self, name, _finite_number(name, getattr(self, name)))
             if not 0.0 <= getattr(self, name) < 1.0:
                 raise ValueError(f"Input {name} must be from 0 to below 1; instead received {getattr(self, name)}.")
-        for name in ("offset_uncertainty_T", "flicker_T", "drift_T_rth", "noise_fraction"):
+        for name in (
+            "offset_uncertainty_T",
+            "flicker_T",
+            "drift_T_rth",
+            "noise_fraction",
+            "induced_uncertainty",
+            "eddy_uncertainty_s",
+        ):
             if getattr(self, name) is None:
                 continue
             object.__setattr__(self, name, _finite_number(name, getattr(self, name)))

@@ -53,6 +53,7 @@ class Pair(NamedTuple):
     significance: float
     bound_m: float
     visible_chi2: float
+    merged: bool
 
 
 class Field(NamedTuple):
@@ -95,7 +96,8 @@ def judged(field: Simulation, false_per_hectare: float = 0.1) -> Field:
         error = target.position_m - position
         own = target.covariance[:3, :3]
         interval, chi2 = target.depth_interval95_m, float(at_truth.significance[j])
-        pairs.append(Pair(error, -position[2], own, interval, target.significance, float(bound[j]), chi2))
+        merged = "merged" in target.flags
+        pairs.append(Pair(error, -position[2], own, interval, target.significance, float(bound[j]), chi2, merged))
     return Field(pairs, missed, len(found) - len(used), found.threshold, found.seconds, found.chi2_per_dof)
 
 
@@ -113,7 +115,8 @@ def summary(pairs: list[Pair]) -> str:
     return (
         f"{len(pairs)} targets: {100.0 * np.median(across):.1f} cm across, {100.0 * np.median(depth):.1f} % of depth"
         f" (medians); ellipsoids hold {np.mean([holds(pair) for pair in pairs]):.3f}, depth intervals"
-        f" {np.mean(inside):.3f}; rms over bound {ratio:.2f}"
+        f" {np.mean(inside):.3f}; rms over bound {ratio:.2f}; merged is said of"
+        f" {np.mean([pair.merged for pair in pairs]):.3f}"
     )
 
 

@@ -44,11 +44,14 @@ class GroundOptions:
         Shortest wavelength in the field of the ground itself; what is smaller is taken for a target.
     false_per_hectare : float
         False targets in a hectare that noise may make, on average.
+    body_length_m : float
+        Longest edge of what may be buried: what a dipole leaves out of its field counts as noise. 0 for points.
     """
 
     ground_m: Annotated[float, Parameter(allow_leading_hyphen=True)] = 0.0
     shortest_geology_m: float = 15.0
     false_per_hectare: float = 0.1
+    body_length_m: float = 0.0
 
 
 def survey(
@@ -71,8 +74,9 @@ def survey(
     All rows count together, and as many targets are found as are significant. Readings need the pose of the array, and
     for scalar sensors the ambient field. The table has the most significant target first: ± xy is the longer half axis
     of the 95 % ellipse, χ² what would be lost without the target. Flags: "weak" = trust the depth interval and not the
-    ellipse; "near" = another target is so near that one of the two may be spurious; "edge" = at the rim of what was
-    searched; "misfit" = errors are larger than is said. Sensors that stick, wild readings and late ones are named.
+    ellipse; "near" = another target is so near that one of the two may be spurious; "merged" = more than one, too near
+    to be told apart; "edge" = at the rim of what was searched; "misfit" = errors are larger than is said. Sensors that
+    stick, wild readings and late ones are named.
 
     Parameters
     ----------
@@ -126,6 +130,7 @@ def survey(
             ground_m=ground.ground_m,
             shortest_geology_m=ground.shortest_geology_m,
             false_per_hectare=ground.false_per_hectare,
+            body_length_m=ground.body_length_m,
             scheduler=scheduler,
             unfinished=None if out is None else out / "tiles",
             progress=None if common.quiet or json else print_note,
@@ -151,7 +156,7 @@ def survey(
 def _naming(readings: str) -> Iterator[None]:
     """Let errors of the library speak of the options and of the file."""
     try:
-        with naming_options("ground_m", "base"):
+        with naming_options("ground_m", "base", "body_length_m"):
             yield
     except ValueError as error:
         if isinstance(error, InputError):

@@ -14,6 +14,9 @@ from arrays.io.errors import _vectors
 from arrays.typing import FloatArray
 from magloc.fields.dipole import MU0_OVER_4PI
 
+# Standard deviations of a component of a body's moments of rank 2 and 4, over L² and L⁴.
+_SIGMA = {2: 0.025, 4: 0.0015}
+
 
 def multipole_field_matrix(points_m: ArrayLike, source_m: ArrayLike, order: int) -> FloatArray:
     """Field of every component of a multipole: the dipole (order 1), the quadrupole (2), the octupole (3), and so on.
@@ -80,6 +83,16 @@ def finite_body_fields(separation_m: FloatArray, moment_Am2: FloatArray, rank: i
     with np.errstate(invalid="ignore", divide="ignore"):
         fields: FloatArray = np.swapaxes(scale * pattern / r ** (rank + 3), -1, -2)
     return fields
+
+
+def finite_body_errors(separation_m: FloatArray, moment_Am2: FloatArray, length_m: FloatArray | float) -> FloatArray:
+    """What bodies of some lengths (..., 1, 1) add to the field of their dipoles, of one σ: (..., 3, 14) [T].
+
+    Their moments of rank 2 and 4 are unknown, with standard deviations that grow with the length:
+    docs/theory/extended-sources.md.
+    """
+    parts = [s * length_m**rank * finite_body_fields(separation_m, moment_Am2, rank) for rank, s in _SIGMA.items()]
+    return np.concatenate(parts, axis=-1)
 
 
 @cache

@@ -181,6 +181,8 @@ def without_lasting_errors(array: SensorArray) -> SensorArray:
             offset_uncertainty_T=0.0,
             flicker_T=0.0,
             drift_T_rth=0.0,
+            induced_uncertainty=0.0,
+            eddy_uncertainty_s=0.0,
         )
         for sensor in array.sensors
     )

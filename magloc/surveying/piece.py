@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.fit.whitening import Drift
 from magloc.surveying.preparation import record_of
 from magloc.surveying.reach import least_moments
-from magloc.surveying.rounds import MOST_ROUNDS, Model, found_in
+from magloc.surveying.rounds import AT_LAST, MOST_ROUNDS, Model, found_in
 from magloc.surveying.search import PITCH, SearchGrid
 from magloc.surveying.targets import targets_of
 from magloc.surveying.tiles import Tile
@@ -29,8 +30,6 @@ _DEEPEST = 4.0
 _MARGIN_M = 1.0
 _LARGEST_MOMENT_Am2 = 300.0
 _SETTLED = 1e-3
-# Rows that pass within such a part of the distance to the nearest sources count as one.
-WHILE_SEARCHING, AT_LAST = 0.25, 0.05
 _MOST_NUMBERS = 2.5e8  # of the columns of the ground: 2 GB
 _MOST_PLACES = 1e6
 
@@ -45,12 +44,15 @@ class Ground:
     ground_m, shortest_geology_m : float
     threshold : float
         χ² of 3 degrees of freedom that a target must exceed.
+    body_length_m : float
+        Longest edge of what may be buried, 0 of points.
     """
 
     prior: SourcePrior
     ground_m: float
     shortest_geology_m: float
     threshold: float
+    body_length_m: float = 0.0
 
     def bounds(self, record: SurveyRecord) -> Bounds:
         """Where sources may be that rows show, and how strong."""
@@ -108,21 +110,21 @@ class Piece:
         bounds = self.ground.bounds(record)
         layer = Layer.below(record, self.ground.shortest_geology_m, self.geology_T)
         x, y = (bounds.high_m - bounds.low_m)[:2]
-        height = record.height_m - bounds.high_m[2]
-        numbers = (self.groups(record, bounds, AT_LAST)[-1] + 1) * record.array.n_channels * len(layer.places_m)
+        model = Model(record, errors, layer, Drift(), bounds, self.ground.threshold, self.ground.body_length_m)
+        height = model.nearest_m
+        numbers = (self.groups(record, AT_LAST * height)[-1] + 1) * record.array.n_channels * len(layer.places_m)
         if numbers > _MOST_NUMBERS or x * y / (max(height, 0.3) / PITCH) ** 2 > _MOST_PLACES:
             raise ValueError(
                 f"Input readings must be cut into smaller pieces; instead received {len(record)} rows over {x:.3g} m by"
                 f" {y:.3g} m, {height:.2g} m above the ground."
             )
-        return Model(record, errors, layer, Drift(), bounds, self.ground.threshold)
+        return model
 
-    def groups(self, record: SurveyRecord, bounds: Bounds, part: float) -> IntArray:
-        """Group of every row (n,): neighbours that pass within a part of the distance to sources count as one."""
+    def groups(self, record: SurveyRecord, length_m: float) -> IntArray:
+        """Group of every row (n,): neighbours that pass within a length count as one."""
         steps = np.linalg.norm(np.diff(record.sensors_m.mean(axis=1), axis=0), axis=1)[np.diff(self.tile.rows) == 1]
         step = float(np.median(steps)) if steps.size else 0.0
-        length = part * (record.height_m - bounds.high_m[2])
-        together = max(1, math.floor(length / step)) if step > 0.0 else 1
+        together = max(1, math.floor(length_m / step)) if step > 0.0 else 1
         return np.unique(self.tile.rows // together, return_inverse=True)[1]
 
 
@@ -141,16 +143,15 @@ def sources_in(piece: Piece) -> Arrays:
 def _rounds_in(piece: Piece, most: int) -> Arrays:
     model = piece.model()
     grid = SearchGrid.below(model.record, model.bounds.low_m, model.bounds.high_m)
-    group = piece.groups(model.record, model.bounds, WHILE_SEARCHING)
-    return dict(vars(found_in(model, group, grid, piece.known, most)))
+    return dict(vars(found_in(model, partial(piece.groups, model.record), grid, piece.known, most)))
 
 
 @one_blas_thread
 def targets_in(piece: Piece) -> Arrays:
     """The sources that are known, fitted to all rows: parts of targets, reach, and what is left of the tile's rows."""
     model = piece.model()
-    group = piece.groups(model.record, model.bounds, AT_LAST)
-    fit, background = model.fitted(piece.known, group, _SETTLED)
+    groups = partial(piece.groups, model.record)
+    fit, background = model.fitted(piece.known, groups(AT_LAST * model.nearest_m), _SETTLED)
     record = model.record
     left = record.values_T - record.predicted(fit.sources.fields(record))
     lines = (
@@ -160,7 +161,7 @@ def targets_in(piece: Piece) -> Arrays:
     )
     own = piece.tile.own
     extent = piece.tile.extent_m(lines[0][own, :2])
-    places, moments = least_moments(model, fit, background, *extent, piece.ground.ground_m)
+    places, moments = least_moments(model, fit.sources, groups, *extent, piece.ground.ground_m)
     return {
         "reach_m": places,
         "reach_Am2": moments,

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.special import chndtrinc
 
 from arrays.typing import FloatArray
-from magloc.surveying.fit.joint_fit import Background, JointFit, with_free_sources
-from magloc.surveying.rounds import Model
+from magloc.surveying.fit.joint_fit import Sources, with_free_sources
+from magloc.surveying.rounds import WHILE_SEARCHING, Groups, Model
 from magloc.surveying.search import WINDOW, SearchGrid, groups_near, normal_equations
 
 DEPTHS_M = (0.5, 1.0, 2.0)
@@ -16,7 +16,7 @@ _ROUNDING = 1e-12  # of what rows say of all three axes
 
 
 def least_moments(
-    model: Model, fit: JointFit, background: Background, low_m: FloatArray, high_m: FloatArray, ground_m: float
+    model: Model, sources: Sources, groups: Groups, low_m: FloatArray, high_m: FloatArray, ground_m: float
 ) -> tuple[FloatArray, FloatArray]:
     """Places (k, 3) below a rectangle (2,), and the moments (k,) that are found there with 95 %, however they point.
 
@@ -24,19 +24,21 @@ def least_moments(
     show none, however strong, there is no place.
     """
     record = model.record
-    Q = with_free_sources(record, background, fit.sources)
-    directions = record.directions(fit.sources.fields(record))
+    directions = record.directions(sources.fields(record))
     bounds = model.bounds
     low, high = np.maximum(low_m, bounds.low_m[:2]), np.minimum(high_m, bounds.high_m[:2])
     needed = chndtrinc(model.threshold, 3, 1.0 - SEEN)
     places, moments = [], []
     inside = [at for at in DEPTHS_M if bounds.low_m[2] <= ground_m - at <= bounds.high_m[2] and (low <= high).all()]
     distances = [record.height_m - ground_m + at for at in inside]
-    for distance, at in SearchGrid.of(low, high, record.height_m, distances).tiles:
-        used = groups_near(record, background.white, at, WINDOW * distance)
-        alone, projected, _ = normal_equations(record, background.white, directions, at, used, Q, fit.residual)
-        least = np.linalg.eigvalsh(projected)[:, 0]
-        shown = least > _ROUNDING * np.trace(alone, axis1=1, axis2=2)
-        places.append(at[shown])
-        moments.append(np.sqrt(needed / least[shown]))
+    for distance, level in SearchGrid.of(low, high, record.height_m, distances).levels.items():
+        background = model.background(sources, groups(WHILE_SEARCHING * distance))
+        white, Q = background.white, with_free_sources(record, background, sources)
+        for _, at in level.tiles:
+            used = groups_near(record, white, at, WINDOW * distance)
+            alone, projected, _ = normal_equations(record, white, directions, at, used, Q, np.zeros(len(Q)))
+            least = np.linalg.eigvalsh(projected)[:, 0]
+            shown = least > _ROUNDING * np.trace(alone, axis1=1, axis2=2)
+            places.append(at[shown])
+            moments.append(np.sqrt(needed / least[shown]))
     return np.concatenate([np.zeros((0, 3)), *places]), np.concatenate([np.zeros(0), *moments])

@@ -43,8 +43,9 @@ class Target:
         χ² that is lost without it, of 3 degrees of freedom.
     flags : tuple of str
         ``weak``: the ellipse is not Gaussian. ``near``: another target is so near that one of the two may be spurious.
-        ``edge``: at the rim of what was searched. ``misfit``: the rows above it do not fit a dipole within what is
-        stated of noise and pose, so that its errors are larger than its covariance says.
+        ``merged``: the rows hold more than one there, too near to be told apart. ``edge``: at the rim of what was
+        searched. ``misfit``: the rows above it do not fit a dipole within what is stated of noise and pose, so that its
+        errors are larger than its covariance says.
 
     Examples
     --------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from magloc.measurement.pose import PoseErrors
 from magloc.surveying.fit.joint_fit import Background, Bounds, JointFit, Layer, Sources, fit_jointly, residual_of
 from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.fit.whitening import Drift
-from magloc.surveying.search import SearchGrid, peaks, search, sources_at
+from magloc.surveying.search import Candidates, SearchGrid, peaks, search, sources_at
 
 MOST_ROUNDS = 60
 _MOST_IN_VAIN = 4  # rounds: beside strong sources, and at the rims of tiles, there is always something left to try
@@ -23,6 +24,10 @@ _SAME_PLACE_M = 1e-6
 _REACH = 0.6  # of a fit, over the distance from the sensors
 _MOST_WEIGHINGS = 4
 _SETTLED_COARSELY = 0.5
+# Rows that pass within such a part of the distance to a source count as one.
+WHILE_SEARCHING, AT_LAST = 0.33, 0.05
+Groups = Callable[[float], IntArray]
+"""Group of every row (n,), of neighbours within a length."""
 # While sources are missing, what they leave of each other's field counts as errors of the place.
 _POSE_WHILE_SEARCHING_M = 0.04
 
@@ -37,10 +42,16 @@ class Model:
     drift: Drift
     bounds: Bounds
     threshold: float
+    body_length_m: float = 0.0
+
+    @property
+    def nearest_m(self) -> float:
+        """Distance from the sensors to the shallowest sources."""
+        return self.record.height_m - float(self.bounds.high_m[2])
 
     def background(self, sources: Sources, group: IntArray) -> Background:
         """Where some sources are, for groups of rows."""
-        return Background.of(self.record, sources, self.layer, self.errors, self.drift, group)
+        return Background.of(self.record, sources, self.layer, self.errors, self.drift, group, self.body_length_m)
 
     def refitted(self, sources: Sources, group: IntArray) -> Sources:
         """The same sources where they fit best, within their reach."""
@@ -81,9 +92,17 @@ class Model:
             fit = fit_jointly(self.record, background, sources, self.bounds, settled=settled)
         return fit, background
 
+    def candidates(self, sources: Sources, grid: SearchGrid, groups: Groups) -> Candidates:
+        """Where one more source would explain most; the deeper, the longer the averages of rows that show it."""
+        return Candidates.joined(
+            search(self.record, self.background(sources, groups(WHILE_SEARCHING * distance)), sources, level)
+            for distance, level in grid.levels.items()
+        )
 
-def found_in(model: Model, group: IntArray, grid: SearchGrid, known: Sources, most: int) -> Sources:
-    """Sources of a record whose rows count in groups, after some rounds."""
+
+def found_in(model: Model, groups: Groups, grid: SearchGrid, known: Sources, most: int) -> Sources:
+    """Sources of a record after some rounds."""
+    group = groups(WHILE_SEARCHING * model.nearest_m)
     stated = model.errors.uncertainty.position_m
     share = max(1.0, _POSE_WHILE_SEARCHING_M / stated) if stated else 1.0
     wide = replace(model, record=replace(model.record, pose_effects=share * model.record.pose_effects))
@@ -92,11 +111,11 @@ def found_in(model: Model, group: IntArray, grid: SearchGrid, known: Sources, mo
     tried: FloatArray = np.zeros((0, 3))
     least = math.inf
     for _ in range(most):
-        fit, background = wide.fitted(sources, group, _SETTLED_COARSELY)
+        fit, _ = wide.fitted(sources, group, _SETTLED_COARSELY)
         at_once = _MOST_AT_ONCE
         if fit.chi2 > _WORSE * least:
             # Too many at a time led away: back, and one by one from there.
-            fit, background = wide.fitted(best, group, _SETTLED_COARSELY)
+            fit, _ = wide.fitted(best, group, _SETTLED_COARSELY)
             at_once = 1
         elif fit.chi2 < min(_PROGRESS * least, least - model.threshold):
             tried, in_vain = np.zeros((0, 3)), 0
@@ -104,7 +123,7 @@ def found_in(model: Model, group: IntArray, grid: SearchGrid, known: Sources, mo
         if in_vain > (_MOST_OF_MISFITS if fit.chi2 > _MISFIT * fit.residual.size else _MOST_IN_VAIN):
             break
         best, least = fit.sources, min(least, fit.chi2)
-        candidates = search(wide.record, background, fit, grid)
+        candidates = wide.candidates(fit.sources, grid, groups)
         # What was left out again is not tried twice, unless something else was found meanwhile.
         tried_before = (np.linalg.norm(candidates.place_m[:, None] - tried, axis=-1) < _SAME_PLACE_M).any(axis=1)
         chosen = sources_at(candidates, peaks(candidates.without(tried_before), model.threshold)[:at_once])

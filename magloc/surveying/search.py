@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -11,7 +11,7 @@ import numpy as np
 from numba import get_num_threads
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.surveying.fit.joint_fit import Background, JointFit, Sources, with_free_sources
+from magloc.surveying.fit.joint_fit import Background, Sources, residual_of, with_free_sources
 from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.fit.whitening import Whitening
 from magloc.surveying.fit.whitening_compiled import moment_columns, whiten
@@ -39,6 +39,11 @@ class Candidates:
     chi2: FloatArray
     moment_Am2: FloatArray
 
+    @classmethod
+    def joined(cls, parts: Iterable[Candidates]) -> Candidates:
+        """Those of several grids."""
+        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
+
     def without(self, which: BoolArray) -> Candidates:
         """The same with some places explaining nothing."""
         return replace(self, chi2=np.where(which, 0.0, self.chi2))
@@ -49,6 +54,12 @@ class SearchGrid:
     """Places under the sensors, in tiles of one distance."""
 
     tiles: list[tuple[float, FloatArray]]
+
+    @property
+    def levels(self) -> dict[float, SearchGrid]:
+        """The grid of every distance alone."""
+        distances = dict.fromkeys(distance for distance, _ in self.tiles)
+        return {at: SearchGrid([tile for tile in self.tiles if tile[0] == at]) for at in distances}
 
     @classmethod
     def below(cls, record: SurveyRecord, low_m: FloatArray, high_m: FloatArray) -> SearchGrid:
@@ -73,13 +84,14 @@ class SearchGrid:
         return cls(tiles)
 
 
-def search(record: SurveyRecord, background: Background, fit: JointFit, grid: SearchGrid) -> Candidates:
+def search(record: SurveyRecord, background: Background, sources: Sources, grid: SearchGrid) -> Candidates:
     """χ² of one more source at every place of a grid, with the sources so far free to move."""
     white = background.white
-    fields = fit.sources.fields(record)
+    fields = sources.fields(record)
     directions = record.directions(fields)
-    Q = with_free_sources(record, background, fit.sources)
-    left = fit.residual - Q @ (Q.T @ fit.residual)
+    Q = with_free_sources(record, background, sources)
+    residual = residual_of(record, background, fields)
+    left = residual - Q @ (Q.T @ residual)
 
     def explained(tile: tuple[float, FloatArray]) -> tuple[FloatArray, ...]:
         distance, places = tile

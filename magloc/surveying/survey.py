@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import shutil
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,10 +29,11 @@ from magloc.surveying.tiled import TiledSurvey
 from magloc.surveying.tiles import owned
 
 _LOG = logging.getLogger(__name__)
-_TRIALS_PER_M2 = 0.8  # independent ones of a map: 0.65 to 0.9
+_TRIALS = 1.25  # independent ones of a map, over its area in distances to the shallowest sources: 1.0 to 1.4
 _HECTARE_M2 = 1e4
 _MOST_SWEEPS = 5
 _MISFIT = 2.0
+_LONGEST_BODY_M = 10.0
 
 
 @one_blas_thread
@@ -43,6 +46,7 @@ def survey(
     ground_m: float = 0.0,
     shortest_geology_m: float = 15.0,
     false_per_hectare: float = 0.1,
+    body_length_m: float = 0.0,
     processes: int | None = None,
     scheduler: str | None = None,
     unfinished: str | os.PathLike[str] | None = None,
@@ -78,6 +82,8 @@ def survey(
         Shortest wavelength in the field of the ground itself [m]: smaller ones are taken for targets.
     false_per_hectare : float
         False targets that noise alone may make in a hectare, on average: decides how significant one must be.
+    body_length_m : float
+        Longest edge of what may be buried [m]: what a dipole leaves out of its field counts as noise. 0 of points.
     processes : int, optional
         That work on tiles beside each other; by default as many as compiled code has threads.
     scheduler : str, optional
@@ -117,10 +123,17 @@ def survey(
         raise ValueError(f"Input shortest_geology_m must be positive; instead received {shortest_geology_m:g}.")
     if processes is not None and processes < 1:
         raise ValueError(f"Input processes must be positive; instead received {processes}.")
+    if not 0.0 <= body_length_m <= _LONGEST_BODY_M:
+        raise ValueError(
+            f"Input body_length_m must be from 0 to {_LONGEST_BODY_M:g} m; instead received {body_length_m:g}."
+        )
     rows = readings if isinstance(readings, Readings) else joined(readings)
     assumed = array.pose is None and rows.pose_sigma is None
-    threshold = float(chdtri(3, min(0.5, false_per_hectare / (_HECTARE_M2 * _TRIALS_PER_M2))))
-    tiled = TiledSurvey.of(*whole_rows(array, rows, base), Ground(prior, ground_m, shortest_geology_m, threshold))
+    ground = Ground(prior, ground_m, shortest_geology_m, math.inf, body_length_m)
+    tiled = TiledSurvey.of(*whole_rows(array, rows, base), ground)
+    trials = _TRIALS * _HECTARE_M2 / tiled.nearest_m**2
+    threshold = float(chdtri(3, min(0.5, false_per_hectare / trials)))
+    tiled = replace(tiled, ground=replace(ground, threshold=threshold))
     tell: Callable[[str], None] = progress or (lambda _: None)
     folder = None if unfinished is None else Path(unfinished)
     every = range(len(tiled.tiles))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from arrays.typing import FloatArray
+from magloc.fields.multipole import multipole_field_matrix
 from magloc.surveying.fit.joint_fit import Background, JointFit, jacobian_of, with_free_sources
 from magloc.surveying.rounds import Model
 from magloc.surveying.search import WINDOW, groups_near, normal_equations
@@ -20,6 +21,8 @@ _NEAR = 1.5
 _MISFIT = 1.5  # χ² per reading
 _N_DEPTHS = 16
 _SPAN = 3.0  # over and under the depth, as a factor
+_N_SECOND = 9  # degrees of freedom
+_FALSE_MERGED = 0.01  # of single sources
 _STEPS = 5  # of places on each side, in thirds of a standard deviation of the position
 
 
@@ -62,6 +65,23 @@ def depth_interval(
     return low, high
 
 
+def second_source_chi2(
+    model: Model, background: Background, directions: FloatArray, Q: FloatArray, left: FloatArray, position: FloatArray
+) -> float:
+    """χ² that the quadrupole and the octupole of sources around a position would explain of what is left, a score test.
+
+    Two dipoles near each other are one at their middle with these, to third order of the gap. Q projects everything
+    else out, the source's own place too, so that 9 degrees of freedom are left of their 12.
+    """
+    record = model.record
+    fields = np.concatenate([multipole_field_matrix(record.sensors_m, position, order) for order in (2, 3)], axis=-1)
+    A = background.white(np.einsum("nci,ncij->ncj", directions, fields[:, record.array.channel_sensor]))
+    A = A / np.linalg.norm(A, axis=0)
+    A = A - Q @ (Q.T @ A)
+    size, axes = np.linalg.eigh(A.T @ A)
+    return float(np.sum((axes.T @ (A.T @ left))[-_N_SECOND:] ** 2 / size[-_N_SECOND:]))
+
+
 def targets_of(model: Model, fit: JointFit, background: Background, ground_m: float) -> dict[str, NDArray[Any]]:
     """Of all sources of a fit: the parts of targets, an entry for each."""
     sources, K = fit.sources, len(fit.sources)
@@ -75,11 +95,16 @@ def targets_of(model: Model, fit: JointFit, background: Background, ground_m: fl
     apart = np.linalg.norm(sources.position_m[:, None] - sources.position_m, axis=-1) + np.diag(np.full(K, np.inf))
     rim = np.minimum(sources.position_m - model.bounds.low_m, model.bounds.high_m - sources.position_m)
     left = (fit.residual - background.Q @ (background.Q.T @ fit.residual)).reshape(len(background.white.H), -1)
+    directions = model.record.directions(sources.fields(model.record))
+    Q = with_free_sources(model.record, background, sources)
+    free = fit.residual - Q @ (Q.T @ fit.residual)
+    second = [second_source_chi2(model, background, directions, Q, free, place) for place in sources.position_m]
     middles = model.record.sensors_m.mean(axis=1)[background.white.starts[:-1]]
     flags = {
         "weak": weak,
         "near": apart.min(axis=1, initial=np.inf) < _NEAR * depth + 0.5,
         "misfit": np.array([_misfit(model, middles, left, place) for place in sources.position_m], np.bool_),
+        "merged": np.array(second) > chdtri(_N_SECOND, _FALSE_MERGED),
         "edge": (rim[:, :2] < 0.3).any(axis=1) | (rim[:, 2] < 0.02),
     }
     words = np.array([" ".join(name for name, set_ in flags.items() if set_[j]) for j in range(K)], np.str_)

@@ -17,9 +17,10 @@ from magloc.readings import Readings
 from magloc.surveying.clock import Lag, lag_of, rows_around, taken_earlier
 from magloc.surveying.fit.joint_fit import Sources
 from magloc.surveying.fit.record import SurveyRecord
-from magloc.surveying.piece import AT_LAST, WHILE_SEARCHING, Ground, Piece
+from magloc.surveying.piece import Ground, Piece
 from magloc.surveying.pose_components import with_likeliest_pose
 from magloc.surveying.preparation import FEWEST_ROWS, record_of
+from magloc.surveying.rounds import AT_LAST, WHILE_SEARCHING
 from magloc.surveying.tiles import Tile, owned, tiles_of
 
 _LOG = logging.getLogger(__name__)
@@ -41,8 +42,8 @@ class TiledSurvey:
     readings : Readings
     ground : Ground
     tiles : sequence of Tile
-    margin_m, same_m : float
-        Width of the tiles' margins, and distance within which what two tiles find is the same.
+    margin_m, nearest_m : float
+        Width of the tiles' margins, and distance from the sensors to the shallowest sources.
     offset_T : ndarray, shape (C,)
     geology_T : float
         Of the anomalies: their medians, and how large they are.
@@ -56,7 +57,7 @@ class TiledSurvey:
     ground: Ground
     tiles: Sequence[Tile]
     margin_m: float
-    same_m: float
+    nearest_m: float
     offset_T: FloatArray
     geology_T: float
     sources: Sources
@@ -86,13 +87,18 @@ class TiledSurvey:
             ground,
             tiles,
             margin_m,
-            _SAME * (sample.height_m - float(bounds.high_m[2])),
+            sample.height_m - float(bounds.high_m[2]),
             offset,
             max(min(spread, _MOST_GEOLOGY_T), _LEAST_GEOLOGY_T),
             Sources.none(),
             [Sources.none()] * len(tiles),
             [Sources.none()] * len(tiles),
         )
+
+    @property
+    def same_m(self) -> float:
+        """Distance within which what two tiles find is one source."""
+        return _SAME * self.nearest_m
 
     def piece(self, number: int) -> Piece:
         """A tile with the sources of all."""
@@ -161,7 +167,7 @@ class TiledSurvey:
         def delayed(lag_s: float) -> SurveyRecord:
             return replace(piece, readings=taken_earlier(readings, lag_s)[own]).model().record
 
-        group = piece.groups(model.record, model.bounds, WHILE_SEARCHING)
+        group = piece.groups(model.record, WHILE_SEARCHING * model.nearest_m)
         lag = lag_of(model, self.found[number], group, delayed)
         return (replace(self, readings=taken_earlier(self.readings, lag.s)) if lag.s else self), lag
 
@@ -169,7 +175,7 @@ class TiledSurvey:
         """With the errors of the pose that the sources of a tile tell."""
         piece = self.piece(self._richest())
         model = piece.model()
-        fit, _ = model.fitted(piece.known, piece.groups(model.record, model.bounds, AT_LAST), 1e-3)
+        fit, _ = model.fitted(piece.known, piece.groups(model.record, AT_LAST * model.nearest_m), 1e-3)
         if not len(fit.sources):
             return self
         return replace(self, array=with_likeliest_pose(model, fit.sources).record.array)

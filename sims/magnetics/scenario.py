@@ -89,12 +89,17 @@ class Platform:
         It oscillates as :math:`\cos(2π f t + φ)` with a random φ; 0 = it is constant.
     noise_T : float
         White noise per axis and sample in the array's frame, the same at all sensors.
+    induced, eddy_s : float
+        Standard deviation of every component (3, 3), of each sensor, of what the ambient field induces in the platform,
+        over that field, and over its derivative in the array's axes. The nominal array states them.
     """
 
     position_m: Vector = _ZERO
     moment_Am2: Vector = _ZERO
     frequency_Hz: float = 0.0
     noise_T: float = 0.0
+    induced: float = 0.0
+    eddy_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -204,4 +209,7 @@ class MagneticScenario:
     def nominal_array(self) -> SensorArray:
         """The array as its user knows it."""
         array = nominal_array(self.array, self.models, self.rate_Hz)
+        induced, eddy_s = self.platform.induced, self.platform.eddy_s
+        sensors = [replace(sensor, induced_uncertainty=induced, eddy_uncertainty_s=eddy_s) for sensor in array.sensors]
+        array = replace(array, sensors=tuple(sensors))
         return array if array.pose is not None else replace(array, pose=self.pose)

@@ -214,7 +214,9 @@ def _pulsation(table: PulsationTable) -> Pulsation:
 
 
 def _platform(table: PlatformTable) -> Platform:
-    return Platform(table.position_m, table.moment_Am2, table.frequency_Hz, table.noise_nT / 1e9)
+    return Platform(
+        table.position_m, table.moment_Am2, table.frequency_Hz, table.noise_nT / 1e9, table.induced, table.eddy_s
+    )
 
 
 def _geology(table: GeologyTable) -> Geology:

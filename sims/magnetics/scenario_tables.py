@@ -128,6 +128,8 @@ class PlatformTable(Table, kw_only=True):
     moment_Am2: Vector = _ORIGIN
     frequency_Hz: NotNegative = 0.0
     noise_nT: NotNegative = 0.0
+    induced: NotNegative = 0.0
+    eddy_s: NotNegative = 0.0
 
 
 class MissingTable(Table, kw_only=True):

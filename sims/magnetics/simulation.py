@@ -92,7 +92,8 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
     array_pose = _pose(scenario.carrier, time_s, seed, "array")
     sensors_m = array_pose.position_m[:, None, :] + _applied(array_pose.rotation, scenario.array.positions[None])
     ambient_T = np.zeros(3) if scenario.ambient_T is None else np.array(scenario.ambient_T)
-    fields_T = np.zeros_like(sensors_m) + (ambient_T + _pulsations(scenario, time_s, seed))[:, None, :]
+    varying_T = ambient_T + _pulsations(scenario, time_s, seed)
+    fields_T = np.zeros_like(sensors_m) + varying_T[:, None, :]
     truths, poses = [], []
     for number, source in enumerate(scenario.sources, start=1):
         pose = _pose(source.carrier, time_s, seed, f"source {number}")
@@ -108,6 +109,7 @@ def simulate(scenario: MagneticScenario, seed: int) -> Simulation:
     if scenario.geology is not None:
         fields_T += scenario.geology.at(sensors_m, seed)
     fields_T = _applied(array_pose.rotation.inv(), fields_T) + _platform_fields(scenario, time_s, seed)
+    fields_T += _induced_fields(scenario, time_s, array_pose.rotation.inv().apply(varying_T), seed)
     fields_T += _stray_fields(scenario, seed)
     true_array = _true_array(scenario, seed)
     values_T = _sensed(scenario, true_array.readings_of(fields_T), seed)
@@ -224,6 +226,23 @@ def _platform_fields(scenario: MagneticScenario, time_s: FloatArray, seed: int) 
     if platform.noise_T:
         common = stream(seed, "platform noise").standard_normal((len(time_s), 1, 3))
         total += platform.noise_T * common
+    return total
+
+
+def _induced_fields(scenario: MagneticScenario, time_s: FloatArray, ambient_T: FloatArray, seed: int) -> FloatArray:
+    """Fields (n, N, 3) at the sensors of what an ambient field (n, 3) induces in the carrier, all in the array's axes.
+
+    Tolles and Lawson's induced and eddy-current terms.
+    """
+    platform, names = scenario.platform, scenario.array.ids
+    total = np.zeros((len(time_s), len(names), 3))
+    for size, cause, field_T in (
+        (platform.induced, "induced", ambient_T),
+        (platform.eddy_s, "eddy currents", np.gradient(ambient_T, time_s, axis=0) if platform.eddy_s else ambient_T),
+    ):
+        if size:
+            drawn = size * np.stack([stream(seed, cause, name).standard_normal((3, 3)) for name in names])
+            total += np.einsum("sij,nj->nsi", drawn, field_T)
     return total
 
 

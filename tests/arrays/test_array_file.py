@@ -48,8 +48,16 @@ gain_uncertainty = 0.003
 offset_uncertainty_nT = 0.5
 flicker_nT = 0.01
 drift_nT_rth = 20
+induced_uncertainty = 2e-4
+eddy_uncertainty_s = 3e-4
 """
-LASTING = {"offset_uncertainty_T": 5e-10, "flicker_T": 1e-11, "drift_T_rth": 2e-8}
+LASTING = {
+    "offset_uncertainty_T": 5e-10,
+    "flicker_T": 1e-11,
+    "drift_T_rth": 2e-8,
+    "induced_uncertainty": 2e-4,
+    "eddy_uncertainty_s": 3e-4,
+}
 WriteFile = Callable[[str | bytes], Path]
 
 

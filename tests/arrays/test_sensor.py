@@ -268,6 +268,10 @@ class TestSensor:
             ({"gain_uncertainty": -0.1}, r"Input gain_uncertainty must be from 0 to below 1; instead received -0\.1"),
             ({"gain_uncertainty": [0.1]}, r"Input gain_uncertainty must be one number; instead received \[0\.1\]"),
             (
+                {"eddy_uncertainty_s": -1e-4},
+                r"Input eddy_uncertainty_s must not be negative; instead received -0.0001",
+            ),
+            (
                 {"offset_uncertainty_T": -1e-9},
                 r"Input offset_uncertainty_T must not be negative; instead received -1e-09",
             ),

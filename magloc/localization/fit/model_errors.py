@@ -14,15 +14,13 @@ from dataclasses import replace
 import numpy as np
 
 from arrays.typing import BoolArray, FloatArray, IntArray
-from magloc.fields.multipole import finite_body_fields
+from magloc.fields.multipole import finite_body_errors
 from magloc.localization.fit.gauss_newton import JointFits, refine
 from magloc.localization.fit.optima import Optima
 from magloc.measurement.whitened import WhitenedModel
 
 DEFAULT_LENGTH = 0.25
 """Length over the distance from the nearest sensor that is assumed of a body of which nothing is said."""
-# Standard deviations of a component of the moments of rank 2 and 4, over L² and L⁴.
-_SIGMA = {2: 0.025, 4: 0.0015}
 # Sensors that are nearer than this, in circumradii of the array, where a body of default length is assumed. A source
 # that a single sensor is near to may be a fault of it.
 _NEAR, _N_NEAR = 0.6, 4
@@ -38,10 +36,7 @@ def body_errors(model: WhitenedModel, q: FloatArray, mu: FloatArray, length_m: F
     sensors = model.centroid + model.radius * model.sensors
     separation = sensors - model.position(q)[:, :, None]
     moment = np.broadcast_to(model.moment(q, mu)[:, :, None], separation.shape)
-    length = length_m[..., None, None, None]
-    fields = np.concatenate(
-        [sigma * length**rank * finite_body_fields(separation, moment, rank) for rank, sigma in _SIGMA.items()], axis=-1
-    )
+    fields = finite_body_errors(separation, moment, length_m[..., None, None, None])
     gain = model.linear_gain(model.source_fields(q, mu))
     columns = np.einsum("bcj,bkcjn->bckn", gain, fields[:, :, model.channel_sensor], optimize=True)
     return columns.reshape(*gain.shape[:2], columns.shape[2] * columns.shape[3])

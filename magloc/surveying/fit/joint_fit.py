@@ -23,6 +23,7 @@ from magloc.surveying.fit.whitening_compiled import pole_columns, source_columns
 _MOST_STEPS = 25
 _SETTLED = 1e-3
 _UNKNOWN = 1e4  # standard deviation of a column of unit length
+_NEGLIGIBLE = 0.1  # of the noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,13 +90,14 @@ class Layer:
 
 @dataclass(frozen=True, eq=False)
 class Background:
-    """What is projected out where some sources are: noise in time, the layer, and what is wrong with the sensors.
+    """What is projected out where some sources are: noise in time, the layer, what is wrong with sensors and points.
 
     Attributes
     ----------
     white : Whitening
     Q : ndarray, shape (g·k, P)
-        White columns of the layer, and of what is wrong with the sensors, times a root of the inverse of ``LᵀL + 1``.
+        White columns of the layer, of what is wrong with the sensors, and of bodies that are no points, times a root of
+        the inverse of ``LᵀL + 1``.
     """
 
     white: Whitening
@@ -115,13 +117,18 @@ class Background:
         errors: PoseErrors,
         drift: Drift,
         group: IntArray,
+        body_length_m: float = 0.0,
     ) -> Background:
-        """With errors of the pose as the field of the sources makes them felt."""
+        """With errors of the pose as the field of the sources makes them felt, and of bodies that are no points."""
         fields = sources.fields(record)
         gradients = record.gradients(sources.position_m, sources.moment_Am2)
         directions = record.directions(fields)
-        white = Whitening.of(record, record.by_pose(directions, fields, gradients), errors, drift, group)
-        columns = [layer.columns(record, directions, white), white(record.by_sensors(directions))]
+        least_T = _NEGLIGIBLE * float(record.array.channel_noise_T.min())
+        where = directions, sources.position_m, sources.moment_Am2
+        by_square = record.by_squared_shift(*where, least_T)
+        white = Whitening.of(record, record.by_pose(directions, fields, gradients), by_square, errors, drift, group)
+        wrong = record.by_sensors(directions), record.by_bodies(*where, body_length_m, least_T)
+        columns = [layer.columns(record, directions, white), *map(white, wrong)]
         return cls(white, orthogonal(np.concatenate(columns, axis=1)))
 
 
@@ -145,7 +152,7 @@ def orthogonal(L: FloatArray) -> FloatArray:
 def _times_root_of_inverse(L: FloatArray, square: FloatArray) -> FloatArray:
     """``Q`` with ``Q Qᵀ = L (A + 1)⁻¹ Lᵀ`` of some symmetric matrix ``A``."""
     factor = cho_factor(square + np.eye(L.shape[1]), lower=True)[0]
-    return np.asarray(solve_triangular(factor, L.T, lower=True, check_finite=False).T)
+    return np.asarray(L @ solve_triangular(factor, np.eye(len(factor)), lower=True, check_finite=False).T)
 
 
 @dataclass(frozen=True, eq=False)

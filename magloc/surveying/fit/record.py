@@ -11,7 +11,8 @@ then on both sides, and is projected out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -23,11 +24,13 @@ from arrays.pose import PoseUncertainty
 from arrays.typing import BoolArray, FloatArray
 from magloc.fields import dipole
 from magloc.fields.dipole_compiled import field_at_points
+from magloc.fields.multipole import finite_body_errors, finite_body_fields
 from magloc.measurement.pose import LEVER, N_POSE, SHIFT, TURN, PoseErrors, rates_of
 from magloc.navigation.rotations import cross_matrix
 from magloc.readings import Readings
 
 _SMALL_TURN = 1e-12
+_SECOND_ORDER = 2.4e-6  # field times distance⁵ over moment and squared shift, on the axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,21 +160,28 @@ class SurveyRecord:
     def by_sensors(self, directions: FloatArray) -> FloatArray:
         """Derivative (n, C, q) of the channels by what is wrong with the sensors, of unit variance.
 
-        Stray fields that turn with the array, and gains and axes of vector sensors in the ambient field.
+        Stray fields that turn with the array, what the ambient field induces in its carrier, and gains and axes of
+        vector sensors in that field: Tolles and Lawson's terms among them, of every sensor.
         """
         R, owner = self.R_world_from_array, self.array.channel_sensor
         by_field = directions @ R  # of a field in the array's axes
         body = np.einsum("nji,nj->ni", R, self.ambient_T)
+        rate = np.gradient(body, self.time_s, axis=0)
         columns = []
         for i, sensor in enumerate(self.array.sensors):
             own = (owner == i)[:, None]
             if sensor.offset_uncertainty_T:
                 columns.append(sensor.offset_uncertainty_T * np.where(own, by_field, 0.0))
-            if sensor.kind == "vector" and (sensor.misalignment_rad or sensor.gain_uncertainty):
-                size = np.full((3, 3), sensor.misalignment_rad)
-                np.fill_diagonal(size, sensor.gain_uncertainty)
-                nine = np.where(own[..., None], by_field[..., None] * (size * body[:, None, None]), 0.0)
-                columns.append(nine.reshape(len(self), -1, 9))
+            axes = np.full((3, 3), sensor.misalignment_rad)
+            np.fill_diagonal(axes, sensor.gain_uncertainty if sensor.kind == "vector" else 0.0)
+            for size, field in (
+                (axes, body),
+                (np.full((3, 3), sensor.induced_uncertainty), body),
+                (np.full((3, 3), sensor.eddy_uncertainty_s), rate),
+            ):
+                if size.any():
+                    nine = np.where(own[..., None], by_field[..., None] * (size * field[:, None, None]), 0.0)
+                    columns.append(nine.reshape(len(self), -1, 9))
         return np.concatenate(columns, axis=2) if columns else np.zeros((len(self), len(owner), 0))
 
     def by_pose(self, directions: FloatArray, fields_T: FloatArray, gradients: FloatArray) -> FloatArray:
@@ -191,6 +201,48 @@ class SurveyRecord:
         whole = changed[:, self.array.channel_sensor]
         whole[:, self.is_vector, :, TURN] += turned[:, self.array.channel_sensor[self.is_vector]]
         return np.einsum("nci,ncij->ncj", directions, whole) @ self.pose_effects
+
+    def by_squared_shift(
+        self, directions: FloatArray, position_m: FloatArray, moment_Am2: FloatArray, least_T: float
+    ) -> FloatArray:
+        r"""Derivative (n, C, 5) of the channels by the square of the pose's shift δ, of unit variance.
+
+        Its share is :math:`δ^T \nabla\nabla B δ / 2`, of the traceless part of δδᵀ alone, whose 5 components have the
+        variance 2σ⁴; no columns where it is below some field everywhere.
+        """
+        variance = np.sum(self.pose_effects[:, SHIFT] ** 2, axis=(1, 2)) / 3.0
+        fields = np.zeros((*self.sensors_m.shape, 5))
+        for near, away, moment in self._bent(position_m, moment_Am2, variance.max(initial=0.0), least_T):
+            fields[near] += finite_body_fields(away, moment, 2)
+        if not fields.any():
+            return np.zeros((*directions.shape[:2], 0))
+        at_channels = fields[:, self.array.channel_sensor]
+        return np.einsum("n,nci,ncij->ncj", math.sqrt(2.0) * variance, directions, at_channels, optimize=True)
+
+    def by_bodies(
+        self, directions: FloatArray, position_m: FloatArray, moment_Am2: FloatArray, length_m: float, least_T: float
+    ) -> FloatArray:
+        """Derivative (n, C, 14 K') of the channels by what bodies of some length are beside their dipoles, of one σ.
+
+        Of those K' for which it exceeds some field anywhere.
+        """
+        columns = [np.zeros((*directions.shape[:2], 0))]
+        for near, away, moment in self._bent(position_m, moment_Am2, 0.05 * length_m**2, least_T):
+            fields = np.zeros((*self.sensors_m.shape, 14))
+            fields[near] = finite_body_errors(away, moment, length_m)
+            columns.append(np.einsum("nci,ncij->ncj", directions, fields[:, self.array.channel_sensor]))
+        return np.concatenate(columns, axis=2)
+
+    def _bent(
+        self, position_m: FloatArray, moment_Am2: FloatArray, square_m2: float, least_T: float
+    ) -> Iterator[tuple[BoolArray, FloatArray, FloatArray]]:
+        """Sources whose second derivatives, times a square, exceed some field: where (n, N), from there, and moment."""
+        reach_m = (_SECOND_ORDER * np.linalg.norm(moment_Am2, axis=-1) * square_m2 / least_T) ** 0.2
+        for position, moment, reach in zip(position_m, moment_Am2, reach_m, strict=True):
+            away = self.sensors_m - position
+            near = np.linalg.norm(away, axis=-1) < reach
+            if near.any():
+                yield near, away[near], np.broadcast_to(moment, away[near].shape)
 
 
 def joined(parts: Sequence[Readings]) -> Readings:

@@ -17,7 +17,7 @@ import numpy as np
 
 from arrays.typing import FloatArray, IntArray
 from magloc.measurement.nuisances import without_lasting_errors
-from magloc.measurement.pose import PoseErrors
+from magloc.measurement.pose import SHIFT, PoseErrors
 from magloc.surveying.fit.record import SurveyRecord
 from magloc.surveying.fit.whitening_compiled import gains_of, whiten
 
@@ -68,24 +68,29 @@ class Whitening:
         cls,
         record: SurveyRecord,
         by_pose: FloatArray,
+        by_square: FloatArray,
         errors: PoseErrors,
         drift: Drift,
         group: IntArray,
     ) -> Whitening:
-        """Where errors of the pose change the channels by (n, C, q)."""
+        """Where errors of the pose change the channels by (n, C, q), and squares of its shift by (n, C, 5) or none."""
         U = independent_measurements(record)
         scale = np.sqrt(1.0 / np.bincount(group))
         time_s = np.bincount(group, record.time_s) * scale**2
         dt_s = np.diff(time_s, prepend=time_s[0])
-        C, q = record.array.n_channels, errors.n_states
+        by_pose = np.concatenate([by_pose, by_square], axis=2)
+        C, q = record.array.n_channels, by_pose.shape[2]
         # Offsets of the channels, and what is common to them: along the ambient field.
         H = np.zeros((len(time_s), len(U), q + C + 2))
         H[..., :q] = _summed(U @ by_pose, group, scale)
         H[..., q : q + C] = U / scale[:, None, None]
         H[..., q + C] = _summed((record.along @ U.T)[..., None], group, scale)[..., 0]
         kept, added = np.ones((len(dt_s), q + C + 2)), np.zeros((len(dt_s), q + C + 2))
-        kept[:, :q], sigma = errors.step(dt_s)
-        added[1:, :q] = sigma[1:] ** 2
+        of_pose = errors.step(dt_s)[0]
+        # A square lasts half as long.
+        squared = of_pose[:, errors.of_pose == SHIFT.start].prod(axis=1, keepdims=True) ** 2
+        kept[:, :q] = np.concatenate([of_pose, np.repeat(squared, by_square.shape[2], axis=1)], axis=1)
+        added[1:, :q] = 1.0 - kept[1:, :q] ** 2
         kept[0] = 1.0
         walk = np.array([sensor.drift_T_rth**2 / _HOUR_S for sensor in record.array.sensors]) + drift.sensor_T2_s
         added[:, q : q + C] = dt_s[:, None] * walk[record.array.channel_sensor]

@@ -18,5 +18,6 @@ def test_fields() -> None:
     assert sum(chi2 > 2.0 * fields[0].threshold for chi2 in missed) <= 1
     assert sum(field.n_false for field in fields) <= 1
     assert sum(map(holds, pairs)) >= 0.75 * len(pairs)
+    assert sum(pair.merged for pair in pairs) <= 3  # of 24 that are one, 1 in 100 each: 4 once in 10,000 times
     assert np.median([np.hypot(*pair.error_m[:2]) for pair in pairs]) < 0.04
     assert np.median([abs(pair.error_m[2]) / pair.depth_m for pair in pairs]) < 0.04

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
+import magpylib
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -12,7 +14,8 @@ from scipy.stats import ncx2
 
 import magloc
 import sims
-from arrays.typing import FloatArray
+from arrays.typing import FloatArray, IntArray
+from magloc.fields import dipole
 from magloc.surveying.fit.joint_fit import (
     Background,
     Bounds,
@@ -23,23 +26,24 @@ from magloc.surveying.fit.joint_fit import (
     residual_of,
     with_free_sources,
 )
-from magloc.surveying.piece import AT_LAST, Ground
+from magloc.surveying.piece import Ground, Piece
 from magloc.surveying.preparation import whole_rows
 from magloc.surveying.reach import DEPTHS_M, least_moments
-from magloc.surveying.rounds import Model
+from magloc.surveying.rounds import AT_LAST, Model
 from magloc.surveying.search import PITCH, WINDOW
-from magloc.surveying.targets import depth_interval
+from magloc.surveying.targets import depth_interval, second_source_chi2
 from magloc.surveying.tiled import TiledSurvey
 from sims.magnetics.paths import Lawnmower, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
 
 WEAK = ((-1.0, 1.0, -1.1), (0.1, 0.2, -0.3))
+Fitted = tuple[Model, JointFit, Background]
 STRONG = ((3.0, -2.0, -0.6), (6.0, 5.0, -8.0))
 
 
 @cache
-def fitted() -> tuple[Model, JointFit, Background]:
-    """A weak target 5 m from a strong one, fitted where they are."""
+def plot() -> Piece:
+    """A weak target 5 m from a strong one, both known."""
     whole = sims.read_scenario("survey-drone")
     assert isinstance(whole, MagneticScenario)
     assert isinstance(whole.carrier.path, Lawnmower)
@@ -50,9 +54,20 @@ def fitted() -> tuple[Model, JointFit, Background]:
     field = sims.simulate(scenario, seed=912)
     tiled = TiledSurvey.of(*whole_rows(field.array, field.readings), Ground(magloc.SourcePrior(), 0.0, 15.0, 25.0))
     place, moment = np.array([WEAK, STRONG]).transpose(1, 0, 2)
-    piece = replace(tiled, sources=Sources(place, moment)).piece(0)
+    return replace(tiled, sources=Sources(place, moment)).piece(0)
+
+
+def groups(length_m: float) -> IntArray:
+    """Rows within a length."""
+    return plot().groups(fitted()[0].record, length_m)
+
+
+@cache
+def fitted() -> Fitted:
+    """The two fitted where they are."""
+    piece = plot()
     model = piece.model()
-    return model, *model.fitted(piece.known, piece.groups(model.record, model.bounds, AT_LAST), 1e-3)
+    return model, *model.fitted(piece.known, piece.groups(model.record, AT_LAST * model.nearest_m), 1e-3)
 
 
 def test_free_sources_leave_nothing_of_themselves() -> None:
@@ -87,7 +102,7 @@ def test_the_least_moment_is_seen_with_95_percent() -> None:
     """Its χ², as of a source of a joint fit, has the tail that is promised in the worst of 300 directions."""
     model, fit, background = fitted()
     low, high = model.bounds.low_m[:2] + 1.0, model.bounds.high_m[:2] - 1.0
-    places, moments = least_moments(model, fit, background, low, high, 0.0)
+    places, moments = least_moments(model, fit.sources, groups, low, high, 0.0)
     assert sorted(set((-places[:, 2]).round(6))) == list(DEPTHS_M)
     directions = np.random.default_rng(1).normal(size=(300, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -106,13 +121,75 @@ def test_the_least_moment_is_seen_with_95_percent() -> None:
 
 def test_no_place_where_no_row_is_near() -> None:
     """Of a rectangle that goes on for 300 m: places beside the rows, where little is seen, and none far from them."""
-    model, fit, background = fitted()
+    model, fit, _ = fitted()
     far = replace(model, bounds=Bounds(model.bounds.low_m, model.bounds.high_m + 300.0 * np.eye(3)[0]))
     low, high = far.bounds.low_m[:2], far.bounds.high_m[:2]
-    places, moments = least_moments(far, fit, background, low, high, 0.0)
+    places, moments = least_moments(far, fit.sources, groups, low, high, 0.0)
     beside_m = places[:, 0] - model.bounds.high_m[0]
     deepest = model.record.height_m + DEPTHS_M[-1]
     assert 5.0 < beside_m.max() < (WINDOW + 8.0 / PITCH) * deepest  # squares of 8 by 8 places are searched at once
     assert np.isfinite(moments).all()
     assert np.median(moments[beside_m > 5.0]) > 10.0 * np.median(moments[beside_m < 0.0])
-    assert not least_moments(model, fit, background, high, high + 20.0, 0.0)[0].size  # beside all sources
+    assert not least_moments(model, fit.sources, groups, high, high + 20.0, 0.0)[0].size  # beside all sources
+
+
+def plot_of(seen: Callable[[FloatArray], FloatArray], start: Sources, body_length_m: float = 0.0) -> Fitted:
+    """A source fitted to what fields (n, N, 3) at the sensors of a small plot look like, without noise."""
+    model, _, _ = fitted()
+    values = model.record.predicted(seen(model.record.sensors_m))
+    model = replace(model, record=replace(model.record, values_T=values), body_length_m=body_length_m)
+    group = np.arange(len(model.record)) // 2
+    background = model.background(start, group)
+    return model, fit_jointly(model.record, background, start, model.bounds), background
+
+
+class TestSecondSource:
+    """Two dipoles near each other are one, a quadrupole and an octupole."""
+
+    @staticmethod
+    def chi2s(gap_m: float) -> tuple[float, float]:
+        """What the test says and what one dipole leaves of two that are some way apart."""
+        place, moment = np.array([[0.3, -0.2, -0.8]]), np.array([[6.0, -4.0, 9.0]])
+        places, moments = place + np.array([[0.5], [-0.5]]) * gap_m * np.eye(3)[:1], moment * [[0.6], [0.4]]
+        model, fit, background = plot_of(
+            lambda sensors: dipole.total_field(sensors, places, moments), Sources(place, moment)
+        )
+        directions = model.record.directions(fit.sources.fields(model.record))
+        Q = with_free_sources(model.record, background, fit.sources)
+        left = fit.residual - Q @ (Q.T @ fit.residual)
+        return second_source_chi2(model, background, directions, Q, left, fit.sources.position_m[0]), fit.chi2
+
+    @pytest.mark.parametrize("gap_m", [0.3, 0.6])
+    def test_explains_what_one_dipole_leaves(self, gap_m: float) -> None:
+        explained, left = self.chi2s(gap_m)
+        assert 0.9 * left < explained < 1.02 * left
+        assert left > 1.0
+
+    def test_one_dipole_leaves_nothing(self) -> None:
+        explained, left = self.chi2s(0.0)
+        assert explained < 1e-6
+        assert left < 1e-6
+
+
+class TestBodies:
+    """A bar that is long against its distance, its field magpylib's."""
+
+    LENGTH_M = 0.7
+    PLACE, MOMENT = np.array([0.3, -0.2, -0.5]), np.array([20.0, 0.0, -10.0])
+
+    def error2(self, body_length_m: float) -> float:
+        """Square of the position's error in its own covariance."""
+        size = np.array([self.LENGTH_M, 0.1, 0.1])
+        polarization = 4e-7 * np.pi * self.MOMENT / size.prod()
+        bar = magpylib.magnet.Cuboid(polarization=polarization, dimension=size, position=self.PLACE)
+        start = Sources(self.PLACE[None], self.MOMENT[None])
+        _, fit, _ = plot_of(
+            lambda sensors: bar.getB(sensors.reshape(-1, 3)).reshape(sensors.shape), start, body_length_m
+        )
+        error = fit.sources.position_m[0] - self.PLACE
+        return float(error @ np.linalg.solve(fit.covariance[:3, :3], error))
+
+    def test_its_length_covers_its_error(self) -> None:
+        """Without noise a right model errs by less than one σ, a point's by more than noise and pose allow."""
+        assert self.error2(self.LENGTH_M) < 1.0
+        assert self.error2(0.0) > 5.0 * self.error2(self.LENGTH_M)

@@ -179,6 +179,26 @@ class TestCommonFields:
         expected = magpylib_field(tetrahedron(1.5).positions, np.array([0.0, 0.0, 3.0]), np.array([0.1, 0.2, -0.3]))
         np.testing.assert_allclose(values, np.tile(expected.ravel(), (201, 1)), rtol=1e-12)
 
+    def test_what_the_ambient_field_induces(self) -> None:
+        """Nine numbers of each sensor for the field in the array's axes, nine for its derivative, of a stated size."""
+        ambient = (2e-6, 20e-6, -44e-6)
+        quiet, induced, eddying = (
+            simulate(scenario(carrier=MOVING, platform=Platform(**terms), sources=(), ambient_T=ambient), 1)
+            for terms in ({}, {"induced": 1e-3}, {"eddy_s": 1e-3})
+        )
+        body = quiet.readings.ambient_T
+        time_s = quiet.readings.time_s
+        sizes = []
+        for loud, cause in ((induced, body), (eddying, np.gradient(body, time_s, axis=0))):
+            added = loud.readings.values_T - quiet.readings.values_T
+            terms = np.linalg.lstsq(cause, added)[0]
+            assert np.abs(added - cause @ terms).max() < 1e-6 * np.abs(added).max()
+            sizes.append(terms.std())
+        # Of 36 numbers: once in 10,000 times beyond.
+        assert all(0.55e-3 < size < 1.5e-3 for size in sizes)
+        assert {s.induced_uncertainty for s in induced.array.sensors} == {1e-3}
+        assert {s.eddy_uncertainty_s for s in eddying.array.sensors} == {1e-3}
+
     def test_it_may_oscillate(self) -> None:
         platform = Platform((0.0, 0.0, 3.0), (0.0, 0.0, 1.0), frequency_Hz=0.5)
         values = simulate(scenario(platform=platform, sources=()), 1).readings.values_T[:, 2]

@@ -104,6 +104,77 @@ class TestDerivatives:
             np.testing.assert_allclose(found, numeric, rtol=1e-2, atol=1e-2 * np.abs(numeric).max())
 
 
+class TestCarrier:
+    """Tolles and Lawson's terms: what carries the sensors is magnetised by the field that it turns in."""
+
+    @pytest.mark.parametrize("kind", ["scalar", "vector"])
+    def test_columns_are_what_readings_have_more(self, kind: str) -> None:
+        """Permanent, induced and eddy-current fields of random coefficients, in closed form."""
+        sensor = arrays.Sensor(
+            "s",
+            kind,  # type: ignore[arg-type]  # one of the two
+            (0.0, 0.0, 0.0),
+            noise_T=1e-10,
+            offset_uncertainty_T=2e-9,
+            induced_uncertainty=1e-4,
+            eddy_uncertainty_s=3e-4,
+        )
+        array = arrays.SensorArray((sensor,), pose=POSE)
+        ambient = TURNS.inv().apply(np.tile(AMBIENT, (N, 1)))
+        coefficients = np.random.default_rng(7).standard_normal(21)
+        p, A, E = 2e-9 * coefficients[:3], 1e-4 * coefficients[3:12], 3e-4 * coefficients[12:]
+        more = p + ambient @ A.reshape(3, 3).T + np.gradient(ambient, TIME, axis=0) @ E.reshape(3, 3).T
+        rows = Readings(
+            array.readings_of((ambient + more)[:, None]),
+            time_s=TIME,
+            array_position_m=PLACES,
+            array_rotation=TURNS,
+            ambient_T=ambient,
+        )
+        record = SurveyRecord.of(array, rows, ambient, PoseErrors.of(POSE))
+        columns = record.by_sensors(record.directions(np.zeros((N, 1, 3)))) @ coefficients
+        unit = AMBIENT / np.linalg.norm(AMBIENT)
+        if kind == "vector":  # across the ambient field the mean of the sensors is zero in the turned axes
+            columns, values = columns @ unit, record.values_T @ unit
+        else:
+            columns, values = columns[:, 0], record.values_T[:, 0]
+        # But for the square of what is added over the ambient field.
+        np.testing.assert_allclose(columns, values, atol=1e-3 * np.abs(values).max())
+
+
+class TestSquaredShift:
+    """What the square of a shift adds to fields, which first order does not know."""
+
+    SIGMA_M = 1e-3
+
+    def columns(self, least_T: float) -> tuple[SurveyRecord, FloatArray]:
+        array = replace(SCALAR, pose=arrays.PoseUncertainty(self.SIGMA_M, 0.01, 0.0, 5.0))
+        record = record_of(array, readings_of(array, PLACES, TURNS))
+        return record, record.by_squared_shift(record.directions(record.fields(*SOURCE)), *SOURCE, least_T)
+
+    def test_covariance(self) -> None:
+        """That of the even part of the field over shifts that are Gaussian, by quadrature."""
+        record, found = self.columns(1e-18)
+        directions = record.directions(record.fields(*SOURCE))
+        node, weight = np.polynomial.hermite_e.hermegauss(4)
+        shifts = self.SIGMA_M * np.stack(np.meshgrid(node, node, node), axis=-1).reshape(-1, 3)
+        weights = np.prod(np.stack(np.meshgrid(weight, weight, weight), axis=-1), axis=-1).ravel() / weight.sum() ** 3
+        here = dipole.total_field(record.sensors_m, *SOURCE)
+        ends = [[dipole.total_field(record.sensors_m + s * shift, *SOURCE) for shift in shifts] for s in (1.0, -1.0)]
+        even = np.einsum("nci,qnci->qnc", directions, 0.5 * np.sum(ends, axis=0) - here)
+        expected = np.einsum("q,qna,qnb->nab", weights, even, even)
+        np.testing.assert_allclose(found @ found.mT, expected, rtol=1e-3, atol=1e-4 * expected.max())
+        np.testing.assert_allclose(weights @ even.reshape(len(weights), -1), 0.0, atol=1e-4 * np.abs(even).max())
+
+    def test_where_it_is_negligible(self) -> None:
+        """There are no columns, and none is left out that is larger than what is said."""
+        _, found = self.columns(1e-18)
+        largest = np.linalg.norm(found, axis=2).max()
+        assert self.columns(10.0 * largest)[1].shape[2] == 0
+        kept = self.columns(0.5 * largest)[1]
+        assert np.linalg.norm(found - kept, axis=2).max() < 0.5 * largest
+
+
 class TestTurns:
     def test_lay_one_along_the_other(self) -> None:
         a, b = RNG.standard_normal((2, 50, 3))
