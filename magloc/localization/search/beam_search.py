@@ -137,7 +137,7 @@ class Search:
         row = np.repeat(np.arange(len(y)), q.shape[1])
         fits = most_refined(problem.rows(row), y[row], q.reshape(-1, 1, 4), mu.reshape(-1, 1, 3))
         # Far from linear every start counts, else where none has led anywhere.
-        nowhere = ~fits.converged.reshape(len(y), -1).any(axis=1)
+        nowhere = np.asarray(~fits.converged.reshape(len(y), -1).any(axis=1))
         left = np.flatnonzero(~fits.converged & (templates | nowhere[row]))
         if left.size:
             fits.put(left, refine(problem.rows(row[left]), y[row[left]], fits.q[left], fits.mu[left]))
