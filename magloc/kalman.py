@@ -112,27 +112,14 @@ def block_update(
 ) -> tuple[FloatArray, FloatArray]:
     r"""Update by independent scalars of one linearisation at once: :func:`sequential_update` but for rounding.
 
-    Parameters
-    ----------
-    x, S, H, innovation, variance : ndarray
-        As there.
-
-    Returns
-    -------
-    x, S : ndarray
-        Updated copies.
-
-    Notes
-    -----
     With :math:`Φ = R^{-1/2} H S` and :math:`L L^T = I + Φ Φ^T` lower triangular,
     :math:`S^+ = S (I - Φ^T L^{-T} (L + I)^{-1} Φ)`: A. Andrews, "A square root formulation of the Kalman covariance
     equations", AIAA Journal 6 (1968) 1165. For one scalar it is Potter's.
     """
     phi, L = _scaled_innovation_root(S, H, variance)
-    unit = np.eye(len(L))
     solved = _solved(L, np.concatenate([phi, (innovation / np.sqrt(variance))[:, None]], axis=1))
     spread, whitened = S @ solved[:, :-1].T, solved[:, -1]
-    return x + spread @ whitened, S - spread @ _solved(L + unit, phi)
+    return x + spread @ whitened, S - spread @ _solved(L + np.eye(len(L)), phi)
 
 
 def _scaled_innovation_root(S: FloatArray, H: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
