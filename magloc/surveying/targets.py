@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +23,18 @@ _N_DEPTHS = 16
 _SPAN = 3.0  # over and under the depth, as a factor
 _N_SECOND = 9  # degrees of freedom
 _FALSE_MERGED = 0.01  # of single sources
-_STEPS = 5  # of places on each side, in thirds of a standard deviation of the position
+_SIGMAS, _STEPS = 3.0, 9  # places on the map, in standard deviations of the position
 
 
-def depth_interval(
-    model: Model, fit: JointFit, background: Background, which: int, ground_m: float
-) -> tuple[float, float]:
-    """95 % interval of the depth of a source, place and moment free, the others linear."""
+class Profile(NamedTuple):
+    """Of χ² over the places of a source: 95 % interval of its depth, and scatter (2, 2) on the map about the fit."""
+
+    depth_interval95_m: tuple[float, float]
+    scatter_m2: FloatArray
+
+
+def profile_of(model: Model, fit: JointFit, background: Background, which: int, ground_m: float) -> Profile:
+    """Of a weak source, whose place and moment are free, the others linear: places weigh as their likelihood."""
     record, white = model.record, background.white
     source = fit.sources.some(np.array([which]))
     others = fit.sources.some(np.delete(np.arange(len(fit.sources)), which))
@@ -49,20 +54,30 @@ def depth_interval(
     lowest = ground_m - model.bounds.high_m[2]
     depths = np.geomspace(max(lowest, depth / _SPAN), min(ground_m - model.bounds.low_m[2], depth * _SPAN), _N_DEPTHS)
     sigma = np.sqrt(np.diagonal(fit.covariance)[6 * which : 6 * which + 2])
-    offset = np.linspace(-1.5, 1.5, _STEPS)
-    x, y = position[0] + sigma[0] * offset, position[1] + sigma[1] * offset
-    explained = np.empty(_N_DEPTHS)
+    offset = np.linspace(-_SIGMAS, _SIGMAS, _STEPS)
+    beside = np.stack(np.meshgrid(sigma[0] * offset, sigma[1] * offset, indexing="ij"), axis=-1).reshape(-1, 2)
+    of_place = np.empty((_N_DEPTHS, len(beside)))
     for i, at in enumerate(depths):
-        places = np.stack(np.meshgrid(x, y, [ground_m - at], indexing="ij"), axis=-1).reshape(-1, 3)
+        places = np.column_stack([position[:2] + beside, np.full(len(beside), ground_m - at)])
         _, projected, v = normal_equations(record, white, directions, places, used, Q, left)
-        explained[i] = np.sum(v * np.linalg.solve(projected, v[..., None])[..., 0], axis=1).max()
+        of_place[i] = np.sum(v * np.linalg.solve(projected, v[..., None])[..., 0], axis=1)
+    weight = np.exp(0.5 * (of_place - of_place.max())).sum(axis=0)
+    scatter = (beside.T * weight) @ beside / weight.sum()
+    explained = of_place.max(axis=1)
     level = explained.max() - chdtri(1, 0.05)
     inside = np.flatnonzero(explained > level)
     low, high = (
         math.exp(np.interp(level, explained[[beyond, last]], np.log(depths[[beyond, last]])))
         for beyond, last in ((max(inside[0] - 1, 0), inside[0]), (min(inside[-1] + 1, _N_DEPTHS - 1), inside[-1]))
     )
-    return low, high
+    return Profile((low, high), scatter)
+
+
+def _scattered(covariance: FloatArray, scatter_m2: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of a source whose place on the map scatters otherwise; all else follows it as before."""
+    on_map = covariance[:2, :2]
+    follows = np.linalg.solve(on_map, covariance[:2]).T
+    return np.asarray(covariance + follows @ (scatter_m2 - on_map) @ follows.T)
 
 
 def second_source_chi2(
@@ -91,7 +106,8 @@ def targets_of(model: Model, fit: JointFit, background: Background, ground_m: fl
     interval = np.column_stack([np.maximum(0.0, depth - 1.96 * sigma), depth + 1.96 * sigma])
     weak = significance < _WEAK
     for j in np.flatnonzero(weak):
-        interval[j] = depth_interval(model, fit, background, int(j), ground_m)
+        interval[j], scatter = profile_of(model, fit, background, int(j), ground_m)
+        covariance[j] = _scattered(covariance[j], scatter)
     apart = np.linalg.norm(sources.position_m[:, None] - sources.position_m, axis=-1) + np.diag(np.full(K, np.inf))
     rim = np.minimum(sources.position_m - model.bounds.low_m, model.bounds.high_m - sources.position_m)
     left = (fit.residual - background.Q @ (background.Q.T @ fit.residual)).reshape(len(background.white.H), -1)

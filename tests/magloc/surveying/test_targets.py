@@ -31,7 +31,7 @@ from magloc.surveying.preparation import whole_rows
 from magloc.surveying.reach import DEPTHS_M, least_moments
 from magloc.surveying.rounds import AT_LAST, Model
 from magloc.surveying.search import PITCH, WINDOW
-from magloc.surveying.targets import depth_interval, second_source_chi2
+from magloc.surveying.targets import profile_of, second_source_chi2
 from magloc.surveying.tiled import TiledSurvey
 from sims.magnetics.paths import Lawnmower, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
@@ -93,9 +93,16 @@ def test_at_its_ends_a_depth_interval_costs_what_chance_does() -> None:
 
     found = np.concatenate([fit.sources.position_m, fit.sources.moment_Am2], axis=1)
     assert np.sum(residual(np.delete(found, 2), -found[0, 2]) ** 2) == pytest.approx(fit.chi2)
-    for depth in depth_interval(model, fit, background, 0, 0.0):
+    for depth in profile_of(model, fit, background, 0, 0.0).depth_interval95_m:
         there = least_squares(residual, np.delete(found, 2), x_scale="jac", args=(depth,))
         assert 2.0 * there.cost - fit.chi2 == pytest.approx(3.84, abs=0.5)
+
+
+def test_where_places_are_gaussian_their_scatter_is_the_covariance() -> None:
+    """That of a strong source, whose likelihood is Gaussian."""
+    model, fit, background = fitted()
+    scatter = profile_of(model, fit, background, 1, 0.0).scatter_m2
+    np.testing.assert_allclose(scatter, fit.covariance[6:8, 6:8], atol=0.15 * scatter.max())
 
 
 def test_the_least_moment_is_seen_with_95_percent() -> None:
