@@ -36,10 +36,14 @@ def comes_from_outside(headers: Headers) -> bool:
     return origins != [f"http://{hosts[0]}"] and not (may_be_silent and not origins)
 
 
-# Until it has connected, viser's page says that it is inactive, as if nothing were to come.
-_CONNECTING = """<style>.tabler-icon-player-pause { display: none; }</style>
+# Until it has connected, viser's page says that it is inactive, as if nothing were to come. On a phone its panel lies
+# over the scene, and is folded at first by a click on its title: the server's word to fold it reaches wider pages only.
+_ADDED = """<style>.tabler-icon-player-pause { display: none; }</style>
 <script>
+let isToFold = matchMedia('(max-width: 36em)').matches;
 const waiting = setInterval(() => {
+  const title = isToFold && document.querySelector('[style*="cursor: pointer"][style*="height: 3.5em"]');
+  if (title) { title.click(); isToFold = false; }
   const said = document.evaluate("//text()[. = 'Inactive']", document, null, 6, null);
   for (let i = 0; i < said.snapshotLength; i++) said.snapshotItem(i).data = "Connecting…";
 }, 30);
@@ -49,7 +53,7 @@ setTimeout(() => clearInterval(waiting), 60000);
 
 
 def _say_what_it_waits_for(page: Response) -> None:
-    """Let a page of viser say that it is connecting."""
+    """Let a page of viser say that it is connecting, and fold its panel on a phone."""
     page.body = _with_words(bytes(page.body), page.headers.get("Content-Encoding") == "gzip")
     del page.headers["Content-Length"]
     page.headers["Content-Length"] = str(len(page.body))
@@ -57,7 +61,7 @@ def _say_what_it_waits_for(page: Response) -> None:
 
 @lru_cache(maxsize=4)
 def _with_words(body: bytes, compressed: bool) -> bytes:
-    return gzip.compress(gzip.decompress(body) + _CONNECTING) if compressed else body + _CONNECTING
+    return gzip.compress(gzip.decompress(body) + _ADDED) if compressed else body + _ADDED
 
 
 def guarded_server(**options: Any) -> viser.ViserServer:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import rich
 import viser
 
@@ -17,7 +18,8 @@ from arrays.io.errors import InputError
 from arrays.io.text import replaced, write_text
 from magloc.viewer.chromium import BrowserError, Chromium
 from magloc.viewer.origin import guarded_server
-from magloc.viewer.scene.legend import ABOVE_THE_PLAYER, with_legend
+from magloc.viewer.scene.framing import ASPECT
+from magloc.viewer.scene.legend import ABOVE_THE_PLAYER, NARROW_PX, with_legend
 
 if TYPE_CHECKING:
     from magloc.viewer.pages.pages import Page
@@ -66,10 +68,28 @@ def opened(port: int, title: str) -> Iterator[viser.ViserServer]:
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(_PANEL_PX)
+        server.on_client_connect(_steps_back(server))
         yield server
     finally:
         with _silent():
             server.stop()
+
+
+def _steps_back(server: viser.ViserServer) -> Callable[[viser.ClientHandle], None]:
+    """Let a page as narrow as a phone see from farther back what a wider one shows from the first camera."""
+    first = server.initial_camera
+
+    def step_back(camera: viser.CameraHandle) -> None:
+        farther = ASPECT * camera.image_height / camera.image_width
+        if camera.image_width < NARROW_PX and farther > 1.0 and np.allclose(camera.position, first.position, rtol=1e-3):
+            camera.position = first.look_at + farther * (first.position - first.look_at)
+            camera.look_at = first.look_at  # a camera that moves takes it along
+
+    def connected(client: viser.ClientHandle) -> None:
+        client.camera.on_update(step_back)  # the page may take the first camera after it has connected
+        step_back(client.camera)
+
+    return connected
 
 
 @contextmanager

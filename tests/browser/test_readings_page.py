@@ -21,6 +21,8 @@ ARRAY = tetrahedron(1.5)
 POSITIONS = np.stack([np.linspace(-2.0, 2.0, 9), np.full(9, 2.0), np.full(9, 0.5)], axis=-1)
 MOMENT = np.array([0.0, 0.0, 80.0])
 ORANGE = hue_of(DIPOLE_COLOUR)
+# Height of the sheet that viser lays over the scene on a phone.
+PANEL_PX = """document.querySelector('[style*="max-height: 60%"]').getBoundingClientRect().height"""
 
 
 @pytest.fixture(scope="module")
@@ -61,3 +63,23 @@ class TestReadings:
         """viser's page says "Inactive" until it has connected."""
         screen.evaluate("document.body.append(Object.assign(document.createElement('p'), {innerText: 'Inactive'}))")
         screen.until(lambda: "Connecting…" in screen.text() and "Inactive" not in screen.text(), "it connects")
+
+    def test_on_a_phone_all_is_in_view_and_the_panel_folded(self, screen: Screen, server: viser.ViserServer) -> None:
+        shape = {"deviceScaleFactor": 1, "mobile": False}
+        screen.leave()
+        screen.browser.call("Emulation.setDeviceMetricsOverride", width=390, height=844, **shape)
+        try:
+            screen.open(f"http://127.0.0.1:{server.get_port()}")
+            away = np.linalg.norm(np.asarray(server.initial_camera.position) - server.initial_camera.look_at)
+
+            def stepped_back() -> bool:
+                cameras = [client.camera for client in server.get_clients().values()]
+                return any(np.linalg.norm(camera.position - camera.look_at) > 2.0 * away for camera in cameras)
+
+            screen.until(stepped_back, "the camera steps back")
+            screen.until(lambda: screen.evaluate(PANEL_PX) < 100.0, "the panel folds")
+            camera = screen.live_camera(server)
+            screen.until_seen(Sight("fixes", camera.pixels(POSITIONS[1:-1]), hue_of(FIT_COLOUR), share=0.7))
+            screen.keep("readings-phone")
+        finally:
+            screen.browser.call("Emulation.setDeviceMetricsOverride", width=1280, height=800, **shape)

@@ -26,7 +26,8 @@ RESIDUALS = "residuals of the differences"
 TICKED, ALL = "those ticked", "all"
 # Okabe and Ito, without yellow, which is not seen on white.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#666666")
-_DASHES: dict[str, tuple[float, ...]] = {"x": (), "y": (6.0, 3.0), "z": (2.0, 2.0), "": ()}
+# Opacities of the axes. Dashes of noise take a browser without a graphics card a second a picture, and cannot be told.
+_SHADES = {"x": "", "y": "a6", "z": "59", "": ""}
 _MOST_POINTS = 400
 _MOST_CHANNELS_AT_FIRST = 12
 
@@ -193,7 +194,7 @@ class ReadingsPlot:
         series = [uplot.Series(label="time [s]")]
         for column, i in enumerate(chosen):
             channel = self._channels[i]
-            colour = _COLOURS[self._ids.index(channel.sensor) % len(_COLOURS)]
+            colour = _COLOURS[self._ids.index(channel.sensor) % len(_COLOURS)] + _SHADES[channel.axis]
             broken = bool(np.isnan(values[:, column]).any())
             series.append(_series(channel, colour, broken=broken))
         series.append(uplot.Series(label="now", scale="mark", stroke="#000000", width=1.5, points={"show": False}))
@@ -279,6 +280,4 @@ def _series(channel: Channel, colour: str, *, broken: bool) -> uplot.Series:
         return uplot.Series(
             label=channel.label, stroke=colour, width=0.0, points={"show": True, "size": 3.0, "fill": colour}
         )
-    return uplot.Series(
-        label=channel.label, stroke=colour, width=1.2, dash=_DASHES[channel.axis], points={"show": False}
-    )
+    return uplot.Series(label=channel.label, stroke=colour, width=1.2, points={"show": False})

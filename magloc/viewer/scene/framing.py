@@ -15,7 +15,8 @@ from magloc.viewer.scene.glyphs import round_length
 _FIELD_OF_VIEW_RAD = np.radians(40.0)
 # From where the first camera looks: from the front right, from above.
 _TOWARDS_CAMERA = np.array([0.55, -0.72, 0.42])
-_ASPECT = 1.15  # of the scene beside the panel, about
+ASPECT = 1.15
+"""Of the scene beside the panel, about."""
 _MARGIN = 1.12
 _CELLS_PER_RADIUS = 4.0
 _FLOOR_RADII = 3.0
@@ -124,7 +125,7 @@ def aim(server: viser.ViserServer, extent: Extent) -> None:
     across, up, towards = axes @ (extent.points_m - extent.centre_m).T
     # A point is in view if it is no farther from the axis than the field of view is wide at its depth.
     tangent = np.tan(0.5 * _FIELD_OF_VIEW_RAD) / _MARGIN
-    distance = np.max(towards + np.maximum(np.abs(up) / tangent, np.abs(across) / (_ASPECT * tangent)))
+    distance = np.max(towards + np.maximum(np.abs(up) / tangent, np.abs(across) / (ASPECT * tangent)))
     camera = server.initial_camera
     camera.fov = float(_FIELD_OF_VIEW_RAD)
     camera.position = extent.centre_m + max(float(distance), 0.5 * extent.radius_m) * back

@@ -9,7 +9,8 @@ from html import escape
 Colour = tuple[int, int, int]
 ABOVE_THE_PLAYER = "4em"
 """Where the legend stands on a page that plays."""
-_NARROW_PX = 600  # of a page whose legend is folded at first, for it would hide the scene
+NARROW_PX = 600
+"""Of a page whose legend or panel is folded at first, for it would hide the scene."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,7 @@ def with_legend(
         'pointer-events:none">'
         '<summary style="font-weight:600;padding:.5em .6em .2em;pointer-events:auto;cursor:pointer">'
         f"{escape(title)}</summary>{legend_html(entries, notes)}</details>"
-        f"<script>document.getElementById('legend').open = innerWidth > {_NARROW_PX}</script>"
+        f"<script>document.getElementById('legend').open = innerWidth > {NARROW_PX}</script>"
     )
     before, end, after = page.rpartition("</body>")
     if script:
