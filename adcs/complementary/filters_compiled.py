@@ -19,6 +19,7 @@ from adcs.satellite.dynamics_compiled import (
     combined,
     conjugate,
     cross,
+    dot,
     error_vector,
     multiply,
     normalised,
@@ -94,12 +95,6 @@ def unit(v: Vector) -> Vector:
     """Vector of length 1; NaN stays NaN."""
     inverse = 1.0 / np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     return v[0] * inverse, v[1] * inverse, v[2] * inverse
-
-
-@compiled
-def dot(a: Vector, b: Vector) -> float:
-    """Product a·b."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @compiled

@@ -20,6 +20,7 @@ from adcs.satellite.dynamics_compiled import (
     Vector,
     applied,
     cross,
+    dot,
     error_jacobian,
     error_vector,
     multiply,
@@ -164,14 +165,14 @@ def _with_reading(
         axes = rotate_back(q, (1.0, 0.0, 0.0)), rotate_back(q, (0.0, 1.0, 0.0)), rotate_back(q, (0.0, 0.0, 1.0))
     if sensor == 0:
         e_q, W = error_vector(q, quaternion_at(reading)), whitening
-        residual = gate.dot(vector_at(W[0]), e_q), gate.dot(vector_at(W[1]), e_q), gate.dot(vector_at(W[2]), e_q)
+        residual = dot(vector_at(W[0]), e_q), dot(vector_at(W[1]), e_q), dot(vector_at(W[2]), e_q)
     elif sensor == 1:
         residual, bias = _minus(_minus(vector_at(reading), _at(x, 4)), _at(x, 10)), firsts[1]
     else:
         v = rotate_back(q, model)
         residual = _minus(vector_at(reading), v)
         if g >= 0:
-            residual = _minus(residual, (gate.dot(_at(x, 22), v), gate.dot(_at(x, 25), v), gate.dot(_at(x, 28), v)))
+            residual = _minus(residual, (dot(_at(x, 22), v), dot(_at(x, 25), v), dot(_at(x, 28), v)))
         if sensor == 2:
             residual, bias = _minus(residual, _at(x, 7)), firsts[0]
     nis, determinant = 0.0, 1.0
@@ -200,11 +201,11 @@ def _with_reading(
             m += 1
         if e >= 0:
             for k in range(3):
-                columns[m + k], h[m + k] = e + k, gate.dot(row, axes[k]) if g >= 0 else axes[k][j]
+                columns[m + k], h[m + k] = e + k, dot(row, axes[k]) if g >= 0 else axes[k][j]
             m += 3
         squared, s = scalar(one.P, one.dx, h, columns, m, residual[j], r, work.u, work.A)
         nis, determinant = nis + squared, determinant * (s / r)
-    length = 0.0 if sensor < 2 else np.sqrt(gate.dot(v, v))
+    length = 0.0 if sensor < 2 else np.sqrt(dot(v, v))
     return nis, gate.eased(nis, r, length, one.attitude_variance[0]), np.log(determinant)
 
 

@@ -112,6 +112,12 @@ def combined(a: Vector, scale: float, b: Vector) -> Vector:
 
 
 @compiled
+def dot(a: Vector, b: Vector) -> float:
+    """Product a·b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled
 def cross(a: Vector, b: Vector) -> Vector:
     """Vector a×b."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

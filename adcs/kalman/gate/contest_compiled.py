@@ -21,7 +21,7 @@ from adcs.kalman.gate.contest import (
     SUN,
     WORSE,
 )
-from adcs.satellite.dynamics_compiled import Quaternion, Vector, cross, multiply, normalised, rotate_back
+from adcs.satellite.dynamics_compiled import Quaternion, Vector, cross, dot, multiply, normalised, rotate_back
 from magloc.compilation import compiled
 
 Array = NDArray[np.float64]
@@ -178,9 +178,3 @@ def turned_about(q: Quaternion, axis: Vector, body: Vector, reference: Vector) -
 def eased(nis: float, variance: float, length: float, attitude_variance: float) -> float:
     """NIS of a direction of some length, at least, with the error of linearising it."""
     return nis * variance / (variance + (2.0 * attitude_variance * length) ** 2)
-
-
-@compiled
-def dot(a: Vector, b: Vector) -> float:
-    """Scalar product."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
