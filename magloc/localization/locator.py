@@ -36,9 +36,9 @@ from magloc.localization.search.single_source import N_UNKNOWNS, SingleSourceSea
 from magloc.localization.uncertainty.covariance import solutions_of
 from magloc.localization.uncertainty.pose_covariance import pose_covariances
 from magloc.localization.uncertainty.range_interval import is_detected
+from magloc.measurement.plausibility import warn_of_doubts
 from magloc.measurement.pose import PosesOfRows, with_stated_pose
 from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, checked_rows, whitened_rows
-from magloc.plausibility import warn_of_doubts
 from magloc.readings import Readings, as_readings, without_saturated
 
 if TYPE_CHECKING:

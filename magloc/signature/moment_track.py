@@ -17,8 +17,8 @@ from magloc.chi_square import mean_bounds, normalised_square
 from magloc.kalman import estimability
 from magloc.localization.fit.results import is_misfit
 from magloc.measurement.nuisances import Drift
+from magloc.measurement.plausibility import usable_readings
 from magloc.navigation.rotations import cross_matrix, rotation_matrix
-from magloc.plausibility import usable_readings
 from magloc.readings import Readings
 from magloc.signature.moment_filter import (
     Basis,

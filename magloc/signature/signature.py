@@ -27,7 +27,7 @@ from arrays.typing import FloatArray
 from magloc.blas_threads import one_blas_thread
 from magloc.fields import dipole
 from magloc.localization.fit.results import is_misfit
-from magloc.plausibility import usable_readings
+from magloc.measurement.plausibility import usable_readings
 from magloc.readings import Readings, as_readings
 from magloc.signature.files import lines_of_signature
 from magloc.signature.moment_filter import Basis, settled

@@ -19,7 +19,7 @@ from arrays.array import SensorArray
 from magloc.blas_threads import one_blas_thread
 from magloc.grids.work import Arrays, workers
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
-from magloc.plausibility import warn_of_doubts
+from magloc.measurement.plausibility import warn_of_doubts
 from magloc.readings import Readings
 from magloc.surveying.fit.record import joined
 from magloc.surveying.piece import OF_ROWS, Ground, sources_in, strongest_in, targets_in

@@ -14,7 +14,7 @@ from arrays.array import SensorArray
 from arrays.io.lazy import by_name
 from arrays.typing import FloatArray
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
-from magloc.plausibility import usable_readings
+from magloc.measurement.plausibility import usable_readings
 from magloc.readings import Readings
 from magloc.tracking.multi_target.files import lines_of_sources
 from magloc.tracking.multi_target.motion import FreeMotion

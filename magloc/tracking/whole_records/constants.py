@@ -26,7 +26,7 @@ from magloc.tracking.whole_records.background import settled_steps
 
 _LEAST_KNOWN = 1e-6
 """A direction of the constants counts of which the rows tell a variance of more."""
-USUAL_AMBIENT_T = 300e-9
+_USUAL_AMBIENT_T = 300e-9
 """Of an ambient field that is called exact: crust and storms make it wrong by some 100 nT."""
 
 
@@ -80,7 +80,7 @@ def _with_constants(array: SensorArray) -> SensorArray:
         constants = {key: getattr(usual, key) for key in ("position_constant_m", "attitude_constant_rad")}
         array = replace(array, pose=replace(pose, **constants))
     if array.channel_is_scalar.any() and not array.ambient_uncertainty_T:
-        array = replace(array, ambient_uncertainty_T=USUAL_AMBIENT_T)
+        array = replace(array, ambient_uncertainty_T=_USUAL_AMBIENT_T)
     return array
 
 

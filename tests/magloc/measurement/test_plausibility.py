@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 import magloc
 import sims
 from arrays.array import SensorArray
-from magloc.plausibility import doubts, noise_ratio
+from magloc.measurement.plausibility import doubts, noise_ratio
 from magloc.readings import Readings
 from tests.passing_source import ARRAY, moving_source, readings_of
 
