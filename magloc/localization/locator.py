@@ -36,6 +36,7 @@ from magloc.localization.search.single_source import N_UNKNOWNS, SingleSourceSea
 from magloc.localization.uncertainty.covariance import solutions_of
 from magloc.localization.uncertainty.pose_covariance import pose_covariances
 from magloc.localization.uncertainty.range_interval import is_detected
+from magloc.measurement.plausibility import warn_of_doubts
 from magloc.measurement.pose import PosesOfRows, with_stated_pose
 from magloc.measurement.rows import NO_SIGNAL, WhitenedRows, checked_rows, whitened_rows
 from magloc.readings import Readings, as_readings, without_saturated
@@ -348,11 +349,15 @@ def locate(
            [-0.049, -0.048,  0.118]])
     """
     measured = as_readings(readings)
+    if ambient_T is not None:
+        of_rows = np.broadcast_to(np.asarray(ambient_T, dtype=np.float64), (len(measured), 3))
+        measured = replace(measured, ambient_T=of_rows)
+    warn_of_doubts(array, measured)
     n_complete = int(complete_rows(without_saturated(measured, array)).sum()) if average else 0
     if 0 < n_complete < len(measured):
         _LOG.info(f"note: {n_complete} of {len(measured)} rows are averaged, the others miss some readings")
     rows, array, saturated = used_rows(measured, array, average=average)
-    ambient = rows.ambient_T if ambient_T is None else np.broadcast_to(np.asarray(ambient_T, float), (len(rows), 3))
+    ambient = rows.ambient_T
     pose = rows.pose
     place = None if position_m is None else _places_in_array(position_m, pose)
     stated = with_stated_pose(array, rows).pose

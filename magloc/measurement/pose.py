@@ -223,6 +223,11 @@ class PoseErrors:
         """Whether every one is a constant of the mounting or of the lever arm (n,)."""
         return np.asarray(~self.changes & (self.of_pose < FIELD.start))
 
+    @property
+    def of_field(self) -> BoolArray:
+        """Whether every one is a constant of the ambient field (n,)."""
+        return np.asarray(~self.changes & (self.of_pose >= FIELD.start) & (self.of_pose < N_POSE))
+
     def step(self, dt_s: float | FloatArray) -> tuple[FloatArray, FloatArray]:
         """What remains of every error after steps (...), and the standard deviation of what is added: (..., n) each."""
         lasts = self.lasts_s > 0.0

@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.io.errors import InputError
 from arrays.typing import FloatArray
-from magloc.ambient import in_world_field
 from magloc.blas_threads import one_blas_thread
 from magloc.chi_square import mean_bounds, normalised_square
 from magloc.kalman import estimability
 from magloc.localization.fit.results import is_misfit
 from magloc.measurement.nuisances import Drift
+from magloc.measurement.plausibility import usable_readings
 from magloc.navigation.rotations import cross_matrix, rotation_matrix
-from magloc.readings import Readings, as_readings, without_saturated
+from magloc.readings import Readings
 from magloc.signature.moment_filter import (
     Basis,
     MomentModel,
@@ -205,7 +205,7 @@ def track_moment(
     >>> magloc.track_moment(array, readings_T, [5.0, 0.0, 0.3]).moment_Am2[-1, 1:].round(1)
     array([ 10., 300.])
     """
-    used = in_world_field(without_saturated(as_readings(readings), array), array)
+    used = usable_readings(array, readings)
     position_m, rotations, used = known_rows(used, path)
     (found,) = _tracks(array, used, position_m[:, None], rotations, turn_rad_s, path_error, smooth=smooth)
     return found
@@ -255,7 +255,7 @@ def track_moments(
     >>> first.moment_Am2[-1, 2].round(4), second.moment_Am2[-1, 1].round(4)
     (np.float64(0.01), np.float64(0.02))
     """
-    used = in_world_field(without_saturated(as_readings(readings), array), array)
+    used = usable_readings(array, readings)
     places = np.asarray(positions_m, dtype=np.float64)
     if places.ndim != 2 or places.shape[1] != 3 or not len(places) or not np.isfinite(places).all():
         raise ValueError(f"Input positions_m must be finite, of shape (K, 3); instead received {places.tolist()}.")

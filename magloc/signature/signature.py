@@ -24,11 +24,11 @@ from arrays.array import SensorArray
 from arrays.io.errors import InputError
 from arrays.io.lazy import by_name
 from arrays.typing import FloatArray
-from magloc.ambient import in_world_field
 from magloc.blas_threads import one_blas_thread
 from magloc.fields import dipole
 from magloc.localization.fit.results import is_misfit
-from magloc.readings import Readings, as_readings, without_saturated
+from magloc.measurement.plausibility import usable_readings
+from magloc.readings import Readings, as_readings
 from magloc.signature.files import lines_of_signature
 from magloc.signature.moment_filter import Basis, settled
 from magloc.signature.moment_track import EXACT, goodness, known_rows, moment_model, turning_basis
@@ -326,7 +326,7 @@ def fit_signature(
         raise ValueError("Input readings must all have the array's pose, or none; instead some have it.")
     used, positions, rotations, fields, rates = [], [], [], [], []
     for measured, of_part in zip(passes, paths, strict=True):
-        part = in_world_field(without_saturated(measured, array), array)
+        part = usable_readings(array, measured)
         position, rotation, rows = known_rows(part, of_part.along_course())
         if rotation is None:
             raise ValueError("Input path must have an attitude; instead it has none.")  # along_course gives one

@@ -19,6 +19,7 @@ from arrays.array import SensorArray
 from magloc.blas_threads import one_blas_thread
 from magloc.grids.work import Arrays, workers
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
+from magloc.measurement.plausibility import warn_of_doubts
 from magloc.readings import Readings
 from magloc.surveying.fit.record import joined
 from magloc.surveying.piece import OF_ROWS, Ground, sources_in, strongest_in, targets_in
@@ -128,6 +129,7 @@ def survey(
             f"Input body_length_m must be from 0 to {_LONGEST_BODY_M:g} m; instead received {body_length_m:g}."
         )
     rows = readings if isinstance(readings, Readings) else joined(readings)
+    warn_of_doubts(array, rows)
     assumed = array.pose is None and rows.pose_sigma is None
     ground = Ground(prior, ground_m, shortest_geology_m, math.inf, body_length_m)
     tiled = TiledSurvey.of(*whole_rows(array, rows, base), ground)

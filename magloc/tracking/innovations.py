@@ -15,6 +15,9 @@ from magloc.tracking.results import TrackPoint
 THRESHOLD = 3.3
 """Standard deviations that a sum may be above its mean: 1 right track in 2,000 is beyond it."""
 
+MATTERS = 2.0
+"""Times their standard deviations that errors would be by what is not stated, from which on that is told."""
+
 FEWEST_STARTS = 3
 """Rows in which tracks begin that say something of the record, and not of its end."""
 
@@ -35,6 +38,11 @@ class InnovationTest:
     z_constants : float
         Of the lever arm and the mounting that the rows tell of, where a pose is stated and these count as exact: too
         large, they are not. NaN elsewhere.
+    z_ambient : float
+        The same of the ambient field of scalar sensors, where it counts as exact.
+    ambient_factor : float
+        How many times their standard deviations errors of the last row would be, rms, if that field were wrong by
+        300 nT per axis.
     starts : int
         Rows in which a track begins.
     """
@@ -43,6 +51,8 @@ class InnovationTest:
     z_chi2: float
     z_lag1: float
     z_constants: float = math.nan
+    z_ambient: float = math.nan
+    ambient_factor: float = math.nan
     starts: int = 0
 
     @property
@@ -51,9 +61,13 @@ class InnovationTest:
         return self.starts >= FEWEST_STARTS and self.starts > self.rows
 
     @property
+    def _sums(self) -> tuple[float, ...]:
+        return self.z_chi2, self.z_lag1, self.z_constants, self.z_ambient
+
+    @property
     def flagged(self) -> bool:
         """Whether one of them is beyond the threshold, or rows tell nothing of each other."""
-        return self.is_disjoint or any(z > THRESHOLD for z in (self.z_chi2, self.z_lag1, self.z_constants))
+        return self.is_disjoint or any(z > THRESHOLD for z in self._sums)
 
     @property
     def reason(self) -> str:
@@ -68,6 +82,9 @@ class InnovationTest:
         if self.z_constants > THRESHOLD:
             what = f"the rows agree on another mounting or lever arm than the exact one (z = {self.z_constants:.1f})"
             why = "position_constant_m and attitude_constant_deg of the pose are stated too small"
+        elif self.z_ambient > THRESHOLD:
+            what = f"the rows agree on another ambient field than the exact one (z = {self.z_ambient:.1f})"
+            why = "ambient_uncertainty_nT is stated too small"
         elif self.z_lag1 > THRESHOLD:
             what = f"innovations of successive rows are alike (z = {self.z_lag1:.1f})"
             why = (
@@ -77,6 +94,16 @@ class InnovationTest:
             what = f"innovations are larger than is stated (z = {self.z_chi2:.1f})"
             why = "errors of the pose, noise or a motion that are not stated"
         return f"{what}: {why}; the standard deviations are too small"
+
+    @property
+    def caution(self) -> str:
+        """What may be wrong and could not be seen, in a sentence; empty where it would not matter."""
+        if not self.ambient_factor > MATTERS:
+            return ""
+        return (
+            "the ambient field counts as exact: were it wrong by 300 nT, errors would be about"
+            f" {self.ambient_factor:.2g} times their standard deviations; state ambient_uncertainty_nT"
+        )
 
     @property
     def json(self) -> dict[str, object]:

@@ -16,14 +16,14 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.io.lazy import by_name
 from arrays.typing import BoolArray, FloatArray, IntArray, Vector
-from magloc.ambient import in_world_field
 from magloc.blas_threads import one_blas_thread
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import EVERYWHERE, Intervals
 from magloc.measurement.nuisances import Drift
+from magloc.measurement.plausibility import usable_readings
 from magloc.measurement.pose import with_stated_pose
 from magloc.navigation.measured_motion import MeasuredMotion
-from magloc.readings import Readings, as_readings, without_saturated
+from magloc.readings import Readings
 from magloc.tracking.batch import track_record
 from magloc.tracking.consistency import Consistency, consistency
 from magloc.tracking.files import dataset_of_track, geojson_of_track, kml_of_track, lines_of_track
@@ -33,7 +33,7 @@ from magloc.tracking.posterior_bound import posterior_bound, smoothing_bound
 from magloc.tracking.results import Row, TrackPoint, rows_of, stacked
 from magloc.tracking.tracker import Tracker
 from magloc.tracking.whole_records.background import track_on_background
-from magloc.tracking.whole_records.constants import constants_score
+from magloc.tracking.whole_records.constants import constants_test
 from magloc.tracking.whole_records.smoother import smoothed
 from magloc.truth import Truth, truth_of_rows
 
@@ -207,13 +207,16 @@ class Track(TrackColumns):
     @cached_property
     def innovations(self) -> InnovationTest:
         """Whether the readings agree with what is stated of sensors, pose and motion."""
-        constants = constants_score(self.tracker, self._rows, self.points)
-        return replace(innovation_test(self), z_constants=constants)
+        test = innovation_test(self)
+        if self.readings.background or self.readings.motion is not None:  # whose states the test does not have
+            return test
+        exact = constants_test(self.tracker, self._rows, self.points)
+        return replace(test, z_constants=exact.mounting, z_ambient=exact.field, ambient_factor=exact.field_factor)
 
     def table(self) -> str:
         """The table that ``magloc track`` prints, and what is wrong with the track."""
-        reason = self.innovations.reason
-        return super().table() + (f"\n{reason}" if reason else "")
+        test = self.innovations
+        return "\n".join([super().table(), *filter(None, (test.reason, test.caution))])
 
     @one_blas_thread
     def consistency(self, truth: Truth) -> Consistency:
@@ -288,7 +291,7 @@ def track(
     >>> round(float(track.position_m[-1, 2]), 1)
     -0.6
     """
-    used = in_world_field(without_saturated(as_readings(readings), array), array)
+    used = usable_readings(array, readings)
     if motion is None:
         lasting = (smooth or used.background) and used.motion is None
         motion = (OrnsteinUhlenbeck if lasting else RandomWalk)(SPEED_M_S, TURN_RAD_S)

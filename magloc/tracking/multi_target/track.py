@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from arrays.array import SensorArray
 from arrays.io.lazy import by_name
 from arrays.typing import FloatArray
-from magloc.ambient import in_world_field
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
-from magloc.readings import Readings, as_readings, without_saturated
+from magloc.measurement.plausibility import usable_readings
+from magloc.readings import Readings
 from magloc.tracking.multi_target.files import lines_of_sources
 from magloc.tracking.multi_target.motion import FreeMotion
 from magloc.tracking.multi_target.results import SourcesPoint
@@ -177,7 +177,7 @@ def track_sources(
     >>> track.ids, len(track)
     ((1,), 30)
     """
-    used = in_world_field(without_saturated(as_readings(readings), array), array)
+    used = usable_readings(array, readings)
     if used.background or used.motion is not None:
         raise ValueError("Input readings must have neither a background nor measured velocities for several sources.")
     tracker = SourcesTracker(array, sources=sources, motion=motion, prior=prior)

@@ -1,7 +1,7 @@
-r"""Whether a track that counts its mounting as exact has a mounting that is not.
+r"""Whether a track that counts its mounting, or the ambient field of its moduli, as exact has one that is not.
 
-The record is fitted once more with constant errors of the pose as unknowns c of unit prior variance. Were they zero,
-what is found of them would be spread by :math:`P - P^2`, with their covariance P after all rows: a Wald test.
+The record is fitted once more with their constant errors as unknowns c of unit prior variance. Were they zero, what is
+found of them would be spread by :math:`P - P^2`, with their covariance P after all rows: a Wald test.
 """
 
 from __future__ import annotations
@@ -9,11 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc, ndtri
 
+from arrays.array import SensorArray
 from arrays.pose import PoseUncertainty
+from arrays.typing import BoolArray, FloatArray
 from magloc.localization.uncertainty.range_interval import relative_range_sigma
 from magloc.tracking.acquisition import START_RANGE_ERROR
 from magloc.tracking.motion import N_SOURCE
@@ -23,35 +26,67 @@ from magloc.tracking.whole_records.background import settled_steps
 
 _LEAST_KNOWN = 1e-6
 """A direction of the constants counts of which the rows tell a variance of more."""
+_USUAL_AMBIENT_T = 300e-9
+"""Of an ambient field that is called exact: crust and storms make it wrong by some 100 nT."""
 
 
-def constants_score(tracker: Tracker, rows: Sequence[Row], points: Sequence[TrackPoint]) -> float:
-    """How far beyond zero a lever arm and a mounting are that count as exact, as a standard normal number.
+class ConstantsTest(NamedTuple):
+    """How far beyond zero constants are that count as exact, as standard normal numbers; NaN of what does not.
 
-    NaN where they do not, or where the rows of the last track do not settle. Its first rows do not count, until the
-    range is known: states from which nothing settles.
+    Those of lever arm and mounting, and those of the ambient field of moduli; and how many times their standard
+    deviations errors of the last row would be, rms, if it were as wrong as it may be.
     """
-    stated = tracker.array.pose
-    if stated is None or stated.position_constant_m or stated.attitude_constant_rad:
-        return math.nan
-    usual = PoseUncertainty()
-    constants = {key: getattr(usual, key) for key in ("position_constant_m", "attitude_constant_rad")}
-    wider = Tracker(replace(tracker.array, pose=replace(stated, **constants)), tracker.motion)
+
+    mounting: float = math.nan
+    field: float = math.nan
+    field_factor: float = math.nan
+
+
+def constants_test(tracker: Tracker, rows: Sequence[Row], points: Sequence[TrackPoint]) -> ConstantsTest:
+    """The test of a track; of NaN where nothing counts as exact, or where the rows of the last track do not settle.
+
+    Its first rows do not count, until the range is known: states from which nothing settles.
+    """
+    array = _with_constants(tracker.array)
     known = [i for i, point in enumerate(points) if point.is_on_track]
-    if not known:
-        return math.nan
+    if array is tracker.array or not known:
+        return ConstantsTest()
+    wider = Tracker(array, tracker.motion)
     begin = max(i for i in known if points[i].status == "acquired" or i == known[0])
     rest = np.zeros(wider.motion.n_states - N_SOURCE + wider.n_errors)
     used = [(rows[i], points[i]) for i in known if i >= begin and _is_placed(points[i])]
     if not used:
-        return math.nan
+        return ConstantsTest()
     states = [np.concatenate([point.position_m, point.moment_Am2, rest]) for _, point in used]
     steps = settled_steps(wider, [row for row, _ in used], states)
     if steps is None:
-        return math.nan
-    errors = wider.pose_errors
-    is_constant = np.concatenate([np.zeros(rest.size + N_SOURCE - errors.n_states, dtype=bool), errors.of_mounting])
-    found, root = steps[-1].x[is_constant], steps[-1].S[is_constant]
+        return ConstantsTest()
+    errors, own = wider.pose_errors, tracker.pose_errors
+    of_errors = steps[-1].x[-errors.n_states :], steps[-1].S[-errors.n_states :]
+    mounting = math.nan if own.of_mounting.any() else _score(*of_errors, errors.of_mounting)
+    if own.of_field.any() or not errors.of_field.any():
+        return ConstantsTest(mounting)
+    claimed, source, field = used[-1][1].covariance, steps[-1].S[:N_SOURCE], of_errors[1][errors.of_field]
+    assert claimed is not None
+    shift = source @ np.linalg.pinv(field)  # of the source by errors of unit variance that are taken for zero
+    factor = math.sqrt(1.0 + float(np.trace(np.linalg.solve(claimed, shift @ shift.T))) / N_SOURCE)
+    return ConstantsTest(mounting, _score(*of_errors, errors.of_field), factor)
+
+
+def _with_constants(array: SensorArray) -> SensorArray:
+    """The array where what counts as exact has its usual errors; itself where nothing does."""
+    pose, usual = array.pose, PoseUncertainty()
+    if pose is not None and not pose.position_constant_m and not pose.attitude_constant_rad:
+        constants = {key: getattr(usual, key) for key in ("position_constant_m", "attitude_constant_rad")}
+        array = replace(array, pose=replace(pose, **constants))
+    if array.channel_is_scalar.any() and not array.ambient_uncertainty_T:
+        array = replace(array, ambient_uncertainty_T=_USUAL_AMBIENT_T)
+    return array
+
+
+def _score(x: FloatArray, S: FloatArray, which: BoolArray) -> float:
+    """Of some states of unit prior variance, found with a covariance S Sᵀ; NaN where the rows tell nothing of them."""
+    found, root = x[which], S[which]
     left, axes = np.linalg.eigh(root @ root.T)
     spread = left * (1.0 - left)
     told = spread > _LEAST_KNOWN

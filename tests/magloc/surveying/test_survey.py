@@ -162,6 +162,20 @@ class TestHostileWorld:
         noise = 20.0 * field.array.channel_noise_T * rng.standard_normal(field.readings.values_T.shape)
         self.check(replace(field.readings, values_T=field.readings.values_T + noise), caplog, "χ² per reading")
 
+    def test_another_unit(self, caplog: pytest.LogCaptureFixture) -> None:
+        readings = simulated("survey-drone", 901).readings
+        found = self.check(replace(readings, values_T=readings.values_T / 1000.0), caplog, "are they in nT")
+        assert not len(found)
+
+    @pytest.mark.slow
+    def test_a_heading_error(self, caplog: pytest.LogCaptureFixture) -> None:
+        """5 nT that go with the course, the upper sensor's a half more."""
+        readings = simulated("survey-drone", 901).readings
+        assert readings.array_rotation is not None
+        heading = readings.array_rotation.as_euler("ZYX")[:, 0]
+        error = 5e-9 * np.outer(np.cos(heading), [1.0, 0.5])
+        self.check(replace(readings, values_T=readings.values_T + error), caplog, "χ² per reading")
+
     @pytest.mark.slow
     def test_poses_that_are_worse_than_is_stated(self, caplog: pytest.LogCaptureFixture) -> None:
         readings, rng = simulated("survey-drone", 901).readings, np.random.default_rng(13)

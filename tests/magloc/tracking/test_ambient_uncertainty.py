@@ -16,6 +16,7 @@ from scipy import stats
 import magloc
 from arrays.array import SensorArray
 from arrays.sensor import Sensor
+from magloc.tracking.innovations import THRESHOLD
 from magloc.tracking.track import Track
 from sims.magnetics.paths import Attitude, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
@@ -73,6 +74,33 @@ class TestNotStated:
     def test_is_far_outside_of_what_is_claimed(self) -> None:
         squares = [nees(*run(seed, 200e-9, stated=False)) for seed in range(4)]
         assert np.mean(squares) > 100.0 * 6
+
+    def test_is_told_of_in_every_record(self) -> None:
+        """Of what errors of 300 nT would do; whether they are there, the rows cannot always tell."""
+        for constant_T in (0.0, 200e-9):
+            test = run(5, constant_T, stated=False)[1].innovations
+            assert constant_T or not test.flagged  # right tracks are once in 1,000
+            assert "were it wrong by 300 nT" in test.caution
+
+    def test_rows_that_see_it_say_so(self) -> None:
+        """Errors of 500 nT, of which every second record or more sees enough."""
+        tests = [run(seed, 500e-9, stated=False)[1].innovations for seed in range(4)]
+        seen = [test.reason for test in tests if test.z_ambient > THRESHOLD]
+        assert seen
+        assert all("another ambient field" in reason for reason in seen)
+
+    @pytest.mark.slow
+    def test_told_size_is_that_of_the_errors(self) -> None:
+        """rms of 6 numbers of 20 runs, driven by three normal ones each: within a factor of 1.6 at 1 in 1,000."""
+        runs = [run(seed, 300e-9, stated=False) for seed in range(20)]
+        told = np.mean([track.innovations.ambient_factor for _, track in runs])
+        rms = math.sqrt(np.mean([nees(*one) for one in runs]) / 6.0)
+        assert told / 1.6 < rms < told * 1.6
+
+    def test_is_not_told_of_where_it_is_stated(self) -> None:
+        test = run(5, 200e-9)[1].innovations
+        assert math.isnan(test.z_ambient)
+        assert not test.caution
 
 
 class TestSimulated:
