@@ -102,17 +102,22 @@ pictures: .venv/installed-test chromium
 test-oldest: .venv-oldest/installed chromium
 	.venv-oldest/bin/python -m pytest -q -n 2 -m "not slow"
 
-.venv/installed: pyproject.toml constraints.txt
+.venv/made: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("magloc needs Python 3.11 or newer, found " + sys.version.split()[0]) if sys.version_info < (3, 11) else None'
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(MAKE_VENV) .venv >/dev/null 2>&1 || \
 		{ $(MAKE_VENV) --without-pip .venv && $(PYTHON) -m pip --python $(BIN)/python install --quiet pip; } >/dev/null 2>&1 || \
 		{ echo "magloc needs Python's venv and pip: on Debian and Ubuntu, apt-get install python3-venv" >&2; exit 1; }
+	@touch $@
+
+.venv/installed: .venv/made
 	$(PIP) install --constraint constraints.txt --editable '.[maps]'
 	@touch $@
 
-.venv/installed-test: .venv/installed
-	$(PIP) install --constraint constraints.txt --editable '.[test]'
-	@touch $@
+# All at once: one after the other, what both need would be looked up twice. A module is compiled when a test imports
+# it: pip would compile all of them, three quarters for nothing.
+.venv/installed-test: .venv/made
+	$(PIP) install --no-compile --constraint constraints.txt --editable '.[test]'
+	@touch .venv/installed $@
 
 .venv/installed-bench: .venv/installed-test
 	$(PIP) install --constraint constraints.txt --editable '.[test,bench]'
