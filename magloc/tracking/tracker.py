@@ -37,7 +37,7 @@ from magloc.tracking.acquisition import STACKED_POSITION_ERROR, Acquisition
 from magloc.tracking.acquisition import Start as RowsStart
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.row import ChartRow
-from magloc.tracking.chart.start import prior_root
+from magloc.tracking.chart.start import NO_DIPOLE, prior_root
 from magloc.tracking.chart.steps import LARGEST_WIDTH, ChartFilter, Known, RowUpdate, cartesian, charted, width_of
 from magloc.tracking.measurement import RowMeasurement, RowMeasurements
 from magloc.tracking.motion import N_SOURCE, MotionModel
@@ -148,7 +148,7 @@ class Tracker:
         index, self._n_rows = self._n_rows, self._n_rows + 1
         out = self._health.dead
         if self._known is None:
-            point = self._started(self._seen(row, out), index)
+            out, point = self._started(row, index)
         else:
             out, point = self._followed(self._known, row, index, dt_s)
         names = (name for name, is_out in zip(self.array.ids, out, strict=True) if is_out)
@@ -273,17 +273,23 @@ class Tracker:
         centroid_m = row.origin_m + row.R_world_from_array @ self.array.centroid
         return TrackPoint(row.time_s, status=reason, centroid_m=centroid_m, radius_m=self.array.circumradius)
 
-    def _started(self, seen: ChartRow, index: int, near: Mixture | None = None) -> TrackPoint:
-        """A new track, if one can be started."""
-        self._known = None
+    def _started(self, row: Row, index: int, near: Mixture | None = None) -> tuple[BoolArray, TrackPoint]:
+        """A new track, if one can be started, and the sensors (N,) that were left out of the row."""
+        self._known, out = None, self._health.dead
+        seen = self._seen(row, out)
         if seen.z.size < N_SOURCE:
-            return self._acquired(seen, index)
+            return out, self._acquired(seen, index)
         mixture, reason = self.filter.started(seen, self.motion, near)
+        if reason == NO_DIPOLE and (faulty := self.filter.faulty(seen)).sum() == 1:
+            seen = self._seen(row, out | faulty)
+            mixture, _ = self.filter.started(seen, self.motion, near)
+            out = out if mixture is None else out | faulty
         if mixture is None:
-            return self._lost(seen.row, reason)
+            return out, self._lost(seen.row, reason)
+        self._judge(row, out, lambda row: math.inf if self.filter.of_row(row, self.motion)[0] is None else 0.0)
         open_loop = self.known_before(seen, mixture.matched().x[0])
         known = self.filter.refitted(Known(mixture, open_loop, young=((seen, self.motion),)))
-        return self._kept(seen.row, index, known, None, status="acquired")
+        return out, self._kept(seen.row, index, known, None, status="acquired")
 
     def _seen(self, row: Row, out: BoolArray) -> ChartRow:
         """What a row says without some of its sensors (N,)."""
@@ -303,7 +309,7 @@ class Tracker:
         if width_of(predicted) > LARGEST_WIDTH:
             # The prediction says too little for an iteration to start from it.
             if self.filter.is_detected(seen):
-                return dead, self._started(seen, index, predicted.matched())
+                return self._started(row, index, predicted.matched())
             return dead, self._kept(seen.row, index, known, prediction, status="predicted")
 
         def updated(of_row: ChartRow) -> RowUpdate:
@@ -319,16 +325,11 @@ class Tracker:
         if update.mixture is None:
             contradictions = before.contradictions + (not of_sensor)
             if contradictions >= ROWS_TO_LOSE:
-                return dead, self._started(seen, index)
+                return self._started(row, index)
             known = replace(known, contradictions=contradictions)
             point = self._kept(seen.row, index, known, prediction, status="outlier", innovation=innovation)
             return dead, replace(point, nis=update.nis)
-        of_dead = np.full(len(dead), np.inf)
-        for sensor in np.flatnonzero(dead):
-            with_it = self._seen(row, out & (np.arange(len(out)) != sensor))
-            if with_it.row.available.sum() > innovation.available.sum():
-                of_dead[sensor] = updated(with_it).nis - update.nis
-        self._health = self._health.after(np.full((len(dead), 3), np.nan), out, of_dead)
+        self._judge(row, out, lambda with_it: updated(with_it).nis - update.nis)
         known = replace(known, mixture=update.mixture, contradictions=0)
         if before.young:
             young = (*before.young, (seen, self.motion))
@@ -342,6 +343,13 @@ class Tracker:
             innovation=innovation,
             iterations=update.iterations,
         )
+
+    def _judge(self, row: Row, out: BoolArray, excess: Callable[[ChartRow], float]) -> None:
+        """Count a row without some sensors (N,), and the χ² that each dead one with readings would add to it."""
+        of_dead, read = np.full(len(out), np.inf), np.unique(self.array.channel_sensor[row.available])
+        for sensor in np.intersect1d(np.flatnonzero(self._health.dead), read):
+            of_dead[sensor] = excess(self._seen(row, out & (np.arange(len(out)) != sensor)))
+        self._health = self._health.after(np.full((len(out), 3), np.nan), out, of_dead)
 
     def _without_one(
         self, update: RowUpdate, updated: Callable[[BoolArray], RowUpdate]
@@ -413,13 +421,6 @@ class Tracker:
         heaviest = mixture.x[np.argmax(mixture.log_weight)]
         point = of_mixture(seen.row.time_s, mixture, np.diagonal(self.known_before(seen, heaviest)))
         return replace(point, status=UNDETERMINED)
-
-    def _range_error(self, x: FloatArray, S: FloatArray, measurement: RowMeasurement) -> float:
-        """Standard deviation of the range over the range."""
-        offset, root = measurement.place_in_array(x, S)
-        square = float(offset @ offset)
-        along = offset @ root
-        return math.sqrt(float(along @ along)) / square if square > 0.0 else math.inf
 
 
 def learned(variance: FloatArray, open_loop: FloatArray) -> FloatArray:

@@ -32,6 +32,7 @@ from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixt
 from magloc.tracking.chart.row import ChartRow
 from magloc.tracking.chart.update import Updated, updated
 from magloc.tracking.motion import N_SOURCE, MotionModel
+from magloc.tracking.results import Row
 
 OF_PITCH = 0.6
 """Standard deviations of a cell, in units of the grid's pitch: neighbours add up to an even density."""
@@ -55,6 +56,7 @@ _MOST_BENT = 100.0
 _VALLEY = 4.0
 _SIGMA_PRIOR = (math.log(FARTHEST / NEAREST) / math.sqrt(12.0), 1.0, 1.0)
 NOT_ALLOWED = "not acquired: no source of the stated region and moment explains the readings"
+NO_DIPOLE = "not acquired: no dipole fits the readings"
 
 
 def prior_root(chart: Chart) -> FloatArray:
@@ -138,8 +140,10 @@ class Start:
         self.errors, self.prior = errors, prior
         self._grid = _Grid.of(array)
         self._locator: Locator | None = None
+        self._examiner: Locator | None = None
         if decorrelated_differences(array).n_differences >= N_SOURCE:
             self._locator = Locator(array, prior=prior, body_length_m=0.0, exclude_faulty=False)
+            self._examiner = Locator(array, prior=prior)
 
     def mixture(self, measurement: ChartRow, motion: MotionModel) -> tuple[Mixture | None, str]:
         """What one row says of a source and of the pose's errors, or why there is none."""
@@ -165,11 +169,16 @@ class Start:
             return None, NOT_ALLOWED
         dof = measurement.z.size - N_SOURCE
         if dof > 0 and found.chi2[sound].min() > chdtri(dof, CONTRADICTION):
-            return None, "not acquired: no dipole fits the readings"
+            return None, NO_DIPOLE
         log_weight = found.log_evidence + _EVEN * ((seeds.cell < 0) @ np.array([1.0, 2.0, 0.0]))
         log_weight -= math.log(2.0) * seeds.cell[:, 2]
         mixture = _mixture(found, log_weight, measurement)
         return mixture.take(sound).take(once(mixture.take(sound), seeds.cell[sound])), ""
+
+    def faulty(self, row: Row) -> BoolArray:
+        """Sensors (N,) that contradict all others, as a fix of the row names them."""
+        dropped = () if self._examiner is None else self._examiner.fit(row.readings_T, row.ambient_T).dropped_sensors
+        return np.isin(self.errors.array.ids, dropped)
 
     def _seeds(self, measurement: ChartRow) -> _Seeds:
         """Chosen cells, and the row's best fits."""

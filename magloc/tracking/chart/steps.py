@@ -16,7 +16,7 @@ from scipy.special import chdtri
 
 from arrays.array import SensorArray
 from arrays.differences import decorrelated_differences
-from arrays.typing import FloatArray, IntArray
+from arrays.typing import BoolArray, FloatArray, IntArray
 from magloc.levels import CONTRADICTION
 from magloc.localization.fit.prior import SourcePrior
 from magloc.measurement.nuisances import SensorErrors
@@ -121,6 +121,10 @@ class ChartFilter:
     def of_row(self, row: ChartRow, motion: MotionModel) -> tuple[Mixture | None, str]:
         """What one row alone says of a source and the pose, by every cell that explains it, or why it says nothing."""
         return self._start.mixture(row, self._posed(motion))
+
+    def faulty(self, row: ChartRow) -> BoolArray:
+        """Sensors (N,) that contradict all others in a row that no dipole fits."""
+        return self._start.faulty(row.row)
 
     def _posed(self, motion: MotionModel) -> MotionModel:
         return PosedMotion.of(motion, self.pose_errors)

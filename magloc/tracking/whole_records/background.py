@@ -129,7 +129,7 @@ def _warn_of_a_pull(tracker: Tracker, measurements: Sequence[RowMeasurement], pa
     where a source is farther and stronger, moves more and reads alike: it matters if the range went by more than its σ.
     """
     states = [x for x, _ in smoothed_states(passed.steps)]
-    sigma = [tracker._range_error(step.x, step.S, m) for step, m in zip(passed.steps, measurements, strict=True)]
+    sigma = [_range_error(step.x, step.S, m) for step, m in zip(passed.steps, measurements, strict=True)]
     log_number = []
     for apart in (-_APART, _APART):
         moved = [_farther(state, m, apart) for state, m in zip(states, measurements, strict=True)]
@@ -257,7 +257,7 @@ def _points(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _P
         row, innovation = measurement.row, passed.innovations[j]
         if j:
             open_loop = tracker.open_loop(open_loop, passed.steps[j - 1].x, row.time_s - measurements[j - 1].row.time_s)
-        range_error = tracker._range_error(step.x, step.S, measurement)
+        range_error = _range_error(step.x, step.S, measurement)
         if range_error > (LARGEST_RANGE_ERROR if tracked else _FIRST_RANGE_ERROR):
             tracked, last = False, None
             points.append(tracker._lost(row, "not acquired: the range is not certain enough"))
@@ -270,3 +270,11 @@ def _points(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _P
         points.append(replace(point, iterations=1, status=status if tracked else "acquired", **told))
         tracked = True
     return points
+
+
+def _range_error(x: FloatArray, S: FloatArray, measurement: RowMeasurement) -> float:
+    """Standard deviation of the range over the range."""
+    offset, root = measurement.place_in_array(x, S)
+    square = float(offset @ offset)
+    along = offset @ root
+    return math.sqrt(float(along @ along)) / square if square > 0.0 else math.inf

@@ -10,6 +10,8 @@ from arrays import geometries
 from arrays.array import SensorArray
 from magloc.measurement.differences import predicted_channels
 from magloc.tracking.batch import track_record
+from magloc.tracking.chart.start import NO_DIPOLE
+from magloc.tracking.motion import RandomWalk
 from magloc.tracking.results import TrackPoint
 from magloc.tracking.sensor_health import ROWS_TO_RETURN, Suspects
 from magloc.tracking.tracker import Tracker
@@ -23,6 +25,7 @@ from tests.passing_source import (
     positions,
     readings_of,
     rows_from,
+    statuses,
 )
 
 FloatArray = NDArray[np.float64]
@@ -112,6 +115,38 @@ class TestFaultySensor:
             ratio.append(rms(points, truth) / rms(tracked(told), truth))
         print(f"{fault}, {array.n_sensors} sensors: rms over told {np.median(ratio):.3f}, at most {max(ratio):.3f}")
         assert np.median(ratio) < 1.1
+
+
+class TestFaultySensorOfRowsAlone:
+    """A source that may be anywhere after a row: every row is acquired anew, and none is tracked."""
+
+    def points(self, n: int, fault: str = "", others_T: FloatArray | float = 0.0) -> list[TrackPoint]:
+        """Of n rows, of which the third to the sixth may have a fault."""
+        rng = np.random.default_rng(3)
+        direction, moment = rng.normal(size=(2, n, 3))
+        place = CUBE.centroid + 3.0 * direction / np.linalg.norm(direction, axis=1)[:, None]
+        values = readings_of(CUBE, place, 100.0 * moment) + others_T
+        if fault:
+            values = with_fault(fault, values, slice(2, 6), slice(6, 9), rng)
+        points = followed(Tracker(CUBE, RandomWalk(50.0, 5.0)), rows_from(np.arange(float(n)), values))
+        if not np.any(others_T):
+            np.testing.assert_allclose(positions(points), place, atol=0.1)
+        return points
+
+    @pytest.mark.parametrize("fault", ["stuck", "noisy"])
+    def test_is_named_left_out_and_taken_back(self, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("magloc.tracking.sensor_health.ROWS_TO_RETURN", 2)
+        points = self.points(9, fault)
+        assert statuses(points) == ["acquired"] * 9
+        assert [point.dropped_sensors for point in points] == [()] * 2 + [("s3",)] * 6 + [()]
+
+    def test_none_is_named_where_none_is_wrong(self) -> None:
+        assert {point.dropped_sensors for point in self.points(6)} == {()}
+
+    def test_none_is_named_for_a_second_source(self) -> None:
+        second = predicted_channels(CUBE, np.array([-2.0, 1.0, 1.0]), np.array([100.0, -60.0, 80.0]))
+        points = self.points(2, others_T=second)
+        assert {(point.status, point.dropped_sensors) for point in points} == {(NO_DIPOLE, ())}
 
 
 def rms(points: list[TrackPoint], truth: FloatArray) -> float:
