@@ -155,7 +155,9 @@ class SensorErrors:
         n = len(self.of_sensor)
         if n:
             sensor, column = self.of_sensor.T
-            of_axes = np.concatenate([calibration_errors(array, readings_T), _of_fields(array)], axis=-1)
+            known = (column >= _FIELD).all()
+            of_axes = np.zeros((array.n_sensors, 3, _FIELD)) if known else calibration_errors(array, readings_T)
+            of_axes = np.concatenate([of_axes, _of_fields(array)], axis=-1)
             channel = array.sensor_channels[sensor]
             state, axis = np.nonzero(channel >= 0)
             effect[channel[state, axis], state] = of_axes[sensor[state], axis, column[state]]

@@ -150,7 +150,7 @@ def updated(
         stale[moved] = True
     R = np.asarray(np.linalg.qr(J, mode="r"))
     log_N = 2.0 * np.sum(np.log(np.abs(np.diagonal(R, axis1=-2, axis2=-1))), axis=1)
-    x_after, S_after = problem.posterior(zeta, R)
+    x_after, S_after = problem.posterior(zeta, residual, R)
     # A start that leads nowhere may end where nothing is a number.
     with np.errstate(all="ignore"):
         converged &= np.isfinite(S_after).all(axis=(1, 2)) & (np.abs(np.linalg.det(S_after[:, :n, :n])) > 0.0)
@@ -287,8 +287,8 @@ class _Problem:
         """Derivative (K, k, n) of the source's differences, in units of their noise, by its coordinates."""
         return measurement.along(*self.chart.linearised(e))
 
-    def posterior(self, zeta: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """States and roots, where R (K, n, n) is the upper root of the information about ζ."""
+    def posterior(self, zeta: FloatArray, residual: FloatArray, R: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """States and roots, by misfits (K, k + n) at ζ and the upper root R (K, n, n) of the information about it."""
         n, e = self.measurement.n_motion, self.e(zeta)
         x = self.x.copy()
         x[:, :n] = self.chart.retracted(e)
@@ -297,17 +297,16 @@ class _Problem:
         if self.whiten is None:
             root = np.linalg.solve(np.swapaxes(R, -1, -2), np.swapaxes(self.U, -1, -2))
             return x, turned @ np.swapaxes(root, -1, -2)
-        return self._posterior_of_errors(x, zeta, e, turned)
+        return self._posterior_of_errors(x, residual, e, turned)
 
     def _posterior_of_errors(
-        self, x: FloatArray, zeta: FloatArray, e: FloatArray, turned: FloatArray
+        self, x: FloatArray, residual: FloatArray, e: FloatArray, turned: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         n, k = self.measurement.n_motion, self.z.shape[1]
         assert self.whiten is not None
         D = self.S[:, n:, n:]
         phi = self.measurement.effect @ D
         share = np.asarray(np.linalg.solve(self.U, self.S[:, :n, n:]))
-        residual = self.residual(zeta)
         left, standard = _T(self.whiten) @ residual[:, :k, None], -residual[:, k:, None]
         of_source = standard - share @ (_T(phi) @ left)
         x[:, n:] += (D @ (_T(share) @ of_source + _T(phi) @ left))[..., 0]
@@ -321,7 +320,8 @@ class _Problem:
         A_after = _T(np.asarray(np.linalg.solve(_T(R), _T(A))))
         seen = H @ B + phi
         # Where the source is not known by itself, its share of the readings is noise to the errors.
-        theta = np.asarray(np.linalg.solve(np.linalg.cholesky(one + HA @ _T(HA)), seen))
+        axes, length, _ = np.linalg.svd(HA, full_matrices=False)
+        theta = seen + axes @ ((1.0 / np.sqrt(1.0 + length**2) - 1.0)[..., None] * (_T(axes) @ seen))
         root = np.asarray(np.linalg.cholesky(one + theta @ _T(theta)))
         back = np.linalg.solve(_T(root), np.linalg.solve(root + one, theta))
         B = B - A_after @ (_T(A_after) @ (_T(H) @ seen))

@@ -218,6 +218,15 @@ class TestEffect:
         vector = ~array.channel_is_scalar
         np.testing.assert_allclose(effect[vector], whole[vector], rtol=1e-9, atol=1e-15)
 
+    def test_of_fields_is_the_same_where_turns_and_gains_are_known(self) -> None:
+        array = mixed_array()
+        readings = array.readings_of(np.tile(AMBIENT_T, (3, 1)))
+        every = SensorErrors.of(array)
+        whole = every.effect(array, readings)
+        known = SensorErrors.of(with_errors(array, misalignment_rad=0.0, gain_uncertainty=0.0))
+        is_left = np.append(every.of_sensor[:, 1] >= 6, np.ones(len(every.of_channel), dtype=bool))
+        np.testing.assert_array_equal(known.effect(known.array, readings), whole[:, is_left])
+
 
 def uncalibrated(array: SensorArray, rng: np.random.Generator) -> tuple[FloatArray, SensorArray]:
     """Errors drawn from what an array of vector sensors states of turns, and the array that has them."""
