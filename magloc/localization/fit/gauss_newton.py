@@ -196,12 +196,12 @@ def refine(
     free source by less than that of :func:`refined`. Where the sources' moments are free compiled twins do it: of
     vector sensors, which begin with the moments that fit best, and of one source by any sensors.
     """
+    free = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
     fits = most_refined(problem, y, q, mu, free=free, max_iterations=max_iterations, promise=promise)
     lost = np.flatnonzero(~fits.converged)
-    if lost.size and problem.channel_is_scalar.any():
-        every = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
+    if lost.size and _is_relinearised(problem, free):
         at, left = problem.rows(lost), fits.rows(lost)
-        fits.put(lost, damped_gauss_newton(at, y[lost], left.q, left.mu, every, max_iterations, promise))
+        fits.put(lost, damped_gauss_newton(at, y[lost], left.q, left.mu, free, max_iterations, promise))
     return fits
 
 
@@ -217,14 +217,13 @@ def most_refined(
 ) -> JointFits:
     """:func:`refine`, but one source by moduli that are far from linear may be left where it stands."""
     free = np.ones((q.shape[1], 3), dtype=bool) if free is None else free
+    if _is_relinearised(problem, free):
+        return _relinearised(problem, y, q, mu, float(free[0, 2]), max_iterations, promise)
     linear = problem.known is None and not problem.channel_is_scalar.any()
-    if problem.known is None and q.shape[1] == 1 and free[0, :2].all():
-        if not linear:
-            return _relinearised(problem, y, q, mu, float(free[0, 2]), max_iterations, promise)
-        if free.all():
-            found = refined(problem, y, q[:, 0], max_iterations)
-            chi2 = np.where(found.converged, found.chi2, np.inf)
-            return JointFits(found.q[:, None], found.mu[:, None], chi2, found.iterations)
+    if linear and q.shape[1] == 1 and free.all():
+        found = refined(problem, y, q[:, 0], max_iterations)
+        chi2 = np.where(found.converged, found.chi2, np.inf)
+        return JointFits(found.q[:, None], found.mu[:, None], chi2, found.iterations)
     if linear and free.any():
         ends = JointEnds(own(q), own(mu), np.empty(len(q)), np.empty(len(q), dtype=np.int64))
         small = (promise, PROMISE_RELATIVE)
@@ -233,6 +232,11 @@ def most_refined(
         )
         return JointFits(*ends)
     return damped_gauss_newton(problem, y, q, mu, free, max_iterations, promise)
+
+
+def _is_relinearised(problem: WhitenedModel, free: NDArray[np.bool_]) -> bool:
+    """Whether :func:`_relinearised` refines: one source of free direction and moment, by scalar sensors too."""
+    return bool(problem.known is None and problem.channel_is_scalar.any() and len(free) == 1 and free[0, :2].all())
 
 
 def _relinearised(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from arrays.typing import FloatArray
 from magloc.directions import hemisphere
-from magloc.localization.fit.gauss_newton import JointFits, fit_moments, most_refined, refine
+from magloc.localization.fit.gauss_newton import JointFits, fit_moments, refine
 from magloc.localization.search.candidates import (
     LastBases,
     SingleArray,
@@ -135,12 +135,7 @@ class Search:
             starts.append(self._template_starts(problem, y))
         q, mu = (np.concatenate(parts, axis=1) for parts in zip(*starts, strict=True))
         row = np.repeat(np.arange(len(y)), q.shape[1])
-        fits = most_refined(problem.rows(row), y[row], q.reshape(-1, 1, 4), mu.reshape(-1, 1, 3))
-        # Far from linear every start counts, else where none has led anywhere.
-        nowhere = np.asarray(~fits.converged.reshape(len(y), -1).any(axis=1))
-        left = np.flatnonzero(~fits.converged & (templates | nowhere[row]))
-        if left.size:
-            fits.put(left, refine(problem.rows(row[left]), y[row[left]], fits.q[left], fits.mu[left]))
+        fits = refine(problem.rows(row), y[row], q.reshape(-1, 1, 4), mu.reshape(-1, 1, 3))
         if problem.is_even:
             fits = fits.with_opposite_moments(len(y))
         return best_distinct(self._known(fits), len(y), self.width)
