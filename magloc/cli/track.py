@@ -305,8 +305,9 @@ def track(
     dropped = sorted({name for names in found.dropped_sensors for name in names})
     if dropped and not common.quiet:
         print_note(f"sensors left out of some rows: {', '.join(dropped)}")
-    for said in filter(None, (found.innovations.reason, found.innovations.caution) if jsonl else ()):
-        print_note(said)
+    if jsonl and not common.quiet:
+        for said in filter(None, (found.innovations.reason, found.innovations.caution)):
+            print_note(said)
 
 
 def _in_ambient_field(array: SensorArray, rows: Readings, where: Place | None) -> tuple[SensorArray, Readings]:

@@ -108,7 +108,7 @@ class InnovationTest:
     @property
     def json(self) -> dict[str, object]:
         """What ``magloc track --json`` prints of it."""
-        return {**asdict(self), "flagged": self.flagged, "reason": self.reason}
+        return {**asdict(self), "flagged": self.flagged, "reason": self.reason, "caution": self.caution}
 
 
 def innovation_test(points: Sequence[TrackPoint]) -> InnovationTest:
