@@ -15,8 +15,8 @@ def proportional_noise(array: SensorArray, readings_T: FloatArray) -> FloatArray
     """Noise of every channel when a part of it is proportional to the field.
 
     ``σ² = noise² + (noise_fraction · |B|)²`` with |B| the modulus of the calibrated reading minus the array's mean
-    (vector sensors), or the deviation of the modulus from the mean modulus (scalar sensors). The noise is in the
-    readings' units, so |B| is multiplied by the channel's gain.
+    (vector sensors; of a sensor alone the whole of it), or the deviation of the modulus from the mean modulus (scalar
+    sensors). The noise is in the readings' units, so |B| is multiplied by the channel's gain.
 
     ``readings_T`` (..., C): raw readings [T], NaN where missing. Returns (..., C): standard deviations [T], in the
     units of the readings. Of a sensor whose reading is incomplete the known axes stand for the missing ones, and
@@ -119,7 +119,8 @@ def _fields_in_sensor_axes(array: SensorArray, readings_T: FloatArray, scale: Fl
 def _deviations(array: SensorArray, readings_T: FloatArray) -> FloatArray:
     """Modulus of every sensor's field minus the array's mean: (..., N) [T]."""
     fields = array.calibrated_field(readings_T)
-    mean = _mean_of_finite(fields, axis=-2)
+    # The mean stands for the common field. With one sensor there is none but the prior's, which is zero.
+    mean = _mean_of_finite(fields, axis=-2) if array.n_sensors > 1 else np.zeros((*fields.shape[:-2], 1, 3))
     deviation: FloatArray = np.linalg.norm(fields - mean, axis=-1)
     missing = np.isnan(deviation)
     if missing.any():

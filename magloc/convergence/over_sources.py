@@ -22,7 +22,7 @@ from arrays.io.errors import check_positive
 from arrays.noise import reading_errors
 from arrays.typing import BoolArray, FloatArray
 from arrays.whitening import whitening
-from magloc.bounds.crlb import cramer_rao_bounds
+from magloc.bounds.crlb import check_uncertainty, cramer_rao_bounds
 from magloc.grids.computed import computed_map
 from magloc.grids.cube import (
     Box,
@@ -37,8 +37,10 @@ from magloc.grids.cube import (
     tallied,
 )
 from magloc.localization.fit.fixes import Fixes
+from magloc.localization.fit.gauss_newton import JointFits, fit_moments, refine
+from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import is_observable, spans
-from magloc.localization.fit.variable_projection_compiled import SAME_CHI2, SAME_COS, Refined, refined
+from magloc.localization.fit.variable_projection_compiled import SAME_CHI2, SAME_COS
 from magloc.localization.locator import Locator
 from magloc.localization.search.single_source import N_UNKNOWNS
 from magloc.measurement.differences import predicted_channels
@@ -76,6 +78,9 @@ class SourcesScenario:
         Sources nearer to the centroid, or farther from it, are left out.
     moment_Am2 : float
         Size of every source's moment.
+    known_moment_sigma_Am2 : float
+        1 σ of that, by which moments differ from it and which the fixes know; infinite: all are alike, and nothing is
+        known.
     seed : int
         Of the moments' directions and the noise. Those of a source depend on the seed and its place in the cube alone.
     """
@@ -86,12 +91,21 @@ class SourcesScenario:
     farthest_m: float = 12.0
     moment_Am2: float = 300.0
     seed: int = 0
+    known_moment_sigma_Am2: float = np.inf
 
     def __post_init__(self) -> None:
         check_magnitudes(self.array)  # before a store is made for it
         if not 0.0 <= self.nearest_m < self.farthest_m:
             raise ValueError(f"Input nearest_m must be between 0 and farthest_m; instead received {self.nearest_m}.")
         check_positive(moment_Am2=self.moment_Am2)
+        check_uncertainty(0.0, self.known_moment_sigma_Am2)
+
+    @property
+    def prior(self) -> SourcePrior:
+        """What fixes know of a source."""
+        if self.known_moment_sigma_Am2 == np.inf:
+            return NOTHING_KNOWN
+        return SourcePrior(known_moment_Am2=self.moment_Am2, known_moment_sigma_Am2=self.known_moment_sigma_Am2)
 
 
 _NO_YES = {"flag_values": np.array([-1, 0, 1], dtype=np.int8), "flag_meanings": "left_out no yes"}
@@ -111,7 +125,9 @@ _VARIABLES = {
         },
     ),
     "iterations": Variable(np.int32, {"long_name": "linearisations that led to the best solution", "units": "1"}),
-    "chi2": Variable(np.float64, {"long_name": "chi-square of the best solution", "units": "1"}),
+    "chi2": Variable(
+        np.float64, {"long_name": "chi-square of the best solution and of what is known of it", "units": "1"}
+    ),
     "chi2_from_truth": Variable(
         np.float64, {"long_name": "chi-square of the optimum searched from the truth", "units": "1"}
     ),
@@ -154,7 +170,7 @@ class SourcesMap(CubeMap):
 
     @cached_property
     def _locator(self) -> Locator:
-        return Locator(self.scenario.array, body_length_m=0.0, exclude_faulty=False)
+        return Locator(self.scenario.array, body_length_m=0.0, exclude_faulty=False, prior=self.scenario.prior)
 
     @cached_property
     def _model(self) -> WhitenedModel:
@@ -176,6 +192,7 @@ class SourcesMap(CubeMap):
             "farthest_m": scenario.farthest_m,
             "moment_magnitude_Am2": scenario.moment_Am2,
             "seed": str(scenario.seed),  # of any size
+            **({"known_moment_sigma_Am2": known} if (known := scenario.known_moment_sigma_Am2) < np.inf else {}),
         }
 
     def warm_up(self) -> None:
@@ -213,9 +230,10 @@ class SourcesMap(CubeMap):
             column[solved] = values
             return column
 
-        chi2 = of_first(every.chi2[first], np.nan)
+        chi2 = of_first((every.chi2 + every.known_chi2)[first], np.nan)
         found = np.where(chi2 <= from_truth.chi2 + CHI2_FOUND, SourceStatus.FOUND, SourceStatus.MISSED)
-        bounds = cramer_rao_bounds(self.scenario.array, position, moment)
+        known = self.scenario.known_moment_sigma_Am2
+        bounds = cramer_rao_bounds(self.scenario.array, position, moment, known_moment_sigma_Am2=known)
         return {
             "status": np.where(np.isnan(chi2), SourceStatus.UNSOLVED, found),
             "iterations": of_first(every.iterations[first], 0),
@@ -233,14 +251,17 @@ class SourcesMap(CubeMap):
         """Moments (n, 3) [A·m²] and standard normal noise (n, C) of a box, the same in whatever boxes."""
         key = np.random.SeedSequence(self.scenario.seed).generate_state(2, np.uint64)
         x, y, z = box.region
+        known = self.scenario.known_moment_sigma_Am2 < np.inf
+        n_numbers = 3 + self.scenario.array.n_channels + known
         lines = []
         for i in range(x.start, x.stop):
             for j in range(y.start, y.stop):
                 generator = np.random.Generator(np.random.Philox(key=key, counter=[0, 0, i, j]))
-                lines.append(generator.standard_normal((z.stop, 3 + self.scenario.array.n_channels))[z])
+                lines.append(generator.standard_normal((z.stop, n_numbers))[z])
         normal = np.concatenate(lines)
         direction = normal[:, :3] / np.linalg.norm(normal[:, :3], axis=1, keepdims=True)
-        return self.scenario.moment_Am2 * direction, normal[:, 3:]
+        size = self.scenario.moment_Am2 + (self.scenario.known_moment_sigma_Am2 * normal[:, -1:] if known else 0.0)
+        return size * direction, normal[:, 3 : 3 + self.scenario.array.n_channels]
 
     def _readings(self, position: FloatArray, moment: FloatArray, noise: FloatArray) -> FloatArray:
         """Raw readings (n, C) [T]; noise as standard normal numbers."""
@@ -248,20 +269,18 @@ class SourcesMap(CubeMap):
         exact = predicted_channels(array, position, moment) + array.channel_offset_T
         return exact + reading_errors(array, exact, noise)
 
-    def _searched_from(self, truth: FloatArray, readings: FloatArray) -> Refined:
-        """Ends of the refinements that start at the truth (n, 3).
-
-        One that has not converged only ever has a χ² that is too high, so it counts like the others: a fix is held
-        against it where it is lower.
-        """
+    def _searched_from(self, truth: FloatArray, readings: FloatArray) -> JointFits:
+        """Ends of the refinements that start at the truth (n, 3); χ² is infinite where one has not converged."""
         (rows,) = whitened_rows(self.scenario.array, readings, None, len(readings))
-        return refined(rows.model, rows.y, rows.model.homogeneous(truth), _MAX_ITERATIONS)
+        rows, q = rows.knowing(self.scenario.prior.known_moment), rows.model.homogeneous(truth)[:, None]
+        return refine(rows.model, rows.y, q, fit_moments(rows.model, rows.y, q), max_iterations=_MAX_ITERATIONS)
 
-    def _listed(self, fixes: Fixes, ends: Refined) -> BoolArray:
+    def _listed(self, fixes: Fixes, ends: JointFits) -> BoolArray:
         """Whether the optima (n,) that the search from the truth ended at are among the solutions."""
         every = fixes.solutions
-        cosine = np.sum(self._model.homogeneous(every.position_m[:, 0]) * ends.q[every.of_row], axis=1)
-        same = (np.abs(cosine) > SAME_COS) & (np.abs(every.chi2 - ends.chi2[every.of_row]) < SAME_CHI2)
+        cosine = np.sum(self._model.homogeneous(every.position_m[:, 0]) * ends.q[every.of_row, 0], axis=1)
+        chi2 = every.chi2 + every.known_chi2
+        same = (np.abs(cosine) > SAME_COS) & (np.abs(chi2 - ends.chi2[every.of_row]) < SAME_CHI2)
         return np.bincount(every.of_row[same], minlength=len(fixes)) > 0
 
 
@@ -298,6 +317,7 @@ def source_map(
     nearest_m: float = SourcesScenario.nearest_m,
     farthest_m: float = SourcesScenario.farthest_m,
     seed: int = 0,
+    known_moment_sigma_Am2: float = np.inf,
     out: str | PathLike[str] | None = None,
     scheduler: str | None = None,
     progress: Callable[[int], None] | None = None,
@@ -318,6 +338,9 @@ def source_map(
         Sources nearer to the centroid, or farther from it, are left out [m].
     seed : int
         Of the moments' directions and the noise.
+    known_moment_sigma_Am2 : float
+        1 σ of the moments' modulus [A·m²]: they are drawn with it, and fixes and bounds know it. Infinite: all are
+        alike, and nothing is known.
     out, scheduler, progress
         See :func:`magloc.grids.computed.computed_map`: a zarr folder that streams and resumes, the address of a dask
         scheduler, and a call with the number of sources finished.
@@ -344,7 +367,9 @@ def source_map(
     >>> sorted(found.sizes)
     ['x', 'y', 'z']
     """
-    scenario = SourcesScenario(array, check_half_width(edge_m), nearest_m, farthest_m, moment_Am2, seed)
+    scenario = SourcesScenario(
+        array, check_half_width(edge_m), nearest_m, farthest_m, moment_Am2, seed, known_moment_sigma_Am2
+    )
     return computed_map(SourcesMap(scenario, n), out, scheduler, progress)
 
 

@@ -47,6 +47,7 @@ class _Sources(Table, kw_only=True):
     nearest_m: float = SourcesScenario.nearest_m
     farthest_m: _Positive = SourcesScenario.farthest_m
     moment_Am2: _Positive = SourcesScenario.moment_Am2
+    known_moment_sigma_Am2: _Positive | None = None
 
     def check(self) -> None:
         if not 0.0 <= self.nearest_m < self.farthest_m:
@@ -110,7 +111,7 @@ def read_starts_scenario(
 def read_sources_scenario(name_or_path: str, *, seed: int = 0) -> SourcesScenario:
     """Scenario of a map over sources: a scenario file's array, and its table ``sources`` if it has one."""
     path, _, file = _read(name_or_path)
-    given = {key: getattr(file.sources, key) for key in _Sources.__struct_fields__}
+    given = {key: value for key in _Sources.__struct_fields__ if (value := getattr(file.sources, key)) is not None}
     with naming(path):
         return SourcesScenario(array=_array(path, file.array), seed=seed, **given)
 

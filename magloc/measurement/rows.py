@@ -175,6 +175,12 @@ def whitened_model(
     return WhitenedModel.of(array, whitening, fields), raw
 
 
+def check_spans(array: SensorArray) -> None:
+    """Refuse a sensor alone, which knows no place."""
+    if array.n_sensors < 2:
+        raise ValueError("Input array must have two sensors at least where no place is known; instead received one.")
+
+
 def check_magnitudes(array: SensorArray) -> None:
     """Refuse what double precision cannot square."""
     noise = array.channel_noise_T

@@ -105,6 +105,7 @@ def write_pictures(
     if truth_m is not None:
         columns |= style.truth_columns(truth_m[found.row])
         columns["error_m"] = distances_from_truth(found, truth_m)
+    columns |= {name: getattr(fixes, name)[found.row] for name in ("detected", "misfit", "too_near", "body_length_m")}
     columns["dropped_sensors"] = [" ".join(fixes.dropped_sensors[row]) for row in found.row]
     columns["reason"] = [fixes.reason[row] for row in found.row]
     write(fix_figure(found, _sensors_of(fixes, array, rows), truth_m), folder / "fixes.png", columns)

@@ -391,7 +391,7 @@ def _points(model: MomentModel, steps: Sequence[MomentStep], k: int, *, smooth: 
                 nis_dof=model.rows[i].z.size,
                 status=step.status if known else "not determined: the readings so far do not tell the whole moment",
                 centroid_m=row.origin_m + row.R_world_from_array @ array.centroid,
-                radius_m=array.circumradius,
+                radius_m=array.circumradius or 1.0,  # where one sensor has none: only a unit of ranges
             )
         )
     return points

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from arrays.typing import FloatArray
+from arrays.typing import FloatArray, IntArray
 from magloc.fields.multipole import multipole_field_matrix
 from magloc.surveying.fit.joint_fit import Background, JointFit, jacobian_of, with_free_sources
 from magloc.surveying.rounds import Model
@@ -19,6 +19,7 @@ OF_TARGETS = ("position_m", "moment_Am2", "covariance", "depth_interval95_m", "s
 _WEAK = 200.0
 _NEAR = 1.5
 _MISFIT = 1.5  # χ² per reading
+_LASTING = 3.72  # standard deviations, one-sided
 _N_DEPTHS = 16
 _SPAN = 3.0  # over and under the depth, as a factor
 _N_SECOND = 9  # degrees of freedom
@@ -116,10 +117,12 @@ def targets_of(model: Model, fit: JointFit, background: Background, ground_m: fl
     free = fit.residual - Q @ (Q.T @ fit.residual)
     second = [second_source_chi2(model, background, directions, Q, free, place) for place in sources.position_m]
     middles = model.record.sensors_m.mean(axis=1)[background.white.starts[:-1]]
+    reach = _NEAR * (model.record.height_m - sources.position_m[:, 2:])
+    above = np.linalg.norm(sources.position_m[:, None, :2] - middles[:, :2], axis=-1) < reach
     flags = {
         "weak": weak,
         "near": apart.min(axis=1, initial=np.inf) < _NEAR * depth + 0.5,
-        "misfit": np.array([_misfit(model, middles, left, place) for place in sources.position_m], np.bool_),
+        "misfit": np.array([is_misfit(left, np.flatnonzero(near)) for near in above], np.bool_),
         "merged": np.array(second) > chdtri(_N_SECOND, _FALSE_MERGED),
         "edge": (rim[:, :2] < 0.3).any(axis=1) | (rim[:, 2] < 0.02),
     }
@@ -128,8 +131,13 @@ def targets_of(model: Model, fit: JointFit, background: Background, ground_m: fl
     return dict(zip(OF_TARGETS, parts, strict=True))
 
 
-def _misfit(model: Model, middles: FloatArray, left: FloatArray, position: FloatArray) -> bool:
-    """Whether groups (g, k) near a target fit worse than one of 10,000 right models, and by more than a half."""
-    apart = np.linalg.norm(middles[:, :2] - position[:2], axis=1)
-    near = left[apart < _NEAR * (model.record.height_m - position[2])]
-    return bool(np.sum(near**2) > max(float(chdtri(max(near.size, 1), 1e-4)), _MISFIT * near.size))
+def is_misfit(left: FloatArray, at: IntArray) -> bool:
+    """Whether groups `at` of what is left (g, k) fit worse than one of 10,000 right models, and by more than a half.
+
+    Or whether what is left of successive groups goes together, more than one of 10,000 right models has it, as where a
+    target moves to and fro: the sum of the products over its standard deviation, which the products tell themselves.
+    """
+    near, after = left[at], np.diff(at) == 1
+    products = near[1:][after] * near[:-1][after]
+    lasting = np.sum(products) > _LASTING * np.linalg.norm(products)
+    return bool(lasting or np.sum(near**2) > max(float(chdtri(max(near.size, 1), 1e-4)), _MISFIT * near.size))

@@ -17,6 +17,7 @@ from arrays.io.text import read_text
 from arrays.io.world_maps import feature, feature_collection, kml, placemark, world_place
 from arrays.typing import FloatArray, Vector
 from magloc.levels import FALSE_ALARM
+from magloc.localization.fit.table import cells_of_strength
 from magloc.tracking.consistency import Consistency
 from magloc.tracking.results import TrackPoint, TrackResult, on_track, stacked
 
@@ -56,11 +57,11 @@ def lines_of_track(points: Sequence[TrackPoint], *, most: int | None = None) -> 
     shown = list(points)
     if most is not None and len(shown) > most:
         shown = shown[: most // 2] + shown[-(most // 2) :]
-    header = ["time_s", "x_m", "y_m", "z_m", "s_x_m", "s_y_m", "s_z_m", "m_Am2", "nis", "status"]
+    header = ["time_s", "x_m", "y_m", "z_m", "s_x_m", "s_y_m", "s_z_m", "m_Am2", "s_m", "nis", "status"]
     rows = [header]
     for point in shown:
         if point.position_m is None or point.moment_Am2 is None or point.covariance is None:
-            rows.append([f"{point.time_s:.10g}", *["-"] * 8, point.status])
+            rows.append([f"{point.time_s:.10g}", *["-"] * 9, point.status])
             continue
         deviations = np.sqrt(np.diagonal(point.covariance)[:3])
         unsure = "" if point.range_observable or point.centroid_m is None else ", range?"
@@ -69,7 +70,7 @@ def lines_of_track(points: Sequence[TrackPoint], *, most: int | None = None) -> 
                 f"{point.time_s:.10g}",
                 *(f"{value:.3f}" for value in point.position_m),
                 *(f"{value:.2g}" for value in deviations),
-                f"{np.linalg.norm(point.moment_Am2):.4g}",
+                *cells_of_strength(point.moment_Am2, point.covariance[3:, 3:]),
                 f"{point.nis:.1f}/{point.nis_dof}" if np.isfinite(point.nis) else "-",
                 "".join((point.status, *(f", without {name}" for name in point.dropped_sensors), unsure)),
             ]

@@ -367,6 +367,10 @@ class TestProportionalNoise:
         assert_allclose(noise[0], np.hypot(2e-9, 0.1 * 4e-6), rtol=1e-12)
         assert_allclose(noise[1], np.hypot(2e-9, 0.03 * 4e-6), rtol=1e-12)
 
+    def test_the_whole_field_counts_of_a_sensor_alone(self):
+        alone = SensorArray(tetrahedron(1.0, noise_T=2e-9).sensors[:1], noise_fraction=0.03, common_field_T=1e-9)
+        assert_allclose(proportional_noise(alone, np.array([3e-6, 0.0, 4e-6])), np.hypot(2e-9, 0.03 * 5e-6), rtol=1e-12)
+
     def test_a_uniform_field_adds_none(self):
         array = SensorArray(tetrahedron(1.0, noise_T=2e-9).sensors, noise_fraction=0.03)
         readings = np.tile([1e-5, 2e-5, 3e-5], 4)

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from arrays.typing import FloatArray
+
 if TYPE_CHECKING:
     from magloc.localization.fit.fixes import Fixes
     from magloc.localization.fit.results import Fix, Source
@@ -38,7 +40,7 @@ def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None 
         *(["source"] if joint else []),
         *lengths[:6],
         "m_Am2",
-        *([] if joint else ["s_m"]),
+        "s_m",
         "chi2/dof",
         lengths[6],
         "flags",
@@ -51,7 +53,7 @@ def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None 
             rows.append([f"{fix.time_s:.10g}"])
             reasons.append(fix.reason)
         for k, source in enumerate(sources):
-            cells = _cells(fix, source, per_m, decimals, joint=joint)
+            cells = _cells(fix, source, per_m, decimals)
             rows.append([f"{fix.time_s:.10g}", *([str(k + 1)] if joint else []), *cells])
             reasons.append("")
     widths = [max(len(row[i]) for row in rows if i < len(row)) for i in range(len(header) - 1)]
@@ -67,7 +69,7 @@ def lines_of_fixes(fixes: Fixes, *, joint: bool | None = None, most: int | None 
     return lines
 
 
-def _cells(fix: Fix, source: Source, per_m: float, decimals: int, *, joint: bool) -> list[str]:
+def _cells(fix: Fix, source: Source, per_m: float, decimals: int) -> list[str]:
     best, others = fix.best, len(fix.solutions) - 1
     covariance = np.zeros((6, 6)) if source.covariance is None else source.covariance
     deviations = np.sqrt(np.diagonal(covariance))
@@ -80,18 +82,21 @@ def _cells(fix: Fix, source: Source, per_m: float, decimals: int, *, joint: bool
         *(["near"] if fix.too_near else []),
         *(f"-{name}" for name in fix.dropped_sensors),
     ]
-    strength = float(np.linalg.norm(source.moment_Am2))
-    along = source.moment_Am2 / strength if strength else np.zeros(3)
-    of_strength = float(np.sqrt(along @ covariance[-3:, -3:] @ along))
     return [
         *(f"{value * per_m:.{decimals}f}" for value in source.position_m),
         *(_two_digits(value * per_m) for value in of_position),
-        f"{strength:.4g}",
-        *([] if joint else [_two_digits(of_strength)]),
+        *cells_of_strength(source.moment_Am2, covariance[-3:, -3:]),
         f"{best.chi2:.1f}/{best.dof}",
         _intervals(source.range_interval_m, per_m),
         ",".join(flags),
     ]
+
+
+def cells_of_strength(moment_Am2: FloatArray, covariance: FloatArray) -> tuple[str, str]:
+    """Modulus of a moment, and its standard deviation by the covariance (3, 3) of the moment."""
+    strength = float(np.linalg.norm(moment_Am2))
+    along = moment_Am2 / strength if strength else np.zeros(3)
+    return f"{strength:.4g}", _two_digits(float(np.sqrt(along @ covariance @ along)))
 
 
 def _of_uncertainty(source: Source, *, misfit: bool) -> list[str]:

@@ -25,7 +25,7 @@ from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.fit.results import DISTINCT_WITHIN
 from magloc.localization.search import single_source_compiled as kernels
 from magloc.localization.search.candidates import SingleArray, allowed_positions, chosen_candidates, linear_bases
-from magloc.measurement.rows import WhitenedRows, channels_above_ambient, check_magnitudes, whitened_rows
+from magloc.measurement.rows import WhitenedRows, channels_above_ambient, check_magnitudes, check_spans, whitened_rows
 from magloc.measurement.whitened import WhitenedModel
 
 N_UNKNOWNS = 6
@@ -95,8 +95,7 @@ class SingleSourceSearch:
         if array.channel_is_scalar.any():
             raise ValueError("Input array must have vector sensors only; instead received one with scalar sensors.")
         check_magnitudes(array)
-        if array.circumradius < 1e-9:
-            raise ValueError("Input array must span 1e-9 m at least; instead it does not.")
+        check_spans(array)
         self.array = array
         self.n_starts = n_starts
         self.apart_rad = apart_rad

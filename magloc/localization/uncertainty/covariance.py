@@ -225,8 +225,9 @@ def _of_known_position(optima: Optima, position_m: FloatArray, moment: FloatArra
     """What is known of moments at known places; the range is that of the place."""
     rows, fits, of_row = optima.rows, optima.fits, optima.of_row
     model = rows.model
-    covariance = moment_covariances(model.rows(of_row), rows.y[of_row], fits)
-    told = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2, np.inf)
+    understated = _understated(fits.chi2[np.searchsorted(of_row, of_row)], optima)
+    covariance = moment_covariances(model.rows(of_row), rows.y[of_row], fits) * understated[:, None, None]
+    told = np.where(np.isfinite(covariance).all(axis=(1, 2)), fits.chi2 / understated, np.inf)
     weight = _weights_of_rows(of_row, told, log_evidence_volume(covariance, moment))
     # The readings of vector sensors are linear in the moment, those of moduli only over a small part of it.
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -26,7 +26,7 @@ from magloc.levels import CONTRADICTION, CREDIBLE_ROW
 from magloc.localization.fit.prior import SourcePrior
 from magloc.localization.locator import Locator
 from magloc.measurement.nuisances import SensorErrors
-from magloc.measurement.rows import check_magnitudes
+from magloc.measurement.rows import check_magnitudes, check_spans
 from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart, source_root
 from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture, block_root
 from magloc.tracking.chart.row import ChartRow
@@ -137,6 +137,7 @@ class Start:
 
     def __init__(self, array: SensorArray, errors: SensorErrors, prior: SourcePrior) -> None:
         check_magnitudes(array)
+        check_spans(array)
         self.errors, self.prior = errors, prior
         self._grid = _Grid.of(array)
         self._locator: Locator | None = None

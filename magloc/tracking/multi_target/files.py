@@ -6,10 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from magloc.localization.fit.table import cells_of_strength
 from magloc.tracking.files import json_entry
 from magloc.tracking.multi_target.results import SourcesPoint
 
-_HEADER = ["time_s", "id", "x_m", "y_m", "z_m", "s_x_m", "s_y_m", "s_z_m", "m_Am2", "status"]
+_HEADER = ["time_s", "id", "x_m", "y_m", "z_m", "s_x_m", "s_y_m", "s_z_m", "m_Am2", "s_m", "status"]
 _KEYS = ("id", "position_m", "moment_Am2", "covariance", "weight", "merged", "range_observable")
 
 
@@ -22,7 +23,7 @@ def lines_of_sources(points: Sequence[SourcesPoint], *, most: int | None = None)
     for point in shown:
         faults = "".join(f", without {name}" for name in point.dropped_sensors)
         if not point.tracks:
-            rows.append([f"{point.time_s:.10g}", *["-"] * 8, point.status + faults])
+            rows.append([f"{point.time_s:.10g}", *["-"] * 9, point.status + faults])
         for track in point.tracks:
             rows.append(
                 [
@@ -30,7 +31,7 @@ def lines_of_sources(points: Sequence[SourcesPoint], *, most: int | None = None)
                     str(track.id),
                     *(f"{value:.4f}" for value in track.position_m),
                     *(f"{value:.2g}" for value in np.sqrt(np.diagonal(track.covariance)[:3])),
-                    f"{np.linalg.norm(track.moment_Am2):.4g}",
+                    *cells_of_strength(track.moment_Am2, track.covariance[3:6, 3:6]),
                     ", ".join([point.status, *(["merged"] if track.merged else [])]) + faults,
                 ]
             )

@@ -15,7 +15,7 @@ from arrays.typing import FloatArray
 from magloc.blas_threads import one_blas_thread
 from magloc.localization.fit.prior import NOTHING_KNOWN, SourcePrior
 from magloc.localization.locator import Locator
-from magloc.measurement.rows import check_magnitudes
+from magloc.measurement.rows import check_magnitudes, check_spans
 from magloc.readings import Readings
 from magloc.tracking.multi_target.explanations import (
     BIRTH,
@@ -133,6 +133,7 @@ class SourcesTracker:
         if array.channel_is_scalar.any():
             raise ValueError("Input array must have vector sensors alone for several moving sources.")
         check_magnitudes(array)
+        check_spans(array)
         most = (array.n_channels - N_COMMON - 1) // N_SEEN
         wanted = min(most, MOST_BY_ITSELF) if sources == "auto" else sources
         if not 1 <= wanted <= most:

@@ -85,6 +85,39 @@ class TestFixes:
         assert (dataset.sigma_range > exact.sigma_range).to_numpy()[used].all()
 
 
+class TestKnownStrength:
+    """Fixes that know the moments' modulus to 10 %, by which the moments differ."""
+
+    KNOWN = replace(PAPER, half_width_m=8.0, farthest_m=8.0, known_moment_sigma_Am2=30.0)
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def known_map(cls):
+        return computed_map(SourcesMap(cls.KNOWN, 7))
+
+    def test_fixes_know_it_as_well_as_their_bounds(self, known_map):
+        assert summary(known_map).fraction == 1.0
+        used = known_map.status.to_numpy() == SourceStatus.FOUND
+        squares = (known_map.distance / known_map.sigma_position).to_numpy()[used] ** 2
+        # E[squares] = 1, and their variance is at most 2 (all of it along one axis): 4 sigma.
+        assert squares.mean() == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / squares.size))
+
+    def test_is_better_than_without(self, known_map):
+        unknown = computed_map(SourcesMap(replace(self.KNOWN, known_moment_sigma_Am2=np.inf), 7))
+        far = (unknown.sigma_range > 0.5).to_numpy()
+        assert far.any()
+        # The range goes as the cube root of the moment: 10 % of it are 3 % of 8 m.
+        assert (known_map.sigma_range.to_numpy()[far] < 0.04 * 8.0).all()
+        assert known_map.range_observable.to_numpy()[far].all()
+        assert known_map.truth_listed.to_numpy()[far].all()
+
+    def test_moments_differ_by_it(self):
+        moment, _ = SourcesMap(self.KNOWN, 17)._random(Box((0, 0, 0), (slice(0, 17),) * 3))
+        size = np.linalg.norm(moment, axis=1)
+        # Mean and deviation within 5 sigma of theirs: one false alarm in a million.
+        assert_allclose([size.mean(), size.std()], [300.0, 30.0], atol=5.0 * 30.0 / np.sqrt(size.size))
+
+
 class TestRandomNumbers:
     def test_boxes_do_not_matter(self):
         cube = SourcesMap(replace(PAPER, seed=3), 9)

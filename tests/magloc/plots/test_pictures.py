@@ -58,6 +58,8 @@ class TestLocate:
         np.testing.assert_allclose(numbers(fixes["y_m"]), position[:, 1])
         sigma = np.sqrt([solution["covariance"][2][2] for solution in best])
         np.testing.assert_allclose(numbers(fixes["s_z_m"]), sigma)
+        assert numbers(fixes["detected"]).tolist() == [entry["detected"] for entry in entries]
+        assert numbers(fixes["misfit"]).tolist() == [entry.get("misfit", False) for entry in entries]
         true = np.column_stack([numbers(fixes[f"true_{name}_m"]) for name in "xyz"])
         np.testing.assert_allclose(numbers(fixes["error_m"]), np.linalg.norm(position - true, axis=1), rtol=1e-6)
         dof = numbers(fixes["dof"])

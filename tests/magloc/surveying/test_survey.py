@@ -183,6 +183,30 @@ class TestHostileWorld:
         moved = readings.array_position_m + 0.2 * rng.standard_normal((len(readings), 3))
         self.check(replace(readings, array_position_m=moved), caplog, "χ² per reading")
 
+    @pytest.mark.slow
+    @pytest.mark.parametrize("seed", [901, 920])
+    def test_a_target_that_moves_to_and_fro(self, seed: int) -> None:
+        """By 0.3 m in 20 s; the one beside it is as right as it says, or flagged."""
+        field = simulated("survey-drone", seed)
+        readings, place = field.readings, field.target_position_m[0]
+        turn, origin, ambient = readings.array_rotation, readings.array_position_m, readings.ambient_T
+        assert turn is not None
+        assert origin is not None
+        assert ambient is not None
+        sensors = origin[:, None] + np.einsum("nab,sb->nsa", turn.as_matrix(), field.array.positions)
+        moved = place + 0.3 * np.outer(np.sin(2.0 * np.pi * readings.time_s / 20.0), [1.0, 0.0, 0.0])
+        still, swung = (
+            np.linalg.norm(
+                turn.apply(ambient)[:, None] + magloc.dipole.field(sensors, at, field.target_moment_Am2[0]), axis=-1
+            )
+            for at in (place, moved[:, None])
+        )
+        found = magloc.survey(field.array, replace(readings, values_T=readings.values_T + swung - still))
+        assert "misfit" in nearest(found, place).flags
+        for target in found:
+            error = target.position_m - nearest_truth(field, target)
+            assert "misfit" in target.flags or error @ np.linalg.solve(target.covariance[:3, :3], error) < 21.0
+
 
 class TestBadInput:
     ROWS = 60

@@ -31,7 +31,7 @@ from magloc.surveying.preparation import whole_rows
 from magloc.surveying.reach import DEPTHS_M, least_moments
 from magloc.surveying.rounds import AT_LAST, Model
 from magloc.surveying.search import PITCH, WINDOW
-from magloc.surveying.targets import profile_of, second_source_chi2
+from magloc.surveying.targets import is_misfit, profile_of, second_source_chi2
 from magloc.surveying.tiled import TiledSurvey
 from sims.magnetics.paths import Lawnmower, Steered
 from sims.magnetics.scenario import Carrier, MagneticScenario, Source
@@ -96,6 +96,37 @@ def test_at_its_ends_a_depth_interval_costs_what_chance_does() -> None:
     for depth in profile_of(model, fit, background, 0, 0.0).depth_interval95_m:
         there = least_squares(residual, np.delete(found, 2), x_scale="jac", args=(depth,))
         assert 2.0 * there.cost - fit.chi2 == pytest.approx(3.84, abs=0.5)
+
+
+class TestMisfit:
+    """Of 300 groups of a lawnmower's passes, two channels each."""
+
+    AT = np.concatenate([np.arange(first, first + 20) for first in range(0, 1500, 100)])
+
+    @staticmethod
+    def lasting(rng: np.random.Generator, correlation: float) -> FloatArray:
+        """Unit variance; successive ones correlated."""
+        left = rng.standard_normal((1500, 2))
+        for i in range(1, len(left)):
+            left[i] = correlation * left[i - 1] + np.sqrt(1.0 - correlation**2) * left[i]
+        return left
+
+    def test_white_residuals_are_none(self) -> None:
+        """Two tests of 1 in 10,000: four or more of 2,000 have a probability of 1 in 1,200."""
+        rng = np.random.default_rng(5)
+        assert sum(is_misfit(rng.standard_normal((1500, 2)), self.AT) for _ in range(2000)) < 4
+
+    def test_residuals_that_last_are(self) -> None:
+        """As large as they should be, and alike from group to group: 0.3 is 7 standard deviations."""
+        rng = np.random.default_rng(6)
+        assert all(is_misfit(self.lasting(rng, 0.3), self.AT) for _ in range(20))
+
+    def test_noise_that_is_understated_is(self) -> None:
+        assert is_misfit(1.5 * np.random.default_rng(7).standard_normal((1500, 2)), self.AT)
+
+    def test_passes_that_do_not_follow_each_other_are_not_compared(self) -> None:
+        """Groups that are alike, each in another pass."""
+        assert not is_misfit(np.ones((1500, 2)), np.arange(0, 1500, 100))
 
 
 def test_where_places_are_gaussian_their_scatter_is_the_covariance() -> None:

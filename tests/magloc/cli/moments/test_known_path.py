@@ -149,6 +149,17 @@ class TestSeveralPlaces:
         np.testing.assert_allclose([s["moment_Am2"] for s in sources], [[0.1, 0.2, -0.3], [0.3, 0.1, 0.2]], atol=1e-2)
 
     def test_tables_and_lines(self, run: Run, cells: tuple[Path, Path]) -> None:
+        outcome = run("locate", cells[0], "--array", cells[1], *self.PLACES)
+        of_table = [float(line.split()[9]) for line in outcome.out.splitlines()[1:]]
+        array = arrays.read_array(cells[1])
+        places = [[0, 0, 0.1], [0.1, 0.05, 0.12]]
+        fixes = magloc.locate(array, magloc.read_readings(cells[0], array), position_m=places)
+        expected = [
+            np.sqrt(s.moment_Am2 @ s.covariance @ s.moment_Am2) / np.linalg.norm(s.moment_Am2)
+            for fix in fixes
+            for s in fix.best.sources
+        ]
+        np.testing.assert_allclose(of_table, expected, rtol=0.05)
         outcome = run("track", cells[0], "--array", cells[1], *self.PLACES)
         assert outcome.status == 0, outcome.err
         assert [line for line in outcome.out.splitlines() if line.startswith("source")] == ["source 1", "source 2"]

@@ -132,6 +132,31 @@ class TestOneSensor:
         noise_T = np.hypot(array.sensors[0].noise_T, 2e-9)
         A = np.transpose([dipole.field(array.positions[0], place, axis) for axis in np.eye(3)])
         assert_allclose(fix.best.covariance, noise_T**2 * np.linalg.inv(A.T @ A), rtol=1e-9, atol=1e-9)
+        track = magloc.track_moment(array, readings[None], place)  # warnings are errors
+        assert_allclose(track[0].range_interval_m, [(1.0, 1.0)])
+
+    def test_no_place_is_found(self):
+        array = SensorArray((tetrahedron(1.5).sensors[0],), common_field_T=2e-9)
+        for estimate in (magloc.locate, magloc.track):
+            with pytest.raises(ValueError, match="Input array must have two sensors at least where no place is known"):
+                estimate(array, np.full((2, 3), 1e-6))
+
+
+class TestMisfit:
+    def test_deviations_are_enlarged(self):
+        """As those of fixes without a place: by √(χ²/dof), also of several places."""
+        array, place = tetrahedron(1.5, noise_T=1e-9), np.array([5.0, 0.0, 0.3])
+        readings = predicted_channels(array, place, [0.0, 10.0, 300.0])
+        readings = readings + 1e-7 * np.random.default_rng(3).normal(size=readings.size)
+        for places in (place, [place, [-4.0, 2.0, 0.0]]):
+            fix, quiet = (
+                magloc.locate(replaced, readings, position_m=places)[0]
+                for replaced in (array, tetrahedron(1.5, noise_T=1e-7))
+            )
+            assert fix.misfit
+            assert not quiet.misfit
+            chi2 = fix.best.chi2 / fix.best.dof
+            assert_allclose(fix.best.covariance, quiet.best.covariance * 1e-4 * chi2, rtol=1e-6, atol=1e-9)
 
 
 class TestKnownAmbientField:
