@@ -192,7 +192,7 @@ class SensorArray:
         """Standard deviation, per axis, of the error of the ambient field in one row by itself [T]."""
         return math.hypot(self.ambient_uncertainty_T, self.ambient_uncertainty_white_T)
 
-    @property
+    @cached_property
     def noise_depends_on_reading(self) -> bool:
         """Whether the covariance of the readings changes with them; else it is diagonal, with the channels' noise."""
         uncertain = any(sensor.misalignment_rad or sensor.gain_uncertainty for sensor in self.sensors)

@@ -28,7 +28,7 @@ from magloc.localization.search.candidates import (
 )
 from magloc.localization.search.single_source_compiled import Ends, search_rows
 from magloc.measurement.whitened import WhitenedModel
-from magloc.measurement.whitened_compiled import LaneModel, signals
+from magloc.measurement.whitened_compiled import signals
 
 # As Locator searches: starts of every refinement, least angle between them, linearisations at most.
 _N_STARTS, _APART_RAD, _MOST_ITERATIONS = 12, 0.25, 100
@@ -133,7 +133,7 @@ class DipoleFilter:
         )
         chosen = chosen_candidates(self._bases, whitened, self._candidates, _N_STARTS, _APART_RAD)
         found = Ends.empty(n, _N_STARTS)
-        signal, in_lanes = signals(problem, whitened), LaneModel.of(problem)
+        signal, in_lanes = signals(problem, whitened), problem.lanes
         over_rows(
             search_rows, n, signal, np.arange(n), self._candidates[chosen], np.inf, _MOST_ITERATIONS, in_lanes, found
         )  # fmt: skip

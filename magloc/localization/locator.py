@@ -165,11 +165,11 @@ class Locator:
             parts.append(self._credible(index, readings[index], None if ambient is None else ambient[index]))
             if progress is not None:
                 progress(len(index))
-        fixes = replace(Fixes.joined(parts), time_s=times)
+        fixes = Fixes.joined(parts)
         if (fixes.solutions.n_sources > 1).any() and not isinstance(self._search, MomentSearch):
             fixes = replace(fixes, solutions=in_stable_order(fixes.solutions))
         near = too_near(self.array, fixes, readings, ambient, self.body_length_m)
-        return replace(fixes, too_near=near)
+        return replace(fixes, time_s=times, too_near=near)
 
     def _credible(self, index: IntArray, readings: FloatArray, ambient: FloatArray | None) -> Fixes:
         """Fixes of some of the rows, without the sensors that contradict all others."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +15,7 @@ from arrays.typing import BoolArray, FloatArray, IntArray
 from arrays.whitening import Whitening, whitening, whitenings
 from magloc.measurement.known_moment import KnownMoment
 from magloc.measurement.whitened import WhitenedModel
-from magloc.measurement.whitened_compiled import LaneModel, signals
+from magloc.measurement.whitened_compiled import signals
 
 NO_SIGNAL = "the sensors' readings do not differ: no signal"
 # Mean square of whitened differences below which they are rounding errors rather than noise.
@@ -70,11 +70,6 @@ class WhitenedRows:
     def knowing(self, moment: KnownMoment | None) -> WhitenedRows:
         """The same where the moment of every source is known."""
         return replace(self, model=replace(self.model, known=moment)) if moment is not None else self
-
-    @cached_property
-    def lanes(self) -> LaneModel:
-        """The model for compiled kernels."""
-        return LaneModel.of(self.model)
 
     @cached_property
     def signal(self) -> FloatArray:
@@ -168,11 +163,19 @@ def whitened_model(
     :meth:`WhitenedModel.whitened` frees these from the common field. The whitening is that of every row or of all, and
     `ambient_T` (n, 3) stands in place of the array's ambient field.
     """
-    fields = ambient_fields(array, len(readings_T), ambient_T)
-    channels = channels_above_ambient(array, mask, readings_T, fields)
     root = whitening.root
+    if len(readings_T) == 1 and ambient_T is None and root.ndim == 2:
+        model = _model_of_one_row(array, whitening)
+    else:
+        model = WhitenedModel.of(array, whitening, ambient_fields(array, len(readings_T), ambient_T))
+    channels = channels_above_ambient(array, mask, readings_T, model.ambient)
     raw = channels @ root.T if root.ndim == 2 else (root @ channels[..., None])[..., 0]
-    return WhitenedModel.of(array, whitening, fields), raw
+    return model, raw
+
+
+@lru_cache(maxsize=16)  # readings that come one by one have one model, and what kernels take of it
+def _model_of_one_row(array: SensorArray, whitening: Whitening) -> WhitenedModel:
+    return WhitenedModel.of(array, whitening, array.ambient_fields[None])
 
 
 def check_spans(array: SensorArray) -> None:

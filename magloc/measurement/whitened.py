@@ -8,6 +8,7 @@ an ordinary point: docs/theory/homogeneous-coordinates.md. The twin of :mod:`mag
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,6 +18,7 @@ from arrays.typing import FloatArray
 from arrays.whitening import Whitening
 from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.measurement.known_moment import KnownMoment
+from magloc.measurement.whitened_compiled import LaneModel, ModelRows
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +117,24 @@ class WhitenedModel(ScaledSensors):
     def shares_whitening(self) -> bool:
         """Whether all rows have one whitening, kept once."""
         return len(self) == 1 or self.gain.strides[0] == self.basis.strides[0] == 0
+
+    @cached_property
+    def of_kernels(self) -> ModelRows:
+        """The model for compiled kernels."""
+        return ModelRows.of(self)
+
+    @cached_property
+    def lanes(self) -> LaneModel:
+        """The model for compiled kernels that fit many starts side by side."""
+        return LaneModel.of(self)
+
+    @cached_property
+    def threes(self) -> tuple[NDArray[np.intp], NDArray[np.intp], int]:
+        """Places of the channels in lanes, columns of the common field with a prior, and sensors with theirs."""
+        owner = self.channel_sensor
+        known = np.flatnonzero((self.shrinkage < 1.0).any(axis=0))
+        place = 3 * owner + np.arange(owner.size) - np.searchsorted(owner, owner)
+        return place, known, len(self.sensors) + -(-known.size // 3)
 
     def rows(self, index: NDArray[np.intp]) -> WhitenedModel:
         """Model of some of the readings, repeated at will."""

@@ -10,7 +10,7 @@ The source is (u, s) on the unit sphere of R⁴: position = centroid + radius ·
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 from arrays.typing import FloatArray
 from magloc.compilation import compiled, own
 from magloc.linalg_compiled import orthonormalise
-from magloc.measurement.whitened import ScaledSensors, WhitenedModel
+
+if TYPE_CHECKING:
+    from magloc.measurement.whitened import ScaledSensors, WhitenedModel
 
 # |s| stays above this: below it the differences lose their digits, and no array resolves a range of 10⁵ radii.
 SMALLEST_S = 1e-5
@@ -82,7 +84,7 @@ class LaneModel(NamedTuple):
         sets = slice(0, 1) if model.shares_whitening else slice(None)
         basis, shrinkage = model.basis[sets], model.shrinkage[sets]
         n_sets, _, n_common = basis.shape
-        place, known, n_sensors = _threes(model)
+        place, known, n_sensors = model.threes
         gain = np.zeros((n_sets, 3 * n_sensors, 3))
         gain[:, place] = model.gain[sets]
         n_triples = -(-n_common // 3)
@@ -101,7 +103,7 @@ class LaneModel(NamedTuple):
 
 def signals(model: WhitenedModel, y: FloatArray) -> FloatArray:
     """Whitened readings (b, C) as those of a :class:`LaneModel`: (b, s, 3)."""
-    place, known, n_sensors = _threes(model)
+    place, known, n_sensors = model.threes
     result = np.zeros((len(y), 3 * n_sensors))
     if not known.size:
         result[:, place] = y
@@ -111,14 +113,6 @@ def signals(model: WhitenedModel, y: FloatArray) -> FloatArray:
     result[:, place] = y - np.einsum("bck,bk->bc", basis, shrinkage * along)
     result[:, 3 * len(model.sensors) + np.arange(known.size)] = -np.sqrt(shrinkage * (2.0 - shrinkage)) * along
     return result.reshape(len(y), n_sensors, 3)
-
-
-def _threes(model: WhitenedModel) -> tuple[NDArray[np.intp], NDArray[np.intp], int]:
-    """Places of the channels, columns of the common field with a prior, and sensors together with theirs."""
-    owner = model.channel_sensor
-    known = np.flatnonzero((model.shrinkage < 1.0).any(axis=0))
-    place = 3 * owner + np.arange(owner.size) - np.searchsorted(owner, owner)
-    return place, known, len(model.sensors) + -(-known.size // 3)
 
 
 @compiled

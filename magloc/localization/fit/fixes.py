@@ -124,7 +124,7 @@ class Fixes(Sequence[Fix]):
     @property
     def solved(self) -> BoolArray:
         """Whether a row has a solution (n,)."""
-        return self.best >= 0
+        return np.diff(self._edges) > 0
 
     @property
     def position_m(self) -> FloatArray:

@@ -20,7 +20,6 @@ from magloc.fields.dipole import MU0_OVER_4PI
 from magloc.localization.fit.joint_compiled import LARGEST_DAMPING, LARGEST_STEP_RAD, JointEnds, refine_rows
 from magloc.localization.fit.variable_projection_compiled import refined
 from magloc.measurement.whitened import WhitenedModel
-from magloc.measurement.whitened_compiled import ModelRows
 
 # A refinement has converged where the linearised model promises to lower χ² by less than this, absolute and relative.
 PROMISE_ABSOLUTE = 1e-8
@@ -227,9 +226,7 @@ def most_refined(
     if linear and free.any():
         ends = JointEnds(own(q), own(mu), np.empty(len(q)), np.empty(len(q), dtype=np.int64))
         small = (promise, PROMISE_RELATIVE)
-        over_rows(
-            refine_rows, len(q), own(y), free.astype(np.float64), ModelRows.of(problem), small, max_iterations, ends
-        )
+        over_rows(refine_rows, len(q), own(y), free.astype(np.float64), problem.of_kernels, small, max_iterations, ends)
         return JointFits(*ends)
     return damped_gauss_newton(problem, y, q, mu, free, max_iterations, promise)
 

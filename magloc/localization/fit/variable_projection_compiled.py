@@ -68,7 +68,7 @@ def refined(
         signals(model, y),
         each,
         own(starts),
-        LaneModel.of(model),
+        model.lanes,
         free_range,
         tolerance,
         float(max_iterations),

@@ -179,7 +179,7 @@ class SingleSourceSearch:
             starts,
             keep_within,
             self.max_iterations,
-            rows.lanes,
+            rows.model.lanes,
             found,
         )
         return found

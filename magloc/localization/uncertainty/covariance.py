@@ -39,7 +39,6 @@ from magloc.localization.uncertainty.range_profile import profile_stretches, ran
 from magloc.localization.uncertainty.range_profile_compiled import FlatFits
 from magloc.localization.uncertainty.single_source_compiled import Certainties, Levels, certainty_rows
 from magloc.measurement.whitened import WhitenedModel
-from magloc.measurement.whitened_compiled import ModelRows
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,8 +161,8 @@ def known_of_one_compiled(optima: Optima, energy: FloatArray) -> _Known:
         own(energy),
         own(rows.y),
         rows.signal,
-        ModelRows.of(model),
-        rows.lanes,
+        model.of_kernels,
+        model.lanes,
         levels_of(rows.n_differences, optima.dof),
         found,
     )

@@ -8,8 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from arrays.array import SensorArray
 from arrays.geometries import tetrahedron
-from magloc.measurement.rows import check_magnitudes
+from arrays.typing import FloatArray
+from magloc.measurement.rows import WhitenedRows, check_magnitudes, whitened_rows
 
 ARRAY = tetrahedron(1.0)
 
@@ -29,3 +31,40 @@ def test_magnitudes(change, name: str, by: float) -> None:
     expected: AbstractContextManager[object] = nullcontext() if by < 1.0 else pytest.raises(ValueError, match=name)
     with expected:
         check_magnitudes(change(by))
+
+
+class TestModelOfOneRow:
+    """Readings that come one by one have one model, which differs from no other."""
+
+    ARRAY = replace(tetrahedron(1.5, noise_T=1e-9), common_field_T=1e-6)
+
+    @staticmethod
+    def rows(array: SensorArray, readings_T: FloatArray, ambient_T: FloatArray | None = None) -> WhitenedRows:
+        (rows,) = whitened_rows(array, readings_T, ambient_T, 100)
+        return rows
+
+    def test_rows_share_it(self) -> None:
+        readings = np.random.default_rng(1).normal(scale=1e-7, size=(2, 12))
+        first, second = (self.rows(self.ARRAY, row[None]) for row in readings)
+        assert first.model.lanes is second.model.lanes
+
+    def test_other_channels_array_or_noise_have_another(self) -> None:
+        readings = np.random.default_rng(1).normal(scale=1e-7, size=(1, 12))
+        missing = np.where(np.arange(12) == 4, np.nan, readings)
+        larger, louder = tetrahedron(3.0, noise_T=1e-9), replace(self.ARRAY, noise_fraction=0.1)
+        cases = [(self.ARRAY, readings), (self.ARRAY, missing), (larger, readings)]
+        cases += [(louder, readings), (louder, 2.0 * readings)]
+        models = [self.rows(*case).model for case in cases]
+        assert len({id(model) for model in models}) == len(cases)
+        assert not np.allclose(models[0].lanes.gain, models[1].lanes.gain)
+        assert not np.allclose(models[3].lanes.gain, models[4].lanes.gain)
+
+    @pytest.mark.parametrize("ambient_T", [None, np.array([[2e-5, -1e-6, 4e-5]])])
+    def test_as_a_row_of_many(self, ambient_T: FloatArray | None) -> None:
+        readings = np.random.default_rng(1).normal(scale=1e-7, size=(3, 12))
+        several = None if ambient_T is None else np.tile(ambient_T, (3, 1))
+        alone, many = self.rows(self.ARRAY, readings[:1], ambient_T), self.rows(self.ARRAY, readings, several)
+        np.testing.assert_allclose(alone.y[0], many.y[0], rtol=1e-12)
+        np.testing.assert_allclose(alone.signal[0], many.signal[0], rtol=1e-12)
+        np.testing.assert_allclose(alone.model.ambient[0], many.model.ambient[0])
+        np.testing.assert_array_equal(alone.model.lanes.common, many.model.lanes.common)
