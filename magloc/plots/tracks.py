@@ -170,7 +170,7 @@ def _figure(
         if truth_m is not None:
             ax.plot(time, per_m * truth_m[:, i], color=style.TRUTH, lw=0.8, ls="--", label="truth")
         low, high = style.limits_of([part[:, i] for part in extent], margin=0.15)
-        ax.set_ylim(per_m * np.array(_at_least(_LEAST_HEIGHT * widest, low, high)))
+        ax.set_ylim(*(per_m * end for end in _at_least(_LEAST_HEIGHT * widest, low, high)))
         style.dress(ax, "time [s]", f"{name} [{unit}]")
     strength = figure.add_subplot(grid[2, 1], sharex=first)
     ends: list[FloatArray] = []
