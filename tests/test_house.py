@@ -5,13 +5,17 @@ from __future__ import annotations
 import ast
 import importlib
 import importlib.util
+import inspect
 import pkgutil
 import re
 from collections import Counter
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+import adcs
+import magloc
 from tests.conftest import REPOSITORY
 
 PACKAGES = ("arrays", "magloc", "adcs", "sims")
@@ -52,6 +56,35 @@ class TestPublicNames:
         users = [path for other in PACKAGES for path in (REPOSITORY / other / "cli").glob("*.py")] + reading
         words = {word for path in users for word in re.findall(r"\w+", path.read_text(encoding="utf-8"))}
         assert sorted(set(importlib.import_module(package).__all__) - words) == []
+
+
+# Results without a figure of their own, and why.
+NOT_DRAWN = {
+    "adcs.attitude_of_vectors": "attitudes of single instants; adcs.vector_attitude makes a track of them",
+    "adcs.circular_orbit": "given, and not found",
+    "adcs.combined_star_fixes": "readings for an estimate, which is drawn",
+    "adcs.hipparcos_catalogue": "given, and not found",
+    "magloc.equivalent_dipole": "one place and one moment",
+    "magloc.fit_gradient_tensor": "one place and one moment",
+    "magloc.fit_source_line": "a field along a line, asked for its distance",
+    "magloc.view": "a page by itself",
+    "adcs.view": "a page by itself",
+}
+
+
+def test_every_result_draws_itself() -> None:
+    """Whatever class of ours a public function of magloc and adcs gives, unless it reads a file."""
+    missing = set()
+    for package in (magloc, adcs):
+        for name, function in ((name, getattr(package, name)) for name in package.__all__):
+            if not inspect.isfunction(function) or name.startswith("read_"):
+                continue
+            module = importlib.import_module(function.__module__)
+            given = [getattr(module, part, None) for part in str(function.__annotations__["return"]).split(" | ")]
+            results = [part for each in given for part in get_args(each) or (each,) if inspect.isclass(part)]
+            if any(part.__module__.split(".")[0] in PACKAGES and not hasattr(part, "plot") for part in results):
+                missing.add(f"{package.__name__}.{name}")
+    assert missing == NOT_DRAWN.keys()
 
 
 def test_only_command_lines_import_the_root_of_their_package(trees: dict[Path, ast.Module]) -> None:

@@ -58,7 +58,7 @@ def frame_figure(
         ceiling.plot(*lights_m[stars[:, 1]].T, "o", color=_FOUND, ms=4.0)
         draw_footprint(ceiling, camera, fix)
         x, y = 1e3 * fix.position_m
-        words = f"ceiling: X {x:.1f} mm, Y {y:.1f} mm, heading {np.degrees(fix.heading_rad):.2f}°"
+        words = f"ceiling: X {x:.1f} mm, Y {y:.1f} mm,\nheading {np.degrees(fix.heading_rad):.2f}°"
     else:
         words = f"ceiling; no fix: {fix.reason}"
     ceiling.set_aspect("equal")
@@ -184,6 +184,7 @@ def drive_figure(
     if not seen.all():
         path.plot(*truth_m[~seen].T, "s", color=_NONE, ms=4.5, mfc="none", label=f"no fix: {int((~seen).sum())}")
     path.set_aspect("equal")
+    path.locator_params(axis="x", nbins=5)
     error_mm = 1e3 * np.linalg.norm((fixes_m - truth_m)[seen], axis=1)
     text = f": {np.sqrt(np.mean(error_mm**2)):.2g} mm rms" if error_mm.size else ""
     style.dress(path, "X [m]", "Y [m]", f"perimeter drive{text}")

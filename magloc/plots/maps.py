@@ -80,10 +80,11 @@ def convergence(dataset: xr.Dataset) -> Figure:
     bar.ax.tick_params(labelsize=style.SMALL_LETTERS)
     handles = _handles(parts, _NOT_CONVERGED) + axes[0].get_legend_handles_labels()[0]
     style.legend(figure, handles=handles, loc="lower center", ncols=6)
+    halves = {"front": counts.front_fraction, "back": counts.back_fraction}
     style.headline(
         figure,
         f"Convergence of '{dataset.attrs['method']}', moment ({', '.join(f'{m:g}' for m in moment)}) A·m²: "
-        f"front half {_percent(counts.front_fraction)}, back half {_percent(counts.back_fraction)}"
+        + ", ".join(f"{half} half {_percent(part)}" for half, part in halves.items() if not np.isnan(part))
         + (f", median {counts.median_iterations:.0f} passes" if counts.converged else ""),
     )
     return figure

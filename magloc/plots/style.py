@@ -43,6 +43,8 @@ _MOST_ELLIPSES = 24
 # Ratios of the limits below which some, many, or all numbers between the powers of ten are written.
 _FEW_DECADES, _FEW_TIMES, _NO_TIMES = 30.0, 4.0, 2.5
 _FEW_MARKS = 40
+# What differs by no more than this share of itself is one number.
+_ROUNDING = 1e-9
 FEW_SENSORS, _MOST_NAMED_SENSORS = 10, 60
 """Columns of position and moment."""
 
@@ -115,13 +117,15 @@ def dress(ax: Axes, across: str, up: str, title: str = "") -> None:
     ax.tick_params(which="major", length=2.5)
     ax.grid(visible=True, color=LIGHT_GREY, linewidth=0.4)
     ax.set_axisbelow(True)
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.get_offset_text().set_fontsize(SMALL_LETTERS)
     for spine in ax.spines.values():
         spine.set_linewidth(0.6)
 
 
 def headline(figure: Figure, text: str) -> None:
-    """Title of the whole figure."""
-    figure.suptitle(text, fontsize=LETTERS + 1.0)
+    """Title of the whole figure, broken where it is wider than the page."""
+    figure.suptitle(text, fontsize=LETTERS + 1.0, wrap=True)
 
 
 def legend(where: Axes | Figure, **options: Any) -> None:
@@ -225,9 +229,11 @@ def limits_of(
         ends += [every.min(), every.max()] if np.ptp(every) <= 2.0 * np.ptp(inner) else inner.tolist()
     if not ends:
         return 0.0, 1.0
-    low, high = min(ends), max(ends)
-    width = float(high - low) or max(abs(float(low)), 1e-3)
-    return float(low) - margin * width, float(high) + margin * width
+    low, high = float(min(ends)), float(max(ends))
+    width, size = high - low, max(abs(low), abs(high))
+    if width <= _ROUNDING * size:
+        width = max(size, 1e-3)
+    return low - margin * width, high + margin * width
 
 
 def _finite(values: Sequence[FloatArray]) -> FloatArray:

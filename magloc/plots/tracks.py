@@ -88,6 +88,8 @@ def write_sources(result: TrackResult, folder: Path, array_m: FloatArray | None 
 _PLAN_IN = (1.2, 3.4, 6.2)
 # Least ratio of the plan's sides.
 _NARROWEST = 0.2
+# Least height of a coordinate's axis, over the width of the plan: what stands still is a line, without ticks of 1 µm.
+_LEAST_HEIGHT = 0.01
 # Of several sources, the first that of estimates; told apart by colour-blind readers too.
 _SOURCES = (style.ESTIMATE, style.ORANGE, "#009e73", "#cc79a7", "#56b4e9")
 
@@ -167,7 +169,8 @@ def _figure(
         style.shade_gaps(ax, time, tracked, "not tracked")
         if truth_m is not None:
             ax.plot(time, per_m * truth_m[:, i], color=style.TRUTH, lw=0.8, ls="--", label="truth")
-        ax.set_ylim(style.limits_of([per_m * part[:, i] for part in extent], margin=0.15))
+        low, high = style.limits_of([part[:, i] for part in extent], margin=0.15)
+        ax.set_ylim(*(per_m * end for end in _at_least(_LEAST_HEIGHT * widest, low, high)))
         style.dress(ax, "time [s]", f"{name} [{unit}]")
     strength = figure.add_subplot(grid[2, 1], sharex=first)
     ends: list[FloatArray] = []

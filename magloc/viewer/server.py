@@ -18,7 +18,7 @@ from arrays.io.errors import InputError
 from arrays.io.text import replaced, write_text
 from magloc.viewer.chromium import BrowserError, Chromium
 from magloc.viewer.origin import guarded_server
-from magloc.viewer.scene.framing import ASPECT
+from magloc.viewer.scene.framing import SIDES_OF_A_PHONE
 from magloc.viewer.scene.legend import ABOVE_THE_PLAYER, NARROW_PX, with_legend
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def _steps_back(server: viser.ViserServer) -> Callable[[viser.ClientHandle], Non
     first = server.initial_camera
 
     def step_back(camera: viser.CameraHandle) -> None:
-        farther = ASPECT * camera.image_height / camera.image_width
+        farther = SIDES_OF_A_PHONE * camera.image_height / camera.image_width
         if camera.image_width < NARROW_PX and farther > 1.0 and np.allclose(camera.position, first.position, rtol=1e-3):
             camera.position = first.look_at + farther * (first.position - first.look_at)
             camera.look_at = first.look_at  # a camera that moves takes it along

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from arrays.array_file import write_array
 from arrays.geometries import tetrahedron
 from magloc.viewer.pages.open_result import MapResult
 from magloc.viewer.pages.pages import array_page, map_page
+from magloc.viewer.scene.framing import SIDES_OF_A_PHONE
 from magloc.viewer.scene.glyphs import DIPOLE_COLOUR
 from magloc.viewer.server import opened, page_html, write_page
 from tests.browser.screen import Screen, Sight, dark_grey, hue_of
@@ -60,3 +62,22 @@ class TestStaticPages:
         with opened(0, "map") as server:
             write_page(page_html(server, map_page(server, result)), tmp_path / "map.html")
         assert (tmp_path / "map.html").stat().st_size < LARGEST
+
+    def test_on_a_phone_all_is_in_view(self, screen: Screen, tmp_path: Path) -> None:
+        """A page that is narrow sees as far to the sides as the first camera does: its picture is that much smaller."""
+        page, shape = tmp_path / "array.html", {"deviceScaleFactor": 1, "mobile": False}
+        array = tetrahedron(0.03)
+        with opened(0, "array") as server:
+            write_page(page_html(server, array_page(server, array, live=False)), page)
+            screen.browser.call("Emulation.setDeviceMetricsOverride", width=390, height=844, **shape)
+            try:
+                screen.open(page.as_uri())
+                camera = screen.camera(server.initial_camera)
+                upright = 2.0 * np.arctan(SIDES_OF_A_PHONE * 844.0 / 390.0 * np.tan(0.5 * camera.field_of_view_rad))
+                places = replace(camera, field_of_view_rad=upright).pixels(array.positions)
+                assert (places[:, 0] > 0.0).all()
+                assert (places[:, 0] < 390.0).all()
+                screen.until_seen(Sight("body of a sensor", places, dark_grey))
+                screen.keep("static-phone")
+            finally:
+                screen.browser.call("Emulation.setDeviceMetricsOverride", width=1280, height=800, **shape)

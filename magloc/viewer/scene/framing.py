@@ -12,11 +12,13 @@ from numpy.typing import ArrayLike
 from arrays.typing import FloatArray
 from magloc.viewer.scene.glyphs import round_length
 
-_FIELD_OF_VIEW_RAD = np.radians(40.0)
+FIELD_OF_VIEW_RAD = np.radians(40.0)
+"""Of the first camera, upright."""
 # From where the first camera looks: from the front right, from above.
 _TOWARDS_CAMERA = np.array([0.55, -0.72, 0.42])
-ASPECT = 1.15
-"""Of the scene beside the panel, about."""
+_ASPECT = 1.15  # of the scene beside the panel, about
+SIDES_OF_A_PHONE = 1.4
+"""What a narrow page sees to its sides, over the height that the first camera sees: words are as large on it."""
 _MARGIN = 1.12
 _CELLS_PER_RADIUS = 4.0
 _FLOOR_RADII = 3.0
@@ -124,10 +126,10 @@ def aim(server: viser.ViserServer, extent: Extent) -> None:
     axes = np.stack([right, np.cross(back, right), back])
     across, up, towards = axes @ (extent.points_m - extent.centre_m).T
     # A point is in view if it is no farther from the axis than the field of view is wide at its depth.
-    tangent = np.tan(0.5 * _FIELD_OF_VIEW_RAD) / _MARGIN
-    distance = np.max(towards + np.maximum(np.abs(up) / tangent, np.abs(across) / (ASPECT * tangent)))
+    tangent = np.tan(0.5 * FIELD_OF_VIEW_RAD) / _MARGIN
+    distance = np.max(towards + np.maximum(np.abs(up) / tangent, np.abs(across) / (_ASPECT * tangent)))
     camera = server.initial_camera
-    camera.fov = float(_FIELD_OF_VIEW_RAD)
+    camera.fov = float(FIELD_OF_VIEW_RAD)
     camera.position = extent.centre_m + max(float(distance), 0.5 * extent.radius_m) * back
     camera.look_at = extent.centre_m
     camera.near = 0.01 * extent.radius_m

@@ -6,11 +6,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
+import numpy as np
+
+from magloc.viewer.scene.framing import FIELD_OF_VIEW_RAD, SIDES_OF_A_PHONE
+
 Colour = tuple[int, int, int]
 ABOVE_THE_PLAYER = "4em"
 """Where the legend stands on a page that plays."""
 NARROW_PX = 600
 """Of a page whose legend or panel is folded at first, for it would hide the scene."""
+_TO_ONE_SIDE = SIDES_OF_A_PHONE * np.tan(0.5 * FIELD_OF_VIEW_RAD)
+# viser's page takes its first camera from its address, which a page of a file must not change.
+_SEES_AS_WIDE = f"""<script>
+if (innerWidth < {NARROW_PX}) {{
+  const inAddress = URLSearchParams.prototype.get;
+  const upright = 2 * Math.atan({_TO_ONE_SIDE:.4f} * Math.max(innerHeight / innerWidth, 1));
+  URLSearchParams.prototype.get = function (name) {{
+    return name === 'initialCameraFov' ? upright : inAddress.call(this, name);
+  }};
+}}
+</script>"""
 
 
 @dataclass(frozen=True)
@@ -70,7 +85,10 @@ def with_legend(
     bottom: str = ".8em",
     script: str = "",
 ) -> str:
-    """A static page as viser makes it, without a panel, with a legend that folds in its corner, and a script."""
+    """A static page as viser makes it, without a panel, with a legend that folds in its corner, and a script.
+
+    A page as narrow as a phone sees as far to the sides as a wider one, and more above and below.
+    """
     box = (
         f'<details id="legend" open style="position:fixed;bottom:{bottom};left:.8em;z-index:1000;max-width:19rem;'
         "background:rgba(255,255,255,.9);"
@@ -80,7 +98,7 @@ def with_legend(
         f"{escape(title)}</summary>{legend_html(entries, notes)}</details>"
         f"<script>document.getElementById('legend').open = innerWidth > {NARROW_PX}</script>"
     )
-    before, end, after = page.rpartition("</body>")
+    before, end, after = page.replace("<head>", f"<head>{_SEES_AS_WIDE}", 1).rpartition("</body>")
     if script:
         box += f"<script>{script}</script>"
     return f"{before}{box}{end}{after}"

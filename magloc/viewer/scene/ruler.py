@@ -13,15 +13,15 @@ from magloc.viewer.scene.glyphs import Colour, LabelAnchor, length_unit, round_l
 _RULER_COLOUR: Colour = (110, 116, 124)
 _TICKS = 4.0
 _TICK_OF_STEP = 0.12
-_MOST_TICKS = 12
+_MOST_NUMBERS = 5
 _FOOT_OF_RADIUS = 0.02
 
 
 def add_ruler(scene: viser.SceneApi, extent: Extent, floor: Floor, name: str = "/ruler") -> FloatArray:
     """Axes with numbers around all that should be in view: x in front, y to the right, z to the left.
 
-    These are the edges that the first camera sees at the border. Returns their ends and the places of their
-    names (9, 3).
+    These are the edges that the first camera sees at the border; the last number of each says its name. Numbers are
+    as large on a phone, where an edge is a hundred pixels long, so that they are few. Returns the ends (6, 3).
     """
     low, high = extent.points_m.min(axis=0), extent.points_m.max(axis=0)
     low[2] = floor.height_m
@@ -44,19 +44,17 @@ def add_ruler(scene: viser.SceneApi, extent: Extent, floor: Floor, name: str = "
         axis, ends = "xyz"[i], np.array([begin, begin])
         ends[1, i] = high[i]
         segments.append(list(ends))
-        every = step * max(1, int(np.ceil((high[i] - low[i]) / step / _MOST_TICKS)))
-        for value in every * np.arange(np.ceil(low[i] / every - 1e-9), np.floor(high[i] / every + 1e-9) + 1.0):
+        corners += list(ends)
+        every = step if high[i] - low[i] < (_MOST_NUMBERS + 0.5) * step else 2.0 * step
+        # Where an axis begins, the one before has its last number, or its first; near its end it has its name.
+        first = np.floor(low[i] / every + 1e-9) + 1.0 if i > 0 else np.ceil(low[i] / every - 1e-9)
+        for value in (*(every * np.arange(first, np.ceil(high[i] / every - 0.6))), high[i]):
             place = np.array(begin)
             place[i] = value
             segments.append([place, place + outwards])
-            if i > 0 and value == low[i]:
-                continue  # where the axis before has its last number, or its first
             number = f"{round(value / metres, 9) + 0.0:.6g}"
-            screen_label(scene, f"{name}/{axis}/{number}", number, place + 2.0 * np.array(outwards), anchor)
-        beyond = ends[1] + 0.0
-        beyond[i] += 0.6 * step
-        corners += [*ends, beyond]
-        screen_label(scene, f"{name}/{axis}/name", f"{axis} [{unit}]", beyond, anchor)
+            words = f"{axis} = {number} {unit}" if value == high[i] else number
+            screen_label(scene, f"{name}/{axis}/{number}", words, place + 2.0 * np.array(outwards), anchor)
     screen_lines(scene, f"{name}/edges", np.array(segments), _RULER_COLOUR, 1.2)
     return np.array(corners)
 

@@ -181,7 +181,7 @@ class TestSky:
         np.testing.assert_allclose(line(frame, "identified"), [[100.0, 50.0], [630.0, 470.0]])
         np.testing.assert_allclose(line(frame, "not identified"), [[300.0, 200.0]])
         assert [text.get_text() for text in frame.texts] == ["7", "11"]
-        assert "X 200.0 mm, Y -100.0 mm, heading 28.65°" in ceiling.get_title(loc="left")
+        assert "X 200.0 mm, Y -100.0 mm,\nheading 28.65°" in ceiling.get_title(loc="left")
 
     def test_frame_without_fix(self):
         figure = self.frame(NoFix("3 stars, 5 needed"))

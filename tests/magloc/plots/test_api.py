@@ -88,12 +88,6 @@ def test_residuals_are_the_same_in_either_frame(fixes: Fixes) -> None:
 class TestEveryResult:
     """Whatever a door gives draws itself."""
 
-    @pytest.mark.parametrize("name", [
-        "Bounds", "Calibration", "Design", "Fixes", "MomentTrack", "Signature", "Survey", "Track",
-    ])  # fmt: skip
-    def test_has_plot(self, name: str) -> None:
-        assert callable(getattr(magloc, name).plot)
-
     def test_bounds_are_drawn_over_the_distance(self) -> None:
         places = np.array([[6.0, 0.0, 0.5], [2.0, 0.0, 0.5], [4.0, 0.0, 0.5]])
         bounds = magloc.cramer_rao_bounds(ARRAY, places, [0.0, 0.0, 100.0])

@@ -217,6 +217,9 @@ class TestLimits:
         low, high = style.limits_of([np.append(np.linspace(0.0, 1.0, 200), 1e6)])
         assert -0.2 < low < high < 1.2
 
+    def test_what_differs_by_rounding_alone_is_one_number(self) -> None:
+        assert style.limits_of([np.array([2.0, 2.0 + 4e-16, 2.0 - 4e-16])]) == pytest.approx((1.84, 2.16))
+
     def test_nothing_to_show(self) -> None:
         low, high = style.limits_of([np.array([np.nan])])
         assert low < high
@@ -277,6 +280,17 @@ class TestMaps:
         assert not figure.axes[2].images[-1].get_array().mask.all()
         named = {text.get_text(): handle.get_hatch() for text, handle in self.legend(figure)}
         assert (named["did not stop"], named["diverged"], named["stopped elsewhere"]) == ("////", "xxxx", "")
+
+    def test_a_headline_stays_on_the_page(self) -> None:
+        """A moment of many figures makes it longer than the page is wide; of a half without a start it says nothing."""
+        dataset = self.dataset()
+        dataset.attrs["moment_Am2"] = [-123456.0, -23456.7, -1.23456e-05]
+        figure = convergence(dataset)
+        figure.canvas.draw()
+        title = figure.get_suptitle()
+        assert "front half 88.9 %, median 10 passes" in title
+        (box,) = [text.get_window_extent() for text in figure.texts if text.get_text() == title]
+        assert 0.0 <= box.x0 < box.x1 <= figure.bbox.width
 
     def legend(self, figure: Figure) -> list[tuple[Any, Any]]:
         (legend,) = figure.legends
@@ -361,6 +375,7 @@ class TestTrack:
         ]
         figure = track_figure(small)
         assert figure.axes[0].get_xlabel() == "x [mm]"
+        assert np.ptp(panel(figure, "z [mm]").get_ylim()) > 0.4  # of what stays 0, in a plan of 46 mm
         assert ellipses(figure.axes[0])[0].width == pytest.approx(2.0 * math.sqrt(chi2.ppf(0.95, 2)))
 
     def test_a_source_that_stands_still_is_marked(self) -> None:
