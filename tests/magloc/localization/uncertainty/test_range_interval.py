@@ -25,6 +25,7 @@ from arrays.sensor import Sensor
 from arrays.whitening import whitening
 from magloc.directions import fibonacci_directions
 from magloc.levels import DELTA_CHI2_95
+from magloc.localization.fit.gauss_newton import refine
 from magloc.localization.fit.results import (
     EVERYWHERE,
     Fix,
@@ -34,6 +35,7 @@ from magloc.localization.fit.results import (
     intervals_of,
     is_observable_set,
 )
+from magloc.localization.uncertainty import range_profile
 from magloc.localization.uncertainty.ambiguity import weights
 from magloc.localization.uncertainty.range_interval import (
     gaussian_ranges,
@@ -44,6 +46,7 @@ from magloc.localization.uncertainty.range_interval import (
     union,
 )
 from magloc.measurement.differences import DifferenceMeasurement, predicted_channels
+from magloc.measurement.rows import whitened_rows
 from magloc.measurement.whitened import WhitenedModel
 from magloc.tracking.batch import track_record
 from magloc.tracking.motion import RandomWalk
@@ -385,6 +388,42 @@ class TestRise:
         assert_allclose(outside, 0.05, rtol=1e-4)
         assert levels(np.array([[3.0, np.inf]]), np.array([[1.0, 0.0]]))[0] == DELTA_CHI2_95
         assert levels(np.array([[3.0, 3.0]]), np.array([[0.5, 0.5]]))[0] == pytest.approx(DELTA_CHI2_95, abs=1e-5)
+
+
+class TestProfileOfModuli:
+    """In an ambient field points of the profile are reached in lanes, damped steps go on to those that bound it."""
+
+    N = 60
+
+    def stretches(self, rise: float) -> FloatArray:
+        """Of the best fits of sources at 1.5 to 8 m, from clearly observable to hopeless."""
+        array, rng = scalar_array((2e-5, 1e-6, 4e-5)), np.random.default_rng(11)
+        direction, moment = rng.normal(size=(2, self.N, 3))
+        direction *= rng.uniform(1.5, 8.0, (self.N, 1)) / np.linalg.norm(direction, axis=1, keepdims=True)
+        moment *= 100.0 / np.linalg.norm(moment, axis=1, keepdims=True)
+        readings = predicted_channels(array, array.centroid + direction, moment) + rng.normal(0.0, 1e-9, (self.N, 9))
+        (rows,) = whitened_rows(array, readings, None, self.N)
+        (optima,) = plain_locator(array)._search.optima(rows)
+        solved, best = np.unique(optima.of_row, return_index=True)
+        return range_profile.profile_stretches(
+            rows.model.rows(solved),
+            rows.y[solved],
+            optima.fits.rows(best),
+            0,
+            np.full(len(solved), np.nan),
+            np.full(len(solved), rise),
+        )
+
+    def test_ends_are_those_of_damped_steps_throughout(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        found = self.stretches(DELTA_CHI2_95)
+        monkeypatch.setattr(range_profile, "most_refined", refine)
+        damped = self.stretches(DELTA_CHI2_95)
+        assert np.all(np.isclose(found, damped, atol=2e-3).mean(axis=0) >= 0.95)
+        # What is still not reached is left within.
+        assert np.all((found - damped) * [1.0, -1.0] <= 2e-3)
+
+    def test_no_end_where_nothing_rises_so_much(self) -> None:
+        assert_allclose(self.stretches(1e12), np.tile([-0.5 * np.pi, 0.5 * np.pi], (self.N, 1)))
 
 
 class TestWeights:
