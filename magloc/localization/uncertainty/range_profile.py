@@ -103,7 +103,7 @@ def ranges_within(
 
 
 def _bracket(rise: FloatArray, allowed: FloatArray) -> tuple[IntArray, IntArray]:
-    """Columns of the last point (s, k) known to be within what is allowed (s,), else -1, and the first beyond, else k."""
+    """Columns of the last point (s, k) known to be within what is allowed (s,), or -1, and the first beyond, or k."""
     n = rise.shape[1]
     within, beyond = np.isfinite(rise) & (rise <= allowed[:, None]), rise > allowed[:, None]
     last = np.where(within.any(axis=1), n - 1 - np.argmax(within[:, ::-1], axis=1), -1)
