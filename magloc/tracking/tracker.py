@@ -287,7 +287,7 @@ class Tracker:
         if mixture is None:
             return out, self._lost(seen.row, reason)
         self._judge(row, out, lambda row: math.inf if self.filter.of_row(row, self.motion)[0] is None else 0.0)
-        open_loop = self.known_before(seen, mixture.matched().x[0])
+        open_loop = self.known_before(seen, mixture.x[np.argmax(mixture.log_weight)])
         known = self.filter.refitted(Known(mixture, open_loop, young=((seen, self.motion),)))
         return out, self._kept(seen.row, index, known, None, status="acquired")
 

@@ -136,7 +136,7 @@ class ChartRow:
             return np.eye(len(self.sigma))
         # Sources without a moment: what is left is the ambient field, turned by the pose's errors.
         nowhere = self.pose.in_array(np.zeros(N_SOURCE))
-        by_pose = self._by_pose(np.zeros((len(self.sigma), N_SOURCE)), nowhere, np.zeros(N_POSE))
+        by_pose = where_smooth(self._by_pose(np.zeros((len(self.sigma), N_SOURCE)), nowhere, np.zeros(N_POSE)))
         return np.linalg.inv(np.linalg.cholesky(np.eye(len(by_pose)) + by_pose @ by_pose.T))
 
     def is_detected(self, sigma_errors: FloatArray) -> bool:
@@ -173,3 +173,8 @@ class ChartRow:
     def _ambient_T(self, error: FloatArray | None) -> FloatArray | None:
         """Ambient fields at the sensors (..., N, 3) that errors make of the array's own, which is meant by None."""
         return None if error is None else self.pose.ambient(self.model.array.ambient_fields, error)
+
+
+def where_smooth(derivative: FloatArray) -> FloatArray:
+    """Zero in place of NaN: differences of moduli in no ambient field, which have a corner where the source is none."""
+    return np.where(np.isnan(derivative), 0.0, derivative)

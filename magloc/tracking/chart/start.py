@@ -29,7 +29,7 @@ from magloc.measurement.nuisances import SensorErrors
 from magloc.measurement.rows import check_magnitudes, check_spans
 from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart, source_root
 from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture, block_root
-from magloc.tracking.chart.row import ChartRow
+from magloc.tracking.chart.row import ChartRow, where_smooth
 from magloc.tracking.chart.update import Updated, updated
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.results import Row
@@ -56,6 +56,7 @@ _MOST_BENT = 100.0
 _VALLEY = 4.0
 _SIGMA_PRIOR = (math.log(FARTHEST / NEAREST) / math.sqrt(12.0), 1.0, 1.0)
 NOT_ALLOWED = "not acquired: no source of the stated region and moment explains the readings"
+NO_AMBIENT = "not acquired: without an ambient field fewer than six differences of moduli do not start a track"
 NO_DIPOLE = "not acquired: no dipole fits the readings"
 
 
@@ -154,7 +155,9 @@ class Start:
         alone = measurement.with_errors_as_noise(self.errors.sigma)
         seeds = self._seeds(alone)
         if not len(seeds.cell):
-            return None, NOT_ALLOWED
+            array = alone.model.array
+            is_linear = array.ambient_fields.any() or not array.channel_is_scalar.any()
+            return None, NOT_ALLOWED if is_linear or alone.z.size >= N_SOURCE else NO_AMBIENT
         found = _components(alone, motion, seeds)
         for refined in (_centred, _along_valleys):
             finer = refined(seeds, found, measurement)
@@ -186,7 +189,9 @@ class Start:
         cells, row = self._grid.position_m, measurement.row
         world = row.origin_m + cells @ row.R_world_from_array.T
         columns = measurement.source_jacobian(np.concatenate([world, np.zeros_like(world)], axis=1))[..., 3:]
-        columns, left = measurement.whitening @ columns, measurement.whitening @ measurement.without_source
+        # Moduli in no ambient field are linear in no moment: their cells explain nothing, and their best fits start.
+        whiten = measurement.whitening
+        columns, left = whiten @ where_smooth(columns), whiten @ measurement.without_source
         moments = (np.linalg.pinv(columns, rcond=1e-6) @ left[:, None])[..., 0]
         explained = np.sum((columns @ moments[..., None])[..., 0] ** 2, axis=1)
         explained[~self.prior.allows_position(cells) | ~(explained > 0.0)] = -np.inf

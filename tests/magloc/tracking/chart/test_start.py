@@ -9,10 +9,13 @@ import pytest
 from scipy import stats
 from scipy.linalg import block_diag
 
+import magloc
+from arrays.array import SensorArray
+from arrays.pose import PoseUncertainty
 from magloc.ambient import in_world_field
 from magloc.tracking.chart.mixture import Mixture
 from magloc.tracking.chart.row import ChartRow
-from magloc.tracking.chart.start import with_errors
+from magloc.tracking.chart.start import NO_AMBIENT, with_errors
 from magloc.tracking.chart.update import updated
 from magloc.tracking.results import rows_of
 from magloc.tracking.tracker import Tracker
@@ -64,3 +67,26 @@ class TestValleyOfRangesThatBends:
         square = np.sum(np.linalg.solve(mixture.S, e[..., None])[..., 0] ** 2, axis=1)
         assert len(mixture) > 10
         assert square.min() < stats.chi2.ppf(1.0 - 1e-5, 6)
+
+
+class TestModuliInNoAmbientField:
+    """They are linear in no moment: fits alone start a track, with either sign of the moment."""
+
+    @pytest.mark.parametrize("pose", [None, PoseUncertainty()], ids=["exact", "with its errors"])
+    def test_seven_differences_follow_a_source(self, pose: PoseUncertainty | None) -> None:
+        """Its place leaves χ² of three numbers with 1e-4; both signs of the moment stay as likely, to the last row."""
+        simulation = simulate(replace(SCENARIO, ambient_T=None, duration_s=3.0, pose=pose), 0)
+        found = magloc.track(simulation.array, simulation.readings, motion=REST)
+        off = found.position_m[-1] - simulation.truth.position_m[-1]
+        assert found.tracked.all()
+        assert off @ np.linalg.solve(found.covariance[-1, :3, :3], off) < stats.chi2.ppf(1.0 - 1e-4, 3)
+        np.testing.assert_allclose(found.moment_Am2[-1], 0.0, atol=1e-3)
+        size = np.sqrt(np.trace(found.covariance[-1, 3:, 3:]))
+        assert simulation.truth.moment_Am2 is not None
+        assert size == pytest.approx(np.linalg.norm(simulation.truth.moment_Am2[-1]), rel=0.1)
+        assert found.estimability[-1][3:].min() > 0.5
+
+    def test_fewer_say_so(self) -> None:
+        few = SensorArray(SCENARIO.array.sensors[:5])
+        simulation = simulate(replace(SCENARIO, array=few, models=SCENARIO.models[:5], ambient_T=None), 0)
+        assert set(magloc.track(few, simulation.readings[:3], motion=REST).status) == {NO_AMBIENT}
