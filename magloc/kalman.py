@@ -51,10 +51,8 @@ def predict_square_root(S: FloatArray, F: FloatArray, S_q: FloatArray) -> FloatA
 
 
 def _factored(rows: FloatArray) -> FloatArray:
-    """Lower root L (n, n) of ``L Lᵀ = rows rowsᵀ``, rows (n, m ≥ n), which are spoilt; above its diagonal is anything.
-
-    LAPACK itself: the checks of NumPy's form take several times longer than so small a factorisation.
-    """
+    """Lower root L (n, n) of ``L Lᵀ = rows rowsᵀ``, rows (n, m ≥ n), which it spoils; above its diagonal anything."""
+    # LAPACK itself: the checks of NumPy's form take several times longer than so small a factorisation.
     lower: FloatArray = dgeqrf(rows.T, overwrite_a=True)[0][: len(rows)].T
     return lower
 
@@ -131,8 +129,8 @@ def _scaled_innovation_root(S: FloatArray, H: FloatArray, variance: FloatArray) 
 
 
 def _solved(L: FloatArray, columns: FloatArray) -> FloatArray:
-    """``L⁻¹`` columns, of the lower triangle of L alone."""
-    solved: FloatArray = dtrtrs(L, columns, lower=True)[0]
+    """``L⁻¹`` columns, of the lower triangle of L alone. LAPACK complains in print of one without rows."""
+    solved: FloatArray = dtrtrs(L, columns, lower=True)[0] if len(L) else columns
     return solved
 
 
@@ -200,9 +198,9 @@ def iterated_update(
     HJacobian : callable
         Their Jacobian, (n,) -> (k, n).
     tolerance : float
-        In the unit of z; a fraction of the sensors' noise.
+        In the unit of z; a fraction of the sensors' noise. 0: as many linearisations as are allowed.
     max_iterations : int
-        Linearisations at most; after the last of them the stop rule is not asked. 1: an extended Kalman filter.
+        Linearisations at most. 1: an extended Kalman filter, which with a `tolerance` of 0 asks for one prediction.
     shrink : float
         What the length of the steps is multiplied by whenever one changes the prediction no less than the one before:
         Gauss-Newton steps may swing to and fro about an optimum in a strongly curved direction. 1: they are whole, as
@@ -213,13 +211,13 @@ def iterated_update(
     innovation = z - predicted
     S_k, nis = S, np.nan
     iteration, change, length = 0, np.inf, 1.0
-    while np.isfinite(predicted).all() and not change < tolerance:
+    while iteration < max_iterations and np.isfinite(predicted).all() and not change < tolerance:
         iteration += 1
         H = HJacobian(x_k)
         optimum, S_k, nis = _least_squares_update(x, S, H, z - predicted - H @ (x - x_k), sigma)
         x_k = optimum if length == 1.0 else x_k + length * (optimum - x_k)
-        if iteration == max_iterations:
-            break
+        if iteration == max_iterations and not tolerance > 0.0:
+            break  # nothing would be below it
         before, predicted = predicted, Hx(x_k)
         step = predicted - before
         change_before, change = change, math.sqrt(step @ step) / length
@@ -239,6 +237,8 @@ def _least_squares_update(
     root is not that of :func:`block_update`, the covariance is.
     """
     k, n = H.shape
+    if not k:
+        return x, S, 0.0
     rows = np.eye(k + n, n + 1, -k, order="F")
     rows[:k, :n], rows[:k, n] = H @ S, innovation
     rows[:k] /= sigma[:, None]
@@ -320,9 +320,9 @@ class IteratedExtendedKalmanFilter:
     dim_x, dim_z : int
         Sizes of the state and of the measurement.
     tolerance : float
-        Stop rule: norm of the change of the predicted measurements between iterations, in the unit of z.
+        Stop rule: norm of the change of the predicted measurements between iterations, in the unit of z; 0: none.
     max_iterations : int
-        Linearisations at most.
+        Linearisations at most, one at least.
 
     Attributes
     ----------
@@ -353,6 +353,8 @@ class IteratedExtendedKalmanFilter:
     """
 
     def __init__(self, dim_x: int, dim_z: int, *, tolerance: float, max_iterations: int = 50) -> None:
+        if max_iterations < 1:
+            raise ValueError(f"Input max_iterations must be at least 1; instead received {max_iterations}.")
         self.dim_x = dim_x
         self.dim_z = dim_z
         self.tolerance = tolerance
@@ -443,8 +445,6 @@ def symmetric_square_root(covariance: FloatArray) -> FloatArray:
         raise ValueError("Input covariance must be symmetric; instead received a matrix that is not.")
     eigenvalue, eigenvector = np.linalg.eigh(correlation)
     if eigenvalue[0] < -1e-9 * max(1.0, eigenvalue[-1]):
-        raise ValueError(
-            "Input covariance must be positive semidefinite; "
-            f"instead received a matrix whose correlations have the eigenvalue {eigenvalue[0]:g}."
-        )
+        found = f"a matrix whose correlations have the eigenvalue {eigenvalue[0]:g}"
+        raise ValueError(f"Input covariance must be positive semidefinite; instead received {found}.")
     return scale[:, None] * eigenvector * np.sqrt(np.clip(eigenvalue, 0.0, None))

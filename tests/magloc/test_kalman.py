@@ -31,6 +31,7 @@ from magloc.kalman import (
     scalar_update,
     sequential_update,
     symmetric_square_root,
+    whitened_innovation,
 )
 from magloc.measurement.differences import DifferenceMeasurement
 from tests import oracles
@@ -239,13 +240,13 @@ def _solve_extended(a, b):
 
 
 class TestOneLinearisationIsAnExtendedKalmanFilter:
-    """With one iteration the prediction is asked once, and the update is that of filterpy, also of a vague prior."""
+    """With one iteration and no stop rule the prediction is asked once; the update is filterpy's, vague priors too."""
 
     @pytest.mark.parametrize("prior", [(0.3, 20.0), (300.0, 1e6)])
     def test_filterpy(self, prior):
         x, S, z, r, h, H = dipole_problem([5.2, 0.1, 0.4, 55.0, 50.0, 60.0], prior=prior)
         asked = []
-        ours = iterated_update(x, S, z, r, lambda y: asked.append(y) or h(y), H, tolerance=1e-9, max_iterations=1)
+        ours = iterated_update(x, S, z, r, lambda y: asked.append(y) or h(y), H, tolerance=0.0, max_iterations=1)
         linear, S_turn = sequential_update(x, S, H(x), z - h(x), r)
         assert (len(asked), ours.iterations, ours.converged) == (1, 1, False)
         np.testing.assert_allclose((ours.x - x) / prior[0], (linear - x) / prior[0], rtol=0.0, atol=1e-7)
@@ -331,6 +332,21 @@ class TestStopRule:
         assert not result.converged
         assert result.iterations == 2
 
+    def test_the_last_iteration_that_is_allowed_may_converge(self):
+        """As many as are needed are enough, and one fewer is not."""
+        x, S, z, r, h, H = dipole_problem(START)
+        needed = iterated_update(x, S, z, r, h, H, tolerance=1e-9)
+        at_most = {
+            n: iterated_update(x, S, z, r, h, H, tolerance=1e-9, max_iterations=n)
+            for n in (needed.iterations - 1, needed.iterations)
+        }
+        assert [update.converged for update in at_most.values()] == [False, True]
+        np.testing.assert_array_equal(at_most[needed.iterations].x, needed.x)
+
+    def test_no_iteration_at_all_is_refused(self):
+        with pytest.raises(ValueError, match="max_iterations must be at least 1; instead received 0"):
+            IteratedExtendedKalmanFilter(6, 9, tolerance=1e-9, max_iterations=0)
+
     def test_a_start_on_a_sensor_does_not_converge(self):
         sensor = tetrahedron(1.5).positions[0]
         x, S, z, r, h, H = dipole_problem([*sensor, 0.0, 0.0, 0.0])
@@ -351,6 +367,20 @@ class TestNormalisedInnovationSquared:
             nis.append(iterated_update(x, S, z, r, lambda y: H @ y, lambda _: H, tolerance=1e-6).nis)
         low, high = chi2_distribution.ppf([0.5e-4, 1 - 0.5e-4], 4 * 400)
         assert low < np.sum(nis) < high
+
+
+class TestNothingMeasured:
+    """No scalar at all leaves the prior as it is, without a word of LAPACK."""
+
+    def test_every_update(self, capfd):
+        x, S, H, nu, r = random_problem(9, k=0)
+        iterated = iterated_update(x, S, nu, r, lambda y: H @ y, lambda _: H, tolerance=1e-9)
+        for x_new, S_new in (block_update(x, S, H, nu, r), (iterated.x, iterated.S), sequential_update(x, S, H, nu, r)):
+            np.testing.assert_array_equal(x_new, x)
+            np.testing.assert_array_equal(S_new, S)
+        assert (iterated.nis, iterated.converged) == (0.0, True)
+        assert whitened_innovation(S, H, nu, r).shape == (0,)
+        assert capfd.readouterr() == ("", "")
 
 
 class TestEstimability:

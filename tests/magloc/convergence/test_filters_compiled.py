@@ -189,6 +189,19 @@ class TestReadableTwins:
         assert ends.stopped.all()
 
     @each_filter
+    def test_the_last_iteration_that_is_allowed_may_stop(self, method: Filter) -> None:
+        """At every limit up to where all have stopped, one too."""
+        measurement, z = problem(TETRAHEDRON)
+        starts, stopped = starts_of("source", 3), 0
+        for limit in range(1, 200):
+            limited = replace(method, tolerance_T=1e-10, max_iterations=limit)
+            ends = self.compare(limited, measurement, z, starts, 1e-6, counts=True)
+            stopped = int(ends.stopped.sum())
+            if stopped == len(starts):
+                return
+        pytest.fail(f"only {stopped} of {len(starts)} stopped")
+
+    @each_filter
     @pytest.mark.parametrize(
         "array",
         [
