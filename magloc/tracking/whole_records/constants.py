@@ -54,11 +54,11 @@ def constants_test(tracker: Tracker, rows: Sequence[Row], points: Sequence[Track
     wider = Tracker(array, tracker.motion)
     begin = max(i for i in known if points[i].status == "acquired" or i == known[0])
     rest = np.zeros(wider.motion.n_states - N_SOURCE + wider.n_errors)
-    used = [(rows[i], points[i]) for i in known if i >= begin and _is_placed(points[i])]
+    used = [(i, P) for i in known if i >= begin and (P := _placed_covariance(points[i])) is not None]
     if not used:
         return ConstantsTest()
-    states = [np.concatenate([point.position_m, point.moment_Am2, rest]) for _, point in used]
-    steps = settled_steps(wider, [row for row, _ in used], states)
+    states = [np.concatenate([points[i].position_m, points[i].moment_Am2, rest]) for i, _ in used]
+    steps = settled_steps(wider, [rows[i] for i, _ in used], states)
     if steps is None:
         return ConstantsTest()
     errors, own = wider.pose_errors, tracker.pose_errors
@@ -66,8 +66,7 @@ def constants_test(tracker: Tracker, rows: Sequence[Row], points: Sequence[Track
     mounting = math.nan if own.of_mounting.any() else _score(*of_errors, errors.of_mounting)
     if own.of_field.any() or not errors.of_field.any():
         return ConstantsTest(mounting)
-    claimed, source, field = used[-1][1].covariance, steps[-1].S[:N_SOURCE], of_errors[1][errors.of_field]
-    assert claimed is not None
+    claimed, source, field = used[-1][1], steps[-1].S[:N_SOURCE], of_errors[1][errors.of_field]
     shift = source @ np.linalg.pinv(field)  # of the source by errors of unit variance that are taken for zero
     factor = math.sqrt(1.0 + float(np.trace(np.linalg.solve(claimed, shift @ shift.T))) / N_SOURCE)
     return ConstantsTest(mounting, _score(*of_errors, errors.of_field), factor)
@@ -96,8 +95,9 @@ def _score(x: FloatArray, S: FloatArray, which: BoolArray) -> float:
     return float(min(-ndtri(max(chdtrc(int(told.sum()), square), 1e-300)), 37.0))
 
 
-def _is_placed(point: TrackPoint) -> bool:
-    """Whether the range is known so well that the source is Gaussian in Cartesian coordinates."""
+def _placed_covariance(point: TrackPoint) -> FloatArray | None:
+    """Of a source whose range is known so well that it is Gaussian in Cartesian coordinates, None of another."""
     if point.covariance is None or point.position_m is None or point.centroid_m is None:
-        return False
-    return bool(relative_range_sigma(point.covariance, point.position_m - point.centroid_m) <= START_RANGE_ERROR)
+        return None
+    error = relative_range_sigma(point.covariance, point.position_m - point.centroid_m)
+    return point.covariance if error <= START_RANGE_ERROR else None
