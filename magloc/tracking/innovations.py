@@ -37,7 +37,7 @@ class InnovationTest:
         or the readings were filtered before. NaN where there are none: compiled steps keep no innovations.
     z_constants : float
         Of the lever arm and the mounting that the rows tell of, where a pose is stated and these count as exact: too
-        large, they are not. NaN elsewhere.
+        large, they are not. NaN elsewhere, and where the motion is measured.
     z_ambient : float
         The same of the ambient field of scalar sensors, where it counts as exact.
     ambient_factor : float

@@ -208,7 +208,7 @@ class Track(TrackColumns):
     def innovations(self) -> InnovationTest:
         """Whether the readings agree with what is stated of sensors, pose and motion."""
         test = innovation_test(self)
-        if self.readings.background or self.readings.motion is not None:  # whose states the test does not have
+        if self.readings.motion is not None:  # whose steps the test does not have
             return test
         exact = constants_test(self.tracker, self._rows, self.points)
         return replace(test, z_constants=exact.mounting, z_ambient=exact.field, ambient_factor=exact.field_factor)

@@ -51,7 +51,7 @@ def constants_test(tracker: Tracker, rows: Sequence[Row], points: Sequence[Track
     known = [i for i, point in enumerate(points) if point.is_on_track]
     if array is tracker.array or not known:
         return ConstantsTest()
-    wider = Tracker(array, tracker.motion)
+    wider = Tracker(array, tracker.motion, background=tracker.background)
     begin = max(i for i in known if points[i].status == "acquired" or i == known[0])
     rest = np.zeros(wider.motion.n_states - N_SOURCE + wider.n_errors)
     used = [(i, P) for i in known if i >= begin and (P := _placed_covariance(points[i])) is not None]

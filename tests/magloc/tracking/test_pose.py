@@ -102,6 +102,17 @@ class TestExactMounting:
         right, wrong = (run(pose, 0, WHITE, diver)[1].innovations for pose in (WHITE, replace(ALL, correlation_s=0.0)))
         assert right.z_constants < THRESHOLD < wrong.z_constants
 
+    def test_right_ones_on_a_background(self) -> None:
+        """Whose states stand beside them."""
+        scores = []
+        for seed in range(20):
+            simulation = simulate(replace(SCENARIO, pose=WHITE), seed)
+            array = replace(simulation.array, pose=WHITE)
+            track = magloc.track(array, simulation.readings.high_passed(0.01), motion=REST)
+            scores.append(track.innovations.z_constants)
+        assert max(scores) < THRESHOLD
+        assert stats.kstest(scores, "norm").pvalue > 1e-3
+
 
 class TestTrack:
     def test_errors_of_the_pose_are_claimed(self) -> None:
@@ -113,6 +124,12 @@ class TestTrack:
         assert not track.innovations.flagged
         assert math.isnan(track.innovations.z_constants)  # they are states already
         assert track.table().count("\n") == len(track)
+
+    def test_a_mounting_that_counts_as_exact_is_seen_on_a_background(self) -> None:
+        """That is not: by 0.5° and 5 cm."""
+        simulation = simulate(replace(SCENARIO, pose=replace(ALL, correlation_s=0.0)), 0)
+        track = magloc.track(replace(simulation.array, pose=WHITE), simulation.readings.high_passed(0.01), motion=REST)
+        assert track.innovations.z_constants > THRESHOLD
 
     def test_a_stream_of_rows_knows_its_motion_from_the_rows_before(self) -> None:
         """Velocities by the row before in place of both neighbours: another track, as right within 5 σ."""
