@@ -35,21 +35,33 @@ _LOG = logging.getLogger(__name__)
 COMPILING = "compiling for this machine, up to a minute; later calls start at once, and warm-up does it ahead"
 
 
-class _Compiling(event.Listener):
-    """Says once a process that something is compiled, which nobody should have to guess from a minute of silence.
+class _Announcement(event.Listener):
+    """Says once a process that something is compiled, which nobody should have to guess from a minute of silence."""
 
-    Garbage is not collected meanwhile: of all that the compiler makes hardly anything is, and the search for it takes a
-    tenth of the time. A kernel waits for those that it calls, so that events are nested.
-    """
-
-    said = collects = False
-    depth = 0
+    said = False
 
     def on_start(self, event: event.Event) -> None:
         """Say so, the first time."""
         if not self.said:
             self.said = True
             _LOG.info(COMPILING)
+
+    def on_end(self, event: event.Event) -> None:
+        """Nothing: results say that it is over."""
+
+
+class _GarbageWaits(event.Listener):
+    """Garbage is not collected while something is compiled.
+
+    Of all that the compiler makes hardly anything is, and the search for it takes a tenth of the time. A kernel waits
+    for those that it calls, so that events are nested.
+    """
+
+    collects = False
+    depth = 0
+
+    def on_start(self, event: event.Event) -> None:
+        """Let it wait."""
         if self.depth == 0:
             self.collects = gc.isenabled()
             gc.disable()
@@ -62,7 +74,8 @@ class _Compiling(event.Listener):
             gc.enable()
 
 
-event.register("numba:compile", _Compiling())  # type: ignore[no-untyped-call]
+for _listener in (_Announcement(), _GarbageWaits()):
+    event.register("numba:compile", _listener)  # type: ignore[no-untyped-call]
 
 
 _NumbasCache: Any = caching.FunctionCache  # which has no types

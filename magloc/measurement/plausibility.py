@@ -22,11 +22,15 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 _FEWEST_ROWS = 20
-_QUIETER = 0.01  # of the noise that is stated; microtesla taken for nanotesla are 0.001
+_OF_A_NANOTESLA = {"µT": 1e-3, "G": 1e-5, "T": 1e-9}
+_LIKE = 3.0  # factor to the noise of another unit
+_WHITE = 5.0  # growth from lag 1 to lag 2: 1 for white noise, 8 behind a filter of second order, 2**6 for smooth fields
 _OTHER_UNIT = 5.0  # ratio of moduli to the ambient field's: a source beside the sensors is not so strong for long
 _STEADY = 0.02  # relative change of the modulus of a field that is the Earth's
 _TURNS_RAD = 0.06  # three times what an attitude of 1° and a source's share of the field do
+_TURNS_UNEXPLAINED_RAD = 0.3  # offsets of 10 µT in 50 µT do 0.2
 _SLOWEST_M_S, _FASTEST_M_S, _FAR_M = 0.01, 500.0, 2.0
+_ORBIT_M_S = (3e3, 11e3)  # geostationary to escape
 
 
 def usable_readings(array: SensorArray, values: Readings | ArrayLike) -> Readings:
@@ -52,69 +56,98 @@ def doubts(array: SensorArray, readings: Readings) -> Iterator[str]:
     if read.any() and saturated > 0.5:
         yield f"{saturated:.0%} of the readings reach saturation_nT: are they in nT?"
     noise = noise_ratio(array, used.values_T)
-    if noise < _QUIETER:
-        yield (
-            f"the readings change from row to row by {noise:.1g} of the noise that is stated: are they in nT, and is"
-            " noise_nT right?"
-        )
+    for unit, nanotesla in _OF_A_NANOTESLA.items():
+        if nanotesla / _LIKE < noise < nanotesla * _LIKE:
+            yield (
+                f"the readings change from row to row by {noise:.1g} of the noise that is stated, as they would in"
+                f" {unit}: are they in nT, is noise_nT right, were they filtered?"
+            )
     ambient_T = array.ambient_fields if used.ambient_T is None else used.ambient_T
-    moduli, ambient = _median(used.values_T[:, array.channel_is_scalar]), _median(np.linalg.norm(ambient_T, axis=-1))
-    if ambient > 0.0 and (moduli < ambient / _OTHER_UNIT or moduli > ambient * _OTHER_UNIT):
-        yield (
-            f"scalar sensors read {1e9 * moduli:.4g} nT in the median where the ambient field is"
-            f" {1e9 * ambient:.4g} nT: are both in nT?"
-        )
+    yield from _of_moduli(used.values_T[:, array.channel_is_scalar], _median(np.linalg.norm(ambient_T, axis=-1)))
     if used.pose is not None:
         yield from _of_path(used.time_s, used.pose[0])
-        yield from _of_attitude(_shared_field(array, used), used.pose[1])
+        yield from _of_attitude(array, used, used.pose[1])
 
 
 def noise_ratio(array: SensorArray, values_T: FloatArray) -> float:
-    """Noise that rows (n, C) show over that which is stated, 1 where it is right; NaN where nothing changes.
+    """White noise that rows (n, C) show over that which is stated, 1 where it is right; NaN where they show none.
 
-    From differences of third order in time, in which little is left of fields that last, of what sensors read beyond
-    each other. A sensor alone of its kind tells it by its modulus, which no attitude changes.
+    From differences of sixth order in time, in which little is left of fields that last. White noise is as large in
+    those of every other row; filtered noise, and a source too fast for the rows, are several times larger there.
+    """
+    own = _beyond_each_other(array, values_T)
+    ratio, of_every_other = (_median(np.abs(_sixth_difference(own, lag))) / 0.6745 for lag in (1, 2))  # if Gaussian
+    return ratio if 0.0 < of_every_other < _WHITE * ratio else float("nan")
+
+
+def _beyond_each_other(array: SensorArray, values_T: FloatArray) -> FloatArray:
+    """What sensors of a kind read beyond their mean, over the noise that is stated: (n, ...).
+
+    A sensor alone of its kind tells it by its modulus, which no attitude changes.
     """
     fields, noise = array.calibrated_field(values_T), np.array([sensor.noise_T for sensor in array.sensors])
     owner, scalar = array.channel_sensor, array.channel_is_scalar
-    ratios = []
-    for kind, of_kind in (("vector", fields), ("scalar", values_T[:, scalar, None])):
-        sigma = noise[[sensor.kind == kind for sensor in array.sensors]]
-        own = of_kind[:, np.unique(owner[~scalar])] if kind == "vector" else of_kind
-        if own.shape[1] == 1:
-            own = np.linalg.norm(own, axis=2, keepdims=True)
-        elif own.shape[1]:
-            own = own - own.mean(axis=1, keepdims=True)
-        ratios.append(np.abs(np.diff(own, n=3, axis=0) / sigma[:, None]).ravel())
-    size = np.concatenate(ratios)
-    size = size[np.isfinite(size)]
-    if not size.size or np.median(size) == 0.0:
-        return float("nan")
-    return float(np.median(size) / (0.6745 * np.sqrt(20.0)))  # of Gaussian noise: 1² + 3² + 3² + 1²
+    own = []
+    for kind, of_kind in (("vector", fields[:, np.unique(owner[~scalar])]), ("scalar", values_T[:, scalar, None])):
+        sigma = noise[[sensor.kind == kind for sensor in array.sensors], None]
+        alone = len(sigma) == 1
+        beyond = np.linalg.norm(of_kind, axis=2, keepdims=True) if alone else of_kind
+        if len(sigma) > 1:
+            beyond = beyond - beyond.mean(axis=1, keepdims=True)
+        own.append((beyond / sigma).reshape(len(values_T), -1))
+    return np.concatenate(own, axis=1)
 
 
-def _shared_field(array: SensorArray, readings: Readings) -> FloatArray:
-    """What vector sensors read on average, else the ambient field of the rows: (n, 3), in the array's frame."""
-    vector = np.unique(array.channel_sensor[~array.channel_is_scalar])
-    if vector.size:
-        return np.asarray(array.calibrated_field(readings.values_T)[:, vector].mean(axis=1))
-    return np.empty((0, 3)) if readings.ambient_T is None else readings.ambient_T
+def _sixth_difference(values: FloatArray, lag: int) -> FloatArray:
+    """Difference of sixth order over rows that lie `lag` apart, of the variance of white noise."""
+    for _ in range(6):
+        values = values[lag:] - values[:-lag]
+    return values / np.sqrt(924.0)  # 1² + 6² + 15² + 20² + 15² + 6² + 1²
+
+
+def _of_moduli(moduli_T: FloatArray, ambient_T: float) -> Iterator[str]:
+    """Whether scalar sensors read about the ambient field; what has both signs is left of it where it was taken off."""
+    read = _median(moduli_T)
+    unlike = read < ambient_T / _OTHER_UNIT or read > ambient_T * _OTHER_UNIT
+    if ambient_T > 0.0 and unlike and not (moduli_T < 0.0).any():
+        yield (
+            f"scalar sensors read {1e9 * read:.4g} nT in the median where the ambient field is {1e9 * ambient_T:.4g}"
+            " nT: are both in nT, or was it taken off the readings?"
+        )
 
 
 def _of_path(time_s: FloatArray, position_m: FloatArray) -> Iterator[str]:
-    steps = np.diff(time_s)
-    if not (steps > 0.0).all() or np.ptp(position_m, axis=0).max() < _FAR_M:
+    known = np.isfinite(time_s) & np.isfinite(position_m).all(axis=1)
+    time_s, position_m = time_s[known], position_m[known]
+    dt_s = np.diff(time_s)
+    if not known.any() or not (dt_s > 0.0).all() or np.ptp(position_m, axis=0).max() < _FAR_M:
         return
-    speed = float(np.quantile(np.linalg.norm(np.diff(position_m, axis=0), axis=1) / steps, 0.9))
-    if not _SLOWEST_M_S <= speed <= _FASTEST_M_S:
-        yield f"the array moves at {speed:.2g} m/s by its poses: are times in s, and places in m?"
+    step_m = np.linalg.norm(np.diff(position_m, axis=0), axis=1)
+    speed = step_m / dt_s
+    order = np.argsort(speed)
+    made_m = np.cumsum(step_m[order])
+    slow = speed[order[np.searchsorted(made_m, made_m[-1] / 2.0)]]  # of half of the path: rests do not count
+    fast = np.quantile(speed, 0.9)  # single jumps do not count
+    if slow < _SLOWEST_M_S or (fast > _FASTEST_M_S and not _ORBIT_M_S[0] < fast < _ORBIT_M_S[1]):
+        wrong = slow if slow < _SLOWEST_M_S else fast
+        yield f"the array moves at {wrong:.2g} m/s by its poses: are times in s, and places in m?"
 
 
-def _of_attitude(field_T: FloatArray, rotation: Rotation) -> Iterator[str]:
-    """Whether a field of steady modulus, which is the Earth's, stands still in the world."""
+def _of_attitude(array: SensorArray, readings: Readings, rotation: Rotation) -> Iterator[str]:
+    """Whether a field of steady modulus, which is the Earth's, stands still in the world.
+
+    It is what vector sensors read on average, else the ambient field of the rows.
+    """
     from scipy.spatial.transform import Rotation
 
-    whole = np.flatnonzero(np.isfinite(field_T).all(axis=1))
+    vector = np.unique(array.channel_sensor[~array.channel_is_scalar])
+    if vector.size:
+        field_T = np.asarray(array.calibrated_field(readings.values_T)[:, vector].mean(axis=1))
+    elif readings.ambient_T is not None:
+        field_T = readings.ambient_T
+    else:
+        return
+    whole = np.flatnonzero(np.isfinite(field_T).all(axis=1) & np.isfinite(rotation.as_quat()).all(axis=1))
     if len(whole) < _FEWEST_ROWS:
         return
     field_T, rotation = field_T[whole], rotation[whole]
@@ -130,7 +163,8 @@ def _of_attitude(field_T: FloatArray, rotation: Rotation) -> Iterator[str]:
         return float(np.median(np.arccos(np.clip(world @ (mean / np.linalg.norm(mean)), -1.0, 1.0))))
 
     stated = turns(rotation)
-    if stated < _TURNS_RAD:
+    by_offsets = 3.0 * max((array.sensors[i].offset_uncertainty_T for i in vector), default=0.0) / middle
+    if stated < _TURNS_RAD + by_offsets:
         return
     x, y, z, w = rotation.as_quat().T
     first = rotation[0]
@@ -141,10 +175,15 @@ def _of_attitude(field_T: FloatArray, rotation: Rotation) -> Iterator[str]:
     }
     left = {words: turns(of) for words, of in others.items()}
     best = min(left, key=lambda words: left[words])
-    cure = f"; {best} it turns by {np.degrees(left[best]):.1f}°" if left[best] < stated / 3.0 else ""
+    if left[best] < stated / 3.0:
+        explained, question = f", and {best} by {np.degrees(left[best]):.1f}°", "?"
+    elif stated > _TURNS_UNEXPLAINED_RAD + by_offsets:
+        explained, question = "", ", and are the sensors calibrated?"
+    else:
+        return
     yield (
         f"the ambient field, of steady modulus, turns in the world by {np.degrees(stated):.0f}° in the median as the"
-        f" array turns: the attitude is not that from the array's frame to the world's{cure}"
+        f" array turns{explained}: is the attitude that from the array's frame to the world's{question}"
     )
 
 

@@ -71,7 +71,7 @@ class TestCompiling:
     def test_is_said_once_where_somebody_watches(
         self, watched: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        listener = compilation._Compiling()
+        listener = compilation._Announcement()
         monkeypatch.setattr(sys.stderr, "isatty", lambda: watched)
         with framework._notes_of_the_library(app.app.name[0]):
             for happens in (listener.on_start, listener.on_start, listener.on_end, listener.on_end):
@@ -82,7 +82,7 @@ class TestCompiling:
         from numba import njit
         from numba.core import event
 
-        listener = compilation._Compiling()
+        listener = compilation._Announcement()
         with caplog.at_level(logging.INFO, "magloc"), event.install_listener("numba:compile", listener):
             assert njit(lambda x: x + 1)(1) == 2
         assert listener.said
@@ -91,7 +91,7 @@ class TestCompiling:
     def test_garbage_waits_until_a_kernel_and_those_that_it_calls_are_compiled(
         self, collects: bool, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        listener, state = compilation._Compiling(), [collects]
+        listener, state = compilation._GarbageWaits(), [collects]
         monkeypatch.setattr(compilation.gc, "isenabled", lambda: state[-1])
         monkeypatch.setattr(compilation.gc, "disable", lambda: state.append(False))
         monkeypatch.setattr(compilation.gc, "enable", lambda: state.append(True))
