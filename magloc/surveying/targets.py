@@ -93,8 +93,8 @@ def second_source_chi2(
     fields = np.concatenate([multipole_field_matrix(record.sensors_m, position, order) for order in (2, 3)], axis=-1)
     A = background.white(np.einsum("nci,ncij->ncj", directions, fields[:, record.array.channel_sensor]))
     A = A / np.linalg.norm(A, axis=0)
-    A = A - Q @ (Q.T @ A)
-    size, axes = np.linalg.eigh(A.T @ A)
+    # 1 - QQᵀ is a weight, no projector: it stands once in the information, and ``left`` has it already.
+    size, axes = np.linalg.eigh(A.T @ (A - Q @ (Q.T @ A)))
     return float(np.sum((axes.T @ (A.T @ left))[-_N_SECOND:] ** 2 / size[-_N_SECOND:]))
 
 

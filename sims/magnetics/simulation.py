@@ -236,9 +236,11 @@ def _induced_fields(scenario: MagneticScenario, time_s: FloatArray, ambient_T: F
     """
     platform, names = scenario.platform, scenario.array.ids
     total = np.zeros((len(time_s), len(names), 3))
+    # One row shows no change.
+    rate_T_s = np.gradient(ambient_T, time_s, axis=0) if len(time_s) > 1 else np.zeros_like(ambient_T)
     for size, cause, field_T in (
         (platform.induced, "induced", ambient_T),
-        (platform.eddy_s, "eddy currents", np.gradient(ambient_T, time_s, axis=0) if platform.eddy_s else ambient_T),
+        (platform.eddy_s, "eddy currents", rate_T_s),
     ):
         if size:
             drawn = size * np.stack([stream(seed, cause, name).standard_normal((3, 3)) for name in names])

@@ -24,6 +24,7 @@ _MOST_STEPS = 25
 _SETTLED = 1e-3
 _UNKNOWN = 1e4  # standard deviation of a column of unit length
 _NEGLIGIBLE = 0.1  # of the noise
+_RIDGE = 1e-10  # of a parameter's own information: above rounding, so that few rows leave no matrix singular
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +180,8 @@ class JointFit:
     def covariance(self) -> FloatArray:
         """Of positions and moments (6 K, 6 K)."""
         scale = 1.0 / np.sqrt(np.diagonal(self.information))
-        return np.asarray(scale[:, None] * np.linalg.inv(scale[:, None] * self.information * scale) * scale)
+        scaled = scale[:, None] * self.information * scale
+        return np.asarray(scale[:, None] * np.linalg.inv(scaled + _RIDGE * np.eye(len(scale))) * scale)
 
     @property
     def significance(self) -> FloatArray:
@@ -190,7 +192,7 @@ class JointFit:
             own = np.arange(6 * j + 3, 6 * j + 6)
             others = np.delete(np.arange(6 * K), np.arange(6 * j, 6 * j + 6))
             scale = 1.0 / np.sqrt(np.diagonal(H)[others])
-            among = scale[:, None] * H[np.ix_(others, others)] * scale
+            among = scale[:, None] * H[np.ix_(others, others)] * scale + _RIDGE * np.eye(len(others))
             shared = scale[:, None] * H[np.ix_(others, own)]
             left = H[np.ix_(own, own)] - shared.T @ np.linalg.solve(among, shared)
             m = self.sources.moment_Am2[j]

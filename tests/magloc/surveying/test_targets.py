@@ -10,6 +10,7 @@ import magpylib
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.stats import chi2 as chi2_distribution
 from scipy.stats import ncx2
 
 import magloc
@@ -39,6 +40,7 @@ from sims.magnetics.scenario import Carrier, MagneticScenario, Source
 WEAK = ((-1.0, 1.0, -1.1), (0.1, 0.2, -0.3))
 Fitted = tuple[Model, JointFit, Background]
 STRONG = ((3.0, -2.0, -0.6), (6.0, 5.0, -8.0))
+DRAWS = 50
 
 
 @cache
@@ -202,6 +204,22 @@ class TestSecondSource:
         explained, left = self.chi2s(gap_m)
         assert 0.9 * left < explained < 1.02 * left
         assert left > 1.0
+
+    @pytest.mark.parametrize("body_length_m", [0.0, 0.7])
+    def test_of_noise_it_is_chi_square(self, body_length_m: float) -> None:
+        """Noise as the model has it, ground and bodies included; of right ones 1 in 1000 sums is beyond the limits."""
+        model, fit, _ = fitted()
+        model, source = replace(model, body_length_m=body_length_m), fit.sources.some(np.array([1]))
+        background = model.background(source, groups(AT_LAST * model.nearest_m))
+        U, size, _ = np.linalg.svd(background.Q, full_matrices=False)
+        noise = np.random.default_rng(5).normal(size=(DRAWS, len(U)))
+        noise += (noise @ U * (1.0 / np.sqrt(1.0 - size**2) - 1.0)) @ U.T  # of covariance (1 - QQᵀ)⁻¹
+        directions = model.record.directions(source.fields(model.record))
+        Q = with_free_sources(model.record, background, source)
+        place = source.position_m[0]
+        chi2 = [second_source_chi2(model, background, directions, Q, r - Q @ (Q.T @ r), place) for r in noise]
+        low, high = chi2_distribution(9 * DRAWS).interval(0.999)
+        assert low < np.sum(chi2) < high
 
     def test_one_dipole_leaves_nothing(self) -> None:
         explained, left = self.chi2s(0.0)

@@ -199,6 +199,13 @@ class TestCommonFields:
         assert {s.induced_uncertainty for s in induced.array.sensors} == {1e-3}
         assert {s.eddy_uncertainty_s for s in eddying.array.sensors} == {1e-3}
 
+    def test_one_row_shows_no_change_of_the_ambient_field(self) -> None:
+        """Which has no derivative, and no eddy currents."""
+        one = {"carrier": MOVING, "duration_s": 0.01, "sources": ()}
+        quiet, eddying = (simulate(scenario(platform=Platform(eddy_s=s), **one), 1) for s in (0.0, 1e-4))
+        assert len(eddying.readings) == 1
+        np.testing.assert_array_equal(eddying.readings.values_T, quiet.readings.values_T)
+
     def test_it_may_oscillate(self) -> None:
         platform = Platform((0.0, 0.0, 3.0), (0.0, 0.0, 1.0), frequency_Hz=0.5)
         values = simulate(scenario(platform=platform, sources=()), 1).readings.values_T[:, 2]
