@@ -337,14 +337,14 @@ class TestSelfCalibration:
         assert result.chi2 < 1e-2
 
     def test_a_trusted_position_holds_the_array_there(self):
-        """It may still be turned and scaled about that sensor."""
+        """It may still be turned and scaled about that sensor: its middle moves, unless the axis is through both."""
         prior = replace(PRIOR, trusted_positions=("s1",))
         case = passage(11, common_field_T=1e-13, prior=prior)
         result = self_calibrate(case.array, case.readings_T, prior=prior)
         combinations = [name for name in unseen(result) if name.startswith("combination of")]
         assert len(result.unobservable) == 5
         assert unseen(result) == GAIN | set(combinations)
-        assert all("translation" in name for name in combinations)
+        assert sum("translation" in name for name in combinations) >= len(combinations) - 1
 
     def test_a_trusted_scale_and_two_positions_hold_all(self):
         prior = replace(PRIOR, trusted_positions=("s1", "s3"), trusted_scales=("s1",))
