@@ -95,7 +95,10 @@ def _cells(fix: Fix, source: Source, per_m: float, decimals: int) -> list[str]:
 def cells_of_strength(moment_Am2: FloatArray, covariance: FloatArray) -> tuple[str, str]:
     """Modulus of a moment, and its standard deviation by the covariance (3, 3) of the moment."""
     strength = float(np.linalg.norm(moment_Am2))
-    along = moment_Am2 / strength if strength else np.zeros(3)
+    spread = float(np.sqrt(np.trace(covariance)))
+    if strength <= 1e-6 * spread:  # the mean of two moments that differ in sign has no direction
+        return "0", _two_digits(spread)
+    along = moment_Am2 / strength
     return f"{strength:.4g}", _two_digits(float(np.sqrt(along @ covariance @ along)))
 
 

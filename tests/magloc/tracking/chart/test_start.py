@@ -85,6 +85,7 @@ class TestModuliInNoAmbientField:
         assert simulation.truth.moment_Am2 is not None
         assert size == pytest.approx(np.linalg.norm(simulation.truth.moment_Am2[-1]), rel=0.1)
         assert found.estimability[-1][3:].min() > 0.5
+        assert found.table().splitlines()[len(found)].split()[7:9] == ["0", f"{size:.0f}"]
 
     def test_fewer_say_so(self) -> None:
         few = SensorArray(SCENARIO.array.sensors[:5])
