@@ -70,14 +70,17 @@ def _each(run: Callable[..., Iterator[Any]], folder: Path | None, work: Work, it
 
 def _pooled(pool: ProcessPoolExecutor, ahead: int, work: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
     waiting = iter(items)
-    running = {pool.submit(work, item) for item in islice(waiting, ahead)}
-    while running:
-        done, running = wait(running, return_when=FIRST_COMPLETED)
-        try:
+    try:
+        running = {pool.submit(work, item) for item in islice(waiting, ahead)}
+        while running:
+            done, running = wait(running, return_when=FIRST_COMPLETED)
             running |= {pool.submit(work, item) for item in islice(waiting, len(done))}
             yield from [future.result() for future in done]
-        except BrokenProcessPool:
-            raise InputError("a process died, for want of memory perhaps: ask for fewer processes.") from None
+    except BrokenProcessPool:
+        raise InputError(
+            "a process died, for want of memory perhaps: ask for fewer processes. A script of your own has to start"
+            " its work below `if __name__ == '__main__':`, as processes import it."
+        ) from None
 
 
 def _numbered(work: Work, item: tuple[int, Any]) -> tuple[int, Arrays]:

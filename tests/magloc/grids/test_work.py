@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from arrays.io.errors import InputError
 from magloc.grids.work import Arrays, workers
 
 ITEMS = [np.arange(3.0), np.arange(4.0), np.ones(2)]
@@ -18,7 +20,15 @@ def squared(item: Any) -> Arrays:
     return {"square": item**2, "name": np.array(["a", "bc"])}
 
 
+def died(_: Any) -> Arrays:
+    os._exit(1)
+
+
 class TestWorkers:
+    def test_a_process_that_dies_is_said(self) -> None:
+        with pytest.raises(InputError, match=r"a process died.*__main__"), workers(2, None, None) as each:
+            list(each(died, ITEMS))
+
     @pytest.mark.parametrize("processes", [1, 2])
     def test_every_item_once(self, processes: int) -> None:
         with workers(processes, None, None) as each:
