@@ -45,7 +45,16 @@ class Filter(Protocol):
         """Which of the ends are the maximum-likelihood optimum."""
 
 
-class _LikelihoodFilter:
+class _PositiveSettings:
+    """A dataclass whose numbers are positive; a tolerance may be zero: all passes are made."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (value > 0 or isinstance(value, bool) or (value == 0 and name == "tolerance_T")):
+                raise ValueError(f"Input {name} must be positive; instead received {value}.")
+
+
+class _LikelihoodFilter(_PositiveSettings):
     """A filter that ends where the likelihood is largest."""
 
     def reached(self, ends: Ends, chi2_optimum: float, position_optimum: FloatArray) -> NDArray[np.bool_]:
@@ -54,7 +63,7 @@ class _LikelihoodFilter:
 
 
 @dataclass(frozen=True)
-class _PriorFilter:
+class _PriorFilter(_PositiveSettings):
     """A filter with the start as the mean of its prior, of these standard deviations per axis."""
 
     position_sigma_m: float = 3.0

@@ -36,21 +36,33 @@ _ORBIT_M_S = (3e3, 11e3)  # geostationary to escape
 def usable_readings(array: SensorArray, values: Readings | ArrayLike) -> Readings:
     """Readings without those that saturate, in their ambient field; warns of what is hardly as stated."""
     readings = as_readings(values)
-    warn_of_doubts(array, readings)
-    return in_world_field(without_saturated(readings, array), array)
+    used = _usable(array, readings)
+    _warn_of(doubts(array, readings, used))
+    return used
 
 
 def warn_of_doubts(array: SensorArray, readings: Readings) -> None:
     """Warn of what in readings is hardly as stated."""
-    for doubt in doubts(array, readings):
+    _warn_of(doubts(array, readings))
+
+
+def _warn_of(sentences: Iterator[str]) -> None:
+    for doubt in sentences:
         _LOG.warning(doubt)
 
 
-def doubts(array: SensorArray, readings: Readings) -> Iterator[str]:
-    """Sentences on readings that are hardly as stated; none for fewer than twenty rows."""
+def _usable(array: SensorArray, readings: Readings) -> Readings:
+    return in_world_field(without_saturated(readings, array), array)
+
+
+def doubts(array: SensorArray, readings: Readings, used: Readings | None = None) -> Iterator[str]:
+    """Sentences on readings that are hardly as stated; none for fewer than twenty rows.
+
+    `used` are those that do not saturate, in their ambient field, where they are known.
+    """
     if len(readings) < _FEWEST_ROWS:
         return
-    used = in_world_field(without_saturated(readings, array), array)
+    used = _usable(array, readings) if used is None else used
     read = np.isfinite(readings.values_T)
     saturated = 1.0 - np.isfinite(used.values_T).sum() / max(int(read.sum()), 1)
     if read.any() and saturated > 0.5:

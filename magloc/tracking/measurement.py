@@ -32,6 +32,14 @@ LEAST_SINGULAR = 1e-6
 """A row has no coordinates of its own if a column of its Jacobian, in units of what is known, is so near to others."""
 
 
+def whitening(effect: FloatArray) -> FloatArray:
+    r"""Matrix (k, k) that whitens unit noise and errors of unit variance with an effect :math:`\Phi` (k, n) on it.
+
+    :math:`L^{-1}` of :math:`L L^T = 1 + \Phi \Phi^T`.
+    """
+    return np.linalg.inv(np.linalg.cholesky(np.eye(len(effect)) + effect @ effect.T))
+
+
 @dataclass(frozen=True, eq=False)
 class RowMeasurement:
     """Differences of one row, in units of their noise, as a function of the state in the world frame.
@@ -88,7 +96,7 @@ class RowMeasurement:
     def with_errors_as_noise(self, sigma: FloatArray) -> RowMeasurement:
         """The row alone: the sensors' errors, known by their σ (n_errors,), are part of the differences' noise."""
         lasting, k = self.effect * sigma, len(self.sigma)
-        whiten = np.linalg.inv(np.linalg.cholesky(np.eye(k) + lasting @ lasting.T))
+        whiten = whitening(lasting)
         differences = Differences(whiten @ (self.model.differences.transform / self.sigma[:, None]), np.ones(k))
         model = replace(self.model, differences=differences)
         return replace(self, model=model, sigma=np.ones(k), effect=np.zeros((k, 0)))

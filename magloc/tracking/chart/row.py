@@ -12,7 +12,7 @@ from magloc.chi_square import energy_threshold
 from magloc.measurement.differences import DifferenceMeasurement
 from magloc.measurement.pose import N_POSE, ArrayPose
 from magloc.tracking.chart.coordinates import Chart
-from magloc.tracking.measurement import RowMeasurement
+from magloc.tracking.measurement import RowMeasurement, whitening
 from magloc.tracking.motion import N_SOURCE
 from magloc.tracking.results import Row
 
@@ -137,7 +137,7 @@ class ChartRow:
         # Sources without a moment: what is left is the ambient field, turned by the pose's errors.
         nowhere = self.pose.in_array(np.zeros(N_SOURCE))
         by_pose = where_smooth(self._by_pose(np.zeros((len(self.sigma), N_SOURCE)), nowhere, np.zeros(N_POSE)))
-        return np.linalg.inv(np.linalg.cholesky(np.eye(len(by_pose)) + by_pose @ by_pose.T))
+        return whitening(by_pose)
 
     def is_detected(self, sigma_errors: FloatArray) -> bool:
         """Whether the differences stand out of noise and of what the errors of sensors and pose may make of them."""

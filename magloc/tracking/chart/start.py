@@ -31,6 +31,7 @@ from magloc.tracking.chart.coordinates import MOMENT_POWER, Chart, source_root
 from magloc.tracking.chart.mixture import DROPPED_BELOW, FARTHEST, NEAREST, Mixture, block_root
 from magloc.tracking.chart.row import ChartRow, where_smooth
 from magloc.tracking.chart.update import Updated, updated
+from magloc.tracking.measurement import whitening
 from magloc.tracking.motion import N_SOURCE, MotionModel
 from magloc.tracking.results import Row
 
@@ -290,7 +291,7 @@ def with_errors(mixture: Mixture, measurement: ChartRow, sigma: FloatArray) -> M
     H = measurement.along(mixture.x, chart.jacobian(np.zeros_like(mixture.x)))
     rows = np.zeros((len(mixture), n + sigma.size, n + sigma.size))
     rows[:, :n, :n], rows[:, n:, :n] = mixture.S, -gain @ (H @ mixture.S)
-    rows[:, n:, n:] = sigma[:, None] * np.linalg.inv(np.linalg.cholesky(np.eye(sigma.size) + unit.T @ unit)).T
+    rows[:, n:, n:] = sigma[:, None] * whitening(unit.T).T
     return replace(mixture, x=np.concatenate([mixture.x, left @ gain.T], axis=1), S=block_root(rows))
 
 

@@ -20,6 +20,7 @@ from scipy.special import chdtri
 from arrays.typing import BoolArray, FloatArray
 from magloc.kalman import block_update, whitened_innovation
 from magloc.levels import CONTRADICTION
+from magloc.localization.uncertainty.range_interval import relative_range_sigma
 from magloc.readings import Readings
 from magloc.tracking.batch import track_record
 from magloc.tracking.chart.coordinates import Chart
@@ -258,7 +259,7 @@ def _points(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _P
         if j:
             open_loop = tracker.open_loop(open_loop, passed.steps[j - 1].x, row.time_s - measurements[j - 1].row.time_s)
         range_error = _range_error(step.x, step.S, measurement)
-        if range_error > (LARGEST_RANGE_ERROR if tracked else _FIRST_RANGE_ERROR):
+        if not range_error <= (LARGEST_RANGE_ERROR if tracked else _FIRST_RANGE_ERROR):
             tracked, last = False, None
             points.append(tracker._lost(row, "not acquired: the range is not certain enough"))
             continue
@@ -274,7 +275,5 @@ def _points(tracker: Tracker, measurements: Sequence[RowMeasurement], passed: _P
 
 def _range_error(x: FloatArray, S: FloatArray, measurement: RowMeasurement) -> float:
     """Standard deviation of the range over the range."""
-    offset, root = measurement.place_in_array(x, S)
-    square = float(offset @ offset)
-    along = offset @ root
-    return math.sqrt(float(along @ along)) / square if square > 0.0 else math.inf
+    offset_m, root = measurement.place_in_array(x, S)
+    return float(relative_range_sigma(root @ root.T, offset_m))

@@ -113,6 +113,16 @@ def solve_exactly(matrix: list[list[Fraction]], right: list[Fraction]) -> list[F
     return [row[-1] / row[i] for i, row in enumerate(rows)]
 
 
+class TestSettings:
+    @each_filter
+    @pytest.mark.parametrize("setting", [{"max_iterations": 0}, {"tolerance_T": -1.0}, {"tolerance_T": np.nan}])
+    def test_no_pass_at_all_is_no_filter(self, method: Filter, setting: dict[str, float]) -> None:
+        """It would return memory that nothing wrote."""
+        name = next(iter(setting))
+        with pytest.raises(ValueError, match=f"Input {name} must be positive"):
+            replace(method, **setting)  # type: ignore[arg-type]
+
+
 class TestOnePassIsTheExactUpdate:
     """The update of a linear model has one right answer: that of the Jacobian and the innovations in doubles.
 
